@@ -1,0 +1,59 @@
+"""What a fit answers: the body, how well it explains the image, and how sure it is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import IntEnum
+
+import numpy as np
+
+from sq_perception.geometry.superquadric import Superquadric
+
+
+class Status(IntEnum):
+    """How far a recovery can be trusted; the numbers travel in messages and never change."""
+
+    CONVERGED = 0
+    WEAK = 1
+    """Converged, but the view does not determine every quantity: see the message."""
+    FAILED = 2
+    """No body: too few points, no convergence, or a residual far above the noise."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """One fitted superquadric.
+
+    Attributes
+    ----------
+    superquadric
+        A single body in the optical frame of the camera, in its canonical form.
+    residual
+        Root mean square distance of the inlying object points to the surface, metres.
+    noise
+        Standard deviation of the depth noise, estimated or given, metres.
+    inlier_share
+        Share of the object's pixels within three noise levels of the surface, 0 to 1.
+    covariance
+        (11, 11) of a1 a2 a3 e1 e2 t1 t2 t3 and the rotation vector in the object frame; metres and radians.
+        NaN for methods that do not compute it.
+    status, message
+        The verdict and the reason for it in words.
+    iterations, milliseconds
+        What it cost.
+    """
+
+    superquadric: Superquadric
+    residual: float
+    noise: float
+    inlier_share: float
+    covariance: np.ndarray
+    status: Status
+    message: str
+    iterations: int
+    milliseconds: float
+
+    @property
+    def sigma_size(self) -> np.ndarray:
+        """Standard deviations (3,) of the half sizes, metres; NaN where unknown."""
+        return np.sqrt(np.diag(self.covariance)[:3])

@@ -1,0 +1,146 @@
+"""Rotations as unit quaternions in ROS order, x y z w.
+
+Conventions
+-----------
+A quaternion q = (x, y, z, w) turns object coordinates into parent coordinates: p_parent = R(q) p_object
+(thesis, equation 3.8).  Products read like matrix products: R(q r) = R(q) R(r).  q and -q are the same rotation.
+Every function takes NumPy arrays or torch tensors with leading batch dimensions and answers in kind.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from array_api_compat import array_namespace
+
+Array = Any
+"""A NumPy array or a torch tensor."""
+
+
+def normalize(quaternion: Array) -> Array:
+    """Scale quaternions (..., 4) to unit length; a zero quaternion becomes NaN, as there is no rotation to name."""
+    xp = array_namespace(quaternion)
+    return quaternion / xp.sqrt(xp.sum(quaternion * quaternion, axis=-1, keepdims=True))
+
+
+def multiply(left: Array, right: Array) -> Array:
+    """Hamilton product (..., 4): first the right rotation, then the left one."""
+    xp = array_namespace(left, right)
+    x1, y1, z1, w1 = left[..., 0], left[..., 1], left[..., 2], left[..., 3]
+    x2, y2, z2, w2 = right[..., 0], right[..., 1], right[..., 2], right[..., 3]
+    return xp.stack(
+        [
+            w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
+            w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
+            w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
+            w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
+        ],
+        axis=-1,
+    )
+
+
+def conjugate(quaternion: Array) -> Array:
+    """The inverse of unit quaternions (..., 4)."""
+    xp = array_namespace(quaternion)
+    return xp.concat([-quaternion[..., :3], quaternion[..., 3:]], axis=-1)
+
+
+def to_matrix(quaternion: Array) -> Array:
+    """Rotation matrices (..., 3, 3) of quaternions (..., 4) of any non-zero length (thesis, equation 3.8)."""
+    xp = array_namespace(quaternion)
+    q = normalize(quaternion)
+    x, y, z, w = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    rows = [
+        xp.stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], axis=-1),
+        xp.stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], axis=-1),
+        xp.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], axis=-1),
+    ]
+    return xp.stack(rows, axis=-2)
+
+
+def from_matrix(matrix: Array) -> Array:
+    """Unit quaternions (..., 4) of rotation matrices (..., 3, 3).
+
+    The four products 4 q_i q_j are read off the matrix for each choice of i; the row with the largest q_i is the well
+    conditioned one (Shepperd 1978).  Only that row is divided by its root, so gradients stay finite for every rotation.
+    """
+    xp = array_namespace(matrix)
+    m = [[matrix[..., i, j] for j in range(3)] for i in range(3)]
+    squares = xp.stack(
+        [
+            1 + m[0][0] - m[1][1] - m[2][2],
+            1 - m[0][0] + m[1][1] - m[2][2],
+            1 - m[0][0] - m[1][1] + m[2][2],
+            1 + m[0][0] + m[1][1] + m[2][2],
+        ],
+        axis=-1,
+    )
+    xy, xz, yz = m[0][1] + m[1][0], m[0][2] + m[2][0], m[1][2] + m[2][1]
+    xw, yw, zw = m[2][1] - m[1][2], m[0][2] - m[2][0], m[1][0] - m[0][1]
+    rows = xp.stack(
+        [
+            xp.stack([squares[..., 0], xy, xz, xw], axis=-1),
+            xp.stack([xy, squares[..., 1], yz, yw], axis=-1),
+            xp.stack([xz, yz, squares[..., 2], zw], axis=-1),
+            xp.stack([xw, yw, zw, squares[..., 3]], axis=-1),
+        ],
+        axis=-2,
+    )
+    best = xp.argmax(squares, axis=-1)
+    row = xp.zeros_like(rows[..., 0, :])
+    for i in range(4):
+        row = xp.where((best == i)[..., None], rows[..., i, :], row)
+    return normalize(row)
+
+
+def from_rotation_vector(vector: Array) -> Array:
+    """Unit quaternions (..., 4) of rotation vectors (..., 3): axis times angle in radians, smooth through zero."""
+    xp = array_namespace(vector)
+    square = xp.sum(vector * vector, axis=-1, keepdims=True)
+    small = square < 1e-12
+    angle = xp.sqrt(xp.where(small, xp.ones_like(square), square))
+    half_sinc = xp.where(small, 0.5 - square / 48, xp.sin(angle / 2) / angle)
+    cosine = xp.where(small, 1 - square / 8, xp.cos(angle / 2))
+    return xp.concat([vector * half_sinc, cosine], axis=-1)
+
+
+def from_six(six: Array) -> Array:
+    """Unit quaternions (..., 4) of the continuous 6D form (..., 6): two columns, made orthonormal (Zhou et al. 2019)."""
+    xp = array_namespace(six)
+    first = _unit(six[..., :3])
+    second = six[..., 3:]
+    second = _unit(second - xp.sum(first * second, axis=-1, keepdims=True) * first)
+    third = cross(first, second)
+    return from_matrix(xp.stack([first, second, third], axis=-1))
+
+
+def cross(left: Array, right: Array) -> Array:
+    """Vector product of (..., 3) arrays."""
+    xp = array_namespace(left, right)
+    a1, a2, a3 = left[..., 0], left[..., 1], left[..., 2]
+    b1, b2, b3 = right[..., 0], right[..., 1], right[..., 2]
+    return xp.stack([a2 * b3 - a3 * b2, a3 * b1 - a1 * b3, a1 * b2 - a2 * b1], axis=-1)
+
+
+def random(count: int, rng: np.random.Generator) -> np.ndarray:
+    """``count`` uniformly distributed rotations as quaternions (count, 4) (Shoemake 1992)."""
+    u = rng.random((count, 3))
+    inner, outer = np.sqrt(1 - u[:, 0]), np.sqrt(u[:, 0])
+    a, b = 2 * math.pi * u[:, 1], 2 * math.pi * u[:, 2]
+    return np.stack([inner * np.sin(a), inner * np.cos(a), outer * np.sin(b), outer * np.cos(b)], axis=-1)
+
+
+def geodesic_angle(left: Array, right: Array) -> Array:
+    """Angle in radians, 0 to pi, of the rotation between two unit quaternions (..., 4)."""
+    xp = array_namespace(left, right)
+    difference = multiply(conjugate(left), right)
+    vector = xp.sqrt(xp.sum(difference[..., :3] ** 2, axis=-1))
+    return 2 * xp.atan2(vector, xp.abs(difference[..., 3]))
+
+
+def _unit(vector: Array) -> Array:
+    xp = array_namespace(vector)
+    square = xp.sum(vector * vector, axis=-1, keepdims=True)
+    return vector / xp.sqrt(square + 1e-12)

@@ -1,0 +1,373 @@
+"""The superquadric: one equation, its gauge, and what follows from them in closed form.
+
+Equation
+--------
+In the object's own frame, with half sizes a1 a2 a3 and exponents e1 (along z) and e2 (in the xy plane),
+
+    F(x, y, z) = (|x/a1|^(2/e2) + |y/a2|^(2/e2))^(e2/e1) + |z/a3|^(2/e1)              (thesis, equation 3.7)
+
+is below 1 inside, 1 on the surface and above 1 outside.  The gauge
+
+    g = F^(e1/2) = || ( || (x/a1, y/a2) ||_{2/e2},  z/a3 ) ||_{2/e1}
+
+is a norm for e1, e2 <= 2: degree one, convex, g = 1 on the surface.  All else is computed from g: F = g^(2/e1), and the
+thesis' adjusted function F^e1 = g^2 (equation 6.4).
+
+Each of the two p-norms, p = 2/e, is evaluated in ratio form: the larger term is factored out and the rest goes through
+log1p.  Nothing overflows down to e = 0.01, no epsilon shifts the surface, and gradients are finite on the axes.
+
+Conventions
+-----------
+Metres and radians; ``rotation`` is a quaternion x y z w from object to parent frame, ``translation`` the centre in the
+parent frame.  The flat order is a1 a2 a3 e1 e2 t1 t2 t3 qx qy qz qw (thesis, equation 3.12).
+
+Reference: A. Jaklic, A. Leonardis, F. Solina, Segmentation and Recovery of Superquadrics, Kluwer 2000, chapter 2.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from array_api_compat import array_namespace, is_torch_array
+from scipy.special import beta
+
+from sq_perception.geometry import rotation as quaternions
+
+Array = Any
+"""A NumPy array or a torch tensor."""
+
+FLAT_LENGTH = 12
+_NEGLIGIBLE_RATIO = 1e-30
+
+
+@dataclass(frozen=True, eq=False)
+class Superquadric:
+    """One superquadric or a batch of them, in NumPy or in torch.
+
+    Attributes
+    ----------
+    size : (..., 3)
+        Half sizes a1 a2 a3 in metres, positive.
+    shape : (..., 2)
+        Exponents e1 (along z) and e2 (in xy), in (0, 2]: 0.1 is a box, 1 an ellipsoid, 2 an octahedron.
+    translation : (..., 3)
+        The centre in the parent frame, metres.
+    rotation : (..., 4)
+        Unit quaternion x y z w, object to parent.
+
+    Raises
+    ------
+    ValueError
+        If a field has the wrong length, or (NumPy only: a tensor may live on a busy device) is not finite, not positive
+        or names no rotation.  NumPy quaternions are normalised on the way in.
+    """
+
+    size: Array
+    shape: Array
+    translation: Array
+    rotation: Array
+
+    def __post_init__(self) -> None:
+        lengths = {"size": 3, "shape": 2, "translation": 3, "rotation": 4}
+        tensors = [is_torch_array(getattr(self, name)) for name in lengths]
+        if any(tensors) and not all(tensors):
+            raise ValueError("a Superquadric is all NumPy or all torch, not a mixture")
+        for name, length in lengths.items():
+            value = getattr(self, name)
+            if not tensors[0]:
+                value = np.asarray(value)
+                value = value.astype(np.result_type(value.dtype, np.float32), copy=False)
+                object.__setattr__(self, name, value)
+            if value.ndim == 0 or value.shape[-1] != length:
+                raise ValueError(f"{name}: expected shape (..., {length}), got {tuple(value.shape)}")
+        if tensors[0]:
+            return
+        for name in lengths:
+            if not np.isfinite(getattr(self, name)).all():
+                raise ValueError(f"{name}: expected finite numbers, got {getattr(self, name)}")
+        if (self.size <= 0).any():
+            raise ValueError(f"size: expected positive half sizes, got {self.size}")
+        if (self.shape <= 0).any() or (self.shape > 2).any():
+            raise ValueError(f"shape: expected exponents in (0, 2], got {self.shape}")
+        norm = np.linalg.norm(self.rotation, axis=-1, keepdims=True)
+        if (norm < 1e-9).any():
+            raise ValueError("rotation: expected a quaternion of non-zero length")
+        object.__setattr__(self, "rotation", self.rotation / norm)
+        batch = np.broadcast_shapes(*(getattr(self, name).shape[:-1] for name in lengths))
+        for name, length in lengths.items():
+            object.__setattr__(self, name, np.broadcast_to(getattr(self, name), (*batch, length)))
+
+    # Batches and flat vectors
+
+    @property
+    def batch_shape(self) -> tuple[int, ...]:
+        """The leading dimensions; () for a single body."""
+        return tuple(self.size.shape[:-1])
+
+    def __getitem__(self, index: Any) -> Superquadric:
+        """Index the leading dimensions."""
+        if not self.batch_shape:
+            raise TypeError("a single Superquadric cannot be indexed")
+        return Superquadric(self.size[index], self.shape[index], self.translation[index], self.rotation[index])
+
+    def __len__(self) -> int:
+        if not self.batch_shape:
+            raise TypeError("a single Superquadric has no length")
+        return self.batch_shape[0]
+
+    def __iter__(self) -> Iterator[Superquadric]:
+        return (self[i] for i in range(len(self)))
+
+    def to_flat(self) -> Array:
+        """Flat parameters (..., 12): a1 a2 a3 e1 e2 t1 t2 t3 qx qy qz qw."""
+        xp = array_namespace(self.size)
+        return xp.concat([self.size, self.shape, self.translation, self.rotation], axis=-1)
+
+    @classmethod
+    def from_flat(cls, flat: Array) -> Superquadric:
+        """The inverse of :meth:`to_flat`."""
+        if not is_torch_array(flat):
+            flat = np.asarray(flat, dtype=float)
+        if flat.ndim == 0 or flat.shape[-1] != FLAT_LENGTH:
+            raise ValueError(f"expected flat parameters of shape (..., {FLAT_LENGTH}), got {tuple(flat.shape)}")
+        return cls(flat[..., 0:3], flat[..., 3:5], flat[..., 5:8], flat[..., 8:12])
+
+    @classmethod
+    def stack(cls, bodies: list[Superquadric]) -> Superquadric:
+        """A batch (n, ...) of equally shaped bodies; an empty list gives an empty NumPy batch."""
+        if not bodies:
+            return cls(np.empty((0, 3)), np.empty((0, 2)), np.empty((0, 3)), np.empty((0, 4)))
+        xp = array_namespace(bodies[0].size)
+        return cls.from_flat(xp.stack([body.to_flat() for body in bodies]))
+
+    # Motion
+
+    @property
+    def rotation_matrix(self) -> Array:
+        """Object to parent, (..., 3, 3)."""
+        return quaternions.to_matrix(self.rotation)
+
+    def to_object(self, points: Array) -> Array:
+        """Points (..., N, 3) of the parent frame in the object's frame."""
+        return (points - self.translation[..., None, :]) @ self.rotation_matrix
+
+    def to_parent(self, points: Array) -> Array:
+        """Points (..., N, 3) of the object's frame in the parent frame."""
+        xp = array_namespace(points)
+        return points @ xp.linalg.matrix_transpose(self.rotation_matrix) + self.translation[..., None, :]
+
+    def transformed(self, rotation: Array, translation: Array, scale: float | Array = 1.0) -> Superquadric:
+        """The same body in another frame: p_new = scale * R(rotation) p + translation.
+
+        Half sizes grow with ``scale`` (a number, or an array (..., 1)); shape stays.
+        """
+        matrix = quaternions.to_matrix(rotation)
+        moved = (matrix @ self.translation[..., None])[..., 0] * scale + translation
+        return Superquadric(self.size * scale, self.shape, moved, quaternions.multiply(rotation, self.rotation))
+
+    # The surface
+
+    def gauge(self, points: Array) -> Array:
+        """g at points (..., N, 3) of the parent frame, shape (..., N); 1 on the surface."""
+        p = self.to_object(points)
+        xp = array_namespace(p)
+        q = xp.abs(p) / self.size[..., None, :]
+        e1, e2 = self.shape[..., None, 0], self.shape[..., None, 1]
+        return p_norm(p_norm(q[..., 0], q[..., 1], e2), q[..., 2], e1)
+
+    def inside_outside(self, points: Array) -> Array:
+        """F at points (..., N, 3), shape (..., N) (thesis, equation 3.7); may overflow to inf far from sharp bodies."""
+        return self.gauge(points) ** (2 / self.shape[..., None, 0])
+
+    def adjusted_inside_outside(self, points: Array) -> Array:
+        """F^e1 = g^2 at points (..., N, 3), shape (..., N) (thesis, equation 6.4)."""
+        return self.gauge(points) ** 2
+
+    def occupancy(self, points: Array, sharpness: float | Array) -> Array:
+        """Soft occupancy sigma(s (1 - F^e1)) at points (..., N, 3), in (0, 1) (thesis, equation 6.6)."""
+        xp = array_namespace(points)
+        exponent = xp.clip(-sharpness * (1 - self.adjusted_inside_outside(points)), -60.0, 60.0)
+        return 1 / (1 + xp.exp(exponent))
+
+    def gauge_gradient(self, points: Array) -> Array:
+        """Gradient of g at points (..., N, 3) in the parent frame, shape (..., N, 3); zero at the centre."""
+        p = self.to_object(points)
+        xp = array_namespace(p)
+        q = xp.abs(p) / self.size[..., None, :]
+        e1, e2 = self.shape[..., None, 0], self.shape[..., None, 1]
+        h, h_x, h_y = _p_norm_and_slopes(q[..., 0], q[..., 1], e2)
+        _, g_h, g_z = _p_norm_and_slopes(h, q[..., 2], e1)
+        slopes = xp.stack([g_h * h_x, g_h * h_y, g_z], axis=-1)
+        gradient = slopes * xp.sign(p) / self.size[..., None, :]
+        return gradient @ xp.linalg.matrix_transpose(self.rotation_matrix)
+
+    def normals(self, points: Array) -> Array:
+        """Outward unit normals at surface points (..., N, 3) in the parent frame, shape (..., N, 3)."""
+        gradient = self.gauge_gradient(points)
+        xp = array_namespace(gradient)
+        return gradient / xp.sqrt(xp.sum(gradient * gradient, axis=-1, keepdims=True))
+
+    def sampson_distance(self, points: Array) -> Array:
+        """First order distance (g - 1) / |grad g| of points (..., N, 3) to the surface, metres, positive outside."""
+        gradient = self.gauge_gradient(points)
+        xp = array_namespace(gradient)
+        length = xp.sqrt(xp.sum(gradient * gradient, axis=-1))
+        return (self.gauge(points) - 1) / xp.where(length > 0, length, xp.ones_like(length))
+
+    def parametric_points(self, eta: Array, omega: Array) -> Array:
+        """Surface points (..., N, 3) in the parent frame at angles (N,) (thesis, equation 3.5).
+
+        ``eta`` in [-pi/2, pi/2] runs from pole to pole, ``omega`` in [-pi, pi) around z.
+        """
+        xp = array_namespace(self.size, eta)
+        e1, e2 = self.shape[..., None, 0], self.shape[..., None, 1]
+        ring = _signed_power(xp.cos(eta), e1)
+        unit = xp.stack(
+            [
+                ring * _signed_power(xp.cos(omega), e2),
+                ring * _signed_power(xp.sin(omega), e2),
+                _signed_power(xp.sin(eta), e1) * xp.ones_like(omega),
+            ],
+            axis=-1,
+        )
+        return self.to_parent(unit * self.size[..., None, :])
+
+    def sample_surface(self, count: int, rng: np.random.Generator, oversampling: int = 12) -> np.ndarray:
+        """Nearly uniform surface points (..., count, 3) in the parent frame; NumPy bodies only.
+
+        Random directions v on the sphere, stretched by the half sizes, hit the surface at p = a v / g.  Such a point
+        stands for the area a1 a2 a3 r^3 |grad g| (r = 1 / g(a v), from the volume of a thin cone), so that systematic
+        resampling with this weight out of ``oversampling * count`` candidates is uniform in area.
+        """
+        if is_torch_array(self.size):
+            raise TypeError("sample_surface draws with a NumPy generator: expected a NumPy Superquadric")
+        shape = (*self.batch_shape, oversampling * count, 3)
+        direction = rng.standard_normal(shape)
+        direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
+        local = Superquadric(self.size, self.shape, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
+        stretched = direction * self.size[..., None, :]
+        gauge = local.gauge(stretched)
+        points = stretched / gauge[..., None]
+        area = np.linalg.norm(local.gauge_gradient(points), axis=-1) / gauge**3
+        cumulative = np.cumsum(area, axis=-1)
+        cumulative /= cumulative[..., -1:]
+        steps = (np.arange(count) + rng.random((*self.batch_shape, 1))) / count
+        chosen = np.sum(cumulative[..., None, :] < steps[..., :, None], axis=-1)
+        return self.to_parent(np.take_along_axis(points, chosen[..., None], axis=-2))
+
+    # Closed forms
+
+    def volume(self) -> np.ndarray:
+        """Volume (...), cubic metres: 2 a1 a2 a3 e1 e2 B(e1/2 + 1, e1) B(e2/2, e2/2)."""
+        a, e1, e2 = self._numpy()
+        return 2 * np.prod(a, axis=-1) * e1 * e2 * beta(e1 / 2 + 1, e1) * beta(e2 / 2, e2 / 2)
+
+    def second_moments(self) -> np.ndarray:
+        """Integrals of x^2, y^2, z^2 over the body about its own axes, (..., 3), m^5."""
+        a, e1, e2 = self._numpy()
+        product = np.prod(a, axis=-1) * e1 * e2
+        across = 0.5 * product * beta(1.5 * e2, e2 / 2) * beta(e1 / 2, 2 * e1 + 1)
+        along = 2 * product * beta(e2 / 2, e2 / 2 + 1) * beta(1.5 * e1, e1 + 1)
+        return np.stack([across, across, along], axis=-1) * a**2
+
+    def support(self, directions: Array) -> Array:
+        """Support function: max of n.p over the body, minus n.t, for unit directions n (..., N, 3), shape (..., N).
+
+        The dual of the gauge: the same nested norm of a * |R^T n| with each exponent p = 2/e replaced by its conjugate
+        2/(2 - e), that is e by 2 - e.  The body touches the plane n.p = n.t + support.
+        """
+        n = directions @ self.rotation_matrix
+        xp = array_namespace(n)
+        q = xp.abs(n) * self.size[..., None, :]
+        e1, e2 = 2 - self.shape[..., None, 0], 2 - self.shape[..., None, 1]
+        return p_norm(p_norm(q[..., 0], q[..., 1], e2), q[..., 2], e1)
+
+    def bounding_box(self) -> tuple[Array, Array]:
+        """Lower and upper corner (..., 3) of the axis-aligned box in the parent frame."""
+        xp = array_namespace(self.size)
+        extent = self.support(xp.eye(3, dtype=self.size.dtype))
+        return self.translation - extent, self.translation + extent
+
+    # The same body, other numbers
+
+    def equivalent_forms(self) -> Superquadric:
+        """The 8 parameter vectors of the same body, batch shape (8, ...).
+
+        Half turns about x, y, z and none, then the same four after a quarter turn about z with a1 and a2 exchanged.
+        """
+        xp = array_namespace(self.size)
+        root = np.sqrt(0.5)
+        turns = np.array([[0, 0, 0, 1.0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]])
+        quarter = np.array([0, 0, root, root])
+        turns = np.concatenate([turns, quaternions.multiply(np.broadcast_to(quarter, (4, 4)), turns)])
+        forms = []
+        for k, turn in enumerate(turns):
+            size = self.size
+            if k >= 4:
+                size = xp.stack([size[..., 1], size[..., 0], size[..., 2]], axis=-1)
+            step = xp.asarray(turn, dtype=self.rotation.dtype)
+            turned = quaternions.multiply(self.rotation, step + xp.zeros_like(self.rotation))
+            forms.append(xp.concat([size, self.shape, self.translation, turned], axis=-1))
+        return Superquadric.from_flat(xp.stack(forms))
+
+    def canonical_form(self) -> Superquadric:
+        """The representative of the 8 forms with a1 >= a2, then the smallest rotation angle, then qw >= 0.
+
+        NumPy bodies only.  Among equal angles the first in the order of :meth:`equivalent_forms` wins.
+        """
+        forms = self.equivalent_forms().to_flat()
+        swapped = forms[..., 0] < forms[..., 1]
+        preference = np.abs(forms[..., 11]) - 10.0 * swapped
+        best = np.argmax(np.round(preference, 12), axis=0)
+        flat = np.take_along_axis(forms, best[None, ..., None], axis=0)[0].copy()
+        flat[..., 8:12] *= np.where(flat[..., 11:12] < 0, -1.0, 1.0)
+        return Superquadric.from_flat(flat)
+
+    def _numpy(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        size, shape = self.size, self.shape
+        if is_torch_array(size):
+            size, shape = size.detach().cpu().numpy(), shape.detach().cpu().numpy()
+        return size, shape[..., 0], shape[..., 1]
+
+
+def p_norm(u: Array, v: Array, e: Array) -> Array:
+    """(u^(2/e) + v^(2/e))^(e/2) for u, v >= 0, elementwise, in ratio form.
+
+    Guarded twice, so that neither value nor gradient is anything but finite at u = 0, v = 0 or both.
+    """
+    big, power = _ratio_form(u, v, e)
+    xp = array_namespace(big)
+    return big * xp.exp(0.5 * e * xp.log1p(power))
+
+
+def _ratio_form(u: Array, v: Array, e: Array) -> tuple[Array, Array]:
+    """The larger of u and v, and (smaller / larger)^(2/e)."""
+    xp = array_namespace(u, v)
+    big, small = xp.maximum(u, v), xp.minimum(u, v)
+    ratio = small / xp.where(big > 0, big, xp.ones_like(big))
+    kept = ratio > _NEGLIGIBLE_RATIO
+    safe = xp.where(kept, ratio, xp.ones_like(ratio))
+    power = xp.exp(2 / e * xp.log(safe))
+    return big, xp.where(kept, power, xp.zeros_like(power))
+
+
+def _p_norm_and_slopes(u: Array, v: Array, e: Array) -> tuple[Array, Array, Array]:
+    """The p-norm and its partial derivatives with respect to u and v."""
+    big, power = _ratio_form(u, v, e)
+    xp = array_namespace(big)
+    log_sum = xp.log1p(power)
+    norm = big * xp.exp(0.5 * e * log_sum)
+    of_big = xp.exp((0.5 * e - 1) * log_sum)
+    ratio = xp.minimum(u, v) / xp.where(big > 0, big, xp.ones_like(big))
+    safe = xp.where(ratio > _NEGLIGIBLE_RATIO, ratio, xp.ones_like(ratio))
+    of_small = of_big * power / safe
+    first = u >= v
+    return norm, xp.where(first, of_big, of_small), xp.where(first, of_small, of_big)
+
+
+def _signed_power(base: Array, exponent: Array) -> Array:
+    xp = array_namespace(base)
+    return xp.sign(base) * xp.abs(base) ** exponent

@@ -1,0 +1,1 @@
+"""Cameras, rendering and views: from bodies to depth images and back."""

@@ -1,0 +1,115 @@
+"""Pinhole and orthographic cameras.
+
+Conventions
+-----------
+Optical frame: x right, y down, z forward, metres.  A pixel's centre has integer coordinates (u, v) = (column, row).
+A depth image holds, per pixel, the z coordinate of what the pixel sees: float, NaN where nothing was measured.
+
+    pinhole         u = fx x / z + cx,   v = fy y / z + cy       (fx, fy in pixels)
+    orthographic    u = fx x + cx,       v = fy y + cy           (fx, fy in pixels per metre)
+
+Every pixel is a ray p = o + z d with d_z = 1 and o_z = 0, so that the ray parameter is the depth itself:
+
+    pinhole         o = 0,  d = ((u - cx) / fx, (v - cy) / fy, 1)
+    orthographic    o = ((u - cx) / fx, (v - cy) / fy, 0),  d = (0, 0, 1)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+
+Projection = Literal["pinhole", "orthographic"]
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Intrinsics of one image; see the module for the equations.
+
+    Raises
+    ------
+    ValueError
+        For a size below one pixel, a focal length that is not positive, or anything not finite.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    projection: Projection = "pinhole"
+
+    def __post_init__(self) -> None:
+        if self.projection not in ("pinhole", "orthographic"):
+            raise ValueError(f"projection: expected 'pinhole' or 'orthographic', got {self.projection!r}")
+        if self.width < 1 or self.height < 1:
+            raise ValueError(f"image size: expected at least 1 x 1, got {self.width} x {self.height}")
+        numbers = np.array([self.fx, self.fy, self.cx, self.cy], dtype=float)
+        if not np.isfinite(numbers).all():
+            raise ValueError(f"fx fy cx cy: expected finite numbers, got {numbers.tolist()}")
+        if self.fx <= 0 or self.fy <= 0:
+            raise ValueError(f"focal lengths: expected positive, got fx = {self.fx:g}, fy = {self.fy:g}")
+
+    @classmethod
+    def from_matrix(cls, matrix: np.ndarray, width: int, height: int) -> Camera:
+        """A pinhole camera from a 3 x 3 matrix K; skew is refused, as no depth camera in use has any."""
+        k = np.asarray(matrix, dtype=float)
+        if k.shape != (3, 3):
+            raise ValueError(f"camera matrix: expected 3 x 3, got {k.shape}")
+        if abs(k[0, 1]) > 1e-6 * abs(k[0, 0]):
+            raise ValueError(f"camera matrix: expected no skew, got {k[0, 1]:g}")
+        return cls(width, height, float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2]))
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """The 3 x 3 matrix K."""
+        return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
+
+    @property
+    def is_pinhole(self) -> bool:
+        return self.projection == "pinhole"
+
+    def rays(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Origins and directions (..., 3) of pixels (...): p = origin + depth * direction."""
+        u, v = np.broadcast_arrays(np.asarray(u, dtype=float), np.asarray(v, dtype=float))
+        lateral = np.stack([(u - self.cx) / self.fx, (v - self.cy) / self.fy], axis=-1)
+        zero, one = np.zeros(u.shape + (1,)), np.ones(u.shape + (1,))
+        flat, forward = np.concatenate([lateral, zero], -1), np.concatenate([lateral, one], -1)
+        if self.is_pinhole:
+            return np.zeros_like(flat), forward
+        return flat, np.concatenate([np.zeros_like(lateral), one], -1)
+
+    def unproject(self, u: np.ndarray, v: np.ndarray, depth: np.ndarray) -> np.ndarray:
+        """Points (..., 3) in the optical frame of pixels (...) at the given depths (...)."""
+        origin, direction = self.rays(u, v)
+        return origin + np.asarray(depth, dtype=float)[..., None] * direction
+
+    def points(self, depth: np.ndarray) -> np.ndarray:
+        """The organised cloud (height, width, 3) of a depth image; NaN where the depth is."""
+        self.check_image(depth)
+        v, u = np.indices(depth.shape)
+        return self.unproject(u, v, depth)
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """Pixel coordinates (..., 2) = (u, v) of points (..., 3); NaN for points not in front of a pinhole camera."""
+        points = np.asarray(points, dtype=float)
+        x, y, z = points[..., 0], points[..., 1], points[..., 2]
+        scale: np.ndarray | float = 1.0
+        if self.is_pinhole:
+            scale = 1.0 / np.where(z > 0, z, np.nan)
+        return np.stack([self.fx * x * scale + self.cx, self.fy * y * scale + self.cy], axis=-1)
+
+    def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
+        """The camera of an image cut out at column ``left`` and row ``top``."""
+        return replace(self, width=width, height=height, cx=self.cx - left, cy=self.cy - top)
+
+    def check_image(self, image: np.ndarray) -> None:
+        """Raise ValueError unless the image has this camera's size."""
+        if image.shape[:2] != (self.height, self.width):
+            raise ValueError(
+                f"image of {image.shape[1]} x {image.shape[0]} pixels does not fit a camera of "
+                f"{self.width} x {self.height}"
+            )
