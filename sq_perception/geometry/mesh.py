@@ -1,0 +1,166 @@
+"""Triangle meshes and outlines of superquadrics.
+
+A superquadric with e1, e2 <= 2 is convex, so the convex hull of surface points is its mesh.  The points are those of the
+parametric form (thesis, equation 3.5) on a uniform grid of angles, which crowds them where the surface bends.  The hull is
+computed at unit size and then stretched by the half sizes: a map that keeps convexity and topology, and spares the hull
+algorithm the nearly flat input of a thin body.
+
+Metres, in the frame that the body is given in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from scipy.spatial import ConvexHull
+
+from sq_perception.geometry.superquadric import Superquadric
+
+MARKER_RESOLUTION = 16
+"""Coarse enough to be serialised at camera rate: about 35 kB per body."""
+
+COLOURS = np.array(
+    [
+        (0.12, 0.47, 0.71),
+        (0.89, 0.42, 0.04),
+        (0.17, 0.63, 0.37),
+        (0.80, 0.24, 0.45),
+        (0.46, 0.37, 0.74),
+        (0.06, 0.64, 0.67),
+        (0.74, 0.60, 0.05),
+        (0.53, 0.34, 0.25),
+    ]
+)
+"""Red, green, blue in [0, 1]: the k-th body has colour k modulo the length, in meshes, markers and pictures alike."""
+
+_HALF_TURN_ABOUT_X = np.diag([1.0, -1.0, -1.0, 1.0])
+_SAME_POINT_DIGITS = 12
+
+
+def mesh(body: Superquadric, resolution: int = 32) -> trimesh.Trimesh:
+    """The closed triangle mesh of one body.
+
+    Parameters
+    ----------
+    body : Superquadric
+        A single NumPy body.
+    resolution : int
+        Points around and rows from pole to pole; a multiple of 8, so that the corners of a box are among the points.
+
+    Returns
+    -------
+    trimesh.Trimesh
+        Watertight and convex, faces outwards, vertices on the surface, in the body's parent frame.
+    """
+    _check_single(body)
+    if resolution < 8 or resolution % 8:
+        raise ValueError(f"resolution: expected a positive multiple of 8, got {resolution}")
+    eta, omega = np.meshgrid(
+        np.linspace(-np.pi / 2, np.pi / 2, resolution + 1),
+        np.linspace(-np.pi, np.pi, resolution, endpoint=False),
+        indexing="ij",
+    )
+    unit = _at_unit_size(body)
+    points = unit.parametric_points(eta.ravel(), omega.ravel())
+    _, kept = np.unique(np.round(points, _SAME_POINT_DIGITS), axis=0, return_index=True)
+    points = points[np.sort(kept)]
+    hull = ConvexHull(points, qhull_options="QbB Pp Qt")
+    used = np.full(len(points), -1)
+    used[hull.vertices] = np.arange(len(hull.vertices))
+    vertices, faces = points[hull.vertices], used[hull.simplices]
+    corners = vertices[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    inwards = np.einsum("ij,ij->i", normals, hull.equations[:, :3]) < 0
+    faces[inwards] = faces[inwards][:, ::-1]
+    return trimesh.Trimesh(body.to_parent(vertices * body.size), faces, process=False)
+
+
+def outline(body: Superquadric, resolution: int = MARKER_RESOLUTION) -> np.ndarray:
+    """Line segments (j, 2, 3) in the parent frame that let the eye read the body: the twelve edges of a box.
+
+    Two rings at eta = +-45 degrees and the four meridians between them.  As e1 and e2 go to zero, these become the edges;
+    on a cylinder they are its rims and four lines of its side, on an ellipsoid a cage.  Each edge has about
+    ``resolution / 4`` segments.
+    """
+    _check_single(body)
+    per_edge = max(2, resolution // 4)
+    around = np.linspace(-np.pi, np.pi, 4 * per_edge + 1)
+    quarter = np.pi / 4
+    along = np.linspace(-quarter, quarter, per_edge + 1)
+    lines = [(np.full_like(around, eta), around) for eta in (-quarter, quarter)]
+    lines += [(along, np.full_like(along, quarter + k * np.pi / 2)) for k in range(4)]
+    segments = []
+    for eta, omega in lines:
+        points = body.parametric_points(eta, omega)
+        segments.append(np.stack([points[:-1], points[1:]], axis=1))
+    return np.concatenate(segments)
+
+
+def export(
+    bodies: Superquadric | Sequence[Superquadric],
+    path: str | Path,
+    *,
+    resolution: int = 64,
+    colours: np.ndarray | None = None,
+    optical: bool = True,
+) -> Path:
+    """Write bodies as a coloured scene.
+
+    Parameters
+    ----------
+    bodies : Superquadric
+        One, a batch (n,) or a sequence of single bodies.
+    path : str or Path
+        ``.glb`` (one node per body, named body_0, body_1 ...) or ``.ply`` (one mesh with vertex colours).
+    colours : (n, 3), optional
+        Red, green, blue in [0, 1]; :data:`COLOURS` in turn if not given.
+    optical : bool
+        The bodies are in the optical frame (y down): a GLB, whose y axis is up by its standard, is turned half about x so
+        that viewers show it upright.  A PLY always keeps the coordinates.
+
+    Raises
+    ------
+    ValueError
+        For another suffix, or where there is no body to write.
+    """
+    path = Path(path)
+    suffix = path.suffix.lower()
+    if suffix not in (".glb", ".ply"):
+        raise ValueError(f"{path.name}: expected a name that ends in .glb or .ply")
+    singles = _singles(bodies)
+    if not singles:
+        raise ValueError(f"{path.name}: no body to write")
+    palette = COLOURS if colours is None else np.asarray(colours, dtype=float)
+    meshes = []
+    for k, body in enumerate(singles):
+        part = mesh(body, resolution)
+        rgba = np.append(np.round(255 * palette[k % len(palette)]), 255).astype(np.uint8)
+        part.visual.vertex_colors = np.tile(rgba, (len(part.vertices), 1))
+        meshes.append(part)
+    if suffix == ".ply":
+        trimesh.util.concatenate(meshes).export(path)
+        return path
+    scene = trimesh.Scene()
+    turn = _HALF_TURN_ABOUT_X if optical else np.eye(4)
+    for k, part in enumerate(meshes):
+        scene.add_geometry(part, node_name=f"body_{k}", geom_name=f"body_{k}", transform=turn)
+    scene.export(path)
+    return path
+
+
+def _check_single(body: Superquadric) -> None:
+    if body.batch_shape:
+        raise ValueError(f"expected a single body, got a batch of shape {body.batch_shape}")
+
+
+def _singles(bodies: Superquadric | Sequence[Superquadric]) -> list[Superquadric]:
+    if isinstance(bodies, Superquadric) and not bodies.batch_shape:
+        return [bodies]
+    return list(bodies)
+
+
+def _at_unit_size(body: Superquadric) -> Superquadric:
+    return Superquadric(np.ones(3), body.shape, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
