@@ -1,0 +1,230 @@
+"""The canonical view: what the network sees of one object, and the way back.
+
+Equation
+--------
+The view is the thesis' world (:mod:`sq_perception.imaging.unit_cube`) fitted to one object: orthographic, unit cube,
+x right, y up, z towards the viewer, pixel (row i, column j) of an n x n image at
+
+    x = (j + 1/2) / n,   y = 1 - (i + 1/2) / n,   value = z in (0, 1],   0 for background.
+
+It follows from the optical frame by
+
+    p_canonical = R (p_optical - anchor) / extent + (1/2, 1/2, z0)
+
+with R = diag(1, -1, -1) R_look, where R_look turns the ray to the object's middle into the z axis (identity for an
+orthographic camera), the anchor at the silhouette's middle and the depth of the nearest point, z0 = (1 + 1/margin)/2,
+and the extent such that silhouette and visible depth fill 1/margin of the cube.  Both directions are exact; a
+superquadric stays one, since the map is a similarity.
+
+What the network must learn shrinks: position, size and (for a pinhole camera) perspective are divided out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numba
+import numpy as np
+
+from sq_perception.geometry import rotation as quaternions
+from sq_perception.geometry.kernels import FAST, ray_entry
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging.camera import Camera
+
+MARGIN = 1.06
+"""Side of the cube over the side of what is seen in it."""
+
+_NEAREST = 0.5 * (1 + 1 / MARGIN)
+_OUTLIERS_PER_END = 1 / 500
+_FLIP = np.diag([1.0, -1.0, -1.0])
+
+
+@dataclass(frozen=True, eq=False)
+class CanonicalView:
+    """The image of one object in its own unit cube.
+
+    Attributes
+    ----------
+    image : float32 (n, n)
+        z of the visible surface, 0 for background.
+    rotation : (4,)
+        Quaternion, optical frame to canonical frame.
+    anchor : (3,)
+        The optical frame's point that lands at (1/2, 1/2, z0), metres.
+    extent : float
+        Side of the cube, metres.
+    """
+
+    image: np.ndarray
+    rotation: np.ndarray
+    anchor: np.ndarray
+    extent: float
+
+    def to_canonical(self, body: Superquadric) -> Superquadric:
+        """A NumPy body of the optical frame in the canonical frame."""
+        rotated = quaternions.to_matrix(self.rotation) @ self.anchor
+        shift = np.array([0.5, 0.5, _NEAREST]) - rotated / self.extent
+        return body.transformed(self.rotation, shift, 1 / self.extent)
+
+    def from_canonical(self, body: Superquadric) -> Superquadric:
+        """A NumPy body of the canonical frame in the optical frame."""
+        inverse = quaternions.conjugate(self.rotation)
+        middle = quaternions.to_matrix(inverse) @ np.array([0.5, 0.5, _NEAREST])
+        return body.transformed(inverse, self.anchor - middle * self.extent, self.extent)
+
+
+def from_mask(depth: np.ndarray, mask: np.ndarray, camera: Camera, pixels: int = 64) -> CanonicalView:
+    """The canonical view of the object under a mask.
+
+    Parameters
+    ----------
+    depth : float (height, width)
+        Metres, NaN where nothing was measured.
+    mask : bool (height, width)
+    camera : Camera
+    pixels : int
+        Side n of the view.
+
+    Raises
+    ------
+    ValueError
+        If the images do not fit the camera, or no pixel of the mask has a depth.
+    """
+    camera.check_image(depth)
+    camera.check_image(mask)
+    rows, columns = np.nonzero(mask & np.isfinite(depth))
+    if rows.size == 0:
+        raise ValueError("a canonical view needs at least one pixel with a depth under the mask")
+    top, bottom, left, right = rows.min(), rows.max() + 1, columns.min(), columns.max() + 1
+    camera = camera.cropped(left, top, right - left, bottom - top)
+    rows, columns = rows - top, columns - left
+    points = camera.unproject(columns, rows, depth[rows + top, columns + left])
+
+    look = np.eye(3)
+    if camera.is_pinhole:
+        _, toward = camera.rays(0.5 * (right - left - 1), 0.5 * (bottom - top - 1))
+        look = _rotation_to_z(toward / np.linalg.norm(toward))
+    matrix = _FLIP @ look
+    turned = points @ matrix.T
+    low, high = turned[:, :2].min(axis=0), turned[:, :2].max(axis=0)
+    outliers = int(rows.size * _OUTLIERS_PER_END)
+    z = np.partition(turned[:, 2], [outliers, rows.size - 1 - outliers])
+    farthest, nearest = z[outliers], z[rows.size - 1 - outliers]
+    pixel = max(1 / camera.fx, 1 / camera.fy) * (nearest_depth(points) if camera.is_pinhole else 1.0)
+    extent = MARGIN * max(*(high - low + pixel), nearest - farthest)
+    anchor = np.array([*(0.5 * (low + high)), nearest])
+
+    image = np.full((camera.height, camera.width), np.nan, dtype=np.float32)
+    image[rows, columns] = turned[:, 2]
+    z_view = _resample(image, matrix, anchor, extent, camera, pixels)
+    value = (z_view - anchor[2]) / extent + _NEAREST
+    value = np.where(np.isfinite(value), np.clip(value, 1 / 255, 1.0), 0.0).astype(np.float32)
+    return CanonicalView(value, quaternions.from_matrix(matrix), matrix.T @ anchor, float(extent))
+
+
+def nearest_depth(points: np.ndarray) -> float:
+    """Smallest depth of points (..., 3)."""
+    return float(points[..., 2].min())
+
+
+def _resample(
+    z_image: np.ndarray, matrix: np.ndarray, anchor: np.ndarray, extent: float, camera: Camera, pixels: int
+) -> np.ndarray:
+    """Turned z of what each pixel of the view sees, NaN where that is nothing.
+
+    A view pixel fixes turned x and y but not z, and a pinhole pixel depends on all three.  Reading z at the projection
+    of the last guess is a contraction wherever the surface is not almost parallel to the ray; three rounds suffice.
+    """
+    steps = ((np.arange(pixels) + 0.5) / pixels - 0.5) * extent
+    x, y = np.meshgrid(anchor[0] + steps, anchor[1] - steps)
+    z = np.full((pixels, pixels), np.nanmedian(z_image))
+    found = z
+    for _ in range(3 if camera.is_pinhole else 1):
+        uv = camera.project(np.stack([x, y, z], axis=-1) @ matrix).astype(np.float32)
+        found = cv2.remap(
+            z_image, uv[..., 0], uv[..., 1], cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan")
+        )
+        z = np.where(np.isfinite(found), found, z)
+    return found
+
+
+def _rotation_to_z(direction: np.ndarray) -> np.ndarray:
+    """The smallest rotation (3, 3) that turns a unit direction with positive z into the z axis."""
+    x, y, z = direction
+    k = 1 / (1 + z)
+    return np.array([[1 - k * x * x, -k * x * y, -x], [-k * x * y, 1 - k * y * y, -y], [x, y, z]])
+
+
+def render_views(bodies: Superquadric, pixels: int = 64, levels: np.ndarray | None = None) -> tuple[np.ndarray, Superquadric]:
+    """Canonical views of whole, unoccluded bodies seen by an orthographic camera, without the detour over an image.
+
+    The silhouette's box and the nearest point come from the support function; the visible depth needs one rendering,
+    and a second one where it, not the silhouette, sets the extent.
+
+    Parameters
+    ----------
+    bodies : Superquadric
+        NumPy batch (n,), in a frame like the cube's: y up, z towards the viewer.
+    pixels : int
+        Side of the views.
+    levels : (n,), optional
+        Grey levels per unit of the bodies' frame: depths are rounded down to them, as in an image of integers.
+
+    Returns
+    -------
+    images : float32 (n, pixels, pixels)
+    bodies : Superquadric
+        The batch in the canonical frame of its views.
+    """
+    lower, upper = bodies.bounding_box()
+    side = MARGIN * (upper - lower)[:, :2].max(axis=1)
+    anchor = np.stack([0.5 * (lower[:, 0] + upper[:, 0]), 0.5 * (lower[:, 1] + upper[:, 1]), upper[:, 2]], axis=-1)
+    flat = np.ascontiguousarray(bodies.to_flat(), dtype=float)
+    matrices = np.ascontiguousarray(bodies.rotation_matrix, dtype=float)
+    images = np.zeros((len(bodies), pixels, pixels), dtype=np.float32)
+    steps = np.zeros(len(bodies)) if levels is None else 1 / np.asarray(levels, dtype=float)
+    _render_views(flat, matrices, anchor, side, steps, images)
+    identity = np.array([0.0, 0.0, 0.0, 1.0])
+    shift = np.array([0.5, 0.5, _NEAREST]) - anchor / side[:, None]
+    return images, bodies.transformed(identity, shift, 1 / side[:, None])
+
+
+@numba.njit(cache=True, nogil=True, parallel=True, fastmath=FAST, error_model="numpy")
+def _render_views(flat, matrices, anchor, side, quantum, images):
+    pixels = images.shape[1]
+    for k in numba.prange(flat.shape[0]):
+        a1, a2, a3, e1, e2, t1, t2, t3 = flat[k, :8]
+        m = matrices[k]
+        for attempt in range(2):
+            farthest = np.inf
+            for i in range(pixels):
+                for j in range(pixels):
+                    x = anchor[k, 0] + ((j + 0.5) / pixels - 0.5) * side[k] - t1
+                    y = anchor[k, 1] - ((i + 0.5) / pixels - 0.5) * side[k] - t2
+                    z = anchor[k, 2] - t3
+                    hit, t = ray_entry(
+                        m[0, 0] * x + m[1, 0] * y + m[2, 0] * z,
+                        m[0, 1] * x + m[1, 1] * y + m[2, 1] * z,
+                        m[0, 2] * x + m[1, 2] * y + m[2, 2] * z,
+                        -m[2, 0],
+                        -m[2, 1],
+                        -m[2, 2],
+                        a1,
+                        a2,
+                        a3,
+                        e1,
+                        e2,
+                    )
+                    images[k, i, j] = 0.0
+                    if hit:
+                        if quantum[k] > 0.0:
+                            surface = anchor[k, 2] - t
+                            t = anchor[k, 2] - (np.floor(surface / quantum[k]) + 0.5) * quantum[k]
+                        farthest = min(farthest, -t)
+                        value = -t / side[k] + _NEAREST
+                        images[k, i, j] = min(max(value, 1 / 255), 1.0)
+            if attempt == 0 and -farthest * MARGIN > side[k] and farthest > -np.inf and farthest != np.inf:
+                side[k] = -farthest * MARGIN
+            else:
+                break

@@ -1,0 +1,103 @@
+"""Network weights on disk: safetensors with a header that says what they are.
+
+The header (strings, as the format demands) holds ``format`` and its version, the network's ``config`` and whatever the
+training noted (``training``, ``metrics``: JSON).  Reading executes nothing, and every name and shape must fit.
+Half precision on disk halves the file; networks compute in single precision.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+
+from sq_perception.learning.regressor import Regressor, RegressorConfig
+
+FORMAT = "sq_perception.regressor"
+VERSION = "1"
+_MAX_PARAMETERS = 200_000_000
+
+
+class CheckpointError(ValueError):
+    """A weights file that is missing, damaged, or of another kind; the message says which."""
+
+
+def default_model_path() -> Path:
+    """The weights that ship with the package."""
+    return Path(str(resources.files("sq_perception").joinpath("weights", "compact.safetensors")))
+
+
+def save(
+    path: Path | str, model: Regressor, notes: dict[str, Any] | None = None, dtype: torch.dtype = torch.float16
+) -> None:
+    """Write a network and ``notes`` (JSON values) to ``path``; replaced at once, never half written."""
+    path = Path(path)
+    state = {}
+    for name, tensor in model.state_dict().items():
+        state[name] = (tensor.to(dtype) if tensor.is_floating_point() else tensor).contiguous().cpu()
+    header = {"format": FORMAT, "version": VERSION, "config": json.dumps(asdict(model.config))}
+    header.update({key: json.dumps(value) for key, value in (notes or {}).items()})
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_suffix(path.suffix + ".partial")
+    save_file(state, str(partial), metadata=header)
+    partial.replace(path)
+
+
+def load(path: Path | str | None = None, device: str | torch.device = "cpu") -> Regressor:
+    """Read a network, in evaluation mode; None reads the shipped one.
+
+    Raises
+    ------
+    CheckpointError
+        If the file is missing, no safetensors file, of another format or version, or does not fit its own config.
+    """
+    path = default_model_path() if path is None else Path(path)
+    header, state = _read(path)
+    if header.get("format") != FORMAT:
+        raise CheckpointError(f"{path}: expected a header 'format: {FORMAT}', got {header.get('format')!r}")
+    if header.get("version") != VERSION:
+        raise CheckpointError(f"{path}: expected format version {VERSION}, got {header.get('version')!r}")
+    try:
+        config = _config(json.loads(header["config"]))
+        model = Regressor(config)
+    except (KeyError, TypeError, ValueError, RuntimeError, ZeroDivisionError) as error:
+        raise CheckpointError(f"{path}: the header's config describes no network: {error}") from error
+    try:
+        model.load_state_dict({name: t.float() if t.is_floating_point() else t for name, t in state.items()})
+    except RuntimeError as error:
+        raise CheckpointError(f"{path}: the weights do not fit the config: {error}") from error
+    if not all(bool(torch.isfinite(t).all()) for t in model.state_dict().values()):
+        raise CheckpointError(f"{path}: the weights are not all finite")
+    return model.to(device).eval()
+
+
+def read_header(path: Path | str) -> dict[str, str]:
+    """The header alone; raises CheckpointError as :func:`load` does."""
+    return _read(Path(path), tensors=False)[0]
+
+
+def _read(path: Path, tensors: bool = True) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
+    if not path.is_file():
+        raise CheckpointError(f"{path}: no such model file")
+    try:
+        with safe_open(str(path), framework="pt", device="cpu") as file:
+            header = file.metadata() or {}
+            state = {name: file.get_tensor(name) for name in file.keys()} if tensors else {}  # noqa: SIM118
+    except (SafetensorError, OSError) as error:
+        raise CheckpointError(f"{path}: not a readable safetensors file: {error}") from error
+    return header, state
+
+
+def _config(values: dict[str, Any]) -> RegressorConfig:
+    config = RegressorConfig(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
+    width = max(config.widths)
+    cells = config.pixels / 2 ** len(config.widths)
+    if width * width * 9 * config.blocks + width * cells * cells * config.hidden > _MAX_PARAMETERS:
+        raise ValueError("the network would be larger than any this package trains")
+    return config
