@@ -31,3 +31,48 @@ def draw_bodies(count: int, rng: np.random.Generator) -> Superquadric:
 def draw_views(count: int, rng: np.random.Generator, pixels: int = 64) -> tuple[np.ndarray, Superquadric]:
     """Views (count, pixels, pixels) of freshly drawn bodies, and the bodies (count,) in the views' frames."""
     return render_views(draw_bodies(count, rng), pixels, np.full(count, GREY_LEVELS))
+
+
+def dihedral(images: np.ndarray, bodies: Superquadric, turns: np.ndarray, mirror: np.ndarray) -> tuple[np.ndarray, Superquadric]:
+    """Views and bodies (n,) after ``turns`` quarter turns and, where ``mirror``, a reflection of x first.
+
+    A mirrored image is the image of the mirrored body, which is a superquadric again: with M = diag(-1, 1, 1), M R M is
+    a rotation, and the body's own symmetry takes up the second M.  A quarter turn is counter-clockwise in x and y.
+    """
+    images = np.where(mirror[:, None, None], images[:, :, ::-1], images)
+    out = np.empty_like(images)
+    for k in range(4):
+        chosen = turns == k
+        out[chosen] = np.rot90(images[chosen], k, axes=(1, 2))
+    sign = np.where(mirror, -1.0, 1.0)
+    centred = bodies.translation - 0.5
+    centred = np.stack([sign * centred[:, 0], centred[:, 1], centred[:, 2]], axis=-1)
+    rotation = bodies.rotation * np.stack([np.ones_like(sign), sign, sign, np.ones_like(sign)], axis=-1)
+    angle = 0.5 * np.pi * turns
+    turn = np.stack([np.zeros_like(angle), np.zeros_like(angle), np.sin(angle / 2), np.cos(angle / 2)], axis=-1)
+    moved = Superquadric(bodies.size, bodies.shape, centred, rotation).transformed(turn, np.full(3, 0.5))
+    return out, moved
+
+
+class ViewPool:
+    """A pool of rendered views from which batches are drawn, each time in another of the 8 dihedral positions.
+
+    Rendering costs as much as a training step.  Each batch renders only ``batch / reuse`` new views, which replace the
+    oldest of the pool; a view is so seen about ``reuse`` times, rarely twice in the same position.
+    """
+
+    def __init__(self, rng: np.random.Generator, capacity: int = 4096, reuse: int = 4, pixels: int = 64) -> None:
+        self._rng, self._reuse, self._pixels = rng, reuse, pixels
+        images, bodies = draw_views(capacity, rng, pixels)
+        self._images, self._flat, self._next = images, bodies.to_flat().copy(), 0
+
+    def batch(self, count: int) -> tuple[np.ndarray, Superquadric]:
+        """Views (count, pixels, pixels) and bodies (count,) in the views' frames."""
+        fresh = max(1, count // self._reuse)
+        images, bodies = draw_views(fresh, self._rng, self._pixels)
+        slots = (self._next + np.arange(fresh)) % len(self._images)
+        self._images[slots], self._flat[slots] = images, bodies.to_flat()
+        self._next = int(slots[-1] + 1) % len(self._images)
+        chosen = self._rng.integers(len(self._images), size=count)
+        turns, mirror = self._rng.integers(4, size=count), self._rng.random(count) < 0.5
+        return dihedral(self._images[chosen], Superquadric.from_flat(self._flat[chosen]), turns, mirror)

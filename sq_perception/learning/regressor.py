@@ -93,13 +93,14 @@ class Regressor(nn.Module):
         """Superquadrics (n,) of views (n, 1, p, p)."""
         h = self.mixer(self.features(views)).float()
         low, high = self.config.size_range
-        size = low * (high / low) ** torch.sigmoid(self.size_head(h))
-        return Superquadric(
-            size,
-            _between(self.config.shape_range, self.shape_head(h)),
-            _between(self.config.translation_range, self.translation_head(h)),
-            quaternions.from_six(self.rotation_head(h)),
-        )
+        with torch.autocast(views.device.type, enabled=False):  # eight bits of mantissa are too few for a size
+            size = low * (high / low) ** torch.sigmoid(self.size_head(h))
+            return Superquadric(
+                size,
+                _between(self.config.shape_range, self.shape_head(h)),
+                _between(self.config.translation_range, self.translation_head(h)),
+                quaternions.from_six(self.rotation_head(h)),
+            )
 
     def predict(self, views: np.ndarray) -> Superquadric:
         """NumPy superquadrics (n,) of NumPy views (n, p, p).

@@ -1,0 +1,64 @@
+"""How large and how sharp a fitted body may be."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sq_perception.geometry.superquadric import Superquadric
+
+SMALLEST_SIZE = 0.02
+"""Smallest half size, as a share of the observed extent, when the data set the bounds."""
+LARGEST_SIZE = 2.0
+"""Largest half size, likewise: a body may hide a few times more than it shows."""
+WIDEST_EXPONENT = 2.0
+_FREE_MOVE = 4.0
+"""How far, in observed extents, the centre may leave the observed points."""
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """Limits of a fit.
+
+    Attributes
+    ----------
+    shape : (float, float)
+        Range of both exponents e1 and e2, within (0, 2].
+    size : (float, float) or None
+        Range of all three half sizes, metres.  None takes it from the extent of the observed points.
+
+    Raises
+    ------
+    ValueError
+        For a range that is empty, not finite or not positive, or exponents above 2.
+    """
+
+    shape: tuple[float, float] = (0.1, 1.0)
+    size: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        for name, limits in (("shape", self.shape), ("size", self.size)):
+            if limits is None:
+                continue
+            low, high = limits
+            if not (np.isfinite([low, high]).all() and 0 < low <= high):
+                raise ValueError(f"bounds of {name}: expected 0 < low <= high, got {limits}")
+        if self.shape[1] > WIDEST_EXPONENT:
+            raise ValueError(f"bounds of shape: expected exponents up to {WIDEST_EXPONENT:g}, got {self.shape}")
+
+    def limits(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper limit (8,) of a1 a2 a3 e1 e2 t1 t2 t3 for observed points (n, 3)."""
+        low, high = points.min(axis=0), points.max(axis=0)
+        extent = max(float(np.linalg.norm(high - low)), 1e-9)
+        size = self.size if self.size is not None else (SMALLEST_SIZE * extent / 2, LARGEST_SIZE * extent / 2)
+        reach = _FREE_MOVE * max(extent, size[1])
+        lower = np.concatenate([np.full(3, size[0]), np.full(2, self.shape[0]), low - reach])
+        upper = np.concatenate([np.full(3, size[1]), np.full(2, self.shape[1]), high + reach])
+        return lower, upper
+
+    def clamped(self, body: Superquadric, lower: np.ndarray, upper: np.ndarray) -> Superquadric:
+        """The body with sizes, shape and centre moved into the limits."""
+        flat = np.array(body.to_flat(), dtype=float)
+        flat[..., :8] = np.clip(flat[..., :8], lower, upper)
+        return Superquadric.from_flat(flat)

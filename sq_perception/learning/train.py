@@ -1,0 +1,188 @@
+"""Train the regressor on views drawn on the fly, with the occupancy loss.
+
+One linear script: draw a batch, predict, compare occupancies at random points around the true body, step.  AdamW under
+a one-cycle schedule (warm up, cosine down), gradients clipped, an exponential average of the weights is what is
+validated and saved.  Everything that changes lives in one state file, so that a killed run goes on where it stopped.
+
+    sq-perception train --steps 20000 --output runs/compact
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import json
+import math
+import time
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+
+import numpy as np
+import torch
+from safetensors.torch import load_file, save_file
+
+from sq_perception.learning import checkpoint
+from sq_perception.learning.dataset import ViewPool, draw_views
+from sq_perception.learning.losses import occupancy_loss, points_around
+from sq_perception.learning.regressor import Regressor, RegressorConfig
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.metrics import volume_iou
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """What a run is made of."""
+
+    steps: int = 20000
+    batch: int = 128
+    points: int = 256
+    """Comparison points a body: half close around it, half in twice its box."""
+    learning_rate: float = 1.5e-3
+    weight_decay: float = 1e-2
+    warm_up: int = 400
+    sharpness_start: float = 6.0
+    sharpness_end: float = 25.0
+    """s of the occupancy, raised over the run: far basins first, fine fit last."""
+    average: float = 0.999
+    clip: float = 1.0
+    validation: int = 1000
+    """Bodies in the validation set, and steps between validations."""
+    seed: int = 1
+    bfloat16: bool = True
+    threads: int = 0
+    """CPU threads; 0 leaves torch's own choice."""
+    device: str = "cpu"
+
+
+def train(config: TrainingConfig, output: Path, network: RegressorConfig | None = None) -> Regressor:
+    """Run, or continue, a training; returns the averaged network, also saved as ``output``/model.safetensors.
+
+    Raises
+    ------
+    FloatingPointError
+        When the loss is no longer finite; the last saved state stays as it was.
+    """
+    if config.threads:
+        torch.set_num_threads(config.threads)
+    output.mkdir(parents=True, exist_ok=True)
+    torch.manual_seed(config.seed)
+    device = torch.device(config.device)
+    model = Regressor(network).to(device, memory_format=torch.channels_last)
+    average = copy.deepcopy(model)
+    optimizer = torch.optim.AdamW(model.parameters(), config.learning_rate, weight_decay=config.weight_decay)
+    state_path = output / "state.safetensors"
+    first = _restore(state_path, model, average, optimizer) if state_path.exists() else 0
+    rng = np.random.default_rng([config.seed, first])
+    generator = torch.Generator(device=device).manual_seed(config.seed + first)
+    pool = ViewPool(rng, pixels=model.config.pixels)
+    validation = draw_views(config.validation, np.random.default_rng(0), model.config.pixels)
+    log = (output / "log.jsonl").open("a", encoding="utf-8")
+    started, losses = time.monotonic(), []
+    for step in range(first, config.steps):
+        progress = step / config.steps
+        rate = config.learning_rate * min(1.0, (step + 1) / config.warm_up) * 0.5 * (1 + math.cos(math.pi * progress))
+        for group in optimizer.param_groups:
+            group["lr"] = rate
+        sharpness = config.sharpness_start * (config.sharpness_end / config.sharpness_start) ** progress
+        images, bodies = pool.batch(config.batch)
+        views = torch.from_numpy(images)[:, None].to(device, memory_format=torch.channels_last)
+        truth = Superquadric.from_flat(torch.from_numpy(bodies.to_flat()).float().to(device))
+        points = torch.cat(
+            [points_around(truth, config.points // 2, generator, scale) for scale in (1.15, 2.0)], dim=1
+        )
+        model.train()
+        with torch.autocast(device.type, torch.bfloat16, enabled=config.bfloat16):
+            prediction = model(views)
+        loss = occupancy_loss(prediction, truth, points, sharpness).mean()
+        if not bool(torch.isfinite(loss)):
+            raise FloatingPointError(f"step {step}: the loss is {loss.item()}; {state_path} holds the last good state")
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(model.parameters(), config.clip)
+        optimizer.step()
+        _update_average(average, model, min(config.average, (step + 1) / (step + 10)))
+        losses.append(loss.item())
+        done = step + 1
+        if done % config.validation == 0 or done == config.steps:
+            iou = validate(average, *validation)
+            record = {
+                "step": done,
+                "loss": float(np.mean(losses)),
+                "iou": float(iou.mean()),
+                "iou_std": float(iou.std()),
+                "over_85": float((iou > 0.85).mean()),
+                "rate": rate,
+                "sharpness": sharpness,
+                "seconds": time.monotonic() - started,
+            }
+            print(json.dumps(record), flush=True)
+            log.write(json.dumps(record) + "\n")
+            log.flush()
+            losses.clear()
+            _store(state_path, done, model, average, optimizer)
+            checkpoint.save(output / "model.safetensors", average, {"training": asdict(config), "metrics": record})
+    return average.eval()
+
+
+def validate(model: Regressor, views: np.ndarray, truth: Superquadric, batch: int = 250) -> np.ndarray:
+    """Volume IoU (n,) of the network's bodies with the true ones, both in the views' frames."""
+    flats = [model.predict(views[i : i + batch]).to_flat() for i in range(0, len(views), batch)]
+    return volume_iou(Superquadric.from_flat(np.concatenate(flats)), truth)
+
+
+@torch.no_grad()
+def _update_average(average: Regressor, model: Regressor, keep: float) -> None:
+    for mine, theirs in zip(average.state_dict().values(), model.state_dict().values(), strict=True):
+        if mine.is_floating_point():
+            mine.lerp_(theirs, 1 - keep)
+        else:
+            mine.copy_(theirs)
+
+
+def _store(path: Path, step: int, model: Regressor, average: Regressor, optimizer: torch.optim.AdamW) -> None:
+    tensors = {"step": torch.tensor(step)}
+    tensors.update({f"model.{k}": v.contiguous() for k, v in model.state_dict().items()})
+    tensors.update({f"average.{k}": v.contiguous() for k, v in average.state_dict().items()})
+    for index, slots in optimizer.state_dict()["state"].items():
+        tensors.update({f"optimizer.{index}.{k}": v.contiguous() for k, v in slots.items()})
+    partial = path.with_suffix(".partial")
+    save_file(tensors, str(partial))
+    partial.replace(path)
+
+
+def _restore(path: Path, model: Regressor, average: Regressor, optimizer: torch.optim.AdamW) -> int:
+    tensors = load_file(str(path), device=str(next(model.parameters()).device))
+    for prefix, network in (("model.", model), ("average.", average)):
+        network.load_state_dict({k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)})
+    state = optimizer.state_dict()
+    for key, value in tensors.items():
+        if key.startswith("optimizer."):
+            _, index, slot = key.split(".")
+            state["state"].setdefault(int(index), {})[slot] = value
+    optimizer.load_state_dict(state)
+    return int(tensors["step"])
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Options of ``sq-perception train``: one per field of TrainingConfig."""
+    parser.add_argument("--output", type=Path, default=Path("runs/compact"), help="folder of state, log and model")
+    for field in fields(TrainingConfig):
+        name = "--" + field.name.replace("_", "-")
+        if isinstance(field.default, bool):
+            parser.add_argument(name, action=argparse.BooleanOptionalAction, default=field.default)
+        else:
+            parser.add_argument(name, type=type(field.default), default=field.default, help=f"default {field.default}")
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Entry of ``sq-perception train``."""
+    parser = argparse.ArgumentParser(prog="sq-perception train", description=__doc__.split("\n\n")[0])
+    add_arguments(parser)
+    options = vars(parser.parse_args(arguments))
+    output = options.pop("output")
+    train(TrainingConfig(**options), output)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
