@@ -1,0 +1,223 @@
+"""Superquadrics in a sensor_msgs/PointCloud2: one point per body, one named field per number.
+
+Equation, in the body's own frame (F < 1 inside, F = 1 on the surface):
+
+    F(x, y, z) = (|x/a1|^(2/e2) + |y/a2|^(2/e2))^(e2/e1) + |z/a3|^(2/e1)
+
+Fields, version 1
+-----------------
+x y z           centre, metres, in the frame of the header
+qx qy qz qw     unit quaternion, body to header frame
+a1 a2 a3        HALF sizes along the body's x y z, metres
+e1 e2           exponents: e1 along z, e2 in the xy plane; 0.1 is a box, 1 an ellipsoid, 2 an octahedron
+score           0 to 1: agreement of the soft-rendered body with the image
+residual        root mean square distance of the seen points to the surface, metres
+sigma_a1..a3    standard deviations of the half sizes, metres; NaN where unknown
+id              label of the body's mask, or its track, or 1..n
+status          0 converged, 1 converged but the view leaves something open, 2 failed
+
+All are float32 but id and status, which are uint32.  The header copies stamp and frame of the depth image.  Readers
+find fields by name: a later version may append fields, and raises VERSION when it changes the meaning of one.
+
+The eight parameter vectors of one body (half turns about the axes, quarter turns about z with a1 and a2 exchanged) are
+equally right: compare bodies, never raw parameters.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from typing import Any
+
+import numpy as np
+from sensor_msgs.msg import PointCloud2, PointField
+
+from sq_msgs_py.depth_image import byte_array
+
+VERSION = 1
+CONVERGED, WEAK, FAILED = 0, 1, 2
+
+FIELDS: tuple[tuple[str, int], ...] = tuple(
+    (name, PointField.FLOAT32)
+    for name in (
+        *("x", "y", "z", "qx", "qy", "qz", "qw", "a1", "a2", "a3", "e1", "e2"),
+        *("score", "residual", "sigma_a1", "sigma_a2", "sigma_a3"),
+    )
+) + (("id", PointField.UINT32), ("status", PointField.UINT32))
+"""Name and PointField datatype of every field, in the order of the message."""
+
+_NUMPY_TYPES = {
+    PointField.INT8: "i1",
+    PointField.UINT8: "u1",
+    PointField.INT16: "i2",
+    PointField.UINT16: "u2",
+    PointField.INT32: "i4",
+    PointField.UINT32: "u4",
+    PointField.FLOAT32: "f4",
+    PointField.FLOAT64: "f8",
+}
+_COLUMNS = {
+    "size": ("a1", "a2", "a3"),
+    "shape": ("e1", "e2"),
+    "translation": ("x", "y", "z"),
+    "rotation": ("qx", "qy", "qz", "qw"),
+    "score": ("score",),
+    "residual": ("residual",),
+    "sigma_size": ("sigma_a1", "sigma_a2", "sigma_a3"),
+    "id": ("id",),
+    "status": ("status",),
+}
+
+
+class MessageError(ValueError):
+    """A PointCloud2 that holds no superquadrics; says what was expected and what arrived."""
+
+
+@dataclass(frozen=True, eq=False)
+class SuperquadricArray:
+    """n superquadrics, column by column; see the module for units and conventions.
+
+    Attributes
+    ----------
+    size : (n, 3) float32
+    shape : (n, 2) float32
+    translation : (n, 3) float32
+    rotation : (n, 4) float32
+    score, residual : (n,) float32
+    sigma_size : (n, 3) float32
+    id, status : (n,) uint32
+
+    Raises
+    ------
+    ValueError
+        If a column has another shape than the size column asks for, a half size, exponent, centre or quaternion is not
+        finite, or an id or status is no unsigned 32 bit integer.
+    """
+
+    size: np.ndarray
+    shape: np.ndarray
+    translation: np.ndarray
+    rotation: np.ndarray
+    score: np.ndarray
+    residual: np.ndarray
+    sigma_size: np.ndarray
+    id: np.ndarray
+    status: np.ndarray
+
+    def __post_init__(self) -> None:
+        count = len(np.atleast_1d(self.size))
+        for column in fields(self):
+            names = _COLUMNS[column.name]
+            values = np.asarray(getattr(self, column.name))
+            shape = (count,) if len(names) == 1 else (count, len(names))
+            if values.size == 0 and count == 0:
+                values = values.reshape(shape)
+            if values.shape != shape:
+                raise ValueError(f"{column.name}: expected shape {shape}, got {values.shape}")
+            if column.name in ("id", "status"):
+                _check_unsigned(column.name, values)
+                values = values.astype(np.uint32)
+            else:
+                values = values.astype(np.float32)
+            if column.name in ("size", "shape", "translation", "rotation") and not np.isfinite(values).all():
+                raise ValueError(f"{column.name}: expected finite numbers, got {values.tolist()}")
+            object.__setattr__(self, column.name, values)
+
+    def __len__(self) -> int:
+        return len(self.size)
+
+    @classmethod
+    def empty(cls) -> SuperquadricArray:
+        """No superquadric at all."""
+        return cls(
+            **{name: np.empty(0) for name in _COLUMNS if name not in ("id", "status")},
+            id=np.empty(0, np.uint32),
+            status=np.empty(0, np.uint32),
+        )
+
+
+def to_message(superquadrics: SuperquadricArray, header: Any) -> PointCloud2:
+    """The message of n superquadrics (n may be 0) with the given std_msgs/Header."""
+    layout = np.dtype([(name, "<" + _NUMPY_TYPES[datatype]) for name, datatype in FIELDS])
+    points = np.zeros(len(superquadrics), layout)
+    for column, names in _COLUMNS.items():
+        values = getattr(superquadrics, column).reshape(len(superquadrics), len(names))
+        for k, name in enumerate(names):
+            points[name] = values[:, k]
+    message = PointCloud2(header=header, height=1, width=len(points), is_bigendian=False)
+    message.fields = [
+        PointField(name=name, offset=int(layout.fields[name][1]), datatype=datatype, count=1)  # type: ignore[index]
+        for name, datatype in FIELDS
+    ]
+    message.point_step = layout.itemsize
+    message.row_step = layout.itemsize * len(points)
+    message.is_dense = bool(
+        np.isfinite(superquadrics.sigma_size).all()
+        and np.isfinite(superquadrics.score).all()
+        and np.isfinite(superquadrics.residual).all()
+    )
+    message.data = byte_array(points)
+    return message
+
+
+def from_message(message: PointCloud2) -> SuperquadricArray:
+    """The superquadrics of a message; fields are found by name, unknown ones are left aside.
+
+    Raises
+    ------
+    MessageError
+        If a field is missing, has an unknown datatype, a count other than one or an offset outside the point, or if the
+        data is not as long as width, height and steps say.
+    """
+    points = _points(message)
+    columns: dict[str, np.ndarray] = {}
+    for column, names in _COLUMNS.items():
+        values = np.stack([points[name] for name in names], axis=-1)
+        columns[column] = values[:, 0] if len(names) == 1 else values
+    try:
+        return SuperquadricArray(**columns)
+    except ValueError as error:
+        raise MessageError(str(error)) from error
+
+
+def _points(message: PointCloud2) -> np.ndarray:
+    """The points (n,) of a cloud as a structured array of the fields of FIELDS."""
+    order = ">" if message.is_bigendian else "<"
+    present = {field.name: field for field in message.fields}
+    missing = [name for name, _ in FIELDS if name not in present]
+    if missing:
+        raise MessageError(f"expected the fields {' '.join(name for name, _ in FIELDS)}; missing: {' '.join(missing)}")
+    formats = []
+    for name, _ in FIELDS:
+        field = present[name]
+        if field.datatype not in _NUMPY_TYPES or field.count != 1:
+            raise MessageError(f"field {name}: expected one number, got datatype {field.datatype} x {field.count}")
+        formats.append(order + _NUMPY_TYPES[field.datatype])
+        if field.offset + np.dtype(formats[-1]).itemsize > message.point_step:
+            raise MessageError(
+                f"field {name}: offset {field.offset} lies outside a point of {message.point_step} bytes"
+            )
+    height, width, row_step = int(message.height), int(message.width), int(message.row_step)
+    if row_step < width * message.point_step:
+        raise MessageError(f"row_step: expected at least {width * message.point_step} bytes, got {row_step}")
+    if len(message.data) != height * row_step:
+        raise MessageError(f"data: expected height x row_step = {height * row_step} bytes, got {len(message.data)}")
+    offsets = [present[name].offset for name, _ in FIELDS]
+    layout = np.dtype(
+        {
+            "names": [name for name, _ in FIELDS],
+            "formats": formats,
+            "offsets": offsets,
+            "itemsize": int(message.point_step),
+        }
+    )
+    if height * width == 0:
+        return np.empty(0, layout)
+    rows = np.ndarray((height, width), layout, buffer=memoryview(message.data), strides=(row_step, message.point_step))
+    return rows.reshape(-1)
+
+
+def _check_unsigned(name: str, values: np.ndarray) -> None:
+    if values.size and not np.issubdtype(values.dtype, np.integer):
+        raise ValueError(f"{name}: expected integers, got {values.dtype}")
+    if values.size and (values.min() < 0 or values.max() > np.iinfo(np.uint32).max):
+        raise ValueError(f"{name}: expected 0 to {np.iinfo(np.uint32).max}, got {values.min()} to {values.max()}")
