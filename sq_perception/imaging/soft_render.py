@@ -1,0 +1,96 @@
+"""Soft images of superquadrics: the thesis' differentiable renderer, with s and tau.
+
+Equations (thesis, chapters 6.3.2 and 7.4)
+------------------------------------------
+Occupancy (6.6) on a grid of points, voxel k = 1..n of a line of sight counted from the viewer:
+
+    V = sigma(s (1 - F^e1))
+
+silhouette (7.8) and depth projection (7.9, 7.10) along the line of sight:
+
+    P(V) = 1 - exp(-tau sum_k V_k),        A_k = exp(-tau sum_{l <= k} V_l),        T(V) = 1 - 1/n sum_k A_k
+
+A_k stays 1 until a voxel is hit and then drops to 0, so the sum counts the empty voxels before the surface: T is the
+image of the unit cube (:mod:`sq_perception.imaging.unit_cube`), z of the nearest surface, near 0 where there is none.
+s is the sharpness of a body's boundary, tau that of the hit; both large make T the exact image, up to half a voxel.
+
+All functions are torch, batched over bodies in the cube frame (y up, z towards the viewer), and differentiable.
+"""
+
+from __future__ import annotations
+
+import torch
+
+from sq_perception.geometry.superquadric import Superquadric
+
+THESIS_SHARPNESS = 117.3
+THESIS_TAU = 4.82
+
+
+def cell_centres(resolution: int, like: torch.Tensor | None = None) -> torch.Tensor:
+    """Centres (resolution,) of equal cells of [0, 1], as the pixels of a canonical view."""
+    axis = (torch.arange(resolution, dtype=torch.float64) + 0.5) / resolution
+    return axis if like is None else axis.to(like)
+
+
+def grid_points(resolution: int, like: torch.Tensor | None = None) -> torch.Tensor:
+    """Points (resolution,) of [0, 1], ends included: an axis of the thesis' grid and of its images."""
+    axis = torch.linspace(0, 1, resolution, dtype=torch.float64)
+    return axis if like is None else axis.to(like)
+
+
+def occupancy_grid(bodies: Superquadric, axis: torch.Tensor, sharpness: float, stride: int = 1) -> torch.Tensor:
+    """Soft occupancy of each body, (n, rows, columns, voxels).
+
+    Parameters
+    ----------
+    bodies : Superquadric
+        Torch batch (n,).
+    axis : (r,)
+        Coordinates shared by x, y and z, ascending.  Rows run from the largest y down, columns along x, voxels from the
+        viewer (largest z) away.
+    sharpness : float
+        s, positive.
+    stride : int
+        Take every ``stride``-th row and column only.
+    """
+    _check_positive("s", sharpness)
+    rows, columns, voxels = axis.flip(0)[::stride], axis[::stride], axis.flip(0)
+    y, x, z = torch.meshgrid(rows, columns, voxels, indexing="ij")
+    points = torch.stack([x, y, z], dim=-1).reshape(-1, 3)
+    return bodies.occupancy(points, sharpness).reshape(-1, *x.shape)
+
+
+def silhouette(occupancy: torch.Tensor, tau: float) -> torch.Tensor:
+    """P(V) of occupancy grids (..., voxels), shape (...), in [0, 1) (equation 7.8)."""
+    _check_positive("tau", tau)
+    return 1 - torch.exp(-tau * occupancy.sum(dim=-1))
+
+
+def depth_projection(occupancy: torch.Tensor, tau: float) -> torch.Tensor:
+    """T(V) of occupancy grids (..., voxels), shape (...), in [0, 1] (equations 7.9 and 7.10)."""
+    _check_positive("tau", tau)
+    return 1 - torch.exp(-tau * occupancy.cumsum(dim=-1)).mean(dim=-1)
+
+
+def render_depth(
+    bodies: Superquadric, axis: torch.Tensor, sharpness: float, tau: float, stride: int = 1
+) -> torch.Tensor:
+    """Soft images (n, rows, columns) of each body alone: :func:`depth_projection` of :func:`occupancy_grid`."""
+    return depth_projection(occupancy_grid(bodies, axis, sharpness, stride), tau)
+
+
+def agreement(image: torch.Tensor, rendered: torch.Tensor) -> torch.Tensor:
+    """How far two images (..., rows, columns) of the cube are the same, in [0, 1].
+
+    1 - sum |X - T| / sum max(X, T): the intersection over union of the two solids between each surface and the back of
+    the cube, hence one number for a wrong silhouette and a wrong depth alike.
+    """
+    difference = (image - rendered).abs().sum(dim=(-2, -1))
+    union = torch.maximum(image, rendered).sum(dim=(-2, -1))
+    return 1 - difference / torch.where(union > 0, union, torch.ones_like(union))
+
+
+def _check_positive(name: str, value: float) -> None:
+    if not value > 0:
+        raise ValueError(f"{name}: expected a positive number, got {value}")
