@@ -1,0 +1,265 @@
+"""Depth images from files: what one camera saw once, in metres of its optical frame.
+
+| file | needs | depth |
+| --- | --- | --- |
+| ``.npz`` | ``depth`` float (h, w) and ``K`` (3, 3); optional ``labels`` (h, w), ``plane`` (4,) | metres, NaN = nothing |
+| 16 bit ``.png`` | a camera_info YAML | millimetres, 0 = nothing |
+| 8 or 16 bit ``.png``, ``.bmp``, orthographic | nothing | the thesis' grey images, :mod:`sq_perception.imaging.unit_cube` |
+| ``.npz``, orthographic | ``depth`` | depth in the unit cube, 1 - z; NaN = nothing |
+
+An NPZ may say so itself in a text field ``projection``.  Nothing in a file is executed: no pickle, safe YAML only.
+"""
+
+from __future__ import annotations
+
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, get_args
+
+import cv2
+import numpy as np
+import yaml
+
+from sq_perception.imaging import unit_cube
+from sq_perception.imaging.camera import Camera, Projection
+
+MILLIMETRE = 1e-3
+_IMAGES = (".png", ".bmp")
+_NO_DISTORTION = 1e-9
+
+
+class FrameError(ValueError):
+    """A file that is missing, damaged, or does not hold what it should; the message says what was expected."""
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedFrame:
+    """One depth image with its camera.
+
+    Attributes
+    ----------
+    depth : float32 (height, width)
+        Metres in the optical frame, NaN where nothing was measured.
+    camera : Camera
+    labels : int32 (height, width) or None
+        Instance masks, 0 for background.
+    name : str
+        The file's name.
+    is_cube : bool
+        A view of the unit cube: results belong in the cube frame (:func:`unit_cube.cube_from_optical`).
+    plane : (4,) or None
+        Support plane of the recording, height above it = n.p + d.
+    """
+
+    depth: np.ndarray
+    camera: Camera
+    labels: np.ndarray | None
+    name: str
+    is_cube: bool
+    plane: np.ndarray | None = None
+
+
+def read(
+    path: str | Path, camera_info: str | Path | None = None, projection: Projection = "pinhole"
+) -> RecordedFrame:
+    """Read one frame.
+
+    Parameters
+    ----------
+    path
+        See the table above.
+    camera_info
+        YAML with the intrinsics of a PNG, as camera_calibration writes it or as a camera_info message prints.
+    projection
+        "pinhole" or "orthographic".
+
+    Raises
+    ------
+    FrameError
+        For anything wrong with a file.
+    ValueError
+        For an unknown projection.
+    """
+    if projection not in get_args(Projection):
+        raise ValueError(f"projection: expected 'pinhole' or 'orthographic', got {projection!r}")
+    path = Path(path)
+    if not path.is_file():
+        raise FrameError(f"{path}: no such file")
+    suffix = path.suffix.lower()
+    if suffix == ".npz":
+        return _read_npz(path, projection)
+    if suffix not in _IMAGES:
+        raise FrameError(f"{path}: expected a name that ends in .npz, .png or .bmp")
+    image = _read_image(path)
+    if projection == "orthographic":
+        return _from_grey(path, image)
+    if image.dtype != np.uint16:
+        raise FrameError(
+            f"{path}: a pinhole depth image has 16 bit (millimetres), this one has 8; "
+            "for grey images of the thesis' kind choose the orthographic projection"
+        )
+    if camera_info is None:
+        raise FrameError(f"{path}: a 16 bit image needs a camera_info file with the camera's intrinsics")
+    camera = read_camera_info(camera_info)
+    _check_size(path, image, camera)
+    depth = np.where(image > 0, image * np.float32(MILLIMETRE), np.float32(np.nan))
+    return RecordedFrame(depth, camera, None, path.name, is_cube=False)
+
+
+def read_camera_info(path: str | Path) -> Camera:
+    """The pinhole camera of a YAML file in the layout of camera_calibration, or of a printed camera_info message.
+
+    Depth is only metric in a rectified image.  Where the file names distortion, the image's intrinsics are therefore
+    those of the projection matrix P, otherwise K.
+
+    Raises
+    ------
+    FrameError
+    """
+    path = Path(path)
+    try:
+        text = path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        raise FrameError(f"{path}: cannot read the camera_info: {error}") from error
+    try:
+        documents = [entry for entry in yaml.safe_load_all(text) if entry is not None]
+    except yaml.YAMLError as error:
+        raise FrameError(f"{path}: not YAML: {' '.join(str(error).split())}") from error
+    if not documents or not isinstance(documents[0], dict):
+        raise FrameError(f"{path}: expected a camera_info as a YAML mapping")
+    info = documents[0]
+    width, height = (_integer(path, info, names) for names in (("image_width", "width"), ("image_height", "height")))
+    matrix = _matrix(path, info, ("camera_matrix", "k", "K"), 9)
+    distortion = _matrix(path, info, ("distortion_coefficients", "d", "D"), None)
+    projection = _matrix(path, info, ("projection_matrix", "p", "P"), 12)
+    if matrix is None:
+        raise FrameError(f"{path}: expected a camera_matrix (or k) of 9 numbers")
+    k = matrix.reshape(3, 3)
+    if distortion is not None and np.abs(distortion).max(initial=0.0) > _NO_DISTORTION:
+        if projection is None or projection[0] <= 0:
+            raise FrameError(f"{path}: a distorted camera needs the projection_matrix (or p) of its rectified image")
+        k = projection.reshape(3, 4)[:, :3]
+    try:
+        return Camera.from_matrix(k, width, height)
+    except ValueError as error:
+        raise FrameError(f"{path}: {error}") from error
+
+
+def _read_npz(path: Path, projection: Projection) -> RecordedFrame:
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            if not isinstance(archive, np.lib.npyio.NpzFile):
+                raise FrameError(f"{path}: expected an NPZ archive, got a single array")
+            known = ("depth", "K", "labels", "plane", "projection")
+            fields = {name: archive[name] for name in known if name in archive.files}
+    except FrameError:
+        raise
+    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+        raise FrameError(f"{path}: not a readable NPZ archive: {error}") from error
+    if "depth" not in fields:
+        raise FrameError(f"{path}: expected a field 'depth' in metres")
+    depth = fields["depth"]
+    if depth.ndim != 2 or depth.dtype.kind != "f" or depth.size == 0:
+        raise FrameError(f"{path}: depth: expected floats (height, width) in metres, got {depth.dtype} {depth.shape}")
+    labels = _labels(path, fields.get("labels"), depth)
+    height, width = depth.shape
+    if projection == "orthographic" or str(fields.get("projection", "")) == "orthographic":
+        depth = np.where(np.isfinite(depth), depth, np.nan).astype(np.float32)
+        return RecordedFrame(depth, _cube_camera(path, width, height), labels, path.name, is_cube=True)
+    if "K" not in fields:
+        raise FrameError(f"{path}: expected a field 'K', the 3 x 3 camera matrix")
+    try:
+        camera = Camera.from_matrix(fields["K"], width, height)
+    except (ValueError, TypeError) as error:
+        raise FrameError(f"{path}: K: {error}") from error
+    with np.errstate(invalid="ignore"):
+        depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.nan).astype(np.float32)
+    return RecordedFrame(depth, camera, labels, path.name, is_cube=False, plane=_plane(path, fields.get("plane")))
+
+
+def _labels(path: Path, labels: np.ndarray | None, depth: np.ndarray) -> np.ndarray | None:
+    if labels is None:
+        return None
+    if labels.shape != depth.shape or labels.dtype.kind not in "iub":
+        raise FrameError(
+            f"{path}: labels: expected integers of the depth's shape {depth.shape}, got {labels.dtype} {labels.shape}"
+        )
+    return labels.astype(np.int32)
+
+
+def _plane(path: Path, plane: np.ndarray | None) -> np.ndarray | None:
+    if plane is None:
+        return None
+    if plane.shape != (4,) or plane.dtype.kind not in "fiu" or not np.isfinite(plane).all():
+        raise FrameError(f"{path}: plane: expected four finite numbers, got {plane.dtype} {plane.shape}")
+    return plane.astype(float)
+
+
+def _read_image(path: Path) -> np.ndarray:
+    """A grey image (height, width), uint8 or uint16."""
+    encoded = np.fromfile(path, dtype=np.uint8)
+    image = None
+    if encoded.size:
+        try:
+            image = cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED)
+        except cv2.error as error:
+            raise FrameError(f"{path}: not a readable image: {error.err}") from error
+    if image is None:
+        raise FrameError(f"{path}: not a readable image")
+    if image.ndim == 3:
+        colours = image[..., :3]
+        if not (colours == colours[..., :1]).all():
+            raise FrameError(f"{path}: expected a grey image, got a colour image")
+        image = np.ascontiguousarray(colours[..., 0])
+    if image.dtype not in (np.uint8, np.uint16):
+        raise FrameError(f"{path}: expected 8 or 16 bit, got {image.dtype}")
+    return image
+
+
+def _from_grey(path: Path, image: np.ndarray) -> RecordedFrame:
+    height, width = image.shape
+    return RecordedFrame(
+        unit_cube.depth_from_grey(image), _cube_camera(path, width, height), None, path.name, is_cube=True
+    )
+
+
+def _cube_camera(path: Path, width: int, height: int) -> Camera:
+    try:
+        return unit_cube.camera(width, height)
+    except ValueError as error:
+        raise FrameError(f"{path}: {error}") from error
+
+
+def _check_size(path: Path, image: np.ndarray, camera: Camera) -> None:
+    try:
+        camera.check_image(image)
+    except ValueError as error:
+        raise FrameError(f"{path}: the camera_info does not fit: {error}") from error
+
+
+def _integer(path: Path, info: dict[Any, Any], names: tuple[str, ...]) -> int:
+    for name in names:
+        if name in info:
+            value = info[name]
+            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+                raise FrameError(f"{path}: {name}: expected a positive integer, got {value!r}")
+            return value
+    raise FrameError(f"{path}: expected {names[0]} (or {names[1]})")
+
+
+def _matrix(path: Path, info: dict[Any, Any], names: tuple[str, ...], length: int | None) -> np.ndarray | None:
+    for name in names:
+        if name not in info:
+            continue
+        entry = info[name]
+        values = entry.get("data") if isinstance(entry, dict) else entry
+        try:
+            numbers = np.array(values, dtype=float).ravel()
+        except (TypeError, ValueError) as error:
+            raise FrameError(f"{path}: {name}: expected numbers, got {values!r}") from error
+        if not np.isfinite(numbers).all() or (length is not None and numbers.size != length):
+            wanted = "finite numbers" if length is None else f"{length} finite numbers"
+            raise FrameError(f"{path}: {name}: expected {wanted}, got {values!r}")
+        return numbers
+    return None

@@ -1,0 +1,480 @@
+"""Depth image and camera in, superquadrics out: the one place that chains the stages.
+
+    depth -> segmentation -> canonical view of each object -> network -> inverse of the view -> fit -> score
+
+| method | body | refine |
+| --- | --- | --- |
+| auto | starts of the network and of central symmetry, the better one after the fit | surface, soft_render, none |
+| symmetry | fit from the starts of central symmetry, no network | surface, soft_render |
+| network | the network alone | ignored |
+| classic | Solina and Bajcsy's fit to the points | ignored |
+
+``refine="surface"`` is the exact surface fit.  ``"soft_render"`` descends on the soft-rendered depth (L_DR) instead, from
+the network's prediction for ``auto`` and after the fit for ``symmetry``.  ``"none"`` leaves the network's prediction as it
+is; ``symmetry`` has no body without its fit and ignores it.
+
+Everything is metres in the optical frame.  A hard image is no error: an object without a body is listed with
+``Status.FAILED``, score 0 and, in place of a body, an ellipsoid around its visible points.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal, get_args
+
+import numpy as np
+import torch
+
+from sq_perception.fitting import soft_render_fit, solina_bajcsy, surface_fit
+from sq_perception.fitting.fit import Fit, Status
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging import canonical_view, raycast, segmentation, soft_render
+from sq_perception.imaging.camera import Camera
+from sq_perception.imaging.canonical_view import CanonicalView
+from sq_perception.learning import checkpoint
+
+Method = Literal["auto", "network", "symmetry", "classic"]
+Refine = Literal["surface", "soft_render", "none"]
+
+_VIEW_PIXELS = 64
+_SCORE_STRIDE = 2
+_FEWEST_PIXELS = 12
+_CLASSIC_POINTS = 2000
+_NEEDS_NETWORK = ("auto", "network")
+_HARD_IMAGE = (ValueError, ArithmeticError, np.linalg.LinAlgError)
+"""What numerical code may raise on degenerate data: reported with the object, never raised."""
+
+
+@dataclass(frozen=True)
+class RecoveryOptions:
+    """What may change from one frame to the next.
+
+    Attributes
+    ----------
+    method, refine
+        See the module.
+    sharpness, tau
+        s and tau of the soft renderer: of the score, and of the ``soft_render`` refinement.
+    depth_range
+        Nearest and farthest depth of an object, metres.
+    max_objects
+        The largest ones are recovered.
+    min_pixels
+        Smaller objects are ignored; None: 0.05 % of the image for own masks, any size for masks from outside.
+    use_plane
+        Let the fit know the support plane.
+
+    Raises
+    ------
+    ValueError
+        For a value outside its range.
+    """
+
+    method: Method = "auto"
+    refine: Refine = "surface"
+    sharpness: float = soft_render.THESIS_SHARPNESS
+    tau: float = soft_render.THESIS_TAU
+    depth_range: tuple[float, float] = (0.0, np.inf)
+    max_objects: int = 20
+    min_pixels: int | None = None
+    use_plane: bool = True
+
+    def __post_init__(self) -> None:
+        for name, value, known in (("method", self.method, Method), ("refine", self.refine, Refine)):
+            if value not in get_args(known):
+                raise ValueError(f"{name}: expected one of {', '.join(get_args(known))}, got {value!r}")
+        for name, number in (("sharpness", self.sharpness), ("tau", self.tau)):
+            if not (np.isfinite(number) and number > 0):
+                raise ValueError(f"{name}: expected a positive number, got {number}")
+        if self.min_pixels is not None and self.min_pixels < 1:
+            raise ValueError(f"min_pixels: expected at least 1, got {self.min_pixels}")
+        self.segmentation_options()
+
+    def segmentation_options(self) -> segmentation.SegmentationOptions:
+        return segmentation.SegmentationOptions(
+            depth_range=self.depth_range, max_objects=self.max_objects, min_pixels=self.min_pixels
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Recovery:
+    """One recovered object.
+
+    Attributes
+    ----------
+    superquadric : Superquadric
+        A single body in the optical frame, in its canonical form.
+    score : float
+        Agreement of the soft-rendered body with the canonical view, 0 to 1 (:func:`soft_render.agreement`).
+    residual : float
+        Root mean square distance of the object's points to the surface, metres; NaN where there is no body.
+    sigma_size : (3,)
+        Standard deviations of the half sizes, metres; NaN for methods that do not compute them.
+    status, message
+        The verdict and the reason for it.
+    label : int
+        The object's value in the label image.
+    pixels : int
+        Measured pixels of the object.
+    """
+
+    superquadric: Superquadric
+    score: float
+    residual: float
+    sigma_size: np.ndarray
+    status: Status
+    message: str
+    label: int
+    pixels: int
+
+
+@dataclass(frozen=True, eq=False)
+class FrameRecovery:
+    """All objects of one frame.
+
+    Attributes
+    ----------
+    bodies
+        One entry per object, the one with most pixels first, failed ones among them.
+    milliseconds
+        By stage: segmentation, network, fit, score, total.
+    labels : int32 (height, width)
+        The masks that were used.
+    plane : (4,) or None
+        Support plane, height above it = n.p + d.
+    message
+        Why there are no objects; empty otherwise.
+    """
+
+    bodies: tuple[Recovery, ...]
+    milliseconds: dict[str, float]
+    labels: np.ndarray
+    plane: np.ndarray | None
+    message: str
+
+    @property
+    def recovered(self) -> tuple[Recovery, ...]:
+        """The bodies that did not fail."""
+        return tuple(body for body in self.bodies if body.status != Status.FAILED)
+
+
+class Recoverer:
+    """Holds the network; one frame at a time.
+
+    Parameters
+    ----------
+    model
+        Weights file; None: the ones that ship with the package.
+    device
+        Of the network: "cpu", "cuda" ...
+    method
+        What :meth:`recover` does unless its options say otherwise.  "symmetry" and "classic" load no network; if a later
+        call asks for one, it is loaded then.
+
+    Raises
+    ------
+    CheckpointError
+        If the method needs the network and the file is missing or wrong.
+    ValueError
+        For an unknown method, or a device that this machine does not have.
+    """
+
+    def __init__(self, model: Path | str | None = None, device: str = "cpu", method: Method = "auto") -> None:
+        self._options = RecoveryOptions(method=method)
+        self._path = model
+        self._device = _checked_device(device)
+        self._network: checkpoint.Regressor | None = None
+        self._lock = threading.Lock()
+        if method in _NEEDS_NETWORK:
+            self._load_network()
+
+    def warm_up(self, camera: Camera) -> None:
+        """Compile or load every kernel and run the whole chain once on an image of the camera's size."""
+        surface_fit.warm_up()
+        depth = 1.0
+        reach = 0.15 * min(camera.width / camera.fx, camera.height / camera.fy)
+        centre = camera.unproject(np.array(camera.width / 2), np.array(camera.height / 2), np.array(depth))
+        body = Superquadric(
+            reach * np.array([1.0, 0.8, 0.6]), np.array([0.5, 0.7]), centre, np.array([0.3, 0.2, 0.1, 1.0])
+        )
+        rendered, index = raycast.render(body, camera)
+        image = np.where(np.isfinite(rendered), rendered, np.nan).astype(np.float32)
+        self.recover(image, camera, (index >= 0).astype(np.int32))
+        self.recover(image, camera)
+
+    def recover(
+        self,
+        depth: np.ndarray,
+        camera: Camera,
+        labels: np.ndarray | None = None,
+        options: RecoveryOptions | None = None,
+    ) -> FrameRecovery:
+        """Recover every object of a depth image.
+
+        Parameters
+        ----------
+        depth : float (height, width)
+            Metres in the optical frame; NaN, inf, and for a pinhole camera 0 and less: nothing measured.
+        camera : Camera
+        labels : integer (height, width), optional
+            Instance masks, 0 for background; without them the image is segmented.
+        options
+            Defaults with the method given to the constructor.
+
+        Raises
+        ------
+        ValueError
+            For images that do not fit the camera or have the wrong type.  No depth *value* raises.
+        CheckpointError
+            If the method needs the network and it cannot be loaded.
+        """
+        options = options or self._options
+        started = time.perf_counter()
+        milliseconds = dict.fromkeys(("segmentation", "network", "fit", "score", "total"), 0.0)
+        network = self._load_network() if options.method in _NEEDS_NETWORK else None
+
+        with _timed(milliseconds, "segmentation"):
+            depth = np.asarray(depth)
+            if labels is None:
+                found = segmentation.segment(depth, camera, options.segmentation_options())
+            else:
+                found = segmentation.from_labels(labels, depth, camera, options.segmentation_options())
+            depth = _cleaned(depth, camera)
+            objects = _objects(depth, found, camera, options)
+
+        with _timed(milliseconds, "network"):
+            pixels = network.config.pixels if network is not None else _VIEW_PIXELS
+            for one in objects:
+                one.view = canonical_view.from_mask(one.depth_crop, one.mask_crop, one.camera_crop, pixels)
+            if network is not None and objects:
+                views = np.stack([one.view.image for one in objects if one.view is not None])
+                predictions = network.predict(views)
+                for one, body in zip(objects, predictions, strict=True):
+                    one.prediction = body
+
+        plane = found.plane if options.use_plane else None
+        with _timed(milliseconds, "fit"):
+            fits = _mapped(lambda one: _fitted(one, depth, camera, plane, options), objects)
+        with _timed(milliseconds, "score"):
+            scores = [_score(one.view, fit.superquadric, options) for one, fit in zip(objects, fits, strict=True)]
+        bodies = tuple(
+            _recovery(one, fit, score) for one, fit, score in zip(objects, fits, scores, strict=True)
+        )
+        milliseconds["total"] = 1e3 * (time.perf_counter() - started)
+        message = "" if bodies else _why_empty(depth, found)
+        return FrameRecovery(bodies, milliseconds, found.labels, found.plane, message)
+
+    def _load_network(self) -> checkpoint.Regressor:
+        with self._lock:
+            if self._network is None:
+                self._network = checkpoint.load(self._path, self._device)
+            return self._network
+
+
+def render_recovery(frame: FrameRecovery, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    """What the recovered bodies would look like to the camera.
+
+    Returns
+    -------
+    depth : float64 (height, width)
+        +inf where there is no body.
+    index : int32 (height, width)
+        Position in ``frame.bodies``, -1 where there is none; failed bodies are not drawn.
+    """
+    shown = [k for k, body in enumerate(frame.bodies) if body.status != Status.FAILED]
+    depth, index = raycast.render(Superquadric.stack([frame.bodies[k].superquadric for k in shown]), camera)
+    return depth, np.append(np.array(shown, dtype=np.int32), np.int32(-1))[index]
+
+
+@dataclass(eq=False)
+class _Object:
+    """One object on its way through the stages."""
+
+    label: int
+    pixels: int
+    mask: np.ndarray
+    depth_crop: np.ndarray
+    mask_crop: np.ndarray
+    camera_crop: Camera
+    view: CanonicalView | None = None
+    prediction: Superquadric | None = None
+    """In the canonical frame."""
+
+    @property
+    def points(self) -> np.ndarray:
+        """At most some thousand measured points (n, 3), evenly taken."""
+        rows, columns = np.nonzero(self.mask_crop)
+        step = max(1, rows.size // _CLASSIC_POINTS)
+        rows, columns = rows[::step], columns[::step]
+        return self.camera_crop.unproject(columns, rows, self.depth_crop[rows, columns])
+
+
+def _checked_device(device: str) -> str:
+    try:
+        kind = torch.device(device).type
+    except RuntimeError as error:
+        raise ValueError(f"device: {error}") from error
+    if kind == "cuda" and not torch.cuda.is_available():
+        raise ValueError(f"device: {device!r} was asked for, but torch sees no CUDA device here")
+    return device
+
+
+def _cleaned(depth: np.ndarray, camera: Camera) -> np.ndarray:
+    """float32 with NaN for everything that is no measurement."""
+    depth = depth.astype(np.float32, copy=False)
+    bad = ~np.isfinite(depth)
+    if camera.is_pinhole:
+        bad |= depth <= 0
+    return np.where(bad, np.float32(np.nan), depth)
+
+
+def _objects(
+    depth: np.ndarray, found: segmentation.Segmentation, camera: Camera, options: RecoveryOptions
+) -> list[_Object]:
+    measured = np.isfinite(depth)
+    near, far = options.depth_range
+    if near > 0 or np.isfinite(far):
+        measured &= (depth >= near) & (depth <= far)
+    objects = []
+    for label in found.ids:
+        mask = (found.labels == label) & measured
+        rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+        window = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+        crop = mask[window]
+        camera_crop = camera.cropped(int(columns[0]), int(rows[0]), crop.shape[1], crop.shape[0])
+        objects.append(_Object(label, int(np.count_nonzero(crop)), mask, depth[window], crop, camera_crop))
+    return objects
+
+
+def _mapped(function, objects: list[_Object]) -> list[Fit]:  # type: ignore[no-untyped-def]
+    workers = min(len(objects), os.cpu_count() or 1)
+    if workers < 2:
+        return [function(one) for one in objects]
+    with ThreadPoolExecutor(workers, thread_name_prefix="fit") as pool:
+        return list(pool.map(function, objects))
+
+
+def _fitted(
+    one: _Object, depth: np.ndarray, camera: Camera, plane: np.ndarray | None, options: RecoveryOptions
+) -> Fit:
+    """The body of one object by the chosen method; FAILED with a reason instead of any exception on hard data."""
+    if one.pixels < _FEWEST_PIXELS:
+        return _failed(one, f"{one.pixels} pixels with a depth are too few for a body")
+    try:
+        fit = _body(one, depth, camera, plane, options)
+    except _HARD_IMAGE as error:
+        return _failed(one, f"{options.method}: {error}")
+    if not np.isfinite(fit.superquadric.to_flat()).all():
+        return _failed(one, f"{options.method}: the result is not finite")
+    return fit
+
+
+def _body(
+    one: _Object, depth: np.ndarray, camera: Camera, plane: np.ndarray | None, options: RecoveryOptions
+) -> Fit:
+    if options.method == "classic":
+        return solina_bajcsy.fit(one.points)
+    predicted = None
+    if one.prediction is not None and one.view is not None:
+        predicted = one.view.from_canonical(one.prediction).canonical_form()
+    if options.method == "network" or (options.method == "auto" and options.refine == "none"):
+        if predicted is None:
+            raise ValueError("no prediction")
+        return _unfitted(predicted, one, "prediction of the network, not refined")
+    if options.method == "auto" and options.refine == "soft_render" and predicted is not None:
+        return _soft_rendered(predicted, one, options)
+    fit = _surface_fit(predicted, one, depth, camera, plane)
+    if options.refine == "soft_render" and fit.status != Status.FAILED:
+        return _soft_rendered(fit.superquadric, one, options)
+    return fit
+
+
+def _surface_fit(
+    predicted: Superquadric | None, one: _Object, depth: np.ndarray, camera: Camera, plane: np.ndarray | None
+) -> Fit:
+    settings = surface_fit.Options(plane=plane)
+    best = surface_fit.fit(depth, one.mask, camera, start="auto", options=settings)
+    if predicted is not None:
+        other = surface_fit.fit(depth, one.mask, camera, start=predicted, options=settings)
+        if _rank(other) < _rank(best):
+            best = other
+    return best
+
+
+def _rank(fit: Fit) -> tuple[bool, float]:
+    return fit.status == Status.FAILED, fit.residual if np.isfinite(fit.residual) else np.inf
+
+
+def _soft_rendered(start: Superquadric, one: _Object, options: RecoveryOptions) -> Fit:
+    assert one.view is not None
+    body, before, after = soft_render_fit.refine(
+        one.view.image, one.view.to_canonical(start), options.sharpness, options.tau
+    )
+    refined = one.view.from_canonical(body).canonical_form()
+    return _unfitted(refined, one, f"soft-rendered residual {before:.4f} before, {after:.4f} after the refinement")
+
+
+def _unfitted(body: Superquadric, one: _Object, message: str) -> Fit:
+    """The answer of a method that is no least squares fit: distances measured, nothing known about uncertainty."""
+    distance = body.sampson_distance(one.points)
+    residual = float(np.sqrt(np.mean(distance**2)))
+    return Fit(
+        body, residual, np.nan, np.nan, np.full((11, 11), np.nan), Status.CONVERGED, message, iterations=0, milliseconds=0.0
+    )
+
+
+def _failed(one: _Object, reason: str) -> Fit:
+    points = one.points
+    low, high = points.min(axis=0), points.max(axis=0)
+    size = np.maximum(0.5 * (high - low), 1e-3 * max(float((high - low).max()), 1e-3))
+    body = Superquadric(size, np.ones(2), 0.5 * (low + high), np.array([0.0, 0.0, 0.0, 1.0]))
+    return Fit(body, np.nan, np.nan, 0.0, np.full((11, 11), np.nan), Status.FAILED, reason, iterations=0, milliseconds=0.0)
+
+
+def _score(view: CanonicalView | None, body: Superquadric, options: RecoveryOptions) -> float:
+    assert view is not None
+    flat = np.array(view.to_canonical(body).to_flat())[None]
+    with torch.inference_mode():
+        image = torch.as_tensor(view.image)
+        axis = soft_render.cell_centres(image.shape[0], image)
+        single = Superquadric.from_flat(torch.as_tensor(flat, dtype=torch.float32))
+        rendered = soft_render.render_depth(single, axis, options.sharpness, options.tau, _SCORE_STRIDE)[0]
+        return float(soft_render.agreement(image[::_SCORE_STRIDE, ::_SCORE_STRIDE], rendered).clip(0, 1))
+
+
+def _recovery(one: _Object, fit: Fit, score: float) -> Recovery:
+    failed = fit.status == Status.FAILED
+    return Recovery(
+        fit.superquadric,
+        score if np.isfinite(score) and not failed else 0.0,
+        fit.residual,
+        fit.sigma_size,
+        fit.status,
+        fit.message,
+        one.label,
+        one.pixels,
+    )
+
+
+def _why_empty(depth: np.ndarray, found: segmentation.Segmentation) -> str:
+    if not np.isfinite(depth).any():
+        return "the image holds no depth"
+    if found.plane is not None:
+        return "nothing stands on the plane"
+    return "no object of the wanted size and distance"
+
+
+@contextmanager
+def _timed(milliseconds: dict[str, float], stage: str) -> Iterator[None]:
+    started = time.perf_counter()
+    try:
+        yield
+    finally:
+        milliseconds[stage] = 1e3 * (time.perf_counter() - started)
