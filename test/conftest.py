@@ -1,0 +1,38 @@
+"""What all tests share: the data beside the repository, the source tree, and a ROS domain of their own."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+REPOSITORY = Path(__file__).resolve().parent.parent
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Keep test nodes, and the processes they start, away from whatever else runs ROS on this machine."""
+    os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
+    os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+
+
+@pytest.fixture(scope="session")
+def repository() -> Path:
+    """The source tree that these tests lie in."""
+    return REPOSITORY
+
+
+@pytest.fixture(scope="session")
+def shared_data() -> Path:
+    """The folder of recorded frames; SQ_SHARED_DATA names another place.  Skips where there is none."""
+    folder = Path(os.environ.get("SQ_SHARED_DATA", REPOSITORY.parent / "shared" / "data"))
+    if not folder.is_dir():
+        pytest.skip(f"no recorded frames: {folder} is missing (set SQ_SHARED_DATA)")
+    return folder
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    """A generator with the same numbers in every run."""
+    return np.random.default_rng(20240607)

@@ -1,0 +1,238 @@
+"""Superquadric clouds and markers: the layout as published, read by hand, and what is refused."""
+
+from __future__ import annotations
+
+import array
+import struct
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("sensor_msgs", reason="message packages missing: install the extra 'ros' or source ROS 2")
+
+from builtin_interfaces.msg import Time
+from sensor_msgs.msg import PointCloud2, PointField
+from std_msgs.msg import Header
+from visualization_msgs.msg import Marker, MarkerArray
+
+from sq_msgs_py import superquadrics
+from sq_msgs_py.markers import PALETTE, markers
+from sq_msgs_py.superquadrics import FIELDS, MessageError, SuperquadricArray
+
+HEADER = Header(stamp=Time(sec=7, nanosec=8), frame_id="optical")
+COLUMNS = ("size", "shape", "translation", "rotation", "score", "residual", "sigma_size", "id", "status")
+LAYOUT_1 = "x y z qx qy qz qw a1 a2 a3 e1 e2 score residual sigma_a1 sigma_a2 sigma_a3 id status"
+
+
+def some(count: int, rng: np.random.Generator) -> SuperquadricArray:
+    return SuperquadricArray(
+        size=rng.uniform(0.02, 0.3, (count, 3)),
+        shape=rng.uniform(0.1, 1.0, (count, 2)),
+        translation=rng.normal(size=(count, 3)),
+        rotation=rng.normal(size=(count, 4)),
+        score=rng.random(count),
+        residual=rng.random(count) * 1e-3,
+        sigma_size=rng.random((count, 3)) * 1e-3,
+        id=rng.integers(0, 2**32, count),
+        status=rng.integers(0, 3, count),
+    )
+
+
+def test_the_published_layout_does_not_change() -> None:
+    """Other programs read these names and types: whoever changes them raises VERSION and this test."""
+    assert superquadrics.VERSION == 1
+    assert " ".join(name for name, _ in FIELDS) == LAYOUT_1
+    types = dict(FIELDS)
+    assert {types.pop("id"), types.pop("status")} == {PointField.UINT32}
+    assert set(types.values()) == {PointField.FLOAT32}
+
+
+def test_one_body_reads_by_hand() -> None:
+    body = SuperquadricArray(
+        size=np.array([[1.0, 2.0, 3.0]]),
+        shape=np.array([[0.25, 0.5]]),
+        translation=np.array([[4.0, 5.0, 6.0]]),
+        rotation=np.array([[0.0, 0.0, 0.0, 1.0]]),
+        score=np.array([0.75]),
+        residual=np.array([0.125]),
+        sigma_size=np.array([[7.0, 8.0, 9.0]]),
+        id=np.array([4_000_000_000]),
+        status=np.array([1]),
+    )
+    message = superquadrics.to_message(body, HEADER)
+    assert (message.header, message.height, message.width, message.point_step, message.row_step) == (
+        HEADER,
+        1,
+        1,
+        76,
+        76,
+    )
+    numbers = struct.unpack("<17f2I", message.data.tobytes())
+    assert numbers == (4, 5, 6, 0, 0, 0, 1, 1, 2, 3, 0.25, 0.5, 0.75, 0.125, 7, 8, 9, 4_000_000_000, 1)
+    assert [field.offset for field in message.fields] == list(range(0, 76, 4))
+    assert message.is_dense
+
+
+@pytest.mark.parametrize("count", [0, 1, 10])
+def test_the_round_trip_keeps_every_number(count: int, rng: np.random.Generator) -> None:
+    before = some(count, rng)
+    after = superquadrics.from_message(superquadrics.to_message(before, HEADER))
+    assert len(after) == count
+    for column in COLUMNS:
+        np.testing.assert_array_equal(getattr(after, column), getattr(before, column))
+        assert getattr(after, column).dtype == getattr(before, column).dtype
+
+
+def test_unknown_uncertainty_travels_and_is_declared(rng: np.random.Generator) -> None:
+    before = some(2, rng)
+    unknown = SuperquadricArray(**{**vars(before), "sigma_size": np.full((2, 3), np.nan)})
+    message = superquadrics.to_message(unknown, HEADER)
+    assert not message.is_dense
+    assert np.isnan(superquadrics.from_message(message).sigma_size).all()
+
+
+def test_readers_go_by_name_offset_type_and_byte_order(rng: np.random.Generator) -> None:
+    """A message as another writer might lay it out: big endian, doubles, other order, a field more, two padded rows."""
+    bodies = some(4, rng)
+    names = [name for name, _ in FIELDS][::-1]
+    layout = np.dtype({
+        "names": ["extra", *names],
+        "formats": [">f4"] + [">u4" if name in ("id", "status") else ">f8" for name in names],
+        "offsets": [0] + [4 + 9 * k for k in range(len(names))],
+        "itemsize": 180,
+    })  # fmt: skip
+    points = np.zeros(4, layout)
+    flat = np.column_stack([bodies.translation, bodies.rotation, bodies.size, bodies.shape, bodies.score,
+                            bodies.residual, bodies.sigma_size])  # fmt: skip
+    for k, (name, _) in enumerate(FIELDS[:-2]):
+        points[name] = flat[:, k]
+    points["id"], points["status"] = bodies.id, bodies.status
+    message = PointCloud2(header=HEADER, height=2, width=2, is_bigendian=True, point_step=180, row_step=365)
+    for name in layout.names:
+        kind = {"f4": PointField.FLOAT32, "f8": PointField.FLOAT64, "u4": PointField.UINT32}[layout[name].str[1:]]
+        message.fields.append(PointField(name=name, offset=layout.fields[name][1], datatype=kind, count=1))
+    message.data = array.array("B", b"".join(points[2 * k : 2 * k + 2].tobytes() + b"\xff" * 5 for k in range(2)))
+    after = superquadrics.from_message(message)
+    for column in COLUMNS:
+        np.testing.assert_array_equal(getattr(after, column), getattr(bodies, column))
+
+
+def broken(change: str, rng: np.random.Generator) -> PointCloud2:
+    message = superquadrics.to_message(some(3, rng), HEADER)
+    if change == "no exponent":
+        message.fields = [field for field in message.fields if field.name != "e1"]
+    elif change == "no field":
+        message.fields = []
+    elif change == "two in one":
+        message.fields[3].count = 2
+    elif change == "unknown type":
+        message.fields[3].datatype = 77
+    elif change == "outside":
+        message.fields[5].offset = 74
+    elif change == "cut":
+        message.data = message.data[:-1]
+    elif change == "short row":
+        message.row_step = 100
+    elif change == "nan":
+        message.data[0:4] = array.array("B", struct.pack("<f", np.nan))
+    return message
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ("no exponent", "missing: e1"),
+        ("no field", "missing: x y z"),
+        ("two in one", "field qx: expected one number"),
+        ("unknown type", "field qx: expected one number, got datatype 77"),
+        ("outside", "field qz: offset 74 lies outside a point of 76 bytes"),
+        ("cut", "228 bytes, got 227"),
+        ("short row", "at least 228 bytes, got 100"),
+        ("nan", "translation: expected finite"),
+    ],
+)
+def test_other_clouds_are_refused_with_the_reason(change: str, words: str, rng: np.random.Generator) -> None:
+    with pytest.raises(MessageError, match=words):
+        superquadrics.from_message(broken(change, rng))
+
+
+@pytest.mark.parametrize(
+    ("column", "value"),
+    [
+        ("shape", np.ones((3, 2))),
+        ("shape", np.ones((2, 3))),
+        ("score", np.ones((2, 1))),
+        ("size", np.full((2, 3), np.inf)),
+        ("id", np.array([0.5, 1.0])),
+        ("id", np.array([-1, 1])),
+        ("status", np.array([0, 2**32])),
+    ],
+)
+def test_columns_that_do_not_fit_are_refused(column: str, value: Any, rng: np.random.Generator) -> None:
+    with pytest.raises(ValueError, match=f"{column}: expected"):
+        SuperquadricArray(**{**vars(some(2, rng)), column: value})
+
+
+TETRAHEDRON = (
+    np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]),
+    np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]),
+    np.array([[[0, 0, 0], [1, 0, 0]], [[0, 0, 0], [0, 1, 0.0]]]),
+)
+
+
+def actions(array_message: MarkerArray) -> dict[tuple[str, int], int]:
+    return {(marker.ns, marker.id): marker.action for marker in array_message.markers}
+
+
+def test_a_mesh_becomes_its_triangles_and_its_outline() -> None:
+    message = markers([TETRAHEDRON], [5], HEADER, namespace="body", line_width=0.004, alpha=0.5)
+    surface, outline = message.markers
+    assert (surface.ns, surface.id, surface.type, surface.action) == (
+        "body/surface",
+        5,
+        Marker.TRIANGLE_LIST,
+        Marker.ADD,
+    )
+    points = np.array([[point.x, point.y, point.z] for point in surface.points])
+    np.testing.assert_array_equal(points, TETRAHEDRON[0][TETRAHEDRON[1].reshape(-1)])
+    assert (outline.ns, outline.id, outline.type) == ("body/outline", 5, Marker.LINE_LIST)
+    ends = np.array([[point.x, point.y, point.z] for point in outline.points])
+    np.testing.assert_array_equal(ends, TETRAHEDRON[2].reshape(-1, 3))
+    assert outline.scale.x == 0.004
+    assert surface.color.a == 0.5
+    assert np.float32([surface.color.r, surface.color.g, surface.color.b]) == pytest.approx(np.float32(PALETTE[5]))
+    for marker in message.markers:
+        assert marker.header == HEADER
+        assert marker.pose.orientation.w == 1.0
+        assert marker.color.a > 0
+
+
+def test_stale_markers_are_deleted_and_no_others() -> None:
+    message = markers([TETRAHEDRON], [2], HEADER, namespace="n", previous_ids=[2, 9])
+    assert actions(message) == {
+        ("n/surface", 2): Marker.ADD,
+        ("n/outline", 2): Marker.ADD,
+        ("n/surface", 9): Marker.DELETE,
+        ("n/outline", 9): Marker.DELETE,
+    }
+    assert set(actions(markers([], [], HEADER, previous_ids=[1])).values()) == {Marker.DELETE}
+    assert actions(markers([], [], HEADER)) == {}
+
+
+@pytest.mark.parametrize(
+    ("meshes", "ids", "options"),
+    [
+        ([TETRAHEDRON], [], {}),
+        ([TETRAHEDRON, TETRAHEDRON], [1, 1], {}),
+        ([TETRAHEDRON], [-1], {}),
+        ([TETRAHEDRON], [2**31], {}),
+        ([(TETRAHEDRON[0], TETRAHEDRON[1] + 1, TETRAHEDRON[2])], [1], {}),
+        ([(TETRAHEDRON[0][:, :2], TETRAHEDRON[1], TETRAHEDRON[2])], [1], {}),
+        ([(TETRAHEDRON[0], TETRAHEDRON[1], np.zeros((2, 3)))], [1], {}),
+        ([TETRAHEDRON], [1], {"colours": np.ones((2, 3))}),
+    ],
+)
+def test_meshes_that_do_not_fit_are_refused(meshes: list, ids: list[int], options: dict) -> None:
+    with pytest.raises(ValueError, match="expected"):
+        markers(meshes, ids, HEADER, **options)
