@@ -13,6 +13,7 @@ An NPZ may say so itself in a text field ``projection``.  Nothing in a file is e
 from __future__ import annotations
 
 import zipfile
+import zlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args
@@ -155,7 +156,7 @@ def _read_npz(path: Path, projection: Projection) -> RecordedFrame:
             fields = {name: archive[name] for name in known if name in archive.files}
     except FrameError:
         raise
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except (OSError, ValueError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
         raise FrameError(f"{path}: not a readable NPZ archive: {error}") from error
     if "depth" not in fields:
         raise FrameError(f"{path}: expected a field 'depth' in metres")
