@@ -399,17 +399,9 @@ def _body(
 def _surface_fit(
     predicted: Superquadric | None, one: _Object, depth: np.ndarray, camera: Camera, plane: np.ndarray | None
 ) -> Fit:
-    settings = surface_fit.Options(plane=plane)
-    best = surface_fit.fit(depth, one.mask, camera, start="auto", options=settings)
-    if predicted is not None:
-        other = surface_fit.fit(depth, one.mask, camera, start=predicted, options=settings)
-        if _rank(other) < _rank(best):
-            best = other
-    return best
-
-
-def _rank(fit: Fit) -> tuple[bool, float]:
-    return fit.status == Status.FAILED, fit.residual if np.isfinite(fit.residual) else np.inf
+    """From the network's prediction, joined by the automatic starts where that one stays above the noise."""
+    start = "auto" if predicted is None else predicted
+    return surface_fit.fit(depth, one.mask, camera, start=start, options=surface_fit.Options(plane=plane))
 
 
 def _soft_rendered(start: Superquadric, one: _Object, options: RecoveryOptions) -> Fit:
