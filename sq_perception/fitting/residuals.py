@@ -31,12 +31,11 @@ Image residuals pass through Huber's loss.  The cost is the weighted sum of the 
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import torch
+import numpy as np
 
 from sq_perception.geometry.kernels import box_interval, gauge_derivatives, kernel, p_norm, ray_minimum
-from sq_perception.geometry.superquadric import Superquadric
 
 CLASSIC, SAMPSON, RENDERED = 0, 1, 2
 STEP_LENGTH = 11
@@ -90,7 +89,7 @@ def _observed(stage, rays, scene, parameters, rotation, normal_matrix, gradient)
     a1, a2, a3, e1, e2, t1, t2, t3 = parameters
     m = rotation
     classic_scale = math.sqrt(a1 * a2 * a3)
-    row = [0.0] * STEP_LENGTH
+    row = np.zeros(STEP_LENGTH)
     cost = 0.0
     for i in range(rays.shape[0]):
         ox, oy, oz = rays[i, 0] - t1, rays[i, 1] - t2, -t3
@@ -163,9 +162,7 @@ def _hit_from(qx, qy, qz, ex, ey, ez, a1, a2, a3, e1, e2, g, gx, gy, gz, g1, g2)
         if t_in > t_out:
             return False, 0.0, g, gx, gy, gz, g1, g2
         shift = t_in
-        h, hx, hy, hz, h1, h2 = gauge_derivatives(
-            qx + shift * ex, qy + shift * ey, qz + shift * ez, a1, a2, a3, e1, e2
-        )
+        h, hx, hy, hz, h1, h2 = gauge_derivatives(qx + shift * ex, qy + shift * ey, qz + shift * ez, a1, a2, a3, e1, e2)
     for _ in range(_HIT_STEPS):
         slope = hx * ex + hy * ey + hz * ez
         if slope >= 0.0:
@@ -173,9 +170,7 @@ def _hit_from(qx, qy, qz, ex, ey, ez, a1, a2, a3, e1, e2, g, gx, gy, gz, g1, g2)
         if abs(h - 1.0) < _HIT_TOLERANCE:
             return True, shift, h, hx, hy, hz, h1, h2
         shift -= (h - 1.0) / slope
-        h, hx, hy, hz, h1, h2 = gauge_derivatives(
-            qx + shift * ex, qy + shift * ey, qz + shift * ez, a1, a2, a3, e1, e2
-        )
+        h, hx, hy, hz, h1, h2 = gauge_derivatives(qx + shift * ex, qy + shift * ey, qz + shift * ez, a1, a2, a3, e1, e2)
     return False, 0.0, g, gx, gy, gz, g1, g2
 
 
@@ -184,7 +179,7 @@ def _free_space(free, scene, parameters, rotation, normal_matrix, gradient):
     a1, a2, a3, e1, e2, t1, t2, t3 = parameters
     m = rotation
     nearest = _NEAREST if scene.pinhole > 0.0 else -1e300
-    row = [0.0] * STEP_LENGTH
+    row = np.zeros(STEP_LENGTH)
     cost = 0.0
     for i in range(free.shape[0]):
         x, y, z = free[i, 0] - t1, free[i, 1] - t2, -t3
@@ -235,10 +230,10 @@ def support_derivatives(nx, ny, nz, a1, a2, a3, e1, e2):
 def _support(scene, parameters, rotation, normal_matrix, gradient):
     a1, a2, a3, e1, e2, t1, t2, t3 = parameters
     n = (scene.normal_x, scene.normal_y, scene.normal_z)
-    m = [0.0] * 3
+    m = np.zeros(3)
     for k in range(3):
         m[k] = rotation[0, k] * n[0] + rotation[1, k] * n[1] + rotation[2, k] * n[2]
-    row = [0.0] * STEP_LENGTH
+    row = np.zeros(STEP_LENGTH)
     cost = 0.0
     h, hx, hy, hz, h1, h2 = support_derivatives(m[0], m[1], m[2], a1, a2, a3, e1, e2)
     lowest = n[0] * t1 + n[1] * t2 + n[2] * t3 + scene.offset - h

@@ -1,0 +1,92 @@
+"""Starts from boxes around the measured points: along their principal axes, or standing on a support plane.
+
+The oriented box of the visible points is a lower bound of the body in every direction; on a plane, its height is exact as
+far as the top is seen.  What the camera does not see lies behind: the narrow side is also tried deeper.
+"""
+
+from __future__ import annotations
+
+import math
+
+import cv2
+import numpy as np
+
+from sq_perception.fitting.levenberg_marquardt import State
+from sq_perception.fitting.symmetry_start import three_orders
+from sq_perception.geometry import rotation as quaternions
+from sq_perception.geometry.superquadric import Superquadric
+
+_START_EXPONENTS = (0.2, 0.6, 1.0)
+_THINNEST = 0.15
+"""A box side is at least this share of the longest side: one visible face says nothing of the depth."""
+_OUTLIER_SHARE = 0.01
+
+
+def enclosing_box(points: np.ndarray, footprint: float) -> Superquadric:
+    """A valid box-like body around any points (n >= 1, 3): the best that can be said when no fit is possible."""
+    centre = points.mean(axis=0)
+    axes = _axes_of(points)
+    local = (points - centre) @ axes
+    low, high = local.min(axis=0), local.max(axis=0)
+    size = np.maximum((high - low) / 2, max(footprint, 1e-6))
+    return Superquadric(size, np.array([0.2, 0.2]), centre + axes @ ((low + high) / 2), quaternions.from_matrix(axes))
+
+
+def principal(points: np.ndarray) -> list[State]:
+    """Boxes along the principal axes of the points, for each choice of z."""
+    axes = _axes_of(points)
+    return _box_states(points, axes, away=None)
+
+
+def on_plane(points: np.ndarray, plane: np.ndarray) -> list[State]:
+    """Boxes that stand on the plane: smallest rectangle around the footprint of the points, down to the plane."""
+    normal = plane[:3]
+    first = np.cross(normal, [0.0, 0.0, 1.0] if abs(normal[2]) < 0.9 else [1.0, 0.0, 0.0])
+    first /= np.linalg.norm(first)
+    second = np.cross(normal, first)
+    flat = np.stack([points @ first, points @ second], axis=1)
+    (_, _), (_, _), angle = cv2.minAreaRect(flat.astype(np.float32))
+    c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
+    axes = np.stack([c * first + s * second, -s * first + c * second, normal], axis=1)
+    ground = -plane[3] * normal
+    return _box_states(points, axes, away=points.mean(axis=0), ground=ground)
+
+
+def _axes_of(points: np.ndarray) -> np.ndarray:
+    centred = points - points.mean(axis=0)
+    _, axes = np.linalg.eigh(centred.T @ centred)
+    if np.linalg.det(axes) < 0:
+        axes[:, 0] *= -1
+    return axes
+
+
+def _box_states(
+    points: np.ndarray, axes: np.ndarray, away: np.ndarray | None, ground: np.ndarray | None = None
+) -> list[State]:
+    local = points @ axes
+    low, high = np.quantile(local, [_OUTLIER_SHARE, 1 - _OUTLIER_SHARE], axis=0)
+    if ground is not None:
+        low[2] = min(float(ground @ axes[:, 2]), high[2] - 1e-4)
+    boxes = [(low, high)]
+    thin = int(np.argmin((high - low)[:2] if ground is not None else high - low))
+    view = points.mean(axis=0) @ axes
+    longest = float((high - low).max())
+    for share in (0.5, 1.0):
+        deeper_low, deeper_high = low.copy(), high.copy()
+        extra = share * longest - (high - low)[thin]
+        if extra <= 0:
+            continue
+        if view[thin] > 0:
+            deeper_high[thin] += extra
+        else:
+            deeper_low[thin] -= extra
+        boxes.append((deeper_low, deeper_high))
+    found = []
+    for lower, upper in boxes:
+        half = np.maximum((upper - lower) / 2, _THINNEST * longest / 2)
+        centre = axes @ ((lower + upper) / 2)
+        for rotation in three_orders(axes):
+            order = np.argmax(np.abs(axes.T @ rotation), axis=0)
+            for exponent in _START_EXPONENTS:
+                found.append(State(np.concatenate([half[order], [exponent, exponent], centre]), rotation, math.inf, 0))
+    return found

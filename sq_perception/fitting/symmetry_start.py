@@ -1,0 +1,132 @@
+"""Starts from central symmetry: a superquadric is its own reflection through its centre C.
+
+Under orthographic projection the hidden half is the visible half reflected, and the silhouette's centre is the centre's
+projection.  With p(u) the point seen at pixel u and u' the pixel opposite to u about the silhouette's centre, the ray of u
+enters the body at p(u) and leaves it near 2 C - p(u').  So, for every pair,
+
+    midpoint    m = (p(u) - p(u')) / 2                  (relative to C)
+    half chord  h = C - (p(u) + p(u')) / 2              (must point away from the camera)
+
+which bounds the centre's depth: z_C >= (z(u) + z(u')) / 2, with equality at the outline.  The largest of these is z_C,
+and the chords together are the whole body: its second moments are M = sum |h| (m m^T + h h^T / 3) / sum |h|.
+
+The principal axes of M are the axes of the body, up to their order: which one is z is not known, so each is tried.  A
+half size is sqrt(M_kk / 0.27): the share is 0.2 for an ellipsoid, 1/3 for a box.  For pinhole cameras all this holds
+approximately, the better the smaller the body against its distance; it starts an iteration.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from sq_perception.fitting.levenberg_marquardt import State
+from sq_perception.fitting.observation import Observation
+from sq_perception.geometry.kernels import kernel
+
+_MOMENT_SHARE = 0.27
+_START_EXPONENT = 0.5
+_RANK = 4
+"""The centre's depth is the largest mean depth but for this many pairs, in case of a stray pixel."""
+_MOST_PAIRS = 2500
+_EIGHTH_TURN = math.pi / 4
+
+
+def completed_moments(observation: Observation) -> tuple[np.ndarray, np.ndarray] | None:
+    """Centre (3,) and second moments (3, 3) about it of the completed body; None if no pixel has an opposite."""
+    camera = observation.camera
+    intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+    u, v, pairs = _opposite_pairs(observation.depth, observation.mask, intrinsics, camera.is_pinhole)
+    if len(pairs) < 3:
+        return None
+    means = pairs[:, 5]
+    rank = min(max(_RANK, int(0.002 * len(means))), len(means) - 1)
+    depth = float(np.partition(means, len(means) - 1 - rank)[len(means) - 1 - rank])
+    centre = camera.unproject(np.array(u), np.array(v), np.array(depth))
+    chosen = pairs[:: max(1, len(pairs) // _MOST_PAIRS)]
+    middle, half_chord = chosen[:, :3], centre - chosen[:, 3:]
+    length = np.maximum(half_chord[:, 2], observation.footprint / 2)
+    weight = length / length.sum()
+    moments = (middle * weight[:, None]).T @ middle
+    moments += np.einsum("i,ij,ik->jk", weight / 3, half_chord, half_chord)
+    return centre, moments
+
+
+@kernel
+def _opposite_pairs(depth, inside, intrinsics, pinhole):
+    """Centre of the silhouette (u, v), and for each pixel with an opposite: half difference and mean of the points."""
+    fx, fy, cx, cy = intrinsics
+    height, width = depth.shape
+    total_u, total_v, count = 0.0, 0.0, 0
+    for v in range(height):
+        for u in range(width):
+            if inside[v, u]:
+                total_u += u
+                total_v += v
+                count += 1
+    centre_u, centre_v = total_u / count, total_v / count
+    pairs = np.empty((count, 6))
+    k = 0
+    for v in range(height):
+        for u in range(width):
+            if not inside[v, u] or not np.isfinite(depth[v, u]):
+                continue
+            u2, v2 = int(round(2.0 * centre_u - u)), int(round(2.0 * centre_v - v))
+            if u2 < 0 or v2 < 0 or u2 >= width or v2 >= height:
+                continue
+            if not inside[v2, u2] or not np.isfinite(depth[v2, u2]):
+                continue
+            z, z2 = np.float64(depth[v, u]), np.float64(depth[v2, u2])
+            s, s2 = (z, z2) if pinhole else (1.0, 1.0)
+            x, y = (u - cx) / fx * s, (v - cy) / fy * s
+            x2, y2 = (u2 - cx) / fx * s2, (v2 - cy) / fy * s2
+            pairs[k, 0], pairs[k, 1], pairs[k, 2] = 0.5 * (x - x2), 0.5 * (y - y2), 0.5 * (z - z2)
+            pairs[k, 3], pairs[k, 4], pairs[k, 5] = 0.5 * (x + x2), 0.5 * (y + y2), 0.5 * (z + z2)
+            k += 1
+    return centre_u, centre_v, pairs[:k]
+
+
+def three_orders(axes: np.ndarray) -> list[np.ndarray]:
+    """The rotations (3, 3) with these axes (columns, right-handed) whose z axis is each of them in turn."""
+    return [np.ascontiguousarray(axes[:, [(k + 1) % 3, (k + 2) % 3, k]]) for k in range(3)]
+
+
+def eighth_turns(axes: np.ndarray) -> list[np.ndarray]:
+    """The axes turned by 45 degrees about each of themselves: where two moments are alike, their axes are arbitrary."""
+    turned = []
+    for k in range(3):
+        turn = np.eye(3)
+        i, j = (k + 1) % 3, (k + 2) % 3
+        c, s = math.cos(_EIGHTH_TURN), math.sin(_EIGHTH_TURN)
+        turn[i, i], turn[i, j], turn[j, i], turn[j, j] = c, -s, s, c
+        turned.append(axes @ turn)
+    return turned
+
+
+def double_turns(axes: np.ndarray) -> list[np.ndarray]:
+    """The axes turned by 45 degrees about two of themselves, one after the other: 6 orders."""
+    twice = []
+    for k, once in enumerate(eighth_turns(axes)):
+        for j, both in enumerate(eighth_turns(once)):
+            if j != k:
+                twice.append(both)
+    return twice
+
+
+def principal_axes(moments: np.ndarray) -> np.ndarray:
+    """Right-handed eigenvectors (3, 3), as columns."""
+    _, axes = np.linalg.eigh(moments)
+    if np.linalg.det(axes) < 0:
+        axes[:, 0] *= -1
+    return axes
+
+
+def states(centre: np.ndarray, moments: np.ndarray, axes: np.ndarray, exponent: float = _START_EXPONENT) -> list[State]:
+    """The three bodies with these axes and moments, one for each choice of z."""
+    found = []
+    for rotation in three_orders(axes):
+        spread = np.einsum("ji,jk,ki->i", rotation, moments, rotation)
+        size = np.sqrt(np.maximum(spread, 1e-12) / _MOMENT_SHARE)
+        found.append(State(np.concatenate([size, [exponent, exponent], centre]), rotation, math.inf, 0))
+    return found
