@@ -67,7 +67,7 @@ def _iou(a: Superquadric, b: Superquadric, lower: np.ndarray, upper: np.ndarray,
 
 
 @kernel
-def _column(body, m, x, y, z0, step, count):
+def _column(body: np.ndarray, m: np.ndarray, x: float, y: float, z0: float, step: float, count: int) -> tuple[int, int]:
     """First and last grid index inside the body on the column (x, y, z0 + k step)."""
     px, py, pz = x - body[5], y - body[6], z0 - body[7]
     hit, first, last = ray_interval(
@@ -89,7 +89,16 @@ def _column(body, m, x, y, z0, step, count):
 
 
 @numba.njit(cache=True, nogil=True, parallel=True, fastmath=FAST, error_model="numpy")
-def _iou_batch(a, a_matrix, b, b_matrix, lower, upper, resolution, out):
+def _iou_batch(
+    a: np.ndarray,
+    a_matrix: np.ndarray,
+    b: np.ndarray,
+    b_matrix: np.ndarray,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    resolution: int,
+    out: np.ndarray,
+) -> None:
     for k in numba.prange(a.shape[0]):
         step = (upper[k] - lower[k]) / (resolution - 1)
         in_a = in_b = in_both = 0

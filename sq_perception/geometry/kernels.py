@@ -33,7 +33,7 @@ _NEGLIGIBLE_LOG = -80.0
 
 
 @kernel
-def p_norm(u, v, e):
+def p_norm(u: float, v: float, e: float) -> tuple[float, float, float, float]:
     """Value of (u^(2/e) + v^(2/e))^(e/2) for u, v >= 0 and its derivatives by u, v and e.
 
     d/de is the norm times the entropy of the two weights u^p / (u^p + v^p) and v^p / (u^p + v^p), halved.
@@ -64,7 +64,7 @@ def p_norm(u, v, e):
 
 
 @kernel
-def gauge(x, y, z, a1, a2, a3, e1, e2):
+def gauge(x: float, y: float, z: float, a1: float, a2: float, a3: float, e1: float, e2: float) -> float:
     """g at a point."""
     h, _, _, _ = p_norm(abs(x) / a1, abs(y) / a2, e2)
     g, _, _, _ = p_norm(h, abs(z) / a3, e1)
@@ -72,7 +72,9 @@ def gauge(x, y, z, a1, a2, a3, e1, e2):
 
 
 @kernel
-def gauge_derivatives(x, y, z, a1, a2, a3, e1, e2):
+def gauge_derivatives(
+    x: float, y: float, z: float, a1: float, a2: float, a3: float, e1: float, e2: float
+) -> tuple[float, float, float, float, float, float]:
     """g at a point and its derivatives: g, g_x, g_y, g_z, g_e1, g_e2.
 
     The derivative by a half size follows from these: dg/da1 = -x g_x / a1.
@@ -90,7 +92,9 @@ def gauge_derivatives(x, y, z, a1, a2, a3, e1, e2):
 
 
 @kernel
-def gauge_slope(x, y, z, dx, dy, dz, a1, a2, a3, e1, e2):
+def gauge_slope(
+    x: float, y: float, z: float, dx: float, dy: float, dz: float, a1: float, a2: float, a3: float, e1: float, e2: float
+) -> tuple[float, float]:
     """g at a point and its derivative along (dx, dy, dz)."""
     h, h_x, h_y, _ = p_norm(abs(x) / a1, abs(y) / a2, e2)
     g, g_h, g_w, _ = p_norm(h, abs(z) / a3, e1)
@@ -99,7 +103,9 @@ def gauge_slope(x, y, z, dx, dy, dz, a1, a2, a3, e1, e2):
 
 
 @kernel
-def box_interval(ox, oy, oz, dx, dy, dz, a1, a2, a3):
+def box_interval(
+    ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, a1: float, a2: float, a3: float
+) -> tuple[float, float]:
     """Where the ray runs inside the box +-a: (t_in, t_out), with t_in > t_out when it misses."""
     t_in, t_out = -1e300, 1e300
     for axis in range(3):
@@ -122,7 +128,19 @@ def box_interval(ox, oy, oz, dx, dy, dz, a1, a2, a3):
 
 
 @kernel
-def ray_entry(ox, oy, oz, dx, dy, dz, a1, a2, a3, e1, e2):
+def ray_entry(
+    ox: float,
+    oy: float,
+    oz: float,
+    dx: float,
+    dy: float,
+    dz: float,
+    a1: float,
+    a2: float,
+    a3: float,
+    e1: float,
+    e2: float,
+) -> tuple[bool, float]:
     """First intersection of the ray with the surface, over all t: (hit, t)."""
     t_in, t_out = box_interval(ox, oy, oz, dx, dy, dz, a1, a2, a3)
     if t_in > t_out:
@@ -131,7 +149,19 @@ def ray_entry(ox, oy, oz, dx, dy, dz, a1, a2, a3, e1, e2):
 
 
 @kernel
-def ray_interval(ox, oy, oz, dx, dy, dz, a1, a2, a3, e1, e2):
+def ray_interval(
+    ox: float,
+    oy: float,
+    oz: float,
+    dx: float,
+    dy: float,
+    dz: float,
+    a1: float,
+    a2: float,
+    a3: float,
+    e1: float,
+    e2: float,
+) -> tuple[bool, float, float]:
     """Both intersections of the ray with the surface: (hit, t_first, t_last)."""
     t_in, t_out = box_interval(ox, oy, oz, dx, dy, dz, a1, a2, a3)
     if t_in > t_out:
@@ -146,7 +176,21 @@ def ray_interval(ox, oy, oz, dx, dy, dz, a1, a2, a3, e1, e2):
 
 
 @kernel
-def _newton(t_in, t_out, ox, oy, oz, dx, dy, dz, a1, a2, a3, e1, e2):
+def _newton(
+    t_in: float,
+    t_out: float,
+    ox: float,
+    oy: float,
+    oz: float,
+    dx: float,
+    dy: float,
+    dz: float,
+    a1: float,
+    a2: float,
+    a3: float,
+    e1: float,
+    e2: float,
+) -> tuple[bool, float]:
     t = t_in
     enough = RAY_TOLERANCE * (t_out - t_in)
     for _ in range(MAX_NEWTON_STEPS):
@@ -165,7 +209,21 @@ def _newton(t_in, t_out, ox, oy, oz, dx, dy, dz, a1, a2, a3, e1, e2):
 
 
 @kernel
-def ray_minimum(t_from, t_to, ox, oy, oz, dx, dy, dz, a1, a2, a3, e1, e2):
+def ray_minimum(
+    t_from: float,
+    t_to: float,
+    ox: float,
+    oy: float,
+    oz: float,
+    dx: float,
+    dy: float,
+    dz: float,
+    a1: float,
+    a2: float,
+    a3: float,
+    e1: float,
+    e2: float,
+) -> tuple[float, float]:
     """The smallest g on the ray between t_from and t_to, as far as it matters: (g, t).
 
     Convexity brackets the minimum between the two tangents; their intersection is both the next guess and a lower

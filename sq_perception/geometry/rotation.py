@@ -107,7 +107,7 @@ def from_rotation_vector(vector: Array) -> Array:
 
 
 def from_six(six: Array) -> Array:
-    """Unit quaternions (..., 4) of the continuous 6D form (..., 6): two columns, made orthonormal (Zhou et al. 2019)."""
+    """Unit quaternions (..., 4) of the 6D form (..., 6), two columns made orthonormal (Zhou et al. 2019)."""
     xp = array_namespace(six)
     first = _unit(six[..., :3])
     second = six[..., 3:]

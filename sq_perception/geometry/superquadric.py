@@ -255,7 +255,10 @@ class Superquadric:
         cumulative = np.cumsum(area, axis=-1)
         cumulative /= cumulative[..., -1:]
         steps = (np.arange(count) + rng.random((*self.batch_shape, 1))) / count
-        chosen = np.sum(cumulative[..., None, :] < steps[..., :, None], axis=-1)
+        # One sorted list for the whole batch: body k's weights fill the interval [k, k + 1].
+        offset = np.arange(int(np.prod(self.batch_shape))).reshape(*self.batch_shape, 1)
+        chosen = np.searchsorted((cumulative + offset).ravel(), (steps + offset).ravel()).reshape(steps.shape)
+        chosen = np.minimum(chosen - offset * shape[-2], shape[-2] - 1)
         return self.to_parent(np.take_along_axis(points, chosen[..., None], axis=-2))
 
     # Closed forms

@@ -37,6 +37,7 @@ MARGIN = 1.06
 
 _NEAREST = 0.5 * (1 + 1 / MARGIN)
 _OUTLIERS_PER_END = 1 / 500
+_NOTHING = -1e300
 _FLIP = np.diag([1.0, -1.0, -1.0])
 
 
@@ -156,11 +157,13 @@ def _rotation_to_z(direction: np.ndarray) -> np.ndarray:
     return np.array([[1 - k * x * x, -k * x * y, -x], [-k * x * y, 1 - k * y * y, -y], [x, y, z]])
 
 
-def render_views(bodies: Superquadric, pixels: int = 64, levels: np.ndarray | None = None) -> tuple[np.ndarray, Superquadric]:
+def render_views(
+    bodies: Superquadric, pixels: int = 64, levels: np.ndarray | None = None
+) -> tuple[np.ndarray, Superquadric]:
     """Canonical views of whole, unoccluded bodies seen by an orthographic camera, without the detour over an image.
 
-    The silhouette's box and the nearest point come from the support function; the visible depth needs one rendering,
-    and a second one where it, not the silhouette, sets the extent.
+    The silhouette's box comes from the support function; nearest point and visible depth need one rendering, and a
+    second one where the depth, not the silhouette, sets the extent.
 
     Parameters
     ----------
@@ -191,22 +194,30 @@ def render_views(bodies: Superquadric, pixels: int = 64, levels: np.ndarray | No
 
 
 @numba.njit(cache=True, nogil=True, parallel=True, fastmath=FAST, error_model="numpy")
-def _render_views(flat, matrices, anchor, side, quantum, images):
+def _render_views(
+    flat: np.ndarray,
+    matrices: np.ndarray,
+    anchor: np.ndarray,
+    side: np.ndarray,
+    quantum: np.ndarray,
+    images: np.ndarray,
+) -> None:
     pixels = images.shape[1]
     for k in numba.prange(flat.shape[0]):
         a1, a2, a3, e1, e2, t1, t2, t3 = flat[k, :8]
         m = matrices[k]
-        for attempt in range(2):
-            farthest = np.inf
+        surface = np.empty((pixels, pixels))
+        for _ in range(2):
+            hits = 0
+            seen = np.empty(pixels * pixels)
             for i in range(pixels):
                 for j in range(pixels):
                     x = anchor[k, 0] + ((j + 0.5) / pixels - 0.5) * side[k] - t1
                     y = anchor[k, 1] - ((i + 0.5) / pixels - 0.5) * side[k] - t2
-                    z = anchor[k, 2] - t3
                     hit, t = ray_entry(
-                        m[0, 0] * x + m[1, 0] * y + m[2, 0] * z,
-                        m[0, 1] * x + m[1, 1] * y + m[2, 1] * z,
-                        m[0, 2] * x + m[1, 2] * y + m[2, 2] * z,
+                        m[0, 0] * x + m[1, 0] * y,
+                        m[0, 1] * x + m[1, 1] * y,
+                        m[0, 2] * x + m[1, 2] * y,
                         -m[2, 0],
                         -m[2, 1],
                         -m[2, 2],
@@ -216,15 +227,25 @@ def _render_views(flat, matrices, anchor, side, quantum, images):
                         e1,
                         e2,
                     )
-                    images[k, i, j] = 0.0
+                    surface[i, j] = _NOTHING
                     if hit:
+                        z = t3 - t
                         if quantum[k] > 0.0:
-                            surface = anchor[k, 2] - t
-                            t = anchor[k, 2] - (np.floor(surface / quantum[k]) + 0.5) * quantum[k]
-                        farthest = min(farthest, -t)
-                        value = -t / side[k] + _NEAREST
-                        images[k, i, j] = min(max(value, 1 / 255), 1.0)
-            if attempt == 0 and -farthest * MARGIN > side[k] and farthest > -np.inf and farthest != np.inf:
-                side[k] = -farthest * MARGIN
-            else:
+                            z = (np.floor(z / quantum[k]) + 0.5) * quantum[k]
+                        surface[i, j] = z
+                        seen[hits] = z
+                        hits += 1
+            if hits == 0:
                 break
+            seen = np.sort(seen[:hits])
+            outliers = int(hits * _OUTLIERS_PER_END)
+            anchor[k, 2] = seen[hits - 1 - outliers]
+            visible = MARGIN * (seen[hits - 1 - outliers] - seen[outliers])
+            if visible <= side[k]:
+                break
+            side[k] = visible
+        for i in range(pixels):
+            for j in range(pixels):
+                if surface[i, j] > _NOTHING:
+                    value = (surface[i, j] - anchor[k, 2]) / side[k] + _NEAREST
+                    images[k, i, j] = min(max(value, 1 / 255), 1.0)

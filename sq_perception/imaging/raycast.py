@@ -1,7 +1,7 @@
 """Exact depth images of superquadrics: rays against the gauge, Newton from the bounding box inwards.
 
-Depth is the z coordinate in the optical frame (metres), +inf where a pixel sees no body.  :func:`render` is the compiled
-renderer for scenes, :func:`render_batch` the torch statement of the same for many single bodies on any device.
+Depth is the z coordinate in the optical frame (metres), +inf where a pixel sees no body.  :func:`render` is the
+compiled renderer for scenes, :func:`render_batch` the torch statement of the same for many single bodies.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numba
 import numpy as np
 import torch
 
-from sq_perception.geometry.kernels import FAST, ray_entry
+from sq_perception.geometry.kernels import FAST, RAY_TOLERANCE, ray_entry
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
 
@@ -63,7 +63,15 @@ def _window(body: Superquadric, camera: Camera) -> tuple[int, int, int, int]:
 
 
 @numba.njit(cache=True, nogil=True, parallel=True, fastmath=FAST, error_model="numpy")
-def _render_bodies(flat, matrices, windows, intrinsics, pinhole, depth, index):
+def _render_bodies(
+    flat: np.ndarray,
+    matrices: np.ndarray,
+    windows: np.ndarray,
+    intrinsics: np.ndarray,
+    pinhole: bool,
+    depth: np.ndarray,
+    index: np.ndarray,
+) -> None:
     fx, fy, cx, cy = intrinsics
     for v in numba.prange(depth.shape[0]):
         for k in range(flat.shape[0]):
@@ -105,9 +113,7 @@ def render_batch(bodies: Superquadric, camera: Camera, steps: int = 40) -> torch
     with torch.no_grad():
         device, dtype = bodies.size.device, bodies.size.dtype
         v, u = np.indices((camera.height, camera.width))
-        origin, direction = (
-            torch.as_tensor(x.reshape(-1, 3), device=device, dtype=dtype) for x in camera.rays(u, v)
-        )
+        origin, direction = (torch.as_tensor(x.reshape(-1, 3), device=device, dtype=dtype) for x in camera.rays(u, v))
         o = bodies.to_object(origin.expand(len(bodies), -1, -1))
         d = direction @ bodies.rotation_matrix
         a = bodies.size[:, None, :]
@@ -120,7 +126,7 @@ def render_batch(bodies: Superquadric, camera: Camera, steps: int = 40) -> torch
         alive = (t_in <= t_out) & ~(flat & (o.abs() > a)).any(-1)
         t = torch.where(alive, t_in, torch.zeros_like(t_in))
         hit = torch.zeros_like(alive)
-        tolerance = 4 * torch.finfo(dtype).eps
+        tolerance = max(RAY_TOLERANCE, 32 * torch.finfo(dtype).eps)
         for _ in range(steps):
             g, slope = _gauge_along(bodies, o + t[..., None] * d, d)
             hit |= alive & (g <= 1 + tolerance)

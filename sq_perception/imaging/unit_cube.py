@@ -37,7 +37,7 @@ def optical_from_cube(body: Superquadric) -> Superquadric:
 
 
 def cube_from_optical(body: Superquadric) -> Superquadric:
-    """A body of the optical frame in the cube frame; the inverse of :func:`optical_from_cube`, as a half turn is its own."""
+    """The inverse of :func:`optical_from_cube`; the same map, as a half turn is its own inverse."""
     return body.transformed(_HALF_TURN_ABOUT_X, _SHIFT)
 
 
@@ -52,7 +52,7 @@ def depth_from_grey(image: np.ndarray) -> np.ndarray:
 
 
 def grey_from_depth(depth: np.ndarray, dtype: type[np.unsignedinteger] = np.uint8) -> np.ndarray:
-    """Grey image of a depth image in the optical frame of :func:`camera`; not finite, or behind the cube: background."""
+    """Grey image of a depth image of :func:`camera`; what is not finite or behind the cube is background."""
     full = np.iinfo(dtype).max
     z = np.where(np.isfinite(depth), 1 - depth, 0.0)
     return np.clip(np.floor(z * full + 1e-6), 0, full).astype(dtype)

@@ -30,7 +30,7 @@ class CheckpointError(ValueError):
 
 def default_model_path() -> Path:
     """The weights that ship with the package."""
-    return Path(str(resources.files("sq_perception").joinpath("weights", "compact.safetensors")))
+    return Path(str(resources.files("sq_perception") / "weights" / "compact.safetensors"))
 
 
 def save(
@@ -95,7 +95,8 @@ def _read(path: Path, tensors: bool = True) -> tuple[dict[str, str], dict[str, t
 
 
 def _config(values: dict[str, Any]) -> RegressorConfig:
-    config = RegressorConfig(**{k: tuple(v) if isinstance(v, list) else v for k, v in values.items()})
+    arguments: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+    config = RegressorConfig(**arguments)
     width = max(config.widths)
     cells = config.pixels / 2 ** len(config.widths)
     if width * width * 9 * config.blocks + width * cells * cells * config.hidden > _MAX_PARAMETERS:

@@ -33,7 +33,9 @@ def draw_views(count: int, rng: np.random.Generator, pixels: int = 64) -> tuple[
     return render_views(draw_bodies(count, rng), pixels, np.full(count, GREY_LEVELS))
 
 
-def dihedral(images: np.ndarray, bodies: Superquadric, turns: np.ndarray, mirror: np.ndarray) -> tuple[np.ndarray, Superquadric]:
+def dihedral(
+    images: np.ndarray, bodies: Superquadric, turns: np.ndarray, mirror: np.ndarray
+) -> tuple[np.ndarray, Superquadric]:
     """Views and bodies (n,) after ``turns`` quarter turns and, where ``mirror``, a reflection of x first.
 
     A mirrored image is the image of the mirrored body, which is a superquadric again: with M = diag(-1, 1, 1), M R M is

@@ -21,11 +21,11 @@ import numpy as np
 import torch
 from safetensors.torch import load_file, save_file
 
+from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.learning import checkpoint
 from sq_perception.learning.dataset import ViewPool, draw_views
 from sq_perception.learning.losses import occupancy_loss, points_around
 from sq_perception.learning.regressor import Regressor, RegressorConfig
-from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.metrics import volume_iou
 
 
@@ -67,7 +67,8 @@ def train(config: TrainingConfig, output: Path, network: RegressorConfig | None 
     output.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(config.seed)
     device = torch.device(config.device)
-    model = Regressor(network).to(device, memory_format=torch.channels_last)
+    model = Regressor(network).to(device)
+    model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     average = copy.deepcopy(model)
     optimizer = torch.optim.AdamW(model.parameters(), config.learning_rate, weight_decay=config.weight_decay)
     state_path = output / "state.safetensors"
@@ -87,9 +88,7 @@ def train(config: TrainingConfig, output: Path, network: RegressorConfig | None 
         images, bodies = pool.batch(config.batch)
         views = torch.from_numpy(images)[:, None].to(device, memory_format=torch.channels_last)
         truth = Superquadric.from_flat(torch.from_numpy(bodies.to_flat()).float().to(device))
-        points = torch.cat(
-            [points_around(truth, config.points // 2, generator, scale) for scale in (1.15, 2.0)], dim=1
-        )
+        points = torch.cat([points_around(truth, config.points // 2, generator, scale) for scale in (1.15, 2.0)], dim=1)
         model.train()
         with torch.autocast(device.type, torch.bfloat16, enabled=config.bfloat16):
             prediction = model(views)
