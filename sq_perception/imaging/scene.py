@@ -1,0 +1,164 @@
+"""Scenes with known truth: one body of the thesis' protocol, or bodies resting on a table.
+
+Thesis protocol (chapter 5.1), in the unit cube: half sizes a in [25, 75] / 255, exponents e in [0.1, 1], the centre at
+(128 +- 40) / 255, rotations uniform, seen by the orthographic camera of :mod:`sq_perception.imaging.unit_cube`.
+
+Table
+-----
+A pinhole camera looks down on the plane n.p + d = 0 (optical frame, |n| = 1, n up) at its point (0, 0, L).  With the
+pitch angle p below the horizon and the roll r,
+
+    n = (-cos p sin r, -cos p cos r, -sin p),    d = L sin p.
+
+A body touches the plane where its support function h says: its centre t has the height n.t + d = h(n).  It stands on
+one of its three axes, turned about n by any angle.  The shortest axis always holds; another one is taken only for
+bodies with flat faces (e1 and e2 below 0.5), since an egg does not stand on its tip.
+
+Metres; depth is the z coordinate, NaN where nothing is seen.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sq_perception.geometry import rotation as quaternions
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging import unit_cube
+from sq_perception.imaging.camera import Camera
+from sq_perception.imaging.raycast import render
+
+THESIS_SIZE = (25 / 255, 75 / 255)
+THESIS_SHAPE = (0.1, 1.0)
+THESIS_CENTRE = (88 / 255, 168 / 255)
+
+TABLE_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
+MAX_TABLE_BODIES = 10
+
+_TABLE_SIZE = (0.02, 0.07)
+_TABLE_SHAPE = (0.1, 1.0)
+_DISTANCE = (0.7, 1.0)
+_PITCH = tuple(np.deg2rad([30.0, 60.0]))
+_ROLL = float(np.deg2rad(5.0))
+_PLACE_RADIUS = 0.3
+_GAP = 0.015
+_FLAT_BELOW = 0.5
+_ATTEMPTS = 2000
+_FARTHEST = 4.0
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Bodies and the camera that sees them.
+
+    Attributes
+    ----------
+    bodies : Superquadric
+        A batch (n,) in the optical frame of the camera, NumPy.
+    camera : Camera
+    plane : (4,) or None
+        Height above the table = n.p + d in the optical frame, n up; None without a table.
+    """
+
+    bodies: Superquadric
+    camera: Camera
+    plane: np.ndarray | None
+
+    def render(self) -> tuple[np.ndarray, np.ndarray]:
+        """Depth float32 (height, width), NaN where nothing is seen; labels int32, k + 1 for body k, 0 elsewhere."""
+        depth, index = render(self.bodies, self.camera)
+        if self.plane is not None:
+            table = plane_depth(self.plane, self.camera)
+            behind = table < depth
+            depth, index = np.where(behind, table, depth), np.where(behind, -1, index)
+        return np.where(np.isfinite(depth), depth, np.nan).astype(np.float32), (index + 1).astype(np.int32)
+
+
+def thesis_scene(rng: np.random.Generator, pixels: int = unit_cube.THESIS_PIXELS) -> Scene:
+    """One random body of the thesis' protocol before the camera of the unit cube."""
+    body = Superquadric(
+        rng.uniform(*THESIS_SIZE, (1, 3)),
+        rng.uniform(*THESIS_SHAPE, (1, 2)),
+        rng.uniform(*THESIS_CENTRE, (1, 3)),
+        quaternions.random(1, rng),
+    )
+    return Scene(unit_cube.optical_from_cube(body), unit_cube.camera(pixels), None)
+
+
+def table_scene(rng: np.random.Generator, count: int = 3, camera: Camera = TABLE_CAMERA) -> Scene:
+    """``count`` random bodies side by side on a table, all of them wholly inside the image.
+
+    Raises
+    ------
+    ValueError
+        If ``count`` is not 1 to 10, the camera is no pinhole, or the bodies find no room in its image.
+    """
+    if not 1 <= count <= MAX_TABLE_BODIES:
+        raise ValueError(f"count: expected 1 to {MAX_TABLE_BODIES} bodies, got {count}")
+    if not camera.is_pinhole:
+        raise ValueError("camera: expected a pinhole camera, got an orthographic one")
+    distance, pitch, roll = rng.uniform(*_DISTANCE), rng.uniform(*_PITCH), rng.uniform(-_ROLL, _ROLL)
+    normal = -np.array([np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll), np.sin(pitch)])
+    plane = np.append(normal, distance * np.sin(pitch))
+    bodies: list[Superquadric] = []
+    reach: list[float] = []
+    for _ in range(_ATTEMPTS):
+        body, radius = _resting_body(rng, plane)
+        apart = all(
+            np.linalg.norm(body.translation - other.translation) > radius + other_radius + _GAP
+            for other, other_radius in zip(bodies, reach, strict=True)
+        )
+        if apart and _inside_image(body, camera):
+            bodies.append(body)
+            reach.append(radius)
+        if len(bodies) == count:
+            return Scene(Superquadric.stack(bodies), camera, plane)
+    raise ValueError(f"no room for {count} bodies in an image of {camera.width} x {camera.height} pixels")
+
+
+def plane_depth(plane: np.ndarray, camera: Camera) -> np.ndarray:
+    """Depth float64 (height, width) of the plane n.p + d = 0; +inf where its front is not seen within 4 m."""
+    v, u = np.indices((camera.height, camera.width))
+    origin, direction = camera.rays(u, v)
+    slope = direction @ plane[:3]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = -(origin @ plane[:3] + plane[3]) / slope
+    return np.where((slope < 0) & (depth > 0) & (depth < _FARTHEST), depth, np.inf)
+
+
+def with_noise(depth: np.ndarray, sigma: float, rng: np.random.Generator) -> np.ndarray:
+    """Depth float32 with independent Gaussian noise of standard deviation ``sigma`` metres; NaN stays NaN."""
+    if not (np.isfinite(sigma) and sigma >= 0):
+        raise ValueError(f"sigma: expected a finite number of at least 0, got {sigma}")
+    if sigma == 0:
+        return depth.astype(np.float32, copy=False)
+    return depth.astype(np.float32) + np.float32(sigma) * rng.standard_normal(depth.shape, dtype=np.float32)
+
+
+def _resting_body(rng: np.random.Generator, plane: np.ndarray) -> tuple[Superquadric, float]:
+    """A random body that touches the plane, and the radius of the ball about its centre that holds it."""
+    normal, offset = plane[:3], plane[3]
+    size, shape = rng.uniform(*_TABLE_SIZE, 3), rng.uniform(*_TABLE_SHAPE, 2)
+    upright = int(rng.integers(3)) if shape.max() < _FLAT_BELOW else int(np.argmin(size))
+    across = np.cross(normal, [0.0, 0.0, 1.0])
+    across /= np.linalg.norm(across)
+    table = np.stack([across, np.cross(normal, across), normal], axis=1)
+    yaw = rng.uniform(0, 2 * np.pi)
+    turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1.0]])
+    axes = np.roll(np.eye(3), upright - 2, axis=1)
+    rotation = quaternions.from_matrix(table @ turn @ axes)
+    radius, bearing = _PLACE_RADIUS * np.sqrt(rng.random()), rng.uniform(0, 2 * np.pi)
+    height = Superquadric(size, shape, np.zeros(3), rotation).support(normal[None])[0]
+    looked_at = np.array([0.0, 0.0, -offset / normal[2]])
+    centre = looked_at + table @ np.array([radius * np.cos(bearing), radius * np.sin(bearing), height])
+    return Superquadric(size, shape, centre, rotation), float(np.linalg.norm(size))
+
+
+def _inside_image(body: Superquadric, camera: Camera) -> bool:
+    lower, upper = body.bounding_box()
+    if lower[2] <= 0:
+        return False
+    corners = np.stack(np.meshgrid(*np.stack([lower, upper], axis=-1), indexing="ij"), axis=-1).reshape(-1, 3)
+    pixels = camera.project(corners)
+    return bool((pixels >= 0).all() and (pixels <= [camera.width - 1, camera.height - 1]).all())
