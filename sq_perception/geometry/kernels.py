@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
 import numba
 
@@ -24,7 +24,8 @@ FAST = {"contract", "arcp", "reassoc", "nsz", "afn"}
 
 def kernel(function: _F) -> _F:
     """Compile to machine code that releases the GIL and is kept on disk; one setting for the whole package."""
-    return numba.njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")(function)  # type: ignore[no-any-return]
+    compiled = numba.njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")(function)
+    return cast(_F, compiled)
 
 
 RAY_TOLERANCE = 1e-9

@@ -90,7 +90,7 @@ class Camera:
     def points(self, depth: np.ndarray) -> np.ndarray:
         """The organised cloud (height, width, 3) of a depth image; NaN where the depth is."""
         self.check_image(depth)
-        v, u = np.indices(depth.shape)
+        u, v = np.meshgrid(np.arange(self.width), np.arange(self.height))
         return self.unproject(u, v, depth)
 
     def project(self, points: np.ndarray) -> np.ndarray:

@@ -29,6 +29,9 @@ from sq_perception.learning.regressor import Regressor, RegressorConfig
 from sq_perception.metrics import volume_iou
 
 
+CALIBRATION_VIEWS = 2048
+
+
 @dataclass(frozen=True)
 class TrainingConfig:
     """What a run is made of."""
@@ -103,6 +106,7 @@ def train(config: TrainingConfig, output: Path, network: RegressorConfig | None 
         losses.append(loss.item())
         done = step + 1
         if done % config.validation == 0 or done == config.steps:
+            recalibrate(average, pool.batch(CALIBRATION_VIEWS)[0], config.batch)
             iou = validate(average, *validation)
             record = {
                 "step": done,
@@ -127,6 +131,26 @@ def validate(model: Regressor, views: np.ndarray, truth: Superquadric, batch: in
     """Volume IoU (n,) of the network's bodies with the true ones, both in the views' frames."""
     flats = [model.predict(views[i : i + batch]).to_flat() for i in range(0, len(views), batch)]
     return volume_iou(Superquadric.from_flat(np.concatenate(flats)), truth)
+
+
+@torch.no_grad()
+def recalibrate(model: Regressor, views: np.ndarray, batch: int) -> None:
+    """Measure the means and variances of all normalisations anew, on ``views`` (n, p, p).
+
+    An average of weights has activations of its own: those recorded while the moving weights trained do not fit it.
+    """
+    norms = [module for module in model.modules() if isinstance(module, torch.nn.BatchNorm2d)]
+    momenta = [norm.momentum for norm in norms]
+    for norm in norms:
+        norm.reset_running_stats()
+        norm.momentum = None
+    device = next(model.parameters()).device
+    model.train()
+    for i in range(0, len(views) - batch + 1, batch):
+        model(torch.from_numpy(views[i : i + batch])[:, None].to(device, memory_format=torch.channels_last))
+    model.eval()
+    for norm, momentum in zip(norms, momenta, strict=True):
+        norm.momentum = momentum
 
 
 @torch.no_grad()
