@@ -1,0 +1,71 @@
+# make demo    watch superquadrics being recovered from a synthetic camera; FRAME=file for a recorded frame
+# make test    lint and the whole test suite, against the installed package
+# make clean   remove everything that these commands made
+#
+# PYTHON=python3.12     the interpreter, 3.10 to 3.13
+# VENV=folder           where to install; .venv, or .venv-<distro> where a ROS 2 installation is sourced
+# PIP_FLAGS='...'       options for pip, for instance --index-url of a CPU build of torch, or --find-links
+
+PYTHON ?= python3
+FRAME ?=
+PIP_FLAGS ?=
+SECONDS_SHOWN ?= 20
+
+ifdef AMENT_PREFIX_PATH
+# A ROS installation brings its own rclpy, whose compiled messages need the NumPy they were built for.
+VENV ?= .venv-$(or $(ROS_DISTRO),ros)
+REQUIREMENTS := '.[test]' 'numpy<2'
+else
+VENV ?= .venv
+REQUIREMENTS := '.[ros,test]'
+endif
+
+PIP := $(VENV)/bin/python -m pip --disable-pip-version-check
+SOURCES := setup.py setup.cfg pyproject.toml package.xml resource/sq_perception $(wildcard resource/ros2_run/*) \
+	$(wildcard config/*) $(wildcard launch_scripts/*.py) $(wildcard sq_msgs_py/*.py) \
+	$(wildcard sq_perception/*.py) $(wildcard sq_perception/*/*.py) $(wildcard sq_perception/weights/*)
+
+.PHONY: demo test lint bench install clean
+.DEFAULT_GOAL := install
+
+install: $(VENV)/.package
+
+# Where python3-venv is missing, pip is brought into the environment from outside.
+$(VENV)/bin/python:
+	$(PYTHON) -c "import sys; sys.exit(0 if (3, 10) <= sys.version_info[:2] <= (3, 13) else \
+		'Python 3.10 to 3.13 is needed, this is ' + sys.version)"
+	@$(PYTHON) -m venv $(VENV) || { \
+		echo "no ensurepip here: using the pip of $(PYTHON)" && \
+		$(PYTHON) -m venv --clear --without-pip $(VENV) && \
+		$(PYTHON) -m pip install --quiet --target \
+			"$$($(VENV)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')" pip; }
+
+$(VENV)/.dependencies: setup.py | $(VENV)/bin/python
+	$(PIP) install $(PIP_FLAGS) --upgrade pip 'setuptools>=68,<82' wheel
+	$(PIP) install $(PIP_FLAGS) $(REQUIREMENTS)
+	touch $@
+
+$(VENV)/.package: $(VENV)/.dependencies $(SOURCES)
+	rm -rf build/lib build/bdist.* *.egg-info
+	$(PIP) install --quiet --no-deps --no-build-isolation --force-reinstall .
+	$(VENV)/bin/python -c "import sys; sys.path.pop(0); from sq_perception.warm_up import main; sys.exit(main())"
+	touch $@
+
+demo: $(VENV)/.package
+	$(VENV)/bin/sq-perception demo --seconds $(SECONDS_SHOWN) $(if $(FRAME),--frame "$(FRAME)") \
+		$(if $(CAMERA_INFO),--camera-info "$(CAMERA_INFO)")
+
+lint: $(VENV)/.package
+	$(VENV)/bin/ruff check .
+	$(VENV)/bin/mypy
+
+# The executable, not `python -m pytest`: that would put the source tree before the installed package.
+test: lint
+	$(VENV)/bin/pytest test
+
+bench: $(VENV)/.package
+	for script in benchmarks/*.py; do $(VENV)/bin/python "$$script" || exit 1; done
+
+clean:
+	rm -rf $(VENV) build install log dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -f demo.png demo.glb

@@ -1,0 +1,96 @@
+"""Package of sq_perception and sq_msgs_py, for pip and for colcon (ament_python)."""
+
+import sys
+from glob import glob
+
+from setuptools import setup
+
+NAME = "sq_perception"
+NODES = ("recover_node", "fitter_node", "synthetic_depth_node")
+
+share = [
+    ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
+    (f"share/{NAME}", ["package.xml"]),
+    (f"share/{NAME}/launch", sorted(glob("launch_scripts/*.py"))),
+    (f"share/{NAME}/config", sorted(glob("config/*.xml") + glob("config/*.yaml"))),
+]
+# `ros2 run` looks for lib/<package>/<executable>.  colcon puts the scripts there itself (setup.cfg); pip puts them into
+# bin/, so that a wheel has to carry a way from the one to the other.
+if "bdist_wheel" in sys.argv:
+    share.append((f"lib/{NAME}", [f"resource/ros2_run/{node}" for node in NODES]))
+
+setup(
+    name=NAME,
+    version="0.1.0",
+    description="Superquadrics from depth images: a network, exact fits and ROS 2 nodes",
+    long_description="Depth images in, superquadrics with pose, shape, score and uncertainty out; see README.md.",
+    author="sq_perception maintainers",
+    author_email="sq-perception@example.org",
+    license="Apache-2.0",
+    python_requires=">=3.10",
+    packages=[
+        "sq_perception",
+        "sq_perception.geometry",
+        "sq_perception.imaging",
+        "sq_perception.fitting",
+        "sq_perception.learning",
+        "sq_perception.evaluation",
+        "sq_perception.nodes",
+        "sq_perception.config",
+        "sq_perception.weights",
+        "sq_msgs_py",
+    ],
+    package_dir={"sq_perception.config": "config"},
+    package_data={
+        "sq_perception.config": ["*.xml", "*.yaml"],
+        "sq_perception.weights": ["*.safetensors", "*.json", "*.md"],
+        "sq_perception": ["py.typed"],
+        "sq_msgs_py": ["py.typed"],
+    },
+    data_files=share,
+    zip_safe=False,
+    install_requires=[
+        "numpy>=1.26",
+        "scipy>=1.11",  # special functions, hulls, small linear algebra
+        "numba>=0.60",  # ray casting and residuals, compiled
+        "opencv-python-headless>=4.8",  # images and contours
+        "trimesh>=4",  # meshes and GLB
+        "torch==2.13.0",  # the network; an open range may fetch several GB
+        "safetensors>=0.4",  # weights that cannot carry code
+        "array-api-compat>=1.9",  # one geometry for NumPy and torch
+        "pyyaml>=6",  # camera_info files
+        "matplotlib>=3.7",  # pictures
+        "rich>=13",  # the live table of the demo
+    ],
+    extras_require={
+        # Never among the requirements: they would shadow the rclpy of a ROS installation.
+        "ros": ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"],
+        "test": [
+            "pytest>=7,<8.4",  # later ones break the launch_testing plugins of a ROS installation
+            "hypothesis>=6",
+            "ruff>=0.6",
+            "mypy>=1.11",
+            "types-PyYAML",
+            "setuptools>=68,<82",  # with colcon: builds this package in a test, without a network
+            "wheel",
+            "colcon-core",
+            "colcon-ros",
+            "colcon-python-setup-py",
+            "colcon-package-information",
+            "colcon-metadata",
+            "colcon-library-path",
+            "colcon-recursive-crawl",
+            "colcon-test-result",
+        ],
+    },
+    entry_points={
+        "console_scripts": [
+            "sq-perception = sq_perception.cli:main",
+            *(f"{node} = sq_perception.nodes.{node}:main" for node in NODES),
+        ],
+    },
+    classifiers=[
+        "Programming Language :: Python :: 3",
+        "Topic :: Scientific/Engineering :: Image Recognition",
+    ],
+)

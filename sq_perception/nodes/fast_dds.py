@@ -1,0 +1,37 @@
+"""The Fast DDS profile that keeps large images from getting lost, and where it lies.
+
+Fast DDS reads FASTRTPS_DEFAULT_PROFILES_FILE (or FASTDDS_DEFAULT_PROFILES_FILE) when the first participant of a process
+is created, so that the variable must be set before rclpy.init.  A file that the user has chosen is left alone.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from pathlib import Path
+
+VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
+_FILE = "fast_dds.xml"
+
+
+def profile_path() -> Path:
+    """The shipped profile: beside the package's modules where it is installed, ``config/`` in a source tree.
+
+    Raises
+    ------
+    FileNotFoundError
+        If the installation is incomplete.
+    """
+    package = Path(__file__).resolve().parent.parent
+    for folder in (package / "config", package.parent / "config"):
+        if (folder / _FILE).is_file():
+            return folder / _FILE
+    raise FileNotFoundError(f"{_FILE} is missing beside {package}: install the package again")
+
+
+def environment(base: Mapping[str, str] | None = None) -> dict[str, str]:
+    """A copy of the environment ``base`` (os.environ by default) with the shipped profile, unless it names one."""
+    variables = dict(os.environ if base is None else base)
+    if not any(variables.get(name) for name in VARIABLES):
+        variables[VARIABLES[0]] = str(profile_path())
+    return variables
