@@ -46,6 +46,7 @@ def save(
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_suffix(path.suffix + ".partial")
     save_file(state, str(partial), metadata=header)
+    partial.chmod(0o644)  # safetensors writes for the owner alone; an installed model is for everybody
     partial.replace(path)
 
 

@@ -1,0 +1,132 @@
+"""From image stamp to received result, with real processes: synthetic_depth_node -> recover_node -> this program.
+
+    python benchmarks/node_latency.py [--seconds 60] [--rate 30]
+
+Two cases: thesis images (mono8, 256 x 256, orthographic) and a table-top with one object (32FC1, 640 x 480, pinhole).
+The stamp is the clock at the camera's publish call, so the latency holds rendering of nothing, but both transports, the
+whole recovery and the way to a subscriber.  The trend (latency of the last third minus that of the first) shows whether
+a queue grows; the counters of /diagnostics show whether every frame was answered or counted.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections import Counter
+from typing import Any
+
+import numpy as np
+import report
+
+os.environ.setdefault("ROS_DOMAIN_ID", "77")
+os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+
+CASES: dict[str, dict[str, list[str]]] = {
+    "thesis 256 x 256": {
+        "camera": ["scene:=thesis", "hold:=10"],
+        "recovery": ["projection:=orthographic"],
+    },
+    "table 640 x 480, one object": {
+        "camera": ["scene:=table", "objects:=1", "hold:=10"],
+        "recovery": [],
+    },
+}
+
+
+def node(name: str, parameters: list[str]) -> subprocess.Popen[bytes]:
+    """A node of this package in a process of its own."""
+    arguments = [argument for parameter in parameters for argument in ("-p", parameter)]
+    command = [sys.executable, "-m", f"sq_perception.nodes.{name}", "--ros-args", "--log-level", "warn", *arguments]
+    return subprocess.Popen(command)
+
+
+def measure(camera: list[str], recovery: list[str], rate: float, seconds: float) -> dict[str, Any]:
+    """Latencies (seconds since the start, milliseconds) and the recovery node's own counters."""
+    import rclpy
+    from diagnostic_msgs.msg import DiagnosticArray
+    from rclpy.time import Time
+    from sensor_msgs.msg import PointCloud2
+
+    rclpy.init()
+    listener = rclpy.create_node("latency")
+    latencies: list[tuple[float, float]] = []
+    counters: dict[str, str] = {}
+    bodies: Counter[int] = Counter()
+
+    def result(message: PointCloud2) -> None:
+        age = (listener.get_clock().now() - Time.from_msg(message.header.stamp)).nanoseconds * 1e-6
+        latencies.append((time.monotonic(), age))
+        bodies[message.width * message.height] += 1
+
+    def diagnosis(message: DiagnosticArray) -> None:
+        for status in message.status:
+            if "recover" in status.name:
+                counters.update({value.key: value.value for value in status.values})
+
+    listener.create_subscription(PointCloud2, "/recover_node/superquadrics", result, 100)
+    listener.create_subscription(DiagnosticArray, "/diagnostics", diagnosis, 10)
+    processes = [node("recover_node", recovery)]
+    try:
+        processes.append(node("synthetic_depth_node", [*camera, f"rate:={rate}"]))
+        deadline = time.monotonic() + 120
+        while len(latencies) < 2 * rate and time.monotonic() < deadline:
+            rclpy.spin_once(listener, timeout_sec=0.1)
+        latencies.clear()
+        bodies.clear()
+        began = time.monotonic()
+        while time.monotonic() < began + seconds:
+            rclpy.spin_once(listener, timeout_sec=0.1)
+        taken = list(latencies)
+        end = time.monotonic() + 2.5
+        processes.pop().send_signal(signal.SIGINT)
+        while time.monotonic() < end:
+            rclpy.spin_once(listener, timeout_sec=0.1)
+    finally:
+        for process in processes:
+            process.send_signal(signal.SIGINT)
+        for process in processes:
+            process.wait(timeout=20)
+        listener.destroy_node()
+        rclpy.shutdown()
+    if not taken:
+        raise RuntimeError("no result arrived within two minutes")
+    when, age = np.array(taken).T
+    third = len(age) // 3
+    return {
+        "milliseconds": report.spread(age),
+        "trend_ms": float(np.median(age[-third:]) - np.median(age[:third])),
+        "results_per_second": len(age) / seconds,
+        "longest_gap_ms": float(np.diff(when).max() * 1e3),
+        "bodies_per_frame": {str(k): v for k, v in sorted(bodies.items())},
+        "diagnostics": counters,
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("--seconds", type=float, default=60.0)
+    parser.add_argument("--rate", type=float, default=30.0)
+    options = parser.parse_args()
+    result, rows = {}, []
+    for name, case in CASES.items():
+        row = result[name] = measure(case["camera"], case["recovery"], options.rate, options.seconds)
+        ms = row["milliseconds"]
+        rows.append(
+            [
+                name,
+                f"{ms['median']:.1f} / {ms['p95']:.1f} / {ms['max']:.1f}",
+                f"{row['results_per_second']:.1f}",
+                f"{row['trend_ms']:+.1f}",
+                f"{row['longest_gap_ms']:.0f}",
+            ]
+        )
+    header = ["frame", "ms median / p95 / max", "results / s", "trend ms", "longest gap ms"]
+    report.write("node_latency", {"options": vars(options), "cases": result}, report.table(header, rows))
+
+
+if __name__ == "__main__":
+    main()

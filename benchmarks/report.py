@@ -1,0 +1,78 @@
+"""What every benchmark shares: metadata, spread, and files of JSON and Markdown beside each other."""
+
+from __future__ import annotations
+
+import json
+import platform
+import subprocess
+import sys
+from datetime import datetime, timezone
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+RESULTS = Path(__file__).resolve().parent / "results"
+_PACKAGES = ("sq-perception", "numpy", "numba", "torch", "ros-jazzy-rclpy")
+
+
+def spread(values: np.ndarray) -> dict[str, float]:
+    """Mean, standard deviation, median, 5th and 95th percentile, minimum of measurements."""
+    values = np.asarray(values, dtype=float)
+    low, median, high = np.percentile(values, [5, 50, 95])
+    names = ("mean", "std", "median", "p5", "p95", "min", "max", "count")
+    numbers = (values.mean(), values.std(), median, low, high, values.min(), values.max(), len(values))
+    return {name: float(number) for name, number in zip(names, numbers, strict=True)}
+
+
+def environment() -> dict[str, Any]:
+    """Processor, versions, commit and command of this run."""
+    versions = {}
+    for package in _PACKAGES:
+        try:
+            versions[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            versions[package] = None
+    return {
+        "command": " ".join(["python", f"benchmarks/{Path(sys.argv[0]).name}", *sys.argv[1:]]),
+        "date": datetime.now(timezone.utc).strftime("%Y-%m-%d"),
+        "commit": _git("rev-parse", "--short", "HEAD"),
+        "modified": bool(_git("status", "--porcelain", "--untracked-files=no")),
+        "processor": _processor(),
+        "python": platform.python_version(),
+        "versions": versions,
+    }
+
+
+def write(name: str, result: dict[str, Any], table: str) -> None:
+    """Write ``results/name.json`` and ``results/name.md``, and print the table."""
+    RESULTS.mkdir(exist_ok=True)
+    facts = environment()
+    (RESULTS / f"{name}.json").write_text(json.dumps({"environment": facts, **result}, indent=1) + "\n")
+    head = f"`{facts['command']}`, {facts['processor']}, {facts['date']}, commit {facts['commit']}"
+    (RESULTS / f"{name}.md").write_text(f"{head}\n\n{table}\n")
+    print(table)
+
+
+def table(header: list[str], rows: list[list[str]]) -> str:
+    """A Markdown table."""
+    lines = [header, ["---"] * len(header), *rows]
+    return "\n".join("| " + " | ".join(line) + " |" for line in lines)
+
+
+def _git(*arguments: str) -> str | None:
+    done = subprocess.run(
+        ["git", *arguments], cwd=RESULTS.parent, capture_output=True, text=True, check=False
+    )
+    return done.stdout.strip() if done.returncode == 0 else None
+
+
+def _processor() -> str:
+    try:
+        for line in Path("/proc/cpuinfo").read_text().splitlines():
+            if line.startswith("model name"):
+                return line.split(":", 1)[1].strip()
+    except OSError:
+        return platform.processor()
+    return platform.processor()

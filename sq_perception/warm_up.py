@@ -1,0 +1,48 @@
+"""Compile every kernel once and keep it on disk, with a line a step, so that no first image has to wait.
+
+    python -m sq_perception.warm_up
+
+Compiled code is kept beside the modules, or in the user's cache where that folder cannot be written.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+
+from sq_perception import metrics
+from sq_perception.fitting import solina_bajcsy, surface_fit
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging import canonical_view, raycast
+from sq_perception.imaging.camera import Camera
+
+
+def steps() -> list[tuple[str, Callable[[], object]]]:
+    """Name and action of everything that compiles."""
+    body = Superquadric(np.array([0.1, 0.2, 0.3]), np.array([0.5, 0.8]), np.array([0, 0, 1.0]), np.array([0, 0, 0, 1.0]))
+    batch = Superquadric.from_flat(body.to_flat()[None])
+    camera = Camera(32, 24, 30.0, 30.0, 16.0, 12.0)
+    points = body.sample_surface(50, np.random.default_rng(0))
+    return [
+        ("ray casting", lambda: raycast.render(body, camera)),
+        ("canonical views", lambda: canonical_view.render_views(batch, 16)),
+        ("overlap", lambda: metrics.volume_iou(batch, batch, 16)),
+        ("classic fit", lambda: solina_bajcsy.fit(points)),
+        ("surface fit", surface_fit.warm_up),
+    ]
+
+
+def main() -> int:
+    """Run every step and say how long each took."""
+    for name, action in steps():
+        began = time.perf_counter()
+        print(f"preparing {name} ...", end=" ", flush=True)
+        action()
+        print(f"{time.perf_counter() - began:.1f} s", flush=True)
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
