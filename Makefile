@@ -41,8 +41,8 @@ $(VENV)/bin/python:
 			"$$($(VENV)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')" pip; }
 
 $(VENV)/.dependencies: setup.py | $(VENV)/bin/python
-	$(PIP) install $(PIP_FLAGS) --upgrade pip 'setuptools>=68,<82' wheel
-	$(PIP) install $(PIP_FLAGS) $(REQUIREMENTS)
+	$(PIP) install $(PIP_FLAGS) --upgrade pip 'setuptools>=68,<80' wheel
+	$(PIP) install $(PIP_FLAGS) --no-build-isolation $(REQUIREMENTS)
 	touch $@
 
 $(VENV)/.package: $(VENV)/.dependencies $(SOURCES)

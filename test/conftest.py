@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -36,3 +37,12 @@ def shared_data() -> Path:
 def rng() -> np.random.Generator:
     """A generator with the same numbers in every run."""
     return np.random.default_rng(20240607)
+
+
+@pytest.fixture(scope="session")
+def source_copy(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the source tree, so that builds leave nothing in the tree itself."""
+    target = tmp_path_factory.mktemp("source") / "sq_perception"
+    generated = ("build", "install", "log", "dist", "runs", "*.egg-info", "__pycache__", ".*")
+    shutil.copytree(repository, target, ignore=shutil.ignore_patterns(*generated))
+    return target

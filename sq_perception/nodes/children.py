@@ -1,0 +1,161 @@
+"""Nodes as child processes: started together, watched, and stopped without leftovers.
+
+Every child leads a process group of its own, so that a Ctrl-C in the terminal reaches the parent alone, which then
+stops the children in order: SIGINT, patience, SIGKILL.  Children import the very package that the parent runs from,
+installed or source tree, whatever the working directory.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections import deque
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+
+NODES = ("recover_node", "fitter_node", "synthetic_depth_node")
+
+_KEPT_LINES = 40
+_ROOT = str(Path(__file__).resolve().parent.parent.parent)
+_CODE = "import sys; sys.path[:1] = [{root!r}]; from sq_perception.nodes.{node} import main; sys.exit(main())"
+
+
+class Child:
+    """One running node.
+
+    Raises
+    ------
+    ValueError
+        If there is no node of that name.
+    """
+
+    def __init__(
+        self, node: str, arguments: Sequence[str], environment: Mapping[str, str], *, echo: bool = False
+    ) -> None:
+        if node not in NODES:
+            raise ValueError(f"node: expected one of {', '.join(NODES)}, got {node!r}")
+        self.name = node
+        self._echo = echo
+        self._lines: deque[str] = deque(maxlen=_KEPT_LINES)
+        self._process = subprocess.Popen(
+            [sys.executable, "-c", _CODE.format(root=_ROOT, node=node), *arguments],
+            env={**environment, "PYTHONUNBUFFERED": "1"},
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors="replace",
+            start_new_session=True,
+        )
+        self._reader = threading.Thread(target=self._read, name=f"output of {node}", daemon=True)
+        self._reader.start()
+
+    @property
+    def pid(self) -> int:
+        """Its process id, and that of its group."""
+        return self._process.pid
+
+    @property
+    def exit_code(self) -> int | None:
+        """None while it runs."""
+        return self._process.poll()
+
+    def last_lines(self, count: int = 15) -> list[str]:
+        """What it said last, standard output and error together."""
+        if self.exit_code is not None:
+            self._reader.join(timeout=1.0)
+        return list(self._lines)[-count:]
+
+    def interrupt(self) -> None:
+        """Ask it to stop, as Ctrl-C does."""
+        self._signal(signal.SIGINT)
+
+    def wait(self, seconds: float) -> bool:
+        """Whether it has ended within some seconds."""
+        try:
+            self._process.wait(timeout=max(seconds, 0.0))
+        except subprocess.TimeoutExpired:
+            return False
+        return True
+
+    def kill(self) -> None:
+        """End it and all that it started."""
+        self._signal(signal.SIGKILL)
+        self._process.wait()
+
+    def _signal(self, number: int) -> None:
+        if self.exit_code is not None:
+            return
+        try:
+            os.killpg(self.pid, number)
+        except ProcessLookupError:
+            return
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        for line in self._process.stdout:
+            self._lines.append(line.rstrip())
+            if self._echo:
+                print(f"[{self.name}] {line}", end="", flush=True)
+
+
+class Children:
+    """Nodes that live as long as a ``with`` block."""
+
+    def __init__(self, environment: Mapping[str, str], *, patience: float = 8.0, echo: bool = False) -> None:
+        self._environment = dict(environment)
+        self._patience = patience
+        self._echo = echo
+        self._running: list[Child] = []
+        self.killed: list[str] = []
+        """Names of those that did not stop when asked to."""
+
+    def __enter__(self) -> Children:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.stop()
+
+    def start(self, node: str, arguments: Sequence[str] = ()) -> Child:
+        """Start one node."""
+        child = Child(node, arguments, self._environment, echo=self._echo)
+        self._running.append(child)
+        return child
+
+    def dead(self) -> Child | None:
+        """The first one that has ended by itself, if any."""
+        return next((child for child in self._running if child.exit_code is not None), None)
+
+    def stop(self) -> None:
+        """Interrupt all, wait, and kill those that do not listen.  A second Ctrl-C must not leave one behind."""
+        previous = {}
+        if threading.current_thread() is threading.main_thread():
+            previous = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            for child in self._running:
+                child.interrupt()
+            deadline = time.monotonic() + self._patience
+            for child in self._running:
+                if not child.wait(deadline - time.monotonic()):
+                    child.kill()
+                    self.killed.append(child.name)
+            self._running.clear()
+        finally:
+            for number, handler in previous.items():
+                signal.signal(number, handler)
+
+
+def parameter_arguments(parameters: Mapping[str, object]) -> list[str]:
+    """Command line arguments that set ROS parameters; JSON is the YAML that ROS expects there."""
+    arguments = ["--ros-args"]
+    for name, value in parameters.items():
+        arguments += ["-p", f"{name}:={json.dumps(value)}"]
+    return arguments
