@@ -1,0 +1,51 @@
+"""fitter_node: superquadrics from depth images by the method of Solina and Bajcsy (see frame_node for the topics)."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from sq_perception.nodes import process
+
+if TYPE_CHECKING:
+    from sq_perception.nodes.frame_node import FrameNode
+    from sq_perception.nodes.parameters import FitterParameters
+    from sq_perception.recovery import Recoverer, RecoveryOptions
+
+NAME = "fitter_node"
+
+
+def create() -> FrameNode:
+    """The node; imported here, as torch takes seconds to import and Ctrl-C must be heard meanwhile."""
+    from sq_perception.nodes.frame_node import FrameNode
+    from sq_perception.nodes.parameters import FitterParameters
+
+    return FrameNode(NAME, FitterParameters, _recoverer, _options)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Entry point; the exit code."""
+    return process.run(NAME, create, arguments)
+
+
+def _recoverer(parameters: FitterParameters) -> Recoverer:
+    from sq_perception.recovery import Recoverer
+
+    return Recoverer(method="classic")
+
+
+def _options(parameters: FitterParameters) -> RecoveryOptions:
+    from sq_perception.recovery import RecoveryOptions
+
+    return RecoveryOptions(
+        method="classic",
+        sharpness=parameters.s,
+        tau=parameters.tau,
+        depth_range=(parameters.depth_min, parameters.depth_max),
+        max_objects=parameters.max_objects,
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,108 @@
+"""One depth image on its way through a node: decoded from its message, and back into messages like it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from sensor_msgs.msg import Image
+
+from sq_msgs_py.depth_image import (
+    DEPTH_ENCODINGS,
+    GREY_ENCODINGS,
+    depth_from_message,
+    depth_to_message,
+    grey_from_message,
+    grey_to_message,
+    labels_from_message,
+)
+from sq_perception.imaging import unit_cube
+from sq_perception.imaging.camera import Camera
+from sq_perception.nodes.inbox import Refused
+
+_GREY_TYPES: dict[str, type[np.unsignedinteger]] = {"mono8": np.uint8, "mono16": np.uint16}
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """A depth image that is fit to be processed.
+
+    Attributes
+    ----------
+    header
+        std_msgs/Header of the message: stamp and frame of every output.
+    encoding
+        Of the message.
+    depth : float32 (height, width)
+        Metres in the optical frame, NaN where nothing was measured.
+    camera : Camera
+    labels : int32 (height, width) or None
+    """
+
+    header: Any
+    encoding: str
+    depth: np.ndarray
+    camera: Camera
+    labels: np.ndarray | None = None
+
+    @property
+    def is_cube(self) -> bool:
+        """Whether results belong in the cube frame."""
+        return not self.camera.is_pinhole
+
+    def with_mask(self, message: Image | None) -> Frame:
+        """The frame with the label image of its objects; None leaves it without.
+
+        Raises
+        ------
+        Refused, ImageError
+            If the mask has another size than the depth image, or is no label image.
+        """
+        if message is None:
+            return self
+        labels = labels_from_message(message)
+        if labels.shape != self.depth.shape:
+            (height, width), (rows, columns) = self.depth.shape, labels.shape
+            raise Refused(f"mask: expected the size of the depth image, {width} x {height}, got {columns} x {rows}")
+        return replace(self, labels=labels)
+
+    def encode(self, depth: np.ndarray) -> Image:
+        """A message like the frame's own with another depth (height, width), NaN or inf for nothing."""
+        if self.is_cube:
+            return grey_to_message(unit_cube.grey_from_depth(depth, _GREY_TYPES[self.encoding]), self.header)
+        return depth_to_message(np.where(np.isfinite(depth), depth, np.nan), self.header, self.encoding)
+
+
+def decode(message: Image, camera_of: Callable[[], Camera] | None) -> Frame:
+    """The frame of a depth image message.
+
+    Parameters
+    ----------
+    message
+        16UC1 or 32FC1 where there is a camera; mono8 or mono16, an image of the unit cube, where there is none.
+    camera_of
+        Looks up the pinhole camera; only called for an image that is sound itself.  None for orthographic images.
+
+    Raises
+    ------
+    Refused, ImageError
+        For anything that keeps the image from being processed.
+    """
+    if camera_of is None:
+        if message.encoding in DEPTH_ENCODINGS:
+            raise Refused(
+                f"encoding: expected mono8 or mono16 for projection = orthographic, got {message.encoding!r}; "
+                "metric depth images of a camera need projection = pinhole"
+            )
+        grey = grey_from_message(message)
+        height, width = grey.shape
+        return Frame(message.header, message.encoding, unit_cube.depth_from_grey(grey), unit_cube.camera(width, height))
+    if message.encoding in GREY_ENCODINGS:
+        raise Refused(
+            f"encoding: expected 16UC1 or 32FC1 for projection = pinhole, got {message.encoding!r}; "
+            "grey images of the unit cube need projection = orthographic"
+        )
+    depth = depth_from_message(message)
+    return Frame(message.header, message.encoding, depth, camera_of())

@@ -1,0 +1,271 @@
+"""ROS parameters of the nodes: one frozen dataclass per node, declared with descriptors and checked as a whole.
+
+Each field of such a dataclass is one parameter of the same name; :func:`setting` carries what its descriptor says:
+meaning, unit, range or choices, and whether it may change while the node runs.  :class:`LiveParameters` declares them
+and holds the current values; a worker that takes ``current`` once per frame sees a consistent set, and a change takes
+effect with the next frame.
+
+``ros2 param set /node s 3`` sends an INTEGER, so every number that is a float here is declared with dynamic typing and
+accepts both.  The range is checked here for both, as the range of a descriptor holds for doubles alone.
+"""
+
+from __future__ import annotations
+
+from dataclasses import Field, asdict, dataclass, field, fields, replace
+from typing import Any, Generic, TypeVar
+
+from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
+from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+
+class ParameterError(ValueError):
+    """A parameter that cannot be used; names it, what was expected and what arrived."""
+
+
+def setting(
+    default: Any,
+    description: str,
+    *,
+    unit: str = "",
+    within: tuple[float, float] | None = None,
+    choices: tuple[str, ...] = (),
+    live: bool = False,
+) -> Any:
+    """A dataclass field that becomes a ROS parameter; read-only after the start unless ``live``."""
+    about = {"description": description, "unit": unit, "within": within, "choices": choices, "live": live}
+    return field(default=default, metadata=about)
+
+
+@dataclass(frozen=True)
+class FrameParameters:
+    """What recover_node and fitter_node have in common."""
+
+    projection: str = setting(
+        "pinhole",
+        "Camera model: pinhole takes 16UC1 and 32FC1 with camera_info; orthographic takes mono8 and mono16 images of "
+        "the unit cube and needs no camera_info.",
+        choices=("pinhole", "orthographic"),
+    )
+    use_masks: str = setting(
+        "auto",
+        "Label images on mask/image with the stamp of the depth image: auto uses them where they come and segments "
+        "where none does, always refuses frames without, never does not look at them.",
+        choices=("auto", "always", "never"),
+        live=True,
+    )
+    s: float = setting(
+        117.3,
+        "Sharpness s of the soft occupancy sigma(s (1 - F^e1)) that the score and refine = soft_render compute with.",
+        within=(0.1, 1000.0),
+        live=True,
+    )
+    tau: float = setting(
+        4.82,
+        "Sharpness tau of the soft depth projection that the score and refine = soft_render compute with.",
+        within=(0.1, 100.0),
+        live=True,
+    )
+    depth_min: float = setting(0.0, "Nearer readings are left out.", unit="m", within=(0.0, 100.0), live=True)
+    depth_max: float = setting(100.0, "Farther readings are left out.", unit="m", within=(0.001, 100.0), live=True)
+    max_objects: int = setting(20, "At most so many bodies per frame, the largest ones.", within=(1, 100), live=True)
+    marker_colours: str = setting(
+        "id",
+        "Colour of the markers: by id, or by score from red (0) to green (1).",
+        choices=("id", "score"),
+        live=True,
+    )
+    marker_alpha: float = setting(0.7, "Opacity of the markers' surfaces.", within=(0.0, 1.0), live=True)
+    marker_line_width: float = setting(
+        0.002, "Width of the markers' outlines.", unit="m", within=(0.0001, 0.1), live=True
+    )
+    no_frame_warning: float = setting(
+        5.0, "Warn when no depth image came for so long; 0 never warns.", unit="s", within=(0.0, 3600.0), live=True
+    )
+    trigger_timeout: float = setting(
+        5.0, "~/trigger answers with a failure when no frame came for so long.", unit="s", within=(0.1, 60.0), live=True
+    )
+
+    def __post_init__(self) -> None:
+        if not self.depth_min < self.depth_max:
+            raise ParameterError(
+                f"depth_min, depth_max: expected depth_min < depth_max, got {self.depth_min:g} and {self.depth_max:g}"
+            )
+
+
+@dataclass(frozen=True)
+class RecoverParameters(FrameParameters):
+    """recover_node: learned start, refined."""
+
+    model: str = setting("", "Network weights (safetensors); empty takes the ones that ship with the package.")
+    device: str = setting("cpu", "Where the network runs: cpu, cuda or cuda:N.")
+    method: str = setting(
+        "auto",
+        "Where the fit starts: network, symmetry, or auto (the best of them); classic is Solina and Bajcsy's method.",
+        choices=("auto", "network", "symmetry", "classic"),
+    )
+    refine: str = setting(
+        "surface",
+        "Refinement: surface fits the measured depth, soft_render the soft-rendered image, none keeps the start.",
+        choices=("surface", "soft_render", "none"),
+        live=True,
+    )
+
+
+@dataclass(frozen=True)
+class FitterParameters(FrameParameters):
+    """fitter_node: nothing but what both have."""
+
+
+@dataclass(frozen=True)
+class SyntheticParameters:
+    """synthetic_depth_node."""
+
+    scene: str = setting(
+        "table",
+        "thesis: orthographic grey images of one random body; table: a pinhole camera over bodies on a table; replay: "
+        "recorded frames from path.",
+        choices=("thesis", "table", "replay"),
+    )
+    rate: float = setting(10.0, "Frames per second.", unit="Hz", within=(0.1, 200.0), live=True)
+    seed: int = setting(0, "Seed of scenes and noise: the same seed gives the same images.", within=(0, 2**31 - 1))
+    noise: float = setting(
+        0.0,
+        "Standard deviation of the depth noise: metres, for orthographic frames grey levels of 255.",
+        unit="m or grey levels",
+        within=(0.0, 50.0),
+        live=True,
+    )
+    hold: int = setting(30, "Frames that a scene or recording stays; the noise is fresh each time.", within=(1, 10**6))
+    scenes: int = setting(0, "Different scenes before the end or the next round; 0 means endless.", within=(0, 10**6))
+    loop: bool = setting(True, "Begin again after the last scene or recording; otherwise publish nothing more.")
+    objects: int = setting(3, "Bodies on the table.", within=(1, 10))
+    pixels: int = setting(256, "Width and height of the thesis' images.", unit="pixels", within=(16, 1024))
+    encoding: str = setting(
+        "auto",
+        "auto: mono8 for orthographic frames, 32FC1 for others.",
+        choices=("auto", "mono8", "mono16", "16UC1", "32FC1"),
+    )
+    masks: str = setting(
+        "auto",
+        "Label images on mask/image: auto publishes those of recordings, always also those of generated scenes.",
+        choices=("auto", "always", "never"),
+    )
+    frame_id: str = setting(
+        "", "Frame of the images; empty: camera_depth_optical_frame, or unit_cube for orthographic frames."
+    )
+    path: str = setting("", "A recorded frame (NPZ, PNG, BMP) or a folder of them, for scene = replay.")
+    camera_info_file: str = setting("", "camera_info YAML of recorded PNG depth images.")
+    projection: str = setting(
+        "pinhole",
+        "Camera model of recorded images: 8 bit orthographic images look like depth images.",
+        choices=("pinhole", "orthographic"),
+    )
+
+    def __post_init__(self) -> None:
+        if self.scene == "replay" and not self.path:
+            raise ParameterError("path: expected a recorded frame or a folder of them for scene = replay, got nothing")
+        grey = self.encoding in ("mono8", "mono16")
+        if self.encoding != "auto" and self.scene != "replay" and grey != (self.scene == "thesis"):
+            expected = "mono8 or mono16" if self.scene == "thesis" else "16UC1 or 32FC1"
+            raise ParameterError(f"encoding: expected {expected} for scene = {self.scene}, got {self.encoding}")
+
+
+P = TypeVar("P", bound="FrameParameters | SyntheticParameters")
+
+
+class LiveParameters(Generic[P]):
+    """Declares the fields of a dataclass as parameters of a node and follows their changes.
+
+    Raises
+    ------
+    ParameterError
+        If a value given at the start has a wrong type, is out of range, or does not fit the others.
+    """
+
+    def __init__(self, node: Node, kind: type[P]) -> None:
+        self._fields: dict[str, Field[Any]] = {one.name: one for one in fields(kind)}
+        values = {name: self._declare(node, one) for name, one in self._fields.items()}
+        self._current: P = kind(**values)
+        node.add_on_set_parameters_callback(self._check)
+        node.add_post_set_parameters_callback(self._accept)
+
+    @property
+    def current(self) -> P:
+        """The values in force: an immutable set, replaced as a whole."""
+        return self._current
+
+    def _declare(self, node: Node, one: Field[Any]) -> Any:
+        try:
+            node.declare_parameter(one.name, one.default, describe(one))
+        except InvalidParameterTypeException as error:
+            raise ParameterError(f"{one.name}: expected a value like {one.default!r}, {error}") from error
+        except InvalidParameterValueException as error:
+            raise ParameterError(str(error)) from error
+        return checked(one, node.get_parameter(one.name).value)
+
+    def _check(self, changes: list[Parameter]) -> SetParametersResult:
+        try:
+            self._changed(changes)
+        except ParameterError as error:
+            return SetParametersResult(successful=False, reason=str(error))
+        return SetParametersResult(successful=True)
+
+    def _accept(self, changes: list[Parameter]) -> None:
+        self._current = self._changed(changes)
+
+    def _changed(self, changes: list[Parameter]) -> P:
+        values = {one.name: checked(self._fields[one.name], one.value) for one in changes if one.name in self._fields}
+        return replace(self._current, **values)
+
+
+def checked(one: Field[Any], value: Any) -> Any:
+    """``value`` in the type of the field.
+
+    Raises
+    ------
+    ParameterError
+        If it has another type, is not finite, out of range or none of the choices.
+    """
+    kind: type = type(one.default)
+    about = one.metadata
+    if kind is float and isinstance(value, int) and not isinstance(value, bool):
+        value = float(value)
+    if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
+        raise ParameterError(f"{one.name}: expected a value like {one.default!r}, got {value!r}")
+    if about["choices"] and value not in about["choices"]:
+        raise ParameterError(f"{one.name}: expected one of {', '.join(about['choices'])}, got {value!r}")
+    if about["within"] is not None:
+        low, high = about["within"]
+        if not low <= value <= high:
+            raise ParameterError(f"{one.name}: expected {low:g} to {high:g}{_unit(about)}, got {value:g}")
+    return value
+
+
+def describe(one: Field[Any]) -> ParameterDescriptor:
+    """The descriptor of a field: its text with the unit, its range or choices, whether it is read-only."""
+    about, kind = one.metadata, type(one.default)
+    descriptor = ParameterDescriptor(
+        name=one.name, description=about["description"] + _unit(about, " [{}]"), read_only=not about["live"]
+    )
+    descriptor.dynamic_typing = kind is float
+    if about["choices"]:
+        descriptor.additional_constraints = "one of: " + ", ".join(about["choices"])
+    elif about["within"] is not None:
+        low, high = about["within"]
+        descriptor.additional_constraints = f"{low:g} to {high:g}{_unit(about)}"
+        if kind is int:
+            descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high), step=0)]
+        else:
+            descriptor.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high))]
+    return descriptor
+
+
+def as_ros(values: FrameParameters | SyntheticParameters) -> dict[str, Any]:
+    """Name and value of every parameter, as a YAML file for ROS holds them."""
+    return asdict(values)
+
+
+def _unit(about: Any, form: str = " {}") -> str:
+    return form.format(about["unit"]) if about["unit"] else ""

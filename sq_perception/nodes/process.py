@@ -1,0 +1,111 @@
+"""The life of a node's process: start, spin, stop, each without a traceback.
+
+Exit code 0 after Ctrl-C or SIGTERM, whether it comes once, twice, or while the node still starts; 1 with one line of
+explanation where the node cannot start.
+"""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Callable, Sequence
+from types import FrameType
+from typing import Protocol
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class Running(Protocol):
+    """A node with something to stop."""
+
+    def close(self) -> None:
+        """Stop threads; the node is destroyed afterwards."""
+
+    def destroy_node(self) -> None:
+        """As rclpy.node.Node."""
+
+
+class _Stop:
+    """Interrupts the start.  While the node spins, rclpy itself ends the spinning and nothing is left to do here."""
+
+    def __init__(self) -> None:
+        self.starting = True
+        self.received = False
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        self.received = True
+        if self.starting:
+            raise KeyboardInterrupt
+
+
+def run(name: str, create: Callable[[], Running], arguments: Sequence[str] | None = None) -> int:
+    """Create a node and spin it until it is told to stop; the exit code.
+
+    ``create`` imports what the node needs, so that a signal during seconds of imports finds this function in charge.
+    """
+    stop = _Stop()
+    for number in SIGNALS:
+        signal.signal(number, stop)
+    node: Running | None = None
+    try:
+        import rclpy
+
+        rclpy.init(args=None if arguments is None else list(arguments))
+        node = create()
+        stop.starting = False
+        _spin(node)
+    except KeyboardInterrupt:
+        return 0
+    except _start_errors() as error:
+        if stop.received:
+            return 0
+        if not stop.starting:
+            raise
+        _explain(name, error)
+        return 1
+    finally:
+        _ignore_signals()
+        _finish(node)
+    return 0
+
+
+def _spin(node: Running) -> None:
+    import rclpy
+    from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    try:
+        while rclpy.ok():
+            executor.spin_once()
+    except ExternalShutdownException:
+        return
+
+
+def _start_errors() -> tuple[type[Exception], ...]:
+    """What a wrong argument, parameter, file or name raises; rclpy's own errors are RuntimeErrors or these."""
+    from rclpy.exceptions import NameValidationException, ParameterException
+    from rclpy.qos_overriding_options import InvalidQosOverridesError
+
+    return (ValueError, OSError, RuntimeError, ParameterException, NameValidationException, InvalidQosOverridesError)
+
+
+def _explain(name: str, error: Exception) -> None:
+    from rclpy.logging import get_logger
+
+    get_logger(name).fatal(f"cannot start: {' '.join(str(error).split())}")
+
+
+def _finish(node: Running | None) -> None:
+    import rclpy
+
+    if node is not None:
+        node.close()
+        node.destroy_node()
+    rclpy.try_shutdown()
+    _ignore_signals()
+
+
+def _ignore_signals() -> None:
+    """A second Ctrl-C (launch sends one) must not interrupt the end; rclpy's shutdown brings old handlers back."""
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
