@@ -15,9 +15,10 @@ import sys
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
+from types import FrameType, TracebackType
 
 NODES = ("recover_node", "fitter_node", "synthetic_depth_node")
 
@@ -134,6 +135,16 @@ class Children:
         """The first one that has ended by itself, if any."""
         return next((child for child in self._running if child.exit_code is not None), None)
 
+    def until_stopped(self) -> int:
+        """Wait for Ctrl-C or SIGTERM (0), or for a node that ends by itself (its exit code)."""
+        with interruptible():
+            try:
+                while (ended := self.dead()) is None:
+                    time.sleep(0.2)
+            except KeyboardInterrupt:
+                return 0
+        return ended.exit_code or 0
+
     def stop(self) -> None:
         """Interrupt all, wait, and kill those that do not listen.  A second Ctrl-C must not leave one behind."""
         previous = {}
@@ -151,6 +162,22 @@ class Children:
         finally:
             for number, handler in previous.items():
                 signal.signal(number, handler)
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Within the block, SIGTERM and SIGHUP raise KeyboardInterrupt as Ctrl-C does; call it in the main thread."""
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        raise KeyboardInterrupt
+
+    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+    previous = {number: signal.signal(number, interrupt) for number in numbers}
+    try:
+        yield
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
 
 
 def parameter_arguments(parameters: Mapping[str, object]) -> list[str]:

@@ -29,9 +29,12 @@ def profile_path() -> Path:
     raise FileNotFoundError(f"{_FILE} is missing beside {package}: install the package again")
 
 
+def additions(base: Mapping[str, str] | None = None) -> dict[str, str]:
+    """What to add to the environment ``base`` (os.environ by default): the shipped profile, or nothing if it names one."""
+    present = os.environ if base is None else base
+    return {} if any(present.get(name) for name in VARIABLES) else {VARIABLES[0]: str(profile_path())}
+
+
 def environment(base: Mapping[str, str] | None = None) -> dict[str, str]:
-    """A copy of the environment ``base`` (os.environ by default) with the shipped profile, unless it names one."""
-    variables = dict(os.environ if base is None else base)
-    if not any(variables.get(name) for name in VARIABLES):
-        variables[VARIABLES[0]] = str(profile_path())
-    return variables
+    """A copy of the environment ``base`` (os.environ by default) with the profile in it."""
+    return {**(os.environ if base is None else base), **additions(base)}

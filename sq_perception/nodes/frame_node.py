@@ -28,7 +28,6 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.node import Node
 from rclpy.qos import QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
@@ -46,6 +45,7 @@ from sq_perception.nodes.counters import Statistics, Throttle
 from sq_perception.nodes.frame import Frame, decode
 from sq_perception.nodes.inbox import Arrival, Inbox, Refused
 from sq_perception.nodes.parameters import FrameParameters, LiveParameters
+from sq_perception.nodes.stoppable_node import StoppableNode
 from sq_perception.recovery import FrameRecovery, Recoverer, RecoveryOptions, render_recovery
 
 WARM_UP_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
@@ -57,7 +57,7 @@ Outcome = tuple[bool, str]
 """Whether a frame was answered, and the summary or the reason."""
 
 
-class FrameNode(Node):
+class FrameNode(StoppableNode):
     """See the module.
 
     Parameters
@@ -88,8 +88,8 @@ class FrameNode(Node):
         context: Any = None,
     ) -> None:
         super().__init__(name, context=context)
-        self._parameters: LiveParameters[Any] = LiveParameters(self, kind)
-        self._recoverer = make_recoverer(self._parameters.current)
+        self._settings: LiveParameters[Any] = LiveParameters(self, kind)
+        self._recoverer = make_recoverer(self._settings.current)
         self._options = options
         self._statistics = Statistics()
         self._throttle = Throttle()
@@ -116,13 +116,13 @@ class FrameNode(Node):
     def _warm_up(self) -> None:
         started = perf_counter()
         self.get_logger().info("warming up: loading compiled code, or compiling it on the first start")
-        orthographic = self._parameters.current.projection == "orthographic"
+        orthographic = self._settings.current.projection == "orthographic"
         camera = unit_cube.camera() if orthographic else WARM_UP_CAMERA
         self._recoverer.warm_up(camera)
         self.get_logger().info(f"warm after {perf_counter() - started:.1f} s")
 
     def _connect(self) -> None:
-        pinhole = self._parameters.current.projection == "pinhole"
+        pinhole = self._settings.current.projection == "pinhole"
         # Subscriptions are served in this order: what an image needs is there before the image.
         self._info_input = self._listen(CameraInfo, "depth/camera_info", self._inbox.put_info) if pinhole else None
         self._mask_input = self._listen(Image, "mask/image", self._inbox.put_mask)
@@ -171,7 +171,7 @@ class FrameNode(Node):
         return response
 
     async def _on_trigger(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        timeout = self._parameters.current.trigger_timeout
+        timeout = self._settings.current.trigger_timeout
         outcome: Future = Future(executor=self.executor)
         entry = monotonic(), outcome
         with self._triggers_lock:
@@ -187,14 +187,14 @@ class FrameNode(Node):
                 return
             self._triggers.remove(entry)
         topic = self._image_input.topic_name
-        entry[1].set_result((False, f"no frame on {topic} within {timeout:g} s: {self._publishers(self._image_input)}"))
+        entry[1].set_result((False, f"no frame on {topic} within {timeout:g} s: {self._heard(self._image_input)}"))
 
     def _on_second(self) -> None:
         silence = monotonic() - self._last_image
-        limit = self._parameters.current.no_frame_warning
+        limit = self._settings.current.no_frame_warning
         silent = 0 < limit < silence
         if silent:
-            topic, publishers = self._image_input.topic_name, self._publishers(self._image_input)
+            topic, publishers = self._image_input.topic_name, self._heard(self._image_input)
             self._warn("silence", f"no depth image on {topic} for {silence:.0f} s: {publishers}")
         now = self._statistics.snapshot()
         message = DiagnosticArray()
@@ -228,7 +228,7 @@ class FrameNode(Node):
 
     def _process(self, arrival: Arrival) -> str:
         """Recover one frame and publish the results; its summary."""
-        parameters = self._parameters.current
+        parameters = self._settings.current
         clock = perf_counter()
         stages = {"wait": 1e3 * (monotonic() - arrival.time)}
         frame = self._decoded(arrival.message, parameters)
@@ -257,7 +257,7 @@ class FrameNode(Node):
             except Refused as error:
                 assert self._info_input is not None
                 topic = self._info_input.topic_name
-                raise Refused(f"{error}, on {topic}: {self._publishers(self._info_input)}") from error
+                raise Refused(f"{error}, on {topic}: {self._heard(self._info_input)}") from error
         return frame.with_mask(self._mask(message, parameters.use_masks))
 
     def _mask(self, message: Image, use: str) -> Image | None:
@@ -295,6 +295,6 @@ class FrameNode(Node):
         if remark is not None:
             self.get_logger().warning(text + remark)
 
-    def _publishers(self, subscription: Subscription) -> str:
+    def _heard(self, subscription: Subscription) -> str:
         offered = self.get_publishers_info_by_topic(subscription.topic_name)
         return report.publishers(offered, subscription.qos_profile)

@@ -129,7 +129,8 @@ class Inbox:
     def _info(self, size: tuple[int, int], stamp: Stamp) -> _Info | None:
         fitting = [info for info in self._infos if info.size == size]
         same_time = [info for info in fitting if info.stamp == stamp]
-        return (same_time or fitting or [None])[-1]
+        best = same_time or fitting
+        return best[-1] if best else None
 
     def _why_no_info(self, size: tuple[int, int]) -> str:
         wanted = f"camera_info: expected one for {size[0]} x {size[1]} pixels"

@@ -12,12 +12,16 @@ accepts both.  The range is checked here for both, as the range of a descriptor 
 from __future__ import annotations
 
 from dataclasses import Field, asdict, dataclass, field, fields, replace
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Literal, TypeVar, get_args
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
+
+Method = Literal["auto", "network", "symmetry", "classic"]
+Refine = Literal["surface", "soft_render", "none"]
+Projection = Literal["pinhole", "orthographic"]
 
 
 class ParameterError(ValueError):
@@ -42,11 +46,11 @@ def setting(
 class FrameParameters:
     """What recover_node and fitter_node have in common."""
 
-    projection: str = setting(
+    projection: Projection = setting(  # noqa: RUF009 - a field
         "pinhole",
         "Camera model: pinhole takes 16UC1 and 32FC1 with camera_info; orthographic takes mono8 and mono16 images of "
         "the unit cube and needs no camera_info.",
-        choices=("pinhole", "orthographic"),
+        choices=get_args(Projection),
     )
     use_masks: str = setting(
         "auto",
@@ -100,15 +104,15 @@ class RecoverParameters(FrameParameters):
 
     model: str = setting("", "Network weights (safetensors); empty takes the ones that ship with the package.")
     device: str = setting("cpu", "Where the network runs: cpu, cuda or cuda:N.")
-    method: str = setting(
+    method: Method = setting(  # noqa: RUF009 - a field
         "auto",
         "Where the fit starts: network, symmetry, or auto (the best of them); classic is Solina and Bajcsy's method.",
-        choices=("auto", "network", "symmetry", "classic"),
+        choices=get_args(Method),
     )
-    refine: str = setting(
+    refine: Refine = setting(  # noqa: RUF009 - a field
         "surface",
         "Refinement: surface fits the measured depth, soft_render the soft-rendered image, none keeps the start.",
-        choices=("surface", "soft_render", "none"),
+        choices=get_args(Refine),
         live=True,
     )
 
@@ -157,10 +161,10 @@ class SyntheticParameters:
     )
     path: str = setting("", "A recorded frame (NPZ, PNG, BMP) or a folder of them, for scene = replay.")
     camera_info_file: str = setting("", "camera_info YAML of recorded PNG depth images.")
-    projection: str = setting(
+    projection: Projection = setting(  # noqa: RUF009 - a field
         "pinhole",
         "Camera model of recorded images: 8 bit orthographic images look like depth images.",
-        choices=("pinhole", "orthographic"),
+        choices=get_args(Projection),
     )
 
     def __post_init__(self) -> None:

@@ -9,19 +9,12 @@ from __future__ import annotations
 import signal
 from collections.abc import Callable, Sequence
 from types import FrameType
-from typing import Protocol
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from sq_perception.nodes.stoppable_node import StoppableNode
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
-
-
-class Running(Protocol):
-    """A node with something to stop."""
-
-    def close(self) -> None:
-        """Stop threads; the node is destroyed afterwards."""
-
-    def destroy_node(self) -> None:
-        """As rclpy.node.Node."""
 
 
 class _Stop:
@@ -37,7 +30,7 @@ class _Stop:
             raise KeyboardInterrupt
 
 
-def run(name: str, create: Callable[[], Running], arguments: Sequence[str] | None = None) -> int:
+def run(name: str, create: Callable[[], StoppableNode], arguments: Sequence[str] | None = None) -> int:
     """Create a node and spin it until it is told to stop; the exit code.
 
     ``create`` imports what the node needs, so that a signal during seconds of imports finds this function in charge.
@@ -45,7 +38,7 @@ def run(name: str, create: Callable[[], Running], arguments: Sequence[str] | Non
     stop = _Stop()
     for number in SIGNALS:
         signal.signal(number, stop)
-    node: Running | None = None
+    node: StoppableNode | None = None
     try:
         import rclpy
 
@@ -55,10 +48,11 @@ def run(name: str, create: Callable[[], Running], arguments: Sequence[str] | Non
         _spin(node)
     except KeyboardInterrupt:
         return 0
-    except _start_errors() as error:
+    except Exception as error:
         if stop.received:
+            # rclpy has shut its context down, and whatever was going on has failed because of that.
             return 0
-        if not stop.starting:
+        if not (stop.starting and isinstance(error, _start_errors())):
             raise
         _explain(name, error)
         return 1
@@ -68,7 +62,7 @@ def run(name: str, create: Callable[[], Running], arguments: Sequence[str] | Non
     return 0
 
 
-def _spin(node: Running) -> None:
+def _spin(node: StoppableNode) -> None:
     import rclpy
     from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 
@@ -95,7 +89,7 @@ def _explain(name: str, error: Exception) -> None:
     get_logger(name).fatal(f"cannot start: {' '.join(str(error).split())}")
 
 
-def _finish(node: Running | None) -> None:
+def _finish(node: StoppableNode | None) -> None:
     import rclpy
 
     if node is not None:
