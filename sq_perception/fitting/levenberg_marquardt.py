@@ -76,27 +76,25 @@ def minimize(
 def _minimize(stage, rays, free, scene, parameters, rotation, lower, upper, max_iterations, tolerance):
     parameters = np.minimum(np.maximum(parameters, lower), upper)
     rotation = rotation.copy()
-    normal_matrix = np.zeros((STEP_LENGTH, STEP_LENGTH))
-    gradient = np.zeros(STEP_LENGTH)
-    next_matrix = np.zeros((STEP_LENGTH, STEP_LENGTH))
-    next_gradient = np.zeros(STEP_LENGTH)
+    sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
+    next_sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
     factor = np.zeros((STEP_LENGTH, STEP_LENGTH))
     step = np.zeros(STEP_LENGTH)
     held = np.zeros(STEP_LENGTH, dtype=np.bool_)
     next_parameters = parameters.copy()
     next_rotation = rotation.copy()
-    cost = evaluate(stage, rays, free, scene, parameters, rotation, normal_matrix, gradient)
+    cost = evaluate(stage, rays, free, scene, parameters, rotation, sums)
     damping = _FIRST_DAMPING
     iterations = 0
     while iterations < max_iterations:
         iterations += 1
-        _hold(parameters, lower, upper, gradient, held)
+        _hold(parameters, lower, upper, sums[STEP_LENGTH], held)
         accepted = False
         for _ in range(_ATTEMPTS):
-            if solve_damped(normal_matrix, gradient, damping, held, factor, step):
+            if solve_damped(sums, damping, held, factor, step):
                 move(parameters, rotation, step, lower, upper, next_parameters, next_rotation)
                 next_cost = evaluate(
-                    stage, rays, free, scene, next_parameters, next_rotation, next_matrix, next_gradient
+                    stage, rays, free, scene, next_parameters, next_rotation, next_sums
                 )
                 if next_cost < cost:
                     accepted = True
@@ -108,8 +106,7 @@ def _minimize(stage, rays, free, scene, parameters, rotation, lower, upper, max_
         cost = next_cost
         parameters, next_parameters = next_parameters, parameters
         rotation, next_rotation = next_rotation, rotation
-        normal_matrix, next_matrix = next_matrix, normal_matrix
-        gradient, next_gradient = next_gradient, gradient
+        sums, next_sums = next_sums, sums
         damping = max(damping * 0.12, 1e-9)
         if gain <= tolerance * max(abs(cost), 1e-12):
             break
@@ -127,16 +124,16 @@ def _hold(parameters, lower, upper, gradient, held):
 
 
 @kernel
-def solve_damped(normal_matrix, gradient, damping, held, factor, step):
-    """Cholesky solution of the damped normal equations (lower triangle given); False if they are not positive."""
+def solve_damped(sums, damping, held, factor, step):
+    """Cholesky solution of the damped normal equations (rows as :func:`evaluate` leaves them); False if they are not positive."""
     largest = 0.0
     for k in range(STEP_LENGTH):
-        largest = max(largest, normal_matrix[k, k])
+        largest = max(largest, sums[k, k])
     if not largest > 0.0:
         return False
     for i in range(STEP_LENGTH):
         for j in range(i + 1):
-            entry = normal_matrix[i, j]
+            entry = sums[i, j]
             if i == j:
                 absolute = 1e-3 if i < 5 or i > 7 else 1e-12 * largest
                 entry = entry * (1.0 + damping) + absolute
@@ -151,7 +148,7 @@ def solve_damped(normal_matrix, gradient, damping, held, factor, step):
             else:
                 factor[i, j] = entry / factor[j, j]
     for i in range(STEP_LENGTH):
-        entry = 0.0 if held[i] else -gradient[i]
+        entry = 0.0 if held[i] else -sums[STEP_LENGTH, i]
         for k in range(i):
             entry -= factor[i, k] * step[k]
         step[i] = entry / factor[i, i]

@@ -30,6 +30,8 @@ _STEEPEST = 6.0
 _BAND_PIXELS = 4
 _BAND_SHARE = 0.03
 _WIDER = 0.5
+_HOLE = 5
+"""Holes and notches of the mask up to this width, pixels, are closed: the outline of a convex body has none."""
 _COARSE = 3
 """Far from the mask, only every third pixel in each direction becomes a free ray."""
 _NOISE_SAMPLES = 4000
@@ -48,16 +50,19 @@ class Observation:
         All pixels of the object; the last column is the area weight for drawing.
     free_rays : (m, 7)
         All candidates for free space; the last column likewise.
+    free_pixels : int
+        Number of pixels that the free rays stand for.
     noise : float
-        Depth noise, metres.
+        Depth noise and model error together, metres.
     footprint : float
         Width of a pixel at the object, metres.
     depth, mask : (h, w)
-        The crop; ``camera`` belongs to it.
+        The crop, the mask with its small holes closed; ``camera`` belongs to them.
     """
 
     object_rays: np.ndarray
     free_rays: np.ndarray
+    free_pixels: int
     noise: float
     footprint: float
     depth: np.ndarray
@@ -72,36 +77,49 @@ class Observation:
 
 
 def observe(
-    depth: np.ndarray, mask: np.ndarray, camera: Camera, noise: float | None, nan_is_empty: bool
+    depth: np.ndarray,
+    mask: np.ndarray,
+    camera: Camera,
+    noise: float | None,
+    model_error: float,
+    nan_is_empty: bool,
 ) -> Observation | None:
-    """Sort the pixels of an image; None if the mask holds no depth at all."""
+    """Sort the pixels of an image; None if the mask holds no depth at all.
+
+    ``noise`` None estimates it; ``model_error`` (metres) adds to it in squares.
+    """
     rows = np.flatnonzero(mask.any(axis=1))
     if rows.size == 0:
         return None
     columns = np.flatnonzero(mask[rows[0] : rows[-1] + 1].any(axis=0))
     extent = max(rows[-1] - rows[0], columns[-1] - columns[0]) + 1
     band = max(_BAND_PIXELS, int(np.ceil(_BAND_SHARE * extent)))
-    margin = max(band, int(np.ceil(_WIDER * extent)))
+    margin = max(band, int(np.ceil(_WIDER * extent / 2)))
     top, left = max(int(rows[0]) - margin, 0), max(int(columns[0]) - margin, 0)
     bottom = min(int(rows[-1]) + margin + 1, camera.height)
     right = min(int(columns[-1]) + margin + 1, camera.width)
     window = (slice(top, bottom), slice(left, right))
     crop = np.ascontiguousarray(depth[window], dtype=np.float32)
+    if camera.is_pinhole:
+        crop = np.where(crop > 0, crop, np.float32(np.nan))
     inside = np.ascontiguousarray(mask[window], dtype=bool)
     view = camera.cropped(left, top, right - left, bottom - top)
-    near = cv2.dilate(inside.view(np.uint8), np.ones((2 * band + 1, 2 * band + 1), np.uint8)).view(bool)
-    intrinsics = np.array([view.fx, view.fy, view.cx, view.cy])
+    filled = cv2.morphologyEx(inside.view(np.uint8), cv2.MORPH_CLOSE, np.ones((_HOLE, _HOLE), np.uint8))
+    near = cv2.dilate(filled, np.ones((2 * band + 1, 2 * band + 1), np.uint8))
     typical = _typical_depth(crop, inside)
     if not np.isfinite(typical):
         return None
     if noise is None:
-        noise = _noise(crop, inside)
-        noise = max(noise, 1e-6 * max(abs(typical), 1e-3))
-    footprint = (
-        float(typical / np.sqrt(view.fx * view.fy)) if view.is_pinhole else float(1 / np.sqrt(view.fx * view.fy))
+        noise = max(_noise(crop, inside), 1e-6 * max(abs(typical), 1e-3))
+    noise = float(np.hypot(noise, model_error))
+    focal = np.sqrt(view.fx * view.fy)
+    footprint = float(typical / focal if view.is_pinhole else 1 / focal)
+    margin_in_front = max(_FREE_MARGIN * noise, 2.0 * model_error)
+    intrinsics = np.array([view.fx, view.fy, view.cx, view.cy])
+    rays, free, free_pixels = _collect(
+        crop, inside, filled, near, intrinsics, view.is_pinhole, noise, footprint, margin_in_front, nan_is_empty
     )
-    rays, free = _collect(crop, inside, near, intrinsics, view.is_pinhole, noise, footprint, nan_is_empty)
-    return Observation(rays, free, float(noise), footprint, crop, inside, view)
+    return Observation(rays, free, free_pixels, noise, footprint, crop, filled.view(bool) | inside, view)
 
 
 def draw(rays: np.ndarray, count: int, offset: float = 0.5) -> np.ndarray:
@@ -149,7 +167,9 @@ def _typical_depth(depth, inside):
 
 
 @kernel
-def _collect(depth, inside, near, intrinsics, pinhole, noise, footprint, nan_is_empty):
+def _collect(
+    depth, inside, filled, near, intrinsics, pinhole, noise, footprint, margin_in_front, nan_is_empty
+):
     fx, fy, cx, cy = intrinsics
     height, width = depth.shape
     count, free_count = 0, 0
@@ -157,11 +177,11 @@ def _collect(depth, inside, near, intrinsics, pinhole, noise, footprint, nan_is_
         for u in range(width):
             if inside[v, u]:
                 count += np.isfinite(depth[v, u])
-            elif near[v, u] or (u % _COARSE == 0 and v % _COARSE == 0):
+            elif not filled[v, u] and (near[v, u] or (u % _COARSE == 0 and v % _COARSE == 0)):
                 free_count += nan_is_empty or np.isfinite(depth[v, u])
     rays = np.empty((count, RAY_COLUMNS))
     free = np.empty((free_count, RAY_COLUMNS))
-    count, free_count = 0, 0
+    count, free_count, free_pixels = 0, 0, 0
     for v in range(height):
         for u in range(width):
             z = depth[v, u]
@@ -174,13 +194,14 @@ def _collect(depth, inside, near, intrinsics, pinhole, noise, footprint, nan_is_
                 row[4] = z
                 row[5] = 1.0 / noise
                 row[6] = _area_weight(depth, inside, v, u, footprint)
-            elif near[v, u] or (u % _COARSE == 0 and v % _COARSE == 0):
+            elif not filled[v, u] and (near[v, u] or (u % _COARSE == 0 and v % _COARSE == 0)):
                 if not known and not nan_is_empty:
                     continue
                 row = free[free_count]
                 free_count += 1
-                row[4] = z - _FREE_MARGIN * noise if known else 1e300
-                row[5] = 1.0 / max(noise, footprint)
+                row[4] = z - margin_in_front if known else 1e300
+                free_pixels += 1 if near[v, u] else _COARSE * _COARSE
+                row[5] = 1.0
                 row[6] = 1.0
             else:
                 continue
@@ -189,7 +210,7 @@ def _collect(depth, inside, near, intrinsics, pinhole, noise, footprint, nan_is_
                 row[0], row[1], row[2], row[3] = 0.0, 0.0, x, y
             else:
                 row[0], row[1], row[2], row[3] = x, y, 0.0, 0.0
-    return rays, free
+    return rays, free, free_pixels
 
 
 @kernel

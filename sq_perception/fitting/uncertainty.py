@@ -15,39 +15,35 @@ import numpy as np
 from sq_perception.fitting.fit import Fit, Status
 from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.observation import Observation, draw
-from sq_perception.fitting.residuals import RENDERED, STEP_LENGTH, Scene, evaluate
+from sq_perception.fitting.residuals import RENDERED, STEP_LENGTH, evaluate, surface_distance
+from sq_perception.fitting.search import Search
 from sq_perception.geometry.superquadric import Superquadric
 
 _PRIOR_LOG_SIZE = 1.0
 _PRIOR_SHAPE = 0.5
 _PRIOR_ANGLE = 1.0
 _INLIER = 3.0
+_JUDGED_RAYS = 1500
 _WEAK_SHARE = 0.15
 """A half size whose standard deviation exceeds this share of it is called undetermined."""
 _FAILED_SHARE = 0.25
 _AXES = "xyz"
 
 
-def judged(
-    state: State,
-    observation: Observation,
-    scene: Scene,
-    limits: tuple[np.ndarray, np.ndarray],
-    pixels: int,
-    began: float,
-) -> Fit:
+def judged(state: State, search: Search, began: float) -> Fit:
     """The result of a search, with everything that can be said about its quality."""
-    rays = draw(observation.object_rays, pixels)
-    free = draw(observation.free_rays, pixels // 5)
-    normal_matrix, gradient = np.zeros((STEP_LENGTH, STEP_LENGTH)), np.zeros(STEP_LENGTH)
-    cost = evaluate(RENDERED, rays, free, scene, state.parameters, state.rotation, normal_matrix, gradient)
-    variance = max(1.0, cost / max(len(rays) - STEP_LENGTH, 1))
+    observation = search.observation
+    rays = search.rays
+    sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
+    cost = evaluate(RENDERED, rays, search.free, search.scene, state.parameters, state.rotation, sums)
+    freedom = max(rays[:, 6].sum() - STEP_LENGTH, 1.0)
+    variance = max(1.0, cost / freedom)
     body = state.body
-    covariance = _covariance(normal_matrix, state.parameters, variance)
+    covariance = _covariance(sums[:STEP_LENGTH, :STEP_LENGTH], state.parameters, variance)
     canonical = body.canonical_form()
     covariance = _carried_over(covariance, body, canonical)
-    points = np.stack([rays[:, 0] + rays[:, 4] * rays[:, 2], rays[:, 1] + rays[:, 4] * rays[:, 3], rays[:, 4]], 1)
-    distance = np.abs(canonical.sampson_distance(points))
+    everything = draw(observation.object_rays, _JUDGED_RAYS)
+    distance = surface_distance(everything, state.parameters, state.rotation)
     inlying = distance < _INLIER * observation.noise
     typical = float(np.median(distance))
     kept = distance < max(_INLIER * observation.noise, _INLIER * typical)

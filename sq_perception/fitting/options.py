@@ -1,0 +1,78 @@
+"""How to fit: the options of :func:`sq_perception.fitting.surface_fit.fit`."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sq_perception.fitting.bounds import Bounds
+
+MIN_PIXELS = 12
+MODEL_ERROR_ON_PLANE = 0.0025
+"""Real objects are no superquadrics; on tables of everyday things this is how far they stray, metres."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of the surface fit.
+
+    Attributes
+    ----------
+    bounds
+        Limits of sizes and exponents.
+    noise
+        Standard deviation of the depth noise, metres; None estimates it from the image.
+    model_error
+        How far the object may stray from a superquadric, metres.  None: 2.5 mm for objects on a plane, else 0.
+    plane
+        (4,) support plane n.x + d = height in the optical frame, n pointing away from the support; None if the object
+        floats.  A body does not reach below it, and is expected to lie on one of its faces.
+    nan_is_empty
+        Whether a pixel without depth beside the mask saw nothing up to infinity (rendered images) or says nothing
+        (sensors).  None: true for orthographic cameras only.
+    pixels
+        Budget of object rays in the last stage; a fifth as many free rays come on top.  None: enough that noise
+        averages out.
+    max_iterations
+        Levenberg-Marquardt steps in the last stage.
+    time_budget
+        Seconds after which no further start is tried; the best body so far is returned.
+    fall_back
+        Whether given starts whose result stays above the noise floor are joined by the automatic ones.
+    """
+
+    bounds: Bounds = field(default_factory=Bounds)
+    noise: float | None = None
+    model_error: float | None = None
+    plane: np.ndarray | None = None
+    nan_is_empty: bool | None = None
+    pixels: int | None = None
+    max_iterations: int = 15
+    time_budget: float = math.inf
+    fall_back: bool = True
+
+    def __post_init__(self) -> None:
+        if self.noise is not None and not (np.isfinite(self.noise) and self.noise > 0):
+            raise ValueError(f"noise: expected a positive number of metres, got {self.noise}")
+        if self.model_error is not None and not (np.isfinite(self.model_error) and self.model_error >= 0):
+            raise ValueError(f"model_error: expected metres, 0 or more, got {self.model_error}")
+        if self.plane is not None:
+            plane = np.asarray(self.plane, dtype=float)
+            if plane.shape != (4,) or not np.isfinite(plane).all() or not np.linalg.norm(plane[:3]) > 0:
+                raise ValueError(f"plane: expected 4 finite numbers n d with a normal, got {self.plane}")
+            object.__setattr__(self, "plane", plane / np.linalg.norm(plane[:3]))
+        if self.pixels is not None and self.pixels < MIN_PIXELS:
+            raise ValueError(f"pixels: expected {MIN_PIXELS} or more, got {self.pixels}")
+        if self.max_iterations < 1:
+            raise ValueError(f"max_iterations: expected 1 or more, got {self.max_iterations}")
+        if not self.time_budget > 0:
+            raise ValueError(f"time_budget: expected positive seconds, got {self.time_budget}")
+
+    @property
+    def tolerated(self) -> float:
+        """The model error that holds, metres."""
+        if self.model_error is not None:
+            return self.model_error
+        return 0.0 if self.plane is None else MODEL_ERROR_ON_PLANE

@@ -1,0 +1,229 @@
+"""The course of one surface fit, from the first start to the last iteration.
+
+1. Starts, cheap ones first: given bodies, central symmetry, boxes on the support plane.
+2. From each, a few Levenberg-Marquardt steps on the Sampson residual and free space with some 150 rays: a wide basin.
+   More starts only while the best residual stays above the noise floor.
+3. Those that the noise does not tell apart go on: Sampson with more rays, then the rendered residual.  If the winner's
+   residual is above the floor, all starts are tried.
+4. The winner alone: rays far off its surface are dropped, the outline's precision is read from its misfit, and the
+   rendered residual is minimised on the full budget of rays.
+
+The noise floor is a mean squared residual of 1, as residuals are in units of the noise.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+
+import numpy as np
+
+from sq_perception.fitting import box_start, symmetry_start
+from sq_perception.fitting.levenberg_marquardt import State, minimize
+from sq_perception.fitting.observation import Observation, draw
+from sq_perception.fitting.options import Options
+from sq_perception.fitting.residuals import RAY_COLUMNS, RENDERED, SAMPSON, Scene, penetration, surface_distance
+
+COARSE_RAYS, COARSE_STEPS = 150, 8
+BASIN_RAYS, BASIN_STEPS = 300, 15
+FINAL_RAYS = 2500
+MOST_FINAL_RAYS = 6000
+FREE_SHARE = 0.25
+"""Free rays per object ray."""
+COARSE_GATE = 3.6
+FINAL_GATE = 1.4
+"""Mean squared residuals above which more starts are tried."""
+DOUBT = 3.0
+"""Candidates within this many standard deviations of the noise's own cost are not told apart by it,"""
+RIVAL = 1.3
+"""nor those within this factor of the best."""
+FINALISTS, ESCALATED_FINALISTS = 3, 6
+TOLERANCE, FINAL_TOLERANCE = 1e-3, 1e-4
+SHARP_OUTLINE = 0.3
+"""Standard deviation of a perfect outline, in pixels: the body covers exactly the centres of the mask's pixels."""
+OUTLIER = 5.0
+PLANE_SIGMA, REST_SIGMA = 0.001, 0.05
+VOLUME_PRICE = 2.0
+REAL_WEIGHT = 100.0
+"""Model errors of neighbouring pixels are alike: an object on a table counts as so many independent rays."""
+
+
+class Search:
+    """One search; ``best`` is the best body so far, ``scene`` and ``rays`` belong to its last stage."""
+
+    def __init__(self, observation: Observation, options: Options, began: float) -> None:
+        self.observation = observation
+        self.options = options
+        self.began = began
+        self.limits = options.bounds.limits(observation.points)
+        self.scene = _scene(observation, options)
+        self.best: State | None = None
+        self.rays = np.empty((0, RAY_COLUMNS))
+        self.free = np.empty((0, RAY_COLUMNS))
+
+    def run(self, given: list[State]) -> State:
+        """The best body from the given starts and, as far as needed, from automatic ones."""
+        if given:
+            self._select(self._coarse(given), FINALISTS)
+        if not given or (self.options.fall_back and not self._good_enough()):
+            self._select(self._automatic(), FINALISTS)
+            if not self._good_enough() and self.options.plane is None and not self._late():
+                self._select(self._coarse(self._everything()), ESCALATED_FINALISTS)
+        assert self.best is not None
+        return self._polished(self.best)
+
+    # Starts
+
+    def _automatic(self) -> list[State]:
+        found: list[State] = []
+        for tier in self._tiers():
+            found += self._coarse(tier)
+            found.sort(key=lambda state: state.cost)
+            if found[0].cost < COARSE_GATE * self._weight(COARSE_RAYS) or self._late():
+                break
+        return found
+
+    def _tiers(self) -> list[list[State]]:
+        """Groups of starts, in the order in which to try them."""
+        points = self.observation.points
+        if self.options.plane is not None:
+            return [box_start.on_plane(points, self.options.plane) + box_start.principal(points)]
+        completed = symmetry_start.completed_moments(self.observation)
+        if completed is None:
+            return [box_start.principal(points)]
+        centre, moments = completed
+        axes = symmetry_start.principal_axes(moments)
+        tiers = [symmetry_start.states(centre, moments, axes)]
+        tiers += [symmetry_start.states(centre, moments, turned) for turned in symmetry_start.eighth_turns(axes)]
+        return tiers
+
+    def _everything(self) -> list[State]:
+        """All starts at once, for images on which the first ones failed."""
+        found = box_start.principal(self.observation.points)
+        completed = symmetry_start.completed_moments(self.observation)
+        if completed is None:
+            return found
+        centre, moments = completed
+        axes = symmetry_start.principal_axes(moments)
+        deeper = centre + np.array([0.0, 0.0, 0.5 * math.sqrt(float(np.trace(moments)) / 3)])
+        for middle in (centre, deeper):
+            for exponent in (0.3, 0.8):
+                for turned in [axes, *symmetry_start.eighth_turns(axes), *symmetry_start.double_turns(axes)]:
+                    found += symmetry_start.states(middle, moments, turned, exponent)
+        return found
+
+    # Stages
+
+    def _draw(self, count: int, offset: float) -> tuple[np.ndarray, np.ndarray]:
+        """Object and free rays for one stage."""
+        rays = draw(self.observation.object_rays, count, offset)
+        free = draw(self.observation.free_rays, int(FREE_SHARE * count), offset)
+        if self.options.tolerated > 0:
+            pixels = len(self.observation.object_rays)
+            rays[:, 6] = REAL_WEIGHT / len(rays)
+            if len(free):
+                free[:, 6] = REAL_WEIGHT / pixels * self.observation.free_pixels / len(free)
+        return rays, free
+
+    def _weight(self, count: int) -> float:
+        """Total weight of the object rays that a stage draws: its cost at the noise floor."""
+        if self.options.tolerated > 0:
+            return REAL_WEIGHT
+        return float(min(count, len(self.observation.object_rays)))
+
+    def _coarse(self, states: list[State]) -> list[State]:
+        rays, free = self._draw(COARSE_RAYS, 0.5)
+        found = []
+        for state in states:
+            found.append(minimize(SAMPSON, rays, free, self.scene, state, self.limits, COARSE_STEPS, TOLERANCE))
+            if self._late():
+                break
+        return found
+
+    def _select(self, candidates: list[State], finalists: int) -> None:
+        """Refine the best candidates; the winner becomes ``best`` if it beats what is there."""
+        for stage, steps in ((SAMPSON, BASIN_STEPS), (RENDERED, BASIN_STEPS)):
+            candidates = self._rivals(candidates)[:finalists]
+            rays, free = self._draw(BASIN_RAYS, 0.7)
+            candidates = [
+                minimize(stage, rays, free, self.scene, candidate, self.limits, steps, TOLERANCE)
+                for candidate in candidates
+            ]
+        winner = min(candidates, key=lambda state: state.cost)
+        if self.best is None or winner.cost < self.best.cost:
+            self.best = winner
+
+    def _rivals(self, candidates: list[State]) -> list[State]:
+        """Candidates, best first, without those that the noise cannot have made worse than the best."""
+        ranked = sorted(candidates, key=lambda state: state.cost)
+        least = ranked[0].cost
+        doubt = DOUBT * math.sqrt(2 * self._weight(COARSE_RAYS))
+        return [state for state in ranked if state.cost <= least + max(doubt, (RIVAL - 1) * abs(least))]
+
+    def _polished(self, state: State) -> State:
+        """The last stage, on the full budget of rays."""
+        count = self.options.pixels or self._enough()
+        self.rays, self.free = self._draw(count, 0.3)
+        if self.options.tolerated == 0:
+            self.rays = self._without_outliers(self.rays, state)
+            self.scene = self.scene._replace(outline_stiffness=1 / self._outline_sigma(state))
+        return minimize(
+            RENDERED,
+            self.rays,
+            self.free,
+            self.scene,
+            state,
+            self.limits,
+            self.options.max_iterations,
+            FINAL_TOLERANCE,
+        )
+
+    def _enough(self) -> int:
+        """Rays that bring the noise of the mean well below a pixel's width."""
+        ratio = self.observation.noise / self.observation.footprint
+        return int(np.clip(FINAL_RAYS * (ratio / 0.3) ** 2, FINAL_RAYS, MOST_FINAL_RAYS))
+
+    def _without_outliers(self, rays: np.ndarray, state: State) -> np.ndarray:
+        """The rays whose points lie near the surface, as seen by the majority."""
+        distance = surface_distance(rays, state.parameters, state.rotation)
+        spread = max(self.observation.noise, 1.4826 * float(np.median(distance)))
+        return rays[distance < OUTLIER * spread]
+
+    def _outline_sigma(self, state: State) -> float:
+        """Standard deviation of the outline, metres, from how far the body reaches into free rays beside the mask."""
+        sharp = SHARP_OUTLINE * self.observation.footprint
+        if len(self.free) == 0:
+            return sharp
+        depth = penetration(self.free, self.scene, state.parameters, state.rotation)
+        reached = depth[depth > 0]
+        if len(reached) < 3:
+            return sharp
+        return max(sharp, float(np.sqrt(np.mean(reached**2))))
+
+    # Verdicts
+
+    def _good_enough(self) -> bool:
+        return self.best is not None and self.best.cost < FINAL_GATE * self._weight(BASIN_RAYS)
+
+    def _late(self) -> bool:
+        return time.perf_counter() - self.began > self.options.time_budget
+
+
+def _scene(observation: Observation, options: Options) -> Scene:
+    """The constants that the residuals share, for all but the last stage."""
+    pinhole = 1.0 if observation.camera.is_pinhole else 0.0
+    outline = max(observation.noise, observation.footprint, options.tolerated)
+    scene = Scene(pinhole=pinhole, outline_stiffness=1 / outline)
+    if options.plane is None:
+        return scene
+    x, y, z, offset = (float(value) for value in options.plane)
+    return scene._replace(
+        huber=2.0,
+        normal_x=x,
+        normal_y=y,
+        normal_z=z,
+        offset=offset,
+        plane_stiffness=1 / PLANE_SIGMA,
+        rest_stiffness=1 / REST_SIGMA,
+        volume_price=VOLUME_PRICE,
+    )
