@@ -1,15 +1,18 @@
 """The life of a node's process: start, spin, stop, each without a traceback.
 
 Exit code 0 after Ctrl-C or SIGTERM, whether it comes once, twice, or while the node still starts; 1 with one line of
-explanation where the node cannot start.
+explanation where the node cannot start.  The shipped Fast DDS profile is used unless the user has chosen one.
 """
 
 from __future__ import annotations
 
+import os
 import signal
 from collections.abc import Callable, Sequence
 from types import FrameType
 from typing import TYPE_CHECKING
+
+from sq_perception.nodes import fast_dds
 
 if TYPE_CHECKING:
     from sq_perception.nodes.stoppable_node import StoppableNode
@@ -42,6 +45,7 @@ def run(name: str, create: Callable[[], StoppableNode], arguments: Sequence[str]
     try:
         import rclpy
 
+        os.environ.update(fast_dds.additions())
         rclpy.init(args=None if arguments is None else list(arguments))
         node = create()
         stop.starting = False
