@@ -135,6 +135,10 @@ class Children:
         """The first one that has ended by itself, if any."""
         return next((child for child in self._running if child.exit_code is not None), None)
 
+    def words(self) -> str:
+        """What the nodes said last, for a report."""
+        return "\n".join(f"[{child.name}] {line}" for child in self._running for line in child.last_lines(8))
+
     def until_stopped(self) -> int:
         """Wait for Ctrl-C or SIGTERM (0), or for a node that ends by itself (its exit code)."""
         with interruptible():

@@ -30,7 +30,7 @@ def profile_path() -> Path:
 
 
 def additions(base: Mapping[str, str] | None = None) -> dict[str, str]:
-    """What to add to the environment ``base`` (os.environ by default): the shipped profile, or nothing if it names one."""
+    """What ``base`` (os.environ by default) lacks: the variable of the shipped profile, or nothing if it names one."""
     present = os.environ if base is None else base
     return {} if any(present.get(name) for name in VARIABLES) else {VARIABLES[0]: str(profile_path())}
 

@@ -1,0 +1,50 @@
+"""recover_node, and fitter_node if asked for, on the topics of a depth camera.
+
+ros2 launch sq_perception recover.launch.py depth:=/camera/camera/depth/image_rect_raw \
+    camera_info:=/camera/camera/depth/camera_info
+"""
+
+from __future__ import annotations
+
+from launch import LaunchContext, LaunchDescription
+from launch.actions import DeclareLaunchArgument, OpaqueFunction, SetEnvironmentVariable
+from launch.substitutions import LaunchConfiguration
+from launch_ros.actions import Node
+
+from sq_perception.nodes import fast_dds
+
+ARGUMENTS = {
+    "depth": ("depth/image", "topic of the depth images"),
+    "camera_info": ("depth/camera_info", "topic of their camera_info"),
+    "mask": ("mask/image", "topic of label images with the same stamps, if there are any"),
+    "params_file": ("", "YAML file of parameters, like the one in share/sq_perception/config"),
+    "fitter": ("false", "also start fitter_node, the classic method"),
+}
+
+
+def generate_launch_description() -> LaunchDescription:
+    """Called by ros2 launch."""
+    declared = [DeclareLaunchArgument(name, default_value=value, description=text)
+                for name, (value, text) in ARGUMENTS.items()]  # fmt: skip
+    profile = [SetEnvironmentVariable(name, value) for name, value in fast_dds.additions().items()]
+    return LaunchDescription([*declared, *profile, OpaqueFunction(function=_nodes)])
+
+
+def _nodes(context: LaunchContext) -> list[Node]:
+    given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
+    executables = ["recover_node"] + ["fitter_node"] * (given["fitter"].lower() in ("true", "1", "yes"))
+    return [
+        Node(
+            package="sq_perception",
+            executable=executable,
+            name=executable,
+            output="screen",
+            parameters=[given["params_file"]] if given["params_file"] else [],
+            remappings=[
+                ("depth/image", given["depth"]),
+                ("depth/camera_info", given["camera_info"]),
+                ("mask/image", given["mask"]),
+            ],
+        )
+        for executable in executables
+    ]
