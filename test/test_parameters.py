@@ -1,0 +1,149 @@
+"""Parameters: descriptors say what the checks do, and the shipped YAML files hold the defaults."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import fields
+from typing import Any
+
+import pytest
+import yaml
+
+pytest.importorskip("rclpy", reason="needs the extra 'ros'")
+
+from rclpy.context import Context
+from rclpy.node import Node
+from rclpy.parameter import Parameter
+
+from sq_perception.nodes.parameters import (
+    FitterParameters,
+    LiveParameters,
+    ParameterError,
+    RecoverParameters,
+    SyntheticParameters,
+    as_ros,
+    checked,
+    describe,
+)
+
+KINDS = {
+    "recover_node": RecoverParameters,
+    "fitter_node": FitterParameters,
+    "synthetic_depth_node": SyntheticParameters,
+}
+
+
+@pytest.fixture(scope="module")
+def context() -> Iterator[Context]:
+    one = Context()
+    one.init()
+    yield one
+    one.try_shutdown()
+
+
+@pytest.fixture
+def make_node(context: Context) -> Iterator[Any]:
+    nodes = []
+
+    def make(**overrides: Any) -> Node:
+        node = Node(
+            f"parameters_{len(nodes)}",
+            context=context,
+            start_parameter_services=False,
+            parameter_overrides=[Parameter(name, value=value) for name, value in overrides.items()],
+        )
+        nodes.append(node)
+        return node
+
+    yield make
+    for node in nodes:
+        node.destroy_node()
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_the_shipped_file_holds_every_parameter_with_its_default(name, repository):
+    with open(repository / "config" / f"{name}.yaml", encoding="utf-8") as file:
+        content = yaml.safe_load(file)
+    assert content == {"/**": {"ros__parameters": as_ros(KINDS[name]())}}
+
+
+@pytest.mark.parametrize("kind", KINDS.values())
+def test_every_parameter_explains_itself_and_accepts_its_default(kind):
+    for one in fields(kind):
+        descriptor = describe(one)
+        assert descriptor.name == one.name
+        assert len(descriptor.description) > 10
+        assert descriptor.read_only != one.metadata["live"]
+        assert checked(one, one.default) == one.default
+        if one.metadata["within"]:
+            low, high = one.metadata["within"]
+            assert (descriptor.integer_range or descriptor.floating_point_range)[0].to_value == high
+            kept = type(one.default)
+            assert checked(one, kept(low)) == low
+            assert checked(one, kept(high)) == high
+            for outside in (kept(low) - 1, kept(high) + 1):
+                with pytest.raises(ParameterError, match=f"{one.name}: expected"):
+                    checked(one, outside)
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf"), -1.0, 0, 1e9, "3", True, None, [1.0]])
+def test_s_refuses_what_is_no_sharpness(value):
+    (s,) = (one for one in fields(RecoverParameters) if one.name == "s")
+    with pytest.raises(ParameterError, match="s: expected"):
+        checked(s, value)
+
+
+def test_changes_arrive_as_a_whole_and_integers_pass_as_floats(make_node):
+    node = make_node(tau=2, model="weights.safetensors")
+    live = LiveParameters(node, RecoverParameters)
+    before = live.current
+    assert (before.s, before.tau, before.model) == (117.3, 2.0, "weights.safetensors")
+    result = node.set_parameters_atomically([Parameter("s", value=3), Parameter("tau", value=1.5)])
+    assert result.successful
+    assert (live.current.s, live.current.tau) == (3.0, 1.5)
+    assert isinstance(live.current.s, float)
+    assert (before.s, before.tau) == (117.3, 2.0)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"s": -1}, "0.1 to 1000"),
+        ({"s": -1.0}, "out of range"),
+        ({"s": float("nan")}, "s"),
+        ({"s": "sharp"}, "s: expected a value like 117.3"),
+        ({"refine": "maybe"}, "surface, soft_render, none"),
+        ({"max_objects": 0}, "out of range"),
+        ({"depth_max": 0.5, "depth_min": 0.6}, "depth_min < depth_max"),
+        ({"model": "other"}, "read-only"),
+        ({"projection": "orthographic"}, "read-only"),
+        ({"marker_alpha": 2}, "0 to 1"),
+        ({"s": 5.0, "tau": -1}, "tau"),
+    ],
+)
+def test_a_refused_change_changes_nothing_and_says_why(make_node, changes, words):
+    node = make_node()
+    live = LiveParameters(node, RecoverParameters)
+    before = live.current
+    result = node.set_parameters_atomically([Parameter(name, value=value) for name, value in changes.items()])
+    assert not result.successful
+    assert words in result.reason
+    assert live.current == before == RecoverParameters()
+
+
+@pytest.mark.parametrize(
+    ("kind", "overrides", "words"),
+    [
+        (RecoverParameters, {"s": 1e6}, "s"),
+        (RecoverParameters, {"projection": "fisheye"}, "pinhole, orthographic"),
+        (RecoverParameters, {"model": 3}, "model"),
+        (RecoverParameters, {"depth_min": 2.0, "depth_max": 1.0}, "depth_min < depth_max"),
+        (SyntheticParameters, {"scene": "replay"}, "path"),
+        (SyntheticParameters, {"scene": "thesis", "encoding": "32FC1"}, "mono8 or mono16"),
+        (SyntheticParameters, {"scene": "table", "encoding": "mono8"}, "16UC1 or 32FC1"),
+        (SyntheticParameters, {"rate": 0}, "rate: expected 0.1 to 200 Hz, got 0"),
+    ],
+)
+def test_a_bad_start_is_refused_with_a_reason(make_node, kind, overrides, words):
+    with pytest.raises(ParameterError, match=words):
+        LiveParameters(make_node(**overrides), kind)
