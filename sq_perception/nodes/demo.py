@@ -1,8 +1,8 @@
 """The demonstration: a synthetic or recorded camera, recover_node and fitter_node as processes, and a live table.
 
 The processes talk in a ROS domain of their own on this machine only, unless ROS_DOMAIN_ID or
-ROS_AUTOMATIC_DISCOVERY_RANGE say otherwise, and use the shipped Fast DDS profile.  At the end the last complete image is
-drawn to demo.png and its bodies are written to demo.glb.
+ROS_AUTOMATIC_DISCOVERY_RANGE say otherwise, and use the shipped Fast DDS profile.  At the end the last complete image
+is drawn to demo.png and its bodies are written to demo.glb.
 
 Exit codes: 0 shown, or stopped with Ctrl-C; 1 a node failed or nothing came; 2 wrong usage or an unreadable frame.
 """
@@ -33,6 +33,7 @@ from sq_perception.evaluation.plots import save
 from sq_perception.geometry.mesh import export
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
+from sq_perception.imaging.camera import Projection
 from sq_perception.imaging.segmentation import segment
 from sq_perception.nodes import demo_table, fast_dds
 from sq_perception.nodes.children import Children, interruptible, parameter_arguments
@@ -138,19 +139,19 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _camera(frame: Path | None, camera_info: Path | None, projection: str | None) -> dict[str, Any]:
+def _camera(frame: Path | None, camera_info: Path | None, projection: Projection | None) -> dict[str, Any]:
     """Parameters of the synthetic camera; a frame is read once, so that what is wrong with it is said at once."""
-    common = {"rate": _RATE, "projection": projection or "pinhole"}
     if frame is None:
         scene = "thesis" if projection == "orthographic" else "table"
-        return {**common, "scene": scene, "objects": 3, "hold": int(3 * _RATE), "seed": 7}
-    if projection is None and _is_grey(frame):
-        common["projection"] = "orthographic"
-    read(frame, camera_info, common["projection"])
+        own = {"scene": scene, "projection": projection or "pinhole", "objects": 3, "hold": int(3 * _RATE), "seed": 7}
+        return {"rate": _RATE, **own}
+    if projection is None:
+        projection = "orthographic" if _is_grey(frame) else "pinhole"
+    read(frame, camera_info, projection)
     files = {"path": str(frame.resolve())}
     if camera_info is not None:
         files["camera_info_file"] = str(camera_info.resolve())
-    return {**common, "scene": "replay", **files}
+    return {"rate": _RATE, "scene": "replay", "projection": projection, **files}
 
 
 def _is_grey(frame: Path) -> bool:

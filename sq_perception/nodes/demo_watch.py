@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections import OrderedDict
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from rclpy.node import Node
@@ -60,9 +61,7 @@ class Watch(Node):
         self.create_subscription(Image, "depth/image", self._on_image, fast)
         self.create_subscription(PointCloud2, f"{TRUTH}/truth", self._on_truth, fast)
         for name in RESULTS:
-            self.create_subscription(
-                PointCloud2, f"{name}/superquadrics", lambda message, name=name: self._on_result(name, message), 10
-            )
+            self.create_subscription(PointCloud2, f"{name}/superquadrics", partial(self._on_result, name), 10)
 
     def frame(self, shot: Shot) -> Frame:
         """The decoded depth image of a complete shot.

@@ -1,0 +1,115 @@
+"""colcon builds the workspace, and what it installs is what ROS tools look for."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("colcon_core", reason="colcon is missing: install the extra 'test'")
+catkin_package = pytest.importorskip("catkin_pkg.package", reason="catkin_pkg is missing: install the extra 'test'")
+
+PACKAGE = "sq_perception"
+EXECUTABLES = ("recover_node", "fitter_node", "synthetic_depth_node", "sq-perception")
+
+
+@pytest.fixture(scope="module")
+def install(source_copy: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The install folder of a workspace with this package in src/."""
+    workspace = tmp_path_factory.mktemp("workspace")
+    shutil.copytree(source_copy, workspace / "src" / PACKAGE)
+    environment = {**os.environ, "COLCON_HOME": str(workspace / "home"), "COLCON_LOG_LEVEL": "30"}
+    environment["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
+    result = subprocess.run(
+        [sys.executable, "-m", "colcon", "build", "--base-paths", "src", "--executor", "sequential"],
+        cwd=workspace,
+        env=environment,
+        capture_output=True,
+        text=True,
+        timeout=300,
+    )
+    assert result.returncode == 0, result.stdout + result.stderr
+    assert f"Finished <<< {PACKAGE}" in result.stdout
+    return workspace / "install"
+
+
+def sourced(install: Path, command: list[str], cwd: Path) -> subprocess.CompletedProcess[str]:
+    """A command in a shell that has sourced the workspace."""
+    environment = {**os.environ, "PATH": os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])}
+    script = '. "$0/local_setup.sh" && exec "$@"'
+    return subprocess.run(
+        ["sh", "-c", script, str(install), *command],
+        cwd=cwd,
+        env={**environment, "COLCON_CURRENT_PREFIX": str(install)},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+
+
+def test_package_xml_is_well_formed(repository: Path) -> None:
+    """An invalid e-mail makes colcon treat the package as plain Python, without a word."""
+    package = catkin_package.parse_package(str(repository / "package.xml"))
+    package.validate()
+    assert package.name == PACKAGE
+    assert package.get_build_type() == "ament_python"
+    assert package.licenses == ["Apache-2.0"]
+    assert all("@" in person.email for person in package.maintainers)
+
+
+def test_versions_agree(repository: Path) -> None:
+    import sq_perception
+
+    package = catkin_package.parse_package(str(repository / "package.xml"))
+    assert package.version == sq_perception.__version__
+    assert f'version="{package.version}"' in (repository / "setup.py").read_text(encoding="utf-8")
+
+
+def test_executables_are_where_ros2_run_looks(install: Path) -> None:
+    for name in EXECUTABLES:
+        path = install / PACKAGE / "lib" / PACKAGE / name
+        assert os.access(path, os.X_OK), path
+        assert path.read_text(encoding="utf-8").startswith("#!/usr/bin/env python3\n"), "misses virtual environments"
+
+
+def test_share_is_complete(install: Path) -> None:
+    share = install / PACKAGE / "share"
+    assert (share / "ament_index/resource_index/packages" / PACKAGE).is_file()
+    for name in (
+        "package.xml",
+        "launch/recover.launch.py",
+        "launch/synthetic.launch.py",
+        "launch/recover.py",
+        "launch/synthetic.py",
+        "config/fast_dds.xml",
+    ):
+        assert (share / PACKAGE / name).is_file(), name
+    assert list((share / PACKAGE / "config").glob("*.yaml"))
+
+
+def test_the_sourced_workspace_is_on_the_ament_path(install: Path, tmp_path: Path) -> None:
+    result = sourced(install, ["sh", "-c", "echo $AMENT_PREFIX_PATH"], tmp_path)
+    assert str(install / PACKAGE) in result.stdout.strip().split(os.pathsep), result.stderr
+
+
+def test_the_built_package_is_the_one_that_runs(install: Path, tmp_path: Path) -> None:
+    code = "import sq_perception, sq_msgs_py; print(sq_perception.__file__); print(sq_msgs_py.__file__)"
+    result = sourced(install, ["python3", "-c", code], tmp_path)
+    assert result.stdout.count(str(install)) == 2, result.stdout + result.stderr
+
+
+def test_executables_run(install: Path, tmp_path: Path) -> None:
+    library = install / PACKAGE / "lib" / PACKAGE
+    result = sourced(install, [str(library / "sq-perception"), "--help"], tmp_path)
+    assert result.returncode == 0, result.stderr
+    assert "recover" in result.stdout
+    pytest.importorskip("rclpy", reason="rclpy missing: install the extra 'ros' or source ROS 2")
+    for node, bad in (("recover_node", "max_objects:=0"), ("synthetic_depth_node", "rate:=-1.0")):
+        result = sourced(install, [str(library / node), "--ros-args", "-p", bad], tmp_path)
+        said = result.stdout + result.stderr
+        assert result.returncode == 1, said
+        assert bad.split(":=")[0] in said
