@@ -1,7 +1,7 @@
 """Recovered bodies beside true ones: who is whom, and in comparable numbers.
 
-Bodies are paired so that the sum of the distances of their centres is least; a pair farther apart than the true body's
-largest half size is none.  Of the 8 parameter vectors of one body, the one most like the truth is shown:
+Bodies are paired so that the sum of the distances of their centres is least; a pair farther apart than the sum of their
+largest half sizes is none.  Of the 8 parameter vectors of one body, the one most like the truth is shown:
 
     least  | log size - log true size | + angle between the rotations      (natural logarithm, radians)
 """
@@ -40,7 +40,7 @@ def pair(truth: Superquadric, recovered: Superquadric, resolution: int = 48) -> 
     distance = np.linalg.norm(truth.translation[:, None] - recovered.translation[None], axis=-1)
     partner: dict[int, int] = {}
     for i, k in zip(*linear_sum_assignment(distance), strict=True):
-        if distance[i, k] <= truth.size[i].max():
+        if distance[i, k] <= truth.size[i].max() + recovered.size[k].max():
             partner[int(i)] = int(k)
     overlap: dict[int, float] = {}
     if partner:

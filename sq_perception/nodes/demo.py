@@ -254,7 +254,7 @@ def draw(watch: Watch, shot: Shot, folder: Path) -> tuple[Path, Path | None]:
         remark = f"mean IoU {100 * np.mean(overlaps):.1f} %, " if overlaps else ""
         methods.append((title, ordered, f"{remark}{shot.latency[name]:.0f} ms after the stamp"))
     plane = None if frame.is_cube else segment(frame.depth, frame.camera).plane
-    heading = "Superquadrics recovered from one depth image" + (", truth as wires" if len(truth) else "")
+    heading = "Superquadrics recovered from one depth image"
     picture = save(
         demo_figure(frame.depth, frame.camera, list(truth), methods, plane, heading, unit), folder / "demo.png"
     )
