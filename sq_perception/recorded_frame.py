@@ -2,12 +2,14 @@
 
 | file | needs | depth |
 | --- | --- | --- |
-| ``.npz`` | ``depth`` float (h, w) and ``K`` (3, 3); optional ``labels`` (h, w), ``plane`` (4,) | metres, NaN = nothing |
+| ``.npz`` | ``depth`` float (h, w), ``K`` (3, 3) | metres, NaN = nothing |
 | 16 bit ``.png`` | a camera_info YAML | millimetres, 0 = nothing |
-| 8 or 16 bit ``.png``, ``.bmp``, orthographic | nothing | the thesis' grey images, :mod:`sq_perception.imaging.unit_cube` |
-| ``.npz``, orthographic | ``depth`` | depth in the unit cube, 1 - z; NaN = nothing |
+| 8 or 16 bit ``.png``, ``.bmp``, orthographic | nothing | grey values of the cube, 0 = nothing |
+| ``.npz``, orthographic | ``depth`` | depth in the cube, 1 - z; NaN = nothing |
 
-An NPZ may say so itself in a text field ``projection``.  Nothing in a file is executed: no pickle, safe YAML only.
+The cube is the thesis' unit cube, :mod:`sq_perception.imaging.unit_cube`.  An NPZ may bring ``labels`` (h, w), a
+support ``plane`` (4,), and the text "orthographic" as ``projection``, which goes before what the caller says.  Nothing
+in a file is executed: no pickle, safe YAML only.
 """
 
 from __future__ import annotations

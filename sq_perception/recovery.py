@@ -9,9 +9,9 @@
 | network | the network alone | ignored |
 | classic | Solina and Bajcsy's fit to the points | ignored |
 
-``refine="surface"`` is the exact surface fit.  ``"soft_render"`` descends on the soft-rendered depth (L_DR) instead, from
-the network's prediction for ``auto`` and after the fit for ``symmetry``.  ``"none"`` leaves the network's prediction as it
-is; ``symmetry`` has no body without its fit and ignores it.
+``refine="surface"`` is the exact surface fit.  ``"soft_render"`` descends on the soft-rendered depth (L_DR) instead,
+from the network's prediction for ``auto`` and after the fit for ``symmetry``.  ``"none"`` leaves the network's
+prediction as it is; ``symmetry`` has no body without its fit and ignores it.
 
 Everything is metres in the optical frame.  A hard image is no error: an object without a body is listed with
 ``Status.FAILED``, score 0 and, in place of a body, an ellipsoid around its visible points.
@@ -45,8 +45,9 @@ Refine = Literal["surface", "soft_render", "none"]
 
 _VIEW_PIXELS = 64
 _SCORE_STRIDE = 3
-"""22 x 22 lines of sight of 64 voxels: just too few for torch to spread over threads, which costs more than it saves."""
+"""22 x 22 lines of sight of 64 voxels: few enough for torch not to spread them over threads, which would cost more."""
 _FEWEST_PIXELS = 12
+_UNKNOWN = np.full((11, 11), np.nan)
 _CLASSIC_POINTS = 2000
 _NEEDS_NETWORK = ("auto", "network")
 _HARD_IMAGE = (ValueError, ArithmeticError, np.linalg.LinAlgError)
@@ -71,6 +72,8 @@ class RecoveryOptions:
         Smaller objects are ignored; None: 0.05 % of the image for own masks, any size for masks from outside.
     use_plane
         Let the fit know the support plane.
+    time_budget
+        Seconds per object after which the surface fit tries no further start.
 
     Raises
     ------
@@ -86,6 +89,7 @@ class RecoveryOptions:
     max_objects: int = 20
     min_pixels: int | None = None
     use_plane: bool = True
+    time_budget: float = np.inf
 
     def __post_init__(self) -> None:
         for name, value, known in (("method", self.method, Method), ("refine", self.refine, Refine)):
@@ -94,6 +98,8 @@ class RecoveryOptions:
         for name, number in (("sharpness", self.sharpness), ("tau", self.tau)):
             if not (np.isfinite(number) and number > 0):
                 raise ValueError(f"{name}: expected a positive number, got {number}")
+        if not self.time_budget > 0:
+            raise ValueError(f"time_budget: expected a positive number of seconds, got {self.time_budget}")
         if self.min_pixels is not None and self.min_pixels < 1:
             raise ValueError(f"min_pixels: expected at least 1, got {self.min_pixels}")
         self.segmentation_options()
@@ -176,8 +182,8 @@ class Recoverer:
     device
         Of the network: "cpu", "cuda" ...
     method
-        What :meth:`recover` does unless its options say otherwise.  "symmetry" and "classic" load no network; if a later
-        call asks for one, it is loaded then.
+        What :meth:`recover` does unless its options say otherwise.  "symmetry" and "classic" load no network; if a
+        later call asks for one, it is loaded then.
 
     Raises
     ------
@@ -391,18 +397,23 @@ def _body(
         return _unfitted(predicted, one, "prediction of the network, not refined")
     if options.method == "auto" and options.refine == "soft_render" and predicted is not None:
         return _soft_rendered(predicted, one, options)
-    fit = _surface_fit(predicted, one, depth, camera, plane)
+    fit = _surface_fit(predicted, one, depth, camera, plane, options.time_budget)
     if options.refine == "soft_render" and fit.status != Status.FAILED:
         return _soft_rendered(fit.superquadric, one, options)
     return fit
 
 
 def _surface_fit(
-    predicted: Superquadric | None, one: _Object, depth: np.ndarray, camera: Camera, plane: np.ndarray | None
+    predicted: Superquadric | None,
+    one: _Object,
+    depth: np.ndarray,
+    camera: Camera,
+    plane: np.ndarray | None,
+    time_budget: float,
 ) -> Fit:
     """From the network's prediction, joined by the automatic starts where that one stays above the noise."""
-    start = "auto" if predicted is None else predicted
-    return surface_fit.fit(depth, one.mask, camera, start=start, options=surface_fit.Options(plane=plane))
+    settings = surface_fit.Options(plane=plane, time_budget=time_budget)
+    return surface_fit.fit(depth, one.mask, camera, start="auto" if predicted is None else predicted, options=settings)
 
 
 def _soft_rendered(start: Superquadric, one: _Object, options: RecoveryOptions) -> Fit:
@@ -418,9 +429,7 @@ def _unfitted(body: Superquadric, one: _Object, message: str) -> Fit:
     """The answer of a method that is no least squares fit: distances measured, nothing known about uncertainty."""
     distance = body.sampson_distance(one.points)
     residual = float(np.sqrt(np.mean(distance**2)))
-    return Fit(
-        body, residual, np.nan, np.nan, np.full((11, 11), np.nan), Status.CONVERGED, message, iterations=0, milliseconds=0.0
-    )
+    return Fit(body, residual, np.nan, np.nan, _UNKNOWN, Status.CONVERGED, message, iterations=0, milliseconds=0.0)
 
 
 def _failed(one: _Object, reason: str) -> Fit:
@@ -428,7 +437,7 @@ def _failed(one: _Object, reason: str) -> Fit:
     low, high = points.min(axis=0), points.max(axis=0)
     size = np.maximum(0.5 * (high - low), 1e-3 * max(float((high - low).max()), 1e-3))
     body = Superquadric(size, np.ones(2), 0.5 * (low + high), np.array([0.0, 0.0, 0.0, 1.0]))
-    return Fit(body, np.nan, np.nan, 0.0, np.full((11, 11), np.nan), Status.FAILED, reason, iterations=0, milliseconds=0.0)
+    return Fit(body, np.nan, np.nan, 0.0, _UNKNOWN, Status.FAILED, reason, iterations=0, milliseconds=0.0)
 
 
 def _score(view: CanonicalView | None, body: Superquadric, options: RecoveryOptions) -> float:

@@ -34,7 +34,8 @@ def test_random_bodies_are_watertight_convex_and_on_the_surface(seed):
     shape = rng.choice([0.01, 0.1, 0.37, 1.0, 1.3, 2.0], 2)
     one = Superquadric(size, shape, rng.normal(size=3), rotation.random(1, rng)[0])
     made = mesh(one, 16)
-    assert made.is_watertight and made.is_winding_consistent
+    assert made.is_watertight
+    assert made.is_winding_consistent
     assert made.volume > 0
     assert made.euler_number == 2
     np.testing.assert_allclose(one.gauge(made.vertices), 1, atol=1e-9)

@@ -48,11 +48,14 @@ def test_npz_with_labels_and_plane(tmp_path):
     labels[10:20, 10:20] = 7
     frame = read(save_npz(tmp_path / "frame.npz", labels=labels, plane=np.array([0, -1, 0, 0.5])))
     assert frame.camera == Camera(64, 48, 60.0, 61.0, 31.5, 23.5)
-    assert frame.depth.dtype == np.float32 and frame.labels.dtype == np.int32
-    assert np.isnan(frame.depth[0, :3]).all() and np.isfinite(frame.depth).sum() == 48 * 64 - 3
+    assert frame.depth.dtype == np.float32
+    assert frame.labels.dtype == np.int32
+    assert np.isnan(frame.depth[0, :3]).all()
+    assert np.isfinite(frame.depth).sum() == 48 * 64 - 3
     assert set(np.unique(frame.labels)) == {0, 7}
     np.testing.assert_array_equal(frame.plane, [0, -1, 0, 0.5])
-    assert frame.name == "frame.npz" and not frame.is_cube
+    assert frame.name == "frame.npz"
+    assert not frame.is_cube
 
 
 def test_sixteen_bit_png_is_millimetres(tmp_path, info):
@@ -67,7 +70,7 @@ def test_sixteen_bit_png_is_millimetres(tmp_path, info):
 
 def test_a_printed_message_is_a_camera_info_too(tmp_path):
     path = tmp_path / "echo.yaml"
-    message = {"header": {"frame_id": "c"}, "width": 64, "height": 48, "d": [], "k": K.ravel().tolist(), "p": [0.0] * 12}
+    message = {"width": 64, "height": 48, "d": [], "k": K.ravel().tolist(), "p": [0.0] * 12}
     path.write_text(yaml.safe_dump(message) + "---\n")
     assert read_camera_info(path) == Camera(64, 48, 60.0, 61.0, 31.5, 23.5)
 
@@ -86,11 +89,12 @@ def test_a_distorted_camera_counts_as_rectified(tmp_path):
 
 @pytest.mark.parametrize("suffix", ["png", "bmp"])
 def test_grey_images_are_views_of_the_cube(tmp_path, suffix):
-    body = Superquadric(np.array([0.2, 0.15, 0.1]), np.array([0.5, 0.5]), np.full(3, 0.5), np.array([0.1, 0.2, 0.3, 0.9]))
+    body = Superquadric([0.2, 0.15, 0.1], [0.5, 0.5], [0.5, 0.5, 0.5], [0.1, 0.2, 0.3, 0.9])
     depth, _ = raycast.render(unit_cube.optical_from_cube(body), unit_cube.camera(64))
     cv2.imwrite(str(tmp_path / f"view.{suffix}"), unit_cube.grey_from_depth(depth))
     frame = read(tmp_path / f"view.{suffix}", projection="orthographic")
-    assert frame.is_cube and frame.camera == unit_cube.camera(64)
+    assert frame.is_cube
+    assert frame.camera == unit_cube.camera(64)
     np.testing.assert_array_equal(np.isfinite(frame.depth), np.isfinite(depth))
     seen = np.isfinite(depth)
     assert np.abs(frame.depth[seen] - depth[seen]).max() <= 0.5 / 255 + 1e-6
@@ -105,7 +109,8 @@ def test_an_orthographic_archive_says_so_itself(tmp_path):
     depth = np.full((32, 32), 0.5, np.float32)
     np.savez(tmp_path / "cube.npz", depth=depth, projection="orthographic")
     frame = read(tmp_path / "cube.npz")
-    assert frame.is_cube and frame.camera == unit_cube.camera(32)
+    assert frame.is_cube
+    assert frame.camera == unit_cube.camera(32)
 
 
 def test_grey_saved_as_colour_is_accepted_and_colour_is_not(tmp_path):
@@ -217,7 +222,10 @@ def test_bad_camera_infos_are_named(tmp_path, text, reason):
 def test_shared_recordings_are_read(shared_data):
     for path in sorted((shared_data / "frames").glob("*.npz")):
         frame = read(path)
-        assert frame.depth.shape == (480, 640) and frame.labels is not None and frame.labels.max() >= 1
+        assert frame.depth.shape == (480, 640)
+        assert frame.labels is not None
+        assert frame.labels.max() >= 1
     for path in sorted((shared_data / "author_renders").glob("*.bmp")):
         frame = read(path, projection="orthographic")
-        assert frame.depth.shape == (256, 256) and np.isfinite(frame.depth).any()
+        assert frame.depth.shape == (256, 256)
+        assert np.isfinite(frame.depth).any()

@@ -61,7 +61,8 @@ THREE = [
 
 
 def best_iou(mask, labels):
-    return max((np.sum(mask & (labels == k)) / np.sum(mask | (labels == k)) for k in range(1, labels.max() + 1)), default=0)
+    found = [labels == k for k in range(1, labels.max() + 1)]
+    return max((np.sum(mask & one) / np.sum(mask | one) for one in found), default=0)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.002])
@@ -108,7 +109,8 @@ def test_options_choose():
     assert segment(depth, CAMERA, SegmentationOptions(min_pixels=10**6)).ids == ()
     assert segment(depth, CAMERA, SegmentationOptions(depth_range=(5.0, 6.0))).ids == ()
     near = segment(depth, CAMERA, SegmentationOptions(depth_range=(0.0, 1.0)))
-    assert near.ids and np.nanmax(depth[near.labels > 0]) <= 1.0
+    assert near.ids
+    assert np.nanmax(depth[near.labels > 0]) <= 1.0
 
 
 @pytest.mark.parametrize(
@@ -125,7 +127,9 @@ def test_options_choose():
 )
 def test_nothing_to_find(depth):
     found = segment(depth, CAMERA)
-    assert found.ids == () and not found.labels.any() and found.labels.shape == depth.shape
+    assert found.ids == ()
+    assert not found.labels.any()
+    assert found.labels.shape == depth.shape
     np.testing.assert_array_equal(from_labels(np.zeros(depth.shape, int), depth, CAMERA).ids, ())
 
 
@@ -164,6 +168,16 @@ def test_orthographic_components():
     found = segment(np.where(np.isfinite(depth), depth, np.nan), camera)
     assert found.plane is None
     np.testing.assert_array_equal(found.labels, index + 1)
+
+
+@pytest.mark.parametrize("shape", [(0.1, 0.1), (0.1, 1.0), (1.0, 1.0)])
+@pytest.mark.parametrize("turn", range(4))
+def test_a_lone_body_is_no_table(shape, turn):
+    body = Superquadric([0.08, 0.06, 0.1], shape, [0, 0, 0.7], rotation.random(4, np.random.default_rng(5))[turn])
+    depth, index = raycast.render(body, CAMERA)
+    found = segment(np.where(np.isfinite(depth), depth, np.nan), CAMERA)
+    assert found.plane is None
+    assert best_iou(index >= 0, found.labels) > 0.95
 
 
 def test_labels_from_outside_win():

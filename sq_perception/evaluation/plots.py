@@ -1,11 +1,12 @@
 """Pictures of recoveries: the depth image, masks, reprojected outlines, and the bodies in 3D.
 
-Drawing functions take a Matplotlib axes; figures are made with the object interface and the Agg canvas, so that nothing
-here touches a display or a global state.  Images are in pixels with centres at integers, bodies in the optical frame.  3D views are
-rendered by the same ray casting as depth images, upright along the support plane's normal where one is known.
+Drawing functions take a Matplotlib axes; figures are made with the object interface and the Agg canvas, so that
+nothing here touches a display or a global state.  Images are in pixels with centres at integers, bodies in the optical
+frame.  3D views are rendered by the same ray casting as depth images, upright along the support plane's normal where
+one is known.
 
-The silhouette of a body is drawn exactly, from its rendering.  Its edges (:func:`sq_perception.geometry.mesh.outline`) are
-solid where the camera sees them: on a convex body, where the normal points towards the camera.
+The silhouette of a body is drawn exactly, from its rendering.  Its edges (:func:`sq_perception.geometry.mesh.outline`)
+are solid where the camera sees them: on a convex body, where the normal points towards the camera.
 """
 
 from __future__ import annotations
@@ -33,10 +34,11 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.recovery import FrameRecovery
 
 INK = "#22303c"
+WIRE = "#d1006c"
 _FAINT = "#8a97a3"
 _NOTHING = "#1b2129"
 _DEPTH_MAP = LinearSegmentedColormap.from_list("depth", ["#f4f6f7", "#c3ced6", "#8b9dab", "#566a7b", "#36475a"])
-_FINER = 4
+_CONTOUR_PIXELS = 1280
 _MOST_POINTS = 1500
 _LIGHT = np.array([-0.48, -0.72, -0.5]) / np.linalg.norm([-0.48, -0.72, -0.5])
 """Towards the light, in the frame of the picture: from the upper left, in front."""
@@ -55,7 +57,8 @@ def draw_depth(ax: Axes, depth: np.ndarray, limits: tuple[float, float] | None =
     finite = np.where(np.isfinite(depth), depth, np.nan)
     if limits is None:
         seen = finite[np.isfinite(finite)]
-        limits = (0.0, 1.0) if seen.size == 0 else tuple(np.quantile(seen, (0.02, 0.98)))  # type: ignore[assignment]
+        near, far = np.quantile(seen, (0.02, 0.98)) if seen.size else (0.0, 1.0)
+        limits = (float(near), float(far))
     shades = _DEPTH_MAP.with_extremes(bad=_NOTHING)
     span = max(limits[1] - limits[0], 1e-6)
     ax.imshow(finite, cmap=shades, vmin=limits[0], vmax=limits[0] + span, interpolation="nearest")
@@ -94,15 +97,15 @@ def draw_outlines(
         pixels = camera.project(segments)
         inside = np.isfinite(pixels).all(axis=(1, 2))
         seen = _faces_camera(body, segments.mean(axis=1), camera)
-        ax.add_collection(LineCollection(pixels[inside & seen], colors=[shade], linewidths=0.55 * width), autolim=False)
-        ax.add_collection(
-            LineCollection(pixels[inside & ~seen][::2], colors=[shade], linewidths=0.4 * width, alpha=0.6), autolim=False
-        )
+        solid = LineCollection(pixels[inside & seen], colors=[shade], linewidths=0.55 * width)
+        faint = LineCollection(pixels[inside & ~seen][::2], colors=[shade], linewidths=0.4 * width, alpha=0.6)
+        for lines in (solid, faint):
+            ax.add_collection(lines, autolim=False)
 
 
 def silhouettes(body: Superquadric, camera: Camera) -> list[np.ndarray]:
     """Closed outlines (n, 2) of a body in the image, in pixels; cut at the image's border, empty if out of sight."""
-    k = _FINER
+    k = max(1, _CONTOUR_PIXELS // max(camera.width, camera.height))
     fine = Camera(
         camera.width * k,
         camera.height * k,
@@ -128,6 +131,7 @@ def draw_bodies_3d(
     azimuth: float = 30.0,
     unit: str = "m",
     pixels: int = 720,
+    wires: Sequence[Superquadric] = (),
 ) -> None:
     """Shaded picture of bodies of the optical frame from another place, exact as the depth images are.
 
@@ -149,6 +153,8 @@ def draw_bodies_3d(
         Name of the unit at the scale bar.
     pixels
         Width and height of the picture.
+    wires
+        Other bodies, the true ones for instance, drawn as edges in front of everything.
     """
     ax.set_axis_off()
     if not bodies:
@@ -159,7 +165,8 @@ def draw_bodies_3d(
     turned = [body.transformed(turn, np.zeros(3)) for body in bodies]
     shades = [np.asarray(colour(k) if colours is None else colours[k % len(colours)]) for k in range(len(bodies))]
     clouds = [np.asarray(cloud) @ view.T for cloud in points or []]
-    low, high = (np.array(corner) for corner in zip(*(body.bounding_box() for body in turned), strict=True))
+    cages = [body.transformed(turn, np.zeros(3)) for body in wires]
+    low, high = (np.array(corner) for corner in zip(*(body.bounding_box() for body in turned + cages), strict=True))
     middle = 0.5 * (low.min(axis=0) + high.max(axis=0))
     half = 0.62 * float((high.max(axis=0) - low.min(axis=0))[:2].max())
     finer = 2
@@ -193,6 +200,9 @@ def draw_bodies_3d(
         cloud = cloud[:: max(1, len(cloud) // _MOST_POINTS)]
         cloud = cloud[~_hidden(cloud, depth, camera, 0.02 * half)]
         ax.scatter(cloud[:, 0], cloud[:, 1], s=1.6, color=[0.25 * shade], alpha=0.55, linewidths=0, zorder=4)
+    for cage in cages:
+        edges = LineCollection(list(outline(cage, 64)[..., :2]), colors=[WIRE], linewidths=1.0, zorder=5)
+        ax.add_collection(edges, autolim=False)
     _scale_bar(ax, extent, unit)
 
 
@@ -204,7 +214,8 @@ def recovery_figure(
     bodies = [body.superquadric for _, body in shown]
     shades = [colour(k) for k, _ in shown]
     figure = new_figure(14.4, 10.4)
-    rows = figure.add_gridspec(2, 1, height_ratios=(1.25, 1), left=0.02, right=0.985, top=0.925, bottom=0.03, hspace=0.12)
+    edges = {"left": 0.02, "right": 0.985, "top": 0.925, "bottom": 0.03}
+    rows = figure.add_gridspec(2, 1, height_ratios=(1.25, 1), hspace=0.12, **edges)
     top = rows[0].subgridspec(1, 2, wspace=0.04)
     bottom = rows[1].subgridspec(1, 3, wspace=0.02, width_ratios=(1, 1, 0.95))
     figure.text(0.02, 0.968, title or "Recovered superquadrics", fontsize=15, weight="bold", color=INK)
@@ -251,8 +262,11 @@ def draw_numbers(ax: Axes, recovery: FrameRecovery, unit: str = "m", most: int =
         sizes = " x ".join(f"{scale * value:.{digits}f}" for value in body.superquadric.size)
         e1, e2 = body.superquadric.shape
         ax.text(0.06, y + 0.018, f"{sizes} {name}", fontsize=10, color=INK, va="center")
-        ax.text(1, y + 0.018, f"e {e1:.2f} {e2:.2f}   {body.score:.2f}", fontsize=9.5, color=INK, ha="right", va="center")
-        verdict = body.message if body.status == Status.WEAK else f"residual {scale * body.residual:.{digits + 1}f} {name}"
+        numbers = f"e {e1:.2f} {e2:.2f}   {body.score:.2f}"
+        ax.text(1, y + 0.018, numbers, fontsize=9.5, color=INK, ha="right", va="center")
+        verdict = f"residual {scale * body.residual:.{digits + 1}f} {name}"
+        if body.status == Status.WEAK:
+            verdict = body.message
         ax.text(0.06, y - 0.032, verdict[:62], fontsize=8, color=_FAINT, va="center")
     if len(recovery.bodies) > most:
         ax.text(0, 0.0, f"and {len(recovery.bodies) - most} more", fontsize=9, color=_FAINT)
@@ -293,7 +307,9 @@ def _cloud(depth: np.ndarray, mask: np.ndarray, camera: Camera) -> np.ndarray:
     return camera.unproject(columns, rows, depth[rows, columns])
 
 
-def _window(recovery: FrameRecovery, bodies: Sequence[Superquadric], camera: Camera) -> tuple[float, float, float, float]:
+def _window(
+    recovery: FrameRecovery, bodies: Sequence[Superquadric], camera: Camera
+) -> tuple[float, float, float, float]:
     """Left, right, top, bottom of the image's part with the objects, in the image's aspect ratio."""
     full = (-0.5, camera.width - 0.5, -0.5, camera.height - 0.5)
     ids = [body.label for body in recovery.bodies]
@@ -392,7 +408,8 @@ def _draw_ground(
         lines.append([(low[0], y), (high[0], y)])
     frame = np.array([(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])])
     ax.add_patch(Polygon(drawn(frame), closed=True, facecolor="#eef1f4", edgecolor="none", zorder=0))
-    ax.add_collection(LineCollection(drawn(np.array(lines)), colors="#cfd7de", linewidths=0.8, zorder=0.5), autolim=False)
+    grid = LineCollection(list(drawn(np.array(lines))), colors="#cfd7de", linewidths=0.8, zorder=0.5)
+    ax.add_collection(grid, autolim=False)
     for footprint in prints:
         ax.add_patch(Polygon(drawn(footprint), closed=True, facecolor="#5d6b78", alpha=0.35, lw=0, zorder=1))
 

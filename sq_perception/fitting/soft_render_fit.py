@@ -7,9 +7,9 @@ In the unit cube of a canonical view X (:mod:`sq_perception.imaging.canonical_vi
 
     L_DR(y) = 1/|X| sum_ij | X_ij - T_ij(y; s, tau) |                                (thesis, chapter 7.5)
 
-Parameters are log a, logit of e within its bounds, t, and a rotation vector on top of the start.  A sharp boundary has a
-gradient in a layer of about a/(2 s) only, thinner than a voxel; s therefore grows geometrically from s/8 to its value,
-which widens the basin and leaves the optimum that the caller's s and tau define.
+Parameters are log a, logit of e within its bounds, t, and a rotation vector on top of the start.  A sharp boundary has
+a gradient in a layer of about a/(2 s) only, thinner than a voxel; s therefore grows geometrically from s/8 to its
+value, which widens the basin and leaves the optimum that the caller's s and tau define.
 """
 
 from __future__ import annotations
@@ -107,7 +107,7 @@ def refine(
         after = float(loss_of(end, sharpness))
     if not after < before:
         return start, before, before
-    return Superquadric.from_flat(end.to_flat()[0].double().numpy()), before, after
+    return Superquadric.from_flat(end.to_flat()[0].detach().double().numpy()), before, after
 
 
 def _resampled(view: np.ndarray) -> tuple[torch.Tensor, torch.Tensor]:

@@ -1,9 +1,9 @@
 """Triangle meshes and outlines of superquadrics.
 
-A superquadric with e1, e2 <= 2 is convex, so the convex hull of surface points is its mesh.  The points are those of the
-parametric form (thesis, equation 3.5) on a uniform grid of angles, which crowds them where the surface bends.  The hull is
-computed at unit size and then stretched by the half sizes: a map that keeps convexity and topology, and spares the hull
-algorithm the nearly flat input of a thin body.
+A superquadric with e1, e2 <= 2 is convex, so the convex hull of surface points is its mesh.  The points are those of
+the parametric form (thesis, equation 3.5) on a uniform grid of angles, which crowds them where the surface bends.  The
+hull is computed at unit size and then stretched by the half sizes: a map that keeps convexity and topology, and spares
+the hull algorithm the nearly flat input of a thin body.
 
 Metres, in the frame that the body is given in.
 """
@@ -81,8 +81,8 @@ def mesh(body: Superquadric, resolution: int = 32) -> trimesh.Trimesh:
 def outline(body: Superquadric, resolution: int = MARKER_RESOLUTION) -> np.ndarray:
     """Line segments (j, 2, 3) in the parent frame that let the eye read the body: the twelve edges of a box.
 
-    Two rings at eta = +-45 degrees and the four meridians between them.  As e1 and e2 go to zero, these become the edges;
-    on a cylinder they are its rims and four lines of its side, on an ellipsoid a cage.  Each edge has about
+    Two rings at eta = +-45 degrees and the four meridians between them.  As e1 and e2 go to zero, these become the
+    edges; on a cylinder they are its rims and four lines of its side, on an ellipsoid a cage.  Each edge has about
     ``resolution / 4`` segments.
     """
     _check_single(body)
@@ -118,8 +118,8 @@ def export(
     colours : (n, 3), optional
         Red, green, blue in [0, 1]; :data:`COLOURS` in turn if not given.
     optical : bool
-        The bodies are in the optical frame (y down): a GLB, whose y axis is up by its standard, is turned half about x so
-        that viewers show it upright.  A PLY always keeps the coordinates.
+        The bodies are in the optical frame (y down): a GLB, whose y axis is up by its standard, is turned half about x
+        so that viewers show it upright.  A PLY always keeps the coordinates.
 
     Raises
     ------
@@ -138,7 +138,7 @@ def export(
     for k, body in enumerate(singles):
         part = mesh(body, resolution)
         rgba = np.append(np.round(255 * palette[k % len(palette)]), 255).astype(np.uint8)
-        part.visual.vertex_colors = np.tile(rgba, (len(part.vertices), 1))
+        part.visual = trimesh.visual.ColorVisuals(part, vertex_colors=np.tile(rgba, (len(part.vertices), 1)))
         meshes.append(part)
     if suffix == ".ply":
         trimesh.util.concatenate(meshes).export(path)

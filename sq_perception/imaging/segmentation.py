@@ -2,13 +2,13 @@
 
 Equation
 --------
-The support plane is n.p + d = 0 with |n| = 1 in the optical frame and n towards the camera, so that the height of a point
-above the table is
+The support plane is n.p + d = 0 with |n| = 1 in the optical frame and n towards the camera, so that the height of a
+point above the table is
 
     h(p) = n.p + d  =  z (n_x (u - cx)/fx + n_y (v - cy)/fy + n_z) + d        for a pinhole camera,
 
-one multiplication per pixel.  Depth noise of triangulating and time-of-flight cameras grows about as z^2; tolerances are
-therefore sigma(z) = sigma_1 z^2 with sigma_1 measured on the plane itself.
+one multiplication per pixel.  Depth noise of triangulating and time-of-flight cameras grows about as z^2; tolerances
+are therefore sigma(z) = sigma_1 z^2 with sigma_1 measured on the plane itself.
 
 Steps: planes by RANSAC on a seeded subsample and least squares on the inliers; the support plane is the one with many
 points that lies low in the image; pixels clearly above it, separated where the depth jumps, are the objects; each grows
@@ -32,6 +32,12 @@ _PLANE_POINTS = 1500
 _REFINE_POINTS = 8000
 _HYPOTHESES = 200
 _PLANES = 3
+_COARSE_PIXELS = 120
+_FACE_TOLERANCE = 0.008
+_BENT_SHARE = 0.08
+_ISLAND_SHARE = 0.25
+
+_Surface = tuple[np.ndarray, bool]
 
 
 @dataclass(frozen=True)
@@ -125,7 +131,7 @@ def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | No
     if np.count_nonzero(valid) < least:
         return Segmentation(np.zeros(depth.shape, np.int32), None, ())
     planes = _planes(depth, valid, camera, options)
-    support = _support_plane(planes)
+    support = _support_plane(planes, _on_one_surface(depth, valid, camera, options))
     if support is None:
         labels, ids = _ordered(_separated(depth, valid, options), least, options.max_objects)
         return Segmentation(labels, None, ids)
@@ -212,9 +218,8 @@ def _noise(z: np.ndarray) -> np.ndarray:
 
 def _planes(depth: np.ndarray, valid: np.ndarray, camera: Camera, options: SegmentationOptions) -> list[_Plane]:
     """Up to three planes, the one with most points first; each is taken away before the next is searched."""
-    rows, columns = np.nonzero(valid)
-    stride = max(1, rows.size // _REFINE_POINTS)
-    rows, columns = rows[::stride], columns[::stride]
+    pixels = np.flatnonzero(valid)
+    rows, columns = np.divmod(pixels[:: max(1, pixels.size // _REFINE_POINTS)], camera.width)
     points = camera.unproject(columns, rows, depth[rows, columns])
     rng = np.random.default_rng(options.seed)
     total, found = len(points), []
@@ -224,7 +229,8 @@ def _planes(depth: np.ndarray, valid: np.ndarray, camera: Camera, options: Segme
         plane, inside = _dominant_plane(points, options.plane_tolerance, rng)
         if plane is None or inside.sum() < options.min_plane_share * total:
             break
-        spread = np.abs(points[inside] @ plane[:3] + plane[3]) / _noise(points[inside, 2])
+        near = points[inside]
+        spread = np.abs(near @ plane[:3] + plane[3]) / _noise(near[:, 2])
         found.append(_Plane(plane, float(inside.sum() / total), float(1.4826 * np.median(spread))))
         points = points[~inside]
     return found
@@ -243,9 +249,10 @@ def _dominant_plane(
         return None, np.zeros(len(points), bool)
     normals = normals[usable] / length[usable, None]
     offsets = -np.einsum("ij,ij->i", normals, corners[usable, 0])
-    reach = (tolerance * _noise(few[:, 2])).astype(np.float32)
-    heights = few.astype(np.float32) @ normals.T.astype(np.float32) + offsets.astype(np.float32)
-    votes = np.count_nonzero(np.abs(heights) < reach[:, None], axis=0)
+    weight = (1 / (tolerance * _noise(few[:, 2]))).astype(np.float32)
+    weighted = np.concatenate([few, np.ones((len(few), 1))], axis=1).astype(np.float32) * weight[:, None]
+    heights = np.column_stack([normals, offsets]).astype(np.float32) @ weighted.T
+    votes = np.count_nonzero(np.abs(heights) < 1, axis=1)
     best = int(np.argmax(votes))
     plane = np.append(normals[best], offsets[best])
     reach = tolerance * _noise(points[:, 2])
@@ -253,7 +260,8 @@ def _dominant_plane(
         inside = np.abs(points @ plane[:3] + plane[3]) < share * reach
         if inside.sum() < 12:
             return None, inside
-        plane = _least_squares_plane(points[inside], 1 / _noise(points[inside, 2]) ** 2)
+        near = points[inside]
+        plane = _least_squares_plane(near, 1 / _noise(near[:, 2]) ** 2)
     return plane, np.abs(points @ plane[:3] + plane[3]) < reach
 
 
@@ -267,15 +275,49 @@ def _least_squares_plane(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
     return np.append(normal, offset) * (1.0 if offset > 0 else -1.0)
 
 
-def _support_plane(planes: list[_Plane]) -> _Plane | None:
+def _support_plane(planes: list[_Plane], surfaces: list[_Surface]) -> _Plane | None:
     """The plane that things stand on: many points, and rather below the camera than in front of it or above it.
 
-    A camera is mounted upright or looks straight down.  The table seen from straight above and a wall look alike; a wall
-    counts less, as a floor or a table in the same picture then has a normal that points up.
+    A camera is mounted upright or looks straight down.  The table seen from straight above and a wall look alike; a
+    wall counts less, as a floor or a table in the same picture then has a normal that points up.
     """
-    if not planes:
-        return None
-    return max(planes, key=_support_vote)
+    candidates = [plane for plane in planes if not _is_face(plane, surfaces)]
+    return max(candidates, key=_support_vote) if candidates else None
+
+
+def _is_face(plane: _Plane, surfaces: list[_Surface]) -> bool:
+    """Whether a plane is part of a body or of a room: a surface joined to it runs on below, away from the camera.
+
+    On recorded tables and floors up to 4 % of the points lie below, on the faces of lone bodies more than 10 %.  A
+    small island before nothing is a body as well, seen face-on.
+    """
+    on, below, alone = 0, 0, False
+    for points, is_island in surfaces:
+        height = (points @ plane.equation[:3] + plane.equation[3]) / (_FACE_TOLERANCE * _noise(points[:, 2]))
+        inside = int(np.count_nonzero(np.abs(height) < 1))
+        if inside > on:
+            on = inside
+            below, alone = int(np.count_nonzero(height < -2)), is_island
+    return alone or below > _BENT_SHARE * on
+
+
+def _on_one_surface(
+    depth: np.ndarray, valid: np.ndarray, camera: Camera, options: SegmentationOptions
+) -> list[_Surface]:
+    """Each connected surface of a coarse image, as far as it is of any size, and whether it is a small island."""
+    k = max(1, min(depth.shape) // _COARSE_PIXELS)
+    coarse, kept = depth[::k, ::k], valid[::k, ::k]
+    labels = _components(kept & ~_jumps(np.where(kept, coarse, np.float32(0)), kept, k * options.depth_step))
+    rows, columns = np.nonzero(labels)
+    numbers = labels[rows, columns]
+    points = camera.unproject(k * columns, k * rows, coarse[rows, columns])
+    surfaces = []
+    for label in np.flatnonzero(np.bincount(numbers) > 0.02 * rows.size):
+        part = numbers == label
+        r, c = rows[part], columns[part]
+        inside = min(r.min(), c.min(), labels.shape[0] - 1 - r.max(), labels.shape[1] - 1 - c.max()) > 0
+        surfaces.append((points[part], bool(inside and r.size < _ISLAND_SHARE * labels.size)))
+    return surfaces
 
 
 def _support_vote(plane: _Plane) -> float:
@@ -336,8 +378,7 @@ def _above(
     """Components (labels from 1, unordered) of what is above the plane."""
     height = _height(depth, camera, plane.equation)
     np.copyto(height, 0, where=~valid)
-    noise = cv2.max(cv2.multiply(depth, depth), 0.1)
-    np.copyto(noise, 1, where=~valid)
+    noise = np.where(valid, _noise(depth), np.float32(1))
     relative = height / noise
     # Half of the tolerance band is a compromise: bent depth of real cameras stays below, thin objects stay above.
     clear = max(0.5 * options.plane_tolerance, 4 * plane.sigma)
@@ -353,12 +394,16 @@ def _separated(
     if valid is not None:
         wanted = wanted & valid
     filled = np.where(wanted, depth, np.float32(0))
-    largest = cv2.dilate(filled, _CROSS, borderType=cv2.BORDER_REPLICATE)
-    jump = wanted & (largest - filled > options.depth_step * filled)
-    kept = wanted & ~jump
+    kept = wanted & ~_jumps(filled, wanted, options.depth_step)
     kept = cv2.morphologyEx(kept.astype(np.uint8), cv2.MORPH_OPEN, _CROSS)
     labels = _components(kept)
     return _grown(labels, wanted & (labels == 0), depth, 2, options.depth_step)
+
+
+def _jumps(filled: np.ndarray, wanted: np.ndarray, step: float) -> np.ndarray:
+    """Wanted pixels beside which another one is farther by more than a share of the depth; 0 is no depth."""
+    farthest = cv2.dilate(filled, _CROSS, borderType=cv2.BORDER_REPLICATE)
+    return wanted & (farthest - filled > step * filled)
 
 
 def _components(mask: np.ndarray) -> np.ndarray:
@@ -389,12 +434,12 @@ def _grown(labels: np.ndarray, free: np.ndarray, depth: np.ndarray, rounds: int,
 
 
 _CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
-_Test = Callable[[np.ndarray, np.ndarray], bool]
+_ObjectTest = Callable[[np.ndarray, np.ndarray], bool]
 
 
 def _object_test(
     depth: np.ndarray, camera: Camera, support: _Plane, walls: list[_Plane], options: SegmentationOptions
-) -> _Test:
+) -> _ObjectTest:
     """Whether a component, given by its pixels, is an object on the table and not the room behind it."""
     last_row, last_column = camera.height - 1, camera.width - 1
 
@@ -415,18 +460,24 @@ def _object_test(
 
 
 def _ordered(
-    labels: np.ndarray, least: int, most: int, accept: _Test | None = None
+    labels: np.ndarray, least: int, most: int, accept: _ObjectTest | None = None
 ) -> tuple[np.ndarray, tuple[int, ...]]:
     """Components with at least ``least`` pixels, renumbered from 1 by falling size, at most ``most`` of them."""
     counts = np.bincount(labels.ravel())
     counts[0] = 0
     order = [int(k) for k in np.argsort(-counts, kind="stable") if counts[k] >= least]
     number = np.zeros(len(counts), np.int32)
+    number[order] = 1
+    pixels = np.flatnonzero(number[labels])
+    pixels = pixels[np.argsort(labels.ravel()[pixels], kind="stable")]
+    ends = np.cumsum(np.where(number > 0, counts, 0))
+    number[:] = 0
     kept = 0
     for label in order:
         if kept == most:
             break
-        if accept is None or accept(*np.nonzero(labels == label)):
+        rows, columns = np.divmod(pixels[ends[label] - counts[label] : ends[label]], labels.shape[1])
+        if accept is None or accept(rows, columns):
             kept += 1
             number[label] = kept
     return number[labels], tuple(range(1, kept + 1))
