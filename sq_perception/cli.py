@@ -11,6 +11,7 @@ import importlib
 import json
 import math
 import os
+import re
 import sys
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 SUCCESS, FAILURE, USAGE = 0, 1, 2
 JSON_VERSION = 1
 PARAMETERS = ("a1", "a2", "a3", "e1", "e2", "t1", "t2", "t3", "qx", "qy", "qz", "qw")
+_NEGATIVE_WITH_EXPONENT = re.compile(r"-(\d+\.?\d*|\.\d+)[eE][-+]?\d+")
 
 _RECOVER_HELP = """\
 Recover superquadrics from recorded depth images.
@@ -92,7 +94,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return {"demo": _demo, "train": _train}[given[0]](given[1:])
     parser = _parser()
     try:
-        options = parser.parse_args(given)
+        options = parser.parse_args([_plain_number(word) for word in given])
     except SystemExit as stop:
         return stop.code if isinstance(stop.code, int) else USAGE
     command: Callable[[argparse.Namespace], int] = options.command
@@ -104,6 +106,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILURE
+
+
+def _plain_number(word: str) -> str:
+    """argparse takes -1e-3 for an option; -0.001 it understands."""
+    return f"{float(word):.20f}" if _NEGATIVE_WITH_EXPONENT.fullmatch(word) else word
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -130,7 +130,7 @@ def draw_bodies_3d(
     elevation: float = 20.0,
     azimuth: float = 30.0,
     unit: str = "m",
-    pixels: int = 720,
+    pixels: int = 560,
     wires: Sequence[Superquadric] = (),
 ) -> None:
     """Shaded picture of bodies of the optical frame from another place, exact as the depth images are.
