@@ -17,7 +17,7 @@ q^2 / 12 at least; q is the smallest depth difference that occurs.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -32,6 +32,9 @@ _BAND_SHARE = 0.03
 _WIDER = 0.5
 _HOLE = 5
 """Holes and notches of the mask up to this width, pixels, are closed: the outline of a convex body has none."""
+_JUMP_PIXELS, _JUMP_NOISE = 10.0, 6.0
+"""A depth step between neighbours above so many pixel widths, plus so many noise levels, ends a surface."""
+_SMALLEST_PIECE = 0.02
 _COARSE = 3
 """Far from the mask, only every third pixel in each direction becomes a free ray."""
 _NOISE_SAMPLES = 4000
@@ -75,6 +78,24 @@ class Observation:
         r = self.object_rays
         return np.stack([r[:, 0] + r[:, 4] * r[:, 2], r[:, 1] + r[:, 4] * r[:, 3], r[:, 4]], axis=1)
 
+    def coarsened(self, model_error: float) -> Observation:
+        """The same observation trusted less: ``model_error`` (metres) joins the noise."""
+        noise = float(np.hypot(self.noise, model_error))
+        rays, free = self.object_rays.copy(), self.free_rays.copy()
+        rays[:, 5] *= self.noise / noise
+        free[:, 4] -= 2.0 * model_error
+        return replace(self, object_rays=rays, free_rays=free, noise=noise)
+
+    def beyond(self, band: float) -> Observation:
+        """The same observation with free rays only farther than ``band`` pixels from the mask."""
+        kept = self.distance_to_mask(self.free_rays) > band + 0.4
+        return replace(self, free_rays=self.free_rays[kept])
+
+    def distance_to_mask(self, rays: np.ndarray) -> np.ndarray:
+        """Distance (n,) of the rays' pixels to the mask, in pixels."""
+        distance = cv2.distanceTransform((~self.mask).astype(np.uint8), cv2.DIST_L2, 5)
+        return distance.ravel()[rays[:, 7].astype(int)]
+
 
 def observe(
     depth: np.ndarray,
@@ -104,8 +125,6 @@ def observe(
         crop = np.where(crop > 0, crop, np.float32(np.nan))
     inside = np.ascontiguousarray(mask[window], dtype=bool)
     view = camera.cropped(left, top, right - left, bottom - top)
-    filled = cv2.morphologyEx(inside.view(np.uint8), cv2.MORPH_CLOSE, np.ones((_HOLE, _HOLE), np.uint8))
-    near = cv2.dilate(filled, np.ones((2 * band + 1, 2 * band + 1), np.uint8))
     typical = _typical_depth(crop, inside)
     if not np.isfinite(typical):
         return None
@@ -114,12 +133,16 @@ def observe(
     noise = float(np.hypot(noise, model_error))
     focal = np.sqrt(view.fx * view.fy)
     footprint = float(typical / focal if view.is_pinhole else 1 / focal)
+    inside = _coherent(crop, inside, _JUMP_PIXELS * footprint + _JUMP_NOISE * noise)
+    filled = cv2.morphologyEx(inside.view(np.uint8), cv2.MORPH_CLOSE, np.ones((_HOLE, _HOLE), np.uint8))
+    claimed = cv2.bitwise_or(filled, np.ascontiguousarray(mask[window]).view(np.uint8))
+    near = cv2.dilate(filled, np.ones((2 * band + 1, 2 * band + 1), np.uint8))
     margin_in_front = max(_FREE_MARGIN * noise, 2.0 * model_error)
     intrinsics = np.array([view.fx, view.fy, view.cx, view.cy])
     rays, free, free_pixels = _collect(
-        crop, inside, filled, near, intrinsics, view.is_pinhole, noise, footprint, margin_in_front, nan_is_empty
+        crop, inside, claimed, near, intrinsics, view.is_pinhole, noise, footprint, margin_in_front, nan_is_empty
     )
-    return Observation(rays, free, free_pixels, noise, footprint, crop, filled.view(bool) | inside, view)
+    return Observation(rays, free, free_pixels, noise, footprint, crop, filled.view(bool), view)
 
 
 def draw(rays: np.ndarray, count: int, offset: float = 0.5) -> np.ndarray:
@@ -167,8 +190,65 @@ def _typical_depth(depth, inside):
 
 
 @kernel
+def _coherent(depth, inside, jump):
+    """The mask without what is not the object: pieces that a depth step separates from the largest piece.
+
+    A convex body has no step in its visible surface.  Pixels without depth belong to no piece and stay.  A piece that
+    touches the largest one across a step, or is tiny, goes; one beyond a gap (a bar in front of the body) stays.
+    """
+    height, width = depth.shape
+    label = np.zeros((height, width), np.int32)
+    stack = np.empty(height * width, np.int32)
+    largest, largest_size, pieces = 0, 0, 0
+    sizes = np.zeros(height * width // 2 + 2, np.int32)
+    for start in range(height * width):
+        v, u = start // width, start % width
+        if label[v, u] > 0 or not inside[v, u] or not np.isfinite(depth[v, u]) or pieces + 1 >= sizes.shape[0]:
+            continue
+        pieces += 1
+        label[v, u] = pieces
+        stack[0] = start
+        top = 1
+        size = 0
+        while top > 0:
+            top -= 1
+            v, u = stack[top] // width, stack[top] % width
+            size += 1
+            for side in range(4):
+                v2, u2 = v + (side == 0) - (side == 1), u + (side == 2) - (side == 3)
+                if v2 < 0 or u2 < 0 or v2 >= height or u2 >= width or label[v2, u2] > 0 or not inside[v2, u2]:
+                    continue
+                if abs(depth[v2, u2] - depth[v, u]) <= jump:
+                    label[v2, u2] = pieces
+                    stack[top] = v2 * width + u2
+                    top += 1
+        sizes[pieces] = size
+        if size > largest_size:
+            largest, largest_size = pieces, size
+    if pieces <= 1:
+        return inside
+    kept = np.ones(pieces + 1, np.bool_)
+    for k in range(1, pieces + 1):
+        kept[k] = sizes[k] >= _SMALLEST_PIECE * largest_size
+    for v in range(height):
+        for u in range(width):
+            if label[v, u] != largest:
+                continue
+            for side in range(4):
+                v2, u2 = v + (side == 0) - (side == 1), u + (side == 2) - (side == 3)
+                if 0 <= v2 < height and 0 <= u2 < width and label[v2, u2] > 0:
+                    kept[label[v2, u2]] = False
+    kept[0] = kept[largest] = True
+    coherent = inside.copy()
+    for v in range(height):
+        for u in range(width):
+            coherent[v, u] = inside[v, u] and kept[label[v, u]]
+    return coherent
+
+
+@kernel
 def _collect(
-    depth, inside, filled, near, intrinsics, pinhole, noise, footprint, margin_in_front, nan_is_empty
+    depth, inside, claimed, near, intrinsics, pinhole, noise, footprint, margin_in_front, nan_is_empty
 ):
     fx, fy, cx, cy = intrinsics
     height, width = depth.shape
@@ -177,7 +257,7 @@ def _collect(
         for u in range(width):
             if inside[v, u]:
                 count += np.isfinite(depth[v, u])
-            elif not filled[v, u] and (near[v, u] or (u % _COARSE == 0 and v % _COARSE == 0)):
+            elif not claimed[v, u] and (near[v, u] or (u % _COARSE == 0 and v % _COARSE == 0)):
                 free_count += nan_is_empty or np.isfinite(depth[v, u])
     rays = np.empty((count, RAY_COLUMNS))
     free = np.empty((free_count, RAY_COLUMNS))
@@ -193,8 +273,9 @@ def _collect(
                 count += 1
                 row[4] = z
                 row[5] = 1.0 / noise
+                row[7] = v * width + u
                 row[6] = _area_weight(depth, inside, v, u, footprint)
-            elif not filled[v, u] and (near[v, u] or (u % _COARSE == 0 and v % _COARSE == 0)):
+            elif not claimed[v, u] and (near[v, u] or (u % _COARSE == 0 and v % _COARSE == 0)):
                 if not known and not nan_is_empty:
                     continue
                 row = free[free_count]
@@ -203,6 +284,7 @@ def _collect(
                 free_pixels += 1 if near[v, u] else _COARSE * _COARSE
                 row[5] = 1.0
                 row[6] = 1.0
+                row[7] = v * width + u
             else:
                 continue
             x, y = (u - cx) / fx, (v - cy) / fy

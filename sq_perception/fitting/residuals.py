@@ -10,7 +10,8 @@ point p of the optical frame, with q = R^T (p - t) in the object frame, the gaug
 
 Residuals
 ---------
-A pixel is a ray p = o + z d with o_z = 0 and d_z = 1; its row is (o_x, o_y, d_x, d_y, z, 1/sigma, weight).
+A pixel is a ray p = o + z d with o_z = 0 and d_z = 1; its row is (o_x, o_y, d_x, d_y, z, 1/sigma, weight,
+index), the last naming the pixel.
 
 classic     sqrt(a1 a2 a3) (g^2 - 1) / sigma at the measured point: Solina and Bajcsy's, as g^2 = F^e1.
 Sampson     (g - 1) / (|grad g| sigma) at the measured point: first order distance; wide basin of attraction.
@@ -22,7 +23,8 @@ free        (1 - min g) / (|grad g| sigma_o), where the smallest g on a free ray
             At a minimum the point may be held fixed (envelope theorem).
 plane       (lowest point above the plane) / sigma where negative: n.t + d - h(R^T n), h the support function.
 rest        the two components of R^T n across the axis nearest to the normal, over sigma, Cauchy: bodies lie on a face.
-volume      a linear price on log(a1 a2 a3), which decides what the image leaves open.
+proportion  log a_k minus the mean of the three, over sigma: what the image leaves open resembles what it shows.
+volume      a linear price on log(a1 a2 a3), for the smaller of two bodies that explain the image alike.
 
 The scales |grad g| and c are held fixed in the derivatives, which residuals small near the answer justify.  Image
 residuals pass through Huber's loss.  The cost is the weighted sum of the losses, r^2 for small r.
@@ -39,7 +41,7 @@ from sq_perception.geometry.kernels import box_interval, gauge_derivatives, kern
 
 CLASSIC, SAMPSON, RENDERED = 0, 1, 2
 STEP_LENGTH = 11
-RAY_COLUMNS = 7
+RAY_COLUMNS = 8
 
 _BLOCK = 64
 _HIT_TOLERANCE = 1e-3
@@ -67,6 +69,7 @@ class Scene(NamedTuple):
     offset: float = 0.0
     plane_stiffness: float = 0.0
     rest_stiffness: float = 0.0
+    proportion_stiffness: float = 0.0
     volume_price: float = 0.0
 
 
@@ -79,6 +82,8 @@ def evaluate(stage, rays, free, scene, parameters, rotation, sums):
     cost += _free_cost(free, scene, parameters, rotation, block, sums)
     if scene.plane_stiffness > 0.0 or scene.rest_stiffness > 0.0:
         cost += _support_cost(scene, parameters, rotation, block, sums)
+    if scene.proportion_stiffness > 0.0:
+        cost += _proportion_cost(scene, parameters, block, sums)
     if scene.volume_price > 0.0:
         for k in range(3):
             cost += scene.volume_price * math.log(parameters[k])
@@ -275,6 +280,22 @@ def _support_cost(scene, parameters, rotation, block, sums):
 
 
 @kernel
+def _proportion_cost(scene, parameters, block, sums):
+    mean = (math.log(parameters[0]) + math.log(parameters[1]) + math.log(parameters[2])) / 3.0
+    cost = 0.0
+    for k in range(3):
+        for j in range(STEP_LENGTH):
+            block[j, 0] = 0.0
+        for j in range(3):
+            block[j, 0] = scene.proportion_stiffness * ((1.0 if j == k else 0.0) - 1.0 / 3.0)
+        residual = scene.proportion_stiffness * (math.log(parameters[k]) - mean)
+        block[STEP_LENGTH, 0] = residual
+        cost += residual * residual
+        _flush(block, 1, sums)
+    return cost
+
+
+@kernel
 def _length(at):
     return math.sqrt(at[1] * at[1] + at[2] * at[2] + at[3] * at[3]) + _TINY
 
@@ -344,7 +365,7 @@ def penetration(free, scene, parameters, rotation):
     depth = np.zeros(free.shape[0])
     block = np.zeros((STEP_LENGTH + 1, _BLOCK))
     sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
-    linear = Scene(0.0, 1e300, 0.0, 1.0, scene.pinhole, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    linear = Scene(0.0, 1e300, 0.0, 1.0, scene.pinhole, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     for i in range(free.shape[0]):
         row = free[i : i + 1].copy()
         row[0, 5], row[0, 6] = 1.0, 1.0

@@ -41,9 +41,15 @@ FINALISTS, ESCALATED_FINALISTS = 3, 6
 TOLERANCE, FINAL_TOLERANCE = 1e-3, 1e-4
 SHARP_OUTLINE = 0.3
 """Standard deviation of a perfect outline, in pixels: the body covers exactly the centres of the mask's pixels."""
+SHRUNK = 0.25
+"""A body that covers free pixels beside the mask this deep on average, in pixels, is larger than its mask."""
+WIDEST_BAND = 4
+RING_RAYS = 200
 OUTLIER = 5.0
+MEDIAN_TO_SIGMA = 1.4826
 PLANE_SIGMA, REST_SIGMA = 0.001, 0.05
 VOLUME_PRICE = 2.0
+PROPORTION_SIGMA = 1.0
 REAL_WEIGHT = 100.0
 """Model errors of neighbouring pixels are alike: an object on a table counts as so many independent rays."""
 
@@ -56,6 +62,7 @@ class Search:
         self.options = options
         self.began = began
         self.limits = options.bounds.limits(observation.points)
+        self.tolerated = options.tolerated
         self.scene = _scene(observation, options)
         self.best: State | None = None
         self.rays = np.empty((0, RAY_COLUMNS))
@@ -67,7 +74,10 @@ class Search:
             self._select(self._coarse(given), FINALISTS)
         if not given or (self.options.fall_back and not self._good_enough()):
             self._select(self._automatic(), FINALISTS)
-            if not self._good_enough() and self.options.plane is None and not self._late():
+            if not self._good_enough() and self.tolerated == 0 and not self._late():
+                self._select(self._coarse(self._everything()), ESCALATED_FINALISTS)
+            if not self._good_enough() and self.tolerated == 0 and not self._late():
+                self._tolerate_what_is_left()
                 self._select(self._coarse(self._everything()), ESCALATED_FINALISTS)
         assert self.best is not None
         return self._polished(self.best)
@@ -112,13 +122,22 @@ class Search:
                     found += symmetry_start.states(middle, moments, turned, exponent)
         return found
 
+    def _tolerate_what_is_left(self) -> None:
+        """The object is no superquadric: what the best body leaves unexplained becomes the model error."""
+        assert self.best is not None
+        distance = surface_distance(self.observation.object_rays, self.best.parameters, self.best.rotation)
+        self.tolerated = MEDIAN_TO_SIGMA * float(np.median(distance))
+        self.observation = self.observation.coarsened(self.tolerated)
+        self.scene = _scene(self.observation, self.options)._replace(huber=2.0, volume_price=VOLUME_PRICE)
+        self.best = None
+
     # Stages
 
     def _draw(self, count: int, offset: float) -> tuple[np.ndarray, np.ndarray]:
         """Object and free rays for one stage."""
         rays = draw(self.observation.object_rays, count, offset)
         free = draw(self.observation.free_rays, int(FREE_SHARE * count), offset)
-        if self.options.tolerated > 0:
+        if self.tolerated > 0:
             pixels = len(self.observation.object_rays)
             rays[:, 6] = REAL_WEIGHT / len(rays)
             if len(free):
@@ -127,7 +146,7 @@ class Search:
 
     def _weight(self, count: int) -> float:
         """Total weight of the object rays that a stage draws: its cost at the noise floor."""
-        if self.options.tolerated > 0:
+        if self.tolerated > 0:
             return REAL_WEIGHT
         return float(min(count, len(self.observation.object_rays)))
 
@@ -162,21 +181,42 @@ class Search:
 
     def _polished(self, state: State) -> State:
         """The last stage, on the full budget of rays."""
+        if self.tolerated == 0:
+            state = self._outlined(state)
         count = self.options.pixels or self._enough()
         self.rays, self.free = self._draw(count, 0.3)
-        if self.options.tolerated == 0:
+        if self.tolerated == 0:
             self.rays = self._without_outliers(self.rays, state)
             self.scene = self.scene._replace(outline_stiffness=1 / self._outline_sigma(state))
-        return minimize(
-            RENDERED,
-            self.rays,
-            self.free,
-            self.scene,
-            state,
-            self.limits,
-            self.options.max_iterations,
-            FINAL_TOLERANCE,
-        )
+        return self._refined(state, self.options.max_iterations)
+
+    def _refined(self, state: State, steps: int) -> State:
+        return minimize(RENDERED, self.rays, self.free, self.scene, state, self.limits, steps, FINAL_TOLERANCE)
+
+    def _outlined(self, state: State) -> State:
+        """Forget the free rays next to the mask if the mask turns out to be smaller than the body."""
+        ring = self._ring_penetration(state, self.observation)
+        if ring[0] < SHRUNK:
+            return state
+        full = self.observation
+        self.observation = full.beyond(WIDEST_BAND)
+        self.rays, self.free = self._draw(FINAL_RAYS, 0.6)
+        state = self._refined(state._replace(cost=math.inf), BASIN_STEPS)
+        ring = self._ring_penetration(state, full)
+        band = next((k for k in range(WIDEST_BAND) if ring[k] < SHRUNK), WIDEST_BAND)
+        self.observation = full.beyond(band) if band > 0 else full
+        return state
+
+    def _ring_penetration(self, state: State, observation: Observation) -> list[float]:
+        """Mean depth, in pixels, to which the body covers free pixels at distance 1, 2, ... from the mask."""
+        free = observation.free_rays
+        distance = observation.distance_to_mask(free)
+        rings = []
+        for k in range(1, WIDEST_BAND + 1):
+            ring = draw(free[(distance > k - 0.6) & (distance <= k + 0.4)], RING_RAYS)
+            depth = penetration(ring, self.scene, state.parameters, state.rotation)
+            rings.append(float(depth.mean()) / observation.footprint if len(ring) else 0.0)
+        return rings
 
     def _enough(self) -> int:
         """Rays that bring the noise of the mean well below a pixel's width."""
@@ -213,7 +253,7 @@ def _scene(observation: Observation, options: Options) -> Scene:
     """The constants that the residuals share, for all but the last stage."""
     pinhole = 1.0 if observation.camera.is_pinhole else 0.0
     outline = max(observation.noise, observation.footprint, options.tolerated)
-    scene = Scene(pinhole=pinhole, outline_stiffness=1 / outline)
+    scene = Scene(pinhole=pinhole, outline_stiffness=1 / outline, proportion_stiffness=1 / PROPORTION_SIGMA)
     if options.plane is None:
         return scene
     x, y, z, offset = (float(value) for value in options.plane)

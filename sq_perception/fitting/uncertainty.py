@@ -3,7 +3,8 @@
 With the whitened residuals r and their Jacobian J at the optimum, the covariance is (J^T J + P)^-1 s^2, where
 s^2 = max(1, sum r^2 / (n - 11)) lets a body that does not explain the data be less sure of itself, and P is the precision
 of a wide prior (a factor e in size, 0.5 in shape, one size in position, one radian in angle): what the image leaves open,
-such as the turn of a round body about its axis, gets the width of the prior instead of infinity.
+such as the turn of a round body about its axis, gets the width of the prior instead of infinity.  The outline counts with a
+whole pixel: its errors are no independent noise.
 """
 
 from __future__ import annotations
@@ -35,7 +36,9 @@ def judged(state: State, search: Search, began: float) -> Fit:
     observation = search.observation
     rays = search.rays
     sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
-    cost = evaluate(RENDERED, rays, search.free, search.scene, state.parameters, state.rotation, sums)
+    outline = max(observation.noise, observation.footprint)
+    scene = search.scene._replace(outline_stiffness=1 / outline)
+    cost = evaluate(RENDERED, rays, search.free, scene, state.parameters, state.rotation, sums)
     freedom = max(rays[:, 6].sum() - STEP_LENGTH, 1.0)
     variance = max(1.0, cost / freedom)
     body = state.body
