@@ -1,0 +1,134 @@
+"""Launch files, run against a stand-in for the launch package (not on PyPI), and the plain scripts as processes."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import signal
+import subprocess
+import sys
+import time
+import types
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import sq_perception
+from sq_perception.nodes import fast_dds
+
+ROOT = str(Path(sq_perception.__file__).parent.parent)
+
+
+class Recorded:
+    """Any class of the launch packages: keeps what it was made of."""
+
+    def __init__(self, *positional: Any, **named: Any) -> None:
+        self.positional, self.named = positional, named
+
+
+class Argument(Recorded):
+    """LaunchConfiguration: looks its name up."""
+
+    def perform(self, context: dict[str, str]) -> str:
+        return context[self.positional[0]]
+
+
+@pytest.fixture
+def launch(monkeypatch: pytest.MonkeyPatch) -> dict[str, type]:
+    names = {
+        "launch": ["LaunchContext", "LaunchDescription"],
+        "launch.actions": ["DeclareLaunchArgument", "OpaqueFunction", "SetEnvironmentVariable"],
+        "launch.substitutions": ["LaunchConfiguration"],
+        "launch_ros": [],
+        "launch_ros.actions": ["Node"],
+    }
+    made: dict[str, type] = {}
+    for module, classes in names.items():
+        stand_in = types.ModuleType(module)
+        for name in classes:
+            base = Argument if name == "LaunchConfiguration" else Recorded
+            made[name] = type(name, (base,), {})
+            setattr(stand_in, name, made[name])
+        monkeypatch.setitem(sys.modules, module, stand_in)
+    for variable in fast_dds.VARIABLES:
+        monkeypatch.delenv(variable, raising=False)
+    return made
+
+
+def load(path: Path) -> types.ModuleType:
+    spec = importlib.util.spec_from_file_location(path.name.replace(".", "_"), path)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def nodes_of(path: Path, made: dict[str, type], **given: str) -> list[Any]:
+    """The nodes that a launch file starts with arguments ``given`` and its defaults otherwise."""
+    entities = load(path).generate_launch_description().positional[0]
+    declared = {
+        e.positional[0]: e.named["default_value"] for e in entities if isinstance(e, made["DeclareLaunchArgument"])
+    }
+    assert set(given) <= set(declared)
+    variables = [e.positional for e in entities if isinstance(e, made["SetEnvironmentVariable"])]
+    assert variables == [(fast_dds.VARIABLES[0], str(fast_dds.profile_path()))]
+    (opaque,) = (e for e in entities if isinstance(e, made["OpaqueFunction"]))
+    return opaque.named["function"]({**declared, **given})
+
+
+def test_recover_is_wired_to_the_camera(repository: Path, launch: dict[str, type]) -> None:
+    path = repository / "launch_scripts" / "recover.launch.py"
+    (node,) = nodes_of(path, launch, depth="/camera/depth", camera_info="/camera/info")
+    assert (node.named["package"], node.named["executable"]) == ("sq_perception", "recover_node")
+    assert dict(node.named["remappings"]) == {
+        "depth/image": "/camera/depth",
+        "depth/camera_info": "/camera/info",
+        "mask/image": "mask/image",
+    }
+    both = nodes_of(path, launch, fitter="true", params_file="mine.yaml")
+    assert [node.named["executable"] for node in both] == ["recover_node", "fitter_node"]
+    assert both[0].named["parameters"] == ["mine.yaml"]
+
+
+@pytest.mark.parametrize(("scene", "projection"), [("table", "pinhole"), ("thesis", "orthographic")])
+def test_the_synthetic_camera_and_its_readers_agree(
+    scene: str, projection: str, repository: Path, launch: dict[str, type]
+) -> None:
+    nodes = nodes_of(repository / "launch_scripts" / "synthetic.launch.py", launch, scene=scene)
+    assert {node.named["executable"] for node in nodes} == {"recover_node", "fitter_node", "synthetic_depth_node"}
+    assert {node.named["parameters"][0]["projection"] for node in nodes} == {projection}
+
+
+@pytest.mark.parametrize("name", ["recover.py", "synthetic.py"])
+def test_plain_scripts_explain_themselves(name: str, repository: Path) -> None:
+    result = run(repository, name, "--help").communicate(timeout=60)
+    assert "usage" in result[0]
+
+
+def run(repository: Path, name: str, *arguments: str) -> subprocess.Popen[str]:
+    path = os.pathsep.join([ROOT, os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
+    return subprocess.Popen(
+        [sys.executable, str(repository / "launch_scripts" / name), *arguments],
+        env={**os.environ, "PYTHONPATH": path},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+def test_a_plain_script_runs_its_node_until_ctrl_c(repository: Path, tmp_path: Path) -> None:
+    pytest.importorskip("rclpy", reason="rclpy missing: install the extra 'ros' or source ROS 2")
+    process = run(repository, "recover.py", "--depth", "/camera/depth")
+    assert process.stdout is not None
+    deadline, said = time.monotonic() + 90, ""
+    while "listening to /camera/depth" not in said:
+        assert time.monotonic() < deadline, said
+        line = process.stdout.readline()
+        assert line, said
+        said += line
+    process.send_signal(signal.SIGINT)
+    rest, _ = process.communicate(timeout=30)
+    assert process.returncode == 0, said + rest
+    assert "Traceback" not in said + rest
