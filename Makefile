@@ -43,11 +43,12 @@ $(VENV)/bin/python:
 $(VENV)/.dependencies: setup.py | $(VENV)/bin/python
 	$(PIP) install $(PIP_FLAGS) --upgrade pip 'setuptools>=68,<80' wheel
 	$(PIP) install $(PIP_FLAGS) --no-build-isolation $(REQUIREMENTS)
+	rm -rf build/lib build/bdist.* *.egg-info
 	touch $@
 
 $(VENV)/.package: $(VENV)/.dependencies $(SOURCES)
-	rm -rf build/lib build/bdist.* *.egg-info
 	$(PIP) install --quiet --no-deps --no-build-isolation --force-reinstall .
+	rm -rf build/lib build/bdist.* *.egg-info
 	$(VENV)/bin/python -c "import sys; sys.path.pop(0); from sq_perception.warm_up import main; sys.exit(main())"
 	touch $@
 

@@ -28,13 +28,9 @@ from rich.live import Live
 from rich.text import Text
 
 from sq_perception.evaluation.comparison import pair
-from sq_perception.evaluation.demo_figure import demo_figure
-from sq_perception.evaluation.plots import save
-from sq_perception.geometry.mesh import export
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Projection
-from sq_perception.imaging.segmentation import segment
 from sq_perception.nodes import demo_table, fast_dds
 from sq_perception.nodes.children import Children, interruptible, parameter_arguments
 from sq_perception.nodes.demo_watch import RESULTS, TRUTH, Shot, Watch
@@ -232,7 +228,15 @@ def _summary(watch: Watch, console: Console, folder: Path) -> None:
 
 
 def draw(watch: Watch, shot: Shot, folder: Path) -> tuple[Path, Path | None]:
-    """Write demo.png and demo.glb of one image; their paths, None for a mesh of nothing."""
+    """Write demo.png and demo.glb of one image; their paths, None for a mesh of nothing.
+
+    What draws is imported here: it takes seconds, which the nodes need not wait for at the start.
+    """
+    from sq_perception.evaluation.demo_figure import demo_figure
+    from sq_perception.evaluation.plots import save
+    from sq_perception.geometry.mesh import export
+    from sq_perception.imaging.segmentation import segment
+
     frame = watch.frame(shot)
     unit = "" if frame.is_cube else "m"
 
