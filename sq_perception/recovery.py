@@ -4,7 +4,7 @@
 
 | method | body | refine |
 | --- | --- | --- |
-| auto | starts of the network and of central symmetry, the better one after the fit | surface, soft_render, none |
+| auto | fit from the starts of the network and of central symmetry; open sizes predicted | surface, soft_render, none |
 | symmetry | fit from the starts of central symmetry, no network | surface, soft_render |
 | network | the network alone | ignored |
 | classic | Solina and Bajcsy's fit to the points | ignored |
@@ -32,7 +32,7 @@ from typing import Literal, get_args
 import numpy as np
 import torch
 
-from sq_perception.fitting import soft_render_fit, solina_bajcsy, surface_fit
+from sq_perception.fitting import prediction, soft_render_fit, solina_bajcsy, surface_fit
 from sq_perception.fitting.fit import Fit, Status
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import canonical_view, raycast, segmentation, soft_render
@@ -205,7 +205,7 @@ class Recoverer:
     def warm_up(self, camera: Camera) -> None:
         """Compile or load every kernel and run the whole chain once on an image of the camera's size."""
         surface_fit.warm_up()
-        depth = 1.0
+        depth = 1.0 if camera.is_pinhole else 0.5
         reach = 0.15 * min(camera.width / camera.fx, camera.height / camera.fy)
         centre = camera.unproject(np.array(camera.width / 2), np.array(camera.height / 2), np.array(depth))
         body = Superquadric(
@@ -411,9 +411,15 @@ def _surface_fit(
     plane: np.ndarray | None,
     time_budget: float,
 ) -> Fit:
-    """From the network's prediction, joined by the automatic starts where that one stays above the noise."""
+    """From the network's prediction, joined by the automatic starts where that one stays above the noise.
+
+    What the image leaves open after all, such as the depth of a box seen face-on, the prediction tells again.
+    """
     settings = surface_fit.Options(plane=plane, time_budget=time_budget)
-    return surface_fit.fit(depth, one.mask, camera, start="auto" if predicted is None else predicted, options=settings)
+    if predicted is None:
+        return surface_fit.fit(depth, one.mask, camera, options=settings)
+    fit = surface_fit.fit(depth, one.mask, camera, start=predicted, options=settings)
+    return prediction.completed(fit, predicted)
 
 
 def _soft_rendered(start: Superquadric, one: _Object, options: RecoveryOptions) -> Fit:
