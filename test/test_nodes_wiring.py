@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -356,7 +357,7 @@ def test_parameters_take_effect_with_the_next_frame(bench):
     assert not bench.node.set_parameters([Parameter("s", value=-1.0)])[0].successful
     bench.answer(bench.depth())
     before, after = (asked[3] for asked in bench.recoverer.asked)
-    assert before.sharpness == 117.3
+    assert (before.sharpness, before.depth_range) == (117.3, (0.0, np.inf))
     assert (after.sharpness, after.tau, after.refine) == (3.0, 2.5, "none")
     assert (after.depth_range, after.max_objects) == ((0.2, 3.0), 4)
 
@@ -513,6 +514,14 @@ def test_diagnostics_count_and_warn(bench):
     assert float(values["stamp to result: median [ms]"]) > 0
     assert {"wait: p95 [ms]", "recovery: total: median [ms]", "publish: median [ms]"} <= set(values)
     assert any(report.status[0].level == DiagnosticStatus.WARN for report in reports)
+
+
+def test_lost_messages_are_counted_and_the_remedy_is_named(bench, capfd):
+    bench.node._on_lost(SimpleNamespace(total_count=3, total_count_change=3))
+    bench.node._on_lost(SimpleNamespace(total_count=5, total_count_change=2))
+    assert bench.counts.lost == 5
+    said = capfd.readouterr().err
+    assert said.count("FASTRTPS_DEFAULT_PROFILES_FILE") == 1
 
 
 def test_silence_is_reported(make_bench):

@@ -42,7 +42,7 @@ def _options(parameters: FitterParameters) -> RecoveryOptions:
         method="classic",
         sharpness=parameters.s,
         tau=parameters.tau,
-        depth_range=(parameters.depth_min, parameters.depth_max),
+        depth_range=parameters.depth_range,
         max_objects=parameters.max_objects,
     )
 

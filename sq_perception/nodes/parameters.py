@@ -11,6 +11,7 @@ accepts both.  The range is checked here for both, as the range of a descriptor 
 
 from __future__ import annotations
 
+import math
 from dataclasses import Field, asdict, dataclass, field, fields, replace
 from typing import Any, Generic, Literal, TypeVar, get_args
 
@@ -72,7 +73,9 @@ class FrameParameters:
         live=True,
     )
     depth_min: float = setting(0.0, "Nearer readings are left out.", unit="m", within=(0.0, 100.0), live=True)
-    depth_max: float = setting(100.0, "Farther readings are left out.", unit="m", within=(0.001, 100.0), live=True)
+    depth_max: float = setting(
+        100.0, "Farther readings are left out; 100 keeps all.", unit="m", within=(0.001, 100.0), live=True
+    )
     max_objects: int = setting(20, "At most so many bodies per frame, the largest ones.", within=(1, 100), live=True)
     marker_colours: str = setting(
         "id",
@@ -90,6 +93,11 @@ class FrameParameters:
     trigger_timeout: float = setting(
         5.0, "~/trigger answers with a failure when no frame came for so long.", unit="s", within=(0.1, 60.0), live=True
     )
+
+    @property
+    def depth_range(self) -> tuple[float, float]:
+        """Nearest and farthest depth in metres, infinity where ``depth_max`` is at its upper end."""
+        return self.depth_min, math.inf if self.depth_max >= 100.0 else self.depth_max
 
     def __post_init__(self) -> None:
         if not self.depth_min < self.depth_max:

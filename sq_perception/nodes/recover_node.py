@@ -43,7 +43,7 @@ def _options(parameters: RecoverParameters) -> RecoveryOptions:
         refine=parameters.refine,
         sharpness=parameters.s,
         tau=parameters.tau,
-        depth_range=(parameters.depth_min, parameters.depth_max),
+        depth_range=parameters.depth_range,
         max_objects=parameters.max_objects,
     )
 
