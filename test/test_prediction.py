@@ -34,7 +34,7 @@ def test_the_open_size_takes_the_prediction_and_the_seen_face_stays():
     assert joined.sigma_size[2] == pytest.approx((prior + measured) ** -0.5, rel=1e-6)
     assert centre[2] - size[2] == pytest.approx(1.0 - 0.3, abs=1e-4)
     np.testing.assert_allclose(size[:2], [0.1, 0.2])
-    assert "prediction z" in joined.message
+    assert "prediction: z 51 +- 10 mm" in joined.message
     assert joined.status == Status.WEAK
 
 

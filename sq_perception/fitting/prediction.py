@@ -45,7 +45,7 @@ def completed(fit: Fit, predicted: Superquadric, share: float = PREDICTION_SHARE
     Returns
     -------
     Fit
-        Exponents and rotation stay; status and inliers, too.
+        Exponents, rotation, status and inliers stay; the message names what was joined.
     """
     size, shape = np.array(fit.superquadric.size), fit.superquadric.shape
     sigma = fit.sigma_size
@@ -61,10 +61,11 @@ def completed(fit: Fit, predicted: Superquadric, share: float = PREDICTION_SHARE
         known = known + gain * (extent - known[k])
         covariance = covariance - np.outer(gain, covariance[k])
     new_size = np.clip(known[:3], size / _LARGEST_CHANGE, size * _LARGEST_CHANGE)
-    names = ", ".join(f"{'xyz'[k]} {1e3 * new_size[k]:.0f} mm" for k in open_axes)
+    left = np.sqrt(np.diag(covariance)[:3])
+    joined = ", ".join(f"{'xyz'[k]} {1e3 * new_size[k]:.0f} +- {1e3 * left[k]:.0f} mm" for k in open_axes)
     return replace(
         fit,
         superquadric=Superquadric(new_size, shape, known[5:8], fit.superquadric.rotation),
         covariance=0.5 * (covariance + covariance.T),
-        message=f"{fit.message}; with the network's prediction {names}",
+        message=f"half sizes open in the image, joined with the network's prediction: {joined}",
     )
