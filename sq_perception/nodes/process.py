@@ -19,8 +19,8 @@ if TYPE_CHECKING:
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _THREADS = {"OMP_WAIT_POLICY": "PASSIVE", "OPENBLAS_NUM_THREADS": "1"}
-"""Threads that spin while they wait take the cores from the nodes beside them: on two busy cores a frame took 30 ms with
-these settings and 50 to 150 ms without.  Small solves gain nothing from a second thread."""
+"""Threads that spin while they wait take the cores from the nodes beside them: on two busy cores a frame took 30 ms
+with these settings and 50 to 150 ms without.  Small solves gain nothing from a second thread."""
 
 
 class _Stop:
