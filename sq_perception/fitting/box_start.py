@@ -1,7 +1,7 @@
 """Starts from boxes around the measured points: along their principal axes, or standing on a support plane.
 
-The oriented box of the visible points is a lower bound of the body in every direction; on a plane, its height is exact as
-far as the top is seen.  What the camera does not see lies behind: the narrow side is also tried deeper.
+The oriented box of the visible points is a lower bound of the body in every direction; on a plane, its height is exact
+as far as the top is seen.  What the camera does not see lies behind: the narrow side is also tried deeper.
 """
 
 from __future__ import annotations

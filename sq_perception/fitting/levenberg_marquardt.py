@@ -73,7 +73,18 @@ def minimize(
 
 
 @kernel
-def _minimize(stage, rays, free, scene, parameters, rotation, lower, upper, max_iterations, tolerance):
+def _minimize(
+    stage: int,
+    rays: np.ndarray,
+    free: np.ndarray,
+    scene: Scene,
+    parameters: np.ndarray,
+    rotation: np.ndarray,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    max_iterations: int,
+    tolerance: float,
+) -> tuple[np.ndarray, np.ndarray, float, int]:
     parameters = np.minimum(np.maximum(parameters, lower), upper)
     rotation = rotation.copy()
     sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
@@ -93,9 +104,7 @@ def _minimize(stage, rays, free, scene, parameters, rotation, lower, upper, max_
         for _ in range(_ATTEMPTS):
             if solve_damped(sums, damping, held, factor, step):
                 move(parameters, rotation, step, lower, upper, next_parameters, next_rotation)
-                next_cost = evaluate(
-                    stage, rays, free, scene, next_parameters, next_rotation, next_sums
-                )
+                next_cost = evaluate(stage, rays, free, scene, next_parameters, next_rotation, next_sums)
                 if next_cost < cost:
                     accepted = True
                     break
@@ -114,7 +123,7 @@ def _minimize(stage, rays, free, scene, parameters, rotation, lower, upper, max_
 
 
 @kernel
-def _hold(parameters, lower, upper, gradient, held):
+def _hold(parameters: np.ndarray, lower: np.ndarray, upper: np.ndarray, gradient: np.ndarray, held: np.ndarray) -> None:
     """Mark what sits on a bound and would be pushed beyond it."""
     for k in range(8):
         slack = 1e-12 * max(abs(lower[k]), abs(upper[k]))
@@ -124,8 +133,8 @@ def _hold(parameters, lower, upper, gradient, held):
 
 
 @kernel
-def solve_damped(sums, damping, held, factor, step):
-    """Cholesky solution of the damped normal equations (rows as :func:`evaluate` leaves them); False if they are not positive."""
+def solve_damped(sums: np.ndarray, damping: float, held: np.ndarray, factor: np.ndarray, step: np.ndarray) -> bool:
+    """Cholesky solution of the damped normal equations, laid out as by ``evaluate``; False if they are not positive."""
     largest = 0.0
     for k in range(STEP_LENGTH):
         largest = max(largest, sums[k, k])
@@ -161,7 +170,15 @@ def solve_damped(sums, damping, held, factor, step):
 
 
 @kernel
-def move(parameters, rotation, step, lower, upper, next_parameters, next_rotation):
+def move(
+    parameters: np.ndarray,
+    rotation: np.ndarray,
+    step: np.ndarray,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    next_parameters: np.ndarray,
+    next_rotation: np.ndarray,
+) -> None:
     """Apply a clipped step: sizes multiply, shape and centre add, the rotation turns about its own axes."""
     largest_size = max(parameters[0], parameters[1], parameters[2])
     for k in range(8):

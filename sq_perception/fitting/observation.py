@@ -1,18 +1,17 @@
 """What one depth image says about one object: rays that hit it, rays that must miss it, and the depth noise.
 
-Rows of rays are (o_x, o_y, d_x, d_y, z, 1/sigma, weight), see :mod:`sq_perception.fitting.residuals`.
+Rows of rays are (o_x, o_y, d_x, d_y, z, 1/sigma, weight, index), see :mod:`sq_perception.fitting.residuals`.
 
-Object rays: pixels of the mask with a depth.  Drawn systematically with weight sqrt(1 + slope^2), that is by surface area
-instead of by pixel, since the steep parts of a body are the ones that fix its hidden extent.
+Object rays: pixels of the mask with a depth.  Drawn systematically with weight sqrt(1 + slope^2), that is by surface
+area instead of by pixel, since the steep parts of a body are the ones that fix its hidden extent.
 
 Free rays: pixels beside the mask.  One that measured something farther says "empty up to there"; one that measured
-something nearer, or nothing, says nothing (a nearer body hides what is behind it, and its ray, cut at its own depth, is
-kept: the body does not stand in front of the occluder either).  Where a missing depth means a truly empty background (the
-thesis' images), the ray is free to infinity.
+something nearer says so up to its own depth only, which binds nothing (what lies behind an occluder is unknown); one
+that measured nothing says nothing, unless a missing depth means a truly empty background (the thesis' images).
 
-Depth noise: third differences z0 - 3 z1 + 3 z2 - z3 of neighbouring pixels have variance 20 sigma^2 and cancel slope and
-curvature; their median absolute value over the mask, times 1.4826 / sqrt(20), is sigma.  Quantisation with step q adds
-q^2 / 12 at least; q is the smallest depth difference that occurs.
+Depth noise: third differences z0 - 3 z1 + 3 z2 - z3 of neighbouring pixels have variance 20 sigma^2 and cancel slope
+and curvature; their median absolute value over the mask, times 1.4826 / sqrt(20), is sigma.  Quantisation with step q
+adds q^2 / 12 at least; q is the smallest depth difference that occurs.
 """
 
 from __future__ import annotations
@@ -156,7 +155,7 @@ def draw(rays: np.ndarray, count: int, offset: float = 0.5) -> np.ndarray:
 
 
 @kernel
-def _draw(rays, count, offset):
+def _draw(rays: np.ndarray, count: int, offset: float) -> np.ndarray:
     total = 0.0
     for i in range(rays.shape[0]):
         total += rays[i, 6]
@@ -177,7 +176,7 @@ def _draw(rays, count, offset):
 
 
 @kernel
-def _typical_depth(depth, inside):
+def _typical_depth(depth: np.ndarray, inside: np.ndarray) -> float:
     total, count = 0.0, 0
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):
@@ -190,7 +189,7 @@ def _typical_depth(depth, inside):
 
 
 @kernel
-def _coherent(depth, inside, jump):
+def _coherent(depth: np.ndarray, inside: np.ndarray, jump: float) -> np.ndarray:
     """The mask without what is not the object: pieces that a depth step separates from the largest piece.
 
     A convex body has no step in its visible surface.  Pixels without depth belong to no piece and stay.  A piece that
@@ -248,8 +247,17 @@ def _coherent(depth, inside, jump):
 
 @kernel
 def _collect(
-    depth, inside, claimed, near, intrinsics, pinhole, noise, footprint, margin_in_front, nan_is_empty
-):
+    depth: np.ndarray,
+    inside: np.ndarray,
+    claimed: np.ndarray,
+    near: np.ndarray,
+    intrinsics: np.ndarray,
+    pinhole: bool,
+    noise: float,
+    footprint: float,
+    margin_in_front: float,
+    nan_is_empty: bool,
+) -> tuple[np.ndarray, np.ndarray, int]:
     fx, fy, cx, cy = intrinsics
     height, width = depth.shape
     count, free_count = 0, 0
@@ -296,7 +304,7 @@ def _collect(
 
 
 @kernel
-def _area_weight(depth, inside, v, u, footprint):
+def _area_weight(depth: np.ndarray, inside: np.ndarray, v: int, u: int, footprint: float) -> float:
     """sqrt(1 + slope^2) by central differences, with the slope capped; 1 at the mask's edge."""
     height, width = depth.shape
     if not (0 < v < height - 1 and 0 < u < width - 1):
@@ -330,7 +338,7 @@ def _noise(depth: np.ndarray, inside: np.ndarray) -> float:
 
 
 @kernel
-def _differences(depth, inside, step):
+def _differences(depth: np.ndarray, inside: np.ndarray, step: int) -> tuple[np.ndarray, np.ndarray]:
     """Absolute third and first differences along rows and columns, every ``step``-th line."""
     height, width = depth.shape
     third = np.empty(2 * height * width // step + 4)

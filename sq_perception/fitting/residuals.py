@@ -44,12 +44,16 @@ STEP_LENGTH = 11
 RAY_COLUMNS = 8
 
 _BLOCK = 64
-_HIT_TOLERANCE = 1e-3
+_HIT_TOLERANCE = 1e-4
 _HIT_STEPS = 12
 _MINIMUM_STEPS = 8
 _NEAREST = 1e-3
 """A free ray starts this far in front of a pinhole camera, metres."""
 _TINY = 1e-12
+
+
+Derivatives = tuple[float, float, float, float, float, float]
+"""A value g or h and its derivatives by x, y, z, e1 and e2."""
 
 
 class Scene(NamedTuple):
@@ -74,7 +78,15 @@ class Scene(NamedTuple):
 
 
 @kernel
-def evaluate(stage, rays, free, scene, parameters, rotation, sums):
+def evaluate(
+    stage: int,
+    rays: np.ndarray,
+    free: np.ndarray,
+    scene: Scene,
+    parameters: np.ndarray,
+    rotation: np.ndarray,
+    sums: np.ndarray,
+) -> float:
     """Cost at a body; fills ``sums`` (12, 12), lower triangle: J^T J in rows 0 to 10, J^T r in row 11."""
     sums[:] = 0.0
     block = np.zeros((STEP_LENGTH + 1, _BLOCK))
@@ -92,7 +104,15 @@ def evaluate(stage, rays, free, scene, parameters, rotation, sums):
 
 
 @kernel
-def _object_cost(stage, rays, scene, parameters, rotation, block, sums):
+def _object_cost(
+    stage: int,
+    rays: np.ndarray,
+    scene: Scene,
+    parameters: np.ndarray,
+    rotation: np.ndarray,
+    block: np.ndarray,
+    sums: np.ndarray,
+) -> float:
     a1, a2, a3, e1, e2, t1, t2, t3 = parameters
     m = rotation
     classic_scale = math.sqrt(a1 * a2 * a3)
@@ -143,7 +163,20 @@ def _object_cost(stage, rays, scene, parameters, rotation, block, sums):
 
 
 @kernel
-def _meet(qx, qy, qz, ex, ey, ez, a1, a2, a3, e1, e2, at):
+def _meet(
+    qx: float,
+    qy: float,
+    qz: float,
+    ex: float,
+    ey: float,
+    ez: float,
+    a1: float,
+    a2: float,
+    a3: float,
+    e1: float,
+    e2: float,
+    at: Derivatives,
+) -> tuple[bool, float, Derivatives]:
     """Where the ray through q along e meets the surface: (hit, shift along the ray, gauge and derivatives there).
 
     Newton's method along the ray from the given point, whose gauge and derivatives are ``at``.  From a point on the
@@ -187,7 +220,9 @@ def _meet(qx, qy, qz, ex, ey, ez, a1, a2, a3, e1, e2, at):
 
 
 @kernel
-def _free_cost(free, scene, parameters, rotation, block, sums):
+def _free_cost(
+    free: np.ndarray, scene: Scene, parameters: np.ndarray, rotation: np.ndarray, block: np.ndarray, sums: np.ndarray
+) -> float:
     a1, a2, a3, e1, e2, t1, t2, t3 = parameters
     m = rotation
     nearest = _NEAREST if scene.pinhole > 0.0 else -1e300
@@ -221,7 +256,9 @@ def _free_cost(free, scene, parameters, rotation, block, sums):
 
 
 @kernel
-def support_derivatives(nx, ny, nz, a1, a2, a3, e1, e2):
+def support_derivatives(
+    nx: float, ny: float, nz: float, a1: float, a2: float, a3: float, e1: float, e2: float
+) -> Derivatives:
     """Support function h at an object-frame direction and its derivatives: h, h_nx, h_ny, h_nz, h_e1, h_e2."""
     inner, inner_x, inner_y, inner_e = p_norm(a1 * abs(nx), a2 * abs(ny), max(2.0 - e2, 1e-3))
     h, h_inner, h_z, h_e = p_norm(inner, a3 * abs(nz), max(2.0 - e1, 1e-3))
@@ -236,7 +273,9 @@ def support_derivatives(nx, ny, nz, a1, a2, a3, e1, e2):
 
 
 @kernel
-def _support_cost(scene, parameters, rotation, block, sums):
+def _support_cost(
+    scene: Scene, parameters: np.ndarray, rotation: np.ndarray, block: np.ndarray, sums: np.ndarray
+) -> float:
     a1, a2, a3, e1, e2, t1, t2, t3 = parameters
     normal = np.array([scene.normal_x, scene.normal_y, scene.normal_z])
     n = np.zeros(3)
@@ -280,7 +319,7 @@ def _support_cost(scene, parameters, rotation, block, sums):
 
 
 @kernel
-def _proportion_cost(scene, parameters, block, sums):
+def _proportion_cost(scene: Scene, parameters: np.ndarray, block: np.ndarray, sums: np.ndarray) -> float:
     mean = (math.log(parameters[0]) + math.log(parameters[1]) + math.log(parameters[2])) / 3.0
     cost = 0.0
     for k in range(3):
@@ -296,12 +335,12 @@ def _proportion_cost(scene, parameters, block, sums):
 
 
 @kernel
-def _length(at):
+def _length(at: Derivatives) -> float:
     return math.sqrt(at[1] * at[1] + at[2] * at[2] + at[3] * at[3]) + _TINY
 
 
 @kernel
-def _huber(residual, huber, weight):
+def _huber(residual: float, huber: float, weight: float) -> tuple[float, float]:
     """Weighted loss of a residual, and the square root of its weight in the normal equations."""
     size = abs(residual)
     if size > huber:
@@ -310,7 +349,18 @@ def _huber(residual, huber, weight):
 
 
 @kernel
-def _write_row(block, i, scale, factor, residual, qx, qy, qz, at, m):
+def _write_row(
+    block: np.ndarray,
+    i: int,
+    scale: float,
+    factor: float,
+    residual: float,
+    qx: float,
+    qy: float,
+    qz: float,
+    at: Derivatives,
+    m: np.ndarray,
+) -> None:
     """Put the derivatives of ``factor * g`` and the residual into column i of the block."""
     s = scale * factor
     gx, gy, gz = s * at[1], s * at[2], s * at[3]
@@ -326,7 +376,7 @@ def _write_row(block, i, scale, factor, residual, qx, qy, qz, at, m):
 
 
 @kernel
-def _flush(block, filled, sums):
+def _flush(block: np.ndarray, filled: int, sums: np.ndarray) -> None:
     """Add the outer products of the block's columns to the sums; long inner loops are what vectorises."""
     for k in range(STEP_LENGTH + 1):
         for j in range(k + 1):
@@ -337,7 +387,7 @@ def _flush(block, filled, sums):
 
 
 @kernel
-def surface_distance(rays, parameters, rotation):
+def surface_distance(rays: np.ndarray, parameters: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     """Absolute Sampson distance (n,) of the measured points to the surface, metres."""
     a1, a2, a3, e1, e2, t1, t2, t3 = parameters
     m = rotation
@@ -360,7 +410,7 @@ def surface_distance(rays, parameters, rotation):
 
 
 @kernel
-def penetration(free, scene, parameters, rotation):
+def penetration(free: np.ndarray, scene: Scene, parameters: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     """How deep (n,) each free ray runs inside the body, metres: (1 - min g) / |grad g|, 0 for rays that miss it."""
     depth = np.zeros(free.shape[0])
     block = np.zeros((STEP_LENGTH + 1, _BLOCK))

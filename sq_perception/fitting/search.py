@@ -33,10 +33,10 @@ FREE_SHARE = 0.25
 COARSE_GATE = 3.6
 FINAL_GATE = 1.4
 """Mean squared residuals above which more starts are tried."""
-DOUBT = 3.0
-"""Candidates within this many standard deviations of the noise's own cost are not told apart by it,"""
+DOUBT = 25.0
+"""Bodies whose costs differ by D on the same rays differ by 2 sqrt(D) through noise: below this they go on together,"""
 RIVAL = 1.3
-"""nor those within this factor of the best."""
+"""and so do those within this factor of the best, as they have not converged yet."""
 FINALISTS, ESCALATED_FINALISTS = 3, 6
 TOLERANCE, FINAL_TOLERANCE = 1e-3, 1e-4
 SHARP_OUTLINE = 0.3
@@ -55,7 +55,7 @@ REAL_WEIGHT = 100.0
 
 
 class Search:
-    """One search; ``best`` is the best body so far, ``scene`` and ``rays`` belong to its last stage."""
+    """One search; ``scene``, ``rays`` and ``free`` are those of the stage it is in, after :meth:`run` of the last."""
 
     def __init__(self, observation: Observation, options: Options, began: float) -> None:
         self.observation = observation
@@ -64,7 +64,7 @@ class Search:
         self.limits = options.bounds.limits(observation.points)
         self.tolerated = options.tolerated
         self.scene = _scene(observation, options)
-        self.best: State | None = None
+        self.finalists: list[State] = []
         self.rays = np.empty((0, RAY_COLUMNS))
         self.free = np.empty((0, RAY_COLUMNS))
 
@@ -79,8 +79,7 @@ class Search:
             if not self._good_enough() and self.tolerated == 0 and not self._late():
                 self._tolerate_what_is_left()
                 self._select(self._coarse(self._everything()), ESCALATED_FINALISTS)
-        assert self.best is not None
-        return self._polished(self.best)
+        return self._decided()
 
     # Starts
 
@@ -124,12 +123,12 @@ class Search:
 
     def _tolerate_what_is_left(self) -> None:
         """The object is no superquadric: what the best body leaves unexplained becomes the model error."""
-        assert self.best is not None
-        distance = surface_distance(self.observation.object_rays, self.best.parameters, self.best.rotation)
+        best = self.finalists[0]
+        distance = surface_distance(self.observation.object_rays, best.parameters, best.rotation)
         self.tolerated = MEDIAN_TO_SIGMA * float(np.median(distance))
         self.observation = self.observation.coarsened(self.tolerated)
         self.scene = _scene(self.observation, self.options)._replace(huber=2.0, volume_price=VOLUME_PRICE)
-        self.best = None
+        self.finalists = []
 
     # Stages
 
@@ -160,35 +159,37 @@ class Search:
         return found
 
     def _select(self, candidates: list[State], finalists: int) -> None:
-        """Refine the best candidates; the winner becomes ``best`` if it beats what is there."""
-        for stage, steps in ((SAMPSON, BASIN_STEPS), (RENDERED, BASIN_STEPS)):
-            candidates = self._rivals(candidates)[:finalists]
-            rays, free = self._draw(BASIN_RAYS, 0.7)
+        """Refine the best candidates; those that come out best, and what is there already, are the finalists."""
+        rays, free = self._draw(BASIN_RAYS, 0.7)
+        for stage in (SAMPSON, RENDERED):
             candidates = [
-                minimize(stage, rays, free, self.scene, candidate, self.limits, steps, TOLERANCE)
-                for candidate in candidates
+                minimize(stage, rays, free, self.scene, candidate, self.limits, BASIN_STEPS, TOLERANCE)
+                for candidate in self._rivals(candidates)[:finalists]
             ]
-        winner = min(candidates, key=lambda state: state.cost)
-        if self.best is None or winner.cost < self.best.cost:
-            self.best = winner
+        self.finalists = self._rivals(self.finalists + candidates)[:FINALISTS]
 
     def _rivals(self, candidates: list[State]) -> list[State]:
         """Candidates, best first, without those that the noise cannot have made worse than the best."""
         ranked = sorted(candidates, key=lambda state: state.cost)
         least = ranked[0].cost
-        doubt = DOUBT * math.sqrt(2 * self._weight(COARSE_RAYS))
-        return [state for state in ranked if state.cost <= least + max(doubt, (RIVAL - 1) * abs(least))]
+        return [state for state in ranked if state.cost <= least + max(DOUBT, (RIVAL - 1) * abs(least))]
 
-    def _polished(self, state: State) -> State:
-        """The last stage, on the full budget of rays."""
+    def _decided(self) -> State:
+        """The last stage: the finalists on the full budget of rays, one scene for all of them."""
+        favourite = self.finalists[0]
+        if self.tolerated == 0 and not self._late():
+            favourite = self._outlined(favourite)
+        self.rays, self.free = self._draw(self.options.pixels or self._enough(), 0.3)
         if self.tolerated == 0:
-            state = self._outlined(state)
-        count = self.options.pixels or self._enough()
-        self.rays, self.free = self._draw(count, 0.3)
-        if self.tolerated == 0:
-            self.rays = self._without_outliers(self.rays, state)
-            self.scene = self.scene._replace(outline_stiffness=1 / self._outline_sigma(state))
-        return self._refined(state, self.options.max_iterations)
+            self.rays = self._without_outliers(self.rays, favourite)
+            self.scene = self.scene._replace(outline_stiffness=1 / self._outline_sigma(favourite))
+        best = self._refined(favourite, self.options.max_iterations)
+        for rival in self.finalists[1:]:
+            if self._late():
+                break
+            state = self._refined(rival, self.options.max_iterations)
+            best = min(best, state, key=lambda each: each.cost)
+        return best
 
     def _refined(self, state: State, steps: int) -> State:
         return minimize(RENDERED, self.rays, self.free, self.scene, state, self.limits, steps, FINAL_TOLERANCE)
@@ -243,7 +244,7 @@ class Search:
     # Verdicts
 
     def _good_enough(self) -> bool:
-        return self.best is not None and self.best.cost < FINAL_GATE * self._weight(BASIN_RAYS)
+        return bool(self.finalists) and self.finalists[0].cost < FINAL_GATE * self._weight(BASIN_RAYS)
 
     def _late(self) -> bool:
         return time.perf_counter() - self.began > self.options.time_budget

@@ -4,16 +4,16 @@ Objective (thesis, chapter 7.3)
 
     minimise over the 11 parameters    sum_i [ sqrt(a1 a2 a3) (F(p_i)^e1 - 1) ]^2
 
-where the factor sqrt(a1 a2 a3) prefers the smaller of two bodies that pass through the points, and the power e1 evens out
-the differences between shapes.  With the gauge g, F^e1 = g^2.  Minimised by Levenberg-Marquardt with analytic derivatives
-(:mod:`sq_perception.fitting.residuals`, stage ``classic``).
+where the factor sqrt(a1 a2 a3) prefers the smaller of two bodies that pass through the points, and the power e1 evens
+out the differences between shapes.  With the gauge g, F^e1 = g^2.  Minimised by Levenberg-Marquardt with analytic
+derivatives (:mod:`sq_perception.fitting.residuals`, stage ``classic``).
 
-Start: an ellipsoid (e1 = e2 = 1) at the centroid of the points, along their principal axes, with the extents of the points
-as its sizes.  The z axis is the principal axis whose moment differs most from the other two: the long axis of a long
-object, the short one of a flat object, and for both the axis of rotational symmetry.
+Start: an ellipsoid (e1 = e2 = 1) at the centroid of the points, along their principal axes, with the extents of the
+points as its sizes.  The z axis is the principal axis whose moment differs most from the other two: the long axis of a
+long object, the short one of a flat object, and for both the axis of rotational symmetry.
 
-It is the baseline of every comparison and deliberately knows nothing else: no free space, no outline, no noise.  Seen from
-one side, the points fix the visible half only, so the centroid start lies too near and hidden extents come out short.
+It is the baseline of every comparison and deliberately knows nothing else: no free space, no outline, no noise.  Seen
+from one side, the points fix the visible half only: the centroid lies too near, and hidden extents are a guess.
 
 Reference: F. Solina, R. Bajcsy, Recovery of parametric models from range images: the case for superquadrics with global
 deformations, IEEE PAMI 12(2), 1990; A. Jaklic, A. Leonardis, F. Solina, Segmentation and Recovery of Superquadrics,

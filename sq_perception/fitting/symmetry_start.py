@@ -1,8 +1,8 @@
 """Starts from central symmetry: a superquadric is its own reflection through its centre C.
 
-Under orthographic projection the hidden half is the visible half reflected, and the silhouette's centre is the centre's
-projection.  With p(u) the point seen at pixel u and u' the pixel opposite to u about the silhouette's centre, the ray of u
-enters the body at p(u) and leaves it near 2 C - p(u').  So, for every pair,
+Under orthographic projection the hidden half is the visible half reflected, and the silhouette's centre is the
+centre's projection.  With p(u) the point seen at pixel u and u' the pixel opposite to u about the silhouette's centre,
+the ray of u enters the body at p(u) and leaves it near 2 C - p(u').  So, for every pair,
 
     midpoint    m = (p(u) - p(u')) / 2                  (relative to C)
     half chord  h = C - (p(u) + p(u')) / 2              (must point away from the camera)
@@ -54,7 +54,9 @@ def completed_moments(observation: Observation) -> tuple[np.ndarray, np.ndarray]
 
 
 @kernel
-def _opposite_pairs(depth, inside, intrinsics, pinhole):
+def _opposite_pairs(
+    depth: np.ndarray, inside: np.ndarray, intrinsics: np.ndarray, pinhole: bool
+) -> tuple[float, float, np.ndarray]:
     """Centre of the silhouette (u, v), and for each pixel with an opposite: half difference and mean of the points."""
     fx, fy, cx, cy = intrinsics
     height, width = depth.shape
@@ -72,7 +74,7 @@ def _opposite_pairs(depth, inside, intrinsics, pinhole):
         for u in range(width):
             if not inside[v, u] or not np.isfinite(depth[v, u]):
                 continue
-            u2, v2 = int(round(2.0 * centre_u - u)), int(round(2.0 * centre_v - v))
+            u2, v2 = round(2.0 * centre_u - u), round(2.0 * centre_v - v)
             if u2 < 0 or v2 < 0 or u2 >= width or v2 >= height:
                 continue
             if not inside[v2, u2] or not np.isfinite(depth[v2, u2]):

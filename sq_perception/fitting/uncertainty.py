@@ -1,10 +1,10 @@
 """How sure a fit is: residual, inliers, covariance, and a verdict in words.
 
-With the whitened residuals r and their Jacobian J at the optimum, the covariance is (J^T J + P)^-1 s^2, where
-s^2 = max(1, sum r^2 / (n - 11)) lets a body that does not explain the data be less sure of itself, and P is the precision
-of a wide prior (a factor e in size, 0.5 in shape, one size in position, one radian in angle): what the image leaves open,
-such as the turn of a round body about its axis, gets the width of the prior instead of infinity.  The outline counts with a
-whole pixel: its errors are no independent noise.
+With the whitened residuals r and their Jacobian J at the optimum, the covariance is (J^T J / s^2 + P)^-1, where
+s^2 = max(1, sum r^2 / (n - 11)) lets a body that does not explain the data be less sure of itself, and P is the
+precision of a wide prior (a factor e in size, 0.5 in shape, one size in position, one radian in angle): what the image
+leaves open, such as the turn of a round body about its axis, gets the width of the prior instead of infinity.  The
+outline counts with a whole pixel: its errors are no independent noise.
 """
 
 from __future__ import annotations

@@ -1,0 +1,244 @@
+"""The compiled residuals against their torch statement: values, and derivatives against autograd."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+import torch
+
+from sq_perception.fitting import residual_statement as statement
+from sq_perception.fitting.levenberg_marquardt import State, minimize
+from sq_perception.fitting.residuals import (
+    CLASSIC,
+    RAY_COLUMNS,
+    RENDERED,
+    SAMPSON,
+    STEP_LENGTH,
+    Scene,
+    evaluate,
+    penetration,
+    surface_distance,
+)
+from sq_perception.geometry import rotation as quaternions
+from sq_perception.geometry.superquadric import Superquadric
+
+NO_RAYS = np.empty((0, RAY_COLUMNS))
+PLAIN = Scene(huber=np.inf, outline_huber=np.inf)
+SIGMA = 0.003
+
+
+def random_body(rng: np.random.Generator, shape: tuple[float, float] | None = None) -> Superquadric:
+    exponents = rng.uniform(0.1, 1.0, 2) if shape is None else np.array(shape)
+    return Superquadric(
+        rng.uniform(0.03, 0.1, 3), exponents, rng.uniform(-0.1, 0.1, 3) + [0, 0, 0.6], quaternions.random(1, rng)[0]
+    )
+
+
+def rays_to(points: np.ndarray, pinhole: bool) -> np.ndarray:
+    rays = np.zeros((len(points), RAY_COLUMNS))
+    if pinhole:
+        rays[:, 2:4] = points[:, :2] / points[:, 2:]
+    else:
+        rays[:, 0:2] = points[:, :2]
+    rays[:, 4], rays[:, 5], rays[:, 6] = points[:, 2], 1 / SIGMA, 1.0
+    return rays
+
+
+def torch_rays(rays: np.ndarray) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    origin, direction = np.zeros((len(rays), 3)), np.ones((len(rays), 3))
+    origin[:, :2], direction[:, :2] = rays[:, 0:2], rays[:, 2:4]
+    return torch.tensor(origin), torch.tensor(direction), torch.tensor(rays[:, 4])
+
+
+def as_torch(body: Superquadric) -> Superquadric:
+    return Superquadric.from_flat(torch.tensor(np.asarray(body.to_flat(), dtype=float)))
+
+
+def expected_sums(body: Superquadric, residuals: Callable[[Superquadric], torch.Tensor]) -> tuple[float, np.ndarray]:
+    """Sum of squares and the normal equations of a residual vector, by autograd."""
+    start = as_torch(body)
+    zero = torch.zeros(STEP_LENGTH, dtype=torch.float64)
+    values = residuals(statement.moved(start, zero)).detach().numpy()
+    jacobian = torch.autograd.functional.jacobian(lambda step: residuals(statement.moved(start, step)), zero).numpy()
+    return float(values @ values), np.concatenate([jacobian.T @ jacobian, (jacobian.T @ values)[None]])
+
+
+def assert_same(
+    stage: int,
+    rays: np.ndarray,
+    free: np.ndarray,
+    scene: Scene,
+    body: Superquadric,
+    expected: tuple[float, np.ndarray],
+    tolerance: float = 1e-5,
+) -> None:
+    sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
+    state = State.of(body)
+    cost = evaluate(stage, rays, free, scene, state.parameters, state.rotation, sums)
+    value, matrix = expected
+    assert cost == pytest.approx(value, rel=tolerance, abs=1e-12)
+    lower = np.tril(np.ones((STEP_LENGTH, STEP_LENGTH), bool))
+    scale = np.sqrt(np.outer(np.diag(matrix[:STEP_LENGTH]), np.diag(matrix[:STEP_LENGTH]))) + 1e-6
+    difference = np.abs(sums[:STEP_LENGTH, :STEP_LENGTH] - matrix[:STEP_LENGTH]) / scale
+    assert difference[lower].max() < 10 * tolerance
+    root = np.sqrt(np.diag(matrix[:STEP_LENGTH]) * max(value, 1e-12)) + 1e-6
+    assert (np.abs(sums[STEP_LENGTH, :STEP_LENGTH] - matrix[STEP_LENGTH]) / root).max() < 10 * tolerance
+
+
+SHAPES = [None, (0.1, 0.1), (0.02, 0.05), (1.0, 1.0), (0.1, 1.0), (1.0, 0.1), (1.8, 1.5)]
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+@pytest.mark.parametrize("stage", [CLASSIC, SAMPSON])
+def test_point_residuals_and_derivatives(
+    stage: int, shape: tuple[float, float] | None, rng: np.random.Generator
+) -> None:
+    body = random_body(rng, shape)
+    points = body.sample_surface(60, rng) + rng.normal(0, 0.004, (60, 3))
+    function = statement.classic if stage == CLASSIC else statement.sampson
+    expected = expected_sums(body, lambda moved: function(moved, torch.tensor(points)) / SIGMA)
+    assert_same(stage, rays_to(points, pinhole=False), NO_RAYS, PLAIN, body, expected)
+
+
+@pytest.mark.parametrize("stage", [CLASSIC, SAMPSON])
+def test_point_residuals_on_the_axes(stage: int, rng: np.random.Generator) -> None:
+    body = random_body(rng)
+    axes = np.concatenate([np.eye(3), -np.eye(3)]) * body.size * 1.02
+    points = np.asarray(body.to_parent(axes))
+    function = statement.classic if stage == CLASSIC else statement.sampson
+    expected = expected_sums(body, lambda moved: function(moved, torch.tensor(points)) / SIGMA)
+    assert_same(stage, rays_to(points, pinhole=True), NO_RAYS, PLAIN, body, expected)
+
+
+def visible_points(body: Superquadric, rng: np.random.Generator, pinhole: bool) -> np.ndarray:
+    points = body.sample_surface(200, rng)
+    normals = np.asarray(body.normals(points))
+    view = points / points[:, 2:] if pinhole else np.array([0.0, 0.0, 1.0])
+    return points[(normals * view).sum(-1) < -0.15]
+
+
+@pytest.mark.parametrize("shape", SHAPES[:5])
+@pytest.mark.parametrize("pinhole", [True, False])
+def test_rendered_depth_and_derivatives(
+    pinhole: bool, shape: tuple[float, float] | None, rng: np.random.Generator
+) -> None:
+    body = random_body(rng, shape)
+    rays = rays_to(visible_points(body, rng, pinhole), pinhole)
+    rays[:, 4] += rng.normal(0, 0.003, len(rays))
+    origin, direction, depth = torch_rays(rays)
+    expected = expected_sums(
+        body, lambda moved: statement.rendered(moved, origin, direction, depth, PLAIN.grazing) / SIGMA
+    )
+    # The kernel stops Newton's method at |g - 1| < 1e-4 and takes the last step in first order.
+    assert_same(RENDERED, rays, NO_RAYS, PLAIN, body, expected, tolerance=1e-3 if shape != (0.02, 0.05) else 0.02)
+
+
+@pytest.mark.parametrize("pinhole", [True, False])
+def test_free_space_and_derivatives(pinhole: bool, rng: np.random.Generator) -> None:
+    body = random_body(rng)
+    around = body.translation + rng.uniform(-0.12, 0.12, (400, 3))
+    free = rays_to(around, pinhole)
+    free[:, 4] = np.where(rng.random(400) < 0.5, np.inf, around[:, 2])
+    free[:, 5] = 1.0
+    free[np.isinf(free[:, 4]), 4] = 1e300
+    origin, direction, limit = torch_rays(free)
+    scene = PLAIN._replace(outline_stiffness=1 / SIGMA, pinhole=float(pinhole))
+    expected = expected_sums(body, lambda moved: torch.relu(statement.outline(moved, origin, direction, limit)) / SIGMA)
+    assert expected[0] > 1
+    assert_same(SAMPSON, NO_RAYS, free, scene, body, expected)
+    state = State.of(body)
+    depth = penetration(free, scene, state.parameters, state.rotation)
+    assert depth @ depth == pytest.approx(expected[0] * SIGMA**2, rel=1e-5)
+
+
+def test_pixels_of_the_object_that_miss_the_body_pull_its_outline(rng: np.random.Generator) -> None:
+    body = Superquadric([0.05, 0.04, 0.03], [0.6, 0.8], [0.0, 0.0, 0.5], quaternions.random(1, rng)[0])
+    angle = np.linspace(0, 2 * np.pi, 200)
+    rim = np.stack([np.cos(angle), np.sin(angle)], 1)
+    extent = np.asarray(body.support(np.concatenate([rim, np.zeros((200, 1))], 1)))
+    rays = rays_to(np.concatenate([rim * extent[:, None] * 1.01, np.full((200, 1), 0.5)], 1), pinhole=False)
+    scene = PLAIN._replace(outline_stiffness=1 / SIGMA)
+    sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
+    state = State.of(body)
+    cost = evaluate(RENDERED, rays, NO_RAYS, scene, state.parameters, state.rotation, sums)
+    assert cost > 0
+    assert np.isfinite(cost)
+    gradient = sums[STEP_LENGTH, :STEP_LENGTH]
+    assert gradient[:3].min() < 0, "growing the body must lower the cost"
+
+
+def test_plane_rest_and_proportion(rng: np.random.Generator) -> None:
+    body = random_body(rng)
+    normal = np.array([0.1, -0.9, -0.3])
+    normal /= np.linalg.norm(normal)
+    plane = np.append(normal, -normal @ body.translation + 0.4 * body.size.min())
+    target = torch.tensor(plane)
+    scene = PLAIN._replace(
+        normal_x=plane[0], normal_y=plane[1], normal_z=plane[2], offset=plane[3], plane_stiffness=200.0
+    )
+    expected = expected_sums(body, lambda moved: 200 * statement.lowest_height(moved, target)[None])
+    assert_same(SAMPSON, NO_RAYS, NO_RAYS, scene, body, expected)
+
+    square = float(statement.leaning(as_torch(body), target).square().sum()) * 9
+    rest = scene._replace(plane_stiffness=0.0, rest_stiffness=3.0)
+    _, matrix = expected_sums(body, lambda moved: 3 * statement.leaning(moved, target) / np.sqrt(1 + square))
+    scaled = matrix.copy()
+    assert_same(SAMPSON, NO_RAYS, NO_RAYS, rest, body, (np.log1p(square), scaled))
+
+    even = PLAIN._replace(proportion_stiffness=2.0)
+    assert_same(
+        SAMPSON, NO_RAYS, NO_RAYS, even, body, expected_sums(body, lambda moved: 2 * statement.proportion(moved))
+    )
+
+
+def test_a_body_above_the_plane_pays_nothing(rng: np.random.Generator) -> None:
+    body = random_body(rng)
+    scene = PLAIN._replace(normal_y=-1.0, offset=1.0, plane_stiffness=1000.0)
+    state = State.of(body)
+    sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
+    assert evaluate(SAMPSON, NO_RAYS, NO_RAYS, scene, state.parameters, state.rotation, sums) == 0
+
+
+def test_huber_loss_grows_linearly(rng: np.random.Generator) -> None:
+    sphere = Superquadric([0.05] * 3, [1.0, 1.0], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0, 1.0])
+    state = State.of(sphere)
+    rays = rays_to(np.array([[0.0, 0.0, 0.44]]), pinhole=False)
+    sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
+    residual = 0.01 / SIGMA
+    for huber, loss in ((10.0, residual**2), (2.0, 2 * 2.0 * residual - 4.0)):
+        scene = PLAIN._replace(huber=huber)
+        assert evaluate(SAMPSON, rays, NO_RAYS, scene, state.parameters, state.rotation, sums) == pytest.approx(loss)
+    distance = surface_distance(rays, state.parameters, state.rotation)
+    assert distance[0] == pytest.approx(0.01)
+
+
+def test_cost_never_rises_and_reaches_the_truth(rng: np.random.Generator) -> None:
+    truth = random_body(rng)
+    points = truth.sample_surface(300, rng)
+    rays = rays_to(points, pinhole=False)
+    limits = (np.r_[[0.01] * 3, [0.1] * 2, [-1.0] * 3], np.r_[[0.3] * 3, [1.0] * 2, [1.0] * 3])
+    step = rng.normal(0, 0.15, STEP_LENGTH) * np.r_[np.ones(5), [0.1] * 3, np.ones(3)]
+    moved = statement.moved(as_torch(truth), torch.tensor(step))
+    flat = np.asarray(moved.to_flat().numpy())
+    flat[3:5] = np.clip(flat[3:5], 0.1, 1.0)
+    state = State.of(Superquadric.from_flat(flat))
+    costs = []
+    for _ in range(60):
+        state = minimize(SAMPSON, rays, NO_RAYS, PLAIN, state, limits, 1, 0.0)
+        costs.append(state.cost)
+    assert all(after <= before for before, after in itertools.pairwise(costs))
+    assert costs[-1] < 1e-4 * costs[0]
+    assert np.sort(state.body.size) == pytest.approx(np.sort(truth.size), rel=1e-3)
+
+
+def test_bounds_hold(rng: np.random.Generator) -> None:
+    truth = random_body(rng, (0.4, 0.5))
+    rays = rays_to(truth.sample_surface(300, rng), pinhole=False)
+    limits = (np.r_[[0.06] * 3, [0.6] * 2, [-1.0] * 3], np.r_[[0.07] * 3, [1.0] * 2, [1.0] * 3])
+    state = minimize(SAMPSON, rays, NO_RAYS, PLAIN, State.of(truth), limits, 30, 1e-6)
+    assert (state.parameters >= limits[0]).all()
+    assert (state.parameters <= limits[1]).all()
+    assert np.isfinite(state.cost)
