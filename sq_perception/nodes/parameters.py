@@ -168,7 +168,9 @@ class SyntheticParameters:
         "", "Frame of the images; empty: camera_depth_optical_frame, or unit_cube for orthographic frames."
     )
     path: str = setting("", "A recorded frame (NPZ, PNG, BMP) or a folder of them, for scene = replay.")
-    camera_info_file: str = setting("", "camera_info YAML of recorded PNG depth images; also the camera of table scenes.")
+    camera_info_file: str = setting(
+        "", "camera_info YAML of recorded PNG depth images; also the camera of table scenes."
+    )
     projection: Projection = setting(  # noqa: RUF009 - a field
         "pinhole",
         "Camera model of recorded images: 8 bit orthographic images look like depth images.",
