@@ -97,40 +97,47 @@ def from_mask(depth: np.ndarray, mask: np.ndarray, camera: Camera, pixels: int =
     rows, columns = np.nonzero(mask & np.isfinite(depth))
     if rows.size == 0:
         raise ValueError("a canonical view needs at least one pixel with a depth under the mask")
-    top, bottom, left, right = rows.min(), rows.max() + 1, columns.min(), columns.max() + 1
+    measured = depth[rows, columns].astype(float)
+    top, bottom, left, right = rows[0], rows[-1] + 1, columns.min(), columns.max() + 1
     camera = camera.cropped(left, top, right - left, bottom - top)
     rows, columns = rows - top, columns - left
-    points = camera.unproject(columns, rows, depth[rows + top, columns + left])
 
     look = np.eye(3)
     if camera.is_pinhole:
         _, toward = camera.rays(0.5 * (right - left - 1), 0.5 * (bottom - top - 1))
         look = _rotation_to_z(toward / np.linalg.norm(toward))
     matrix = _FLIP @ look
-    turned = points @ matrix.T
-    low, high = turned[:, :2].min(axis=0), turned[:, :2].max(axis=0)
-    outliers = int(rows.size * _OUTLIERS_PER_END)
-    z = np.partition(turned[:, 2], [outliers, rows.size - 1 - outliers])
-    farthest, nearest = z[outliers], z[rows.size - 1 - outliers]
-    pixel = max(1 / camera.fx, 1 / camera.fy) * (nearest_depth(points) if camera.is_pinhole else 1.0)
+    x, y, z = matrix @ _coordinates(camera, columns, rows, measured)
+    low, high = np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
+    outliers = int(z.size * _OUTLIERS_PER_END)
+    ordered = np.partition(z, [outliers, z.size // 2, z.size - 1 - outliers])
+    farthest, middle, nearest = ordered[[outliers, z.size // 2, z.size - 1 - outliers]]
+    pixel = max(1 / camera.fx, 1 / camera.fy) * (measured.min() if camera.is_pinhole else 1.0)
     extent = MARGIN * max(*(high - low + pixel), nearest - farthest)
     anchor = np.array([*(0.5 * (low + high)), nearest])
 
     image = np.full((camera.height, camera.width), np.nan, dtype=np.float32)
-    image[rows, columns] = turned[:, 2]
-    z_view = _resample(image, matrix, anchor, extent, camera, pixels)
+    image[rows, columns] = z
+    z_view = _resample(image, middle, matrix, anchor, extent, camera, pixels)
     value = (z_view - anchor[2]) / extent + _NEAREST
     value = np.where(np.isfinite(value), np.clip(value, 1 / 255, 1.0), 0.0).astype(np.float32)
     return CanonicalView(value, quaternions.from_matrix(matrix), matrix.T @ anchor, float(extent))
 
 
-def nearest_depth(points: np.ndarray) -> float:
-    """Smallest depth of points (..., 3)."""
-    return float(points[..., 2].min())
+def _coordinates(camera: Camera, u: np.ndarray, v: np.ndarray, depth: np.ndarray) -> np.ndarray:
+    """Points of pixels as (3, n): one contiguous row a coordinate, several times as fast to turn as (n, 3)."""
+    scale = depth if camera.is_pinhole else 1.0
+    return np.stack([(u - camera.cx) / camera.fx * scale, (v - camera.cy) / camera.fy * scale, depth])
 
 
 def _resample(
-    z_image: np.ndarray, matrix: np.ndarray, anchor: np.ndarray, extent: float, camera: Camera, pixels: int
+    z_image: np.ndarray,
+    z_guess: float,
+    matrix: np.ndarray,
+    anchor: np.ndarray,
+    extent: float,
+    camera: Camera,
+    pixels: int,
 ) -> np.ndarray:
     """Turned z of what each pixel of the view sees, NaN where that is nothing.
 
@@ -139,7 +146,7 @@ def _resample(
     """
     steps = ((np.arange(pixels) + 0.5) / pixels - 0.5) * extent
     x, y = np.meshgrid(anchor[0] + steps, anchor[1] - steps)
-    z = np.full((pixels, pixels), np.nanmedian(z_image))
+    z = np.full((pixels, pixels), z_guess)
     found = z
     for _ in range(3 if camera.is_pinhole else 1):
         uv = camera.project(np.stack([x, y, z], axis=-1) @ matrix).astype(np.float32)
