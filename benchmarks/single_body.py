@@ -2,7 +2,7 @@
 
     python benchmarks/single_body.py [--bodies 2000] [--rows "clean; noise 2"]
 
-Every row draws its bodies and its damage from a seed of its own (``SEED`` + the row's number).  Orthographic rows follow
+Every row draws its bodies and its damage from a seed of its own (``SEED`` + the row's number).  Orthographic rows have
 the thesis' protocol (a in [25, 75], e in [0.1, 1], centre 128 +- 40, uniform rotations, 256 x 256, 8 bit); pinhole rows
 see bodies of 3 to 12 cm half size at 3 to 10 times their length, 640 x 480 pixels, 60 degrees wide, 16 bit millimetres.
 No start is given, all rows share one set of options (but for the row that names a pixel budget).
@@ -35,7 +35,7 @@ from sq_perception.fitting.fit import Fit, Status  # noqa: E402
 from sq_perception.geometry import Superquadric, rotation  # noqa: E402
 from sq_perception.imaging import raycast, unit_cube  # noqa: E402
 from sq_perception.imaging.camera import Camera  # noqa: E402
-from sq_perception.learning.dataset import draw_bodies  # noqa: E402
+from sq_perception.imaging.scene import thesis_bodies  # noqa: E402
 
 SEED = 7000
 GREY = 1 / 255
@@ -125,8 +125,8 @@ def occluded(image: Image, rng: np.random.Generator) -> Image:
     return Image(np.where(hidden, nearer, image.depth), image.mask & ~hidden, image.camera)
 
 
-def thesis_bodies(count: int, rng: np.random.Generator) -> Superquadric:
-    return unit_cube.optical_from_cube(draw_bodies(count, rng))
+def cube_bodies(count: int, rng: np.random.Generator) -> Superquadric:
+    return unit_cube.optical_from_cube(thesis_bodies(count, rng))
 
 
 def pinhole_bodies(count: int, rng: np.random.Generator) -> Superquadric:
@@ -143,7 +143,7 @@ def tilted_bodies(degrees: float) -> Callable[[int, np.random.Generator], Superq
     """Sharp bodies, one face towards the viewer but for a tilt about a random axis in the image plane."""
 
     def draw(count: int, rng: np.random.Generator) -> Superquadric:
-        bodies = thesis_bodies(count, rng)
+        bodies = cube_bodies(count, rng)
         angle = rng.uniform(0, 2 * np.pi, count)
         about = np.column_stack([np.cos(angle), np.sin(angle), np.zeros(count)]) * np.deg2rad(degrees)
         spin = np.column_stack([np.zeros((count, 2)), rng.uniform(0, 2 * np.pi, count)])
@@ -168,17 +168,17 @@ class Row:
 
 
 ROWS = {
-    "clean": Row(thesis_bodies, goal="99.9 / 97 / 3 ms"),
-    "clean, 500 pixels": Row(thesis_bodies, pixels=500, goal="99.8 / 96 / 1.5 ms"),
-    "noise 1": Row(thesis_bodies, damage=noise(1), goal="99.6 / - / 10 ms"),
-    "noise 2": Row(thesis_bodies, damage=noise(2), goal="99.2 / 97 / 10 ms"),
-    "noise 4": Row(thesis_bodies, damage=noise(4), goal="98 / - / 10 ms"),
-    "noise 8": Row(thesis_bodies, damage=noise(8), goal="94 / - / 10 ms"),
-    "dropout 10 %": Row(thesis_bodies, damage=dropout, goal="99.5 / 95 / 10 ms"),
-    "mask eroded 2 px": Row(thesis_bodies, damage=eroded, goal="99.5 / 95 / 10 ms"),
-    "mask grown 2 px": Row(thesis_bodies, damage=grown, goal="99.5 / 95 / 10 ms"),
-    "outliers 2 %": Row(thesis_bodies, damage=outliers, goal="99 / 95 / 10 ms"),
-    "occluded 30 %": Row(thesis_bodies, damage=occluded, goal="97 / 70 / 10 ms"),
+    "clean": Row(cube_bodies, goal="99.9 / 97 / 3 ms"),
+    "clean, 500 pixels": Row(cube_bodies, pixels=500, goal="99.8 / 96 / 1.5 ms"),
+    "noise 1": Row(cube_bodies, damage=noise(1), goal="99.6 / - / 10 ms"),
+    "noise 2": Row(cube_bodies, damage=noise(2), goal="99.2 / 97 / 10 ms"),
+    "noise 4": Row(cube_bodies, damage=noise(4), goal="98 / - / 10 ms"),
+    "noise 8": Row(cube_bodies, damage=noise(8), goal="94 / - / 10 ms"),
+    "dropout 10 %": Row(cube_bodies, damage=dropout, goal="99.5 / 95 / 10 ms"),
+    "mask eroded 2 px": Row(cube_bodies, damage=eroded, goal="99.5 / 95 / 10 ms"),
+    "mask grown 2 px": Row(cube_bodies, damage=grown, goal="99.5 / 95 / 10 ms"),
+    "outliers 2 %": Row(cube_bodies, damage=outliers, goal="99 / 95 / 10 ms"),
+    "occluded 30 %": Row(cube_bodies, damage=occluded, goal="97 / 70 / 10 ms"),
     "pinhole, 16 bit": Row(pinhole_bodies, pinhole, goal="99.8 / 97 / 5 ms"),
     "pinhole, sensor": Row(pinhole_bodies, None, goal="98 / 85 / 10 ms"),
     "tilt 0": Row(tilted_bodies(0.0), goal="curve"),

@@ -22,7 +22,7 @@ import torch  # noqa: E402
 from sq_perception import metrics  # noqa: E402
 from sq_perception.geometry import Superquadric  # noqa: E402
 from sq_perception.imaging import raycast, unit_cube  # noqa: E402
-from sq_perception.learning.dataset import draw_bodies  # noqa: E402
+from sq_perception.imaging.scene import thesis_bodies  # noqa: E402
 from sq_perception.recovery import Recoverer, RecoveryOptions  # noqa: E402
 
 THESIS = {"network": "94.62 +- 3.18, 2.88 ms (GPU)", "classic": "84.51 +- 8.89, 690 ms"}
@@ -34,7 +34,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=2020)
     options = parser.parse_args()
     torch.set_num_threads(1)
-    truth = draw_bodies(options.bodies, np.random.default_rng(options.seed))
+    truth = thesis_bodies(options.bodies, np.random.default_rng(options.seed))
     camera = unit_cube.camera()
     images = []
     for body in truth:

@@ -21,8 +21,8 @@ from sq_perception.imaging.camera import Camera
 
 def steps() -> list[tuple[str, Callable[[], object]]]:
     """Name and action of everything that compiles."""
-    body = Superquadric(np.array([0.1, 0.2, 0.3]), np.array([0.5, 0.8]), np.array([0, 0, 1.0]), np.array([0, 0, 0, 1.0]))
-    batch = Superquadric.from_flat(body.to_flat()[None])
+    batch = Superquadric.from_flat(np.array([[0.1, 0.2, 0.3, 0.5, 0.8, 0, 0, 1, 0, 0, 0, 1]]))
+    body = batch[0]
     camera = Camera(32, 24, 30.0, 30.0, 16.0, 12.0)
     points = body.sample_surface(50, np.random.default_rng(0))
     return [

@@ -12,7 +12,7 @@ import torch
 from sq_perception.geometry import Superquadric, rotation
 from sq_perception.imaging import canonical_view, raycast, soft_render, unit_cube
 from sq_perception.imaging.camera import Camera
-from sq_perception.learning.dataset import draw_bodies
+from sq_perception.imaging.scene import thesis_bodies
 
 VGA = Camera(640, 480, 520.0, 530.0, 322.5, 238.0)
 
@@ -133,7 +133,7 @@ class TestRaycast:
 
 class TestUnitCube:
     def test_frames_are_inverse_and_larger_is_nearer(self) -> None:
-        bodies = draw_bodies(10, np.random.default_rng(4))
+        bodies = thesis_bodies(10, np.random.default_rng(4))
         back = unit_cube.cube_from_optical(unit_cube.optical_from_cube(bodies))
         np.testing.assert_allclose(back.to_flat()[:, :8], bodies.to_flat()[:, :8], atol=1e-12)
         np.testing.assert_allclose(rotation.geodesic_angle(back.rotation, bodies.rotation), 0, atol=1e-7)
@@ -167,7 +167,7 @@ class TestCanonicalView:
     def test_view_shows_the_body_it_maps(self, projection: str) -> None:
         """Every pixel of the view, put back, lies on the canonical body: the two halves of the map agree."""
         rng = np.random.default_rng(6)
-        bodies = draw_bodies(20, rng)
+        bodies = thesis_bodies(20, rng)
         camera = unit_cube.camera()
         if projection == "pinhole":
             bodies = Superquadric(
@@ -191,7 +191,7 @@ class TestCanonicalView:
             assert np.abs(canonical.translation[:2] - 0.5).max() < 0.1
 
     def test_direct_rendering_is_the_view_of_the_image(self) -> None:
-        bodies = draw_bodies(20, np.random.default_rng(7))
+        bodies = thesis_bodies(20, np.random.default_rng(7))
         images, canonical = canonical_view.render_views(bodies, levels=np.full(20, 255.0))
         for k, body in enumerate(bodies):
             depth, _ = raycast.render(unit_cube.optical_from_cube(body), unit_cube.camera(512))
@@ -219,7 +219,7 @@ class TestSoftRender:
 
     def test_matches_the_ray_caster_at_the_thesis_parameters(self) -> None:
         """Mean absolute error at most the thesis' 0.0056 at s = 117.3, tau = 4.82 on 64^3 (figure 7.6)."""
-        bodies = draw_bodies(10, np.random.default_rng(8))
+        bodies = thesis_bodies(10, np.random.default_rng(8))
         tensors = Superquadric.from_flat(torch.tensor(bodies.to_flat()))
         axis = soft_render.grid_points(64)
         soft = soft_render.render_depth(tensors, axis, soft_render.THESIS_SHARPNESS, soft_render.THESIS_TAU).numpy()
@@ -229,7 +229,7 @@ class TestSoftRender:
             assert np.abs(image - exact).mean() < 0.0056
 
     def test_gradcheck(self) -> None:
-        bodies = draw_bodies(2, np.random.default_rng(9))
+        bodies = thesis_bodies(2, np.random.default_rng(9))
         axis = soft_render.cell_centres(6)
         flat = torch.tensor(bodies.to_flat(), requires_grad=True)
         assert torch.autograd.gradcheck(
@@ -244,6 +244,6 @@ class TestSoftRender:
 
     @pytest.mark.parametrize(("s", "tau"), [(0.0, 1.0), (1.0, -1.0)])
     def test_refuses_nonsense(self, s: float, tau: float) -> None:
-        bodies = Superquadric.from_flat(torch.tensor(draw_bodies(1, np.random.default_rng(0)).to_flat()))
+        bodies = Superquadric.from_flat(torch.tensor(thesis_bodies(1, np.random.default_rng(0)).to_flat()))
         with pytest.raises(ValueError, match="positive"):
             soft_render.render_depth(bodies, soft_render.cell_centres(4), s, tau)

@@ -12,8 +12,9 @@ from safetensors.torch import load_file, save_file
 
 from sq_perception.geometry import Superquadric
 from sq_perception.imaging import canonical_view
+from sq_perception.imaging.scene import thesis_bodies
 from sq_perception.learning import checkpoint, losses
-from sq_perception.learning.dataset import ViewPool, dihedral, draw_bodies, draw_views
+from sq_perception.learning.dataset import ViewPool, dihedral, draw_views
 from sq_perception.learning.regressor import Regressor, RegressorConfig
 from sq_perception.learning.train import TrainingConfig, train, validate
 
@@ -34,7 +35,7 @@ class TestOccupancyLoss:
         assert loss.item() == pytest.approx((1 / (1 + np.exp(-3)) - 0.5) ** 2, rel=1e-5)
 
     def test_zero_for_all_eight_forms(self) -> None:
-        bodies = draw_bodies(5, np.random.default_rng(0))
+        bodies = thesis_bodies(5, np.random.default_rng(0))
         points = losses.grid(10, dtype=torch.float64)
         for form in bodies.equivalent_forms():
             assert losses.occupancy_loss(tensors(form), tensors(bodies), points, 10.0).max() < 1e-18
@@ -59,7 +60,7 @@ class TestOccupancyLoss:
         assert peaks[1] > peaks[2] > peaks[0]
 
     def test_gradcheck(self) -> None:
-        truth, guess = draw_bodies(2, np.random.default_rng(1)), draw_bodies(2, np.random.default_rng(2))
+        truth, guess = thesis_bodies(2, np.random.default_rng(1)), thesis_bodies(2, np.random.default_rng(2))
         points = losses.points_around(tensors(truth), 20, torch.Generator().manual_seed(0)).double()
         flat = torch.tensor(guess.to_flat(), requires_grad=True)
         assert torch.autograd.gradcheck(
@@ -69,7 +70,7 @@ class TestOccupancyLoss:
 
 class TestData:
     def test_bodies_follow_the_protocol(self) -> None:
-        bodies = draw_bodies(4000, np.random.default_rng(3))
+        bodies = thesis_bodies(4000, np.random.default_rng(3))
         for values, low, high in (
             (bodies.size * 255, 25, 75),
             (bodies.shape, 0.1, 1.0),

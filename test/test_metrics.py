@@ -7,14 +7,14 @@ import pytest
 
 from sq_perception import metrics
 from sq_perception.geometry import Superquadric, rotation
-from sq_perception.learning.dataset import draw_bodies
+from sq_perception.imaging.scene import thesis_bodies
 
 IDENTITY = np.array([0.0, 0, 0, 1])
 
 
 def test_column_counting_is_the_thesis_grid() -> None:
     """Equation 5.1 with every one of the 24^3 points evaluated; only points on a surface may fall either way."""
-    a, b = draw_bodies(20, np.random.default_rng(0)), draw_bodies(20, np.random.default_rng(1))
+    a, b = thesis_bodies(20, np.random.default_rng(0)), thesis_bodies(20, np.random.default_rng(1))
     axis = np.linspace(0, 1, 24)
     grid = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
     in_a, in_b = a.gauge(grid[None]) <= 1, b.gauge(grid[None]) <= 1
@@ -31,13 +31,13 @@ def test_shifted_box_in_closed_form() -> None:
 
 
 def test_nested_bodies_give_the_volume_ratio() -> None:
-    bodies = draw_bodies(10, np.random.default_rng(2))
+    bodies = thesis_bodies(10, np.random.default_rng(2))
     inner = Superquadric(bodies.size * 0.8, bodies.shape, bodies.translation, bodies.rotation)
     np.testing.assert_allclose(metrics.volume_iou(inner, bodies, 128), 0.8**3, atol=0.01)
 
 
 def test_invariant_under_forms_and_rigid_motion() -> None:
-    a, b = draw_bodies(5, np.random.default_rng(3)), draw_bodies(5, np.random.default_rng(4))
+    a, b = thesis_bodies(5, np.random.default_rng(3)), thesis_bodies(5, np.random.default_rng(4))
     expected = metrics.volume_iou(a, b, 96)
     for form in a.equivalent_forms():
         np.testing.assert_allclose(metrics.volume_iou(form, b, 96), expected, atol=1e-9)
@@ -47,7 +47,7 @@ def test_invariant_under_forms_and_rigid_motion() -> None:
 
 
 def test_relative_errors_have_the_thesis_signs() -> None:
-    truth = draw_bodies(6, np.random.default_rng(6))
+    truth = thesis_bodies(6, np.random.default_rng(6))
     prediction = Superquadric(
         truth.size * [1.1, 1, 1], truth.shape * 0.9, truth.translation + [0, 0, 0.1], truth.rotation
     )
@@ -58,4 +58,4 @@ def test_relative_errors_have_the_thesis_signs() -> None:
 
 def test_batches_must_match() -> None:
     with pytest.raises(ValueError, match="two batches"):
-        metrics.volume_iou(draw_bodies(2, np.random.default_rng(0)), draw_bodies(3, np.random.default_rng(0)))
+        metrics.volume_iou(thesis_bodies(2, np.random.default_rng(0)), thesis_bodies(3, np.random.default_rng(0)))

@@ -75,15 +75,19 @@ class Scene:
         return np.where(np.isfinite(depth), depth, np.nan).astype(np.float32), (index + 1).astype(np.int32)
 
 
+def thesis_bodies(count: int, rng: np.random.Generator) -> Superquadric:
+    """A batch (count,) of bodies of the thesis' protocol, in the cube frame."""
+    return Superquadric(
+        rng.uniform(*THESIS_SIZE, (count, 3)),
+        rng.uniform(*THESIS_SHAPE, (count, 2)),
+        rng.uniform(*THESIS_CENTRE, (count, 3)),
+        quaternions.random(count, rng),
+    )
+
+
 def thesis_scene(rng: np.random.Generator, pixels: int = unit_cube.THESIS_PIXELS) -> Scene:
     """One random body of the thesis' protocol before the camera of the unit cube."""
-    body = Superquadric(
-        rng.uniform(*THESIS_SIZE, (1, 3)),
-        rng.uniform(*THESIS_SHAPE, (1, 2)),
-        rng.uniform(*THESIS_CENTRE, (1, 3)),
-        quaternions.random(1, rng),
-    )
-    return Scene(unit_cube.optical_from_cube(body), unit_cube.camera(pixels), None)
+    return Scene(unit_cube.optical_from_cube(thesis_bodies(1, rng)), unit_cube.camera(pixels), None)
 
 
 def table_scene(rng: np.random.Generator, count: int = 3, camera: Camera = TABLE_CAMERA) -> Scene:

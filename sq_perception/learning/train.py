@@ -28,7 +28,6 @@ from sq_perception.learning.losses import occupancy_loss, points_around
 from sq_perception.learning.regressor import Regressor, RegressorConfig
 from sq_perception.metrics import volume_iou
 
-
 CALIBRATION_VIEWS = 2048
 
 
