@@ -43,7 +43,7 @@ def rays_to(points: np.ndarray, pinhole: bool) -> np.ndarray:
         rays[:, 2:4] = points[:, :2] / points[:, 2:]
     else:
         rays[:, 0:2] = points[:, :2]
-    rays[:, 4], rays[:, 5], rays[:, 6] = points[:, 2], 1 / SIGMA, 1.0
+    rays[:, 4], rays[:, 5], rays[:, 6], rays[:, 7] = points[:, 2], 1 / SIGMA, 1.0, points[:, 2]
     return rays
 
 
@@ -128,6 +128,7 @@ def test_rendered_depth_and_derivatives(
     body = random_body(rng, shape)
     rays = rays_to(visible_points(body, rng, pinhole), pinhole)
     rays[:, 4] += rng.normal(0, 0.003, len(rays))
+    rays[:, 7] = rays[:, 4]
     origin, direction, depth = torch_rays(rays)
     expected = expected_sums(
         body, lambda moved: statement.rendered(moved, origin, direction, depth, PLAIN.grazing) / SIGMA

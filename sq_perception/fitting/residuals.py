@@ -11,7 +11,8 @@ point p of the optical frame, with q = R^T (p - t) in the object frame, the gaug
 Residuals
 ---------
 A pixel is a ray p = o + z d with o_z = 0 and d_z = 1; its row is (o_x, o_y, d_x, d_y, z, 1/sigma, weight,
-index), the last naming the pixel.
+last).  ``last`` is the pixel's index for a free ray; for an object ray it is the depth at which the ray met the body
+last time, where the next search for the intersection starts.
 
 classic     sqrt(a1 a2 a3) (g^2 - 1) / sigma at the measured point: Solina and Bajcsy's, as g^2 = F^e1.
 Sampson     (g - 1) / (|grad g| sigma) at the measured point: first order distance; wide basin of attraction.
@@ -44,7 +45,6 @@ STEP_LENGTH = 11
 RAY_COLUMNS = 8
 
 _BLOCK = 64
-_HIT_TOLERANCE = 1e-4
 _HIT_STEPS = 12
 _MINIMUM_STEPS = 8
 _NEAREST = 1e-3
@@ -59,12 +59,14 @@ Derivatives = tuple[float, float, float, float, float, float]
 class Scene(NamedTuple):
     """What holds for all rays: losses, and what is known beyond the image.
 
+    A rendered depth is found by Newton's method until |g - 1| < ``hit_tolerance``, then in first order.
     ``outline_stiffness`` is 1/sigma_o; the plane is n.x + d = height; a stiffness or price of 0 switches its term off.
     """
 
     huber: float = 3.0
     outline_huber: float = 3.0
     grazing: float = 0.01
+    hit_tolerance: float = 1e-4
     outline_stiffness: float = 1.0
     pinhole: float = 0.0
     normal_x: float = 0.0
@@ -120,7 +122,8 @@ def _object_cost(
     filled = 0
     for i in range(rays.shape[0]):
         dx, dy, depth, stiffness = rays[i, 2], rays[i, 3], rays[i, 4], rays[i, 5]
-        x, y, z = rays[i, 0] - t1 + depth * dx, rays[i, 1] - t2 + depth * dy, depth - t3
+        start = rays[i, 7] if stage == RENDERED else depth
+        x, y, z = rays[i, 0] - t1 + start * dx, rays[i, 1] - t2 + start * dy, start - t3
         qx = m[0, 0] * x + m[1, 0] * y + m[2, 0] * z
         qy = m[0, 1] * x + m[1, 1] * y + m[2, 1] * z
         qz = m[0, 2] * x + m[1, 2] * y + m[2, 2] * z
@@ -136,18 +139,21 @@ def _object_cost(
             ex = m[0, 0] * dx + m[1, 0] * dy + m[2, 0]
             ey = m[0, 1] * dx + m[1, 1] * dy + m[2, 1]
             ez = m[0, 2] * dx + m[1, 2] * dy + m[2, 2]
-            hit, shift, at = _meet(qx, qy, qz, ex, ey, ez, a1, a2, a3, e1, e2, at)
+            hit, shift, at = _meet(qx, qy, qz, ex, ey, ez, a1, a2, a3, e1, e2, at, scene.hit_tolerance)
             qx, qy, qz = qx + shift * ex, qy + shift * ey, qz + shift * ez
             if hit:
                 along = at[1] * ex + at[2] * ey + at[3] * ez
                 length = _length(at)
                 across = scene.grazing * length * length * (dx * dx + dy * dy + 1.0)
                 factor = stiffness / math.sqrt(along * along + across)
-                residual = (at[0] - 1.0 - shift * along) * factor
+                hit_depth = start + shift - (at[0] - 1.0) / along
+                residual = (depth - hit_depth) * along * factor
+                rays[i, 7] = hit_depth
             else:
                 factor = scene.outline_stiffness / _length(at)
                 residual = (at[0] - 1.0) * factor
                 huber = scene.outline_huber
+                rays[i, 7] = depth
         loss, scale = _huber(residual, huber, rays[i, 6])
         cost += loss
         _write_row(block, filled, scale, factor, residual, qx, qy, qz, at, m)
@@ -176,6 +182,7 @@ def _meet(
     e1: float,
     e2: float,
     at: Derivatives,
+    tolerance: float,
 ) -> tuple[bool, float, Derivatives]:
     """Where the ray through q along e meets the surface: (hit, shift along the ray, gauge and derivatives there).
 
@@ -197,7 +204,7 @@ def _meet(
         if slope >= 0.0 and here[0] > 1.0:
             return False, shift, here
     for _ in range(_HIT_STEPS):
-        if abs(here[0] - 1.0) < _HIT_TOLERANCE:
+        if abs(here[0] - 1.0) < tolerance:
             return True, shift, here
         step = (1.0 - here[0]) / slope
         before = shift
@@ -415,7 +422,7 @@ def penetration(free: np.ndarray, scene: Scene, parameters: np.ndarray, rotation
     depth = np.zeros(free.shape[0])
     block = np.zeros((STEP_LENGTH + 1, _BLOCK))
     sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
-    linear = Scene(0.0, 1e300, 0.0, 1.0, scene.pinhole, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    linear = Scene(0.0, 1e300, 0.0, 1.0, 1.0, scene.pinhole, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     for i in range(free.shape[0]):
         row = free[i : i + 1].copy()
         row[0, 5], row[0, 6] = 1.0, 1.0

@@ -26,7 +26,7 @@ from sq_perception.fitting.residuals import RAY_COLUMNS, RENDERED, SAMPSON, Scen
 
 COARSE_RAYS, COARSE_STEPS = 150, 8
 BASIN_RAYS, BASIN_STEPS = 300, 15
-FINAL_RAYS = 2500
+FINAL_RAYS = 2000
 MOST_FINAL_RAYS = 6000
 FREE_SHARE = 0.25
 """Free rays per object ray."""
@@ -38,13 +38,14 @@ DOUBT = 25.0
 RIVAL = 1.3
 """and so do those within this factor of the best, as they have not converged yet."""
 FINALISTS, ESCALATED_FINALISTS = 3, 6
-TOLERANCE, FINAL_TOLERANCE = 1e-3, 1e-4
+TOLERANCE, FINAL_TOLERANCE = 1e-3, 1e-3
 SHARP_OUTLINE = 0.3
 """Standard deviation of a perfect outline, in pixels: the body covers exactly the centres of the mask's pixels."""
 SHRUNK = 0.25
 """A body that covers free pixels beside the mask this deep on average, in pixels, is larger than its mask."""
 WIDEST_BAND = 4
 RING_RAYS = 200
+HIT_TOLERANCE = 3e-3
 OUTLIER = 5.0
 MEDIAN_TO_SIGMA = 1.4826
 PLANE_SIGMA, REST_SIGMA = 0.001, 0.05
@@ -196,28 +197,25 @@ class Search:
 
     def _outlined(self, state: State) -> State:
         """Forget the free rays next to the mask if the mask turns out to be smaller than the body."""
-        ring = self._ring_penetration(state, self.observation)
-        if ring[0] < SHRUNK:
-            return state
         full = self.observation
+        if self._ring_penetration(state, full, 1) < SHRUNK:
+            return state
         self.observation = full.beyond(WIDEST_BAND)
         self.rays, self.free = self._draw(FINAL_RAYS, 0.6)
         state = self._refined(state._replace(cost=math.inf), BASIN_STEPS)
-        ring = self._ring_penetration(state, full)
-        band = next((k for k in range(WIDEST_BAND) if ring[k] < SHRUNK), WIDEST_BAND)
+        rings = (k for k in range(1, WIDEST_BAND + 1) if self._ring_penetration(state, full, k) < SHRUNK)
+        band = next(rings, WIDEST_BAND + 1) - 1
         self.observation = full.beyond(band) if band > 0 else full
         return state
 
-    def _ring_penetration(self, state: State, observation: Observation) -> list[float]:
-        """Mean depth, in pixels, to which the body covers free pixels at distance 1, 2, ... from the mask."""
-        free = observation.free_rays
-        distance = observation.distance_to_mask(free)
-        rings = []
-        for k in range(1, WIDEST_BAND + 1):
-            ring = draw(free[(distance > k - 0.6) & (distance <= k + 0.4)], RING_RAYS)
-            depth = penetration(ring, self.scene, state.parameters, state.rotation)
-            rings.append(float(depth.mean()) / observation.footprint if len(ring) else 0.0)
-        return rings
+    def _ring_penetration(self, state: State, observation: Observation, radius: int) -> float:
+        """Mean depth, in pixels, to which the body covers the free pixels at this distance from the mask."""
+        distance = observation.distance_to_mask(observation.free_rays)
+        ring = observation.free_rays[np.abs(distance - radius) < 0.5]
+        if len(ring) == 0:
+            return 0.0
+        depth = penetration(draw(ring, RING_RAYS), self.scene, state.parameters, state.rotation)
+        return float(depth.mean()) / observation.footprint
 
     def _enough(self) -> int:
         """Rays that bring the noise of the mean well below a pixel's width."""
@@ -254,7 +252,12 @@ def _scene(observation: Observation, options: Options) -> Scene:
     """The constants that the residuals share, for all but the last stage."""
     pinhole = 1.0 if observation.camera.is_pinhole else 0.0
     outline = max(observation.noise, observation.footprint, options.tolerated)
-    scene = Scene(pinhole=pinhole, outline_stiffness=1 / outline, proportion_stiffness=1 / PROPORTION_SIGMA)
+    scene = Scene(
+        hit_tolerance=HIT_TOLERANCE,
+        pinhole=pinhole,
+        outline_stiffness=1 / outline,
+        proportion_stiffness=1 / PROPORTION_SIGMA,
+    )
     if options.plane is None:
         return scene
     x, y, z, offset = (float(value) for value in options.plane)

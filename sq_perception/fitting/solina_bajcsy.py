@@ -93,7 +93,7 @@ def fit(
     if not reason:
         rays = np.zeros((len(points), RAY_COLUMNS))
         rays[:, 0], rays[:, 1], rays[:, 4] = points.T
-        rays[:, 5], rays[:, 6] = 1 / (_UNIT * extent**1.5), 1.0
+        rays[:, 5], rays[:, 6], rays[:, 7] = 1 / (_UNIT * extent**1.5), 1.0, points[:, 2]
         limits = (bounds or Bounds()).limits(points)
         scene = Scene(huber=math.inf)
         state = minimize(CLASSIC, rays, _NO_FREE_SPACE, scene, start, limits, max_iterations, tolerance)

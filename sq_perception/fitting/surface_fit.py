@@ -87,6 +87,7 @@ def warm_up() -> None:
         rendered, _ = raycast.render(body, camera)
         mask = np.isfinite(rendered)
         depth = np.where(mask, rendered, 0.7).astype(np.float32)
+        fit(depth, mask, camera)
         fit(depth, mask, camera, options=Options(plane=np.array([0.0, 0.0, -1.0, 0.7])))
         fit(depth, mask, camera, start=body)
 
@@ -126,7 +127,8 @@ def _hopeless(observation: Observation) -> str:
     count = len(observation.object_rays)
     if count < MIN_PIXELS:
         return f"{count} pixels with a depth; a fit needs {MIN_PIXELS}"
-    centred = observation.points - observation.points.mean(axis=0)
+    points = observation.points[:: max(1, count // 500)]
+    centred = points - points.mean(axis=0)
     spread = np.linalg.eigvalsh(centred.T @ centred)
     if spread[1] <= 1e-6 * spread[2]:
         return "the measured points lie on one line"

@@ -24,7 +24,7 @@ _PRIOR_LOG_SIZE = 1.0
 _PRIOR_SHAPE = 0.5
 _PRIOR_ANGLE = 1.0
 _INLIER = 3.0
-_JUDGED_RAYS = 1500
+_JUDGED_RAYS = 800
 _WEAK_SHARE = 0.15
 """A half size whose standard deviation exceeds this share of it is called undetermined."""
 _FAILED_SHARE = 0.25
@@ -34,15 +34,16 @@ _AXES = "xyz"
 def judged(state: State, search: Search, began: float) -> Fit:
     """The result of a search, with everything that can be said about its quality."""
     observation = search.observation
-    rays = search.rays
+    stride = max(1, len(search.rays) // _JUDGED_RAYS)
+    rays, free = (np.ascontiguousarray(kind[::stride]) for kind in (search.rays, search.free))
     sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
     outline = max(observation.noise, observation.footprint)
     scene = search.scene._replace(outline_stiffness=1 / outline)
-    cost = evaluate(RENDERED, rays, search.free, scene, state.parameters, state.rotation, sums)
+    cost = evaluate(RENDERED, rays, free, scene, state.parameters, state.rotation, sums)
     freedom = max(rays[:, 6].sum() - STEP_LENGTH, 1.0)
     variance = max(1.0, cost / freedom)
     body = state.body
-    covariance = _covariance(sums[:STEP_LENGTH, :STEP_LENGTH], state.parameters, variance)
+    covariance = _covariance(stride * sums[:STEP_LENGTH, :STEP_LENGTH], state.parameters, variance)
     canonical = body.canonical_form()
     covariance = _carried_over(covariance, body, canonical)
     everything = draw(observation.object_rays, _JUDGED_RAYS)
