@@ -72,7 +72,7 @@ class Camera:
     def is_pinhole(self) -> bool:
         return self.projection == "pinhole"
 
-    def rays(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def rays(self, u: np.ndarray | float, v: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
         """Origins and directions (..., 3) of pixels (...): p = origin + depth * direction."""
         u, v = np.broadcast_arrays(np.asarray(u, dtype=float), np.asarray(v, dtype=float))
         lateral = np.stack([(u - self.cx) / self.fx, (v - self.cy) / self.fy], axis=-1)

@@ -28,7 +28,7 @@ import numba
 import numpy as np
 
 from sq_perception.geometry import rotation as quaternions
-from sq_perception.geometry.kernels import FAST, ray_entry
+from sq_perception.geometry.kernels import FAST, gauge_derivatives, ray_entry
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
 
@@ -94,30 +94,31 @@ def from_mask(depth: np.ndarray, mask: np.ndarray, camera: Camera, pixels: int =
     """
     camera.check_image(depth)
     camera.check_image(mask)
-    rows, columns = np.nonzero(mask & np.isfinite(depth))
-    if rows.size == 0:
+    left, top, width, height = cv2.boundingRect((mask & np.isfinite(depth)).view(np.uint8))
+    if width == 0:
         raise ValueError("a canonical view needs at least one pixel with a depth under the mask")
-    measured = depth[rows, columns].astype(float)
-    top, bottom, left, right = rows[0], rows[-1] + 1, columns.min(), columns.max() + 1
-    camera = camera.cropped(left, top, right - left, bottom - top)
-    rows, columns = rows - top, columns - left
+    camera = camera.cropped(left, top, width, height)
+    window = np.s_[top : top + height, left : left + width]
+    seen = mask[window] & np.isfinite(depth[window])
+    rows, columns = np.nonzero(seen)
+    measured = depth[window][seen].astype(np.float32)
 
     look = np.eye(3)
     if camera.is_pinhole:
-        _, toward = camera.rays(0.5 * (right - left - 1), 0.5 * (bottom - top - 1))
+        _, toward = camera.rays(0.5 * (width - 1), 0.5 * (height - 1))
         look = _rotation_to_z(toward / np.linalg.norm(toward))
     matrix = _FLIP @ look
-    x, y, z = matrix @ _coordinates(camera, columns, rows, measured)
+    x, y, z = matrix.astype(np.float32) @ _coordinates(camera, columns, rows, measured)
     low, high = np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
     outliers = int(z.size * _OUTLIERS_PER_END)
     ordered = np.partition(z, [outliers, z.size // 2, z.size - 1 - outliers])
-    farthest, middle, nearest = ordered[[outliers, z.size // 2, z.size - 1 - outliers]]
+    farthest, middle, nearest = (float(ordered[k]) for k in (outliers, z.size // 2, z.size - 1 - outliers))
     pixel = max(1 / camera.fx, 1 / camera.fy) * (measured.min() if camera.is_pinhole else 1.0)
     extent = MARGIN * max(*(high - low + pixel), nearest - farthest)
     anchor = np.array([*(0.5 * (low + high)), nearest])
 
     image = np.full((camera.height, camera.width), np.nan, dtype=np.float32)
-    image[rows, columns] = z
+    image[seen] = z
     z_view = _resample(image, middle, matrix, anchor, extent, camera, pixels)
     value = (z_view - anchor[2]) / extent + _NEAREST
     value = np.where(np.isfinite(value), np.clip(value, 1 / 255, 1.0), 0.0).astype(np.float32)
@@ -126,8 +127,13 @@ def from_mask(depth: np.ndarray, mask: np.ndarray, camera: Camera, pixels: int =
 
 def _coordinates(camera: Camera, u: np.ndarray, v: np.ndarray, depth: np.ndarray) -> np.ndarray:
     """Points of pixels as (3, n): one contiguous row a coordinate, several times as fast to turn as (n, 3)."""
-    scale = depth if camera.is_pinhole else 1.0
-    return np.stack([(u - camera.cx) / camera.fx * scale, (v - camera.cy) / camera.fy * scale, depth])
+    points = np.empty((3, depth.size), dtype=np.float32)
+    points[0] = ((np.arange(camera.width) - camera.cx) / camera.fx).astype(np.float32)[u]
+    points[1] = ((np.arange(camera.height) - camera.cy) / camera.fy).astype(np.float32)[v]
+    points[2] = depth
+    if camera.is_pinhole:
+        points[:2] *= depth
+    return points
 
 
 def _resample(
@@ -143,18 +149,32 @@ def _resample(
 
     A view pixel fixes turned x and y but not z, and a pinhole pixel depends on all three.  Reading z at the projection
     of the last guess is a contraction wherever the surface is not almost parallel to the ray; three rounds suffice.
+    Guesses that fall beside the object go on with the z of its nearest pixel.
     """
     steps = ((np.arange(pixels) + 0.5) / pixels - 0.5) * extent
     x, y = np.meshgrid(anchor[0] + steps, anchor[1] - steps)
     z = np.full((pixels, pixels), z_guess)
-    found = z
-    for _ in range(3 if camera.is_pinhole else 1):
-        uv = camera.project(np.stack([x, y, z], axis=-1) @ matrix).astype(np.float32)
-        found = cv2.remap(
-            z_image, uv[..., 0], uv[..., 1], cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan")
-        )
-        z = np.where(np.isfinite(found), found, z)
-    return found
+    if camera.is_pinhole:
+        filled = _filled(z_image)
+        for _ in range(3):
+            z = _read(filled, np.stack([x, y, z], axis=-1) @ matrix, camera, cv2.BORDER_REPLICATE)
+    return _read(z_image, np.stack([x, y, z], axis=-1) @ matrix, camera, cv2.BORDER_CONSTANT)
+
+
+def _read(image: np.ndarray, points: np.ndarray, camera: Camera, border: int) -> np.ndarray:
+    """The image at the projections of points (n, n, 3); NaN beyond a constant border."""
+    uv = camera.project(points).astype(np.float32)
+    return cv2.remap(image, uv[..., 0], uv[..., 1], cv2.INTER_NEAREST, borderMode=border, borderValue=float("nan"))
+
+
+def _filled(image: np.ndarray) -> np.ndarray:
+    """The image with each NaN replaced by the nearest number."""
+    empty = np.isnan(image).astype(np.uint8)
+    _, nearest = cv2.distanceTransformWithLabels(empty, cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
+    known = image[empty == 0]
+    by_label = np.zeros(nearest.max() + 1, dtype=np.float32)
+    by_label[nearest[empty == 0]] = known
+    return by_label[nearest]
 
 
 def _rotation_to_z(direction: np.ndarray) -> np.ndarray:
@@ -165,12 +185,13 @@ def _rotation_to_z(direction: np.ndarray) -> np.ndarray:
 
 
 def render_views(
-    bodies: Superquadric, pixels: int = 64, levels: np.ndarray | None = None
+    bodies: Superquadric, pixels: int = 64, levels: np.ndarray | None = None, distance: np.ndarray | None = None
 ) -> tuple[np.ndarray, Superquadric]:
-    """Canonical views of whole, unoccluded bodies seen by an orthographic camera, without the detour over an image.
+    """Canonical views of whole, unoccluded bodies, without the detour over an image: the source of training data.
 
-    The silhouette's box comes from the support function; nearest point and visible depth need one rendering, and a
-    second one where the depth, not the silhouette, sets the extent.
+    A canonical view is orthographic whatever camera took the image, but a pinhole camera sees less of the body: of a
+    convex body just the points whose normals point to it.  Rays along z, less what faces away from the eye, are so the
+    view of an image with any number of pixels.
 
     Parameters
     ----------
@@ -180,6 +201,9 @@ def render_views(
         Side of the views.
     levels : (n,), optional
         Grey levels per unit of the bodies' frame: depths are rounded down to them, as in an image of integers.
+    distance : (n,), optional
+        Distance of a pinhole camera from the nearest face of the body's box, in the bodies' unit; infinite, as by
+        default, for an orthographic camera.
 
     Returns
     -------
@@ -194,10 +218,19 @@ def render_views(
     matrices = np.ascontiguousarray(bodies.rotation_matrix, dtype=float)
     images = np.zeros((len(bodies), pixels, pixels), dtype=np.float32)
     steps = np.zeros(len(bodies)) if levels is None else 1 / np.asarray(levels, dtype=float)
-    _render_views(flat, matrices, anchor, side, steps, images)
+    away = np.full(len(bodies), np.inf) if distance is None else np.asarray(distance, dtype=float)
+    if (away <= 0).any():
+        raise ValueError("distance: expected positive distances of the camera")
+    pinhole = np.isfinite(away)
+    eye = upper[:, 2] + np.where(pinhole, away, 0.0)
+    _render_views(flat, matrices, anchor, side, steps, pinhole, eye, images)
     identity = np.array([0.0, 0.0, 0.0, 1.0])
     shift = np.array([0.5, 0.5, _NEAREST]) - anchor / side[:, None]
     return images, bodies.transformed(identity, shift, 1 / side[:, None])
+
+
+_MOST_ROUNDS = 4
+_SAME_EXTENT = 0.005
 
 
 @numba.njit(cache=True, nogil=True, parallel=True, fastmath=FAST, error_model="numpy")
@@ -207,34 +240,32 @@ def _render_views(
     anchor: np.ndarray,
     side: np.ndarray,
     quantum: np.ndarray,
+    pinhole: np.ndarray,
+    eye: np.ndarray,
     images: np.ndarray,
 ) -> None:
+    """Render, read off what is visible, and render again until the extent is that of the visible part."""
     pixels = images.shape[1]
     for k in numba.prange(flat.shape[0]):
         a1, a2, a3, e1, e2, t1, t2, t3 = flat[k, :8]
         m = matrices[k]
+        eye_1, eye_2, eye_3 = m[2, 0] * (eye[k] - t3), m[2, 1] * (eye[k] - t3), m[2, 2] * (eye[k] - t3)
         surface = np.empty((pixels, pixels))
-        for _ in range(2):
+        for _ in range(_MOST_ROUNDS):
             hits = 0
             seen = np.empty(pixels * pixels)
+            first_row, last_row, first_column, last_column = pixels, -1, pixels, -1
             for i in range(pixels):
                 for j in range(pixels):
                     x = anchor[k, 0] + ((j + 0.5) / pixels - 0.5) * side[k] - t1
                     y = anchor[k, 1] - ((i + 0.5) / pixels - 0.5) * side[k] - t2
-                    hit, t = ray_entry(
-                        m[0, 0] * x + m[1, 0] * y,
-                        m[0, 1] * x + m[1, 1] * y,
-                        m[0, 2] * x + m[1, 2] * y,
-                        -m[2, 0],
-                        -m[2, 1],
-                        -m[2, 2],
-                        a1,
-                        a2,
-                        a3,
-                        e1,
-                        e2,
-                    )
+                    ox, oy, oz = m[0, 0] * x + m[1, 0] * y, m[0, 1] * x + m[1, 1] * y, m[0, 2] * x + m[1, 2] * y
+                    hit, t = ray_entry(ox, oy, oz, -m[2, 0], -m[2, 1], -m[2, 2], a1, a2, a3, e1, e2)
                     surface[i, j] = _NOTHING
+                    if hit and pinhole[k]:
+                        px, py, pz = ox - t * m[2, 0], oy - t * m[2, 1], oz - t * m[2, 2]
+                        _, nx, ny, nz, _, _ = gauge_derivatives(px, py, pz, a1, a2, a3, e1, e2)
+                        hit = nx * (eye_1 - px) + ny * (eye_2 - py) + nz * (eye_3 - pz) > 0.0
                     if hit:
                         z = t3 - t
                         if quantum[k] > 0.0:
@@ -242,15 +273,24 @@ def _render_views(
                         surface[i, j] = z
                         seen[hits] = z
                         hits += 1
+                        first_row, last_row = min(first_row, i), max(last_row, i)
+                        first_column, last_column = min(first_column, j), max(last_column, j)
             if hits == 0:
                 break
             seen = np.sort(seen[:hits])
             outliers = int(hits * _OUTLIERS_PER_END)
             anchor[k, 2] = seen[hits - 1 - outliers]
-            visible = MARGIN * (seen[hits - 1 - outliers] - seen[outliers])
-            if visible <= side[k]:
+            extent = seen[hits - 1 - outliers] - seen[outliers]
+            if pinhole[k]:
+                extent = max(extent, max(last_row - first_row, last_column - first_column) * side[k] / pixels)
+            else:
+                extent = max(extent, side[k] / MARGIN)
+            if abs(extent * MARGIN - side[k]) <= (_SAME_EXTENT + 1.5 * pinhole[k] / pixels) * side[k]:
                 break
-            side[k] = visible
+            if pinhole[k]:
+                anchor[k, 0] += (0.5 * (first_column + last_column + 1) / pixels - 0.5) * side[k]
+                anchor[k, 1] -= (0.5 * (first_row + last_row + 1) / pixels - 0.5) * side[k]
+            side[k] = extent * MARGIN
         for i in range(pixels):
             for j in range(pixels):
                 if surface[i, j] > _NOTHING:
