@@ -12,11 +12,24 @@ from sq_perception.imaging.canonical_view import render_views
 from sq_perception.imaging.scene import thesis_bodies
 
 GREY_LEVELS = 255.0
+CAMERA_DISTANCE = (1.5, 12.0)
+"""Nearest and farthest pinhole camera, in lengths of the body."""
 
 
-def draw_views(count: int, rng: np.random.Generator, pixels: int = 64) -> tuple[np.ndarray, Superquadric]:
-    """Views (count, pixels, pixels) of freshly drawn bodies, and the bodies (count,) in the views' frames."""
-    return render_views(thesis_bodies(count, rng), pixels, np.full(count, GREY_LEVELS))
+def draw_views(
+    count: int, rng: np.random.Generator, pixels: int = 64, pinhole_share: float = 0.0
+) -> tuple[np.ndarray, Superquadric]:
+    """Views (count, pixels, pixels) of freshly drawn bodies, and the bodies (count,) in the views' frames.
+
+    A share of them is seen by a pinhole camera, at 1.5 to 12 times the body's length.
+    """
+    bodies = thesis_bodies(count, rng)
+    distance = None
+    if pinhole_share > 0:
+        length = 2 * bodies.size.max(axis=1)
+        distance = length * np.exp(rng.uniform(*np.log(CAMERA_DISTANCE), count))
+        distance = np.where(rng.random(count) < pinhole_share, distance, np.inf)
+    return render_views(bodies, pixels, np.full(count, GREY_LEVELS), distance)
 
 
 def dihedral(
@@ -49,15 +62,23 @@ class ViewPool:
     oldest of the pool; a view is so seen about ``reuse`` times, rarely twice in the same position.
     """
 
-    def __init__(self, rng: np.random.Generator, capacity: int = 4096, reuse: int = 4, pixels: int = 64) -> None:
-        self._rng, self._reuse, self._pixels = rng, reuse, pixels
-        images, bodies = draw_views(capacity, rng, pixels)
+    def __init__(
+        self,
+        rng: np.random.Generator,
+        capacity: int = 4096,
+        reuse: int = 4,
+        pixels: int = 64,
+        pinhole_share: float = 0.0,
+    ) -> None:
+        self._rng, self._reuse = rng, reuse
+        self._pixels, self._pinhole_share = pixels, pinhole_share
+        images, bodies = draw_views(capacity, rng, pixels, pinhole_share)
         self._images, self._flat, self._next = images, bodies.to_flat().copy(), 0
 
     def batch(self, count: int) -> tuple[np.ndarray, Superquadric]:
         """Views (count, pixels, pixels) and bodies (count,) in the views' frames."""
         fresh = max(1, count // self._reuse)
-        images, bodies = draw_views(fresh, self._rng, self._pixels)
+        images, bodies = draw_views(fresh, self._rng, self._pixels, self._pinhole_share)
         slots = (self._next + np.arange(fresh)) % len(self._images)
         self._images[slots], self._flat[slots] = images, bodies.to_flat()
         self._next = int(slots[-1] + 1) % len(self._images)

@@ -47,6 +47,10 @@ class TrainingConfig:
     """s of the occupancy, raised over the run: far basins first, fine fit last."""
     average: float = 0.999
     clip: float = 1.0
+    pinhole_share: float = 0.0
+    """Share of the views that a pinhole camera sees; the others are orthographic, as in the thesis."""
+    start: str = ""
+    """A model file whose weights the network begins with; empty begins at random."""
     validation: int = 1000
     """Bodies in the validation set, and steps between validations."""
     seed: int = 1
@@ -69,7 +73,7 @@ def train(config: TrainingConfig, output: Path, network: RegressorConfig | None 
     output.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(config.seed)
     device = torch.device(config.device)
-    model = Regressor(network).to(device)
+    model = (checkpoint.load(config.start) if config.start else Regressor(network)).to(device)
     model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     average = copy.deepcopy(model)
     optimizer = torch.optim.AdamW(model.parameters(), config.learning_rate, weight_decay=config.weight_decay)
@@ -77,8 +81,9 @@ def train(config: TrainingConfig, output: Path, network: RegressorConfig | None 
     first = _restore(state_path, model, average, optimizer) if state_path.exists() else 0
     rng = np.random.default_rng([config.seed, first])
     generator = torch.Generator(device=device).manual_seed(config.seed + first)
-    pool = ViewPool(rng, pixels=model.config.pixels)
+    pool = ViewPool(rng, pixels=model.config.pixels, pinhole_share=config.pinhole_share)
     validation = draw_views(config.validation, np.random.default_rng(0), model.config.pixels)
+    near = draw_views(config.validation, np.random.default_rng(0), model.config.pixels, pinhole_share=1.0)
     log = (output / "log.jsonl").open("a", encoding="utf-8")
     started, losses = time.monotonic(), []
     for step in range(first, config.steps):
@@ -112,6 +117,7 @@ def train(config: TrainingConfig, output: Path, network: RegressorConfig | None 
                 "loss": float(np.mean(losses)),
                 "iou": float(iou.mean()),
                 "iou_std": float(iou.std()),
+                "iou_pinhole": float(validate(average, *near).mean()),
                 "over_85": float((iou > 0.85).mean()),
                 "rate": rate,
                 "sharpness": sharpness,
