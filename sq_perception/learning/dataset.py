@@ -27,7 +27,8 @@ def draw_views(
     distance = None
     if pinhole_share > 0:
         length = 2 * bodies.size.max(axis=1)
-        distance = length * np.exp(rng.uniform(*np.log(CAMERA_DISTANCE), count))
+        nearest, farthest = CAMERA_DISTANCE
+        distance = length * nearest * (farthest / nearest) ** rng.random(count)
         distance = np.where(rng.random(count) < pinhole_share, distance, np.inf)
     return render_views(bodies, pixels, np.full(count, GREY_LEVELS), distance)
 
