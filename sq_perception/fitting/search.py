@@ -19,6 +19,7 @@ import time
 import numpy as np
 
 from sq_perception.fitting import box_start, symmetry_start
+from sq_perception.fitting.covariance import covariance_at, undetermined
 from sq_perception.fitting.levenberg_marquardt import State, minimize
 from sq_perception.fitting.observation import Observation, draw
 from sq_perception.fitting.options import Options
@@ -47,11 +48,13 @@ WIDEST_BAND = 4
 RING_RAYS = 200
 HIT_TOLERANCE = 3e-3
 OUTLIER = 5.0
+PROMISING = 24
+THIN = 0.3
 MEDIAN_TO_SIGMA = 1.4826
 PLANE_SIGMA, REST_SIGMA = 0.001, 0.05
 VOLUME_PRICE = 2.0
 PROPORTION_SIGMA = 1.0
-REAL_WEIGHT = 100.0
+REAL_WEIGHT = 50.0
 """Model errors of neighbouring pixels are alike: an object on a table counts as so many independent rays."""
 
 
@@ -66,6 +69,7 @@ class Search:
         self.tolerated = options.tolerated
         self.scene = _scene(observation, options)
         self.finalists: list[State] = []
+        self.tried: list[State] = []
         self.rays = np.empty((0, RAY_COLUMNS))
         self.free = np.empty((0, RAY_COLUMNS))
 
@@ -79,7 +83,8 @@ class Search:
                 self._select(self._coarse(self._everything()), ESCALATED_FINALISTS)
             if not self._good_enough() and self.tolerated == 0 and not self._late():
                 self._tolerate_what_is_left()
-                self._select(self._coarse(self._everything()), ESCALATED_FINALISTS)
+                promising = sorted(self.tried, key=lambda state: state.cost)[:PROMISING]
+                self._select(self._coarse(promising), ESCALATED_FINALISTS)
         return self._decided()
 
     # Starts
@@ -97,7 +102,7 @@ class Search:
         """Groups of starts, in the order in which to try them."""
         points = self.observation.points
         if self.options.plane is not None:
-            return [box_start.on_plane(points, self.options.plane) + box_start.principal(points)]
+            return [box_start.on_plane(points, self.options.plane)]
         completed = symmetry_start.completed_moments(self.observation)
         if completed is None:
             return [box_start.principal(points)]
@@ -157,6 +162,7 @@ class Search:
             found.append(minimize(SAMPSON, rays, free, self.scene, state, self.limits, COARSE_STEPS, TOLERANCE))
             if self._late():
                 break
+        self.tried += found
         return found
 
     def _select(self, candidates: list[State], finalists: int) -> None:
@@ -184,13 +190,45 @@ class Search:
         if self.tolerated == 0:
             self.rays = self._without_outliers(self.rays, favourite)
             self.scene = self.scene._replace(outline_stiffness=1 / self._outline_sigma(favourite))
+        else:
+            excess = max(1.0, favourite.cost / REAL_WEIGHT)
+            self.rays[:, 6] /= excess
+            self.free[:, 6] /= excess
         best = self._refined(favourite, self.options.max_iterations)
         for rival in self.finalists[1:]:
             if self._late():
                 break
             state = self._refined(rival, self.options.max_iterations)
             best = min(best, state, key=lambda each: each.cost)
+        if self.observation.camera.is_pinhole and not self._late():
+            best = self._doubted(best)
         return best
+
+    def _doubted(self, state: State) -> State:
+        """Where the image hardly tells a size, small model errors would decide it: leave it to the priors instead.
+
+        The same body with that size like the others, or as small as can be, its seen face in place, competes.
+        """
+        covariance = covariance_at(state, self.rays, self.free, self.scene, self.outline)
+        weak = np.flatnonzero(undetermined(covariance, state.parameters[:3]))
+        if len(weak) == 0:
+            return state
+        if self.tolerated == 0:
+            weight = REAL_WEIGHT / self.rays[:, 6].sum()
+            self.rays[:, 6] *= weight
+            self.free[:, 6] *= weight
+            self.scene = self.scene._replace(volume_price=VOLUME_PRICE)
+        rivals = [state]
+        for k in weak:
+            typical = float(np.exp(np.mean(np.log(np.delete(state.parameters[:3], k)))))
+            rivals += [_resized(state, int(k), size) for size in (typical, THIN * typical)]
+        steps = 2 * self.options.max_iterations
+        return min((self._refined(rival, steps) for rival in rivals), key=lambda each: each.cost)
+
+    @property
+    def outline(self) -> float:
+        """Standard deviation of the outline where it is not known better, metres."""
+        return max(self.observation.noise, self.observation.footprint)
 
     def _refined(self, state: State, steps: int) -> State:
         return minimize(RENDERED, self.rays, self.free, self.scene, state, self.limits, steps, FINAL_TOLERANCE)
@@ -271,3 +309,13 @@ def _scene(observation: Observation, options: Options) -> Scene:
         rest_stiffness=1 / REST_SIGMA,
         volume_price=VOLUME_PRICE,
     )
+
+
+def _resized(state: State, axis: int, size: float) -> State:
+    """The body with another half size along one of its axes; the face towards the camera stays in place."""
+    parameters = state.parameters.copy()
+    direction = state.rotation[:, axis]
+    away = 1.0 if direction @ parameters[5:8] > 0 else -1.0
+    parameters[5:8] += away * (size - parameters[axis]) * direction
+    parameters[axis] = size
+    return State(parameters, state.rotation, math.inf, state.iterations)

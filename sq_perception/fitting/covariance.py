@@ -1,0 +1,61 @@
+"""The covariance of a fitted body.
+
+With the whitened residuals r and their Jacobian J at the optimum, the covariance is (J^T J / s^2 + P)^-1, where
+s^2 = max(1, mean of r^2) lets a body that does not explain the data be less sure of itself, and P is the precision of a
+wide prior (a factor e in size, 0.5 in shape, one size in position, one radian in angle): what the image leaves open,
+such as the turn of a round body about its axis, gets the width of the prior instead of infinity.  The outline counts
+with the noise or a whole pixel, whichever is more: its errors are no independent noise.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sq_perception.fitting.levenberg_marquardt import State
+from sq_perception.fitting.residuals import RENDERED, STEP_LENGTH, Scene, evaluate
+from sq_perception.geometry.superquadric import Superquadric
+
+WEAK_SHARE = 0.15
+"""A half size whose standard deviation exceeds this share of it is called undetermined."""
+_PRIOR_LOG_SIZE = 1.0
+_PRIOR_SHAPE = 0.5
+_PRIOR_ANGLE = 1.0
+_RAYS = 800
+
+
+def covariance_at(state: State, rays: np.ndarray, free: np.ndarray, scene: Scene, outline: float) -> np.ndarray:
+    """(11, 11) of a1 a2 a3 e1 e2 t1 t2 t3 and the rotation vector in the object frame; metres and radians.
+
+    ``outline`` is the standard deviation of the outline, metres.
+    """
+    stride = max(1, len(rays) // _RAYS)
+    rays, free = np.ascontiguousarray(rays[::stride]), np.ascontiguousarray(free[::stride])
+    rays[:, 6] *= stride
+    if len(free):
+        free[:, 6] *= stride
+    sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
+    scene = scene._replace(outline_stiffness=1 / outline)
+    cost = evaluate(RENDERED, rays, free, scene, state.parameters, state.rotation, sums)
+    variance = max(1.0, cost / float(rays[:, 6].sum()))
+    lower = np.tril(sums[:STEP_LENGTH, :STEP_LENGTH])
+    full = lower + np.tril(lower, -1).T
+    length = float(np.mean(state.parameters[:3]))
+    prior = np.array([1 / _PRIOR_LOG_SIZE] * 3 + [1 / _PRIOR_SHAPE] * 2 + [1 / length] * 3 + [1 / _PRIOR_ANGLE] * 3)
+    covariance = np.linalg.inv(full / variance + np.diag(prior**2))
+    units = np.concatenate([state.parameters[:3], np.ones(STEP_LENGTH - 3)])
+    covariance = units[:, None] * covariance * units
+    return (covariance + covariance.T) / 2
+
+
+def carried_over(covariance: np.ndarray, body: Superquadric, form: Superquadric) -> np.ndarray:
+    """The covariance in another of the body's 8 forms: axes exchange and reverse."""
+    turn = np.round(body.rotation_matrix.T @ form.rotation_matrix)
+    change = np.eye(STEP_LENGTH)
+    change[0:3, 0:3] = np.abs(turn).T
+    change[8:11, 8:11] = turn.T
+    return change @ covariance @ change.T
+
+
+def undetermined(covariance: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Which half sizes (3,) the image leaves open."""
+    return np.sqrt(np.diag(covariance)[:3]) > WEAK_SHARE * size
