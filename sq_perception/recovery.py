@@ -281,7 +281,7 @@ class Recoverer:
     def _load_network(self) -> checkpoint.Regressor:
         with self._lock:
             if self._network is None:
-                self._network = checkpoint.load(self._path, self._device)
+                self._network = checkpoint.load(self._path, self._device).for_inference()
             return self._network
 
 

@@ -106,6 +106,15 @@ class TestNetwork:
         assert (bodies.shape <= 1).all()
         np.testing.assert_allclose(np.linalg.norm(bodies.rotation, axis=1), 1)
 
+    def test_folded_copy_predicts_the_same(self) -> None:
+        torch.manual_seed(2)
+        model = Regressor(SMALL)
+        views = torch.rand(64, 1, 32, 32)
+        model.train()(views)
+        expected = model.eval()(views).to_flat().detach().numpy()
+        np.testing.assert_allclose(model.for_inference().predict(views[:, 0].numpy()).to_flat(), expected, atol=1e-4)
+        np.testing.assert_allclose(model.predict(views[:, 0].numpy()).to_flat(), expected, atol=1e-5)
+
     @pytest.mark.parametrize("views", [np.zeros((32, 32)), np.zeros((1, 31, 32)), np.full((1, 32, 32), np.nan)])
     def test_refuses_other_views(self, views: np.ndarray) -> None:
         with pytest.raises(ValueError, match="expected"):

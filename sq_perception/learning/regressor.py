@@ -10,14 +10,21 @@ Output Superquadric  batch (n,) in the canonical frame (unit cube, y up, z towar
 
 from __future__ import annotations
 
+import copy
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
+from array_api_compat import array_namespace
 from torch import nn
+from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
+
+Array = Any
+"""A NumPy array or a torch tensor."""
 
 
 @dataclass(frozen=True)
@@ -42,9 +49,9 @@ class ResidualBlock(nn.Module):
     def __init__(self, channels_in: int, channels_out: int, stride: int) -> None:
         super().__init__()
         self.first = nn.Conv2d(channels_in, channels_out, 3, stride, 1, bias=False)
-        self.first_norm = nn.BatchNorm2d(channels_out)
+        self.first_norm: nn.Module = nn.BatchNorm2d(channels_out)
         self.second = nn.Conv2d(channels_out, channels_out, 3, 1, 1, bias=False)
-        self.second_norm = nn.BatchNorm2d(channels_out)
+        self.second_norm: nn.Module = nn.BatchNorm2d(channels_out)
         self.shortcut: nn.Module = nn.Identity()
         if stride != 1 or channels_in != channels_out:
             self.shortcut = nn.Sequential(
@@ -54,6 +61,13 @@ class ResidualBlock(nn.Module):
     def forward(self, x: torch.Tensor) -> torch.Tensor:
         y = torch.relu(self.first_norm(self.first(x)))
         return torch.relu(self.second_norm(self.second(y)) + self.shortcut(x))
+
+    def fold(self) -> None:
+        """Move the normalisations into the convolutions before them; for inference only."""
+        self.first, self.first_norm = _folded(self.first, self.first_norm), nn.Identity()
+        self.second, self.second_norm = _folded(self.second, self.second_norm), nn.Identity()
+        if isinstance(self.shortcut, nn.Sequential):
+            self.shortcut = _folded(self.shortcut[0], self.shortcut[1])
 
 
 class Regressor(nn.Module):
@@ -91,16 +105,26 @@ class Regressor(nn.Module):
 
     def forward(self, views: torch.Tensor) -> Superquadric:
         """Superquadrics (n,) of views (n, 1, p, p)."""
+        return self.decode(self.raw(views))
+
+    def raw(self, views: torch.Tensor) -> torch.Tensor:
+        """Outputs (n, 14) of the heads: size 3, shape 2, translation 3, rotation 6, all unbounded."""
         h = self.mixer(self.features(views)).float()
-        low, high = self.config.size_range
         with torch.autocast(views.device.type, enabled=False):  # eight bits of mantissa are too few for a size
-            size = low * (high / low) ** torch.sigmoid(self.size_head(h))
-            return Superquadric(
-                size,
-                _between(self.config.shape_range, self.shape_head(h)),
-                _between(self.config.translation_range, self.translation_head(h)),
-                quaternions.from_six(self.rotation_head(h)),
-            )
+            heads = (self.size_head, self.shape_head, self.translation_head, self.rotation_head)
+            return torch.cat([head(h) for head in heads], dim=-1)
+
+    def decode(self, raw: Array) -> Superquadric:
+        """Bodies (n,) of outputs (n, 14), NumPy or torch."""
+        xp = array_namespace(raw)
+        unit = 1 / (1 + xp.exp(-raw[..., :8]))
+        low, high = self.config.size_range
+        return Superquadric(
+            low * (high / low) ** unit[..., 0:3],
+            _between(self.config.shape_range, unit[..., 3:5]),
+            _between(self.config.translation_range, unit[..., 5:8]),
+            quaternions.from_six(raw[..., 8:]),
+        )
 
     def predict(self, views: np.ndarray) -> Superquadric:
         """NumPy superquadrics (n,) of NumPy views (n, p, p).
@@ -116,13 +140,29 @@ class Regressor(nn.Module):
         if not np.isfinite(views).all():
             raise ValueError("expected finite views; background is 0")
         self.eval()
-        parameter = next(self.parameters())
+        device = next(self.parameters()).device
         with torch.inference_mode():
             batch = torch.from_numpy(np.ascontiguousarray(views, dtype=np.float32))[:, None]
-            flat = self(batch.to(parameter.device)).to_flat()
-        return Superquadric.from_flat(flat.cpu().numpy().astype(float))
+            raw = self.raw(batch.to(device, memory_format=torch.channels_last))
+        return self.decode(raw.cpu().numpy().astype(float))
+
+    def for_inference(self) -> Regressor:
+        """A copy that predicts the same, faster: normalisations folded into their convolutions, channels last."""
+        copied = copy.deepcopy(self).eval()
+        layers = copied.features
+        layers[0], layers[1] = _folded(layers[0], layers[1]), nn.Identity()
+        for block in layers:
+            if isinstance(block, ResidualBlock):
+                block.fold()
+        copied.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        return copied
 
 
-def _between(bounds: tuple[float, float], x: torch.Tensor) -> torch.Tensor:
+def _between(bounds: tuple[float, float], unit: Array) -> Array:
     low, high = bounds
-    return low + (high - low) * torch.sigmoid(x)
+    return low + (high - low) * unit
+
+
+def _folded(convolution: nn.Module, norm: nn.Module) -> nn.Conv2d:
+    assert isinstance(convolution, nn.Conv2d) and isinstance(norm, nn.BatchNorm2d)
+    return fuse_conv_bn_eval(convolution, norm)
