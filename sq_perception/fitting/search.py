@@ -101,15 +101,16 @@ class Search:
     def _tiers(self) -> list[list[State]]:
         """Groups of starts, in the order in which to try them."""
         points = self.observation.points
-        if self.options.plane is not None:
-            return [box_start.on_plane(points, self.options.plane)]
         completed = symmetry_start.completed_moments(self.observation)
         if completed is None:
-            return [box_start.principal(points)]
-        centre, moments = completed
-        axes = symmetry_start.principal_axes(moments)
-        tiers = [symmetry_start.states(centre, moments, axes)]
-        tiers += [symmetry_start.states(centre, moments, turned) for turned in symmetry_start.eighth_turns(axes)]
+            tiers = [box_start.principal(points)]
+        else:
+            centre, moments = completed
+            axes = symmetry_start.principal_axes(moments)
+            turns = [axes, *symmetry_start.eighth_turns(axes)]
+            tiers = [symmetry_start.states(centre, moments, turned) for turned in turns]
+        if self.options.plane is not None:
+            tiers[0] += box_start.on_plane(points, self.options.plane)
         return tiers
 
     def _everything(self) -> list[State]:
