@@ -219,7 +219,7 @@ def test_a_box_seen_face_on_is_weak_and_says_what_is_missing() -> None:
     assert "undetermined" in fit.message
     hidden = int(np.argmax(fit.sigma_size))
     assert abs(fit.superquadric.rotation_matrix[2, hidden]) > 0.9
-    assert abs(fit.superquadric.size[hidden] - 0.04) < 2 * fit.sigma_size[hidden]
+    assert abs(fit.superquadric.size[hidden] - 0.04) < 3 * fit.sigma_size[hidden]
 
 
 def test_reported_deviations_cover_the_errors() -> None:

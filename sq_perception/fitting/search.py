@@ -5,8 +5,10 @@
    More starts only while the best residual stays above the noise floor.
 3. Those that the noise does not tell apart go on: Sampson with more rays, then the rendered residual.  If the winner's
    residual is above the floor, all starts are tried.
-4. The winner alone: rays far off its surface are dropped, the outline's precision is read from its misfit, and the
-   rendered residual is minimised on the full budget of rays.
+4. The winner, and whatever still rivals it: rays far off its surface are dropped, the outline's precision is read from
+   its misfit, and the rendered residual is minimised on the full budget of rays.
+5. If no superquadric reaches the floor, what is left becomes the model error, and stages 2 to 4 run once more with it:
+   then neighbouring pixels err alike, the object counts as few independent rays, and wide priors decide what is open.
 
 The noise floor is a mean squared residual of 1, as residuals are in units of the noise.
 """
@@ -47,13 +49,21 @@ SHRUNK = 0.25
 WIDEST_BAND = 4
 RING_RAYS = 200
 HIT_TOLERANCE = 3e-3
+"""Rays remember where they met the body, so that this error of g vanishes as the search converges."""
 OUTLIER = 5.0
+"""Object rays this many standard deviations off the surface of the winner are dropped."""
+SETTLED = 1.02
+"""A last mean squared residual above this makes the order of the axes worth another look."""
 PROMISING = 24
+"""So many bodies of the exact search start the one that tolerates a model error."""
 THIN = 0.3
+"""A size that the image leaves open is also tried this thin, as a share of the other two."""
 MEDIAN_TO_SIGMA = 1.4826
 PLANE_SIGMA, REST_SIGMA = 0.001, 0.05
+"""Metres below the plane, and sine of the angle between the normal and an axis of the body."""
 VOLUME_PRICE = 2.0
 PROPORTION_SIGMA = 1.0
+"""Of a log size against the mean of the three: a wide prior."""
 REAL_WEIGHT = 50.0
 """Model errors of neighbouring pixels are alike: an object on a table counts as so many independent rays."""
 
@@ -201,9 +211,24 @@ class Search:
                 break
             state = self._refined(rival, self.options.max_iterations)
             best = min(best, state, key=lambda each: each.cost)
+        if self.tolerated == 0 and best.cost > SETTLED * self.rays[:, 6].sum() and not self._late():
+            best = self._reordered(best)
         if self.observation.camera.is_pinhole and not self._late():
             best = self._doubted(best)
         return best
+
+    def _reordered(self, best: State) -> State:
+        """The same box of axes with another z, or turned by 45 degrees, where noise may have hidden the difference."""
+        rays, free = self._draw(2 * BASIN_RAYS, 0.2)
+        moments = best.rotation @ np.diag(best.parameters[:3] ** 2 * symmetry_start.MOMENT_SHARE) @ best.rotation.T
+        rivals: list[State] = []
+        for axes in [best.rotation, *symmetry_start.eighth_turns(best.rotation)]:
+            rivals += symmetry_start.states(best.parameters[5:8], moments, axes)
+        rivals = [
+            minimize(RENDERED, rays, free, self.scene, rival, self.limits, BASIN_STEPS, TOLERANCE) for rival in rivals
+        ]
+        rivals = self._rivals(rivals)[:FINALISTS]
+        return min([best, *(self._refined(rival, self.options.max_iterations) for rival in rivals)], key=_cost)
 
     def _doubted(self, state: State) -> State:
         """Where the image hardly tells a size, small model errors would decide it: leave it to the priors instead.
@@ -310,6 +335,10 @@ def _scene(observation: Observation, options: Options) -> Scene:
         rest_stiffness=1 / REST_SIGMA,
         volume_price=VOLUME_PRICE,
     )
+
+
+def _cost(state: State) -> float:
+    return state.cost
 
 
 def _resized(state: State, axis: int, size: float) -> State:

@@ -25,7 +25,7 @@ from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.observation import Observation
 from sq_perception.geometry.kernels import kernel
 
-_MOMENT_SHARE = 0.27
+MOMENT_SHARE = 0.27
 _START_EXPONENT = 0.5
 _RANK = 4
 """The centre's depth is the largest mean depth but for this many pairs, in case of a stray pixel."""
@@ -129,6 +129,6 @@ def states(centre: np.ndarray, moments: np.ndarray, axes: np.ndarray, exponent: 
     found = []
     for rotation in three_orders(axes):
         spread = np.einsum("ji,jk,ki->i", rotation, moments, rotation)
-        size = np.sqrt(np.maximum(spread, 1e-12) / _MOMENT_SHARE)
+        size = np.sqrt(np.maximum(spread, 1e-12) / MOMENT_SHARE)
         found.append(State(np.concatenate([size, [exponent, exponent], centre]), rotation, math.inf, 0))
     return found
