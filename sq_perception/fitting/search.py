@@ -83,6 +83,17 @@ class Search:
         self.rays = np.empty((0, RAY_COLUMNS))
         self.free = np.empty((0, RAY_COLUMNS))
 
+    def explained(self, given: list[State]) -> bool:
+        """Whether the given or the first automatic starts lead to a body that leaves nothing but noise.
+
+        If so, :meth:`decided` finishes it.
+        """
+        if given:
+            self._select(self._coarse(given), FINALISTS)
+        if not self._good_enough():
+            self._select(self._coarse(self._symmetric_tiers()[0]), FINALISTS)
+        return self._good_enough()
+
     def run(self, given: list[State]) -> State:
         """The best body from the given starts and, as far as needed, from automatic ones."""
         if given:
@@ -95,7 +106,7 @@ class Search:
                 self._tolerate_what_is_left()
                 promising = sorted(self.tried, key=lambda state: state.cost)[:PROMISING]
                 self._select(self._coarse(promising), ESCALATED_FINALISTS)
-        return self._decided()
+        return self.decided()
 
     # Starts
 
@@ -110,18 +121,20 @@ class Search:
 
     def _tiers(self) -> list[list[State]]:
         """Groups of starts, in the order in which to try them."""
-        points = self.observation.points
+        tiers = self._symmetric_tiers()
+        if self.options.plane is not None:
+            tiers[0] += box_start.on_plane(self.observation.points, self.options.plane)
+        return tiers
+
+    def _symmetric_tiers(self) -> list[list[State]]:
+        """Starts from central symmetry; from the points' box where nothing shows the symmetry."""
         completed = symmetry_start.completed_moments(self.observation)
         if completed is None:
-            tiers = [box_start.principal(points)]
-        else:
-            centre, moments = completed
-            axes = symmetry_start.principal_axes(moments)
-            turns = [axes, *symmetry_start.eighth_turns(axes)]
-            tiers = [symmetry_start.states(centre, moments, turned) for turned in turns]
-        if self.options.plane is not None:
-            tiers[0] += box_start.on_plane(points, self.options.plane)
-        return tiers
+            return [box_start.principal(self.observation.points)]
+        centre, moments = completed
+        axes = symmetry_start.principal_axes(moments)
+        turns = [axes, *symmetry_start.eighth_turns(axes)]
+        return [symmetry_start.states(centre, moments, turned) for turned in turns]
 
     def _everything(self) -> list[State]:
         """All starts at once, for images on which the first ones failed."""
@@ -192,7 +205,7 @@ class Search:
         least = ranked[0].cost
         return [state for state in ranked if state.cost <= least + max(DOUBT, (RIVAL - 1) * abs(least))]
 
-    def _decided(self) -> State:
+    def decided(self) -> State:
         """The last stage: the finalists on the full budget of rays, one scene for all of them."""
         favourite = self.finalists[0]
         if self.tolerated == 0 and not self._late():

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -67,6 +68,12 @@ def fit(
     depth, mask = _checked_images(depth, mask, camera)
     given = _checked_starts(start)
     empty = not camera.is_pinhole if options.nan_is_empty is None else options.nan_is_empty
+    if options.plane is not None and options.model_error is None:
+        exact = observe(depth, mask, camera, options.noise, 0.0, empty)
+        if exact is not None and not _hopeless(exact):
+            search = Search(exact, replace(options, model_error=0.0), began)
+            if search.explained(given):
+                return uncertainty.judged(search.decided(), search, began)
     observation = observe(depth, mask, camera, options.noise, options.tolerated, empty)
     if observation is None:
         raise ValueError("the mask holds no pixel with a depth: there is nothing to fit")
