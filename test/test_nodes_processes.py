@@ -389,7 +389,7 @@ def test_recordings_are_replayed_with_their_masks(client, start, shared_data):
     seen = len(heard)
     message = until(lambda: next((one for one in heard[seen:] if one.width), None), process)
     assert len(from_message(message)) == count
-    assert any((one.height, one.width) == shape for one in infos)
+    until(lambda: any((one.height, one.width) == shape for one in infos), process)
     client.node.destroy_subscription(listener)
     for one in (source, process):
         assert one.stop() == 0, one.output()

@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING
 from sq_perception.nodes import fast_dds
 
 if TYPE_CHECKING:
+    from rclpy.executors import Executor
+
     from sq_perception.nodes.stoppable_node import StoppableNode
 
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -50,11 +52,14 @@ def run(name: str, create: Callable[[], StoppableNode], arguments: Sequence[str]
         for variable, value in {**_THREADS, **fast_dds.additions()}.items():
             os.environ.setdefault(variable, value)
         import rclpy
+        from rclpy.executors import SingleThreadedExecutor
 
         rclpy.init(args=None if arguments is None else list(arguments))
+        # Before the node announces itself: an executor whose creation a signal interrupts complains when it is deleted.
+        executor = SingleThreadedExecutor()
         node = create()
         stop.starting = False
-        _spin(node)
+        _spin(node, executor)
     except KeyboardInterrupt:
         return 0
     except Exception as error:
@@ -71,11 +76,10 @@ def run(name: str, create: Callable[[], StoppableNode], arguments: Sequence[str]
     return 0
 
 
-def _spin(node: StoppableNode) -> None:
+def _spin(node: StoppableNode, executor: Executor) -> None:
     import rclpy
-    from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+    from rclpy.executors import ExternalShutdownException
 
-    executor = SingleThreadedExecutor()
     executor.add_node(node)
     try:
         while rclpy.ok():
