@@ -12,7 +12,7 @@ import math
 import numba
 import numpy as np
 
-from sq_perception.geometry.kernels import FAST, kernel, ray_interval
+from sq_perception.geometry.kernels import kernel, parallel_kernel, ray_interval
 from sq_perception.geometry.superquadric import Superquadric
 
 
@@ -88,7 +88,7 @@ def _column(body: np.ndarray, m: np.ndarray, x: float, y: float, z0: float, step
     return max(0, math.ceil(first / step - 1e-9)), min(count - 1, math.floor(last / step + 1e-9))
 
 
-@numba.njit(cache=True, nogil=True, parallel=True, fastmath=FAST, error_model="numpy")
+@parallel_kernel
 def _iou_batch(
     a: np.ndarray,
     a_matrix: np.ndarray,

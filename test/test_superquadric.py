@@ -2,6 +2,11 @@
 
 from __future__ import annotations
 
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
 import pytest
 import torch
@@ -266,3 +271,30 @@ class TestMisuse:
     def test_flat_vectors_have_twelve_numbers(self) -> None:
         with pytest.raises(ValueError, match=r"\(\.\.\., 12\)"):
             Superquadric.from_flat(np.zeros(11))
+
+
+def test_kept_machine_code_is_bound_to_all_kernel_sources(tmp_path: Path) -> None:
+    """A kernel compiled into another module's function: after an edit of its file alone, the new code must run."""
+    package = tmp_path / "sq_perception"
+    source = Path(kernels.__file__).parents[1]
+    for name in ("__init__.py", "metrics.py", "geometry"):
+        target = package / name
+        if (source / name).is_dir():
+            shutil.copytree(source / name, target, ignore=shutil.ignore_patterns("__pycache__"))
+        else:
+            target.parent.mkdir(exist_ok=True)
+            shutil.copy(source / name, target)
+    program = (
+        "import numpy as np; from sq_perception.metrics import _column;"
+        "body = np.array([1.0, 1, 1, 1, 1, 0, 0, 0]);"
+        "print(_column(body, np.eye(3), 0.0, 0.0, -2.0, 0.5, 9))"
+    )
+    edited = package / "geometry" / "kernels.py"
+    answers = []
+    for _ in range(2):
+        done = subprocess.run(
+            [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=True, timeout=120
+        )
+        answers.append(done.stdout.strip())
+        edited.write_text(edited.read_text().replace("return True, first, -last", "return True, first, first"))
+    assert answers == ["(2, 6)", "(2, 2)"]

@@ -10,8 +10,10 @@ from outside without overshooting; a slope that is not negative before g = 1 mea
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
@@ -24,9 +26,36 @@ FAST = {"contract", "arcp", "reassoc", "nsz", "afn"}
 
 def kernel(function: _F) -> _F:
     """Compile to machine code that releases the GIL and is kept on disk; one setting for the whole package."""
-    compiled = numba.njit(cache=True, nogil=True, fastmath=FAST, error_model="numpy")(function)
-    return cast(_F, compiled)
+    return _compiled(function, parallel=False)
 
+
+def parallel_kernel(function: _F) -> _F:
+    """The same, with ``numba.prange`` over all cores; not to be called from several threads at once."""
+    return _compiled(function, parallel=True)
+
+
+def _compiled(function: _F, parallel: bool) -> _F:
+    function.__qualname__ += f"_{_FINGERPRINT}"
+    options: dict[str, Any] = {"nogil": True, "fastmath": FAST, "error_model": "numpy", "parallel": parallel}
+    return cast(_F, numba.njit(cache=True, **options)(function))
+
+
+def _fingerprint() -> str:
+    """A digest of every source file with kernels.
+
+    numba keeps machine code under the name of a function and checks the file that holds it, but not the files of the
+    kernels that were compiled into it: an update of this module alone would leave the old code at work elsewhere.  With
+    the digest in the name, code of other sources is never found.
+    """
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).resolve().parents[1].rglob("*.py")):
+        source = path.read_bytes()
+        if b"geometry.kernels" in source or path == Path(__file__).resolve():
+            digest.update(source)
+    return digest.hexdigest()[:12]
+
+
+_FINGERPRINT = _fingerprint()
 
 RAY_TOLERANCE = 1e-9
 MAX_NEWTON_STEPS = 60

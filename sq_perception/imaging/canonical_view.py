@@ -28,7 +28,7 @@ import numba
 import numpy as np
 
 from sq_perception.geometry import rotation as quaternions
-from sq_perception.geometry.kernels import FAST, gauge_derivatives, ray_entry
+from sq_perception.geometry.kernels import gauge_derivatives, parallel_kernel, ray_entry
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
 
@@ -233,7 +233,7 @@ _MOST_ROUNDS = 4
 _SAME_EXTENT = 0.005
 
 
-@numba.njit(cache=True, nogil=True, parallel=True, fastmath=FAST, error_model="numpy")
+@parallel_kernel
 def _render_views(
     flat: np.ndarray,
     matrices: np.ndarray,

@@ -12,7 +12,7 @@ import numba
 import numpy as np
 import torch
 
-from sq_perception.geometry.kernels import FAST, RAY_TOLERANCE, ray_entry
+from sq_perception.geometry.kernels import RAY_TOLERANCE, parallel_kernel, ray_entry
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
 
@@ -62,7 +62,7 @@ def _window(body: Superquadric, camera: Camera) -> tuple[int, int, int, int]:
     return left, top, right, bottom
 
 
-@numba.njit(cache=True, nogil=True, parallel=True, fastmath=FAST, error_model="numpy")
+@parallel_kernel
 def _render_bodies(
     flat: np.ndarray,
     matrices: np.ndarray,
