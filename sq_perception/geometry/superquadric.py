@@ -41,6 +41,8 @@ Array = Any
 
 FLAT_LENGTH = 12
 _NEGLIGIBLE_RATIO = 1e-30
+_HALF_TURNS = np.array([[0.0, 0, 0, 1], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]])
+_QUARTER_TURN = np.array([0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -302,10 +304,7 @@ class Superquadric:
         Half turns about x, y, z and none, then the same four after a quarter turn about z with a1 and a2 exchanged.
         """
         xp = array_namespace(self.size)
-        root = np.sqrt(0.5)
-        turns = np.array([[0, 0, 0, 1.0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0]])
-        quarter = np.array([0, 0, root, root])
-        turns = np.concatenate([turns, quaternions.multiply(np.broadcast_to(quarter, (4, 4)), turns)])
+        turns = np.concatenate([_HALF_TURNS, quaternions.multiply(_QUARTER_TURN, _HALF_TURNS)])
         forms = []
         for k, turn in enumerate(turns):
             size = self.size
@@ -319,15 +318,16 @@ class Superquadric:
     def canonical_form(self) -> Superquadric:
         """The representative of the 8 forms with a1 >= a2, then the smallest rotation angle, then qw >= 0.
 
-        NumPy bodies only.  Among equal angles the first in the order of :meth:`equivalent_forms` wins.
+        NumPy bodies only.  A half turn about an axis moves that axis' component of the quaternion to qw, up to sign, so
+        that the largest component names the half turn of the smallest angle; among equals qw, then x, y, z wins.
         """
-        forms = self.equivalent_forms().to_flat()
-        swapped = forms[..., 0] < forms[..., 1]
-        preference = np.abs(forms[..., 11]) - 10.0 * swapped
-        best = np.argmax(np.round(preference, 12), axis=0)
-        flat = np.take_along_axis(forms, best[None, ..., None], axis=0)[0].copy()
-        flat[..., 8:12] *= np.where(flat[..., 11:12] < 0, -1.0, 1.0)
-        return Superquadric.from_flat(flat)
+        swapped = self.size[..., :1] < self.size[..., 1:2]
+        size = np.where(swapped, self.size[..., [1, 0, 2]], self.size)
+        q = np.where(swapped, quaternions.multiply(self.rotation, _QUARTER_TURN), self.rotation)
+        largest = np.asarray(np.argmax(np.round(np.abs(q[..., [3, 0, 1, 2]]), 12), axis=-1))
+        q = quaternions.multiply(q, _HALF_TURNS[largest])
+        q = q * np.where(q[..., 3:] < 0, -1.0, 1.0)
+        return Superquadric(size, self.shape, self.translation, q)
 
     def _numpy(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         size, shape = self.size, self.shape
