@@ -238,7 +238,8 @@ class Search:
         for axes in [best.rotation, *symmetry_start.eighth_turns(best.rotation)]:
             rivals += symmetry_start.states(best.parameters[5:8], moments, axes)
         rivals = [
-            minimize(RENDERED, rays, free, self.scene, rival, self.limits, BASIN_STEPS, TOLERANCE) for rival in rivals
+            minimize(RENDERED, rays, free, self.scene, rival, self.limits, BASIN_STEPS, TOLERANCE)
+            for rival in self._rivals(self._coarse(rivals))[:ESCALATED_FINALISTS]
         ]
         rivals = self._rivals(rivals)[:FINALISTS]
         return min([best, *(self._refined(rival, self.options.max_iterations) for rival in rivals)], key=_cost)

@@ -323,8 +323,8 @@ class Superquadric:
         """
         swapped = self.size[..., :1] < self.size[..., 1:2]
         size = np.where(swapped, self.size[..., [1, 0, 2]], self.size)
-        q = np.where(swapped, quaternions.multiply(self.rotation, _QUARTER_TURN), self.rotation)
-        largest = np.asarray(np.argmax(np.round(np.abs(q[..., [3, 0, 1, 2]]), 12), axis=-1))
+        q: Any = np.where(swapped, quaternions.multiply(self.rotation, _QUARTER_TURN), self.rotation)
+        largest = np.argmax(np.round(np.abs(q[..., [3, 0, 1, 2]]), 12), axis=-1)
         q = quaternions.multiply(q, _HALF_TURNS[largest])
         q = q * np.where(q[..., 3:] < 0, -1.0, 1.0)
         return Superquadric(size, self.shape, self.translation, q)
