@@ -30,8 +30,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _recoverer(parameters: RecoverParameters) -> Recoverer:
+    import torch
+
     from sq_perception.recovery import Recoverer
 
+    # On a robot's busy cores the slowest of several threads sets the time; one image is too small to gain from them.
+    torch.set_num_threads(1)
     return Recoverer(parameters.model or None, parameters.device, parameters.method)
 
 
