@@ -4,7 +4,7 @@
 
 | method | body | refine |
 | --- | --- | --- |
-| auto | fit from the starts of the network and of central symmetry; open sizes predicted | surface, soft_render, none |
+| auto | fit from the starts of central symmetry and, where needed, the network; open sizes predicted | all |
 | symmetry | fit from the starts of central symmetry, no network | surface, soft_render |
 | network | the network alone | ignored |
 | classic | Solina and Bajcsy's fit to the points | ignored |
@@ -12,6 +12,9 @@
 ``refine="surface"`` is the exact surface fit.  ``"soft_render"`` descends on the soft-rendered depth (L_DR) instead,
 from the network's prediction for ``auto`` and after the fit for ``symmetry``.  ``"none"`` leaves the network's
 prediction as it is; ``symmetry`` has no body without its fit and ignores it.
+
+With ``auto`` and ``surface`` the network computes beside the fit's first, cheapest starts.  A body that these explain
+down to the noise needs no prediction and does not wait for it.
 
 Everything is metres in the optical frame.  A hard image is no error: an object without a body is listed with
 ``Status.FAILED``, score 0 and, in place of a body, an ellipsoid around its visible points.
@@ -23,7 +26,7 @@ import os
 import threading
 import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -199,6 +202,7 @@ class Recoverer:
         self._device = _checked_device(device)
         self._network: checkpoint.Regressor | None = None
         self._lock = threading.Lock()
+        self._beside = ThreadPoolExecutor(1, thread_name_prefix="network")
         if method in _NEEDS_NETWORK:
             self._load_network()
 
@@ -262,9 +266,11 @@ class Recoverer:
                 one.view = canonical_view.from_mask(one.depth_crop, one.mask_crop, one.camera_crop, pixels)
             if network is not None and objects:
                 views = np.stack([one.view.image for one in objects if one.view is not None])
-                predictions = network.predict(views)
-                for one, body in zip(objects, predictions, strict=True):
-                    one.prediction = body
+                predictions = self._beside.submit(network.predict, views)
+                for k, one in enumerate(objects):
+                    one.predictions, one.number = predictions, k
+                if options.method == "network" or options.refine != "surface":
+                    predictions.result()
 
         plane = found.plane if options.use_plane else None
         with _timed(milliseconds, "fit"):
@@ -311,8 +317,16 @@ class _Object:
     mask_crop: np.ndarray
     camera_crop: Camera
     view: CanonicalView | None = None
-    prediction: Superquadric | None = None
-    """In the canonical frame."""
+    predictions: Future[Superquadric] | None = None
+    """Of all objects of the frame, in the canonical frames of their views; still being computed, perhaps."""
+    number: int = 0
+    """Of this object among them."""
+
+    def predicted(self) -> Superquadric:
+        """The network's prediction in the optical frame; waits for it."""
+        if self.predictions is None or self.view is None:
+            raise ValueError("no prediction")
+        return self.view.from_canonical(self.predictions.result()[self.number]).canonical_form()
 
     @property
     def points(self) -> np.ndarray:
@@ -388,38 +402,29 @@ def _body(
 ) -> Fit:
     if options.method == "classic":
         return solina_bajcsy.fit(one.points)
-    predicted = None
-    if one.prediction is not None and one.view is not None:
-        predicted = one.view.from_canonical(one.prediction).canonical_form()
     if options.method == "network" or (options.method == "auto" and options.refine == "none"):
-        if predicted is None:
-            raise ValueError("no prediction")
-        return _unfitted(predicted, one, "prediction of the network, not refined")
-    if options.method == "auto" and options.refine == "soft_render" and predicted is not None:
-        return _soft_rendered(predicted, one, options)
-    fit = _surface_fit(predicted, one, depth, camera, plane, options.time_budget)
+        return _unfitted(one.predicted(), one, "prediction of the network, not refined")
+    if options.method == "auto" and options.refine == "soft_render":
+        return _soft_rendered(one.predicted(), one, options)
+    fit = _surface_fit(one, depth, camera, plane, options.time_budget)
     if options.refine == "soft_render" and fit.status != Status.FAILED:
         return _soft_rendered(fit.superquadric, one, options)
     return fit
 
 
 def _surface_fit(
-    predicted: Superquadric | None,
-    one: _Object,
-    depth: np.ndarray,
-    camera: Camera,
-    plane: np.ndarray | None,
-    time_budget: float,
+    one: _Object, depth: np.ndarray, camera: Camera, plane: np.ndarray | None, time_budget: float
 ) -> Fit:
-    """From the network's prediction, joined by the automatic starts where that one stays above the noise.
+    """From the cheapest starts of central symmetry; where those leave something, from the network's prediction too.
 
-    What the image leaves open after all, such as the depth of a box seen face-on, the prediction tells again.
+    The network computes beside the fit.  What the image leaves open after all, such as the depth of a box seen
+    face-on, its prediction tells again.
     """
     settings = surface_fit.Options(plane=plane, time_budget=time_budget)
-    if predicted is None:
+    if one.predictions is None:
         return surface_fit.fit(depth, one.mask, camera, options=settings)
-    fit = surface_fit.fit(depth, one.mask, camera, start=predicted, options=settings)
-    return prediction.completed(fit, predicted)
+    fit = surface_fit.fit(depth, one.mask, camera, start=one.predicted, options=settings)
+    return prediction.completed(fit, one.predicted()) if prediction.is_open(fit) else fit
 
 
 def _soft_rendered(start: Superquadric, one: _Object, options: RecoveryOptions) -> Fit:

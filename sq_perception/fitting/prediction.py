@@ -29,6 +29,13 @@ _OPEN_SHARE = 0.15
 _LARGEST_CHANGE = 10.0
 
 
+def is_open(fit: Fit) -> bool:
+    """Whether a fit leaves a half size to a prediction: one with a standard deviation above 15 % of it."""
+    if fit.status == Status.FAILED or not np.isfinite(fit.covariance).all():
+        return False
+    return bool((fit.sigma_size > _OPEN_SHARE * fit.superquadric.size).any())
+
+
 def completed(fit: Fit, predicted: Superquadric, share: float = PREDICTION_SHARE) -> Fit:
     """The fit with those half sizes that it leaves open joined with the prediction's.
 
@@ -49,7 +56,7 @@ def completed(fit: Fit, predicted: Superquadric, share: float = PREDICTION_SHARE
     """
     size, shape = np.array(fit.superquadric.size), fit.superquadric.shape
     sigma = fit.sigma_size
-    if fit.status == Status.FAILED or not np.isfinite(fit.covariance).all() or not (sigma > _OPEN_SHARE * size).any():
+    if not is_open(fit):
         return fit
     known = np.concatenate([size, shape, fit.superquadric.translation, np.zeros(3)])
     covariance = fit.covariance.copy()

@@ -80,17 +80,19 @@ class Search:
         self.scene = _scene(observation, options)
         self.finalists: list[State] = []
         self.tried: list[State] = []
+        self._symmetry_tried = False
         self.rays = np.empty((0, RAY_COLUMNS))
         self.free = np.empty((0, RAY_COLUMNS))
 
     def explained(self, given: list[State]) -> bool:
-        """Whether the given or the first automatic starts lead to a body that leaves nothing but noise.
+        """Whether the given starts, or the cheapest automatic ones, lead to a body that leaves nothing but noise.
 
-        If so, :meth:`decided` finishes it.
+        If so, :meth:`decided` finishes it.  May be called again with other starts.
         """
         if given:
             self._select(self._coarse(given), FINALISTS)
-        if not self._good_enough():
+        if not self._good_enough() and not self._symmetry_tried:
+            self._symmetry_tried = True
             self._select(self._coarse(self._symmetric_tiers()[0]), FINALISTS)
         return self._good_enough()
 

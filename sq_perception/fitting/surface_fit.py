@@ -11,7 +11,7 @@ Frames and units: optical frame, metres, radians.
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Literal
 
@@ -35,7 +35,7 @@ def fit(
     mask: np.ndarray,
     camera: Camera,
     *,
-    start: Superquadric | Literal["auto"] | Sequence[Superquadric] = "auto",
+    start: Superquadric | Literal["auto"] | Sequence[Superquadric] | Callable[[], Superquadric] = "auto",
     options: Options | None = None,
 ) -> Fit:
     """The superquadric that explains the masked pixels of a depth image, and contradicts none beside them.
@@ -48,7 +48,8 @@ def fit(
         Pixels of the object.
     camera : Camera
     start : "auto", one body, a batch of bodies or a sequence of bodies, in the optical frame
-        Where to begin.
+        Where to begin.  A function that returns them is called only if the cheapest automatic starts leave something
+        unexplained: for starts that cost time, or are still being computed.
     options : Options
 
     Returns
@@ -66,14 +67,18 @@ def fit(
     began = time.perf_counter()
     options = options or Options()
     depth, mask = _checked_images(depth, mask, camera)
-    given = _checked_starts(start)
+    given = [] if callable(start) else _checked_starts(start)
     empty = not camera.is_pinhole if options.nan_is_empty is None else options.nan_is_empty
-    if options.plane is not None and options.model_error is None:
+    if options.model_error is None and (options.plane is not None or callable(start)):
         exact = observe(depth, mask, camera, options.noise, 0.0, empty)
         if exact is not None and not _hopeless(exact):
             search = Search(exact, replace(options, model_error=0.0), began)
             if search.explained(given):
                 return uncertainty.judged(search.decided(), search, began)
+            if callable(start):
+                given = _checked_starts(start())
+                if search.explained(given):
+                    return uncertainty.judged(search.decided(), search, began)
     observation = observe(depth, mask, camera, options.noise, options.tolerated, empty)
     if observation is None:
         raise ValueError("the mask holds no pixel with a depth: there is nothing to fit")
@@ -81,6 +86,8 @@ def fit(
     if reason:
         body = box_start.enclosing_box(observation.points, observation.footprint)
         return uncertainty.failed(body, observation, reason, began)
+    if callable(start) and not given:
+        given = _checked_starts(start())
     search = Search(observation, options, began)
     best = search.run(given)
     return uncertainty.judged(best, search, began)
