@@ -4,8 +4,8 @@
 
 Bodies: a in [25, 75], e in [0.1, 1], centre 128 +- 40, uniform rotations, 256 x 256 pixels, floor of z (thesis, 5.1).
 IoU on the thesis' grid of 64^3 points of the cube (5.1).  Times are the whole recovery of one image, segmentation to
-score, each stage on one thread; with ``auto`` the network computes beside the fit.  The thesis' own figures stand in the
-last column, measured there on its own images and machine.
+score, each stage on one thread; with ``auto`` the network computes beside the fit.  The thesis' own figures stand in
+the last column, measured there on its own images and machine.
 """
 
 from __future__ import annotations
