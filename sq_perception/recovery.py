@@ -266,11 +266,13 @@ class Recoverer:
                 one.view = canonical_view.from_mask(one.depth_crop, one.mask_crop, one.camera_crop, pixels)
             if network is not None and objects:
                 views = np.stack([one.view.image for one in objects if one.view is not None])
-                predictions = self._beside.submit(network.predict, views)
+                predictions: Future[Superquadric] = Future()
+                if options.method == "auto" and options.refine == "surface":
+                    predictions = self._beside.submit(network.predict, views)
+                else:
+                    predictions.set_result(network.predict(views))
                 for k, one in enumerate(objects):
                     one.predictions, one.number = predictions, k
-                if options.method == "network" or options.refine != "surface":
-                    predictions.result()
 
         plane = found.plane if options.use_plane else None
         with _timed(milliseconds, "fit"):
