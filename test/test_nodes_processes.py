@@ -365,7 +365,7 @@ def test_thesis_frames_are_recovered_in_the_cube_frame(client, start):
     truth = client.listen("/synthetic_depth_node/truth")
     heard = client.listen("/fitter_node/superquadrics")
     answer = until(lambda: next((one for one in heard if one.header.frame_id == "unit_cube"), None), process)
-    known = next(one for one in truth if one.header.frame_id == "unit_cube")
+    known = until(lambda: next((one for one in truth if one.header.frame_id == "unit_cube"), None), source)
     bodies = [
         Superquadric(one.size, one.shape, one.translation, one.rotation)
         for one in (from_message(known), from_message(answer))

@@ -33,8 +33,8 @@ class _Stop:
         self.received = False
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
-        self.received = True
-        if self.starting:
+        first, self.received = not self.received, True
+        if self.starting and first:
             raise KeyboardInterrupt
 
 
