@@ -11,17 +11,17 @@ import torch
 
 from sq_perception.fitting import residual_statement as statement
 from sq_perception.fitting.levenberg_marquardt import State, minimize
+from sq_perception.fitting.normal_equations import STEP_LENGTH
 from sq_perception.fitting.residuals import (
     CLASSIC,
     RAY_COLUMNS,
     RENDERED,
     SAMPSON,
-    STEP_LENGTH,
-    Scene,
     evaluate,
     penetration,
     surface_distance,
 )
+from sq_perception.fitting.scene import Scene
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 

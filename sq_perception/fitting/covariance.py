@@ -12,7 +12,9 @@ from __future__ import annotations
 import numpy as np
 
 from sq_perception.fitting.levenberg_marquardt import State
-from sq_perception.fitting.residuals import RENDERED, STEP_LENGTH, Scene, evaluate
+from sq_perception.fitting.normal_equations import STEP_LENGTH
+from sq_perception.fitting.residuals import RENDERED, evaluate
+from sq_perception.fitting.scene import Scene
 from sq_perception.geometry.superquadric import Superquadric
 
 WEAK_SHARE = 0.15

@@ -15,7 +15,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sq_perception.fitting.residuals import STEP_LENGTH, Scene, evaluate
+from sq_perception.fitting.normal_equations import STEP_LENGTH
+from sq_perception.fitting.residuals import evaluate
+from sq_perception.fitting.scene import Scene
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.superquadric import Superquadric

@@ -22,61 +22,47 @@ covered     (min g - 1) / (|grad g| sigma_o) instead, where a pixel of the objec
             the outline.  A ray that misses even the bounding box counts by its Sampson distance.
 free        (1 - min g) / (|grad g| sigma_o), where the smallest g on a free ray, up to its free depth z, is below 1.
             At a minimum the point may be held fixed (envelope theorem).
-plane       (lowest point above the plane) / sigma where negative: n.t + d - h(R^T n), h the support function.
-rest        the two components of R^T n across the axis nearest to the normal, over sigma, Cauchy: bodies lie on a face.
-proportion  log a_k minus the mean of the three, over sigma: what the image leaves open resembles what it shows.
-volume      a linear price on log(a1 a2 a3), for the smaller of two bodies that explain the image alike.
 
 The scales |grad g| and c are held fixed in the derivatives, which residuals small near the answer justify.  Image
-residuals pass through Huber's loss.  The cost is the weighted sum of the losses, r^2 for small r.
+residuals pass through Huber's loss.  The cost is the weighted sum of the losses, r^2 for small r, and of the priors
+(:mod:`sq_perception.fitting.priors`).
+
+Rays are worked on in blocks of ``LANES``: every line of the mathematics is a loop over the block without a branch, which
+the compiler turns into vector code.  ``lanes`` (ROWS, LANES) holds the block's intermediate values, a row each.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 
-from sq_perception.geometry.kernels import box_interval, gauge_derivatives, kernel, p_norm, ray_minimum
+from sq_perception.fitting.normal_equations import LANES, STEP_LENGTH, add_block, huber_loss
+from sq_perception.fitting.priors import prior_cost
+from sq_perception.fitting.scene import Scene
+from sq_perception.geometry.kernels import box_interval, gauge_derivatives, inline_kernel, kernel
 
 CLASSIC, SAMPSON, RENDERED = 0, 1, 2
-STEP_LENGTH = 11
 RAY_COLUMNS = 8
 
-_BLOCK = 64
+_QX, _QY, _QZ, _EX, _EY, _EZ, _SHIFT = range(7)
+"""A ray in the object frame, q + shift e;"""
+_G, _GX, _GY, _GZ, _G1, _G2, _SLOPE = range(7, 14)
+"""the gauge there and its derivatives, the last one along the ray;"""
+_DEPTH, _STIFFNESS, _WEIGHT, _START = range(14, 18)
+"""what the pixel measured, and the depth of q;"""
+_LOW, _HIGH, _G_LOW, _G_HIGH, _S_LOW, _S_HIGH = range(18, 24)
+"""a bracket around the smallest gauge."""
+_ROWS = 24
+
 _HIT_STEPS = 12
-_MINIMUM_STEPS = 8
+_LOWEST_STEPS = 20
+_LOWEST_TOLERANCE = 1e-9
 _NEAREST = 1e-3
 """A free ray starts this far in front of a pinhole camera, metres."""
+_FAR_OUTSIDE = 2.0
+"""From a gauge above this, Newton's method starts where the ray enters the bounding box instead."""
 _TINY = 1e-12
-
-
-Derivatives = tuple[float, float, float, float, float, float]
-"""A value g or h and its derivatives by x, y, z, e1 and e2."""
-
-
-class Scene(NamedTuple):
-    """What holds for all rays: losses, and what is known beyond the image.
-
-    A rendered depth is found by Newton's method until |g - 1| < ``hit_tolerance``, then in first order.
-    ``outline_stiffness`` is 1/sigma_o; the plane is n.x + d = height; a stiffness or price of 0 switches its term off.
-    """
-
-    huber: float = 3.0
-    outline_huber: float = 3.0
-    grazing: float = 0.01
-    hit_tolerance: float = 1e-4
-    outline_stiffness: float = 1.0
-    pinhole: float = 0.0
-    normal_x: float = 0.0
-    normal_y: float = 0.0
-    normal_z: float = 0.0
-    offset: float = 0.0
-    plane_stiffness: float = 0.0
-    rest_stiffness: float = 0.0
-    proportion_stiffness: float = 0.0
-    volume_price: float = 0.0
 
 
 @kernel
@@ -89,330 +75,338 @@ def evaluate(
     rotation: np.ndarray,
     sums: np.ndarray,
 ) -> float:
-    """Cost at a body; fills ``sums`` (12, 12), lower triangle: J^T J in rows 0 to 10, J^T r in row 11."""
+    """Cost at a body; fills ``sums`` (12, 12), lower triangle: J^T J in rows 0 to 10, J^T r in row 11.
+
+    The RENDERED stage keeps in the last column of ``rays`` where each ray met the body.
+    """
     sums[:] = 0.0
-    block = np.zeros((STEP_LENGTH + 1, _BLOCK))
-    cost = _object_cost(stage, rays, scene, parameters, rotation, block, sums)
-    cost += _free_cost(free, scene, parameters, rotation, block, sums)
-    if scene.plane_stiffness > 0.0 or scene.rest_stiffness > 0.0:
-        cost += _support_cost(scene, parameters, rotation, block, sums)
-    if scene.proportion_stiffness > 0.0:
-        cost += _proportion_cost(scene, parameters, block, sums)
-    if scene.volume_price > 0.0:
-        for k in range(3):
-            cost += scene.volume_price * math.log(parameters[k])
-            sums[STEP_LENGTH, k] += 0.5 * scene.volume_price
+    block = np.empty((STEP_LENGTH + 1, LANES))
+    lanes = np.empty((_ROWS, LANES))
+    missed = np.empty(LANES, np.bool_)
+    cost = 0.0
+    for begin in range(0, rays.shape[0], LANES):
+        filled = min(LANES, rays.shape[0] - begin)
+        part = rays[begin : begin + filled]
+        _place(part, stage == RENDERED, parameters, rotation, lanes)
+        if stage == RENDERED:
+            _meet(filled, scene.hit_tolerance, parameters, lanes, missed)
+            cost += _rendered_rows(part, scene, lanes, missed, block)
+        else:
+            _gauge(filled, parameters, lanes)
+            cost += _measured_rows(filled, stage, scene, parameters, lanes, block)
+        _differentiate(filled, rotation, lanes, block)
+        if stage == CLASSIC:
+            # The volume factor's own derivative by log a_k is half the residual.
+            for k in range(3):
+                for i in range(filled):
+                    block[k, i] += 0.5 * block[STEP_LENGTH, i]
+        add_block(block, filled, sums)
+    filled = 0
+    for i in range(free.shape[0]):
+        filled += _enter(free[i], scene, parameters, rotation, filled, lanes)
+        if filled == LANES:
+            cost += _free_rows(filled, scene, parameters, rotation, lanes, missed, block, sums)
+            filled = 0
+    if filled > 0:
+        cost += _free_rows(filled, scene, parameters, rotation, lanes, missed, block, sums)
+    return cost + prior_cost(scene, parameters, rotation, sums)
+
+
+@kernel
+def _place(part: np.ndarray, resume: bool, parameters: np.ndarray, rotation: np.ndarray, lanes: np.ndarray) -> None:
+    """Rays of the object, in its frame; q at the measured depth, or where the ray met the body last time."""
+    t1, t2, t3 = parameters[5], parameters[6], parameters[7]
+    m11, m12, m13 = rotation[0]
+    m21, m22, m23 = rotation[1]
+    m31, m32, m33 = rotation[2]
+    for i in range(part.shape[0]):
+        dx, dy = part[i, 2], part[i, 3]
+        start = part[i, 7] if resume else part[i, 4]
+        x, y, z = part[i, 0] - t1 + start * dx, part[i, 1] - t2 + start * dy, start - t3
+        lanes[_QX, i] = m11 * x + m21 * y + m31 * z
+        lanes[_QY, i] = m12 * x + m22 * y + m32 * z
+        lanes[_QZ, i] = m13 * x + m23 * y + m33 * z
+        lanes[_EX, i] = m11 * dx + m21 * dy + m31
+        lanes[_EY, i] = m12 * dx + m22 * dy + m32
+        lanes[_EZ, i] = m13 * dx + m23 * dy + m33
+        lanes[_SHIFT, i] = 0.0
+        lanes[_DEPTH, i], lanes[_STIFFNESS, i], lanes[_WEIGHT, i] = part[i, 4], part[i, 5], part[i, 6]
+        lanes[_START, i] = start
+
+
+@kernel
+def _gauge(filled: int, parameters: np.ndarray, lanes: np.ndarray) -> None:
+    """The gauge and its derivatives at q + shift e."""
+    a1, a2, a3, e1, e2 = parameters[0], parameters[1], parameters[2], parameters[3], parameters[4]
+    for i in range(filled):
+        ex, ey, ez, shift = lanes[_EX, i], lanes[_EY, i], lanes[_EZ, i], lanes[_SHIFT, i]
+        x, y, z = lanes[_QX, i] + shift * ex, lanes[_QY, i] + shift * ey, lanes[_QZ, i] + shift * ez
+        g, gx, gy, gz, g1, g2 = gauge_derivatives(x, y, z, a1, a2, a3, e1, e2)
+        lanes[_G, i], lanes[_GX, i], lanes[_GY, i], lanes[_GZ, i] = g, gx, gy, gz
+        lanes[_G1, i], lanes[_G2, i] = g1, g2
+        lanes[_SLOPE, i] = gx * ex + gy * ey + gz * ez
+
+
+@kernel
+def _meet(filled: int, tolerance: float, parameters: np.ndarray, lanes: np.ndarray, missed: np.ndarray) -> None:
+    """Where the rays meet the surface: shift along the ray and the gauge there; ``missed`` where they do not.
+
+    Newton's method along the ray.  From a point on the near side of the body it cannot fail, as g is convex along the
+    ray; from the far side, from far outside, and where it passes the smallest g, it starts again at the bounding box.
+    The last point lies within the tolerance of the surface; the caller takes the last step in first order.  For a miss
+    it is the point of the smallest g, or q if even the bounding box is missed.
+    """
+    _gauge(filled, parameters, lanes)
+    for i in range(filled):
+        missed[i] = lanes[_SLOPE, i] >= 0.0 or lanes[_G, i] > _FAR_OUTSIDE
+    for _ in range(_HIT_STEPS):
+        moving = 0
+        for i in range(filled):
+            over = 1.0 - lanes[_G, i]
+            moves = abs(over) >= tolerance and lanes[_SLOPE, i] < 0.0 and not missed[i]
+            lanes[_SHIFT, i] += over / lanes[_SLOPE, i] if moves else 0.0
+            moving += moves
+        if moving == 0:
+            break
+        _gauge(filled, parameters, lanes)
+        for i in range(filled):
+            missed[i] = missed[i] or lanes[_SLOPE, i] >= 0.0
+    for i in range(filled):
+        if missed[i]:
+            missed[i] = not _meet_from_box(i, tolerance, parameters, lanes)
+
+
+@kernel
+def _meet_from_box(i: int, tolerance: float, parameters: np.ndarray, lanes: np.ndarray) -> bool:
+    """The same for one ray, from where it enters the bounding box; whether it meets the surface."""
+    a1, a2, a3, e1, e2 = parameters[0], parameters[1], parameters[2], parameters[3], parameters[4]
+    qx, qy, qz, ex, ey, ez = lanes[_QX, i], lanes[_QY, i], lanes[_QZ, i], lanes[_EX, i], lanes[_EY, i], lanes[_EZ, i]
+    shift, t_out = box_interval(qx, qy, qz, ex, ey, ez, a1, a2, a3)
+    inside = shift <= t_out
+    if not inside:
+        shift = 0.0
+    hit = False
+    before = shift
+    for _ in range(_HIT_STEPS):
+        g, gx, gy, gz, _, _ = gauge_derivatives(qx + shift * ex, qy + shift * ey, qz + shift * ez, a1, a2, a3, e1, e2)
+        slope = gx * ex + gy * ey + gz * ez
+        hit = inside and (abs(g - 1.0) < tolerance or slope < 0.0)
+        if not hit or abs(g - 1.0) < tolerance:
+            break
+        before = shift
+        shift += (1.0 - g) / slope
+    if inside and not hit:
+        low, high = before, shift
+        for _ in range(_HIT_STEPS):
+            shift = 0.5 * (low + high)
+            g, gx, gy, gz, _, _ = gauge_derivatives(
+                qx + shift * ex, qy + shift * ey, qz + shift * ez, a1, a2, a3, e1, e2
+            )
+            if gx * ex + gy * ey + gz * ez > 0.0:
+                high = shift
+            else:
+                low = shift
+    g, gx, gy, gz, g1, g2 = gauge_derivatives(qx + shift * ex, qy + shift * ey, qz + shift * ez, a1, a2, a3, e1, e2)
+    lanes[_SHIFT, i] = shift
+    lanes[_G, i], lanes[_GX, i], lanes[_GY, i], lanes[_GZ, i], lanes[_G1, i], lanes[_G2, i] = g, gx, gy, gz, g1, g2
+    lanes[_SLOPE, i] = gx * ex + gy * ey + gz * ez
+    return hit
+
+
+@kernel
+def _rendered_rows(
+    part: np.ndarray, scene: Scene, lanes: np.ndarray, missed: np.ndarray, block: np.ndarray
+) -> float:
+    """Rendered and covered residuals: their cost, and in the block's first and last row their scale and value."""
+    cost = 0.0
+    for i in range(part.shape[0]):
+        gx, gy, gz, along = lanes[_GX, i], lanes[_GY, i], lanes[_GZ, i], lanes[_SLOPE, i]
+        ex, ey, ez = lanes[_EX, i], lanes[_EY, i], lanes[_EZ, i]
+        square = gx * gx + gy * gy + gz * gz + _TINY
+        over = lanes[_G, i] - 1.0
+        across = scene.grazing * square * (ex * ex + ey * ey + ez * ez)
+        covered = scene.outline_stiffness / math.sqrt(square)
+        factor = covered if missed[i] else lanes[_STIFFNESS, i] / math.sqrt(along * along + across)
+        short = lanes[_DEPTH, i] - lanes[_START, i] - lanes[_SHIFT, i]
+        residual = over * covered if missed[i] else (short * along + over) * factor
+        loss, scale = huber_loss(residual, scene.outline_huber if missed[i] else scene.huber, lanes[_WEIGHT, i])
+        cost += loss
+        block[0, i] = scale * factor
+        block[STEP_LENGTH, i] = scale * residual
+    for i in range(part.shape[0]):
+        reached = lanes[_START, i] + lanes[_SHIFT, i] - (lanes[_G, i] - 1.0) / lanes[_SLOPE, i]
+        part[i, 7] = lanes[_DEPTH, i] if missed[i] else reached
     return cost
 
 
 @kernel
-def _object_cost(
-    stage: int,
-    rays: np.ndarray,
+def _measured_rows(
+    filled: int, stage: int, scene: Scene, parameters: np.ndarray, lanes: np.ndarray, block: np.ndarray
+) -> float:
+    """Classic or Sampson residuals at the measured points, likewise."""
+    root_of_volume = math.sqrt(parameters[0] * parameters[1] * parameters[2])
+    cost = 0.0
+    for i in range(filled):
+        gx, gy, gz, g = lanes[_GX, i], lanes[_GY, i], lanes[_GZ, i], lanes[_G, i]
+        sampson = lanes[_STIFFNESS, i] / math.sqrt(gx * gx + gy * gy + gz * gz + _TINY)
+        classic = (g + 1.0) * root_of_volume * lanes[_STIFFNESS, i]
+        residual = (g - 1.0) * (classic if stage == CLASSIC else sampson)
+        factor = 2.0 * g * root_of_volume * lanes[_STIFFNESS, i] if stage == CLASSIC else sampson
+        loss, scale = huber_loss(residual, scene.huber, lanes[_WEIGHT, i])
+        cost += loss
+        block[0, i] = scale * factor
+        block[STEP_LENGTH, i] = scale * residual
+    return cost
+
+
+@kernel
+def _differentiate(filled: int, rotation: np.ndarray, lanes: np.ndarray, block: np.ndarray) -> None:
+    """The derivatives of scale * g by a step, scale from the block's first row, into rows 0 to 10."""
+    m11, m12, m13 = rotation[0]
+    m21, m22, m23 = rotation[1]
+    m31, m32, m33 = rotation[2]
+    for i in range(filled):
+        scale, shift = block[0, i], lanes[_SHIFT, i]
+        x = lanes[_QX, i] + shift * lanes[_EX, i]
+        y = lanes[_QY, i] + shift * lanes[_EY, i]
+        z = lanes[_QZ, i] + shift * lanes[_EZ, i]
+        gx, gy, gz = scale * lanes[_GX, i], scale * lanes[_GY, i], scale * lanes[_GZ, i]
+        block[0, i], block[1, i], block[2, i] = -x * gx, -y * gy, -z * gz
+        block[3, i], block[4, i] = scale * lanes[_G1, i], scale * lanes[_G2, i]
+        block[5, i] = -(m11 * gx + m12 * gy + m13 * gz)
+        block[6, i] = -(m21 * gx + m22 * gy + m23 * gz)
+        block[7, i] = -(m31 * gx + m32 * gy + m33 * gz)
+        block[8, i] = gy * z - gz * y
+        block[9, i] = gz * x - gx * z
+        block[10, i] = gx * y - gy * x
+
+
+@inline_kernel
+def _enter(
+    ray: np.ndarray, scene: Scene, parameters: np.ndarray, rotation: np.ndarray, i: int, lanes: np.ndarray
+) -> int:
+    """Put a free ray into lane i if it crosses the bounding box in free space; 1 if so, 0 if not."""
+    m = rotation
+    x, y, z = ray[0] - parameters[5], ray[1] - parameters[6], -parameters[7]
+    dx, dy = ray[2], ray[3]
+    ox = m[0, 0] * x + m[1, 0] * y + m[2, 0] * z
+    oy = m[0, 1] * x + m[1, 1] * y + m[2, 1] * z
+    oz = m[0, 2] * x + m[1, 2] * y + m[2, 2] * z
+    ex = m[0, 0] * dx + m[1, 0] * dy + m[2, 0]
+    ey = m[0, 1] * dx + m[1, 1] * dy + m[2, 1]
+    ez = m[0, 2] * dx + m[1, 2] * dy + m[2, 2]
+    t_in, t_out = box_interval(ox, oy, oz, ex, ey, ez, parameters[0], parameters[1], parameters[2])
+    low = max(t_in, _NEAREST if scene.pinhole > 0.0 else -1e300)
+    high = min(t_out, ray[4])
+    if low >= high:
+        return 0
+    lanes[_QX, i], lanes[_QY, i], lanes[_QZ, i], lanes[_EX, i], lanes[_EY, i], lanes[_EZ, i] = ox, oy, oz, ex, ey, ez
+    lanes[_LOW, i], lanes[_HIGH, i] = low, high
+    lanes[_STIFFNESS, i], lanes[_WEIGHT, i] = ray[5], ray[6]
+    return 1
+
+
+@kernel
+def _lowest(filled: int, parameters: np.ndarray, lanes: np.ndarray, missed: np.ndarray) -> None:
+    """The smallest gauge on each ray between LOW and HIGH, as far as it matters: shift and gauge there.
+
+    Convexity brackets the minimum between two tangents; their intersection is a lower bound, and the search of a ray
+    ends once that is above 1 (``missed``) or within a tolerance of the best point.  The next point is the minimum of
+    the cubic through both ends, exact for smooth g, or the intersection, exact for edges, by turns.
+    """
+    for i in range(filled):
+        missed[i] = False
+        lanes[_SHIFT, i] = lanes[_LOW, i]
+    _gauge(filled, parameters, lanes)
+    for i in range(filled):
+        lanes[_G_LOW, i], lanes[_S_LOW, i] = lanes[_G, i], lanes[_SLOPE, i]
+        lanes[_SHIFT, i] = lanes[_HIGH, i]
+    _gauge(filled, parameters, lanes)
+    for i in range(filled):
+        lanes[_G_HIGH, i], lanes[_S_HIGH, i] = lanes[_G, i], lanes[_SLOPE, i]
+        # A minimum at an end closes the bracket there.
+        if lanes[_S_LOW, i] >= 0.0:
+            lanes[_HIGH, i] = lanes[_LOW, i]
+        elif lanes[_S_HIGH, i] <= 0.0:
+            lanes[_LOW, i] = lanes[_HIGH, i]
+        lanes[_SHIFT, i] = lanes[_HIGH, i]
+    for step in range(_LOWEST_STEPS):
+        searching = 0
+        for i in range(filled):
+            low, high, shift = lanes[_LOW, i], lanes[_HIGH, i], lanes[_SHIFT, i]
+            g_low, g_high, s_low, s_high = lanes[_G_LOW, i], lanes[_G_HIGH, i], lanes[_S_LOW, i], lanes[_S_HIGH, i]
+            width = high - low
+            tangents = (g_low - g_high + s_high * width) / (s_high - s_low)
+            bound = g_low + s_low * tangents
+            open_bracket = width > 0.0
+            missed[i] = missed[i] or (open_bracket and bound > 1.0)
+            best = min(g_low, g_high)
+            goes_on = open_bracket and not missed[i] and best - bound > _LOWEST_TOLERANCE
+            bend = 3.0 * (g_low - g_high) / width + s_low + s_high
+            root = math.sqrt(max(bend * bend - s_low * s_high, 0.0))
+            cubic = width - width * (s_high + root - bend) / (s_high - s_low + 2.0 * root)
+            ahead = tangents if step % 2 == 1 else cubic
+            ahead = min(max(ahead, 0.02 * width), 0.98 * width)
+            settled = (low if g_low < g_high else high) if open_bracket else shift
+            lanes[_SHIFT, i] = low + ahead if goes_on else settled
+            searching += goes_on
+        _gauge(filled, parameters, lanes)
+        if searching == 0:
+            break
+        for i in range(filled):
+            shift, slope = lanes[_SHIFT, i], lanes[_SLOPE, i]
+            within = shift > lanes[_LOW, i] and shift < lanes[_HIGH, i]
+            above = within and slope > 0.0
+            below = within and slope <= 0.0
+            lanes[_HIGH, i] = shift if above else lanes[_HIGH, i]
+            lanes[_G_HIGH, i] = lanes[_G, i] if above else lanes[_G_HIGH, i]
+            lanes[_S_HIGH, i] = slope if above else lanes[_S_HIGH, i]
+            lanes[_LOW, i] = shift if below else lanes[_LOW, i]
+            lanes[_G_LOW, i] = lanes[_G, i] if below else lanes[_G_LOW, i]
+            lanes[_S_LOW, i] = slope if below else lanes[_S_LOW, i]
+
+
+@kernel
+def _free_rows(
+    filled: int,
     scene: Scene,
     parameters: np.ndarray,
     rotation: np.ndarray,
+    lanes: np.ndarray,
+    missed: np.ndarray,
     block: np.ndarray,
     sums: np.ndarray,
 ) -> float:
-    a1, a2, a3, e1, e2, t1, t2, t3 = parameters
-    m = rotation
-    classic_scale = math.sqrt(a1 * a2 * a3)
+    """The residuals of free rays that cross the bounding box: their cost, added to the normal equations."""
+    _lowest(filled, parameters, lanes, missed)
     cost = 0.0
-    filled = 0
-    for i in range(rays.shape[0]):
-        dx, dy, depth, stiffness = rays[i, 2], rays[i, 3], rays[i, 4], rays[i, 5]
-        start = rays[i, 7] if stage == RENDERED else depth
-        x, y, z = rays[i, 0] - t1 + start * dx, rays[i, 1] - t2 + start * dy, start - t3
-        qx = m[0, 0] * x + m[1, 0] * y + m[2, 0] * z
-        qy = m[0, 1] * x + m[1, 1] * y + m[2, 1] * z
-        qz = m[0, 2] * x + m[1, 2] * y + m[2, 2] * z
-        at = gauge_derivatives(qx, qy, qz, a1, a2, a3, e1, e2)
-        huber = scene.huber
-        if stage == CLASSIC:
-            residual = classic_scale * (at[0] * at[0] - 1.0) * stiffness
-            factor = 2.0 * at[0] * classic_scale * stiffness
-        elif stage == SAMPSON:
-            factor = stiffness / _length(at)
-            residual = (at[0] - 1.0) * factor
-        else:
-            ex = m[0, 0] * dx + m[1, 0] * dy + m[2, 0]
-            ey = m[0, 1] * dx + m[1, 1] * dy + m[2, 1]
-            ez = m[0, 2] * dx + m[1, 2] * dy + m[2, 2]
-            hit, shift, at = _meet(qx, qy, qz, ex, ey, ez, a1, a2, a3, e1, e2, at, scene.hit_tolerance)
-            qx, qy, qz = qx + shift * ex, qy + shift * ey, qz + shift * ez
-            if hit:
-                along = at[1] * ex + at[2] * ey + at[3] * ez
-                length = _length(at)
-                across = scene.grazing * length * length * (dx * dx + dy * dy + 1.0)
-                factor = stiffness / math.sqrt(along * along + across)
-                hit_depth = start + shift - (at[0] - 1.0) / along
-                residual = (depth - hit_depth) * along * factor
-                rays[i, 7] = hit_depth
-            else:
-                factor = scene.outline_stiffness / _length(at)
-                residual = (at[0] - 1.0) * factor
-                huber = scene.outline_huber
-                rays[i, 7] = depth
-        loss, scale = _huber(residual, huber, rays[i, 6])
+    for i in range(filled):
+        gx, gy, gz = lanes[_GX, i], lanes[_GY, i], lanes[_GZ, i]
+        factor = -scene.outline_stiffness * lanes[_STIFFNESS, i] / math.sqrt(gx * gx + gy * gy + gz * gz + _TINY)
+        residual = 0.0 if missed[i] else max(0.0, (lanes[_G, i] - 1.0) * factor)
+        loss, scale = huber_loss(residual, scene.outline_huber, lanes[_WEIGHT, i])
         cost += loss
-        _write_row(block, filled, scale, factor, residual, qx, qy, qz, at, m)
-        if stage == CLASSIC:
-            for k in range(3):
-                block[k, filled] += 0.5 * scale * residual
-        filled += 1
-        if filled == _BLOCK:
-            _flush(block, filled, sums)
-            filled = 0
-    _flush(block, filled, sums)
+        block[0, i] = scale * factor if residual > 0.0 else 0.0
+        block[STEP_LENGTH, i] = scale * residual
+    if cost > 0.0:
+        _differentiate(filled, rotation, lanes, block)
+        add_block(block, filled, sums)
     return cost
-
-
-@kernel
-def _meet(
-    qx: float,
-    qy: float,
-    qz: float,
-    ex: float,
-    ey: float,
-    ez: float,
-    a1: float,
-    a2: float,
-    a3: float,
-    e1: float,
-    e2: float,
-    at: Derivatives,
-    tolerance: float,
-) -> tuple[bool, float, Derivatives]:
-    """Where the ray through q along e meets the surface: (hit, shift along the ray, gauge and derivatives there).
-
-    Newton's method along the ray from the given point, whose gauge and derivatives are ``at``.  From a point on the
-    near side of the body it cannot fail, as g is convex along the ray; from the far side it starts again where the ray
-    enters the bounding box.  The last point lies within the tolerance of the surface; the caller takes the last step
-    in first order.  For a miss it is the point of the smallest g, or the given point if even the box is missed.
-    """
-    shift = 0.0
-    here = at
-    slope = here[1] * ex + here[2] * ey + here[3] * ez
-    if slope >= 0.0 or here[0] > 2.0:
-        t_in, t_out = box_interval(qx, qy, qz, ex, ey, ez, a1, a2, a3)
-        if t_in > t_out:
-            return False, 0.0, at
-        shift = t_in
-        here = gauge_derivatives(qx + shift * ex, qy + shift * ey, qz + shift * ez, a1, a2, a3, e1, e2)
-        slope = here[1] * ex + here[2] * ey + here[3] * ez
-        if slope >= 0.0 and here[0] > 1.0:
-            return False, shift, here
-    for _ in range(_HIT_STEPS):
-        if abs(here[0] - 1.0) < tolerance:
-            return True, shift, here
-        step = (1.0 - here[0]) / slope
-        before = shift
-        shift += step
-        here = gauge_derivatives(qx + shift * ex, qy + shift * ey, qz + shift * ez, a1, a2, a3, e1, e2)
-        slope = here[1] * ex + here[2] * ey + here[3] * ez
-        if slope >= 0.0:
-            break
-    if slope < 0.0:
-        return True, shift, here
-    low, high = min(before, shift), max(before, shift)
-    for _ in range(_MINIMUM_STEPS):
-        shift = 0.5 * (low + high)
-        here = gauge_derivatives(qx + shift * ex, qy + shift * ey, qz + shift * ez, a1, a2, a3, e1, e2)
-        if here[1] * ex + here[2] * ey + here[3] * ez > 0.0:
-            high = shift
-        else:
-            low = shift
-    return False, shift, here
-
-
-@kernel
-def _free_cost(
-    free: np.ndarray, scene: Scene, parameters: np.ndarray, rotation: np.ndarray, block: np.ndarray, sums: np.ndarray
-) -> float:
-    a1, a2, a3, e1, e2, t1, t2, t3 = parameters
-    m = rotation
-    nearest = _NEAREST if scene.pinhole > 0.0 else -1e300
-    cost = 0.0
-    filled = 0
-    for i in range(free.shape[0]):
-        x, y, z = free[i, 0] - t1, free[i, 1] - t2, -t3
-        dx, dy = free[i, 2], free[i, 3]
-        ox = m[0, 0] * x + m[1, 0] * y + m[2, 0] * z
-        oy = m[0, 1] * x + m[1, 1] * y + m[2, 1] * z
-        oz = m[0, 2] * x + m[1, 2] * y + m[2, 2] * z
-        ex = m[0, 0] * dx + m[1, 0] * dy + m[2, 0]
-        ey = m[0, 1] * dx + m[1, 1] * dy + m[2, 1]
-        ez = m[0, 2] * dx + m[1, 2] * dy + m[2, 2]
-        least, t = ray_minimum(nearest, free[i, 4], ox, oy, oz, ex, ey, ez, a1, a2, a3, e1, e2)
-        if least >= 1.0:
-            continue
-        qx, qy, qz = ox + t * ex, oy + t * ey, oz + t * ez
-        at = gauge_derivatives(qx, qy, qz, a1, a2, a3, e1, e2)
-        factor = -scene.outline_stiffness * free[i, 5] / _length(at)
-        residual = (at[0] - 1.0) * factor
-        loss, scale = _huber(residual, scene.outline_huber, free[i, 6])
-        cost += loss
-        _write_row(block, filled, scale, factor, residual, qx, qy, qz, at, m)
-        filled += 1
-        if filled == _BLOCK:
-            _flush(block, filled, sums)
-            filled = 0
-    _flush(block, filled, sums)
-    return cost
-
-
-@kernel
-def support_derivatives(
-    nx: float, ny: float, nz: float, a1: float, a2: float, a3: float, e1: float, e2: float
-) -> Derivatives:
-    """Support function h at an object-frame direction and its derivatives: h, h_nx, h_ny, h_nz, h_e1, h_e2."""
-    inner, inner_x, inner_y, inner_e = p_norm(a1 * abs(nx), a2 * abs(ny), max(2.0 - e2, 1e-3))
-    h, h_inner, h_z, h_e = p_norm(inner, a3 * abs(nz), max(2.0 - e1, 1e-3))
-    return (
-        h,
-        math.copysign(h_inner * inner_x * a1, nx),
-        math.copysign(h_inner * inner_y * a2, ny),
-        math.copysign(h_z * a3, nz),
-        -h_e,
-        -h_inner * inner_e,
-    )
-
-
-@kernel
-def _support_cost(
-    scene: Scene, parameters: np.ndarray, rotation: np.ndarray, block: np.ndarray, sums: np.ndarray
-) -> float:
-    a1, a2, a3, e1, e2, t1, t2, t3 = parameters
-    normal = np.array([scene.normal_x, scene.normal_y, scene.normal_z])
-    n = np.zeros(3)
-    for k in range(3):
-        n[k] = rotation[0, k] * normal[0] + rotation[1, k] * normal[1] + rotation[2, k] * normal[2]
-    cost = 0.0
-    h, hx, hy, hz, h1, h2 = support_derivatives(n[0], n[1], n[2], a1, a2, a3, e1, e2)
-    lowest = normal[0] * t1 + normal[1] * t2 + normal[2] * t3 + scene.offset - h
-    if scene.plane_stiffness > 0.0 and lowest < 0.0:
-        s = scene.plane_stiffness
-        residual = s * lowest
-        cost += residual * residual
-        block[0, 0], block[1, 0], block[2, 0] = -s * hx * n[0], -s * hy * n[1], -s * hz * n[2]
-        block[3, 0], block[4, 0] = -s * h1, -s * h2
-        block[5, 0], block[6, 0], block[7, 0] = s * normal[0], s * normal[1], s * normal[2]
-        block[8, 0] = -s * (hy * n[2] - hz * n[1])
-        block[9, 0] = -s * (hz * n[0] - hx * n[2])
-        block[10, 0] = -s * (hx * n[1] - hy * n[0])
-        block[11, 0] = residual
-        _flush(block, 1, sums)
-    if scene.rest_stiffness > 0.0:
-        s = scene.rest_stiffness
-        upright = 0
-        for k in range(1, 3):
-            if abs(n[k]) > abs(n[upright]):
-                upright = k
-        square = (n[0] * n[0] + n[1] * n[1] + n[2] * n[2] - n[upright] * n[upright]) * s * s
-        cost += math.log1p(square)
-        scale = s / math.sqrt(1.0 + square)
-        for k in range(3):
-            if k == upright:
-                continue
-            for j in range(STEP_LENGTH):
-                block[j, 0] = 0.0
-            after, before = (k + 1) % 3, (k + 2) % 3
-            block[8 + before, 0] = scale * n[after]
-            block[8 + after, 0] = -scale * n[before]
-            block[STEP_LENGTH, 0] = scale * n[k]
-            _flush(block, 1, sums)
-    return cost
-
-
-@kernel
-def _proportion_cost(scene: Scene, parameters: np.ndarray, block: np.ndarray, sums: np.ndarray) -> float:
-    mean = (math.log(parameters[0]) + math.log(parameters[1]) + math.log(parameters[2])) / 3.0
-    cost = 0.0
-    for k in range(3):
-        for j in range(STEP_LENGTH):
-            block[j, 0] = 0.0
-        for j in range(3):
-            block[j, 0] = scene.proportion_stiffness * ((1.0 if j == k else 0.0) - 1.0 / 3.0)
-        residual = scene.proportion_stiffness * (math.log(parameters[k]) - mean)
-        block[STEP_LENGTH, 0] = residual
-        cost += residual * residual
-        _flush(block, 1, sums)
-    return cost
-
-
-@kernel
-def _length(at: Derivatives) -> float:
-    return math.sqrt(at[1] * at[1] + at[2] * at[2] + at[3] * at[3]) + _TINY
-
-
-@kernel
-def _huber(residual: float, huber: float, weight: float) -> tuple[float, float]:
-    """Weighted loss of a residual, and the square root of its weight in the normal equations."""
-    size = abs(residual)
-    if size > huber:
-        return weight * huber * (2.0 * size - huber), math.sqrt(weight * huber / size)
-    return weight * residual * residual, math.sqrt(weight)
-
-
-@kernel
-def _write_row(
-    block: np.ndarray,
-    i: int,
-    scale: float,
-    factor: float,
-    residual: float,
-    qx: float,
-    qy: float,
-    qz: float,
-    at: Derivatives,
-    m: np.ndarray,
-) -> None:
-    """Put the derivatives of ``factor * g`` and the residual into column i of the block."""
-    s = scale * factor
-    gx, gy, gz = s * at[1], s * at[2], s * at[3]
-    block[0, i], block[1, i], block[2, i] = -qx * gx, -qy * gy, -qz * gz
-    block[3, i], block[4, i] = s * at[4], s * at[5]
-    block[5, i] = -(m[0, 0] * gx + m[0, 1] * gy + m[0, 2] * gz)
-    block[6, i] = -(m[1, 0] * gx + m[1, 1] * gy + m[1, 2] * gz)
-    block[7, i] = -(m[2, 0] * gx + m[2, 1] * gy + m[2, 2] * gz)
-    block[8, i] = gy * qz - gz * qy
-    block[9, i] = gz * qx - gx * qz
-    block[10, i] = gx * qy - gy * qx
-    block[11, i] = scale * residual
-
-
-@kernel
-def _flush(block: np.ndarray, filled: int, sums: np.ndarray) -> None:
-    """Add the outer products of the block's columns to the sums; long inner loops are what vectorises."""
-    for k in range(STEP_LENGTH + 1):
-        for j in range(k + 1):
-            total = 0.0
-            for i in range(filled):
-                total += block[k, i] * block[j, i]
-            sums[k, j] += total
 
 
 @kernel
 def surface_distance(rays: np.ndarray, parameters: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     """Absolute Sampson distance (n,) of the measured points to the surface, metres."""
-    a1, a2, a3, e1, e2, t1, t2, t3 = parameters
-    m = rotation
     distance = np.empty(rays.shape[0])
-    for i in range(rays.shape[0]):
-        depth = rays[i, 4]
-        x, y, z = rays[i, 0] - t1 + depth * rays[i, 2], rays[i, 1] - t2 + depth * rays[i, 3], depth - t3
-        at = gauge_derivatives(
-            m[0, 0] * x + m[1, 0] * y + m[2, 0] * z,
-            m[0, 1] * x + m[1, 1] * y + m[2, 1] * z,
-            m[0, 2] * x + m[1, 2] * y + m[2, 2] * z,
-            a1,
-            a2,
-            a3,
-            e1,
-            e2,
-        )
-        distance[i] = abs(at[0] - 1.0) / _length(at)
+    lanes = np.empty((_ROWS, LANES))
+    for begin in range(0, rays.shape[0], LANES):
+        part = rays[begin : begin + LANES]
+        filled = part.shape[0]
+        _place(part, False, parameters, rotation, lanes)
+        _gauge(filled, parameters, lanes)
+        for i in range(filled):
+            gx, gy, gz = lanes[_GX, i], lanes[_GY, i], lanes[_GZ, i]
+            distance[begin + i] = abs(lanes[_G, i] - 1.0) / math.sqrt(gx * gx + gy * gy + gz * gz + _TINY)
     return distance
 
 
@@ -420,11 +414,19 @@ def surface_distance(rays: np.ndarray, parameters: np.ndarray, rotation: np.ndar
 def penetration(free: np.ndarray, scene: Scene, parameters: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     """How deep (n,) each free ray runs inside the body, metres: (1 - min g) / |grad g|, 0 for rays that miss it."""
     depth = np.zeros(free.shape[0])
-    block = np.zeros((STEP_LENGTH + 1, _BLOCK))
-    sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
-    linear = Scene(0.0, 1e300, 0.0, 1.0, 1.0, scene.pinhole, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    for i in range(free.shape[0]):
-        row = free[i : i + 1].copy()
-        row[0, 5], row[0, 6] = 1.0, 1.0
-        depth[i] = math.sqrt(_free_cost(row, linear, parameters, rotation, block, sums))
+    lanes = np.empty((_ROWS, LANES))
+    missed = np.empty(LANES, np.bool_)
+    owner = np.empty(LANES, np.int64)
+    filled = 0
+    for n in range(free.shape[0] + 1):
+        if n < free.shape[0]:
+            owner[filled] = n
+            filled += _enter(free[n], scene, parameters, rotation, filled, lanes)
+        if filled == LANES or (n == free.shape[0] and filled > 0):
+            _lowest(filled, parameters, lanes, missed)
+            for i in range(filled):
+                gx, gy, gz = lanes[_GX, i], lanes[_GY, i], lanes[_GZ, i]
+                inside = (1.0 - lanes[_G, i]) / math.sqrt(gx * gx + gy * gy + gz * gz + _TINY)
+                depth[owner[i]] = 0.0 if missed[i] else max(inside, 0.0)
+            filled = 0
     return depth

@@ -25,7 +25,8 @@ from sq_perception.fitting.covariance import covariance_at, undetermined
 from sq_perception.fitting.levenberg_marquardt import State, minimize
 from sq_perception.fitting.observation import Observation, draw
 from sq_perception.fitting.options import Options
-from sq_perception.fitting.residuals import RAY_COLUMNS, RENDERED, SAMPSON, Scene, penetration, surface_distance
+from sq_perception.fitting.residuals import RAY_COLUMNS, RENDERED, SAMPSON, penetration, surface_distance
+from sq_perception.fitting.scene import Scene
 
 COARSE_RAYS, COARSE_STEPS = 150, 8
 BASIN_RAYS, BASIN_STEPS = 300, 15

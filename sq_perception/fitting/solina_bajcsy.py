@@ -30,7 +30,9 @@ import numpy as np
 from sq_perception.fitting.bounds import Bounds
 from sq_perception.fitting.fit import Fit, Status
 from sq_perception.fitting.levenberg_marquardt import State, minimize
-from sq_perception.fitting.residuals import CLASSIC, RAY_COLUMNS, STEP_LENGTH, Scene
+from sq_perception.fitting.normal_equations import STEP_LENGTH
+from sq_perception.fitting.residuals import CLASSIC, RAY_COLUMNS
+from sq_perception.fitting.scene import Scene
 
 MIN_POINTS = 12
 _NO_FREE_SPACE = np.empty((0, RAY_COLUMNS))

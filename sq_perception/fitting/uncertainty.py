@@ -10,7 +10,8 @@ from sq_perception.fitting.covariance import carried_over, covariance_at, undete
 from sq_perception.fitting.fit import Fit, Status
 from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.observation import Observation, draw
-from sq_perception.fitting.residuals import STEP_LENGTH, surface_distance
+from sq_perception.fitting.normal_equations import STEP_LENGTH
+from sq_perception.fitting.residuals import surface_distance
 from sq_perception.fitting.search import Search
 from sq_perception.geometry.superquadric import Superquadric
 

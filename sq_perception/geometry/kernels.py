@@ -18,6 +18,8 @@ from typing import Any, TypeVar, cast
 
 import numba
 
+from sq_perception.geometry.elementary import exp2, exp2_to_half, log2, log2_from_1_to_2
+
 _F = TypeVar("_F", bound=Callable[..., Any])
 
 FAST = {"contract", "arcp", "reassoc", "nsz", "afn"}
@@ -26,7 +28,7 @@ FAST = {"contract", "arcp", "reassoc", "nsz", "afn"}
 
 def kernel(function: _F) -> _F:
     """Compile to machine code that releases the GIL and is kept on disk; one setting for the whole package."""
-    return _compiled(function, parallel=False)
+    return _compiled(function)
 
 
 def parallel_kernel(function: _F) -> _F:
@@ -34,9 +36,14 @@ def parallel_kernel(function: _F) -> _F:
     return _compiled(function, parallel=True)
 
 
-def _compiled(function: _F, parallel: bool) -> _F:
+def inline_kernel(function: _F) -> _F:
+    """A kernel that becomes part of every kernel that calls it: what a loop needs in order to be vectorised."""
+    return _compiled(function, forceinline=True)
+
+
+def _compiled(function: _F, **more: bool) -> _F:
     function.__qualname__ += f"_{_FINGERPRINT}"
-    options: dict[str, Any] = {"nogil": True, "fastmath": FAST, "error_model": "numpy", "parallel": parallel}
+    options: dict[str, Any] = {"nogil": True, "fastmath": FAST, "error_model": "numpy", **more}
     return cast(_F, numba.njit(cache=True, **options)(function))
 
 
@@ -50,7 +57,7 @@ def _fingerprint() -> str:
     digest = hashlib.sha256()
     for path in sorted(Path(__file__).resolve().parents[1].rglob("*.py")):
         source = path.read_bytes()
-        if b"geometry.kernels" in source or path == Path(__file__).resolve():
+        if b"numba" in source or b"geometry.kernels" in source:
             digest.update(source)
     return digest.hexdigest()[:12]
 
@@ -59,38 +66,33 @@ _FINGERPRINT = _fingerprint()
 
 RAY_TOLERANCE = 1e-9
 MAX_NEWTON_STEPS = 60
-_NEGLIGIBLE_LOG = -80.0
+_NEGLIGIBLE_LOG2 = -115.0
+"""A power below 2^this adds nothing to 1."""
+_TINIEST, _TINY = 1e-290, 1e-145
+_FLAT = 1e-12
+"""Below this share of the larger coordinate, the slope by the smaller one fades to 0, its value on the axis."""
+_ROOT_OF_2 = math.sqrt(2.0)
+_HALF_LN_2 = 0.5 * math.log(2.0)
 
 
-@kernel
+@inline_kernel
 def p_norm(u: float, v: float, e: float) -> tuple[float, float, float, float]:
     """Value of (u^(2/e) + v^(2/e))^(e/2) for u, v >= 0 and its derivatives by u, v and e.
 
-    d/de is the norm times the entropy of the two weights u^p / (u^p + v^p) and v^p / (u^p + v^p), halved.
+    With the larger of u and v in front, the norm is big (1 + p)^(e/2), p = (small / big)^(2/e).  The derivatives by u
+    and v are norm s / u and norm (1 - s) / v, s = u^(2/e) / (u^(2/e) + v^(2/e)) the share of u; d/de is the norm times
+    the entropy of the two shares, halved.  No branch: a loop over points becomes vector code.
     """
-    if u >= v:
-        big, small = u, v
-    else:
-        big, small = v, u
-    if big <= 0.0:
-        return 0.0, 0.0, 0.0, 0.0
-    log_power = -1e300
-    if small > 0.0:
-        log_power = math.log(small / big) * (2.0 / e)
-    if log_power < _NEGLIGIBLE_LOG:
-        if u >= v:
-            return big, 1.0, 0.0, 0.0
-        return big, 0.0, 1.0, 0.0
-    power = math.exp(log_power)
-    log_sum = math.log1p(power)
-    norm = big * math.exp(0.5 * e * log_sum)
+    big, small = max(u, v), min(u, v)
+    log_power = max((2.0 / e) * log2(max(small, _TINIEST) / max(big, _TINY)), _NEGLIGIBLE_LOG2)
+    power = exp2(log_power)
+    log_sum = log2_from_1_to_2(1.0 + power)
+    norm = big * (_ROOT_OF_2 * exp2_to_half(0.5 * e * log_sum - 0.5))
     share = power / (1.0 + power)
-    of_big = (1.0 - share) * norm / big
-    of_small = share * norm / small
-    of_e = 0.5 * norm * (log_sum - share * log_power)
-    if u >= v:
-        return norm, of_big, of_small, of_e
-    return norm, of_small, of_big, of_e
+    of_big = (1.0 - share) * norm / max(big, _TINY)
+    of_small = share * norm / max(small, _FLAT * big + _TINY)
+    of_e = _HALF_LN_2 * norm * (log_sum - share * log_power)
+    return norm, (of_big if u >= v else of_small), (of_small if u >= v else of_big), of_e
 
 
 @kernel
@@ -101,7 +103,7 @@ def gauge(x: float, y: float, z: float, a1: float, a2: float, a3: float, e1: flo
     return g
 
 
-@kernel
+@inline_kernel
 def gauge_derivatives(
     x: float, y: float, z: float, a1: float, a2: float, a3: float, e1: float, e2: float
 ) -> tuple[float, float, float, float, float, float]:
@@ -121,7 +123,7 @@ def gauge_derivatives(
     )
 
 
-@kernel
+@inline_kernel
 def gauge_slope(
     x: float, y: float, z: float, dx: float, dy: float, dz: float, a1: float, a2: float, a3: float, e1: float, e2: float
 ) -> tuple[float, float]:

@@ -1,0 +1,50 @@
+"""The normal equations J^T J and J^T r, summed over blocks of residuals, compiled.
+
+A block is an array (12, LANES): rows 0 to 10 hold the derivatives of each residual by the 11 entries of a step
+(see :mod:`sq_perception.fitting.residuals`), row 11 the residuals themselves, all times the square root of their
+weight.  Its outer product, lower triangle, adds to ``sums`` (12, 12): J^T J in rows 0 to 10, J^T r in row 11.
+Summing over a block at a time keeps the inner loop long and free of branches, which is what vectorises.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from sq_perception.geometry.kernels import inline_kernel, kernel
+
+STEP_LENGTH = 11
+LANES = 64
+_SMALL = 1e-300
+
+
+@inline_kernel
+def huber_loss(residual: float, huber: float, weight: float) -> tuple[float, float]:
+    """Huber's loss of a residual, quadratic up to ``huber``, and the square root of its weight; no branch.
+
+    P. J. Huber, Robust estimation of a location parameter, Annals of Mathematical Statistics 35(1), 1964.
+    """
+    size = abs(residual)
+    inner = min(size, huber)
+    loss = weight * inner * (2.0 * size - inner)
+    return loss, math.sqrt(weight * min(1.0, huber / max(size, _SMALL)))
+
+
+@kernel
+def add_block(block: np.ndarray, filled: int, sums: np.ndarray) -> None:
+    """Add the outer products of the first ``filled`` columns of the block."""
+    for k in range(STEP_LENGTH + 1):
+        for j in range(k + 1):
+            total = 0.0
+            for i in range(filled):
+                total += block[k, i] * block[j, i]
+            sums[k, j] += total
+
+
+@kernel
+def add_row(row: np.ndarray, sums: np.ndarray) -> None:
+    """Add the outer product of a single residual's row (12,)."""
+    for k in range(STEP_LENGTH + 1):
+        for j in range(k + 1):
+            sums[k, j] += row[k] * row[j]

@@ -1,0 +1,118 @@
+"""What is known of a body beyond its image: a support plane, and how bodies mostly are; compiled.
+
+plane       (lowest point above the plane) / sigma where negative: n.t + d - h(R^T n), h the support function, which is
+            the gauge's dual norm: two nested p-norms of a n with exponents 2 - e.
+rest        the two components of R^T n across the axis nearest to the normal, over sigma, Cauchy: bodies lie on a face.
+proportion  log a_k minus the mean of the three, over sigma: what the image leaves open resembles what it shows.
+volume      a linear price on log(a1 a2 a3), for the smaller of two bodies that explain the image alike.
+
+Each function returns its share of the cost and adds its derivatives to the normal equations ``sums``; the unknowns are
+those of :mod:`sq_perception.fitting.residuals`, the sizes of the terms those of its :class:`Scene`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from sq_perception.fitting.normal_equations import STEP_LENGTH, add_row
+from sq_perception.fitting.scene import Scene
+from sq_perception.geometry.kernels import kernel, p_norm
+
+Derivatives = tuple[float, float, float, float, float, float]
+"""h and its derivatives by x, y, z, e1 and e2."""
+
+
+@kernel
+def prior_cost(scene: Scene, parameters: np.ndarray, rotation: np.ndarray, sums: np.ndarray) -> float:
+    """All terms together."""
+    cost = 0.0
+    if scene.plane_stiffness > 0.0 or scene.rest_stiffness > 0.0:
+        cost += _support_cost(scene, parameters, rotation, sums)
+    if scene.proportion_stiffness > 0.0:
+        cost += _proportion_cost(scene, parameters, sums)
+    if scene.volume_price > 0.0:
+        for k in range(3):
+            cost += scene.volume_price * math.log(parameters[k])
+            sums[STEP_LENGTH, k] += 0.5 * scene.volume_price
+    return cost
+
+
+@kernel
+def support_derivatives(
+    nx: float, ny: float, nz: float, a1: float, a2: float, a3: float, e1: float, e2: float
+) -> Derivatives:
+    """Support function h at an object-frame direction and its derivatives: h, h_nx, h_ny, h_nz, h_e1, h_e2."""
+    inner, inner_x, inner_y, inner_e = p_norm(a1 * abs(nx), a2 * abs(ny), max(2.0 - e2, 1e-3))
+    h, h_inner, h_z, h_e = p_norm(inner, a3 * abs(nz), max(2.0 - e1, 1e-3))
+    return (
+        h,
+        math.copysign(h_inner * inner_x * a1, nx),
+        math.copysign(h_inner * inner_y * a2, ny),
+        math.copysign(h_z * a3, nz),
+        -h_e,
+        -h_inner * inner_e,
+    )
+
+
+@kernel
+def _support_cost(
+    scene: Scene, parameters: np.ndarray, rotation: np.ndarray, sums: np.ndarray
+) -> float:
+    a1, a2, a3, e1, e2, t1, t2, t3 = parameters
+    normal = np.array([scene.normal_x, scene.normal_y, scene.normal_z])
+    n = np.zeros(3)
+    for k in range(3):
+        n[k] = rotation[0, k] * normal[0] + rotation[1, k] * normal[1] + rotation[2, k] * normal[2]
+    cost = 0.0
+    row = np.zeros(STEP_LENGTH + 1)
+    h, hx, hy, hz, h1, h2 = support_derivatives(n[0], n[1], n[2], a1, a2, a3, e1, e2)
+    lowest = normal[0] * t1 + normal[1] * t2 + normal[2] * t3 + scene.offset - h
+    if scene.plane_stiffness > 0.0 and lowest < 0.0:
+        s = scene.plane_stiffness
+        residual = s * lowest
+        cost += residual * residual
+        row[0], row[1], row[2] = -s * hx * n[0], -s * hy * n[1], -s * hz * n[2]
+        row[3], row[4] = -s * h1, -s * h2
+        row[5], row[6], row[7] = s * normal[0], s * normal[1], s * normal[2]
+        row[8] = -s * (hy * n[2] - hz * n[1])
+        row[9] = -s * (hz * n[0] - hx * n[2])
+        row[10] = -s * (hx * n[1] - hy * n[0])
+        row[STEP_LENGTH] = residual
+        add_row(row, sums)
+    if scene.rest_stiffness > 0.0:
+        s = scene.rest_stiffness
+        upright = 0
+        for k in range(1, 3):
+            if abs(n[k]) > abs(n[upright]):
+                upright = k
+        square = (n[0] * n[0] + n[1] * n[1] + n[2] * n[2] - n[upright] * n[upright]) * s * s
+        cost += math.log1p(square)
+        scale = s / math.sqrt(1.0 + square)
+        for k in range(3):
+            if k == upright:
+                continue
+            row[:] = 0.0
+            after, before = (k + 1) % 3, (k + 2) % 3
+            row[8 + before] = scale * n[after]
+            row[8 + after] = -scale * n[before]
+            row[STEP_LENGTH] = scale * n[k]
+            add_row(row, sums)
+    return cost
+
+
+@kernel
+def _proportion_cost(scene: Scene, parameters: np.ndarray, sums: np.ndarray) -> float:
+    mean = (math.log(parameters[0]) + math.log(parameters[1]) + math.log(parameters[2])) / 3.0
+    cost = 0.0
+    row = np.zeros(STEP_LENGTH + 1)
+    for k in range(3):
+        row[:] = 0.0
+        for j in range(3):
+            row[j] = scene.proportion_stiffness * ((1.0 if j == k else 0.0) - 1.0 / 3.0)
+        residual = scene.proportion_stiffness * (math.log(parameters[k]) - mean)
+        row[STEP_LENGTH] = residual
+        cost += residual * residual
+        add_row(row, sums)
+    return cost
