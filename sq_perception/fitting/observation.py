@@ -1,17 +1,14 @@
-"""What one depth image says about one object: rays that hit it, rays that must miss it, and the depth noise.
+"""What one depth image says about one object: pixels that hit it, pixels that must miss it, and the depth noise.
 
-Rows of rays are (o_x, o_y, d_x, d_y, z, 1/sigma, weight, last), see :mod:`sq_perception.fitting.residuals`.
-
-Object rays: pixels of the mask with a depth.  Drawn systematically with weight sqrt(1 + slope^2), that is by surface
+Object pixels: those of the mask with a depth.  Drawn systematically with weight sqrt(1 + slope^2), that is by surface
 area instead of by pixel, since the steep parts of a body are the ones that fix its hidden extent.
 
-Free rays: pixels beside the mask.  One that measured something farther says "empty up to there"; one that measured
+Free pixels: those beside the mask.  One that measured something farther says "empty up to there"; one that measured
 something nearer says so up to its own depth only, which binds nothing (what lies behind an occluder is unknown); one
 that measured nothing says nothing, unless a missing depth means a truly empty background (the thesis' images).
 
-Depth noise: third differences z0 - 3 z1 + 3 z2 - z3 of neighbouring pixels have variance 20 sigma^2 and cancel slope
-and curvature; their median absolute value over the mask, times 1.4826 / sqrt(20), is sigma.  Quantisation with step q
-adds q^2 / 12 at least; q is the smallest depth difference that occurs.
+Both become rays, rows (o_x, o_y, d_x, d_y, z, 1/sigma, weight, z) of :mod:`sq_perception.fitting.residuals`, when a stage
+of the fit draws them.
 """
 
 from __future__ import annotations
@@ -22,6 +19,8 @@ from functools import cached_property
 import cv2
 import numpy as np
 
+from sq_perception.fitting import depth_noise
+from sq_perception.fitting.depth_noise import DepthNoise
 from sq_perception.fitting.residuals import RAY_COLUMNS
 from sq_perception.geometry.kernels import kernel
 from sq_perception.imaging.camera import Camera
@@ -36,11 +35,12 @@ _JUMP_PIXELS, _JUMP_NOISE = 10.0, 6.0
 """A depth step between neighbours above so many pixel widths, plus so many noise levels, ends a surface."""
 _SMALLEST_PIECE = 0.02
 _COARSE = 3
-"""Far from the mask, only every third pixel in each direction becomes a free ray."""
-_NOISE_SAMPLES = 2000
-_MEDIAN_TO_SIGMA = 1.4826
-_FREE_MARGIN = 3.0
-"""Free space ends this many noise levels in front of the measured depth."""
+"""Far from the mask, only every third pixel in each direction is a free pixel."""
+_FREE_MARGIN, _FREE_MODEL_MARGIN = 3.0, 2.0
+"""Free space ends this many noise levels, or model errors, in front of the measured depth."""
+_POINTS = 2000
+_NO_NOISE = 1e-6
+"""The least noise, as a share of the distance: what single precision can tell."""
 
 
 @dataclass(frozen=True)
@@ -49,62 +49,99 @@ class Observation:
 
     Attributes
     ----------
-    object_rays : (n, 7)
-        All pixels of the object; the last column is the area weight for drawing.
-    free_rays : (m, 7)
-        All candidates for free space; the last column likewise.
+    pixels : (n,)
+        All pixels of the object, as indices into the crop in row-major order.
+    areas : (n,)
+        Their weights for drawing.
+    free : (m,)
+        The pixels beside the object that may bind it, likewise.
     free_pixels : int
-        Number of pixels that the free rays stand for.
-    noise : float
-        Depth noise and model error together, metres.
+        Number of pixels that these stand for.
+    noise : DepthNoise
+        The depth noise; ``model_error`` metres join it in squares.
+    distance : float
+        Mean depth of the object, metres.
     footprint : float
-        Width of a pixel at the object, metres.
+        Width of a pixel at that distance, metres.
     depth, mask : (h, w)
         The crop, the mask with its small holes closed; ``camera`` belongs to them.
     """
 
-    object_rays: np.ndarray
-    free_rays: np.ndarray
+    pixels: np.ndarray
+    areas: np.ndarray
+    free: np.ndarray
     free_pixels: int
-    noise: float
+    noise: DepthNoise
+    model_error: float
+    distance: float
     footprint: float
     depth: np.ndarray
     mask: np.ndarray
     camera: Camera
 
     @cached_property
-    def points(self) -> np.ndarray:
-        """Measured points (n, 3) of the object in the optical frame."""
-        r = self.object_rays
-        return np.stack([r[:, 0] + r[:, 4] * r[:, 2], r[:, 1] + r[:, 4] * r[:, 3], r[:, 4]], axis=1)
-
-    def coarsened(self, model_error: float) -> Observation:
-        """The same observation trusted less: ``model_error`` (metres) joins the noise."""
-        noise = float(np.hypot(self.noise, model_error))
-        rays, free = self.object_rays.copy(), self.free_rays.copy()
-        rays[:, 5] *= self.noise / noise
-        free[:, 4] -= 2.0 * model_error
-        return replace(self, object_rays=rays, free_rays=free, noise=noise)
-
-    def beyond(self, band: float) -> Observation:
-        """The same observation with free rays only farther than ``band`` pixels from the mask."""
-        kept = self.distance_to_mask(self.free_rays) > band + 0.4
-        return replace(self, free_rays=self.free_rays[kept])
-
-    def distance_to_mask(self, rays: np.ndarray) -> np.ndarray:
-        """Distance (n,) of the rays' pixels to the mask, in pixels."""
-        return self._distance.ravel()[rays[:, 7].astype(int)]
+    def sigma(self) -> float:
+        """Noise and model error together at the object's distance, metres."""
+        return float(np.hypot(self.noise.at(self.distance), self.model_error))
 
     @cached_property
-    def _distance(self) -> np.ndarray:
-        return cv2.distanceTransform((~self.mask).view(np.uint8), cv2.DIST_L2, 3)
+    def points(self) -> np.ndarray:
+        """Some 2000 measured points (k, 3) of the object in the optical frame, evenly over its surface."""
+        r = self.object_rays(_POINTS)
+        return np.stack([r[:, 0] + r[:, 4] * r[:, 2], r[:, 1] + r[:, 4] * r[:, 3], r[:, 4]], axis=1)
+
+    def object_rays(self, count: int, offset: float = 0.5) -> np.ndarray:
+        """About ``count`` rays (k, 8) of the object, systematically by area; each weighs 1.
+
+        Draws with other offsets (0 to 1) take other pixels.
+        """
+        chosen = self.pixels if len(self.pixels) <= count else _draw(self.pixels, self.areas, count, offset)
+        return self._rays(chosen, 0.0)
+
+    def free_rays(self, count: int, offset: float = 0.5) -> np.ndarray:
+        """At most ``count`` rays (k, 8) through free space, likewise; z is where free space ends."""
+        return self.free_rays_of(self.free, count, offset)
+
+    def free_rays_of(self, pixels: np.ndarray, count: int, offset: float = 0.5) -> np.ndarray:
+        """The same through some of the free pixels."""
+        if len(pixels) > count:
+            pixels = pixels[((np.arange(count) + offset) * (len(pixels) / count)).astype(np.int64)]
+        return self._rays(pixels, 1.0)
+
+    def ring(self, radius: float) -> np.ndarray:
+        """The free pixels at this distance from the mask, to half a pixel."""
+        return self.free[np.abs(self._distance_to_mask - radius) < 0.5]
+
+    def beyond(self, band: float) -> Observation:
+        """The same observation with free pixels only farther than ``band`` pixels from the mask."""
+        return replace(self, free=self.free[self._distance_to_mask > band + 0.4])
+
+    def coarsened(self, model_error: float) -> Observation:
+        """The same observation trusted less."""
+        return replace(self, model_error=float(np.hypot(self.model_error, model_error)))
+
+    @cached_property
+    def _distance_to_mask(self) -> np.ndarray:
+        distance = cv2.distanceTransform((~self.mask).view(np.uint8), cv2.DIST_L2, 3)
+        return distance.ravel()[self.free]
+
+    def _rays(self, pixels: np.ndarray, free: float) -> np.ndarray:
+        c, n = self.camera, self.noise
+        return _rays(
+            pixels,
+            self.depth,
+            (c.fx, c.fy, c.cx, c.cy),
+            c.is_pinhole,
+            (n.constant, n.quadratic, self.model_error),
+            (free * _FREE_MARGIN, free * _FREE_MODEL_MARGIN),
+        )
 
 
 def observe(
     depth: np.ndarray,
     mask: np.ndarray,
     camera: Camera,
-    noise: float | None,
+    noise: float | DepthNoise | None,
     model_error: float,
     nan_is_empty: bool,
 ) -> Observation | None:
@@ -128,59 +165,82 @@ def observe(
         crop = np.where(crop > 0, crop, np.float32(np.nan))
     inside = np.ascontiguousarray(mask[window], dtype=bool)
     view = camera.cropped(left, top, right - left, bottom - top)
-    typical = _typical_depth(crop, inside)
-    if not np.isfinite(typical):
+    distance = _mean_depth(crop, inside)
+    if not np.isfinite(distance):
         return None
     if noise is None:
-        noise = max(_noise(crop, inside), 1e-6 * max(abs(typical), 1e-3))
-    noise = float(np.hypot(noise, model_error))
+        noise = DepthNoise(max(depth_noise.estimate(crop, inside), _NO_NOISE * max(abs(distance), 1e-3)))
+    elif not isinstance(noise, DepthNoise):
+        noise = DepthNoise(noise)
+    sigma = float(np.hypot(noise.at(distance), model_error))
     focal = np.sqrt(view.fx * view.fy)
-    footprint = float(typical / focal if view.is_pinhole else 1 / focal)
-    inside = _coherent(crop, inside, _JUMP_PIXELS * footprint + _JUMP_NOISE * noise)
+    footprint = float(distance / focal if view.is_pinhole else 1 / focal)
+    inside = _coherent(crop, inside, _JUMP_PIXELS * footprint + _JUMP_NOISE * sigma)
     filled = cv2.morphologyEx(inside.view(np.uint8), cv2.MORPH_CLOSE, np.ones((_HOLE, _HOLE), np.uint8))
     claimed = cv2.bitwise_or(filled, np.ascontiguousarray(mask[window]).view(np.uint8))
     near = cv2.dilate(filled, np.ones((2 * band + 1, 2 * band + 1), np.uint8))
-    margin_in_front = max(_FREE_MARGIN * noise, 2.0 * model_error)
-    intrinsics = np.array([view.fx, view.fy, view.cx, view.cy])
-    rays, free, free_pixels = _collect(
-        crop, inside, claimed, near, intrinsics, view.is_pinhole, noise, footprint, margin_in_front, nan_is_empty
+    pixels, areas, free, free_pixels = _sort(crop, inside, claimed, near, footprint, nan_is_empty)
+    return Observation(
+        pixels, areas, free, free_pixels, noise, model_error, distance, footprint, crop, filled.view(bool), view
     )
-    return Observation(rays, free, free_pixels, noise, footprint, crop, filled.view(bool), view)
-
-
-def draw(rays: np.ndarray, count: int, offset: float = 0.5) -> np.ndarray:
-    """About ``count`` of the rays, systematically by their weight; each then weighs 1."""
-    total = rays[:, 6].sum()
-    if len(rays) > count and total > 0:
-        return _draw(rays, count, offset)
-    chosen = rays.copy()
-    chosen[:, 6] = 1.0
-    return chosen
 
 
 @kernel
-def _draw(rays: np.ndarray, count: int, offset: float) -> np.ndarray:
+def _draw(pixels: np.ndarray, areas: np.ndarray, count: int, offset: float) -> np.ndarray:
     total = 0.0
-    for i in range(rays.shape[0]):
-        total += rays[i, 6]
-    chosen = np.empty((count, RAY_COLUMNS))
+    for i in range(areas.shape[0]):
+        total += areas[i]
+    chosen = np.empty(count, np.int32)
     step = total / count
     ahead = step * offset
     passed = 0.0
     k = 0
-    for i in range(rays.shape[0]):
-        passed += rays[i, 6]
+    for i in range(pixels.shape[0]):
+        passed += areas[i]
         if passed > ahead and k < count:
-            chosen[k] = rays[i]
-            chosen[k, 6] = 1.0
+            chosen[k] = pixels[i]
             k += 1
             while passed > ahead:
                 ahead += step
-    return chosen[:k].copy()
+    return chosen[:k]
 
 
 @kernel
-def _typical_depth(depth: np.ndarray, inside: np.ndarray) -> float:
+def _rays(
+    pixels: np.ndarray,
+    depth: np.ndarray,
+    intrinsics: tuple[float, float, float, float],
+    pinhole: bool,
+    noise: tuple[float, float, float],
+    margins: tuple[float, float],
+) -> np.ndarray:
+    """Rays (n, 8) of pixels; their z is nearer by the margins, in noise levels and model errors."""
+    fx, fy, cx, cy = intrinsics
+    constant, quadratic, model_error = noise
+    width = depth.shape[1]
+    rays = np.zeros((pixels.shape[0], RAY_COLUMNS))
+    for i in range(pixels.shape[0]):
+        v, u = pixels[i] // width, pixels[i] % width
+        x, y = (u - cx) / fx, (v - cy) / fy
+        if pinhole:
+            rays[i, 2], rays[i, 3] = x, y
+        else:
+            rays[i, 0], rays[i, 1] = x, y
+        z = np.float64(depth[v, u])
+        rays[i, 5] = rays[i, 6] = 1.0
+        if not np.isfinite(z):
+            rays[i, 4] = 1e300
+            continue
+        growing = quadratic * z * z
+        sigma = np.sqrt(constant * constant + growing * growing + model_error * model_error)
+        rays[i, 4] = rays[i, 7] = z - max(margins[0] * sigma, margins[1] * model_error)
+        if margins[0] == 0.0:
+            rays[i, 5] = 1.0 / sigma
+    return rays
+
+
+@kernel
+def _mean_depth(depth: np.ndarray, inside: np.ndarray) -> float:
     total, count = 0.0, 0
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):
@@ -250,65 +310,37 @@ def _coherent(depth: np.ndarray, inside: np.ndarray, jump: float) -> np.ndarray:
 
 
 @kernel
-def _collect(
+def _sort(
     depth: np.ndarray,
     inside: np.ndarray,
     claimed: np.ndarray,
     near: np.ndarray,
-    intrinsics: np.ndarray,
-    pinhole: bool,
-    noise: float,
     footprint: float,
-    margin_in_front: float,
     nan_is_empty: bool,
-) -> tuple[np.ndarray, np.ndarray, int]:
-    fx, fy, cx, cy = intrinsics
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
+    """Object pixels with their areas, free pixels, and how many pixels these stand for."""
     height, width = depth.shape
-    count, free_count = 0, 0
-    for v in range(height):
-        for u in range(width):
-            if inside[v, u]:
-                count += np.isfinite(depth[v, u])
-            elif not claimed[v, u] and (near[v, u] or (u % _COARSE == 0 and v % _COARSE == 0)):
-                free_count += nan_is_empty or np.isfinite(depth[v, u])
-    rays = np.empty((count, RAY_COLUMNS))
-    free = np.empty((free_count, RAY_COLUMNS))
+    pixels, free = np.empty(height * width, np.int32), np.empty(height * width, np.int32)
+    areas = np.empty(height * width, np.float32)
     count, free_count, free_pixels = 0, 0, 0
     for v in range(height):
         for u in range(width):
-            z = depth[v, u]
-            known = np.isfinite(z)
+            known = np.isfinite(depth[v, u])
             if inside[v, u]:
-                if not known:
-                    continue
-                row = rays[count]
-                count += 1
-                row[4] = z
-                row[5] = 1.0 / noise
-                row[7] = z
-                row[6] = _area_weight(depth, inside, v, u, footprint)
-            elif not claimed[v, u] and (near[v, u] or (u % _COARSE == 0 and v % _COARSE == 0)):
-                if not known and not nan_is_empty:
-                    continue
-                row = free[free_count]
-                free_count += 1
-                row[4] = z - margin_in_front if known else 1e300
-                free_pixels += 1 if near[v, u] else _COARSE * _COARSE
-                row[5] = 1.0
-                row[6] = 1.0
-                row[7] = v * width + u
-            else:
-                continue
-            x, y = (u - cx) / fx, (v - cy) / fy
-            if pinhole:
-                row[0], row[1], row[2], row[3] = 0.0, 0.0, x, y
-            else:
-                row[0], row[1], row[2], row[3] = x, y, 0.0, 0.0
-    return rays, free, free_pixels
+                if known:
+                    pixels[count] = v * width + u
+                    areas[count] = _area(depth, inside, v, u, footprint)
+                    count += 1
+            elif not claimed[v, u] and (known or nan_is_empty):
+                if near[v, u] or (u % _COARSE == 0 and v % _COARSE == 0):
+                    free[free_count] = v * width + u
+                    free_count += 1
+                    free_pixels += 1 if near[v, u] else _COARSE * _COARSE
+    return pixels[:count].copy(), areas[:count].copy(), free[:free_count].copy(), free_pixels
 
 
 @kernel
-def _area_weight(depth: np.ndarray, inside: np.ndarray, v: int, u: int, footprint: float) -> float:
+def _area(depth: np.ndarray, inside: np.ndarray, v: int, u: int, footprint: float) -> float:
     """sqrt(1 + slope^2) by central differences, with the slope capped; 1 at the mask's edge."""
     height, width = depth.shape
     if not (0 < v < height - 1 and 0 < u < width - 1):
@@ -321,51 +353,3 @@ def _area_weight(depth: np.ndarray, inside: np.ndarray, v: int, u: int, footprin
     if not square >= 0.0:
         return 1.0
     return np.sqrt(1.0 + min(square, _STEEPEST * _STEEPEST))
-
-
-def _noise(depth: np.ndarray, inside: np.ndarray) -> float:
-    """Standard deviation of the depth noise within the mask, metres; 0 if it cannot be told."""
-    step = max(1, int(np.sqrt(inside.size / _NOISE_SAMPLES / 8)))
-    third, first = _differences(depth, inside, step)
-    if third.size < 8:
-        return 0.0
-    spread = float(np.median(third)) * _MEDIAN_TO_SIGMA / np.sqrt(20.0)
-    moved = first[first > 0]
-    quantum = 0.0
-    if moved.size >= 8:
-        smallest = float(np.quantile(moved, 0.02))
-        if np.mean(np.abs(moved / smallest - np.round(moved / smallest)) < 0.02) > 0.8:
-            quantum = smallest
-    if spread < 0.5 * quantum:
-        return quantum / float(np.sqrt(12.0))
-    return spread
-
-
-@kernel
-def _differences(depth: np.ndarray, inside: np.ndarray, step: int) -> tuple[np.ndarray, np.ndarray]:
-    """Absolute third and first differences along rows and columns, every ``step``-th line."""
-    height, width = depth.shape
-    third = np.empty(2 * height * width // step + 4)
-    first = np.empty(2 * height * width // step + 4)
-    count, moved = 0, 0
-    for v in range(0, height, step):
-        for u in range(width - 3):
-            if inside[v, u] and inside[v, u + 1] and inside[v, u + 2] and inside[v, u + 3]:
-                a, b, c, d = depth[v, u], depth[v, u + 1], depth[v, u + 2], depth[v, u + 3]
-                value = abs(a - 3.0 * b + 3.0 * c - d)
-                if value >= 0.0:
-                    third[count] = value
-                    count += 1
-                    first[moved] = abs(np.float64(a) - np.float64(b))
-                    moved += 1
-    for u in range(0, width, step):
-        for v in range(height - 3):
-            if inside[v, u] and inside[v + 1, u] and inside[v + 2, u] and inside[v + 3, u]:
-                a, b, c, d = depth[v, u], depth[v + 1, u], depth[v + 2, u], depth[v + 3, u]
-                value = abs(a - 3.0 * b + 3.0 * c - d)
-                if value >= 0.0:
-                    third[count] = value
-                    count += 1
-                    first[moved] = abs(np.float64(a) - np.float64(b))
-                    moved += 1
-    return third[:count], first[:moved]

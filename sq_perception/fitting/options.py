@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sq_perception.fitting.bounds import Bounds
+from sq_perception.fitting.depth_noise import DepthNoise
 
 MIN_PIXELS = 12
 MODEL_ERROR_ON_PLANE = 0.0025
@@ -23,7 +24,7 @@ class Options:
     bounds
         Limits of sizes and exponents.
     noise
-        Standard deviation of the depth noise, metres; None estimates it from the image.
+        Standard deviation of the depth noise, metres, or how it grows with depth; None estimates it from the image.
     model_error
         How far the object may stray from a superquadric, metres.  None: 0 if a superquadric explains the image down
         to its noise, else 2.5 mm for objects on a plane and what is left over for others.
@@ -45,7 +46,7 @@ class Options:
     """
 
     bounds: Bounds = field(default_factory=Bounds)
-    noise: float | None = None
+    noise: float | DepthNoise | None = None
     model_error: float | None = None
     plane: np.ndarray | None = None
     nan_is_empty: bool | None = None
@@ -55,8 +56,8 @@ class Options:
     fall_back: bool = True
 
     def __post_init__(self) -> None:
-        if self.noise is not None and not (np.isfinite(self.noise) and self.noise > 0):
-            raise ValueError(f"noise: expected a positive number of metres, got {self.noise}")
+        if isinstance(self.noise, (int, float)):
+            object.__setattr__(self, "noise", DepthNoise(self.noise))
         if self.model_error is not None and not (np.isfinite(self.model_error) and self.model_error >= 0):
             raise ValueError(f"model_error: expected metres, 0 or more, got {self.model_error}")
         if self.plane is not None:

@@ -23,7 +23,7 @@ import numpy as np
 from sq_perception.fitting import box_start, symmetry_start
 from sq_perception.fitting.covariance import covariance_at, undetermined
 from sq_perception.fitting.levenberg_marquardt import State, minimize
-from sq_perception.fitting.observation import Observation, draw
+from sq_perception.fitting.observation import Observation
 from sq_perception.fitting.options import Options
 from sq_perception.fitting.residuals import RAY_COLUMNS, RENDERED, SAMPSON, penetration, surface_distance
 from sq_perception.fitting.scene import Scene
@@ -157,7 +157,7 @@ class Search:
     def _tolerate_what_is_left(self) -> None:
         """The object is no superquadric: what the best body leaves unexplained becomes the model error."""
         best = self.finalists[0]
-        distance = surface_distance(self.observation.object_rays, best.parameters, best.rotation)
+        distance = surface_distance(self.observation.object_rays(FINAL_RAYS), best.parameters, best.rotation)
         self.tolerated = MEDIAN_TO_SIGMA * float(np.median(distance))
         self.observation = self.observation.coarsened(self.tolerated)
         self.scene = _scene(self.observation, self.options)._replace(huber=2.0, volume_price=VOLUME_PRICE)
@@ -167,10 +167,10 @@ class Search:
 
     def _draw(self, count: int, offset: float) -> tuple[np.ndarray, np.ndarray]:
         """Object and free rays for one stage."""
-        rays = draw(self.observation.object_rays, count, offset)
-        free = draw(self.observation.free_rays, int(FREE_SHARE * count), offset)
+        rays = self.observation.object_rays(count, offset)
+        free = self.observation.free_rays(int(FREE_SHARE * count), offset)
         if self.tolerated > 0:
-            pixels = len(self.observation.object_rays)
+            pixels = len(self.observation.pixels)
             rays[:, 6] = REAL_WEIGHT / len(rays)
             if len(free):
                 free[:, 6] = REAL_WEIGHT / pixels * self.observation.free_pixels / len(free)
@@ -180,7 +180,7 @@ class Search:
         """Total weight of the object rays that a stage draws: its cost at the noise floor."""
         if self.tolerated > 0:
             return REAL_WEIGHT
-        return float(min(count, len(self.observation.object_rays)))
+        return float(min(count, len(self.observation.pixels)))
 
     def _coarse(self, states: list[State]) -> list[State]:
         rays, free = self._draw(COARSE_RAYS, 0.5)
@@ -271,7 +271,7 @@ class Search:
     @property
     def outline(self) -> float:
         """Standard deviation of the outline where it is not known better, metres."""
-        return max(self.observation.noise, self.observation.footprint)
+        return max(self.observation.sigma, self.observation.footprint)
 
     def _refined(self, state: State, steps: int) -> State:
         return minimize(RENDERED, self.rays, self.free, self.scene, state, self.limits, steps, FINAL_TOLERANCE)
@@ -291,22 +291,21 @@ class Search:
 
     def _ring_penetration(self, state: State, observation: Observation, radius: int) -> float:
         """Mean depth, in pixels, to which the body covers the free pixels at this distance from the mask."""
-        distance = observation.distance_to_mask(observation.free_rays)
-        ring = observation.free_rays[np.abs(distance - radius) < 0.5]
+        ring = observation.free_rays_of(observation.ring(radius), RING_RAYS)
         if len(ring) == 0:
             return 0.0
-        depth = penetration(draw(ring, RING_RAYS), self.scene, state.parameters, state.rotation)
+        depth = penetration(ring, self.scene, state.parameters, state.rotation)
         return float(depth.mean()) / observation.footprint
 
     def _enough(self) -> int:
         """Rays that bring the noise of the mean well below a pixel's width."""
-        ratio = self.observation.noise / self.observation.footprint
+        ratio = self.observation.sigma / self.observation.footprint
         return int(np.clip(FINAL_RAYS * (ratio / 0.3) ** 2, FINAL_RAYS, MOST_FINAL_RAYS))
 
     def _without_outliers(self, rays: np.ndarray, state: State) -> np.ndarray:
         """The rays whose points lie near the surface, as seen by the majority."""
         distance = surface_distance(rays, state.parameters, state.rotation)
-        spread = max(self.observation.noise, 1.4826 * float(np.median(distance)))
+        spread = max(self.observation.sigma, 1.4826 * float(np.median(distance)))
         return rays[distance < OUTLIER * spread]
 
     def _outline_sigma(self, state: State) -> float:
@@ -332,7 +331,7 @@ class Search:
 def _scene(observation: Observation, options: Options) -> Scene:
     """The constants that the residuals share, for all but the last stage."""
     pinhole = 1.0 if observation.camera.is_pinhole else 0.0
-    outline = max(observation.noise, observation.footprint, options.tolerated)
+    outline = max(observation.sigma, observation.footprint, options.tolerated)
     scene = Scene(
         hit_tolerance=HIT_TOLERANCE,
         pinhole=pinhole,

@@ -138,10 +138,10 @@ def _checked_starts(start: object) -> list[State]:
 
 def _hopeless(observation: Observation) -> str:
     """Why no body can be fitted to these pixels; empty if one can."""
-    count = len(observation.object_rays)
+    count = len(observation.pixels)
     if count < MIN_PIXELS:
         return f"{count} pixels with a depth; a fit needs {MIN_PIXELS}"
-    points = observation.points[:: max(1, count // 500)]
+    points = observation.points[::4]
     centred = points - points.mean(axis=0)
     spread = np.linalg.eigvalsh(centred.T @ centred)
     if spread[1] <= 1e-6 * spread[2]:

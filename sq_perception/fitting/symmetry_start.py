@@ -36,45 +36,67 @@ _EIGHTH_TURN = math.pi / 4
 def completed_moments(observation: Observation) -> tuple[np.ndarray, np.ndarray] | None:
     """Centre (3,) and second moments (3, 3) about it of the completed body; None if no pixel has an opposite."""
     camera = observation.camera
-    intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
-    u, v, pairs = _opposite_pairs(observation.depth, observation.mask, intrinsics, camera.is_pinhole)
+    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
+    stride = max(1, round(math.sqrt(len(observation.pixels) / _MOST_PAIRS)))
+    u, v, pairs = _opposite_pairs(observation.depth, observation.mask, intrinsics, camera.is_pinhole, stride)
     if len(pairs) < 3:
         return None
-    means = pairs[:, 5]
-    rank = min(max(_RANK, int(0.002 * len(means))), len(means) - 1)
-    depth = float(np.partition(means, len(means) - 1 - rank)[len(means) - 1 - rank])
+    rank = len(pairs) - 1 - min(max(_RANK // stride**2, int(0.002 * len(pairs))), len(pairs) - 1)
+    depth = float(np.partition(pairs[:, 5], rank)[rank])
     centre = camera.unproject(np.array(u), np.array(v), np.array(depth))
-    chosen = pairs[:: max(1, len(pairs) // _MOST_PAIRS)]
-    middle, half_chord = chosen[:, :3], centre - chosen[:, 3:]
-    length = np.maximum(half_chord[:, 2], observation.footprint / 2)
-    weight = length / length.sum()
-    moments = (middle * weight[:, None]).T @ middle
-    moments += np.einsum("i,ij,ik->jk", weight / 3, half_chord, half_chord)
-    return centre, moments
+    return centre, _moments(pairs, centre, observation.footprint / 2)
+
+
+@kernel
+def _moments(pairs: np.ndarray, centre: np.ndarray, shortest: float) -> np.ndarray:
+    """sum |h| (m m^T + h h^T / 3) / sum |h| over pairs of m and C - h."""
+    moments = np.zeros((3, 3))
+    total = 0.0
+    for i in range(pairs.shape[0]):
+        weight = max(centre[2] - pairs[i, 5], shortest)
+        total += weight
+        for j in range(3):
+            chord = centre[j] - pairs[i, 3 + j]
+            for k in range(j + 1):
+                moments[j, k] += weight * (pairs[i, j] * pairs[i, k] + chord * (centre[k] - pairs[i, 3 + k]) / 3.0)
+    for j in range(3):
+        for k in range(j + 1):
+            moments[j, k] /= total
+            moments[k, j] = moments[j, k]
+    return moments
 
 
 @kernel
 def _opposite_pairs(
-    depth: np.ndarray, inside: np.ndarray, intrinsics: np.ndarray, pinhole: bool
+    depth: np.ndarray,
+    inside: np.ndarray,
+    intrinsics: tuple[float, float, float, float],
+    pinhole: bool,
+    stride: int,
 ) -> tuple[float, float, np.ndarray]:
-    """Centre of the silhouette (u, v), and for each pixel with an opposite: half difference and mean of the points."""
+    """Centre of the silhouette (u, v), and for each pixel with an opposite: half difference and mean of the points.
+
+    Of the pairs, those of every ``stride``-th row and column.
+    """
     fx, fy, cx, cy = intrinsics
     height, width = depth.shape
     total_u, total_v, count = 0.0, 0.0, 0
     for v in range(height):
+        in_row = 0
         for u in range(width):
             if inside[v, u]:
                 total_u += u
-                total_v += v
-                count += 1
+                in_row += 1
+        total_v += v * in_row
+        count += in_row
     centre_u, centre_v = total_u / count, total_v / count
-    pairs = np.empty((count, 6))
+    pairs = np.empty((((height - 1) // stride + 1) * ((width - 1) // stride + 1), 6))
     k = 0
-    for v in range(height):
-        for u in range(width):
+    for v in range(0, height, stride):
+        for u in range(0, width, stride):
             if not inside[v, u] or not np.isfinite(depth[v, u]):
                 continue
-            u2, v2 = round(2.0 * centre_u - u), round(2.0 * centre_v - v)
+            u2, v2 = int(np.floor(2.0 * centre_u - u + 0.5)), int(np.floor(2.0 * centre_v - v + 0.5))
             if u2 < 0 or v2 < 0 or u2 >= width or v2 >= height:
                 continue
             if not inside[v2, u2] or not np.isfinite(depth[v2, u2]):

@@ -9,7 +9,7 @@ import numpy as np
 from sq_perception.fitting.covariance import carried_over, covariance_at, undetermined
 from sq_perception.fitting.fit import Fit, Status
 from sq_perception.fitting.levenberg_marquardt import State
-from sq_perception.fitting.observation import Observation, draw
+from sq_perception.fitting.observation import Observation
 from sq_perception.fitting.normal_equations import STEP_LENGTH
 from sq_perception.fitting.residuals import surface_distance
 from sq_perception.fitting.search import Search
@@ -28,17 +28,17 @@ def judged(state: State, search: Search, began: float) -> Fit:
     covariance = covariance_at(state, search.rays, search.free, search.scene, search.outline)
     canonical = body.canonical_form()
     covariance = carried_over(covariance, body, canonical)
-    everything = draw(observation.object_rays, _JUDGED_RAYS)
+    everything = observation.object_rays(_JUDGED_RAYS)
     distance = surface_distance(everything, state.parameters, state.rotation)
-    inlying = distance < _INLIER * observation.noise
+    inlying = distance < _INLIER * observation.sigma
     typical = float(np.median(distance))
-    kept = distance < max(_INLIER * observation.noise, _INLIER * typical)
+    kept = distance < max(_INLIER * observation.sigma, _INLIER * typical)
     residual = float(np.sqrt(np.mean(distance[kept] ** 2))) if kept.any() else typical
     status, message = _verdict(canonical, covariance, typical)
     return Fit(
         superquadric=canonical,
         residual=residual,
-        noise=observation.noise,
+        noise=observation.sigma,
         inlier_share=float(inlying.mean()),
         covariance=covariance,
         status=status,
@@ -55,7 +55,7 @@ def failed(body: Superquadric, observation: Observation, reason: str, began: flo
     return Fit(
         superquadric=body.canonical_form(),
         residual=float(np.sqrt(np.mean(distance**2))),
-        noise=observation.noise,
+        noise=observation.sigma,
         inlier_share=0.0,
         covariance=np.full((STEP_LENGTH, STEP_LENGTH), np.nan),
         status=Status.FAILED,
