@@ -52,8 +52,6 @@ def estimate(depth: np.ndarray, inside: np.ndarray) -> float:
     third, first = _differences(depth, inside, step)
     if third.size < _FEWEST:
         return 0.0
-    middle = third.size // 2
-    spread = float(np.partition(third, middle)[middle]) * _MEDIAN_TO_SIGMA / np.sqrt(20.0)
     moved = first[first > 0]
     quantum = 0.0
     if moved.size >= _FEWEST:
@@ -61,9 +59,22 @@ def estimate(depth: np.ndarray, inside: np.ndarray) -> float:
         smallest = float(np.partition(moved, rank)[rank])
         if np.mean(np.abs(moved / smallest - np.rint(moved / smallest)) < 0.02) > 0.8:
             quantum = smallest
+    spread = _median(third, quantum) * _MEDIAN_TO_SIGMA / np.sqrt(20.0)
     if spread < 0.5 * quantum:
         return quantum / float(np.sqrt(12.0))
-    return spread
+    return float(spread)
+
+
+def _median(values: np.ndarray, quantum: float) -> float:
+    """The median of positive values (n,); of multiples of a quantum as if each were spread evenly over its interval."""
+    middle = values.size // 2
+    median = float(np.partition(values, middle)[middle])
+    if quantum == 0.0:
+        return median
+    below = np.count_nonzero(values < median - quantum / 2)
+    level = np.count_nonzero(values < median + quantum / 2) - below
+    lower = max(median - quantum / 2, 0.0)
+    return lower + (median + quantum / 2 - lower) * (values.size / 2 - below) / level
 
 
 @kernel

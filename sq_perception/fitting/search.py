@@ -42,7 +42,7 @@ DOUBT = 25.0
 RIVAL = 1.3
 """and so do those within this factor of the best, as they have not converged yet."""
 FINALISTS, ESCALATED_FINALISTS = 3, 6
-TOLERANCE, FINAL_TOLERANCE = 1e-3, 1e-3
+TOLERANCE, FINAL_TOLERANCE = 1e-3, 1e-4
 SHARP_OUTLINE = 0.3
 """Standard deviation of a perfect outline, in pixels: the body covers exactly the centres of the mask's pixels."""
 SHRUNK = 0.25
@@ -53,8 +53,13 @@ HIT_TOLERANCE = 3e-3
 """Rays remember where they met the body, so that this error of g vanishes as the search converges."""
 OUTLIER = 5.0
 """Object rays this many standard deviations off the surface of the winner are dropped."""
-SETTLED = 1.02
-"""A last mean squared residual above this makes the order of the axes worth another look."""
+SETTLED, UNSURE = 1.02, 0.02
+"""A last mean squared residual above the one, or a half size less certain than the other, as a share of it, make other
+valleys of the cost worth a look."""
+MOST_VARIATIONS = 2
+RIVAL_SLACK, SIGNIFICANT = 4.0, 0.5
+"""Of costs: what few rays may hide, and what is a difference."""
+ALIKE = 0.01
 PROMISING = 24
 """So many bodies of the exact search start the one that tolerates a model error."""
 THIN = 0.3
@@ -107,7 +112,7 @@ class Search:
                 self._select(self._coarse(self._everything()), ESCALATED_FINALISTS)
             if not self._good_enough() and self.tolerated == 0 and not self._late():
                 self._tolerate_what_is_left()
-                promising = sorted(self.tried, key=lambda state: state.cost)[:PROMISING]
+                promising = sorted(self.tried, key=_cost)[:PROMISING]
                 self._select(self._coarse(promising), ESCALATED_FINALISTS)
         return self.decided()
 
@@ -117,7 +122,7 @@ class Search:
         found: list[State] = []
         for tier in self._tiers():
             found += self._coarse(tier)
-            found.sort(key=lambda state: state.cost)
+            found.sort(key=_cost)
             if found[0].cost < COARSE_GATE * self._weight(COARSE_RAYS) or self._late():
                 break
         return found
@@ -204,7 +209,7 @@ class Search:
 
     def _rivals(self, candidates: list[State]) -> list[State]:
         """Candidates, best first, without those that the noise cannot have made worse than the best."""
-        ranked = sorted(candidates, key=lambda state: state.cost)
+        ranked = sorted(candidates, key=_cost)
         least = ranked[0].cost
         return [state for state in ranked if state.cost <= least + max(DOUBT, (RIVAL - 1) * abs(least))]
 
@@ -226,26 +231,54 @@ class Search:
             if self._late():
                 break
             state = self._refined(rival, self.options.max_iterations)
-            best = min(best, state, key=lambda each: each.cost)
-        if self.tolerated == 0 and best.cost > SETTLED * self.rays[:, 6].sum() and not self._late():
-            best = self._reordered(best)
+            best = min(best, state, key=_cost)
+        if self.tolerated == 0:
+            best = self._varied(best)
         if self.observation.camera.is_pinhole and not self._late():
             best = self._doubted(best)
         return best
 
-    def _reordered(self, best: State) -> State:
-        """The same box of axes with another z, or turned by 45 degrees, where noise may have hidden the difference."""
-        rays, free = self._draw(2 * BASIN_RAYS, 0.2)
-        moments = best.rotation @ np.diag(best.parameters[:3] ** 2 * symmetry_start.MOMENT_SHARE) @ best.rotation.T
-        rivals: list[State] = []
-        for axes in [best.rotation, *symmetry_start.eighth_turns(best.rotation)]:
-            rivals += symmetry_start.states(best.parameters[5:8], moments, axes)
-        rivals = [
-            minimize(RENDERED, rays, free, self.scene, rival, self.limits, BASIN_STEPS, TOLERANCE)
-            for rival in self._rivals(self._coarse(rivals))[:ESCALATED_FINALISTS]
-        ]
-        rivals = self._rivals(rivals)[:FINALISTS]
-        return min([best, *(self._refined(rival, self.options.max_iterations) for rival in rivals)], key=_cost)
+    def _varied(self, best: State) -> State:
+        """Look beyond the valley that the search came down into: noise and poor sight hide that another one is deeper.
+
+        Rivals are the same body with a half size that the image hardly tells made smaller or larger, the seen face in
+        place, and, where something is left unexplained, the same box of axes with another z or turned by 45 degrees.
+        They go on with the rendered residual: Sampson's would make them grow, as g is convex and noise enters it.
+        """
+        for _ in range(MOST_VARIATIONS):
+            unexplained = best.cost > SETTLED * self.rays[:, 6].sum()
+            unsure = np.sqrt(np.diag(covariance_at(best, self.rays, self.free, self.scene, self.outline))[:3])
+            unsure /= best.parameters[:3]
+            if self._late() or not (unexplained or unsure.max() > UNSURE):
+                break
+            first, second, _ = (int(k) for k in np.argsort(-unsure))
+            rivals = [_resized(best, first, share * best.parameters[first]) for share in (0.35, 0.5, 1.4)]
+            rivals += [_resized(best, second, share * best.parameters[second]) for share in (0.35, 1.4)]
+            if unexplained:
+                moments = best.rotation @ np.diag(best.parameters[:3] ** 2) @ best.rotation.T * symmetry_start.MOMENT_SHARE
+                for axes in [best.rotation, *symmetry_start.eighth_turns(best.rotation)]:
+                    rivals += symmetry_start.states(best.parameters[5:8], moments, axes)
+            better = self._better(best, rivals)
+            if better is best:
+                break
+            best = better
+        return best
+
+    def _better(self, best: State, rivals: list[State]) -> State:
+        """The best of a body and its rivals: these must not be worse on few rays before they are tried on all."""
+        rays, free = self._draw(BASIN_RAYS, 0.2)
+        settled: list[State] = []
+        for state in [best, *rivals]:
+            state = state._replace(cost=math.inf)
+            state = minimize(RENDERED, rays, free, self.scene, state, self.limits, BASIN_STEPS, TOLERANCE)
+            known = any(_alike(state, other) for other in settled)
+            if not known and (not settled or state.cost < settled[0].cost + RIVAL_SLACK):
+                settled.append(state)
+        for rival in sorted(settled[1:], key=_cost)[:FINALISTS]:
+            state = self._refined(rival, self.options.max_iterations)
+            if state.cost < best.cost - SIGNIFICANT:
+                best = state
+        return best
 
     def _doubted(self, state: State) -> State:
         """Where the image hardly tells a size, small model errors would decide it: leave it to the priors instead.
@@ -266,7 +299,7 @@ class Search:
             typical = float(np.exp(np.mean(np.log(np.delete(state.parameters[:3], k)))))
             rivals += [_resized(state, int(k), size) for size in (typical, THIN * typical)]
         steps = 2 * self.options.max_iterations
-        return min((self._refined(rival, steps) for rival in rivals), key=lambda each: each.cost)
+        return min((self._refined(rival, steps) for rival in rivals), key=_cost)
 
     @property
     def outline(self) -> float:
@@ -355,6 +388,14 @@ def _scene(observation: Observation, options: Options) -> Scene:
 
 def _cost(state: State) -> float:
     return state.cost
+
+
+def _alike(one: State, other: State) -> bool:
+    """Whether two searches ended in the same valley, in the same of the body's forms or with the same sizes."""
+    if abs(one.cost - other.cost) > SIGNIFICANT:
+        return False
+    sizes = np.abs(np.sort(one.parameters[:3]) - np.sort(other.parameters[:3]))
+    return bool((sizes < ALIKE * np.sort(one.parameters[:3])).all())
 
 
 def _resized(state: State, axis: int, size: float) -> State:
