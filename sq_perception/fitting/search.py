@@ -53,7 +53,7 @@ HIT_TOLERANCE = 3e-3
 """Rays remember where they met the body, so that this error of g vanishes as the search converges."""
 OUTLIER = 5.0
 """Object rays this many standard deviations off the surface of the winner are dropped."""
-SETTLED, UNSURE = 1.02, 0.02
+SETTLED, UNSURE = 1.02, 0.015
 """A last mean squared residual above the one, or a half size less certain than the other, as a share of it, make other
 valleys of the cost worth a look."""
 MOST_VARIATIONS = 2
@@ -251,13 +251,9 @@ class Search:
             unsure /= best.parameters[:3]
             if self._late() or not (unexplained or unsure.max() > UNSURE):
                 break
-            first, second, _ = (int(k) for k in np.argsort(-unsure))
-            rivals = [_resized(best, first, share * best.parameters[first]) for share in (0.35, 0.5, 1.4)]
-            rivals += [_resized(best, second, share * best.parameters[second]) for share in (0.35, 1.4)]
+            rivals = _other_depths(best, np.argsort(-unsure))
             if unexplained:
-                moments = best.rotation @ np.diag(best.parameters[:3] ** 2) @ best.rotation.T * symmetry_start.MOMENT_SHARE
-                for axes in [best.rotation, *symmetry_start.eighth_turns(best.rotation)]:
-                    rivals += symmetry_start.states(best.parameters[5:8], moments, axes)
+                rivals += _other_axes(best)
             better = self._better(best, rivals)
             if better is best:
                 break
@@ -396,6 +392,30 @@ def _alike(one: State, other: State) -> bool:
         return False
     sizes = np.abs(np.sort(one.parameters[:3]) - np.sort(other.parameters[:3]))
     return bool((sizes < ALIKE * np.sort(one.parameters[:3])).all())
+
+
+def _other_depths(state: State, axes: np.ndarray) -> list[State]:
+    """The body with another half size along the first of these axes, or the second: thinner, also with another z."""
+    first, second = int(axes[0]), int(axes[1])
+    size = state.parameters
+    thinner = _resized(state, first, 0.5 * size[first])
+    found = [thinner, _resized(state, first, 0.35 * size[first]), _resized(state, first, 1.4 * size[first])]
+    found += [_resized(state, second, share * size[second]) for share in (0.35, 1.4)]
+    for order in symmetry_start.three_orders(np.eye(3))[:2]:
+        parameters = thinner.parameters.copy()
+        parameters[:3] = order.T @ parameters[:3]
+        parameters[3:5] = symmetry_start.START_EXPONENT
+        found.append(State(parameters, np.ascontiguousarray(thinner.rotation @ order), math.inf, state.iterations))
+    return found
+
+
+def _other_axes(state: State) -> list[State]:
+    """The same box of axes with each z, and turned by 45 degrees about each axis."""
+    moments = state.rotation @ np.diag(state.parameters[:3] ** 2 * symmetry_start.MOMENT_SHARE) @ state.rotation.T
+    found: list[State] = []
+    for axes in [state.rotation, *symmetry_start.eighth_turns(state.rotation)]:
+        found += symmetry_start.states(state.parameters[5:8], moments, axes)
+    return found
 
 
 def _resized(state: State, axis: int, size: float) -> State:

@@ -26,7 +26,7 @@ from sq_perception.fitting.observation import Observation
 from sq_perception.geometry.kernels import kernel
 
 MOMENT_SHARE = 0.27
-_START_EXPONENT = 0.5
+START_EXPONENT = 0.5
 _RANK = 4
 """The centre's depth is the largest mean depth but for this many pairs, in case of a stray pixel."""
 _MOST_PAIRS = 2500
@@ -146,7 +146,7 @@ def principal_axes(moments: np.ndarray) -> np.ndarray:
     return axes
 
 
-def states(centre: np.ndarray, moments: np.ndarray, axes: np.ndarray, exponent: float = _START_EXPONENT) -> list[State]:
+def states(centre: np.ndarray, moments: np.ndarray, axes: np.ndarray, exponent: float = START_EXPONENT) -> list[State]:
     """The three bodies with these axes and moments, one for each choice of z."""
     found = []
     for rotation in three_orders(axes):
