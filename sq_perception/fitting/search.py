@@ -267,8 +267,12 @@ class Search:
         for state in [best, *rivals]:
             state = state._replace(cost=math.inf)
             state = minimize(RENDERED, rays, free, self.scene, state, self.limits, BASIN_STEPS, TOLERANCE)
+            if not settled:
+                reference = state
+                # On other rays the body may already find its way out of a shallow valley.
+                settled.append(best._replace(cost=state.cost))
             known = any(_alike(state, other) for other in settled)
-            if not known and (not settled or state.cost < settled[0].cost + RIVAL_SLACK):
+            if not known and state.cost < reference.cost + RIVAL_SLACK:
                 settled.append(state)
         for rival in sorted(settled[1:], key=_cost)[:FINALISTS]:
             state = self._refined(rival, self.options.max_iterations)
