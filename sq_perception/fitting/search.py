@@ -30,7 +30,7 @@ from sq_perception.fitting.scene import Scene
 
 COARSE_RAYS, COARSE_STEPS = 150, 8
 BASIN_RAYS, BASIN_STEPS = 300, 15
-FINAL_RAYS = 2000
+FINAL_RAYS = 4000
 MOST_FINAL_RAYS = 6000
 FREE_SHARE = 0.25
 """Free rays per object ray."""
