@@ -1,8 +1,9 @@
-"""What every benchmark shares: metadata, spread, and files of JSON and Markdown beside each other."""
+"""What every benchmark shares: metadata, spread, recorded data, and files of JSON and Markdown beside each other."""
 
 from __future__ import annotations
 
 import json
+import os
 import platform
 import subprocess
 import sys
@@ -15,6 +16,18 @@ import numpy as np
 
 RESULTS = Path(__file__).resolve().parent / "results"
 _PACKAGES = ("sq-perception", "numpy", "numba", "torch", "ros-jazzy-rclpy")
+
+
+def shared_data(folder: str) -> Path | None:
+    """A folder of recorded data beside the repository; None, and a line that says so, where there is none.
+
+    SQ_SHARED_DATA names another place for all of it.
+    """
+    path = Path(os.environ.get("SQ_SHARED_DATA", RESULTS.parents[2] / "shared" / "data")) / folder
+    if path.is_dir():
+        return path
+    print(f"skipped: no recorded data, {path} is missing (set SQ_SHARED_DATA)")
+    return None
 
 
 def spread(values: np.ndarray) -> dict[str, float]:

@@ -1,0 +1,167 @@
+"""Depth images of triangle meshes: a rasteriser, a depth sensor, and poses in the air and on a table.
+
+With the corners a, b, c of a triangle in the optical frame and the ray z d of a pixel, d = (x, y, 1),
+
+    z = a.(b x c) / (e1 + e2 + e3),   e1 = d.(b x c),  e2 = d.(c x a),  e3 = d.(a x b),
+
+and the ray meets the triangle where e1, e2, e3 have the same sign: exact in perspective, without clipping or
+interpolation.  Pinhole cameras only; the mesh lies in front of the camera.
+
+Metres; optical frame; p_camera = rotation p_mesh + translation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+import trimesh
+
+from sq_perception.geometry import rotation as quaternions
+from sq_perception.geometry.kernels import kernel
+from sq_perception.imaging.camera import Camera
+from sq_perception.imaging.scene import plane_depth
+
+CAMERA = Camera(640, 480, 320 / np.tan(np.deg2rad(30)), 320 / np.tan(np.deg2rad(30)), 319.5, 239.5)
+DISTANCE = (0.5, 1.0)
+"""From the camera to the middle of the object, metres."""
+OFF_AXIS = 0.1
+"""How far beside the optical axis, as a share of the distance."""
+ELEVATION = (30.0, 60.0)
+"""How steeply the camera looks down on a table, degrees."""
+ROLL = 10.0
+SIGMA_AT_1_M = 0.0015
+QUANTUM = 0.001
+
+
+@dataclass(frozen=True)
+class View:
+    """One object in one image.
+
+    Attributes
+    ----------
+    depth : (height, width)
+        Metres as measured, NaN where nothing was.
+    mask : (height, width)
+        The object's true pixels.
+    plane : (4,) or None
+        The support, height above it = n.p + d.
+    rotation, translation : (3, 3), (3,)
+        Camera from mesh.
+    """
+
+    depth: np.ndarray
+    mask: np.ndarray
+    camera: Camera
+    plane: np.ndarray | None
+    rotation: np.ndarray
+    translation: np.ndarray
+
+
+Poser = Callable[[np.random.Generator], tuple[np.ndarray, np.ndarray, np.ndarray | None]]
+
+
+def render(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> np.ndarray:
+    """Depth (height, width) of a mesh in the optical frame, faces seen from both sides; +inf where there is none."""
+    if not camera.is_pinhole or vertices[:, 2].min() <= 0:
+        raise ValueError("expected a pinhole camera and a mesh in front of it")
+    depth = np.full((camera.height, camera.width), np.inf)
+    corners = np.ascontiguousarray(vertices[faces], dtype=float)
+    pixels = camera.project(corners)
+    windows = np.concatenate([np.ceil(pixels.min(axis=1) - 1e-6), np.floor(pixels.max(axis=1) + 1e-6) + 1], axis=1)
+    limits = np.array([camera.width, camera.height, camera.width, camera.height])
+    windows = np.clip(windows, 0, limits).astype(np.int64)
+    _rasterise(corners, windows, np.array([camera.fx, camera.fy, camera.cx, camera.cy]), depth)
+    return depth
+
+
+@kernel
+def _rasterise(corners: np.ndarray, windows: np.ndarray, intrinsics: np.ndarray, depth: np.ndarray) -> None:
+    fx, fy, cx, cy = intrinsics
+    for k in range(corners.shape[0]):
+        a, b, c = corners[k]
+        left, top, right, bottom = windows[k]
+        bc, ca, ab = np.cross(b, c), np.cross(c, a), np.cross(a, b)
+        volume = a[0] * bc[0] + a[1] * bc[1] + a[2] * bc[2]
+        if volume == 0.0:
+            continue
+        for v in range(top, bottom):
+            y = (v - cy) / fy
+            for u in range(left, right):
+                x = (u - cx) / fx
+                e1 = x * bc[0] + y * bc[1] + bc[2]
+                e2 = x * ca[0] + y * ca[1] + ca[2]
+                e3 = x * ab[0] + y * ab[1] + ab[2]
+                if not ((e1 >= 0 and e2 >= 0 and e3 >= 0) or (e1 <= 0 and e2 <= 0 and e3 <= 0)):
+                    continue
+                total = e1 + e2 + e3
+                if total == 0.0:
+                    continue
+                z = volume / total
+                if 0.0 < z < depth[v, u]:
+                    depth[v, u] = z
+
+
+def floating(hull: trimesh.Trimesh) -> Poser:
+    """Any orientation, nothing behind."""
+    middle = hull.bounds.mean(axis=0)
+
+    def pose(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, None]:
+        turn = quaternions.to_matrix(quaternions.random(1, rng)[0])
+        return turn, _place(rng) - turn @ middle, None
+
+    return pose
+
+
+def resting(hull: trimesh.Trimesh) -> Poser:
+    """On one of its stable faces, as likely as it would come to lie there; the camera looks down on the table."""
+    rests, likely = hull.compute_stable_poses()
+    likely = likely / likely.sum()
+
+    def pose(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        rest = rests[rng.choice(len(rests), p=likely)]
+        down, roll, yaw = np.deg2rad([rng.uniform(*ELEVATION), rng.uniform(-ROLL, ROLL), rng.uniform(0, 360)])
+        # Columns: the table's x, y and upward normal in the frame of a camera that looks along it, then down on it.
+        level = np.array([[1.0, 0, 0], [0, -np.sin(down), -np.cos(down)], [0, np.cos(down), -np.sin(down)]])
+        table = _about_z(roll) @ level @ _about_z(yaw)
+        turn = table @ rest[:3, :3]
+        middle = trimesh.transform_points(hull.vertices, rest)
+        middle = (middle.min(axis=0) + middle.max(axis=0)) / 2
+        origin = _place(rng) - table @ middle
+        normal = table[:, 2]
+        return turn, origin + table @ rest[:3, 3], np.append(normal, -normal @ origin)
+
+    return pose
+
+
+def view(mesh: trimesh.Trimesh, pose: Poser, rng: np.random.Generator) -> View:
+    """One image of the mesh through the sensor; poses that the image cuts are drawn again."""
+    while True:
+        turn, translation, plane = pose(rng)
+        vertices = mesh.vertices @ turn.T + translation
+        pixels = CAMERA.project(vertices)
+        if (pixels > 1).all() and (pixels < [CAMERA.width - 2, CAMERA.height - 2]).all():
+            break
+    depth = render(vertices, mesh.faces, CAMERA)
+    mask = np.isfinite(depth)
+    if plane is not None:
+        depth = np.where(mask, depth, plane_depth(plane, CAMERA))
+    return View(measured(depth, rng), mask, CAMERA, plane, turn, translation)
+
+
+def measured(depth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """What the sensor makes of true depth: noise that grows with z^2, whole millimetres, NaN for infinity."""
+    depth = np.where(np.isfinite(depth), depth, np.nan)
+    noisy = depth + rng.standard_normal(depth.shape) * SIGMA_AT_1_M * depth**2
+    return np.round(noisy / QUANTUM) * QUANTUM
+
+
+def _place(rng: np.random.Generator) -> np.ndarray:
+    distance = rng.uniform(*DISTANCE)
+    return distance * np.append(rng.uniform(-OFF_AXIS, OFF_AXIS, 2), 1.0)
+
+
+def _about_z(angle: float) -> np.ndarray:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
