@@ -32,8 +32,9 @@ class Options:
         (4,) support plane n.x + d = height in the optical frame, n pointing away from the support; None if the object
         floats.  A body does not reach below it, and is expected to lie on one of its faces.
     nan_is_empty
-        Whether a pixel without depth beside the mask saw nothing up to infinity (rendered images) or says nothing
-        (sensors).  None: true for orthographic cameras only.
+        Whether a pixel without depth beside the mask saw nothing up to infinity (rendered images) or says nothing.
+        None: true for orthographic cameras; for pinhole cameras true but for the pixels next to the mask, where sensors
+        lose the edges of objects.
     pixels
         Budget of object rays in the last stage; a fifth as many free rays come on top.  None: enough that noise
         averages out.

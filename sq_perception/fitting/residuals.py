@@ -229,7 +229,8 @@ def _rendered_rows(
         factor = covered if missed[i] else lanes[_STIFFNESS, i] / math.sqrt(along * along + across)
         short = lanes[_DEPTH, i] - lanes[_START, i] - lanes[_SHIFT, i]
         residual = over * covered if missed[i] else (short * along + over) * factor
-        loss, scale = huber_loss(residual, scene.outline_huber if missed[i] else scene.huber, lanes[_WEIGHT, i])
+        huber = scene.huber if residual > 0.0 else scene.inner_huber
+        loss, scale = huber_loss(residual, scene.outline_huber if missed[i] else huber, lanes[_WEIGHT, i])
         cost += loss
         block[0, i] = scale * factor
         block[STEP_LENGTH, i] = scale * residual
@@ -252,7 +253,8 @@ def _measured_rows(
         classic = (g + 1.0) * root_of_volume * lanes[_STIFFNESS, i]
         residual = (g - 1.0) * (classic if stage == CLASSIC else sampson)
         factor = 2.0 * g * root_of_volume * lanes[_STIFFNESS, i] if stage == CLASSIC else sampson
-        loss, scale = huber_loss(residual, scene.huber, lanes[_WEIGHT, i])
+        huber = scene.huber if residual > 0.0 else scene.inner_huber
+        loss, scale = huber_loss(residual, huber, lanes[_WEIGHT, i])
         cost += loss
         block[0, i] = scale * factor
         block[STEP_LENGTH, i] = scale * residual

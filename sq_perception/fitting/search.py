@@ -45,8 +45,8 @@ FINALISTS, ESCALATED_FINALISTS = 3, 6
 TOLERANCE, FINAL_TOLERANCE = 1e-3, 1e-4
 SHARP_OUTLINE = 0.3
 """Standard deviation of a perfect outline, in pixels: the body covers exactly the centres of the mask's pixels."""
-SHRUNK = 0.25
-"""A body that covers free pixels beside the mask this deep on average, in pixels, is larger than its mask."""
+SHRUNK, MOST = 0.25, 0.7
+"""A body that covers most of the free pixels beside the mask this deep, in pixels, is larger than its mask."""
 WIDEST_BAND = 4
 RING_RAYS = 200
 HIT_TOLERANCE = 3e-3
@@ -67,7 +67,10 @@ THIN = 0.3
 MEDIAN_TO_SIGMA = 1.4826
 PLANE_SIGMA, REST_SIGMA = 0.001, 0.05
 """Metres below the plane, and sine of the angle between the normal and an axis of the body."""
-VOLUME_PRICE = 2.0
+VOLUME_PRICE = 0.5
+OUTER_HUBER, INNER_HUBER = 2.0, 0.4
+"""Objects that are no superquadrics are hollow and notched, not hairy: a point may well lie behind the surface of the
+body that encloses the object, but not in front of it."""
 PROPORTION_SIGMA = 1.0
 """Of a log size against the mean of the three: a wide prior."""
 REAL_WEIGHT = 50.0
@@ -165,7 +168,9 @@ class Search:
         distance = surface_distance(self.observation.object_rays(FINAL_RAYS), best.parameters, best.rotation)
         self.tolerated = MEDIAN_TO_SIGMA * float(np.median(distance))
         self.observation = self.observation.coarsened(self.tolerated)
-        self.scene = _scene(self.observation, self.options)._replace(huber=2.0, volume_price=VOLUME_PRICE)
+        self.scene = _scene(self.observation, self.options)._replace(
+            huber=OUTER_HUBER, inner_huber=INNER_HUBER, volume_price=VOLUME_PRICE
+        )
         self.finalists = []
 
     # Stages
@@ -323,12 +328,15 @@ class Search:
         return state
 
     def _ring_penetration(self, state: State, observation: Observation, radius: int) -> float:
-        """Mean depth, in pixels, to which the body covers the free pixels at this distance from the mask."""
+        """Depth, in pixels, to which the body covers most of the free pixels at this distance from the mask.
+
+        Most: a body that is merely too long covers them on one side only.
+        """
         ring = observation.free_rays_of(observation.ring(radius), RING_RAYS)
         if len(ring) == 0:
             return 0.0
         depth = penetration(ring, self.scene, state.parameters, state.rotation)
-        return float(depth.mean()) / observation.footprint
+        return float(np.quantile(depth, 1 - MOST)) / observation.footprint
 
     def _enough(self) -> int:
         """Rays that bring the noise of the mean well below a pixel's width."""
@@ -375,7 +383,8 @@ def _scene(observation: Observation, options: Options) -> Scene:
         return scene
     x, y, z, offset = (float(value) for value in options.plane)
     return scene._replace(
-        huber=2.0,
+        huber=OUTER_HUBER,
+        inner_huber=INNER_HUBER,
         normal_x=x,
         normal_y=y,
         normal_z=z,

@@ -68,9 +68,8 @@ def fit(
     options = options or Options()
     depth, mask = _checked_images(depth, mask, camera)
     given = [] if callable(start) else _checked_starts(start)
-    empty = not camera.is_pinhole if options.nan_is_empty is None else options.nan_is_empty
     if options.model_error is None and (options.plane is not None or callable(start)):
-        exact = observe(depth, mask, camera, options.noise, 0.0, empty)
+        exact = observe(depth, mask, camera, options.noise, 0.0, options.nan_is_empty)
         if exact is not None and not _hopeless(exact):
             search = Search(exact, replace(options, model_error=0.0), began)
             if search.explained(given):
@@ -79,7 +78,7 @@ def fit(
                 given = _checked_starts(start())
                 if search.explained(given):
                     return uncertainty.judged(search.decided(), search, began)
-    observation = observe(depth, mask, camera, options.noise, options.tolerated, empty)
+    observation = observe(depth, mask, camera, options.noise, options.tolerated, options.nan_is_empty)
     if observation is None:
         raise ValueError("the mask holds no pixel with a depth: there is nothing to fit")
     reason = _hopeless(observation)
