@@ -26,7 +26,7 @@ from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 
 NO_RAYS = np.empty((0, RAY_COLUMNS))
-PLAIN = Scene(huber=np.inf, inner_huber=np.inf, outline_huber=np.inf)
+PLAIN = Scene(huber=np.inf, outline_huber=np.inf)
 SIGMA = 0.003
 
 
@@ -210,7 +210,7 @@ def test_huber_loss_grows_linearly(rng: np.random.Generator) -> None:
     sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
     residual = 0.01 / SIGMA
     for huber, loss in ((10.0, residual**2), (2.0, 2 * 2.0 * residual - 4.0)):
-        scene = PLAIN._replace(huber=huber, inner_huber=huber)
+        scene = PLAIN._replace(huber=huber)
         assert evaluate(SAMPSON, rays, NO_RAYS, scene, state.parameters, state.rotation, sums) == pytest.approx(loss)
     distance = surface_distance(rays, state.parameters, state.rotation)
     assert distance[0] == pytest.approx(0.01)

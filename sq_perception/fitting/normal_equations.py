@@ -31,6 +31,13 @@ def huber_loss(residual: float, huber: float, weight: float) -> tuple[float, flo
     return loss, math.sqrt(weight * min(1.0, huber / max(size, _SMALL)))
 
 
+@inline_kernel
+def cauchy_loss(residual: float, scale: float, weight: float) -> tuple[float, float]:
+    """Cauchy's loss, which almost stops growing beyond ``scale``, and the square root of its weight; no branch."""
+    square = residual * residual / (scale * scale)
+    return weight * scale * scale * math.log1p(square), math.sqrt(weight / (1.0 + square))
+
+
 @kernel
 def add_block(block: np.ndarray, filled: int, sums: np.ndarray) -> None:
     """Add the outer products of the first ``filled`` columns of the block."""

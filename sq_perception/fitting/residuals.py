@@ -37,7 +37,7 @@ import math
 
 import numpy as np
 
-from sq_perception.fitting.normal_equations import LANES, STEP_LENGTH, add_block, huber_loss
+from sq_perception.fitting.normal_equations import LANES, STEP_LENGTH, add_block, cauchy_loss, huber_loss
 from sq_perception.fitting.priors import prior_cost
 from sq_perception.fitting.scene import Scene
 from sq_perception.geometry.kernels import box_interval, gauge_derivatives, inline_kernel, kernel
@@ -229,8 +229,9 @@ def _rendered_rows(
         factor = covered if missed[i] else lanes[_STIFFNESS, i] / math.sqrt(along * along + across)
         short = lanes[_DEPTH, i] - lanes[_START, i] - lanes[_SHIFT, i]
         residual = over * covered if missed[i] else (short * along + over) * factor
-        huber = scene.huber if residual > 0.0 else scene.inner_huber
-        loss, scale = huber_loss(residual, scene.outline_huber if missed[i] else huber, lanes[_WEIGHT, i])
+        loss, scale = huber_loss(residual, scene.outline_huber if missed[i] else scene.huber, lanes[_WEIGHT, i])
+        if scene.inner_cauchy > 0.0 and residual < 0.0:
+            loss, scale = cauchy_loss(residual, scene.inner_cauchy, lanes[_WEIGHT, i])
         cost += loss
         block[0, i] = scale * factor
         block[STEP_LENGTH, i] = scale * residual
@@ -253,8 +254,9 @@ def _measured_rows(
         classic = (g + 1.0) * root_of_volume * lanes[_STIFFNESS, i]
         residual = (g - 1.0) * (classic if stage == CLASSIC else sampson)
         factor = 2.0 * g * root_of_volume * lanes[_STIFFNESS, i] if stage == CLASSIC else sampson
-        huber = scene.huber if residual > 0.0 else scene.inner_huber
-        loss, scale = huber_loss(residual, huber, lanes[_WEIGHT, i])
+        loss, scale = huber_loss(residual, scene.huber, lanes[_WEIGHT, i])
+        if scene.inner_cauchy > 0.0 and residual < 0.0:
+            loss, scale = cauchy_loss(residual, scene.inner_cauchy, lanes[_WEIGHT, i])
         cost += loss
         block[0, i] = scale * factor
         block[STEP_LENGTH, i] = scale * residual

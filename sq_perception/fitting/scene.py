@@ -8,12 +8,13 @@ from typing import NamedTuple
 class Scene(NamedTuple):
     """Constants of the residuals; see :mod:`sq_perception.fitting.residuals` and :mod:`sq_perception.fitting.priors`.
 
-    ``huber`` is for points outside the body, ``inner_huber`` for those inside, behind its surface.  A rendered depth is found by Newton's method until |g - 1| < ``hit_tolerance``, then in first order.
+    Points that lie inside the body, behind its surface, count by Cauchy's loss of scale ``inner_cauchy`` if that is not 0,
+    all others by Huber's.  A rendered depth is found by Newton's method until |g - 1| < ``hit_tolerance``, then in first order.
     ``outline_stiffness`` is 1/sigma_o; the plane is n.x + d = height; a stiffness or price of 0 switches its term off.
     """
 
     huber: float = 3.0
-    inner_huber: float = 3.0
+    inner_cauchy: float = 0.0
     outline_huber: float = 3.0
     grazing: float = 0.01
     hit_tolerance: float = 1e-4

@@ -68,7 +68,7 @@ MEDIAN_TO_SIGMA = 1.4826
 PLANE_SIGMA, REST_SIGMA = 0.001, 0.05
 """Metres below the plane, and sine of the angle between the normal and an axis of the body."""
 VOLUME_PRICE = 0.5
-OUTER_HUBER, INNER_HUBER = 2.0, 0.4
+OUTER_HUBER, INNER_CAUCHY = 2.0, 1.0
 """Objects that are no superquadrics are hollow and notched, not hairy: a point may well lie behind the surface of the
 body that encloses the object, but not in front of it."""
 PROPORTION_SIGMA = 1.0
@@ -169,7 +169,7 @@ class Search:
         self.tolerated = MEDIAN_TO_SIGMA * float(np.median(distance))
         self.observation = self.observation.coarsened(self.tolerated)
         self.scene = _scene(self.observation, self.options)._replace(
-            huber=OUTER_HUBER, inner_huber=INNER_HUBER, volume_price=VOLUME_PRICE
+            huber=OUTER_HUBER, inner_cauchy=INNER_CAUCHY, volume_price=VOLUME_PRICE
         )
         self.finalists = []
 
@@ -384,7 +384,7 @@ def _scene(observation: Observation, options: Options) -> Scene:
     x, y, z, offset = (float(value) for value in options.plane)
     return scene._replace(
         huber=OUTER_HUBER,
-        inner_huber=INNER_HUBER,
+        inner_cauchy=INNER_CAUCHY,
         normal_x=x,
         normal_y=y,
         normal_z=z,

@@ -97,7 +97,7 @@ def fit(
         rays[:, 0], rays[:, 1], rays[:, 4] = points.T
         rays[:, 5], rays[:, 6], rays[:, 7] = 1 / (_UNIT * extent**1.5), 1.0, points[:, 2]
         limits = (bounds or Bounds()).limits(points)
-        scene = Scene(huber=math.inf, inner_huber=math.inf)
+        scene = Scene(huber=math.inf)
         state = minimize(CLASSIC, rays, _NO_FREE_SPACE, scene, start, limits, max_iterations, tolerance)
     body = state.body.canonical_form()
     distance = np.abs(body.sampson_distance(points))
