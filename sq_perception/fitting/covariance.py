@@ -9,6 +9,8 @@ with the noise or a whole pixel, whichever is more: its errors are no independen
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from sq_perception.fitting.levenberg_marquardt import State
@@ -47,6 +49,30 @@ def covariance_at(state: State, rays: np.ndarray, free: np.ndarray, scene: Scene
     units = np.concatenate([state.parameters[:3], np.ones(STEP_LENGTH - 3)])
     covariance = units[:, None] * covariance * units
     return (covariance + covariance.T) / 2
+
+
+class Alternative(NamedTuple):
+    """Another body that the image allows, and its weight against all others."""
+
+    state: State
+    weight: float
+
+
+def spread(state: State, alternatives: list[Alternative]) -> np.ndarray:
+    """(11, 11) second moments of the alternatives about a body: what several valleys of the cost add to its covariance.
+
+    Sizes are compared along the axes of the body, exponents between bodies with the same z axis.
+    """
+    moments = np.zeros((STEP_LENGTH, STEP_LENGTH))
+    for other, weight in alternatives:
+        partner = np.abs(state.rotation.T @ other.rotation).argmax(axis=1)
+        difference = np.zeros(STEP_LENGTH)
+        difference[0:3] = other.parameters[partner] - state.parameters[0:3]
+        if partner[2] == 2:
+            difference[3:5] = other.parameters[3:5] - state.parameters[3:5]
+        difference[5:8] = other.parameters[5:8] - state.parameters[5:8]
+        moments += weight * np.outer(difference, difference)
+    return moments
 
 
 def carried_over(covariance: np.ndarray, body: Superquadric, form: Superquadric) -> np.ndarray:

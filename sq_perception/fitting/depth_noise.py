@@ -27,6 +27,9 @@ _FEWEST = 8
 class DepthNoise:
     """Standard deviation of the depth noise: ``constant`` metres, and ``quadratic`` metres at 1 m, growing with z^2.
 
+    ``quantum`` is the step of the readings, metres, where these have little other noise: then all readings of a face that
+    looks at the camera err alike, as the same number was rounded.  0 where noise mixes the steps.
+
     Raises
     ------
     ValueError
@@ -35,23 +38,24 @@ class DepthNoise:
 
     constant: float
     quadratic: float = 0.0
+    quantum: float = 0.0
 
     def __post_init__(self) -> None:
-        parts = (self.constant, self.quadratic)
-        if not (np.isfinite(parts).all() and min(parts) >= 0 and max(parts) > 0):
-            raise ValueError(f"noise: expected a positive number of metres, got {self.constant} and {self.quadratic}")
+        parts = (self.constant, self.quadratic, self.quantum)
+        if not (np.isfinite(parts).all() and min(parts) >= 0 and max(parts[:2]) > 0):
+            raise ValueError(f"noise: expected positive metres, got {self.constant}, {self.quadratic}, {self.quantum}")
 
     def at(self, z: float) -> float:
         """Standard deviation at depth z, metres."""
         return float(np.hypot(self.constant, self.quadratic * z * z))
 
 
-def estimate(depth: np.ndarray, inside: np.ndarray) -> float:
-    """Standard deviation of the depth noise within a mask (h, w), metres; 0 if it cannot be told."""
+def estimate(depth: np.ndarray, inside: np.ndarray, least: float) -> DepthNoise:
+    """The noise of the depth image within a mask (h, w); ``least`` metres if it is smaller or cannot be told."""
     step = max(1, int(np.sqrt(inside.size / _SAMPLES / 8)))
     third, first = _differences(depth, inside, step)
     if third.size < _FEWEST:
-        return 0.0
+        return DepthNoise(least)
     moved = first[first > 0]
     quantum = 0.0
     if moved.size >= _FEWEST:
@@ -61,8 +65,8 @@ def estimate(depth: np.ndarray, inside: np.ndarray) -> float:
             quantum = smallest
     spread = _median(third, quantum) * _MEDIAN_TO_SIGMA / np.sqrt(20.0)
     if spread < 0.5 * quantum:
-        return quantum / float(np.sqrt(12.0))
-    return float(spread)
+        return DepthNoise(max(quantum / float(np.sqrt(12.0)), least), quantum=quantum)
+    return DepthNoise(max(float(spread), least))
 
 
 def _median(values: np.ndarray, quantum: float) -> float:

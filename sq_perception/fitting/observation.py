@@ -171,7 +171,7 @@ def observe(
     if not np.isfinite(distance):
         return None
     if noise is None:
-        noise = DepthNoise(max(depth_noise.estimate(crop, inside), _NO_NOISE * max(abs(distance), 1e-3)))
+        noise = depth_noise.estimate(crop, inside, _NO_NOISE * max(abs(distance), 1e-3))
     elif not isinstance(noise, DepthNoise):
         noise = DepthNoise(noise)
     sigma = float(np.hypot(noise.at(distance), model_error))

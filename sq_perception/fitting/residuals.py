@@ -229,6 +229,10 @@ def _rendered_rows(
         factor = covered if missed[i] else lanes[_STIFFNESS, i] / math.sqrt(along * along + across)
         short = lanes[_DEPTH, i] - lanes[_START, i] - lanes[_SHIFT, i]
         residual = over * covered if missed[i] else (short * along + over) * factor
+        if scene.dead_zone > 0.0 and not missed[i]:
+            excess = max(abs(residual) - scene.dead_zone, 0.0)
+            factor = factor if excess > 0.0 else 0.0
+            residual = math.copysign(excess, residual)
         loss, scale = huber_loss(residual, scene.outline_huber if missed[i] else scene.huber, lanes[_WEIGHT, i])
         if scene.inner_cauchy > 0.0 and residual < 0.0:
             loss, scale = cauchy_loss(residual, scene.inner_cauchy, lanes[_WEIGHT, i])

@@ -10,6 +10,7 @@ class Scene(NamedTuple):
 
     Points that lie inside the body, behind its surface, count by Cauchy's loss of scale ``inner_cauchy`` if that is not 0,
     all others by Huber's.  A rendered depth is found by Newton's method until |g - 1| < ``hit_tolerance``, then in first order.
+    Rendered residuals up to ``dead_zone`` noise levels count as 0: what rounding may do.
     ``outline_stiffness`` is 1/sigma_o; the plane is n.x + d = height; a stiffness or price of 0 switches its term off.
     """
 
@@ -18,6 +19,7 @@ class Scene(NamedTuple):
     outline_huber: float = 3.0
     grazing: float = 0.01
     hit_tolerance: float = 1e-4
+    dead_zone: float = 0.0
     outline_stiffness: float = 1.0
     pinhole: float = 0.0
     normal_x: float = 0.0

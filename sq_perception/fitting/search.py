@@ -20,12 +20,13 @@ import time
 
 import numpy as np
 
-from sq_perception.fitting import box_start, symmetry_start
-from sq_perception.fitting.covariance import covariance_at, undetermined
+from sq_perception.fitting import box_start, rounding, symmetry_start
+from sq_perception.fitting.covariance import Alternative, covariance_at, undetermined
 from sq_perception.fitting.levenberg_marquardt import State, minimize
 from sq_perception.fitting.observation import Observation
 from sq_perception.fitting.options import Options
 from sq_perception.fitting.residuals import RAY_COLUMNS, RENDERED, SAMPSON, penetration, surface_distance
+from sq_perception.fitting.rivals import SIGNIFICANT, alike, other_axes, other_depths, resized
 from sq_perception.fitting.scene import Scene
 
 COARSE_RAYS, COARSE_STEPS = 150, 8
@@ -57,9 +58,8 @@ SETTLED, UNSURE = 1.02, 0.015
 """A last mean squared residual above the one, or a half size less certain than the other, as a share of it, make other
 valleys of the cost worth a look."""
 MOST_VARIATIONS = 2
-RIVAL_SLACK, SIGNIFICANT = 4.0, 0.5
-"""Of costs: what few rays may hide, and what is a difference."""
-ALIKE = 0.01
+RIVAL_SLACK = 4.0
+"""Cost that few rays may hide."""
 PROMISING = 24
 """So many bodies of the exact search start the one that tolerates a model error."""
 THIN = 0.3
@@ -73,6 +73,8 @@ OUTER_HUBER, INNER_CAUCHY = 2.0, 1.0
 body that encloses the object, but not in front of it."""
 PROPORTION_SIGMA = 1.0
 """Of a log size against the mean of the three: a wide prior."""
+MODEL_SPREAD = 2.5**2
+"""Read from scanned objects: with it, 90 % of their half sizes lie within two standard deviations."""
 REAL_WEIGHT = 50.0
 """Model errors of neighbouring pixels are alike: an object on a table counts as so many independent rays."""
 
@@ -89,6 +91,8 @@ class Search:
         self.scene = _scene(observation, options)
         self.finalists: list[State] = []
         self.tried: list[State] = []
+        self.alternatives: list[Alternative] = []
+        self._refined_rivals: list[State] = []
         self._symmetry_tried = False
         self.rays = np.empty((0, RAY_COLUMNS))
         self.free = np.empty((0, RAY_COLUMNS))
@@ -239,6 +243,9 @@ class Search:
             best = min(best, state, key=_cost)
         if self.tolerated == 0:
             best = self._varied(best)
+            quantum = self.observation.noise.quantum
+            if quantum > 0 and not self._late() and rounding.faces_camera(self.rays, quantum):
+                best, self.alternatives = rounding.plausible(best, self.rays, self.free, self.scene, self.limits)
         if self.observation.camera.is_pinhole and not self._late():
             best = self._doubted(best)
         return best
@@ -256,13 +263,15 @@ class Search:
             unsure /= best.parameters[:3]
             if self._late() or not (unexplained or unsure.max() > UNSURE):
                 break
-            rivals = _other_depths(best, np.argsort(-unsure))
+            rivals = other_depths(best, np.argsort(-unsure))
             if unexplained:
-                rivals += _other_axes(best)
+                rivals += other_axes(best)
             better = self._better(best, rivals)
             if better is best:
                 break
+            self._refined_rivals.append(best)
             best = better
+        self.alternatives = self._alternatives(best)
         return best
 
     def _better(self, best: State, rivals: list[State]) -> State:
@@ -276,14 +285,21 @@ class Search:
                 reference = state
                 # On other rays the body may already find its way out of a shallow valley.
                 settled.append(best._replace(cost=state.cost))
-            known = any(_alike(state, other) for other in settled)
+            known = any(alike(state, other) for other in settled)
             if not known and state.cost < reference.cost + RIVAL_SLACK:
                 settled.append(state)
         for rival in sorted(settled[1:], key=_cost)[:FINALISTS]:
             state = self._refined(rival, self.options.max_iterations)
+            self._refined_rivals.append(state)
             if state.cost < best.cost - SIGNIFICANT:
                 best = state
         return best
+
+    def _alternatives(self, best: State) -> list[Alternative]:
+        """The other valleys that explain the image almost as well."""
+        others = [state for state in self._refined_rivals if not alike(state, best)]
+        weights = np.array([math.exp(-0.5 * max(state.cost - best.cost, 0.0)) for state in others])
+        return [Alternative(state, weight / (1 + weights.sum())) for state, weight in zip(others, weights, strict=True)]
 
     def _doubted(self, state: State) -> State:
         """Where the image hardly tells a size, small model errors would decide it: leave it to the priors instead.
@@ -302,9 +318,14 @@ class Search:
         rivals = [state]
         for k in weak:
             typical = float(np.exp(np.mean(np.log(np.delete(state.parameters[:3], k)))))
-            rivals += [_resized(state, int(k), size) for size in (typical, THIN * typical)]
+            rivals += [resized(state, int(k), size) for size in (typical, THIN * typical)]
         steps = 2 * self.options.max_iterations
         return min((self._refined(rival, steps) for rival in rivals), key=_cost)
+
+    @property
+    def model_spread(self) -> float:
+        """Factor of the covariance for objects that are no superquadrics: theirs fit with errors that are alike."""
+        return MODEL_SPREAD if self.tolerated > 0 else 1.0
 
     @property
     def outline(self) -> float:
@@ -397,45 +418,3 @@ def _scene(observation: Observation, options: Options) -> Scene:
 
 def _cost(state: State) -> float:
     return state.cost
-
-
-def _alike(one: State, other: State) -> bool:
-    """Whether two searches ended in the same valley, in the same of the body's forms or with the same sizes."""
-    if abs(one.cost - other.cost) > SIGNIFICANT:
-        return False
-    sizes = np.abs(np.sort(one.parameters[:3]) - np.sort(other.parameters[:3]))
-    return bool((sizes < ALIKE * np.sort(one.parameters[:3])).all())
-
-
-def _other_depths(state: State, axes: np.ndarray) -> list[State]:
-    """The body with another half size along the first of these axes, or the second: thinner, also with another z."""
-    first, second = int(axes[0]), int(axes[1])
-    size = state.parameters
-    thinner = _resized(state, first, 0.5 * size[first])
-    found = [thinner, _resized(state, first, 0.35 * size[first]), _resized(state, first, 1.4 * size[first])]
-    found += [_resized(state, second, share * size[second]) for share in (0.35, 1.4)]
-    for order in symmetry_start.three_orders(np.eye(3))[:2]:
-        parameters = thinner.parameters.copy()
-        parameters[:3] = order.T @ parameters[:3]
-        parameters[3:5] = symmetry_start.START_EXPONENT
-        found.append(State(parameters, np.ascontiguousarray(thinner.rotation @ order), math.inf, state.iterations))
-    return found
-
-
-def _other_axes(state: State) -> list[State]:
-    """The same box of axes with each z, and turned by 45 degrees about each axis."""
-    moments = state.rotation @ np.diag(state.parameters[:3] ** 2 * symmetry_start.MOMENT_SHARE) @ state.rotation.T
-    found: list[State] = []
-    for axes in [state.rotation, *symmetry_start.eighth_turns(state.rotation)]:
-        found += symmetry_start.states(state.parameters[5:8], moments, axes)
-    return found
-
-
-def _resized(state: State, axis: int, size: float) -> State:
-    """The body with another half size along one of its axes; the face towards the camera stays in place."""
-    parameters = state.parameters.copy()
-    direction = state.rotation[:, axis]
-    away = 1.0 if direction @ parameters[5:8] > 0 else -1.0
-    parameters[5:8] += away * (size - parameters[axis]) * direction
-    parameters[axis] = size
-    return State(parameters, state.rotation, math.inf, state.iterations)

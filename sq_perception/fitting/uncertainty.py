@@ -6,7 +6,7 @@ import time
 
 import numpy as np
 
-from sq_perception.fitting.covariance import carried_over, covariance_at, undetermined
+from sq_perception.fitting.covariance import carried_over, covariance_at, spread, undetermined
 from sq_perception.fitting.fit import Fit, Status
 from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.observation import Observation
@@ -26,6 +26,7 @@ def judged(state: State, search: Search, began: float) -> Fit:
     observation = search.observation
     body = state.body
     covariance = covariance_at(state, search.rays, search.free, search.scene, search.outline)
+    covariance = covariance * search.model_spread + spread(state, search.alternatives)
     canonical = body.canonical_form()
     covariance = carried_over(covariance, body, canonical)
     everything = observation.object_rays(_JUDGED_RAYS)

@@ -1,0 +1,60 @@
+"""Other bodies that might explain the same image: where a search goes on looking once it has found one.
+
+Seen from one side, a body's own axes and the face it shows are mostly certain, while the order of its axes and the half
+size that runs away from the camera are not: the cost has a valley for each.  A rival starts in another valley.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from sq_perception.fitting import symmetry_start
+from sq_perception.fitting.levenberg_marquardt import State
+
+SIGNIFICANT = 0.5
+"""A difference of costs."""
+_ALIKE = 0.01
+
+
+def alike(one: State, other: State) -> bool:
+    """Whether two searches ended in the same valley, in the same of the body's forms or with the same sizes."""
+    if abs(one.cost - other.cost) > SIGNIFICANT:
+        return False
+    sizes = np.abs(np.sort(one.parameters[:3]) - np.sort(other.parameters[:3]))
+    return bool((sizes < _ALIKE * np.sort(one.parameters[:3])).all())
+
+
+def other_depths(state: State, axes: np.ndarray) -> list[State]:
+    """The body with another half size along the first of these axes, or the second: thinner, also with another z."""
+    first, second = int(axes[0]), int(axes[1])
+    size = state.parameters
+    thinner = resized(state, first, 0.5 * size[first])
+    found = [thinner, resized(state, first, 0.35 * size[first]), resized(state, first, 1.4 * size[first])]
+    found += [resized(state, second, share * size[second]) for share in (0.35, 1.4)]
+    for order in symmetry_start.three_orders(np.eye(3))[:2]:
+        parameters = thinner.parameters.copy()
+        parameters[:3] = order.T @ parameters[:3]
+        parameters[3:5] = symmetry_start.START_EXPONENT
+        found.append(State(parameters, np.ascontiguousarray(thinner.rotation @ order), math.inf, state.iterations))
+    return found
+
+
+def other_axes(state: State) -> list[State]:
+    """The same box of axes with each z, and turned by 45 degrees about each axis."""
+    moments = state.rotation @ np.diag(state.parameters[:3] ** 2 * symmetry_start.MOMENT_SHARE) @ state.rotation.T
+    found: list[State] = []
+    for axes in [state.rotation, *symmetry_start.eighth_turns(state.rotation)]:
+        found += symmetry_start.states(state.parameters[5:8], moments, axes)
+    return found
+
+
+def resized(state: State, axis: int, size: float) -> State:
+    """The body with another half size along one of its axes; the face towards the camera stays in place."""
+    parameters = state.parameters.copy()
+    direction = state.rotation[:, axis]
+    away = 1.0 if direction @ parameters[5:8] > 0 else -1.0
+    parameters[5:8] += away * (size - parameters[axis]) * direction
+    parameters[axis] = size
+    return State(parameters, state.rotation, math.inf, state.iterations)
