@@ -29,6 +29,8 @@ _DEAD_ZONE = math.sqrt(3.0) * 1.01
 _RAYS, _STEPS, _TOLERANCE = 1000, 12, 1e-3
 _VALUES = np.exp(np.linspace(math.log(0.2), math.log(3.2), 13))
 """Of the half size, in geometric means of the other two."""
+_NEIGHBOURS, _UNLIKELY = (0.8, 1.25), 12.0
+"""If both of these shares of the half size cost so much more, there is no need to look further."""
 _CERTAIN = 0.9
 """With so much weight on one value, the readings leave nothing open."""
 
@@ -57,6 +59,9 @@ def plausible(
     typical = math.exp(float(np.mean(np.log(np.delete(best.parameters[:3], axis)))))
     values = typical * _VALUES
     nearest = int(np.argmin(np.abs(np.log(values / best.parameters[axis]))))
+    here = held(best, best.parameters[axis])
+    if all(held(best, share * best.parameters[axis]).cost > here.cost + _UNLIKELY for share in _NEIGHBOURS):
+        return best, []
     states: dict[int, State] = {}
     # Each value starts from its neighbour's body, outwards from the one at hand.
     for values_in_turn in (range(nearest, len(values)), range(nearest - 1, -1, -1)):

@@ -49,6 +49,7 @@ SHARP_OUTLINE = 0.3
 SHRUNK, MOST = 0.25, 0.7
 """A body that covers most of the free pixels beside the mask this deep, in pixels, is larger than its mask."""
 WIDEST_BAND = 4
+MOST_SHARPENINGS, SHARPENING_STEPS, SHARPER = 4, 6, 0.7
 RING_RAYS = 200
 HIT_TOLERANCE = 3e-3
 """Rays remember where they met the body, so that this error of g vanishes as the search converges."""
@@ -230,7 +231,7 @@ class Search:
         self.rays, self.free = self._draw(self.options.pixels or self._enough(), 0.3)
         if self.tolerated == 0:
             self.rays = self._without_outliers(self.rays, favourite)
-            self.scene = self.scene._replace(outline_stiffness=1 / self._outline_sigma(favourite))
+            favourite = self._sharpened(favourite)
         else:
             excess = max(1.0, favourite.cost / REAL_WEIGHT)
             self.rays[:, 6] /= excess
@@ -249,6 +250,20 @@ class Search:
         if self.observation.camera.is_pinhole and not self._late():
             best = self._doubted(best)
         return best
+
+    def _sharpened(self, state: State) -> State:
+        """Read the outline's precision from a body's misfit, and again from the better body that this allows."""
+        rays, free = self._draw(self._enough() // 4, 0.3)
+        rays = self._without_outliers(rays, state)
+        sigma = math.inf
+        for _ in range(MOST_SHARPENINGS):
+            before, sigma = sigma, self._outline_sigma(state)
+            if sigma > SHARPER * before:
+                break
+            self.scene = self.scene._replace(outline_stiffness=1 / sigma)
+            state = state._replace(cost=math.inf)
+            state = minimize(RENDERED, rays, free, self.scene, state, self.limits, SHARPENING_STEPS, TOLERANCE)
+        return state
 
     def _varied(self, best: State) -> State:
         """Look beyond the valley that the search came down into: noise and poor sight hide that another one is deeper.
