@@ -110,6 +110,11 @@ class Observation:
             pixels = pixels[((np.arange(count) + offset) * (len(pixels) / count)).astype(np.int64)]
         return self._rays(pixels, 1.0)
 
+    def rim(self) -> np.ndarray:
+        """The free pixels that touch the mask."""
+        touching = cv2.dilate(self.mask.view(np.uint8), np.ones((3, 3), np.uint8)).ravel()
+        return self.free[touching[self.free] > 0]
+
     def ring(self, radius: float) -> np.ndarray:
         """The free pixels at this distance from the mask, to half a pixel."""
         return self.free[np.abs(self._distance_to_mask - radius) < 0.5]
@@ -335,14 +340,13 @@ def _sort(
     count, free_count, free_pixels = 0, 0, 0
     for v in range(height):
         for u in range(width):
-            known = np.isfinite(depth[v, u])
             if inside[v, u]:
-                if known:
+                if np.isfinite(depth[v, u]):
                     pixels[count] = v * width + u
                     areas[count] = _area(depth, inside, v, u, footprint)
                     count += 1
-            elif not claimed[v, u] and (known or not lost[v, u]):
-                if near[v, u] or (u % _COARSE == 0 and v % _COARSE == 0):
+            elif near[v, u] or (u % _COARSE == 0 and v % _COARSE == 0):
+                if not claimed[v, u] and (np.isfinite(depth[v, u]) or not lost[v, u]):
                     free[free_count] = v * width + u
                     free_count += 1
                     free_pixels += 1 if near[v, u] else _COARSE * _COARSE

@@ -31,7 +31,7 @@ from sq_perception.fitting.scene import Scene
 
 COARSE_RAYS, COARSE_STEPS = 150, 8
 BASIN_RAYS, BASIN_STEPS = 300, 15
-FINAL_RAYS = 4000
+FINAL_RAYS = 3000
 MOST_FINAL_RAYS = 6000
 FREE_SHARE = 0.25
 """Free rays per object ray."""
@@ -55,7 +55,7 @@ HIT_TOLERANCE = 3e-3
 """Rays remember where they met the body, so that this error of g vanishes as the search converges."""
 OUTLIER = 5.0
 """Object rays this many standard deviations off the surface of the winner are dropped."""
-SETTLED, UNSURE = 1.02, 0.015
+SETTLED, UNSURE = 1.01, 0.01
 """A last mean squared residual above the one, or a half size less certain than the other, as a share of it, make other
 valleys of the cost worth a look."""
 MOST_VARIATIONS = 2
@@ -254,7 +254,6 @@ class Search:
     def _sharpened(self, state: State) -> State:
         """Read the outline's precision from a body's misfit, and again from the better body that this allows."""
         rays, free = self._draw(self._enough() // 4, 0.3)
-        rays = self._without_outliers(rays, state)
         sigma = math.inf
         for _ in range(MOST_SHARPENINGS):
             before, sigma = sigma, self._outline_sigma(state)
@@ -353,26 +352,26 @@ class Search:
     def _outlined(self, state: State) -> State:
         """Forget the free rays next to the mask if the mask turns out to be smaller than the body."""
         full = self.observation
-        if self._ring_penetration(state, full, 1) < SHRUNK:
+        if self._penetration(state, full.rim()) < SHRUNK:
             return state
         self.observation = full.beyond(WIDEST_BAND)
         self.rays, self.free = self._draw(FINAL_RAYS, 0.6)
         state = self._refined(state._replace(cost=math.inf), BASIN_STEPS)
-        rings = (k for k in range(1, WIDEST_BAND + 1) if self._ring_penetration(state, full, k) < SHRUNK)
+        rings = (k for k in range(1, WIDEST_BAND + 1) if self._penetration(state, full.ring(k)) < SHRUNK)
         band = next(rings, WIDEST_BAND + 1) - 1
         self.observation = full.beyond(band) if band > 0 else full
         return state
 
-    def _ring_penetration(self, state: State, observation: Observation, radius: int) -> float:
-        """Depth, in pixels, to which the body covers most of the free pixels at this distance from the mask.
+    def _penetration(self, state: State, pixels: np.ndarray) -> float:
+        """Depth, in pixels, to which the body covers most of these free pixels.
 
-        Most: a body that is merely too long covers them on one side only.
+        Most: a body that is merely too long covers those around the mask on one side only.
         """
-        ring = observation.free_rays_of(observation.ring(radius), RING_RAYS)
-        if len(ring) == 0:
+        rays = self.observation.free_rays_of(pixels, RING_RAYS)
+        if len(rays) == 0:
             return 0.0
-        depth = penetration(ring, self.scene, state.parameters, state.rotation)
-        return float(np.quantile(depth, 1 - MOST)) / observation.footprint
+        depth = penetration(rays, self.scene, state.parameters, state.rotation)
+        return float(np.quantile(depth, 1 - MOST)) / self.observation.footprint
 
     def _enough(self) -> int:
         """Rays that bring the noise of the mean well below a pixel's width."""
