@@ -279,9 +279,7 @@ class Recoverer:
             fits = _mapped(lambda one: _fitted(one, depth, camera, plane, options), objects)
         with _timed(milliseconds, "score"):
             scores = [_score(one.view, fit.superquadric, options) for one, fit in zip(objects, fits, strict=True)]
-        bodies = tuple(
-            _recovery(one, fit, score) for one, fit, score in zip(objects, fits, scores, strict=True)
-        )
+        bodies = tuple(_recovery(one, fit, score) for one, fit, score in zip(objects, fits, scores, strict=True))
         milliseconds["total"] = 1e3 * (time.perf_counter() - started)
         message = "" if bodies else _why_empty(depth, found)
         return FrameRecovery(bodies, milliseconds, found.labels, found.plane, message)
@@ -384,9 +382,7 @@ def _mapped(function, objects: list[_Object]) -> list[Fit]:  # type: ignore[no-u
         return list(pool.map(function, objects))
 
 
-def _fitted(
-    one: _Object, depth: np.ndarray, camera: Camera, plane: np.ndarray | None, options: RecoveryOptions
-) -> Fit:
+def _fitted(one: _Object, depth: np.ndarray, camera: Camera, plane: np.ndarray | None, options: RecoveryOptions) -> Fit:
     """The body of one object by the chosen method; FAILED with a reason instead of any exception on hard data."""
     if one.pixels < _FEWEST_PIXELS:
         return _failed(one, f"{one.pixels} pixels with a depth are too few for a body")
@@ -399,9 +395,7 @@ def _fitted(
     return fit
 
 
-def _body(
-    one: _Object, depth: np.ndarray, camera: Camera, plane: np.ndarray | None, options: RecoveryOptions
-) -> Fit:
+def _body(one: _Object, depth: np.ndarray, camera: Camera, plane: np.ndarray | None, options: RecoveryOptions) -> Fit:
     if options.method == "classic":
         return solina_bajcsy.fit(one.points)
     if options.method == "network" or (options.method == "auto" and options.refine == "none"):
@@ -414,9 +408,7 @@ def _body(
     return fit
 
 
-def _surface_fit(
-    one: _Object, depth: np.ndarray, camera: Camera, plane: np.ndarray | None, time_budget: float
-) -> Fit:
+def _surface_fit(one: _Object, depth: np.ndarray, camera: Camera, plane: np.ndarray | None, time_budget: float) -> Fit:
     """From the cheapest starts of central symmetry; where those leave something, from the network's prediction too.
 
     The network computes beside the fit.  What the image leaves open after all, such as the depth of a box seen
@@ -442,7 +434,9 @@ def _unfitted(body: Superquadric, one: _Object, message: str) -> Fit:
     """The answer of a method that is no least squares fit: distances measured, nothing known about uncertainty."""
     distance = body.sampson_distance(one.points)
     residual = float(np.sqrt(np.mean(distance**2)))
-    return Fit(body, residual, np.nan, np.nan, _UNKNOWN, Status.CONVERGED, message, iterations=0, milliseconds=0.0)
+    return Fit(
+        body, residual, np.nan, np.nan, np.nan, _UNKNOWN, Status.CONVERGED, message, iterations=0, milliseconds=0.0
+    )
 
 
 def _failed(one: _Object, reason: str) -> Fit:
@@ -450,7 +444,7 @@ def _failed(one: _Object, reason: str) -> Fit:
     low, high = points.min(axis=0), points.max(axis=0)
     size = np.maximum(0.5 * (high - low), 1e-3 * max(float((high - low).max()), 1e-3))
     body = Superquadric(size, np.ones(2), 0.5 * (low + high), np.array([0.0, 0.0, 0.0, 1.0]))
-    return Fit(body, np.nan, np.nan, 0.0, _UNKNOWN, Status.FAILED, reason, iterations=0, milliseconds=0.0)
+    return Fit(body, np.nan, np.nan, 0.0, np.nan, _UNKNOWN, Status.FAILED, reason, iterations=0, milliseconds=0.0)
 
 
 def _score(view: CanonicalView | None, body: Superquadric, options: RecoveryOptions) -> float:

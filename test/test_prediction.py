@@ -13,7 +13,7 @@ from sq_perception.geometry.superquadric import Superquadric
 
 def fit_of(covariance, size=(0.1, 0.2, 0.3), status=Status.WEAK, turn=(0, 0, 0, 1.0)):
     body = Superquadric(np.array(size), [0.2, 0.2], [0.0, 0.0, 1.0], np.array(turn))
-    return Fit(body, 0.001, 0.001, 0.9, covariance, status, "half size along z undetermined", 5, 1.0)
+    return Fit(body, 0.001, 0.001, 0.9, 0.4, covariance, status, "half size along z undetermined", 5, 1.0)
 
 
 def face_on(sigma=0.2):

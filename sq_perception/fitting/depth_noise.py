@@ -27,8 +27,8 @@ _FEWEST = 8
 class DepthNoise:
     """Standard deviation of the depth noise: ``constant`` metres, and ``quadratic`` metres at 1 m, growing with z^2.
 
-    ``quantum`` is the step of the readings, metres, where these have little other noise: then all readings of a face that
-    looks at the camera err alike, as the same number was rounded.  0 where noise mixes the steps.
+    ``quantum`` is the step of the readings, metres, where these have little other noise: then all readings of a face
+    that looks at the camera err alike, as the same number was rounded.  0 where noise mixes the steps.
 
     Raises
     ------
@@ -85,8 +85,8 @@ def _median(values: np.ndarray, quantum: float) -> float:
 def _differences(depth: np.ndarray, inside: np.ndarray, step: int) -> tuple[np.ndarray, np.ndarray]:
     """Absolute third and first differences along rows and columns, every ``step``-th line."""
     height, width = depth.shape
-    third = np.empty(2 * height * width // step + 4)
-    first = np.empty(2 * height * width // step + 4)
+    most = ((height - 1) // step + 1) * width + ((width - 1) // step + 1) * height
+    third, first = np.empty(most), np.empty(most)
     count, moved = 0, 0
     for v in range(0, height, step):
         for u in range(width - 3):

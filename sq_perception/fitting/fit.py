@@ -34,6 +34,8 @@ class Fit:
         Standard deviation of the depth noise, estimated or given, metres.
     inlier_share
         Share of the object's pixels within three noise levels of the surface, 0 to 1.
+    visible_share
+        Share of the body's surface that the camera saw, 0 to 1; NaN for methods that do not compute it.
     covariance
         (11, 11) of a1 a2 a3 e1 e2 t1 t2 t3 and the rotation vector in the object frame; metres and radians.
         NaN for methods that do not compute it.
@@ -47,6 +49,7 @@ class Fit:
     residual: float
     noise: float
     inlier_share: float
+    visible_share: float
     covariance: np.ndarray
     status: Status
     message: str

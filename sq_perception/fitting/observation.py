@@ -7,8 +7,8 @@ Free pixels: those beside the mask.  One that measured something farther says "e
 something nearer says so up to its own depth only, which binds nothing (what lies behind an occluder is unknown).  One
 that measured nothing still is no pixel of the object: it says "empty" too, but for those next to the mask.
 
-Both become rays, rows (o_x, o_y, d_x, d_y, z, 1/sigma, weight, z) of :mod:`sq_perception.fitting.residuals`, when a stage
-of the fit draws them.
+Both become rays, rows (o_x, o_y, d_x, d_y, z, 1/sigma, weight, z) of :mod:`sq_perception.fitting.residuals`, when a
+stage of the fit draws them.
 """
 
 from __future__ import annotations
@@ -345,11 +345,12 @@ def _sort(
                     pixels[count] = v * width + u
                     areas[count] = _area(depth, inside, v, u, footprint)
                     count += 1
-            elif near[v, u] or (u % _COARSE == 0 and v % _COARSE == 0):
-                if not claimed[v, u] and (np.isfinite(depth[v, u]) or not lost[v, u]):
-                    free[free_count] = v * width + u
-                    free_count += 1
-                    free_pixels += 1 if near[v, u] else _COARSE * _COARSE
+                continue
+            chosen = near[v, u] or (u % _COARSE == 0 and v % _COARSE == 0)
+            if chosen and not claimed[v, u] and (np.isfinite(depth[v, u]) or not lost[v, u]):
+                free[free_count] = v * width + u
+                free_count += 1
+                free_pixels += 1 if near[v, u] else _COARSE * _COARSE
     return pixels[:count].copy(), areas[:count].copy(), free[:free_count].copy(), free_pixels
 
 

@@ -57,9 +57,7 @@ def support_derivatives(
 
 
 @kernel
-def _support_cost(
-    scene: Scene, parameters: np.ndarray, rotation: np.ndarray, sums: np.ndarray
-) -> float:
+def _support_cost(scene: Scene, parameters: np.ndarray, rotation: np.ndarray, sums: np.ndarray) -> float:
     a1, a2, a3, e1, e2, t1, t2, t3 = parameters
     normal = np.array([scene.normal_x, scene.normal_y, scene.normal_z])
     n = np.zeros(3)

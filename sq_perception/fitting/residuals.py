@@ -27,8 +27,8 @@ The scales |grad g| and c are held fixed in the derivatives, which residuals sma
 residuals pass through Huber's loss.  The cost is the weighted sum of the losses, r^2 for small r, and of the priors
 (:mod:`sq_perception.fitting.priors`).
 
-Rays are worked on in blocks of ``LANES``: every line of the mathematics is a loop over the block without a branch, which
-the compiler turns into vector code.  ``lanes`` (ROWS, LANES) holds the block's intermediate values, a row each.
+Rays are worked on in blocks of ``LANES``: every line of the mathematics is a loop over the block without a branch,
+which the compiler turns into vector code.  ``lanes`` (ROWS, LANES) holds the block's intermediate values, a row each.
 """
 
 from __future__ import annotations
@@ -214,9 +214,7 @@ def _meet_from_box(i: int, tolerance: float, parameters: np.ndarray, lanes: np.n
 
 
 @kernel
-def _rendered_rows(
-    part: np.ndarray, scene: Scene, lanes: np.ndarray, missed: np.ndarray, block: np.ndarray
-) -> float:
+def _rendered_rows(part: np.ndarray, scene: Scene, lanes: np.ndarray, missed: np.ndarray, block: np.ndarray) -> float:
     """Rendered and covered residuals: their cost, and in the block's first and last row their scale and value."""
     cost = 0.0
     for i in range(part.shape[0]):

@@ -1,10 +1,11 @@
 """What rounded readings leave open: the half size behind a face that looks at the camera.
 
-A sharp body seen face-on shows its depth only in the last pixels before its outline.  Where readings are whole steps q of
-depth with little noise, all those of the face err alike, by up to q / 2, and least squares takes that error for news of
-the outline.  What is certain is that the true body passes every reading at no more than q / 2.  So the half size along
-the view is held at one value after another, the rest is fitted with residuals that count only beyond q / 2 (a dead zone),
-and each value has the weight exp(-cost / 2).  Their mean is the estimate, their spread the standard deviation.
+A sharp body seen face-on shows its depth only in the last pixels before its outline.  Where readings are whole steps
+q of depth with little noise, all those of the face err alike, by up to q / 2, and least squares takes that error for
+news of the outline.  What is certain is that the true body passes every reading at no more than q / 2.  So the half
+size along the view is held at one value after another, the rest is fitted with residuals that count only beyond q / 2
+(a dead zone), and each value has the weight exp(-cost / 2).  Their mean is the estimate, their spread the standard
+deviation.
 
 Reference for the bounded-error view: M. Milanese, A. Vicino, Optimal estimation theory for dynamic systems with set
 membership uncertainty, Automatica 27(6), 1991.

@@ -8,10 +8,11 @@ from typing import NamedTuple
 class Scene(NamedTuple):
     """Constants of the residuals; see :mod:`sq_perception.fitting.residuals` and :mod:`sq_perception.fitting.priors`.
 
-    Points that lie inside the body, behind its surface, count by Cauchy's loss of scale ``inner_cauchy`` if that is not 0,
-    all others by Huber's.  A rendered depth is found by Newton's method until |g - 1| < ``hit_tolerance``, then in first order.
-    Rendered residuals up to ``dead_zone`` noise levels count as 0: what rounding may do.
-    ``outline_stiffness`` is 1/sigma_o; the plane is n.x + d = height; a stiffness or price of 0 switches its term off.
+    Points that lie inside the body, behind its surface, count by Cauchy's loss of scale ``inner_cauchy`` if that is
+    not 0, all others by Huber's.  A rendered depth is found by Newton's method until |g - 1| < ``hit_tolerance``,
+    then in first order. Rendered residuals up to ``dead_zone`` noise levels count as 0: what rounding may do.
+    ``outline_stiffness`` is 1/sigma_o; the plane is n.x + d = height; a stiffness or price of 0 switches its term
+    off.
     """
 
     huber: float = 3.0

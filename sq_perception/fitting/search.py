@@ -293,6 +293,8 @@ class Search:
         rays, free = self._draw(BASIN_RAYS, 0.2)
         settled: list[State] = []
         for state in [best, *rivals]:
+            if self._late():
+                break
             state = state._replace(cost=math.inf)
             state = minimize(RENDERED, rays, free, self.scene, state, self.limits, BASIN_STEPS, TOLERANCE)
             if not settled:

@@ -33,12 +33,15 @@ from sq_perception.fitting.levenberg_marquardt import State, minimize
 from sq_perception.fitting.normal_equations import STEP_LENGTH
 from sq_perception.fitting.residuals import CLASSIC, RAY_COLUMNS
 from sq_perception.fitting.scene import Scene
+from sq_perception.geometry import rotation as quaternions
 
 MIN_POINTS = 12
 _NO_FREE_SPACE = np.empty((0, RAY_COLUMNS))
 _UNIT = 0.01
 """Residuals count in this share of the extent to the power 3/2, which makes the damping independent of units."""
 _FAILED_SHARE = 0.25
+_ESCAPE = 0.3
+"""Standard deviation of a disturbance: of log sizes, exponents, angles, and of the centre in mean half sizes."""
 _INLIER = 3.0
 
 
@@ -49,6 +52,8 @@ def fit(
     max_points: int | None = 1000,
     max_iterations: int = 100,
     tolerance: float = 1e-6,
+    escapes: int = 0,
+    seed: int = 0,
 ) -> Fit:
     """Fit one superquadric to points (n, 3) of its visible surface.
 
@@ -62,6 +67,9 @@ def fit(
         Budget; more points are thinned evenly in their given order.  None uses all.
     max_iterations, tolerance
         Levenberg-Marquardt stops after so many steps, or when a step gains less than this share of the cost.
+    escapes, seed
+        How often to disturb the result at random and to start again from there, and the seed of the disturbances; the
+        best of all results counts.  The original adds noise to the cost for the same end: to leave shallow minima.
 
     Returns
     -------
@@ -99,6 +107,11 @@ def fit(
         limits = (bounds or Bounds()).limits(points)
         scene = Scene(huber=math.inf)
         state = minimize(CLASSIC, rays, _NO_FREE_SPACE, scene, start, limits, max_iterations, tolerance)
+        rng = np.random.default_rng(seed)
+        for _ in range(escapes):
+            other = _disturbed(state, rng)
+            other = minimize(CLASSIC, rays, _NO_FREE_SPACE, scene, other, limits, max_iterations, tolerance)
+            state = min(state, other, key=lambda each: each.cost)
     body = state.body.canonical_form()
     distance = np.abs(body.sampson_distance(points))
     residual = float(np.sqrt(np.mean(distance**2)))
@@ -109,12 +122,23 @@ def fit(
         residual=residual,
         noise=residual,
         inlier_share=float(np.mean(distance <= _INLIER * residual)),
+        visible_share=float("nan"),
         covariance=np.full((STEP_LENGTH, STEP_LENGTH), np.nan),
         status=Status.FAILED if reason else Status.CONVERGED,
         message=reason or "converged",
         iterations=state.iterations,
         milliseconds=(time.perf_counter() - began) * 1e3,
     )
+
+
+def _disturbed(state: State, rng: np.random.Generator) -> State:
+    """Another size, shape, centre and rotation nearby."""
+    parameters = state.parameters.copy()
+    parameters[0:3] *= np.exp(_ESCAPE * rng.standard_normal(3))
+    parameters[3:5] += _ESCAPE * rng.standard_normal(2)
+    parameters[5:8] += _ESCAPE * float(parameters[0:3].mean()) * rng.standard_normal(3)
+    turn = quaternions.to_matrix(quaternions.from_rotation_vector(_ESCAPE * rng.standard_normal(3)))
+    return State(parameters, np.ascontiguousarray(state.rotation @ turn), math.inf, state.iterations)
 
 
 def moment_start(points: np.ndarray) -> State:

@@ -9,10 +9,11 @@ import numpy as np
 from sq_perception.fitting.covariance import carried_over, covariance_at, spread, undetermined
 from sq_perception.fitting.fit import Fit, Status
 from sq_perception.fitting.levenberg_marquardt import State
-from sq_perception.fitting.observation import Observation
 from sq_perception.fitting.normal_equations import STEP_LENGTH
+from sq_perception.fitting.observation import Observation
 from sq_perception.fitting.residuals import surface_distance
 from sq_perception.fitting.search import Search
+from sq_perception.fitting.visibility import visible_share
 from sq_perception.geometry.superquadric import Superquadric
 
 _INLIER = 3.0
@@ -41,6 +42,7 @@ def judged(state: State, search: Search, began: float) -> Fit:
         residual=residual,
         noise=observation.sigma,
         inlier_share=float(inlying.mean()),
+        visible_share=visible_share(state, observation),
         covariance=covariance,
         status=status,
         message=message,
@@ -58,6 +60,7 @@ def failed(body: Superquadric, observation: Observation, reason: str, began: flo
         residual=float(np.sqrt(np.mean(distance**2))),
         noise=observation.sigma,
         inlier_share=0.0,
+        visible_share=float("nan"),
         covariance=np.full((STEP_LENGTH, STEP_LENGTH), np.nan),
         status=Status.FAILED,
         message=reason,

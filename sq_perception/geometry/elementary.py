@@ -42,8 +42,7 @@ _OPTIONS: dict[str, Any] = {
 }
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def _bits(_typing: Any, number: Any) -> Any:
+def _bits_of(_typing: Any, number: Any) -> Any:
     """The bits of a float64 as int64."""
     del number
 
@@ -53,8 +52,7 @@ def _bits(_typing: Any, number: Any) -> Any:
     return types.int64(types.float64), generate
 
 
-@intrinsic  # type: ignore[untyped-decorator]
-def _number(_typing: Any, bits: Any) -> Any:
+def _number_of(_typing: Any, bits: Any) -> Any:
     """The float64 of these bits."""
     del bits
 
@@ -62,6 +60,10 @@ def _number(_typing: Any, bits: Any) -> Any:
         return builder.bitcast(arguments[0], context.get_value_type(types.float64))
 
     return types.float64(types.int64), generate
+
+
+_bits: Any = intrinsic(_bits_of)
+_number: Any = intrinsic(_number_of)
 
 
 @numba.njit(**_OPTIONS)
