@@ -33,11 +33,17 @@ def other_depths(state: State, axes: np.ndarray) -> list[State]:
     thinner = resized(state, first, 0.5 * size[first])
     found = [thinner, resized(state, first, 0.35 * size[first]), resized(state, first, 1.4 * size[first])]
     found += [resized(state, second, share * size[second]) for share in (0.35, 1.4)]
+    return found + other_orders(thinner)
+
+
+def other_orders(state: State) -> list[State]:
+    """The same box with each of its other axes as z."""
+    found = []
     for order in symmetry_start.three_orders(np.eye(3))[:2]:
-        parameters = thinner.parameters.copy()
+        parameters = state.parameters.copy()
         parameters[:3] = order.T @ parameters[:3]
         parameters[3:5] = symmetry_start.START_EXPONENT
-        found.append(State(parameters, np.ascontiguousarray(thinner.rotation @ order), math.inf, state.iterations))
+        found.append(State(parameters, np.ascontiguousarray(state.rotation @ order), math.inf, state.iterations))
     return found
 
 

@@ -20,7 +20,7 @@ import numpy as np
 from sq_perception.fitting.covariance import Alternative
 from sq_perception.fitting.levenberg_marquardt import State, minimize
 from sq_perception.fitting.residuals import RENDERED
-from sq_perception.fitting.rivals import resized
+from sq_perception.fitting.rivals import other_orders, resized
 from sq_perception.fitting.scene import Scene
 
 _FACE_SHARE = 0.04
@@ -28,12 +28,18 @@ _FACE_SHARE = 0.04
 _DEAD_ZONE = math.sqrt(3.0) * 1.01
 """Half a step in standard deviations q / sqrt(12) of its noise, and a little for single precision."""
 _RAYS, _STEPS, _TOLERANCE = 1000, 12, 1e-3
-_VALUES = np.exp(np.linspace(math.log(0.2), math.log(3.2), 13))
-"""Of the half size, in geometric means of the other two."""
-_NEIGHBOURS, _UNLIKELY = (0.8, 1.25), 12.0
-"""If both of these shares of the half size cost so much more, there is no need to look further."""
-_CERTAIN = 0.9
-"""With so much weight on one value, the readings leave nothing open."""
+_PACES = (1.05, 1.08, 1.12, 1.18, 1.25, 1.25, 1.25, 1.25, 1.25, 1.25)
+"""Factors from one half size to the next, up and down from the one at hand."""
+_UNLIKELY = 12.0
+"""Where values cost so much more, twice in a row, there is no need to go on,"""
+_ALLOWED = 3.0
+"""unless none at hand is what the readings allow: the true one costs nothing."""
+_CERTAIN = 0.02
+"""A standard deviation of the log size below this leaves nothing open."""
+_OPEN = 0.1
+"""Above this, the mean of all bodies replaces the one of least squares."""
+FACE_SPREAD = 1.5
+"""Of the other standard deviations: all readings of a face err alike."""
 
 
 def faces_camera(rays: np.ndarray, quantum: float) -> bool:
@@ -45,35 +51,86 @@ def faces_camera(rays: np.ndarray, quantum: float) -> bool:
 def plausible(
     best: State, rays: np.ndarray, free: np.ndarray, scene: Scene, limits: tuple[np.ndarray, np.ndarray]
 ) -> tuple[State, list[Alternative]]:
-    """The mean of the bodies that the rounded readings allow, and these; the given body if they allow no other."""
-    axis = int(np.argmax(np.abs(best.rotation[2])))
+    """The bodies that the rounded readings allow, none if no other than the given one; and the best of them.
+
+    The best is the given one, which averages roundings out, as long as the readings hardly leave a size open, else the
+    mean of all.
+    """
     stride = max(1, len(rays) // _RAYS)
-    rays, free = rays[::stride].copy(), free[::stride].copy()
-    scene = scene._replace(dead_zone=_DEAD_ZONE)
+    walk = _Walk(rays[::stride].copy(), free[::stride].copy(), scene._replace(dead_zone=_DEAD_ZONE), limits)
+    walk.along_view(best)
+    if walk.least < _ALLOWED and walk.deviation() < _CERTAIN:
+        return best, []
+    start = walk.states[walk.sizes.index(math.log(best.parameters[_view_axis(best)]))]
+    for rival in other_orders(best):
+        walk.along_view(rival)
+    if walk.deviation() < _OPEN and start.cost < walk.least + _ALLOWED:
+        return best, walk.alternatives()
+    return walk.mean(), walk.alternatives()
 
-    def held(start: State, size: float) -> State:
-        lower, upper = limits[0].copy(), limits[1].copy()
-        size = min(max(size, lower[axis]), upper[axis])
+
+class _Walk:
+    """Bodies held at one half size along the view after another, from starts outwards, and their weights."""
+
+    def __init__(self, rays: np.ndarray, free: np.ndarray, scene: Scene, limits: tuple[np.ndarray, np.ndarray]) -> None:
+        self.rays, self.free, self.scene, self.limits = rays, free, scene, limits
+        self.states: list[State] = []
+        self.sizes: list[float] = []
+        self.paces: list[float] = []
+        self.least = math.inf
+
+    def along_view(self, start: State) -> None:
+        """Walk from one start, up and down, until the readings forbid to go on."""
+        axis = _view_axis(start)
+        log_size = math.log(start.parameters[axis])
+        here = self._held(start, log_size)
+        found = {log_size: here}
+        self.least = min(self.least, here.cost)
+        for direction in (1, -1):
+            state, position, unlikely = here, log_size, 0
+            for pace in _PACES:
+                position += direction * math.log(pace)
+                state = found[position] = self._held(state, position)
+                self.least = min(self.least, state.cost)
+                unlikely = unlikely + 1 if state.cost > self.least + _UNLIKELY else 0
+                if unlikely == 2 and self.least < _ALLOWED:
+                    break
+        sizes = sorted(found)
+        self.sizes += sizes
+        self.states += [found[x] for x in sizes]
+        self.paces += np.gradient(sizes).tolist()
+
+    def weights(self) -> np.ndarray:
+        """Of the bodies (n,), a uniform density of the log size assumed; they sum to 1."""
+        cost = np.array([state.cost for state in self.states])
+        weights = np.exp(-0.5 * (cost - self.least)) * np.array(self.paces)
+        return np.asarray(weights / weights.sum())
+
+    def deviation(self) -> float:
+        """Standard deviation of the log size."""
+        weights, sizes = self.weights(), np.array(self.sizes)
+        return math.sqrt(weights @ (sizes - weights @ sizes) ** 2)
+
+    def mean(self) -> State:
+        """The body of the mean log size, from the likeliest near it."""
+        weights, sizes = self.weights(), np.array(self.sizes)
+        mean = float(weights @ sizes)
+        near = np.argsort(np.abs(sizes - mean))[:3]
+        nearest = min((self.states[k] for k in near), key=lambda state: state.cost)
+        return self._held(nearest, mean)
+
+    def alternatives(self) -> list[Alternative]:
+        return [Alternative(state, float(w)) for state, w in zip(self.states, self.weights(), strict=True)]
+
+    def _held(self, start: State, log_size: float) -> State:
+        axis = _view_axis(start)
+        lower, upper = self.limits[0].copy(), self.limits[1].copy()
+        size = min(max(math.exp(log_size), lower[axis]), upper[axis])
         lower[axis] = upper[axis] = size
-        return minimize(RENDERED, rays, free, scene, resized(start, axis, size), (lower, upper), _STEPS, _TOLERANCE)
+        start = resized(start, axis, size)
+        return minimize(RENDERED, self.rays, self.free, self.scene, start, (lower, upper), _STEPS, _TOLERANCE)
 
-    typical = math.exp(float(np.mean(np.log(np.delete(best.parameters[:3], axis)))))
-    values = typical * _VALUES
-    nearest = int(np.argmin(np.abs(np.log(values / best.parameters[axis]))))
-    here = held(best, best.parameters[axis])
-    if all(held(best, share * best.parameters[axis]).cost > here.cost + _UNLIKELY for share in _NEIGHBOURS):
-        return best, []
-    states: dict[int, State] = {}
-    # Each value starts from its neighbour's body, outwards from the one at hand.
-    for values_in_turn in (range(nearest, len(values)), range(nearest - 1, -1, -1)):
-        state = states.get(nearest, best)
-        for k in values_in_turn:
-            state = states[k] = held(state, values[k])
-    least = min(state.cost for state in states.values())
-    weights = np.array([math.exp(-0.5 * (states[k].cost - least)) for k in range(len(values))])
-    weights /= weights.sum()
-    if weights.max() > _CERTAIN:
-        return best, []
-    mean = math.exp(float(weights @ np.log(values)))
-    middle = held(states[int(np.argmin(np.abs(np.log(values / mean))))], mean)
-    return middle, [Alternative(states[k], float(weights[k])) for k in range(len(values))]
+
+def _view_axis(state: State) -> int:
+    """The axis of the body that is nearest to the camera's."""
+    return int(np.argmax(np.abs(state.rotation[2])))

@@ -75,7 +75,7 @@ body that encloses the object, but not in front of it."""
 PROPORTION_SIGMA = 1.0
 """Of a log size against the mean of the three: a wide prior."""
 MODEL_SPREAD = 2.5**2
-"""Read from scanned objects: with it, 90 % of their half sizes lie within two standard deviations."""
+"""Factor of the covariance for objects that are no superquadrics, whose errors are alike; read from scanned objects."""
 REAL_WEIGHT = 50.0
 """Model errors of neighbouring pixels are alike: an object on a table counts as so many independent rays."""
 
@@ -93,6 +93,7 @@ class Search:
         self.finalists: list[State] = []
         self.tried: list[State] = []
         self.alternatives: list[Alternative] = []
+        self.spread_factor = MODEL_SPREAD if self.tolerated > 0 else 1.0
         self._refined_rivals: list[State] = []
         self._symmetry_tried = False
         self.rays = np.empty((0, RAY_COLUMNS))
@@ -177,6 +178,7 @@ class Search:
             huber=OUTER_HUBER, inner_cauchy=INNER_CAUCHY, volume_price=VOLUME_PRICE
         )
         self.finalists = []
+        self.spread_factor = MODEL_SPREAD
 
     # Stages
 
@@ -246,7 +248,9 @@ class Search:
             best = self._varied(best)
             quantum = self.observation.noise.quantum
             if quantum > 0 and not self._late() and rounding.faces_camera(self.rays, quantum):
-                best, self.alternatives = rounding.plausible(best, self.rays, self.free, self.scene, self.limits)
+                best, allowed = rounding.plausible(best, self.rays, self.free, self.scene, self.limits)
+                if allowed:
+                    self.alternatives, self.spread_factor = allowed, rounding.FACE_SPREAD**2
         if self.observation.camera.is_pinhole and not self._late():
             best = self._doubted(best)
         return best
@@ -337,11 +341,6 @@ class Search:
             rivals += [resized(state, int(k), size) for size in (typical, THIN * typical)]
         steps = 2 * self.options.max_iterations
         return min((self._refined(rival, steps) for rival in rivals), key=_cost)
-
-    @property
-    def model_spread(self) -> float:
-        """Factor of the covariance for objects that are no superquadrics: theirs fit with errors that are alike."""
-        return MODEL_SPREAD if self.tolerated > 0 else 1.0
 
     @property
     def outline(self) -> float:

@@ -27,7 +27,7 @@ def judged(state: State, search: Search, began: float) -> Fit:
     observation = search.observation
     body = state.body
     covariance = covariance_at(state, search.rays, search.free, search.scene, search.outline)
-    covariance = covariance * search.model_spread + spread(state, search.alternatives)
+    covariance = covariance * search.spread_factor + spread(state, search.alternatives)
     canonical = body.canonical_form()
     covariance = carried_over(covariance, body, canonical)
     everything = observation.object_rays(_JUDGED_RAYS)
