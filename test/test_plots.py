@@ -27,8 +27,10 @@ def shot(body=BODY, camera=CAMERA):
 
 @pytest.mark.parametrize("camera", [CAMERA, unit_cube.camera(96), Camera(2000, 1500, 1700, 1700, 999.5, 749.5)])
 def test_the_silhouette_encloses_the_pixels_of_the_body(camera):
-    body = BODY if camera.is_pinhole else unit_cube.optical_from_cube(
-        Superquadric([0.3, 0.2, 0.1], BODY.shape, [0.5, 0.5, 0.5], BODY.rotation)
+    body = (
+        BODY
+        if camera.is_pinhole
+        else unit_cube.optical_from_cube(Superquadric([0.3, 0.2, 0.1], BODY.shape, [0.5, 0.5, 0.5], BODY.rotation))
     )
     _, index = raycast.render(body, camera)
     (loop,) = plots.silhouettes(body, camera)

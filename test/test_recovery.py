@@ -180,9 +180,9 @@ def test_methods_do_what_they_say(weights):
 def test_s_and_tau_drive_the_score(symmetry):
     depth, labels = seen(random_bodies(1, 5), CAMERA, background=1.4)
     scores = [
-        symmetry.recover(
-            depth, CAMERA, labels, RecoveryOptions(method="symmetry", sharpness=s, tau=tau)
-        ).bodies[0].score
+        symmetry.recover(depth, CAMERA, labels, RecoveryOptions(method="symmetry", sharpness=s, tau=tau))
+        .bodies[0]
+        .score
         for s, tau in ((117.3, 4.82), (2.0, 4.82), (117.3, 0.05))
     ]
     assert scores[0] > scores[1] + 0.01

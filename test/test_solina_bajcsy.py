@@ -8,7 +8,7 @@ import pytest
 from sq_perception import metrics
 from sq_perception.fitting import solina_bajcsy
 from sq_perception.fitting.bounds import Bounds
-from sq_perception.fitting.fit import Status
+from sq_perception.fitting.fit import Fit, Status
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 
@@ -96,3 +96,21 @@ def test_points_that_are_not_finite_are_ignored(rng: np.random.Generator) -> Non
 def test_misuse_raises(points: np.ndarray) -> None:
     with pytest.raises(ValueError, match="point"):
         solina_bajcsy.fit(points)
+
+
+def test_escapes_never_make_it_worse_and_repeat(rng: np.random.Generator) -> None:
+    body = Superquadric([0.03, 0.06, 0.1], [0.3, 0.4], [0.0, 0.0, 0.5], [0.3, 0.5, 0.1, 0.8])
+    points = body.sample_surface(600, rng)
+    points = points[points[:, 2] < np.median(points[:, 2])]
+
+    def cost(fit: Fit) -> float:
+        found = fit.superquadric
+        residual = np.sqrt(np.prod(found.size)) * (found.adjusted_inside_outside(points) - 1)
+        return float(residual @ residual)
+
+    plain = solina_bajcsy.fit(points)
+    escaped = solina_bajcsy.fit(points, escapes=8, seed=3)
+    assert cost(escaped) <= cost(plain) * (1 + 1e-9)
+    assert escaped.iterations > plain.iterations
+    again = solina_bajcsy.fit(points, escapes=8, seed=3)
+    np.testing.assert_array_equal(again.superquadric.to_flat(), escaped.superquadric.to_flat())

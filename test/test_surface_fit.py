@@ -366,3 +366,69 @@ def test_recorded_box_on_a_table(shared_data: Path) -> None:
         assert fit.status != Status.FAILED
         sizes.append(np.sort(fit.superquadric.size))
     assert np.abs(sizes[0] - sizes[1]).max() < 0.004
+
+
+HARD_SENSOR = {
+    "wrong order of the axes, half again as deep": [
+        [0.0572, 0.1074, 0.0585, 0.3235, 0.2392, -0.2553, -0.0206, 1.4608, 0.8913, -0.3293, 0.1179, 0.2886]
+    ],
+    "a slab taken for a block": [
+        [0.0375, 0.1122, 0.1108, 0.2937, 0.4964, 0.328, 0.1772, 1.4751, 0.5716, -0.6366, -0.4077, -0.319]
+    ],
+    "a slab far away": [
+        [0.1124, 0.0872, 0.0347, 0.6613, 0.3403, -0.2296, -0.3932, 2.1054, -0.1787, -0.1988, -0.8346, 0.4816]
+    ],
+    "a stick with a square end": [
+        [0.0326, 0.0326, 0.0921, 0.3072, 0.5984, -0.3748, 0.0872, 1.8106, 0.0852, 0.7379, 0.4299, 0.5132]
+    ],
+}
+
+
+@pytest.mark.parametrize("name", HARD_SENSOR)
+def test_hard_bodies_through_a_sensor(name: str) -> None:
+    """Bodies that an earlier search left in a wrong valley, at IoU 0.3 to 0.7; both explain the image almost as well."""
+    focal = 320 / np.tan(np.deg2rad(30))
+    camera = Camera(640, 480, focal, focal, 319.5, 239.5)
+    rng = np.random.default_rng(5)
+    for flat in HARD_SENSOR[name]:
+        body = Superquadric.from_flat(np.array(flat))
+        depth, index = raycast.render(body, camera)
+        mask = index >= 0
+        depth = np.where(mask, depth, np.nan)
+        noisy = np.round((depth + rng.standard_normal(depth.shape) * 0.0015 * depth**2) * 1000) / 1000
+        assert iou(surface_fit.fit(noisy, mask, camera), body) > 0.9
+
+
+@pytest.mark.parametrize(
+    "flat",
+    [
+        [0.2233, 0.2067, 0.1212, 0.33, 0.7848, 0.3657, 0.4311, 0.6132, 0.5732, 0.4275, 0.0861, -0.6938],
+        [0.1085, 0.247, 0.2471, 0.5249, 0.3061, 0.3565, 0.445, 0.5274, 0.1896, 0.9345, 0.2959, 0.0559],
+    ],
+)
+def test_hard_bodies_under_heavy_noise(flat: list[float]) -> None:
+    """Eight grey levels: an earlier search read the outline from a body that noise had swollen (IoU 0.3 to 0.6)."""
+    body = Superquadric.from_flat(np.array(flat))
+    depth, index = raycast.render(body, unit_cube.camera())
+    grey = (1 - depth) / GREY - 0.5 + np.random.default_rng(6).normal(0, 8, depth.shape)
+    depth = 1 - (np.clip(np.round(grey), 1, 255) + 0.5) * GREY
+    assert iou(surface_fit.fit(depth, index >= 0, unit_cube.camera()), body) > 0.8
+
+
+def test_a_hollow_body_is_taken_for_its_hull() -> None:
+    """Points behind the surface, as in a box without a lid, do not pull it in."""
+    body = Superquadric([0.1, 0.08, 0.06], [0.1, 0.1], [0.0, 0.0, 0.6], [0.3, 0.25, 0.0, 0.92])
+    depth, mask = pinhole_image(body)
+    notch = np.zeros_like(mask)
+    notch[100:125, 140:175] = True
+    depth = np.where(notch & mask, depth + 0.03, depth).astype(np.float32)
+    assert (notch & mask).sum() > 500
+    assert iou(surface_fit.fit(depth, mask, CAMERA), body) > 0.9
+
+
+def test_a_longer_body_is_not_taken_for_a_smaller_mask() -> None:
+    """A body that covers free pixels on one side only is too long; the mask is right."""
+    truth = pinhole_body(np.random.default_rng(3))
+    depth, mask = pinhole_image(truth)
+    start = Superquadric(truth.size * np.array([1.0, 1.0, 1.3]), truth.shape, truth.translation, truth.rotation)
+    assert iou(surface_fit.fit(depth, mask, CAMERA, start=start), truth) > 0.97

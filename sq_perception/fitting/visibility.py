@@ -19,14 +19,14 @@ from sq_perception.fitting.observation import Observation
 from sq_perception.geometry.kernels import gauge_derivatives, kernel
 
 _DIRECTIONS = 800
-_NOISE_LEVELS, _PIXELS = 3.0, 4.0
-"""A measured depth may differ from the surface's by so many noise levels and so many widths of a pixel."""
+_NOISE_LEVELS, _PIXELS, _FLATTEST = 3.0, 1.5, 0.3
+"""A measured depth may differ from the surface's by so many noise levels, and by what so many widths of a pixel across
+the line of sight make along it; the cosine of incidence counts down to the last number."""
 
 
 def visible_share(state: State, observation: Observation) -> float:
     """Share of the surface, 0 to 1, that the object's pixels measured."""
     c = observation.camera
-    tolerance = _NOISE_LEVELS * observation.sigma + _PIXELS * observation.footprint
     seen, total = _areas(
         state.parameters,
         state.rotation,
@@ -34,7 +34,8 @@ def visible_share(state: State, observation: Observation) -> float:
         observation.mask,
         (c.fx, c.fy, c.cx, c.cy),
         c.is_pinhole,
-        tolerance,
+        _NOISE_LEVELS * observation.sigma,
+        _PIXELS * observation.footprint,
     )
     return float(seen / total)
 
@@ -47,7 +48,8 @@ def _areas(
     mask: np.ndarray,
     intrinsics: tuple[float, float, float, float],
     pinhole: bool,
-    tolerance: float,
+    noise: float,
+    width: float,
 ) -> tuple[float, float]:
     """The seen and the whole surface."""
     a1, a2, a3, e1, e2, t1, t2, t3 = parameters
@@ -76,6 +78,7 @@ def _areas(
         u, v = math.floor(fx * rx + cx + 0.5), math.floor(fy * ry + cy + 0.5)
         if u < 0 or v < 0 or u >= depth.shape[1] or v >= depth.shape[0] or not mask[v, u]:
             continue
-        if abs(depth[v, u] - z) < tolerance:
+        cosine = -towards / math.sqrt((nx * nx + ny * ny + nz * nz) * (rx * rx + ry * ry + 1.0 if pinhole else 1.0))
+        if abs(depth[v, u] - z) < noise + width / max(cosine, _FLATTEST):
             seen += area
     return seen, total
