@@ -386,7 +386,7 @@ HARD_SENSOR = {
 
 @pytest.mark.parametrize("name", HARD_SENSOR)
 def test_hard_bodies_through_a_sensor(name: str) -> None:
-    """Bodies that an earlier search left in a wrong valley, at IoU 0.3 to 0.7; both explain the image almost as well."""
+    """Bodies that an earlier search left in a wrong valley, at IoU 0.3 to 0.7, as both explain the image well."""
     focal = 320 / np.tan(np.deg2rad(30))
     camera = Camera(640, 480, focal, focal, 319.5, 239.5)
     rng = np.random.default_rng(5)
