@@ -1,4 +1,4 @@
-"""The command ``sq-perception``: recover, render, demo, train.
+"""The command ``sq-perception``: recover, render, demo, train, render-search.
 
 Exit codes: 0 all went well, 1 a frame could not be read or something is missing, 2 wrong usage.  Heavy imports happen
 inside the commands, so that ``--help`` answers at once.
@@ -90,8 +90,9 @@ examples:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
     given = list(sys.argv[1:] if arguments is None else arguments)
-    if given and given[0] in ("demo", "train"):
-        return {"demo": _demo, "train": _train}[given[0]](given[1:])
+    others = {"demo": _demo, "train": _train, "render-search": _render_search}
+    if given and given[0] in others:
+        return others[given[0]](given[1:])
     parser = _parser()
     try:
         options = parser.parse_args([_plain_number(word) for word in given])
@@ -168,6 +169,7 @@ def _parser() -> argparse.ArgumentParser:
 
     commands.add_parser("demo", help="live demonstration with real ROS 2 nodes (extra 'ros')", add_help=False)
     commands.add_parser("train", help="train the network from scratch", add_help=False)
+    commands.add_parser("render-search", help="find the best s and tau of the soft renderer", add_help=False)
     return parser
 
 
@@ -422,7 +424,7 @@ def _write_camera_info(path: Path, camera: Camera) -> None:
     path.write_text(yaml.safe_dump(info, sort_keys=False), encoding="utf-8")
 
 
-# demo and train
+# demo, train and render-search
 
 
 def _demo(arguments: list[str]) -> int:
@@ -441,6 +443,12 @@ def _train(arguments: list[str]) -> int:
     from sq_perception.learning import train
 
     return _code(train.main(arguments))
+
+
+def _render_search(arguments: list[str]) -> int:
+    from sq_perception.evaluation import render_search
+
+    return _code(render_search.main(arguments))
 
 
 def _code(result: Any) -> int:

@@ -201,7 +201,9 @@ def test_train_has_its_own_help(capsys):
     with pytest.raises(SystemExit) as stop:
         cli.main(["train", "--help"])
     assert stop.value.code == 0
-    assert "--steps" in capsys.readouterr().out
+    help_text = capsys.readouterr().out
+    assert "--steps" in help_text
+    assert "least_squares_free" in help_text
 
 
 def test_author_renders(shared_data, tmp_path):

@@ -178,7 +178,7 @@ class Superquadric:
         xp = array_namespace(p)
         q = xp.abs(p) / self.size[..., None, :]
         e1, e2 = self.shape[..., None, 0], self.shape[..., None, 1]
-        return p_norm(p_norm(q[..., 0], q[..., 1], e2), q[..., 2], e1)
+        return nested_norm(q[..., 0], q[..., 1], q[..., 2], e1, e2)
 
     def inside_outside(self, points: Array) -> Array:
         """F at points (..., N, 3), shape (..., N) (thesis, equation 3.7); may overflow to inf far from sharp bodies."""
@@ -200,10 +200,8 @@ class Superquadric:
         xp = array_namespace(p)
         q = xp.abs(p) / self.size[..., None, :]
         e1, e2 = self.shape[..., None, 0], self.shape[..., None, 1]
-        h, h_x, h_y = _p_norm_and_slopes(q[..., 0], q[..., 1], e2)
-        _, g_h, g_z = _p_norm_and_slopes(h, q[..., 2], e1)
-        slopes = xp.stack([g_h * h_x, g_h * h_y, g_z], axis=-1)
-        gradient = slopes * xp.sign(p) / self.size[..., None, :]
+        _, slopes = nested_norm_and_slopes(q[..., 0], q[..., 1], q[..., 2], e1, e2)
+        gradient = xp.stack(slopes, axis=-1) * xp.sign(p) / self.size[..., None, :]
         return gradient @ xp.linalg.matrix_transpose(self.rotation_matrix)
 
     def normals(self, points: Array) -> Array:
@@ -288,7 +286,7 @@ class Superquadric:
         xp = array_namespace(n)
         q = xp.abs(n) * self.size[..., None, :]
         e1, e2 = 2 - self.shape[..., None, 0], 2 - self.shape[..., None, 1]
-        return p_norm(p_norm(q[..., 0], q[..., 1], e2), q[..., 2], e1)
+        return nested_norm(q[..., 0], q[..., 1], q[..., 2], e1, e2)
 
     def bounding_box(self) -> tuple[Array, Array]:
         """Lower and upper corner (..., 3) of the axis-aligned box in the parent frame."""
@@ -334,6 +332,20 @@ class Superquadric:
         if is_torch_array(size):
             size, shape = size.detach().cpu().numpy(), shape.detach().cpu().numpy()
         return size, shape[..., 0], shape[..., 1]
+
+
+def nested_norm(x: Array, y: Array, z: Array, e1: Array, e2: Array) -> Array:
+    """|| ( || (x, y) ||_{2/e2}, z ) ||_{2/e1} for x, y, z >= 0: the gauge at (x, y, z) in units of the half sizes."""
+    return p_norm(p_norm(x, y, e2), z, e1)
+
+
+def nested_norm_and_slopes(
+    x: Array, y: Array, z: Array, e1: Array, e2: Array
+) -> tuple[Array, tuple[Array, Array, Array]]:
+    """The nested norm and its partial derivatives with respect to x, y and z."""
+    h, h_x, h_y = _p_norm_and_slopes(x, y, e2)
+    g, g_h, g_z = _p_norm_and_slopes(h, z, e1)
+    return g, (g_h * h_x, g_h * h_y, g_z)
 
 
 def p_norm(u: Array, v: Array, e: Array) -> Array:

@@ -1,18 +1,50 @@
-"""Training losses; every one batched over bodies, with finite gradients everywhere.
+"""Losses that know the true body; every one batched over bodies, with finite gradients everywhere.
 
-Occupancy loss (thesis, equations 6.6 to 6.8): the mean squared difference of two soft occupancies
+Parameters (thesis, equation 6.10)
+
+    L_MSE = 1/N sum (y - y_hat)^2      over the named groups; rotation as the nearer one of the quaternions q and -q.
+
+Occupancy (6.6 to 6.8): the mean squared difference of two soft occupancies
 
     L_OC = 1/|P| sum_p (G(p; y) - G(p; y_hat))^2,      G = sigma(s (1 - F^e1)) = sigma(s (1 - g^2)).
 
 It compares bodies, never parameters, so the 8 equivalent parameter vectors and every symmetry cost nothing.  P is the
 thesis' grid or any other set of points; random points around the body are an unbiased and far cheaper choice.
+
+Rotation only, and both together (6.9)
+
+    L_OC(q) = L_OC with a, e and t of the truth,        L_DUAL = L_MSE(a, e, t) + L_OC(q).
+
+L_OC(q) fits the predicted rotation to the true sizes, hence to the order in which the truth happens to list its axes.
+That order is no property of the body: a1 and a2 may be exchanged, and where e1 is about e2 any axis may pass for z.  A
+predictor that sees the body alone can only guess it; L_OC over all parameters does not ask.
+
+Bodies are torch batches (n,) in the frame of the canonical view, lengths in sides of the cube.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 
 from sq_perception.geometry.superquadric import Superquadric
+
+NOT_ROTATION = ("size", "shape", "translation")
+ALL_GROUPS = (*NOT_ROTATION, "rotation")
+
+
+def parameter_loss(prediction: Superquadric, truth: Superquadric, groups: Sequence[str] = NOT_ROTATION) -> torch.Tensor:
+    """L_MSE of each body over the parameters of ``groups`` (fields of a Superquadric), shape (n,)."""
+    differences = []
+    for group in groups:
+        mine, theirs = getattr(prediction, group), getattr(truth, group)
+        if group == "rotation":
+            opposite = (mine * theirs).sum(dim=-1, keepdim=True) < 0
+            theirs = torch.where(opposite, -theirs, theirs)
+        differences.append(mine - theirs)
+    difference = torch.cat(differences, dim=-1)
+    return (difference * difference).mean(dim=-1)
 
 
 def occupancy_loss(
@@ -31,6 +63,23 @@ def occupancy_loss(
     """
     difference = prediction.occupancy(points, sharpness) - truth.occupancy(points, sharpness)
     return (difference * difference).mean(dim=-1)
+
+
+def turned_truth(prediction: Superquadric, truth: Superquadric) -> Superquadric:
+    """The true bodies in the predicted rotations: all that L_OC(q) sees of a prediction."""
+    return Superquadric(truth.size, truth.shape, truth.translation, prediction.rotation)
+
+
+def rotation_loss(
+    prediction: Superquadric, truth: Superquadric, points: torch.Tensor, sharpness: float
+) -> torch.Tensor:
+    """L_OC(q) of each body, shape (n,): :func:`occupancy_loss` of the predicted rotation alone."""
+    return occupancy_loss(turned_truth(prediction, truth), truth, points, sharpness)
+
+
+def dual_loss(prediction: Superquadric, truth: Superquadric, points: torch.Tensor, sharpness: float) -> torch.Tensor:
+    """L_DUAL of each body, shape (n,)."""
+    return parameter_loss(prediction, truth) + rotation_loss(prediction, truth, points, sharpness)
 
 
 def grid(resolution: int, low: float = 0.0, high: float = 1.0, **like: torch.dtype | torch.device) -> torch.Tensor:

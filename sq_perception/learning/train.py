@@ -1,10 +1,11 @@
-"""Train the regressor on views drawn on the fly, with the occupancy loss.
+"""Train the regressor on views drawn on the fly, with one of the losses of :mod:`sq_perception.learning.objective`.
 
-One linear script: draw a batch, predict, compare occupancies at random points around the true body, step.  AdamW under
-a one-cycle schedule (warm up, cosine down), gradients clipped, an exponential average of the weights is what is
-validated and saved.  Everything that changes lives in one state file, so that a killed run goes on where it stopped.
+One linear script: draw a batch, predict, compare, step.  AdamW under a one-cycle schedule (warm up, cosine down),
+gradients clipped, an exponential average of the weights is what is validated and saved.  Everything that changes lives
+in one state file, so that a killed run goes on where it stopped.  An unsupervised loss is handed no labels.
 
     sq-perception train --steps 20000 --output runs/compact
+    sq-perception train --loss render --pixels 32 --steps 12000 --output runs/render
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from safetensors.torch import load_file, save_file
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.learning import checkpoint
 from sq_perception.learning.dataset import ViewPool, draw_views
-from sq_perception.learning.losses import occupancy_loss, points_around
+from sq_perception.learning.objective import LOSSES, Objective
 from sq_perception.learning.regressor import Regressor, RegressorConfig
 from sq_perception.metrics import volume_iou
 
@@ -35,16 +36,30 @@ CALIBRATION_VIEWS = 2048
 class TrainingConfig:
     """What a run is made of."""
 
+    loss: str = "occupancy"
+    """What is minimised, by its name in :mod:`sq_perception.learning.objective`."""
+    pixels: int = 64
+    """Side of the views, a multiple of 16."""
+    largest: float = RegressorConfig().size_range[1]
+    """Largest half size the network can express, in sides of the cube.  Bodies of the thesis' protocol reach 0.8."""
+    canonical_labels: bool = False
+    """List the axes of every label so that a1 >= a2; as drawn, their order is random."""
     steps: int = 20000
     batch: int = 128
     points: int = 256
     """Comparison points a body: half close around it, half in twice its box."""
+    stride: int = 2
+    """Losses of the view take every ``stride``-th row and column, from a random one on."""
+    free_space: float = 4.0
+    """Weight of the free space in least_squares_free."""
+    density: float = 2.0
+    """Density n tau of the soft image in render, in units of s."""
     learning_rate: float = 1.5e-3
     weight_decay: float = 1e-2
     warm_up: int = 400
-    sharpness_start: float = 6.0
-    sharpness_end: float = 25.0
-    """s of the occupancy, raised over the run: far basins first, fine fit last."""
+    sharpness_start: float = 0.0
+    sharpness_end: float = 0.0
+    """s, raised over the run: far basins first, fine fit last; 0 takes the loss's own values."""
     average: float = 0.999
     clip: float = 1.0
     pinhole_share: float = 0.0
@@ -70,9 +85,20 @@ def train(config: TrainingConfig, output: Path, network: RegressorConfig | None 
     """
     if config.threads:
         torch.set_num_threads(config.threads)
+    objective = Objective(
+        config.loss,
+        config.points,
+        config.sharpness_start,
+        config.sharpness_end,
+        config.stride,
+        config.density,
+        config.free_space,
+    )
     output.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(config.seed)
     device = torch.device(config.device)
+    if network is None:
+        network = RegressorConfig(pixels=config.pixels, size_range=(RegressorConfig().size_range[0], config.largest))
     model = (checkpoint.load(config.start) if config.start else Regressor(network)).to(device)
     model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     average = copy.deepcopy(model)
@@ -91,15 +117,16 @@ def train(config: TrainingConfig, output: Path, network: RegressorConfig | None 
         rate = config.learning_rate * min(1.0, (step + 1) / config.warm_up) * 0.5 * (1 + math.cos(math.pi * progress))
         for group in optimizer.param_groups:
             group["lr"] = rate
-        sharpness = config.sharpness_start * (config.sharpness_end / config.sharpness_start) ** progress
         images, bodies = pool.batch(config.batch)
         views = torch.from_numpy(images)[:, None].to(device, memory_format=torch.channels_last)
-        truth = Superquadric.from_flat(torch.from_numpy(bodies.to_flat()).float().to(device))
-        points = torch.cat([points_around(truth, config.points // 2, generator, scale) for scale in (1.15, 2.0)], dim=1)
+        truth = None
+        if objective.needs_labels:
+            labels = bodies.canonical_form() if config.canonical_labels else bodies
+            truth = Superquadric.from_flat(torch.from_numpy(labels.to_flat()).float().to(device))
         model.train()
         with torch.autocast(device.type, torch.bfloat16, enabled=config.bfloat16):
             prediction = model(views)
-        loss = occupancy_loss(prediction, truth, points, sharpness).mean()
+        loss = objective.loss(prediction, views, truth, progress, generator).mean()
         if not bool(torch.isfinite(loss)):
             raise FloatingPointError(f"step {step}: the loss is {loss.item()}; {state_path} holds the last good state")
         optimizer.zero_grad(set_to_none=True)
@@ -111,16 +138,16 @@ def train(config: TrainingConfig, output: Path, network: RegressorConfig | None 
         done = step + 1
         if done % config.validation == 0 or done == config.steps:
             recalibrate(average, pool.batch(CALIBRATION_VIEWS)[0], config.batch)
-            iou = validate(average, *validation)
+            iou = validate(average, *validation, objective=objective)
             record = {
                 "step": done,
                 "loss": float(np.mean(losses)),
                 "iou": float(iou.mean()),
                 "iou_std": float(iou.std()),
-                "iou_pinhole": float(validate(average, *near).mean()),
+                "iou_pinhole": float(validate(average, *near, objective=objective).mean()),
                 "over_85": float((iou > 0.85).mean()),
                 "rate": rate,
-                "sharpness": sharpness,
+                "sharpness": objective.sharpness(progress),
                 "seconds": time.monotonic() - started,
             }
             print(json.dumps(record), flush=True)
@@ -132,10 +159,16 @@ def train(config: TrainingConfig, output: Path, network: RegressorConfig | None 
     return average.eval()
 
 
-def validate(model: Regressor, views: np.ndarray, truth: Superquadric, batch: int = 250) -> np.ndarray:
-    """Volume IoU (n,) of the network's bodies with the true ones, both in the views' frames."""
+def validate(
+    model: Regressor, views: np.ndarray, truth: Superquadric, batch: int = 250, objective: Objective | None = None
+) -> np.ndarray:
+    """Volume IoU (n,) of the network's bodies with the true ones, both in the views' frames.
+
+    With an ``objective`` for which some parameters are given, those are taken from the truth.
+    """
     flats = [model.predict(views[i : i + batch]).to_flat() for i in range(0, len(views), batch)]
-    return volume_iou(Superquadric.from_flat(np.concatenate(flats)), truth)
+    prediction = Superquadric.from_flat(np.concatenate(flats))
+    return volume_iou(objective.judged(prediction, truth) if objective else prediction, truth)
 
 
 @torch.no_grad()
@@ -196,7 +229,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--output", type=Path, default=Path("runs/compact"), help="folder of state, log and model")
     for field in fields(TrainingConfig):
         name = "--" + field.name.replace("_", "-")
-        if isinstance(field.default, bool):
+        if field.name == "loss":
+            parser.add_argument(name, choices=LOSSES, default=field.default, help=f"default {field.default}")
+        elif isinstance(field.default, bool):
             parser.add_argument(name, action=argparse.BooleanOptionalAction, default=field.default)
         else:
             parser.add_argument(name, type=type(field.default), default=field.default, help=f"default {field.default}")
