@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,8 +16,9 @@ from sq_perception.imaging import canonical_view
 from sq_perception.imaging.scene import thesis_bodies
 from sq_perception.learning import checkpoint, losses
 from sq_perception.learning.dataset import ViewPool, dihedral, draw_views
+from sq_perception.learning.objective import UNSUPERVISED, Objective
 from sq_perception.learning.regressor import Regressor, RegressorConfig
-from sq_perception.learning.train import TrainingConfig, train, validate
+from sq_perception.learning.train import TrainingConfig, recalibrate, train, validate
 
 SMALL = RegressorConfig(pixels=32, widths=(4, 8, 8), blocks=1, hidden=32)
 
@@ -145,6 +147,41 @@ class TestTraining:
         records = [json.loads(line) for line in (tmp_path / "whole" / "log.jsonl").read_text().splitlines()]
         assert [r["step"] for r in records] == [20, 40, 60]
         assert int(load_file(str(state))["step"]) == 60
+
+    @pytest.mark.parametrize("loss", ["dual", "render"])
+    def test_labels_go_to_the_losses_that_need_them_and_to_no_other(
+        self, loss: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        given = []
+        compute = Objective.loss
+
+        def watched(self: Objective, prediction: Superquadric, views: torch.Tensor, truth: Any, *rest: Any) -> Any:
+            given.append(truth is not None)
+            return compute(self, prediction, views, truth, *rest)
+
+        monkeypatch.setattr(Objective, "loss", watched)
+        config = TrainingConfig(**{**vars(self.CONFIG), "loss": loss, "steps": 2})
+        train(config, tmp_path, SMALL)
+        assert given == [loss not in UNSUPERVISED] * 2
+        header = checkpoint.read_header(tmp_path / "model.safetensors")
+        assert json.loads(header["training"])["loss"] == loss
+
+    def test_a_few_views_are_learned_without_labels(self) -> None:
+        """Overfit: 8 views, no labels, and the network's bodies become those of the views."""
+        torch.manual_seed(3)
+        views, truth = draw_views(8, np.random.default_rng(9), 32)
+        batch = torch.from_numpy(views)[:, None]
+        model, generator = Regressor(SMALL), torch.Generator().manual_seed(0)
+        objective = Objective("least_squares_free")
+        before = validate(model, views, truth).mean()
+        optimizer = torch.optim.AdamW(model.parameters(), 3e-3)
+        for step in range(200):
+            model.train()
+            optimizer.zero_grad()
+            objective.loss(model(batch), batch, None, step / 200, generator).mean().backward()
+            optimizer.step()
+        recalibrate(model, views, 8)
+        assert validate(model, views, truth).mean() > max(before + 0.2, 0.7)
 
 
 class TestCheckpoint:
