@@ -146,6 +146,7 @@ class TestTraining:
         train(longer, tmp_path / "whole", SMALL)
         records = [json.loads(line) for line in (tmp_path / "whole" / "log.jsonl").read_text().splitlines()]
         assert [r["step"] for r in records] == [20, 40, 60]
+        assert records[1]["seconds"] < records[2]["seconds"]
         assert int(load_file(str(state))["step"]) == 60
 
     @pytest.mark.parametrize("loss", ["dual", "render"])

@@ -104,14 +104,14 @@ def train(config: TrainingConfig, output: Path, network: RegressorConfig | None 
     average = copy.deepcopy(model)
     optimizer = torch.optim.AdamW(model.parameters(), config.learning_rate, weight_decay=config.weight_decay)
     state_path = output / "state.safetensors"
-    first = _restore(state_path, model, average, optimizer) if state_path.exists() else 0
+    first, spent = _restore(state_path, model, average, optimizer) if state_path.exists() else (0, 0.0)
     rng = np.random.default_rng([config.seed, first])
     generator = torch.Generator(device=device).manual_seed(config.seed + first)
     pool = ViewPool(rng, pixels=model.config.pixels, pinhole_share=config.pinhole_share)
     validation = draw_views(config.validation, np.random.default_rng(0), model.config.pixels)
     near = draw_views(config.validation, np.random.default_rng(0), model.config.pixels, pinhole_share=1.0)
     log = (output / "log.jsonl").open("a", encoding="utf-8")
-    started, losses = time.monotonic(), []
+    started, losses = time.monotonic() - spent, []
     for step in range(first, config.steps):
         progress = step / config.steps
         rate = config.learning_rate * min(1.0, (step + 1) / config.warm_up) * 0.5 * (1 + math.cos(math.pi * progress))
@@ -154,7 +154,7 @@ def train(config: TrainingConfig, output: Path, network: RegressorConfig | None 
             log.write(json.dumps(record) + "\n")
             log.flush()
             losses.clear()
-            _store(state_path, done, model, average, optimizer)
+            _store(state_path, done, record["seconds"], model, average, optimizer)
             checkpoint.save(output / "model.safetensors", average, {"training": asdict(config), "metrics": record})
     return average.eval()
 
@@ -200,8 +200,10 @@ def _update_average(average: Regressor, model: Regressor, keep: float) -> None:
             mine.copy_(theirs)
 
 
-def _store(path: Path, step: int, model: Regressor, average: Regressor, optimizer: torch.optim.AdamW) -> None:
-    tensors = {"step": torch.tensor(step)}
+def _store(
+    path: Path, step: int, seconds: float, model: Regressor, average: Regressor, optimizer: torch.optim.AdamW
+) -> None:
+    tensors = {"step": torch.tensor(step), "seconds": torch.tensor(seconds)}
     tensors.update({f"model.{k}": v.contiguous() for k, v in model.state_dict().items()})
     tensors.update({f"average.{k}": v.contiguous() for k, v in average.state_dict().items()})
     for index, slots in optimizer.state_dict()["state"].items():
@@ -211,7 +213,8 @@ def _store(path: Path, step: int, model: Regressor, average: Regressor, optimize
     partial.replace(path)
 
 
-def _restore(path: Path, model: Regressor, average: Regressor, optimizer: torch.optim.AdamW) -> int:
+def _restore(path: Path, model: Regressor, average: Regressor, optimizer: torch.optim.AdamW) -> tuple[int, float]:
+    """Steps done and seconds spent by the run that is continued."""
     tensors = load_file(str(path), device=str(next(model.parameters()).device))
     for prefix, network in (("model.", model), ("average.", average)):
         network.load_state_dict({k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)})
@@ -221,7 +224,7 @@ def _restore(path: Path, model: Regressor, average: Regressor, optimizer: torch.
             _, index, slot = key.split(".")
             state["state"].setdefault(int(index), {})[slot] = value
     optimizer.load_state_dict(state)
-    return int(tensors["step"])
+    return int(tensors["step"]), float(tensors.get("seconds", 0.0))
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
