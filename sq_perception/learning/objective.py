@@ -37,6 +37,7 @@ _SHARPNESS = {"render": (6.0, 100.0)}
 _OTHER_SHARPNESS = (6.0, 25.0)
 _TYPICAL_VOLUME = 0.05
 _CURRICULUM = 0.8
+_ROOT_FLOOR = 1e-6
 
 
 @dataclass(frozen=True)
@@ -61,6 +62,9 @@ class Objective:
     """D of the soft depth, in units of s."""
     free_space: float = 4.0
     """Weight w of the free space."""
+    root: bool = True
+    """Take the root of each body's least_squares_free: the same optimum, but a few badly seen bodies, whose squares are
+    a hundred times those of the others, no longer make the whole gradient."""
 
     def __post_init__(self) -> None:
         if self.name not in LOSSES:
@@ -106,6 +110,7 @@ class Objective:
         loss = loss * (prediction.size.prod(dim=-1) / _TYPICAL_VOLUME) ** smallness
         if self.name == "least_squares_free":
             loss = loss + self.free_space * depth_losses.free_space_loss(prediction, lines, depth)
+            loss = torch.sqrt(loss + _ROOT_FLOOR) if self.root else loss
         return loss
 
     def judged(self, prediction: Superquadric, truth: Superquadric) -> Superquadric:

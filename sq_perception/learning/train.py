@@ -52,6 +52,8 @@ class TrainingConfig:
     """Losses of the view take every ``stride``-th row and column, from a random one on."""
     free_space: float = 4.0
     """Weight of the free space in least_squares_free."""
+    root: bool = True
+    """Whether least_squares_free is the root of its squares."""
     density: float = 2.0
     """Density n tau of the soft image in render, in units of s."""
     learning_rate: float = 1.5e-3
@@ -93,6 +95,7 @@ def train(config: TrainingConfig, output: Path, network: RegressorConfig | None 
         config.stride,
         config.density,
         config.free_space,
+        config.root,
     )
     output.mkdir(parents=True, exist_ok=True)
     torch.manual_seed(config.seed)
