@@ -60,7 +60,7 @@ def main() -> None:
         iou, cube = entry["iou"], entry["thesis_iou"]
         rows.append(
             [
-                entry["loss"],
+                folder.name,
                 f"{entry['steps']} / {entry['minutes']:.0f}",
                 f"{100 * iou['mean']:.2f} +- {100 * iou['std']:.2f}",
                 f"{100 * entry['over_85']:.1f}",
@@ -72,7 +72,7 @@ def main() -> None:
                 THESIS.get(entry["loss"], ""),
             ]
         )
-    header = ["loss", "steps / min", "IoU %", "over 85 %", "thesis IoU %", "dA %", "dE %", "dT %", "quarter turns %"]
+    header = ["run", "steps / min", "IoU %", "over 85 %", "thesis IoU %", "dA %", "dE %", "dT %", "quarter turns %"]
     report.write("losses", {"bodies": options.bodies, "runs": result}, report.table([*header, "thesis: IoU %"], rows))
 
 
