@@ -27,13 +27,22 @@ def alike(one: State, other: State) -> bool:
 
 
 def other_depths(state: State, axes: np.ndarray) -> list[State]:
-    """The body with another half size along the first of these axes, or the second: thinner, also with another z."""
+    """The body with another half size along the first of these axes, or the second; thinner with another z; turned."""
     first, second = int(axes[0]), int(axes[1])
     size = state.parameters
     thinner = resized(state, first, 0.5 * size[first])
     found = [thinner, resized(state, first, 0.35 * size[first]), resized(state, first, 1.4 * size[first])]
     found += [resized(state, second, share * size[second]) for share in (0.35, 1.4)]
-    return found + other_orders(thinner)
+    return [*found, *other_orders(thinner), _turned(state)]
+
+
+def _turned(state: State) -> State:
+    """The body turned by 45 degrees about its z: a square cross-section and a round one are hard to tell apart."""
+    parameters = state.parameters.copy()
+    parameters[:2] = math.sqrt(0.5 * (parameters[0] ** 2 + parameters[1] ** 2))
+    parameters[4] = symmetry_start.START_EXPONENT
+    turned = symmetry_start.eighth_turns(state.rotation)[2]
+    return State(parameters, np.ascontiguousarray(turned), math.inf, state.iterations)
 
 
 def other_orders(state: State) -> list[State]:

@@ -55,12 +55,14 @@ HIT_TOLERANCE = 3e-3
 """Rays remember where they met the body, so that this error of g vanishes as the search converges."""
 OUTLIER = 5.0
 """Object rays this many standard deviations off the surface of the winner are dropped."""
-SETTLED, UNSURE = 1.01, 0.01
+SETTLED, UNSURE = 1.03, 0.01
 """A last mean squared residual above the one, or a half size less certain than the other, as a share of it, make other
 valleys of the cost worth a look."""
 MOST_VARIATIONS = 2
 RIVAL_SLACK = 4.0
 """Cost that few rays may hide."""
+FIRST_STEPS, HOPELESS = 5, 2.0
+MORE_RAYS = 1500
 PROMISING = 24
 """So many bodies of the exact search start the one that tolerates a model error."""
 THIN = 0.3
@@ -78,6 +80,10 @@ MODEL_SPREAD = 2.5**2
 """Factor of the covariance for objects that are no superquadrics, whose errors are alike; read from scanned objects."""
 REAL_WEIGHT = 50.0
 """Model errors of neighbouring pixels are alike: an object on a table counts as so many independent rays."""
+
+
+Rays = tuple[np.ndarray, np.ndarray]
+"""Of the object and of free space."""
 
 
 class Search:
@@ -117,6 +123,8 @@ class Search:
             self._select(self._coarse(given), FINALISTS)
         if not given or (self.options.fall_back and not self._good_enough()):
             self._select(self._automatic(), FINALISTS)
+            if not self._good_enough() and self.tolerated == 0 and not self._late():
+                self._look_around()
             if not self._good_enough() and self.tolerated == 0 and not self._late():
                 self._select(self._coarse(self._everything()), ESCALATED_FINALISTS)
             if not self._good_enough() and self.tolerated == 0 and not self._late():
@@ -182,7 +190,7 @@ class Search:
 
     # Stages
 
-    def _draw(self, count: int, offset: float) -> tuple[np.ndarray, np.ndarray]:
+    def _draw(self, count: int, offset: float) -> Rays:
         """Object and free rays for one stage."""
         rays = self.observation.object_rays(count, offset)
         free = self.observation.free_rays(int(FREE_SHARE * count), offset)
@@ -219,6 +227,13 @@ class Search:
             ]
         self.finalists = self._rivals(self.finalists + candidates)[:FINALISTS]
 
+    def _look_around(self) -> None:
+        """Try the rivals of the favourite."""
+        rays = self._draw(BASIN_RAYS, 0.7)
+        best = self._settled(self.finalists[0], rays, BASIN_STEPS)
+        rivals = other_depths(best, np.argsort(-np.abs(best.rotation[2]))) + other_axes(best)
+        self.finalists = self._rivals([*self.finalists, *self._promising(rivals, rays, best.cost)])[:FINALISTS]
+
     def _rivals(self, candidates: list[State]) -> list[State]:
         """Candidates, best first, without those that the noise cannot have made worse than the best."""
         ranked = sorted(candidates, key=_cost)
@@ -227,19 +242,20 @@ class Search:
 
     def decided(self) -> State:
         """The last stage: the finalists on the full budget of rays, one scene for all of them."""
-        favourite = self.finalists[0]
+        finalists = self.finalists
+        favourite = finalists[0]
         if self.tolerated == 0 and not self._late():
             favourite = self._outlined(favourite)
         self.rays, self.free = self._draw(self.options.pixels or self._enough(), 0.3)
         if self.tolerated == 0:
             self.rays = self._without_outliers(self.rays, favourite)
-            favourite = self._sharpened(favourite)
+            finalists = self._shortlist([self._sharpened(favourite), *self.finalists[1:]])
         else:
             excess = max(1.0, favourite.cost / REAL_WEIGHT)
             self.rays[:, 6] /= excess
             self.free[:, 6] /= excess
-        best = self._refined(favourite, self.options.max_iterations)
-        for rival in self.finalists[1:]:
+        best = self._refined(finalists[0], self.options.max_iterations)
+        for rival in finalists[1:]:
             if self._late():
                 break
             state = self._refined(rival, self.options.max_iterations)
@@ -254,6 +270,18 @@ class Search:
         if self.observation.camera.is_pinhole and not self._late():
             best = self._doubted(best)
         return best
+
+    def _shortlist(self, finalists: list[State]) -> list[State]:
+        """The finalists, best first, that are worth all rays."""
+        if len(finalists) == 1:
+            return finalists
+        rays = self._draw(MORE_RAYS, 0.3)
+        settled = sorted((self._settled(state, rays, BASIN_STEPS) for state in finalists), key=_cost)
+        chosen: list[State] = []
+        for state in settled:
+            if state.cost < settled[0].cost + RIVAL_SLACK and not any(alike(state, other) for other in chosen):
+                chosen.append(state)
+        return [state._replace(cost=math.inf) for state in chosen]
 
     def _sharpened(self, state: State) -> State:
         """Read the outline's precision from a body's misfit, and again from the better body that this allows."""
@@ -293,27 +321,42 @@ class Search:
         return best
 
     def _better(self, best: State, rivals: list[State]) -> State:
-        """The best of a body and its rivals: these must not be worse on few rays before they are tried on all."""
-        rays, free = self._draw(BASIN_RAYS, 0.2)
-        settled: list[State] = []
-        for state in [best, *rivals]:
-            if self._late():
-                break
-            state = state._replace(cost=math.inf)
-            state = minimize(RENDERED, rays, free, self.scene, state, self.limits, BASIN_STEPS, TOLERANCE)
-            if not settled:
-                reference = state
-                # On other rays the body may already find its way out of a shallow valley.
-                settled.append(best._replace(cost=state.cost))
-            known = any(alike(state, other) for other in settled)
-            if not known and state.cost < reference.cost + RIVAL_SLACK:
+        """The best of a body and its rivals: these must not be worse on few rays before they are tried on more."""
+        few = self._draw(BASIN_RAYS, 0.2)
+        reference = self._settled(best, few, BASIN_STEPS)
+        # On other rays the body may already find its way out of a shallow valley.
+        settled = [best._replace(cost=reference.cost)]
+        for state in [reference, *self._promising(rivals, few, reference.cost)]:
+            if state.cost < reference.cost + RIVAL_SLACK and not any(alike(state, other) for other in settled):
                 settled.append(state)
+        if len(settled) == 1:
+            return best
+        more = self._draw(MORE_RAYS, 0.8)
+        reference = self._settled(best, more, BASIN_STEPS)
         for rival in sorted(settled[1:], key=_cost)[:FINALISTS]:
-            state = self._refined(rival, self.options.max_iterations)
+            state = self._settled(rival, more, BASIN_STEPS)
+            if state.cost > reference.cost + RIVAL_SLACK or self._late():
+                continue
+            state = self._refined(state._replace(cost=math.inf), self.options.max_iterations)
             self._refined_rivals.append(state)
             if state.cost < best.cost - SIGNIFICANT:
                 best = state
         return best
+
+    def _promising(self, rivals: list[State], rays: Rays, cost: float) -> list[State]:
+        """Rivals on few rays, some steps at a time: those that stay far behind are given up."""
+        found = []
+        for rival in rivals:
+            if self._late():
+                break
+            state = self._settled(rival, rays, FIRST_STEPS)
+            if state.cost < HOPELESS * cost:
+                found.append(self._settled(state, rays, BASIN_STEPS - FIRST_STEPS))
+        return found
+
+    def _settled(self, state: State, rays: Rays, steps: int) -> State:
+        state = state._replace(cost=math.inf)
+        return minimize(RENDERED, *rays, self.scene, state, self.limits, steps, TOLERANCE)
 
     def _alternatives(self, best: State) -> list[Alternative]:
         """The other valleys that explain the image almost as well."""
