@@ -108,11 +108,12 @@ def _finish(node: StoppableNode | None) -> None:
     if node is not None:
         node.close()
         node.destroy_node()
-    rclpy.try_shutdown()
-    _ignore_signals()
+    # Uninstalling handlers that are no longer there, rclpy installs the default action for an instant: a second Ctrl-C
+    # would kill the process.
+    rclpy.try_shutdown(uninstall_handlers=False)
 
 
 def _ignore_signals() -> None:
-    """A second Ctrl-C (launch sends one) must not interrupt the end; rclpy's shutdown brings old handlers back."""
+    """A second Ctrl-C (launch sends one) must not interrupt the end."""
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)
