@@ -48,28 +48,32 @@ def run(name: str, create: Callable[[], StoppableNode], arguments: Sequence[str]
         signal.signal(number, stop)
     node: StoppableNode | None = None
     try:
-        # Libraries read these when they are loaded, rclpy already loads numpy.
-        for variable, value in {**_THREADS, **fast_dds.additions()}.items():
-            os.environ.setdefault(variable, value)
-        import rclpy
-        from rclpy.executors import SingleThreadedExecutor
+        try:
+            # Libraries read these when they are loaded, rclpy already loads numpy.
+            for variable, value in {**_THREADS, **fast_dds.additions()}.items():
+                os.environ.setdefault(variable, value)
+            import rclpy
+            from rclpy.executors import SingleThreadedExecutor
 
-        rclpy.init(args=None if arguments is None else list(arguments))
-        # Before the node announces itself: an executor whose creation a signal interrupts complains when it is deleted.
-        executor = SingleThreadedExecutor()
-        node = create()
-        stop.starting = False
-        _spin(node, executor)
+            rclpy.init(args=None if arguments is None else list(arguments))
+            # Before the node announces itself: an executor whose creation a signal interrupts complains when it is
+            # deleted.
+            executor = SingleThreadedExecutor()
+            node = create()
+            stop.starting = False
+            _spin(node, executor)
+        except Exception as error:
+            if stop.received:
+                # rclpy has shut its context down, and whatever was going on has failed because of that.
+                return 0
+            if not (stop.starting and isinstance(error, _start_errors())):
+                raise
+            _explain(name, error)
+            return 1
     except KeyboardInterrupt:
+        # Around the handling of failures too: rclpy's own thread may end the context, and thereby the start, before
+        # Python comes to look at the signal.
         return 0
-    except Exception as error:
-        if stop.received:
-            # rclpy has shut its context down, and whatever was going on has failed because of that.
-            return 0
-        if not (stop.starting and isinstance(error, _start_errors())):
-            raise
-        _explain(name, error)
-        return 1
     finally:
         _ignore_signals()
         _finish(node)
@@ -108,12 +112,11 @@ def _finish(node: StoppableNode | None) -> None:
     if node is not None:
         node.close()
         node.destroy_node()
-    # Uninstalling handlers that are no longer there, rclpy installs the default action for an instant: a second Ctrl-C
-    # would kill the process.
-    rclpy.try_shutdown(uninstall_handlers=False)
+    rclpy.try_shutdown()
+    _ignore_signals()
 
 
 def _ignore_signals() -> None:
-    """A second Ctrl-C (launch sends one) must not interrupt the end."""
+    """A second Ctrl-C (launch sends one) must not interrupt the end; rclpy's shutdown may bring old handlers back."""
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)
