@@ -4,10 +4,13 @@
 2. From each, a few Levenberg-Marquardt steps on the Sampson residual and free space with some 150 rays: a wide basin.
    More starts only while the best residual stays above the noise floor.
 3. Those that the noise does not tell apart go on: Sampson with more rays, then the rendered residual.  If the winner's
-   residual is above the floor, all starts are tried.
+   residual is above the floor, its rivals are tried (:mod:`sq_perception.fitting.rivals`), then all starts.
 4. The winner, and whatever still rivals it: rays far off its surface are dropped, the outline's precision is read from
-   its misfit, and the rendered residual is minimised on the full budget of rays.
-5. If no superquadric reaches the floor, what is left becomes the model error, and stages 2 to 4 run once more with it:
+   its misfit, and again from the better body that this allows, and the rendered residual is minimised on all rays.
+5. Where something is left unexplained, or a half size is not certain to 1 %, the rivals of the result are tried, few
+   rays first.  Those that explain the image almost as well stay as alternatives and add to the covariance.
+6. Rounded readings of a face that looks at the camera are treated apart (:mod:`sq_perception.fitting.rounding`).
+7. If no superquadric reaches the floor, what is left becomes the model error, and stages 2 to 4 run once more with it:
    then neighbouring pixels err alike, the object counts as few independent rays, and wide priors decide what is open.
 
 The noise floor is a mean squared residual of 1, as residuals are in units of the noise.
@@ -62,6 +65,7 @@ MOST_VARIATIONS = 2
 RIVAL_SLACK = 4.0
 """Cost that few rays may hide."""
 FIRST_STEPS, HOPELESS = 5, 2.0
+"""A rival that costs so many times more than the body at hand after its first steps is given up."""
 MORE_RAYS = 1500
 PROMISING = 24
 """So many bodies of the exact search start the one that tolerates a model error."""
