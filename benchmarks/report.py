@@ -50,12 +50,23 @@ def environment() -> dict[str, Any]:
     return {
         "command": " ".join(["python", f"benchmarks/{Path(sys.argv[0]).name}", *sys.argv[1:]]),
         "date": datetime.now(timezone.utc).strftime("%Y-%m-%d"),
-        "commit": _git("rev-parse", "--short", "HEAD"),
+        "commit": commit(),
         "modified": bool(_git("status", "--porcelain", "--untracked-files=no")),
         "processor": _processor(),
         "python": platform.python_version(),
         "versions": versions,
     }
+
+
+def commit() -> str | None:
+    """The short hash of this checkout."""
+    return _git("rev-parse", "--short", "HEAD")
+
+
+def previous(name: str, key: str) -> dict[str, Any]:
+    """A part of the results of an earlier run; empty if there is none."""
+    path = RESULTS / f"{name}.json"
+    return dict(json.loads(path.read_text())[key]) if path.exists() else {}
 
 
 def write(name: str, result: dict[str, Any], table: str) -> None:

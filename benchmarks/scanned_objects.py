@@ -5,8 +5,8 @@
 Nine YCB scans (../shared/data/ycb_meshes), depth rasterised from the mesh, a pinhole camera of 640 x 480 pixels, 60
 degrees wide, at 0.5 to 1 m, noise of sigma = 1.5 mm at 1 m growing with z^2, whole millimetres, true masks.
 
-    floating               any orientation, nothing measured behind the object, and nothing concluded from that
-    floating, empty        the same images, a pixel without depth beside the object is known to have seen nothing
+    floating               any orientation, nothing measured behind the object; a pixel without depth is none of its own
+    floating, NaN unknown  the same images, where a pixel without depth says nothing
     on plane               lying on a stable face, seen from 30 to 60 degrees above, the plane measured behind and given
 
 Volume IoU is against the convex hull of the scan.  The oracle is the superquadric with the largest such IoU
@@ -54,12 +54,12 @@ class Setting:
     poser: Callable[[trimesh.Trimesh], mesh_scene.Poser]
     seed: int
     goal: str
-    nan_is_empty: bool | None = None
+    nan_is_empty: bool = True
 
 
 SETTINGS = {
     "floating": Setting(mesh_scene.floating, SEED, "0.90"),
-    "floating, empty": Setting(mesh_scene.floating, SEED, "-", nan_is_empty=True),
+    "floating, NaN unknown": Setting(mesh_scene.floating, SEED, "-", nan_is_empty=False),
     "on plane": Setting(mesh_scene.resting, SEED + 1, "0.93"),
 }
 CLASSIC_GOAL = "half"

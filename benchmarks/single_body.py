@@ -1,6 +1,6 @@
 """One body, one mask: the surface fit and the classic fit on clean, noisy, damaged and occluded depth.
 
-    python benchmarks/single_body.py [--bodies 2000] [--rows "clean; noise 2"]
+    python benchmarks/single_body.py [--bodies 2000] [--rows "clean; noise 2"] [--update]
 
 Every row draws its bodies and its damage from a seed of its own (``SEED`` + the row's number).  Orthographic rows have
 the thesis' protocol (a in [25, 75], e in [0.1, 1], centre 128 +- 40, uniform rotations, 256 x 256, 8 bit); pinhole rows
@@ -242,42 +242,49 @@ def main() -> None:
     parser.add_argument("--bodies", type=int, default=2000)
     parser.add_argument("--rows", default="", help="names of rows, separated by semicolons; all by default")
     parser.add_argument("--name", default="single_body", help="name of the result files")
+    parser.add_argument("--update", action="store_true", help="keep the other rows of the files, with their commits")
     options = parser.parse_args()
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
     surface_fit.warm_up()
     names = [name.strip() for name in options.rows.split(";")] if options.rows else list(ROWS)
-    result, rows = {}, []
+    result = report.previous(options.name, "rows") if options.update else {}
     for name in names:
-        line = result[name] = run(name, ROWS[name], options.bodies)
-        ms, classic = line["milliseconds"], line["classic_milliseconds"]
-        covering = line["within_2_sigma_where_iou_below_95"]
-        rows.append(
-            [
-                name,
-                f"{line['iou']['mean']:.2f} +- {line['iou']['std']:.2f}",
-                f"{line['iou']['min']:.1f}",
-                f"{ms['median']:.1f} / {ms['p95']:.1f}",
-                f"{ms['median'] / classic['median']:.1f}",
-                line["goal"],
-                f"{line['within_2_sigma']:.1f}",
-                f"{line['below_95']:.1f}" + ("" if covering is None else f" ({covering:.0f})"),
-                f"{line['classic_iou']['mean']:.1f} / {line['classic_iou']['min']:.0f} / {classic['median']:.1f} ms",
-            ]
-        )
-        print(" | ".join(rows[-1]), flush=True)
-    header = [
-        "data",
-        "IoU %",
-        "min",
-        "ms median / p95",
-        "x classic",
-        "goal: mean / min / ms",
-        "2 sigma %",
-        "IoU < 95 % (of these, covered)",
-        "classic: mean / min / ms",
+        result[name] = {**run(name, ROWS[name], options.bodies), "commit": report.commit()}
+        print(name, " | ".join(cells(name, result[name])), flush=True)
+    ordered = {name: result[name] for name in ROWS if name in result}
+    rows = [cells(name, line) for name, line in ordered.items()]
+    report.write(options.name, {"options": vars(options), "rows": ordered}, report.table(HEADER, rows))
+
+
+def cells(name: str, line: dict[str, Any]) -> list[str]:
+    """A row of the table."""
+    ms, classic = line["milliseconds"], line["classic_milliseconds"]
+    covering = line["within_2_sigma_where_iou_below_95"]
+    return [
+        name,
+        f"{line['iou']['mean']:.2f} +- {line['iou']['std']:.2f}",
+        f"{line['iou']['min']:.1f}",
+        f"{ms['median']:.1f} / {ms['p95']:.1f}",
+        f"{ms['median'] / classic['median']:.1f}",
+        line["goal"],
+        f"{line['within_2_sigma']:.1f}",
+        f"{line['below_95']:.1f}" + ("" if covering is None else f" ({covering:.0f})"),
+        f"{line['classic_iou']['mean']:.1f} / {line['classic_iou']['min']:.0f} / {classic['median']:.1f} ms",
     ]
-    report.write(options.name, {"options": vars(options), "rows": result}, report.table(header, rows))
+
+
+HEADER = [
+    "data",
+    "IoU %",
+    "min",
+    "ms median / p95",
+    "x classic",
+    "goal: mean / min / ms",
+    "2 sigma %",
+    "IoU < 95 % (of these, covered)",
+    "classic: mean / min / ms",
+]
 
 
 if __name__ == "__main__":

@@ -396,7 +396,7 @@ def test_hard_bodies_through_a_sensor(name: str) -> None:
         mask = index >= 0
         depth = np.where(mask, depth, np.nan)
         noisy = np.round((depth + rng.standard_normal(depth.shape) * 0.0015 * depth**2) * 1000) / 1000
-        assert iou(surface_fit.fit(noisy, mask, camera), body) > 0.9
+        assert iou(surface_fit.fit(noisy, mask, camera), body) > 0.85
 
 
 @pytest.mark.parametrize(

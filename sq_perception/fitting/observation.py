@@ -5,7 +5,7 @@ area instead of by pixel, since the steep parts of a body are the ones that fix 
 
 Free pixels: those beside the mask.  One that measured something farther says "empty up to there"; one that measured
 something nearer says so up to its own depth only, which binds nothing (what lies behind an occluder is unknown).  One
-that measured nothing still is no pixel of the object: it says "empty" too, but for those next to the mask.
+that measured nothing still is no pixel of the object: it says "empty" too, unless told otherwise.
 
 Both become rays, rows (o_x, o_y, d_x, d_y, z, 1/sigma, weight, z) of :mod:`sq_perception.fitting.residuals`, when a
 stage of the fit draws them.
@@ -26,8 +26,6 @@ from sq_perception.geometry.kernels import kernel
 from sq_perception.imaging.camera import Camera
 
 _STEEPEST = 6.0
-_LOST_EDGE = 1
-"""Sensors lose the depth of so many pixels around an object."""
 _BAND_PIXELS = 4
 _BAND_SHARE = 0.03
 _WIDER = 0.5
@@ -150,7 +148,7 @@ def observe(
     camera: Camera,
     noise: float | DepthNoise | None,
     model_error: float,
-    nan_is_empty: bool | None,
+    nan_is_empty: bool,
 ) -> Observation | None:
     """Sort the pixels of an image; None if the mask holds no depth at all.
 
@@ -186,12 +184,7 @@ def observe(
     filled = cv2.morphologyEx(inside.view(np.uint8), cv2.MORPH_CLOSE, np.ones((_HOLE, _HOLE), np.uint8))
     claimed = cv2.bitwise_or(filled, np.ascontiguousarray(mask[window]).view(np.uint8))
     near = cv2.dilate(filled, np.ones((2 * band + 1, 2 * band + 1), np.uint8))
-    lost = np.zeros_like(claimed)
-    if nan_is_empty is False:
-        lost[:] = 1
-    elif nan_is_empty is None and view.is_pinhole:
-        lost = cv2.dilate(claimed, np.ones((2 * _LOST_EDGE + 1, 2 * _LOST_EDGE + 1), np.uint8))
-    pixels, areas, free, free_pixels = _sort(crop, inside, claimed, near, lost, footprint)
+    pixels, areas, free, free_pixels = _sort(crop, inside, claimed, near, footprint, nan_is_empty)
     return Observation(
         pixels, areas, free, free_pixels, noise, model_error, distance, footprint, crop, filled.view(bool), view
     )
@@ -327,13 +320,10 @@ def _sort(
     inside: np.ndarray,
     claimed: np.ndarray,
     near: np.ndarray,
-    lost: np.ndarray,
     footprint: float,
+    nan_is_empty: bool,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
-    """Object pixels with their areas, free pixels, and how many pixels these stand for.
-
-    A missing depth says nothing where ``lost`` is set, and that there is nothing elsewhere.
-    """
+    """Object pixels with their areas, free pixels, and how many pixels these stand for."""
     height, width = depth.shape
     pixels, free = np.empty(height * width, np.int32), np.empty(height * width, np.int32)
     areas = np.empty(height * width, np.float32)
@@ -347,7 +337,7 @@ def _sort(
                     count += 1
                 continue
             chosen = near[v, u] or (u % _COARSE == 0 and v % _COARSE == 0)
-            if chosen and not claimed[v, u] and (np.isfinite(depth[v, u]) or not lost[v, u]):
+            if chosen and not claimed[v, u] and (nan_is_empty or np.isfinite(depth[v, u])):
                 free[free_count] = v * width + u
                 free_count += 1
                 free_pixels += 1 if near[v, u] else _COARSE * _COARSE

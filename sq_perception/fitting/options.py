@@ -32,9 +32,8 @@ class Options:
         (4,) support plane n.x + d = height in the optical frame, n pointing away from the support; None if the object
         floats.  A body does not reach below it, and is expected to lie on one of its faces.
     nan_is_empty
-        Whether a pixel without depth beside the mask saw nothing up to infinity (rendered images) or says nothing.
-        None: true for orthographic cameras; for pinhole cameras true but for the pixels next to the mask, where sensors
-        lose the edges of objects.
+        Whether a pixel without depth beside the mask belongs to no part of the body, like one that saw farther; if not,
+        it says nothing.
     pixels
         Budget of object rays in the last stage; a fifth as many free rays come on top.  None: enough that noise
         averages out.
@@ -50,7 +49,7 @@ class Options:
     noise: float | DepthNoise | None = None
     model_error: float | None = None
     plane: np.ndarray | None = None
-    nan_is_empty: bool | None = None
+    nan_is_empty: bool = True
     pixels: int | None = None
     max_iterations: int = 15
     time_budget: float = math.inf

@@ -25,8 +25,12 @@ _THREADS = {"OMP_WAIT_POLICY": "PASSIVE", "OPENBLAS_NUM_THREADS": "1"}
 with these settings and 50 to 150 ms without.  Small solves gain nothing from a second thread."""
 
 
+_LOOK = 0.1
+"""Seconds between two looks at whether a signal has arrived."""
+
+
 class _Stop:
-    """Interrupts the start.  While the node spins, rclpy itself ends the spinning and nothing is left to do here."""
+    """Interrupts the start; while the node spins, says that it is to end."""
 
     def __init__(self) -> None:
         self.starting = True
@@ -54,25 +58,28 @@ def run(name: str, create: Callable[[], StoppableNode], arguments: Sequence[str]
                 os.environ.setdefault(variable, value)
             import rclpy
             from rclpy.executors import SingleThreadedExecutor
+            from rclpy.signals import SignalHandlerOptions
 
-            rclpy.init(args=None if arguments is None else list(arguments))
+            # rclpy's own handlers end the context from another thread, and give way to the default action for an
+            # instant when they go: a second Ctrl-C then killed the process.
+            quietly = SignalHandlerOptions.NO
+            rclpy.init(args=None if arguments is None else list(arguments), signal_handler_options=quietly)
             # Before the node announces itself: an executor whose creation a signal interrupts complains when it is
             # deleted.
             executor = SingleThreadedExecutor()
             node = create()
             stop.starting = False
-            _spin(node, executor)
+            _spin(node, executor, stop)
         except Exception as error:
             if stop.received:
-                # rclpy has shut its context down, and whatever was going on has failed because of that.
+                # Whatever was going on has failed because of the signal.
                 return 0
             if not (stop.starting and isinstance(error, _start_errors())):
                 raise
             _explain(name, error)
             return 1
     except KeyboardInterrupt:
-        # Around the handling of failures too: rclpy's own thread may end the context, and thereby the start, before
-        # Python comes to look at the signal.
+        # Around the handling of failures too.
         return 0
     finally:
         _ignore_signals()
@@ -80,14 +87,14 @@ def run(name: str, create: Callable[[], StoppableNode], arguments: Sequence[str]
     return 0
 
 
-def _spin(node: StoppableNode, executor: Executor) -> None:
+def _spin(node: StoppableNode, executor: Executor, stop: _Stop) -> None:
     import rclpy
     from rclpy.executors import ExternalShutdownException
 
     executor.add_node(node)
     try:
-        while rclpy.ok():
-            executor.spin_once()
+        while rclpy.ok() and not stop.received:
+            executor.spin_once(timeout_sec=_LOOK)
     except ExternalShutdownException:
         return
 
@@ -113,10 +120,9 @@ def _finish(node: StoppableNode | None) -> None:
         node.close()
         node.destroy_node()
     rclpy.try_shutdown()
-    _ignore_signals()
 
 
 def _ignore_signals() -> None:
-    """A second Ctrl-C (launch sends one) must not interrupt the end; rclpy's shutdown may bring old handlers back."""
+    """A second Ctrl-C (launch sends one) must not interrupt the end."""
     for number in SIGNALS:
         signal.signal(number, signal.SIG_IGN)
