@@ -251,7 +251,7 @@ def main() -> None:
     result = report.previous(options.name, "rows") if options.update else {}
     for name in names:
         result[name] = {**run(name, ROWS[name], options.bodies), "commit": report.commit()}
-        print(name, " | ".join(cells(name, result[name])), flush=True)
+        print(" | ".join(cells(name, result[name])), flush=True)
     ordered = {name: result[name] for name in ROWS if name in result}
     rows = [cells(name, line) for name, line in ordered.items()]
     report.write(options.name, {"options": vars(options), "rows": ordered}, report.table(HEADER, rows))
