@@ -426,6 +426,18 @@ def test_a_hollow_body_is_taken_for_its_hull() -> None:
     assert iou(surface_fit.fit(depth, mask, CAMERA), body) > 0.9
 
 
+@pytest.mark.parametrize("behind", [1.5, np.nan])
+def test_a_hole_that_the_sensor_left_is_no_hole_in_the_body(behind: float) -> None:
+    """Shiny and black surfaces give no depth, and masks made from depth leave them out."""
+    truth = pinhole_body(np.random.default_rng(1))
+    depth, mask = pinhole_image(truth, behind)
+    rows, columns = np.nonzero(mask)
+    v, u = int(rows.mean()), int(columns.mean())
+    depth[v - 8 : v + 9, u - 12 : u + 7] = np.nan
+    mask &= np.isfinite(depth)
+    assert iou(surface_fit.fit(depth, mask, CAMERA), truth) > 0.97
+
+
 def test_a_longer_body_is_not_taken_for_a_smaller_mask() -> None:
     """A body that covers free pixels on one side only is too long; the mask is right."""
     truth = pinhole_body(np.random.default_rng(3))

@@ -5,7 +5,8 @@ area instead of by pixel, since the steep parts of a body are the ones that fix 
 
 Free pixels: those beside the mask.  One that measured something farther says "empty up to there"; one that measured
 something nearer says so up to its own depth only, which binds nothing (what lies behind an occluder is unknown).  One
-that measured nothing still is no pixel of the object: it says "empty" too, unless told otherwise.
+that measured nothing is no pixel of the object either: it says "empty" too, unless told otherwise, or within the
+convex hull of the mask, where it is a hole that the sensor left.
 
 Both become rays, rows (o_x, o_y, d_x, d_y, z, 1/sigma, weight, z) of :mod:`sq_perception.fitting.residuals`, when a
 stage of the fit draws them.
@@ -184,10 +185,19 @@ def observe(
     filled = cv2.morphologyEx(inside.view(np.uint8), cv2.MORPH_CLOSE, np.ones((_HOLE, _HOLE), np.uint8))
     claimed = cv2.bitwise_or(filled, np.ascontiguousarray(mask[window]).view(np.uint8))
     near = cv2.dilate(filled, np.ones((2 * band + 1, 2 * band + 1), np.uint8))
-    pixels, areas, free, free_pixels = _sort(crop, inside, claimed, near, footprint, nan_is_empty)
+    lost = _convex_hull(claimed) if nan_is_empty else np.ones_like(claimed)
+    pixels, areas, free, free_pixels = _sort(crop, inside, claimed, near, lost, footprint)
     return Observation(
         pixels, areas, free, free_pixels, noise, model_error, distance, footprint, crop, filled.view(bool), view
     )
+
+
+def _convex_hull(mask: np.ndarray) -> np.ndarray:
+    """The convex hull of a mask (h, w) of 0 and more, as one of 0 and 1."""
+    outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    hull = np.zeros_like(mask)
+    cv2.fillConvexPoly(hull, cv2.convexHull(np.concatenate(outlines)), 1)
+    return hull
 
 
 @kernel
@@ -320,10 +330,13 @@ def _sort(
     inside: np.ndarray,
     claimed: np.ndarray,
     near: np.ndarray,
+    lost: np.ndarray,
     footprint: float,
-    nan_is_empty: bool,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
-    """Object pixels with their areas, free pixels, and how many pixels these stand for."""
+    """Object pixels with their areas, free pixels, and how many pixels these stand for.
+
+    A missing depth says nothing where ``lost`` is set, and elsewhere that there is nothing.
+    """
     height, width = depth.shape
     pixels, free = np.empty(height * width, np.int32), np.empty(height * width, np.int32)
     areas = np.empty(height * width, np.float32)
@@ -337,7 +350,7 @@ def _sort(
                     count += 1
                 continue
             chosen = near[v, u] or (u % _COARSE == 0 and v % _COARSE == 0)
-            if chosen and not claimed[v, u] and (nan_is_empty or np.isfinite(depth[v, u])):
+            if chosen and not claimed[v, u] and (np.isfinite(depth[v, u]) or not lost[v, u]):
                 free[free_count] = v * width + u
                 free_count += 1
                 free_pixels += 1 if near[v, u] else _COARSE * _COARSE

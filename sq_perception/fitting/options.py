@@ -32,8 +32,8 @@ class Options:
         (4,) support plane n.x + d = height in the optical frame, n pointing away from the support; None if the object
         floats.  A body does not reach below it, and is expected to lie on one of its faces.
     nan_is_empty
-        Whether a pixel without depth beside the mask belongs to no part of the body, like one that saw farther; if not,
-        it says nothing.
+        Whether a pixel without depth, outside the mask's convex hull, belongs to no part of the body, like one that saw
+        farther; if not, it says nothing.
     pixels
         Budget of object rays in the last stage; a fifth as many free rays come on top.  None: enough that noise
         averages out.

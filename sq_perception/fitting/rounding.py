@@ -69,6 +69,19 @@ def plausible(
     return walk.mean(), walk.alternatives()
 
 
+def uncertain(
+    best: State, rays: np.ndarray, free: np.ndarray, scene: Scene, limits: tuple[np.ndarray, np.ndarray]
+) -> list[Alternative]:
+    """The bodies with other half sizes along the view that noise allows, where a covariance is too local to tell."""
+    stride = max(1, len(rays) // _RAYS)
+    rays, free = rays[::stride].copy(), free[::stride].copy()
+    rays[:, 6] *= stride
+    free[:, 6] *= stride
+    walk = _Walk(rays, free, scene, limits)
+    walk.along_view(best)
+    return walk.alternatives()
+
+
 class _Walk:
     """Bodies held at one half size along the view after another, from starts outwards, and their weights."""
 
@@ -86,6 +99,7 @@ class _Walk:
         here = self._held(start, log_size)
         found = {log_size: here}
         self.least = min(self.least, here.cost)
+        allowed = _ALLOWED if self.scene.dead_zone > 0 else math.inf
         for direction in (1, -1):
             state, position, unlikely = here, log_size, 0
             for pace in _PACES:
@@ -93,7 +107,7 @@ class _Walk:
                 state = found[position] = self._held(state, position)
                 self.least = min(self.least, state.cost)
                 unlikely = unlikely + 1 if state.cost > self.least + _UNLIKELY else 0
-                if unlikely == 2 and self.least < _ALLOWED:
+                if unlikely == 2 and self.least < allowed:
                     break
         sizes = sorted(found)
         self.sizes += sizes

@@ -61,6 +61,8 @@ OUTLIER = 5.0
 SETTLED, UNSURE = 1.03, 0.01
 """A last mean squared residual above the one, or a half size less certain than the other, as a share of it, make other
 valleys of the cost worth a look."""
+OPEN = 0.1
+"""A half size less certain than this share of it may be anything that the image allows."""
 MOST_VARIATIONS = 2
 RIVAL_SLACK = 4.0
 """Cost that few rays may hide."""
@@ -266,13 +268,24 @@ class Search:
             best = min(best, state, key=_cost)
         if self.tolerated == 0:
             best = self._varied(best)
-            quantum = self.observation.noise.quantum
-            if quantum > 0 and not self._late() and rounding.faces_camera(self.rays, quantum):
-                best, allowed = rounding.plausible(best, self.rays, self.free, self.scene, self.limits)
-                if allowed:
-                    self.alternatives, self.spread_factor = allowed, rounding.FACE_SPREAD**2
+            best = self._spread_along_view(best)
         if self.observation.camera.is_pinhole and not self._late():
             best = self._doubted(best)
+        return best
+
+    def _spread_along_view(self, best: State) -> State:
+        """Ask for all half sizes along the view that the image allows, where readings are rounded or say little."""
+        if self._late():
+            return best
+        quantum = self.observation.noise.quantum
+        if quantum > 0 and rounding.faces_camera(self.rays, quantum):
+            best, allowed = rounding.plausible(best, self.rays, self.free, self.scene, self.limits)
+            if allowed:
+                self.alternatives, self.spread_factor = allowed, rounding.FACE_SPREAD**2
+        elif quantum == 0:
+            covariance = covariance_at(best, self.rays, self.free, self.scene, self.outline)
+            if (np.sqrt(np.diag(covariance)[:3]) > OPEN * best.parameters[:3]).any():
+                self.alternatives = rounding.uncertain(best, self.rays, self.free, self.scene, self.limits)
         return best
 
     def _shortlist(self, finalists: list[State]) -> list[State]:
