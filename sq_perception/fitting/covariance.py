@@ -5,6 +5,8 @@ s^2 = max(1, mean of r^2) lets a body that does not explain the data be less sur
 wide prior (a factor e in size, 0.5 in shape, one size in position, one radian in angle): what the image leaves open,
 such as the turn of a round body about its axis, gets the width of the prior instead of infinity.  The outline counts
 with the noise or a whole pixel, whichever is more: its errors are no independent noise.
+
+That describes one valley of the cost.  Other bodies that the image allows add their second moments about the result.
 """
 
 from __future__ import annotations
