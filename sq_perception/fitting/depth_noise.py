@@ -87,25 +87,20 @@ def _differences(depth: np.ndarray, inside: np.ndarray, step: int) -> tuple[np.n
     height, width = depth.shape
     most = ((height - 1) // step + 1) * width + ((width - 1) // step + 1) * height
     third, first = np.empty(most), np.empty(most)
-    count, moved = 0, 0
-    for v in range(0, height, step):
-        for u in range(width - 3):
-            if inside[v, u] and inside[v, u + 1] and inside[v, u + 2] and inside[v, u + 3]:
-                a, b, c, d = depth[v, u], depth[v, u + 1], depth[v, u + 2], depth[v, u + 3]
+    count = 0
+    for down, right in ((0, 1), (1, 0)):
+        for v in range(0, height - 3 * down, 1 if down else step):
+            for u in range(0, width - 3 * right, 1 if right else step):
+                line = True
+                for k in range(4):
+                    line = line and inside[v + k * down, u + k * right]
+                if not line:
+                    continue
+                a, b = depth[v, u], depth[v + down, u + right]
+                c, d = depth[v + 2 * down, u + 2 * right], depth[v + 3 * down, u + 3 * right]
                 value = abs(a - 3.0 * b + 3.0 * c - d)
                 if value >= 0.0:
                     third[count] = value
+                    first[count] = abs(np.float64(a) - np.float64(b))
                     count += 1
-                    first[moved] = abs(np.float64(a) - np.float64(b))
-                    moved += 1
-    for u in range(0, width, step):
-        for v in range(height - 3):
-            if inside[v, u] and inside[v + 1, u] and inside[v + 2, u] and inside[v + 3, u]:
-                a, b, c, d = depth[v, u], depth[v + 1, u], depth[v + 2, u], depth[v + 3, u]
-                value = abs(a - 3.0 * b + 3.0 * c - d)
-                if value >= 0.0:
-                    third[count] = value
-                    count += 1
-                    first[moved] = abs(np.float64(a) - np.float64(b))
-                    moved += 1
-    return third[:count], first[:moved]
+    return third[:count], first[:count]

@@ -5,7 +5,8 @@ q of depth with little noise, all those of the face err alike, by up to q / 2, a
 news of the outline.  What is certain is that the true body passes every reading at no more than q / 2.  So the half
 size along the view is held at one value after another, the rest is fitted with residuals that count only beyond q / 2
 (a dead zone), and each value has the weight exp(-cost / 2).  Their mean is the estimate, their spread the standard
-deviation.
+deviation.  Under noise the same walk along the half size, without the dead zone, says how far a covariance, which is
+local, can be trusted (:func:`uncertain`).
 
 Reference for the bounded-error view: M. Milanese, A. Vicino, Optimal estimation theory for dynamic systems with set
 membership uncertainty, Automatica 27(6), 1991.
