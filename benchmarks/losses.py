@@ -30,7 +30,7 @@ from sq_perception.geometry import Superquadric  # noqa: E402
 from sq_perception.geometry import rotation as quaternions  # noqa: E402
 from sq_perception.imaging.scene import thesis_bodies  # noqa: E402
 from sq_perception.learning import checkpoint  # noqa: E402
-from sq_perception.learning.dataset import draw_views  # noqa: E402
+from sq_perception.learning.dataset import ViewSource, draw_views  # noqa: E402
 from sq_perception.learning.objective import Objective  # noqa: E402
 
 THESIS = {
@@ -82,7 +82,7 @@ def evaluate(folder: Path, count: int, seed: int) -> dict[str, Any]:
     header = checkpoint.read_header(folder / "model.safetensors")
     training, last = json.loads(header["training"]), json.loads(header["metrics"])
     drawn = thesis_bodies(count, np.random.default_rng(seed))
-    views, truth = draw_views(count, np.random.default_rng(seed), model.config.pixels)
+    views, truth = draw_views(count, np.random.default_rng(seed), ViewSource(model.config.pixels))
     flats = [model.predict(views[i : i + 250]).to_flat() for i in range(0, count, 250)]
     found = Objective(training["loss"]).judged(Superquadric.from_flat(np.concatenate(flats)), truth)
     # The view is the cube moved and scaled; the way back follows from what it did to the true body.

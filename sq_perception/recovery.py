@@ -261,11 +261,13 @@ class Recoverer:
             objects = _objects(depth, found, camera, options)
 
         with _timed(milliseconds, "network"):
-            pixels = network.config.pixels if network is not None else _VIEW_PIXELS
+            form = network.config if network is not None else None
+            pixels, find_hidden = (form.pixels, form.marks_hidden) if form is not None else (_VIEW_PIXELS, False)
             for one in objects:
-                one.view = canonical_view.from_mask(one.depth_crop, one.mask_crop, one.camera_crop, pixels)
+                source = (depth, one.mask, camera) if find_hidden else (one.depth_crop, one.mask_crop, one.camera_crop)
+                one.view = canonical_view.from_mask(*source, pixels, find_hidden=find_hidden, plane=found.plane)
             if network is not None and objects:
-                views = np.stack([one.view.image for one in objects if one.view is not None])
+                views = np.stack([one.view.marked for one in objects if one.view is not None])
                 predictions: Future[Superquadric] = Future()
                 if options.method == "auto" and options.refine == "surface":
                     predictions = self._beside.submit(network.predict, views)

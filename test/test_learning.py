@@ -15,7 +15,7 @@ from sq_perception.geometry import Superquadric
 from sq_perception.imaging import canonical_view
 from sq_perception.imaging.scene import thesis_bodies
 from sq_perception.learning import checkpoint, losses
-from sq_perception.learning.dataset import ViewPool, dihedral, draw_views
+from sq_perception.learning.dataset import ViewPool, ViewSource, dihedral, draw_views
 from sq_perception.learning.objective import UNSUPERVISED, Objective
 from sq_perception.learning.regressor import Regressor, RegressorConfig
 from sq_perception.learning.train import TrainingConfig, recalibrate, train, validate
@@ -92,7 +92,7 @@ class TestData:
         assert np.abs(again - turned)[(again > 0) & (turned > 0)].mean() < 0.004
 
     def test_pool_pairs_views_with_their_bodies(self) -> None:
-        pool = ViewPool(np.random.default_rng(5), capacity=32, pixels=32)
+        pool = ViewPool(np.random.default_rng(5), ViewSource(32), capacity=32)
         images, bodies = pool.batch(16)
         again, _ = canonical_view.render_views(bodies, 32)
         assert np.abs(again - images).mean() < 0.01
@@ -134,7 +134,7 @@ class TestTraining:
     CONFIG = TrainingConfig(steps=40, batch=16, points=64, validation=20, warm_up=5, threads=1)
 
     def test_learns_and_goes_on_after_a_kill(self, tmp_path: Path) -> None:
-        views, truth = draw_views(60, np.random.default_rng(7), 32)
+        views, truth = draw_views(60, np.random.default_rng(7), ViewSource(32))
         before = validate(Regressor(SMALL), views, truth).mean()
         model = train(self.CONFIG, tmp_path / "whole", SMALL)
         assert validate(model, views, truth).mean() > before + 0.05
@@ -170,7 +170,7 @@ class TestTraining:
     def test_a_few_views_are_learned_without_labels(self) -> None:
         """Overfit: 8 views, no labels, and the network's bodies become those of the views."""
         torch.manual_seed(3)
-        views, truth = draw_views(8, np.random.default_rng(9), 32)
+        views, truth = draw_views(8, np.random.default_rng(9), ViewSource(32))
         batch = torch.from_numpy(views)[:, None]
         model, generator = Regressor(SMALL), torch.Generator().manual_seed(0)
         objective = Objective("least_squares_free")

@@ -28,16 +28,24 @@ import numba
 import numpy as np
 
 from sq_perception.geometry import rotation as quaternions
-from sq_perception.geometry.kernels import gauge_derivatives, parallel_kernel, ray_entry
+from sq_perception.geometry.kernels import gauge_derivatives, kernel, parallel_kernel, ray_entry
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
 
 MARGIN = 1.06
 """Side of the cube over the side of what is seen in it."""
 
+HIDDEN = -0.5
+"""Value of a pixel at which the object may go on unseen, in views that tell this from background."""
+
 _NEAREST = 0.5 * (1 + 1 / MARGIN)
 _OUTLIERS_PER_END = 1 / 500
+_SURROUNDINGS = 1.2
+"""More than MARGIN: under perspective the view's edges are not where those of the silhouette's box are."""
+_NEARER = 0.04
+"""What stands nearer than the object by this share of the view's side hides what is behind it."""
 _NOTHING = -1e300
+_BEHIND = -2e300
 _FLIP = np.diag([1.0, -1.0, -1.0])
 
 
@@ -49,6 +57,9 @@ class CanonicalView:
     ----------
     image : float32 (n, n)
         z of the visible surface, 0 for background.
+    hidden : bool (n, n)
+        Background pixels at which the object may go on unseen: something nearer stands there, or nothing was measured
+        within the object's convex hull.  All False where :func:`from_mask` was not asked for it.
     rotation : (4,)
         Quaternion, optical frame to canonical frame.
     anchor : (3,)
@@ -58,9 +69,15 @@ class CanonicalView:
     """
 
     image: np.ndarray
+    hidden: np.ndarray
     rotation: np.ndarray
     anchor: np.ndarray
     extent: float
+
+    @property
+    def marked(self) -> np.ndarray:
+        """The image with :data:`HIDDEN` at the hidden pixels: the input of networks that tell them from background."""
+        return np.where(self.hidden, np.float32(HIDDEN), self.image)
 
     def to_canonical(self, body: Superquadric) -> Superquadric:
         """A NumPy body of the optical frame in the canonical frame."""
@@ -75,7 +92,15 @@ class CanonicalView:
         return body.transformed(inverse, self.anchor - middle * self.extent, self.extent)
 
 
-def from_mask(depth: np.ndarray, mask: np.ndarray, camera: Camera, pixels: int = 64) -> CanonicalView:
+def from_mask(
+    depth: np.ndarray,
+    mask: np.ndarray,
+    camera: Camera,
+    pixels: int = 64,
+    *,
+    find_hidden: bool = False,
+    plane: np.ndarray | None = None,
+) -> CanonicalView:
     """The canonical view of the object under a mask.
 
     Parameters
@@ -86,6 +111,10 @@ def from_mask(depth: np.ndarray, mask: np.ndarray, camera: Camera, pixels: int =
     camera : Camera
     pixels : int
         Side n of the view.
+    find_hidden : bool
+        Whether to look at the object's surroundings for what may hide a part of it.
+    plane : (4,), optional
+        What the object stands on, n.p + d = 0: seen in front of the object it hides nothing.
 
     Raises
     ------
@@ -97,16 +126,19 @@ def from_mask(depth: np.ndarray, mask: np.ndarray, camera: Camera, pixels: int =
     left, top, width, height = cv2.boundingRect((mask & np.isfinite(depth)).view(np.uint8))
     if width == 0:
         raise ValueError("a canonical view needs at least one pixel with a depth under the mask")
-    camera = camera.cropped(left, top, width, height)
-    window = np.s_[top : top + height, left : left + width]
-    seen = mask[window] & np.isfinite(depth[window])
-    rows, columns = np.nonzero(seen)
-    measured = depth[window][seen].astype(np.float32)
-
     look = np.eye(3)
     if camera.is_pinhole:
-        _, toward = camera.rays(0.5 * (width - 1), 0.5 * (height - 1))
+        _, toward = camera.rays(left + 0.5 * (width - 1), top + 0.5 * (height - 1))
         look = _rotation_to_z(toward / np.linalg.norm(toward))
+    if find_hidden:
+        left, top, width, height = _with_surroundings(left, top, width, height, camera)
+    camera = camera.cropped(left, top, width, height)
+    window = np.s_[top : top + height, left : left + width]
+    depth, mask = depth[window], mask[window]
+    seen = mask & np.isfinite(depth)
+    rows, columns = np.nonzero(seen)
+    measured = depth[seen].astype(np.float32)
+
     matrix = _FLIP @ look
     x, y, z = matrix.astype(np.float32) @ _coordinates(camera, columns, rows, measured)
     low, high = np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
@@ -119,10 +151,52 @@ def from_mask(depth: np.ndarray, mask: np.ndarray, camera: Camera, pixels: int =
 
     image = np.full((camera.height, camera.width), np.nan, dtype=np.float32)
     image[seen] = z
-    z_view = _resample(image, middle, matrix, anchor, extent, camera, pixels)
+    filled = _filled(image) if camera.is_pinhole or find_hidden else None
+    points = _looked_at(filled, middle, matrix, anchor, extent, camera, pixels)
+    z_view = _read(image, points, camera, cv2.BORDER_CONSTANT)
     value = (z_view - anchor[2]) / extent + _NEAREST
     value = np.where(np.isfinite(value), np.clip(value, 1 / 255, 1.0), 0.0).astype(np.float32)
-    return CanonicalView(value, quaternions.from_matrix(matrix), matrix.T @ anchor, float(extent))
+    hidden = np.zeros(value.shape, dtype=bool)
+    if find_hidden:
+        assert filled is not None
+        covered = _covered(depth, mask, filled, camera, matrix, plane, _NEARER * extent)
+        hidden = (_read(covered.astype(np.float32), points, camera, cv2.BORDER_CONSTANT) > 0) & (value == 0)
+    return CanonicalView(value, hidden, quaternions.from_matrix(matrix), matrix.T @ anchor, float(extent))
+
+
+def _with_surroundings(left: int, top: int, width: int, height: int, camera: Camera) -> tuple[int, int, int, int]:
+    """The part of the image that a square view of a box of pixels shows."""
+    side = _SURROUNDINGS * max(width, height)
+    right, bottom = left + width, top + height
+    beside, above = int(np.ceil(0.5 * (side - width))) + 1, int(np.ceil(0.5 * (side - height))) + 1
+    left, top = max(0, left - beside), max(0, top - above)
+    return left, top, min(camera.width, right + beside) - left, min(camera.height, bottom + above) - top
+
+
+def _covered(
+    depth: np.ndarray,
+    mask: np.ndarray,
+    filled: np.ndarray,
+    camera: Camera,
+    matrix: np.ndarray,
+    plane: np.ndarray | None,
+    tolerance: float,
+) -> np.ndarray:
+    """Pixels (height, width) of the surroundings where the object may go on unseen; see :class:`CanonicalView`."""
+    measured = np.isfinite(depth)
+    hull = np.zeros(mask.shape, dtype=np.uint8)
+    outline, _ = cv2.findContours((mask & measured).view(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    cv2.fillConvexPoly(hull, cv2.convexHull(np.concatenate(outline)), 1)
+    # The hull's own border passes outside of a convex set of pixels.
+    inside = cv2.erode(hull, np.ones((3, 3), np.uint8)) > 0
+    rows, columns = np.nonzero(measured & ~mask)
+    points = _coordinates(camera, columns, rows, depth[rows, columns].astype(np.float32))
+    nearer = matrix[2].astype(np.float32) @ points > filled[rows, columns] + tolerance
+    if plane is not None:
+        nearer &= np.abs(np.asarray(plane[:3], dtype=np.float32) @ points + np.float32(plane[3])) > tolerance
+    covered = ~measured & inside
+    covered[rows[nearer], columns[nearer]] = True
+    return covered
 
 
 def _coordinates(camera: Camera, u: np.ndarray, v: np.ndarray, depth: np.ndarray) -> np.ndarray:
@@ -136,8 +210,8 @@ def _coordinates(camera: Camera, u: np.ndarray, v: np.ndarray, depth: np.ndarray
     return points
 
 
-def _resample(
-    z_image: np.ndarray,
+def _looked_at(
+    filled: np.ndarray | None,
     z_guess: float,
     matrix: np.ndarray,
     anchor: np.ndarray,
@@ -145,20 +219,20 @@ def _resample(
     camera: Camera,
     pixels: int,
 ) -> np.ndarray:
-    """Turned z of what each pixel of the view sees, NaN where that is nothing.
+    """The point (pixels, pixels, 3) of the optical frame that each pixel of the view looks at.
 
     A view pixel fixes turned x and y but not z, and a pinhole pixel depends on all three.  Reading z at the projection
     of the last guess is a contraction wherever the surface is not almost parallel to the ray; three rounds suffice.
-    Guesses that fall beside the object go on with the z of its nearest pixel.
+    Guesses that fall beside the object go on with the z of its nearest pixel, which ``filled`` (turned z) holds.
     """
     steps = ((np.arange(pixels) + 0.5) / pixels - 0.5) * extent
     x, y = np.meshgrid(anchor[0] + steps, anchor[1] - steps)
     z = np.full((pixels, pixels), z_guess)
     if camera.is_pinhole:
-        filled = _filled(z_image)
+        assert filled is not None
         for _ in range(3):
             z = _read(filled, np.stack([x, y, z], axis=-1) @ matrix, camera, cv2.BORDER_REPLICATE)
-    return _read(z_image, np.stack([x, y, z], axis=-1) @ matrix, camera, cv2.BORDER_CONSTANT)
+    return np.stack([x, y, z], axis=-1) @ matrix
 
 
 def _read(image: np.ndarray, points: np.ndarray, camera: Camera, border: int) -> np.ndarray:
@@ -184,14 +258,48 @@ def _rotation_to_z(direction: np.ndarray) -> np.ndarray:
     return np.array([[1 - k * x * x, -k * x * y, -x], [-k * x * y, 1 - k * y * y, -y], [x, y, z]])
 
 
+@dataclass(frozen=True, eq=False)
+class Occluder:
+    """Something opaque before each body (n,): all that lies beyond a front that came in from one side.
+
+    In the plane of the view, in units of its side and from its middle, (u, v) are coordinates along and across the
+    direction the occluder comes from; hidden is
+
+        c < u - bow |v - offset|^power < c + thickness,
+
+    c such that ``share`` of the body's pixels lie beyond the front.  bow = 0 is a straight edge, power 1 a corner,
+    power 2 a round thing.
+
+    Attributes
+    ----------
+    direction : (n,)
+        Angle of u, radians from the view's x axis.
+    bow, offset, power, thickness : (n,)
+    share : (n,)
+        Of the body's own pixels, 0 to below 1; 0 is no occluder.
+    """
+
+    direction: np.ndarray
+    bow: np.ndarray
+    offset: np.ndarray
+    power: np.ndarray
+    thickness: np.ndarray
+    share: np.ndarray
+
+
 def render_views(
-    bodies: Superquadric, pixels: int = 64, levels: np.ndarray | None = None, distance: np.ndarray | None = None
+    bodies: Superquadric,
+    pixels: int = 64,
+    levels: np.ndarray | None = None,
+    distance: np.ndarray | None = None,
+    occluder: Occluder | None = None,
+    miss: np.ndarray | None = None,
 ) -> tuple[np.ndarray, Superquadric]:
-    """Canonical views of whole, unoccluded bodies, without the detour over an image: the source of training data.
+    """Canonical views of single bodies, without the detour over an image: the source of training data.
 
     A canonical view is orthographic whatever camera took the image, but a pinhole camera sees less of the body: of a
     convex body just the points whose normals point to it.  Rays along z, less what faces away from the eye, are so the
-    view of an image with any number of pixels.
+    view of an image with any number of pixels.  The view is fitted to what is visible, as :func:`from_mask` does it.
 
     Parameters
     ----------
@@ -204,6 +312,11 @@ def render_views(
     distance : (n,), optional
         Distance of a pinhole camera from the nearest face of the body's box, in the bodies' unit; infinite, as by
         default, for an orthographic camera.
+    occluder : Occluder, optional
+        What stands before the bodies; its pixels are :data:`HIDDEN`.
+    miss : (n, 4), optional
+        How far the view's middle (x, y), nearest depth (z) and the logarithm of its side are off, the first three in
+        sides: errors of a mask and of noisy depths.
 
     Returns
     -------
@@ -223,7 +336,14 @@ def render_views(
         raise ValueError("distance: expected positive distances of the camera")
     pinhole = np.isfinite(away)
     eye = upper[:, 2] + np.where(pinhole, away, 0.0)
-    _render_views(flat, matrices, anchor, side, steps, pinhole, eye, images)
+    fronts = np.zeros((len(bodies), 6))
+    if occluder is not None:
+        if not ((occluder.share >= 0) & (occluder.share < 1)).all():
+            raise ValueError("occluder: expected shares of at least 0 and below 1")
+        columns = (occluder.direction, occluder.bow, occluder.offset, occluder.power, occluder.thickness)
+        fronts[:] = np.stack([*columns, occluder.share], axis=-1)
+    misses = np.zeros((len(bodies), 4)) if miss is None else np.array(miss, dtype=float)
+    _render_views(flat, matrices, anchor, side, steps, pinhole, eye, fronts, misses, images)
     identity = np.array([0.0, 0.0, 0.0, 1.0])
     shift = np.array([0.5, 0.5, _NEAREST]) - anchor / side[:, None]
     return images, bodies.transformed(identity, shift, 1 / side[:, None])
@@ -242,6 +362,8 @@ def _render_views(
     quantum: np.ndarray,
     pinhole: np.ndarray,
     eye: np.ndarray,
+    fronts: np.ndarray,
+    misses: np.ndarray,
     images: np.ndarray,
 ) -> None:
     """Render, read off what is visible, and render again until the extent is that of the visible part."""
@@ -250,15 +372,29 @@ def _render_views(
         a1, a2, a3, e1, e2, t1, t2, t3 = flat[k, :8]
         m = matrices[k]
         eye_1, eye_2, eye_3 = m[2, 0] * (eye[k] - t3), m[2, 1] * (eye[k] - t3), m[2, 2] * (eye[k] - t3)
+        middle_x, middle_y, unit = anchor[k, 0], anchor[k, 1], side[k]
+        occluded = fronts[k, 5] > 0.0
+        measured = pinhole[k] or occluded
+        missed = misses[k, 0] != 0.0 or misses[k, 1] != 0.0 or misses[k, 2] != 0.0 or misses[k, 3] != 0.0
+        front = np.inf
         surface = np.empty((pixels, pixels))
-        for _ in range(_MOST_ROUNDS):
+        seen = np.empty(pixels * pixels)
+        reach = np.empty(pixels * pixels)
+        last_round = _MOST_ROUNDS - 1
+        for turn in range(_MOST_ROUNDS + 1):
             hits = 0
-            seen = np.empty(pixels * pixels)
             first_row, last_row, first_column, last_column = pixels, -1, pixels, -1
             for i in range(pixels):
                 for j in range(pixels):
-                    x = anchor[k, 0] + ((j + 0.5) / pixels - 0.5) * side[k] - t1
-                    y = anchor[k, 1] - ((i + 0.5) / pixels - 0.5) * side[k] - t2
+                    x = anchor[k, 0] + ((j + 0.5) / pixels - 0.5) * side[k]
+                    y = anchor[k, 1] - ((i + 0.5) / pixels - 0.5) * side[k]
+                    if occluded:
+                        distance = _front_distance((x - middle_x) / unit, (y - middle_y) / unit, fronts[k])
+                        if front < distance < front + fronts[k, 4]:
+                            surface[i, j] = _BEHIND
+                            continue
+                    x -= t1
+                    y -= t2
                     ox, oy, oz = m[0, 0] * x + m[1, 0] * y, m[0, 1] * x + m[1, 1] * y, m[0, 2] * x + m[1, 2] * y
                     hit, t = ray_entry(ox, oy, oz, -m[2, 0], -m[2, 1], -m[2, 2], a1, a2, a3, e1, e2)
                     surface[i, j] = _NOTHING
@@ -272,27 +408,48 @@ def _render_views(
                             z = (np.floor(z / quantum[k]) + 0.5) * quantum[k]
                         surface[i, j] = z
                         seen[hits] = z
+                        if occluded:
+                            reach[hits] = distance
                         hits += 1
                         first_row, last_row = min(first_row, i), max(last_row, i)
                         first_column, last_column = min(first_column, j), max(last_column, j)
-            if hits == 0:
+            if hits == 0 or turn > last_round:
                 break
-            seen = np.sort(seen[:hits])
+            if occluded and turn == 0:
+                front = np.sort(reach[:hits])[int((1.0 - fronts[k, 5]) * (hits - 1))]
+                continue
+            ordered = np.sort(seen[:hits])
             outliers = int(hits * _OUTLIERS_PER_END)
-            anchor[k, 2] = seen[hits - 1 - outliers]
-            extent = seen[hits - 1 - outliers] - seen[outliers]
-            if pinhole[k]:
+            anchor[k, 2] = ordered[hits - 1 - outliers]
+            extent = ordered[hits - 1 - outliers] - ordered[outliers]
+            if measured:
                 extent = max(extent, max(last_row - first_row, last_column - first_column) * side[k] / pixels)
             else:
                 extent = max(extent, side[k] / MARGIN)
-            if abs(extent * MARGIN - side[k]) <= (_SAME_EXTENT + 1.5 * pinhole[k] / pixels) * side[k]:
+            done = abs(extent * MARGIN - side[k]) <= (_SAME_EXTENT + 1.5 * measured / pixels) * side[k]
+            if done and not missed:
                 break
-            if pinhole[k]:
+            if measured:
                 anchor[k, 0] += (0.5 * (first_column + last_column + 1) / pixels - 0.5) * side[k]
                 anchor[k, 1] -= (0.5 * (first_row + last_row + 1) / pixels - 0.5) * side[k]
             side[k] = extent * MARGIN
+            if missed and (done or turn == last_round):
+                for axis in range(3):
+                    anchor[k, axis] += misses[k, axis] * side[k]
+                side[k] *= np.exp(misses[k, 3])
+                last_round = turn
         for i in range(pixels):
             for j in range(pixels):
                 if surface[i, j] > _NOTHING:
                     value = (surface[i, j] - anchor[k, 2]) / side[k] + _NEAREST
                     images[k, i, j] = min(max(value, 1 / 255), 1.0)
+                elif surface[i, j] == _BEHIND:
+                    images[k, i, j] = HIDDEN
+
+
+@kernel
+def _front_distance(x: float, y: float, front: np.ndarray) -> float:
+    """How far a point of the view lies in the direction of an occluder, its bow taken off; see :class:`Occluder`."""
+    cosine, sine = np.cos(front[0]), np.sin(front[0])
+    across = abs(cosine * y - sine * x - front[2])
+    return cosine * x + sine * y - front[1] * across ** front[3]

@@ -5,32 +5,71 @@ The protocol itself is in :mod:`sq_perception.imaging.scene`; depth comes in 255
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+
 import numpy as np
 
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.imaging.canonical_view import render_views
-from sq_perception.imaging.scene import thesis_bodies
+from sq_perception.imaging.canonical_view import Occluder, render_views
+from sq_perception.imaging.scene import THESIS_SIZE, thesis_bodies
+from sq_perception.learning.disturbance import Disturbance
 
 GREY_LEVELS = 255.0
 CAMERA_DISTANCE = (1.5, 12.0)
 """Nearest and farthest pinhole camera, in lengths of the body."""
+_PROPORTION = 6.0
+
+
+@dataclass(frozen=True)
+class ViewSource:
+    """Which bodies are drawn, and how they are seen."""
+
+    pixels: int = 64
+    """Side of the views."""
+    pinhole_share: float = 0.0
+    """Share of the views that a pinhole camera sees, at 1.5 to 12 times the body's length; the others are
+    orthographic, as in the thesis."""
+    wide_share: float = 0.0
+    """Share of the bodies with proportions up to 1 : 6, many of them boxes, cylinders or ellipsoids; the others are
+    those of the thesis' protocol."""
+    disturbance: Disturbance = field(default_factory=Disturbance)
+
+
+def wide_bodies(count: int, rng: np.random.Generator) -> Superquadric:
+    """Bodies (count,) with half sizes log-uniform within 1 : 6; two thirds nearly boxes, cylinders or ellipsoids."""
+    bodies = thesis_bodies(count, rng)
+    size = THESIS_SIZE[1] * _PROPORTION ** -rng.random((count, 3))
+    edged, round_ = rng.uniform(0.1, 0.3, (count, 2)), rng.uniform(0.8, 1.0, (count, 2))
+    kind = rng.integers(6, size=count)[:, None]
+    cylinder = np.stack([edged[:, 0], round_[:, 1]], axis=1)
+    shape = np.select([kind < 2, kind == 2, kind == 3], [edged, cylinder, round_], bodies.shape)
+    return Superquadric(size, shape, bodies.translation, bodies.rotation)
 
 
 def draw_views(
-    count: int, rng: np.random.Generator, pixels: int = 64, pinhole_share: float = 0.0
+    count: int, rng: np.random.Generator, source: ViewSource | None = None, occluder: Occluder | None = None
 ) -> tuple[np.ndarray, Superquadric]:
-    """Views (count, pixels, pixels) of freshly drawn bodies, and the bodies (count,) in the views' frames.
+    """Views (count, p, p) of freshly drawn bodies, and the bodies (count,) in the views' frames.
 
-    A share of them is seen by a pinhole camera, at 1.5 to 12 times the body's length.
+    Occluders and framing are those of the source's disturbance, or the ones given; noise, holes and edges are left to
+    :meth:`Disturbance.worn`, which a view may undergo anew each time it is used.
     """
+    source = source or ViewSource()
+    pinhole_share, disturbance = source.pinhole_share, source.disturbance
     bodies = thesis_bodies(count, rng)
+    if source.wide_share > 0:
+        wide = wide_bodies(count, rng).to_flat()
+        chosen = rng.random((count, 1)) < source.wide_share
+        bodies = Superquadric.from_flat(np.where(chosen, wide, bodies.to_flat()))
     distance = None
     if pinhole_share > 0:
         length = 2 * bodies.size.max(axis=1)
         nearest, farthest = CAMERA_DISTANCE
         distance = length * nearest * (farthest / nearest) ** rng.random(count)
         distance = np.where(rng.random(count) < pinhole_share, distance, np.inf)
-    return render_views(bodies, pixels, np.full(count, GREY_LEVELS), distance)
+    occluder = occluder or disturbance.occluder(count, rng)
+    miss = disturbance.framing(count, rng)
+    return render_views(bodies, source.pixels, np.full(count, GREY_LEVELS), distance, occluder, miss)
 
 
 def dihedral(
@@ -60,29 +99,26 @@ class ViewPool:
     """A pool of rendered views from which batches are drawn, each time in another of the 8 dihedral positions.
 
     Rendering costs as much as a training step.  Each batch renders only ``batch / reuse`` new views, which replace the
-    oldest of the pool; a view is so seen about ``reuse`` times, rarely twice in the same position.
+    oldest of the pool; a view is so seen about ``reuse`` times, rarely twice in the same position, and with new noise
+    each time.
     """
 
     def __init__(
-        self,
-        rng: np.random.Generator,
-        capacity: int = 4096,
-        reuse: int = 4,
-        pixels: int = 64,
-        pinhole_share: float = 0.0,
+        self, rng: np.random.Generator, source: ViewSource | None = None, capacity: int = 4096, reuse: int = 4
     ) -> None:
         self._rng, self._reuse = rng, reuse
-        self._pixels, self._pinhole_share = pixels, pinhole_share
-        images, bodies = draw_views(capacity, rng, pixels, pinhole_share)
+        self._source = source or ViewSource()
+        images, bodies = draw_views(capacity, rng, self._source)
         self._images, self._flat, self._next = images, bodies.to_flat().copy(), 0
 
     def batch(self, count: int) -> tuple[np.ndarray, Superquadric]:
-        """Views (count, pixels, pixels) and bodies (count,) in the views' frames."""
+        """Views (count, p, p) and bodies (count,) in the views' frames."""
         fresh = max(1, count // self._reuse)
-        images, bodies = draw_views(fresh, self._rng, self._pixels, self._pinhole_share)
+        images, bodies = draw_views(fresh, self._rng, self._source)
         slots = (self._next + np.arange(fresh)) % len(self._images)
         self._images[slots], self._flat[slots] = images, bodies.to_flat()
         self._next = int(slots[-1] + 1) % len(self._images)
         chosen = self._rng.integers(len(self._images), size=count)
         turns, mirror = self._rng.integers(4, size=count), self._rng.random(count) < 0.5
-        return dihedral(self._images[chosen], Superquadric.from_flat(self._flat[chosen]), turns, mirror)
+        views, bodies = dihedral(self._images[chosen], Superquadric.from_flat(self._flat[chosen]), turns, mirror)
+        return self._source.disturbance.worn(views, self._rng), bodies

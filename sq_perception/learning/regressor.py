@@ -41,6 +41,8 @@ class RegressorConfig:
     """Half sizes in sides of the cube; interpolated on a logarithmic scale."""
     shape_range: tuple[float, float] = (0.1, 1.0)
     translation_range: tuple[float, float] = (-0.4, 1.4)
+    marks_hidden: bool = False
+    """Whether views tell hidden pixels from background (``CanonicalView.marked``)."""
 
 
 class ResidualBlock(nn.Module):

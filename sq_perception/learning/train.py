@@ -24,7 +24,8 @@ from safetensors.torch import load_file, save_file
 
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.learning import checkpoint
-from sq_perception.learning.dataset import ViewPool, draw_views
+from sq_perception.learning.dataset import ViewPool, ViewSource, draw_views
+from sq_perception.learning.disturbance import Disturbance, any_occluder
 from sq_perception.learning.objective import LOSSES, Objective
 from sq_perception.learning.regressor import Regressor, RegressorConfig
 from sq_perception.metrics import volume_iou
@@ -66,6 +67,16 @@ class TrainingConfig:
     clip: float = 1.0
     pinhole_share: float = 0.0
     """Share of the views that a pinhole camera sees; the others are orthographic, as in the thesis."""
+    wide_share: float = 0.0
+    """Share of bodies with proportions up to 1 : 6; the others are those of the thesis' protocol."""
+    occluded_share: float = 0.0
+    """Share of the views with an occluder before the body."""
+    most_hidden: float = 0.4
+    """Largest share of a body that an occluder hides."""
+    noisy_share: float = 0.0
+    """Share of the views with noise, steps, holes and wrong edges."""
+    reuse: int = 4
+    """How often a rendered view is used."""
     start: str = ""
     """A model file whose weights the network begins with; empty begins at random."""
     validation: int = 1000
@@ -110,9 +121,17 @@ def train(config: TrainingConfig, output: Path, network: RegressorConfig | None 
     first, spent = _restore(state_path, model, average, optimizer) if state_path.exists() else (0, 0.0)
     rng = np.random.default_rng([config.seed, first])
     generator = torch.Generator(device=device).manual_seed(config.seed + first)
-    pool = ViewPool(rng, pixels=model.config.pixels, pinhole_share=config.pinhole_share)
-    validation = draw_views(config.validation, np.random.default_rng(0), model.config.pixels)
-    near = draw_views(config.validation, np.random.default_rng(0), model.config.pixels, pinhole_share=1.0)
+    pixels = model.config.pixels
+    disturbance = Disturbance(config.occluded_share, config.most_hidden, config.noisy_share)
+    source = ViewSource(pixels, config.pinhole_share, config.wide_share, disturbance)
+    pool = ViewPool(rng, source, reuse=config.reuse)
+    validation = draw_views(config.validation, np.random.default_rng(0), ViewSource(pixels))
+    near = draw_views(config.validation, np.random.default_rng(0), ViewSource(pixels, 1.0))
+    hidden_rng = np.random.default_rng(0)
+    hidden = draw_views(
+        config.validation, hidden_rng, ViewSource(pixels), any_occluder(np.full(config.validation, 0.3), hidden_rng)
+    )
+    worn = (Disturbance(0, 0, 1.0).worn(near[0], np.random.default_rng(0)), near[1])
     log = (output / "log.jsonl").open("a", encoding="utf-8")
     started, losses = time.monotonic() - spent, []
     for step in range(first, config.steps):
@@ -148,6 +167,8 @@ def train(config: TrainingConfig, output: Path, network: RegressorConfig | None 
                 "iou": float(iou.mean()),
                 "iou_std": float(iou.std()),
                 "iou_pinhole": float(validate(average, *near, objective=objective).mean()),
+                "iou_hidden": float(validate(average, *hidden, objective=objective).mean()),
+                "iou_worn": float(validate(average, *worn, objective=objective).mean()),
                 "over_85": float((iou > 0.85).mean()),
                 "rate": rate,
                 "sharpness": objective.sharpness(progress),
