@@ -22,6 +22,8 @@ from sq_perception.learning.regressor import Regressor, RegressorConfig
 FORMAT = "sq_perception.regressor"
 VERSION = "1"
 _MAX_PARAMETERS = 200_000_000
+_MAX_BLOCKS = 64
+_MAX_PIXELS = 1024
 
 
 class CheckpointError(ValueError):
@@ -65,12 +67,14 @@ def load(path: Path | str | None = None, device: str | torch.device = "cpu") -> 
     if header.get("version") != VERSION:
         raise CheckpointError(f"{path}: expected format version {VERSION}, got {header.get('version')!r}")
     try:
-        config = _config(json.loads(header["config"]))
-        model = Regressor(config)
-    except (KeyError, TypeError, ValueError, RuntimeError, ZeroDivisionError) as error:
+        model = _network(_config(json.loads(header["config"])))
+    except (KeyError, TypeError, ValueError, RuntimeError, ArithmeticError, AttributeError) as error:
         raise CheckpointError(f"{path}: the header's config describes no network: {error}") from error
     try:
-        model.load_state_dict({name: t.float() if t.is_floating_point() else t for name, t in state.items()})
+        model.load_state_dict(
+            {name: t.to(torch.float32 if t.is_floating_point() else t.dtype, copy=True) for name, t in state.items()},
+            assign=True,
+        )
     except RuntimeError as error:
         raise CheckpointError(f"{path}: the weights do not fit the config: {error}") from error
     if not all(bool(torch.isfinite(t).all()) for t in model.state_dict().values()):
@@ -98,8 +102,15 @@ def _read(path: Path, tensors: bool = True) -> tuple[dict[str, str], dict[str, t
 def _config(values: dict[str, Any]) -> RegressorConfig:
     arguments: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
     config = RegressorConfig(**arguments)
-    width = max(config.widths)
-    cells = config.pixels / 2 ** len(config.widths)
-    if width * width * 9 * config.blocks + width * cells * cells * config.hidden > _MAX_PARAMETERS:
-        raise ValueError("the network would be larger than any this package trains")
+    if config.pixels > _MAX_PIXELS or config.blocks > _MAX_BLOCKS:
+        raise ValueError(f"expected at most {_MAX_PIXELS} pixels and {_MAX_BLOCKS} blocks a stage")
     return config
+
+
+def _network(config: RegressorConfig) -> Regressor:
+    """The network without memory of its own: only what the file really holds is ever allocated."""
+    with torch.device("meta"):
+        model = Regressor(config)
+    if sum(parameter.numel() for parameter in model.parameters()) > _MAX_PARAMETERS:
+        raise ValueError("the network would be larger than any this package trains")
+    return model

@@ -1,75 +1,96 @@
 """The network: canonical view in, superquadric parameters out.
 
-A residual network (He et al. 2016) in the thesis' arrangement (chapter 5.2): convolutions, two fully connected layers
-of 256, and one head a parameter group.  Size, shape and translation pass a sigmoid into their ranges, so that the first
-predictions are moderate bodies; rotation comes out as a unit quaternion, inside as the continuous 6D form.
+The thesis' arrangement (chapter 5.2): a residual network (:mod:`sq_perception.learning.backbone`), two fully connected
+layers of 256, and one head a parameter group.  Size, shape and translation pass a sigmoid into their ranges, so that
+the first predictions are moderate bodies; rotation comes out as a unit quaternion, inside as the continuous 6D form.
 
-Input  (n, 1, p, p)  views of :mod:`sq_perception.imaging.canonical_view`, p = ``config.pixels``.
-Output Superquadric  batch (n,) in the canonical frame (unit cube, y up, z towards the viewer).
+Input  (n, 1, p, p)  views, p = ``config.pixels``, of one of two framings; the network itself does not care which.
+Output Superquadric  batch (n,) in the frame of the views: a unit cube, y up, z towards the viewer.
+
+| framing | view, z of the surface and 0 for background | body |
+| --- | --- | --- |
+| cropped | one object fills it (:mod:`sq_perception.imaging.canonical_view`) | in the view's own cube |
+| full | the thesis' image (:mod:`sq_perception.imaging.unit_cube`), (grey + 0.5) / 255 | in the image's cube |
 """
 
 from __future__ import annotations
 
 import copy
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal, get_args
 
 import numpy as np
 import torch
 from array_api_compat import array_namespace
 from torch import nn
-from torch.nn.utils.fusion import fuse_conv_bn_eval
 
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.learning.backbone import ResNet18, compact_backbone, fold
 
 Array = Any
 """A NumPy array or a torch tensor."""
+Backbone = Literal["compact", "resnet18"]
+Framing = Literal["cropped", "full"]
+INFERENCE_DTYPES = (torch.float32, torch.bfloat16, torch.float16)
 
 
 @dataclass(frozen=True)
 class RegressorConfig:
-    """Everything that fixes the network's form; travels in the checkpoint's header."""
+    """Everything that fixes the network's form; travels in the checkpoint's header.
+
+    Raises
+    ------
+    ValueError
+        For an unknown backbone or framing, a side that the backbone cannot halve often enough, or an empty range.
+    """
 
     pixels: int = 64
+    """Side of the views: a multiple of 32 for resnet18, of 2 to the number of ``widths`` for compact."""
     widths: tuple[int, ...] = (32, 64, 128, 256)
-    """Channels of the stem and of each stage; every stage halves the resolution."""
+    """Of compact: channels of the stem and of each stage; every stage halves the resolution."""
     blocks: int = 2
-    """Residual blocks a stage."""
+    """Of compact: residual blocks a stage."""
     hidden: int = 256
     size_range: tuple[float, float] = (0.04, 1.2)
     """Half sizes in sides of the cube; interpolated on a logarithmic scale."""
     shape_range: tuple[float, float] = (0.1, 1.0)
     translation_range: tuple[float, float] = (-0.4, 1.4)
+    backbone: Backbone = "compact"
+    framing: Framing = "cropped"
+    """What the views show; see the module."""
     marks_hidden: bool = False
     """Whether views tell hidden pixels from background (``CanonicalView.marked``)."""
 
+    def __post_init__(self) -> None:
+        for name, value, known in (("backbone", self.backbone, Backbone), ("framing", self.framing, Framing)):
+            if value not in get_args(known):
+                raise ValueError(f"{name}: expected one of {', '.join(get_args(known))}, got {value!r}")
+        if self.pixels < 1 or self.pixels % self.stride:
+            raise ValueError(f"pixels: {self.backbone} expects a multiple of {self.stride}, got {self.pixels}")
+        for name, (low, high) in (
+            ("size_range", self.size_range),
+            ("shape_range", self.shape_range),
+            ("translation_range", self.translation_range),
+        ):
+            if not (np.isfinite([low, high]).all() and low < high and (low > 0 or name == "translation_range")):
+                raise ValueError(f"{name}: expected a lower and a larger upper end, got {low} and {high}")
 
-class ResidualBlock(nn.Module):
-    """Two 3 x 3 convolutions beside a shortcut; the first one may halve the resolution."""
+    @classmethod
+    def thesis(cls) -> RegressorConfig:
+        """The thesis' network for the thesis' images: ResNet-18, 256 x 256, the whole cube.
 
-    def __init__(self, channels_in: int, channels_out: int, stride: int) -> None:
-        super().__init__()
-        self.first = nn.Conv2d(channels_in, channels_out, 3, stride, 1, bias=False)
-        self.first_norm: nn.Module = nn.BatchNorm2d(channels_out)
-        self.second = nn.Conv2d(channels_out, channels_out, 3, 1, 1, bias=False)
-        self.second_norm: nn.Module = nn.BatchNorm2d(channels_out)
-        self.shortcut: nn.Module = nn.Identity()
-        if stride != 1 or channels_in != channels_out:
-            self.shortcut = nn.Sequential(
-                nn.Conv2d(channels_in, channels_out, 1, stride, bias=False), nn.BatchNorm2d(channels_out)
-            )
+        Its bodies have half sizes of 0.098 to 0.294 and centres of 0.35 to 0.66; the ranges leave room beside them.
+        """
+        return cls(
+            pixels=256, size_range=(0.05, 0.4), translation_range=(0.0, 1.0), backbone="resnet18", framing="full"
+        )
 
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        y = torch.relu(self.first_norm(self.first(x)))
-        return torch.relu(self.second_norm(self.second(y)) + self.shortcut(x))
-
-    def fold(self) -> None:
-        """Move the normalisations into the convolutions before them; for inference only."""
-        self.first, self.first_norm = _folded(self.first, self.first_norm), nn.Identity()
-        self.second, self.second_norm = _folded(self.second, self.second_norm), nn.Identity()
-        if isinstance(self.shortcut, nn.Sequential):
-            self.shortcut = _folded(self.shortcut[0], self.shortcut[1])
+    @property
+    def stride(self) -> int:
+        """Pixels of the view, along x or y, to a cell of the backbone's last stage."""
+        return ResNet18.STRIDE if self.backbone == "resnet18" else 2 ** len(self.widths)
 
 
 class Regressor(nn.Module):
@@ -78,22 +99,15 @@ class Regressor(nn.Module):
     def __init__(self, config: RegressorConfig | None = None) -> None:
         super().__init__()
         self.config = config = config or RegressorConfig()
-        stem, *stages = config.widths
-        layers: list[nn.Module] = [
-            nn.Conv2d(1, stem, 5, 2, 2, bias=False),
-            nn.BatchNorm2d(stem),
-            nn.ReLU(),
-        ]
-        channels = stem
-        for width in stages:
-            layers.append(ResidualBlock(channels, width, 2))
-            layers.extend(ResidualBlock(width, width, 1) for _ in range(config.blocks - 1))
-            channels = width
-        self.features = nn.Sequential(*layers)
-        cells = config.pixels // 2 ** len(config.widths)
+        self.features: nn.Module
+        if config.backbone == "resnet18":
+            self.features, inputs = ResNet18(), ResNet18.CHANNELS
+        else:
+            self.features = compact_backbone(config.widths, config.blocks)
+            inputs = config.widths[-1] * (config.pixels // config.stride) ** 2
         self.mixer = nn.Sequential(
             nn.Flatten(),
-            nn.Linear(channels * cells * cells, config.hidden),
+            nn.Linear(inputs, config.hidden),
             nn.ReLU(),
             nn.Linear(config.hidden, config.hidden),
             nn.ReLU(),
@@ -111,7 +125,7 @@ class Regressor(nn.Module):
 
     def raw(self, views: torch.Tensor) -> torch.Tensor:
         """Outputs (n, 14) of the heads: size 3, shape 2, translation 3, rotation 6, all unbounded."""
-        h = self.mixer(self.features(views)).float()
+        h = self.mixer(self.features(views.to(self._dtype))).float()
         with torch.autocast(views.device.type, enabled=False):  # eight bits of mantissa are too few for a size
             heads = (self.size_head, self.shape_head, self.translation_head, self.rotation_head)
             return torch.cat([head(h) for head in heads], dim=-1)
@@ -148,24 +162,47 @@ class Regressor(nn.Module):
             raw = self.raw(batch.to(device, memory_format=torch.channels_last))
         return self.decode(raw.cpu().numpy().astype(float))
 
-    def for_inference(self) -> Regressor:
-        """A copy that predicts the same, faster: normalisations folded into their convolutions, channels last."""
+    def for_inference(self, dtype: torch.dtype = torch.float32) -> Regressor:
+        """A copy that predicts the same, faster: normalisations folded into their convolutions, channels last.
+
+        Parameters
+        ----------
+        dtype
+            Of everything but the heads, which stay in single precision.  bfloat16 pays on processors that multiply it
+            (AVX512-BF16, AMX), float16 on graphics cards; elsewhere they work and are slower.
+
+        Raises
+        ------
+        ValueError
+            For a type other than float32, bfloat16 and float16.
+        """
+        if dtype not in INFERENCE_DTYPES:
+            raise ValueError(f"dtype: expected one of {', '.join(map(str, INFERENCE_DTYPES))}, got {dtype}")
         copied = copy.deepcopy(self).eval()
-        layers = copied.features
-        layers[0], layers[1] = _folded(layers[0], layers[1]), nn.Identity()
-        for block in layers:
-            if isinstance(block, ResidualBlock):
-                block.fold()
+        fold(copied.features)
+        copied.features.to(dtype)
+        copied.mixer.to(dtype)
         copied.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         return copied
+
+    @property
+    def _dtype(self) -> torch.dtype:
+        return next(self.features.parameters()).dtype
+
+
+def load_imagenet(model: Regressor, state: Mapping[str, torch.Tensor]) -> None:
+    """Begin with ImageNet weights: :meth:`sq_perception.learning.backbone.ResNet18.load_imagenet`.
+
+    Raises
+    ------
+    ValueError
+        If the backbone is another than resnet18, or the weights do not fit.
+    """
+    if not isinstance(model.features, ResNet18):
+        raise ValueError(f"backbone: ImageNet weights are for resnet18, got {model.config.backbone}")
+    model.features.load_imagenet(state)
 
 
 def _between(bounds: tuple[float, float], unit: Array) -> Array:
     low, high = bounds
     return low + (high - low) * unit
-
-
-def _folded(convolution: nn.Module, norm: nn.Module) -> nn.Conv2d:
-    assert isinstance(convolution, nn.Conv2d)
-    assert isinstance(norm, nn.BatchNorm2d)
-    return fuse_conv_bn_eval(convolution, norm)
