@@ -23,7 +23,7 @@ endif
 PIP := $(VENV)/bin/python -m pip --disable-pip-version-check
 SOURCES := setup.py setup.cfg pyproject.toml package.xml resource/sq_perception $(wildcard resource/ros2_run/*) \
 	$(wildcard config/*) $(wildcard launch_scripts/*.py) $(wildcard sq_msgs_py/*.py) \
-	$(wildcard sq_perception/*.py) $(wildcard sq_perception/*/*.py) $(wildcard sq_perception/weights/*)
+	$(wildcard sq_perception/*.py) $(wildcard sq_perception/*/*.py) $(wildcard sq_perception/*/*/*.yaml) $(wildcard sq_perception/weights/*)
 
 .PHONY: demo test lint bench install clean
 .DEFAULT_GOAL := install

@@ -43,6 +43,7 @@ setup(
     package_dir={"sq_perception.config": "config"},
     package_data={
         "sq_perception.config": ["*.xml", "*.yaml"],
+        "sq_perception.learning": ["configurations/*.yaml"],
         "sq_perception.weights": ["*.safetensors", "*.json", "*.md"],
         "sq_perception": ["py.typed"],
         "sq_msgs_py": ["py.typed"],
@@ -58,7 +59,7 @@ setup(
         "torch==2.13.0",  # the network; an open range may fetch several GB
         "safetensors>=0.4",  # weights that cannot carry code
         "array-api-compat>=1.9",  # one geometry for NumPy and torch
-        "pyyaml>=6",  # camera_info files
+        "pyyaml>=6",  # camera_info files, training configurations
         "matplotlib>=3.7",  # pictures
         "rich>=13",  # the live table of the demo
     ],

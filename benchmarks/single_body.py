@@ -110,8 +110,8 @@ def outliers(image: Image, rng: np.random.Generator) -> Image:
     return Image(np.where(gross, rng.random(image.mask.shape), image.depth), image.mask, image.camera)
 
 
-def occluded(image: Image, rng: np.random.Generator) -> Image:
-    """30 % of the silhouette behind a nearer half plane or disc."""
+def occluded(image: Image, rng: np.random.Generator, share: float = 0.3) -> Image:
+    """A share of the silhouette behind a nearer half plane or disc."""
     rows, columns = np.nonzero(image.mask)
     v, u = np.indices(image.mask.shape)
     if rng.random() < 0.5:
@@ -120,7 +120,7 @@ def occluded(image: Image, rng: np.random.Generator) -> Image:
     else:
         middle = rng.integers(len(rows))
         order = np.hypot(u - columns[middle], v - rows[middle])
-    hidden = order <= np.quantile(order[rows, columns], 0.3)
+    hidden = order <= np.quantile(order[rows, columns], share)
     nearer = np.nanmin(image.depth) - 0.05
     return Image(np.where(hidden, nearer, image.depth), image.mask & ~hidden, image.camera)
 

@@ -18,7 +18,9 @@ from sq_perception.learning import checkpoint, losses
 from sq_perception.learning.dataset import ViewPool, ViewSource, dihedral, draw_views
 from sq_perception.learning.objective import UNSUPERVISED, Objective
 from sq_perception.learning.regressor import Regressor, RegressorConfig
-from sq_perception.learning.train import TrainingConfig, recalibrate, train, validate
+from sq_perception.learning.train import train, validate
+from sq_perception.learning.training_config import TrainingConfig
+from sq_perception.learning.training_state import recalibrate
 
 SMALL = RegressorConfig(pixels=32, widths=(4, 8, 8), blocks=1, hidden=32)
 
@@ -181,7 +183,7 @@ class TestTraining:
             optimizer.zero_grad()
             objective.loss(model(batch), batch, None, step / 200, generator).mean().backward()
             optimizer.step()
-        recalibrate(model, views, 8)
+        recalibrate(model, batch, 8)
         assert validate(model, views, truth).mean() > max(before + 0.2, 0.7)
 
 

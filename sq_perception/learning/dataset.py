@@ -10,9 +10,11 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging import raycast, unit_cube
 from sq_perception.imaging.canonical_view import Occluder, render_views
 from sq_perception.imaging.scene import THESIS_SIZE, thesis_bodies
 from sq_perception.learning.disturbance import Disturbance
+from sq_perception.learning.regressor import Framing
 
 GREY_LEVELS = 255.0
 CAMERA_DISTANCE = (1.5, 12.0)
@@ -33,6 +35,8 @@ class ViewSource:
     """Share of the bodies with proportions up to 1 : 6, many of them boxes, cylinders or ellipsoids; the others are
     those of the thesis' protocol."""
     disturbance: Disturbance = field(default_factory=Disturbance)
+    framing: Framing = "cropped"
+    """Canonical views, or full: the whole cube, as in the thesis' images."""
 
 
 def wide_bodies(count: int, rng: np.random.Generator) -> Superquadric:
@@ -61,6 +65,8 @@ def draw_views(
         wide = wide_bodies(count, rng).to_flat()
         chosen = rng.random((count, 1)) < source.wide_share
         bodies = Superquadric.from_flat(np.where(chosen, wide, bodies.to_flat()))
+    if source.framing == "full":
+        return full_frames(bodies, source.pixels), bodies
     distance = None
     if pinhole_share > 0:
         length = 2 * bodies.size.max(axis=1)
@@ -70,6 +76,16 @@ def draw_views(
     occluder = occluder or disturbance.occluder(count, rng)
     miss = disturbance.framing(count, rng)
     return render_views(bodies, source.pixels, np.full(count, GREY_LEVELS), distance, occluder, miss)
+
+
+def full_frames(bodies: Superquadric, pixels: int = unit_cube.THESIS_PIXELS) -> np.ndarray:
+    """The thesis' images of bodies (n,) of the cube frame: float32 (n, p, p), z of the surface and 0 for background."""
+    camera = unit_cube.camera(pixels)
+    frames = np.empty((len(bodies), pixels, pixels), dtype=np.float32)
+    for frame, body in zip(frames, unit_cube.optical_from_cube(bodies), strict=True):
+        depth = unit_cube.depth_from_grey(unit_cube.grey_from_depth(raycast.render(body, camera)[0]))
+        frame[:] = np.where(np.isfinite(depth), 1 - depth, 0.0)
+    return frames
 
 
 def dihedral(

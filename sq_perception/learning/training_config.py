@@ -1,0 +1,229 @@
+"""What a training run is made of, and where that is read from: a YAML file, the command line, or both.
+
+A file holds fields of :class:`TrainingConfig` by name; what the command line gives wins.  Some travel with the package,
+those of the shipped weights among them, and go by their name: ``sq-perception train --config robust``.
+"""
+
+from __future__ import annotations
+
+import argparse
+from contextlib import suppress
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import yaml
+
+from sq_perception.learning.dataset import ViewSource
+from sq_perception.learning.disturbance import Disturbance
+from sq_perception.learning.objective import LOSSES, UNSUPERVISED, Objective
+from sq_perception.learning.regressor import RegressorConfig
+from sq_perception.learning.schedule import Cosine, Plateau
+
+Network = Literal["compact", "thesis"]
+Optimizer = Literal["adamw", "adam"]
+_SHIPPED = Path(__file__).with_name("configurations")
+ScheduleName = Literal["cosine", "plateau"]
+_CHOICES = {"network": get_args(Network), "optimizer": get_args(Optimizer), "schedule": get_args(ScheduleName)}
+
+
+@dataclass(frozen=True)
+class TrainingConfig:
+    """A run.  The defaults are those of the compact network under L_OC.
+
+    Raises
+    ------
+    ValueError
+        For an unknown name, a number out of its range, or settings that contradict each other.
+    """
+
+    loss: str = "occupancy"
+    """What is minimised, by its name in :mod:`sq_perception.learning.objective`."""
+    network: str = "compact"
+    """compact, or thesis: ResNet-18 on full frames of 256 x 256 pixels."""
+    pixels: int = 64
+    """Side of the compact network's views, a multiple of 16."""
+    largest: float = RegressorConfig().size_range[1]
+    """Largest half size the compact network can express, in sides of the cube; the thesis' bodies reach 0.8."""
+    start: str = ""
+    """A model file whose weights the network begins with; empty begins at random."""
+    imagenet: str = ""
+    """A ResNet-18 state dict trained on ImageNet (.safetensors or .pth) for the thesis network to begin with."""
+    data: str = ""
+    """Folder of a fixed set made by `sq-perception dataset`; empty draws and renders on the fly."""
+    canonical_labels: bool = False
+    """List the axes of every label so that a1 >= a2; as drawn, their order is random."""
+    pinhole_share: float = 0.0
+    """Share of the views that a pinhole camera sees; the others are orthographic, as in the thesis."""
+    wide_share: float = 0.0
+    """Share of bodies with proportions up to 1 : 6; the others are those of the thesis' protocol."""
+    occluded_share: float = 0.0
+    """Share of the views with an occluder before the body."""
+    most_hidden: float = 0.4
+    """Largest share of a body that an occluder hides."""
+    noisy_share: float = 0.0
+    """Share of the views with noise, steps, holes and wrong edges."""
+    reuse: int = 4
+    """How often a rendered view is used."""
+    steps: int = 20000
+    """Steps of the run; with the plateau schedule, the most it may take."""
+    batch: int = 128
+    """Views a step, in each process."""
+    points: int = 256
+    """Comparison points a body: half close around it, half in twice its box."""
+    stride: int = 2
+    """Losses of the view take every stride-th row and column, from a random one on."""
+    free_space: float = 4.0
+    """Weight of the free space in least_squares_free."""
+    root: bool = True
+    """Whether least_squares_free is the root of its squares."""
+    density: float = 2.0
+    """Density n tau of the soft image in render, in units of s."""
+    sharpness_start: float = 0.0
+    """s at the start of the run: far basins first, fine fit last; 0 takes the loss's own value."""
+    sharpness_end: float = 0.0
+    """s at its end."""
+    optimizer: str = "adamw"
+    """adamw, or adam as in the thesis."""
+    schedule: str = "cosine"
+    """cosine: warm up, then fall to 0; plateau: divide by 10 after 10 validations without progress, stop after 20."""
+    learning_rate: float = 1.5e-3
+    weight_decay: float = 1e-2
+    warm_up: int = 400
+    """Steps over which the learning rate rises under the cosine schedule."""
+    average: float = 0.999
+    """The averaged weights keep this much of themselves at each step; they are what is validated and saved."""
+    clip: float = 1.0
+    """Largest norm of the gradient."""
+    bfloat16: bool = True
+    """Compute the network in bfloat16 where it is safe (automatic mixed precision)."""
+    validation: int = 1000
+    """Bodies in each validation set, and steps between validations."""
+    save_minutes: float = 5.0
+    """Longest time between two saved states."""
+    seed: int = 1
+    threads: int = 0
+    """CPU threads; 0 leaves torch's own choice."""
+    device: str = "cpu"
+    """cpu or cuda; under torchrun each process takes its own device."""
+
+    def __post_init__(self) -> None:
+        for name, choices in (*_CHOICES.items(), ("loss", LOSSES)):
+            if getattr(self, name) not in choices:
+                raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {getattr(self, name)!r}")
+        for name in ("steps", "batch", "points", "stride", "validation", "reuse"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}: expected at least 1, got {getattr(self, name)}")
+        for name in ("learning_rate", "clip", "density", "save_minutes"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}")
+        if not 0 <= self.average < 1:
+            raise ValueError(f"average: expected 0 to below 1, got {self.average}")
+        if self.loss in UNSUPERVISED and (self.occluded_share or self.noisy_share):
+            raise ValueError(f"{self.loss} takes each view as it is; occluders and noise need a loss with labels")
+        if self.network == "thesis" and (self.pinhole_share or self.occluded_share or self.noisy_share):
+            raise ValueError("the thesis network sees the thesis' images: orthographic, whole and clean")
+        if self.imagenet and self.network != "thesis":
+            raise ValueError("imagenet: only the thesis network has the form of those weights")
+        self.disturbance()
+
+    def disturbance(self) -> Disturbance:
+        """What happens to the views."""
+        return Disturbance(self.occluded_share, self.most_hidden, self.noisy_share)
+
+    def objective(self) -> Objective:
+        """What is minimised."""
+        return Objective(
+            self.loss,
+            self.points,
+            self.sharpness_start,
+            self.sharpness_end,
+            self.stride,
+            self.density,
+            self.free_space,
+            self.root,
+        )
+
+    @property
+    def marks_hidden(self) -> bool:
+        """Whether the network learns what hidden pixels are; who uses it then looks for what hides."""
+        return self.occluded_share > 0 or self.noisy_share > 0
+
+    def regressor(self) -> RegressorConfig:
+        """The network's form, unless ``start`` brings its own."""
+        if self.network == "thesis":
+            return replace(RegressorConfig.thesis(), marks_hidden=self.marks_hidden)
+        smallest = RegressorConfig().size_range[0]
+        return RegressorConfig(self.pixels, size_range=(smallest, self.largest), marks_hidden=self.marks_hidden)
+
+    def views(self, network: RegressorConfig) -> ViewSource:
+        """What is drawn for a network."""
+        return ViewSource(network.pixels, self.pinhole_share, self.wide_share, self.disturbance(), network.framing)
+
+    def learning_schedule(self) -> Cosine | Plateau:
+        """How the learning rate goes."""
+        if self.schedule == "plateau":
+            return Plateau(self.learning_rate)
+        return Cosine(self.learning_rate, self.warm_up, self.steps)
+
+
+def read(path: str | Path, **changes: Any) -> TrainingConfig:
+    """The configuration of a YAML file, or of a shipped one by its name, with ``changes`` made to it.
+
+    Raises
+    ------
+    ValueError
+        If there is no such file, or it holds anything but fields of :class:`TrainingConfig`.
+    """
+    return TrainingConfig(**{**_values(path), **changes})
+
+
+def shipped() -> list[str]:
+    """Names of the configurations that travel with the package."""
+    return sorted(path.stem for path in _SHIPPED.glob("*.yaml"))
+
+
+def _values(path: str | Path) -> dict[str, Any]:
+    source = Path(path)
+    if str(path) in shipped():
+        source = _SHIPPED / f"{path}.yaml"
+    if not source.is_file():
+        raise ValueError(f"{path}: no such configuration file; shipped ones are {', '.join(shipped())}")
+    try:
+        values = yaml.safe_load(source.read_text(encoding="utf-8")) or {}
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: not a YAML file: {error}") from error
+    if not isinstance(values, dict):
+        raise ValueError(f"{path}: expected 'name: value' lines")
+    known = {field.name: type(field.default) for field in fields(TrainingConfig)}
+    for name, value in values.items():
+        if name not in known:
+            raise ValueError(f"{path}: there is no setting {name!r}")
+        wanted = known[name]
+        # YAML 1.1 reads 1e-4 as text, and 1 is as good a number as 1.0.
+        if wanted is float and isinstance(value, (int, str)) and not isinstance(value, bool):
+            with suppress(ValueError):
+                values[name] = value = float(value)
+        if type(value) is not wanted:
+            raise ValueError(f"{path}: {name}: expected {wanted.__name__}, got {value!r}")
+    return values
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """``--config`` and one option for each field of :class:`TrainingConfig`; what is not given is not in the result."""
+    parser.add_argument("--config", metavar="FILE", help=f"YAML file, or one of {', '.join(shipped())}")
+    for field in fields(TrainingConfig):
+        name = "--" + field.name.replace("_", "-")
+        default, text = argparse.SUPPRESS, f"default {field.default!r}"
+        choices = _CHOICES.get(field.name, LOSSES if field.name == "loss" else None)
+        if isinstance(field.default, bool):
+            parser.add_argument(name, action=argparse.BooleanOptionalAction, default=default, help=text)
+        else:
+            parser.add_argument(name, type=type(field.default), choices=choices, default=default, help=text)
+
+
+def from_arguments(options: dict[str, Any]) -> TrainingConfig:
+    """The configuration that parsed arguments ask for; raises ValueError as :func:`read` does."""
+    options = dict(options)
+    path = options.pop("config", None)
+    return TrainingConfig(**options) if path is None else read(path, **options)

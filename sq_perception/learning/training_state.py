@@ -1,0 +1,106 @@
+"""All of a run that changes, in one file: weights, their average, the optimiser's moments, schedule, step and time.
+
+A state is written beside the old one and takes its place at once, so that a run killed at any moment finds the last
+whole state again.  Like every file of weights it is safetensors and can carry no code.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+
+from sq_perception.learning.checkpoint import CheckpointError
+from sq_perception.learning.regressor import Regressor
+from sq_perception.learning.schedule import Cosine, Plateau
+
+
+@dataclass(eq=False)
+class TrainingState:
+    """What a training holds between two steps."""
+
+    model: Regressor
+    average: Regressor
+    optimizer: torch.optim.Optimizer
+    schedule: Cosine | Plateau
+    step: int = 0
+    """Steps done."""
+    seconds: float = 0.0
+    """Time spent, in all parts of the run."""
+    best: float = -math.inf
+    """Best validation so far."""
+
+    def save(self, path: Path) -> None:
+        """Write everything to ``path``."""
+        tensors = {
+            "step": torch.tensor(self.step),
+            "seconds": torch.tensor(self.seconds, dtype=torch.float64),
+            "best": torch.tensor(self.best, dtype=torch.float64),
+            "schedule": torch.tensor(self.schedule.state(), dtype=torch.float64),
+        }
+        for prefix, network in (("model", self.model), ("average", self.average)):
+            tensors.update({f"{prefix}.{k}": v.contiguous() for k, v in network.state_dict().items()})
+        for index, slots in self.optimizer.state_dict()["state"].items():
+            tensors.update({f"optimizer.{index}.{k}": torch.as_tensor(v).contiguous() for k, v in slots.items()})
+        partial = path.with_suffix(".partial")
+        save_file(tensors, str(partial))
+        partial.replace(path)
+
+    def restore(self, path: Path) -> None:
+        """Go on from :meth:`save`.
+
+        Raises
+        ------
+        CheckpointError
+            If the file is damaged, or of a run with another network or schedule.
+        """
+        try:
+            tensors = load_file(str(path), device=str(next(self.model.parameters()).device))
+            for prefix, network in (("model.", self.model), ("average.", self.average)):
+                own = {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
+                network.load_state_dict(own)
+            state = self.optimizer.state_dict()
+            for key, value in tensors.items():
+                if key.startswith("optimizer."):
+                    _, index, slot = key.split(".")
+                    state["state"].setdefault(int(index), {})[slot] = value
+            self.optimizer.load_state_dict(state)
+            self.schedule.restore(tensors["schedule"].tolist())
+            self.step, self.seconds = int(tensors["step"]), float(tensors["seconds"])
+            self.best = float(tensors["best"])
+        except (SafetensorError, OSError, KeyError, IndexError, RuntimeError, ValueError) as error:
+            raise CheckpointError(f"{path}: not the state of such a run: {error}") from error
+
+    @torch.no_grad()
+    def follow(self, keep: float) -> None:
+        """Move the averaged weights towards the trained ones; early in a run they keep less than ``keep``."""
+        keep = min(keep, (self.step + 1) / (self.step + 10))
+        for mine, theirs in zip(self.average.state_dict().values(), self.model.state_dict().values(), strict=True):
+            if mine.is_floating_point():
+                mine.lerp_(theirs, 1 - keep)
+            else:
+                mine.copy_(theirs)
+
+
+@torch.no_grad()
+def recalibrate(model: Regressor, views: torch.Tensor, batch: int) -> None:
+    """Measure the means and variances of all normalisations anew, on ``views`` (n, 1, p, p).
+
+    An average of weights has activations of its own: those recorded while the moving weights trained do not fit it.
+    """
+    norms = [module for module in model.modules() if isinstance(module, torch.nn.BatchNorm2d)]
+    momenta = [norm.momentum for norm in norms]
+    for norm in norms:
+        norm.reset_running_stats()
+        norm.momentum = None
+    device = next(model.parameters()).device
+    model.train()
+    for i in range(0, len(views) - batch + 1, batch):
+        model(views[i : i + batch].to(device, memory_format=torch.channels_last))
+    model.eval()
+    for norm, momentum in zip(norms, momenta, strict=True):
+        norm.momentum = momentum
