@@ -265,7 +265,8 @@ class Recoverer:
             pixels, find_hidden = (form.pixels, form.marks_hidden) if form is not None else (_VIEW_PIXELS, False)
             for one in objects:
                 source = (depth, one.mask, camera) if find_hidden else (one.depth_crop, one.mask_crop, one.camera_crop)
-                one.view = canonical_view.from_mask(*source, pixels, find_hidden=find_hidden, plane=found.plane)
+                one.plane = _support(one, found.plane)
+                one.view = canonical_view.from_mask(*source, pixels, find_hidden=find_hidden, plane=one.plane)
             if network is not None and objects:
                 views = np.stack([one.view.marked for one in objects if one.view is not None])
                 predictions: Future[Superquadric] = Future()
@@ -276,9 +277,8 @@ class Recoverer:
                 for k, one in enumerate(objects):
                     one.predictions, one.number = predictions, k
 
-        plane = found.plane if options.use_plane else None
         with _timed(milliseconds, "fit"):
-            fits = _mapped(lambda one: _fitted(one, depth, camera, plane, options), objects)
+            fits = _mapped(lambda one: _fitted(one, depth, camera, options), objects)
         with _timed(milliseconds, "score"):
             scores = [_score(one.view, fit.superquadric, options) for one, fit in zip(objects, fits, strict=True)]
         bodies = tuple(_recovery(one, fit, score) for one, fit, score in zip(objects, fits, scores, strict=True))
@@ -318,6 +318,8 @@ class _Object:
     depth_crop: np.ndarray
     mask_crop: np.ndarray
     camera_crop: Camera
+    plane: np.ndarray | None = None
+    """What it stands on."""
     view: CanonicalView | None = None
     predictions: Future[Superquadric] | None = None
     """Of all objects of the frame, in the canonical frames of their views; still being computed, perhaps."""
@@ -384,12 +386,19 @@ def _mapped(function, objects: list[_Object]) -> list[Fit]:  # type: ignore[no-u
         return list(pool.map(function, objects))
 
 
-def _fitted(one: _Object, depth: np.ndarray, camera: Camera, plane: np.ndarray | None, options: RecoveryOptions) -> Fit:
+def _support(one: _Object, plane: np.ndarray | None) -> np.ndarray | None:
+    """The frame's support plane, unless this object lies behind it: it then stands on something else."""
+    if plane is None or np.median(one.points @ plane[:3] + plane[3]) <= 0:
+        return None
+    return plane
+
+
+def _fitted(one: _Object, depth: np.ndarray, camera: Camera, options: RecoveryOptions) -> Fit:
     """The body of one object by the chosen method; FAILED with a reason instead of any exception on hard data."""
     if one.pixels < _FEWEST_PIXELS:
         return _failed(one, f"{one.pixels} pixels with a depth are too few for a body")
     try:
-        fit = _body(one, depth, camera, plane, options)
+        fit = _body(one, depth, camera, options)
     except _HARD_IMAGE as error:
         return _failed(one, f"{options.method}: {error}")
     if not np.isfinite(fit.superquadric.to_flat()).all():
@@ -397,13 +406,14 @@ def _fitted(one: _Object, depth: np.ndarray, camera: Camera, plane: np.ndarray |
     return fit
 
 
-def _body(one: _Object, depth: np.ndarray, camera: Camera, plane: np.ndarray | None, options: RecoveryOptions) -> Fit:
+def _body(one: _Object, depth: np.ndarray, camera: Camera, options: RecoveryOptions) -> Fit:
     if options.method == "classic":
         return solina_bajcsy.fit(one.points)
     if options.method == "network" or (options.method == "auto" and options.refine == "none"):
         return _unfitted(one.predicted(), one, "prediction of the network, not refined")
     if options.method == "auto" and options.refine == "soft_render":
         return _soft_rendered(one.predicted(), one, options)
+    plane = one.plane if options.use_plane else None
     fit = _surface_fit(one, depth, camera, plane, options.time_budget)
     if options.refine == "soft_render" and fit.status != Status.FAILED:
         return _soft_rendered(fit.superquadric, one, options)

@@ -76,6 +76,20 @@ def test_symmetry_recovers_thesis_images(symmetry, seed):
     assert found.plane is None
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_the_flat_front_of_an_occluder_is_no_support(symmetry, seed):
+    """A wide box before the body is the largest plane of the image, and the body is behind it, not on it."""
+    truth = random_bodies(1, seed, scale=0.1)[0]
+    truth = Superquadric(truth.size, truth.shape, truth.translation + [0, 0, 0.1], truth.rotation)
+    depth, labels = seen([truth], CAMERA, background=1.6)
+    rows, _ = np.nonzero(labels)
+    below = np.arange(CAMERA.height)[:, None] > np.quantile(rows, 0.75)
+    depth = np.where(below, np.float32(np.nanmin(depth) - 0.05), depth)
+    found = symmetry.recover(depth, CAMERA, np.where(below, 0, labels))
+    assert found.bodies[0].status != Status.FAILED
+    assert iou(found.bodies[0].superquadric, truth) > 0.85
+
+
 def test_a_frame_with_masks_keeps_their_values_and_order(symmetry):
     left, right = random_bodies(2, 7, scale=0.07)
     left = Superquadric(left.size, left.shape, [-0.15, 0, 0.8], left.rotation)

@@ -354,7 +354,9 @@ def _plane_around(
         contact = []
         for points in bodies:
             heights = (points @ plane.equation[:3] + plane.equation[3]) / _noise(points[:, 2])
-            contact.append(np.exp(-np.abs(np.quantile(heights, 0.02)) / (4 * options.plane_tolerance)))
+            lowest, middle = np.quantile(heights, (0.02, 0.5))
+            # What a body lies behind is not what it stands on, but perhaps the front of its occluder.
+            contact.append(np.exp(-np.abs(lowest) / (4 * options.plane_tolerance)) if middle > 0 else 0.0)
         vote = _support_vote(plane) * float(np.mean(contact))
         if vote > best_vote:
             best, best_vote = plane.equation, vote
