@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 RESULTS = Path(__file__).resolve().parent / "results"
-_PACKAGES = ("sq-perception", "numpy", "numba", "torch", "ros-jazzy-rclpy")
+_PACKAGES = ("sq-perception", "numpy", "numba", "torch", "onnxruntime", "ros-jazzy-rclpy")
 
 
 def shared_data(folder: str) -> Path | None:

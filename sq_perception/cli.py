@@ -1,4 +1,4 @@
-"""The command ``sq-perception``: recover, render, demo, train, render-search.
+"""The command ``sq-perception``: recover, render, demo, train, render-search, export.
 
 Exit codes: 0 all went well, 1 a frame could not be read or something is missing, 2 wrong usage.  Heavy imports happen
 inside the commands, so that ``--help`` answers at once.
@@ -90,7 +90,7 @@ examples:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
     given = list(sys.argv[1:] if arguments is None else arguments)
-    others = {"demo": _demo, "train": _train, "render-search": _render_search}
+    others = {"demo": _demo, "train": _train, "render-search": _render_search, "export": _export}
     if given and given[0] in others:
         return others[given[0]](given[1:])
     parser = _parser()
@@ -170,6 +170,7 @@ def _parser() -> argparse.ArgumentParser:
     commands.add_parser("demo", help="live demonstration with real ROS 2 nodes (extra 'ros')", add_help=False)
     commands.add_parser("train", help="train the network from scratch", add_help=False)
     commands.add_parser("render-search", help="find the best s and tau of the soft renderer", add_help=False)
+    commands.add_parser("export", help="write the network as ONNX (extra 'onnx')", add_help=False)
     return parser
 
 
@@ -424,7 +425,7 @@ def _write_camera_info(path: Path, camera: Camera) -> None:
     path.write_text(yaml.safe_dump(info, sort_keys=False), encoding="utf-8")
 
 
-# demo, train and render-search
+# demo, train, render-search and export
 
 
 def _demo(arguments: list[str]) -> int:
@@ -449,6 +450,12 @@ def _render_search(arguments: list[str]) -> int:
     from sq_perception.evaluation import render_search
 
     return _code(render_search.main(arguments))
+
+
+def _export(arguments: list[str]) -> int:
+    from sq_perception.learning import onnx_export
+
+    return _code(onnx_export.main(arguments))
 
 
 def _code(result: Any) -> int:

@@ -150,15 +150,10 @@ class Regressor(nn.Module):
         ValueError
             If the views are not (n, p, p) with p = ``config.pixels``, or not finite.
         """
-        expected = (self.config.pixels, self.config.pixels)
-        if views.ndim != 3 or views.shape[1:] != expected:
-            raise ValueError(f"expected views of shape (n, {expected[0]}, {expected[1]}), got {views.shape}")
-        if not np.isfinite(views).all():
-            raise ValueError("expected finite views; background is 0")
+        batch = torch.from_numpy(checked_views(views, self.config))[:, None]
         self.eval()
         device = next(self.parameters()).device
         with torch.inference_mode():
-            batch = torch.from_numpy(np.ascontiguousarray(views, dtype=np.float32))[:, None]
             raw = self.raw(batch.to(device, memory_format=torch.channels_last))
         return self.decode(raw.cpu().numpy().astype(float))
 
@@ -201,6 +196,16 @@ def load_imagenet(model: Regressor, state: Mapping[str, torch.Tensor]) -> None:
     if not isinstance(model.features, ResNet18):
         raise ValueError(f"backbone: ImageNet weights are for resnet18, got {model.config.backbone}")
     model.features.load_imagenet(state)
+
+
+def checked_views(views: np.ndarray, config: RegressorConfig) -> np.ndarray:
+    """Views (n, p, p) as contiguous float32; raises ValueError if they are of another form, or not finite."""
+    expected = (config.pixels, config.pixels)
+    if views.ndim != 3 or views.shape[1:] != expected:
+        raise ValueError(f"expected views of shape (n, {expected[0]}, {expected[1]}), got {views.shape}")
+    if not np.isfinite(views).all():
+        raise ValueError("expected finite views; background is 0")
+    return np.ascontiguousarray(views, dtype=np.float32)
 
 
 def _between(bounds: tuple[float, float], unit: Array) -> Array:
