@@ -1,4 +1,4 @@
-"""The command ``sq-perception``: recover, render, demo, train, render-search, export.
+"""The command ``sq-perception``; ``sq-perception --help`` lists what it can do.
 
 Exit codes: 0 all went well, 1 a frame could not be read or something is missing, 2 wrong usage.  Heavy imports happen
 inside the commands, so that ``--help`` answers at once.
@@ -28,6 +28,15 @@ if TYPE_CHECKING:
 SUCCESS, FAILURE, USAGE = 0, 1, 2
 JSON_VERSION = 1
 PARAMETERS = ("a1", "a2", "a3", "e1", "e2", "t1", "t2", "t3", "qx", "qy", "qz", "qw")
+_OTHER_COMMANDS = {
+    "demo": ("sq_perception.nodes.demo", "live demonstration with real ROS 2 nodes (extra 'ros')"),
+    "train": ("sq_perception.learning.train", "train a network"),
+    "evaluate": ("sq_perception.evaluation.evaluate", "the thesis' tables and plots, for networks and fits"),
+    "render-search": ("sq_perception.evaluation.render_search", "find the best s and tau of the soft renderer"),
+    "gradient-search": ("sq_perception.evaluation.gradient_search", "watch a body walk down a loss, step by step"),
+    "export": ("sq_perception.learning.onnx_export", "write a network as ONNX (extra 'onnx')"),
+}
+"""Modules with a main of their own."""
 _NEGATIVE_WITH_EXPONENT = re.compile(r"-(\d+\.?\d*|\.\d+)[eE][-+]?\d+")
 
 _RECOVER_HELP = """\
@@ -90,9 +99,8 @@ examples:
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
     given = list(sys.argv[1:] if arguments is None else arguments)
-    others = {"demo": _demo, "train": _train, "render-search": _render_search, "export": _export}
-    if given and given[0] in others:
-        return others[given[0]](given[1:])
+    if given and given[0] in _OTHER_COMMANDS:
+        return _other_command(given[0], given[1:])
     parser = _parser()
     try:
         options = parser.parse_args([_plain_number(word) for word in given])
@@ -167,10 +175,8 @@ def _parser() -> argparse.ArgumentParser:
     render.add_argument("--bits", type=int, choices=(8, 16), default=8, help="depth of an orthographic PNG")
     render.set_defaults(command=_render)
 
-    commands.add_parser("demo", help="live demonstration with real ROS 2 nodes (extra 'ros')", add_help=False)
-    commands.add_parser("train", help="train the network from scratch", add_help=False)
-    commands.add_parser("render-search", help="find the best s and tau of the soft renderer", add_help=False)
-    commands.add_parser("export", help="write the network as ONNX (extra 'onnx')", add_help=False)
+    for name, (_, text) in _OTHER_COMMANDS.items():
+        commands.add_parser(name, help=text, add_help=False)
     return parser
 
 
@@ -425,40 +431,21 @@ def _write_camera_info(path: Path, camera: Camera) -> None:
     path.write_text(yaml.safe_dump(info, sort_keys=False), encoding="utf-8")
 
 
-# demo, train, render-search and export
+# all other commands
 
 
-def _demo(arguments: list[str]) -> int:
+def _other_command(name: str, arguments: list[str]) -> int:
     try:
-        demo = importlib.import_module("sq_perception.nodes.demo")
+        module = importlib.import_module(_OTHER_COMMANDS[name][0])
     except ModuleNotFoundError as error:
+        if name != "demo":
+            raise
         _complain(
             f"the demonstration needs ROS 2 in Python, and the module {error.name!r} is missing: "
             "pip install 'sq_perception[ros]', or source a ROS 2 Jazzy installation"
         )
         return FAILURE
-    return _code(demo.main(arguments))
-
-
-def _train(arguments: list[str]) -> int:
-    from sq_perception.learning import train
-
-    return _code(train.main(arguments))
-
-
-def _render_search(arguments: list[str]) -> int:
-    from sq_perception.evaluation import render_search
-
-    return _code(render_search.main(arguments))
-
-
-def _export(arguments: list[str]) -> int:
-    from sq_perception.learning import onnx_export
-
-    return _code(onnx_export.main(arguments))
-
-
-def _code(result: Any) -> int:
+    result = module.main(arguments)
     return result if isinstance(result, int) else SUCCESS
 
 

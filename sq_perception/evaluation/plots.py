@@ -160,7 +160,7 @@ def draw_bodies_3d(
     if not bodies:
         return
     upright = _upright(plane)
-    view = _view_matrix(elevation, azimuth) @ upright
+    view = picture_axes(elevation, azimuth, plane)
     turn = quaternions.from_matrix(view)
     turned = [body.transformed(turn, np.zeros(3)) for body in bodies]
     shades = [np.asarray(colour(k) if colours is None else colours[k % len(colours)]) for k in range(len(bodies))]
@@ -204,6 +204,11 @@ def draw_bodies_3d(
         edges = LineCollection(list(outline(cage, 64)[..., :2]), colors=[WIRE], linewidths=1.0, zorder=5)
         ax.add_collection(edges, autolim=False)
     _scale_bar(ax, extent, unit)
+
+
+def picture_axes(elevation: float, azimuth: float, plane: np.ndarray | None = None) -> np.ndarray:
+    """Rows: right, down, forward of a picture of :func:`draw_bodies_3d`, in the optical frame."""
+    return _view_matrix(elevation, azimuth) @ _upright(plane)
 
 
 def recovery_figure(

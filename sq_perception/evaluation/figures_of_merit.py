@@ -1,0 +1,181 @@
+"""The thesis' figures of merit, body by body, and their summary (thesis, chapter 5.4).
+
+| figure | definition | summary |
+| --- | --- | --- |
+| IoU | equation 5.1, 64^3 points of the unit cube | mean, standard deviation, min, max, share over 85 % |
+| volume IoU | the same over the box around both bodies | mean, standard deviation |
+| Delta A | (a1 a2 a3)^ / (a1 a2 a3) - 1, equation 5.2 | mean |
+| Delta E | (e1 + e2)^ / (e1 + e2) - 1, equation 5.3 | mean |
+| Delta T | t^ - t, equation 5.4, in sides of the cube | mean of each coordinate |
+
+Rotations, q^ predicted, q true, r = q^-1 q^ = (v, w):
+
+| angle | definition | range |
+| --- | --- | --- |
+| shortest arc, figure 6.3 | 2 atan2(|v|, w), the signs of the quaternions as they are | 0 to 2 pi |
+| axes | least over the 4 half turns of the body | 0 to 120 degrees |
+| symmetric | least over the 8 parameter vectors of the body | 0 to 98.4 degrees |
+
+q and -q are one rotation, so that the first is symmetric about pi wherever signs are arbitrary, and 0, pi (about an
+axis of the body) and 2 pi are the same body.  Only the last is a property of the bodies; it takes a quarter turn about
+z for none, whatever the sizes, as the IoU tells those apart.  The summary counts as quarter turns the bodies whose axes
+angle is 70 to 110 degrees.
+
+A body that was not recovered has IoU 0, and NaN in everything that compares parameters.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from sq_perception import metrics
+from sq_perception.geometry import rotation as quaternions
+from sq_perception.geometry.superquadric import Superquadric
+
+GOOD_IOU = 0.85
+_QUARTER_TURN = np.deg2rad([70.0, 110.0])
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Means over a test set, as the thesis defines them: shares and relative errors as fractions, angles in radians.
+
+    Numbers about parameters are over the ``recovered`` bodies, times over the ``timed`` ones; NaN where there is none.
+    """
+
+    bodies: int
+    recovered: int
+    iou_mean: float
+    iou_std: float
+    iou_median: float
+    iou_min: float
+    iou_max: float
+    over_85: float
+    volume_iou_mean: float
+    volume_iou_std: float
+    delta_a: float
+    delta_e: float
+    delta_t: tuple[float, float, float]
+    quarter_turns: float
+    symmetric_angle_median: float
+    timed: int
+    milliseconds_mean: float
+    milliseconds_std: float
+    milliseconds_median: float
+    milliseconds_p95: float
+
+
+@dataclass(frozen=True, eq=False)
+class FiguresOfMerit:
+    """Figures of n bodies; see the module.
+
+    Attributes
+    ----------
+    iou, volume_iou : (n,)
+        0 to 1; 0 where no body was recovered.
+    delta_a, delta_e, delta_t : (n,), (n,), (n, 3)
+        Errors of volume, shape and place as fractions; NaN where no body was recovered.
+    shortest_arc, axes_angle, symmetric_angle : (n,)
+        Radians; NaN likewise.
+    milliseconds : (n,)
+        Execution time of the image alone, NaN where it was not measured.
+    """
+
+    iou: np.ndarray
+    volume_iou: np.ndarray
+    delta_a: np.ndarray
+    delta_e: np.ndarray
+    delta_t: np.ndarray
+    shortest_arc: np.ndarray
+    axes_angle: np.ndarray
+    symmetric_angle: np.ndarray
+    milliseconds: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.iou)
+
+    @classmethod
+    def of(
+        cls,
+        prediction: Superquadric,
+        truth: Superquadric,
+        recovered: np.ndarray | None = None,
+        milliseconds: np.ndarray | None = None,
+    ) -> FiguresOfMerit:
+        """Compare batches (n,) of the cube frame.
+
+        Parameters
+        ----------
+        prediction, truth : Superquadric
+            NumPy.
+        recovered : bool (n,), optional
+            Where False, there is no prediction and what stands in its place does not count.
+        milliseconds : (n,), optional
+        """
+        count = len(truth)
+        missing = np.zeros(count, bool) if recovered is None else ~np.asarray(recovered, dtype=bool)
+        turns = truth.equivalent_forms().rotation
+        angles = quaternions.geodesic_angle(np.broadcast_to(prediction.rotation, turns.shape), turns)
+
+        def known(values: np.ndarray) -> np.ndarray:
+            return np.where(missing.reshape(-1, *[1] * (values.ndim - 1)), np.nan, values)
+
+        return cls(
+            np.where(missing, 0.0, metrics.thesis_iou(prediction, truth)),
+            np.where(missing, 0.0, metrics.volume_iou(prediction, truth)),
+            known(metrics.volume_error(prediction, truth)),
+            known(metrics.shape_error(prediction, truth)),
+            known(metrics.translation_error(prediction, truth)),
+            known(shortest_arc(prediction.rotation, truth.rotation)),
+            known(angles[:4].min(axis=0)),
+            known(angles.min(axis=0)),
+            np.full(count, np.nan) if milliseconds is None else np.asarray(milliseconds, dtype=float),
+        )
+
+    @classmethod
+    def concatenated(cls, parts: Sequence[FiguresOfMerit]) -> FiguresOfMerit:
+        """The figures of several batches, one after the other."""
+        return cls(*(np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(cls)))
+
+    def summary(self) -> Summary:
+        """Means as in the thesis' tables."""
+        recovered = np.isfinite(self.delta_a)
+        times = self.milliseconds[np.isfinite(self.milliseconds)]
+        axes = self.axes_angle[recovered]
+        low, high = _QUARTER_TURN
+        delta_t = self.delta_t[recovered]
+        return Summary(
+            bodies=len(self),
+            recovered=int(recovered.sum()),
+            iou_mean=_mean(self.iou),
+            iou_std=float(self.iou.std()),
+            iou_median=float(np.median(self.iou)),
+            iou_min=float(self.iou.min()),
+            iou_max=float(self.iou.max()),
+            over_85=_mean(self.iou > GOOD_IOU),
+            volume_iou_mean=_mean(self.volume_iou),
+            volume_iou_std=float(self.volume_iou.std()),
+            delta_a=_mean(self.delta_a[recovered]),
+            delta_e=_mean(self.delta_e[recovered]),
+            delta_t=(_mean(delta_t[:, 0]), _mean(delta_t[:, 1]), _mean(delta_t[:, 2])),
+            quarter_turns=_mean((axes > low) & (axes < high)),
+            symmetric_angle_median=float(np.median(self.symmetric_angle[recovered])) if recovered.any() else np.nan,
+            timed=times.size,
+            milliseconds_mean=_mean(times),
+            milliseconds_std=float(times.std()) if times.size else np.nan,
+            milliseconds_median=float(np.median(times)) if times.size else np.nan,
+            milliseconds_p95=float(np.percentile(times, 95)) if times.size else np.nan,
+        )
+
+
+def shortest_arc(predicted: np.ndarray, true: np.ndarray) -> np.ndarray:
+    """Angle 0 to 2 pi of the rotation from predicted to true quaternions (..., 4), signs as they are (figure 6.3)."""
+    between = quaternions.multiply(quaternions.conjugate(predicted), true)
+    return 2 * np.arctan2(np.linalg.norm(between[..., :3], axis=-1), between[..., 3])
+
+
+def _mean(values: np.ndarray) -> float:
+    return float(np.mean(values)) if len(values) else float("nan")
