@@ -4,18 +4,15 @@ from __future__ import annotations
 
 import json
 import os
-import platform
-import subprocess
 import sys
-from datetime import datetime, timezone
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from sq_perception.evaluation import provenance
+
 RESULTS = Path(__file__).resolve().parent / "results"
-_PACKAGES = ("sq-perception", "numpy", "numba", "torch", "onnxruntime", "ros-jazzy-rclpy")
 
 
 def shared_data(folder: str) -> Path | None:
@@ -41,26 +38,12 @@ def spread(values: np.ndarray) -> dict[str, float]:
 
 def environment() -> dict[str, Any]:
     """Processor, versions, commit and command of this run."""
-    versions = {}
-    for package in _PACKAGES:
-        try:
-            versions[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            versions[package] = None
-    return {
-        "command": " ".join(["python", f"benchmarks/{Path(sys.argv[0]).name}", *sys.argv[1:]]),
-        "date": datetime.now(timezone.utc).strftime("%Y-%m-%d"),
-        "commit": commit(),
-        "modified": bool(_git("status", "--porcelain", "--untracked-files=no")),
-        "processor": _processor(),
-        "python": platform.python_version(),
-        "versions": versions,
-    }
+    return provenance.facts(" ".join(["python", f"benchmarks/{Path(sys.argv[0]).name}", *sys.argv[1:]]), __file__)
 
 
 def commit() -> str | None:
     """The short hash of this checkout."""
-    return _git("rev-parse", "--short", "HEAD")
+    return provenance.commit(__file__)
 
 
 def previous(name: str, key: str) -> dict[str, Any]:
@@ -83,18 +66,3 @@ def table(header: list[str], rows: list[list[str]]) -> str:
     """A Markdown table."""
     lines = [header, ["---"] * len(header), *rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-
-def _git(*arguments: str) -> str | None:
-    done = subprocess.run(["git", *arguments], cwd=RESULTS.parent, capture_output=True, text=True, check=False)
-    return done.stdout.strip() if done.returncode == 0 else None
-
-
-def _processor() -> str:
-    try:
-        for line in Path("/proc/cpuinfo").read_text().splitlines():
-            if line.startswith("model name"):
-                return line.split(":", 1)[1].strip()
-    except OSError:
-        return platform.processor()
-    return platform.processor()

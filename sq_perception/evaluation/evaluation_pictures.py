@@ -14,6 +14,8 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LogNorm
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Patch
 from matplotlib.ticker import FuncFormatter, LogLocator
 
 from sq_perception.evaluation.contest import Outcome
@@ -39,6 +41,7 @@ _ELEVATION, _AZIMUTH = 22.0, 55.0
 _EACH = 3
 _F_RANGE = (1e-3, 1e3)
 _ARC_BINS = np.linspace(0, 360, 121)
+_ANGLE_BINS = np.linspace(0, 100, 101)
 _IOU_BINS = np.linspace(0, 100, 101)
 
 INSIDE_OUTSIDE_BODY = Superquadric([0.32, 0.22, 0.26], [0.3, 0.8], [0.5, 0.5, 0.5], [0.35, 0.15, 0.1, 0.92])
@@ -91,11 +94,16 @@ def distributions(outcome: Outcome) -> Figure:
     _heading(ax, "Shortest arc to the label (figure 6.3)", f"{100 * summary.quarter_turns:.0f} % quarter turns")
 
     ax = figure.add_subplot(grid[2])
-    _histogram(ax, np.rad2deg(figures.symmetric_angle), np.linspace(0, 100, 101))
+    _histogram(ax, np.rad2deg(figures.symmetric_angle), _ANGLE_BINS)
+    free = np.rad2deg(figures.any_order_angle)
+    ax.hist(free[np.isfinite(free)], bins=_ANGLE_BINS.tolist(), color=WIRE, lw=1.1, histtype="step")
     ax.set_xlabel("degrees", fontsize=9, color=INK)
-    median = np.rad2deg(summary.symmetric_angle_median)
-    detail = f"median {median:.1f} degrees" if np.isfinite(median) else "no body recovered"
-    _heading(ax, "Angle of the bodies, symmetries aside", detail)
+    if summary.recovered:
+        medians = np.rad2deg([summary.symmetric_angle_median, summary.any_order_angle_median])
+        names = (f"8 parameter vectors, median {medians[0]:.1f}", f"any order of axes, median {medians[1]:.1f}")
+        keys = [Patch(color=_BAR), Line2D([], [], color=WIRE, lw=1.1)]
+        ax.legend(keys, names, frameon=False, fontsize=8.5, labelcolor=INK, loc="upper center")
+    _heading(ax, "Angle, symmetries aside", "" if summary.recovered else "no body recovered")
     return figure
 
 
@@ -151,12 +159,12 @@ def inside_outside(body: Superquadric = INSIDE_OUTSIDE_BODY, points: int = 22) -
             list((segments[away == hidden] @ view.T)[..., :2]), colors=[WIRE], linewidths=0.7, alpha=opacity
         )
         ax.add_collection(lines, autolim=False)
-    _square(ax, centre, 0.75 * reach)
+    _square(ax, centre, 0.65 * reach)
     _heading(ax, "(a) wires: true bodies", "")
 
     ax = figure.add_subplot(grid[1])
     draw_bodies_3d(ax, [seen], unit="of the cube", elevation=_ELEVATION, azimuth=_AZIMUTH)
-    _square(ax, centre, 0.75 * reach)
+    _square(ax, centre, 0.65 * reach)
     _heading(ax, "(b) shaded: predicted bodies", "")
 
     ax = figure.add_subplot(grid[2])
@@ -170,11 +178,12 @@ def inside_outside(body: Superquadric = INSIDE_OUTSIDE_BODY, points: int = 22) -
     scale = LogNorm(*_F_RANGE)
     for part, opacity in ((~inside, 0.15), (inside, 1.0)):
         chosen = order[part[order]]
-        ax.scatter(*drawn[chosen, :2].T, c=value[chosen], norm=scale, cmap="viridis", s=11, alpha=opacity, linewidths=0)
-    _square(ax, centre, reach)
+        x, y, _ = drawn[chosen].T
+        ax.scatter(x, y, c=value[chosen], norm=scale, cmap="viridis", s=13, alpha=opacity, linewidths=0)
+    _square(ax, centre, 0.9 * reach)
     _heading(ax, "(c) inside-outside function F", "opaque: inside, F ≤ 1")
     bar = figure.colorbar(ScalarMappable(scale, "viridis"), cax=figure.add_axes((0.94, 0.12, 0.011, 0.68)))
-    bar.outline.set_visible(False)  # type: ignore[operator]
+    bar.outline.set_visible(False)
     bar.ax.tick_params(which="both", labelsize=8.5, colors=_FAINT)
     return figure
 

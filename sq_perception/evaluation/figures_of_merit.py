@@ -15,11 +15,13 @@ Rotations, q^ predicted, q true, r = q^-1 q^ = (v, w):
 | shortest arc, figure 6.3 | 2 atan2(|v|, w), the signs of the quaternions as they are | 0 to 2 pi |
 | axes | least over the 4 half turns of the body | 0 to 120 degrees |
 | symmetric | least over the 8 parameter vectors of the body | 0 to 98.4 degrees |
+| any order | least over the 24 rotations of a cube about the body's axes | 0 to 62.8 degrees |
 
 q and -q are one rotation, so that the first is symmetric about pi wherever signs are arbitrary, and 0, pi (about an
-axis of the body) and 2 pi are the same body.  Only the last is a property of the bodies; it takes a quarter turn about
-z for none, whatever the sizes, as the IoU tells those apart.  The summary counts as quarter turns the bodies whose axes
-angle is 70 to 110 degrees.
+axis of the body) and 2 pi are the same body.  The symmetric angle does not depend on how a body is written; it takes a
+quarter turn about z for none, whatever the sizes, as the IoU tells those apart.  Where e1 is about e2 and any axis may
+pass for z, only the last one is small for bodies that are alike.  The summary counts as quarter turns the bodies whose
+axes angle is 70 to 110 degrees.
 
 A body that was not recovered has IoU 0, and NaN in everything that compares parameters.
 """
@@ -37,6 +39,8 @@ from sq_perception.geometry.superquadric import Superquadric
 
 GOOD_IOU = 0.85
 _QUARTER_TURN = np.deg2rad([70.0, 110.0])
+_CYCLES = np.array([[0.5, 0.5, 0.5, 0.5], [-0.5, -0.5, -0.5, 0.5]])
+"""x to y to z to x, and back."""
 
 
 @dataclass(frozen=True)
@@ -61,6 +65,7 @@ class Summary:
     delta_t: tuple[float, float, float]
     quarter_turns: float
     symmetric_angle_median: float
+    any_order_angle_median: float
     timed: int
     milliseconds_mean: float
     milliseconds_std: float
@@ -78,7 +83,7 @@ class FiguresOfMerit:
         0 to 1; 0 where no body was recovered.
     delta_a, delta_e, delta_t : (n,), (n,), (n, 3)
         Errors of volume, shape and place as fractions; NaN where no body was recovered.
-    shortest_arc, axes_angle, symmetric_angle : (n,)
+    shortest_arc, axes_angle, symmetric_angle, any_order_angle : (n,)
         Radians; NaN likewise.
     milliseconds : (n,)
         Execution time of the image alone, NaN where it was not measured.
@@ -92,6 +97,7 @@ class FiguresOfMerit:
     shortest_arc: np.ndarray
     axes_angle: np.ndarray
     symmetric_angle: np.ndarray
+    any_order_angle: np.ndarray
     milliseconds: np.ndarray
 
     def __len__(self) -> int:
@@ -118,7 +124,9 @@ class FiguresOfMerit:
         count = len(truth)
         missing = np.zeros(count, bool) if recovered is None else ~np.asarray(recovered, dtype=bool)
         turns = truth.equivalent_forms().rotation
-        angles = quaternions.geodesic_angle(np.broadcast_to(prediction.rotation, turns.shape), turns)
+        # The 8 and a cyclic exchange of the axes make the 24 rotations of a cube.
+        orders = np.stack([turns, *(quaternions.multiply(turns, cycle + 0 * turns) for cycle in _CYCLES)])
+        angles = quaternions.geodesic_angle(np.broadcast_to(prediction.rotation, orders.shape), orders)
 
         def known(values: np.ndarray) -> np.ndarray:
             return np.where(missing.reshape(-1, *[1] * (values.ndim - 1)), np.nan, values)
@@ -130,8 +138,9 @@ class FiguresOfMerit:
             known(metrics.shape_error(prediction, truth)),
             known(metrics.translation_error(prediction, truth)),
             known(shortest_arc(prediction.rotation, truth.rotation)),
-            known(angles[:4].min(axis=0)),
-            known(angles.min(axis=0)),
+            known(angles[0, :4].min(axis=0)),
+            known(angles[0].min(axis=0)),
+            known(angles.min(axis=(0, 1))),
             np.full(count, np.nan) if milliseconds is None else np.asarray(milliseconds, dtype=float),
         )
 
@@ -162,11 +171,12 @@ class FiguresOfMerit:
             delta_e=_mean(self.delta_e[recovered]),
             delta_t=(_mean(delta_t[:, 0]), _mean(delta_t[:, 1]), _mean(delta_t[:, 2])),
             quarter_turns=_mean((axes > low) & (axes < high)),
-            symmetric_angle_median=float(np.median(self.symmetric_angle[recovered])) if recovered.any() else np.nan,
+            symmetric_angle_median=_median(self.symmetric_angle[recovered]),
+            any_order_angle_median=_median(self.any_order_angle[recovered]),
             timed=times.size,
             milliseconds_mean=_mean(times),
             milliseconds_std=float(times.std()) if times.size else np.nan,
-            milliseconds_median=float(np.median(times)) if times.size else np.nan,
+            milliseconds_median=_median(times),
             milliseconds_p95=float(np.percentile(times, 95)) if times.size else np.nan,
         )
 
@@ -179,3 +189,7 @@ def shortest_arc(predicted: np.ndarray, true: np.ndarray) -> np.ndarray:
 
 def _mean(values: np.ndarray) -> float:
     return float(np.mean(values)) if len(values) else float("nan")
+
+
+def _median(values: np.ndarray) -> float:
+    return float(np.median(values)) if len(values) else float("nan")

@@ -53,9 +53,11 @@ _CAPTIONS = {
     "iou": "Distribution of IoU (figures 6.6, 7.3 and 7.7 of the thesis), bins of one per cent.",
     "distributions": "Left: IoU. Middle: the shortest arc as in figure 6.3, from the predicted to the label's "
     "quaternion with their signs as they are: 0, π and 2π are the same body where the axis is one of the body's own. "
-    "Right: the least angle over the 8 parameter vectors of the label's body.",
+    "Right: the least angle over the 8 parameter vectors of the label's body (filled), and over all 24 ways to list "
+    "its axes (line), which forgives the exchange of z where e1 is about e2.",
     "examples": "The three bodies of largest IoU, three about the median, and the three of least IoU. Of each, the "
-    "input and the prediction rendered from the same place, both cropped, and the prediction seen from aside, the true body as wires.",
+    "input and the prediction rendered from the same place, both cropped, and the prediction seen from aside, the true "
+    "body as wires.",
     "training": "From the log.jsonl beside the model file.",
 }
 
