@@ -93,6 +93,7 @@ examples:
   sq-perception render 0.25 0.15 0.1  0.2 0.8  0.5 0.5 0.5  0 0 0 1 --output view.png
   sq-perception demo
   sq-perception train --help
+  sq-perception evaluate --help
 """
 
 

@@ -206,6 +206,15 @@ def test_train_has_its_own_help(capsys):
     assert "least_squares_free" in help_text
 
 
+def test_evaluate_has_its_own_help(capsys):
+    with pytest.raises(SystemExit) as stop:
+        cli.main(["evaluate", "--help"])
+    assert stop.value.code == 0
+    help_text = capsys.readouterr().out
+    assert "--fit-bodies" in help_text
+    assert "report.html" in help_text
+
+
 def test_author_renders(shared_data, tmp_path):
     """The renders of the thesis' author come back with IoU above 0.97 (8 bit depth)."""
     out = tmp_path / "out.json"

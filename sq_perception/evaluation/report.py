@@ -39,7 +39,7 @@ p, figcaption { max-width: 62rem; }
 .scroll { overflow-x: auto; }
 table { border-collapse: collapse; font-size: .87rem; font-variant-numeric: tabular-nums; }
 th, td { padding: .28rem .8rem; text-align: right; white-space: nowrap; border-bottom: 1px solid #edf0f3; }
-th { font-weight: 600; border-bottom: 2px solid #c3ced6; vertical-align: bottom; }
+th { font-weight: 600; border-bottom: 2px solid #c3ced6; vertical-align: bottom; white-space: normal; }
 th:first-child, td:first-child, th:nth-child(2), td:nth-child(2) { text-align: left; }
 .overview th:nth-child(2), .overview td:nth-child(2) { text-align: right; }
 figure { margin: 1rem 0 1.6rem; }
