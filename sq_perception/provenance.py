@@ -11,23 +11,23 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-PACKAGES = ("sq-perception", "numpy", "numba", "torch", "ros-jazzy-rclpy")
+PACKAGES = ("sq-perception", "numpy", "numba", "torch", "onnxruntime", "ros-jazzy-rclpy")
 
 
-def facts(command: str, packages: Sequence[str] = PACKAGES) -> dict[str, Any]:
-    """JSON values that belong beside every figure; what is not known is None."""
+def facts(command: str, file: str | Path = __file__, packages: Sequence[str] = PACKAGES) -> dict[str, Any]:
+    """JSON values that belong beside every figure, for code in ``file``; what is not known is None."""
     versions: dict[str, str | None] = {}
     for package in packages:
         try:
             versions[package] = metadata.version(package)
         except metadata.PackageNotFoundError:
             versions[package] = None
-    known = commit()
+    known = commit(file)
     return {
         "command": command,
         "date": datetime.now(timezone.utc).strftime("%Y-%m-%d"),
         "commit": known,
-        "modified": bool(_git("status", "--porcelain", "--untracked-files=no")) if known else None,
+        "modified": bool(_git(file, "status", "--porcelain", "--untracked-files=no")) if known else None,
         "processor": processor(),
         "cores": os.cpu_count(),
         "python": platform.python_version(),
@@ -35,12 +35,12 @@ def facts(command: str, packages: Sequence[str] = PACKAGES) -> dict[str, Any]:
     }
 
 
-def commit() -> str | None:
-    """The short hash of the checkout that this file belongs to; None for an installed package."""
+def commit(file: str | Path = __file__) -> str | None:
+    """The short hash of the checkout that a file belongs to; None for an installed package."""
     # An installation may lie inside of some checkout without being part of it.
-    if _git("ls-files", "--error-unmatch", Path(__file__).name) is None:
+    if _git(file, "ls-files", "--error-unmatch", Path(file).name) is None:
         return None
-    return _git("rev-parse", "--short", "HEAD")
+    return _git(file, "rev-parse", "--short", "HEAD")
 
 
 def processor() -> str:
@@ -54,11 +54,10 @@ def processor() -> str:
     return platform.processor()
 
 
-def _git(*arguments: str) -> str | None:
+def _git(file: str | Path, *arguments: str) -> str | None:
+    folder = Path(file).resolve().parent
     try:
-        done = subprocess.run(
-            ["git", *arguments], cwd=Path(__file__).parent, capture_output=True, text=True, check=False, timeout=10
-        )
+        done = subprocess.run(["git", *arguments], cwd=folder, capture_output=True, text=True, check=False, timeout=10)
     except (OSError, subprocess.TimeoutExpired):
         return None
     return done.stdout.strip() if done.returncode == 0 else None

@@ -20,7 +20,8 @@ from pathlib import Path
 import numba
 import torch
 
-from sq_perception.evaluation import provenance, report
+from sq_perception import provenance
+from sq_perception.evaluation import report
 from sq_perception.evaluation.contest import Advance, compare
 from sq_perception.evaluation.contestants import FITS, Contestant, Fit, Network, unique_names
 from sq_perception.evaluation.thesis_images import DEFAULT_SEED, ThesisImages
