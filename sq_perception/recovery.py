@@ -261,14 +261,15 @@ class Recoverer:
             objects = _objects(depth, found, camera, options)
 
         with _timed(milliseconds, "network"):
-            form = network.config if network is not None else None
-            pixels, find_hidden = (form.pixels, form.marks_hidden) if form is not None else (_VIEW_PIXELS, False)
             for one in objects:
-                source = (depth, one.mask, camera) if find_hidden else (one.depth_crop, one.mask_crop, one.camera_crop)
                 one.plane = _support(one, found.plane)
-                one.view = canonical_view.from_mask(*source, pixels, find_hidden=find_hidden, plane=one.plane)
+                if network is not None:
+                    one.shown = network.view_of(depth, one.mask, camera, one.plane)
+                one.view = one.shown
+                if network is None or network.config.framing == "full":
+                    one.view = canonical_view.from_mask(one.depth_crop, one.mask_crop, one.camera_crop, _VIEW_PIXELS)
             if network is not None and objects:
-                views = np.stack([one.view.marked for one in objects if one.view is not None])
+                views = np.stack([one.shown.marked for one in objects if one.shown is not None])
                 predictions: Future[Superquadric] = Future()
                 if options.method == "auto" and options.refine == "surface":
                     predictions = self._beside.submit(network.predict, views)
@@ -320,17 +321,20 @@ class _Object:
     camera_crop: Camera
     plane: np.ndarray | None = None
     """What it stands on."""
+    shown: CanonicalView | None = None
+    """To the network, where there is one."""
     view: CanonicalView | None = None
+    """What its score is measured on."""
     predictions: Future[Superquadric] | None = None
-    """Of all objects of the frame, in the canonical frames of their views; still being computed, perhaps."""
+    """Of all objects of the frame, each in the frame of what was shown; still being computed, perhaps."""
     number: int = 0
     """Of this object among them."""
 
     def predicted(self) -> Superquadric:
         """The network's prediction in the optical frame; waits for it."""
-        if self.predictions is None or self.view is None:
+        if self.predictions is None or self.shown is None:
             raise ValueError("no prediction")
-        return self.view.from_canonical(self.predictions.result()[self.number]).canonical_form()
+        return self.shown.from_canonical(self.predictions.result()[self.number]).canonical_form()
 
     @property
     def points(self) -> np.ndarray:

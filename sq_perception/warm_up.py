@@ -15,7 +15,7 @@ import numpy as np
 from sq_perception import metrics
 from sq_perception.fitting import solina_bajcsy, surface_fit
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.imaging import canonical_view, raycast
+from sq_perception.imaging import raycast, view_rendering
 from sq_perception.imaging.camera import Camera
 
 
@@ -27,7 +27,7 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
     points = body.sample_surface(50, np.random.default_rng(0))
     return [
         ("ray casting", lambda: raycast.render(body, camera)),
-        ("canonical views", lambda: canonical_view.render_views(batch, 16)),
+        ("canonical views", lambda: view_rendering.render_views(batch, 16)),
         ("overlap", lambda: metrics.volume_iou(batch, batch, 16)),
         ("classic fit", lambda: solina_bajcsy.fit(points)),
         ("surface fit", surface_fit.warm_up),

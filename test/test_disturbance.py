@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sq_perception.geometry import Superquadric
-from sq_perception.imaging import canonical_view, raycast
+from sq_perception.imaging import canonical_view, raycast, view_rendering
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.canonical_view import HIDDEN
 from sq_perception.imaging.scene import TABLE_CAMERA, plane_depth, table_scene, thesis_bodies
@@ -30,8 +30,8 @@ class TestOccluder:
         bodies, share = thesis_bodies(60, rng), rng.uniform(0.1, 0.4, 60)
         occluder = any_occluder(share, rng)
         occluder.thickness[:] = np.inf
-        whole, free = canonical_view.render_views(bodies)
-        views, fitted = canonical_view.render_views(bodies, occluder=occluder)
+        whole, free = view_rendering.render_views(bodies)
+        views, fitted = view_rendering.render_views(bodies, occluder=occluder)
         side = free.size[:, 0] / fitted.size[:, 0]
         area = (views > 0).sum(axis=(1, 2)) * side**2 / (whole > 0).sum(axis=(1, 2))
         assert np.abs(area - (1 - share)).max() < 0.06
@@ -55,14 +55,14 @@ class TestOccluder:
     def test_without_one_nothing_changes(self) -> None:
         bodies = thesis_bodies(8, np.random.default_rng(4))
         nothing = any_occluder(np.zeros(8), np.random.default_rng(5))
-        plain, plain_bodies = canonical_view.render_views(bodies)
-        views, same = canonical_view.render_views(bodies, occluder=nothing, miss=np.zeros((8, 4)))
+        plain, plain_bodies = view_rendering.render_views(bodies)
+        views, same = view_rendering.render_views(bodies, occluder=nothing, miss=np.zeros((8, 4)))
         np.testing.assert_array_equal(views, plain)
         np.testing.assert_array_equal(same.to_flat(), plain_bodies.to_flat())
 
     def test_whole_body_cannot_be_hidden(self) -> None:
         with pytest.raises(ValueError, match="below 1"):
-            canonical_view.render_views(
+            view_rendering.render_views(
                 thesis_bodies(1, np.random.default_rng(0)), occluder=any_occluder(np.ones(1), np.random.default_rng(0))
             )
 

@@ -12,7 +12,7 @@ import torch
 from safetensors.torch import load_file, save_file
 
 from sq_perception.geometry import Superquadric
-from sq_perception.imaging import canonical_view
+from sq_perception.imaging import view_rendering
 from sq_perception.imaging.scene import thesis_bodies
 from sq_perception.learning import checkpoint, losses
 from sq_perception.learning.dataset import ViewPool, ViewSource, dihedral, draw_views
@@ -89,14 +89,14 @@ class TestData:
         images, bodies = draw_views(48, rng)
         turns, mirror = np.arange(48) % 4, np.arange(48) // 4 % 2 == 0
         turned, moved = dihedral(images, bodies, turns, mirror)
-        again, _ = canonical_view.render_views(moved)
+        again, _ = view_rendering.render_views(moved)
         assert ((again > 0) != (turned > 0)).mean() < 0.001
         assert np.abs(again - turned)[(again > 0) & (turned > 0)].mean() < 0.004
 
     def test_pool_pairs_views_with_their_bodies(self) -> None:
         pool = ViewPool(np.random.default_rng(5), ViewSource(32), capacity=32)
         images, bodies = pool.batch(16)
-        again, _ = canonical_view.render_views(bodies, 32)
+        again, _ = view_rendering.render_views(bodies, 32)
         assert np.abs(again - images).mean() < 0.01
 
 

@@ -11,8 +11,8 @@ import torch
 from sq_perception.geometry import Superquadric
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.imaging import sight_lines, soft_render
-from sq_perception.imaging.canonical_view import render_views
 from sq_perception.imaging.scene import thesis_bodies
+from sq_perception.imaging.view_rendering import render_views
 from sq_perception.learning import depth_losses, losses
 from sq_perception.learning.objective import LOSSES, UNSUPERVISED, Objective
 from sq_perception.metrics import volume_iou

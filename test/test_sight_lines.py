@@ -8,8 +8,8 @@ import torch
 
 from sq_perception.geometry import Superquadric
 from sq_perception.imaging import sight_lines, soft_render
-from sq_perception.imaging.canonical_view import render_views
 from sq_perception.imaging.scene import thesis_bodies
+from sq_perception.imaging.view_rendering import render_views
 
 IDENTITY = [0.0, 0.0, 0.0, 1.0]
 SPHERE = Superquadric.from_flat(torch.tensor([[0.3, 0.3, 0.3, 1, 1, 0.5, 0.5, 0.5, *IDENTITY]], dtype=torch.float64))

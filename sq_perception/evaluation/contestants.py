@@ -134,11 +134,11 @@ class Network:
         return ", ".join(parts)
 
     def recover(self, images: ImageChunk) -> Answers:
-        views = images.views(self.model.config.pixels)
+        views = images.views(self.model)
         there = [k for k, view in enumerate(views) if view is not None]
         flat, recovered = np.tile(_NOBODY, (len(views), 1)), np.zeros(len(views), bool)
         if there:
-            predicted = self.model.predict(np.stack([views[k].image for k in there]))  # type: ignore[union-attr]
+            predicted = self.model.predict(np.stack([views[k].marked for k in there]))  # type: ignore[union-attr]
             for k, body in zip(there, predicted, strict=True):
                 back = views[k].from_canonical(body)  # type: ignore[union-attr]
                 flat[k] = unit_cube.cube_from_optical(back).to_flat()

@@ -19,10 +19,11 @@ from functools import cached_property
 import numpy as np
 
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.imaging import canonical_view, raycast, segmentation, unit_cube
+from sq_perception.imaging import raycast, segmentation, unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.canonical_view import CanonicalView
 from sq_perception.imaging.scene import thesis_bodies
+from sq_perception.learning.regressor import Regressor
 
 DEFAULT_SEED = 2020
 CHUNK = 200
@@ -49,7 +50,7 @@ class ImageChunk:
     truth: Superquadric
     depth: np.ndarray
     camera: Camera
-    _views: dict[int, list[CanonicalView | None]] = field(default_factory=dict, repr=False)
+    _views: dict[tuple[object, ...], list[CanonicalView | None]] = field(default_factory=dict, repr=False)
 
     def __len__(self) -> int:
         return len(self.depth)
@@ -61,14 +62,16 @@ class ImageChunk:
         count = max(count, 0)
         return ImageChunk(self.first, self.truth[:count], self.depth[:count], self.camera)
 
-    def views(self, pixels: int) -> list[CanonicalView | None]:
-        """The canonical view of each image's largest object, as a recovery sees it; None where nothing is found."""
-        if pixels not in self._views:
-            self._views[pixels] = [
-                None if mask is None else canonical_view.from_mask(depth, mask, self.camera, pixels)
+    def views(self, network: Regressor) -> list[CanonicalView | None]:
+        """What a network is shown of each image's largest object, as in a recovery; None where nothing is found."""
+        form = network.config
+        kind = (form.pixels, form.framing, form.marks_hidden)
+        if kind not in self._views:
+            self._views[kind] = [
+                None if mask is None else network.view_of(depth, mask, self.camera)
                 for depth, mask in zip(self.depth, self._masks, strict=True)
             ]
-        return self._views[pixels]
+        return self._views[kind]
 
     @cached_property
     def _masks(self) -> list[np.ndarray | None]:

@@ -11,8 +11,8 @@ import numpy as np
 
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast, unit_cube
-from sq_perception.imaging.canonical_view import Occluder, render_views
 from sq_perception.imaging.scene import THESIS_SIZE, thesis_bodies
+from sq_perception.imaging.view_rendering import Occluder, render_views
 from sq_perception.learning.disturbance import Disturbance
 from sq_perception.learning.regressor import Framing
 

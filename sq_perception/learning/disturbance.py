@@ -3,7 +3,7 @@
 Everything here is relative to the side of the view, so that one description serves objects of any size.  Values of a
 view: z in (0, 1] where the object is seen, 0 background, HIDDEN where it may go on unseen.
 
-    occluder    hides a share of the body, uniform up to ``most_hidden`` (see canonical_view.Occluder)
+    occluder    hides a share of the body, uniform up to ``most_hidden`` (see view_rendering.Occluder)
     noise       sigma log-uniform from 1/2000 of the side up to ``noise``; a part of it is common to blocks of pixels,
                 as where one measurement covers several pixels of the view or a matching window smooths
     steps       quantised depth, 1/400 to 1/25 of the side
@@ -18,7 +18,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sq_perception.imaging.canonical_view import HIDDEN, Occluder
+from sq_perception.imaging.canonical_view import HIDDEN
+from sq_perception.imaging.view_rendering import Occluder
 
 _LEAST_NOISE = 1 / 2000
 _STEPS = (1 / 400, 1 / 25)
@@ -57,7 +58,7 @@ class Disturbance:
         return any_occluder(share, rng)
 
     def framing(self, count: int, rng: np.random.Generator) -> np.ndarray | None:
-        """Errors (count, 4) of the framing, see :func:`canonical_view.render_views`; None where nothing is noisy."""
+        """Errors (count, 4) of the framing, see :func:`view_rendering.render_views`; None where nothing is noisy."""
         if self.noisy_share == 0:
             return None
         return np.where(rng.random((count, 1)) < self.noisy_share, _FRAMING * rng.standard_normal((count, 4)), 0.0)

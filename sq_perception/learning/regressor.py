@@ -27,6 +27,9 @@ from torch import nn
 
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging import canonical_view
+from sq_perception.imaging.camera import Camera
+from sq_perception.imaging.canonical_view import CanonicalView
 from sq_perception.learning.backbone import ResNet18, compact_backbone, fold
 
 Array = Any
@@ -156,6 +159,19 @@ class Regressor(nn.Module):
         with torch.inference_mode():
             raw = self.raw(batch.to(device, memory_format=torch.channels_last))
         return self.decode(raw.cpu().numpy().astype(float))
+
+    def view_of(
+        self, depth: np.ndarray, mask: np.ndarray, camera: Camera, plane: np.ndarray | None = None
+    ) -> CanonicalView:
+        """What the network is shown of the object under a mask; its predictions are in the frame of this view.
+
+        Arguments and errors are those of :func:`canonical_view.from_mask`; a network for full frames knows the unit
+        cube alone and refuses pinhole cameras.
+        """
+        if self.config.framing == "full":
+            return canonical_view.full_frame(depth, mask, camera, self.config.pixels)
+        hidden = self.config.marks_hidden
+        return canonical_view.from_mask(depth, mask, camera, self.config.pixels, find_hidden=hidden, plane=plane)
 
     def for_inference(self, dtype: torch.dtype = torch.float32) -> Regressor:
         """A copy that predicts the same, faster: normalisations folded into their convolutions, channels last.
