@@ -66,6 +66,7 @@ setup(
         "array-api-compat>=1.9",  # one geometry for NumPy and torch
         "pyyaml>=6",  # camera_info files, training configurations
         "matplotlib>=3.7",  # pictures
+        "pillow>=9.1",  # animated GIFs; Matplotlib brings it anyway
         "rich>=13",  # the live table of the demo
     ],
     extras_require={

@@ -35,8 +35,8 @@ from sq_perception.recovery import FrameRecovery
 
 INK = "#22303c"
 WIRE = "#d1006c"
+NOTHING = "#1b2129"
 _FAINT = "#8a97a3"
-_NOTHING = "#1b2129"
 _DEPTH_MAP = LinearSegmentedColormap.from_list("depth", ["#f4f6f7", "#c3ced6", "#8b9dab", "#566a7b", "#36475a"])
 _CONTOUR_PIXELS = 1280
 _MOST_POINTS = 1500
@@ -59,7 +59,7 @@ def draw_depth(ax: Axes, depth: np.ndarray, limits: tuple[float, float] | None =
         seen = finite[np.isfinite(finite)]
         near, far = np.quantile(seen, (0.02, 0.98)) if seen.size else (0.0, 1.0)
         limits = (float(near), float(far))
-    shades = _DEPTH_MAP.with_extremes(bad=_NOTHING)
+    shades = _DEPTH_MAP.with_extremes(bad=NOTHING)
     span = max(limits[1] - limits[0], 1e-6)
     ax.imshow(finite, cmap=shades, vmin=limits[0], vmax=limits[0] + span, interpolation="nearest")
     ax.set_xticks([])
@@ -132,6 +132,7 @@ def draw_bodies_3d(
     unit: str = "m",
     pixels: int = 560,
     wires: Sequence[Superquadric] = (),
+    enclosed: Sequence[Superquadric] = (),
 ) -> None:
     """Shaded picture of bodies of the optical frame from another place, exact as the depth images are.
 
@@ -155,6 +156,8 @@ def draw_bodies_3d(
         Width and height of the picture.
     wires
         Other bodies, the true ones for instance, drawn as edges in front of everything.
+    enclosed
+        Bodies that the picture has room for without drawing them, so that the pictures of a film do not jump.
     """
     ax.set_axis_off()
     if not bodies:
@@ -166,7 +169,8 @@ def draw_bodies_3d(
     shades = [np.asarray(colour(k) if colours is None else colours[k % len(colours)]) for k in range(len(bodies))]
     clouds = [np.asarray(cloud) @ view.T for cloud in points or []]
     cages = [body.transformed(turn, np.zeros(3)) for body in wires]
-    low, high = (np.array(corner) for corner in zip(*(body.bounding_box() for body in turned + cages), strict=True))
+    shown = turned + cages + [body.transformed(turn, np.zeros(3)) for body in enclosed]
+    low, high = (np.array(corner) for corner in zip(*(body.bounding_box() for body in shown), strict=True))
     middle = 0.5 * (low.min(axis=0) + high.max(axis=0))
     half = 0.62 * float((high.max(axis=0) - low.min(axis=0))[:2].max())
     finer = 2

@@ -38,6 +38,9 @@ Backbone = Literal["compact", "resnet18"]
 Framing = Literal["cropped", "full"]
 INFERENCE_DTYPES = (torch.float32, torch.bfloat16, torch.float16)
 
+_EDGE = 1e-3
+"""How near to the ends of their ranges bodies can be encoded."""
+
 
 @dataclass(frozen=True)
 class RegressorConfig:
@@ -66,6 +69,7 @@ class RegressorConfig:
     marks_hidden: bool = False
     """Whether views tell hidden pixels from background (``CanonicalView.marked``)."""
 
+<<<<<<< HEAD
     def __post_init__(self) -> None:
         for name, value, known in (("backbone", self.backbone, Backbone), ("framing", self.framing, Framing)):
             if value not in get_args(known):
@@ -79,6 +83,44 @@ class RegressorConfig:
         ):
             if not (np.isfinite([low, high]).all() and low < high and (low > 0 or name == "translation_range")):
                 raise ValueError(f"{name}: expected a lower and a larger upper end, got {low} and {high}")
+=======
+    def decode(self, raw: Array) -> Superquadric:
+        """Bodies (n,) of unbounded outputs (n, 14), NumPy or torch: size 3, shape 2, translation 3, rotation 6."""
+        xp = array_namespace(raw)
+        unit = 1 / (1 + xp.exp(-raw[..., :8]))
+        low, high = self.size_range
+        return Superquadric(
+            low * (high / low) ** unit[..., 0:3],
+            _between(self.shape_range, unit[..., 3:5]),
+            _between(self.translation_range, unit[..., 5:8]),
+            quaternions.from_six(raw[..., 8:]),
+        )
+
+    def encode(self, bodies: Superquadric) -> np.ndarray:
+        """Outputs (n, 14) that :meth:`decode` turns into these NumPy bodies (n,).
+
+        A sigmoid reaches its ends at infinity only, and has no slope there: parameters on a limit, or beyond it by less
+        than a thousandth of the range, are moved that far into it.
+
+        Raises
+        ------
+        ValueError
+            For a body outside of the ranges.
+        """
+        low, high = self.size_range
+        shares = (
+            ("size", np.log(bodies.size / low) / np.log(high / low), self.size_range),
+            ("shape", _share(self.shape_range, bodies.shape), self.shape_range),
+            ("translation", _share(self.translation_range, bodies.translation), self.translation_range),
+        )
+        for name, share, limits in shares:
+            if (share < -_EDGE).any() or (share > 1 + _EDGE).any():
+                raise ValueError(f"{name}: expected values in {limits}, got {getattr(bodies, name)}")
+        unit = np.clip(np.concatenate([share for _, share, _ in shares], axis=-1), _EDGE, 1 - _EDGE)
+        matrix = bodies.rotation_matrix
+        return np.concatenate([np.log(unit / (1 - unit)), matrix[..., :, 0], matrix[..., :, 1]], axis=-1)
+
+>>>>>>> 87cb18a (Walk down a loss step by step: gradient-search)
 
     @classmethod
     def thesis(cls) -> RegressorConfig:
@@ -135,15 +177,7 @@ class Regressor(nn.Module):
 
     def decode(self, raw: Array) -> Superquadric:
         """Bodies (n,) of outputs (n, 14), NumPy or torch."""
-        xp = array_namespace(raw)
-        unit = 1 / (1 + xp.exp(-raw[..., :8]))
-        low, high = self.config.size_range
-        return Superquadric(
-            low * (high / low) ** unit[..., 0:3],
-            _between(self.config.shape_range, unit[..., 3:5]),
-            _between(self.config.translation_range, unit[..., 5:8]),
-            quaternions.from_six(raw[..., 8:]),
-        )
+        return self.config.decode(raw)
 
     def predict(self, views: np.ndarray) -> Superquadric:
         """NumPy superquadrics (n,) of NumPy views (n, p, p).
@@ -227,3 +261,17 @@ def checked_views(views: np.ndarray, config: RegressorConfig) -> np.ndarray:
 def _between(bounds: tuple[float, float], unit: Array) -> Array:
     low, high = bounds
     return low + (high - low) * unit
+<<<<<<< HEAD
+=======
+
+
+def _share(bounds: tuple[float, float], value: Array) -> Array:
+    low, high = bounds
+    return (value - low) / (high - low)
+
+
+def _folded(convolution: nn.Module, norm: nn.Module) -> nn.Conv2d:
+    assert isinstance(convolution, nn.Conv2d)
+    assert isinstance(norm, nn.BatchNorm2d)
+    return fuse_conv_bn_eval(convolution, norm)
+>>>>>>> 87cb18a (Walk down a loss step by step: gradient-search)
