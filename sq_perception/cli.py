@@ -31,6 +31,7 @@ PARAMETERS = ("a1", "a2", "a3", "e1", "e2", "t1", "t2", "t3", "qx", "qy", "qz", 
 _OTHER_COMMANDS = {
     "demo": ("sq_perception.nodes.demo", "live demonstration with real ROS 2 nodes (extra 'ros')"),
     "train": ("sq_perception.learning.train", "train a network"),
+    "dataset": ("sq_perception.learning.fixed_set_writer", "write a fixed set of training and test images"),
     "evaluate": ("sq_perception.evaluation.evaluate", "the thesis' tables and plots, for networks and fits"),
     "render-search": ("sq_perception.evaluation.render_search", "find the best s and tau of the soft renderer"),
     "gradient-search": ("sq_perception.evaluation.gradient_search", "watch a body walk down a loss, step by step"),

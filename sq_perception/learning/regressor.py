@@ -69,7 +69,6 @@ class RegressorConfig:
     marks_hidden: bool = False
     """Whether views tell hidden pixels from background (``CanonicalView.marked``)."""
 
-<<<<<<< HEAD
     def __post_init__(self) -> None:
         for name, value, known in (("backbone", self.backbone, Backbone), ("framing", self.framing, Framing)):
             if value not in get_args(known):
@@ -83,7 +82,7 @@ class RegressorConfig:
         ):
             if not (np.isfinite([low, high]).all() and low < high and (low > 0 or name == "translation_range")):
                 raise ValueError(f"{name}: expected a lower and a larger upper end, got {low} and {high}")
-=======
+
     def decode(self, raw: Array) -> Superquadric:
         """Bodies (n,) of unbounded outputs (n, 14), NumPy or torch: size 3, shape 2, translation 3, rotation 6."""
         xp = array_namespace(raw)
@@ -119,8 +118,6 @@ class RegressorConfig:
         unit = np.clip(np.concatenate([share for _, share, _ in shares], axis=-1), _EDGE, 1 - _EDGE)
         matrix = bodies.rotation_matrix
         return np.concatenate([np.log(unit / (1 - unit)), matrix[..., :, 0], matrix[..., :, 1]], axis=-1)
-
->>>>>>> 87cb18a (Walk down a loss step by step: gradient-search)
 
     @classmethod
     def thesis(cls) -> RegressorConfig:
@@ -261,17 +258,8 @@ def checked_views(views: np.ndarray, config: RegressorConfig) -> np.ndarray:
 def _between(bounds: tuple[float, float], unit: Array) -> Array:
     low, high = bounds
     return low + (high - low) * unit
-<<<<<<< HEAD
-=======
 
 
 def _share(bounds: tuple[float, float], value: Array) -> Array:
     low, high = bounds
     return (value - low) / (high - low)
-
-
-def _folded(convolution: nn.Module, norm: nn.Module) -> nn.Conv2d:
-    assert isinstance(convolution, nn.Conv2d)
-    assert isinstance(norm, nn.BatchNorm2d)
-    return fuse_conv_bn_eval(convolution, norm)
->>>>>>> 87cb18a (Walk down a loss step by step: gradient-search)

@@ -1,0 +1,241 @@
+"""Makes the fixed sets of :mod:`sq_perception.learning.fixed_set`, and goes on with those that were interrupted.
+
+Rendering runs on numba's threads, encoding on as many of its own.  A shard is written beside its place and renamed, and
+entered in the manifest only then: whatever is killed, and whenever, costs one shard.
+
+    sq-perception dataset sets/thesis --full-frame
+    sq-perception dataset sets/views --pixels 64 --train 50000 --test 2000
+    sq-perception dataset sets/thesis --verify
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+import sys
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numba
+import numpy as np
+from safetensors.numpy import save
+
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging import raycast, unit_cube
+from sq_perception.imaging.scene import thesis_bodies
+from sq_perception.learning import dataset
+from sq_perception.learning.fixed_set import (
+    FORMAT,
+    MANIFEST,
+    SPLITS,
+    VERSION,
+    FixedSetError,
+    Kind,
+    Settings,
+    check_file,
+    read_manifest,
+    shard_name,
+    verify,
+)
+
+_PNG_LEVEL = 6
+
+
+def draw(settings: Settings, split: str, shard: int) -> tuple[np.ndarray, np.ndarray]:
+    """Grey images (n, p, p) of one shard, and the bodies (n, 12) float32 in the frame of the images."""
+    rng = np.random.default_rng(settings.seed_of(split, shard))
+    count = settings.bodies_in(split, shard)
+    if settings.kind == "view":
+        views, seen = dataset.draw_views(count, rng, settings.pixels, settings.pinhole_share)
+        # A view's nearest surface is at least 1/255: nothing seen is rounded to background.
+        return np.round(views * np.float32(2**settings.bits - 1)).astype(settings.dtype), _flat(seen)
+    # Rendered as written, in single precision: whoever reads a body and renders it gets the image to the bit.
+    flat = _flat(thesis_bodies(count, rng))
+    camera = unit_cube.camera(settings.pixels)
+    images = np.empty((count, settings.pixels, settings.pixels), settings.dtype)
+    for k, body in enumerate(unit_cube.optical_from_cube(Superquadric.from_flat(flat))):
+        images[k] = unit_cube.grey_from_depth(raycast.render(body, camera)[0], settings.dtype)
+    return images, flat
+
+
+def _flat(bodies: Superquadric) -> np.ndarray:
+    return np.ascontiguousarray(bodies.to_flat(), dtype=np.float32)
+
+
+def generate(
+    folder: Path | str, settings: Settings, threads: int = 0, progress: Callable[[int], None] | None = None
+) -> None:
+    """Make a set, or finish one that was interrupted.
+
+    Parameters
+    ----------
+    folder
+        Made if it is missing.  Shards of the same settings whose checksums are right are kept.
+    threads
+        For rendering and for encoding; 0 takes as many as numba is allowed.
+    progress
+        Called with the number of bodies of every finished shard.
+
+    Raises
+    ------
+    FixedSetError
+        If the folder holds a set of other settings, shards of none, or a manifest that cannot be read.
+    ValueError
+        For more threads than numba was given.
+    """
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    most = _most_threads()
+    if not 0 <= threads <= most:
+        raise ValueError(f"threads: expected 0 to {most} (NUMBA_NUM_THREADS), got {threads}")
+    done: dict[str, dict[str, Any]] = {}
+    if (folder / MANIFEST).exists():
+        theirs, done = read_manifest(folder)
+        if theirs != settings:
+            raise FixedSetError(f"{folder}: holds a set of other settings, {asdict(theirs)}, not {asdict(settings)}")
+    elif any(folder.glob("*.safetensors")):
+        raise FixedSetError(f"{folder}: holds .safetensors files but no {MANIFEST}; choose another folder")
+    _write_manifest(folder, settings, done)
+    before = numba.get_num_threads()
+    numba.set_num_threads(threads or most)
+    try:
+        with ThreadPoolExecutor(threads or most, thread_name_prefix="encode") as pool:
+            for split in SPLITS:
+                for shard in range(settings.shards(split)):
+                    name = shard_name(split, shard)
+                    if name not in done or not _is_intact(folder / name, done[name]):
+                        done[name] = _write_shard(folder / name, settings, split, shard, pool)
+                        _write_manifest(folder, settings, done)
+                    if progress is not None:
+                        progress(settings.bodies_in(split, shard))
+    finally:
+        numba.set_num_threads(before)
+
+
+def _is_intact(path: Path, entry: dict[str, Any]) -> bool:
+    try:
+        check_file(path, entry)
+    except FixedSetError:
+        return False
+    return True
+
+
+def _most_threads() -> int:
+    return int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
+
+
+def _write_shard(path: Path, settings: Settings, split: str, shard: int, pool: ThreadPoolExecutor) -> dict[str, Any]:
+    images, flat = draw(settings, split, shard)
+    encoded = list(pool.map(_encoded, images))
+    offset = np.concatenate([[0], np.cumsum([len(each) for each in encoded])]).astype(np.int64)
+    about = {"format": FORMAT, "version": VERSION, "split": split, "shard": shard, "settings": asdict(settings)}
+    # One entry of sorted JSON: safetensors writes several entries in no fixed order.
+    content = save(
+        {"image": np.concatenate(encoded), "offset": offset, "body": flat},
+        {"fixed_set": json.dumps(about, sort_keys=True)},
+    )
+    _replace(path, content)
+    return {
+        "bodies": len(flat),
+        "seed": settings.seed_of(split, shard),
+        "bytes": len(content),
+        "sha256": hashlib.sha256(content).hexdigest(),
+    }
+
+
+def _encoded(image: np.ndarray) -> np.ndarray:
+    good, encoded = cv2.imencode(".png", image, [cv2.IMWRITE_PNG_COMPRESSION, _PNG_LEVEL])
+    if not good:
+        raise RuntimeError("OpenCV could not encode a PNG")
+    return encoded.ravel()
+
+
+def _write_manifest(folder: Path, settings: Settings, done: dict[str, dict[str, Any]]) -> None:
+    document = {"format": FORMAT, "version": VERSION, "settings": asdict(settings), "shards": done}
+    _replace(folder / MANIFEST, (json.dumps(document, indent=1) + "\n").encode())
+
+
+def _replace(path: Path, content: bytes) -> None:
+    """Whole or not at all."""
+    unfinished = path.with_name(path.name + ".partial")
+    unfinished.write_bytes(content)
+    unfinished.replace(path)
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Entry of ``sq-perception dataset``."""
+    parser = argparse.ArgumentParser(
+        prog="sq-perception dataset",
+        description="Make a fixed set of images on disk, go on with an interrupted one, or verify one.",
+        epilog="170 000 full frames take 0.5 GB, as many views of 64 pixels 0.35 GB.",
+    )
+    parser.add_argument("folder", type=Path, help="of the set")
+    parser.add_argument("--full-frame", action="store_true", help="images of the whole cube instead of cropped views")
+    parser.add_argument("--pixels", type=int, help="side of the images (64; 256 for full frames)")
+    parser.add_argument("--bits", type=int, choices=(8, 16), help="of a pixel (16; 8 for full frames)")
+    parser.add_argument("--train", type=int, default=Settings.train, help=f"bodies to train on ({Settings.train})")
+    parser.add_argument("--test", type=int, default=Settings.test, help=f"bodies to test on ({Settings.test})")
+    parser.add_argument("--shard", type=int, default=Settings.shard, help=f"bodies a file ({Settings.shard})")
+    parser.add_argument("--seed", type=int, default=Settings.seed, help=f"default {Settings.seed}")
+    parser.add_argument("--pinhole-share", type=float, default=0.0, help="share of views as a pinhole camera sees them")
+    parser.add_argument("--threads", type=int, default=0, help="default: all that numba may use")
+    parser.add_argument("--verify", action="store_true", help="check all checksums and make nothing")
+    given = parser.parse_args(arguments)
+    kind: Kind = "full" if given.full_frame else "view"
+    try:
+        settings = Settings(
+            kind,
+            (unit_cube.THESIS_PIXELS if given.full_frame else 64) if given.pixels is None else given.pixels,
+            (8 if given.full_frame else 16) if given.bits is None else given.bits,
+            given.train,
+            given.test,
+            given.shard,
+            given.seed,
+            given.pinhole_share,
+        )
+    except ValueError as error:
+        parser.error(f"--{str(error).replace('_', '-')}")
+    if not 0 <= given.threads <= _most_threads():
+        parser.error(f"--threads: expected 0 to {_most_threads()}, got {given.threads}")
+    try:
+        return _run(given, settings)
+    except FixedSetError as error:
+        return _failed(str(error))
+    except OSError as error:
+        return _failed(f"{given.folder}: {error}")
+
+
+def _run(given: argparse.Namespace, settings: Settings) -> int:
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    if given.verify:
+        settings, _ = read_manifest(given.folder)
+    total = settings.train + settings.test
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty()) as bar:
+        task = bar.add_task("verifying" if given.verify else "drawing", total=total)
+        advance = partial(bar.advance, task)
+        if given.verify:
+            complaints = verify(given.folder, advance)
+        else:
+            complaints = []
+            generate(given.folder, settings, given.threads, advance)
+    for complaint in complaints:
+        _failed(complaint)
+    if complaints:
+        return 1
+    size = sum(path.stat().st_size for path in given.folder.glob("*.safetensors"))
+    print(f"{given.folder}: {settings.train} + {settings.test} images, {size / 1e6:.1f} MB, all checksums right")
+    return 0
+
+
+def _failed(message: str) -> int:
+    print(f"sq-perception dataset: {message}", file=sys.stderr)
+    return 1
