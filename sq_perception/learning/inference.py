@@ -5,9 +5,8 @@
 | onnxruntime | cpu | float32 | the extra 'onnx' |
 | torch | any | float32, bfloat16, float16 | |
 
-``auto`` takes onnxruntime for single precision on a CPU where it is installed.  For one view at a time it needs less
-than half of torch's time, as its weights are laid out for the processor once and not at every call
-(``benchmarks/network_speed.py``); the bodies are the same to 1e-6.
+``auto`` takes onnxruntime for single precision on a CPU where it is installed: one view at a time, it needs less than
+half of torch's time (``benchmarks/network_speed.py``), and the bodies are the same to 1e-6.
 """
 
 from __future__ import annotations
