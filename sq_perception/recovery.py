@@ -41,7 +41,7 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import canonical_view, raycast, segmentation, soft_render
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.canonical_view import CanonicalView
-from sq_perception.learning import checkpoint
+from sq_perception.learning import checkpoint, inference
 
 Method = Literal["auto", "network", "symmetry", "classic"]
 Refine = Literal["surface", "soft_render", "none"]
@@ -200,7 +200,7 @@ class Recoverer:
         self._options = RecoveryOptions(method=method)
         self._path = model
         self._device = _checked_device(device)
-        self._network: checkpoint.Regressor | None = None
+        self._network: inference.Predictor | None = None
         self._lock = threading.Lock()
         self._beside = ThreadPoolExecutor(1, thread_name_prefix="network")
         if method in _NEEDS_NETWORK:
@@ -264,7 +264,7 @@ class Recoverer:
             for one in objects:
                 one.plane = _support(one, found.plane)
                 if network is not None:
-                    one.shown = network.view_of(depth, one.mask, camera, one.plane)
+                    one.shown = network.config.view_of(depth, one.mask, camera, one.plane)
                 one.view = one.shown
                 if network is None or network.config.framing == "full":
                     one.view = canonical_view.from_mask(one.depth_crop, one.mask_crop, one.camera_crop, _VIEW_PIXELS)
@@ -287,10 +287,10 @@ class Recoverer:
         message = "" if bodies else _why_empty(depth, found)
         return FrameRecovery(bodies, milliseconds, found.labels, found.plane, message)
 
-    def _load_network(self) -> checkpoint.Regressor:
+    def _load_network(self) -> inference.Predictor:
         with self._lock:
             if self._network is None:
-                self._network = checkpoint.load(self._path, self._device).for_inference()
+                self._network = inference.prepare(checkpoint.load(self._path, self._device))
             return self._network
 
 

@@ -15,13 +15,13 @@ from safetensors.numpy import load_file, save
 
 from sq_perception import cli
 from sq_perception.geometry import Superquadric
-from sq_perception.imaging import canonical_view, raycast, unit_cube
+from sq_perception.imaging import raycast, unit_cube, view_rendering
 from sq_perception.learning import fixed_set, fixed_set_writer
 from sq_perception.learning.dataset import dihedral, draw_views
 from sq_perception.learning.fixed_set import FixedSet, FixedSetError, Settings, ShuffledBatches, verify
 from sq_perception.learning.fixed_set_writer import draw, generate
 
-VIEWS = Settings("view", 24, 16, train=50, test=7, shard=16, seed=5)
+VIEWS = Settings("cropped", 24, 16, train=50, test=7, shard=16, seed=5)
 FULL = Settings("full", 48, 8, train=20, test=5, shard=8, seed=5)
 
 
@@ -65,7 +65,7 @@ class TestGeneration:
 
     def test_a_shard_does_not_depend_on_the_others(self) -> None:
         alone = draw(VIEWS, "train", 2)
-        longer = draw(Settings("view", 24, 16, train=500, test=0, shard=16, seed=5), "train", 2)
+        longer = draw(Settings("cropped", 24, 16, train=500, test=0, shard=16, seed=5), "train", 2)
         for mine, theirs in zip(alone, longer, strict=True):
             np.testing.assert_array_equal(mine, theirs)
         others = [draw(VIEWS, "train", 1), draw(VIEWS, "test", 0)]
@@ -108,7 +108,7 @@ class TestGeneration:
     def test_another_set_is_never_overwritten(self, own: Path) -> None:
         before = contents(own)
         with pytest.raises(FixedSetError, match="other settings"):
-            generate(own, Settings("view", 24, 16, train=50, test=7, shard=16, seed=6))
+            generate(own, Settings("cropped", 24, 16, train=50, test=7, shard=16, seed=6))
         assert contents(own) == before
         (own / "manifest.json").unlink()
         with pytest.raises(FixedSetError, match="choose another folder"):
@@ -122,15 +122,15 @@ class TestGeneration:
             {"train": -1},
             {"shard": 0},
             {"shard": 1, "train": 10_000_000},
-            {"kind": "cropped"},
-            {"kind": "full", "pinhole_share": 0.5},
+            {"framing": "view"},
+            {"framing": "full", "pinhole_share": 0.5},
             {"pinhole_share": float("nan")},
             {"seed": 1.5},
         ],
     )
     def test_misuse_is_named(self, wrong: dict[str, Any]) -> None:
         with pytest.raises(
-            ValueError, match=f"^{'pinhole_share' if len(wrong) == 2 and 'kind' in wrong else next(iter(wrong))}:"
+            ValueError, match=f"^{'pinhole_share' if len(wrong) == 2 and 'framing' in wrong else next(iter(wrong))}:"
         ):
             Settings(**wrong)
 
@@ -151,7 +151,7 @@ class TestReading:
         np.testing.assert_allclose(images, drawn, atol=0.51 / 65535)
         np.testing.assert_array_equal(images > 0, drawn > 0)
         np.testing.assert_allclose(bodies.to_flat(), seen.to_flat(), atol=1e-6)
-        again, _ = canonical_view.render_views(bodies, 24)
+        again, _ = view_rendering.render_views(bodies, 24)
         assert np.abs(again - images).mean() < 0.01
 
     def test_any_order_and_a_cache_of_one_shard(self, views: Path) -> None:
@@ -185,7 +185,7 @@ class TestReading:
 
     def test_batches_turn_images_with_their_bodies(self, views: Path) -> None:
         images, bodies = ShuffledBatches(FixedSet(views, "train"), np.random.default_rng(1)).batch(50)
-        again, _ = canonical_view.render_views(bodies, 24)
+        again, _ = view_rendering.render_views(bodies, 24)
         assert np.abs(again - images).mean() < 0.01
         plain, _ = ShuffledBatches(FixedSet(views, "train"), np.random.default_rng(1), dihedral=False).batch(50)
         assert (np.abs(plain - images).mean(axis=(1, 2)) > 0.01).sum() > 30

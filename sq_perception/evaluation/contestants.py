@@ -25,9 +25,9 @@ from sq_perception.evaluation.thesis_images import ImageChunk
 from sq_perception.fitting.fit import Status
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
-from sq_perception.learning import checkpoint
+from sq_perception.learning import checkpoint, inference
+from sq_perception.learning.inference import Predictor
 from sq_perception.learning.objective import LOSSES, Objective
-from sq_perception.learning.regressor import Regressor
 from sq_perception.recovery import Method, Recoverer, RecoveryOptions
 
 FITS = ("auto", "symmetry", "classic")
@@ -94,7 +94,7 @@ class Network:
 
     name: str
     path: Path
-    model: Regressor
+    model: Predictor
     training: dict[str, Any]
     metrics: dict[str, Any]
     recoverer: Recoverer
@@ -114,7 +114,7 @@ class Network:
         if training.get("loss", LOSSES[0]) not in LOSSES:
             raise checkpoint.CheckpointError(f"{path}: the header names an unknown loss: {training['loss']!r}")
         recoverer = Recoverer(path, method="network")
-        return cls(name or default_name(path), path, model.for_inference(), training, found, recoverer)
+        return cls(name or default_name(path), path, inference.prepare(model), training, found, recoverer)
 
     @property
     def loss(self) -> str:
@@ -134,7 +134,7 @@ class Network:
         return ", ".join(parts)
 
     def recover(self, images: ImageChunk) -> Answers:
-        views = images.views(self.model)
+        views = images.views(self.model.config)
         there = [k for k, view in enumerate(views) if view is not None]
         flat, recovered = np.tile(_NOBODY, (len(views), 1)), np.zeros(len(views), bool)
         if there:

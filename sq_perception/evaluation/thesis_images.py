@@ -23,7 +23,7 @@ from sq_perception.imaging import raycast, segmentation, unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.canonical_view import CanonicalView
 from sq_perception.imaging.scene import thesis_bodies
-from sq_perception.learning.regressor import Regressor
+from sq_perception.learning.regressor import RegressorConfig
 
 DEFAULT_SEED = 2020
 CHUNK = 200
@@ -62,13 +62,12 @@ class ImageChunk:
         count = max(count, 0)
         return ImageChunk(self.first, self.truth[:count], self.depth[:count], self.camera)
 
-    def views(self, network: Regressor) -> list[CanonicalView | None]:
+    def views(self, form: RegressorConfig) -> list[CanonicalView | None]:
         """What a network is shown of each image's largest object, as in a recovery; None where nothing is found."""
-        form = network.config
         kind = (form.pixels, form.framing, form.marks_hidden)
         if kind not in self._views:
             self._views[kind] = [
-                None if mask is None else network.view_of(depth, mask, self.camera)
+                None if mask is None else form.view_of(depth, mask, self.camera)
                 for depth, mask in zip(self.depth, self._masks, strict=True)
             ]
         return self._views[kind]

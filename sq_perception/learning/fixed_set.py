@@ -2,10 +2,10 @@
 
 A set is a folder of shards and a manifest.  Bodies follow the thesis' protocol (:mod:`sq_perception.imaging.scene`).
 
-| kind | image | value of a pixel from its grey level v | bodies in |
+| framing | image | value of a pixel from its grey level v | bodies in |
 | --- | --- | --- | --- |
 | full | the cube, :mod:`sq_perception.imaging.unit_cube` | (v + 1/2) / (2^bits - 1) | the cube frame |
-| view | cropped, :func:`sq_perception.imaging.canonical_view.render_views` | v / (2^bits - 1) | the frame of the view |
+| cropped | :func:`sq_perception.imaging.view_rendering.render_views` | v / (2^bits - 1) | the frame of the view |
 
 In both 0 is background, and a value is the z of what is seen.  Full frames of 8 bit and 256 x 256 pixels are the
 thesis'.  The depths of a view lie between its grey levels; hence 16 bit there by default, half a level off at most.
@@ -39,7 +39,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import cv2
 import numpy as np
@@ -47,12 +47,12 @@ from safetensors import SafetensorError, safe_open
 
 from sq_perception.geometry.superquadric import FLAT_LENGTH, Superquadric
 from sq_perception.learning import dataset
+from sq_perception.learning.regressor import Framing
 
 FORMAT = "sq_perception.fixed_set"
 VERSION = 1
 SPLITS = ("train", "test")
 MANIFEST = "manifest.json"
-Kind = Literal["full", "view"]
 
 _MOST_PIXELS = 4096
 _MOST_BODIES = 100_000_000
@@ -78,7 +78,7 @@ class Settings:
         For a value outside its range.
     """
 
-    kind: Kind = "view"
+    framing: Framing = "cropped"
     pixels: int = 64
     bits: int = 16
     train: int = 150_000
@@ -87,7 +87,7 @@ class Settings:
     """Bodies in each shard but the last of a split."""
     seed: int = 1
     pinhole_share: float = 0.0
-    """Share of the views that a pinhole camera sees, as in :func:`dataset.draw_views`."""
+    """Share of the views that a pinhole camera sees, as in :class:`dataset.ViewSource`."""
 
     def __post_init__(self) -> None:
         whole = {
@@ -109,13 +109,13 @@ class Settings:
                 )
         if self.bits not in (8, 16):
             raise ValueError(f"bits: expected 8 or 16, got {self.bits}")
-        if self.kind not in get_args(Kind):
-            raise ValueError(f"kind: expected one of {', '.join(get_args(Kind))}, got {self.kind!r}")
+        if self.framing not in get_args(Framing):
+            raise ValueError(f"framing: expected one of {', '.join(get_args(Framing))}, got {self.framing!r}")
         if isinstance(self.pinhole_share, bool) or not (
             isinstance(self.pinhole_share, (int, float)) and 0 <= self.pinhole_share <= 1
         ):
             raise ValueError(f"pinhole_share: expected a number from 0 to 1, got {self.pinhole_share!r}")
-        if self.kind == "full" and self.pinhole_share:
+        if self.framing == "full" and self.pinhole_share:
             raise ValueError("pinhole_share: a full frame is orthographic")
 
     @property
@@ -146,7 +146,7 @@ class Settings:
     def _table(self) -> np.ndarray:
         """The value of every grey level, float32."""
         levels = np.arange(2**self.bits)
-        centred = levels + 0.5 * (levels > 0) if self.kind == "full" else levels
+        centred = levels + 0.5 * (levels > 0) if self.framing == "full" else levels
         return (centred / (2**self.bits - 1)).astype(np.float32)
 
 

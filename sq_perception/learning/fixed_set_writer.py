@@ -36,13 +36,13 @@ from sq_perception.learning.fixed_set import (
     SPLITS,
     VERSION,
     FixedSetError,
-    Kind,
     Settings,
     check_file,
     read_manifest,
     shard_name,
     verify,
 )
+from sq_perception.learning.regressor import Framing
 
 _PNG_LEVEL = 6
 
@@ -51,8 +51,8 @@ def draw(settings: Settings, split: str, shard: int) -> tuple[np.ndarray, np.nda
     """Grey images (n, p, p) of one shard, and the bodies (n, 12) float32 in the frame of the images."""
     rng = np.random.default_rng(settings.seed_of(split, shard))
     count = settings.bodies_in(split, shard)
-    if settings.kind == "view":
-        views, seen = dataset.draw_views(count, rng, settings.pixels, settings.pinhole_share)
+    if settings.framing == "cropped":
+        views, seen = dataset.draw_views(count, rng, dataset.ViewSource(settings.pixels, settings.pinhole_share))
         # A view's nearest surface is at least 1/255: nothing seen is rounded to background.
         return np.round(views * np.float32(2**settings.bits - 1)).astype(settings.dtype), _flat(seen)
     # Rendered as written, in single precision: whoever reads a body and renders it gets the image to the bit.
@@ -187,10 +187,10 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--threads", type=int, default=0, help="default: all that numba may use")
     parser.add_argument("--verify", action="store_true", help="check all checksums and make nothing")
     given = parser.parse_args(arguments)
-    kind: Kind = "full" if given.full_frame else "view"
+    framing: Framing = "full" if given.full_frame else "cropped"
     try:
         settings = Settings(
-            kind,
+            framing,
             (unit_cube.THESIS_PIXELS if given.full_frame else 64) if given.pixels is None else given.pixels,
             (8 if given.full_frame else 16) if given.bits is None else given.bits,
             given.train,

@@ -119,6 +119,19 @@ class RegressorConfig:
         matrix = bodies.rotation_matrix
         return np.concatenate([np.log(unit / (1 - unit)), matrix[..., :, 0], matrix[..., :, 1]], axis=-1)
 
+    def view_of(
+        self, depth: np.ndarray, mask: np.ndarray, camera: Camera, plane: np.ndarray | None = None
+    ) -> CanonicalView:
+        """What a network is shown of the object under a mask; its predictions are in the frame of this view.
+
+        Arguments and errors are those of :func:`canonical_view.from_mask`; a network for full frames knows the unit
+        cube alone and refuses pinhole cameras.
+        """
+        if self.framing == "full":
+            return canonical_view.full_frame(depth, mask, camera, self.pixels)
+        hidden = self.marks_hidden
+        return canonical_view.from_mask(depth, mask, camera, self.pixels, find_hidden=hidden, plane=plane)
+
     @classmethod
     def thesis(cls) -> RegressorConfig:
         """The thesis' network for the thesis' images: ResNet-18, 256 x 256, the whole cube.
@@ -190,19 +203,6 @@ class Regressor(nn.Module):
         with torch.inference_mode():
             raw = self.raw(batch.to(device, memory_format=torch.channels_last))
         return self.decode(raw.cpu().numpy().astype(float))
-
-    def view_of(
-        self, depth: np.ndarray, mask: np.ndarray, camera: Camera, plane: np.ndarray | None = None
-    ) -> CanonicalView:
-        """What the network is shown of the object under a mask; its predictions are in the frame of this view.
-
-        Arguments and errors are those of :func:`canonical_view.from_mask`; a network for full frames knows the unit
-        cube alone and refuses pinhole cameras.
-        """
-        if self.config.framing == "full":
-            return canonical_view.full_frame(depth, mask, camera, self.config.pixels)
-        hidden = self.config.marks_hidden
-        return canonical_view.from_mask(depth, mask, camera, self.config.pixels, find_hidden=hidden, plane=plane)
 
     def for_inference(self, dtype: torch.dtype = torch.float32) -> Regressor:
         """A copy that predicts the same, faster: normalisations folded into their convolutions, channels last.

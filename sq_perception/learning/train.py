@@ -27,6 +27,7 @@ from typing import Any, Protocol
 
 import numpy as np
 import torch
+from safetensors import SafetensorError
 from safetensors.torch import load_file
 
 from sq_perception import provenance
@@ -34,6 +35,7 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.learning import checkpoint, training_config
 from sq_perception.learning.dataset import ViewPool, ViewSource, draw_views
 from sq_perception.learning.disturbance import Disturbance, any_occluder
+from sq_perception.learning.fixed_set import FixedSet, ShuffledBatches
 from sq_perception.learning.objective import Objective
 from sq_perception.learning.processes import Processes, joined
 from sq_perception.learning.regressor import Regressor, RegressorConfig, load_imagenet
@@ -196,11 +198,9 @@ def _new_network(config: TrainingConfig, form: RegressorConfig | None) -> Regres
 
 def _state_dict(path: Path) -> dict[str, torch.Tensor]:
     try:
-        if path.suffix == ".safetensors":
-            return load_file(str(path))
-        return dict(torch.load(str(path), map_location="cpu", weights_only=True))
-    except Exception as error:  # torch.load raises whatever the file provokes
-        raise checkpoint.CheckpointError(f"{path}: not a readable state dict: {error}") from error
+        return load_file(str(path))
+    except (SafetensorError, OSError) as error:
+        raise checkpoint.CheckpointError(f"{path}: not a readable safetensors file: {error}") from error
 
 
 def _optimizer(config: TrainingConfig, model: Regressor) -> torch.optim.Optimizer:
@@ -212,13 +212,12 @@ def _optimizer(config: TrainingConfig, model: Regressor) -> torch.optim.Optimize
 def _batches(config: TrainingConfig, network: RegressorConfig, rng: np.random.Generator) -> Batches:
     if not config.data:
         return ViewPool(rng, config.views(network), reuse=config.reuse)
-    from sq_perception.learning.fixed_set import FixedSet, ShuffledBatches
-
     fixed = FixedSet(Path(config.data), "train")
-    if (fixed.pixels, fixed.framing) != (network.pixels, network.framing):
+    theirs = fixed.settings
+    if (theirs.pixels, theirs.framing) != (network.pixels, network.framing):
         raise ValueError(
             f"{config.data}: expected {network.framing} views of {network.pixels} pixels, "
-            f"got {fixed.framing} ones of {fixed.pixels}"
+            f"got {theirs.framing} ones of {theirs.pixels}"
         )
     return ShuffledBatches(fixed, rng)
 

@@ -48,7 +48,7 @@ class TrainingConfig:
     start: str = ""
     """A model file whose weights the network begins with; empty begins at random."""
     imagenet: str = ""
-    """A ResNet-18 state dict trained on ImageNet (.safetensors or .pth) for the thesis network to begin with."""
+    """A ResNet-18 state dict trained on ImageNet (.safetensors) for the thesis network to begin with."""
     data: str = ""
     """Folder of a fixed set made by `sq-perception dataset`; empty draws and renders on the fly."""
     canonical_labels: bool = False
