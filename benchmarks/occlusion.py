@@ -72,7 +72,7 @@ def cell(figures: dict[str, np.ndarray]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--bodies", type=int, default=500)
-    shipped = sorted(checkpoint.default_model_path().parent.glob("*.safetensors"))
+    shipped = list(checkpoint.shipped().values())
     parser.add_argument("--models", type=Path, nargs="*", default=shipped, help="default: all shipped weights")
     options = parser.parse_args()
     torch.set_num_threads(1)
@@ -94,7 +94,7 @@ def main() -> None:
             }
             rows.append([name, *map(cell, found.values()), f"{gain.mean():+.2f} +- {doubt:.2f}"])
             header = ["IoU % / over 85 % / ms", *found, "auto - symmetry"]
-    facts = {"bodies": options.bodies, "seed": SEED, "default_model": checkpoint.default_model_path().name}
+    facts = {"bodies": options.bodies, "seed": SEED, "default_model": checkpoint.DEFAULT}
     report.write("occlusion", {**facts, "rows": result}, report.table(header, rows))
 
 

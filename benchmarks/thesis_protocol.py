@@ -24,7 +24,7 @@ import torch  # noqa: E402
 from sq_perception.evaluation.contest import compare  # noqa: E402
 from sq_perception.evaluation.contestants import Fit, Network  # noqa: E402
 from sq_perception.evaluation.thesis_images import ThesisImages  # noqa: E402
-from sq_perception.learning.checkpoint import default_model_path  # noqa: E402
+from sq_perception.learning.checkpoint import resolve  # noqa: E402
 
 THESIS = {"network": "94.62 +- 3.18, 2.88 ms (GPU)", "classic": "84.51 +- 8.89, 690 ms"}
 
@@ -35,7 +35,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=2020)
     options = parser.parse_args()
     torch.set_num_threads(1)
-    methods = [Fit.of("auto"), Fit.of("symmetry"), Network.read(default_model_path(), "network"), Fit.of("classic")]
+    methods = [Fit.of("auto"), Fit.of("symmetry"), Network.read(resolve("supervised"), "network"), Fit.of("classic")]
     result, rows = {}, []
     for outcome in compare([(one, options.bodies) for one in methods], ThesisImages(options.bodies, options.seed)):
         method, figures, summary = outcome.contestant.name, outcome.figures, outcome.figures.summary()

@@ -154,7 +154,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     recover.add_argument("--camera-info", metavar="FILE", help="YAML with the intrinsics of 16 bit PNGs")
     recover.add_argument("--pictures", metavar="DIR", help="draw a picture per frame into this folder")
-    recover.add_argument("--model", metavar="FILE", help="weights (.safetensors) other than the shipped ones")
+    recover.add_argument("--model", metavar="FILE", help="weights: a .safetensors file, or the name of shipped ones")
     recover.add_argument("--ignore-masks", action="store_true", help="segment, even where a frame brings labels")
     recover.add_argument("--max-objects", type=int, default=20, metavar="N", help="largest ones first (default 20)")
     recover.set_defaults(command=_recover)

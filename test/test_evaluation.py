@@ -150,7 +150,7 @@ class TestImages:
 
 class TestContest:
     def test_chunks_do_not_change_the_result(self) -> None:
-        network, fit = Network.read(checkpoint.default_model_path()), Fit.of("classic")
+        network, fit = Network.read(checkpoint.resolve()), Fit.of("classic")
         results = [contest.compare([(network, 7), (fit, 4)], ThesisImages(7), chunk) for chunk in (2, 7)]
         for small, large in zip(*results, strict=True):
             np.testing.assert_allclose(small.bodies.to_flat(), large.bodies.to_flat(), atol=1e-4)
@@ -161,7 +161,7 @@ class TestContest:
         """In batches and one by one: two ways to the same bodies."""
         images = ThesisImages(6)
         (chunk,) = images.chunks()
-        answers = Network.read(checkpoint.default_model_path()).recover(chunk)
+        answers = Network.read(checkpoint.resolve()).recover(chunk)
         recoverer = Recoverer(method="network")
         for k, depth in enumerate(chunk.depth):
             (found,) = recoverer.recover(depth, images.camera).bodies
@@ -174,7 +174,7 @@ class TestContest:
         images = ThesisImages(2)
         (chunk,) = images.chunks()
         chunk.depth[1] = np.nan
-        for contestant in (Network.read(checkpoint.default_model_path()), Fit.of("symmetry")):
+        for contestant in (Network.read(checkpoint.resolve()), Fit.of("symmetry")):
             assert contestant.recover(chunk).recovered.tolist() == [True, False]
 
     @pytest.mark.parametrize("canonical", [False, True])

@@ -99,7 +99,7 @@ def test_the_shipped_network_as_a_file(runtime: Any, tmp_path: Path) -> None:
     assert (given.name, given.shape[1:], given.type) == ("views", [1, 64, 64], "tensor(float)")
     assert (got.name, got.shape[1:]) == ("parameters", [12])
     facts = net.get_modelmeta().custom_metadata_map
-    header = checkpoint.read_header(checkpoint.default_model_path())
+    header = checkpoint.read_header(checkpoint.resolve())
     assert facts["format"] == checkpoint.FORMAT
     assert facts["parameters"].split() == list(cli.PARAMETERS)
     assert json.loads(facts["config"])["pixels"] == 64

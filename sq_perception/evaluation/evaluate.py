@@ -25,7 +25,7 @@ from sq_perception.evaluation import report
 from sq_perception.evaluation.contest import Advance, compare
 from sq_perception.evaluation.contestants import FITS, Contestant, Fit, Network, unique_names
 from sq_perception.evaluation.thesis_images import DEFAULT_SEED, ThesisImages
-from sq_perception.learning.checkpoint import CheckpointError, default_model_path
+from sq_perception.learning.checkpoint import CheckpointError, shipped
 
 BODIES, FIT_BODIES = 20_000, 2000
 
@@ -56,7 +56,7 @@ examples:
 
 def default_models() -> list[Path]:
     """All weights that ship with the package."""
-    return sorted(default_model_path().parent.glob("*.safetensors"))
+    return list(shipped().values())
 
 
 def main(arguments: list[str] | None = None) -> int:

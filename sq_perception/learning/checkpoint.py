@@ -21,6 +21,8 @@ from sq_perception.learning.regressor import Regressor, RegressorConfig
 
 FORMAT = "sq_perception.regressor"
 VERSION = "1"
+DEFAULT = "compact"
+"""Name of the weights that are used where none are named."""
 _MAX_PARAMETERS = 200_000_000
 _MAX_BLOCKS = 64
 _MAX_PIXELS = 1024
@@ -30,9 +32,18 @@ class CheckpointError(ValueError):
     """A weights file that is missing, damaged, or of another kind; the message says which."""
 
 
-def default_model_path() -> Path:
-    """The weights that ship with the package."""
-    return Path(str(resources.files("sq_perception") / "weights" / "compact.safetensors"))
+def shipped() -> dict[str, Path]:
+    """The weights that ship with the package, by name."""
+    folder = Path(str(resources.files("sq_perception") / "weights"))
+    return {path.stem: path for path in sorted(folder.glob("*.safetensors"))}
+
+
+def resolve(model: Path | str | None = None) -> Path:
+    """The file that is meant by a path, by the name of shipped weights, or by None: those for real cameras."""
+    if model is None:
+        model = DEFAULT
+    path = Path(model)
+    return path if path.suffix else shipped().get(str(model), path)
 
 
 def save(
@@ -53,14 +64,14 @@ def save(
 
 
 def load(path: Path | str | None = None, device: str | torch.device = "cpu") -> Regressor:
-    """Read a network, in evaluation mode; None reads the shipped one.
+    """Read a network, in evaluation mode; the path as :func:`resolve` takes it.
 
     Raises
     ------
     CheckpointError
         If the file is missing, no safetensors file, of another format or version, or does not fit its own config.
     """
-    path = default_model_path() if path is None else Path(path)
+    path = resolve(path)
     header, state = _read(path)
     if header.get("format") != FORMAT:
         raise CheckpointError(f"{path}: expected a header 'format: {FORMAT}', got {header.get('format')!r}")
@@ -84,7 +95,7 @@ def load(path: Path | str | None = None, device: str | torch.device = "cpu") -> 
 
 def read_header(path: Path | str) -> dict[str, str]:
     """The header alone; raises CheckpointError as :func:`load` does."""
-    return _read(Path(path), tensors=False)[0]
+    return _read(resolve(path), tensors=False)[0]
 
 
 def _read(path: Path, tensors: bool = True) -> tuple[dict[str, str], dict[str, torch.Tensor]]:

@@ -214,12 +214,12 @@ def main(arguments: list[str] | None = None) -> int:
         prog="sq-perception export",
         description="Write a network as ONNX: views (n, 1, p, p) in, the 12 parameters of n bodies out.",
     )
-    parser.add_argument("--model", metavar="FILE", help="weights (.safetensors) other than the shipped ones")
+    parser.add_argument("--model", metavar="FILE", help="weights: a .safetensors file, or the name of shipped ones")
     parser.add_argument("--output", "-o", type=Path, required=True, metavar="FILE", help="the .onnx file")
     options = parser.parse_args(arguments)
     if not options.output.resolve().parent.is_dir():
         parser.error(f"--output: the folder of {options.output} does not exist")
-    path = checkpoint.default_model_path() if options.model is None else Path(options.model)
+    path = checkpoint.resolve(options.model)
     try:
         content = build(checkpoint.load(path), checkpoint.read_header(path)).SerializeToString()
         partial = options.output.with_name(options.output.name + ".partial")
