@@ -337,7 +337,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--learning-rate", type=float, default=0.05, help="of Adam, at the first step (default 0.05)")
     parser.add_argument("--s", type=float, nargs="+", metavar="S", help="sharpness, or its first and its last value")
     parser.add_argument("--points", type=int, default=1024, help="comparison points or lines of sight (default 1024)")
-    parser.add_argument("--model", metavar="FILE", help="weights of --start network: a file, or the name of shipped ones")
+    parser.add_argument("--model", metavar="FILE", help="weights of --start network: a file or a shipped name")
     parser.add_argument(
         "--output", type=Path, action="append", default=[], metavar="OUT", help=".gif or folder of PNGs"
     )

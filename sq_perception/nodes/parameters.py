@@ -110,7 +110,7 @@ class FrameParameters:
 class RecoverParameters(FrameParameters):
     """recover_node: learned start, refined."""
 
-    model: str = setting("", "Network weights: a .safetensors file or the name of shipped ones; empty: the default ones.")
+    model: str = setting("", "Network weights: a .safetensors file or the name of shipped ones; empty: the default.")
     device: str = setting("cpu", "Where the network runs: cpu, cuda or cuda:N.")
     method: Method = setting(  # noqa: RUF009 - a field
         "auto",
