@@ -107,7 +107,7 @@ def main(arguments: list[str] | None = None) -> int:
         "spawn_key": "(6, block), blocks of 500 bodies",
     }
     written = report.write(options.output, outcomes, images, facts, failures)
-    print(report.overview(outcomes).markdown())
+    print("\n\n".join(table.markdown() for table in report.overview(outcomes)))
     print(f"written: {written}")
     return 1 if failures else 0
 

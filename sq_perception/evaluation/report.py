@@ -38,10 +38,11 @@ p, figcaption { max-width: 62rem; }
 .failure { border-left: 4px solid #d1006c; padding: .3rem .9rem; background: #fbf1f6; }
 .scroll { overflow-x: auto; }
 table { border-collapse: collapse; font-size: .87rem; font-variant-numeric: tabular-nums; }
-th, td { padding: .28rem .8rem; text-align: right; white-space: nowrap; border-bottom: 1px solid #edf0f3; }
+th, td { padding: .28rem .6rem; text-align: right; white-space: nowrap; border-bottom: 1px solid #edf0f3; }
 th { font-weight: 600; border-bottom: 2px solid #c3ced6; vertical-align: bottom; white-space: normal; }
 th:first-child, td:first-child, th:nth-child(2), td:nth-child(2) { text-align: left; }
 .overview th:nth-child(2), .overview td:nth-child(2) { text-align: right; }
+sub { line-height: 0; }
 figure { margin: 1rem 0 1.6rem; }
 img { max-width: 100%; height: auto; display: block; }
 code { font-size: .85em; background: #f4f6f7; padding: .1rem .3rem; overflow-wrap: anywhere; }
@@ -107,8 +108,8 @@ def write(
     return path
 
 
-def overview(outcomes: Sequence[Outcome]) -> Table:
-    """All contestants in one table."""
+def overview(outcomes: Sequence[Outcome]) -> list[Table]:
+    """All contestants, in everything that is one number."""
     return thesis_tables.overview(_results(outcomes))
 
 
@@ -208,7 +209,7 @@ def _markdown(
     lines = ["# Evaluation", "", f"`{facts.get('command')}`", "", _facts_line(facts), "", _protocol(outcomes), ""]
     lines += [f"Left out: {failure}\n" for failure in failures]
     lines += [f"- {one.contestant.name}: {one.contestant.description}" for one in outcomes]
-    for table in (overview(outcomes), *tables):
+    for table in (*overview(outcomes), *tables):
         lines += ["", f"## {table.title}", "", table.markdown()]
         if table.note:
             lines += ["", table.note]
@@ -236,13 +237,12 @@ def _html(
         f"<p>{e(_protocol(outcomes))}</p>",
     ]
     parts += [f'<p class="failure">Left out: {e(failure)}</p>' for failure in failures]
-    parts += ["<h2>All contestants</h2>", f'<div class="scroll overview">{overview(outcomes).html()}</div>', "<ul>"]
+    parts.append("<h2>All contestants</h2><ul>")
     parts += [f"<li><b>{e(one.contestant.name)}</b>: {e(one.contestant.description)}</li>" for one in outcomes]
-    parts += ["</ul>", _figure(general[0]), "<h2>The thesis' tables</h2>"]
-    for table in tables:
-        parts.append(f'<h3>{e(table.title)}</h3><div class="scroll">{table.html()}</div>')
-        if table.note:
-            parts.append(f'<p class="faint">{e(table.note)}</p>')
+    parts.append("</ul>")
+    parts += [_section(table, "scroll overview") for table in overview(outcomes)]
+    parts += [_figure(general[0]), "<h2>The thesis' tables</h2>"]
+    parts += [_section(table, "scroll") for table in tables]
     parts += ["<h2>How bodies are drawn</h2>", _figure(general[1])]
     for outcome in outcomes:
         name = outcome.contestant.name
@@ -250,6 +250,11 @@ def _html(
         parts += [_figure(picture) for picture in own[name]]
     parts.append("</body></html>")
     return "\n".join(parts) + "\n"
+
+
+def _section(table: Table, kind: str) -> str:
+    note = f'<p class="faint">{html.escape(table.note)}</p>' if table.note else ""
+    return f'<h3>{table.html_title}</h3><div class="{kind}">{table.html()}</div>{note}'
 
 
 def _figure(picture: _Picture) -> str:

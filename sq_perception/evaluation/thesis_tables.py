@@ -36,8 +36,13 @@ class Table:
         lines = [escaped[0], ["---"] * len(self.header), *escaped[1:]]
         return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
+    @property
+    def html_title(self) -> str:
+        """The title, escaped, with the symbols of the losses set as such."""
+        return _marked_up(self.title)
+
     def html(self) -> str:
-        """As an HTML table, without the title; first column left, numbers right."""
+        """As an HTML table, without the title."""
         head = "".join(f"<th>{_marked_up(cell)}</th>" for cell in self.header)
         body = []
         for row in self.rows:
@@ -127,7 +132,7 @@ def thesis_tables(results: Sequence[Result]) -> list[Table]:
         _table("Table 6.1: networks of all 12 parameters, supervised", (_DUAL_6_1, _OCCUPANCY_6_1), results, _iou),
         _table("Section 6.5.2: rotation alone, the other parameters given", (_ROTATION,), results, _iou,
                "A random rotation reaches about 58 % in the thesis."),
-        _table("Figure 6.6 and 7.7, in words: how IoU is distributed", (_OCCUPANCY, _RENDER), results, _distribution),
+        _table("Figures 6.6 and 7.7, in words: how IoU is distributed", (_OCCUPANCY, _RENDER), results, _distribution),
         _table("Table 6.2: errors of each parameter group", (_ITERATIVE, _OCCUPANCY), results, _errors),
         _table("Table 6.3: against the classic method", (_ITERATIVE, _OCCUPANCY), results, _iou_and_time, time),
         _table("Table 7.1: errors under L_LS", (_LEAST_SQUARES,), results, _errors),
@@ -138,14 +143,12 @@ def thesis_tables(results: Sequence[Result]) -> list[Table]:
     ]  # fmt: skip
 
 
-def overview(results: Sequence[Result]) -> Table:
-    """Every contestant, with everything that is one number."""
-    header = ("Contestant", "IoU", "min", "median", "max", "> 85 %", "volume IoU", "ΔA", "ΔE", "ΔT",
-              "quarter turns", "recovered", "ms median / p95", "timed")  # fmt: skip
-    rows = []
+def overview(results: Sequence[Result]) -> list[Table]:
+    """Every contestant: how well the bodies overlap, and what is wrong about them, with the time it took."""
+    accuracy, errors = [], []
     for result in results:
         s = result.summary
-        rows.append(
+        accuracy.append(
             (
                 result.name,
                 spread(s.iou_mean, s.iou_std),
@@ -154,16 +157,35 @@ def overview(results: Sequence[Result]) -> Table:
                 percent(s.iou_max),
                 percent(s.over_85),
                 spread(s.volume_iou_mean, s.volume_iou_std),
+                f"{s.recovered} of {s.bodies}",
+            )
+        )
+        errors.append(
+            (
+                result.name,
                 signed(s.delta_a),
                 signed(s.delta_e),
                 _triple(s.delta_t),
                 percent(s.quarter_turns, 1),
-                f"{s.recovered} of {s.bodies}",
+                _degrees(s.symmetric_angle_median),
+                _degrees(s.any_order_angle_median),
                 f"{s.milliseconds_median:.1f} / {s.milliseconds_p95:.1f}" if s.timed else "not timed",
                 str(s.timed),
             )
         )
-    return Table("All contestants", header, tuple(rows))
+    return [
+        Table(
+            "All contestants: IoU",
+            ("Contestant", "IoU", "min", "median", "max", "over 85 %", "volume IoU", "recovered"),
+            tuple(accuracy),
+        ),
+        Table(
+            "All contestants: errors, rotations and times",
+            ("Contestant", "ΔA", "ΔE", "ΔT", "quarter turns", "angle", "axes in any order", "ms median / p95", "timed"),
+            tuple(errors),
+            "Angles are medians, symmetries aside; times are those of one image by itself, on so many images.",
+        ),
+    ]
 
 
 def percent(value: float, digits: int = 2) -> str:
@@ -213,7 +235,7 @@ def _iou_and_time(row: _Row, result: Result | None) -> dict[str, str]:
         **_iou(row, result),
         "Execution time [ms]": time,
         "[ms], thesis": row.time or NOT_IN_THESIS,
-        "bodies": str(s.bodies) if s else NOTHING,
+        "bodies, timed": f"{s.bodies}, {s.timed}" if s else NOTHING,
     }
 
 
@@ -233,6 +255,10 @@ def _distribution(row: _Row, result: Result | None) -> dict[str, str]:
     for name, mine, theirs in zip(("least", "largest", "over 85 %"), ours, _DISTRIBUTIONS[row.label], strict=True):
         cells[name], cells[f"{name}, thesis"] = mine, theirs or NOT_IN_THESIS
     return cells
+
+
+def _degrees(radians: float) -> str:
+    return f"{math.degrees(radians):.1f}°" if math.isfinite(radians) else "unknown"
 
 
 def _triple(values: Sequence[float]) -> str:
