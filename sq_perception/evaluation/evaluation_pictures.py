@@ -28,7 +28,6 @@ from sq_perception.evaluation.plots import (
     draw_depth,
     new_figure,
     picture_axes,
-    silhouettes,
 )
 from sq_perception.evaluation.thesis_images import ThesisImages
 from sq_perception.geometry.superquadric import Superquadric
@@ -227,7 +226,7 @@ def _draw_example(axes: Sequence[Axes], outcome: Outcome, images: ThesisImages, 
         predicted = unit_cube.optical_from_cube(outcome.bodies[number])
         rendered, _ = raycast.render(predicted, images.camera)
         draw_depth(axes[1], rendered, limits)
-        _crop(axes[:2], [true, predicted], images)
+        _crop(axes[:2], np.isfinite(depth) | np.isfinite(rendered))
         draw_bodies_3d(
             axes[2],
             [predicted],
@@ -239,20 +238,20 @@ def _draw_example(axes: Sequence[Axes], outcome: Outcome, images: ThesisImages, 
             azimuth=_AZIMUTH,
         )
     else:
-        _crop(axes[:1], [true], images)
+        _crop(axes[:1], np.isfinite(depth))
         axes[2].set_axis_off()
         axes[1].set_axis_off()
         axes[1].text(0.5, 0.5, "no body", transform=axes[1].transAxes, ha="center", fontsize=9, color=_FAINT)
 
 
-def _crop(axes: Sequence[Axes], bodies: Sequence[Superquadric], images: ThesisImages) -> None:
-    """Show the square around the silhouettes of all bodies, kept within the image."""
-    loops = [loop for body in bodies for loop in silhouettes(body, images.camera)]
-    if not loops:
+def _crop(axes: Sequence[Axes], shown: np.ndarray) -> None:
+    """Show the square around the pixels (height, width) that are True, kept within the image."""
+    rows, columns = np.nonzero(shown)
+    if rows.size == 0:
         return
-    size = np.array([images.camera.width, images.camera.height], dtype=float)
-    low, high = np.vstack(loops).min(axis=0), np.vstack(loops).max(axis=0)
-    half = min(0.62 * float((high - low).max()), 0.5 * float(size.min()))
+    size = np.array(shown.shape[::-1], dtype=float)
+    low, high = (np.array([of(columns), of(rows)], dtype=float) for of in (np.min, np.max))
+    half = min(0.62 * float((high - low + 1).max()), 0.5 * float(size.min()))
     middle = np.clip(0.5 * (low + high), half - 0.5, size - 0.5 - half)
     for ax in axes:
         ax.set_xlim(middle[0] - half, middle[0] + half)
