@@ -42,6 +42,8 @@ _F_RANGE = (1e-3, 1e3)
 _ARC_BINS = np.linspace(0, 360, 121)
 _ANGLE_BINS = np.linspace(0, 100, 101)
 _IOU_BINS = np.linspace(0, 100, 101)
+_CLOSE_IOU_BINS = np.linspace(95, 100, 101)
+"""Where every body is this good."""
 
 INSIDE_OUTSIDE_BODY = Superquadric([0.32, 0.22, 0.26], [0.3, 0.8], [0.5, 0.5, 0.5], [0.35, 0.15, 0.1, 0.92])
 """Shown in the picture of the inside-outside function; cube frame."""
@@ -78,10 +80,10 @@ def distributions(outcome: Outcome) -> Figure:
     figures, summary = outcome.figures, outcome.figures.summary()
 
     ax = figure.add_subplot(grid[0])
-    _histogram(ax, 100 * figures.iou, _IOU_BINS)
+    _histogram(ax, 100 * figures.iou, _CLOSE_IOU_BINS if summary.iou_min > 0.01 * _CLOSE_IOU_BINS[0] else _IOU_BINS)
     ax.axvline(100 * summary.iou_mean, color=WIRE, lw=1.2)
     low, high = (100 * (summary.iou_mean + side * summary.iou_std) for side in (-1, 1))
-    ax.axvspan(low, min(high, 100.0), color="#fbeaf3", lw=0, zorder=0)
+    ax.axvspan(max(low, 0.0), min(high, 100.0), color="#fbeaf3", lw=0, zorder=0)
     ax.set_xlabel("IoU, per cent", fontsize=9, color=INK)
     ax.set_ylabel("bodies", fontsize=9, color=INK)
     _heading(ax, "IoU", f"{100 * summary.over_85:.1f} % over {100 * GOOD_IOU:.0f} %; line, band: mean ± std")
