@@ -53,8 +53,8 @@ _CAPTIONS = {
     "inside-outside function F on a logarithmic scale; those inside are opaque, those outside at 15 %.",
     "iou": "Distribution of IoU (figures 6.6, 7.3 and 7.7 of the thesis), bins of one per cent.",
     "distributions": "Left: IoU; where every body is above 95 %, that part only. Middle: the shortest arc as in figure "
-    "6.3, from the predicted to the label's quaternion with their signs as they are: 0, π and 2π are the same body where "
-    "the axis is one of the body's own. "
+    "6.3, from the predicted to the label's quaternion with their signs as they are: 0, π and 2π are the same body "
+    "where the axis is one of the body's own. "
     "Right: the least angle over the 8 parameter vectors of the label's body (filled), and over all 24 ways to list "
     "its axes (line), which forgives the exchange of z where e1 is about e2.",
     "examples": "The three bodies of largest IoU, three about the median, and the three of least IoU. Of each, the "
