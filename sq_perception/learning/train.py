@@ -236,6 +236,8 @@ def _validation_sets(config: TrainingConfig, network: RegressorConfig) -> dict[s
         rng = np.random.default_rng(0)
         occluder = any_occluder(np.full(count, VALIDATION_HIDDEN), rng)
         sets["iou_hidden"] = draw_views(count, rng, ViewSource(pixels, config.pinhole_share), occluder)
+    if config.canonical_labels:  # what is given to the network counts as it was given in training
+        return {name: (views, bodies.canonical_form()) for name, (views, bodies) in sets.items()}
     return sets
 
 
