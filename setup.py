@@ -24,6 +24,10 @@ onnx = [
     "onnxruntime>=1.18",  # computes that graph in less than half of torch's time for a single view
 ]
 
+train = [
+    "tensorboard>=2.14",  # curves of a running training
+]
+
 setup(
     name=NAME,
     version="0.1.0",
@@ -73,8 +77,10 @@ setup(
         # Never among the requirements: they would shadow the rclpy of a ROS installation.
         "ros": ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"],
         "onnx": onnx,
+        "train": train,
         "test": [
             *onnx,
+            *train,
             "pytest>=7,<8.4",  # later ones break the launch_testing plugins of a ROS installation
             "hypothesis>=6",
             "ruff>=0.6",

@@ -17,7 +17,7 @@ from sq_perception import cli
 from sq_perception.geometry import Superquadric
 from sq_perception.imaging import raycast, unit_cube, view_rendering
 from sq_perception.learning import fixed_set, fixed_set_writer
-from sq_perception.learning.dataset import dihedral, draw_views
+from sq_perception.learning.dataset import ViewSource, dihedral, draw_views
 from sq_perception.learning.fixed_set import FixedSet, FixedSetError, Settings, ShuffledBatches, verify
 from sq_perception.learning.fixed_set_writer import draw, generate
 
@@ -147,7 +147,7 @@ class TestReading:
 
     def test_views_are_what_is_drawn_directly(self, views: Path) -> None:
         images, bodies = FixedSet(views, "train").batch(np.arange(32, 48))
-        drawn, seen = draw_views(16, np.random.default_rng([5, 0, 2]), 24)
+        drawn, seen = draw_views(16, np.random.default_rng([5, 0, 2]), ViewSource(24))
         np.testing.assert_allclose(images, drawn, atol=0.51 / 65535)
         np.testing.assert_array_equal(images > 0, drawn > 0)
         np.testing.assert_allclose(bodies.to_flat(), seen.to_flat(), atol=1e-6)

@@ -19,7 +19,7 @@ PACKAGES = (PERCEPTION, MESSAGES)
 
 # Floor by floor, from the ground up; a module may import from its own floor and from those below it.
 FLOORS = (
-    ("geometry",),
+    ("geometry", "provenance"),
     ("imaging", "metrics", "tracking", "recorded_frame"),
     ("learning", "fitting"),
     ("recovery", "warm_up"),

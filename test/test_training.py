@@ -166,6 +166,27 @@ class TestInterruptions:
             train.train(RUN, tmp_path, SMALL)
 
 
+class TestLog:
+    def test_of_a_step_validated_twice_the_later_counts(self, tmp_path: Path) -> None:
+        for loss in (2.0, 1.0):
+            log = training_log.TrainingLog(tmp_path, 10, 0)
+            log.record({"step": 5, "loss": loss})
+            log.record({"step": 10, "loss": loss})
+            log.close()
+        assert training_log.read(tmp_path) == [{"step": 5, "loss": 1.0}, {"step": 10, "loss": 1.0}]
+        assert training_log.read(tmp_path / "nowhere") == []
+
+    def test_tensorboard_gets_the_same_numbers(self, tmp_path: Path) -> None:
+        events = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator", reason="no tensorboard")
+        log = training_log.TrainingLog(tmp_path, 10, 0)
+        log.record({"step": 5, "loss": 0.25, "iou": 0.5})
+        log.close()
+        written = events.EventAccumulator(str(tmp_path))
+        written.Reload()
+        assert [(e.step, e.value) for e in written.Scalars("iou")] == [(5, 0.5)]
+        assert [(e.step, e.value) for e in written.Scalars("loss")] == [(5, 0.25)]
+
+
 class TestContinuation:
     def test_average_follows_and_is_what_is_saved(self, tmp_path: Path) -> None:
         model = train.train(replace(RUN, average=0.0), tmp_path, SMALL)
