@@ -10,14 +10,23 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
 
+from sq_perception.imaging import unit_cube
+from sq_perception.imaging.camera import Camera
+from sq_perception.imaging.scene import thesis_bodies
 from sq_perception.learning import checkpoint, train, training_config, training_log
+from sq_perception.learning.dataset import full_frames
+from sq_perception.learning.fixed_set import Settings
+from sq_perception.learning.fixed_set_writer import generate
 from sq_perception.learning.regressor import Regressor, RegressorConfig
 from sq_perception.learning.schedule import Cosine, Plateau
 from sq_perception.learning.training_config import TrainingConfig
+from sq_perception.metrics import volume_iou
+from sq_perception.recovery import Recoverer
 
 SMALL = RegressorConfig(pixels=32, widths=(4, 8, 8), blocks=1, hidden=32)
 RUN = TrainingConfig(steps=40, batch=16, points=64, validation=20, warm_up=5, threads=1)
@@ -212,6 +221,40 @@ class TestContinuation:
         assert model.config == replace(SMALL, marks_hidden=True)
         record = training_log.read(tmp_path / "run")[-1]
         assert {"iou", "iou_hidden", "iou_worn"} <= set(record)
+
+
+class TestThesisSetting:
+    """ResNet-18 on full frames, here of 64 pixels; drawn on the fly, and from a fixed set."""
+
+    FORM = replace(RegressorConfig.thesis(), pixels=64)
+    RUN = replace(training_config.read("thesis"), steps=3, batch=4, points=32, validation=3, threads=1)
+
+    def test_runs_and_is_recovered_with(self, tmp_path: Path) -> None:
+        train.train(self.RUN, tmp_path, self.FORM)
+        frame = full_frames(thesis_bodies(1, np.random.default_rng(3)))[0]
+        depth = np.where(frame > 0, 1 - frame, np.nan).astype(np.float32)
+        recoverer = Recoverer(tmp_path / "model.safetensors", method="network")
+        body = recoverer.recover(depth, unit_cube.camera()).bodies[0].superquadric
+        model = checkpoint.load(tmp_path / "model.safetensors")
+        # Pixels of both sizes lie at column / (n - 1); nearest neighbours make the small frame of the large one.
+        chosen = np.rint(np.linspace(0, 255, 64)).astype(int)
+        expected = unit_cube.optical_from_cube(model.predict(frame[None][:, chosen][:, :, chosen]))[0]
+        assert volume_iou(body, expected) > 0.999
+
+    def test_a_full_frame_has_no_perspective(self, tmp_path: Path) -> None:
+        checkpoint.save(tmp_path / "model.safetensors", Regressor(self.FORM))
+        recoverer = Recoverer(tmp_path / "model.safetensors", method="network")
+        depth, labels = np.full((48, 64), 0.8, np.float32), np.ones((48, 64), np.int32)
+        with pytest.raises(ValueError, match="orthographic"):
+            recoverer.recover(depth, Camera(64, 48, 50, 50, 32, 24), labels)
+
+    def test_from_a_fixed_set(self, tmp_path: Path) -> None:
+        generate(tmp_path / "set", Settings("full", 64, 8, train=24, test=0, shard=10))
+        train.train(replace(self.RUN, data=str(tmp_path / "set")), tmp_path / "run", self.FORM)
+        assert training_log.read(tmp_path / "run")[-1]["step"] == 3
+        other = replace(RUN, data=str(tmp_path / "set"))
+        with pytest.raises(ValueError, match="expected cropped views of 32 pixels, got full ones of 64"):
+            train.train(other, tmp_path / "other", SMALL)
 
 
 def test_two_processes_learn_one_network(tmp_path: Path) -> None:

@@ -151,8 +151,9 @@ def _train(
             stopping = processes.any(stop_requested())
             if state.step % config.validation == 0 or finished:
                 state.seconds = time.monotonic() - started
-                calibration = batches.batch(max(CALIBRATION_VIEWS, config.batch))[0]
-                recalibrate(state.average, torch.from_numpy(calibration)[:, None], config.batch)
+                if config.average > 0:
+                    calibration = batches.batch(max(CALIBRATION_VIEWS, config.batch))[0]
+                    recalibrate(state.average, torch.from_numpy(calibration)[:, None], config.batch)
                 record: dict[str, Any] = {}
                 if processes.is_first:
                     record = {"step": state.step, "loss": float(np.mean(losses)), "rate": rate}
