@@ -19,11 +19,6 @@ share = [
 if "bdist_wheel" in sys.argv:
     share.append((f"lib/{NAME}", [f"resource/ros2_run/{node}" for node in NODES]))
 
-onnx = [
-    "onnx>=1.16",  # the network as a graph for other runtimes
-    "onnxruntime>=1.18",  # computes that graph in less than half of torch's time for a single view
-]
-
 train = [
     "tensorboard>=2.14",  # curves of a running training
 ]
@@ -66,6 +61,8 @@ setup(
         "opencv-python-headless>=4.8",  # images and contours
         "trimesh>=4",  # meshes and GLB
         "torch==2.13.0",  # the network; an open range may fetch several GB
+        "onnx>=1.16",  # the network as a graph for other runtimes
+        "onnxruntime>=1.18",  # computes that graph in less than half of torch's time for a single view
         "safetensors>=0.4",  # weights that cannot carry code
         "array-api-compat>=1.9",  # one geometry for NumPy and torch
         "pyyaml>=6",  # camera_info files, training configurations
@@ -76,10 +73,8 @@ setup(
     extras_require={
         # Never among the requirements: they would shadow the rclpy of a ROS installation.
         "ros": ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"],
-        "onnx": onnx,
         "train": train,
         "test": [
-            *onnx,
             *train,
             "pytest>=7,<8.4",  # later ones break the launch_testing plugins of a ROS installation
             "hypothesis>=6",

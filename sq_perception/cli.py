@@ -35,7 +35,7 @@ _OTHER_COMMANDS = {
     "evaluate": ("sq_perception.evaluation.evaluate", "the thesis' tables and plots, for networks and fits"),
     "render-search": ("sq_perception.evaluation.render_search", "find the best s and tau of the soft renderer"),
     "gradient-search": ("sq_perception.evaluation.gradient_search", "watch a body walk down a loss, step by step"),
-    "export": ("sq_perception.learning.onnx_export", "write a network as ONNX (extra 'onnx')"),
+    "export": ("sq_perception.learning.onnx_export", "write a network as ONNX"),
 }
 """Modules with a main of their own."""
 _NEGATIVE_WITH_EXPONENT = re.compile(r"-(\d+\.?\d*|\.\d+)[eE][-+]?\d+")

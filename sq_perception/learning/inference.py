@@ -2,7 +2,7 @@
 
 | engine | device | type | needs |
 | --- | --- | --- | --- |
-| onnxruntime | cpu | float32 | the extra 'onnx' |
+| onnxruntime | cpu | float32 | the packages onnx and onnxruntime |
 | torch | any | float32, bfloat16, float16 | |
 
 ``auto`` takes onnxruntime for single precision on a CPU where it is installed: one view at a time, it needs less than
@@ -63,7 +63,7 @@ def prepare(model: Regressor, engine: Engine = "auto", dtype: torch.dtype = torc
     ValueError
         For an unknown engine, or onnxruntime with a type or on a device that it does not compute here.
     MissingPackageError
-        If onnxruntime is asked for by name and a package of the extra 'onnx' is missing.
+        If onnxruntime is asked for by name and it or onnx is missing.
     """
     if engine not in get_args(Engine):
         raise ValueError(f"engine: expected one of {', '.join(get_args(Engine))}, got {engine!r}")

@@ -36,7 +36,7 @@ OPSET, IR_VERSION = 18, 8
 
 
 class MissingPackageError(ImportError):
-    """A package of the extra 'onnx' is not installed; the message says what to do."""
+    """onnx or onnxruntime is not installed; the message says what to do."""
 
 
 def require(name: str) -> Any:
@@ -44,7 +44,7 @@ def require(name: str) -> Any:
     try:
         return importlib.import_module(name)
     except ModuleNotFoundError as error:
-        raise MissingPackageError(f"ONNX needs the package {name!r}: pip install 'sq_perception[onnx]'") from error
+        raise MissingPackageError(f"ONNX needs the package {name!r}: pip install {name}") from error
 
 
 def build(model: Regressor, notes: Mapping[str, str] | None = None) -> Any:
