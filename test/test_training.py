@@ -62,7 +62,7 @@ class TestConfig:
             ("[1, 2]", "name: value"),
             ("a: [", "not a YAML file"),
             ("loss: render\noccluded_share: 0.5", "need a loss with labels"),
-            ("network: thesis\npinhole_share: 0.5", "orthographic"),
+            ("framing: full\npinhole_share: 0.5", "orthographic"),
             ("!!python/object/apply:os.system ['true']", "not a YAML file"),
         ],
     )

@@ -73,7 +73,7 @@ def train(config: TrainingConfig, output: Path, network: RegressorConfig | None 
     output
         Its folder.
     network
-        A form other than those of ``config.network``.
+        A form other than that of ``config``.
 
     Raises
     ------

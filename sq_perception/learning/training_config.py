@@ -17,14 +17,18 @@ import yaml
 from sq_perception.learning.dataset import ViewSource
 from sq_perception.learning.disturbance import Disturbance
 from sq_perception.learning.objective import LOSSES, UNSUPERVISED, Objective
-from sq_perception.learning.regressor import RegressorConfig
+from sq_perception.learning.regressor import Backbone, Framing, RegressorConfig
 from sq_perception.learning.schedule import Cosine, Plateau
 
-Network = Literal["compact", "thesis"]
 Optimizer = Literal["adamw", "adam"]
 _SHIPPED = Path(__file__).with_name("configurations")
 ScheduleName = Literal["cosine", "plateau"]
-_CHOICES = {"network": get_args(Network), "optimizer": get_args(Optimizer), "schedule": get_args(ScheduleName)}
+_CHOICES = {
+    "backbone": get_args(Backbone),
+    "framing": get_args(Framing),
+    "optimizer": get_args(Optimizer),
+    "schedule": get_args(ScheduleName),
+}
 
 
 @dataclass(frozen=True)
@@ -39,16 +43,18 @@ class TrainingConfig:
 
     loss: str = "occupancy"
     """What is minimised, by its name in :mod:`sq_perception.learning.objective`."""
-    network: str = "compact"
-    """compact, or thesis: ResNet-18 on full frames of 256 x 256 pixels."""
+    backbone: str = "compact"
+    """compact, or resnet18 as in the thesis."""
+    framing: str = "cropped"
+    """What the network sees: cropped canonical views, or full frames of the unit cube as in the thesis."""
     pixels: int = 64
-    """Side of the compact network's views, a multiple of 16."""
+    """Side of the views: a multiple of 16 for compact, of 32 for resnet18; 256 in the thesis."""
     largest: float = RegressorConfig().size_range[1]
-    """Largest half size the compact network can express, in sides of the cube; the thesis' bodies reach 0.8."""
+    """Largest half size a network for cropped views can express, in their sides; the thesis' bodies reach 0.8."""
     start: str = ""
     """A model file whose weights the network begins with; empty begins at random."""
     imagenet: str = ""
-    """A ResNet-18 state dict trained on ImageNet (.safetensors) for the thesis network to begin with."""
+    """A ResNet-18 state dict trained on ImageNet (.safetensors) for resnet18 to begin with."""
     data: str = ""
     """Folder of a fixed set made by `sq-perception dataset`; empty draws and renders on the fly."""
     canonical_labels: bool = False
@@ -121,10 +127,10 @@ class TrainingConfig:
             raise ValueError(f"average: expected 0 to below 1, got {self.average}")
         if self.loss in UNSUPERVISED and (self.occluded_share or self.noisy_share):
             raise ValueError(f"{self.loss} takes each view as it is; occluders and noise need a loss with labels")
-        if self.network == "thesis" and (self.pinhole_share or self.occluded_share or self.noisy_share):
-            raise ValueError("the thesis network sees the thesis' images: orthographic, whole and clean")
-        if self.imagenet and self.network != "thesis":
-            raise ValueError("imagenet: only the thesis network has the form of those weights")
+        if self.framing == "full" and (self.pinhole_share or self.occluded_share or self.noisy_share):
+            raise ValueError("full frames are the thesis' images: orthographic, whole and clean")
+        if self.imagenet and self.backbone != "resnet18":
+            raise ValueError("imagenet: only resnet18 has the form of those weights")
         self.disturbance()
 
     def disturbance(self) -> Disturbance:
@@ -151,10 +157,11 @@ class TrainingConfig:
 
     def regressor(self) -> RegressorConfig:
         """The network's form, unless ``start`` brings its own."""
-        if self.network == "thesis":
-            return replace(RegressorConfig.thesis(), marks_hidden=self.marks_hidden)
-        smallest = RegressorConfig().size_range[0]
-        return RegressorConfig(self.pixels, size_range=(smallest, self.largest), marks_hidden=self.marks_hidden)
+        form = RegressorConfig.thesis()
+        if self.framing == "cropped":
+            form = RegressorConfig(size_range=(RegressorConfig().size_range[0], self.largest))
+        changes = {"backbone": self.backbone, "pixels": self.pixels, "marks_hidden": self.marks_hidden}
+        return replace(form, **changes)  # type: ignore[arg-type]
 
     def views(self, network: RegressorConfig) -> ViewSource:
         """What is drawn for a network."""
