@@ -155,6 +155,9 @@ def _parser() -> argparse.ArgumentParser:
     recover.add_argument("--camera-info", metavar="FILE", help="YAML with the intrinsics of 16 bit PNGs")
     recover.add_argument("--pictures", metavar="DIR", help="draw a picture per frame into this folder")
     recover.add_argument("--model", metavar="FILE", help="weights: a .safetensors file, or the name of shipped ones")
+    recover.add_argument(
+        "--consensus", action="store_true", help="average the network's answers to 8 positions of each view"
+    )
     recover.add_argument("--ignore-masks", action="store_true", help="segment, even where a frame brings labels")
     recover.add_argument("--max-objects", type=int, default=20, metavar="N", help="largest ones first (default 20)")
     recover.set_defaults(command=_recover)
@@ -206,7 +209,7 @@ def _recover(options: argparse.Namespace) -> int:
     torch.set_num_threads(1)  # the network's layers are so small that threads cost more than they save
     settings = RecoveryOptions(method=options.method, refine=options.refine, max_objects=options.max_objects)
     try:
-        recoverer = Recoverer(options.model, method=options.method)
+        recoverer = Recoverer(options.model, method=options.method, consensus=options.consensus)
     except CheckpointError as error:
         _complain(str(error))
         return FAILURE

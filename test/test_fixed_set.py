@@ -17,7 +17,8 @@ from sq_perception import cli
 from sq_perception.geometry import Superquadric
 from sq_perception.imaging import raycast, unit_cube, view_rendering
 from sq_perception.learning import fixed_set, fixed_set_writer
-from sq_perception.learning.dataset import ViewSource, dihedral, draw_views
+from sq_perception.learning.dataset import ViewSource, draw_views
+from sq_perception.learning.dihedral import moved_bodies, moved_images
 from sq_perception.learning.fixed_set import FixedSet, FixedSetError, Settings, ShuffledBatches, verify
 from sq_perception.learning.fixed_set_writer import draw, generate
 
@@ -177,7 +178,7 @@ class TestReading:
             FixedSet(views, "validation")
 
     def test_batches_show_everything_once_a_round(self, views: Path) -> None:
-        batches = ShuffledBatches(FixedSet(views, "train"), np.random.default_rng(0), dihedral=False)
+        batches = ShuffledBatches(FixedSet(views, "train"), np.random.default_rng(0), positions=False)
         sizes = np.concatenate([batches.batch(25)[1].size[:, 0] for _ in range(4)])
         assert len(np.unique(sizes)) == 50
         assert len(np.unique(sizes[:50])) == 50
@@ -187,14 +188,14 @@ class TestReading:
         images, bodies = ShuffledBatches(FixedSet(views, "train"), np.random.default_rng(1)).batch(50)
         again, _ = view_rendering.render_views(bodies, 24)
         assert np.abs(again - images).mean() < 0.01
-        plain, _ = ShuffledBatches(FixedSet(views, "train"), np.random.default_rng(1), dihedral=False).batch(50)
+        plain, _ = ShuffledBatches(FixedSet(views, "train"), np.random.default_rng(1), positions=False).batch(50)
         assert (np.abs(plain - images).mean(axis=(1, 2)) > 0.01).sum() > 30
 
     def test_dihedral_positions_hold_for_full_frames(self, full: Path) -> None:
         """Pixels at column / (n - 1) lie symmetrically about 1/2 too: a turned frame is that of the turned body."""
         images, bodies = FixedSet(full, "train").batch(range(16))
         turns, mirror = np.arange(16) % 4, np.arange(16) // 4 % 2 == 0
-        turned, moved = dihedral(images, bodies, turns, mirror)
+        turned, moved = moved_images(images, turns, mirror), moved_bodies(bodies, turns, mirror)
         again = FULL.values(np.stack([rendered(body, FULL) for body in moved]))
         assert (turned != again).mean() < 1e-4  # where z lies on a grey level, to the last digit
         assert (turned != images).mean() > 0.1

@@ -15,7 +15,8 @@ from sq_perception.geometry import Superquadric
 from sq_perception.imaging import view_rendering
 from sq_perception.imaging.scene import thesis_bodies
 from sq_perception.learning import checkpoint, losses
-from sq_perception.learning.dataset import ViewPool, ViewSource, dihedral, draw_views
+from sq_perception.learning.dataset import ViewPool, ViewSource, draw_views
+from sq_perception.learning.dihedral import MIRROR, TURNS, moved_back, moved_bodies, moved_images
 from sq_perception.learning.objective import UNSUPERVISED, Objective
 from sq_perception.learning.regressor import Regressor, RegressorConfig
 from sq_perception.learning.train import train, validate
@@ -88,10 +89,17 @@ class TestData:
         rng = np.random.default_rng(4)
         images, bodies = draw_views(48, rng)
         turns, mirror = np.arange(48) % 4, np.arange(48) // 4 % 2 == 0
-        turned, moved = dihedral(images, bodies, turns, mirror)
+        turned, moved = moved_images(images, turns, mirror), moved_bodies(bodies, turns, mirror)
         again, _ = view_rendering.render_views(moved)
         assert ((again > 0) != (turned > 0)).mean() < 0.001
         assert np.abs(again - turned)[(again > 0) & (turned > 0)].mean() < 0.004
+
+    def test_every_position_has_a_way_back(self) -> None:
+        bodies = thesis_bodies(8, np.random.default_rng(11))
+        back = moved_back(moved_bodies(bodies, TURNS, MIRROR), TURNS, MIRROR)
+        np.testing.assert_allclose(back.size, bodies.size)
+        np.testing.assert_allclose(back.translation, bodies.translation, atol=1e-12)
+        assert np.abs(np.abs(np.sum(back.rotation * bodies.rotation, axis=-1)) - 1).max() < 1e-12
 
     def test_pool_pairs_views_with_their_bodies(self) -> None:
         pool = ViewPool(np.random.default_rng(5), ViewSource(32), capacity=32)

@@ -26,6 +26,7 @@ from sq_perception.fitting.fit import Status
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
 from sq_perception.learning import checkpoint, inference
+from sq_perception.learning.consensus import Consensus
 from sq_perception.learning.inference import Predictor
 from sq_perception.learning.objective import LOSSES, Objective
 from sq_perception.recovery import Method, Recoverer, RecoveryOptions
@@ -100,8 +101,8 @@ class Network:
     recoverer: Recoverer
 
     @classmethod
-    def read(cls, path: Path, name: str | None = None) -> Network:
-        """Load a weights file.
+    def read(cls, path: Path, name: str | None = None, consensus: bool = False) -> Network:
+        """Load a weights file; with ``consensus`` the network is asked in 8 positions of each view.
 
         Raises
         ------
@@ -113,8 +114,16 @@ class Network:
         training, found = (_note(header, key, path) for key in ("training", "metrics"))
         if training.get("loss", LOSSES[0]) not in LOSSES:
             raise checkpoint.CheckpointError(f"{path}: the header names an unknown loss: {training['loss']!r}")
-        recoverer = Recoverer(path, method="network")
-        return cls(name or default_name(path), path, inference.prepare(model), training, found, recoverer)
+        recoverer = Recoverer(path, method="network", consensus=consensus)
+        predictor = inference.prepare(model)
+        return cls(
+            name or default_name(path),
+            path,
+            Consensus(predictor) if consensus else predictor,
+            training,
+            found,
+            recoverer,
+        )
 
     @property
     def loss(self) -> str:
@@ -127,6 +136,8 @@ class Network:
         parts.append(f"views of {self.model.config.pixels} x {self.model.config.pixels}")
         if "step" in self.metrics:
             parts.append(f"{self.metrics['step']} steps in its last training")
+        if isinstance(self.model, Consensus):
+            parts.append("asked in 8 positions of each view")
         if self.training.get("start"):
             parts.append("started from another network")
         if self.loss == "occupancy_rotation":

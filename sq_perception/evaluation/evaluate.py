@@ -84,6 +84,8 @@ def main(arguments: list[str] | None = None) -> int:
     for path, name in zip(paths, unique_names(paths), strict=True):
         try:
             contestants.append((Network.read(path, name), options.bodies))
+            if options.consensus:
+                contestants.append((Network.read(path, f"{name} x 8", consensus=True), options.bodies))
         except CheckpointError as error:
             failures.append(str(error))
     for method in methods:
@@ -118,6 +120,9 @@ def _parser() -> argparse.ArgumentParser:
         description=_DESCRIPTION,
         epilog=_EPILOG,
         formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument(
+        "--consensus", action="store_true", help="each network a second time, asked in 8 positions of each view"
     )
     parser.add_argument(
         "--models", type=Path, nargs="*", metavar="FILE", help="weights to compare (default: all that are shipped)"

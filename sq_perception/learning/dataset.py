@@ -13,6 +13,7 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast, unit_cube
 from sq_perception.imaging.scene import THESIS_SIZE, thesis_bodies
 from sq_perception.imaging.view_rendering import Occluder, render_views
+from sq_perception.learning import dihedral
 from sq_perception.learning.disturbance import Disturbance
 from sq_perception.learning.regressor import Framing
 
@@ -88,29 +89,6 @@ def full_frames(bodies: Superquadric, pixels: int = unit_cube.THESIS_PIXELS) -> 
     return frames
 
 
-def dihedral(
-    images: np.ndarray, bodies: Superquadric, turns: np.ndarray, mirror: np.ndarray
-) -> tuple[np.ndarray, Superquadric]:
-    """Views and bodies (n,) after ``turns`` quarter turns and, where ``mirror``, a reflection of x first.
-
-    A mirrored image is the image of the mirrored body, which is a superquadric again: with M = diag(-1, 1, 1), M R M is
-    a rotation, and the body's own symmetry takes up the second M.  A quarter turn is counter-clockwise in x and y.
-    """
-    images = np.where(mirror[:, None, None], images[:, :, ::-1], images)
-    out = np.empty_like(images)
-    for k in range(4):
-        chosen = turns == k
-        out[chosen] = np.rot90(images[chosen], k, axes=(1, 2))
-    sign = np.where(mirror, -1.0, 1.0)
-    centred = bodies.translation - 0.5
-    centred = np.stack([sign * centred[:, 0], centred[:, 1], centred[:, 2]], axis=-1)
-    rotation = bodies.rotation * np.stack([np.ones_like(sign), sign, sign, np.ones_like(sign)], axis=-1)
-    angle = 0.5 * np.pi * turns
-    turn = np.stack([np.zeros_like(angle), np.zeros_like(angle), np.sin(angle / 2), np.cos(angle / 2)], axis=-1)
-    moved = Superquadric(bodies.size, bodies.shape, centred, rotation).transformed(turn, np.full(3, 0.5))
-    return out, moved
-
-
 class ViewPool:
     """A pool of rendered views from which batches are drawn, each time in another of the 8 dihedral positions.
 
@@ -136,5 +114,6 @@ class ViewPool:
         self._next = int(slots[-1] + 1) % len(self._images)
         chosen = self._rng.integers(len(self._images), size=count)
         turns, mirror = self._rng.integers(4, size=count), self._rng.random(count) < 0.5
-        views, bodies = dihedral(self._images[chosen], Superquadric.from_flat(self._flat[chosen]), turns, mirror)
+        views = dihedral.moved_images(self._images[chosen], turns, mirror)
+        bodies = dihedral.moved_bodies(Superquadric.from_flat(self._flat[chosen]), turns, mirror)
         return self._source.disturbance.worn(views, self._rng), bodies

@@ -46,7 +46,7 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 
 from sq_perception.geometry.superquadric import FLAT_LENGTH, Superquadric
-from sq_perception.learning import dataset
+from sq_perception.learning import dihedral
 from sq_perception.learning.regressor import Framing
 
 FORMAT = "sq_perception.fixed_set"
@@ -87,7 +87,7 @@ class Settings:
     """Bodies in each shard but the last of a split."""
     seed: int = 1
     pinhole_share: float = 0.0
-    """Share of the views that a pinhole camera sees, as in :class:`dataset.ViewSource`."""
+    """Share of the views that a pinhole camera sees, as in :class:`sq_perception.learning.dataset.ViewSource`."""
 
     def __post_init__(self) -> None:
         whole = {
@@ -362,13 +362,13 @@ class FixedSet:
 class ShuffledBatches:
     """Batches of a fixed set, every image once a round, in a new order each round; stands where a ViewPool stands.
 
-    With ``dihedral`` each image comes in a random one of its 8 positions.
+    With ``positions`` each image comes in a random one of its 8 positions (:mod:`sq_perception.learning.dihedral`).
     """
 
-    def __init__(self, fixed_set: FixedSet, rng: np.random.Generator, dihedral: bool = True) -> None:
+    def __init__(self, fixed_set: FixedSet, rng: np.random.Generator, positions: bool = True) -> None:
         if len(fixed_set) == 0:
             raise ValueError("the set is empty: there is nothing to draw batches from")
-        self._set, self._rng, self._dihedral = fixed_set, rng, dihedral
+        self._set, self._rng, self._positions = fixed_set, rng, positions
         self._order = np.empty(0, dtype=np.int64)
 
     def batch(self, count: int) -> tuple[np.ndarray, Superquadric]:
@@ -377,7 +377,7 @@ class ShuffledBatches:
             self._order = np.concatenate([self._order, self._rng.permutation(len(self._set))])
         chosen, self._order = self._order[:count], self._order[count:]
         images, bodies = self._set.batch(chosen)
-        if not self._dihedral:
+        if not self._positions:
             return images, bodies
         turns, mirror = self._rng.integers(4, size=count), self._rng.random(count) < 0.5
-        return dataset.dihedral(images, bodies, turns, mirror)
+        return dihedral.moved_images(images, turns, mirror), dihedral.moved_bodies(bodies, turns, mirror)

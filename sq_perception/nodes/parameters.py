@@ -112,6 +112,9 @@ class RecoverParameters(FrameParameters):
 
     model: str = setting("", "Network weights: a .safetensors file or the name of shipped ones; empty: the default.")
     device: str = setting("cpu", "Where the network runs: cpu, cuda or cuda:N.")
+    consensus: bool = setting(
+        False, "Average the network's answers to 8 positions of each view: better alone, and slower."
+    )
     method: Method = setting(  # noqa: RUF009 - a field
         "auto",
         "Where the fit starts: network, symmetry, or auto (the best of them); classic is Solina and Bajcsy's method.",

@@ -36,7 +36,7 @@ def _recoverer(parameters: RecoverParameters) -> Recoverer:
 
     # On a robot's busy cores the slowest of several threads sets the time; one image is too small to gain from them.
     torch.set_num_threads(1)
-    return Recoverer(parameters.model or None, parameters.device, parameters.method)
+    return Recoverer(parameters.model or None, parameters.device, parameters.method, parameters.consensus)
 
 
 def _options(parameters: RecoverParameters) -> RecoveryOptions:
