@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
@@ -52,6 +53,18 @@ def test_a_seed_names_the_images_whatever_the_noise():
     np.testing.assert_array_equal(first.next(0.0).truth.to_flat(), again.next(0.5).truth.to_flat())
     other = FrameSource(SyntheticParameters(seed=6, hold=1))
     assert not np.array_equal(other.next(0.0).depth, FrameSource(SyntheticParameters(seed=5)).next(0.0).depth)
+
+
+def test_a_sensor_measures_the_scene_it_is_held_at():
+    source = FrameSource(SyntheticParameters(sensor="kinect_v1", hold=2, objects=2))
+    true = FrameSource(SyntheticParameters(hold=2, objects=2)).next(0.0)
+    first, again = (source.next(0.0, "kinect_v1") for _ in range(2))
+    np.testing.assert_array_equal(first.truth.to_flat(), true.truth.to_flat())
+    assert not np.array_equal(first.depth, again.depth, equal_nan=True)
+    assert np.isnan(first.depth).sum() > np.isnan(true.depth).sum()
+    assert 0.5e-3 < np.nanmedian(np.abs(first.depth - true.depth)) < 5e-3
+    with pytest.raises(ValueError, match="sensor: expected one of"):
+        source.next(0.0, "lidar")
 
 
 def test_scenes_end_or_begin_again():
@@ -110,6 +123,9 @@ def test_misuse_is_named(recordings, tmp_path):
         replay(path=str(tmp_path / "empty"))
     with pytest.raises(ParameterError, match="expected 16UC1 or 32FC1"):
         replay(path=str(recordings), encoding="mono8")
+    cv2.imwrite(str(tmp_path / "grey.png"), np.full((16, 16), 90, np.uint8))
+    with pytest.raises(ParameterError, match=r"sensor: expected ideal for grey\.png, got zed"):
+        replay(path=str(tmp_path / "grey.png"), projection="orthographic", sensor="zed")
     (recordings / "0.npz").write_bytes(b"damaged")
     with pytest.raises(FrameError, match=r"0\.npz"):
         replay(path=str(recordings))

@@ -141,6 +141,9 @@ def test_a_refused_change_changes_nothing_and_says_why(make_node, changes, words
         (SyntheticParameters, {"scene": "replay"}, "path"),
         (SyntheticParameters, {"scene": "thesis", "encoding": "32FC1"}, "mono8 or mono16"),
         (SyntheticParameters, {"scene": "table", "encoding": "mono8"}, "16UC1 or 32FC1"),
+        (SyntheticParameters, {"sensor": "lidar"}, "ideal, kinect_v1, azure_kinect, realsense_d435, zed"),
+        (SyntheticParameters, {"scene": "thesis", "sensor": "zed"}, "sensor: expected ideal for scene = thesis"),
+        (SyntheticParameters, {"sensor": "zed", "noise": 0.001}, "noise: expected 0 for sensor = zed"),
         (SyntheticParameters, {"rate": 0}, "rate: expected 0.1 to 200 Hz, got 0"),
     ],
 )

@@ -8,7 +8,7 @@ import pytest
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
-from sq_perception.imaging.scene import Scene, plane_depth, table_scene, thesis_scene, with_noise
+from sq_perception.imaging.scene import Scene, plane_depth, table_scene, thesis_scene
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -70,16 +70,6 @@ def test_a_body_below_the_table_is_not_seen():
     assert not labels.any()
 
 
-def test_noise_has_its_sigma_and_leaves_holes():
-    depth = np.full((200, 200), 1.0, np.float32)
-    depth[:20] = np.nan
-    noisy = with_noise(depth, 0.01, np.random.default_rng(0))
-    assert noisy.dtype == np.float32
-    assert np.isnan(noisy[:20]).all()
-    assert np.std(noisy[20:]) == pytest.approx(0.01, rel=0.02)
-    np.testing.assert_array_equal(with_noise(depth, 0.0, np.random.default_rng(0)), depth)
-
-
 def test_misuse_is_named():
     rng = np.random.default_rng(0)
     with pytest.raises(ValueError, match="1 to 10"):
@@ -88,5 +78,3 @@ def test_misuse_is_named():
         table_scene(rng, 1, unit_cube.camera())
     with pytest.raises(ValueError, match="no room for 3 bodies"):
         table_scene(rng, 3, Camera(64, 48, 2000.0, 2000.0, 31.5, 23.5))
-    with pytest.raises(ValueError, match="sigma"):
-        with_noise(np.ones((2, 2)), float("nan"), rng)

@@ -131,15 +131,6 @@ def plane_depth(plane: np.ndarray, camera: Camera) -> np.ndarray:
     return np.where((slope < 0) & (depth > 0) & (depth < _FARTHEST), depth, np.inf)
 
 
-def with_noise(depth: np.ndarray, sigma: float, rng: np.random.Generator) -> np.ndarray:
-    """Depth float32 with independent Gaussian noise of standard deviation ``sigma`` metres; NaN stays NaN."""
-    if not (np.isfinite(sigma) and sigma >= 0):
-        raise ValueError(f"sigma: expected a finite number of at least 0, got {sigma}")
-    if sigma == 0:
-        return depth.astype(np.float32, copy=False)
-    return depth.astype(np.float32) + np.float32(sigma) * rng.standard_normal(depth.shape, dtype=np.float32)
-
-
 def _resting_body(rng: np.random.Generator, plane: np.ndarray) -> tuple[Superquadric, float]:
     """A random body that touches the plane, and the radius of the ball about its centre that holds it."""
     normal, offset = plane[:3], plane[3]

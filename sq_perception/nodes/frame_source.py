@@ -15,8 +15,9 @@ from sq_perception import recorded_frame
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
-from sq_perception.imaging.scene import table_scene, thesis_scene, with_noise
-from sq_perception.nodes.parameters import ParameterError, SyntheticParameters
+from sq_perception.imaging.scene import table_scene, thesis_scene
+from sq_perception.imaging.sensor_noise import Ideal, preset
+from sq_perception.nodes.parameters import IDEAL, ParameterError, SyntheticParameters
 
 SUFFIXES = (".npz", ".png", ".bmp")
 _SCENES, _NOISE = 1, 2
@@ -71,6 +72,8 @@ class FrameSource:
         if parameters.encoding != "auto" and self.is_cube != (parameters.encoding in ("mono8", "mono16")):
             expected = "mono8 or mono16" if self.is_cube else "16UC1 or 32FC1"
             raise ParameterError(f"encoding: expected {expected} for {self._clean.name}, got {parameters.encoding}")
+        if self.is_cube and parameters.sensor != IDEAL:
+            raise ParameterError(f"sensor: expected {IDEAL} for {self._clean.name}, got {parameters.sensor}")
 
     @property
     def is_cube(self) -> bool:
@@ -82,13 +85,17 @@ class FrameSource:
         """Whether the current image comes with masks."""
         return self._clean.labels is not None
 
-    def next(self, noise: float) -> SourceFrame | None:
-        """The next image with noise (metres, or grey levels of 255 for the unit cube); None after the last one.
+    def next(self, noise: float, sensor: str = IDEAL) -> SourceFrame | None:
+        """The next image as the sensor measures it; None after the last one.
+
+        ``noise`` is that of the ideal sensor, metres, or grey levels of 255 for the unit cube.
 
         Raises
         ------
         FrameError
             If a recording cannot be read; the one after it is next.
+        ValueError
+            If the sensor is unknown or cannot have taken the image, as it is orthographic.
         """
         if self._left == 0:
             self._position += 1
@@ -100,8 +107,8 @@ class FrameSource:
             self._clean = self._make(self._position)
             self._left = self._parameters.hold
         self._left -= 1
-        sigma = noise / 255 if self.is_cube else noise
-        return replace(self._clean, depth=with_noise(self._clean.depth, sigma, self._noise))
+        model = Ideal(noise / 255 if self.is_cube else noise) if sensor == IDEAL else preset(sensor)
+        return replace(self._clean, depth=model.measured(self._clean.depth, self._clean.camera, self._noise))
 
     def _make(self, position: int) -> SourceFrame:
         if self._files:

@@ -20,9 +20,13 @@ from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValu
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from sq_perception.imaging.sensor_noise import PRESETS
+
 Method = Literal["auto", "network", "symmetry", "classic"]
 Refine = Literal["surface", "soft_render", "none"]
 Projection = Literal["pinhole", "orthographic"]
+IDEAL = "ideal"
+"""The sensor with Gaussian noise and nothing else."""
 
 
 class ParameterError(ValueError):
@@ -147,9 +151,16 @@ class SyntheticParameters:
     seed: int = setting(0, "Seed of scenes and noise: the same seed gives the same images.", within=(0, 2**31 - 1))
     noise: float = setting(
         0.0,
-        "Standard deviation of the depth noise: metres, for orthographic frames grey levels of 255.",
+        "Standard deviation of the ideal sensor's depth noise: metres, for orthographic frames grey levels of 255.",
         unit="m or grey levels",
         within=(0.0, 50.0),
+        live=True,
+    )
+    sensor: str = setting(
+        IDEAL,
+        "Depth sensor to imitate: ideal adds noise alone; the others have noise, steps, edges and holes of their own "
+        "(docs/sensors.md).",
+        choices=(IDEAL, *PRESETS),
         live=True,
     )
     hold: int = setting(30, "Frames that a scene or recording stays; the noise is fresh each time.", within=(1, 10**6))
@@ -187,6 +198,10 @@ class SyntheticParameters:
         if self.encoding != "auto" and self.scene != "replay" and grey != (self.scene == "thesis"):
             expected = "mono8 or mono16" if self.scene == "thesis" else "16UC1 or 32FC1"
             raise ParameterError(f"encoding: expected {expected} for scene = {self.scene}, got {self.encoding}")
+        if self.sensor != IDEAL and self.scene == "thesis":
+            raise ParameterError(f"sensor: expected {IDEAL} for scene = thesis, got {self.sensor}")
+        if self.sensor != IDEAL and self.noise != 0:
+            raise ParameterError(f"noise: expected 0 for sensor = {self.sensor}, which has its own, got {self.noise:g}")
 
 
 P = TypeVar("P", bound="FrameParameters | SyntheticParameters")

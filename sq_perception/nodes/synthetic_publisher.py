@@ -62,7 +62,7 @@ class SyntheticDepthNode(StoppableNode):
             self._rate = settings.rate
             self._ticks.timer_period_ns = int(1e9 / self._rate)
         try:
-            frame = self._source.next(settings.noise)
+            frame = self._source.next(settings.noise, settings.sensor)
         except (FrameError, ValueError) as error:
             self.get_logger().warning(f"left out: {error}")
             return
