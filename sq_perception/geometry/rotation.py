@@ -106,6 +106,17 @@ def from_rotation_vector(vector: Array) -> Array:
     return xp.concat([vector * half_sinc, cosine], axis=-1)
 
 
+def to_rotation_vector(quaternion: Array) -> Array:
+    """Rotation vectors (..., 3) of unit quaternions (..., 4): the shorter way, at most pi, smooth through zero."""
+    xp = array_namespace(quaternion)
+    sign = xp.where(quaternion[..., 3:] < 0, -xp.ones_like(quaternion[..., 3:]), xp.ones_like(quaternion[..., 3:]))
+    vector, cosine = sign * quaternion[..., :3], sign * quaternion[..., 3:]
+    square = xp.sum(vector * vector, axis=-1, keepdims=True)
+    small = square < 1e-12
+    sine = xp.sqrt(xp.where(small, xp.ones_like(square), square))
+    return vector * xp.where(small, 2 + square / 3, 2 * xp.atan2(sine, cosine) / sine)
+
+
 def from_six(six: Array) -> Array:
     """Unit quaternions (..., 4) of the 6D form (..., 6), two columns made orthonormal (Zhou et al. 2019)."""
     xp = array_namespace(six)
