@@ -28,7 +28,7 @@ import time
 from collections.abc import Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, get_args
 
@@ -134,6 +134,9 @@ class Recovery:
         The object's value in the label image.
     pixels : int
         Measured pixels of the object.
+    covariance : (11, 11)
+        Of a1 a2 a3 e1 e2 t1 t2 t3 and the rotation vector in the object frame, metres and radians, as in
+        :class:`~sq_perception.fitting.fit.Fit`; NaN for methods that do not compute it.
     """
 
     superquadric: Superquadric
@@ -144,6 +147,7 @@ class Recovery:
     message: str
     label: int
     pixels: int
+    covariance: np.ndarray = field(default_factory=_UNKNOWN.copy)
 
 
 @dataclass(frozen=True, eq=False)
@@ -493,6 +497,7 @@ def _recovery(one: _Object, fit: Fit, score: float) -> Recovery:
         fit.message,
         one.label,
         one.pixels,
+        fit.covariance,
     )
 
 

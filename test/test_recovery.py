@@ -72,6 +72,9 @@ def test_symmetry_recovers_thesis_images(symmetry, seed):
     assert found.bodies[0].status != Status.FAILED
     assert iou(found.bodies[0].superquadric, truth) > 0.97
     assert found.bodies[0].score > 0.93
+    covariance = found.bodies[0].covariance
+    np.testing.assert_array_equal(np.sqrt(np.diag(covariance)[:3]), found.bodies[0].sigma_size)
+    assert np.linalg.eigvalsh(covariance).min() > 0
     assert set(found.milliseconds) == STAGES
     assert found.plane is None
 
