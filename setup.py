@@ -40,6 +40,7 @@ setup(
         "sq_perception.learning",
         "sq_perception.evaluation",
         "sq_perception.nodes",
+        "sq_perception.tracking",
         "sq_perception.config",
         "sq_perception.weights",
         "sq_msgs_py",

@@ -1,0 +1,131 @@
+"""Which observation continues which track.
+
+A pair is possible in place if the bodies overlap: with h the support functions along the line of the centres, whose
+distance is D,
+
+    D / (h_track + h_observed) < 1/2,    or < 1 while the centres agree within their covariances.
+
+Its cost is the negative logarithm of a Student density of the whole difference, in the observation's best form
+(:mod:`sq_perception.tracking.forms`): with Mahalanobis distance d in n = 11 dimensions
+
+    cost = (n + nu) log(1 + d^2 / nu) + log det S,
+
+which ranks like a normal density close by and stays moderate for bodies that moved.  The assignment with most pairs and
+then least cost wins.
+
+What is left over may have been moved by more than its own size.  A body whose sizes and exponents alone agree, within
+the distance that something can travel in the time, is taken for the same: these five errors are compared in the form
+whose sizes fit best, whatever the rotation.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+from scipy.stats import chi2
+
+from sq_perception.tracking import forms, state
+from sq_perception.tracking.state import CENTRE, LENGTH, SIZE_AND_SHAPE
+
+_DEEP = 0.5
+_FREEDOM = 5.0
+_IMPOSSIBLE = 1e6
+
+
+class Pairs(NamedTuple):
+    """k pairs: indices of tracks and observations, and the observations in the tracks' forms."""
+
+    track: np.ndarray
+    observed: np.ndarray
+    state: np.ndarray
+    covariance: np.ndarray
+
+    @classmethod
+    def none(cls) -> Pairs:
+        nothing = np.zeros(0, dtype=int)
+        return cls(nothing, nothing, np.zeros((0, 12)), np.zeros((0, LENGTH, LENGTH)))
+
+    def __add__(self, other: Pairs) -> Pairs:  # type: ignore[override]
+        return Pairs(*(np.concatenate(both) for both in zip(self, other, strict=True)))
+
+
+def in_place(
+    track: np.ndarray,
+    track_covariance: np.ndarray,
+    observed: np.ndarray,
+    covariance: np.ndarray,
+    exchange: float,
+    gate: float,
+) -> Pairs:
+    """Pairs of n tracks (n, 12) and m observations (m, 12) that overlap; ``gate`` is a probability.
+
+    Covariances are (n, 11, 11) and (m, 11, 11); what observations have in addition to theirs, such as a least error,
+    is part of the tracks'.
+    """
+    if not len(track) or not len(observed):
+        return Pairs.none()
+    between = observed[None, :, 5:8] - track[:, None, 5:8]
+    distance = np.linalg.norm(between, axis=-1)
+    line = between / np.maximum(distance, 1e-12)[..., None]
+    extent = state.bodies(track).support(line) + state.bodies(observed).support(line.swapaxes(0, 1)).T
+    apart = distance / np.maximum(extent, 1e-12)
+    centres = track_covariance[:, None, CENTRE, CENTRE] + covariance[None, :, CENTRE, CENTRE]
+    agree = state.mahalanobis(centres, between) < chi2.ppf(gate, 3)
+    i, j = np.nonzero((apart < _DEEP) | ((apart < 1) & agree))
+    if not len(i):
+        return Pairs.none()
+    match = forms.nearest(track[i], track_covariance[i], observed[j], covariance[j], exchange)
+    total = track_covariance[i] + match.covariance
+    cost = _student(total, state.difference(track[i], match.state))
+    return _assigned(Pairs(i, j, match.state, match.covariance), cost, (len(track), len(observed)))
+
+
+def elsewhere(
+    track: np.ndarray,
+    track_covariance: np.ndarray,
+    reach: np.ndarray,
+    observed: np.ndarray,
+    covariance: np.ndarray,
+    exchange: float,
+    gate: float,
+) -> Pairs:
+    """Pairs that agree in sizes and exponents, with centres within ``reach`` (n,) metres."""
+    if not len(track) or not len(observed):
+        return Pairs.none()
+    distance = np.linalg.norm(observed[None, :, 5:8] - track[:, None, 5:8], axis=-1)
+    i, j = np.nonzero(distance < reach[:, None])
+    if not len(i):
+        return Pairs.none()
+    free = _unplaced(track_covariance[i], distance[i, j])
+    match = forms.nearest(track[i], free, observed[j], covariance[j], exchange)
+    total = (track_covariance[i] + match.covariance)[:, SIZE_AND_SHAPE, SIZE_AND_SHAPE]
+    error = state.difference(track[i], match.state)[:, SIZE_AND_SHAPE]
+    alike = state.mahalanobis(total, error) < chi2.ppf(gate, 5)
+    pairs = Pairs(i[alike], j[alike], match.state[alike], match.covariance[alike])
+    cost = _student(total[alike], error[alike]) + (distance[i, j] / reach[i])[alike]
+    return _assigned(pairs, cost, (len(track), len(observed)))
+
+
+def _unplaced(covariance: np.ndarray, distance: np.ndarray) -> np.ndarray:
+    """Covariances (k, 11, 11) that know sizes and exponents only."""
+    free = covariance.copy()
+    free[:, range(5, 8), range(5, 8)] += 1 + distance[:, None] ** 2
+    free[:, range(8, 11), range(8, 11)] += 10.0
+    return free
+
+
+def _student(covariance: np.ndarray, error: np.ndarray) -> np.ndarray:
+    square = state.mahalanobis(covariance, error)
+    return (error.shape[-1] + _FREEDOM) * np.log1p(square / _FREEDOM) + np.linalg.slogdet(covariance)[1]
+
+
+def _assigned(pairs: Pairs, cost: np.ndarray, shape: tuple[int, int]) -> Pairs:
+    table = np.full(shape, _IMPOSSIBLE)
+    table[pairs.track, pairs.observed] = cost
+    rows, columns = linear_sum_assignment(table)
+    kept = np.zeros(shape, dtype=bool)
+    kept[rows, columns] = True
+    chosen = kept[pairs.track, pairs.observed]
+    return Pairs(*(part[chosen] for part in pairs))

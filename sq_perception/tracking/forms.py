@@ -1,0 +1,123 @@
+"""Which of the parameter vectors of one body continues a track.
+
+The 24 turns T of a cube onto itself rename the axes of a body: R -> R T, sizes change places, a rotation vector w of
+the body's frame becomes T^T w.  The 8 that leave z on its line describe the same body (its equivalent forms).  The
+other 16 exchange z with x or y.  They describe the same body only where e1 = e2, and nearly so where both are alike:
+of the three principal cross sections of a body xy is rounded by e2, yz and zx by e1.  After the exchange of z with x
+the section yz has become xy, and the two others have to share one exponent, so that
+
+    e2' = e1,    e1' = (e1 + e2) / 2,
+
+wrong by (e1 - e2) / 2 in each of the two.  A box whose roundings differ by less than the noise is therefore fitted
+now with this axis as z and now with that one.  Such an exchange is undone where |e1 - e2| is below a limit, with the
+variances
+
+    (e1 - e2)^2 on the exponents,    (0.1 (e1 - e2))^2 on the logarithms of the sizes
+
+added to what was observed.  Candidates are compared by their likelihood, d^2 + log det S, so that an exchange has to
+earn its wider covariance.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from sq_perception.geometry import rotation as quaternions
+from sq_perception.tracking import state
+from sq_perception.tracking.state import LENGTH, SHAPE, SIZE, TURN
+
+_SHORTLIST = 4
+"""Forms compared with their whole covariances; the others are farther off already by their variances."""
+_SIZE_PER_SHAPE = 0.1
+
+
+def _turns() -> np.ndarray:
+    """The 24 rotation matrices with entries 0 and +-1, the 8 that leave z on its line first."""
+    found = []
+    for order in ((0, 1, 2), (1, 0, 2), (0, 2, 1), (2, 1, 0), (1, 2, 0), (2, 0, 1)):
+        for signs in np.ndindex(2, 2, 2):
+            turn = np.eye(3)[:, list(order)] * (1 - 2 * np.array(signs))
+            if np.linalg.det(turn) > 0:
+                found.append(turn)
+    return np.array(found)
+
+
+TURNS = _turns()
+EXACT = 8
+_QUATERNIONS = quaternions.from_matrix(TURNS)
+
+
+def _changes() -> np.ndarray:
+    changes = np.zeros((len(TURNS), LENGTH, LENGTH))
+    changes[:, range(3, 8), range(3, 8)] = 1
+    changes[:, SIZE, SIZE] = np.abs(TURNS).transpose(0, 2, 1)
+    changes[:, TURN, TURN] = TURNS.transpose(0, 2, 1)
+    changes[EXACT:, SHAPE, SHAPE] = [[0.5, 0.5], [1.0, 0.0]]
+    return changes
+
+
+_CHANGES = _changes()
+
+
+class Match(NamedTuple):
+    """Observations in the forms nearest to their tracks; ``cost`` is d^2 + log det S, lower is better."""
+
+    state: np.ndarray
+    covariance: np.ndarray
+    cost: np.ndarray
+
+
+def candidates(observed: np.ndarray) -> np.ndarray:
+    """All 24 forms (..., 24, 12) of states (..., 12)."""
+    shape = np.broadcast_to(observed[..., None, 3:5], (*observed.shape[:-1], len(TURNS), 2))
+    return np.concatenate(
+        [
+            np.einsum("kij,...j->...ki", _CHANGES[:, SIZE, SIZE], observed[..., 0:3]),
+            np.einsum("kij,...kj->...ki", _CHANGES[:, SHAPE, SHAPE], shape),
+            np.broadcast_to(observed[..., None, 5:8], (*shape.shape[:-1], 3)),
+            quaternions.multiply(observed[..., None, 8:12], _QUATERNIONS),
+        ],
+        axis=-1,
+    )
+
+
+def nearest(
+    track: np.ndarray, track_covariance: np.ndarray, observed: np.ndarray, covariance: np.ndarray, exchange: float
+) -> Match:
+    """Each of n observations in the form that continues its track.
+
+    Parameters
+    ----------
+    track, observed : (n, 12)
+    track_covariance, covariance : (n, 11, 11)
+        In logarithms of sizes, world frame.
+    exchange
+        Largest |e1 - e2| for which z may change places with x or y.
+    """
+    count = len(track)
+    forms = candidates(observed)
+    errors = state.difference(track[:, None], forms)
+    unlike = np.abs(observed[:, 3] - observed[:, 4])
+    added = np.zeros((count, LENGTH))
+    added[:, SIZE] = (_SIZE_PER_SHAPE * unlike[:, None]) ** 2
+    added[:, SHAPE] = unlike[:, None] ** 2
+
+    own = np.einsum("nii->ni", covariance)
+    variances = np.einsum("kij,nj->nki", _CHANGES**2, own) + np.einsum("nii->ni", track_covariance)[:, None]
+    variances[:, EXACT:] += added[:, None]
+    rough = (errors**2 / variances + np.log(variances)).sum(axis=-1)
+    rough[:, EXACT:][unlike > exchange] = np.inf
+
+    some = np.argpartition(rough, _SHORTLIST - 1, axis=1)[:, :_SHORTLIST]
+    row = np.arange(count)[:, None]
+    changes = _CHANGES[some]
+    changed = changes @ covariance[:, None] @ changes.swapaxes(-1, -2)
+    changed[..., range(LENGTH), range(LENGTH)] += np.where(some[..., None] >= EXACT, added[:, None], 0)
+    total = changed + track_covariance[:, None]
+    cost = state.mahalanobis(total, errors[row, some]) + np.linalg.slogdet(total)[1]
+    cost = np.where(np.isfinite(rough[row, some]), cost, np.inf)
+    best = np.argmin(cost, axis=1)
+    one = np.arange(count)
+    return Match(forms[one, some[one, best]], changed[one, best], cost[one, best])

@@ -1,0 +1,149 @@
+"""Fusing what was observed of one body, without counting the same error twice.
+
+Equations
+---------
+An observation z of the state x with covariance R, seen from the direction c in the body's frame, has two errors,
+
+    z = x + b_c + v,    cov b_c = B = rho R + F,    cov v = W = (1 - rho) R.
+
+v is new in every frame.  b_c is common to all views from within an angle of c: it is what a still camera sees wrongly
+again and again, an outline, a wrong hidden side, an object that is no superquadric, a camera that is not quite
+calibrated.  F is its least size.  b_c is considered and not estimated (Schmidt 1966): along with the covariance P of
+the error x^ - x of the estimate its correlation C_c = cov(x^ - x, b_c) with each view is kept, and
+
+    S = P - C_c - C_c^T + B + W,    K = (P - C_c) S^-1,    x^ <- x^ + K (z - x^),
+    P <- (I-K) P (I-K)^T + (I-K) C_c K^T + K C_c^T (I-K)^T + K (B + W) K^T,
+    C_j <- (I-K) C_j + K B [j = c].
+
+Equal views are averaged with equal weights and P falls to B, not to zero; views from elsewhere count as new.  With rho
+= 0 and F = 0 it is the Kalman filter of a constant.
+
+A view beyond the kept number takes the place of the one used longest ago: P keeps its error, only that a later look
+from there counts as new.
+
+Reference: S. F. Schmidt, Application of State-Space Methods to Navigation Problems, Adv. in Control Systems 3, 1966.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sq_perception.geometry import rotation as quaternions
+from sq_perception.tracking import state
+from sq_perception.tracking.state import LENGTH, TURN
+
+_TOLD = 0.2
+"""Radians: a turn about an axis whose standard deviation is larger is not told by an observation."""
+
+
+@dataclass
+class Views:
+    """The directions that bodies were seen from; batch dimensions first, then one entry per kept view.
+
+    Attributes
+    ----------
+    direction : (..., m, 3)
+        Unit vector from the body to the camera, body frame; zero for an entry not used yet.
+    bias : (..., m, 11, 11)
+        B of each view.
+    correlation : (..., m, 11, 11)
+        C of each view.
+    used : (..., m)
+        Number of the observation that used it last; -1 never.
+    """
+
+    direction: np.ndarray
+    bias: np.ndarray
+    correlation: np.ndarray
+    used: np.ndarray
+
+    @classmethod
+    def none(cls, kept: int) -> Views:
+        """No view yet, room for some."""
+        square = np.zeros((kept, LENGTH, LENGTH))
+        return cls(np.zeros((kept, 3)), square, square.copy(), np.full(kept, -1))
+
+    @classmethod
+    def stack(cls, several: list[Views]) -> Views:
+        """A batch (n, ...)."""
+        return cls(
+            np.stack([one.direction for one in several]),
+            np.stack([one.bias for one in several]),
+            np.stack([one.correlation for one in several]),
+            np.stack([one.used for one in several]),
+        )
+
+    def __getitem__(self, index: int) -> Views:
+        return Views(self.direction[index], self.bias[index], self.correlation[index], self.used[index])
+
+
+def fused(
+    track: np.ndarray,
+    covariance: np.ndarray,
+    views: Views,
+    observed: np.ndarray,
+    white: np.ndarray,
+    common: np.ndarray,
+    direction: np.ndarray,
+    angle: float,
+    turning: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, Views]:
+    """n tracks after one observation each.
+
+    Parameters
+    ----------
+    track, observed : (n, 12)
+        States in the world frame, in the same form.
+    covariance : (n, 11, 11)
+        P.
+    views : Views
+        A batch (n,); changed in place and returned.
+    white, common : (n, 11, 11)
+        W, and B for a view from a new direction.
+    direction : (n, 3)
+        Unit vector from the body to the camera, world frame.
+    angle
+        Views closer than this, radians, share their systematic error.
+    turning : (n,) bool
+        Bodies that have turned themselves.  What rotates a resting body's estimate is a correction, and what it was
+        seen from stays where it is in the world; a turned body shows another side.
+    """
+    count = len(track)
+    seen_as = track[:, 8:12]
+    if turning.any():
+        turn = state.difference(track, observed)[:, TURN]
+        told = np.einsum("nii->ni", white + common)[:, TURN] < _TOLD**2
+        turn = np.where(told & turning[:, None], turn, 0.0)
+        seen_as = quaternions.multiply(seen_as, quaternions.from_rotation_vector(turn))
+    local = np.einsum("nji,nj->ni", quaternions.to_matrix(seen_as), direction)
+
+    row = np.arange(count)
+    likeness = np.einsum("nmi,ni->nm", views.direction, local)
+    place = np.argmax(likeness, axis=1)
+    fresh = likeness[row, place] < np.cos(angle)
+    place = np.where(fresh, np.argmin(views.used, axis=1), place)
+    views.direction[row[fresh], place[fresh]] = local[fresh]
+    views.bias[row[fresh], place[fresh]] = common[fresh]
+    views.correlation[row[fresh], place[fresh]] = 0.0
+    views.used[row, place] = views.used.max(axis=1) + 1
+
+    bias, correlation = views.bias[row, place], views.correlation[row, place]
+    noise = bias + white
+    total = covariance - correlation - correlation.swapaxes(1, 2) + noise
+    gain = np.linalg.solve(total, (covariance - correlation).swapaxes(1, 2)).swapaxes(1, 2)
+    step = np.einsum("nij,nj->ni", gain, state.difference(track, observed))
+
+    kept = np.eye(LENGTH) - gain
+    cross = kept @ correlation @ gain.swapaxes(1, 2)
+    after = kept @ covariance @ kept.swapaxes(1, 2) + cross + cross.swapaxes(1, 2) + gain @ noise @ gain.swapaxes(1, 2)
+    views.correlation[:] = kept[:, None] @ views.correlation
+    views.correlation[row, place] += gain @ bias
+
+    correction = step[:, TURN]
+    if turning.any():
+        correction = np.where(told & turning[:, None], 0.0, correction)
+    back = quaternions.to_matrix(quaternions.from_rotation_vector(correction))
+    views.direction[:] = views.direction @ back
+    return state.moved(track, step), 0.5 * (after + after.swapaxes(1, 2)), views

@@ -1,0 +1,55 @@
+"""Whether an observation agrees with its track, and in what it does not.
+
+With the error e = z - x^, its covariance S and the gate's probability p, an observation agrees if
+
+    e^T S^-1 e < chi2_11(p)
+
+and neither its centre nor its rotation alone is outside of chi2_3(p).  A centre or a rotation that is, by more than
+errors of no importance, has strayed.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.stats import chi2
+
+from sq_perception.tracking import state
+from sq_perception.tracking.state import CENTRE, LENGTH, SIZE_AND_SHAPE, TURN
+
+STILL_SHARE = 0.05
+"""Displacements below this share of the mean half size, and turns below so many radians, are no motion."""
+
+
+class Judgement(NamedTuple):
+    """Of n observations, all (n,).
+
+    ``agrees``, ``fits`` (sizes and exponents agree), ``slid``, ``turned``: bool.  ``excess``: e^T S^-1 e over its
+    limit, at least 1.
+    """
+
+    agrees: np.ndarray
+    fits: np.ndarray
+    slid: np.ndarray
+    turned: np.ndarray
+    excess: np.ndarray
+
+
+def judged(size: np.ndarray, total: np.ndarray, error: np.ndarray, gate: float) -> Judgement:
+    """Judge errors (n, 11) with covariances (n, 11, 11) of bodies with half sizes (n, 3)."""
+    limit, limit_five, limit_three = chi2.ppf(gate, [LENGTH, 5, 3])
+
+    def outside(part: slice, bound: float) -> np.ndarray:
+        return state.mahalanobis(total[:, part, part], error[:, part]) > bound
+
+    slid = outside(CENTRE, limit_three) & (np.linalg.norm(error[:, CENTRE], axis=-1) > STILL_SHARE * size.mean(axis=-1))
+    turned = outside(TURN, limit_three) & (np.linalg.norm(error[:, TURN], axis=-1) > STILL_SHARE)
+    excess = state.mahalanobis(total, error) / limit
+    agrees = (excess <= 1) & ~slid & ~turned
+    return Judgement(agrees, ~outside(SIZE_AND_SHAPE, limit_five), slid, turned, np.maximum(excess, 1))
+
+
+def same_side(before: np.ndarray, now: np.ndarray) -> bool:
+    """Whether two vectors are less than 60 degrees apart; zero is apart from everything."""
+    return bool(before @ now > 0.5 * np.linalg.norm(before) * np.linalg.norm(now))

@@ -1,0 +1,371 @@
+"""Bodies followed from frame to frame.
+
+Observations come in the optical frame, with the pose of the camera in the world where it moves; tracks live in the
+world frame.  A frame is dealt with in this order:
+
+1. Tracks are predicted: at rest with a slow drift, or with their velocity where they were seen to move.
+2. Observations are assigned (:mod:`~sq_perception.tracking.association`) in the form that continues the track
+   (:mod:`~sq_perception.tracking.forms`).
+3. An observation that agrees with its track is fused (:mod:`~sq_perception.tracking.fusion`).  One that does not agree
+   counts little; where several in a row disagree in the pose alone, the body has moved: its pose starts again, its
+   sizes and exponents are kept.  Where they disagree otherwise, the track is doubted too and learns anew.
+4. Observations without a track start one; ids are never used again.
+5. A track without observation is kept while it is hidden (:mod:`~sq_perception.tracking.sight`), and dies after a
+   number of frames in which it should have been seen.
+
+Metres, radians, seconds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sq_perception.geometry import rotation as quaternions
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging.camera import Camera
+from sq_perception.tracking import association, fusion, judgement, sight, state
+from sq_perception.tracking.association import Pairs
+from sq_perception.tracking.fusion import Views
+from sq_perception.tracking.judgement import STILL_SHARE
+from sq_perception.tracking.options import TrackerOptions
+from sq_perception.tracking.state import CENTRE, LENGTH, POSE, TURN, Observed
+from sq_perception.tracking.track import Track, TrackState
+
+__all__ = ["Track", "TrackState", "Tracker", "TrackerOptions"]
+
+_EXPECTED_SHARE = 0.5
+_RESTART = 3.0
+"""A restarted pose is unsure by this many times the displacement."""
+_MOTION_SHARE = 0.5
+"""Standard deviation of a predicted motion, as a share of it."""
+_MOVING_TURN = 0.3
+_COASTING = 1.0
+"""Seconds: so long an unseen body is taken to go on as it was seen to move."""
+_UNPLACED = 1.0
+
+
+@dataclass(eq=False)
+class _Body:
+    """What is kept of one track; state and covariance are those of :mod:`sq_perception.tracking.state`."""
+
+    id: int
+    state: np.ndarray
+    covariance: np.ndarray
+    views: Views
+    born: float
+    last: float
+    agreed: float
+    """Stamp of the last observation that the centre follows."""
+    velocity: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    seen: int = 1
+    disagreed: int = 0
+    strayed: np.ndarray = field(default_factory=lambda: np.zeros(LENGTH))
+    """The last observation's error if it disagreed."""
+    jumps: int = 0
+    """Observations in a row that were found elsewhere."""
+    missed: int = 0
+    observation: int | None = None
+
+    @property
+    def is_moving(self) -> bool:
+        return bool(self.velocity.any())
+
+
+class Tracker:
+    """Follows bodies; one call of :meth:`update` for each frame.
+
+    Parameters
+    ----------
+    options : TrackerOptions, optional
+    """
+
+    def __init__(self, options: TrackerOptions | None = None) -> None:
+        self._options = options or TrackerOptions()
+        self._bodies: list[_Body] = []
+        self._stamp: float | None = None
+        self._next_id = 1
+
+    def reset(self) -> None:
+        """Forget every body; ids go on."""
+        self._bodies, self._stamp = [], None
+
+    def update(
+        self,
+        recoveries: Sequence[Observed],
+        stamp: float,
+        camera_pose: object = None,
+        *,
+        camera: Camera | None = None,
+        depth: np.ndarray | None = None,
+        expected_visible: Callable[[Track], bool] | None = None,
+    ) -> tuple[Track, ...]:
+        """The tracks after another frame, oldest first.
+
+        Parameters
+        ----------
+        recoveries
+            Bodies of the frame in the optical frame, without failed ones:
+            :attr:`~sq_perception.recovery.FrameRecovery.recovered`.
+        stamp
+            Seconds; a stamp before the last one resets the tracker.
+        camera_pose
+            Camera in the world: 4 x 4, or (quaternion x y z w, translation).  None: the camera is the world.
+        camera : Camera, optional
+            With it, bodies outside of the image or behind other ones do not count as missed.
+        depth : float (height, width), optional
+            The frame's depth image, metres, NaN invalid.  With it, and the camera, only bodies that the image sees
+            through count as missed.
+        expected_visible
+            Asked instead, for each track without observation: should it have been seen?
+
+        Raises
+        ------
+        ValueError
+            For a stamp that is not finite, a pose that is no rigid motion, a covariance of another shape than (11, 11),
+            a depth image without camera or of another size.
+        """
+        if not np.isfinite(stamp):
+            raise ValueError(f"stamp: expected a finite number of seconds, got {stamp}")
+        if depth is not None:
+            if camera is None:
+                raise ValueError("depth: expected its camera along with it")
+            camera.check_image(depth)
+        rotation, position = state.as_pose(camera_pose)
+        orthographic = camera is not None and not camera.is_pinhole
+        observed, covariance = self._in_world(recoveries, rotation, position)
+
+        if self._stamp is not None and stamp < self._stamp:
+            self.reset()
+        self._predict(stamp)
+        self._stamp = stamp
+
+        expected = _Expectation(camera, rotation, position, depth, expected_visible, observed)
+        pairs, missing = self._pairs(observed, covariance, stamp, expected)
+        to_camera = _towards(observed[:, 5:8], rotation, position, orthographic)
+        self._fuse(pairs, to_camera, stamp)
+        taken = set(pairs.observed.tolist())
+        for j in range(len(observed)):
+            if j not in taken:
+                self._begin(j, observed[j], covariance[j], to_camera[j], stamp)
+        self._miss(missing, stamp)
+        return tuple(_published(one, self._options) for one in self._bodies if one.seen >= self._options.publish_after)
+
+    def _in_world(
+        self, recoveries: Sequence[Observed], rotation: np.ndarray, position: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """States (m, 12) and covariances (m, 11, 11) of what was observed."""
+        if not len(recoveries):
+            return np.zeros((0, 12)), np.zeros((0, LENGTH, LENGTH))
+        for one in recoveries:
+            if not isinstance(one.superquadric, Superquadric) or one.superquadric.batch_shape:
+                raise ValueError("recoveries: expected a single body in each")
+            if np.shape(one.covariance) != (LENGTH, LENGTH):
+                raise ValueError(f"covariance: expected shape (11, 11), got {np.shape(one.covariance)}")
+        flat = np.array([one.superquadric.to_flat() for one in recoveries], dtype=float)
+        covariance = state.to_log(np.array([one.covariance for one in recoveries], dtype=float), flat[:, 0:3])
+        unknown = ~np.isfinite(covariance).all(axis=(1, 2))
+        if unknown.any():
+            o = self._options
+            for k in np.flatnonzero(unknown):
+                centre = o.unknown_centre * float(flat[k, 0:3].mean())
+                covariance[k] = state.diagonal(o.unknown_log_size, o.unknown_shape, centre, o.unknown_turn)
+        matrix = quaternions.to_matrix(rotation)
+        flat[:, 5:8] = flat[:, 5:8] @ matrix.T + position
+        flat[:, 8:12] = quaternions.multiply(rotation, flat[:, 8:12])
+        return flat, state.turned(covariance, matrix)
+
+    def _predict(self, stamp: float) -> None:
+        o = self._options
+        elapsed = 0.0 if self._stamp is None else stamp - self._stamp
+        for one in self._bodies:
+            variance = np.zeros(LENGTH)
+            variance[CENTRE] = o.drift_centre**2 * elapsed
+            variance[TURN] = o.drift_turn**2 * elapsed
+            if stamp - one.last > _COASTING:
+                one.velocity = np.zeros(3)
+            if one.is_moving:
+                step = one.velocity * elapsed
+                one.state = one.state.copy()
+                one.state[5:8] += step
+                variance[CENTRE] += _MOTION_SHARE**2 * (step @ step)
+                variance[TURN] += _MOVING_TURN**2 * min(elapsed, 1.0)
+            if stamp - one.last > o.forget_pose_after:
+                variance[POSE] += _UNPLACED**2
+            one.covariance = one.covariance + np.diag(variance)
+            one.observation = None
+
+    def _pairs(
+        self, observed: np.ndarray, covariance: np.ndarray, stamp: float, expectation: _Expectation
+    ) -> tuple[Pairs, set[int]]:
+        """In place first, then what was moved; and the ids of tracks that should have been in place and were not."""
+        o = self._options
+        if not self._bodies:
+            return Pairs.none(), set()
+        states, covariances = self._stacked(self._bodies)
+        covariances = covariances + o.least()
+        here = association.in_place(states, covariances, observed, covariance, o.exchange, o.gate)
+        left = np.setdiff1d(np.arange(len(states)), here.track)
+        new = np.setdiff1d(np.arange(len(observed)), here.observed)
+        open_place = expectation.of([self._bodies[k] for k in left], o)
+        missing = {self._bodies[k].id for k, visible in zip(left, open_place, strict=True) if visible}
+        # What is hidden has rather stayed where it was than become one more body of its kind far away.
+        free = np.array([visible or self._bodies[k].is_moving for k, visible in zip(left, open_place, strict=True)])
+        reach = o.fastest * np.array([stamp - self._bodies[k].last for k in left])
+        reach = np.where(free, reach, np.minimum(reach, 2 * states[left, 0:3].max(axis=1)))
+        there = association.elsewhere(
+            states[left], covariances[left], reach, observed[new], covariance[new], o.exchange, o.gate
+        )
+        there = there._replace(track=left[there.track], observed=new[there.observed])
+        for k in here.track:
+            self._bodies[k].jumps = 0
+        for k in there.track:
+            # Its sizes and exponents were found elsewhere: nothing more has to be waited for.
+            self._bodies[k].jumps += 1
+            self._bodies[k].disagreed = max(self._bodies[k].disagreed, o.patience)
+        return here + there, missing
+
+    def _fuse(self, pairs: Pairs, to_camera: np.ndarray, stamp: float) -> None:
+        if not len(pairs.track):
+            return
+        o = self._options
+        some = [self._bodies[k] for k in pairs.track]
+        states, covariances = self._stacked(some)
+        common, white = o.common_share * pairs.covariance + o.least(), (1 - o.common_share) * pairs.covariance
+        whole = common + white
+        total, error = covariances + whole, state.difference(states, pairs.state)
+        verdict = judgement.judged(states[:, 0:3], total, error, o.gate)
+        turning = np.zeros(len(some), dtype=bool)
+        for k, one in enumerate(some):
+            agrees, slid, turned = verdict.agrees[k], verdict.slid[k], verdict.turned[k]
+            one.disagreed = 0 if agrees else one.disagreed + 1
+            impatient = one.disagreed > 0 and (one.is_moving or one.disagreed >= o.patience)
+            if not one.is_moving and one.jumps == 0:
+                # What moves strays to the same side again; errors larger than they are said to be do so seldom.
+                slid = slid and judgement.same_side(one.strayed[CENTRE], error[k, CENTRE])
+                turned = turned and judgement.same_side(one.strayed[TURN], error[k, TURN])
+            one.strayed = np.zeros(LENGTH) if agrees else error[k]
+            if impatient and verdict.fits[k] and (slid or turned):
+                turning[k] = turned
+                variance = np.zeros(LENGTH)
+                variance[CENTRE] = (_RESTART * np.linalg.norm(error[k, CENTRE])) ** 2 if slid else 0.0
+                variance[TURN] = (_RESTART * np.linalg.norm(error[k, TURN])) ** 2 if turned else 0.0
+                covariances[k] += np.diag(variance)
+            else:
+                # One stray observation is doubted itself; of several in a row, both sides are.
+                white[k] += (verdict.excess[k] - 1) * whole[k]
+                if one.disagreed >= o.patience:
+                    covariances[k] *= verdict.excess[k]
+            self._follow(one, error[k, CENTRE], slid and impatient, stamp, total[k, CENTRE, CENTRE])
+            if agrees or impatient:
+                one.agreed = stamp
+
+        after, covariances, views = fusion.fused(
+            states,
+            covariances,
+            Views.stack([one.views for one in some]),
+            pairs.state,
+            white,
+            common,
+            to_camera[pairs.observed],
+            o.view_angle,
+            turning,
+        )
+        for k, one in enumerate(some):
+            one.state, one.covariance, one.views = after[k], covariances[k], views[k]
+            one.seen, one.missed, one.last = one.seen + 1, 0, stamp
+            one.observation = int(pairs.observed[k])
+
+    def _follow(self, one: _Body, error: np.ndarray, slid: bool, stamp: float, covariance: np.ndarray) -> None:
+        """The velocity after an observation of the centre, ``error`` (3,) off its prediction."""
+        elapsed = stamp - one.agreed
+        if elapsed <= 0:
+            return
+        if one.is_moving:
+            velocity = one.velocity + 0.5 * error / elapsed
+            noise = float(np.sqrt(np.trace(covariance)))
+            still = max(STILL_SHARE * float(one.state[0:3].mean()), 0.5 * noise)
+            one.velocity = velocity if np.linalg.norm(velocity) * elapsed > still else np.zeros(3)
+        elif slid and one.jumps != 1:
+            velocity = error / elapsed
+            one.velocity = velocity * min(1.0, self._options.fastest / float(np.linalg.norm(velocity)))
+
+    def _begin(self, index: int, observed: np.ndarray, covariance: np.ndarray, view: np.ndarray, stamp: float) -> None:
+        o = self._options
+        whole, views = covariance + o.least(), Views.none(o.views)
+        views.direction[0] = quaternions.to_matrix(observed[8:12]).T @ view
+        views.bias[0] = views.correlation[0] = o.common_share * covariance + o.least()
+        views.used[0] = 0
+        born = _Body(self._next_id, observed, whole, views, stamp, stamp, stamp, observation=index)
+        self._next_id += 1
+        self._bodies.append(born)
+
+    def _miss(self, missing: set[int], stamp: float) -> None:
+        """Count misses of what should have been seen, and bury the dead."""
+        o = self._options
+        dead = set()
+        for one in self._bodies:
+            if one.observation is not None:
+                continue
+            one.missed = one.missed + 1 if one.id in missing else 0
+            patience = o.misses if one.seen >= o.confirm_after else min(2, o.misses)
+            if one.missed >= patience or stamp - one.last > o.forget_after:
+                dead.add(one.id)
+        self._bodies = [one for one in self._bodies if one.id not in dead]
+
+    @staticmethod
+    def _stacked(some: list[_Body]) -> tuple[np.ndarray, np.ndarray]:
+        return np.array([one.state for one in some]), np.array([one.covariance for one in some])
+
+
+@dataclass(frozen=True, eq=False)
+class _Expectation:
+    """Whether tracks without observation should have been seen, by what is known of the frame."""
+
+    camera: Camera | None
+    rotation: np.ndarray
+    position: np.ndarray
+    depth: np.ndarray | None
+    asked: Callable[[Track], bool] | None
+    observed: np.ndarray
+
+    def of(self, unseen: list[_Body], options: TrackerOptions) -> list[bool]:
+        if not unseen:
+            return []
+        if self.asked is not None:
+            return [bool(self.asked(_published(one, options))) for one in unseen]
+        if self.camera is None:
+            return [True] * len(unseen)
+        back = quaternions.conjugate(self.rotation)
+        home = -quaternions.to_matrix(back) @ self.position
+        places = state.bodies(np.array([one.state for one in unseen])).transformed(back, home)
+        others = state.bodies(self.observed).transformed(back, home)
+        share = sight.open_share(places, self.camera, self.depth, others)
+        return [bool(visible) for visible in share >= _EXPECTED_SHARE]
+
+
+def _published(one: _Body, options: TrackerOptions) -> Track:
+    covariance = state.from_log(one.covariance, one.state[0:3])
+    known = TrackState.CONFIRMED if one.seen >= options.confirm_after else TrackState.TENTATIVE
+    return Track(
+        id=one.id,
+        superquadric=Superquadric.from_flat(one.state.copy()),
+        sigma_size=np.sqrt(np.diag(covariance)[0:3]),
+        covariance=covariance,
+        velocity=one.velocity.copy(),
+        age=one.last - one.born,
+        seen=one.seen,
+        last_stamp=one.last,
+        state=known if one.observation is not None else TrackState.LOST,
+        observation=one.observation,
+    )
+
+
+def _towards(centres: np.ndarray, rotation: np.ndarray, position: np.ndarray, orthographic: bool) -> np.ndarray:
+    """Unit vectors (m, 3) from centres (m, 3) to the camera; an orthographic one looks along its z from everywhere."""
+    if orthographic:
+        return np.broadcast_to(-quaternions.to_matrix(rotation)[:, 2], centres.shape)
+    way = position - centres
+    return way / np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-12)
