@@ -477,10 +477,12 @@ def _scene(observation: Observation, options: Options) -> Scene:
     )
     if options.plane is None:
         return scene
+    if options.tolerated > 0:
+        # Points behind the surface are what a hull leaves over.  Of an exact superquadric they are noise like those
+        # before it, and weighing them less would pull the body towards the camera by half of that noise.
+        scene = scene._replace(huber=OUTER_HUBER, inner_cauchy=INNER_CAUCHY)
     x, y, z, offset = (float(value) for value in options.plane)
     return scene._replace(
-        huber=OUTER_HUBER,
-        inner_cauchy=INNER_CAUCHY,
         normal_x=x,
         normal_y=y,
         normal_z=z,
