@@ -4,6 +4,9 @@ Depth follows REP 118: 16UC1 holds millimetres with 0 for "no reading", 32FC1 ho
 image is always float32 (height, width) in metres, NaN where nothing was measured.  Pixels are read in place through
 their row stride (``step``) and byte order (``is_bigendian``); only the conversion to metres copies.
 
+What reads a message only looks at its fields, so that messages of rosbags, which come without a ROS installation, are
+read by the same code; only what makes messages imports their classes.
+
 Reference: REP 118, Depth Images, https://www.ros.org/reps/rep-0118.html
 """
 
@@ -12,10 +15,12 @@ from __future__ import annotations
 import array
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from sensor_msgs.msg import CameraInfo, Image
+
+if TYPE_CHECKING:
+    from sensor_msgs.msg import CameraInfo, Image
 
 DEPTH_ENCODINGS = ("16UC1", "32FC1")
 GREY_ENCODINGS = ("mono8", "mono16")
@@ -216,6 +221,8 @@ def intrinsics_from_message(message: CameraInfo) -> Intrinsics:
 
 def intrinsics_to_message(intrinsics: Intrinsics, header: Any) -> CameraInfo:
     """A camera_info without distortion: K, R = I and P of the intrinsics."""
+    from sensor_msgs.msg import CameraInfo
+
     message = CameraInfo(header=header, width=intrinsics.width, height=intrinsics.height)
     message.distortion_model = "plumb_bob"
     message.d = [0.0] * 5
@@ -236,6 +243,8 @@ def byte_array(pixels: np.ndarray) -> array.array[int]:
 def _to_message(pixels: np.ndarray, header: Any, encoding: str) -> Image:
     if pixels.ndim != 2 or pixels.size == 0:
         raise ImageError(f"image: expected (height, width) with at least one pixel, got {pixels.shape}")
+    from sensor_msgs.msg import Image
+
     little = pixels.astype(pixels.dtype.newbyteorder("<"), copy=False)
     height, width = pixels.shape
     message = Image(header=header, height=height, width=width, encoding=encoding, is_bigendian=0)
