@@ -80,3 +80,5 @@ def test_misuse_is_refused(tmp_path):
         export(body(), tmp_path / "body.stl")
     with pytest.raises(ValueError, match="no body"):
         export([], tmp_path / "none.glb")
+    with pytest.raises(ValueError, match="names: expected 2 different ones"):
+        export([body(), body()], tmp_path / "two.glb", names=["a", "a"])

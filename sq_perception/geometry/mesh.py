@@ -105,6 +105,7 @@ def export(
     *,
     resolution: int = 64,
     colours: np.ndarray | None = None,
+    names: Sequence[str] | None = None,
     optical: bool = True,
 ) -> Path:
     """Write bodies as a coloured scene.
@@ -114,9 +115,11 @@ def export(
     bodies : Superquadric
         One, a batch (n,) or a sequence of single bodies.
     path : str or Path
-        ``.glb`` (one node per body, named body_0, body_1 ...) or ``.ply`` (one mesh with vertex colours).
+        ``.glb`` (one node per body) or ``.ply`` (one mesh with vertex colours).
     colours : (n, 3), optional
         Red, green, blue in [0, 1]; :data:`COLOURS` in turn if not given.
+    names : (n,), optional
+        Of the nodes of a GLB; body_0, body_1 ... if not given.
     optical : bool
         The bodies are in the optical frame (y down): a GLB, whose y axis is up by its standard, is turned half about x
         so that viewers show it upright.  A PLY always keeps the coordinates.
@@ -124,7 +127,7 @@ def export(
     Raises
     ------
     ValueError
-        For another suffix, or where there is no body to write.
+        For another suffix, where there is no body to write, or not one name a body.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -133,6 +136,9 @@ def export(
     singles = _singles(bodies)
     if not singles:
         raise ValueError(f"{path.name}: no body to write")
+    names = [f"body_{k}" for k in range(len(singles))] if names is None else list(names)
+    if len(set(names)) != len(singles):
+        raise ValueError(f"names: expected {len(singles)} different ones, got {names}")
     palette = COLOURS if colours is None else np.asarray(colours, dtype=float)
     meshes = []
     for k, body in enumerate(singles):
@@ -145,8 +151,8 @@ def export(
         return path
     scene = trimesh.Scene()
     turn = _HALF_TURN_ABOUT_X if optical else np.eye(4)
-    for k, part in enumerate(meshes):
-        scene.add_geometry(part, node_name=f"body_{k}", geom_name=f"body_{k}", transform=turn)
+    for name, part in zip(names, meshes, strict=True):
+        scene.add_geometry(part, node_name=name, geom_name=name, transform=turn)
     scene.export(path)
     return path
 
