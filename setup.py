@@ -19,6 +19,9 @@ share = [
 if "bdist_wheel" in sys.argv:
     share.append((f"lib/{NAME}", [f"resource/ros2_run/{node}" for node in NODES]))
 
+bags = [
+    "rosbags>=0.11.9,<0.12",  # rosbag2 without ROS; its tables of decompressors are no promise beyond
+]
 train = [
     "tensorboard>=2.14",  # curves of a running training
 ]
@@ -74,8 +77,10 @@ setup(
     extras_require={
         # Never among the requirements: they would shadow the rclpy of a ROS installation.
         "ros": ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"],
+        "bags": bags,
         "train": train,
         "test": [
+            *bags,
             *train,
             "pytest>=7,<8.4",  # later ones break the launch_testing plugins of a ROS installation
             "hypothesis>=6",

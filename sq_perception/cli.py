@@ -1,32 +1,29 @@
 """The command ``sq-perception``; ``sq-perception --help`` lists what it can do.
 
-Exit codes: 0 all went well, 1 a frame could not be read or something is missing, 2 wrong usage.  Heavy imports happen
-inside the commands, so that ``--help`` answers at once.
+Exit codes: 0 all went well, 1 a frame could not be read or something is missing, 2 wrong usage, 130 interrupted.
+Heavy imports happen inside the commands, so that ``--help`` answers at once.
 """
 
 from __future__ import annotations
 
 import argparse
 import importlib
-import json
-import math
 import os
 import re
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from sq_perception import recover_command
+from sq_perception.recover_command import FAILURE, INTERRUPTED, SUCCESS, USAGE, complain, misused
 
 if TYPE_CHECKING:
     import numpy as np
 
     from sq_perception.geometry.superquadric import Superquadric
     from sq_perception.imaging.camera import Camera
-    from sq_perception.recorded_frame import RecordedFrame
-    from sq_perception.recovery import FrameRecovery
 
-SUCCESS, FAILURE, USAGE = 0, 1, 2
-JSON_VERSION = 1
 PARAMETERS = ("a1", "a2", "a3", "e1", "e2", "t1", "t2", "t3", "qx", "qy", "qz", "qw")
 _OTHER_COMMANDS = {
     "demo": ("sq_perception.nodes.demo", "live demonstration with real ROS 2 nodes (extra 'ros')"),
@@ -40,36 +37,6 @@ _OTHER_COMMANDS = {
 """Modules with a main of their own."""
 _NEGATIVE_WITH_EXPONENT = re.compile(r"-(\d+\.?\d*|\.\d+)[eE][-+]?\d+")
 
-_RECOVER_HELP = """\
-Recover superquadrics from recorded depth images.
-
-A FRAME is
-  .npz           depth (float, metres, NaN = no reading) and K (3 x 3); optional labels = instance masks, which are
-                 then used instead of an own segmentation
-  .png, 16 bit   millimetres, 0 = no reading, with --camera-info
-  .png, .bmp     with --projection orthographic: grey images of the unit cube, larger is nearer, 0 = background
-"""
-_RECOVER_EPILOG = """\
-methods:
-  auto       the network and central symmetry start an exact surface fit (best)
-  symmetry   the same fit, without the network
-  network    the network alone, unrefined (fastest)
-  classic    Solina and Bajcsy's fit to the points
-
-examples:
-  sq-perception recover table.npz --json out.json --pictures pictures/
-  sq-perception recover depth_*.png --camera-info camera.yaml --json out.json
-  sq-perception recover views/*.bmp --projection orthographic --method network --json -
-  sq-perception recover table.npz --ignore-masks --refine soft_render
-
-output:
-  {"frames": [{"file": ..., "ms": ..., "superquadrics": [{"size": [a1, a2, a3], "shape": [e1, e2],
-   "translation": [x, y, z], "rotation": [x, y, z, w], "score": ..., "residual": ..., "sigma_size": [...],
-   "status": "converged" | "weak" | "failed", "message": ..., "label": ...}, ...]}, ...]}
-  Half sizes and positions are metres in the optical frame (x right, y down, z forward); for orthographic frames the
-  unit cube (x right, y up, z to the viewer).  What is unknown is null.  A failed object is listed with its reason;
-  its numbers only say where it is.  "label" is the mask's value, null without masks.
-"""
 _RENDER_HELP = """\
 Draw one superquadric as a depth image.
 
@@ -112,8 +79,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         return command(options)
     except KeyboardInterrupt:
-        _complain("interrupted")
-        return 130
+        complain("interrupted")
+        return INTERRUPTED
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILURE
@@ -137,30 +104,12 @@ def _parser() -> argparse.ArgumentParser:
     recover = commands.add_parser(
         "recover",
         help="depth images in, superquadrics out",
-        description=_RECOVER_HELP,
-        epilog=_RECOVER_EPILOG,
+        description=recover_command.HELP,
+        epilog=recover_command.EPILOG,
         formatter_class=raw,
     )
-    recover.add_argument("frames", nargs="+", metavar="FRAME", help="recorded depth images")
-    recover.add_argument("--json", metavar="OUT", help="write the results there; - is the standard output")
-    recover.add_argument("--projection", choices=("pinhole", "orthographic"), default="pinhole")
-    methods = ("auto", "network", "symmetry", "classic")
-    recover.add_argument("--method", choices=methods, default="auto", help="see below")
-    recover.add_argument(
-        "--refine",
-        choices=("surface", "soft_render", "none"),
-        default="surface",
-        help="what follows the start: the exact fit, descent on the soft-rendered depth, or nothing",
-    )
-    recover.add_argument("--camera-info", metavar="FILE", help="YAML with the intrinsics of 16 bit PNGs")
-    recover.add_argument("--pictures", metavar="DIR", help="draw a picture per frame into this folder")
-    recover.add_argument("--model", metavar="FILE", help="weights: a .safetensors file, or the name of shipped ones")
-    recover.add_argument(
-        "--consensus", action="store_true", help="average the network's answers to 8 positions of each view"
-    )
-    recover.add_argument("--ignore-masks", action="store_true", help="segment, even where a frame brings labels")
-    recover.add_argument("--max-objects", type=int, default=20, metavar="N", help="largest ones first (default 20)")
-    recover.set_defaults(command=_recover)
+    recover_command.add_arguments(recover)
+    recover.set_defaults(command=recover_command.run)
 
     render = commands.add_parser(
         "render",
@@ -185,161 +134,6 @@ def _parser() -> argparse.ArgumentParser:
     return parser
 
 
-# recover
-
-
-def _recover(options: argparse.Namespace) -> int:
-    if options.max_objects < 1:
-        return _misused(f"--max-objects: expected at least 1, got {options.max_objects}")
-    to_stdout = options.json == "-"
-    if options.json and not to_stdout and not Path(options.json).resolve().parent.is_dir():
-        return _misused(f"--json: the folder of {options.json} does not exist")
-    if options.pictures:
-        try:
-            Path(options.pictures).mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            return _misused(f"--pictures: {error}")
-
-    import torch
-
-    from sq_perception.learning.checkpoint import CheckpointError
-    from sq_perception.recorded_frame import FrameError, read
-    from sq_perception.recovery import Recoverer, RecoveryOptions
-
-    torch.set_num_threads(1)  # the network's layers are so small that threads cost more than they save
-    settings = RecoveryOptions(method=options.method, refine=options.refine, max_objects=options.max_objects)
-    try:
-        recoverer = Recoverer(options.model, method=options.method, consensus=options.consensus)
-    except CheckpointError as error:
-        _complain(str(error))
-        return FAILURE
-
-    results: list[dict[str, Any]] = []
-    names: set[str] = set()
-    failed = 0
-    warm: set[Camera] = set()
-    for name in _progress(options.frames):
-        try:
-            frame = read(name, options.camera_info, options.projection)
-        except (FrameError, OSError) as error:
-            _complain(str(error))
-            failed += 1
-            continue
-        if frame.camera not in warm:
-            recoverer.warm_up(frame.camera)
-            warm.add(frame.camera)
-        labels = None if options.ignore_masks else frame.labels
-        recovery = recoverer.recover(frame.depth, frame.camera, labels, settings)
-        results.append(_frame_entry(name, frame, recovery, has_masks=labels is not None))
-        if options.pictures:
-            _draw(_free_name(Path(options.pictures), Path(name).stem, names), frame, recovery)
-    document = {"format": "sq_perception.recovery", "version": JSON_VERSION, "frames": results}
-    if to_stdout:
-        print(json.dumps(document, indent=1, allow_nan=False))
-    else:
-        if options.json:
-            try:
-                _write_json(Path(options.json), document)
-            except OSError as error:
-                _complain(f"--json: {error}")
-                return FAILURE
-        _print_table(results)
-    return FAILURE if failed else SUCCESS
-
-
-def _frame_entry(name: str, frame: RecordedFrame, recovery: FrameRecovery, has_masks: bool) -> dict[str, Any]:
-    """One element of ``frames`` in the output."""
-    bodies = []
-    for body in recovery.bodies:
-        superquadric = _in_result_frame(body.superquadric, frame.is_cube)
-        bodies.append(
-            {
-                "size": _numbers(superquadric.size),
-                "shape": _numbers(superquadric.shape),
-                "translation": _numbers(superquadric.translation),
-                "rotation": _numbers(superquadric.rotation),
-                "score": _number(body.score),
-                "residual": _number(body.residual),
-                "sigma_size": _numbers(body.sigma_size),
-                "status": body.status.name.lower(),
-                "message": body.message,
-                "label": int(body.label) if has_masks else None,
-            }
-        )
-    return {
-        "file": name,
-        "ms": _number(recovery.milliseconds["total"]),
-        "superquadrics": bodies,
-        "coordinates": "cube" if frame.is_cube else "optical",
-        "message": recovery.message,
-        "ms_by_stage": {stage: _number(value) for stage, value in recovery.milliseconds.items()},
-        "plane": None if recovery.plane is None else _numbers(recovery.plane),
-    }
-
-
-def _in_result_frame(body: Superquadric, is_cube: bool) -> Superquadric:
-    from sq_perception.imaging import unit_cube
-
-    return unit_cube.cube_from_optical(body).canonical_form() if is_cube else body
-
-
-def _numbers(values: Iterable[float]) -> list[float | None]:
-    return [_number(value) for value in values]
-
-
-def _number(value: float) -> float | None:
-    """JSON knows neither NaN nor infinity."""
-    return float(value) if math.isfinite(value) else None
-
-
-def _write_json(path: Path, document: dict[str, Any]) -> None:
-    """Whole or not at all."""
-    partial = path.with_name(path.name + ".partial")
-    partial.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    partial.replace(path)
-
-
-def _draw(path: Path, frame: RecordedFrame, recovery: FrameRecovery) -> None:
-    from sq_perception.evaluation import plots
-
-    unit = "of the cube" if frame.is_cube else "m"
-    plots.save(plots.recovery_figure(frame.depth, frame.camera, recovery, frame.name, unit), path)
-
-
-def _free_name(folder: Path, stem: str, taken: set[str]) -> Path:
-    """A picture's name that no other frame of this call has."""
-    name, k = stem, 2
-    while name in taken:
-        name, k = f"{stem}_{k}", k + 1
-    taken.add(name)
-    return folder / f"{name}.png"
-
-
-def _progress(names: list[str]) -> Iterable[str]:
-    if len(names) < 2 or not sys.stderr.isatty():
-        return names
-    from rich.console import Console
-    from rich.progress import track
-
-    return track(names, description="recovering", console=Console(stderr=True), transient=True)
-
-
-def _print_table(results: list[dict[str, Any]]) -> None:
-    for entry in results:
-        cube = entry["coordinates"] == "cube"
-        print(f"{entry['file']}  {entry['ms']:.0f} ms  {entry['message']}".rstrip())
-        scale, unit, digits = (1.0, "", 4) if cube else (1e3, " mm", 1)
-        for body in entry["superquadrics"]:
-            label = "" if body["label"] is None else f"mask {body['label']}: "
-            if body["status"] == "failed":
-                print(f"  {label}failed: {body['message']}")
-                continue
-            size = " x ".join(f"{scale * value:.{digits}f}" for value in body["size"])
-            shape = " ".join(f"{value:.2f}" for value in body["shape"])
-            note = f"  ({body['message']})" if body["status"] == "weak" else ""
-            print(f"  {label}half sizes {size}{unit}, exponents {shape}, score {body['score']:.3f}{note}")
-
-
 # render
 
 
@@ -349,11 +143,11 @@ def _render(options: argparse.Namespace) -> int:
     pinhole = options.projection == "pinhole"
     if suffix not in ((".png", ".npz") if pinhole else (".png", ".bmp", ".npz")):
         kinds = ".png or .npz" if pinhole else ".png, .bmp or .npz"
-        return _misused(f"--output: {output.name}: an image of this projection is a {kinds}")
+        return misused(f"--output: {output.name}: an image of this projection is a {kinds}")
     if not output.resolve().parent.is_dir():
-        return _misused(f"--output: the folder of {output} does not exist")
+        return misused(f"--output: the folder of {output} does not exist")
     if options.bits == 16 and (pinhole or suffix != ".png"):
-        return _misused("--bits: only orthographic PNGs have a choice")
+        return misused("--bits: only orthographic PNGs have a choice")
 
     import numpy as np
 
@@ -377,14 +171,14 @@ def _render(options: argparse.Namespace) -> int:
                 focal = options.focal
                 camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
     except ValueError as error:
-        return _misused(str(error))
+        return misused(str(error))
     depth, index = raycast.render(seen, camera)
     if not (index >= 0).any():
-        _complain("the camera does not see the body: the image is empty")
+        complain("the camera does not see the body: the image is empty")
     try:
         _write_depth(output, depth, index, camera, body, options.bits)
     except OSError as error:
-        _complain(str(error))
+        complain(str(error))
         return FAILURE
     return SUCCESS
 
@@ -445,22 +239,13 @@ def _other_command(name: str, arguments: list[str]) -> int:
     except ModuleNotFoundError as error:
         if name != "demo":
             raise
-        _complain(
+        complain(
             f"the demonstration needs ROS 2 in Python, and the module {error.name!r} is missing: "
             "pip install 'sq_perception[ros]', or source a ROS 2 Jazzy installation"
         )
         return FAILURE
     result = module.main(arguments)
     return result if isinstance(result, int) else SUCCESS
-
-
-def _complain(message: str) -> None:
-    print(f"sq-perception: {message}", file=sys.stderr)
-
-
-def _misused(message: str) -> int:
-    _complain(message)
-    return USAGE
 
 
 if __name__ == "__main__":

@@ -10,6 +10,8 @@
 The cube is the thesis' unit cube, :mod:`sq_perception.imaging.unit_cube`.  An NPZ may bring ``labels`` (h, w), a
 support ``plane`` (4,), and the text "orthographic" as ``projection``, which goes before what the caller says.  Nothing
 in a file is executed: no pickle, safe YAML only.
+
+Whole folders and rosbags are read by :mod:`sq_perception.recorded_input`, frame by frame, into the same class.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ import zipfile
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any, NamedTuple, get_args
 
 import cv2
 import numpy as np
@@ -27,13 +29,24 @@ import yaml
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera, Projection
 
-MILLIMETRE = 1e-3
+SUFFIXES = (".npz", ".png", ".bmp")
+_MILLIMETRES = np.float32(1000.0)
 _IMAGES = (".png", ".bmp")
 _NO_DISTORTION = 1e-9
 
 
 class FrameError(ValueError):
     """A file that is missing, damaged, or does not hold what it should; the message says what was expected."""
+
+
+class Stamp(NamedTuple):
+    """Seconds and nanoseconds, as ROS keeps a time: a float would lose the last digits."""
+
+    sec: int
+    nanosec: int
+
+    def __str__(self) -> str:
+        return f"{self.sec}.{self.nanosec:09d}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,11 +61,17 @@ class RecordedFrame:
     labels : int32 (height, width) or None
         Instance masks, 0 for background.
     name : str
-        The file's name.
+        The file's name; of a frame in a bag, the bag's and the stamp.
     is_cube : bool
         A view of the unit cube: results belong in the cube frame (:func:`unit_cube.cube_from_optical`).
     plane : (4,) or None
         Support plane of the recording, height above it = n.p + d.
+    stamp : Stamp or None
+        When it was taken, where the recording knows.
+    topic, frame_id : str
+        Where it was published, and the name of its optical frame; empty for files.
+    warning : str
+        What should be known about the frame before its results are believed; empty if nothing.
     """
 
     depth: np.ndarray
@@ -61,6 +80,10 @@ class RecordedFrame:
     name: str
     is_cube: bool
     plane: np.ndarray | None = None
+    stamp: Stamp | None = None
+    topic: str = ""
+    frame_id: str = ""
+    warning: str = ""
 
 
 def read(
@@ -104,10 +127,19 @@ def read(
         )
     if camera_info is None:
         raise FrameError(f"{path}: a 16 bit image needs a camera_info file with the camera's intrinsics")
-    camera = read_camera_info(camera_info)
+    camera, warning = read_camera(camera_info)
     _check_size(path, image, camera)
-    depth = np.where(image > 0, image * np.float32(MILLIMETRE), np.float32(np.nan))
-    return RecordedFrame(depth, camera, None, path.name, is_cube=False)
+    depth = np.where(image > 0, image / _MILLIMETRES, np.float32(np.nan))
+    return RecordedFrame(depth, camera, None, path.name, is_cube=False, warning=warning)
+
+
+def distortion_warning(where: str, coefficients: np.ndarray) -> str:
+    """What to say about a camera with these distortion coefficients; empty if all are zero."""
+    coefficients = np.asarray(coefficients, dtype=float)
+    if not np.abs(coefficients).max(initial=0.0) > _NO_DISTORTION:
+        return ""
+    numbers = " ".join(f"{value:g}" for value in coefficients)
+    return f"{where}: the distortion coefficients ({numbers}) are not applied: the image is taken for rectified"
 
 
 def read_camera_info(path: str | Path) -> Camera:
@@ -120,6 +152,11 @@ def read_camera_info(path: str | Path) -> Camera:
     ------
     FrameError
     """
+    return read_camera(path)[0]
+
+
+def read_camera(path: str | Path) -> tuple[Camera, str]:
+    """As :func:`read_camera_info`, with the warning about its distortion; empty where there is none."""
     path = Path(path)
     try:
         text = path.read_text(encoding="utf-8")
@@ -139,12 +176,13 @@ def read_camera_info(path: str | Path) -> Camera:
     if matrix is None:
         raise FrameError(f"{path}: expected a camera_matrix (or k) of 9 numbers")
     k = matrix.reshape(3, 3)
-    if distortion is not None and np.abs(distortion).max(initial=0.0) > _NO_DISTORTION:
+    warning = "" if distortion is None else distortion_warning(str(path), distortion)
+    if warning:
         if projection is None or projection[0] <= 0:
             raise FrameError(f"{path}: a distorted camera needs the projection_matrix (or p) of its rectified image")
         k = projection.reshape(3, 4)[:, :3]
     try:
-        return Camera.from_matrix(k, width, height)
+        return Camera.from_matrix(k, width, height), warning
     except ValueError as error:
         raise FrameError(f"{path}: {error}") from error
 

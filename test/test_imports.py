@@ -20,10 +20,10 @@ PACKAGES = (PERCEPTION, MESSAGES)
 # Floor by floor, from the ground up; a module may import from its own floor and from those below it.
 FLOORS = (
     ("geometry", "provenance"),
-    ("imaging", "metrics", "tracking", "recorded_frame"),
+    ("imaging", "metrics", "tracking", "recorded_frame", "recorded_bag", "recorded_input"),
     ("learning", "fitting"),
     ("recovery", "warm_up"),
-    ("evaluation", "nodes", "cli"),
+    ("evaluation", "nodes", "cli", "recover_command"),
 )
 ROS = ("rclpy", "sensor_msgs", "std_msgs", "std_srvs", "visualization_msgs", "diagnostic_msgs", "geometry_msgs",
        "rcl_interfaces", "builtin_interfaces")  # fmt: skip
@@ -89,8 +89,14 @@ def test_only_nodes_know_ros() -> None:
     assert guilty == []
 
 
-def test_only_nodes_join_the_two_packages() -> None:
-    assert [path for path in PERCEPTION.rglob("*.py") if not is_node(path) and "sq_msgs_py" in roots(path)] == []
+def test_only_nodes_and_bags_join_the_two_packages() -> None:
+    """What a recorded message says is decoded by the code that decodes a live one; that needs no ROS."""
+    joining = {path for path in PERCEPTION.rglob("*.py") if not is_node(path) and "sq_msgs_py" in roots(path)}
+    assert joining == {PERCEPTION / "recorded_bag.py"}
+    absent = f"import sys; sys.modules.update(dict.fromkeys({ROS!r}))"
+    modules = loaded_after(f"{absent}; import sq_perception.recorded_input, sq_perception.recover_command")
+    assert "sq_msgs_py.depth_image" in modules
+    assert not modules & {"rosbags", "torch"}
 
 
 def test_messages_need_numpy_and_messages_only() -> None:
