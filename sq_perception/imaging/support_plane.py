@@ -1,0 +1,237 @@
+"""The plane that things stand on: planes of a depth image, and which of them is the table.
+
+Equation
+--------
+n.p + d = 0 with |n| = 1 in the optical frame and n towards the camera, so that the height of a point above it is
+
+    h(p) = n.p + d  =  z (n_x (u - cx)/fx + n_y (v - cy)/fy + n_z) + d        for a pinhole camera,
+
+one multiplication per pixel.  Depth noise of triangulating and time-of-flight cameras grows about as z^2; tolerances
+are therefore sigma(z) = sigma_1 z^2 with sigma_1 measured on the plane itself.
+
+Planes are found by RANSAC on a seeded subsample and least squares on the inliers.  The table is the one with many
+points that lies low in the image and is not the face of a body.
+
+Metres and pixels.  Reference: M. A. Fischler, R. C. Bolles, Random Sample Consensus, Comm. ACM 24 (1981).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from sq_perception.imaging import depth_steps
+from sq_perception.imaging.camera import Camera
+
+_PLANE_POINTS = 1500
+_REFINE_POINTS = 8000
+_HYPOTHESES = 200
+_PLANES = 3
+_COARSE_PIXELS = 120
+_FACE_TOLERANCE = 0.008
+_BENT_SHARE = 0.08
+_ISLAND_SHARE = 0.25
+
+_Surface = tuple[np.ndarray, bool]
+
+
+@dataclass(frozen=True)
+class Search:
+    """How planes are searched.
+
+    Attributes
+    ----------
+    tolerance
+        Half thickness of a plane, metres at a depth of one metre.
+    min_share
+        Share of the points that a plane has at least.
+    seed
+        Of the random sample; the same image gives the same planes.
+    """
+
+    tolerance: float
+    min_share: float
+    seed: int
+
+
+@dataclass(frozen=True, eq=False)
+class Plane:
+    """A plane with many points.
+
+    Attributes
+    ----------
+    equation : (4,)
+        n and d, height above it = n.p + d, n towards the camera.
+    share
+        Of the image's points that lie on it.
+    sigma
+        Of their heights at a depth of one metre, metres.
+    """
+
+    equation: np.ndarray
+    share: float
+    sigma: float
+
+    def height(self, points: np.ndarray) -> np.ndarray:
+        """Height (...) of points (..., 3) above the plane, metres."""
+        return points @ self.equation[:3] + self.equation[3]
+
+    def image_height(self, depth: np.ndarray, camera: Camera) -> np.ndarray:
+        """Height float32 (height, width) of every pixel of a pinhole camera's depth image."""
+        n_x, n_y, n_z, d = self.equation
+        across = (n_x * (np.arange(camera.width) - camera.cx) / camera.fx + n_z).astype(np.float32)
+        down = (n_y * (np.arange(camera.height) - camera.cy) / camera.fy).astype(np.float32)
+        height = across[None, :] + down[:, None]
+        height *= depth
+        height += np.float32(d)
+        return height
+
+
+def noise_growth(z: np.ndarray) -> np.ndarray:
+    """Growth of the depth noise, 1 at one metre; not below what near objects' own quantisation needs."""
+    return np.maximum(z * z, 0.1)
+
+
+def planes(depth: np.ndarray, valid: np.ndarray, camera: Camera, search: Search) -> list[Plane]:
+    """Up to three planes, the one with most points first; each is taken away before the next is searched."""
+    pixels = np.flatnonzero(valid)
+    rows, columns = np.divmod(pixels[:: max(1, pixels.size // _REFINE_POINTS)], camera.width)
+    points = camera.unproject(columns, rows, depth[rows, columns])
+    rng = np.random.default_rng(search.seed)
+    total, found = len(points), []
+    for _ in range(_PLANES):
+        if len(points) < max(12, search.min_share * total):
+            break
+        plane, inside = _dominant_plane(points, search.tolerance, rng)
+        if plane is None or inside.sum() < search.min_share * total:
+            break
+        near = points[inside]
+        spread = np.abs(near @ plane[:3] + plane[3]) / noise_growth(near[:, 2])
+        found.append(Plane(plane, float(inside.sum() / total), float(1.4826 * np.median(spread))))
+        points = points[~inside]
+    return found
+
+
+def support(
+    candidates: list[Plane], depth: np.ndarray, valid: np.ndarray, camera: Camera, depth_step: float
+) -> Plane | None:
+    """The plane that things stand on: many points, and rather below the camera than in front of it or above it.
+
+    A camera is mounted upright or looks straight down.  The table seen from straight above and a wall look alike; a
+    wall counts less, as a floor or a table in the same picture then has a normal that points up.
+    """
+    surfaces = _on_one_surface(depth, valid, camera, depth_step)
+    chosen = [plane for plane in candidates if not _is_face(plane, surfaces)]
+    return max(chosen, key=_vote) if chosen else None
+
+
+def around(
+    labels: np.ndarray, ids: tuple[int, ...], depth: np.ndarray, valid: np.ndarray, camera: Camera, search: Search
+) -> np.ndarray | None:
+    """The support plane (4,) from the unlabelled pixels near the bodies: below all of them, and touched."""
+    near = np.zeros(labels.shape, bool)
+    bodies = []
+    for label in ids:
+        rows, columns = np.nonzero((labels == label) & valid)
+        margin = 10 + (int(rows.max() - rows.min()) + int(columns.max() - columns.min())) // 3
+        top, left = max(rows.min() - margin, 0), max(columns.min() - margin, 0)
+        near[top : rows.max() + margin + 1, left : columns.max() + margin + 1] = True
+        step = max(1, rows.size // 500)
+        rows, columns = rows[::step], columns[::step]
+        bodies.append(camera.unproject(columns, rows, depth[rows, columns]))
+    labelled = cv2.dilate((labels > 0).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
+    near &= valid & ~labelled
+    if np.count_nonzero(near) < 30:
+        return None
+    best, best_vote = None, 0.0
+    for plane in planes(depth, near, camera, search):
+        contact = []
+        for points in bodies:
+            heights = plane.height(points) / noise_growth(points[:, 2])
+            lowest, middle = np.quantile(heights, (0.02, 0.5))
+            # What a body lies behind is not what it stands on, but perhaps the front of its occluder.
+            contact.append(np.exp(-np.abs(lowest) / (4 * search.tolerance)) if middle > 0 else 0.0)
+        vote = _vote(plane) * float(np.mean(contact))
+        if vote > best_vote:
+            best, best_vote = plane.equation, vote
+    return best
+
+
+def _dominant_plane(
+    points: np.ndarray, tolerance: float, rng: np.random.Generator
+) -> tuple[np.ndarray | None, np.ndarray]:
+    """The plane (4,) with most points within tolerance * z^2, and which points these are."""
+    few = points[:: max(1, len(points) // _PLANE_POINTS)]
+    corners = few[rng.integers(len(few), size=(_HYPOTHESES, 3))]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    length = np.linalg.norm(normals, axis=1)
+    usable = length > 1e-9
+    if not usable.any():
+        return None, np.zeros(len(points), bool)
+    normals = normals[usable] / length[usable, None]
+    offsets = -np.einsum("ij,ij->i", normals, corners[usable, 0])
+    weight = (1 / (tolerance * noise_growth(few[:, 2]))).astype(np.float32)
+    weighted = np.concatenate([few, np.ones((len(few), 1))], axis=1).astype(np.float32) * weight[:, None]
+    heights = np.column_stack([normals, offsets]).astype(np.float32) @ weighted.T
+    votes = np.count_nonzero(np.abs(heights) < 1, axis=1)
+    best = int(np.argmax(votes))
+    plane = np.append(normals[best], offsets[best])
+    reach = tolerance * noise_growth(points[:, 2])
+    for share in (1.0, 1.0, 0.5):
+        inside = np.abs(points @ plane[:3] + plane[3]) < share * reach
+        if inside.sum() < 12:
+            return None, inside
+        near = points[inside]
+        plane = _least_squares_plane(near, 1 / noise_growth(near[:, 2]) ** 2)
+    return plane, np.abs(points @ plane[:3] + plane[3]) < reach
+
+
+def _least_squares_plane(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """The plane (4,) through weighted points, normal towards the camera."""
+    middle = weights @ points / weights.sum()
+    centred = points - middle
+    _, axes = np.linalg.eigh((weights[:, None] * centred).T @ centred)
+    normal = axes[:, 0]
+    offset = -normal @ middle
+    return np.append(normal, offset) * (1.0 if offset > 0 else -1.0)
+
+
+def _is_face(plane: Plane, surfaces: list[_Surface]) -> bool:
+    """Whether a plane is part of a body or of a room: a surface joined to it runs on below, away from the camera.
+
+    On recorded tables and floors up to 4 % of the points lie below, on the faces of lone bodies more than 10 %.  A
+    small island before nothing is a body as well, seen face-on.
+    """
+    on, below, alone = 0, 0, False
+    for points, is_island in surfaces:
+        height = plane.height(points) / (_FACE_TOLERANCE * noise_growth(points[:, 2]))
+        inside = int(np.count_nonzero(np.abs(height) < 1))
+        if inside > on:
+            on = inside
+            below, alone = int(np.count_nonzero(height < -2)), is_island
+    return alone or below > _BENT_SHARE * on
+
+
+def _on_one_surface(depth: np.ndarray, valid: np.ndarray, camera: Camera, depth_step: float) -> list[_Surface]:
+    """Each connected surface of a coarse image, as far as it is of any size, and whether it is a small island."""
+    k = max(1, min(depth.shape) // _COARSE_PIXELS)
+    coarse, kept = depth[::k, ::k], valid[::k, ::k]
+    jumps = depth_steps.edges(np.where(kept, coarse, np.float32(0)), kept, k * depth_step)
+    labels = depth_steps.components(kept & ~jumps)
+    rows, columns = np.nonzero(labels)
+    numbers = labels[rows, columns]
+    points = camera.unproject(k * columns, k * rows, coarse[rows, columns])
+    surfaces = []
+    for label in np.flatnonzero(np.bincount(numbers) > 0.02 * rows.size):
+        part = numbers == label
+        r, c = rows[part], columns[part]
+        inside = min(r.min(), c.min(), labels.shape[0] - 1 - r.max(), labels.shape[1] - 1 - c.max()) > 0
+        surfaces.append((points[part], bool(inside and r.size < _ISLAND_SHARE * labels.size)))
+    return surfaces
+
+
+def _vote(plane: Plane) -> float:
+    up = -plane.equation[1]
+    return plane.share * (0.25 + max(0.0, up))

@@ -1,0 +1,281 @@
+"""Smooth patches of what is seen: cut at depth steps and where the surface folds.
+
+Equation
+--------
+The inverse depth w = 1/z of a plane is linear in the pixel coordinates of a pinhole camera, and the noise of a
+triangulating camera is constant in it.  With two pixels rho to either side of p along a line,
+
+    s(p) = [(w(p - rho) + w(p + rho)) / 2 - w(p)] / (w(p) rho / f)
+
+is therefore 0 on every plane, however it is turned.  The sign is that of the convexity: s < 0 where p lies nearer
+than the chord (the edge of a box), s > 0 where it lies behind it (a box on a table).  Seen in the direction of its
+bisector, an edge at which the normal turns by theta has |s| = tan(theta / 2), and a surface of curvature radius R has
+|s| = r / (2 R) with r = z rho / f, the chord's radius in metres.  s is the strongest over four directions.
+
+The radius r is a length of the world, so that a body looks the same near and far; images are sampled on a grid that
+makes it some four samples long.  Chords that cross a depth step or a hole say nothing.
+
+Grid images are float32 (rows, columns), every ``stride``-th pixel.
+Reference: S. C. Stein et al., Object Partitioning using Local Convexity, CVPR 2014 (patches and signs of convexity).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from sq_perception.imaging import depth_steps
+from sq_perception.imaging.camera import Camera
+
+_RADIUS_SAMPLES = 4
+_LEAST_RADIUS = 2.0
+_CHORD_NOISE = float(np.sqrt(1.5))
+_DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
+_SHAPE_SAMPLES = 300
+_SHAPE_TERMS = 6
+_SQUARE = 5
+_FULL = 0.9
+_MOST_PATCHES = 150
+_FAR_RADII = 3.0
+
+
+@dataclass(frozen=True)
+class FoldOptions:
+    """What counts as a fold.
+
+    Attributes
+    ----------
+    radius
+        Half length of the chord, metres; longer where noise would hide the fold.
+    angle
+        The normal turns at least by this, radians.
+    steepest
+        A surface turned farther from the line of sight shows steps, radians.
+    noise_margin
+        A fold is that many standard deviations of the noise.
+    bent_margin
+        So is a curved patch off its plane, on average; less, as hundreds of samples tell it.
+    least_area
+        Of a patch, square metres across the line of sight.
+    """
+
+    radius: float = 0.01
+    angle: float = float(np.deg2rad(30))
+    steepest: float = float(np.deg2rad(80))
+    noise_margin: float = 3.0
+    bent_margin: float = 0.5
+    least_area: float = 1e-4
+
+    def __post_init__(self) -> None:
+        for name in ("radius", "noise_margin", "bent_margin", "least_area"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}")
+        for name in ("angle", "steepest"):
+            if not 0 < getattr(self, name) < np.pi / 2:
+                raise ValueError(f"{name}: expected radians between 0 and pi / 2, got {getattr(self, name)}")
+
+    def radius_at(self, depth: float, sigma: float) -> float:
+        """Half length of the chord, metres, at a depth with noise ``sigma`` at one metre.
+
+        Both ends and the middle are means over squares whose side is half of the chord's radius, about five pixels.
+        """
+        noise = self.noise_margin * _CHORD_NOISE * sigma * depth**2 / _SQUARE
+        return max(self.radius, noise / float(np.tan(self.angle / 2)))
+
+    def resolved_at(self, depth: float, sigma: float, camera: Camera) -> bool:
+        """Whether folds of bodies a few times the radius large are seen at a depth, metres."""
+        enough = self.radius * camera.fx >= _LEAST_RADIUS * depth
+        return bool(enough and self.radius_at(depth, sigma) <= _FAR_RADII * self.radius)
+
+
+@dataclass(frozen=True, eq=False)
+class Patches:
+    """Patches on a grid over a part of the image.
+
+    Attributes
+    ----------
+    labels : int32 (rows, columns)
+        1..count, 0 where nothing is wanted.
+    count
+        Of patches.
+    depth : float32 (rows, columns)
+        Of the grid's pixels, wanted or not, metres, 0 where there is none.
+    stepped : bool (rows, columns)
+        Samples with a depth step beside them.
+    fold : float32 (rows, columns)
+        s divided by its threshold: below -1 a convex edge, above 1 a concave one, NaN where no chord tells.
+    curvature : float (count + 1,)
+        Of each patch, the sum of the two directions, 1 / metres, positive where it is hollow.
+    planes : float (count + 1, 3)
+        w = a (u - cx)/fx + b (v - cy)/fy + c of each patch, by least squares; NaN for those too small.
+    stride
+        Pixels per sample.
+    depth_step
+        Share of the depth by which neighbouring samples of one surface differ at most.
+    """
+
+    labels: np.ndarray
+    count: int
+    depth: np.ndarray
+    stepped: np.ndarray
+    fold: np.ndarray
+    curvature: np.ndarray
+    planes: np.ndarray
+    stride: int
+    depth_step: float
+
+
+def find(
+    depth: np.ndarray,
+    wanted: np.ndarray,
+    camera: Camera,
+    sigma: float,
+    depth_step: float,
+    options: FoldOptions | None = None,
+) -> Patches | None:
+    """Patches of the wanted pixels of a pinhole camera.
+
+    Parameters
+    ----------
+    depth : float32 (height, width)
+        Metres, 0 where nothing was measured; those are not wanted.
+    wanted : bool (height, width)
+    sigma
+        Noise of the depth at one metre, metres.
+    depth_step
+        Share of the depth by which neighbouring pixels of one surface differ at most.
+
+    Returns
+    -------
+    Patches or None
+        None where nothing is wanted, or bodies are too far for the camera to show the chord in two pixels.
+    """
+    options = options or FoldOptions()
+    filled = np.where(wanted, depth, np.float32(0))
+    some = filled[::4, ::4]
+    some = some[some > 0]
+    if some.size == 0:
+        return None
+    focal = float(np.sqrt(camera.fx * camera.fy))
+    middle = float(np.median(some))
+    pixels = options.radius_at(middle, sigma) * focal / middle
+    if pixels < _LEAST_RADIUS:
+        return None
+    stride = max(1, round(pixels / _RADIUS_SAMPLES))
+    half = max(1, round(pixels / _RADIUS_SAMPLES))
+    inverse, known = _inverse_depth(filled, wanted, half, stride)
+    coarse = filled[::stride, ::stride]
+    step = max(depth_step, float(np.tan(options.steepest)) * stride / focal)
+    stepped = _steps(filled, wanted, depth_step, stride)
+    rho = max(2, round(pixels / stride))
+    known &= coarse > 0
+    fold = _fold(inverse, known & ~stepped, rho, stride / focal)
+    noise = _CHORD_NOISE * sigma / (2 * half + 1) * focal / (rho * stride) * coarse
+    limit = np.maximum(np.tan(options.angle / 2), options.noise_margin * noise)
+    with np.errstate(invalid="ignore"):
+        fold /= limit
+        smooth = known & ~stepped & (np.abs(fold) < 1)
+    least = max(6, round(options.least_area * (focal / middle / stride) ** 2))
+    seeds = _large(cv2.morphologyEx(smooth.astype(np.uint8), cv2.MORPH_OPEN, depth_steps.CROSS), least)
+    free = (coarse > 0) & (seeds == 0)
+    labels = depth_steps.grown(seeds, free, coarse, 2 * rho, step)
+    left = _large((coarse > 0) & (labels == 0), least)
+    count = int(seeds.max())
+    labels = np.where(left > 0, left + count, labels)
+    count += int(left.max())
+    curvature, planes = _shapes(seeds, count, inverse, camera, stride, options.bent_margin * sigma)
+    return Patches(labels, count, depth[::stride, ::stride], stepped, fold, curvature, planes, stride, step)
+
+
+def _inverse_depth(filled: np.ndarray, wanted: np.ndarray, half: int, stride: int) -> tuple[np.ndarray, np.ndarray]:
+    """1/z on the grid, averaged over a square of wanted pixels, and where at least half of the square is wanted."""
+    mask = wanted.astype(np.float32)
+    with np.errstate(divide="ignore"):
+        inverse = np.where(wanted, 1 / filled, np.float32(0)).astype(np.float32)
+    side = (2 * half + 1, 2 * half + 1)
+    total = cv2.blur(inverse, side, borderType=cv2.BORDER_CONSTANT)[::stride, ::stride]
+    share = cv2.blur(mask, side, borderType=cv2.BORDER_CONSTANT)[::stride, ::stride]
+    known = share > _FULL
+    return np.where(known, total / np.maximum(share, np.float32(1e-6)), np.float32(0)), known
+
+
+def _steps(filled: np.ndarray, wanted: np.ndarray, step: float, stride: int) -> np.ndarray:
+    """Grid samples that have a depth step, or the end of what is wanted, in their square."""
+    near = depth_steps.edges(filled, wanted, step).astype(np.uint8)
+    size = 2 * (stride // 2) + 3
+    return cv2.dilate(near, np.ones((size, size), np.uint8))[::stride, ::stride] > 0
+
+
+def _fold(inverse: np.ndarray, known: np.ndarray, rho: int, pixel: float) -> np.ndarray:
+    """s (rows, columns), the strongest over the directions; NaN where no chord lies within the known."""
+    rows, columns = inverse.shape
+    padded = np.pad(inverse, rho)
+    unknown = (~known).astype(np.uint8)
+    strongest = np.full(inverse.shape, np.nan, np.float32)
+    size = np.full(inverse.shape, -1, np.float32)
+    reciprocal = 1 / np.where(known, inverse, np.float32(1))
+    for down, right in _DIRECTIONS:
+        reach = rho if 0 in (down, right) else max(1, round(rho / np.sqrt(2)))
+        length = reach * float(np.hypot(down, right))
+        kernel = np.zeros((2 * rho + 1, 2 * rho + 1), np.uint8)
+        t = np.arange(-reach, reach + 1)
+        kernel[rho + t * down, rho + t * right] = 1
+        told = cv2.dilate(unknown, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=1) == 0
+        a, b = rho + reach * down, rho + reach * right
+        c, d = rho - reach * down, rho - reach * right
+        s = 0.5 * (padded[a : a + rows, b : b + columns] + padded[c : c + rows, d : d + columns]) - inverse
+        s *= reciprocal / np.float32(length * pixel)
+        better = told & (np.abs(s) > size)
+        strongest[better] = s[better]
+        size[better] = np.abs(s[better])
+    return strongest
+
+
+def _large(mask: np.ndarray, least: int) -> np.ndarray:
+    """Components of a mask with at least so many samples, the largest ones if there are very many; labels from 1."""
+    labels = depth_steps.components(mask)
+    counts = np.bincount(labels.ravel())
+    counts[0] = 0
+    kept = counts >= least
+    if np.count_nonzero(kept) > _MOST_PATCHES:
+        kept = np.zeros(len(counts), bool)
+        kept[np.argsort(-counts, kind="stable")[:_MOST_PATCHES]] = True
+    number = np.zeros(len(counts), np.int32)
+    number[kept] = np.arange(1, np.count_nonzero(kept) + 1)
+    return number[labels]
+
+
+def _shapes(
+    seeds: np.ndarray, count: int, inverse: np.ndarray, camera: Camera, stride: int, least_bend: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Curvature (count + 1,) and plane (count + 1, 3) of the smooth part of each patch; 0 and NaN for small ones.
+
+    With x = (u - cx)/fx and y = (v - cy)/fy, the second derivative of w in x or y is the curvature of a surface seen
+    frontally, 1 / metres, positive where it is hollow.  What may be noise counts as 0.
+    """
+    curvature, planes = np.zeros(count + 1), np.full((count + 1, 3), np.nan)
+    rows, columns = np.nonzero(seeds)
+    numbers = seeds[rows, columns].astype(np.uint16)
+    order = np.argsort(numbers, kind="stable")
+    rows, columns = rows[order], columns[order]
+    ends = np.cumsum(np.bincount(numbers, minlength=count + 1))
+    w = inverse[rows, columns].astype(float)
+    x, y = (columns * stride - camera.cx) / camera.fx, (rows * stride - camera.cy) / camera.fy
+    for label in range(1, count + 1):
+        part = slice(ends[label - 1], ends[label], max(1, (ends[label] - ends[label - 1]) // _SHAPE_SAMPLES))
+        if ends[label] - ends[label - 1] < _SHAPE_TERMS + 4:
+            continue
+        x0, y0 = x[part].mean(), y[part].mean()
+        p, q = x[part] - x0, y[part] - y0
+        design = np.stack([p, q, np.ones_like(p), p * p, p * q, q * q, w[part]])
+        gram = design @ design.T
+        a, b, c = np.linalg.lstsq(gram[:3, :3], gram[:3, 6], rcond=None)[0]
+        planes[label] = a, b, c - a * x0 - b * y0
+        bent = np.linalg.lstsq(gram[:6, :6], gram[:6, 6], rcond=None)[0]
+        # What the curvature explains, w - w_plane, may be noise if it is small beside that of single pixels.
+        explained = bent @ gram[:6, 6] - np.array([a, b, c]) @ gram[:3, 6]
+        if explained > p.size * least_bend**2:
+            curvature[label] = 2 * (bent[3] + bent[5])
+    return curvature, planes
