@@ -30,6 +30,7 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.surface_patches import Patches
 
 _FLAT = 0.3
+_CLEARLY = 1.0
 _UNKNOWN = 0.1
 _SIGHT_SAMPLES = 24
 _SEEN_THROUGH = 0.1
@@ -101,7 +102,7 @@ def _borders(patches: Patches, options: GroupingOptions) -> tuple[np.ndarray, np
     known = np.nan_to_num(patches.fold)
     square = np.ones((5, 5), np.uint8)
     concave, convex = cv2.dilate(known, square), -cv2.erode(known, square)
-    fold = np.where(concave > convex, concave, -convex)
+    fold = np.where((concave > convex) | (concave > _CLEARLY), concave, -convex)
     weights, over, joint = np.zeros(n * n), np.zeros(n * n), np.zeros(n * n)
     for here, there in (
         ((slice(None), slice(None, -1)), (slice(None), slice(1, None))),
