@@ -48,7 +48,6 @@ OTHER = "other frames"
 HELD_OUT = 3
 """Every third frame, from the first, was not looked at while constants were chosen."""
 VARIED = (0.7, 1.3)
-ANGLES = ("angle", "steepest", "plane_angle")
 _MATCH = 0.5
 _PIECE = 0.1
 
@@ -223,8 +222,8 @@ def varied(name: str, factor: float) -> SegmentationOptions:
     part, _, field = name.rpartition(".")
     inner = getattr(options, part) if part else options
     value = factor * getattr(inner, field)
-    if field in ANGLES:
-        value = min(value, np.deg2rad(89))
+    if field == "steepest":  # what is left to the right angle is what varies
+        value = np.pi / 2 - factor * (np.pi / 2 - inner.steepest)
     changed = replace(inner, **{field: value})
     return replace(options, **{part: changed}) if part else changed
 

@@ -62,7 +62,7 @@ class FoldOptions:
     """
 
     radius: float = 0.01
-    angle: float = float(np.deg2rad(30))
+    angle: float = float(np.deg2rad(33))
     steepest: float = float(np.deg2rad(80))
     noise_margin: float = 3.0
     bent_margin: float = 0.5
