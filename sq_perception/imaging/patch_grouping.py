@@ -7,7 +7,8 @@ Every pair of patches that touch in the image gets a score, a sum over the sampl
 Convex bodies never show a concave edge or a depth step of their own, so that these say two bodies; a step counts fully
 from twice the difference at which it is one, as noise makes small ones.  Two exceptions:
 
-* a hollow patch (a bowl's inner wall) belongs to what it is seen over: its steps down from a nearer patch count +1,
+* a hollow patch (a bowl's inner wall) belongs to what it is seen over, and to other hollow ones: its steps down from a
+  nearer patch count +1, and so do its concave edges with another hollow patch,
 * two patches in one plane between whose centres nothing farther was seen, but something nearer, go on behind that: the
   root of the smaller one's samples counts.
 
@@ -72,10 +73,10 @@ def bodies(patches: Patches, camera: Camera, options: GroupingOptions | None = N
     """Body (count + 1,) of each patch, from 1; 0 for 0."""
     options = options or GroupingOptions()
     n = patches.count + 1
-    weights, over, joint = _borders(patches, options)
+    weights, dents, over, joint = _borders(patches, options)
     hollow = patches.curvature > 1 / options.hollow_radius
     gain = 2 * over * hollow[:, None]
-    weights += gain + gain.T
+    weights += gain + gain.T + 2 * dents * (hollow[:, None] & hollow[None, :])
     areas = np.bincount(patches.labels.ravel(), minlength=n) * _sample_area(patches, camera)
     body = _contracted(weights)
     member = (body[None, :] == np.arange(int(body.max()) + 1)[:, None]).astype(float)
@@ -90,9 +91,9 @@ def _sample_area(patches: Patches, camera: Camera) -> float:
     return (z * patches.stride) ** 2 / (camera.fx * camera.fy)
 
 
-def _borders(patches: Patches, options: GroupingOptions) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of each pair of patches (n, n): sum of the scores, samples at which the first lies a step behind, and samples of
-    continuous border.
+def _borders(patches: Patches, options: GroupingOptions) -> tuple[np.ndarray, ...]:
+    """Of each pair of patches (n, n): sum of the scores, what concave edges took from it, samples at which the first
+    lies a step behind, and samples of attached border.
 
     Samples without a depth count to the nearest one that has some, as a body throws a shadow beside itself in which a
     triangulating camera measures nothing.
@@ -103,7 +104,7 @@ def _borders(patches: Patches, options: GroupingOptions) -> tuple[np.ndarray, np
     square = np.ones((5, 5), np.uint8)
     concave, convex = cv2.dilate(known, square), -cv2.erode(known, square)
     fold = np.where((concave > convex) | (concave > _CLEARLY), concave, -convex)
-    weights, over, joint = np.zeros(n * n), np.zeros(n * n), np.zeros(n * n)
+    weights, dents, over, joint = np.zeros((4, n * n))
     for here, there in (
         ((slice(None), slice(None, -1)), (slice(None), slice(1, None))),
         ((slice(None, -1), slice(None)), (slice(1, None), slice(None))),
@@ -118,11 +119,12 @@ def _borders(patches: Patches, options: GroupingOptions) -> tuple[np.ndarray, np
         score = np.where(s != 0, np.clip(_FLAT - s, -1, 1), _UNKNOWN)
         score = np.where(step, -np.minimum(beyond, 1), np.where(far, 0.0, score))
         weights += np.bincount(a * n + b, score, n * n)
+        dents += np.bincount(a * n + b, np.where(step, 0.0, np.maximum(-score, 0)), n * n)
         joint += np.bincount((a * n + b)[np.abs(za - zb) < options.attached], minlength=n * n)
         behind = np.where(za > zb, a * n + b, b * n + a)
         over += np.bincount(behind[step & (np.abs(za - zb) < options.hollow_depth)], minlength=n * n)
-    scores, behind_of, attached = (each.reshape(n, n) for each in (weights, over, joint))
-    return scores + scores.T, behind_of, attached + attached.T
+    scores, bent, behind_of, attached = (each.reshape(n, n) for each in (weights, dents, over, joint))
+    return scores + scores.T, bent + bent.T, behind_of, attached + attached.T
 
 
 def _bridged(patches: Patches) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -13,7 +13,8 @@ bisector, an edge at which the normal turns by theta has |s| = tan(theta / 2), a
 |s| = r / (2 R) with r = z rho / f, the chord's radius in metres.  s is the strongest over four directions.
 
 The radius r is a length of the world, so that a body looks the same near and far; images are sampled on a grid that
-makes it some four samples long.  Chords that cross a depth step or a hole say nothing.
+makes it some four samples long, or fewer where bodies fill the image.  Chords that cross a depth step or a hole say
+nothing.
 
 Grid images are float32 (rows, columns), every ``stride``-th pixel.
 Reference: S. C. Stein et al., Object Partitioning using Local Convexity, CVPR 2014 (patches and signs of convexity).
@@ -30,6 +31,7 @@ from sq_perception.imaging import depth_steps
 from sq_perception.imaging.camera import Camera
 
 _RADIUS_SAMPLES = 4
+_MOST_SAMPLES = 50_000
 _LEAST_RADIUS = 2.0
 _CHORD_NOISE = float(np.sqrt(1.5))
 _DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
@@ -38,6 +40,7 @@ _SHAPE_TERMS = 6
 _SQUARE = 5
 _FULL = 0.9
 _MOST_PATCHES = 150
+_CONCAVE_BAND = 0.5
 _FAR_RADII = 3.0
 
 
@@ -48,7 +51,7 @@ class FoldOptions:
     Attributes
     ----------
     radius
-        Half length of the chord, metres; longer where noise would hide the fold.
+        Half length of the chord, metres; up to three times as long where noise would hide the fold.
     angle
         The normal turns at least by this, radians.
     steepest
@@ -82,12 +85,12 @@ class FoldOptions:
         Both ends and the middle are means over squares whose side is half of the chord's radius, about five pixels.
         """
         noise = self.noise_margin * _CHORD_NOISE * sigma * depth**2 / _SQUARE
-        return max(self.radius, noise / float(np.tan(self.angle / 2)))
+        return float(np.clip(noise / np.tan(self.angle / 2), self.radius, _FAR_RADII * self.radius))
 
     def resolved_at(self, depth: float, sigma: float, camera: Camera) -> bool:
         """Whether folds of bodies a few times the radius large are seen at a depth, metres."""
         enough = self.radius * camera.fx >= _LEAST_RADIUS * depth
-        return bool(enough and self.radius_at(depth, sigma) <= _FAR_RADII * self.radius)
+        return bool(enough and self.radius_at(depth, sigma) < _FAR_RADII * self.radius)
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,6 +167,8 @@ def find(
     if pixels < _LEAST_RADIUS:
         return None
     stride = max(1, round(pixels / _RADIUS_SAMPLES))
+    while np.count_nonzero(wanted) > _MOST_SAMPLES * stride**2 and pixels >= _LEAST_RADIUS * (stride + 1):
+        stride += 1
     half = max(1, round(pixels / _RADIUS_SAMPLES))
     inverse, known = _inverse_depth(filled, wanted, half, stride)
     coarse = filled[::stride, ::stride]
@@ -180,7 +185,12 @@ def find(
     least = max(6, round(options.least_area * (focal / middle / stride) ** 2))
     seeds = _large(cv2.morphologyEx(smooth.astype(np.uint8), cv2.MORPH_OPEN, depth_steps.CROSS), least)
     free = (coarse > 0) & (seeds == 0)
-    labels = depth_steps.grown(seeds, free, coarse, 2 * rho, step)
+    # Concave bands come last, so that two patches meet in the middle of theirs, even if the other edge of a narrow ledge
+    # lies within the chord.
+    with np.errstate(invalid="ignore"):
+        concave = fold > _CONCAVE_BAND
+    labels = depth_steps.grown(seeds, free & ~concave, coarse, 2 * rho, step)
+    labels = depth_steps.grown(labels, free & (labels == 0), coarse, 2 * rho, step)
     left = _large((coarse > 0) & (labels == 0), least)
     count = int(seeds.max())
     labels = np.where(left > 0, left + count, labels)
