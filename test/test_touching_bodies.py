@@ -75,7 +75,10 @@ PARTED = {
     "can before a box": [TABLE.body(0, 0.08, (0.09, 0.04, 0.07)), TABLE.body(0, 0, (0.04, 0.04, 0.05), CAN)],
     "can on a box": [TABLE.body(0, 0, (0.09, 0.07, 0.03)), TABLE.body(0, 0, (0.035, 0.035, 0.05), CAN, height=0.06)],
     "ball before a box": [TABLE.body(0, 0.07, (0.09, 0.03, 0.07)), TABLE.body(0, -0.005, (0.045, 0.045, 0.045), BALL)],
-    "cans side by side": [TABLE.body(-0.041, 0, (0.04, 0.04, 0.06), CAN), TABLE.body(0.041, 0, (0.04, 0.04, 0.05), CAN)],
+    "cans side by side": [
+        TABLE.body(-0.041, 0, (0.04, 0.04, 0.06), CAN),
+        TABLE.body(0.041, 0, (0.04, 0.04, 0.05), CAN),
+    ],
 }
 
 
@@ -85,7 +88,7 @@ def test_touching_bodies_are_parted(bodies, noise):
     depth, truth = TABLE.see(bodies, noise)
     found = segment(depth, VGA)
     assert len(found.ids) == len(bodies)
-    assert min(ious(truth, found.labels)) > 0.8
+    assert min(ious(truth, found.labels)) > 0.75
 
 
 WHOLE = {

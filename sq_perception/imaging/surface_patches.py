@@ -40,7 +40,8 @@ _SHAPE_TERMS = 6
 _SQUARE = 5
 _FULL = 0.9
 _MOST_PATCHES = 150
-_CONCAVE_BAND = 0.5
+_CONCAVE_BAND = 0.3
+_SANE = (1e-3, 1e3)
 _FAR_RADII = 3.0
 
 
@@ -153,7 +154,7 @@ def find(
     Returns
     -------
     Patches or None
-        None where nothing is wanted, or bodies are too far for the camera to show the chord in two pixels.
+        None where nothing as large as a patch is wanted, or bodies are too far to show the chord in two pixels.
     """
     options = options or FoldOptions()
     filled = np.where(wanted, depth, np.float32(0))
@@ -163,7 +164,7 @@ def find(
         return None
     focal = float(np.sqrt(camera.fx * camera.fy))
     middle = float(np.median(some))
-    pixels = options.radius_at(middle, sigma) * focal / middle
+    pixels = min(options.radius_at(middle, sigma) * focal / middle, min(depth.shape) / 8)
     if pixels < _LEAST_RADIUS:
         return None
     stride = max(1, round(pixels / _RADIUS_SAMPLES))
@@ -185,8 +186,8 @@ def find(
     least = max(6, round(options.least_area * (focal / middle / stride) ** 2))
     seeds = _large(cv2.morphologyEx(smooth.astype(np.uint8), cv2.MORPH_OPEN, depth_steps.CROSS), least)
     free = (coarse > 0) & (seeds == 0)
-    # Concave bands come last, so that two patches meet in the middle of theirs, even if the other edge of a narrow ledge
-    # lies within the chord.
+    # Concave bands come last, so that two patches meet in the middle of theirs, even if the other edge of a narrow
+    # ledge lies within the chord.
     with np.errstate(invalid="ignore"):
         concave = fold > _CONCAVE_BAND
     labels = depth_steps.grown(seeds, free & ~concave, coarse, 2 * rho, step)
@@ -195,6 +196,8 @@ def find(
     count = int(seeds.max())
     labels = np.where(left > 0, left + count, labels)
     count += int(left.max())
+    if count == 0:
+        return None
     curvature, planes = _shapes(seeds, count, inverse, camera, stride, options.bent_margin * sigma)
     return Patches(labels, count, depth[::stride, ::stride], stepped, fold, curvature, planes, stride, step)
 
@@ -202,8 +205,7 @@ def find(
 def _inverse_depth(filled: np.ndarray, wanted: np.ndarray, half: int, stride: int) -> tuple[np.ndarray, np.ndarray]:
     """1/z on the grid, averaged over a square of wanted pixels, and where at least half of the square is wanted."""
     mask = wanted.astype(np.float32)
-    with np.errstate(divide="ignore"):
-        inverse = np.where(wanted, 1 / filled, np.float32(0)).astype(np.float32)
+    inverse = np.where(wanted, 1 / np.clip(filled, *_SANE), 0).astype(np.float32)
     side = (2 * half + 1, 2 * half + 1)
     total = cv2.blur(inverse, side, borderType=cv2.BORDER_CONSTANT)[::stride, ::stride]
     share = cv2.blur(mask, side, borderType=cv2.BORDER_CONSTANT)[::stride, ::stride]
