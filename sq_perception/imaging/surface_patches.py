@@ -203,7 +203,7 @@ def find(
 
 
 def _inverse_depth(filled: np.ndarray, wanted: np.ndarray, half: int, stride: int) -> tuple[np.ndarray, np.ndarray]:
-    """1/z on the grid, averaged over a square of wanted pixels, and where at least half of the square is wanted."""
+    """1/z on the grid, averaged over the wanted pixels of a square, and where nearly all of it is wanted."""
     mask = wanted.astype(np.float32)
     inverse = np.where(wanted, 1 / np.clip(filled, *_SANE), 0).astype(np.float32)
     side = (2 * half + 1, 2 * half + 1)
@@ -214,7 +214,7 @@ def _inverse_depth(filled: np.ndarray, wanted: np.ndarray, half: int, stride: in
 
 
 def _steps(filled: np.ndarray, wanted: np.ndarray, step: float, stride: int) -> np.ndarray:
-    """Grid samples that have a depth step, or the end of what is wanted, in their square."""
+    """Grid samples that have the near side of a depth step in their square or beside it."""
     near = depth_steps.edges(filled, wanted, step).astype(np.uint8)
     size = 2 * (stride // 2) + 3
     return cv2.dilate(near, np.ones((size, size), np.uint8))[::stride, ::stride] > 0
