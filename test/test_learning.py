@@ -17,6 +17,7 @@ from sq_perception.imaging.scene import thesis_bodies
 from sq_perception.learning import checkpoint, losses
 from sq_perception.learning.dataset import ViewPool, ViewSource, draw_views
 from sq_perception.learning.dihedral import MIRROR, TURNS, moved_back, moved_bodies, moved_images
+from sq_perception.learning.disturbance import any_occluder
 from sq_perception.learning.objective import UNSUPERVISED, Objective
 from sq_perception.learning.regressor import Regressor, RegressorConfig
 from sq_perception.learning.train import train, validate
@@ -132,12 +133,42 @@ class TestNetwork:
         with pytest.raises(ValueError, match="expected"):
             Regressor(SMALL).predict(views)
 
-    def test_shipped_model_reads_unseen_bodies(self) -> None:
-        """The floor promised for the network alone, on bodies of seeds that no training uses."""
-        views, truth = draw_views(300, np.random.default_rng(123456))
-        iou = validate(checkpoint.load(), views, truth)
-        assert iou.mean() > 0.92
-        assert (iou > 0.85).mean() > 0.95
+    @pytest.mark.parametrize(
+        ("name", "source", "hidden", "least", "over_85"),
+        [
+            ("supervised", ViewSource(), 0.0, 0.935, 0.96),
+            ("robust", ViewSource(), 0.0, 0.915, 0.93),
+            ("robust", ViewSource(pinhole_share=1.0), 0.0, 0.905, 0.92),
+            ("robust", ViewSource(), 0.3, 0.85, 0.6),
+        ],
+    )
+    def test_shipped_models_read_unseen_bodies(
+        self, name: str, source: ViewSource, hidden: float, least: float, over_85: float
+    ) -> None:
+        """Networks alone, on bodies of seeds that no training uses."""
+        rng = np.random.default_rng(123456)
+        views, truth = draw_views(300, rng, source, any_occluder(np.full(300, hidden), rng) if hidden else None)
+        iou = validate(checkpoint.load(name), views, truth)
+        assert iou.mean() > least
+        assert (iou > 0.85).mean() > over_85
+
+    def test_names_of_shipped_weights_stand_for_their_files(self, tmp_path: Path) -> None:
+        assert set(checkpoint.shipped()) == {"robust", "supervised"}
+        assert checkpoint.resolve() == checkpoint.shipped()[checkpoint.DEFAULT]
+        assert checkpoint.resolve("supervised").is_file()
+        assert checkpoint.resolve(tmp_path / "supervised.safetensors") == tmp_path / "supervised.safetensors"
+        with pytest.raises(checkpoint.CheckpointError, match="no such model file"):
+            checkpoint.load("unheard-of")
+
+    def test_shipped_weights_say_where_they_come_from(self) -> None:
+        for path in checkpoint.shipped().values():
+            header = checkpoint.read_header(path)
+            made, training = json.loads(header["made"]), json.loads(header["training"])
+            assert made["hours"] > 0
+            assert made["commit"]
+            assert training["seed"]
+            assert json.loads(header["metrics"])["iou"] > 0.9
+            assert path.stat().st_size < 8_000_000
 
 
 class TestTraining:

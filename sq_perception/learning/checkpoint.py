@@ -21,7 +21,7 @@ from sq_perception.learning.regressor import Regressor, RegressorConfig
 
 FORMAT = "sq_perception.regressor"
 VERSION = "1"
-DEFAULT = "compact"
+DEFAULT = "robust"
 """Name of the weights that are used where none are named."""
 _MAX_PARAMETERS = 200_000_000
 _MAX_BLOCKS = 64
