@@ -15,6 +15,7 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import scene
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.raycast import render
+from sq_perception.imaging.sensor_model import Ideal
 from sq_perception.recovery import Recoverer
 from sq_perception.tracking import forms, sight, state
 from sq_perception.tracking.tracker import Tracker, TrackerOptions, TrackState
@@ -623,7 +624,7 @@ def frames_about(shown, count, step, rng, sigma=0.001):
         plane = np.append(matrix @ normal, shown.plane[3] + normal @ position)
         moved = scene.Scene(shown.bodies.transformed(back, -matrix @ position), shown.camera, plane)
         depth, labels = moved.render()
-        depth = scene.with_noise(depth, sigma, rng)
+        depth = Ideal(sigma).measured(depth, shown.camera, rng)
         yield recoverer.recover(depth, shown.camera, labels), (turn, position), depth
 
 
