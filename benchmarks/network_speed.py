@@ -118,14 +118,14 @@ def measure_networks(names: list[str], seconds: float, compile_too: bool) -> dic
     import torch
 
     from sq_perception.learning import checkpoint
-    from sq_perception.learning.dataset import draw_views
+    from sq_perception.learning.dataset import ViewSource, draw_views
     from sq_perception.learning.regressor import Regressor, RegressorConfig
 
     torch.manual_seed(0)
     result: dict[str, Any] = {}
     for name in names:
         model = checkpoint.load() if name == "compact" else Regressor(RegressorConfig.thesis()).eval()
-        views, _ = draw_views(max(BATCHES), np.random.default_rng(0), model.config.pixels)
+        views, _ = draw_views(max(BATCHES), np.random.default_rng(0), ViewSource(model.config.pixels))
         expected = model.predict(views).to_flat()
         result[name] = {}
         for engine, make in engines(model, compile_too):
