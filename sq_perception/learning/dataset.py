@@ -79,14 +79,21 @@ def draw_views(
     return render_views(bodies, source.pixels, np.full(count, GREY_LEVELS), distance, occluder, miss)
 
 
-def full_frames(bodies: Superquadric, pixels: int = unit_cube.THESIS_PIXELS) -> np.ndarray:
-    """The thesis' images of bodies (n,) of the cube frame: float32 (n, p, p), z of the surface and 0 for background."""
+def grey_frames(
+    bodies: Superquadric, pixels: int = unit_cube.THESIS_PIXELS, dtype: type[np.unsignedinteger] = np.uint8
+) -> np.ndarray:
+    """The thesis' images (n, p, p) of bodies (n,) of the cube frame, in 8 or 16 bit grey levels, 0 for background."""
     camera = unit_cube.camera(pixels)
-    frames = np.empty((len(bodies), pixels, pixels), dtype=np.float32)
+    frames = np.empty((len(bodies), pixels, pixels), dtype=dtype)
     for frame, body in zip(frames, unit_cube.optical_from_cube(bodies), strict=True):
-        depth = unit_cube.depth_from_grey(unit_cube.grey_from_depth(raycast.render(body, camera)[0]))
-        frame[:] = np.where(np.isfinite(depth), 1 - depth, 0.0)
+        frame[:] = unit_cube.grey_from_depth(raycast.render(body, camera)[0], dtype)
     return frames
+
+
+def full_frames(bodies: Superquadric, pixels: int = unit_cube.THESIS_PIXELS) -> np.ndarray:
+    """The same as a network takes them: float32 (n, p, p), z of the surface and 0 for background."""
+    grey = grey_frames(bodies, pixels)
+    return np.where(grey > 0, (grey + np.float32(0.5)) / np.float32(GREY_LEVELS), np.float32(0))
 
 
 class ViewPool:

@@ -27,7 +27,7 @@ import numpy as np
 from safetensors.numpy import save
 
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.imaging import raycast, unit_cube
+from sq_perception.imaging import unit_cube
 from sq_perception.imaging.scene import thesis_bodies
 from sq_perception.learning import dataset
 from sq_perception.learning.fixed_set import (
@@ -57,11 +57,7 @@ def draw(settings: Settings, split: str, shard: int) -> tuple[np.ndarray, np.nda
         return np.round(views * np.float32(2**settings.bits - 1)).astype(settings.dtype), _flat(seen)
     # Rendered as written, in single precision: whoever reads a body and renders it gets the image to the bit.
     flat = _flat(thesis_bodies(count, rng))
-    camera = unit_cube.camera(settings.pixels)
-    images = np.empty((count, settings.pixels, settings.pixels), settings.dtype)
-    for k, body in enumerate(unit_cube.optical_from_cube(Superquadric.from_flat(flat))):
-        images[k] = unit_cube.grey_from_depth(raycast.render(body, camera)[0], settings.dtype)
-    return images, flat
+    return dataset.grey_frames(Superquadric.from_flat(flat), settings.pixels, settings.dtype), flat
 
 
 def _flat(bodies: Superquadric) -> np.ndarray:
