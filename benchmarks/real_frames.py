@@ -22,8 +22,9 @@ from __future__ import annotations
 import argparse
 import os
 
-for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
-    os.environ.setdefault(variable, "1")
+if __name__ == "__main__":  # as a script only: a process that imports this has threads already
+    for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
+        os.environ.setdefault(variable, "1")
 
 import sys  # noqa: E402
 from dataclasses import dataclass  # noqa: E402
