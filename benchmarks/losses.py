@@ -19,12 +19,12 @@ if __name__ == "__main__":  # as a script only: a process that imports this has 
     for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
 
-import report  # noqa: E402
-import torch  # noqa: E402
+import report
+import torch
 
-from sq_perception.evaluation.contest import compare  # noqa: E402
-from sq_perception.evaluation.contestants import Network  # noqa: E402
-from sq_perception.evaluation.thesis_images import ThesisImages  # noqa: E402
+from sq_perception.evaluation.contest import compare
+from sq_perception.evaluation.contestants import Network
+from sq_perception.evaluation.thesis_images import ThesisImages
 
 THESIS = {
     "occupancy": "94.62 +- 3.18",

@@ -19,18 +19,18 @@ if __name__ == "__main__":  # as a script only: a process that imports this has 
     for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
 
-from typing import Any  # noqa: E402
+from typing import Any
 
-import numpy as np  # noqa: E402
-import report  # noqa: E402
-import single_body  # noqa: E402
-import torch  # noqa: E402
+import numpy as np
+import report
+import single_body
+import torch
 
-from sq_perception import metrics  # noqa: E402
-from sq_perception.fitting.fit import Status  # noqa: E402
-from sq_perception.geometry import Superquadric  # noqa: E402
-from sq_perception.learning import checkpoint  # noqa: E402
-from sq_perception.recovery import Recoverer, RecoveryOptions  # noqa: E402
+from sq_perception import metrics
+from sq_perception.fitting.fit import Status
+from sq_perception.geometry import Superquadric
+from sq_perception.learning import checkpoint
+from sq_perception.recovery import Recoverer, RecoveryOptions
 
 SEED = 7400
 SHARES = (0.0, 0.1, 0.2, 0.3, 0.4)

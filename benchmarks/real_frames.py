@@ -26,21 +26,21 @@ if __name__ == "__main__":  # as a script only: a process that imports this has 
     for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
 
-import sys  # noqa: E402
-from dataclasses import dataclass  # noqa: E402
-from pathlib import Path  # noqa: E402
-from typing import Any  # noqa: E402
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
-import numpy as np  # noqa: E402
-import report  # noqa: E402
-from both_fits import Both, both  # noqa: E402
+import numpy as np
+import report
+from both_fits import Both, both
 
-from sq_perception import metrics, recorded_frame  # noqa: E402
-from sq_perception.fitting import surface_fit  # noqa: E402
-from sq_perception.fitting.covariance import undetermined  # noqa: E402
-from sq_perception.fitting.fit import Status  # noqa: E402
-from sq_perception.geometry import Superquadric  # noqa: E402
-from sq_perception.imaging import unit_cube  # noqa: E402
+from sq_perception import metrics, recorded_frame
+from sq_perception.fitting import surface_fit
+from sq_perception.fitting.covariance import undetermined
+from sq_perception.fitting.fit import Status
+from sq_perception.geometry import Superquadric
+from sq_perception.imaging import unit_cube
 
 AGREEMENT = 4.0
 DISTANCE = 3.0

@@ -24,23 +24,23 @@ if __name__ == "__main__":  # as a script only: a process that imports this has 
     for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
 
-import sys  # noqa: E402
-from collections.abc import Callable  # noqa: E402
-from dataclasses import dataclass  # noqa: E402
-from pathlib import Path  # noqa: E402
-from typing import Any  # noqa: E402
+import sys
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
 
-import mesh_scene  # noqa: E402
-import numpy as np  # noqa: E402
-import report  # noqa: E402
-import trimesh  # noqa: E402
-from both_fits import Both, both  # noqa: E402
-from hull_oracle import Columns, oracle  # noqa: E402
+import mesh_scene
+import numpy as np
+import report
+import trimesh
+from both_fits import Both, both
+from hull_oracle import Columns, oracle
 
-from sq_perception.fitting import surface_fit  # noqa: E402
-from sq_perception.fitting.fit import Status  # noqa: E402
-from sq_perception.geometry import Superquadric  # noqa: E402
-from sq_perception.geometry import rotation as quaternions  # noqa: E402
+from sq_perception.fitting import surface_fit
+from sq_perception.fitting.fit import Status
+from sq_perception.geometry import Superquadric
+from sq_perception.geometry import rotation as quaternions
 
 SEED = 9000
 POOR = 0.8

@@ -28,19 +28,19 @@ if __name__ == "__main__":  # as a script only: a process that imports this has 
     for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
 
-import sys  # noqa: E402
-import time  # noqa: E402
-from dataclasses import dataclass, fields, replace  # noqa: E402
-from pathlib import Path  # noqa: E402
-from typing import Any  # noqa: E402
+import sys
+import time
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
 
-import cv2  # noqa: E402
-import numpy as np  # noqa: E402
-import report  # noqa: E402
-from scipy.optimize import linear_sum_assignment  # noqa: E402
+import cv2
+import numpy as np
+import report
+from scipy.optimize import linear_sum_assignment
 
-from sq_perception import recorded_frame  # noqa: E402
-from sq_perception.imaging.segmentation import SegmentationOptions, segment  # noqa: E402
+from sq_perception import recorded_frame
+from sq_perception.imaging.segmentation import SegmentationOptions, segment
 
 IOU_GOAL = 0.85
 F1_GOAL = {"boxes": 0.9, "stacked_boxes": 0.9, "cylindric": 0.9, "occluded": 0.8}

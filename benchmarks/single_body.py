@@ -20,23 +20,23 @@ if __name__ == "__main__":  # as a script only: a process that imports this has 
     for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
 
-import time  # noqa: E402
-from collections.abc import Callable  # noqa: E402
-from dataclasses import dataclass  # noqa: E402
-from typing import Any  # noqa: E402
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
 
-import cv2  # noqa: E402
-import numpy as np  # noqa: E402
-import report  # noqa: E402
-from scipy.optimize import linear_sum_assignment  # noqa: E402
+import cv2
+import numpy as np
+import report
+from scipy.optimize import linear_sum_assignment
 
-from sq_perception import metrics  # noqa: E402
-from sq_perception.fitting import solina_bajcsy, surface_fit  # noqa: E402
-from sq_perception.fitting.fit import Fit, Status  # noqa: E402
-from sq_perception.geometry import Superquadric, rotation  # noqa: E402
-from sq_perception.imaging import raycast, unit_cube  # noqa: E402
-from sq_perception.imaging.camera import Camera  # noqa: E402
-from sq_perception.imaging.scene import thesis_bodies  # noqa: E402
+from sq_perception import metrics
+from sq_perception.fitting import solina_bajcsy, surface_fit
+from sq_perception.fitting.fit import Fit, Status
+from sq_perception.geometry import Superquadric, rotation
+from sq_perception.imaging import raycast, unit_cube
+from sq_perception.imaging.camera import Camera
+from sq_perception.imaging.scene import thesis_bodies
 
 SEED = 7000
 GREY = 1 / 255

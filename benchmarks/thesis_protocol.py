@@ -18,14 +18,14 @@ if __name__ == "__main__":  # as a script only: a process that imports this has 
     for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
 
-import numpy as np  # noqa: E402
-import report  # noqa: E402
-import torch  # noqa: E402
+import numpy as np
+import report
+import torch
 
-from sq_perception.evaluation.contest import compare  # noqa: E402
-from sq_perception.evaluation.contestants import Fit, Network  # noqa: E402
-from sq_perception.evaluation.thesis_images import ThesisImages  # noqa: E402
-from sq_perception.learning.checkpoint import resolve  # noqa: E402
+from sq_perception.evaluation.contest import compare
+from sq_perception.evaluation.contestants import Fit, Network
+from sq_perception.evaluation.thesis_images import ThesisImages
+from sq_perception.learning.checkpoint import resolve
 
 THESIS = {"network": "94.62 +- 3.18, 2.88 ms (GPU)", "classic": "84.51 +- 8.89, 690 ms"}
 

@@ -86,9 +86,7 @@ class RecordedFrame:
     warning: str = ""
 
 
-def read(
-    path: str | Path, camera_info: str | Path | None = None, projection: Projection = "pinhole"
-) -> RecordedFrame:
+def read(path: str | Path, camera_info: str | Path | None = None, projection: Projection = "pinhole") -> RecordedFrame:
     """Read one frame.
 
     Parameters

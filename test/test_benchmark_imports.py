@@ -22,6 +22,9 @@ sys.exit(f"{changed} set by the import" if changed else 0)
 def test_an_import_leaves_the_number_of_threads_alone(name: str, repository: Path) -> None:
     # Numba refuses to compile once its threads run and NUMBA_NUM_THREADS names another number.
     done = subprocess.run(
-        [sys.executable, "-c", IMPORT, str(repository / "benchmarks"), name], capture_output=True, text=True, timeout=300
+        [sys.executable, "-c", IMPORT, str(repository / "benchmarks"), name],
+        capture_output=True,
+        text=True,
+        timeout=300,
     )
     assert done.returncode == 0, done.stderr

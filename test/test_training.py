@@ -107,9 +107,7 @@ class TestSchedule:
 
     def test_plateau_ends_a_run(self, tmp_path: Path) -> None:
         """With a rate of almost nothing there is no progress, and a run of a million steps ends soon."""
-        config = replace(
-            RUN, schedule="plateau", learning_rate=1e-12, steps=10**6, validation=2, batch=4, average=0.0
-        )
+        config = replace(RUN, schedule="plateau", learning_rate=1e-12, steps=10**6, validation=2, batch=4, average=0.0)
         train.train(config, tmp_path, SMALL)
         records = training_log.read(tmp_path)
         assert 42 <= records[-1]["step"] < 120
