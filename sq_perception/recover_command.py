@@ -56,12 +56,13 @@ examples:
 output:
   {"frames": [{"file": ..., "ms": ..., "superquadrics": [{"size": [a1, a2, a3], "shape": [e1, e2],
    "translation": [x, y, z], "rotation": [x, y, z, w], "score": ..., "residual": ..., "sigma_size": [...],
-   "status": "converged" | "weak" | "failed", "message": ..., "label": ..., "pixels": ...}, ...],
+   "seen": [...], "status": "converged" | "weak" | "failed", "message": ..., "label": ..., "pixels": ...}, ...],
    "stamp": {"sec": ..., "nanosec": ...}, "topic": ..., "frame_id": ...}, ...]}
   Half sizes and positions are metres in the optical frame (x right, y down, z forward); for orthographic frames the
   unit cube (x right, y up, z to the viewer).  What is unknown is null: stamp, topic and frame_id of anything but a
-  bag.  A failed object is listed with its reason; its numbers only say where it is.  "label" is the mask's value, null
-  without masks; "pixels" counts the measured ones.
+  bag.  "seen" is the share of each size that the measured points span; the rest is inferred.  A failed object is
+  listed with its reason; its numbers only say where it is.  "label" is the mask's value, null without masks; "pixels"
+  counts the measured ones.
 
 meshes:
   One file a frame with all its bodies, in metres, coloured as in the pictures; a frame without a body gets none.  PLY
@@ -233,6 +234,7 @@ def _frame_entry(file: str, frame: RecordedFrame, recovery: FrameRecovery, has_m
                 "score": _number(body.score),
                 "residual": _number(body.residual),
                 "sigma_size": _numbers(body.sigma_size),
+                "seen": _numbers(body.seen),
                 "status": body.status.name.lower(),
                 "message": body.message,
                 "label": int(body.label) if has_masks else None,

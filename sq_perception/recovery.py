@@ -35,12 +35,13 @@ from typing import Literal, get_args
 import numpy as np
 import torch
 
-from sq_perception.fitting import prediction, soft_render_fit, solina_bajcsy, surface_fit
+from sq_perception.fitting import soft_render_fit, solina_bajcsy, surface_fit
 from sq_perception.fitting.fit import Fit, Status
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import canonical_view, raycast, segmentation, soft_render
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.canonical_view import CanonicalView
+from sq_perception.imaging.coherence import coherent
 from sq_perception.learning import checkpoint, inference
 from sq_perception.learning.consensus import Consensus
 
@@ -52,7 +53,11 @@ _SCORE_STRIDE = 3
 """22 x 22 lines of sight of 64 voxels: few enough for torch not to spread them over threads, which would cost more."""
 _FEWEST_PIXELS = 12
 _UNKNOWN = np.full((11, 11), np.nan)
+_UNSEEN = np.full(3, np.nan)
 _CLASSIC_POINTS = 2000
+_ON_TABLE = 0.003
+_JUMP_PIXELS, _JUMP = 10.0, 0.002
+"""What a network is shown, and a score is measured on: metres above the table; steps in pixel widths, and metres."""
 _NEEDS_NETWORK = ("auto", "network")
 _HARD_IMAGE = (ValueError, ArithmeticError, np.linalg.LinAlgError)
 """What numerical code may raise on degenerate data: reported with the object, never raised."""
@@ -137,6 +142,8 @@ class Recovery:
     covariance : (11, 11)
         Of a1 a2 a3 e1 e2 t1 t2 t3 and the rotation vector in the object frame, metres and radians, as in
         :class:`~sq_perception.fitting.fit.Fit`; NaN for methods that do not compute it.
+    seen : (3,)
+        Share of each size that was seen, as in :class:`~sq_perception.fitting.fit.Fit`; the rest is inferred.
     """
 
     superquadric: Superquadric
@@ -148,6 +155,7 @@ class Recovery:
     label: int
     pixels: int
     covariance: np.ndarray = field(default_factory=_UNKNOWN.copy)
+    seen: np.ndarray = field(default_factory=_UNSEEN.copy)
 
 
 @dataclass(frozen=True, eq=False)
@@ -274,11 +282,12 @@ class Recoverer:
         with _timed(milliseconds, "network"):
             for one in objects:
                 one.plane = _support(one, found.plane)
+                core = _core(one, camera)
                 if network is not None:
-                    one.shown = network.config.view_of(depth, one.mask, camera, one.plane)
+                    one.shown = network.config.view_of(depth, core, camera, one.plane)
                 one.view = one.shown
                 if network is None or network.config.framing == "full":
-                    one.view = canonical_view.from_mask(one.depth_crop, one.mask_crop, one.camera_crop, _VIEW_PIXELS)
+                    one.view = canonical_view.from_mask(depth, core, camera, _VIEW_PIXELS)
             if network is not None and objects:
                 views = np.stack([one.shown.marked for one in objects if one.shown is not None])
                 predictions: Future[Superquadric] = Future()
@@ -331,6 +340,7 @@ class _Object:
     depth_crop: np.ndarray
     mask_crop: np.ndarray
     camera_crop: Camera
+    window: tuple[slice, slice]
     plane: np.ndarray | None = None
     """What it stands on."""
     shown: CanonicalView | None = None
@@ -390,7 +400,7 @@ def _objects(
         window = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
         crop = mask[window]
         camera_crop = camera.cropped(int(columns[0]), int(rows[0]), crop.shape[1], crop.shape[0])
-        objects.append(_Object(label, int(np.count_nonzero(crop)), mask, depth[window], crop, camera_crop))
+        objects.append(_Object(label, int(np.count_nonzero(crop)), mask, depth[window], crop, camera_crop, window))
     return objects
 
 
@@ -407,6 +417,27 @@ def _support(one: _Object, plane: np.ndarray | None) -> np.ndarray | None:
     if plane is None or np.median(one.points @ plane[:3] + plane[3]) <= 0:
         return None
     return plane
+
+
+def _core(one: _Object, camera: Camera) -> np.ndarray:
+    """The mask (height, width) without pixels that measured the table or the background: a view is framed by all.
+
+    Sensors widen what is near, masks from colour what they like.  A thin thing on the table keeps its pixels.
+    """
+    if not camera.is_pinhole:
+        return one.mask
+    core = one.mask_crop
+    if one.plane is not None:
+        rows, columns = np.nonzero(core)
+        points = one.camera_crop.unproject(columns, rows, one.depth_crop[rows, columns])
+        above = core.copy()
+        above[rows, columns] = points @ one.plane[:3] + one.plane[3] > _ON_TABLE
+        core = above if 2 * np.count_nonzero(above) > rows.size else core
+    footprint = float(np.median(one.depth_crop[one.mask_crop])) / np.sqrt(camera.fx * camera.fy)
+    core = coherent(one.depth_crop, core, _JUMP_PIXELS * footprint + _JUMP)
+    whole = np.zeros_like(one.mask)
+    whole[one.window] = core & one.mask_crop
+    return whole
 
 
 def _fitted(one: _Object, depth: np.ndarray, camera: Camera, options: RecoveryOptions) -> Fit:
@@ -442,11 +473,12 @@ def _surface_fit(one: _Object, depth: np.ndarray, camera: Camera, plane: np.ndar
     The network computes beside the fit.  What the image leaves open after all, such as the depth of a box seen
     face-on, its prediction tells again.
     """
-    settings = surface_fit.Options(plane=plane, time_budget=time_budget)
     if one.predictions is None:
-        return surface_fit.fit(depth, one.mask, camera, options=settings)
-    fit = surface_fit.fit(depth, one.mask, camera, start=one.predicted, options=settings)
-    return prediction.completed(fit, one.predicted()) if prediction.is_open(fit) else fit
+        return surface_fit.fit(
+            depth, one.mask, camera, options=surface_fit.Options(plane=plane, time_budget=time_budget)
+        )
+    settings = surface_fit.Options(plane=plane, time_budget=time_budget, expected=one.predicted)
+    return surface_fit.fit(depth, one.mask, camera, start=one.predicted, options=settings)
 
 
 def _soft_rendered(start: Superquadric, one: _Object, options: RecoveryOptions) -> Fit:
@@ -463,7 +495,17 @@ def _unfitted(body: Superquadric, one: _Object, message: str) -> Fit:
     distance = body.sampson_distance(one.points)
     residual = float(np.sqrt(np.mean(distance**2)))
     return Fit(
-        body, residual, np.nan, np.nan, np.nan, _UNKNOWN, Status.CONVERGED, message, iterations=0, milliseconds=0.0
+        body,
+        residual,
+        np.nan,
+        np.nan,
+        np.nan,
+        _UNSEEN,
+        _UNKNOWN,
+        Status.CONVERGED,
+        message,
+        iterations=0,
+        milliseconds=0.0,
     )
 
 
@@ -472,7 +514,9 @@ def _failed(one: _Object, reason: str) -> Fit:
     low, high = points.min(axis=0), points.max(axis=0)
     size = np.maximum(0.5 * (high - low), 1e-3 * max(float((high - low).max()), 1e-3))
     body = Superquadric(size, np.ones(2), 0.5 * (low + high), np.array([0.0, 0.0, 0.0, 1.0]))
-    return Fit(body, np.nan, np.nan, 0.0, np.nan, _UNKNOWN, Status.FAILED, reason, iterations=0, milliseconds=0.0)
+    return Fit(
+        body, np.nan, np.nan, 0.0, np.nan, _UNSEEN, _UNKNOWN, Status.FAILED, reason, iterations=0, milliseconds=0.0
+    )
 
 
 def _score(view: CanonicalView | None, body: Superquadric, options: RecoveryOptions) -> float:
@@ -498,6 +542,7 @@ def _recovery(one: _Object, fit: Fit, score: float) -> Recovery:
         one.label,
         one.pixels,
         fit.covariance,
+        fit.seen,
     )
 
 

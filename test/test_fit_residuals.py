@@ -194,6 +194,18 @@ def test_plane_rest_and_proportion(rng: np.random.Generator) -> None:
         SAMPSON, NO_RAYS, NO_RAYS, even, body, expected_sums(body, lambda moved: 2 * statement.proportion(moved))
     )
 
+    round_ = PLAIN._replace(roundness_stiffness=7.0)
+    assert_same(
+        SAMPSON, NO_RAYS, NO_RAYS, round_, body, expected_sums(body, lambda moved: 7 * statement.roundness(moved))
+    )
+
+    sizes = np.array([0.02, 0.05, 0.08])
+    expecting = PLAIN._replace(expected_1=0.02, expected_2=0.05, expected_3=0.08, expectation_stiffness=4.0)
+    residual = 4 * np.log(body.size / sizes)
+    scale = torch.tensor(4 / np.sqrt(1 + residual**2))
+    _, matrix = expected_sums(body, lambda moved: scale * statement.surprise(moved, torch.tensor(sizes)))
+    assert_same(SAMPSON, NO_RAYS, NO_RAYS, expecting, body, (np.log1p(residual**2).sum(), matrix))
+
 
 def test_a_body_above_the_plane_pays_nothing(rng: np.random.Generator) -> None:
     body = random_body(rng)

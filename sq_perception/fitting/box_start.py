@@ -40,16 +40,20 @@ def principal(points: np.ndarray) -> list[State]:
 
 def on_plane(points: np.ndarray, plane: np.ndarray) -> list[State]:
     """Boxes that stand on the plane: smallest rectangle around the footprint of the points, down to the plane."""
-    normal = plane[:3]
+    axes = standing_axes(points, plane[:3])
+    ground = -plane[3] * plane[:3]
+    return _box_states(points, axes, away=points.mean(axis=0), ground=ground)
+
+
+def standing_axes(points: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    """Columns (3, 3): the sides of the smallest rectangle around the footprint of the points, and the unit normal."""
     first = np.cross(normal, [0.0, 0.0, 1.0] if abs(normal[2]) < 0.9 else [1.0, 0.0, 0.0])
     first /= np.linalg.norm(first)
     second = np.cross(normal, first)
     flat = np.stack([points @ first, points @ second], axis=1)
     (_, _), (_, _), angle = cv2.minAreaRect(flat.astype(np.float32))
     c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
-    axes = np.stack([c * first + s * second, -s * first + c * second, normal], axis=1)
-    ground = -plane[3] * normal
-    return _box_states(points, axes, away=points.mean(axis=0), ground=ground)
+    return np.stack([c * first + s * second, -s * first + c * second, normal], axis=1)
 
 
 def _axes_of(points: np.ndarray) -> np.ndarray:

@@ -36,6 +36,9 @@ class Fit:
         Share of the object's pixels within three noise levels of the surface, 0 to 1.
     visible_share
         Share of the body's surface that the camera saw, 0 to 1; NaN for methods that do not compute it.
+    seen
+        (3,) share of each full size that the measured points span along its axis, 0 to 1: the rest is inferred, from
+        free space, the support plane, symmetry and what bodies mostly are.  NaN for methods that do not compute it.
     covariance
         (11, 11) of a1 a2 a3 e1 e2 t1 t2 t3 and the rotation vector in the object frame; metres and radians.
         NaN for methods that do not compute it.
@@ -50,6 +53,7 @@ class Fit:
     noise: float
     inlier_share: float
     visible_share: float
+    seen: np.ndarray
     covariance: np.ndarray
     status: Status
     message: str

@@ -25,6 +25,7 @@ from sq_perception.fitting.depth_noise import DepthNoise
 from sq_perception.fitting.residuals import RAY_COLUMNS
 from sq_perception.geometry.kernels import kernel
 from sq_perception.imaging.camera import Camera
+from sq_perception.imaging.coherence import coherent
 
 _STEEPEST = 6.0
 _BAND_PIXELS = 4
@@ -34,7 +35,6 @@ _HOLE = 5
 """Holes and notches of the mask up to this width, pixels, are closed: the outline of a convex body has none."""
 _JUMP_PIXELS, _JUMP_NOISE = 10.0, 6.0
 """A depth step between neighbours above so many pixel widths, plus so many noise levels, ends a surface."""
-_SMALLEST_PIECE = 0.02
 _COARSE = 3
 """Far from the mask, only every third pixel in each direction is a free pixel."""
 _FREE_MARGIN, _FREE_MODEL_MARGIN = 3.0, 2.0
@@ -181,7 +181,7 @@ def observe(
     sigma = float(np.hypot(noise.at(distance), model_error))
     focal = np.sqrt(view.fx * view.fy)
     footprint = float(distance / focal if view.is_pinhole else 1 / focal)
-    inside = _coherent(crop, inside, _JUMP_PIXELS * footprint + _JUMP_NOISE * sigma)
+    inside = coherent(crop, inside, _JUMP_PIXELS * footprint + _JUMP_NOISE * sigma)
     filled = cv2.morphologyEx(inside.view(np.uint8), cv2.MORPH_CLOSE, np.ones((_HOLE, _HOLE), np.uint8))
     claimed = cv2.bitwise_or(filled, np.ascontiguousarray(mask[window]).view(np.uint8))
     near = cv2.dilate(filled, np.ones((2 * band + 1, 2 * band + 1), np.uint8))
@@ -265,63 +265,6 @@ def _mean_depth(depth: np.ndarray, inside: np.ndarray) -> float:
     if count == 0:
         return np.nan
     return total / count
-
-
-@kernel
-def _coherent(depth: np.ndarray, inside: np.ndarray, jump: float) -> np.ndarray:
-    """The mask without what is not the object: pieces that a depth step separates from the largest piece.
-
-    A convex body has no step in its visible surface.  Pixels without depth belong to no piece and stay.  A piece that
-    touches the largest one across a step, or is tiny, goes; one beyond a gap (a bar in front of the body) stays.
-    """
-    height, width = depth.shape
-    label = np.zeros((height, width), np.int32)
-    stack = np.empty(height * width, np.int32)
-    largest, largest_size, pieces = 0, 0, 0
-    sizes = np.zeros(height * width // 2 + 2, np.int32)
-    for start in range(height * width):
-        v, u = start // width, start % width
-        if label[v, u] > 0 or not inside[v, u] or not np.isfinite(depth[v, u]) or pieces + 1 >= sizes.shape[0]:
-            continue
-        pieces += 1
-        label[v, u] = pieces
-        stack[0] = start
-        top = 1
-        size = 0
-        while top > 0:
-            top -= 1
-            v, u = stack[top] // width, stack[top] % width
-            size += 1
-            for side in range(4):
-                v2, u2 = v + (side == 0) - (side == 1), u + (side == 2) - (side == 3)
-                if v2 < 0 or u2 < 0 or v2 >= height or u2 >= width or label[v2, u2] > 0 or not inside[v2, u2]:
-                    continue
-                if abs(depth[v2, u2] - depth[v, u]) <= jump:
-                    label[v2, u2] = pieces
-                    stack[top] = v2 * width + u2
-                    top += 1
-        sizes[pieces] = size
-        if size > largest_size:
-            largest, largest_size = pieces, size
-    if pieces <= 1:
-        return inside
-    kept = np.ones(pieces + 1, np.bool_)
-    for k in range(1, pieces + 1):
-        kept[k] = sizes[k] >= _SMALLEST_PIECE * largest_size
-    for v in range(height):
-        for u in range(width):
-            if label[v, u] != largest:
-                continue
-            for side in range(4):
-                v2, u2 = v + (side == 0) - (side == 1), u + (side == 2) - (side == 3)
-                if 0 <= v2 < height and 0 <= u2 < width and label[v2, u2] > 0:
-                    kept[label[v2, u2]] = False
-    kept[0] = kept[largest] = True
-    coherent = inside.copy()
-    for v in range(height):
-        for u in range(width):
-            coherent[v, u] = inside[v, u] and kept[label[v, u]]
-    return coherent
 
 
 @kernel

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
 
 from sq_perception.fitting.bounds import Bounds
 from sq_perception.fitting.depth_noise import DepthNoise
+from sq_perception.geometry.superquadric import Superquadric
 
 MIN_PIXELS = 12
 MODEL_ERROR_ON_PLANE = 0.0025
@@ -31,6 +33,9 @@ class Options:
     plane
         (4,) support plane n.x + d = height in the optical frame, n pointing away from the support; None if the object
         floats.  A body does not reach below it, and is expected to lie on one of its faces.
+    expected
+        A body in the optical frame, or a function that returns it, that says how large the object may be where the
+        image does not: the prediction of a network.  A wide prior with long tails; asked for only where it matters.
     nan_is_empty
         Whether a pixel without depth, outside the mask's convex hull, belongs to no part of the body, like one that saw
         farther; if not, it says nothing.
@@ -49,6 +54,7 @@ class Options:
     noise: float | DepthNoise | None = None
     model_error: float | None = None
     plane: np.ndarray | None = None
+    expected: Superquadric | Callable[[], Superquadric] | None = None
     nan_is_empty: bool = True
     pixels: int | None = None
     max_iterations: int = 15

@@ -4,6 +4,8 @@ plane       (lowest point above the plane) / sigma where negative: n.t + d - h(R
             the gauge's dual norm: two nested p-norms of a n with exponents 2 - e.
 rest        the two components of R^T n across the axis nearest to the normal, over sigma, Cauchy: bodies lie on a face.
 proportion  log a_k minus the mean of the three, over sigma: what the image leaves open resembles what it shows.
+expectation log a_k minus that of a predicted half size, over sigma, Cauchy: a prediction may be altogether wrong.
+roundness   log(a1 / a2) and 1 - e2, over sigma: a body of revolution about its z axis.
 volume      a linear price on log(a1 a2 a3), for the smaller of two bodies that explain the image alike.
 
 Each function returns its share of the cost and adds its derivatives to the normal equations ``sums``; the unknowns are
@@ -32,6 +34,10 @@ def prior_cost(scene: Scene, parameters: np.ndarray, rotation: np.ndarray, sums:
         cost += _support_cost(scene, parameters, rotation, sums)
     if scene.proportion_stiffness > 0.0:
         cost += _proportion_cost(scene, parameters, sums)
+    if scene.expectation_stiffness > 0.0:
+        cost += _expectation_cost(scene, parameters, sums)
+    if scene.roundness_stiffness > 0.0:
+        cost += _roundness_cost(scene, parameters, sums)
     if scene.volume_price > 0.0:
         for k in range(3):
             cost += scene.volume_price * math.log(parameters[k])
@@ -114,3 +120,32 @@ def _proportion_cost(scene: Scene, parameters: np.ndarray, sums: np.ndarray) -> 
         cost += residual * residual
         add_row(row, sums)
     return cost
+
+
+@kernel
+def _expectation_cost(scene: Scene, parameters: np.ndarray, sums: np.ndarray) -> float:
+    expected = (scene.expected_1, scene.expected_2, scene.expected_3)
+    cost = 0.0
+    row = np.zeros(STEP_LENGTH + 1)
+    for k in range(3):
+        residual = scene.expectation_stiffness * math.log(parameters[k] / expected[k])
+        scale = 1.0 / math.sqrt(1.0 + residual * residual)
+        cost += math.log1p(residual * residual)
+        row[:] = 0.0
+        row[k] = scale * scene.expectation_stiffness
+        row[STEP_LENGTH] = scale * residual
+        add_row(row, sums)
+    return cost
+
+
+@kernel
+def _roundness_cost(scene: Scene, parameters: np.ndarray, sums: np.ndarray) -> float:
+    s = scene.roundness_stiffness
+    row = np.zeros(STEP_LENGTH + 1)
+    oval = s * (math.log(parameters[0]) - math.log(parameters[1]))
+    row[0], row[1], row[STEP_LENGTH] = s, -s, oval
+    add_row(row, sums)
+    square = s * (1.0 - parameters[4])
+    row[0], row[1], row[4], row[STEP_LENGTH] = 0.0, 0.0, -s, square
+    add_row(row, sums)
+    return oval * oval + square * square

@@ -82,6 +82,16 @@ def proportion(body: Superquadric) -> torch.Tensor:
     return logs - logs.mean()
 
 
+def roundness(body: Superquadric) -> torch.Tensor:
+    """log(a1 / a2) and 1 - e2 (2,): 0 for a body of revolution."""
+    return torch.stack([torch.log(body.size[0] / body.size[1]), 1 - body.shape[1]])
+
+
+def surprise(body: Superquadric, expected: torch.Tensor) -> torch.Tensor:
+    """log a_k minus that of expected half sizes (3,)."""
+    return torch.log(body.size / expected)
+
+
 def _slope(body: Superquadric, points: torch.Tensor) -> torch.Tensor:
     return body.gauge_gradient(points)
 

@@ -30,4 +30,9 @@ class Scene(NamedTuple):
     plane_stiffness: float = 0.0
     rest_stiffness: float = 0.0
     proportion_stiffness: float = 0.0
+    roundness_stiffness: float = 0.0
+    expected_1: float = 1.0
+    expected_2: float = 1.0
+    expected_3: float = 1.0
+    expectation_stiffness: float = 0.0
     volume_price: float = 0.0

@@ -23,7 +23,7 @@ import time
 
 import numpy as np
 
-from sq_perception.fitting import box_start, rounding, symmetry_start
+from sq_perception.fitting import box_start, revolution, rounding, symmetry_start
 from sq_perception.fitting.covariance import Alternative, covariance_at, undetermined
 from sq_perception.fitting.levenberg_marquardt import State, minimize
 from sq_perception.fitting.observation import Observation
@@ -31,6 +31,7 @@ from sq_perception.fitting.options import Options
 from sq_perception.fitting.residuals import RAY_COLUMNS, RENDERED, SAMPSON, penetration, surface_distance
 from sq_perception.fitting.rivals import SIGNIFICANT, alike, other_axes, other_depths, resized
 from sq_perception.fitting.scene import Scene
+from sq_perception.geometry.superquadric import Superquadric
 
 COARSE_RAYS, COARSE_STEPS = 150, 8
 BASIN_RAYS, BASIN_STEPS = 300, 15
@@ -80,6 +81,8 @@ VOLUME_PRICE = 0.5
 OUTER_HUBER, INNER_CAUCHY = 2.0, 1.0
 """Objects that are no superquadrics are hollow and notched, not hairy: a point may well lie behind the surface of the
 body that encloses the object, but not in front of it."""
+EXPECTATION_SIGMA = 0.25
+"""Of a log half size against the network's: its errors on household things, of which one in ten is far off."""
 PROPORTION_SIGMA = 1.0
 """Of a log size against the mean of the three: a wide prior."""
 MODEL_SPREAD = 2.5**2
@@ -105,9 +108,12 @@ class Search:
         self.finalists: list[State] = []
         self.tried: list[State] = []
         self.alternatives: list[Alternative] = []
+        self.notes: list[str] = []
+        """What the body rests on beyond the image, in words."""
         self.spread_factor = MODEL_SPREAD if self.tolerated > 0 else 1.0
         self._refined_rivals: list[State] = []
         self._symmetry_tried = False
+        self._prior: Superquadric | None = None
         self.rays = np.empty((0, RAY_COLUMNS))
         self.free = np.empty((0, RAY_COLUMNS))
 
@@ -269,9 +275,43 @@ class Search:
         if self.tolerated == 0:
             best = self._varied(best)
             best = self._spread_along_view(best)
-        if self.observation.camera.is_pinhole and not self._late():
+        if not self._late():
             best = self._doubted(best)
+        if self.observation.camera.is_pinhole and not self._late():
+            best = self._rounded(best)
+        self.scene = self._expecting(self.scene, best)
         return best
+
+    def _rounded(self, free: State) -> State:
+        """Read a body with a half size that the image leaves open as one of revolution, where that explains as much."""
+        if self._late() or (self.tolerated == 0 and self.options.plane is None):
+            return free
+        covariance = covariance_at(free, self.rays, self.free, self._expecting(self.scene, free), self.outline)
+        if (np.sqrt(np.diag(covariance)[:3]) < revolution.OPEN * free.parameters[:3]).all():
+            return free
+        plain, self.scene = self.scene, self.scene._replace(roundness_stiffness=1 / revolution.SIGMA)
+        starts = revolution.from_body(free)
+        if self.options.plane is not None:
+            starts += revolution.on_plane(self.observation.points, self.options.plane)
+        rays, beside = self._draw(COARSE_RAYS, 0.5)
+        coarse = [
+            minimize(SAMPSON, rays, beside, self._expecting(self.scene, s), s, self.limits, COARSE_STEPS, TOLERANCE)
+            for s in starts
+        ]
+        few = self._draw(BASIN_RAYS, 0.7)
+        settled = sorted((self._settled(s, few, BASIN_STEPS) for s in sorted(coarse, key=_cost)[:FINALISTS]), key=_cost)
+        best = min(
+            (self._refined(s._replace(cost=math.inf), self.options.max_iterations) for s in settled[:2]), key=_cost
+        )
+        gain = revolution.gain(free.cost, best.cost, float(self.rays[:, 6].sum()))
+        chosen, other = (best, free) if gain > 0 else (free, best)
+        weight = math.exp(-0.5 * abs(gain))
+        self.alternatives = [*self.alternatives, Alternative(other, weight / (1 + weight))]
+        if gain <= 0:
+            self.scene = plain
+        else:
+            self.notes.append("taken for a body of revolution")
+        return chosen
 
     def _spread_along_view(self, best: State) -> State:
         """Ask for all half sizes along the view that the image allows, where readings are rounded or say little."""
@@ -373,7 +413,7 @@ class Search:
 
     def _settled(self, state: State, rays: Rays, steps: int) -> State:
         state = state._replace(cost=math.inf)
-        return minimize(RENDERED, *rays, self.scene, state, self.limits, steps, TOLERANCE)
+        return minimize(RENDERED, *rays, self._expecting(self.scene, state), state, self.limits, steps, TOLERANCE)
 
     def _alternatives(self, best: State) -> list[Alternative]:
         """The other valleys that explain the image almost as well."""
@@ -386,11 +426,12 @@ class Search:
 
         The same body with that size like the others, or as small as can be, its seen face in place, competes.
         """
-        covariance = covariance_at(state, self.rays, self.free, self.scene, self.outline)
+        covariance = covariance_at(state, self.rays, self.free, self.scene, self.outline) * self.spread_factor
         weak = np.flatnonzero(undetermined(covariance, state.parameters[:3]))
-        if len(weak) == 0:
+        pinhole = self.observation.camera.is_pinhole
+        if len(weak) == 0 or not (pinhole or self.options.expected is not None):
             return state
-        if self.tolerated == 0:
+        if self.tolerated == 0 and pinhole:
             weight = REAL_WEIGHT / self.rays[:, 6].sum()
             self.rays[:, 6] *= weight
             self.free[:, 6] *= weight
@@ -399,8 +440,25 @@ class Search:
         for k in weak:
             typical = float(np.exp(np.mean(np.log(np.delete(state.parameters[:3], k)))))
             rivals += [resized(state, int(k), size) for size in (typical, THIN * typical)]
+        self._prior = self._expected()
+        if self._prior is not None:
+            self.scene = self.scene._replace(expectation_stiffness=1 / EXPECTATION_SIGMA)
+            self.notes.append("half sizes weighed against a prediction")
+            extents = self._prior.support(state.rotation.T)
+            rivals += [resized(state, int(k), float(extents[k])) for k in weak]
         steps = 2 * self.options.max_iterations
         return min((self._refined(rival, steps) for rival in rivals), key=_cost)
+
+    def _expected(self) -> Superquadric | None:
+        expected = self.options.expected
+        return expected() if callable(expected) else expected
+
+    def _expecting(self, scene: Scene, state: State) -> Scene:
+        """The scene with the expected half sizes along the axes that the state has now."""
+        if scene.expectation_stiffness == 0 or self._prior is None:
+            return scene
+        x, y, z = (float(extent) for extent in self._prior.support(state.rotation.T))
+        return scene._replace(expected_1=x, expected_2=y, expected_3=z)
 
     @property
     def outline(self) -> float:
@@ -408,7 +466,8 @@ class Search:
         return max(self.observation.sigma, self.observation.footprint)
 
     def _refined(self, state: State, steps: int) -> State:
-        return minimize(RENDERED, self.rays, self.free, self.scene, state, self.limits, steps, FINAL_TOLERANCE)
+        scene = self._expecting(self.scene, state)
+        return minimize(RENDERED, self.rays, self.free, scene, state, self.limits, steps, FINAL_TOLERANCE)
 
     def _outlined(self, state: State) -> State:
         """Forget the free rays next to the mask if the mask turns out to be smaller than the body."""

@@ -123,6 +123,7 @@ def fit(
         noise=residual,
         inlier_share=float(np.mean(distance <= _INLIER * residual)),
         visible_share=float("nan"),
+        seen=np.full(3, np.nan),
         covariance=np.full((STEP_LENGTH, STEP_LENGTH), np.nan),
         status=Status.FAILED if reason else Status.CONVERGED,
         message=reason or "converged",

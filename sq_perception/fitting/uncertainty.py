@@ -13,7 +13,7 @@ from sq_perception.fitting.normal_equations import STEP_LENGTH
 from sq_perception.fitting.observation import Observation
 from sq_perception.fitting.residuals import surface_distance
 from sq_perception.fitting.search import Search
-from sq_perception.fitting.visibility import visible_share
+from sq_perception.fitting.visibility import seen_extents, visible_share
 from sq_perception.geometry.superquadric import Superquadric
 
 _INLIER = 3.0
@@ -43,9 +43,10 @@ def judged(state: State, search: Search, began: float) -> Fit:
         noise=observation.sigma,
         inlier_share=float(inlying.mean()),
         visible_share=visible_share(state, observation),
+        seen=seen_extents(canonical, observation.points),
         covariance=covariance,
         status=status,
-        message=message,
+        message="; ".join([message, *search.notes]),
         iterations=state.iterations,
         milliseconds=(time.perf_counter() - began) * 1e3,
     )
@@ -61,6 +62,7 @@ def failed(body: Superquadric, observation: Observation, reason: str, began: flo
         noise=observation.sigma,
         inlier_share=0.0,
         visible_share=float("nan"),
+        seen=np.full(3, np.nan),
         covariance=np.full((STEP_LENGTH, STEP_LENGTH), np.nan),
         status=Status.FAILED,
         message=reason,

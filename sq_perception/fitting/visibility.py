@@ -1,4 +1,4 @@
-"""How much of a body's surface the camera saw.
+"""How much of a body's surface, and of each of its sizes, the camera saw.
 
 Directions d, evenly over the unit sphere, meet the surface at q = d / g(d).  With Euler's theorem for the gauge,
 d.grad g = g, the piece of surface behind a solid angle dw has the area
@@ -17,8 +17,11 @@ import numpy as np
 from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.observation import Observation
 from sq_perception.geometry.kernels import gauge_derivatives, kernel
+from sq_perception.geometry.superquadric import Superquadric
 
 _DIRECTIONS = 800
+_TAIL = 0.01
+"""Of the points, at either end: outliers."""
 _NOISE_LEVELS, _PIXELS, _FLATTEST = 3.0, 1.5, 0.3
 """A measured depth may differ from the surface's by so many noise levels, and by what so many widths of a pixel across
 the line of sight make along it; the cosine of incidence counts down to the last number."""
@@ -38,6 +41,14 @@ def visible_share(state: State, observation: Observation) -> float:
         _PIXELS * observation.footprint,
     )
     return float(seen / total)
+
+
+def seen_extents(body: Superquadric, points: np.ndarray) -> np.ndarray:
+    """Share (3,) of each full size of a single body that points (n, 3) span along its axis, 0 to 1."""
+    local = (points - body.translation) @ body.rotation_matrix
+    low, high = np.quantile(local, [_TAIL, 1 - _TAIL], axis=0)
+    low, high = np.maximum(low, -body.size), np.minimum(high, body.size)
+    return np.clip((high - low) / (2 * body.size * (1 - 2 * _TAIL)), 0.0, 1.0)
 
 
 @kernel

@@ -1,0 +1,114 @@
+"""Bodies of revolution: the simpler family that many things of a household belong to, tried where a side is unseen.
+
+A can, a bottle, a bowl or a fruit shows half of its mantle.  As any superquadric its depth stays open; as a body of
+revolution, a1 = a2 and e2 = 1, the half that is seen tells the half that is not.  The family has 3 parameters less:
+one half size, one exponent, and the turn about z.  By the Bayesian
+information criterion (G. Schwarz, Annals of Statistics 6(2), 1978) it is the better description if
+
+    D(cost(round)) < D(cost(free)) + 3 log W,      D(c) = c for c <= W,  W + W log(c / W) above,
+
+W the total weight of the object's rays, the number of independent residuals that the cost stands for.  D is twice the
+negative log likelihood with variance max(1, c / W): where no superquadric explains a bottle with its neck, what is left
+over is no reason to prefer the body that happens to leave less.  Both readings stay with the weights that follow,
+exp(-difference / 2), and what they disagree about widens the covariance.
+
+Metres, optical frame; costs are those of :mod:`sq_perception.fitting.residuals`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from sq_perception.fitting.box_start import standing_axes
+from sq_perception.fitting.levenberg_marquardt import State
+from sq_perception.fitting.rivals import resized
+from sq_perception.fitting.symmetry_start import three_orders
+
+SPARED = 3
+"""Parameters that a body of revolution has less."""
+SIGMA = 0.01
+"""Of log(a1 / a2) and of 1 - e2: how exactly round."""
+OPEN = 0.05
+"""A half size less certain than this share of it may be told by the other one of a round section."""
+_OUTLIER_SHARE = 0.01
+_START_EXPONENT = 0.4
+
+
+def gain(free_cost: float, round_cost: float, weight: float) -> float:
+    """How much better a body of revolution describes rays of a total weight than a free body; see the module."""
+    return _deviance(free_cost, weight) - _deviance(round_cost, weight) + SPARED * math.log(max(weight, 1.0))
+
+
+def _deviance(cost: float, weight: float) -> float:
+    return cost if cost <= weight else weight * (1.0 + math.log(cost / weight))
+
+
+def from_body(state: State) -> list[State]:
+    """Round bodies about each axis of a body; of the two half sizes across, the one across the line of sight holds."""
+    found = []
+    sight = state.parameters[5:8] / np.linalg.norm(state.parameters[5:8])
+    for k, rotation in enumerate(three_orders(state.rotation)):
+        order = [(k + 1) % 3, (k + 2) % 3, k]
+        parameters = state.parameters.copy()
+        parameters[:3] = parameters[order]
+        parameters[3] = state.parameters[3] if k == 2 else _START_EXPONENT
+        parameters[4] = 1.0
+        turned = State(parameters, rotation, math.inf, state.iterations)
+        hidden = int(np.argmax(np.abs(sight @ rotation[:, :2])))
+        found.append(resized(turned, hidden, float(parameters[1 - hidden])))
+    return found
+
+
+def on_plane(points: np.ndarray, plane: np.ndarray) -> list[State]:
+    """Round bodies that stand on a plane, or lie on it along either side of the footprint's smallest rectangle.
+
+    A standing one is as thick as it is wide across the view, a lying one as it is high.  Both begin where the points
+    are nearest.
+    """
+    axes = standing_axes(points, plane[:3])
+    normal = axes[:, 2]
+    heights = points @ normal + plane[3]
+    high = max(float(np.quantile(heights, 1 - _OUTLIER_SHARE)), 1e-4)
+    middle = points.mean(axis=0)
+    ahead = middle - (middle @ normal) * normal
+    ahead /= max(float(np.linalg.norm(ahead)), 1e-9)
+    found = [_round(points, normal, np.cross(normal, ahead), ahead, (0.0, high), plane, None)]
+    for k in (0, 1):
+        along, across = axes[:, k], axes[:, 1 - k]
+        across = across * (1.0 if across @ ahead >= 0 else -1.0)
+        found.append(_round(points, along, normal, across, None, plane, 0.5 * high))
+    return found
+
+
+def _round(
+    points: np.ndarray,
+    axis: np.ndarray,
+    side: np.ndarray,
+    away: np.ndarray,
+    span: tuple[float, float] | None,
+    plane: np.ndarray,
+    radius: float | None,
+) -> State:
+    """A round body about ``axis``: its section spans ``side``, and goes ``away`` from its nearest points.
+
+    ``span`` is what it covers along the axis, above the plane; None: what its points cover.  ``radius`` None: half of
+    what they cover along the side; otherwise the body lies on the plane, along which ``side`` is the normal.
+    """
+    tail = [_OUTLIER_SHARE, 1 - _OUTLIER_SHARE]
+    low, high = np.quantile(points @ side, tail)
+    first, last = np.quantile(points @ axis, tail)
+    if span is not None:
+        first, last = span[0] - plane[3], span[1] - plane[3]
+    across = 0.5 * (low + high)
+    if radius is None:
+        radius = 0.5 * (high - low)
+    else:
+        across = radius - plane[3]
+    radius = max(float(radius), 1e-4)
+    half = max(float(0.5 * (last - first)), 1e-4)
+    centre = 0.5 * (first + last) * axis + across * side + (float(np.quantile(points @ away, tail[0])) + radius) * away
+    rotation = np.ascontiguousarray(np.stack([side, np.cross(axis, side), axis], axis=1))
+    parameters = np.concatenate([[radius, radius, half, _START_EXPONENT, 1.0], centre])
+    return State(parameters, rotation, math.inf, 0)

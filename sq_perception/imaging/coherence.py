@@ -1,0 +1,71 @@
+"""The coherent part of a mask: what a depth step separates from the object is something else.
+
+A convex body has no step in its visible surface.  Masks that come from colour, or that a sensor widens at edges, hold
+pixels that measured the background instead.  A piece that touches the largest one across a step, or is tiny, goes; one
+beyond a gap (a bar in front of the body) stays.  Metres; float depth, NaN where nothing was measured.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sq_perception.geometry.kernels import kernel
+
+_SMALLEST_PIECE = 0.02
+"""Of the largest one's pixels."""
+
+
+@kernel
+def coherent(depth: np.ndarray, inside: np.ndarray, jump: float) -> np.ndarray:
+    """The mask (height, width) without the pieces that a step of more than ``jump`` metres separates from the largest.
+
+    Pixels without depth belong to no piece and stay.
+    """
+    height, width = depth.shape
+    label = np.zeros((height, width), np.int32)
+    stack = np.empty(height * width, np.int32)
+    largest, largest_size, pieces = 0, 0, 0
+    sizes = np.zeros(height * width // 2 + 2, np.int32)
+    for start in range(height * width):
+        v, u = start // width, start % width
+        if label[v, u] > 0 or not inside[v, u] or not np.isfinite(depth[v, u]) or pieces + 1 >= sizes.shape[0]:
+            continue
+        pieces += 1
+        label[v, u] = pieces
+        stack[0] = start
+        top = 1
+        size = 0
+        while top > 0:
+            top -= 1
+            v, u = stack[top] // width, stack[top] % width
+            size += 1
+            for side in range(4):
+                v2, u2 = v + (side == 0) - (side == 1), u + (side == 2) - (side == 3)
+                if v2 < 0 or u2 < 0 or v2 >= height or u2 >= width or label[v2, u2] > 0 or not inside[v2, u2]:
+                    continue
+                if abs(depth[v2, u2] - depth[v, u]) <= jump:
+                    label[v2, u2] = pieces
+                    stack[top] = v2 * width + u2
+                    top += 1
+        sizes[pieces] = size
+        if size > largest_size:
+            largest, largest_size = pieces, size
+    if pieces <= 1:
+        return inside
+    kept = np.ones(pieces + 1, np.bool_)
+    for k in range(1, pieces + 1):
+        kept[k] = sizes[k] >= _SMALLEST_PIECE * largest_size
+    for v in range(height):
+        for u in range(width):
+            if label[v, u] != largest:
+                continue
+            for side in range(4):
+                v2, u2 = v + (side == 0) - (side == 1), u + (side == 2) - (side == 3)
+                if 0 <= v2 < height and 0 <= u2 < width and label[v2, u2] > 0:
+                    kept[label[v2, u2]] = False
+    kept[0] = kept[largest] = True
+    coherent = inside.copy()
+    for v in range(height):
+        for u in range(width):
+            coherent[v, u] = inside[v, u] and kept[label[v, u]]
+    return coherent
