@@ -2,7 +2,7 @@
 
 | kind | what | full edges |
 | --- | --- | --- |
-| box | cartons, edges rounded by 0.5 to 4 mm | longest 6 to 30 cm, others 45 to 100 and 15 to 70 % of it, at least 2 cm |
+| box | cartons, edges rounded by 0.5 to 4 mm | 6 to 30 cm, 45 to 100 and 15 to 70 % of that, at least 2 cm |
 | can | cylinders, rims rounded by 1 to 3 mm | diameter 5 to 11 cm, height 4 to 20 cm |
 | bottle | body, shoulder and neck, bodies of revolution | diameter 6 to 9 cm, height 15 to 28 cm |
 | vessel | bowls and cups, open at the top | diameter 7 to 16 cm, height 4 to 11 cm |
