@@ -1,6 +1,6 @@
 """A picture of a scene of household things: depth, true hulls and recovered bodies from the camera and from above.
 
-White outlines are true hulls, red ones bodies with the masks given, blue ones bodies with the program's own.
+Green outlines are true hulls, red ones bodies with the masks given, blue ones bodies with the program's own.
 """
 
 from __future__ import annotations
@@ -17,8 +17,11 @@ from sq_perception.evaluation.plots import draw_depth, new_figure, save
 from sq_perception.geometry import Superquadric
 from sq_perception.geometry.mesh import mesh
 
-TRUTH, GIVEN, OWN = "white", "#e4572e", "#2e86e4"
+TRUTH, GIVEN, OWN = "#3fd34a", "#e4572e", "#2e86e4"
 _RESOLUTION = 24
+_BESIDE = 25
+"""Pixels beside the things."""
+_DEEPER = 0.1
 
 
 def save_picture(scene: Tabletop, folder: Path) -> Path:
@@ -28,11 +31,17 @@ def save_picture(scene: Tabletop, folder: Path) -> Path:
     given = recoverer.recover(scene.depth, scene.camera, scene.labels)
     own = recoverer.recover(scene.depth, scene.camera)
     verdict = scene_verdict.judge(scene)
+    rows, columns = np.nonzero(scene.labels)
+    top, bottom, left, right = rows.min(), rows.max(), columns.min(), columns.max()
+    shown = scene.true_depth[rows, columns]
+    limits = (float(shown.min()), float(shown.max()) + _DEEPER)
     figure = new_figure(18.0, 7.4)
     axes = figure.subplots(1, 3, gridspec_kw={"wspace": 0.03, "width_ratios": [640, 640, 420]})
     figure.subplots_adjust(left=0.005, right=0.995, top=0.93, bottom=0.01)
     for ax, frame, colour, title in zip(axes, (given, own), (GIVEN, OWN), ("masks given", "own masks"), strict=False):
-        draw_depth(ax, scene.depth)
+        draw_depth(ax, scene.depth, limits)
+        ax.set_xlim(left - _BESIDE, right + _BESIDE)
+        ax.set_ylim(bottom + _BESIDE, top - _BESIDE)
         ax.set_title(f"{scene.seed}, {scene.sensor}: {title}", loc="left", fontsize=11)
         for placed in scene.placed:
             _outline(ax, scene.camera.project(placed.hull), TRUTH)
@@ -47,7 +56,7 @@ def _above(ax: Axes, scene: Tabletop, bodies: list[Superquadric], verdict: scene
     answers = {one.label: one.answers["given"] for one in verdict.judged}
     v, u = np.nonzero((scene.labels > 0) & np.isfinite(scene.depth))
     points = scene.camera.unproject(u[::5], v[::5], scene.depth[v[::5], u[::5]]) @ scene.table
-    ax.scatter(points[:, 0], points[:, 1], s=0.2, color="#999999")
+    ax.scatter(points[:, 0], points[:, 1], s=0.4, color="#999999")
     for placed in scene.placed:
         flat = placed.hull @ scene.table
         _outline(ax, flat[:, :2], "black")
@@ -57,6 +66,9 @@ def _above(ax: Axes, scene: Tabletop, bodies: list[Superquadric], verdict: scene
         ax.text(*flat[:, :2].mean(axis=0), text, fontsize=8, ha="center", va="center")
     for body in bodies:
         _outline(ax, (_corners(body) @ scene.table)[:, :2], GIVEN)
+    hulls = np.vstack([placed.hull for placed in scene.placed]) @ scene.table
+    for axis, limit in enumerate((ax.set_xlim, ax.set_ylim)):
+        limit(hulls[:, axis].min() - _DEEPER / 3, hulls[:, axis].max() + _DEEPER / 3)
     ax.set_aspect("equal")
     ax.set_axis_off()
 
