@@ -122,6 +122,13 @@ class Observation:
         """The same observation with free pixels only farther than ``band`` pixels from the mask."""
         return replace(self, free=self.free[self._distance_to_mask > band + 0.4])
 
+    def of_hull(self) -> Observation:
+        """The same observation of the object's convex hull: free pixels within the hull of the mask say nothing."""
+        hull = _convex_hull(np.ascontiguousarray(self.mask).view(np.uint8))
+        kept = self.free[hull.ravel()[self.free] == 0]
+        count = round(self.free_pixels * len(kept) / max(len(self.free), 1))
+        return replace(self, free=kept, free_pixels=count)
+
     def coarsened(self, model_error: float) -> Observation:
         """The same observation trusted less."""
         return replace(self, model_error=float(np.hypot(self.model_error, model_error)))

@@ -28,17 +28,20 @@ from sq_perception.fitting.symmetry_start import three_orders
 
 SPARED = 3
 """Parameters that a body of revolution has less."""
+ODDS = 3.0
+"""Of the things whose unseen side is in question, so many more are round than any other one oval shape."""
 SIGMA = 0.01
 """Of log(a1 / a2) and of 1 - e2: how exactly round."""
-OPEN = 0.05
-"""A half size less certain than this share of it may be told by the other one of a round section."""
+OPEN, EXPLAINED = 0.05, 0.5
+"""Half sizes more certain than this share of them, of a body with a mean squared residual below that: not asked."""
 _OUTLIER_SHARE = 0.01
 _START_EXPONENT = 0.4
 
 
 def gain(free_cost: float, round_cost: float, weight: float) -> float:
     """How much better a body of revolution describes rays of a total weight than a free body; see the module."""
-    return _deviance(free_cost, weight) - _deviance(round_cost, weight) + SPARED * math.log(max(weight, 1.0))
+    simpler = SPARED * math.log(max(weight, 1.0)) + 2 * math.log(ODDS)
+    return _deviance(free_cost, weight) - _deviance(round_cost, weight) + simpler
 
 
 def _deviance(cost: float, weight: float) -> float:

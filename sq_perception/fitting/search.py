@@ -200,6 +200,18 @@ class Search:
         self.finalists = []
         self.spread_factor = MODEL_SPREAD
 
+    def _take_for_hull(self) -> None:
+        """No superquadric comes near the object: look for one that resembles its convex hull.
+
+        What lies within the outline's hull, such as the space beside the neck of a bottle, then binds no longer.
+        """
+        observation = self.observation.of_hull()
+        if len(observation.free) == len(self.observation.free):
+            return
+        self.observation = observation
+        self.finalists = []
+        self._select(self._coarse(sorted(self.tried, key=_cost)[:PROMISING]), ESCALATED_FINALISTS)
+
     # Stages
 
     def _draw(self, count: int, offset: float) -> Rays:
@@ -254,6 +266,8 @@ class Search:
 
     def decided(self) -> State:
         """The last stage: the finalists on the full budget of rays, one scene for all of them."""
+        if self.tolerated > 0 and not self._good_enough() and not self._late():
+            self._take_for_hull()
         finalists = self.finalists
         favourite = finalists[0]
         if self.tolerated == 0 and not self._late():
@@ -283,11 +297,12 @@ class Search:
         return best
 
     def _rounded(self, free: State) -> State:
-        """Read a body with a half size that the image leaves open as one of revolution, where that explains as much."""
+        """Read a body as one of revolution where that explains as much, unless the image leaves nothing open."""
         if self._late() or (self.tolerated == 0 and self.options.plane is None):
             return free
         covariance = covariance_at(free, self.rays, self.free, self._expecting(self.scene, free), self.outline)
-        if (np.sqrt(np.diag(covariance)[:3]) < revolution.OPEN * free.parameters[:3]).all():
+        unsure = np.sqrt(self.spread_factor * np.diag(covariance)[:3]) / free.parameters[:3]
+        if (unsure < revolution.OPEN).all() and free.cost < revolution.EXPLAINED * self.rays[:, 6].sum():
             return free
         plain, self.scene = self.scene, self.scene._replace(roundness_stiffness=1 / revolution.SIGMA)
         starts = revolution.from_body(free)
