@@ -4,7 +4,7 @@
 | --- | --- | --- |
 | box | cartons, edges rounded by 0.5 to 4 mm | 6 to 30 cm, 45 to 100 and 15 to 70 % of that, at least 2 cm |
 | can | cylinders, rims rounded by 1 to 3 mm | diameter 5 to 11 cm, height 4 to 20 cm |
-| bottle | body, shoulder and neck, bodies of revolution | diameter 6 to 9 cm, height 15 to 28 cm |
+| bottle | body of 50 to 68 % of the height, shoulder, neck of 2.2 to 4 cm | diameter 6 to 9 cm, height 15 to 28 cm |
 | vessel | bowls and cups, open at the top | diameter 7 to 16 cm, height 4 to 11 cm |
 | scan | YCB objects (../shared/data/ycb_meshes) | as they are |
 

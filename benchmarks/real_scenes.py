@@ -1,7 +1,7 @@
 """Household things on a table through a depth sensor: how close the recovered bodies come to the true hulls.
 
     python benchmarks/real_scenes.py [--scenes 1000] [--first 0] [--jobs 1] [--kinds "box; can"] [--sensor stereo]
-                                     [--pictures 0] [--name real_scenes]
+                                     [--pictures 0] [--each FILE] [--name real_scenes]
 
 Scenes are those of :mod:`tabletop`, methods and measures those of :mod:`scene_verdict`.  Counted are things at least
 half visible; things with under 200 pixels are left out and numbered, vessels (--kinds) are apart from all others.
@@ -24,6 +24,7 @@ if __name__ == "__main__":  # as a script only: a process that imports this has 
     for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
 
+import json
 import multiprocessing
 import time
 from collections.abc import Callable, Iterator
@@ -85,6 +86,7 @@ def main() -> None:
     parser.add_argument("--pictures", type=int, default=0, help="save pictures of the first scenes")
     parser.add_argument("--picture", type=int, help="save a picture of the scene of this seed, and do nothing else")
     parser.add_argument("--folder", type=Path, default=Path("runs/real_scenes"), help="for pictures")
+    parser.add_argument("--each", type=Path, help="write every thing's figures and bodies to this file, JSON")
     parser.add_argument("--name", default="real_scenes", help="name of the result files")
     options = parser.parse_args()
     words = [word.strip() for word in options.kinds.split(";") if word.strip()]
@@ -103,6 +105,9 @@ def main() -> None:
             return
     judge = partial(scene_verdict.verdict, kinds=kinds, scans=scans, sensor=options.sensor)
     verdicts = list(judged(judge, range(options.first, options.first + options.scenes), options.jobs))
+    if options.each is not None:
+        everything = [_facts(one) for each in verdicts for one in each.judged]
+        options.each.write_text(json.dumps(everything, indent=1) + "\n")
     result, text = tables(verdicts)
     facts = {name: str(value) if isinstance(value, Path) else value for name, value in vars(options).items()}
     report.write(options.name, {"options": facts, **result}, text)
@@ -167,7 +172,6 @@ def tables(verdicts: list[SceneVerdict]) -> tuple[dict[str, Any], str]:
         worst = [worst_line(one, method) for one in order]
         result[f"worst: {method}"] = [dict(zip(WORST_HEADER, row, strict=True)) for row in worst]
         text.append(f"The worst with masks {method}\n\n{report.table(WORST_HEADER, worst)}")
-    result["each"] = [_facts(one) for one in everything]
     return {**chain_result, **result}, "\n\n".join(text)
 
 

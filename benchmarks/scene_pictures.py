@@ -63,12 +63,14 @@ def _above(ax: Axes, scene: Tabletop, bodies: list[Superquadric], verdict: scene
         answer = answers.get(placed.label)
         score = "tiny" if answer is None else f"{100 * answer.iou:.0f}"
         text = f"{placed.label} {placed.thing.name} {score}\n{100 * placed.visible_share:.0f} % visible"
-        ax.text(*flat[:, :2].mean(axis=0), text, fontsize=8, ha="center", va="center")
+        x, y = flat[:, :2].mean(axis=0)
+        ax.text(x, y, text, fontsize=8, ha="center", va="center")
     for body in bodies:
         _outline(ax, (_corners(body) @ scene.table)[:, :2], GIVEN)
     hulls = np.vstack([placed.hull for placed in scene.placed]) @ scene.table
-    for axis, limit in enumerate((ax.set_xlim, ax.set_ylim)):
-        limit(hulls[:, axis].min() - _DEEPER / 3, hulls[:, axis].max() + _DEEPER / 3)
+    low, high = hulls.min(axis=0) - _DEEPER / 3, hulls.max(axis=0) + _DEEPER / 3
+    ax.set_xlim(low[0], high[0])
+    ax.set_ylim(low[1], high[1])
     ax.set_aspect("equal")
     ax.set_axis_off()
 

@@ -22,7 +22,9 @@ KINDS = {"box": 0.4, "can": 0.3, "bottle": 0.2, "vessel": 0.1}
 def modules(repository: Path) -> Iterator[dict[str, ModuleType]]:
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(repository / "benchmarks"))
-        yield {name: importlib.import_module(name) for name in ("household", "tabletop", "scene_verdict")}
+        yield {
+            name: importlib.import_module(name) for name in ("household", "tabletop", "scene_verdict", "real_scenes")
+        }
 
 
 @pytest.fixture(scope="module")
@@ -139,3 +141,17 @@ def test_masks_match_by_their_common_share(modules: dict[str, ModuleType]) -> No
     assert modules["scene_verdict"]._matches(own, true) == {1: 7, 2: 9, 3: 5}
     own[:, 24:26] = 0
     assert modules["scene_verdict"]._matches(own, true) == {1: 7, 2: 9}
+
+
+def test_a_missed_thing_has_no_iou_and_no_size(modules: dict[str, ModuleType]) -> None:
+    verdict, tables = modules["scene_verdict"], modules["real_scenes"]
+    found = verdict.Answer(0.9, np.array([0.001, -0.002, 0.006]), np.zeros(3), np.array([1.0, 1, 0]), "weak", "")
+    things = [
+        verdict.Judged(0, "stereo", "box", "box", "flat", 1, 900, 900, 1.0, np.ones(3), {"own": answer})
+        for answer in (found, verdict.Answer())
+    ]
+    figures = tables.summary(things, "own")
+    assert figures["iou"]["mean"] == pytest.approx(45)
+    assert figures["edge_error"]["mean"] == pytest.approx(3)
+    assert figures["within_2_sigma"] == pytest.approx(200 / 3)
+    assert figures["status"] == {"converged": 0, "weak": 50, "failed": 0, "none": 50}
