@@ -92,7 +92,7 @@ def main() -> None:
     words = [word.strip() for word in options.kinds.split(";") if word.strip()]
     if not set(words) <= set(household.KINDS):
         parser.error(f"--kinds: expected some of {', '.join(household.KINDS)}")
-    kinds = {word: household.KINDS[word] or 1.0 for word in words} or None
+    kinds = {word: max(household.KINDS[word], min(filter(None, household.KINDS.values()))) for word in words} or None
     scans = report.shared_data("ycb_meshes")
     if options.picture is not None or options.pictures:
         import scene_pictures
