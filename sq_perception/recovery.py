@@ -25,12 +25,12 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal, TypeVar, get_args
 
 import numpy as np
 import torch
@@ -45,6 +45,8 @@ from sq_perception.imaging.coherence import coherent
 from sq_perception.learning import checkpoint, inference
 from sq_perception.learning.consensus import Consensus
 
+_Item = TypeVar("_Item")
+_Answer = TypeVar("_Answer")
 Method = Literal["auto", "network", "symmetry", "classic"]
 Refine = Literal["surface", "soft_render", "none"]
 
@@ -52,6 +54,8 @@ _VIEW_PIXELS = 64
 _SCORE_STRIDE = 3
 """22 x 22 lines of sight of 64 voxels: few enough for torch not to spread them over threads, which would cost more."""
 _FEWEST_PIXELS = 12
+_LEAST_BUDGET = 1e-6
+"""Seconds; an object whose turn comes too late is still fitted, from one start."""
 _UNKNOWN = np.full((11, 11), np.nan)
 _UNSEEN = np.full(3, np.nan)
 _CLASSIC_POINTS = 2000
@@ -82,7 +86,8 @@ class RecoveryOptions:
     use_plane
         Let the fit know the support plane.
     time_budget
-        Seconds per object after which the surface fit tries no further start.
+        Seconds per frame after which the surface fit tries no further start for any object.  The objects with most
+        pixels, large or near, come first.
 
     Raises
     ------
@@ -280,14 +285,7 @@ class Recoverer:
             objects = _objects(depth, found, camera, options)
 
         with _timed(milliseconds, "network"):
-            for one in objects:
-                one.plane = _support(one, found.plane)
-                core = _core(one, camera)
-                if network is not None:
-                    one.shown = network.config.view_of(depth, core, camera, one.plane)
-                one.view = one.shown
-                if network is None or network.config.framing == "full":
-                    one.view = canonical_view.from_mask(depth, core, camera, _VIEW_PIXELS)
+            _mapped(lambda one: _view(one, depth, camera, found.plane, network), objects)
             if network is not None and objects:
                 views = np.stack([one.shown.marked for one in objects if one.shown is not None])
                 predictions: Future[Superquadric] = Future()
@@ -299,9 +297,11 @@ class Recoverer:
                     one.predictions, one.number = predictions, k
 
         with _timed(milliseconds, "fit"):
-            fits = _mapped(lambda one: _fitted(one, depth, camera, options), objects)
+            deadline = started + options.time_budget
+            fits = _mapped(lambda one: _fitted(one, depth, camera, options, deadline), objects)
         with _timed(milliseconds, "score"):
-            scores = [_score(one.view, fit.superquadric, options) for one, fit in zip(objects, fits, strict=True)]
+            pairs = list(zip(objects, fits, strict=True))
+            scores = _mapped(lambda pair: _score(pair[0].view, pair[1].superquadric, options), pairs)
         bodies = tuple(_recovery(one, fit, score) for one, fit, score in zip(objects, fits, scores, strict=True))
         milliseconds["total"] = 1e3 * (time.perf_counter() - started)
         message = "" if bodies else _why_empty(depth, found)
@@ -404,12 +404,25 @@ def _objects(
     return objects
 
 
-def _mapped(function, objects: list[_Object]) -> list[Fit]:  # type: ignore[no-untyped-def]
-    workers = min(len(objects), os.cpu_count() or 1)
+def _mapped(function: Callable[[_Item], _Answer], items: Sequence[_Item]) -> list[_Answer]:
+    workers = min(len(items), os.cpu_count() or 1)
     if workers < 2:
-        return [function(one) for one in objects]
+        return [function(one) for one in items]
     with ThreadPoolExecutor(workers, thread_name_prefix="fit") as pool:
-        return list(pool.map(function, objects))
+        return list(pool.map(function, items))
+
+
+def _view(
+    one: _Object, depth: np.ndarray, camera: Camera, plane: np.ndarray | None, network: inference.Predictor | None
+) -> None:
+    """What the object stands on, what a network is shown of it, and what its score is measured on."""
+    one.plane = _support(one, plane)
+    core = _core(one, camera)
+    if network is not None:
+        one.shown = network.config.view_of(depth, core, camera, one.plane)
+    one.view = one.shown
+    if network is None or network.config.framing == "full":
+        one.view = canonical_view.from_mask(depth, core, camera, _VIEW_PIXELS)
 
 
 def _support(one: _Object, plane: np.ndarray | None) -> np.ndarray | None:
@@ -440,12 +453,12 @@ def _core(one: _Object, camera: Camera) -> np.ndarray:
     return whole
 
 
-def _fitted(one: _Object, depth: np.ndarray, camera: Camera, options: RecoveryOptions) -> Fit:
+def _fitted(one: _Object, depth: np.ndarray, camera: Camera, options: RecoveryOptions, deadline: float) -> Fit:
     """The body of one object by the chosen method; FAILED with a reason instead of any exception on hard data."""
     if one.pixels < _FEWEST_PIXELS:
         return _failed(one, f"{one.pixels} pixels with a depth are too few for a body")
     try:
-        fit = _body(one, depth, camera, options)
+        fit = _body(one, depth, camera, options, deadline)
     except _HARD_IMAGE as error:
         return _failed(one, f"{options.method}: {error}")
     if not np.isfinite(fit.superquadric.to_flat()).all():
@@ -453,7 +466,7 @@ def _fitted(one: _Object, depth: np.ndarray, camera: Camera, options: RecoveryOp
     return fit
 
 
-def _body(one: _Object, depth: np.ndarray, camera: Camera, options: RecoveryOptions) -> Fit:
+def _body(one: _Object, depth: np.ndarray, camera: Camera, options: RecoveryOptions, deadline: float) -> Fit:
     if options.method == "classic":
         return solina_bajcsy.fit(one.points)
     if options.method == "network" or (options.method == "auto" and options.refine == "none"):
@@ -461,7 +474,7 @@ def _body(one: _Object, depth: np.ndarray, camera: Camera, options: RecoveryOpti
     if options.method == "auto" and options.refine == "soft_render":
         return _soft_rendered(one.predicted(), one, options)
     plane = one.plane if options.use_plane else None
-    fit = _surface_fit(one, depth, camera, plane, options.time_budget)
+    fit = _surface_fit(one, depth, camera, plane, max(deadline - time.perf_counter(), _LEAST_BUDGET))
     if options.refine == "soft_render" and fit.status != Status.FAILED:
         return _soft_rendered(fit.superquadric, one, options)
     return fit

@@ -87,8 +87,9 @@ PROPORTION_SIGMA = 1.0
 """Of a log size against the mean of the three: a wide prior."""
 MODEL_SPREAD = 2.5**2
 """Factor of the covariance for objects that are no superquadrics, whose errors are alike; read from scanned objects."""
-REAL_WEIGHT = 50.0
-"""Model errors of neighbouring pixels are alike: an object on a table counts as so many independent rays."""
+REAL_WEIGHT, REAL_RAYS = 50.0, 800
+"""Model errors of neighbouring pixels are alike: an object on a table counts as so many independent rays, however many
+are drawn."""
 
 
 Rays = tuple[np.ndarray, np.ndarray]
@@ -315,9 +316,7 @@ class Search:
         ]
         few = self._draw(BASIN_RAYS, 0.7)
         settled = sorted((self._settled(s, few, BASIN_STEPS) for s in sorted(coarse, key=_cost)[:FINALISTS]), key=_cost)
-        best = min(
-            (self._refined(s._replace(cost=math.inf), self.options.max_iterations) for s in settled[:2]), key=_cost
-        )
+        best = self._best_refined(settled, self.options.max_iterations)
         gain = revolution.gain(free.cost, best.cost, float(self.rays[:, 6].sum()))
         chosen, other = (best, free) if gain > 0 else (free, best)
         weight = math.exp(-0.5 * abs(gain))
@@ -461,8 +460,18 @@ class Search:
             self.notes.append("half sizes weighed against a prediction")
             extents = self._prior.support(state.rotation.T)
             rivals += [resized(state, int(k), float(extents[k])) for k in weak]
+        few = self._draw(BASIN_RAYS, 0.2)
+        share = self.rays[:, 6].sum() / few[0][:, 6].sum()
+        for rays in few:
+            rays[:, 6] *= share
+        promising = sorted((self._settled(rival, few, BASIN_STEPS) for rival in rivals), key=_cost)
         steps = 2 * self.options.max_iterations
-        return min((self._refined(rival, steps) for rival in rivals), key=_cost)
+        return self._best_refined(promising, steps)
+
+    def _best_refined(self, settled: list[State], steps: int) -> State:
+        """The best of some bodies, ranked on few rays, on all of them; the second one only if the ranking is close."""
+        chosen = [s for s in settled[:2] if s.cost < settled[0].cost + RIVAL_SLACK]
+        return min((self._refined(state._replace(cost=math.inf), steps) for state in chosen), key=_cost)
 
     def _expected(self) -> Superquadric | None:
         expected = self.options.expected
@@ -509,7 +518,9 @@ class Search:
         return float(np.quantile(depth, 1 - MOST)) / self.observation.footprint
 
     def _enough(self) -> int:
-        """Rays that bring the noise of the mean well below a pixel's width."""
+        """Rays that bring the noise of the mean well below a pixel's width, or all that errors of the model allow."""
+        if self.tolerated > 0:
+            return REAL_RAYS
         ratio = self.observation.sigma / self.observation.footprint
         return int(np.clip(FINAL_RAYS * (ratio / 0.3) ** 2, FINAL_RAYS, MOST_FINAL_RAYS))
 
