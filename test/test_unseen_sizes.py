@@ -74,10 +74,11 @@ def test_an_oval_that_shows_both_of_its_sides_stays_oval() -> None:
 
 def test_the_simpler_family_wins_ties_and_loses_against_evidence() -> None:
     weight = 50.0
-    assert revolution.gain(30.0, 30.0, weight) == pytest.approx(3 * math.log(weight))
-    assert revolution.gain(30.0, 30.0 + 3 * math.log(weight), weight) == pytest.approx(0.0)
+    bonus = 3 * math.log(weight) + 2 * math.log(revolution.ODDS)
+    assert revolution.gain(30.0, 30.0, weight) == pytest.approx(bonus)
+    assert revolution.gain(10.0, 10.0 + bonus, weight) == pytest.approx(0.0)
     # Where neither explains the object, a difference counts in units of what both leave over.
-    assert revolution.gain(300.0, 330.0, weight) == pytest.approx(3 * math.log(weight) - weight * math.log(1.1))
+    assert revolution.gain(300.0, 330.0, weight) == pytest.approx(bonus - weight * math.log(1.1))
     # The deviance has neither a step nor a kink where the variance begins to be estimated.
     below, above = revolution.gain(weight - 1e-6, 10.0, weight), revolution.gain(weight + 1e-6, 10.0, weight)
     assert above - below == pytest.approx(2e-6, rel=1e-3)
