@@ -2,6 +2,7 @@
 
 plane       (lowest point above the plane) / sigma where negative: n.t + d - h(R^T n), h the support function, which is
             the gauge's dual norm: two nested p-norms of a n with exponents 2 - e.
+gap         the same where positive, over another sigma, Cauchy: bodies do not hover, unless they stand on other things.
 rest        the two components of R^T n across the axis nearest to the normal, over sigma, Cauchy: bodies lie on a face.
 proportion  log a_k minus the mean of the three, over sigma: what the image leaves open resembles what it shows.
 expectation log a_k minus that of a predicted half size, over sigma, Cauchy: a prediction may be altogether wrong.
@@ -73,10 +74,16 @@ def _support_cost(scene: Scene, parameters: np.ndarray, rotation: np.ndarray, su
     row = np.zeros(STEP_LENGTH + 1)
     h, hx, hy, hz, h1, h2 = support_derivatives(n[0], n[1], n[2], a1, a2, a3, e1, e2)
     lowest = normal[0] * t1 + normal[1] * t2 + normal[2] * t3 + scene.offset - h
-    if scene.plane_stiffness > 0.0 and lowest < 0.0:
-        s = scene.plane_stiffness
+    s = scene.plane_stiffness if lowest < 0.0 else scene.gap_stiffness
+    if s > 0.0:
         residual = s * lowest
-        cost += residual * residual
+        if lowest < 0.0:
+            cost += residual * residual
+        else:
+            square = residual * residual
+            cost += math.log1p(square)
+            s /= math.sqrt(1.0 + square)
+            residual /= math.sqrt(1.0 + square)
         row[0], row[1], row[2] = -s * hx * n[0], -s * hy * n[1], -s * hz * n[2]
         row[3], row[4] = -s * h1, -s * h2
         row[5], row[6], row[7] = s * normal[0], s * normal[1], s * normal[2]

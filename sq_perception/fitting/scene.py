@@ -28,6 +28,7 @@ class Scene(NamedTuple):
     normal_z: float = 0.0
     offset: float = 0.0
     plane_stiffness: float = 0.0
+    gap_stiffness: float = 0.0
     rest_stiffness: float = 0.0
     proportion_stiffness: float = 0.0
     roundness_stiffness: float = 0.0

@@ -75,8 +75,8 @@ PROMISING = 24
 THIN = 0.3
 """A size that the image leaves open is also tried this thin, as a share of the other two."""
 MEDIAN_TO_SIGMA = 1.4826
-PLANE_SIGMA, REST_SIGMA = 0.001, 0.05
-"""Metres below the plane, and sine of the angle between the normal and an axis of the body."""
+PLANE_SIGMA, GAP_SIGMA, REST_SIGMA = 0.001, 0.005, 0.05
+"""Metres below the plane and above it, and sine of the angle between the normal and an axis of the body."""
 VOLUME_PRICE = 0.5
 OUTER_HUBER, INNER_CAUCHY = 2.0, 1.0
 """Objects that are no superquadrics are hollow and notched, not hairy: a point may well lie behind the surface of the
@@ -573,6 +573,7 @@ def _scene(observation: Observation, options: Options) -> Scene:
         normal_z=z,
         offset=offset,
         plane_stiffness=1 / PLANE_SIGMA,
+        gap_stiffness=1 / GAP_SIGMA,
         rest_stiffness=1 / REST_SIGMA,
         volume_price=VOLUME_PRICE,
     )
