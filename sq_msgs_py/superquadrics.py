@@ -13,7 +13,7 @@ e1 e2           exponents: e1 along z, e2 in the xy plane; 0.1 is a box, 1 an el
 score           0 to 1: agreement of the soft-rendered body with the image
 residual        root mean square distance of the seen points to the surface, metres
 sigma_a1..a3    standard deviations of the half sizes, metres; NaN where unknown
-id              label of the body's mask, or its track, or 1..n
+id              of its track, kept from frame to frame (failed bodies: 2^31 + label); untracked, the label of its mask
 status          0 converged, 1 converged but the view leaves something open, 2 failed
 
 All are float32 but id and status, which are uint32.  The header copies stamp and frame of the depth image.  Readers

@@ -7,6 +7,8 @@
 | 8 or 16 bit ``.png``, ``.bmp``, orthographic | nothing | grey values of the cube, 0 = nothing |
 | ``.npz``, orthographic | ``depth`` | depth in the cube, 1 - z; NaN = nothing |
 
+A file whose name is a time, such as 1305031102.160407.png, has that stamp in seconds.
+
 The cube is the thesis' unit cube, :mod:`sq_perception.imaging.unit_cube`.  An NPZ may bring ``labels`` (h, w), a
 support ``plane`` (4,), and the text "orthographic" as ``projection``, which goes before what the caller says.  Nothing
 in a file is executed: no pickle, safe YAML only.
@@ -16,9 +18,10 @@ Whole folders and rosbags are read by :mod:`sq_perception.recorded_input`, frame
 
 from __future__ import annotations
 
+import re
 import zipfile
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
@@ -33,6 +36,7 @@ SUFFIXES = (".npz", ".png", ".bmp")
 _MILLIMETRES = np.float32(1000.0)
 _IMAGES = (".png", ".bmp")
 _NO_DISTORTION = 1e-9
+_TIME = re.compile(r"(\d{1,18})\.(\d{1,9})")
 
 
 class FrameError(ValueError):
@@ -110,6 +114,10 @@ def read(path: str | Path, camera_info: str | Path | None = None, projection: Pr
     path = Path(path)
     if not path.is_file():
         raise FrameError(f"{path}: no such file")
+    return replace(_read(path, camera_info, projection), stamp=_stamp(path))
+
+
+def _read(path: Path, camera_info: str | Path | None, projection: Projection) -> RecordedFrame:
     suffix = path.suffix.lower()
     if suffix == ".npz":
         return _read_npz(path, projection)
@@ -129,6 +137,12 @@ def read(path: str | Path, camera_info: str | Path | None = None, projection: Pr
     _check_size(path, image, camera)
     depth = np.where(image > 0, image / _MILLIMETRES, np.float32(np.nan))
     return RecordedFrame(depth, camera, None, path.name, is_cube=False, warning=warning)
+
+
+def _stamp(path: Path) -> Stamp | None:
+    """The time that a name says, seconds and their fraction."""
+    parts = _TIME.fullmatch(path.stem)
+    return Stamp(int(parts[1]), int(parts[2].ljust(9, "0"))) if parts else None
 
 
 def distortion_warning(where: str, coefficients: np.ndarray) -> str:

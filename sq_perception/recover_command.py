@@ -11,7 +11,7 @@ import json
 import math
 import statistics
 import sys
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from sq_perception.recorded_frame import RecordedFrame
     from sq_perception.recorded_input import RecordedInput
     from sq_perception.recovery import FrameRecovery, Recoverer, RecoveryOptions
+    from sq_perception.tracking.session import Followed
 
 SUCCESS, FAILURE, USAGE, INTERRUPTED = 0, 1, 2, 130
 JSON_VERSION = 1
@@ -50,19 +51,26 @@ examples:
   sq-perception recover table.npz --json out.json --pictures pictures/
   sq-perception recover depth_*.png --camera-info camera.yaml --json out.json
   sq-perception recover recording/ --topic /camera/depth/image_rect_raw --every 10 --meshes meshes/
+  sq-perception recover recording/ --track --json tracks.json
   sq-perception recover views/*.bmp --projection orthographic --method network --json -
   sq-perception recover table.npz --ignore-masks --refine soft_render
 
 output:
   {"frames": [{"file": ..., "ms": ..., "superquadrics": [{"size": [a1, a2, a3], "shape": [e1, e2],
    "translation": [x, y, z], "rotation": [x, y, z, w], "score": ..., "residual": ..., "sigma_size": [...],
-   "seen": [...], "status": "converged" | "weak" | "failed", "message": ..., "label": ..., "pixels": ...}, ...],
-   "stamp": {"sec": ..., "nanosec": ...}, "topic": ..., "frame_id": ...}, ...]}
+   "seen": [...], "status": "converged" | "weak" | "failed", "message": ..., "label": ..., "pixels": ...,
+   "track": ...}, ...], "stamp": {"sec": ..., "nanosec": ...}, "topic": ..., "frame_id": ...}, ...]}
   Half sizes and positions are metres in the optical frame (x right, y down, z forward); for orthographic frames the
-  unit cube (x right, y up, z to the viewer).  What is unknown is null: stamp, topic and frame_id of anything but a
-  bag.  "seen" is the share of each size that the measured points span; the rest is inferred.  A failed object is
-  listed with its reason; its numbers only say where it is.  "label" is the mask's value, null without masks; "pixels"
-  counts the measured ones.
+  unit cube (x right, y up, z to the viewer).  What is unknown is null: topic and frame_id of anything but a bag,
+  and stamp, unless a file's name is its time (1305031102.160407.png).  "seen" is the share of each size that the
+  measured points span; the rest is inferred.  A failed object is listed with its reason; its numbers only say where it
+  is.  "label" is the mask's value, null without masks; "pixels" counts the measured ones.
+
+tracking:
+  --track follows bodies over the frames of each bag and folder, for a camera that stands still.  "track" is then
+  {"id": ..., "seen": ..., "fused": true | false, "size": ..., "shape": ..., "translation": ..., "rotation": ...,
+  "sigma_size": ...}: the same body keeps its id and the names of its axes; fused numbers are those of all frames so
+  far, others the frame's own.  It is null without --track and for failed objects.
 
 meshes:
   One file a frame with all its bodies, in metres, coloured as in the pictures; a frame without a body gets none.  PLY
@@ -100,6 +108,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--consensus", action="store_true", help="average the network's answers to 8 positions of each view"
     )
     parser.add_argument("--ignore-masks", action="store_true", help="segment, even where a frame brings labels")
+    parser.add_argument(
+        "--track",
+        action="store_true",
+        help="follow bodies over the frames of each bag or folder, see below; not for folders of unrelated frames",
+    )
+    parser.add_argument(
+        "--time-budget",
+        type=float,
+        default=math.inf,
+        metavar="S",
+        help="seconds per frame after which no further start is tried; the largest and nearest objects come first",
+    )
     parser.add_argument("--max-objects", type=int, default=20, metavar="N", help="largest ones first (default 20)")
 
 
@@ -109,6 +129,8 @@ def run(options: argparse.Namespace) -> int:
         value = getattr(options, name)
         if value is not None and value < 1:
             return misused(f"--{name.replace('_', '-')}: expected at least 1, got {value}")
+    if not options.time_budget > 0:
+        return misused(f"--time-budget: expected a positive number of seconds, got {options.time_budget:g}")
     to_stdout = options.json == "-"
     if options.json and not to_stdout and not Path(options.json).resolve().parent.is_dir():
         return misused(f"--json: the folder of {options.json} does not exist")
@@ -127,7 +149,12 @@ def run(options: argparse.Namespace) -> int:
     from sq_perception.recovery import Recoverer, RecoveryOptions
 
     torch.set_num_threads(1)  # the network's layers are so small that threads cost more than they save
-    settings = RecoveryOptions(method=options.method, refine=options.refine, max_objects=options.max_objects)
+    settings = RecoveryOptions(
+        method=options.method,
+        refine=options.refine,
+        max_objects=options.max_objects,
+        time_budget=options.time_budget,
+    )
     try:
         recorded = RecordedInput(
             options.frames, options.camera_info, options.projection, options.topic, options.every, options.limit
@@ -159,9 +186,12 @@ class _Run:
     """One pass over the frames, and what it has come to so far."""
 
     def __init__(self, options: argparse.Namespace, recoverer: Recoverer, settings: RecoveryOptions) -> None:
+        from sq_perception.recorded_tracks import RecordedTracks
+
         self.results: list[dict[str, Any]] = []
         self.unreadable = 0
         self._options, self._recoverer, self._settings = options, recoverer, settings
+        self._tracks = RecordedTracks(lambda text: complain(f"warning: {text}")) if options.track else None
         self._warm: set[Any] = set()
         self._stems: set[str] = set()
         self._warnings: set[str] = set()
@@ -212,18 +242,21 @@ class _Run:
             recovery = self._recoverer.recover(frame.depth, frame.camera, labels, self._settings)
         except (ValueError, ArithmeticError) as error:  # a camera that no image can have come from
             raise FrameError(f"{file}: {frame.name}: {error}") from error
-        self.results.append(_frame_entry(file, frame, recovery, has_masks=labels is not None))
-        stem = _free_stem(frame.name if frame.stamp else Path(frame.name).stem, self._stems)
+        tracks = self._tracks.follow(file, frame, recovery) if self._tracks else [None] * len(recovery.bodies)
+        self.results.append(_frame_entry(file, frame, recovery, tracks, has_masks=labels is not None))
+        stem = _free_stem(frame.name if frame.topic else Path(frame.name).stem, self._stems)
         if self._options.pictures:
             _draw(Path(self._options.pictures) / f"{stem}.png", frame, recovery)
         if self._options.meshes:
             _write_mesh(Path(self._options.meshes) / f"{stem}.{self._options.mesh_format}", frame, recovery)
 
 
-def _frame_entry(file: str, frame: RecordedFrame, recovery: FrameRecovery, has_masks: bool) -> dict[str, Any]:
+def _frame_entry(
+    file: str, frame: RecordedFrame, recovery: FrameRecovery, tracks: Sequence[Followed | None], has_masks: bool
+) -> dict[str, Any]:
     """One element of ``frames`` in the output."""
     bodies = []
-    for body in recovery.bodies:
+    for body, track in zip(recovery.bodies, tracks, strict=True):
         superquadric = _in_result_frame(body.superquadric, frame.is_cube)
         bodies.append(
             {
@@ -239,6 +272,7 @@ def _frame_entry(file: str, frame: RecordedFrame, recovery: FrameRecovery, has_m
                 "message": body.message,
                 "label": int(body.label) if has_masks else None,
                 "pixels": int(body.pixels),
+                "track": None if track is None else _track_entry(track, frame.is_cube),
             }
         )
     return {
@@ -252,6 +286,24 @@ def _frame_entry(file: str, frame: RecordedFrame, recovery: FrameRecovery, has_m
         "stamp": None if frame.stamp is None else frame.stamp._asdict(),
         "topic": frame.topic or None,
         "frame_id": frame.frame_id or None,
+    }
+
+
+def _track_entry(track: Followed, is_cube: bool) -> dict[str, Any]:
+    body = track.superquadric
+    if is_cube:
+        from sq_perception.imaging import unit_cube
+
+        body = unit_cube.cube_from_optical(body)  # not its canonical form: the track keeps its own
+    return {
+        "id": track.id,
+        "seen": track.seen,
+        "fused": track.is_fused,
+        "size": _numbers(body.size),
+        "shape": _numbers(body.shape),
+        "translation": _numbers(body.translation),
+        "rotation": _numbers(body.rotation),
+        "sigma_size": _numbers(track.sigma_size),
     }
 
 
@@ -345,6 +397,7 @@ def _print_table(results: list[dict[str, Any]]) -> None:
         scale, unit, digits = (1.0, "", 4) if cube else (1e3, " mm", 1)
         for body in entry["superquadrics"]:
             label = "" if body["label"] is None else f"mask {body['label']}: "
+            label += "" if body["track"] is None else f"id {body['track']['id']}: "
             if body["status"] == "failed":
                 print(f"  {label}failed: {body['message']}")
                 continue

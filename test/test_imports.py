@@ -22,11 +22,11 @@ FLOORS = (
     ("geometry", "provenance"),
     ("imaging", "metrics", "tracking", "recorded_frame", "recorded_bag", "recorded_input"),
     ("learning", "fitting"),
-    ("recovery", "warm_up"),
+    ("recovery", "recorded_tracks", "warm_up"),
     ("evaluation", "nodes", "cli", "recover_command"),
 )
 ROS = ("rclpy", "sensor_msgs", "std_msgs", "std_srvs", "visualization_msgs", "diagnostic_msgs", "geometry_msgs",
-       "rcl_interfaces", "builtin_interfaces")  # fmt: skip
+       "rcl_interfaces", "builtin_interfaces", "tf2_ros")  # fmt: skip
 
 
 def sources() -> list[Path]:

@@ -352,6 +352,7 @@ def test_no_bodies_is_an_answer(bench):
 def test_parameters_take_effect_with_the_next_frame(bench):
     bench.answer(bench.depth())
     values = {"s": 3, "tau": 2.5, "refine": "none", "depth_min": 0.2, "depth_max": 3, "max_objects": 4}
+    values["time_budget"] = 0.5
     for result in bench.node.set_parameters([Parameter(name, value=value) for name, value in values.items()]):
         assert result.successful, result.reason
     assert not bench.node.set_parameters([Parameter("s", value=-1.0)])[0].successful
@@ -359,7 +360,8 @@ def test_parameters_take_effect_with_the_next_frame(bench):
     before, after = (asked[3] for asked in bench.recoverer.asked)
     assert (before.sharpness, before.depth_range) == (117.3, (0.0, np.inf))
     assert (after.sharpness, after.tau, after.refine) == (3.0, 2.5, "none")
-    assert (after.depth_range, after.max_objects) == ((0.2, 3.0), 4)
+    assert (after.depth_range, after.max_objects, after.time_budget) == ((0.2, 3.0), 4, 0.5)
+    assert before.time_budget == np.inf
 
 
 def test_enable_and_trigger(bench):
@@ -433,6 +435,7 @@ def test_masks_of_the_same_stamp_are_used(bench):
 
 
 def test_pictures_are_made_while_somebody_listens_and_stale_markers_go(bench):
+    assert bench.node.set_parameters([Parameter("tracking", value=False)])[0].successful
     bench.recoverer.bodies = (ball(1), ball(5), ball(6, Status.FAILED))
     assert len(bench.answer(bench.depth())[1]) == 3
     shown: list[MarkerArray] = []

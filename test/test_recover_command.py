@@ -178,6 +178,58 @@ def test_a_full_disk_ends_the_run_with_what_is_done(tmp_path, monkeypatch, capsy
     assert "No space left" in capsys.readouterr().err
 
 
+def save_grown(path, share):
+    """The two bodies, grown by a share, with labels that say which way."""
+    bodies = Superquadric((1 + share) * BODIES.size, BODIES.shape, BODIES.translation, BODIES.rotation)
+    rendered, index = raycast.render(bodies, CAMERA)
+    labels = np.array([0, 1, 2] if share > 0 else [0, 2, 1])[index + 1]
+    depth = np.where(np.isfinite(rendered), rendered, np.nan).astype(np.float32)
+    np.savez(path, depth=depth, K=CAMERA.matrix, labels=labels)
+
+
+def test_track_puts_ids_into_the_json(tmp_path, capsys):
+    """Masks change their labels and bodies their sizes from frame to frame; names that are times are stamps."""
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    for k in range(4):
+        save_grown(folder / f"1305031102.{k}.npz", 0.02 * (-1) ** k)
+    frames = recover(tmp_path, folder, "--track", "--time-budget", "10")
+    assert [frame["stamp"] for frame in frames] == [{"sec": 1305031102, "nanosec": k * 10**8} for k in range(4)]
+    assert "no stamp" not in capsys.readouterr().err
+    by_id = {}
+    for frame in frames:
+        for one in frame["superquadrics"]:
+            by_id.setdefault(one["track"]["id"], []).append(one)
+    assert sorted(by_id) == [1, 2]
+    for entries in by_id.values():
+        assert [one["track"]["seen"] for one in entries] == [1, 2, 3, 4]
+        assert {one["label"] for one in entries} == {1, 2}
+        last = entries[-1]["track"]
+        assert last["fused"]
+        truth = min(BODIES.size, key=lambda size: abs(np.prod(size) / np.prod(last["size"]) - 1))
+        np.testing.assert_allclose(np.sort(last["size"]), np.sort(truth), rtol=0.012)
+
+
+def test_track_is_asked_for_and_says_where_stamps_are_missing(tmp_path, capsys):
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        for k in range(2):
+            save_npz(tmp_path / folder / f"f{k}.npz")
+    plain = recover(tmp_path, tmp_path / "a")
+    assert all(one["track"] is None for frame in plain for one in frame["superquadrics"])
+    assert plain[0]["stamp"] is None
+    capsys.readouterr()
+    frames = recover(tmp_path, tmp_path / "a", tmp_path / "b", "--track")
+    ids = [sorted(one["track"]["id"] for one in frame["superquadrics"]) for frame in frames]
+    assert ids == [[1, 2], [1, 2], [3, 4], [3, 4]]
+    assert capsys.readouterr().err.count("taken to be 0.1 s apart") == 1
+
+
+def test_a_budget_is_positive(tmp_path, capsys):
+    assert cli.main(["recover", str(tmp_path), "--time-budget", "0"]) == 2
+    assert "--time-budget" in capsys.readouterr().err
+
+
 def test_a_message_is_one_printable_line(capsys):
     recover_command.complain("a\x1b[2J\nb")
     assert capsys.readouterr().err == "sq-perception: a?[2J b\n"

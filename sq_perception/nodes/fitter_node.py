@@ -44,6 +44,7 @@ def _options(parameters: FitterParameters) -> RecoveryOptions:
         tau=parameters.tau,
         depth_range=parameters.depth_range,
         max_objects=parameters.max_objects,
+        time_budget=parameters.seconds,
     )
 
 

@@ -13,8 +13,9 @@
 | `~/trigger` | std_srvs/Trigger | process the next frame, also while disabled, and answer with a summary |
 
 The executor's thread only stores messages; one worker thread takes the newest and does the work, so that services and
-parameters answer at once.  Stamp and frame of the input are copied to every output.  Results of orthographic frames are
-in the cube frame of :mod:`sq_perception.imaging.unit_cube`, those of others in the optical frame.
+parameters answer at once.  Stamp and frame of the input are copied to every output.  Bodies are followed from frame to
+frame (:mod:`sq_perception.nodes.identity`), and those that a frame shows are published.  Results of orthographic frames
+are in the cube frame of :mod:`sq_perception.imaging.unit_cube`, those of others in the optical frame.
 """
 
 from __future__ import annotations
@@ -41,12 +42,14 @@ from sq_msgs_py.superquadrics import to_message
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.nodes import report, results
+from sq_perception.nodes.camera_poses import CameraPoses
 from sq_perception.nodes.counters import Statistics, Throttle
 from sq_perception.nodes.frame import Frame, decode
+from sq_perception.nodes.identity import Identified, Identity
 from sq_perception.nodes.inbox import Arrival, Inbox, Refused
 from sq_perception.nodes.parameters import FrameParameters, LiveParameters
 from sq_perception.nodes.stoppable_node import StoppableNode
-from sq_perception.recovery import FrameRecovery, Recoverer, RecoveryOptions, render_recovery
+from sq_perception.recovery import Recoverer, RecoveryOptions, render_recovery
 
 WARM_UP_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 _COMPANION_PATIENCE = 0.25
@@ -98,6 +101,9 @@ class FrameNode(StoppableNode):
         self._triggers: list[tuple[float, Future]] = []
         self._triggers_lock = threading.Lock()
         self._shown_ids: list[int] = []
+        fixed_frame = self._settings.current.fixed_frame
+        poses = CameraPoses(self, fixed_frame) if fixed_frame else None
+        self._identity = Identity(poses, self._warn, self.get_logger().info)
         self._last_image = monotonic()
         self._last_level_counts = self._statistics.snapshot()
         self._warm_up()
@@ -199,9 +205,9 @@ class FrameNode(StoppableNode):
         now = self._statistics.snapshot()
         message = DiagnosticArray()
         message.header.stamp = self.get_clock().now().to_msg()
-        message.status.append(
-            report.status(self.get_fully_qualified_name(), now, self._last_level_counts, silent, self._enabled)
-        )
+        tally = self._identity.tally if self._settings.current.tracking else None
+        name = self.get_fully_qualified_name()
+        message.status.append(report.status(name, now, self._last_level_counts, silent, self._enabled, tally))
         self._last_level_counts = now
         self._diagnostics.publish(message)
 
@@ -238,15 +244,23 @@ class FrameNode(StoppableNode):
         stages |= {f"recovery: {stage}": duration for stage, duration in recovery.milliseconds.items()}
 
         clock = perf_counter()
-        self._superquadrics.publish(to_message(results.superquadric_array(recovery, frame.is_cube), frame.header))
+        if parameters.tracking:
+            found = self._identity.tracked(recovery, frame, arrival.time)
+            stages["tracking"] = 1e3 * (perf_counter() - clock)
+        else:
+            found = self._identity.untracked(recovery)
+
+        clock = perf_counter()
+        array = results.superquadric_array(found.recovery, found.ids, frame.is_cube)
+        self._superquadrics.publish(to_message(array, frame.header))
         stages["publish"] = 1e3 * (perf_counter() - clock)
         age = self.get_clock().now() - Time.from_msg(frame.header.stamp, clock_type=self.get_clock().clock_type)
         stages["stamp to result"] = age.nanoseconds * 1e-6
         clock = perf_counter()
-        self._publish_pictures(frame, recovery, parameters)
+        self._publish_pictures(frame, found, parameters)
         stages["pictures"] = 1e3 * (perf_counter() - clock)
         self._statistics.answer(stages)
-        return report.summary(recovery)
+        return report.summary(found.recovery, found.ids)
 
     def _decoded(self, message: Image, parameters: FrameParameters) -> Frame:
         if parameters.projection == "orthographic":
@@ -269,13 +283,13 @@ class FrameNode(StoppableNode):
             raise Refused(f"mask: expected one with the stamp of the image (use_masks is always), none came on {topic}")
         return mask
 
-    def _publish_pictures(self, frame: Frame, recovery: FrameRecovery, parameters: FrameParameters) -> None:
+    def _publish_pictures(self, frame: Frame, found: Identified, parameters: FrameParameters) -> None:
         if self._markers.get_subscription_count():
-            markers = results.marker_array(recovery, frame, parameters, self._shown_ids)
-            self._shown_ids = results.shown_ids(recovery)
+            markers = results.marker_array(found.recovery, found.ids, frame, parameters, self._shown_ids)
+            self._shown_ids = results.shown_ids(found.recovery, found.ids)
             self._markers.publish(markers)
         if self._rendered.get_subscription_count():
-            depth, _ = render_recovery(recovery, frame.camera)
+            depth, _ = render_recovery(found.recovery, frame.camera)
             self._rendered.publish(frame.encode(depth))
 
     def _answer_triggers(self, arrival: Arrival, outcome: Outcome) -> None:

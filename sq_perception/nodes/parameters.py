@@ -81,6 +81,24 @@ class FrameParameters:
         100.0, "Farther readings are left out; 100 keeps all.", unit="m", within=(0.001, 100.0), live=True
     )
     max_objects: int = setting(20, "At most so many bodies per frame, the largest ones.", within=(1, 100), live=True)
+    time_budget: float = setting(
+        0.0,
+        "Seconds per frame after which no further start is tried; the largest and nearest objects come first. 0: none.",
+        unit="s",
+        within=(0.0, 60.0),
+        live=True,
+    )
+    tracking: bool = setting(
+        True,
+        "Follow bodies from frame to frame: ids are those of tracks, axes keep their names, and numbers are fused over "
+        "the frames. Without, ids are mask labels and each frame stands for itself.",
+        live=True,
+    )
+    fixed_frame: str = setting(
+        "",
+        "tf2 frame that the bodies rest in, for a camera that moves; its pose at the image's stamp is looked up. "
+        "Empty: the camera stands still.",
+    )
     marker_colours: str = setting(
         "id",
         "Colour of the markers: by id, or by score from red (0) to green (1).",
@@ -99,6 +117,11 @@ class FrameParameters:
     )
 
     @property
+    def seconds(self) -> float:
+        """``time_budget``, infinity where there is none."""
+        return self.time_budget if self.time_budget > 0 else math.inf
+
+    @property
     def depth_range(self) -> tuple[float, float]:
         """Nearest and farthest depth in metres, infinity where ``depth_max`` is at its upper end."""
         return self.depth_min, math.inf if self.depth_max >= 100.0 else self.depth_max
@@ -108,6 +131,8 @@ class FrameParameters:
             raise ParameterError(
                 f"depth_min, depth_max: expected depth_min < depth_max, got {self.depth_min:g} and {self.depth_max:g}"
             )
+        if self.fixed_frame and self.projection == "orthographic":
+            raise ParameterError(f"fixed_frame: expected none for projection = orthographic, got {self.fixed_frame}")
 
 
 @dataclass(frozen=True)

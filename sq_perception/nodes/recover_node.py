@@ -49,6 +49,7 @@ def _options(parameters: RecoverParameters) -> RecoveryOptions:
         tau=parameters.tau,
         depth_range=parameters.depth_range,
         max_objects=parameters.max_objects,
+        time_budget=parameters.seconds,
     )
 
 

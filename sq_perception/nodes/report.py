@@ -11,10 +11,16 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 from sq_perception.fitting.fit import Status
 from sq_perception.nodes.counters import Snapshot
 from sq_perception.recovery import FrameRecovery
+from sq_perception.tracking.session import Tally
 
 
-def status(name: str, now: Snapshot, before: Snapshot, silent: bool, enabled: bool) -> DiagnosticStatus:
-    """The diagnostics of a node: WARN where frames stay away, get lost or were refused since the last report."""
+def status(
+    name: str, now: Snapshot, before: Snapshot, silent: bool, enabled: bool, tally: Tally | None = None
+) -> DiagnosticStatus:
+    """The diagnostics of a node: WARN where frames stay away, get lost or were refused since the last report.
+
+    ``tally`` is that of the tracking session, None where nothing is tracked.
+    """
     level, message = DiagnosticStatus.OK, f"{now.rate:.1f} Hz"
     if not enabled:
         message = "disabled"
@@ -35,6 +41,11 @@ def status(name: str, now: Snapshot, before: Snapshot, silent: bool, enabled: bo
         "enabled": str(enabled).lower(),
         "last error": now.last_error,
     }
+    if tally is not None:
+        values["tracks"] = str(tally.tracks)
+        values["track ids given"] = str(tally.births)
+        values["track resets"] = str(tally.resets)
+        values["frames without camera pose"] = str(tally.without_pose)
     for stage, (median, high) in now.latency.items():
         values[f"{stage}: median [ms]"] = f"{median:.2f}"
         values[f"{stage}: p95 [ms]"] = f"{high:.2f}"
@@ -44,19 +55,19 @@ def status(name: str, now: Snapshot, before: Snapshot, silent: bool, enabled: bo
     )
 
 
-def summary(recovery: FrameRecovery) -> str:
-    """One frame's results in a line."""
+def summary(recovery: FrameRecovery, ids: Sequence[int]) -> str:
+    """One frame's results in a line, with the ids of its bodies."""
     took = f"in {recovery.milliseconds.get('total', 0.0):.0f} ms"
     if not recovery.bodies:
         return f"no bodies {took}" + (f": {recovery.message}" if recovery.message else "")
     parts = []
-    for one in recovery.bodies:
+    for one, number in zip(recovery.bodies, ids, strict=True):
         if one.status == Status.FAILED:
-            parts.append(f"{one.label}: failed, {one.message}")
+            parts.append(f"{number}: failed, {one.message}")
             continue
         size, shape = one.superquadric.size, one.superquadric.shape
         parts.append(
-            f"{one.label}: a = {size[0]:.4f} {size[1]:.4f} {size[2]:.4f}, e = {shape[0]:.2f} {shape[1]:.2f}, "
+            f"{number}: a = {size[0]:.4f} {size[1]:.4f} {size[2]:.4f}, e = {shape[0]:.2f} {shape[1]:.2f}, "
             f"score {one.score:.2f}"
         )
     count = len(recovery.bodies)

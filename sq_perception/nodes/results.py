@@ -20,7 +20,7 @@ from sq_perception.recovery import FrameRecovery
 _WORST, _BEST = np.array([0.80, 0.20, 0.15]), np.array([0.20, 0.65, 0.30])
 
 
-def superquadric_array(recovery: FrameRecovery, is_cube: bool) -> SuperquadricArray:
+def superquadric_array(recovery: FrameRecovery, ids: Sequence[int], is_cube: bool) -> SuperquadricArray:
     """Every object of a frame, failed ones included; in the cube frame if ``is_cube``, else in the optical frame."""
     if not recovery.bodies:
         return SuperquadricArray.empty()
@@ -35,7 +35,7 @@ def superquadric_array(recovery: FrameRecovery, is_cube: bool) -> SuperquadricAr
         score=np.array([one.score for one in recovery.bodies]),
         residual=np.array([one.residual for one in recovery.bodies]),
         sigma_size=np.stack([one.sigma_size for one in recovery.bodies]),
-        id=np.array([one.label for one in recovery.bodies], dtype=np.uint32),
+        id=np.array(ids, dtype=np.uint32),
         status=np.array([one.status for one in recovery.bodies], dtype=np.uint32),
     )
 
@@ -56,16 +56,20 @@ def truth_array(bodies: Superquadric) -> SuperquadricArray:
     )
 
 
-def shown_ids(recovery: FrameRecovery) -> list[int]:
+def shown_ids(recovery: FrameRecovery, ids: Sequence[int]) -> list[int]:
     """Ids of the bodies that have markers: those that did not fail."""
-    return [one.label for one in recovery.bodies if one.status != Status.FAILED]
+    return [number for one, number in zip(recovery.bodies, ids, strict=True) if one.status != Status.FAILED]
 
 
 def marker_array(
-    recovery: FrameRecovery, frame: Frame, parameters: FrameParameters, previous_ids: Sequence[int]
+    recovery: FrameRecovery,
+    ids: Sequence[int],
+    frame: Frame,
+    parameters: FrameParameters,
+    previous_ids: Sequence[int],
 ) -> MarkerArray:
     """Meshes and outlines of the recovered bodies; markers of ``previous_ids`` that are gone are deleted."""
-    shown = [one for one in recovery.bodies if one.status != Status.FAILED]
+    shown = recovery.recovered
     bodies = [unit_cube.cube_from_optical(one.superquadric) if frame.is_cube else one.superquadric for one in shown]
     meshes = []
     for body in bodies:
@@ -77,7 +81,7 @@ def marker_array(
         colours = (1 - share) * _WORST + share * _BEST
     return markers(
         meshes,
-        [one.label for one in shown],
+        shown_ids(recovery, ids),
         frame.header,
         colours=colours,
         alpha=parameters.marker_alpha,

@@ -13,6 +13,11 @@ Its cost is the negative logarithm of a Student density of the whole difference,
 which ranks like a normal density close by and stays moderate for bodies that moved.  The assignment with most pairs and
 then least cost wins.
 
+Two bodies cannot be in one place.  A track that overlaps an older one so deeply is its twin: most likely a piece that
+a segmentation once cut off.  An observation that overlaps one before it so is its twin as well, and the twins are for
+each other: a pair of a twin and what is none costs more.  Bodies of quite other sizes, such as an apple in a bowl,
+outweigh that.
+
 What is left over may have been moved by more than its own size.  A body whose sizes and exponents alone agree, within
 the distance that something can travel in the time, is taken for the same: these five errors are compared in the form
 whose sizes fit best, whatever the rotation.
@@ -32,6 +37,7 @@ from sq_perception.tracking.state import CENTRE, LENGTH, SIZE_AND_SHAPE
 _DEEP = 0.5
 _FREEDOM = 5.0
 _IMPOSSIBLE = 1e6
+_TWIN = 30.0
 
 
 class Pairs(NamedTuple):
@@ -59,18 +65,14 @@ def in_place(
     exchange: float,
     gate: float,
 ) -> Pairs:
-    """Pairs of n tracks (n, 12) and m observations (m, 12) that overlap; ``gate`` is a probability.
+    """Pairs of n tracks (n, 12), oldest first, and m observations (m, 12), most important first, that overlap.
 
-    Covariances are (n, 11, 11) and (m, 11, 11); what observations have in addition to theirs, such as a least error,
-    is part of the tracks'.
+    ``gate`` is a probability.  Covariances are (n, 11, 11) and (m, 11, 11); what observations have in addition to
+    theirs, such as a least error, is part of the tracks'.
     """
     if not len(track) or not len(observed):
         return Pairs.none()
-    between = observed[None, :, 5:8] - track[:, None, 5:8]
-    distance = np.linalg.norm(between, axis=-1)
-    line = between / np.maximum(distance, 1e-12)[..., None]
-    extent = state.bodies(track).support(line) + state.bodies(observed).support(line.swapaxes(0, 1)).T
-    apart = distance / np.maximum(extent, 1e-12)
+    between, apart = _apart(track, observed)
     centres = track_covariance[:, None, CENTRE, CENTRE] + covariance[None, :, CENTRE, CENTRE]
     agree = state.mahalanobis(centres, between) < chi2.ppf(gate, 3)
     i, j = np.nonzero((apart < _DEEP) | ((apart < 1) & agree))
@@ -79,7 +81,18 @@ def in_place(
     match = forms.nearest(track[i], track_covariance[i], observed[j], covariance[j], exchange)
     total = track_covariance[i] + match.covariance
     cost = _student(total, state.difference(track[i], match.state))
+    younger, piece = np.any(twins(track), axis=1), np.any(twins(observed), axis=1)
+    unlike = younger[i] != piece[j]
+    cost = cost + _TWIN * unlike
     return _assigned(Pairs(i, j, match.state, match.covariance), cost, (len(track), len(observed)))
+
+
+def twins(states: np.ndarray) -> np.ndarray:
+    """(n, n) of states (n, 12), whether each is a twin of which one before it."""
+    if not len(states):
+        return np.zeros((0, 0), dtype=bool)
+    _, apart = _apart(states, states)
+    return np.tril(apart < _DEEP, -1)
 
 
 def elsewhere(
@@ -106,6 +119,15 @@ def elsewhere(
     pairs = Pairs(i[alike], j[alike], match.state[alike], match.covariance[alike])
     cost = _student(total[alike], error[alike]) + (distance[i, j] / reach[i])[alike]
     return _assigned(pairs, cost, (len(track), len(observed)))
+
+
+def _apart(some: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Ways (n, m, 3) between the centres of states (n, 12) and (m, 12), their lengths (n, m) over both supports."""
+    between = others[None, :, 5:8] - some[:, None, 5:8]
+    distance = np.linalg.norm(between, axis=-1)
+    line = between / np.maximum(distance, 1e-12)[..., None]
+    extent = state.bodies(some).support(line) + state.bodies(others).support(line.swapaxes(0, 1)).T
+    return between, distance / np.maximum(extent, 1e-12)
 
 
 def _unplaced(covariance: np.ndarray, distance: np.ndarray) -> np.ndarray:

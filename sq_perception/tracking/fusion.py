@@ -2,9 +2,9 @@
 
 Equations
 ---------
-An observation z of the state x with covariance R, seen from the direction c in the body's frame, has two errors,
+An observation z of the state x with covariance R, seen from the direction c in the body's frame, has three errors,
 
-    z = x + b_c + v,    cov b_c = B = rho R + F,    cov v = W = (1 - rho) R.
+    z = x + g + b_c + v,    cov g = gamma R,    cov b_c = B = rho R + F,    cov v = W = (1 - rho - gamma) R.
 
 v is new in every frame.  b_c is common to all views from within an angle of c: it is what a still camera sees wrongly
 again and again, an outline, a wrong hidden side, an object that is no superquadric, a camera that is not quite
@@ -15,8 +15,17 @@ the error x^ - x of the estimate its correlation C_c = cov(x^ - x, b_c) with eac
     P <- (I-K) P (I-K)^T + (I-K) C_c K^T + K C_c^T (I-K)^T + K (B + W) K^T,
     C_j <- (I-K) C_j + K B [j = c].
 
+g is common to all views from anywhere, such as edges that a sensor widens, and no number of views lessens it.  It is
+g = L q with L L^T = gamma R and one unknown q of unit covariance for the life of the track.  What it has come to is
+carried along,
+
+    M <- (I-K) M + K L,    cov(x^ - x) = P + M M^T,
+
+and K does not know of it: a gain that did would subtract one view from another to cancel what they are supposed to
+share.
+
 Equal views are averaged with equal weights and P falls to B, not to zero; views from elsewhere count as new.  With rho
-= 0 and F = 0 it is the Kalman filter of a constant.
+= gamma = 0 and F = 0 it is the Kalman filter of a constant.
 
 A view beyond the kept number takes the place of the one used longest ago: P keeps its error, only that a later look
 from there counts as new.
@@ -82,14 +91,16 @@ class Views:
 def fused(
     track: np.ndarray,
     covariance: np.ndarray,
+    lasting: np.ndarray,
     views: Views,
     observed: np.ndarray,
     white: np.ndarray,
     common: np.ndarray,
+    shared: np.ndarray,
     direction: np.ndarray,
     angle: float,
     turning: np.ndarray,
-) -> tuple[np.ndarray, np.ndarray, Views]:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, Views]:
     """n tracks after one observation each.
 
     Parameters
@@ -98,10 +109,14 @@ def fused(
         States in the world frame, in the same form.
     covariance : (n, 11, 11)
         P.
+    lasting : (n, 11, 11)
+        M.
     views : Views
         A batch (n,); changed in place and returned.
     white, common : (n, 11, 11)
         W, and B for a view from a new direction.
+    shared : (n, 11, 11)
+        L.
     direction : (n, 3)
         Unit vector from the body to the camera, world frame.
     angle
@@ -146,4 +161,11 @@ def fused(
         correction = np.where(told & turning[:, None], 0.0, correction)
     back = quaternions.to_matrix(quaternions.from_rotation_vector(correction))
     views.direction[:] = views.direction @ back
-    return state.moved(track, step), 0.5 * (after + after.swapaxes(1, 2)), views
+    after = 0.5 * (after + after.swapaxes(1, 2))
+    return state.moved(track, step), after, kept @ lasting + gain @ shared, views
+
+
+def root(covariance: np.ndarray) -> np.ndarray:
+    """The symmetric roots of covariances (..., 11, 11): they turn with the world, which Cholesky's do not."""
+    values, vectors = np.linalg.eigh(covariance)
+    return (vectors * np.sqrt(np.maximum(values, 0))[..., None, :]) @ vectors.swapaxes(-1, -2)

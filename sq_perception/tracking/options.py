@@ -15,8 +15,9 @@ class TrackerOptions:
 
     Attributes
     ----------
-    common_share
-        rho, the share of an observation's covariance that all views from one direction have in common; 0 to 1.
+    common_share, lasting_share
+        rho and gamma, the shares of an observation's covariance that all views from one direction, and all views from
+        anywhere, have in common; at least 0, below 1 together.
     view_angle
         Views closer than this share it, radians.
     views
@@ -42,6 +43,8 @@ class TrackerOptions:
         second.
     forget_pose_after, forget_after
         Seconds without observation until a body may be anywhere within reach, and until it is given up, hidden or not.
+    most
+        Tracks that are kept; beyond them those die first that were not observed for longest.
 
     Raises
     ------
@@ -49,7 +52,8 @@ class TrackerOptions:
         For a value outside its range.
     """
 
-    common_share: float = 0.5
+    common_share: float = 0.25
+    lasting_share: float = 0.25
     view_angle: float = 0.25
     views: int = 16
     least_log_size: float = 0.01
@@ -71,16 +75,18 @@ class TrackerOptions:
     misses: int = 5
     forget_pose_after: float = 5.0
     forget_after: float = 30.0
+    most: int = 100
 
     def __post_init__(self) -> None:
         for name, value in vars(self).items():
             if not np.isfinite(value) or value < 0:
                 raise ValueError(f"{name}: expected a finite number of at least 0, got {value}")
-        for name in ("views", "patience", "confirm_after", "publish_after", "misses"):
+        for name in ("views", "patience", "confirm_after", "publish_after", "misses", "most"):
             if getattr(self, name) != int(getattr(self, name)) or getattr(self, name) < 1:
                 raise ValueError(f"{name}: expected a whole number of at least 1, got {getattr(self, name)}")
-        if not self.common_share < 1:
-            raise ValueError(f"common_share: expected 0 <= rho < 1, got {self.common_share}")
+        if not self.common_share + self.lasting_share < 1:
+            shares = f"{self.common_share} and {self.lasting_share}"
+            raise ValueError(f"common_share, lasting_share: expected a sum below 1, got {shares}")
         if not 0 < self.gate < 1:
             raise ValueError(f"gate: expected a probability between 0 and 1, got {self.gate}")
         if not 0 < self.view_angle < np.pi:

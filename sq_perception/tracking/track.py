@@ -46,6 +46,9 @@ class Track:
     state : TrackState
     observation
         Index of this frame's observation; None if there is none.
+    follows
+        Whether the body is where this frame's observation says.  False for an observation whose centre or rotation is
+        elsewhere and which the track does not believe yet, and where there is none.
     """
 
     id: int
@@ -58,3 +61,4 @@ class Track:
     last_stamp: float
     state: TrackState
     observation: int | None
+    follows: bool

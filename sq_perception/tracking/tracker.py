@@ -11,7 +11,7 @@ world frame.  A frame is dealt with in this order:
    sizes and exponents are kept.  Where they disagree otherwise, the track is doubted too and learns anew.
 4. Observations without a track start one; ids are never used again.
 5. A track without observation is kept while it is hidden (:mod:`~sq_perception.tracking.sight`), and dies after a
-   number of frames in which it should have been seen.
+   number of frames in which it should have been seen, or in which another body was seen in its place.
 
 Metres, radians, seconds.
 """
@@ -54,6 +54,8 @@ class _Body:
     id: int
     state: np.ndarray
     covariance: np.ndarray
+    lasting: np.ndarray
+    """M: of the error that all views have in common; ``covariance`` is without it."""
     views: Views
     born: float
     last: float
@@ -68,6 +70,7 @@ class _Body:
     """Observations in a row that were found elsewhere."""
     missed: int = 0
     observation: int | None = None
+    follows: bool = False
 
     @property
     def is_moving(self) -> bool:
@@ -88,6 +91,11 @@ class Tracker:
         self._stamp: float | None = None
         self._next_id = 1
 
+    @property
+    def births(self) -> int:
+        """Ids given so far."""
+        return self._next_id - 1
+
     def reset(self) -> None:
         """Forget every body; ids go on."""
         self._bodies, self._stamp = [], None
@@ -107,8 +115,8 @@ class Tracker:
         Parameters
         ----------
         recoveries
-            Bodies of the frame in the optical frame, without failed ones:
-            :attr:`~sq_perception.recovery.FrameRecovery.recovered`.
+            Bodies of the frame in the optical frame, without failed ones, of pieces in one place the most important
+            first: :attr:`~sq_perception.recovery.FrameRecovery.recovered`.
         stamp
             Seconds; a stamp before the last one resets the tracker.
         camera_pose
@@ -195,7 +203,7 @@ class Tracker:
             if stamp - one.last > o.forget_pose_after:
                 variance[POSE] += _UNPLACED**2
             one.covariance = one.covariance + np.diag(variance)
-            one.observation = None
+            one.observation, one.follows = None, False
 
     def _pairs(
         self, observed: np.ndarray, covariance: np.ndarray, stamp: float, expectation: _Expectation
@@ -233,8 +241,9 @@ class Tracker:
         o = self._options
         some = [self._bodies[k] for k in pairs.track]
         states, covariances = self._stacked(some)
-        common, white = o.common_share * pairs.covariance + o.least(), (1 - o.common_share) * pairs.covariance
-        whole = common + white
+        common = o.common_share * pairs.covariance + o.least()
+        white = (1 - o.common_share - o.lasting_share) * pairs.covariance
+        whole = pairs.covariance + o.least()
         total, error = covariances + whole, state.difference(states, pairs.state)
         verdict = judgement.judged(states[:, 0:3], total, error, o.gate)
         turning = np.zeros(len(some), dtype=bool)
@@ -262,21 +271,25 @@ class Tracker:
             if agrees or impatient:
                 one.agreed = stamp
 
-        after, covariances, views = fusion.fused(
+        after, covariances, lasting, views = fusion.fused(
             states,
             covariances,
+            np.array([one.lasting for one in some]),
             Views.stack([one.views for one in some]),
             pairs.state,
             white,
             common,
+            fusion.root(o.lasting_share * pairs.covariance),
             to_camera[pairs.observed],
             o.view_angle,
             turning,
         )
+        strays = judgement.judged(after[:, 0:3], whole, state.difference(after, pairs.state), o.gate)
         for k, one in enumerate(some):
-            one.state, one.covariance, one.views = after[k], covariances[k], views[k]
+            one.state, one.covariance, one.lasting, one.views = after[k], covariances[k], lasting[k], views[k]
             one.seen, one.missed, one.last = one.seen + 1, 0, stamp
             one.observation = int(pairs.observed[k])
+            one.follows = not (strays.slid[k] or strays.turned[k])
 
     def _follow(self, one: _Body, error: np.ndarray, slid: bool, stamp: float, covariance: np.ndarray) -> None:
         """The velocity after an observation of the centre, ``error`` (3,) off its prediction."""
@@ -294,11 +307,13 @@ class Tracker:
 
     def _begin(self, index: int, observed: np.ndarray, covariance: np.ndarray, view: np.ndarray, stamp: float) -> None:
         o = self._options
-        whole, views = covariance + o.least(), Views.none(o.views)
+        whole, views = (1 - o.lasting_share) * covariance + o.least(), Views.none(o.views)
+        lasting = fusion.root(o.lasting_share * covariance)
         views.direction[0] = quaternions.to_matrix(observed[8:12]).T @ view
         views.bias[0] = views.correlation[0] = o.common_share * covariance + o.least()
         views.used[0] = 0
-        born = _Body(self._next_id, observed, whole, views, stamp, stamp, stamp, observation=index)
+        born = _Body(self._next_id, observed, whole, lasting, views, stamp, stamp, stamp)
+        born.observation, born.follows = index, True
         self._next_id += 1
         self._bodies.append(born)
 
@@ -306,14 +321,28 @@ class Tracker:
         """Count misses of what should have been seen, and bury the dead."""
         o = self._options
         dead = set()
+        ousted = self._ousted()
         for one in self._bodies:
             if one.observation is not None:
                 continue
-            one.missed = one.missed + 1 if one.id in missing else 0
-            patience = o.misses if one.seen >= o.confirm_after else min(2, o.misses)
+            one.missed = one.missed + 1 if one.id in missing | ousted else 0
+            patience = o.misses if one.seen >= o.confirm_after else min(1 if one.id in ousted else 2, o.misses)
             if one.missed >= patience or stamp - one.last > o.forget_after:
                 dead.add(one.id)
+        left = [one for one in self._bodies if one.id not in dead]
+        if len(left) > o.most:
+            unseen = sorted((one for one in left if one.observation is None), key=lambda one: one.last)
+            dead |= {one.id for one in unseen[: len(left) - o.most]}
         self._bodies = [one for one in self._bodies if one.id not in dead]
+
+    def _ousted(self) -> set[int]:
+        """Ids of bodies that were not observed and whose place another one takes that was."""
+        if all(one.observation is not None for one in self._bodies):
+            return set()
+        seen = np.array([one.observation is not None for one in self._bodies])
+        overlap = association.twins(self._stacked(self._bodies)[0])
+        ousted = ~seen & ((overlap | overlap.T) & seen).any(axis=1)
+        return {self._bodies[k].id for k in np.flatnonzero(ousted)}
 
     @staticmethod
     def _stacked(some: list[_Body]) -> tuple[np.ndarray, np.ndarray]:
@@ -347,7 +376,7 @@ class _Expectation:
 
 
 def _published(one: _Body, options: TrackerOptions) -> Track:
-    covariance = state.from_log(one.covariance, one.state[0:3])
+    covariance = state.from_log(one.covariance + one.lasting @ one.lasting.T, one.state[0:3])
     known = TrackState.CONFIRMED if one.seen >= options.confirm_after else TrackState.TENTATIVE
     return Track(
         id=one.id,
@@ -360,6 +389,7 @@ def _published(one: _Body, options: TrackerOptions) -> Track:
         last_stamp=one.last,
         state=known if one.observation is not None else TrackState.LOST,
         observation=one.observation,
+        follows=one.follows,
     )
 
 

@@ -1,0 +1,186 @@
+"""A tracker at work on a stream of frames: for every recovered body its id, and the numbers to publish.
+
+What a consumer gets of each body is in the optical frame of its frame and in the form that continues its track:
+
+| the frame's camera pose | the observation | numbers |
+| --- | --- | --- |
+| known, or the camera stands still | lies where its track is | those of the track: fused over all frames |
+| known, or the camera stands still | has left its track's place, and the track has not followed | its own |
+| wanted and not known | any | its own; the pose of the frame before is taken to find the ids |
+
+So a body that is moved by a hand is never published where it was, and nothing is published that the frame does not
+show.  Observations are in the exact forms only (:mod:`sq_perception.tracking.forms`): their bodies are not changed.
+
+Ids count from 1 and are never used again, not after a reset either.  A body that failed has no track; its id is
+FIRST_FAILED_ID + its label, which no track reaches.
+
+Metres, radians, seconds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sq_perception.geometry import rotation as quaternions
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging.camera import Camera
+from sq_perception.tracking import forms, state
+from sq_perception.tracking.options import TrackerOptions
+from sq_perception.tracking.state import LENGTH, Observed
+from sq_perception.tracking.tracker import Tracker
+
+FIRST_FAILED_ID = 2**31
+
+
+@dataclass(frozen=True, eq=False)
+class Followed:
+    """One body of a frame, as its consumer gets it.
+
+    Attributes
+    ----------
+    id
+        Of its track.
+    seen
+        Number of frames that showed the body, this one included.
+    is_fused
+        Whether the numbers are the track's; otherwise they are this frame's own.
+    superquadric : Superquadric
+        A single body in the optical frame.
+    covariance : (11, 11)
+        As in :class:`~sq_perception.tracking.state.Observed`; NaN if the observation's is unknown.
+    """
+
+    id: int
+    seen: int
+    is_fused: bool
+    superquadric: Superquadric
+    covariance: np.ndarray
+
+    @property
+    def sigma_size(self) -> np.ndarray:
+        """Standard deviations (3,) of the half sizes, metres; NaN where unknown."""
+        return np.sqrt(np.diag(self.covariance)[:3])
+
+
+@dataclass(frozen=True)
+class Tally:
+    """What a session has come to.
+
+    Attributes
+    ----------
+    tracks
+        Alive now, hidden ones included.
+    births
+        Ids given so far.
+    resets
+        How often time went back.
+    without_pose
+        Frames whose camera pose was wanted and not known.
+    """
+
+    tracks: int = 0
+    births: int = 0
+    resets: int = 0
+    without_pose: int = 0
+
+
+class TrackingSession:
+    """Follows the bodies of one camera's frames.
+
+    Parameters
+    ----------
+    options : TrackerOptions, optional
+        ``publish_after`` is taken as 1: every body of a frame has a track.
+    """
+
+    def __init__(self, options: TrackerOptions | None = None) -> None:
+        self._tracker = Tracker(replace(options or TrackerOptions(), publish_after=1))
+        self._stamp = -np.inf
+        self._pose: tuple[np.ndarray, np.ndarray] = state.as_pose(None)
+        self._tally = Tally()
+
+    @property
+    def tally(self) -> Tally:
+        """Counts after the last frame; may be read from another thread."""
+        return self._tally
+
+    def reset(self) -> None:
+        """Forget every body; ids go on."""
+        self._tracker.reset()
+        self._stamp = -np.inf
+        self._tally = replace(self._tally, tracks=0)
+
+    def follow(
+        self,
+        observed: Sequence[Observed],
+        stamp: float,
+        camera_pose: object = None,
+        *,
+        is_pose_known: bool = True,
+        camera: Camera | None = None,
+        depth: np.ndarray | None = None,
+    ) -> tuple[Followed, ...]:
+        """The bodies of another frame, in the order of ``observed``.
+
+        Parameters
+        ----------
+        observed
+            Bodies in the optical frame, without failed ones.
+        stamp
+            Seconds; a stamp before the last one resets the session.
+        camera_pose
+            Camera in the world, as in :meth:`Tracker.update`; None: the camera is the world.
+        is_pose_known
+            False for a frame whose pose was wanted and is not known; ``camera_pose`` is then not looked at.
+        camera, depth
+            As in :meth:`Tracker.update`.
+
+        Raises
+        ------
+        ValueError
+            As :meth:`Tracker.update`; nothing has changed then.
+        """
+        rotation, position = state.as_pose(camera_pose) if is_pose_known else self._pose
+        tracks = self._tracker.update(observed, stamp, (rotation, position), camera=camera, depth=depth)
+        self._tally = Tally(
+            tracks=len(tracks),
+            births=self._tracker.births,
+            resets=self._tally.resets + (stamp < self._stamp),
+            without_pose=self._tally.without_pose + (not is_pose_known),
+        )
+        self._stamp, self._pose = stamp, (rotation, position)
+
+        back = quaternions.conjugate(rotation)
+        matrix = quaternions.to_matrix(back)
+        by_index = {one.observation: one for one in tracks if one.observation is not None}
+        found = []
+        for index, one in enumerate(observed):
+            track = by_index[index]
+            body = track.superquadric.transformed(back, -matrix @ position)
+            covariance = state.turned(track.covariance, matrix)
+            is_fused = is_pose_known and track.follows
+            if not is_fused:
+                body, covariance = _in_form_of(body, covariance, one)
+            elif not np.isfinite(one.covariance).all():
+                covariance = np.full((LENGTH, LENGTH), np.nan)
+            found.append(Followed(track.id, track.seen, is_fused, body, covariance))
+        return tuple(found)
+
+
+def _in_form_of(body: Superquadric, covariance: np.ndarray, one: Observed) -> tuple[Superquadric, np.ndarray]:
+    """What was observed in its form nearest to a body with this covariance, and the covariance of the observation."""
+    own = np.asarray(one.covariance, dtype=float)
+    known = np.isfinite(own).all()
+    size = one.superquadric.size
+    match = forms.nearest(
+        body.to_flat()[None],
+        state.to_log(covariance, body.size)[None],
+        one.superquadric.to_flat()[None],
+        state.to_log(own if known else 0 * np.eye(LENGTH), size)[None],
+        exchange=0.0,
+    )
+    found = Superquadric.from_flat(match.state[0])
+    return found, state.from_log(match.covariance[0], found.size) if known else own

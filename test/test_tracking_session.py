@@ -1,0 +1,122 @@
+"""A tracking session: whose numbers are published, in which frame and form, and what is counted."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from tracked_bodies import Seen, angle_between, body, draw, from_camera, looking_at, noise, spread_bodies
+
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.tracking import session, state
+from sq_perception.tracking.session import Tally, TrackingSession
+from sq_perception.tracking.tracker import Tracker, TrackerOptions
+
+
+def test_numbers_are_those_of_the_tracks_in_the_optical_frame(rng):
+    """A camera that goes about four bodies: what comes out is what a tracker has, seen from the camera."""
+    truths, one, other = spread_bodies(4, rng), TrackingSession(), Tracker()
+    for k in range(8):
+        pose = looking_at(truths.translation.mean(axis=0), np.array([np.sin(0.3 * k), 0.2, -np.cos(0.3 * k)]), 2.0)
+        seen = [from_camera(draw(t, noise(), rng), *pose) for t in truths]
+        followed = one.follow(seen, 0.1 * k, pose)
+        tracks = other.update(seen, 0.1 * k, pose)
+        assert [f.id for f in followed] == [1, 2, 3, 4]
+        assert all(f.is_fused and f.seen == k + 1 for f in followed)
+        for found, track in zip(followed, tracks, strict=True):
+            back = from_camera(Seen(track.superquadric, track.covariance), *pose)
+            difference = state.difference(back.superquadric.to_flat(), found.superquadric.to_flat())
+            np.testing.assert_allclose(difference, 0, atol=1e-9)
+            np.testing.assert_allclose(found.covariance, back.covariance, atol=1e-12)
+            np.testing.assert_allclose(found.sigma_size, track.sigma_size)
+    raw = [np.abs(np.log(s.superquadric.volume() / t.volume())) for s, t in zip(seen, truths, strict=True)]
+    fused = [np.abs(np.log(f.superquadric.volume() / t.volume())) for f, t in zip(followed, truths, strict=True)]
+    assert np.mean(fused) < np.mean(raw)
+
+
+def test_a_body_moved_by_a_hand_is_never_published_where_it_was(rng):
+    """3 cm, then 8 cm, then a quarter turn: in the very frame of the motion the observation itself comes out."""
+    one, truth = TrackingSession(), body()
+    for k in range(40):
+        if k == 10:
+            truth = Superquadric(truth.size, truth.shape, truth.translation + [0.03, 0, 0], truth.rotation)
+        if k == 20:
+            truth = Superquadric(truth.size, truth.shape, truth.translation + [0, 0.08, 0], truth.rotation)
+        if k == 30:
+            truth = body(centre=truth.translation, turn=(0.1, 1.0, 0.3))
+        seen = draw(truth, noise(), rng)
+        (found,) = one.follow([seen], 0.1 * k)
+        assert found.id == 1
+        assert np.linalg.norm(found.superquadric.translation - truth.translation) < 0.006
+        turns = [angle_between(found.superquadric, form) for form in truth.equivalent_forms()]
+        assert min(turns) < 0.2
+        if k in (10, 30):
+            assert not found.is_fused
+            points = seen.superquadric.translation + rng.uniform(-0.06, 0.06, (50, 3))
+            np.testing.assert_allclose(found.superquadric.gauge(points), seen.superquadric.gauge(points), rtol=1e-9)
+
+
+def test_without_a_pose_there_are_ids_and_forms_but_no_fusion(rng):
+    truth, one = body(), TrackingSession()
+    last = None
+    for k in range(20):
+        seen = draw(truth, noise(), rng)
+        (found,) = one.follow([seen], 0.1 * k, np.eye(4), is_pose_known=k < 5)
+        assert found.id == 1
+        assert found.is_fused == (k < 5)
+        if k >= 5:
+            assert sorted(found.superquadric.size) == pytest.approx(sorted(seen.superquadric.size), rel=1e-9)
+            np.testing.assert_allclose(np.sort(found.sigma_size), np.sort(np.sqrt(np.diag(seen.covariance)[:3])))
+        if last is not None:
+            assert angle_between(found.superquadric, last) < 0.3
+        last = found.superquadric
+    assert one.tally == Tally(tracks=1, births=1, resets=0, without_pose=15)
+
+
+def test_time_that_goes_back_resets_and_ids_go_on(rng):
+    one = TrackingSession()
+    assert [one.follow([draw(body(), noise(), rng)], stamp)[0].id for stamp in (5.0, 5.1, 5.1, 2.0, 2.1)] == [
+        *(1, 1, 1),
+        *(2, 2),
+    ]
+    assert one.tally == Tally(tracks=1, births=2, resets=1)
+    one.reset()
+    assert one.tally == Tally(tracks=0, births=2, resets=1)
+    assert one.follow([draw(body(), noise(), rng)], 1.0)[0].id == 3
+    assert one.tally.resets == 1
+
+
+def test_every_body_of_a_frame_has_a_track_and_nothing_else_comes_out(rng):
+    one = TrackingSession(TrackerOptions(publish_after=3))
+    near, far = body(), body(centre=(0.3, 0, 0.8))
+    assert [f.id for f in one.follow([draw(near, noise(), rng), draw(far, noise(), rng)], 0.0)] == [1, 2]
+    assert [f.id for f in one.follow([draw(far, noise(), rng)], 0.1)] == [2]
+    assert one.follow([], 0.2) == ()
+    assert one.tally.births == 2
+
+
+def test_what_a_fit_does_not_know_a_track_does_not_claim():
+    """A method without covariance: numbers are fused, deviations stay unknown."""
+    one, unknown = TrackingSession(), np.full((11, 11), np.nan)
+    for k, size in enumerate((0.050, 0.052)):
+        (found,) = one.follow([Seen(body((size, 0.04, 0.03)), unknown)], 0.1 * k)
+    assert found.is_fused
+    assert 0.0502 < found.superquadric.size.max() < 0.0518
+    assert np.isnan(found.sigma_size).all()
+    (found,) = one.follow([Seen(body((0.05, 0.04, 0.03)), unknown)], 0.2, is_pose_known=False)
+    assert np.isnan(found.covariance).all()
+
+
+def test_misuse_changes_nothing(rng):
+    one = TrackingSession()
+    one.follow([draw(body(), noise(), rng)], 0.0)
+    before = one.tally
+    with pytest.raises(ValueError, match="stamp"):
+        one.follow([], np.nan)
+    with pytest.raises(ValueError, match="rigid"):
+        one.follow([], 1.0, 2 * np.eye(4))
+    assert one.tally == before
+
+
+def test_failed_bodies_have_ids_that_no_track_reaches():
+    assert session.FIRST_FAILED_ID == 2**31
+    assert session.FIRST_FAILED_ID + np.iinfo(np.int32).max <= np.iinfo(np.uint32).max
