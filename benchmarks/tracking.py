@@ -1,6 +1,6 @@
 """Five bodies on a table followed over 300 frames: ids, and how size errors go down.
 
-    python benchmarks/tracking.py [--scenes 3] [--frames 300] [--seed 1] [--name tracking]
+    python benchmarks/tracking.py [--scenes 2] [--frames 300] [--seed 1] [--name tracking]
 
 Scenes of :func:`sq_perception.imaging.scene.table_scene`, all bodies 0.6 to 1.0 m away, 640 x 480 pixels, 30 frames a
 second.  The camera goes 90 degrees about the table's normal through the point it looks at, its pose known, or stands
@@ -274,7 +274,7 @@ def _owners(labels: np.ndarray, found: FrameRecovery) -> tuple[dict[int, int], s
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("--scenes", type=int, default=3)
+    parser.add_argument("--scenes", type=int, default=2)
     parser.add_argument("--frames", type=int, default=300)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--rows", nargs="+", choices=tuple(ROWS), default=tuple(ROWS))

@@ -10,13 +10,12 @@ Its cost is the negative logarithm of a Student density of the whole difference,
 
     cost = (n + nu) log(1 + d^2 / nu) + log det S,
 
-which ranks like a normal density close by and stays moderate for bodies that moved.  The assignment with most pairs and
-then least cost wins.
+which ranks like a normal density close by and stays moderate for bodies that moved.  The assignment of least cost wins,
+where what is left alone costs as much as a pair at d = 100: a pair close by is not given up for two far apart.
 
 Two bodies cannot be in one place.  A track that overlaps an older one so deeply is its twin: most likely a piece that
-a segmentation once cut off.  An observation that overlaps one before it so is its twin as well, and the twins are for
-each other: a pair of a twin and what is none costs more.  Bodies of quite other sizes, such as an apple in a bowl,
-outweigh that.
+a segmentation once cut off.  Of several observations in the place of a track the first is for the elder, the rest for
+its twins: other pairs cost more.  Bodies of quite other sizes, such as an apple in a bowl, outweigh that.
 
 What is left over may have been moved by more than its own size.  A body whose sizes and exponents alone agree, within
 the distance that something can travel in the time, is taken for the same: these five errors are compared in the form
@@ -36,7 +35,8 @@ from sq_perception.tracking.state import CENTRE, LENGTH, SIZE_AND_SHAPE
 
 _DEEP = 0.5
 _FREEDOM = 5.0
-_IMPOSSIBLE = 1e6
+_ALONE = 1e4
+"""d^2."""
 _TWIN = 30.0
 
 
@@ -75,16 +75,19 @@ def in_place(
     between, apart = _apart(track, observed)
     centres = track_covariance[:, None, CENTRE, CENTRE] + covariance[None, :, CENTRE, CENTRE]
     agree = state.mahalanobis(centres, between) < chi2.ppf(gate, 3)
-    i, j = np.nonzero((apart < _DEEP) | ((apart < 1) & agree))
+    deep = apart < _DEEP
+    i, j = np.nonzero(deep | ((apart < 1) & agree))
     if not len(i):
         return Pairs.none()
     match = forms.nearest(track[i], track_covariance[i], observed[j], covariance[j], exchange)
     total = track_covariance[i] + match.covariance
-    cost = _student(total, state.difference(track[i], match.state))
-    younger, piece = np.any(twins(track), axis=1), np.any(twins(observed), axis=1)
-    unlike = younger[i] != piece[j]
+    error = state.difference(track[i], match.state)
+    cost = _student(total, error)
+    younger, later = np.any(twins(track), axis=1), np.cumsum(deep, axis=1) - deep > 0
+    unlike = younger[i] != later[i, j]
     cost = cost + _TWIN * unlike
-    return _assigned(Pairs(i, j, match.state, match.covariance), cost, (len(track), len(observed)))
+    alone = _alone(total, error)
+    return _assigned(Pairs(i, j, match.state, match.covariance), cost, alone, (len(track), len(observed)))
 
 
 def twins(states: np.ndarray) -> np.ndarray:
@@ -117,8 +120,10 @@ def elsewhere(
     error = state.difference(track[i], match.state)[:, SIZE_AND_SHAPE]
     alike = state.mahalanobis(total, error) < chi2.ppf(gate, 5)
     pairs = Pairs(i[alike], j[alike], match.state[alike], match.covariance[alike])
+    if not alike.any():
+        return Pairs.none()
     cost = _student(total[alike], error[alike]) + (distance[i, j] / reach[i])[alike]
-    return _assigned(pairs, cost, (len(track), len(observed)))
+    return _assigned(pairs, cost, _alone(total[alike], error[alike]), (len(track), len(observed)))
 
 
 def _apart(some: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -143,8 +148,14 @@ def _student(covariance: np.ndarray, error: np.ndarray) -> np.ndarray:
     return (error.shape[-1] + _FREEDOM) * np.log1p(square / _FREEDOM) + np.linalg.slogdet(covariance)[1]
 
 
-def _assigned(pairs: Pairs, cost: np.ndarray, shape: tuple[int, int]) -> Pairs:
-    table = np.full(shape, _IMPOSSIBLE)
+def _alone(covariance: np.ndarray, error: np.ndarray) -> float:
+    """Cost of a pair at d^2 = _ALONE with the median of covariances (k, n, n)."""
+    volume = float(np.median(np.linalg.slogdet(covariance)[1]))
+    return (error.shape[-1] + _FREEDOM) * float(np.log1p(_ALONE / _FREEDOM)) + volume
+
+
+def _assigned(pairs: Pairs, cost: np.ndarray, alone: float, shape: tuple[int, int]) -> Pairs:
+    table = np.full(shape, alone)
     table[pairs.track, pairs.observed] = cost
     rows, columns = linear_sum_assignment(table)
     kept = np.zeros(shape, dtype=bool)
