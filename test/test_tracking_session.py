@@ -55,6 +55,18 @@ def test_a_body_moved_by_a_hand_is_never_published_where_it_was(rng):
             np.testing.assert_allclose(found.superquadric.gauge(points), seen.superquadric.gauge(points), rtol=1e-9)
 
 
+def test_a_body_exchanged_for_another_is_published_late_by_one_frame_at_most(rng):
+    """The same place and pose, other sizes: one such frame may be an error, the second one is believed."""
+    one, old, new = TrackingSession(), body((0.05, 0.04, 0.03)), body((0.05, 0.04, 0.06))
+    for k in range(30):
+        truth = old if k < 10 else new
+        (found,) = one.follow([draw(truth, noise(0.02, 0.03, 0.001, 0.02), rng)], 0.1 * k)
+        if k != 10:
+            np.testing.assert_allclose(np.sort(found.superquadric.size), np.sort(truth.size), rtol=0.1)
+    assert found.id == 1
+    assert found.is_fused
+
+
 def test_without_a_pose_there_are_ids_and_forms_but_no_fusion(rng):
     truth, one = body(), TrackingSession()
     last = None

@@ -83,7 +83,7 @@ def in_place(
     total = track_covariance[i] + match.covariance
     error = state.difference(track[i], match.state)
     cost = _student(total, error)
-    younger, later = np.any(twins(track), axis=1), np.cumsum(deep, axis=1) - deep > 0
+    younger, later = np.any(twins(track), axis=1), np.greater(np.cumsum(deep, axis=1), deep)
     unlike = younger[i] != later[i, j]
     cost = cost + _TWIN * unlike
     alone = _alone(total, error)

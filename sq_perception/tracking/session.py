@@ -5,11 +5,12 @@ What a consumer gets of each body is in the optical frame of its frame and in th
 | the frame's camera pose | the observation | numbers |
 | --- | --- | --- |
 | known, or the camera stands still | lies where its track is | those of the track: fused over all frames |
-| known, or the camera stands still | has left its track's place, and the track has not followed | its own |
+| known, or the camera stands still | has left its track, and the track has not followed | its own |
 | wanted and not known | any | its own; the pose of the frame before is taken to find the ids |
 
 So a body that is moved by a hand is never published where it was, and nothing is published that the frame does not
-show.  Observations are in the exact forms only (:mod:`sq_perception.tracking.forms`): their bodies are not changed.
+show.  A single observation of other sizes in the same place is taken for an error and left out.  Observations are in
+the exact forms only (:mod:`sq_perception.tracking.forms`): their bodies are not changed.
 
 Ids count from 1 and are never used again, not after a reset either.  A body that failed has no track; its id is
 FIRST_FAILED_ID + its label, which no track reaches.

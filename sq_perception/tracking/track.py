@@ -47,8 +47,9 @@ class Track:
     observation
         Index of this frame's observation; None if there is none.
     follows
-        Whether the body is where this frame's observation says.  False for an observation whose centre or rotation is
-        elsewhere and which the track does not believe yet, and where there is none.
+        Whether the body is what this frame's observation says.  False where there is none, for one whose centre or
+        rotation is elsewhere and which the track does not believe yet, and for one of other sizes or exponents if it is
+        not the first in a row.
     """
 
     id: int

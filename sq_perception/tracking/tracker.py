@@ -289,7 +289,8 @@ class Tracker:
             one.state, one.covariance, one.lasting, one.views = after[k], covariances[k], lasting[k], views[k]
             one.seen, one.missed, one.last = one.seen + 1, 0, stamp
             one.observation = int(pairs.observed[k])
-            one.follows = not (strays.slid[k] or strays.turned[k])
+            insists = one.disagreed >= o.patience and not strays.fits[k]
+            one.follows = not (strays.slid[k] or strays.turned[k] or insists)
 
     def _follow(self, one: _Body, error: np.ndarray, slid: bool, stamp: float, covariance: np.ndarray) -> None:
         """The velocity after an observation of the centre, ``error`` (3,) off its prediction."""
