@@ -417,7 +417,7 @@ def _view(
 ) -> None:
     """What the object stands on, what a network is shown of it, and what its score is measured on."""
     one.plane = _support(one, plane)
-    core = _core(one, camera)
+    core = _core(one, depth, camera)
     if network is not None:
         one.shown = network.config.view_of(depth, core, camera, one.plane)
     one.view = one.shown
@@ -432,7 +432,7 @@ def _support(one: _Object, plane: np.ndarray | None) -> np.ndarray | None:
     return plane
 
 
-def _core(one: _Object, camera: Camera) -> np.ndarray:
+def _core(one: _Object, depth: np.ndarray, camera: Camera) -> np.ndarray:
     """The mask (height, width) without pixels that measured the table or the background: a view is framed by all.
 
     Sensors widen what is near, masks from colour what they like.  A thin thing on the table keeps its pixels.
@@ -447,9 +447,13 @@ def _core(one: _Object, camera: Camera) -> np.ndarray:
         above[rows, columns] = points @ one.plane[:3] + one.plane[3] > _ON_TABLE
         core = above if 2 * np.count_nonzero(above) > rows.size else core
     footprint = float(np.median(one.depth_crop[one.mask_crop])) / np.sqrt(camera.fx * camera.fy)
-    core = coherent(one.depth_crop, core, _JUMP_PIXELS * footprint + _JUMP)
     whole = np.zeros_like(one.mask)
-    whole[one.window] = core & one.mask_crop
+    whole[one.window] = core
+    rows, columns = (slice(max(side.start - 1, 0), side.stop + 1) for side in one.window)
+    around = rows, columns  # with a margin, as what goes on beyond the mask is something else
+    whole[around] &= coherent(
+        np.ascontiguousarray(depth[around]), np.ascontiguousarray(whole[around]), _JUMP_PIXELS * footprint + _JUMP
+    )
     return whole
 
 

@@ -16,6 +16,7 @@ from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
+from sq_perception.imaging.coherence import coherent
 from sq_perception.imaging.scene import plane_depth
 
 CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)
@@ -176,3 +177,39 @@ def test_a_can_from_above_shows_all_of_its_width() -> None:
     assert (fit.seen > 0.85).all()
     assert (face_on().seen > 0.9).sum() == 2
     assert face_on().seen.min() < 0.2
+
+
+# What a mask holds beside the body
+
+
+def test_the_fringe_of_an_occluder_is_no_part_of_the_body() -> None:
+    depth = np.full((40, 60), 1.0)
+    depth[:, 40:] = 0.6
+    depth[:, 34:40] = np.nan
+    mask = np.zeros(depth.shape, dtype=bool)
+    mask[5:35, 10:43] = True
+    core = coherent(depth, mask, 0.02)
+    assert not core[:, 40:].any()
+    assert core[5:35, 10:40].all()
+
+
+def test_the_far_end_of_a_body_behind_a_bar_stays() -> None:
+    depth = np.full((40, 60), 1.5)
+    depth[5:35, 10:50] = 1.0
+    depth[:, 36:40] = 0.6
+    mask = depth == 1.0
+    np.testing.assert_array_equal(coherent(depth, mask, 0.02), mask)
+
+
+def test_a_hidden_foot_is_thought_to_reach_the_plane() -> None:
+    truth = standing([0.04, 0.03, 0.07], [0.1, 0.1], 0.4)
+    shown, _ = raycast.render(truth, CAMERA)
+    mask = np.isfinite(shown)
+    depth = np.where(mask, shown, plane_depth(PLANE, CAMERA))
+    rows = np.flatnonzero(mask.any(axis=1))
+    hidden = np.arange(CAMERA.height)[:, None] > rows[0] + 0.6 * len(rows)
+    depth = np.where(hidden, 0.3, depth) + np.random.default_rng(4).normal(0, NOISE, depth.shape)
+    settings = Options(plane=PLANE, model_error=0.0025)
+    fit = surface_fit.fit(depth.astype(np.float32), mask & ~hidden, CAMERA, options=settings)
+    lowest = NORMAL @ fit.superquadric.translation + PLANE[3] - extent(fit.superquadric, NORMAL)
+    assert abs(lowest) < 0.006

@@ -1,7 +1,8 @@
 """The coherent part of a mask: what a depth step separates from the object is something else.
 
 A convex body has no step in its visible surface.  Masks that come from colour, or that a sensor widens at edges, hold
-pixels that measured the background instead.  A piece that touches the largest one across a step, or is tiny, goes; one
+pixels that measured the background, or what stands in front, instead.  A piece that touches the largest one across a
+step, or is tiny, goes, and so does one that mostly goes on beyond the mask: it is the fringe of something else.  One
 beyond a gap (a bar in front of the body) stays.  Metres; float depth, NaN where nothing was measured.
 """
 
@@ -13,6 +14,8 @@ from sq_perception.geometry.kernels import kernel
 
 _SMALLEST_PIECE = 0.02
 """Of the largest one's pixels."""
+_FRINGE = 1 / 3
+"""A piece with so many of its pixels beside others of its depth outside the mask."""
 
 
 @kernel
@@ -25,6 +28,7 @@ def coherent(depth: np.ndarray, inside: np.ndarray, jump: float) -> np.ndarray:
     label = np.zeros((height, width), np.int32)
     stack = np.empty(height * width, np.int32)
     largest, largest_size, pieces = 0, 0, 0
+    outside = np.zeros(height * width // 2 + 2, np.int32)
     sizes = np.zeros(height * width // 2 + 2, np.int32)
     for start in range(height * width):
         v, u = start // width, start % width
@@ -34,27 +38,32 @@ def coherent(depth: np.ndarray, inside: np.ndarray, jump: float) -> np.ndarray:
         label[v, u] = pieces
         stack[0] = start
         top = 1
-        size = 0
+        size, beside = 0, 0
         while top > 0:
             top -= 1
             v, u = stack[top] // width, stack[top] % width
             size += 1
+            goes_on = False
             for side in range(4):
                 v2, u2 = v + (side == 0) - (side == 1), u + (side == 2) - (side == 3)
-                if v2 < 0 or u2 < 0 or v2 >= height or u2 >= width or label[v2, u2] > 0 or not inside[v2, u2]:
+                if v2 < 0 or u2 < 0 or v2 >= height or u2 >= width or label[v2, u2] > 0:
+                    continue
+                if not inside[v2, u2]:
+                    goes_on |= abs(depth[v2, u2] - depth[v, u]) <= jump
                     continue
                 if abs(depth[v2, u2] - depth[v, u]) <= jump:
                     label[v2, u2] = pieces
                     stack[top] = v2 * width + u2
                     top += 1
-        sizes[pieces] = size
+            beside += goes_on
+        sizes[pieces], outside[pieces] = size, beside
         if size > largest_size:
             largest, largest_size = pieces, size
     if pieces <= 1:
         return inside
     kept = np.ones(pieces + 1, np.bool_)
     for k in range(1, pieces + 1):
-        kept[k] = sizes[k] >= _SMALLEST_PIECE * largest_size
+        kept[k] = sizes[k] >= _SMALLEST_PIECE * largest_size and outside[k] < _FRINGE * sizes[k]
     for v in range(height):
         for u in range(width):
             if label[v, u] != largest:
