@@ -1,6 +1,8 @@
 """Depth image and camera in, superquadrics out: the one place that chains the stages.
 
-    depth -> segmentation -> canonical view of each object -> network -> inverse of the view -> fit -> score
+    depth -> segmentation -> canonical view of each object -> network -> inverse of the view -> fit -> repair -> score
+
+Own segments are joined and split by the bodies that were fitted to them (:mod:`sq_perception.segment_repair`).
 
 | method | body | refine |
 | --- | --- | --- |
@@ -28,13 +30,14 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, TypeVar, get_args
 
 import numpy as np
 import torch
 
+from sq_perception import segment_repair
 from sq_perception.fitting import soft_render_fit, solina_bajcsy, surface_fit
 from sq_perception.fitting.fit import Fit, Status
 from sq_perception.geometry.superquadric import Superquadric
@@ -63,6 +66,7 @@ _ON_TABLE = 0.003
 _JUMP_PIXELS, _JUMP = 10.0, 0.002
 """What a network is shown, and a score is measured on: metres above the table; steps in pixel widths, and metres."""
 _NEEDS_NETWORK = ("auto", "network")
+_FITTED = ("auto", "symmetry")
 _HARD_IMAGE = (ValueError, ArithmeticError, np.linalg.LinAlgError)
 """What numerical code may raise on degenerate data: reported with the object, never raised."""
 
@@ -86,8 +90,10 @@ class RecoveryOptions:
     use_plane
         Let the fit know the support plane.
     time_budget
-        Seconds per frame after which the surface fit tries no further start for any object.  The objects with most
-        pixels, large or near, come first.
+        Seconds per frame after which the surface fit tries no further start for any object, and the repair of segments
+        begins no further fit.  The objects with most pixels, large or near, come first.
+    repair
+        Join and split own segments where that describes the image in fewer words; masks from outside stay as they are.
 
     Raises
     ------
@@ -104,6 +110,7 @@ class RecoveryOptions:
     min_pixels: int | None = None
     use_plane: bool = True
     time_budget: float = np.inf
+    repair: bool = True
 
     def __post_init__(self) -> None:
         for name, value, known in (("method", self.method, Method), ("refine", self.refine, Refine)):
@@ -172,7 +179,7 @@ class FrameRecovery:
     bodies
         One entry per object, the one with most pixels first, failed ones among them.
     milliseconds
-        By stage: segmentation, network, fit, score, total.
+        By stage: segmentation, network, fit, repair, score, total.
     labels : int32 (height, width)
         The masks that were used.
     plane : (4,) or None
@@ -272,7 +279,7 @@ class Recoverer:
         """
         options = options or self._options
         started = time.perf_counter()
-        milliseconds = dict.fromkeys(("segmentation", "network", "fit", "score", "total"), 0.0)
+        milliseconds = dict.fromkeys(("segmentation", "network", "fit", "repair", "score", "total"), 0.0)
         network = self._load_network() if options.method in _NEEDS_NETWORK else None
 
         with _timed(milliseconds, "segmentation"):
@@ -299,6 +306,9 @@ class Recoverer:
         with _timed(milliseconds, "fit"):
             deadline = started + options.time_budget
             fits = _mapped(lambda one: _fitted(one, depth, camera, options, deadline), objects)
+        with _timed(milliseconds, "repair"):
+            if labels is None and options.repair and options.method in _FITTED and options.refine == "surface":
+                found, objects, fits = _repaired(found, objects, fits, depth, camera, options, deadline)
         with _timed(milliseconds, "score"):
             pairs = list(zip(objects, fits, strict=True))
             scores = _mapped(lambda pair: _score(pair[0].view, pair[1].superquadric, options), pairs)
@@ -423,6 +433,44 @@ def _view(
     one.view = one.shown
     if network is None or network.config.framing == "full":
         one.view = canonical_view.from_mask(depth, core, camera, _VIEW_PIXELS)
+
+
+def _repaired(
+    found: segmentation.Segmentation,
+    objects: list[_Object],
+    fits: list[Fit],
+    depth: np.ndarray,
+    camera: Camera,
+    options: RecoveryOptions,
+    deadline: float,
+) -> tuple[segmentation.Segmentation, list[_Object], list[Fit]]:
+    """Segments, objects and bodies after joining and splitting; new segments are fitted without the network."""
+
+    def prepared(mask: np.ndarray) -> _Object:
+        one = _objects(depth, segmentation.Segmentation(mask.astype(np.int32), None, (1,)), camera, options)[0]
+        _view(one, depth, camera, found.plane, None)
+        return one
+
+    known = dict(zip((one.label for one in objects), fits, strict=True))
+    repair = segment_repair.repaired(
+        depth,
+        camera,
+        found.labels,
+        found.plane,
+        known,
+        lambda mask: _fitted(prepared(mask), depth, camera, options, deadline),
+        found.sigma,
+        deadline - time.perf_counter(),
+    )
+    if not repair.changed:
+        return found, objects, fits
+    same = {one.label: one for one in objects if repair.fits.get(one.label) is known[one.label]}
+    for label in repair.fits.keys() - same.keys():
+        same[label] = prepared(repair.labels == label)
+        same[label].label = label
+    ordered = sorted(same.values(), key=lambda one: (-one.pixels, one.label))
+    ids = tuple(one.label for one in ordered)
+    return replace(found, labels=repair.labels, ids=ids), ordered, [repair.fits[label] for label in ids]
 
 
 def _support(one: _Object, plane: np.ndarray | None) -> np.ndarray | None:

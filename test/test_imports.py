@@ -21,8 +21,8 @@ PACKAGES = (PERCEPTION, MESSAGES)
 FLOORS = (
     ("geometry", "provenance"),
     ("imaging", "metrics", "tracking", "recorded_frame", "recorded_bag", "recorded_input"),
-    ("learning", "fitting"),
-    ("recovery", "recorded_tracks", "warm_up"),
+    ("learning", "fitting", "scene_description"),
+    ("recovery", "recorded_tracks", "segment_repair", "warm_up"),
     ("evaluation", "nodes", "cli", "recover_command"),
 )
 ROS = ("rclpy", "sensor_msgs", "std_msgs", "std_srvs", "visualization_msgs", "diagnostic_msgs", "geometry_msgs",

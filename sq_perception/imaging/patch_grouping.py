@@ -85,6 +85,14 @@ def bodies(patches: Patches, camera: Camera, options: GroupingOptions | None = N
     return _without_fragments(body, areas, joint, options.least_area)
 
 
+def hollow_share(patches: Patches, body: np.ndarray, options: GroupingOptions | None = None) -> np.ndarray:
+    """Share (bodies + 1,) of each body's samples that lie on hollow patches; ``body`` is what :func:`bodies` found."""
+    options = options or GroupingOptions()
+    samples = np.bincount(patches.labels.ravel(), minlength=patches.count + 1).astype(float)
+    hollow = np.bincount(body, samples * (patches.curvature > 1 / options.hollow_radius))
+    return hollow / np.maximum(np.bincount(body, samples), 1)
+
+
 def _sample_area(patches: Patches, camera: Camera) -> float:
     """Square metres of a sample in the image plane at the bodies' depth."""
     z = float(np.median(patches.depth[patches.labels > 0]))

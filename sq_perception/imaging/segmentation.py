@@ -6,7 +6,9 @@ Steps
 2. Smooth patches of surface, cut at depth steps and folds (:mod:`sq_perception.imaging.surface_patches`).
 3. Patches that belong to one body: convex edges join, concave edges and steps part, with exceptions for vessels and
    for bodies that go on behind others (:mod:`sq_perception.imaging.patch_grouping`).
-4. Each body back to full resolution, beside a step with the pixels whose depth is like its own, and down to the edge of
+4. Where lines of sight within a body cross empty space it is several, and where none do so between two they are one
+   (:mod:`sq_perception.imaging.convex_parts`): that holds where noise hides folds, or makes some.
+5. Each body back to full resolution, beside a step with the pixels whose depth is like its own, and down to the edge of
    the noise on the table.
 
 Bodies are taken to be convex, or vessels.  Two bodies whose faces lie flush cannot be told apart by their depth.
@@ -24,8 +26,9 @@ from dataclasses import dataclass, field
 import cv2
 import numpy as np
 
-from sq_perception.imaging import depth_steps, patch_grouping, support_plane, surface_patches
+from sq_perception.imaging import convex_parts, depth_steps, patch_grouping, support_plane, surface_patches
 from sq_perception.imaging.camera import Camera
+from sq_perception.imaging.convex_parts import SightOptions
 from sq_perception.imaging.patch_grouping import GroupingOptions
 from sq_perception.imaging.support_plane import Plane, noise_growth
 from sq_perception.imaging.surface_patches import FoldOptions
@@ -33,6 +36,8 @@ from sq_perception.imaging.surface_patches import FoldOptions
 _FOOT_PIXELS = 3
 _LEAST_SIGMA = 5e-4
 _UNKNOWN_SIGMA = 1.5e-3
+_VESSEL = 0.15
+"""A segment with more hollow surface than this share may be a vessel."""
 
 
 @dataclass(frozen=True)
@@ -55,8 +60,8 @@ class SegmentationOptions:
         Half thickness of a plane while it is searched, metres at a depth of one metre.
     min_plane_share
         Share of the valid pixels that a support plane has at least.
-    folds, grouping
-        What parts touching bodies, and what holds one body together.
+    folds, grouping, sight
+        What parts touching bodies, what holds one body together, and what corrects both.
     seed
         Of the random sample; the same image gives the same result.
     """
@@ -71,6 +76,7 @@ class SegmentationOptions:
     seed: int = 0
     folds: FoldOptions = field(default_factory=FoldOptions)
     grouping: GroupingOptions = field(default_factory=GroupingOptions)
+    sight: SightOptions = field(default_factory=SightOptions)
 
     def __post_init__(self) -> None:
         near, far = self.depth_range
@@ -99,6 +105,8 @@ class Segmentation:
         Those of ``ids`` that reach the border of what the camera measures, so that a part of them may be missing.
     too_far : tuple of int
         Those of ``ids`` at whose distance the noise or the pixels are too coarse to part touching bodies.
+    sigma
+        Noise of the depth at one metre as measured on the plane, or a guess where there is none, metres.
     """
 
     labels: np.ndarray
@@ -106,6 +114,7 @@ class Segmentation:
     ids: tuple[int, ...]
     truncated: tuple[int, ...] = ()
     too_far: tuple[int, ...] = ()
+    sigma: float = _UNKNOWN_SIGMA
 
 
 def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | None = None) -> Segmentation:
@@ -210,7 +219,7 @@ def _marked(
             z = depth[some][(labels[some] == k) & valid[some]]
             if z.size and not options.folds.resolved_at(float(np.median(z)), sigma, camera):
                 far.append(k)
-    return Segmentation(labels, plane, ids, truncated, tuple(far))
+    return Segmentation(labels, plane, ids, truncated, tuple(far), max(sigma, _LEAST_SIGMA))
 
 
 def _search(options: SegmentationOptions) -> support_plane.Search:
@@ -272,8 +281,10 @@ def _bodies(
     patches = surface_patches.find(depth, wanted, camera, sigma, options.depth_step, options.folds)
     if patches is None:
         return depth_steps.separated(depth, wanted, options.depth_step)
-    body = patch_grouping.bodies(patches, camera, options.grouping)[patches.labels].astype(np.int32)
-    labels = _refined(body, patches, depth, wanted, options.depth_step)
+    body = patch_grouping.bodies(patches, camera, options.grouping)
+    vessels = patch_grouping.hollow_share(patches, body, options.grouping) > _VESSEL
+    labels = _refined(body[patches.labels].astype(np.int32), patches, depth, wanted, options.depth_step)
+    labels = convex_parts.corrected(labels, depth, camera, sigma, vessels, options.sight)
     # What is too small for a patch stays what the steps made of it.
     rest = cv2.morphologyEx((wanted & (labels == 0)).view(np.uint8), cv2.MORPH_OPEN, depth_steps.CROSS)
     rest = depth_steps.components(rest)

@@ -1,0 +1,207 @@
+"""Whole frames of the project's own tables: 2 to 12 bodies that touch and hide each other, seen by a stereo camera.
+
+    python benchmarks/synthetic_tabletop.py [--scenes 60] [--sensors realsense_d435 ...] [--name synthetic_tabletop]
+
+Scenes: sq_perception.imaging.scene.crowded_scene, 640 x 480 pixels, from 0.5 to 1.2 m, scene k from the seed
+(``SEED``, k) alone.  Sensors: those of sq_perception.imaging.sensor_noise, and ``plain``: sigma = 1.5 mm z^2 for each
+pixel by itself, then millimetres.
+
+    matched IoU   volume IoU (64^3 points) of the best one-to-one assignment of recovered to true bodies, mean over the
+                  true bodies that are at least half visible; 0 for those that nothing was assigned to
+    seen IoU      the same for masks: true pixels against labels of the matched body
+    false         recovered bodies a frame that are left over, or whose IoU with every true body is below ``FALSE``
+
+``own`` are the program's masks, ``own, no repair`` those before segments are joined and split by their bodies, ``true``
+those of the renderer: the difference is what the segmentation costs.  Failed bodies count as not recovered.  Times are
+medians of one pinned thread.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+
+if __name__ == "__main__":  # as a script only: a process that imports this has threads already
+    for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
+        os.environ.setdefault(variable, "1")
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+import report
+import torch
+from scipy.optimize import linear_sum_assignment
+
+from sq_perception import metrics
+from sq_perception.geometry import Superquadric
+from sq_perception.imaging import raycast, sensor_noise
+from sq_perception.imaging.scene import Scene, crowded_scene
+from sq_perception.recovery import FrameRecovery, Recoverer, RecoveryOptions
+
+SEED = 7500
+BODIES = (2, 12)
+IOU_GOAL, FALSE_GOAL = 0.92, 0.1
+HALF = 0.5
+FALSE = 0.2
+PLAIN = "plain"
+STAGES = ("segmentation", "network", "fit", "repair", "score", "total")
+SETTINGS: dict[str, tuple[bool, RecoveryOptions]] = {
+    "own": (False, RecoveryOptions()),
+    "own, no repair": (False, RecoveryOptions(repair=False)),
+    "true": (True, RecoveryOptions()),
+    "own, classic": (False, RecoveryOptions(method="classic")),
+    "true, classic": (True, RecoveryOptions(method="classic")),
+}
+"""Whether the true masks are given, and how bodies are recovered."""
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """A scene as the sensor sees it.
+
+    Attributes
+    ----------
+    depth, labels : (height, width)
+        Measured depth; the true body of each measured pixel, from 1.
+    visible : (n,)
+        Share of each body's silhouette that nothing hides.
+    """
+
+    scene: Scene
+    depth: np.ndarray
+    labels: np.ndarray
+    visible: np.ndarray
+
+
+@dataclass(frozen=True)
+class Score:
+    """One frame: IoU of each true body that is half visible, of its mask, and what was invented."""
+
+    ious: tuple[float, ...]
+    masks: tuple[float, ...]
+    false: int
+    milliseconds: dict[str, float]
+
+
+def frame(number: int, sensor: str) -> Frame:
+    """Scene ``number`` through a sensor."""
+    rng = np.random.default_rng([SEED, number])
+    scene = crowded_scene(rng, int(rng.integers(BODIES[0], BODIES[1] + 1)))
+    depth, labels = scene.render()
+    whole = [np.count_nonzero(raycast.render(body, scene.camera)[1] >= 0) for body in scene.bodies]
+    seen = np.bincount(labels.ravel(), minlength=len(whole) + 1)[1:]
+    if sensor == PLAIN:
+        depth = np.round(1e3 * (depth + 1.5e-3 * depth**2 * rng.standard_normal(depth.shape))) / 1e3
+    else:
+        depth = sensor_noise.preset(sensor).measured(depth, scene.camera, rng)
+    depth = depth.astype(np.float32)
+    return Frame(scene, depth, np.where(np.isfinite(depth), labels, 0), seen / np.maximum(whole, 1))
+
+
+def scored(seen: Frame, found: FrameRecovery) -> Score:
+    """Compare what was recovered with the truth."""
+    truth, bodies = list(seen.scene.bodies), found.recovered
+    iou, mask = np.zeros((2, len(truth), len(bodies)))
+    for i, one in enumerate(truth):
+        inside = seen.labels == i + 1
+        for j, body in enumerate(bodies):
+            iou[i, j] = _volume_iou(body.superquadric, one)
+            label = found.labels == body.label
+            mask[i, j] = np.count_nonzero(inside & label) / max(np.count_nonzero(inside | label), 1)
+    rows, columns = linear_sum_assignment(-iou)
+    best, seen_iou = np.zeros((2, len(truth)))
+    best[rows], seen_iou[rows] = iou[rows, columns], mask[rows, columns]
+    real = np.zeros(len(bodies), bool)
+    real[columns] = iou[rows, columns] >= FALSE
+    half = seen.visible >= HALF
+    return Score(
+        tuple(best[half].tolist()), tuple(seen_iou[half].tolist()), int(np.count_nonzero(~real)), found.milliseconds
+    )
+
+
+def _volume_iou(body: Superquadric, truth: Superquadric) -> float:
+    """0 for bodies that are far apart, without counting points."""
+    if np.linalg.norm(body.translation - truth.translation) > np.linalg.norm(body.size) + np.linalg.norm(truth.size):
+        return 0.0
+    return float(metrics.volume_iou(body, truth))
+
+
+def figures(scores: list[Score]) -> dict[str, Any]:
+    """Pooled over all bodies of all frames."""
+    ious, masks = (np.concatenate([getattr(each, name) for each in scores]) for name in ("ious", "masks"))
+    return {
+        "iou": report.spread(ious),
+        "mask_iou": report.spread(masks),
+        "over_85": float((ious > 0.85).mean()),
+        "missed": float((ious < FALSE).mean()),
+        "false_per_frame": float(np.mean([each.false for each in scores])),
+        "milliseconds": {
+            stage: float(np.median([each.milliseconds.get(stage, 0.0) for each in scores])) for stage in STAGES
+        },
+        "each": [[round(iou, 3) for iou in each.ious] for each in scores],
+    }
+
+
+def line(sensor: str, name: str, group: dict[str, Any]) -> list[str]:
+    """A row of the table."""
+    times = group["milliseconds"]
+    return [
+        sensor,
+        name,
+        str(group["iou"]["count"]).removesuffix(".0"),
+        f"{100 * group['iou']['mean']:.1f}",
+        f"{100 * group['iou']['median']:.1f}",
+        f"{100 * group['over_85']:.0f}",
+        f"{100 * group['missed']:.1f}",
+        f"{100 * group['mask_iou']['mean']:.1f}",
+        f"{group['false_per_frame']:.2f}",
+        " / ".join(f"{times[stage]:.0f}" for stage in STAGES),
+    ]
+
+
+HEADER = [
+    "sensor",
+    "masks",
+    "bodies",
+    f"matched IoU % (goal {100 * IOU_GOAL:.0f})",
+    "median",
+    "over 85 %",
+    "missed %",
+    "masks' IoU %",
+    f"false a frame (goal {FALSE_GOAL})",
+    "ms: " + " / ".join(STAGES),
+]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("--scenes", type=int, default=60)
+    parser.add_argument("--first", type=int, default=0, help="number of the first scene")
+    parser.add_argument("--sensors", nargs="*", default=["realsense_d435", PLAIN])
+    parser.add_argument("--settings", nargs="*", default=list(SETTINGS), choices=list(SETTINGS))
+    parser.add_argument("--name", default="synthetic_tabletop", help="name of the result files")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    recoverer = Recoverer()
+    result: dict[str, Any] = {}
+    rows = []
+    for sensor in options.sensors:
+        scores: dict[str, list[Score]] = {name: [] for name in options.settings}
+        recoverer.warm_up(frame(0, sensor).scene.camera)
+        for number in range(options.first, options.first + options.scenes):
+            seen = frame(number, sensor)
+            for name in options.settings:
+                masks, how = SETTINGS[name]
+                found = recoverer.recover(
+                    seen.depth, seen.scene.camera, seen.labels if masks else None, replace(how, max_objects=20)
+                )
+                scores[name].append(scored(seen, found))
+        result[sensor] = {name: figures(each) for name, each in scores.items()}
+        rows += [line(sensor, name, group) for name, group in result[sensor].items()]
+    facts = {"scenes": options.scenes, "first": options.first, "seed": SEED}
+    report.write(options.name, {**facts, "rows": result}, report.table(HEADER, rows))
+
+
+if __name__ == "__main__":
+    main()
