@@ -234,7 +234,7 @@ def constants(known: list[Instances]) -> tuple[dict[str, Any], str]:
     table = [each for each in known if each.category != OTHER]
     usual = SegmentationOptions()
     names = ["depth_step", "plane_tolerance", "min_height"]
-    names += [f"{part}.{each.name}" for part in ("folds", "grouping") for each in fields(getattr(usual, part))]
+    names += [f"{part}.{each.name}" for part in ("folds", "grouping", "sight") for each in fields(getattr(usual, part))]
     result, rows = {}, []
     for name in names:
         part, _, field = name.rpartition(".")

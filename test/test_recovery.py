@@ -21,7 +21,7 @@ from sq_perception.metrics import volume_iou
 from sq_perception.recovery import FrameRecovery, Recoverer, RecoveryOptions, render_recovery
 
 CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)
-STAGES = {"segmentation", "network", "fit", "score", "total"}
+STAGES = {"segmentation", "network", "fit", "repair", "score", "total"}
 
 
 def seen(bodies, camera, background=np.nan):

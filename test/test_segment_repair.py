@@ -9,9 +9,11 @@ from sq_perception import scene_description, segment_repair
 from sq_perception.fitting import surface_fit
 from sq_perception.geometry import rotation
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.imaging import raycast
+from sq_perception.imaging import raycast, segmentation
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.scene import plane_depth
+from sq_perception.imaging.segmentation import Segmentation
+from sq_perception.recovery import Recoverer, RecoveryOptions
 from sq_perception.scene_description import Evidence, description_length
 
 CAMERA = Camera(320, 240, 262.5, 262.5, 159.5, 119.5)
@@ -233,3 +235,35 @@ def test_misuse_raises():
     orthographic = Camera(320, 240, 262.5, 262.5, 159.5, 119.5, "orthographic")
     with pytest.raises(ValueError, match="pinhole"):
         Evidence.of(depth, truth > 0, orthographic, NOISE)
+
+
+def test_masks_from_outside_win():
+    """A box cut in two by given labels stays so; found by the program itself it is one, and the stage is timed."""
+    depth, truth = seen([standing(0, 0, LONG_BOX, turn=0.4)])
+    recoverer = Recoverer(method="symmetry")
+    given = cut(truth, 1, np.median(np.nonzero(truth)[1]))
+    frame = recoverer.recover(depth, CAMERA, given)
+    np.testing.assert_array_equal(frame.labels, given)
+    assert len(frame.bodies) == 2
+    own = recoverer.recover(depth, CAMERA)
+    assert len(own.bodies) == 1
+    assert own.milliseconds["repair"] > 0
+
+
+def test_a_repaired_frame_is_consistent(monkeypatch):
+    """Own segments that merge two bodies and cut one: afterwards labels, bodies, pixels and their order agree."""
+    bodies = [standing(-0.055, 0, (0.05, 0.04, 0.03)), standing(0.035, 0.01, (0.04, 0.03, 0.06))]
+    depth, truth = seen([*bodies, standing(0.15, -0.05, (0.035, 0.035, 0.035))])
+    merged = np.where(truth == 3, 2, np.minimum(truth, 1)).astype(np.int32)
+    merged = cut(merged, 2, np.median(np.nonzero(merged == 2)[1]))
+    wrong = Segmentation(merged, PLANE, (1, 2, 3), sigma=NOISE)
+    monkeypatch.setattr(segmentation, "segment", lambda *_: wrong)
+    frame = Recoverer(method="symmetry").recover(depth, CAMERA)
+    assert len(frame.recovered) == 3
+    assert min(overlap(frame.labels, truth)) > 0.9
+    assert sorted(body.label for body in frame.bodies) == sorted(set(np.unique(frame.labels)) - {0})
+    assert [body.pixels for body in frame.bodies] == [np.sum(frame.labels == body.label) for body in frame.bodies]
+    assert [body.pixels for body in frame.bodies] == sorted((body.pixels for body in frame.bodies), reverse=True)
+    assert all(body.score > 0.5 for body in frame.bodies)
+    untouched = Recoverer(method="symmetry").recover(depth, CAMERA, options=RecoveryOptions("symmetry", repair=False))
+    np.testing.assert_array_equal(untouched.labels, merged)
