@@ -41,7 +41,7 @@ from sq_perception import segment_repair
 from sq_perception.fitting import soft_render_fit, solina_bajcsy, surface_fit
 from sq_perception.fitting.fit import Fit, Status
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.imaging import canonical_view, raycast, segmentation, soft_render
+from sq_perception.imaging import canonical_view, convex_parts, raycast, segmentation, soft_render
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.canonical_view import CanonicalView
 from sq_perception.imaging.coherence import coherent
@@ -240,6 +240,7 @@ class Recoverer:
     def warm_up(self, camera: Camera) -> None:
         """Compile or load every kernel and run the whole chain once on an image of the camera's size."""
         surface_fit.warm_up()
+        convex_parts.warm_up()
         depth = 1.0 if camera.is_pinhole else 0.5
         reach = 0.15 * min(camera.width / camera.fx, camera.height / camera.fy)
         centre = camera.unproject(np.array(camera.width / 2), np.array(camera.height / 2), np.array(depth))

@@ -15,7 +15,7 @@ import numpy as np
 from sq_perception import metrics
 from sq_perception.fitting import solina_bajcsy, surface_fit
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.imaging import raycast, view_rendering
+from sq_perception.imaging import convex_parts, raycast, view_rendering
 from sq_perception.imaging.camera import Camera
 
 
@@ -31,6 +31,7 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
         ("overlap", lambda: metrics.volume_iou(batch, batch, 16)),
         ("classic fit", lambda: solina_bajcsy.fit(points)),
         ("surface fit", surface_fit.warm_up),
+        ("lines of sight", convex_parts.warm_up),
     ]
 
 

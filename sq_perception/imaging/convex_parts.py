@@ -122,6 +122,7 @@ def corrected(
         From 1, in no order; of the same pixels.
     """
     options = options or SightOptions()
+    depth, labels = _plain(depth), np.ascontiguousarray(labels)
     segments = _segments(labels)
     if not segments:
         return labels
@@ -158,7 +159,7 @@ def parts(
     ``depth``, ``camera`` and ``sigma`` as in :func:`corrected`.
     """
     options = options or SightOptions()
-    labels = mask.astype(np.int32)
+    depth, labels = _plain(depth), mask.astype(np.int32)
     pixels = np.stack(np.nonzero(mask & (depth > 0)), axis=-1)
     whole = _Part.of(pixels, depth, camera, 1)
     if whole is None or whole.lines(depth, labels, sigma, options)[0].mean() < options.suspicious:
@@ -179,6 +180,7 @@ def free_pairs(
     segments touch, or something nearer hides all that is between them.
     """
     options = options or SightOptions()
+    depth = _plain(depth)
     known = [_Part.of(pixels, depth, camera, label) for label, pixels in _segments(np.where(depth > 0, labels, 0))]
     found = [part for part in known if part is not None]
     return [
@@ -187,6 +189,20 @@ def free_pairs(
         for b in found[:k]
         if a.crossed_towards(b, depth, sigma, options) < options.one_body
     ]
+
+
+def warm_up() -> None:
+    """Compile, or load from disk, every kernel by parting and joining two balls."""
+    camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+    v, u = np.indices((camera.height, camera.width))
+    radius = np.hypot(np.abs(u - camera.cx) - 12, v - camera.cy) / 12
+    depth = np.where(radius < 1, 0.7 - 0.13 * np.sqrt(np.maximum(1 - radius**2, 0)), 1.0)
+    corrected((radius < 1).astype(np.int32), depth, camera, 1e-3)
+
+
+def _plain(depth: np.ndarray) -> np.ndarray:
+    """The one layout that kernels are compiled for."""
+    return np.ascontiguousarray(depth, dtype=np.float32)
 
 
 @dataclass(frozen=True, eq=False)
