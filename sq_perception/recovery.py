@@ -62,6 +62,8 @@ _LEAST_BUDGET = 1e-6
 _UNKNOWN = np.full((11, 11), np.nan)
 _UNSEEN = np.full(3, np.nan)
 _CLASSIC_POINTS = 2000
+_LOWEST, _HOVERING = 0.02, 0.02
+"""An object this many metres above its plane, by its lowest points, may stand on another one."""
 _ON_TABLE = 0.003
 _JUMP_PIXELS, _JUMP = 10.0, 0.002
 """What a network is shown, and a score is measured on: metres above the table; steps in pixel widths, and metres."""
@@ -293,7 +295,7 @@ class Recoverer:
             objects = _objects(depth, found, camera, options)
 
         with _timed(milliseconds, "network"):
-            _mapped(lambda one: _view(one, depth, camera, found.plane, network), objects)
+            _mapped(lambda one: _view(one, depth, camera, found, options, network), objects)
             if network is not None and objects:
                 views = np.stack([one.shown.marked for one in objects if one.shown is not None])
                 predictions: Future[Superquadric] = Future()
@@ -424,10 +426,15 @@ def _mapped(function: Callable[[_Item], _Answer], items: Sequence[_Item]) -> lis
 
 
 def _view(
-    one: _Object, depth: np.ndarray, camera: Camera, plane: np.ndarray | None, network: inference.Predictor | None
+    one: _Object,
+    depth: np.ndarray,
+    camera: Camera,
+    found: segmentation.Segmentation,
+    options: RecoveryOptions,
+    network: inference.Predictor | None,
 ) -> None:
     """What the object stands on, what a network is shown of it, and what its score is measured on."""
-    one.plane = _support(one, plane)
+    one.plane = _support(one, depth, camera, found, options)
     core = _core(one, depth, camera)
     if network is not None:
         one.shown = network.config.view_of(depth, core, camera, one.plane)
@@ -448,8 +455,10 @@ def _repaired(
     """Segments, objects and bodies after joining and splitting; new segments are fitted without the network."""
 
     def prepared(mask: np.ndarray) -> _Object:
-        one = _objects(depth, segmentation.Segmentation(mask.astype(np.int32), None, (1,)), camera, options)[0]
-        _view(one, depth, camera, found.plane, None)
+        label = int(found.labels.max()) + 1
+        alone = replace(found, labels=np.where(mask, np.int32(label), found.labels), ids=(label,))
+        one = _objects(depth, alone, camera, options)[0]
+        _view(one, depth, camera, alone, options, None)
         return one
 
     known = dict(zip((one.label for one in objects), fits, strict=True))
@@ -474,11 +483,27 @@ def _repaired(
     return replace(found, labels=repair.labels, ids=ids), ordered, [repair.fits[label] for label in ids]
 
 
-def _support(one: _Object, plane: np.ndarray | None) -> np.ndarray | None:
-    """The frame's support plane, unless this object lies behind it: it then stands on something else."""
-    if plane is None or np.median(one.points @ plane[:3] + plane[3]) <= 0:
+def _support(
+    one: _Object, depth: np.ndarray, camera: Camera, found: segmentation.Segmentation, options: RecoveryOptions
+) -> np.ndarray | None:
+    """What the object stands on: the frame's plane, or another one that its surroundings show right below it.
+
+    An object behind the frame's plane does not stand on it.  One above it without any such surroundings stands on
+    other objects.
+    """
+    if found.plane is None:
         return None
-    return plane
+    points = one.points
+    heights = points @ found.plane[:3] + found.plane[3]
+    behind = float(np.median(heights)) <= 0
+    if not behind and np.quantile(heights, _LOWEST) < _HOVERING:
+        return found.plane
+    other = segmentation.support_under(found, one.label, depth, camera, options.segmentation_options())
+    if other is not None:
+        lowest, middle = np.quantile(points @ other[:3] + other[3], [_LOWEST, 0.5])
+        if abs(lowest) < _HOVERING < middle + _HOVERING:
+            return other
+    return None if behind else found.plane
 
 
 def _core(one: _Object, depth: np.ndarray, camera: Camera) -> np.ndarray:
@@ -498,8 +523,9 @@ def _core(one: _Object, depth: np.ndarray, camera: Camera) -> np.ndarray:
     footprint = float(np.median(one.depth_crop[one.mask_crop])) / np.sqrt(camera.fx * camera.fy)
     whole = np.zeros_like(one.mask)
     whole[one.window] = core
-    rows, columns = (slice(max(side.start - 1, 0), side.stop + 1) for side in one.window)
-    around = rows, columns  # with a margin, as what goes on beyond the mask is something else
+    # With a margin, as a part that goes on beyond the mask is something else.
+    down, across = one.window
+    around = slice(max(down.start - 1, 0), down.stop + 1), slice(max(across.start - 1, 0), across.stop + 1)
     whole[around] &= coherent(
         np.ascontiguousarray(depth[around]), np.ascontiguousarray(whole[around]), _JUMP_PIXELS * footprint + _JUMP
     )

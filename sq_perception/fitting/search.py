@@ -290,9 +290,13 @@ class Search:
         if self.tolerated == 0:
             best = self._varied(best)
             best = self._spread_along_view(best)
+        pinhole = self.observation.camera.is_pinhole
+        # An exact body's symmetry is judged on all its rays, before doubts about the model lessen their weight.
+        if pinhole and self.tolerated == 0 and not self._late():
+            best = self._rounded(best)
         if not self._late():
             best = self._doubted(best)
-        if self.observation.camera.is_pinhole and not self._late():
+        if pinhole and self.tolerated > 0 and not self._late():
             best = self._rounded(best)
         self.scene = self._expecting(self.scene, best)
         return best

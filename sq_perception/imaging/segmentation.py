@@ -197,6 +197,21 @@ def from_labels(
     return _marked(labels, plane, ids, depth, valid, camera, _UNKNOWN_SIGMA, options)
 
 
+def support_under(
+    found: Segmentation, label: int, depth: np.ndarray, camera: Camera, options: SegmentationOptions | None = None
+) -> np.ndarray | None:
+    """The plane (4,) that the surroundings of one object show below it; None where they show none.
+
+    For objects that do not stand on the plane of the segmentation: a frame may show a table, a shelf and the floor.
+    ``depth`` and ``camera`` are those of the segmentation.
+    """
+    options = options or SegmentationOptions()
+    depth, valid = _checked(depth, camera, options.depth_range)
+    if not camera.is_pinhole or not ((found.labels == label) & valid).any():
+        return None
+    return support_plane.around(found.labels, (label,), depth, valid, camera, _search(options))
+
+
 def _marked(
     labels: np.ndarray,
     plane: np.ndarray | None,
