@@ -64,6 +64,8 @@ _UNSEEN = np.full(3, np.nan)
 _CLASSIC_POINTS = 2000
 _LOWEST, _HOVERING = 0.02, 0.02
 """An object this many metres above its plane, by its lowest points, may stand on another one."""
+_HIGHEST_STACK = 0.5
+"""Higher above its plane, metres, an object does not even stand on others that stand on it."""
 _ON_TABLE = 0.003
 _JUMP_PIXELS, _JUMP = 10.0, 0.002
 """What a network is shown, and a score is measured on: metres above the table; steps in pixel widths, and metres."""
@@ -488,8 +490,8 @@ def _support(
 ) -> np.ndarray | None:
     """What the object stands on: the frame's plane, or another one that its surroundings show right below it.
 
-    An object behind the frame's plane does not stand on it.  One above it without any such surroundings stands on
-    other objects.
+    An object behind the frame's plane does not stand on it, and one high above it neither: held in a hand before a wall,
+    say.  One less high above it, without any such surroundings, stands on other objects.
     """
     if found.plane is None:
         return None
@@ -503,7 +505,8 @@ def _support(
         lowest, middle = np.quantile(points @ other[:3] + other[3], [_LOWEST, 0.5])
         if abs(lowest) < _HOVERING < middle + _HOVERING:
             return other
-    return None if behind else found.plane
+    far_above = float(np.quantile(heights, _LOWEST)) > _HIGHEST_STACK
+    return None if behind or far_above else found.plane
 
 
 def _core(one: _Object, depth: np.ndarray, camera: Camera) -> np.ndarray:

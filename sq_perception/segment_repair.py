@@ -223,7 +223,7 @@ class _Work:
     def _badly_told(self, label: int, mask: np.ndarray) -> bool:
         """Whether the body leaves so much over that a second one might pay."""
         fit = self.fits[label]
-        if fit.status != Status.FAILED and fit.inlier_share > 1 - _LEAST_LEFT:
+        if fit.status != Status.FAILED and fit.inlier_share > 1 - _LEAST_LEFT and not fit.as_hull:
             return False
         evidence = Evidence.of(self.depth, mask, self.camera, self.sigma)
         return self._left(evidence, [fit]) > scene_description.price(evidence) + _LEAST_GAIN

@@ -46,6 +46,9 @@ class Fit:
         The verdict and the reason for it in words.
     iterations, milliseconds
         What it cost.
+    as_hull
+        Whether no superquadric came near, so that the body was fitted as to the convex hull of the object: what the
+        camera saw to be empty within the hull of the outline was let go.
     """
 
     superquadric: Superquadric
@@ -59,6 +62,7 @@ class Fit:
     message: str
     iterations: int
     milliseconds: float
+    as_hull: bool = False
 
     @property
     def sigma_size(self) -> np.ndarray:

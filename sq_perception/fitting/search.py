@@ -109,6 +109,7 @@ class Search:
         self.finalists: list[State] = []
         self.tried: list[State] = []
         self.alternatives: list[Alternative] = []
+        self.as_hull = False
         self.notes: list[str] = []
         """What the body rests on beyond the image, in words."""
         self.spread_factor = MODEL_SPREAD if self.tolerated > 0 else 1.0
@@ -210,6 +211,8 @@ class Search:
         if len(observation.free) == len(self.observation.free):
             return
         self.observation = observation
+        self.as_hull = True
+        self.notes.append("like the convex hull of the object")
         self.finalists = []
         self._select(self._coarse(sorted(self.tried, key=_cost)[:PROMISING]), ESCALATED_FINALISTS)
 

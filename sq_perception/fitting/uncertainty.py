@@ -49,6 +49,7 @@ def judged(state: State, search: Search, began: float) -> Fit:
         message="; ".join([message, *search.notes]),
         iterations=state.iterations,
         milliseconds=(time.perf_counter() - began) * 1e3,
+        as_hull=search.as_hull,
     )
 
 
