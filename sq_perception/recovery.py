@@ -490,7 +490,7 @@ def _support(
 ) -> np.ndarray | None:
     """What the object stands on: the frame's plane, or another one that its surroundings show right below it.
 
-    An object behind the frame's plane does not stand on it, and one high above it neither: held in a hand before a wall,
+    An object behind the frame's plane does not stand on it, and one high above it neither: held before a wall,
     say.  One less high above it, without any such surroundings, stands on other objects.
     """
     if found.plane is None:

@@ -135,7 +135,9 @@ class Search:
         """The best body from the given starts and, as far as needed, from automatic ones."""
         if given:
             self._select(self._coarse(given), FINALISTS)
-        if not given or (self.options.fall_back and not self._good_enough()):
+        # A wrong valley is good enough soon where a model error is tolerated: there, all starts compete.
+        enough = self._good_enough() and self.tolerated == 0
+        if not given or (self.options.fall_back and not enough and not self._late()):
             self._select(self._automatic(), FINALISTS)
             if not self._good_enough() and self.tolerated == 0 and not self._late():
                 self._look_around()
