@@ -30,6 +30,8 @@ SPARED = 3
 """Parameters that a body of revolution has less."""
 ODDS = 3.0
 """Of the things whose unseen side is in question, so many more are round than any other one oval shape."""
+HOPELESS = 15.0
+"""A round reading worse by so much on few rays is given up."""
 SIGMA = 0.01
 """Of log(a1 / a2) and of 1 - e2: how exactly round."""
 OPEN, EXPLAINED = 0.05, 0.5

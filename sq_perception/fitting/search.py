@@ -46,7 +46,7 @@ DOUBT = 25.0
 """Bodies whose costs differ by D on the same rays differ by 2 sqrt(D) through noise: below this they go on together,"""
 RIVAL = 1.3
 """and so do those within this factor of the best, as they have not converged yet."""
-FINALISTS, ESCALATED_FINALISTS = 3, 6
+FINALISTS, ESCALATED_FINALISTS, ROUND_FINALISTS = 3, 6, 2
 TOLERANCE, FINAL_TOLERANCE = 1e-3, 1e-4
 SHARP_OUTLINE = 0.3
 """Standard deviation of a perfect outline, in pixels: the body covers exactly the centres of the mask's pixels."""
@@ -324,7 +324,13 @@ class Search:
             for s in starts
         ]
         few = self._draw(BASIN_RAYS, 0.7)
-        settled = sorted((self._settled(s, few, BASIN_STEPS) for s in sorted(coarse, key=_cost)[:FINALISTS]), key=_cost)
+        promising = sorted(coarse, key=_cost)[:ROUND_FINALISTS]
+        settled = sorted((self._settled(s, few, BASIN_STEPS) for s in promising), key=_cost)
+        round_scene, self.scene = self.scene, plain
+        reference = self._settled(free, few, FIRST_STEPS)
+        if revolution.gain(reference.cost, settled[0].cost, float(few[0][:, 6].sum())) < -revolution.HOPELESS:
+            return free
+        self.scene = round_scene
         best = self._best_refined(settled, self.options.max_iterations)
         gain = revolution.gain(free.cost, best.cost, float(self.rays[:, 6].sum()))
         chosen, other = (best, free) if gain > 0 else (free, best)
