@@ -19,6 +19,8 @@ from sq_perception.geometry.superquadric import Superquadric
 _INLIER = 3.0
 _JUDGED_RAYS = 800
 _FAILED_SHARE = 0.25
+_REACHED = 0.9
+"""Of the points of a thing that was fitted as a hull: what the rest sticks out tells whether the body encloses it."""
 _AXES = "xyz"
 
 
@@ -36,6 +38,10 @@ def judged(state: State, search: Search, began: float) -> Fit:
     typical = float(np.median(distance))
     kept = distance < max(_INLIER * observation.sigma, _INLIER * typical)
     residual = float(np.sqrt(np.mean(distance[kept] ** 2))) if kept.any() else typical
+    if search.as_hull:
+        # A hollow thing lies inside its hull: only what sticks out speaks against the body.
+        outside = body.gauge(observation.points) > 1
+        typical = float(np.quantile(np.where(outside, np.abs(body.sampson_distance(observation.points)), 0.0), _REACHED))
     status, message = _verdict(canonical, covariance, typical)
     return Fit(
         superquadric=canonical,
@@ -75,7 +81,7 @@ def failed(body: Superquadric, observation: Observation, reason: str, began: flo
 def _verdict(body: Superquadric, covariance: np.ndarray, typical: float) -> tuple[Status, str]:
     if typical > _FAILED_SHARE * float(body.size.min()):
         return Status.FAILED, (
-            f"no superquadric found: half of the points lie more than {1e3 * typical:.1f} mm off the best one"
+            f"no superquadric found: {1e3 * typical:.1f} mm and more between many of the points and the best one"
         )
     sigma, weak_axes = np.sqrt(np.diag(covariance)), undetermined(covariance, body.size)
     weak = [
