@@ -159,8 +159,8 @@ def judge(scene: Tabletop) -> SceneVerdict:
             continue
         measured = int(((labels == placed.label) & np.isfinite(depth)).sum())
         answers = {
-            "given": _of_frame(frames["given"], placed.label, placed, scene),
-            "own": _of_frame(frames["own"], matches.get(placed.label, 0), placed, scene),
+            "given": of_frame(frames["given"], placed.label, placed, scene),
+            "own": of_frame(frames["own"], matches.get(placed.label, 0), placed, scene),
             **_simple(_inner_points(placed.label, scene), placed, scene),
         }
         judged.append(
@@ -199,7 +199,7 @@ def judge(scene: Tabletop) -> SceneVerdict:
     )
 
 
-def _of_frame(frame: FrameRecovery, label: int, placed: Placed, scene: Tabletop) -> Answer:
+def of_frame(frame: FrameRecovery, label: int, placed: Placed, scene: Tabletop) -> Answer:
     """The answer that a frame gives for one of its labels; 0 is none."""
     for body in frame.bodies:
         if body.label == label:
