@@ -41,7 +41,8 @@ def judged(state: State, search: Search, began: float) -> Fit:
     if search.as_hull:
         # A hollow thing lies inside its hull: only what sticks out speaks against the body.
         outside = body.gauge(observation.points) > 1
-        typical = float(np.quantile(np.where(outside, np.abs(body.sampson_distance(observation.points)), 0.0), _REACHED))
+        sticking_out = np.where(outside, np.abs(body.sampson_distance(observation.points)), 0.0)
+        typical = float(np.quantile(sticking_out, _REACHED))
     status, message = _verdict(canonical, covariance, typical)
     return Fit(
         superquadric=canonical,

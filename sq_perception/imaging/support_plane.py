@@ -33,6 +33,9 @@ _COARSE_PIXELS = 120
 _FACE_TOLERANCE = 0.008
 _BENT_SHARE = 0.08
 _ISLAND_SHARE = 0.25
+_LEVEL, _STOREY, _TABLE_SHARE = 0.99, 0.3, 0.4
+"""Cosine between the normals of level planes, metres from a floor to the table above it, and the share that it shows of
+what the floor does.  Of lower steps the larger level is the support, and things are found on both."""
 
 _Surface = tuple[np.ndarray, bool]
 
@@ -120,11 +123,22 @@ def support(
     """The plane that things stand on: many points, and rather below the camera than in front of it or above it.
 
     A camera is mounted upright or looks straight down.  The table seen from straight above and a wall look alike; a
-    wall counts less, as a floor or a table in the same picture then has a normal that points up.
+    wall counts less, as a floor or a table in the same picture then has a normal that points up.  Of a table and the
+    floor below it things stand on the table, though the picture may show more of the floor.
     """
     surfaces = _on_one_surface(depth, valid, camera, depth_step)
     chosen = [plane for plane in candidates if not _is_face(plane, surfaces)]
-    return max(chosen, key=_vote) if chosen else None
+    if not chosen:
+        return None
+    best = max(chosen, key=_vote)
+    tables = [
+        plane
+        for plane in chosen
+        if plane.equation[:3] @ best.equation[:3] > _LEVEL
+        and best.equation[3] - plane.equation[3] > _STOREY
+        and plane.share > _TABLE_SHARE * best.share
+    ]
+    return max(tables, key=_vote) if tables else best
 
 
 def around(
