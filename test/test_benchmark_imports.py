@@ -19,7 +19,8 @@ sys.exit(f"{changed} set by the import" if changed else 0)
 
 
 @pytest.mark.parametrize(
-    "name", ["segmentation", "single_body", "scanned_objects", "real_scenes", "tracking", "unseen_sizes"]
+    NAMES=["frame_time", "real_scenes", "scanned_objects", "segmentation", "single_body", "tracking", "unseen_sizes"]
+    @ pytest.mark.parametrize("name", NAMES)
 )
 def test_an_import_leaves_the_number_of_threads_alone(name: str, repository: Path) -> None:
     # Numba refuses to compile once its threads run and NUMBA_NUM_THREADS names another number.
