@@ -2,9 +2,9 @@
 
     python benchmarks/gallery.py [--only can bottles] [--docs docs]
 
-Every scene is household things (:mod:`household`) at given places on a table, through a simulated sensor; sets of frames
-are those of :mod:`tracking`.  Left, what the sensor saw; in the middle, the program's own masks with the outlines of
-the recovered bodies; right, these bodies from another place, with the true things as thin lines.  All numbers of the
+Every scene is household things (:mod:`household`) at given places on a table, through a simulated sensor; the moving
+camera is that of :mod:`tracking`.  Left, what the sensor saw; in the middle, the program's own masks with the outlines
+of the recovered bodies; right, these bodies from another place, with the true things as thin lines.  All numbers of the
 page are measured here, so that text and pictures agree; ``--only`` draws some pictures and leaves the page as it is.
 
 Edges are full ones, descending, those of a thing and those of its body; deviations belong to edges, so that they are
@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import textwrap
 
 if __name__ == "__main__":  # as a script only: a process that imports this has threads already
     for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
@@ -26,11 +27,13 @@ from dataclasses import dataclass, field
 from functools import cache
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 import household
 import mesh_scene
 import numpy as np
 import report
+import tabletop
 import tracking
 from household import Thing
 from hull_oracle import Columns
@@ -54,23 +57,28 @@ from sq_perception.evaluation.plots import (
 )
 from sq_perception.fitting.fit import Status
 from sq_perception.geometry import Superquadric
+from sq_perception.geometry import rotation as quaternions
 from sq_perception.imaging import sensor_noise
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.scene import plane_depth
 from sq_perception.recovery import FrameRecovery, Recoverer, Recovery
 from sq_perception.tracking.session import Followed, TrackingSession
 
-SENSORS = {"realsense_d435": "stereo (RealSense D435)", "kinect_v1": "structured light (Kinect v1)"}
+SENSORS = {"realsense_d435": "stereo, RealSense D435", "kinect_v1": "structured light, Kinect v1"}
 DOTS = 100
-COLOURS = 96
-TINY = 50
-"""Fewer visible pixels than this, and a thing is not expected to be found."""
+COLOURS = 224
+ASPECT = 1.28
+"""Width over height of a panel with an image."""
 TRACKED = (1, 10, 30)
 TRACKED_SCENE = 2
+TRACKED_WINDOW = (70.0, 550.0, 40.0, 440.0)
+"""Left, right, top, bottom of what is shown of these frames, pixels."""
+WRAPPED: dict[str, Any] = {"break_long_words": False, "break_on_hyphens": False}
 _FAINT = "#6b7885"
 _MARGIN = 30
-_DEEPER = 0.12
+_BEFORE, _BEHIND = 0.05, 0.08
 _SEGMENTS = 64
+_CONTACT = 3e-4
 
 
 # Scenes
@@ -120,7 +128,13 @@ class View:
 
 
 def viewed(things: Sequence[Stood], sensor: str, down: float = 40.0, distance: float = 0.75, seed: int = 0) -> View:
-    """Things on a table whose middle is ``distance`` metres away, looked down on by ``down`` degrees."""
+    """Things on a table whose middle is ``distance`` metres away, looked down on by ``down`` degrees.
+
+    Raises
+    ------
+    ValueError
+        If two things are in one place, as seen from above.
+    """
     camera, angle = mesh_scene.CAMERA, np.deg2rad(down)
     table = np.array([[1.0, 0, 0], [0, -np.sin(angle), -np.cos(angle)], [0, np.cos(angle), -np.sin(angle)]])
     origin = np.array([0.0, 0.0, distance])
@@ -128,12 +142,16 @@ def viewed(things: Sequence[Stood], sensor: str, down: float = 40.0, distance: f
     depth = plane_depth(plane, camera)
     labels = np.zeros(depth.shape, np.int32)
     poses, alone = [], []
+    outlines: list[np.ndarray] = []
     for k, each in enumerate(things):
         c, s = np.cos(np.deg2rad(each.heading)), np.sin(np.deg2rad(each.heading))
         turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]]) @ each.turn
         corners = each.thing.hull @ turn.T
         low, high = corners.min(axis=0), corners.max(axis=0)
         place = np.append(each.place, 0.0) - np.append((low + high)[:2] / 2, low[2])
+        outlines.append(tabletop.outline(corners + place))
+        if any(tabletop.gap(outlines[-1], other) < -_CONTACT for other in outlines[:-1]):
+            raise ValueError(f"{each.name}: stands where another thing is")
         rotation, translation = table @ turn, table @ place + origin
         vertices = each.thing.mesh.vertices @ rotation.T + translation
         own = mesh_scene.render(vertices, np.asarray(each.thing.mesh.faces), camera)
@@ -176,9 +194,10 @@ def kitchen() -> tuple[Stood, ...]:
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """A thing and its body; None where nothing was recovered of it."""
+    """A thing and its body; None where nothing was recovered of it.  ``labels`` is the frame's true label image."""
 
     stood: Stood
+    labels: np.ndarray
     visible: float
     body: Recovery | None
     iou: float
@@ -200,6 +219,7 @@ def matched(view: View, frame: FrameRecovery) -> list[Found]:
     return [
         Found(
             stood,
+            view.labels,
             float(view.visible[k]),
             frame.recovered[pairs[k]] if k in pairs else None,
             float(iou[k, pairs[k]]) if k in pairs else 0.0,
@@ -210,13 +230,13 @@ def matched(view: View, frame: FrameRecovery) -> list[Found]:
 
 def scene_figure(view: View, frame: FrameRecovery, azimuth: float = 35.0, elevation: float = 24.0) -> Figure:
     """The three panels of one scene."""
-    figure = new_figure(12.6, 3.55)
-    axes = figure.subplots(1, 3, gridspec_kw={"wspace": 0.025, "width_ratios": [1.28, 1.28, 1.0]})
+    figure = new_figure(11.8, 3.55)
+    axes = figure.subplots(1, 3, gridspec_kw={"wspace": 0.028, "width_ratios": [ASPECT, ASPECT, 1.0]})
     figure.subplots_adjust(left=0.004, right=0.996, top=0.925, bottom=0.012)
     bodies = [body.superquadric for body in frame.recovered]
     shades = [colour(k) for k in range(len(bodies))]
     window = _window(view)
-    limits = _limits(view.depth, window)
+    limits = _limits(view)
     for ax in axes[:2]:
         draw_depth(ax, view.depth, limits)
     draw_masks(axes[1], frame.labels, [body.label for body in frame.recovered], 0.5)
@@ -224,10 +244,10 @@ def scene_figure(view: View, frame: FrameRecovery, azimuth: float = 35.0, elevat
     for ax in axes[:2]:
         ax.set_xlim(window[0], window[1])
         ax.set_ylim(window[3], window[2])
-    _title(axes[0], "What the sensor saw", f"{SENSORS[view.sensor]}; black: nothing")
+    _title(axes[0], "Depth", SENSORS[view.sensor])
     _title(axes[1], "Own masks, recovered outlines", f"{len(bodies)} bodies" if len(bodies) != 1 else "1 body")
     cages = [line for k in range(len(view.things)) for line in _cage(view, k)]
-    around = [_box_around(view.hull(k)) for k in range(len(view.things))]
+    around = [_box_around(view, k) for k in range(len(view.things))]
     draw_bodies_3d(
         axes[2], bodies, plane=view.plane, colours=shades, elevation=elevation, azimuth=azimuth, enclosed=around
     )
@@ -238,7 +258,7 @@ def scene_figure(view: View, frame: FrameRecovery, azimuth: float = 35.0, elevat
 
 def empty_figure(views: Sequence[View]) -> Figure:
     """What each sensor makes of a table with nothing on it."""
-    figure = new_figure(12.6, 2.75)
+    figure = new_figure(11.62, 2.42)
     axes = figure.subplots(1, len(views), gridspec_kw={"wspace": 0.025})
     figure.subplots_adjust(left=0.004, right=0.996, top=0.9, bottom=0.012)
     for ax, view in zip(axes, views, strict=True):
@@ -246,7 +266,7 @@ def empty_figure(views: Sequence[View]) -> Figure:
         draw_depth(ax, view.depth)
         draw_masks(ax, frame.labels, [body.label for body in frame.bodies])
         missing = 100 * (1 - np.isfinite(view.depth).mean())
-        _title(ax, f"{view.sensor}: {len(frame.bodies)} bodies", f"{missing:.0f} % without depth")
+        _title(ax, f"{view.sensor}: {len(frame.bodies)} bodies", f"{missing:.0f} % missing")
     return figure
 
 
@@ -255,17 +275,17 @@ def _window(view: View) -> tuple[float, float, float, float]:
     rows, columns = np.nonzero(view.labels)
     low = np.array([columns.min(), rows.min()], dtype=float) - _MARGIN
     high = np.array([columns.max(), rows.max()], dtype=float) + _MARGIN
-    half = max((high - low)[1] / 2, (high - low)[0] / 2 / 1.28) * np.array([1.28, 1.0])
+    half = max((high - low)[1] / 2, (high - low)[0] / 2 / ASPECT) * np.array([ASPECT, 1.0])
     limit = np.array([view.camera.width, view.camera.height]) / 2
     half = half * min(1.0, float((limit / half).min()))
     middle = np.clip((low + high) / 2, half - 0.5, 2 * limit - 0.5 - half)
     return middle[0] - half[0], middle[0] + half[0], middle[1] - half[1], middle[1] + half[1]
 
 
-def _limits(depth: np.ndarray, window: tuple[float, float, float, float]) -> tuple[float, float]:
-    left, right, top, bottom = (max(0, round(edge)) for edge in window)
-    near, far = np.nanquantile(depth[top:bottom, left:right], (0.005, 0.97))
-    return float(near), float(far)
+def _limits(view: View) -> tuple[float, float]:
+    """Nearest and farthest depth of the scale: those of the things, and a little behind them."""
+    near, far = np.nanquantile(view.depth[view.labels > 0], (0.005, 0.995))
+    return float(near) - _BEFORE, float(far) + _BEHIND
 
 
 def _title(ax: Axes, text: str, detail: str) -> None:
@@ -273,13 +293,16 @@ def _title(ax: Axes, text: str, detail: str) -> None:
     ax.set_title(detail, loc="right", fontsize=8.5, color=_FAINT, pad=4)
 
 
-def _box_around(points: np.ndarray) -> Superquadric:
-    low, high = points.min(axis=0), points.max(axis=0)
-    return Superquadric((high - low) / 2, np.full(2, 0.1), (low + high) / 2, np.array([0.0, 0.0, 0.0, 1.0]))
+def _box_around(view: View, k: int) -> Superquadric:
+    """A thing's box in its own frame."""
+    hull, (rotation, translation) = view.things[k].thing.hull, view.poses[k]
+    low, high = hull.min(axis=0), hull.max(axis=0)
+    middle = rotation @ ((low + high) / 2) + translation
+    return Superquadric((high - low) / 2, np.full(2, 0.1), middle, quaternions.from_matrix(rotation))
 
 
 def _cage(view: View, k: int) -> list[np.ndarray]:
-    """Lines (n, 3) in the optical frame that show a thing: edges of a box, rims and outlines of a body of revolution."""
+    """Lines (n, 3) in the optical frame that show a thing: edges of a box, rims and sides of a body of revolution."""
     thing = view.things[k].thing
     rotation, translation = view.poses[k]
     lines: list[np.ndarray] = []
@@ -328,11 +351,19 @@ def write_picture(figure: Figure, path: Path) -> int:
 # Tables
 
 
-HEADER = ["thing", "visible", "true edges, mm", "recovered, mm", "seen of each", "IoU", "score", "status"]
+HEADER = ["thing", "visible", "true edges, mm", "recovered, mm", "seen", "IoU", "score", "status"]
 
 
-def table(found: Sequence[Found]) -> str:
-    return report.table(HEADER, [_line(one) for one in found])
+def table(found: Sequence[Found], frame: FrameRecovery) -> str:
+    """A line for each thing, and for each body that belongs to none."""
+    lines = [_line(one) for one in found]
+    lines += [["none", "", "", *_numbers(body), "", *_verdict(body)] for body in _surplus(found, frame)]
+    return report.table(HEADER, lines)
+
+
+def _surplus(found: Sequence[Found], frame: FrameRecovery) -> list[Recovery]:
+    taken = {one.body.label for one in found if one.body is not None}
+    return [body for body in frame.recovered if body.label not in taken]
 
 
 def _line(one: Found) -> list[str]:
@@ -340,16 +371,20 @@ def _line(one: Found) -> list[str]:
     start = [one.stood.name, f"{100 * one.visible:.0f} %", true]
     if one.body is None:
         return [*start, "nothing", "", "0 %", "", ""]
-    order = np.argsort(-one.body.superquadric.size)
-    edges, sigma = 2e3 * one.body.superquadric.size[order], 2e3 * one.body.sigma_size[order]
+    return [*start, *_numbers(one.body), f"{100 * one.iou:.0f} %", *_verdict(one.body)]
+
+
+def _numbers(body: Recovery) -> list[str]:
+    order = np.argsort(-body.superquadric.size)
+    edges, sigma = 2e3 * body.superquadric.size[order], 2e3 * body.sigma_size[order]
     return [
-        *start,
         " x ".join(f"{edge:.0f} ± {deviation:.0f}" for edge, deviation in zip(edges, sigma, strict=True)),
-        " / ".join(f"{100 * share:.0f}" for share in one.body.seen[order]) + " %",
-        f"{100 * one.iou:.0f} %",
-        f"{one.body.score:.2f}",
-        Status(one.body.status).name.lower(),
+        " / ".join(f"{100 * share:.0f}" for share in body.seen[order]) + " %",
     ]
+
+
+def _verdict(body: Recovery) -> list[str]:
+    return [f"{body.score:.2f}", Status(body.status).name.lower()]
 
 
 def mean_iou(found: Sequence[Found]) -> float:
@@ -384,7 +419,7 @@ def of_scene(
         frame = recoverer().recover(view.depth, view.camera)
         found = matched(view, frame)
         write_picture(scene_figure(view, frame, azimuth), path)
-        return Entry(title, text(found, frame), table(found))
+        return Entry(title, text(found, frame), table(found, frame))
 
     return draw
 
@@ -392,41 +427,42 @@ def of_scene(
 def _can(found: list[Found], frame: FrameRecovery) -> str:
     (one,) = found
     return (
-        f"A can of {_edges(one)} mm. The camera never sees its back: the far side comes from the silhouette and from the "
-        f"curvature of the near one, the foot from the table. IoU with the true can {100 * one.iou:.0f} %."
+        f"A can of {_edges(one)} mm. The camera never sees its back: that comes from the silhouette and the curvature "
+        f"of the front, the foot from the table. IoU with the true can {100 * one.iou:.0f} %."
     )
 
 
 def _kitchen(found: list[Found], frame: FrameRecovery) -> str:
     hidden = min(found, key=lambda one: one.visible)
     return (
-        f"Six things, the {hidden.stood.name} only {100 * hidden.visible:.0f} % visible. {_count(found, frame)} Mean IoU "
-        f"with the true hulls {mean_iou(found):.0f} %. Stereo widens what is near by some pixels and leaves edges ragged; "
-        f"sizes come out too large rather than too small: edges are off by {_bias(found):+.1f} mm in the mean."
+        f"Six things that stand before each other, the {hidden.stood.name} {100 * hidden.visible:.0f} % visible. "
+        f"{_count(found, frame)} Mean IoU with the true hulls {mean_iou(found):.0f} %. Stereo matches windows, which "
+        f"widens what is near by some pixels: edges are off by {_bias(found):+.1f} mm in the mean."
     )
 
 
 def _kitchen_light(found: list[Found], frame: FrameRecovery) -> str:
+    light, stereo = (1e3 * float(sensor_noise.preset(name).sigma(0.85)) for name in ("kinect_v1", "realsense_d435"))
     return (
-        f"The same table through structured light: less noise, a shadow of missing depth beside every edge. "
-        f"{_count(found, frame)} Mean IoU {mean_iou(found):.0f} %, edges off by {_bias(found):+.1f} mm in the mean."
+        f"The same table through structured light, with a noise of {light:.1f} mm at 0.85 m where stereo has "
+        f"{stereo:.1f}. {_count(found, frame)} Mean IoU {mean_iou(found):.0f} %, edges off by {_bias(found):+.1f} mm "
+        f"in the mean."
     )
 
 
 def _touching(found: list[Found], frame: FrameRecovery) -> str:
     return (
-        f"Boxes that touch, and a can that leans on none of them but stands against one. {_count(found, frame)} "
-        f"Folds in the depth part them; under stereo noise, lines of sight through the empty space between them do. "
-        f"Mean IoU {mean_iou(found):.0f} %."
+        f"Three boxes and a can, each touching another. {_count(found, frame)} What parts them are folds in the depth, "
+        f"and lines of sight that pass through the empty space between them. Mean IoU {mean_iou(found):.0f} %."
     )
 
 
 def _bottles(found: list[Found], frame: FrameRecovery) -> str:
     worst = min(found, key=lambda one: one.iou)
     return (
-        f"Here we lose. A bottle is no superquadric: no exponents give a shoulder and a neck. The body that fits best cuts "
-        f"the shoulder short or swallows the neck, or the segmentation parts bottle and neck. {_count(found, frame)} Mean "
-        f"IoU {mean_iou(found):.0f} %, the worst {100 * worst.iou:.0f} % ({worst.stood.name})."
+        f"Here we lose. A bottle is no superquadric: no exponents make a shoulder and a neck. One body leaves out the "
+        f"neck, or bottle and neck become two. {_count(found, frame)} Mean IoU {mean_iou(found):.0f} %, the worst "
+        f"{100 * worst.iou:.0f} % ({worst.stood.name})."
     )
 
 
@@ -438,14 +474,13 @@ def _hidden(found: list[Found], frame: FrameRecovery) -> str:
     seen, sigma = 100 * one.body.seen[order], 2e3 * one.body.sigma_size[order]
     edges, true = 2e3 * one.body.superquadric.size[order], 1e3 * one.stood.thing.edges[::-1]
     parts = [
-        f"{'longest middle shortest'.split()[k]} edge: {seen[k]:.0f} % measured, {edges[k]:.0f} ± {sigma[k]:.0f} mm, "
-        f"truly {true[k]:.0f}"
-        for k in range(3)
+        f"{name} edge {seen[k]:.0f} % measured, {edges[k]:.0f} ± {sigma[k]:.0f} mm, truly {true[k]:.0f}"
+        for k, name in enumerate(("longest", "middle", "shortest"))
     ]
     return (
-        f"A box of which another one hides {100 * (1 - one.visible):.0f} %. `Recovery.seen` tells how much of each edge was "
-        f"measured; the rest is inferred, and its deviation says how surely. {'; '.join(parts)}. Status "
-        f"{Status(one.body.status).name}" + (f": {one.body.message}." if one.body.message else ".")
+        f"A box of which another one hides {100 * (1 - one.visible):.0f} %. `Recovery.seen` says how much of each edge "
+        f"was measured, the rest is inferred; `sigma_size` says how surely: {'; '.join(parts)}. Status "
+        f"`{Status(one.body.status).name}`, message: {one.body.message}."
     )
 
 
@@ -459,7 +494,16 @@ def _count(found: list[Found], frame: FrameRecovery) -> str:
     extra = len(frame.recovered) - matched_bodies
     text = f"{matched_bodies} of {len(found)} things have a body"
     text += f" (none: {', '.join(missed)})" if missed else ""
-    return text + (f", {extra} too many." if extra else ", none too many.")
+    return text + (f", and there are {extra} bodies too many{_where(found, frame)}." if extra else ", none too many.")
+
+
+def _where(found: list[Found], frame: FrameRecovery) -> str:
+    """What the surplus bodies are pieces of."""
+    names = set()
+    for body in _surplus(found, frame):
+        pixels = np.bincount(found[0].labels[frame.labels == body.label], minlength=len(found) + 1)
+        names.add(found[int(pixels[1:].argmax())].stood.name if pixels[1:].any() else "table")
+    return f", pieces of {' and '.join(sorted(names))}" if names else ""
 
 
 def _bias(found: list[Found]) -> float:
@@ -479,8 +523,8 @@ def empty(path: Path) -> Entry:
     reasons = " / ".join(sorted({frame.message for frame in frames if frame.message}))
     return Entry(
         "An empty table",
-        f"Nothing stands on it, and {number or 'nothing'} is found by any of {len(views)} sensors: noise and ragged edges "
-        f"make no bodies. `FrameRecovery.message`: {reasons or 'empty'}.",
+        f"Nothing stands on it. Bodies found through {len(views)} sensors together: {number}. `FrameRecovery.message`: "
+        f"{reasons or 'empty'}.",
     )
 
 
@@ -508,18 +552,21 @@ def tracked(path: Path) -> Entry:
     # The body whose first view tells least.
     chosen = int(np.nanargmax(np.where(np.isfinite(sigma[0]).all(axis=-1), sigma[0].max(axis=-1), np.nan)))
     axis = int(sigma[0, chosen].argmax())
-    figure = new_figure(12.6, 3.1)
-    axes = figure.subplots(1, 4, gridspec_kw={"wspace": 0.03, "width_ratios": [1, 1, 1, 1.15]})
-    figure.subplots_adjust(left=0.004, right=0.99, top=0.915, bottom=0.03)
-    for ax, (k, (view, _, followed)) in zip(axes, kept.items(), strict=False):
+    figure = new_figure(11.62, 2.62)
+    grid = figure.add_gridspec(
+        1, 2, width_ratios=[3, 1.02], wspace=0.075, left=0.004, right=0.99, top=0.905, bottom=0.085
+    )
+    axes = grid[0].subgridspec(1, len(kept), wspace=0.015).subplots()
+    for ax, (k, (view, _, followed)) in zip(axes, kept.items(), strict=True):
+        camera = view.scene.camera
         draw_depth(ax, view.depth)
         bodies = [one.superquadric for one in followed]
-        draw_outlines(ax, bodies, view.scene.camera, [colour(one.id - 1) for one in followed], width=1.5)
-        margin = 0.16 * np.array([view.scene.camera.width, view.scene.camera.height])
-        ax.set_xlim(margin[0], view.scene.camera.width - margin[0])
-        ax.set_ylim(view.scene.camera.height - margin[1] * 0.6, margin[1] * 1.4)
+        draw_outlines(ax, bodies, camera, [colour(one.id - 1) for one in followed], width=1.5)
+        ax.set_xlim(TRACKED_WINDOW[0], TRACKED_WINDOW[1])
+        ax.set_ylim(TRACKED_WINDOW[3], TRACKED_WINDOW[2])
         _title(ax, f"Frame {k}", f"camera at {tracking.ARC * (k - 1) / (TRACKED[-1] - 1):.0f}°")
-    _draw_course(axes[3], error[:, chosen, axis], sigma[:, chosen, axis], single[:, chosen, axis])
+    course = figure.add_subplot(grid[1])
+    _draw_course(course, error[:, chosen, axis], sigma[:, chosen, axis], single[:, chosen, axis])
     write_picture(figure, path)
     header = ["after frame", "mean error of edges, mm", "mean reported deviation, mm", "within 2 deviations"]
     rows = []
@@ -535,13 +582,13 @@ def tracked(path: Path) -> Entry:
             ]
         )
     births = session.tally.births
-    course = ", ".join(f"{error[k - 1, chosen, axis]:+.1f} ± {sigma[k - 1, chosen, axis]:.1f} mm" for k in TRACKED)
+    steps = ", ".join(f"{error[k - 1, chosen, axis]:+.1f} ± {sigma[k - 1, chosen, axis]:.1f}" for k in TRACKED)
     return Entry(
         "Thirty frames of a moving camera",
-        f"{count} bodies, a stereo camera that goes {tracking.ARC:.0f} degrees about the table, own masks, {births} ids "
-        f"given. Right, the edge that the first frame knows least: its error {course} after frames "
-        f"{', '.join(map(str, TRACKED))} (dots: each frame by itself). What all views share, such as edges widened by "
-        f"stereo, no number of frames takes out, and the deviations stay as wide as that.",
+        f"{count} bodies, a stereo camera that goes {tracking.ARC:.0f} degrees about the table, its pose known, own "
+        f"masks; ids given: {births}. Right, the edge of which the first frame knows least: its error is {steps} mm "
+        f"after frames {', '.join(map(str, TRACKED))} (line: fused; dots: each frame by itself). What all views "
+        f"share, such as edges widened by stereo, is not taken out by any number of frames.",
         report.table(header, rows),
     )
 
@@ -555,11 +602,10 @@ def _draw_course(ax: Axes, error: np.ndarray, sigma: np.ndarray, single: np.ndar
     ax.axhline(0, color=WIRE, lw=1.0)
     ax.set_xlim(1, len(error))
     ax.set_xticks(TRACKED)
-    ax.tick_params(labelsize=8, colors=_FAINT, direction="in", pad=-14)
-    ax.tick_params(axis="y", pad=-24)
+    ax.tick_params(labelsize=8, colors=_FAINT, length=2, pad=2)
     for side in ("top", "right", "left", "bottom"):
         ax.spines[side].set_color("#cfd7de")
-    _title(ax, "Error of one edge, mm", "± 1 and 2 deviations")
+    _title(ax, "Error, mm", "± 1 and ± 2 deviations")
 
 
 ENTRIES: dict[str, Callable[[Path], Entry]] = {
@@ -573,7 +619,7 @@ ENTRIES: dict[str, Callable[[Path], Entry]] = {
         (
             Stood("high box", carton(80, 60, 130), (-0.07, 0.03)),
             Stood("low box", carton(100, 80, 60), (0.0201, 0.02)),
-            Stood("flat box", carton(90, 60, 35), (-0.045, -0.061), 8),
+            Stood("flat box", carton(90, 60, 35), (-0.045, -0.0562), 8),
             Stood("can", can(66, 100), (0.1035, 0.02)),
         ),
         _touching,
@@ -593,8 +639,8 @@ ENTRIES: dict[str, Callable[[Path], Entry]] = {
     "half_hidden": of_scene(
         "Half hidden",
         (
-            Stood("box in front", carton(90, 50, 110), (-0.06, -0.05), 5),
-            Stood("hidden box", carton(170, 70, 90), (0.0, 0.09), 10),
+            Stood("box in front", carton(150, 50, 160), (-0.06, -0.04), 4),
+            Stood("hidden box", carton(190, 70, 90), (0.02, 0.08), 8),
         ),
         _hidden,
         azimuth=50.0,
@@ -605,17 +651,17 @@ ENTRIES: dict[str, Callable[[Path], Entry]] = {
     "empty_table": empty,
 }
 
-INTRODUCTION = """# Gallery
+INTRODUCTION = """
+Synthetic scenes with known truth, seen by simulated [sensors](sensors.md), and what
+`Recoverer().recover(depth, camera)` makes of them: own masks, default options. Pictures, tables and numbers are those
+of one run of `python benchmarks/gallery.py` ({facts}). The scenes were composed to show something;
+for figures over many scenes see [the surface fit](surface_fit.md), [segmentation](segmentation.md) and
+[tracking](tracking.md).
 
-Synthetic scenes with known truth, seen by simulated sensors ([docs/sensors.md](sensors.md)), and what
-`Recoverer().recover(depth, camera)` makes of them: own masks, default options. Pictures, tables and numbers are those of one run of
-
-    python benchmarks/gallery.py
-
-({facts}). Scenes were composed to show something, not drawn by chance: for figures over many scenes see
-[the surface fit](surface_fit.md), [segmentation](segmentation.md) and [tracking](tracking.md). Edges are full lengths, ± one reported
-standard deviation. *Seen of each* is the share of each edge that the measured points span; the rest is inferred. IoU is that
-of volumes with the true convex hull.
+Left the depth image, near is light and black is nothing measured; in the middle masks and recovered outlines, hidden
+edges faint; right the recovered bodies, and the true things as thin lines. Edges are full lengths, ± one reported
+standard deviation. *Seen* is the share of each edge that the measured points span; the rest is inferred. IoU is that of
+volumes with the true convex hull.
 """
 
 
@@ -628,12 +674,14 @@ def main() -> None:
     pictures.mkdir(parents=True, exist_ok=True)
     recoverer().warm_up(mesh_scene.CAMERA)
     facts = report.environment()
-    parts = [INTRODUCTION.format(facts=f"{facts['date']}, commit {facts['commit']}")]
+    introduction = INTRODUCTION.format(facts=f"{facts['date']}, commit {facts['commit']}")
+    parts = ["# Gallery\n" + introduction]
     for name in options.only or ENTRIES:
         path = pictures / f"{name}.png"
         entry = ENTRIES[name](path)
         below = f"\n{entry.below}\n" if entry.below else ""
-        parts.append(f"## {entry.title}\n\n![{entry.title}](gallery/{path.name})\n\n{entry.text}\n{below}")
+        text = textwrap.fill(entry.text, 120, **WRAPPED)
+        parts.append(f"## {entry.title}\n\n![{entry.title}](gallery/{path.name})\n\n{text}\n{below}")
         print(f"{path.name}: {path.stat().st_size / 1e3:.0f} kB\n{entry.text}\n{entry.below}\n", flush=True)
     if not options.only:
         (options.docs / "gallery.md").write_text("\n".join(parts), encoding="utf-8")

