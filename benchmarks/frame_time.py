@@ -1,6 +1,6 @@
 """How long a whole frame takes: 1, 5 and 20 bodies on a table, three image sizes, two sensors, stage by stage.
 
-    python benchmarks/frame_time.py [--scenes 4] [--repeats 5] [--name frame_time]
+    python benchmarks/frame_time.py [--scenes 3] [--repeats 5] [--name frame_time]
 
 Superquadrics of 2 to 4 cm half size stand apart on a table, seen from 0.9 m at 45 to 55 degrees; scene k of n bodies
 comes from the seed (``SEED``, n, k) alone and is the same in all images, which are 63 degrees wide.  Sensors: those of
@@ -215,7 +215,7 @@ def line(sensor: str, image: tuple[int, int], count: int, setting: str, row: dic
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("--scenes", type=int, default=4)
+    parser.add_argument("--scenes", type=int, default=3)
     parser.add_argument("--repeats", type=int, default=5, help="of each scene")
     parser.add_argument("--name", default="frame_time", help="name of the result files")
     options = parser.parse_args()

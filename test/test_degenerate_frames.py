@@ -26,9 +26,10 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast, sensor_noise
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.scene import plane_depth
-from sq_perception.recovery import FrameRecovery, Recoverer, Recovery
+from sq_perception.recovery import FrameRecovery, Recoverer, Recovery, RecoveryOptions
 
 CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)
+VGA = Camera(640, 480, 540.0, 540.0, 319.5, 239.5)
 COARSE = Camera(160, 120, 135.0, 135.0, 79.5, 59.5)
 """Of frames that need no more pixels."""
 SENSORS = sorted(sensor_noise.PRESETS)
@@ -144,7 +145,7 @@ def small(width: int, height: int, shown: str) -> Frame:
     return Frame(depth.astype(np.float32), camera)
 
 
-def room(kind: str) -> np.ndarray:
+def room(kind: str, camera: Camera = CAMERA) -> np.ndarray:
     """True depth of planes that are the room, not things in it."""
     walls = {
         "empty table": [TABLE],
@@ -154,7 +155,7 @@ def room(kind: str) -> np.ndarray:
         "corner of the room": [tilted([0.9, 0, -1], 1.8), tilted([-0.9, 0, -1], 1.8), tilted([0, -1, -0.5], 1.5)],
         "table before a wall": [TABLE, tilted([0, 0, -1], 1.1)],
     }[kind]
-    return np.min([plane_depth(wall, CAMERA) for wall in walls], axis=0)
+    return np.min([plane_depth(wall, camera) for wall in walls], axis=0)
 
 
 ROOMS = (
@@ -167,9 +168,9 @@ ROOMS = (
 )
 
 
-def seen(kind: str, sensor: str, seed: int = 3) -> Frame:
-    depth = sensor_noise.preset(sensor).measured(room(kind), CAMERA, np.random.default_rng(seed))
-    return Frame(depth, CAMERA, TABLE if "table" in kind else None)
+def seen(kind: str, sensor: str, seed: int = 3, camera: Camera = CAMERA) -> Frame:
+    depth = sensor_noise.preset(sensor).measured(room(kind, camera), camera, np.random.default_rng(seed))
+    return Frame(depth, camera, TABLE if "table" in kind else None)
 
 
 NOTHING: dict[str, Callable[[], Frame]] = {
@@ -187,8 +188,8 @@ NOTHING: dict[str, Callable[[], Frame]] = {
     },
 }
 NEAR: dict[str, Callable[[], Frame]] = {
-    **{f"hand over the lens {seed}": lambda seed=seed: hand_over_the_lens(seed) for seed in range(3)},
-    **{f"box at 5 cm turned by {a} degrees": lambda a=a: box_close_by(a) for a in (0, 20, 45)},
+    **{f"hand over the lens {seed}": lambda seed=seed: hand_over_the_lens(seed) for seed in range(2)},
+    **{f"box at 5 cm turned by {a} degrees": lambda a=a: box_close_by(a) for a in (0, 45)},
 }
 SIZES: dict[str, Callable[[], Frame]] = {
     f"{width} x {height} {shown}": lambda width=width, height=height, shown=shown: small(width, height, shown)
@@ -206,14 +207,14 @@ def whole(frame: Frame) -> np.ndarray:
 
 
 def random_pixels(frame: Frame) -> np.ndarray:
-    """Three objects, each a random quarter of all pixels."""
-    return np.random.default_rng(1).integers(0, 4, frame.depth.shape).astype(np.int32)
+    """Two objects, each a random third of all pixels."""
+    return np.random.default_rng(1).integers(0, 3, frame.depth.shape).astype(np.int32)
 
 
 def random_tiles(frame: Frame) -> np.ndarray:
     """Random labels, some negative, in tiles of 12 pixels."""
     rows, columns = (np.arange(size) // 12 for size in frame.depth.shape)
-    values = np.random.default_rng(2).integers(-1, 4, (rows[-1] + 1, columns[-1] + 1))
+    values = np.random.default_rng(2).integers(-1, 3, (rows[-1] + 1, columns[-1] + 1))
     return values[np.ix_(rows, columns)].astype(np.int16)
 
 
@@ -287,6 +288,12 @@ def test_a_room_without_things_has_no_bodies(recoverer: Recoverer, kind: str, se
 def test_noise_on_a_wall_is_no_body(recoverer: Recoverer, kind: str, seed: int) -> None:
     frame = seen(kind, "realsense_d435", seed)
     check_empty(recoverer.recover(frame.depth, frame.camera), frame)
+
+
+@pytest.mark.xfail(strict=True, reason="bodies three times as long as what was measured, WEAK but with scores of 0.5")
+def test_noise_in_the_corner_of_a_room_makes_no_wild_body(recoverer: Recoverer) -> None:
+    frame = seen("corner of the room", "realsense_d435", 0, VGA)
+    check(recoverer.recover(frame.depth, frame.camera, options=RecoveryOptions(repair=False)), frame)
 
 
 @pytest.mark.parametrize("sensor", ["realsense_d435", "kinect_v1"])
