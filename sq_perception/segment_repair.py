@@ -140,7 +140,7 @@ class _Work:
         """Fits of all these masks, or None if there is no time for them or one of them fails."""
         found = []
         for mask in masks:
-            if self._fits_left < 1 or time.perf_counter() > self.deadline:
+            if not self._may_fit():
                 return None
             self._fits_left -= 1
             found.append(self._fit_mask(mask))
@@ -151,15 +151,26 @@ class _Work:
     # Joining
 
     def join(self) -> None:
-        """Join pairs until none makes the description shorter."""
+        """Join pairs until none makes the description shorter, or there is no fit left to try one."""
         refused: set[tuple[int, int]] = set()
-        while True:
-            pairs = [pair for pair in self._free_pairs() if pair not in refused]
-            if not pairs:
+        agreement: dict[tuple[int, int], float] = {}
+        pairs = self._free_pairs()
+        while self._may_fit():
+            left = [pair for pair in pairs if pair not in refused]
+            if not left:
                 return
-            a, b = max(pairs, key=lambda pair: self._agreement(*pair))
+            for pair in left:
+                if pair not in agreement:
+                    agreement[pair] = self._agreement(*pair)
+            a, b = max(left, key=agreement.__getitem__)
             if not self._joined(a, b):
                 refused.add((a, b))
+                continue
+            agreement = {pair: share for pair, share in agreement.items() if not {a, b} & set(pair)}
+            pairs = self._free_pairs()
+
+    def _may_fit(self) -> bool:
+        return self._fits_left > 0 and time.perf_counter() < self.deadline
 
     def _free_pairs(self) -> list[tuple[int, int]]:
         labels = (
@@ -199,8 +210,10 @@ class _Work:
 
     def split(self, label: int, deepest: int) -> None:
         """Split a segment into its convex parts, and these again, while that makes the description shorter."""
+        if deepest == 0 or not self._may_fit():
+            return
         mask = self.labels == label
-        if deepest == 0 or not self._badly_told(label, mask):
+        if not self._badly_told(label, mask):
             return
         parts = convex_parts.parts(mask, self.known, self.camera, self.sigma, _SPLITTING)
         if len(parts) < 2:
