@@ -16,7 +16,7 @@ from sq_perception.fitting.symmetry_start import three_orders
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 
-_START_EXPONENTS = (0.2, 0.8)
+_START_EXPONENTS = (0.3,)
 _THINNEST = 0.15
 """A box side is at least this share of the longest side: one visible face says nothing of the depth."""
 _OUTLIER_SHARE = 0.01
