@@ -284,13 +284,11 @@ def test_a_room_without_things_has_no_bodies(recoverer: Recoverer, kind: str, se
     ("kind", "seed"),
     [("wall at an angle", 1), ("wall at an angle", 6), ("wall at an angle", 7), ("corner of two walls", 5)],
 )
-@pytest.mark.xfail(strict=True, reason="stereo noise on an oblique wall 1 m away makes bodies of 1 to 5 cm, CONVERGED")
 def test_noise_on_a_wall_is_no_body(recoverer: Recoverer, kind: str, seed: int) -> None:
     frame = seen(kind, "realsense_d435", seed)
     check_empty(recoverer.recover(frame.depth, frame.camera), frame)
 
 
-@pytest.mark.xfail(strict=True, reason="bodies three times as long as what was measured, WEAK but with scores of 0.5")
 def test_noise_in_the_corner_of_a_room_makes_no_wild_body(recoverer: Recoverer) -> None:
     frame = seen("corner of the room", "realsense_d435", 0, VGA)
     check(recoverer.recover(frame.depth, frame.camera, options=RecoveryOptions(repair=False)), frame)

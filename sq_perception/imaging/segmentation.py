@@ -35,6 +35,11 @@ from sq_perception.imaging.surface_patches import FoldOptions
 
 _FOOT_PIXELS = 3
 _LEAST_SIGMA = 5e-4
+_BUMP, _ON_WALL = 6.0, 3.5
+"""An object rises so many deviations of the plane's own points above it; what lies within so many of another plane is a
+part of that,"""
+_FACE_SHARE = 0.5
+"""unless it makes up this share of its points: then the plane is a face of the object."""
 _UNKNOWN_SIGMA = 1.5e-3
 _VESSEL = 0.15
 """A segment with more hollow surface than this share may be a vessel."""
@@ -339,17 +344,26 @@ def _object_test(
 ) -> _ObjectTest:
     """Whether a component, given by its pixels, is an object on the table and not the room behind it."""
     last_row, last_column = camera.height - 1, camera.width - 1
+    measured = np.count_nonzero(np.isfinite(depth) & (depth > 0))
 
     def is_object(rows: np.ndarray, columns: np.ndarray) -> bool:
         step = max(1, rows.size // 2000)
         points = camera.unproject(columns[::step], rows[::step], depth[rows[::step], columns[::step]])
         heights = support.height(points)
+        growth = noise_growth(points[:, 2])
         if np.quantile(heights, 0.95) < options.min_height:
             return False
+        # Noise that is alike over a window makes bumps; walls fall apart into pieces where things hide parts of them.
+        if np.quantile(heights / growth, 0.95) < _BUMP * support.sigma:
+            return False
+        for wall in walls:
+            on_it = rows.size < _FACE_SHARE * wall.share * measured
+            if on_it and np.quantile(np.abs(wall.height(points)) / growth, 0.95) < _ON_WALL * wall.sigma:
+                return False
         at_border = rows.min() == 0 or columns.min() == 0 or rows.max() == last_row or columns.max() == last_column
         if not at_border:
             return True
-        reach = options.plane_tolerance * noise_growth(points[:, 2])
+        reach = options.plane_tolerance * growth
         on_wall = [np.mean(np.abs(wall.height(points)) < 2 * reach) for wall in walls]
         return not any(share > 0.5 for share in on_wall)
 
