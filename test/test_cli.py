@@ -19,7 +19,20 @@ from sq_perception.recorded_frame import read
 
 CUBE_BODY = ["0.25", "0.15", "0.1", "0.2", "0.8", "0.5", "0.45", "0.5", "0.2", "-0.3", "0.1", "0.9"]
 CAN = ["0.05", "0.05", "0.08", "0.1", "1.0", "-5e-2", "0", "0.8", "0.7", "0.2", "0", "0.7"]
-KEYS = {"size", "shape", "translation", "rotation", "score", "residual", "sigma_size", "status", "message", "label"}
+KEYS = {
+    "size",
+    "shape",
+    "translation",
+    "rotation",
+    "score",
+    "residual",
+    "seen",
+    "sigma_size",
+    "track",
+    "status",
+    "message",
+    "label",
+}
 KEYS |= {"pixels"}
 
 
@@ -65,6 +78,9 @@ def test_rendered_cube_images_come_back(tmp_path, suffix):
     assert entry["status"] in ("converged", "weak")
     assert thesis_iou(batch(body_of(entry)), batch(flat(CUBE_BODY)))[0] > 0.98
     assert len(entry["sigma_size"]) == 3
+    assert len(entry["seen"]) == 3
+    assert all(0 <= share <= 1 for share in entry["seen"])
+    assert entry["track"] is None
 
 
 def test_pinhole_round_trips(tmp_path):
