@@ -25,7 +25,7 @@ import tabletop
 from rich.progress import track
 from scene_verdict import Answer
 
-from sq_perception import recovery
+from sq_perception import seen_object
 from sq_perception.fitting import revolution, search
 from sq_perception.fitting.observation import Observation
 from sq_perception.recovery import RecoveryOptions
@@ -55,7 +55,7 @@ SETTINGS = {
     "all of it": Setting(),
     "without the network": Setting(RecoveryOptions(method="symmetry")),
     "network shown all pixels of the mask": Setting(
-        switch=constant(recovery, "_core", lambda one, depth, camera: one.mask)
+        switch=constant(seen_object, "core", lambda one, depth, camera: one.mask)
     ),
     "without bodies of revolution": Setting(switch=constant(revolution, "ODDS", 1e-300)),
     "bodies may hover": Setting(switch=constant(search, "GAP_SIGMA", np.inf)),

@@ -37,16 +37,16 @@ from typing import Literal, TypeVar, get_args
 import numpy as np
 import torch
 
-from sq_perception import segment_repair
+from sq_perception import seen_object, segment_repair
 from sq_perception.fitting import soft_render_fit, solina_bajcsy, surface_fit
 from sq_perception.fitting.fit import Fit, Status
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import canonical_view, convex_parts, raycast, segmentation, soft_render
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.canonical_view import CanonicalView
-from sq_perception.imaging.coherence import coherent
 from sq_perception.learning import checkpoint, inference
 from sq_perception.learning.consensus import Consensus
+from sq_perception.seen_object import SeenObject
 
 _Item = TypeVar("_Item")
 _Answer = TypeVar("_Answer")
@@ -61,14 +61,6 @@ _LEAST_BUDGET = 1e-6
 """Seconds; an object whose turn comes too late is still fitted, from one start."""
 _UNKNOWN = np.full((11, 11), np.nan)
 _UNSEEN = np.full(3, np.nan)
-_CLASSIC_POINTS = 2000
-_LOWEST, _HOVERING = 0.02, 0.02
-"""An object this many metres above its plane, by its lowest points, may stand on another one."""
-_HIGHEST_STACK = 0.5
-"""Higher above its plane, metres, an object does not even stand on others that stand on it."""
-_ON_TABLE = 0.003
-_JUMP_PIXELS, _JUMP = 10.0, 0.002
-"""What a network is shown, and a score is measured on: metres above the table; steps in pixel widths, and metres."""
 _NEEDS_NETWORK = ("auto", "network")
 _FITTED = ("auto", "symmetry")
 _HARD_IMAGE = (ValueError, ArithmeticError, np.linalg.LinAlgError)
@@ -294,7 +286,7 @@ class Recoverer:
             else:
                 found = segmentation.from_labels(labels, depth, camera, options.segmentation_options())
             depth = _cleaned(depth, camera)
-            objects = _objects(depth, found, camera, options)
+            objects = seen_object.objects(depth, found, camera, options.depth_range)
 
         with _timed(milliseconds, "network"):
             _mapped(lambda one: _view(one, depth, camera, found, options, network), objects)
@@ -345,43 +337,6 @@ def render_recovery(frame: FrameRecovery, camera: Camera) -> tuple[np.ndarray, n
     return depth, np.append(np.array(shown, dtype=np.int32), np.int32(-1))[index]
 
 
-@dataclass(eq=False)
-class _Object:
-    """One object on its way through the stages."""
-
-    label: int
-    pixels: int
-    mask: np.ndarray
-    depth_crop: np.ndarray
-    mask_crop: np.ndarray
-    camera_crop: Camera
-    window: tuple[slice, slice]
-    plane: np.ndarray | None = None
-    """What it stands on."""
-    shown: CanonicalView | None = None
-    """To the network, where there is one."""
-    view: CanonicalView | None = None
-    """What its score is measured on."""
-    predictions: Future[Superquadric] | None = None
-    """Of all objects of the frame, each in the frame of what was shown; still being computed, perhaps."""
-    number: int = 0
-    """Of this object among them."""
-
-    def predicted(self) -> Superquadric:
-        """The network's prediction in the optical frame; waits for it."""
-        if self.predictions is None or self.shown is None:
-            raise ValueError("no prediction")
-        return self.shown.from_canonical(self.predictions.result()[self.number]).canonical_form()
-
-    @property
-    def points(self) -> np.ndarray:
-        """At most some thousand measured points (n, 3), evenly taken."""
-        rows, columns = np.nonzero(self.mask_crop)
-        step = max(1, rows.size // _CLASSIC_POINTS)
-        rows, columns = rows[::step], columns[::step]
-        return self.camera_crop.unproject(columns, rows, self.depth_crop[rows, columns])
-
-
 def _checked_device(device: str) -> str:
     try:
         kind = torch.device(device).type
@@ -401,24 +356,6 @@ def _cleaned(depth: np.ndarray, camera: Camera) -> np.ndarray:
     return np.where(bad, np.float32(np.nan), depth)
 
 
-def _objects(
-    depth: np.ndarray, found: segmentation.Segmentation, camera: Camera, options: RecoveryOptions
-) -> list[_Object]:
-    measured = np.isfinite(depth)
-    near, far = options.depth_range
-    if near > 0 or np.isfinite(far):
-        measured &= (depth >= near) & (depth <= far)
-    objects = []
-    for label in found.ids:
-        mask = (found.labels == label) & measured
-        rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-        window = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
-        crop = mask[window]
-        camera_crop = camera.cropped(int(columns[0]), int(rows[0]), crop.shape[1], crop.shape[0])
-        objects.append(_Object(label, int(np.count_nonzero(crop)), mask, depth[window], crop, camera_crop, window))
-    return objects
-
-
 def _mapped(function: Callable[[_Item], _Answer], items: Sequence[_Item]) -> list[_Answer]:
     workers = min(len(items), os.cpu_count() or 1)
     if workers < 2:
@@ -428,7 +365,7 @@ def _mapped(function: Callable[[_Item], _Answer], items: Sequence[_Item]) -> lis
 
 
 def _view(
-    one: _Object,
+    one: SeenObject,
     depth: np.ndarray,
     camera: Camera,
     found: segmentation.Segmentation,
@@ -436,8 +373,8 @@ def _view(
     network: inference.Predictor | None,
 ) -> None:
     """What the object stands on, what a network is shown of it, and what its score is measured on."""
-    one.plane = _support(one, depth, camera, found, options)
-    core = _core(one, depth, camera)
+    one.plane = seen_object.support(one, depth, camera, found, options.segmentation_options())
+    core = seen_object.core(one, depth, camera)
     if network is not None:
         one.shown = network.config.view_of(depth, core, camera, one.plane)
     one.view = one.shown
@@ -447,19 +384,19 @@ def _view(
 
 def _repaired(
     found: segmentation.Segmentation,
-    objects: list[_Object],
+    objects: list[SeenObject],
     fits: list[Fit],
     depth: np.ndarray,
     camera: Camera,
     options: RecoveryOptions,
     deadline: float,
-) -> tuple[segmentation.Segmentation, list[_Object], list[Fit]]:
+) -> tuple[segmentation.Segmentation, list[SeenObject], list[Fit]]:
     """Segments, objects and bodies after joining and splitting; new segments are fitted without the network."""
 
-    def prepared(mask: np.ndarray) -> _Object:
+    def prepared(mask: np.ndarray) -> SeenObject:
         label = int(found.labels.max()) + 1
         alone = replace(found, labels=np.where(mask, np.int32(label), found.labels), ids=(label,))
-        one = _objects(depth, alone, camera, options)[0]
+        one = seen_object.objects(depth, alone, camera, options.depth_range)[0]
         _view(one, depth, camera, alone, options, None)
         return one
 
@@ -485,57 +422,7 @@ def _repaired(
     return replace(found, labels=repair.labels, ids=ids), ordered, [repair.fits[label] for label in ids]
 
 
-def _support(
-    one: _Object, depth: np.ndarray, camera: Camera, found: segmentation.Segmentation, options: RecoveryOptions
-) -> np.ndarray | None:
-    """What the object stands on: the frame's plane, or another one that its surroundings show right below it.
-
-    An object behind the frame's plane does not stand on it, and one high above it neither: held before a wall,
-    say.  One less high above it, without any such surroundings, stands on other objects.
-    """
-    if found.plane is None:
-        return None
-    points = one.points
-    heights = points @ found.plane[:3] + found.plane[3]
-    behind = float(np.median(heights)) <= 0
-    if not behind and np.quantile(heights, _LOWEST) < _HOVERING:
-        return found.plane
-    other = segmentation.support_under(found, one.label, depth, camera, options.segmentation_options())
-    if other is not None:
-        lowest, middle = np.quantile(points @ other[:3] + other[3], [_LOWEST, 0.5])
-        if abs(lowest) < _HOVERING < middle + _HOVERING:
-            return other
-    far_above = float(np.quantile(heights, _LOWEST)) > _HIGHEST_STACK
-    return None if behind or far_above else found.plane
-
-
-def _core(one: _Object, depth: np.ndarray, camera: Camera) -> np.ndarray:
-    """The mask (height, width) without pixels that measured the table or the background: a view is framed by all.
-
-    Sensors widen what is near, masks from colour what they like.  A thin thing on the table keeps its pixels.
-    """
-    if not camera.is_pinhole:
-        return one.mask
-    core = one.mask_crop
-    if one.plane is not None:
-        rows, columns = np.nonzero(core)
-        points = one.camera_crop.unproject(columns, rows, one.depth_crop[rows, columns])
-        above = core.copy()
-        above[rows, columns] = points @ one.plane[:3] + one.plane[3] > _ON_TABLE
-        core = above if 2 * np.count_nonzero(above) > rows.size else core
-    footprint = float(np.median(one.depth_crop[one.mask_crop])) / np.sqrt(camera.fx * camera.fy)
-    whole = np.zeros_like(one.mask)
-    whole[one.window] = core
-    # With a margin, as a part that goes on beyond the mask is something else.
-    down, across = one.window
-    around = slice(max(down.start - 1, 0), down.stop + 1), slice(max(across.start - 1, 0), across.stop + 1)
-    whole[around] &= coherent(
-        np.ascontiguousarray(depth[around]), np.ascontiguousarray(whole[around]), _JUMP_PIXELS * footprint + _JUMP
-    )
-    return whole
-
-
-def _fitted(one: _Object, depth: np.ndarray, camera: Camera, options: RecoveryOptions, deadline: float) -> Fit:
+def _fitted(one: SeenObject, depth: np.ndarray, camera: Camera, options: RecoveryOptions, deadline: float) -> Fit:
     """The body of one object by the chosen method; FAILED with a reason instead of any exception on hard data."""
     if one.pixels < _FEWEST_PIXELS:
         return _failed(one, f"{one.pixels} pixels with a depth are too few for a body")
@@ -548,7 +435,7 @@ def _fitted(one: _Object, depth: np.ndarray, camera: Camera, options: RecoveryOp
     return fit
 
 
-def _body(one: _Object, depth: np.ndarray, camera: Camera, options: RecoveryOptions, deadline: float) -> Fit:
+def _body(one: SeenObject, depth: np.ndarray, camera: Camera, options: RecoveryOptions, deadline: float) -> Fit:
     if options.method == "classic":
         return solina_bajcsy.fit(one.points)
     if options.method == "network" or (options.method == "auto" and options.refine == "none"):
@@ -562,7 +449,9 @@ def _body(one: _Object, depth: np.ndarray, camera: Camera, options: RecoveryOpti
     return fit
 
 
-def _surface_fit(one: _Object, depth: np.ndarray, camera: Camera, plane: np.ndarray | None, time_budget: float) -> Fit:
+def _surface_fit(
+    one: SeenObject, depth: np.ndarray, camera: Camera, plane: np.ndarray | None, time_budget: float
+) -> Fit:
     """From the cheapest starts of central symmetry; where those leave something, from the network's prediction too.
 
     The network computes beside the fit.  What the image leaves open after all, such as the depth of a box seen
@@ -576,7 +465,7 @@ def _surface_fit(one: _Object, depth: np.ndarray, camera: Camera, plane: np.ndar
     return surface_fit.fit(depth, one.mask, camera, start=one.predicted, options=settings)
 
 
-def _soft_rendered(start: Superquadric, one: _Object, options: RecoveryOptions) -> Fit:
+def _soft_rendered(start: Superquadric, one: SeenObject, options: RecoveryOptions) -> Fit:
     assert one.view is not None
     body, before, after = soft_render_fit.refine(
         one.view.image, one.view.to_canonical(start), options.sharpness, options.tau
@@ -585,7 +474,7 @@ def _soft_rendered(start: Superquadric, one: _Object, options: RecoveryOptions) 
     return _unfitted(refined, one, f"soft-rendered residual {before:.4f} before, {after:.4f} after the refinement")
 
 
-def _unfitted(body: Superquadric, one: _Object, message: str) -> Fit:
+def _unfitted(body: Superquadric, one: SeenObject, message: str) -> Fit:
     """The answer of a method that is no least squares fit: distances measured, nothing known about uncertainty."""
     distance = body.sampson_distance(one.points)
     residual = float(np.sqrt(np.mean(distance**2)))
@@ -604,7 +493,7 @@ def _unfitted(body: Superquadric, one: _Object, message: str) -> Fit:
     )
 
 
-def _failed(one: _Object, reason: str) -> Fit:
+def _failed(one: SeenObject, reason: str) -> Fit:
     points = one.points
     low, high = points.min(axis=0), points.max(axis=0)
     size = np.maximum(0.5 * (high - low), 1e-3 * max(float((high - low).max()), 1e-3))
@@ -625,7 +514,7 @@ def _score(view: CanonicalView | None, body: Superquadric, options: RecoveryOpti
         return float(soft_render.agreement(image[::_SCORE_STRIDE, ::_SCORE_STRIDE], rendered).clip(0, 1))
 
 
-def _recovery(one: _Object, fit: Fit, score: float) -> Recovery:
+def _recovery(one: SeenObject, fit: Fit, score: float) -> Recovery:
     failed = fit.status == Status.FAILED
     return Recovery(
         fit.superquadric,

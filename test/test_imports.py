@@ -21,7 +21,7 @@ PACKAGES = (PERCEPTION, MESSAGES)
 FLOORS = (
     ("geometry", "provenance"),
     ("imaging", "metrics", "tracking", "recorded_frame", "recorded_bag", "recorded_input"),
-    ("learning", "fitting", "scene_description"),
+    ("learning", "fitting", "scene_description", "seen_object"),
     ("recovery", "recorded_tracks", "segment_repair", "warm_up"),
     ("evaluation", "nodes", "cli", "recover_command"),
 )
