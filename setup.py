@@ -69,6 +69,7 @@ setup(
         "onnxruntime>=1.18",  # computes that graph in less than half of torch's time for a single view
         "safetensors>=0.4",  # weights that cannot carry code
         "array-api-compat>=1.9",  # one geometry for NumPy and torch
+        "threadpoolctl>=3",  # keeps BLAS from threading products of 2000 x 3, which took the second core from the fits
         "pyyaml>=6",  # camera_info files, training configurations
         "matplotlib>=3.7",  # pictures
         "pillow>=9.1",  # animated GIFs; Matplotlib brings it anyway

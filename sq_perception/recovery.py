@@ -36,6 +36,7 @@ from typing import Literal, TypeVar, get_args
 
 import numpy as np
 import torch
+from threadpoolctl import ThreadpoolController
 
 from sq_perception import seen_object, segment_repair
 from sq_perception.fitting import soft_render_fit, solina_bajcsy, surface_fit
@@ -229,6 +230,7 @@ class Recoverer:
         self._consensus = consensus
         self._network: inference.Predictor | None = None
         self._lock = threading.Lock()
+        self._blas = ThreadpoolController()
         self._beside = ThreadPoolExecutor(1, thread_name_prefix="network")
         if method in _NEEDS_NETWORK:
             self._load_network()
@@ -274,7 +276,13 @@ class Recoverer:
         CheckpointError
             If the method needs the network and it cannot be loaded.
         """
-        options = options or self._options
+        # Threads of a BLAS spin after products as small as these, on the cores that fits of other objects want.
+        with self._blas.limit(limits=1, user_api="blas"):
+            return self._recover(depth, camera, labels, options or self._options)
+
+    def _recover(
+        self, depth: np.ndarray, camera: Camera, labels: np.ndarray | None, options: RecoveryOptions
+    ) -> FrameRecovery:
         started = time.perf_counter()
         milliseconds = dict.fromkeys(("segmentation", "network", "fit", "repair", "score", "total"), 0.0)
         network = self._load_network() if options.method in _NEEDS_NETWORK else None
