@@ -12,10 +12,9 @@
 6. Rounded readings of a face that looks at the camera are treated apart (:mod:`sq_perception.fitting.rounding`).
 7. If no superquadric reaches the floor, what is left becomes the model error, and stages 2 to 4 run once more with it:
    then neighbouring pixels err alike, the object counts as few independent rays, and wide priors decide what is open.
-8. Where a model error is tolerated all starts compete, and what no superquadric comes near is fitted as its convex hull:
-   free space within the hull of the outline is let go.
-9. A half size that stays open is also tried as the others, thin, and as predicted, with the seen face in place
-   (:mod:`sq_perception.fitting.priors`); and the body as one of revolution (:mod:`sq_perception.fitting.revolution`).
+   There all starts compete, and what no superquadric comes near is fitted as a hull, the space beside it let go.
+8. A half size that stays open is also tried as the others, thin, and as predicted, with the seen face in place, and the
+   body as one of revolution (:mod:`sq_perception.fitting.revolution`).
 
 The noise floor is a mean squared residual of 1, as residuals are in units of the noise.
 """
