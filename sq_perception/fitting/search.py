@@ -300,12 +300,10 @@ class Search:
             best = self._spread_along_view(best)
         pinhole = self.observation.camera.is_pinhole
         # An exact body's symmetry is judged on all its rays, before doubts about the model lessen their weight.
-        if pinhole and self.tolerated == 0 and not self._late():
-            best = self._rounded(best)
-        if not self._late():
-            best = self._doubted(best)
-        if pinhole and self.tolerated > 0 and not self._late():
-            best = self._rounded(best)
+        steps = (self._rounded, self._doubted) if self.tolerated == 0 else (self._doubted, self._rounded)
+        for step in steps:
+            if not self._late() and (pinhole or step == self._doubted):
+                best = step(best)
         self.scene = self._expecting(self.scene, best)
         return best
 
