@@ -540,7 +540,7 @@ def tracked(path: Path) -> Entry:
         camera = view.scene.camera
         frame = recoverer().recover(view.depth, camera)
         followed = session.follow(frame.recovered, k / tracking.RATE, view.pose, camera=camera, depth=view.depth)
-        owner, _ = tracking._owners(view.labels, frame)
+        owner, _ = tracking.owners(view.labels, frame)
         for j, index in owner.items():
             truth = view.scene.bodies[j]
             relative, order = tracking.size_errors(followed[index].superquadric, truth)

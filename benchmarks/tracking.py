@@ -155,7 +155,7 @@ def follow(session: TrackingSession, record: Record, k: int, view: View, found: 
     followed = session.follow(found.recovered, k / RATE, view.pose, camera=view.scene.camera, depth=view.depth)
     record.milliseconds.append(1e3 * (time.process_time() - started))
     record.births = session.tally.births - BODIES
-    owner, now_cut = _owners(view.labels, found)
+    owner, now_cut = owners(view.labels, found)
     for j in range(BODIES):
         if j not in owner:
             record.lost += bool(view.visible[j] > VISIBLE)
@@ -257,7 +257,7 @@ def _fits(shown: Scene) -> bool:
     return bool((away > RANGE[0]).all() and (away < RANGE[1]).all() and inside.all())
 
 
-def _owners(labels: np.ndarray, found: FrameRecovery) -> tuple[dict[int, int], set[int]]:
+def owners(labels: np.ndarray, found: FrameRecovery) -> tuple[dict[int, int], set[int]]:
     """For each body the recovery that is its own, and the bodies that two segments or more have a part of."""
     owner, best, pieces = {}, np.full(BODIES, _MATCH), np.zeros(BODIES, dtype=int)
     area = np.bincount(labels.ravel(), minlength=BODIES + 1)[1:]

@@ -387,7 +387,7 @@ def _view(
         one.shown = network.config.view_of(depth, core, camera, one.plane)
     one.view = one.shown
     if network is None or network.config.framing == "full":
-        one.view = canonical_view.from_mask(depth, core, camera, _VIEW_PIXELS)
+        one.view = canonical_view.from_mask(one.depth_crop, core[one.window], one.camera_crop, _VIEW_PIXELS)
 
 
 def _repaired(

@@ -38,7 +38,7 @@ def test_a_body_has_the_segment_that_overlaps_it_most(benchmark):
     truth[:, :20], truth[:, 20:30] = 1, 2
     found[:, :13], found[:, 13:20], found[:, 20:29] = 3, 2, 1
     bodies = tuple(Recovery(BODY, 1.0, 0.0, np.zeros(3), Status.CONVERGED, "", label, 10) for label in (3, 1, 2))
-    owner, cut = benchmark._owners(truth, FrameRecovery(bodies, {}, found, None, ""))
+    owner, cut = benchmark.owners(truth, FrameRecovery(bodies, {}, found, None, ""))
     assert owner == {0: 0, 1: 1}
     assert cut == {0}
 

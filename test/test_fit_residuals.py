@@ -183,6 +183,14 @@ def test_plane_rest_and_proportion(rng: np.random.Generator) -> None:
     expected = expected_sums(body, lambda moved: 200 * statement.lowest_height(moved, target)[None])
     assert_same(SAMPSON, NO_RAYS, NO_RAYS, scene, body, expected)
 
+    lifted = plane + np.array([0, 0, 0, 3 * body.size.max()])
+    height = float(statement.lowest_height(as_torch(body), torch.tensor(lifted))) * 40
+    assert height > 0
+    gap = scene._replace(offset=lifted[3], gap_stiffness=40.0)
+    damped = 40 / np.sqrt(1 + height**2)
+    _, matrix = expected_sums(body, lambda moved: damped * statement.lowest_height(moved, torch.tensor(lifted))[None])
+    assert_same(SAMPSON, NO_RAYS, NO_RAYS, gap, body, (np.log1p(height**2), matrix))
+
     square = float(statement.leaning(as_torch(body), target).square().sum()) * 9
     rest = scene._replace(plane_stiffness=0.0, rest_stiffness=3.0)
     _, matrix = expected_sums(body, lambda moved: 3 * statement.leaning(moved, target) / np.sqrt(1 + square))

@@ -2,10 +2,10 @@
 
 A can, a bottle, a bowl or a fruit shows half of its mantle.  As any superquadric its depth stays open; as a body of
 revolution, a1 = a2 and e2 = 1, the half that is seen tells the half that is not.  The family has 3 parameters less:
-one half size, one exponent, and the turn about z.  By the Bayesian
-information criterion (G. Schwarz, Annals of Statistics 6(2), 1978) it is the better description if
+one half size, one exponent, and the turn about z.  By the Bayesian information criterion (G. Schwarz, Annals of
+Statistics 6(2), 1978), and as more things are round than of any one oval shape, it is the better description if
 
-    D(cost(round)) < D(cost(free)) + 3 log W,      D(c) = c for c <= W,  W + W log(c / W) above,
+    D(cost(round)) < D(cost(free)) + 3 log W + 2 log ODDS,    D(c) = c for c <= W,  W + W log(c / W) above,
 
 W the total weight of the object's rays, the number of independent residuals that the cost stands for.  D is twice the
 negative log likelihood with variance max(1, c / W): where no superquadric explains a bottle with its neck, what is left

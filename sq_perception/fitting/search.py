@@ -495,7 +495,7 @@ class Search:
 
     def _expecting(self, scene: Scene, state: State) -> Scene:
         """The scene with the expected half sizes along the axes that the state has now."""
-        if scene.expectation_stiffness == 0 or self._prior is None:
+        if self._prior is None:
             return scene
         x, y, z = (float(extent) for extent in self._prior.support(state.rotation.T))
         return scene._replace(expected_1=x, expected_2=y, expected_3=z)

@@ -115,9 +115,7 @@ def table_scene(rng: np.random.Generator, count: int = 3, camera: Camera = TABLE
         raise ValueError(f"count: expected 1 to {MAX_TABLE_BODIES} bodies, got {count}")
     if not camera.is_pinhole:
         raise ValueError("camera: expected a pinhole camera, got an orthographic one")
-    distance, pitch, roll = rng.uniform(*_DISTANCE), rng.uniform(*_PITCH), rng.uniform(-_ROLL, _ROLL)
-    normal = -np.array([np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll), np.sin(pitch)])
-    plane = np.append(normal, distance * np.sin(pitch))
+    plane = _table(rng, _DISTANCE, _PITCH)
     bodies: list[Superquadric] = []
     reach: list[float] = []
     for _ in range(_ATTEMPTS):
@@ -147,9 +145,7 @@ def crowded_scene(rng: np.random.Generator, count: int = 6, camera: Camera = TAB
     if not camera.is_pinhole:
         raise ValueError("camera: expected a pinhole camera, got an orthographic one")
     for _ in range(_VIEWS):
-        distance, pitch, roll = rng.uniform(*_CROWD_DISTANCE), rng.uniform(*_CROWD_PITCH), rng.uniform(-_ROLL, _ROLL)
-        normal = -np.array([np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll), np.sin(pitch)])
-        plane = np.append(normal, distance * np.sin(pitch))
+        plane = _table(rng, _CROWD_DISTANCE, _CROWD_PITCH)
         bodies: list[_Placed] = []
         for _ in range(_ATTEMPTS // _VIEWS):
             drawn = _resting_body(rng, plane, _CROWD_RADIUS)[0]
@@ -157,7 +153,7 @@ def crowded_scene(rng: np.random.Generator, count: int = 6, camera: Camera = TAB
                 continue
             body = _Placed.of(drawn, rng)
             if bodies and rng.random() < _PUSHED:
-                body = _pushed(body, bodies[rng.integers(len(bodies))], normal)
+                body = _pushed(body, bodies[rng.integers(len(bodies))], plane[:3])
             if not any(map(body.overlaps, bodies)) and _inside_image(body.body, camera):
                 bodies.append(body)
             if len(bodies) == count:
@@ -209,6 +205,13 @@ def plane_depth(plane: np.ndarray, camera: Camera) -> np.ndarray:
     with np.errstate(divide="ignore", invalid="ignore"):
         depth = -(origin @ plane[:3] + plane[3]) / slope
     return np.where((slope < 0) & (depth > 0) & (depth < _FARTHEST), depth, np.inf)
+
+
+def _table(rng: np.random.Generator, distance: tuple[float, float], pitch: tuple[float, float]) -> np.ndarray:
+    """The plane (4,) of a table that the camera looks down on, at a distance along its axis."""
+    far, down, roll = rng.uniform(*distance), rng.uniform(*pitch), rng.uniform(-_ROLL, _ROLL)
+    normal = -np.array([np.cos(down) * np.sin(roll), np.cos(down) * np.cos(roll), np.sin(down)])
+    return np.append(normal, far * np.sin(down))
 
 
 def _resting_body(
