@@ -23,9 +23,7 @@ if __name__ == "__main__":  # as a script only: a process that imports this has 
         os.environ.setdefault(variable, "1")
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from functools import cache
-from itertools import product
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -33,319 +31,37 @@ import household
 import mesh_scene
 import numpy as np
 import report
-import tabletop
 import tracking
-from household import Thing
-from hull_oracle import Columns
+from gallery_figures import (
+    FAINT,
+    Found,
+    empty_figure,
+    matched,
+    panel_title,
+    recoverer,
+    scene_figure,
+    write_picture,
+)
+from gallery_scenes import Stood, bottle, can, carton, kitchen, viewed
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
-from matplotlib.figure import Figure
-from PIL import Image
-from scipy.optimize import linear_sum_assignment
 
 from sq_perception.evaluation.plots import (
-    INK,
     WIRE,
     colour,
-    draw_bodies_3d,
     draw_depth,
-    draw_masks,
     draw_outlines,
     new_figure,
-    picture_axes,
-    save,
 )
 from sq_perception.fitting.fit import Status
-from sq_perception.geometry import Superquadric
-from sq_perception.geometry import rotation as quaternions
 from sq_perception.imaging import sensor_noise
-from sq_perception.imaging.camera import Camera
-from sq_perception.imaging.scene import plane_depth
-from sq_perception.recovery import FrameRecovery, Recoverer, Recovery
+from sq_perception.recovery import FrameRecovery, Recovery
 from sq_perception.tracking.session import Followed, TrackingSession
 
-SENSORS = {"realsense_d435": "stereo, RealSense D435", "kinect_v1": "structured light, Kinect v1"}
-DOTS = 100
-COLOURS = 224
-ASPECT = 1.28
-"""Width over height of a panel with an image."""
 TRACKED = (1, 10, 30)
 TRACKED_SCENE = 2
 TRACKED_WINDOW = (70.0, 550.0, 40.0, 440.0)
 """Left, right, top, bottom of what is shown of these frames, pixels."""
 WRAPPED: dict[str, Any] = {"break_long_words": False, "break_on_hyphens": False}
-_FAINT = "#6b7885"
-_MARGIN = 30
-_BEFORE, _BEHIND = 0.05, 0.08
-_SEGMENTS = 64
-_CONTACT = 3e-4
-
-
-# Scenes
-
-
-@dataclass(frozen=True, eq=False)
-class Stood:
-    """A thing on a table: its middle there (to the right, away from the camera), metres, and its heading, degrees."""
-
-    name: str
-    thing: Thing
-    place: tuple[float, float]
-    heading: float = 0.0
-    turn: np.ndarray = field(default_factory=lambda: household.UPRIGHT)
-
-
-@dataclass(frozen=True, eq=False)
-class View:
-    """A composed scene through a sensor.
-
-    Attributes
-    ----------
-    depth, labels : (height, width)
-        As measured; true things from 1, 0 elsewhere.
-    plane : (4,)
-        The true table.
-    things
-        Name and thing, in the order of labels.
-    poses
-        Rotation (3, 3) and translation (3,), camera from thing.
-    visible
-        Share of each thing's pixels that nothing hides.
-    """
-
-    camera: Camera
-    sensor: str
-    depth: np.ndarray
-    labels: np.ndarray
-    plane: np.ndarray
-    things: tuple[Stood, ...]
-    poses: tuple[tuple[np.ndarray, np.ndarray], ...]
-    visible: np.ndarray
-
-    def hull(self, k: int) -> np.ndarray:
-        rotation, translation = self.poses[k]
-        return self.things[k].thing.hull @ rotation.T + translation
-
-
-def viewed(things: Sequence[Stood], sensor: str, down: float = 40.0, distance: float = 0.75, seed: int = 0) -> View:
-    """Things on a table whose middle is ``distance`` metres away, looked down on by ``down`` degrees.
-
-    Raises
-    ------
-    ValueError
-        If two things are in one place, as seen from above.
-    """
-    camera, angle = mesh_scene.CAMERA, np.deg2rad(down)
-    table = np.array([[1.0, 0, 0], [0, -np.sin(angle), -np.cos(angle)], [0, np.cos(angle), -np.sin(angle)]])
-    origin = np.array([0.0, 0.0, distance])
-    plane = np.append(table[:, 2], -table[:, 2] @ origin)
-    depth = plane_depth(plane, camera)
-    labels = np.zeros(depth.shape, np.int32)
-    poses, alone = [], []
-    outlines: list[np.ndarray] = []
-    for k, each in enumerate(things):
-        c, s = np.cos(np.deg2rad(each.heading)), np.sin(np.deg2rad(each.heading))
-        turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]]) @ each.turn
-        corners = each.thing.hull @ turn.T
-        low, high = corners.min(axis=0), corners.max(axis=0)
-        place = np.append(each.place, 0.0) - np.append((low + high)[:2] / 2, low[2])
-        outlines.append(tabletop.outline(corners + place))
-        if any(tabletop.gap(outlines[-1], other) < -_CONTACT for other in outlines[:-1]):
-            raise ValueError(f"{each.name}: stands where another thing is")
-        rotation, translation = table @ turn, table @ place + origin
-        vertices = each.thing.mesh.vertices @ rotation.T + translation
-        own = mesh_scene.render(vertices, np.asarray(each.thing.mesh.faces), camera)
-        nearer = own < depth
-        depth, labels = np.where(nearer, own, depth), np.where(nearer, np.int32(k + 1), labels)
-        poses.append((rotation, translation))
-        alone.append(np.isfinite(own).sum())
-    visible = np.bincount(labels.ravel(), minlength=len(things) + 1)[1:] / np.maximum(alone, 1)
-    measured = sensor_noise.preset(sensor).measured(depth, camera, np.random.default_rng(seed))
-    return View(camera, sensor, measured, labels, plane, tuple(things), tuple(poses), visible)
-
-
-def carton(width: float, depth: float, height: float) -> Thing:
-    """A box with these edges along x, y and z, millimetres, rounded by 2 mm; none need be the shortest."""
-    return household.rounded_box(np.array([width, depth, height]) / 1e3, 0.002)
-
-
-def can(diameter: float, height: float) -> Thing:
-    return household.cylinder(diameter / 1e3, height / 1e3, 0.002)
-
-
-def bottle(number: int) -> Thing:
-    return household.bottle(np.random.default_rng(number))
-
-
-def kitchen() -> tuple[Stood, ...]:
-    """Six things that hide each other."""
-    return (
-        Stood("cereal box", carton(190, 60, 270), (-0.06, 0.19), 12),
-        Stood("can", can(75, 110), (-0.11, 0.06)),
-        Stood("small box", carton(85, 60, 45), (0.0, -0.05), 35),
-        Stood("tall can", can(66, 160), (0.115, 0.09)),
-        Stood("carton", carton(70, 95, 120), (0.2, 0.2), -20),
-        Stood("lying can", can(66, 115), (-0.22, -0.06), 60, household.ON_X),
-    )
-
-
-# Pictures
-
-
-@dataclass(frozen=True, eq=False)
-class Found:
-    """A thing and its body; None where nothing was recovered of it.  ``labels`` is the frame's true label image."""
-
-    stood: Stood
-    labels: np.ndarray
-    visible: float
-    body: Recovery | None
-    iou: float
-
-
-@cache
-def recoverer() -> Recoverer:
-    return Recoverer()
-
-
-def matched(view: View, frame: FrameRecovery) -> list[Found]:
-    """Each thing with its body."""
-    iou = np.zeros((len(view.things), len(frame.recovered)))
-    for k in range(len(view.things)):
-        columns = Columns.of(view.hull(k))
-        iou[k] = [columns.iou(body.superquadric) for body in frame.recovered]
-    rows, chosen = linear_sum_assignment(-iou)
-    pairs = {k: j for k, j in zip(rows, chosen, strict=True) if iou[k, j] > 0}
-    return [
-        Found(
-            stood,
-            view.labels,
-            float(view.visible[k]),
-            frame.recovered[pairs[k]] if k in pairs else None,
-            float(iou[k, pairs[k]]) if k in pairs else 0.0,
-        )
-        for k, stood in enumerate(view.things)
-    ]
-
-
-def scene_figure(view: View, frame: FrameRecovery, azimuth: float = 35.0, elevation: float = 24.0) -> Figure:
-    """The three panels of one scene."""
-    figure = new_figure(11.8, 3.55)
-    axes = figure.subplots(1, 3, gridspec_kw={"wspace": 0.028, "width_ratios": [ASPECT, ASPECT, 1.0]})
-    figure.subplots_adjust(left=0.004, right=0.996, top=0.925, bottom=0.012)
-    bodies = [body.superquadric for body in frame.recovered]
-    shades = [colour(k) for k in range(len(bodies))]
-    window = _window(view)
-    limits = _limits(view)
-    for ax in axes[:2]:
-        draw_depth(ax, view.depth, limits)
-    draw_masks(axes[1], frame.labels, [body.label for body in frame.recovered], 0.5)
-    draw_outlines(axes[1], bodies, view.camera, shades, width=1.5)
-    for ax in axes[:2]:
-        ax.set_xlim(window[0], window[1])
-        ax.set_ylim(window[3], window[2])
-    _title(axes[0], "Depth", SENSORS[view.sensor])
-    _title(axes[1], "Own masks, recovered outlines", f"{len(bodies)} bodies" if len(bodies) != 1 else "1 body")
-    cages = [line for k in range(len(view.things)) for line in _cage(view, k)]
-    around = [_box_around(view, k) for k in range(len(view.things))]
-    draw_bodies_3d(
-        axes[2], bodies, plane=view.plane, colours=shades, elevation=elevation, azimuth=azimuth, enclosed=around
-    )
-    _draw_lines(axes[2], cages, picture_axes(elevation, azimuth, view.plane))
-    _title(axes[2], "From the right", "thin lines: the true things")
-    return figure
-
-
-def empty_figure(views: Sequence[View]) -> Figure:
-    """What each sensor makes of a table with nothing on it."""
-    figure = new_figure(11.62, 2.42)
-    axes = figure.subplots(1, len(views), gridspec_kw={"wspace": 0.025})
-    figure.subplots_adjust(left=0.004, right=0.996, top=0.9, bottom=0.012)
-    for ax, view in zip(axes, views, strict=True):
-        frame = recoverer().recover(view.depth, view.camera)
-        draw_depth(ax, view.depth)
-        draw_masks(ax, frame.labels, [body.label for body in frame.bodies])
-        missing = 100 * (1 - np.isfinite(view.depth).mean())
-        _title(ax, f"{view.sensor}: {len(frame.bodies)} bodies", f"{missing:.0f} % missing")
-    return figure
-
-
-def _window(view: View) -> tuple[float, float, float, float]:
-    """Left, right, top, bottom of the part of the image with the things, in the proportions of a panel."""
-    rows, columns = np.nonzero(view.labels)
-    low = np.array([columns.min(), rows.min()], dtype=float) - _MARGIN
-    high = np.array([columns.max(), rows.max()], dtype=float) + _MARGIN
-    half = max((high - low)[1] / 2, (high - low)[0] / 2 / ASPECT) * np.array([ASPECT, 1.0])
-    limit = np.array([view.camera.width, view.camera.height]) / 2
-    half = half * min(1.0, float((limit / half).min()))
-    middle = np.clip((low + high) / 2, half - 0.5, 2 * limit - 0.5 - half)
-    return middle[0] - half[0], middle[0] + half[0], middle[1] - half[1], middle[1] + half[1]
-
-
-def _limits(view: View) -> tuple[float, float]:
-    """Nearest and farthest depth of the scale: those of the things, and a little behind them."""
-    near, far = np.nanquantile(view.depth[view.labels > 0], (0.005, 0.995))
-    return float(near) - _BEFORE, float(far) + _BEHIND
-
-
-def _title(ax: Axes, text: str, detail: str) -> None:
-    ax.set_title(text, loc="left", fontsize=10.5, color=INK, pad=4)
-    ax.set_title(detail, loc="right", fontsize=8.5, color=_FAINT, pad=4)
-
-
-def _box_around(view: View, k: int) -> Superquadric:
-    """A thing's box in its own frame."""
-    hull, (rotation, translation) = view.things[k].thing.hull, view.poses[k]
-    low, high = hull.min(axis=0), hull.max(axis=0)
-    middle = rotation @ ((low + high) / 2) + translation
-    return Superquadric((high - low) / 2, np.full(2, 0.1), middle, quaternions.from_matrix(rotation))
-
-
-def _cage(view: View, k: int) -> list[np.ndarray]:
-    """Lines (n, 3) in the optical frame that show a thing: edges of a box, rims and sides of a body of revolution."""
-    thing = view.things[k].thing
-    rotation, translation = view.poses[k]
-    lines: list[np.ndarray] = []
-    low, high = thing.hull.min(axis=0), thing.hull.max(axis=0)
-    if thing.kind == "box":
-        corners = np.array(list(product(*zip(low, high, strict=True))))
-        lines = [corners[[i, j]] for i in range(8) for j in range(i) if np.isclose(corners[i], corners[j]).sum() == 2]
-    else:
-        vertices = np.asarray(thing.mesh.vertices)
-        radius, height = np.hypot(vertices[:, 0], vertices[:, 1]), vertices[:, 2]
-        outside = radius > 1e-6
-        order = np.unique(np.round(np.stack([height, radius], 1)[outside], 6), axis=0)
-        angle = np.linspace(0, 2 * np.pi, _SEGMENTS + 1)
-        ring = np.stack([np.cos(angle), np.sin(angle)], 1)
-        for z, r in _rims(order):
-            lines.append(np.column_stack([r * ring, np.full(len(ring), z)]))
-        for direction in ring[: -1 : _SEGMENTS // 4]:
-            lines.append(np.column_stack([order[:, 1:] * direction, order[:, 0]]))
-    return [line @ rotation.T + translation for line in lines]
-
-
-def _rims(profile: np.ndarray) -> list[tuple[float, float]]:
-    """Height and radius of the rims of a profile (n, 2) of both: below, above, and where the neck begins and ends."""
-    height, radius = profile.T
-    wide = radius > 0.99 * radius.max()
-    rims = [(height.min(), radius[wide][0]), (height[wide].max(), radius.max())]
-    if radius[-1] < 0.7 * radius.max():
-        narrow = radius < 1.01 * radius[-1]
-        rims += [(height[narrow & (height > height[wide].max())].min(), radius[-1])]
-    rims.append((height.max(), radius[height > height.max() - 1e-3].max()))
-    return [(float(z), float(r)) for z, r in rims]
-
-
-def _draw_lines(ax: Axes, lines: Sequence[np.ndarray], view: np.ndarray) -> None:
-    flat = [(line @ view.T)[:, :2] for line in lines]
-    ax.add_collection(LineCollection(flat, colors=[WIRE], linewidths=0.7, zorder=6), autolim=False)
-
-
-def write_picture(figure: Figure, path: Path) -> int:
-    """Write a figure with few colours, since noise does not compress; returns its bytes."""
-    save(figure, path, DOTS)
-    Image.open(path).convert("RGB").quantize(COLOURS, kmeans=2, dither=Image.Dither.NONE).save(path, optimize=True)
-    return path.stat().st_size
 
 
 # Tables
@@ -564,7 +280,7 @@ def tracked(path: Path) -> Entry:
         draw_outlines(ax, bodies, camera, [colour(one.id - 1) for one in followed], width=1.5)
         ax.set_xlim(TRACKED_WINDOW[0], TRACKED_WINDOW[1])
         ax.set_ylim(TRACKED_WINDOW[3], TRACKED_WINDOW[2])
-        _title(ax, f"Frame {k}", f"camera at {tracking.ARC * (k - 1) / (TRACKED[-1] - 1):.0f}°")
+        panel_title(ax, f"Frame {k}", f"camera at {tracking.ARC * (k - 1) / (TRACKED[-1] - 1):.0f}°")
     course = figure.add_subplot(grid[1])
     _draw_course(course, error[:, chosen, axis], sigma[:, chosen, axis], single[:, chosen, axis])
     write_picture(figure, path)
@@ -598,14 +314,14 @@ def _draw_course(ax: Axes, error: np.ndarray, sigma: np.ndarray, single: np.ndar
     ax.fill_between(frames, error - 2 * sigma, error + 2 * sigma, color="#2e86e4", alpha=0.15, lw=0)
     ax.fill_between(frames, error - sigma, error + sigma, color="#2e86e4", alpha=0.25, lw=0)
     ax.plot(frames, error, color="#2e86e4", lw=1.8)
-    ax.plot(frames, single, ".", color=_FAINT, ms=4)
+    ax.plot(frames, single, ".", color=FAINT, ms=4)
     ax.axhline(0, color=WIRE, lw=1.0)
     ax.set_xlim(1, len(error))
     ax.set_xticks(TRACKED)
-    ax.tick_params(labelsize=8, colors=_FAINT, length=2, pad=2)
+    ax.tick_params(labelsize=8, colors=FAINT, length=2, pad=2)
     for side in ("top", "right", "left", "bottom"):
         ax.spines[side].set_color("#cfd7de")
-    _title(ax, "Error, mm", "± 1 and ± 2 deviations")
+    panel_title(ax, "Error, mm", "± 1 and ± 2 deviations")
 
 
 ENTRIES: dict[str, Callable[[Path], Entry]] = {

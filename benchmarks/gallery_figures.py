@@ -1,0 +1,204 @@
+"""Figures of the gallery: what the sensor saw, what was recovered of each thing, and both in space.
+
+A body belongs to the thing with which the sum of all IoU is largest.  True things are thin lines, recovered bodies
+shaded; pictures are written with few colours, as noise does not compress.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+from gallery_scenes import Stood, View
+from hull_oracle import Columns
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+from PIL import Image
+from scipy.optimize import linear_sum_assignment
+
+from sq_perception.evaluation.plots import (
+    INK,
+    WIRE,
+    colour,
+    draw_bodies_3d,
+    draw_depth,
+    draw_masks,
+    draw_outlines,
+    new_figure,
+    picture_axes,
+    save,
+)
+from sq_perception.geometry import Superquadric
+from sq_perception.geometry import rotation as quaternions
+from sq_perception.recovery import FrameRecovery, Recoverer, Recovery
+
+SENSORS = {"realsense_d435": "stereo, RealSense D435", "kinect_v1": "structured light, Kinect v1"}
+DOTS = 100
+COLOURS = 224
+ASPECT = 1.28
+"""Width over height of a panel with an image."""
+FAINT = "#6b7885"
+_MARGIN = 30
+_BEFORE, _BEHIND = 0.05, 0.08
+_SEGMENTS = 64
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """A thing and its body; None where nothing was recovered of it.  ``labels`` is the frame's true label image."""
+
+    stood: Stood
+    labels: np.ndarray
+    visible: float
+    body: Recovery | None
+    iou: float
+
+
+@cache
+def recoverer() -> Recoverer:
+    return Recoverer()
+
+
+def matched(view: View, frame: FrameRecovery) -> list[Found]:
+    """Each thing with its body."""
+    iou = np.zeros((len(view.things), len(frame.recovered)))
+    for k in range(len(view.things)):
+        columns = Columns.of(view.hull(k))
+        iou[k] = [columns.iou(body.superquadric) for body in frame.recovered]
+    rows, chosen = linear_sum_assignment(-iou)
+    pairs = {k: j for k, j in zip(rows, chosen, strict=True) if iou[k, j] > 0}
+    return [
+        Found(
+            stood,
+            view.labels,
+            float(view.visible[k]),
+            frame.recovered[pairs[k]] if k in pairs else None,
+            float(iou[k, pairs[k]]) if k in pairs else 0.0,
+        )
+        for k, stood in enumerate(view.things)
+    ]
+
+
+def scene_figure(view: View, frame: FrameRecovery, azimuth: float = 35.0, elevation: float = 24.0) -> Figure:
+    """The three panels of one scene."""
+    figure = new_figure(11.8, 3.55)
+    axes = figure.subplots(1, 3, gridspec_kw={"wspace": 0.028, "width_ratios": [ASPECT, ASPECT, 1.0]})
+    figure.subplots_adjust(left=0.004, right=0.996, top=0.925, bottom=0.012)
+    bodies = [body.superquadric for body in frame.recovered]
+    shades = [colour(k) for k in range(len(bodies))]
+    window = _window(view)
+    limits = _limits(view)
+    for ax in axes[:2]:
+        draw_depth(ax, view.depth, limits)
+    draw_masks(axes[1], frame.labels, [body.label for body in frame.recovered], 0.5)
+    draw_outlines(axes[1], bodies, view.camera, shades, width=1.5)
+    for ax in axes[:2]:
+        ax.set_xlim(window[0], window[1])
+        ax.set_ylim(window[3], window[2])
+    panel_title(axes[0], "Depth", SENSORS[view.sensor])
+    panel_title(axes[1], "Own masks, recovered outlines", f"{len(bodies)} bodies" if len(bodies) != 1 else "1 body")
+    cages = [line for k in range(len(view.things)) for line in _cage(view, k)]
+    around = [_box_around(view, k) for k in range(len(view.things))]
+    draw_bodies_3d(
+        axes[2], bodies, plane=view.plane, colours=shades, elevation=elevation, azimuth=azimuth, enclosed=around
+    )
+    _draw_lines(axes[2], cages, picture_axes(elevation, azimuth, view.plane))
+    panel_title(axes[2], "From the right", "thin lines: the true things")
+    return figure
+
+
+def empty_figure(views: Sequence[View]) -> Figure:
+    """What each sensor makes of a table with nothing on it."""
+    figure = new_figure(11.62, 2.42)
+    axes = figure.subplots(1, len(views), gridspec_kw={"wspace": 0.025})
+    figure.subplots_adjust(left=0.004, right=0.996, top=0.9, bottom=0.012)
+    for ax, view in zip(axes, views, strict=True):
+        frame = recoverer().recover(view.depth, view.camera)
+        draw_depth(ax, view.depth)
+        draw_masks(ax, frame.labels, [body.label for body in frame.bodies])
+        missing = 100 * (1 - np.isfinite(view.depth).mean())
+        panel_title(ax, f"{view.sensor}: {len(frame.bodies)} bodies", f"{missing:.0f} % missing")
+    return figure
+
+
+def _window(view: View) -> tuple[float, float, float, float]:
+    """Left, right, top, bottom of the part of the image with the things, in the proportions of a panel."""
+    rows, columns = np.nonzero(view.labels)
+    low = np.array([columns.min(), rows.min()], dtype=float) - _MARGIN
+    high = np.array([columns.max(), rows.max()], dtype=float) + _MARGIN
+    half = max((high - low)[1] / 2, (high - low)[0] / 2 / ASPECT) * np.array([ASPECT, 1.0])
+    limit = np.array([view.camera.width, view.camera.height]) / 2
+    half = half * min(1.0, float((limit / half).min()))
+    middle = np.clip((low + high) / 2, half - 0.5, 2 * limit - 0.5 - half)
+    return middle[0] - half[0], middle[0] + half[0], middle[1] - half[1], middle[1] + half[1]
+
+
+def _limits(view: View) -> tuple[float, float]:
+    """Nearest and farthest depth of the scale: those of the things, and a little behind them."""
+    near, far = np.nanquantile(view.depth[view.labels > 0], (0.005, 0.995))
+    return float(near) - _BEFORE, float(far) + _BEHIND
+
+
+def panel_title(ax: Axes, text: str, detail: str) -> None:
+    ax.set_title(text, loc="left", fontsize=10.5, color=INK, pad=4)
+    ax.set_title(detail, loc="right", fontsize=8.5, color=FAINT, pad=4)
+
+
+def _box_around(view: View, k: int) -> Superquadric:
+    """A thing's box in its own frame."""
+    hull, (rotation, translation) = view.things[k].thing.hull, view.poses[k]
+    low, high = hull.min(axis=0), hull.max(axis=0)
+    middle = rotation @ ((low + high) / 2) + translation
+    return Superquadric((high - low) / 2, np.full(2, 0.1), middle, quaternions.from_matrix(rotation))
+
+
+def _cage(view: View, k: int) -> list[np.ndarray]:
+    """Lines (n, 3) in the optical frame that show a thing: edges of a box, rims and sides of a body of revolution."""
+    thing = view.things[k].thing
+    rotation, translation = view.poses[k]
+    lines: list[np.ndarray] = []
+    low, high = thing.hull.min(axis=0), thing.hull.max(axis=0)
+    if thing.kind == "box":
+        corners = np.array(list(product(*zip(low, high, strict=True))))
+        lines = [corners[[i, j]] for i in range(8) for j in range(i) if np.isclose(corners[i], corners[j]).sum() == 2]
+    else:
+        vertices = np.asarray(thing.mesh.vertices)
+        radius, height = np.hypot(vertices[:, 0], vertices[:, 1]), vertices[:, 2]
+        outside = radius > 1e-6
+        order = np.unique(np.round(np.stack([height, radius], 1)[outside], 6), axis=0)
+        angle = np.linspace(0, 2 * np.pi, _SEGMENTS + 1)
+        ring = np.stack([np.cos(angle), np.sin(angle)], 1)
+        for z, r in _rims(order):
+            lines.append(np.column_stack([r * ring, np.full(len(ring), z)]))
+        for direction in ring[: -1 : _SEGMENTS // 4]:
+            lines.append(np.column_stack([order[:, 1:] * direction, order[:, 0]]))
+    return [line @ rotation.T + translation for line in lines]
+
+
+def _rims(profile: np.ndarray) -> list[tuple[float, float]]:
+    """Height and radius of the rims of a profile (n, 2) of both: below, above, and where the neck begins and ends."""
+    height, radius = profile.T
+    wide = radius > 0.99 * radius.max()
+    rims = [(height.min(), radius[wide][0]), (height[wide].max(), radius.max())]
+    if radius[-1] < 0.7 * radius.max():
+        narrow = radius < 1.01 * radius[-1]
+        rims += [(height[narrow & (height > height[wide].max())].min(), radius[-1])]
+    rims.append((height.max(), radius[height > height.max() - 1e-3].max()))
+    return [(float(z), float(r)) for z, r in rims]
+
+
+def _draw_lines(ax: Axes, lines: Sequence[np.ndarray], view: np.ndarray) -> None:
+    flat = [(line @ view.T)[:, :2] for line in lines]
+    ax.add_collection(LineCollection(flat, colors=[WIRE], linewidths=0.7, zorder=6), autolim=False)
+
+
+def write_picture(figure: Figure, path: Path) -> int:
+    """Write a figure with few colours, since noise does not compress; returns its bytes."""
+    save(figure, path, DOTS)
+    Image.open(path).convert("RGB").quantize(COLOURS, kmeans=2, dither=Image.Dither.NONE).save(path, optimize=True)
+    return path.stat().st_size

@@ -1,0 +1,128 @@
+"""Scenes of the gallery: household things at given places on a table, seen by one simulated sensor.
+
+A thing stands with its middle at (right, away) of the table's origin, metres, turned by a heading, degrees; optical
+frame for whatever the camera sees.  :mod:`tabletop` draws its scenes at random,
+these are composed to show something.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import household
+import mesh_scene
+import numpy as np
+import tabletop
+from household import Thing
+
+from sq_perception.imaging import sensor_noise
+from sq_perception.imaging.camera import Camera
+from sq_perception.imaging.scene import plane_depth
+
+_CONTACT = 3e-4
+
+
+@dataclass(frozen=True, eq=False)
+class Stood:
+    """A thing on a table: its middle there (to the right, away from the camera), metres, and its heading, degrees."""
+
+    name: str
+    thing: Thing
+    place: tuple[float, float]
+    heading: float = 0.0
+    turn: np.ndarray = field(default_factory=lambda: household.UPRIGHT)
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A composed scene through a sensor.
+
+    Attributes
+    ----------
+    depth, labels : (height, width)
+        As measured; true things from 1, 0 elsewhere.
+    plane : (4,)
+        The true table.
+    things
+        Name and thing, in the order of labels.
+    poses
+        Rotation (3, 3) and translation (3,), camera from thing.
+    visible
+        Share of each thing's pixels that nothing hides.
+    """
+
+    camera: Camera
+    sensor: str
+    depth: np.ndarray
+    labels: np.ndarray
+    plane: np.ndarray
+    things: tuple[Stood, ...]
+    poses: tuple[tuple[np.ndarray, np.ndarray], ...]
+    visible: np.ndarray
+
+    def hull(self, k: int) -> np.ndarray:
+        rotation, translation = self.poses[k]
+        return self.things[k].thing.hull @ rotation.T + translation
+
+
+def viewed(things: Sequence[Stood], sensor: str, down: float = 40.0, distance: float = 0.75, seed: int = 0) -> View:
+    """Things on a table whose middle is ``distance`` metres away, looked down on by ``down`` degrees.
+
+    Raises
+    ------
+    ValueError
+        If two things are in one place, as seen from above.
+    """
+    camera, angle = mesh_scene.CAMERA, np.deg2rad(down)
+    table = np.array([[1.0, 0, 0], [0, -np.sin(angle), -np.cos(angle)], [0, np.cos(angle), -np.sin(angle)]])
+    origin = np.array([0.0, 0.0, distance])
+    plane = np.append(table[:, 2], -table[:, 2] @ origin)
+    depth = plane_depth(plane, camera)
+    labels = np.zeros(depth.shape, np.int32)
+    poses, alone = [], []
+    outlines: list[np.ndarray] = []
+    for k, each in enumerate(things):
+        c, s = np.cos(np.deg2rad(each.heading)), np.sin(np.deg2rad(each.heading))
+        turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]]) @ each.turn
+        corners = each.thing.hull @ turn.T
+        low, high = corners.min(axis=0), corners.max(axis=0)
+        place = np.append(each.place, 0.0) - np.append((low + high)[:2] / 2, low[2])
+        outlines.append(tabletop.outline(corners + place))
+        if any(tabletop.gap(outlines[-1], other) < -_CONTACT for other in outlines[:-1]):
+            raise ValueError(f"{each.name}: stands where another thing is")
+        rotation, translation = table @ turn, table @ place + origin
+        vertices = each.thing.mesh.vertices @ rotation.T + translation
+        own = mesh_scene.render(vertices, np.asarray(each.thing.mesh.faces), camera)
+        nearer = own < depth
+        depth, labels = np.where(nearer, own, depth), np.where(nearer, np.int32(k + 1), labels)
+        poses.append((rotation, translation))
+        alone.append(np.isfinite(own).sum())
+    visible = np.bincount(labels.ravel(), minlength=len(things) + 1)[1:] / np.maximum(alone, 1)
+    measured = sensor_noise.preset(sensor).measured(depth, camera, np.random.default_rng(seed))
+    return View(camera, sensor, measured, labels, plane, tuple(things), tuple(poses), visible)
+
+
+def carton(width: float, depth: float, height: float) -> Thing:
+    """A box with these edges along x, y and z, millimetres, rounded by 2 mm; none need be the shortest."""
+    return household.rounded_box(np.array([width, depth, height]) / 1e3, 0.002)
+
+
+def can(diameter: float, height: float) -> Thing:
+    return household.cylinder(diameter / 1e3, height / 1e3, 0.002)
+
+
+def bottle(number: int) -> Thing:
+    return household.bottle(np.random.default_rng(number))
+
+
+def kitchen() -> tuple[Stood, ...]:
+    """Six things that hide each other."""
+    return (
+        Stood("cereal box", carton(190, 60, 270), (-0.06, 0.19), 12),
+        Stood("can", can(75, 110), (-0.11, 0.06)),
+        Stood("small box", carton(85, 60, 45), (0.0, -0.05), 35),
+        Stood("tall can", can(66, 160), (0.115, 0.09)),
+        Stood("carton", carton(70, 95, 120), (0.2, 0.2), -20),
+        Stood("lying can", can(66, 115), (-0.22, -0.06), 60, household.ON_X),
+    )
