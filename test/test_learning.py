@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -258,5 +259,29 @@ class TestCheckpoint:
             checkpoint.load(path)
         cut = path.read_bytes()[:-100]
         path.write_bytes(cut)
-        with pytest.raises(checkpoint.CheckpointError, match="not a readable safetensors"):
+        for reads in (checkpoint.load, checkpoint.check):
+            with pytest.raises(checkpoint.CheckpointError, match="not a readable safetensors"):
+                reads(path)
+        checkpoint.save(path, Regressor(SMALL))
+        checkpoint.check(path)
+
+    def test_the_length_of_a_header_is_believed_only_where_the_file_is_as_long(self, tmp_path: Path) -> None:
+        path = tmp_path / "m.safetensors"
+        for length in (0, 2**20 + 1, 2**40, 2**64 - 1):
+            path.write_bytes(struct.pack("<Q", length) + b"{}")
+            for reads in (checkpoint.load, checkpoint.check, checkpoint.read_header):
+                with pytest.raises(checkpoint.CheckpointError, match="not a readable safetensors"):
+                    reads(path)
+        with path.open("wb") as file:
+            file.truncate(2**34)  # a hole, no bytes
+        with pytest.raises(checkpoint.CheckpointError, match="expected at most"):
             checkpoint.load(path)
+
+    def test_a_file_that_is_overwritten_leaves_the_network_as_it_was(self, tmp_path: Path) -> None:
+        path, views = tmp_path / "m.safetensors", np.random.default_rng(8).random((2, 32, 32))
+        checkpoint.save(path, Regressor(SMALL))
+        model = checkpoint.load(path)
+        before = model.predict(views).to_flat()
+        with path.open("r+b") as file:
+            file.truncate(100)
+        np.testing.assert_array_equal(model.predict(views).to_flat(), before)

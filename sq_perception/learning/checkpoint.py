@@ -3,18 +3,27 @@
 The header (strings, as the format demands) holds ``format`` and its version, the network's ``config`` and whatever the
 training noted (``training``, ``metrics``: JSON).  Reading executes nothing, and every name and shape must fit.
 Half precision on disk halves the file; networks compute in single precision.
+
+A file is taken in as a whole and never mapped: one that is cut short or replaced while it is read, or afterwards, is
+an error or another network, and no fault of memory that ends the process.  Nothing is allocated on the word of a
+header: the file's own length bounds it, and that is looked at first.
+
+Reference: the safetensors format, https://huggingface.co/docs/safetensors: 8 bytes little endian, length of the header;
+the header, JSON; the tensors, as one block that the header's offsets cover without gap or overlap.
 """
 
 from __future__ import annotations
 
 import json
+import struct
 from dataclasses import asdict
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
+from safetensors.torch import load as tensors_of
 from safetensors.torch import save_file
 
 from sq_perception.learning.regressor import Regressor, RegressorConfig
@@ -24,6 +33,9 @@ VERSION = "1"
 DEFAULT = "robust"
 """Name of the weights that are used where none are named."""
 _MAX_PARAMETERS = 200_000_000
+_MAX_BYTES = 4 * _MAX_PARAMETERS + 2**20
+_MAX_HEADER_BYTES = 2**20
+_LENGTH = struct.Struct("<Q")
 _MAX_BLOCKS = 64
 _MAX_PIXELS = 1024
 
@@ -72,15 +84,12 @@ def load(path: Path | str | None = None, device: str | torch.device = "cpu") -> 
         If the file is missing, no safetensors file, of another format or version, or does not fit its own config.
     """
     path = resolve(path)
-    header, state = _read(path)
-    if header.get("format") != FORMAT:
-        raise CheckpointError(f"{path}: expected a header 'format: {FORMAT}', got {header.get('format')!r}")
-    if header.get("version") != VERSION:
-        raise CheckpointError(f"{path}: expected format version {VERSION}, got {header.get('version')!r}")
+    data, _ = _bytes(path)
+    model = _described(path, _strings(path, data, len(data)))
     try:
-        model = _network(_config(json.loads(header["config"])))
-    except (KeyError, TypeError, ValueError, RuntimeError, ArithmeticError, AttributeError) as error:
-        raise CheckpointError(f"{path}: the header's config describes no network: {error}") from error
+        state = tensors_of(data)
+    except (SafetensorError, ValueError, KeyError) as error:
+        raise CheckpointError(f"{path}: not a readable safetensors file: {error}") from error
     try:
         model.load_state_dict(
             {name: t.to(torch.float32 if t.is_floating_point() else t.dtype, copy=True) for name, t in state.items()},
@@ -93,21 +102,76 @@ def load(path: Path | str | None = None, device: str | torch.device = "cpu") -> 
     return model.to(device).eval()
 
 
-def read_header(path: Path | str) -> dict[str, str]:
-    """The header alone; raises CheckpointError as :func:`load` does."""
-    return _read(resolve(path), tensors=False)[0]
+def read_header(path: Path | str | None = None) -> dict[str, str]:
+    """The header's strings alone; raises CheckpointError as :func:`load` does, but looks at no weights."""
+    path = resolve(path)
+    data, size = _bytes(path, header_only=True)
+    return _strings(path, data, size)
 
 
-def _read(path: Path, tensors: bool = True) -> tuple[dict[str, str], dict[str, torch.Tensor]]:
+def check(path: Path | str | None = None) -> None:
+    """Raise CheckpointError where a look at the header is enough to tell that :func:`load` would.
+
+    Reads a megabyte at most, whatever the file.
+    """
+    path = resolve(path)
+    _described(path, read_header(path))
+
+
+def _bytes(path: Path, header_only: bool = False) -> tuple[bytes, int]:
+    """What the file holds, or no more than its header, and how many bytes it has."""
     if not path.is_file():
         raise CheckpointError(f"{path}: no such model file")
     try:
-        with safe_open(str(path), framework="pt", device="cpu") as file:
-            header = file.metadata() or {}
-            state = {name: file.get_tensor(name) for name in file.keys()} if tensors else {}  # noqa: SIM118
-    except (SafetensorError, OSError) as error:
+        with path.open("rb") as file:
+            size = path.stat().st_size
+            if size > _MAX_BYTES:
+                raise CheckpointError(f"{path}: expected at most {_MAX_BYTES} bytes, got {size}")
+            start = file.read(_LENGTH.size)
+            length = _LENGTH.unpack(start)[0] if len(start) == _LENGTH.size else 0
+            if not 0 < length <= min(_MAX_HEADER_BYTES, size - _LENGTH.size):
+                raise CheckpointError(
+                    f"{path}: not a readable safetensors file: a header of {length} bytes in a file of {size}"
+                )
+            return start + file.read(length if header_only else size - _LENGTH.size), size
+    except OSError as error:
+        raise CheckpointError(f"{path}: cannot be read: {error}") from error
+
+
+def _strings(path: Path, data: bytes, size: int) -> dict[str, str]:
+    """The header's strings; ``size`` bytes must be what its tensors cover."""
+    length = _LENGTH.unpack_from(data)[0]
+    try:
+        header = json.loads(data[_LENGTH.size : _LENGTH.size + length])
+        strings = header.pop("__metadata__", None) or {}
+        end = max((int(one["data_offsets"][1]) for one in header.values()), default=0)
+        strings = {str(key): str(value) for key, value in strings.items()}
+    except (ValueError, TypeError, KeyError, IndexError, AttributeError, RecursionError) as error:
         raise CheckpointError(f"{path}: not a readable safetensors file: {error}") from error
-    return header, state
+    if _LENGTH.size + length + end != size:
+        raise CheckpointError(
+            f"{path}: not a readable safetensors file: its header tells of {_LENGTH.size + length + end} bytes, "
+            f"the file has {size}"
+        )
+    return strings
+
+
+def _described(path: Path, header: dict[str, str]) -> Regressor:
+    """The network that a header describes, without weights.
+
+    Raises
+    ------
+    CheckpointError
+        If it describes none.
+    """
+    if header.get("format") != FORMAT:
+        raise CheckpointError(f"{path}: expected a header 'format: {FORMAT}', got {header.get('format')!r}")
+    if header.get("version") != VERSION:
+        raise CheckpointError(f"{path}: expected format version {VERSION}, got {header.get('version')!r}")
+    try:
+        return _network(_config(json.loads(header["config"])))
+    except (KeyError, TypeError, ValueError, RuntimeError, ArithmeticError, AttributeError, RecursionError) as error:
+        raise CheckpointError(f"{path}: the header's config describes no network: {error}") from error
 
 
 def _config(values: dict[str, Any]) -> RegressorConfig:
