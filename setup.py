@@ -6,7 +6,7 @@ from glob import glob
 from setuptools import setup
 
 NAME = "sq_perception"
-NODES = ("recover_node", "fitter_node", "synthetic_depth_node")
+NODES = ("recover_node", "recover_cameras", "fitter_node", "synthetic_depth_node")
 
 share = [
     ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),

@@ -212,21 +212,31 @@ class Recoverer:
     method
         What :meth:`recover` does unless its options say otherwise.  "symmetry" and "classic" load no network; if a
         later call asks for one, it is loaded then.
+    threads
+        How many objects of a frame are worked on at the same time; None: as many as this process has cores.
 
     Raises
     ------
     CheckpointError
         If the method needs the network and the file is missing or wrong.
     ValueError
-        For an unknown method, or a device that this machine does not have.
+        For an unknown method, a device that this machine does not have, or less than one thread.
     """
 
     def __init__(
-        self, model: Path | str | None = None, device: str = "cpu", method: Method = "auto", consensus: bool = False
+        self,
+        model: Path | str | None = None,
+        device: str = "cpu",
+        method: Method = "auto",
+        consensus: bool = False,
+        threads: int | None = None,
     ) -> None:
+        if threads is not None and threads < 1:
+            raise ValueError(f"threads: expected at least 1, got {threads}")
+        self._threads = threads or len(os.sched_getaffinity(0))
         self._options = RecoveryOptions(method=method)
         self._path = model
-        self._device = _checked_device(device)
+        self._device = checked_device(device)
         self._consensus = consensus
         self._network: inference.Predictor | None = None
         self._lock = threading.Lock()
@@ -297,7 +307,7 @@ class Recoverer:
             objects = seen_object.objects(depth, found, camera, options.depth_range)
 
         with _timed(milliseconds, "network"):
-            _mapped(lambda one: _view(one, depth, camera, found, options, network), objects)
+            _mapped(lambda one: _view(one, depth, camera, found, options, network), objects, self._threads)
             if network is not None and objects:
                 views = np.stack([one.shown.marked for one in objects if one.shown is not None])
                 predictions: Future[Superquadric] = Future()
@@ -310,13 +320,13 @@ class Recoverer:
 
         with _timed(milliseconds, "fit"):
             deadline = started + options.time_budget
-            fits = _mapped(lambda one: _fitted(one, depth, camera, options, deadline), objects)
+            fits = _mapped(lambda one: _fitted(one, depth, camera, options, deadline), objects, self._threads)
         with _timed(milliseconds, "repair"):
             if labels is None and options.repair and options.method in _FITTED and options.refine == "surface":
                 found, objects, fits = _repaired(found, objects, fits, depth, camera, options, deadline)
         with _timed(milliseconds, "score"):
             pairs = list(zip(objects, fits, strict=True))
-            scores = _mapped(lambda pair: _score(pair[0].view, pair[1].superquadric, options), pairs)
+            scores = _mapped(lambda pair: _score(pair[0].view, pair[1].superquadric, options), pairs, self._threads)
         bodies = tuple(_recovery(one, fit, score) for one, fit, score in zip(objects, fits, scores, strict=True))
         milliseconds["total"] = 1e3 * (time.perf_counter() - started)
         message = "" if bodies else _why_empty(depth, found)
@@ -345,13 +355,23 @@ def render_recovery(frame: FrameRecovery, camera: Camera) -> tuple[np.ndarray, n
     return depth, np.append(np.array(shown, dtype=np.int32), np.int32(-1))[index]
 
 
-def _checked_device(device: str) -> str:
+def checked_device(device: str) -> str:
+    """The name of a torch device that is there.
+
+    Raises
+    ------
+    ValueError
+        If torch does not know the name or sees no such device.
+    """
     try:
         kind = torch.device(device).type
     except RuntimeError as error:
         raise ValueError(f"device: {error}") from error
-    if kind == "cuda" and not torch.cuda.is_available():
-        raise ValueError(f"device: {device!r} was asked for, but torch sees no CUDA device here")
+    if kind not in ("cpu", "cuda"):
+        raise ValueError(f"device: expected cpu, cuda or cuda:N, got {device!r}")
+    if kind == "cuda" and (torch.device(device).index or 0) >= torch.cuda.device_count():
+        count = torch.cuda.device_count()
+        raise ValueError(f"device: {device!r} was asked for, but torch sees {count} CUDA devices here")
     return device
 
 
@@ -364,8 +384,8 @@ def _cleaned(depth: np.ndarray, camera: Camera) -> np.ndarray:
     return np.where(bad, np.float32(np.nan), depth)
 
 
-def _mapped(function: Callable[[_Item], _Answer], items: Sequence[_Item]) -> list[_Answer]:
-    workers = min(len(items), os.cpu_count() or 1)
+def _mapped(function: Callable[[_Item], _Answer], items: Sequence[_Item], threads: int) -> list[_Answer]:
+    workers = min(len(items), threads)
     if workers < 2:
         return [function(one) for one in items]
     with ThreadPoolExecutor(workers, thread_name_prefix="fit") as pool:

@@ -301,7 +301,9 @@ def test_parameters_change_from_another_process(recover_node, client):
         ("s", "high", "s: expected"),
         ("tau", 0, "tau: expected 0.1 to 100"),
         ("refine", "perhaps", "surface, soft_render, none"),
-        ("model", "other.safetensors", "read-only"),
+        ("model", "other.safetensors", "no such model file"),
+        ("device", "cuda:77", "device"),
+        ("projection", "orthographic", "lifecycle set /recover_node deactivate"),
         ("max_objects", 0, "max_objects"),
         ("nonsense", 1, "undeclared"),
     ):
@@ -313,7 +315,7 @@ def test_parameters_change_from_another_process(recover_node, client):
     assert again.score[0] == pytest.approx(before.score[0], abs=1e-3)
     request = DescribeParameters.Request(names=["s", "model"])
     s, model = client.call(recover_node, DescribeParameters, "describe_parameters", request).descriptors
-    assert (s.floating_point_range[0].to_value, s.read_only, model.read_only) == (1000.0, False, True)
+    assert (s.floating_point_range[0].to_value, s.read_only, model.read_only) == (1000.0, False, False)
 
 
 def test_publishers_come_and_go(recover_node, client, start):

@@ -37,6 +37,7 @@ from sq_perception.fitting.fit import Status
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
+from sq_perception.nodes.engine import Workshop
 from sq_perception.nodes.frame_node import FrameNode
 from sq_perception.nodes.parameters import RecoverParameters
 from sq_perception.nodes.recover_node import _options
@@ -80,7 +81,8 @@ class Bench:
         self.context = Context()
         self.context.init(args=["--ros-args", *arguments])
         self.recoverer = Recoverer()
-        self.node = FrameNode("recover_node", RecoverParameters, lambda _: self.recoverer, _options, self.context)
+        workshop = Workshop(make=lambda _: self.recoverer, options=_options)
+        self.node = FrameNode("recover_node", RecoverParameters, workshop, context=self.context)
         self.peer = Node("peer", context=self.context)
         self.images = self.peer.create_publisher(Image, "depth/image", 5)
         self.infos = self.peer.create_publisher(CameraInfo, "depth/camera_info", 5)

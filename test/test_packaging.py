@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-NODES = ("recover_node", "fitter_node", "synthetic_depth_node")
+NODES = ("recover_node", "recover_cameras", "fitter_node", "synthetic_depth_node")
 PACKAGE = "sq_perception"
 
 
@@ -109,8 +109,9 @@ def test_the_found_executable_starts_the_node(prefix: Path, node: str, tmp_path:
     (site,) = prefix.glob("lib/python3*/site-packages")
     python_path = os.pathsep.join([str(site), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
     bad = "rate:=-1.0" if node == "synthetic_depth_node" else "max_objects:=0"
+    cameras = ["front", "wrist"] if node == "recover_cameras" else []
     result = subprocess.run(
-        [path, "--ros-args", "-p", bad],
+        [path, *cameras, "--ros-args", "-p", bad],
         cwd=tmp_path,
         env={**os.environ, "PYTHONPATH": python_path},
         capture_output=True,

@@ -15,6 +15,7 @@ from rclpy.context import Context
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from sq_perception.nodes import parameter_reference
 from sq_perception.nodes.parameters import (
     FitterParameters,
     LiveParameters,
@@ -67,6 +68,13 @@ def test_the_shipped_file_holds_every_parameter_with_its_default(name, repositor
     assert content == {"/**": {"ros__parameters": as_ros(KINDS[name]())}}
 
 
+def test_the_reference_is_what_the_generator_writes(repository):
+    assert (repository / parameter_reference.PAGE).read_text(encoding="utf-8") == parameter_reference.page()
+    for name in KINDS:
+        written = (repository / "config" / f"{name}.yaml").read_text(encoding="utf-8")
+        assert written == parameter_reference.yaml_text(name), f"run {parameter_reference.COMMAND}"
+
+
 @pytest.mark.parametrize("kind", KINDS.values())
 def test_every_parameter_explains_itself_and_accepts_its_default(kind):
     for one in fields(kind):
@@ -74,6 +82,7 @@ def test_every_parameter_explains_itself_and_accepts_its_default(kind):
         assert descriptor.name == one.name
         assert len(descriptor.description) > 10
         assert descriptor.read_only != one.metadata["live"]
+        assert not describe(one, is_fixed=False).read_only
         assert checked(one, one.default) == one.default
         if one.metadata["within"]:
             low, high = one.metadata["within"]
@@ -115,7 +124,6 @@ def test_changes_arrive_as_a_whole_and_integers_pass_as_floats(make_node):
         ({"refine": "maybe"}, "surface, soft_render, none"),
         ({"max_objects": 0}, "out of range"),
         ({"depth_max": 0.5, "depth_min": 0.6}, "depth_min < depth_max"),
-        ({"model": "other"}, "read-only"),
         ({"projection": "orthographic"}, "read-only"),
         ({"marker_alpha": 2}, "0 to 1"),
         ({"s": 5.0, "tau": -1}, "tau"),
@@ -150,3 +158,32 @@ def test_a_refused_change_changes_nothing_and_says_why(make_node, changes, words
 def test_a_bad_start_is_refused_with_a_reason(make_node, kind, overrides, words):
     with pytest.raises(ParameterError, match=words):
         LiveParameters(make_node(**overrides), kind)
+
+
+def test_what_is_not_live_changes_while_it_is_not_locked(make_node):
+    node, reason = make_node(), [""]
+    live = LiveParameters(node, RecoverParameters, locked=lambda: reason[0])
+    assert node.set_parameters([Parameter("projection", value="orthographic")])[0].successful
+    reason[0] = "is read when the node is configured"
+    refused = node.set_parameters([Parameter("projection", value="pinhole")])[0]
+    assert (refused.successful, refused.reason) == (False, "projection: is read when the node is configured")
+    assert node.set_parameters([Parameter("s", value=3)])[0].successful
+    assert (live.current.projection, live.current.s) == ("orthographic", 3.0)
+
+
+def test_a_judge_may_refuse_and_a_listener_hears_what_was_set(make_node):
+    heard = []
+
+    def judge(candidate, names):
+        if "model" in names and candidate.model == "bad":
+            raise ValueError("model: no such file")
+
+    node = make_node()
+    live = LiveParameters(node, RecoverParameters, judge=judge, changed=lambda new, names: heard.append((new, names)))
+    refused = node.set_parameters_atomically([Parameter("model", value="bad"), Parameter("s", value=3.0)])
+    assert (refused.successful, refused.reason) == (False, "model: no such file")
+    assert (live.current, heard) == (RecoverParameters(), [])
+    assert node.set_parameters_atomically([Parameter("model", value="good"), Parameter("s", value=3.0)]).successful
+    assert heard == [(live.current, frozenset({"model", "s"}))]
+    assert node.set_parameters([Parameter("use_sim_time", value=False)])[0].successful
+    assert len(heard) == 1

@@ -20,7 +20,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from types import FrameType, TracebackType
 
-NODES = ("recover_node", "fitter_node", "synthetic_depth_node")
+NODES = ("recover_node", "recover_cameras", "fitter_node", "synthetic_depth_node")
 
 _KEPT_LINES = 40
 _ROOT = str(Path(__file__).resolve().parent.parent.parent)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING
 from sq_perception.nodes import process
 
 if TYPE_CHECKING:
+    from sq_perception.nodes.engine import Workshop
     from sq_perception.nodes.frame_node import FrameNode
     from sq_perception.nodes.parameters import FitterParameters
     from sq_perception.recovery import Recoverer, RecoveryOptions
@@ -16,17 +17,26 @@ if TYPE_CHECKING:
 NAME = "fitter_node"
 
 
-def create() -> FrameNode:
+def create(namespace: str | None = None) -> FrameNode:
     """The node; imported here, as torch takes seconds to import and Ctrl-C must be heard meanwhile."""
     from sq_perception.nodes.frame_node import FrameNode
     from sq_perception.nodes.parameters import FitterParameters
 
-    return FrameNode(NAME, FitterParameters, _recoverer, _options)
+    return FrameNode(NAME, FitterParameters, workshop(), namespace=namespace)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point; the exit code."""
-    return process.run(NAME, create, arguments)
+    return process.run(NAME, lambda: [create()], arguments)
+
+
+def workshop() -> Workshop[FitterParameters]:
+    """How the node's recoverer is made."""
+    from sq_perception.nodes.engine import Workshop
+
+    return Workshop(
+        make=_recoverer, options=_options, key=lambda _: "classic", describe=lambda _: "method classic, no network"
+    )
 
 
 def _recoverer(parameters: FitterParameters) -> Recoverer:

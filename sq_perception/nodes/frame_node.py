@@ -8,9 +8,12 @@
 | `~/superquadrics` | sensor_msgs/PointCloud2 | out: one point per body, see sq_msgs_py.superquadrics |
 | `~/markers` | visualization_msgs/MarkerArray | out, while somebody listens |
 | `~/rendered_depth` | sensor_msgs/Image | out, while somebody listens; in the encoding of the input |
-| `/diagnostics` | diagnostic_msgs/DiagnosticArray | out, once per second |
+| `/diagnostics` | diagnostic_msgs/DiagnosticArray | out, once per second, in every state |
 | `~/enable` | std_srvs/SetBool | drop all frames, or process them again |
 | `~/trigger` | std_srvs/Trigger | process the next frame, also while disabled, and answer with a summary |
+
+A lifecycle node (:mod:`sq_perception.nodes.managed_node`): configuring loads the network and warms up, activating
+subscribes, deactivating ends the subscriptions after the frame at hand, cleaning up frees the network's memory.
 
 The executor's thread only stores messages; one worker thread takes the newest and does the work, so that services and
 parameters answer at once.  Stamp and frame of the input are copied to every output.  Bodies are followed from frame to
@@ -20,6 +23,7 @@ are in the cube frame of :mod:`sq_perception.imaging.unit_cube`, those of others
 
 from __future__ import annotations
 
+import gc
 import threading
 import traceback
 from collections.abc import Callable
@@ -32,7 +36,6 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
-from rclpy.task import Future
 from rclpy.time import Time
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from std_srvs.srv import SetBool, Trigger
@@ -44,103 +47,153 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.nodes import report, results
 from sq_perception.nodes.camera_poses import CameraPoses
 from sq_perception.nodes.counters import Statistics, Throttle
+from sq_perception.nodes.engine import TURNS, Engine, Workshop
 from sq_perception.nodes.frame import Frame, decode
 from sq_perception.nodes.identity import Identified, Identity
 from sq_perception.nodes.inbox import Arrival, Inbox, Refused
+from sq_perception.nodes.managed_node import ManagedNode
 from sq_perception.nodes.parameters import FrameParameters, LiveParameters
-from sq_perception.nodes.stoppable_node import StoppableNode
-from sq_perception.recovery import Recoverer, RecoveryOptions, render_recovery
+from sq_perception.nodes.triggers import Outcome, Triggers
+from sq_perception.recovery import FrameRecovery, render_recovery
 
 WARM_UP_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
-_COMPANION_PATIENCE = 0.25
-"""Seconds to wait for the camera_info or the mask of a frame that is already here."""
-_WORKER_END = 10.0
-
-Outcome = tuple[bool, str]
-"""Whether a frame was answered, and the summary or the reason."""
+_WORKER_END = 3.0
+"""Seconds that a deactivation waits for the frame at hand."""
+_DEFECTS = 10
+"""Frames in a row that end in a defect of ours or of the device, after which the node starts anew."""
 
 
-class FrameNode(StoppableNode):
+class FrameNode(ManagedNode):
     """See the module.
 
     Parameters
     ----------
-    name
+    name, namespace
         Of the node.
     kind
         The dataclass of its parameters.
-    make_recoverer, options
-        What does the work, and how it is told what the parameters say.
+    workshop
+        What makes the recoverer that does the work, and tells it what the parameters say.
     context
         rclpy's default if not given.
 
     Raises
     ------
     ParameterError
-        For a parameter that cannot be used.
-    CheckpointError
-        For a model file that is missing or wrong.
+        For a parameter that cannot be used.  A model that is missing or wrong is a fault of the configuration, as it is
+        read there.
     """
 
     def __init__(
         self,
         name: str,
         kind: type[Any],
-        make_recoverer: Callable[[Any], Recoverer],
-        options: Callable[[Any], RecoveryOptions],
+        workshop: Workshop[Any],
+        *,
+        namespace: str | None = None,
         context: Any = None,
     ) -> None:
-        super().__init__(name, context=context)
-        self._settings: LiveParameters[Any] = LiveParameters(self, kind)
-        self._recoverer = make_recoverer(self._settings.current)
-        self._options = options
+        super().__init__(name, namespace=namespace, context=context)
+        self._engine: Engine[Any] = Engine(workshop, self._inform, self._complain)
+        self._settings: LiveParameters[Any] = LiveParameters(
+            self, kind, locked=self._why_locked, judge=workshop.judge, changed=self._on_changed
+        )
         self._statistics = Statistics()
         self._throttle = Throttle()
-        self._inbox = Inbox()
         self._enabled = True
-        self._triggers: list[tuple[float, Future]] = []
-        self._triggers_lock = threading.Lock()
+        self._triggers = Triggers(self)
         self._shown_ids: list[int] = []
-        fixed_frame = self._settings.current.fixed_frame
-        poses = CameraPoses(self, fixed_frame) if fixed_frame else None
-        self._identity = Identity(poses, self._warn, self.get_logger().info)
+        self._defects = 0
+        self._inbox: Inbox | None = None
+        self._worker: threading.Thread | None = None
+        self._image_input: Subscription | None = None
         self._last_image = monotonic()
-        self._last_level_counts = self._statistics.snapshot()
-        self._warm_up()
-        self._connect()
-        self._worker = threading.Thread(target=self._work, name="worker", daemon=True)
-        self._worker.start()
-        self.get_logger().info(f"ready, listening to {self._image_input.topic_name}")
-
-    def close(self) -> None:
-        """Stop the worker; the frame at hand is finished first."""
-        self._inbox.close()
-        self._worker.join(_WORKER_END)
-
-    # Wiring
-
-    def _warm_up(self) -> None:
-        started = perf_counter()
-        self.get_logger().info("warming up: loading compiled code, or compiling it on the first start")
-        orthographic = self._settings.current.projection == "orthographic"
-        camera = unit_cube.camera() if orthographic else WARM_UP_CAMERA
-        self._recoverer.warm_up(camera)
-        self.get_logger().info(f"warm after {perf_counter() - started:.1f} s")
-
-    def _connect(self) -> None:
-        pinhole = self._settings.current.projection == "pinhole"
-        # Subscriptions are served in this order: what an image needs is there before the image.
-        self._info_input = self._listen(CameraInfo, "depth/camera_info", self._inbox.put_info) if pinhole else None
-        self._mask_input = self._listen(Image, "mask/image", self._inbox.put_mask)
-        self._image_input = self._listen(Image, "depth/image", self._on_image)
-        self._superquadrics = self.create_publisher(PointCloud2, "~/superquadrics", 10)
-        self._markers = self.create_publisher(MarkerArray, "~/markers", 1)
-        self._rendered = self.create_publisher(Image, "~/rendered_depth", 1)
+        self._last_counts = self._statistics.snapshot()
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.create_service(SetBool, "~/enable", self._on_enable)
         # Its answer waits for a frame; in the default group nothing else would run meanwhile.
         self.create_service(Trigger, "~/trigger", self._on_trigger, callback_group=ReentrantCallbackGroup())
         self.create_timer(1.0, self._on_second)
+        if self._settings.current.autostart:
+            self.start()
+
+    # The lifecycle
+
+    def _configure(self) -> None:
+        parameters = self._settings.current
+        started = perf_counter()
+        self.get_logger().info("warming up: loading compiled code, or compiling it on the first start")
+        self._engine.build(parameters, self._warm_up_camera)
+        self.get_logger().info(f"warm after {perf_counter() - started:.1f} s")
+        poses = CameraPoses(self, parameters.fixed_frame) if parameters.fixed_frame else None
+        self._identity = Identity(poses, self._warn, self._inform)
+        self._superquadrics = self.create_publisher(PointCloud2, "~/superquadrics", 10)
+        self._markers = self.create_publisher(MarkerArray, "~/markers", 1)
+        self._rendered = self.create_publisher(Image, "~/rendered_depth", 1)
+
+    def _activate(self) -> None:
+        pinhole = self._settings.current.projection == "pinhole"
+        self._defects = 0
+        self._last_image = monotonic()
+        self._inbox = inbox = Inbox(
+            needs_info=pinhole,
+            needs_mask=lambda: self._expects_mask(self._settings.current.use_masks),
+            patience=lambda: self._settings.current.patience,
+            dropped=lambda number: self._statistics.count("dropped", number),
+        )
+        self._worker = threading.Thread(target=self._work, args=(inbox,), name="worker", daemon=True)
+        self._worker.start()
+        # Subscriptions are served in this order: what an image needs is there before the image.
+        self._info_input = self._listen(CameraInfo, "depth/camera_info", inbox.put_info) if pinhole else None
+        self._mask_input = self._listen(Image, "mask/image", inbox.put_mask)
+        self._image_input = self._listen(Image, "depth/image", self._on_image)
+        self.get_logger().info(f"ready, listening to {self._image_input.topic_name}")
+
+    def _deactivate(self) -> None:
+        inputs = (self._image_input, self._mask_input, self._info_input)
+        self._image_input = None
+        for one in inputs:
+            if one is not None:
+                self.destroy_subscription(one)
+        if self._inbox is not None:
+            self._statistics.count("dropped", self._inbox.close())
+        if self._worker is not None and self._worker is not threading.current_thread():
+            self._worker.join(_WORKER_END)
+            if self._worker.is_alive():
+                self.get_logger().warning("the frame at hand takes long; it is the last one")
+        self._inbox = self._worker = None
+        self._triggers.answer((False, "the node has been deactivated"))
+
+    def _cleanup(self) -> None:
+        if self._image_input is not None:
+            self._deactivate()
+        for name in ("_superquadrics", "_markers", "_rendered"):
+            publisher = self.__dict__.pop(name, None)
+            if publisher is not None:
+                self.destroy_publisher(publisher)
+        self._engine.release()
+        self._shown_ids = []
+        gc.collect()  # a network's weights hang in reference cycles
+
+    def _comes_back(self) -> bool:
+        return bool(self._settings.current.autostart)
+
+    @property
+    def _warm_up_camera(self) -> Camera:
+        return unit_cube.camera() if self._settings.current.projection == "orthographic" else WARM_UP_CAMERA
+
+    def _why_locked(self) -> str:
+        """Why parameters that are read at the configuration cannot change now; empty if they can."""
+        if not self.is_configured:
+            return ""
+        name = self.get_fully_qualified_name()
+        return (
+            f"is read when the node is configured, and it is {self.state}: ros2 lifecycle set {name} deactivate, then "
+            "cleanup; set it; configure, activate"
+        )
+
+    def _on_changed(self, parameters: Any, names: frozenset[str]) -> None:
+        self._engine.follow(parameters, names, self._warm_up_camera)
 
     def _listen(self, kind: type[Any], topic: str, callback: Callable[[Any], None]) -> Subscription:
         profile = QoSProfile(depth=1, history=QoSHistoryPolicy.KEEP_LAST, reliability=QoSReliabilityPolicy.BEST_EFFORT)
@@ -156,9 +209,14 @@ class FrameNode(StoppableNode):
     # Callbacks, in the executor's thread: quick, and nothing in them can fail on a message's content
 
     def _on_image(self, message: Image) -> None:
+        inbox = self._inbox
+        if inbox is None:
+            return
         self._last_image = monotonic()
         self._statistics.count("received")
-        if (not self._enabled and not self._triggers) or self._inbox.put_image(message):
+        if self._enabled or len(self._triggers):
+            inbox.put_image(message)
+        else:
             self._statistics.count("dropped")
 
     def _on_lost(self, event: Any) -> None:
@@ -177,47 +235,55 @@ class FrameNode(StoppableNode):
         return response
 
     async def _on_trigger(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        image_input = self._image_input
+        if image_input is None:
+            response.success, response.message = False, f"the node is {self.state}, not active"
+            return response
         timeout = self._settings.current.trigger_timeout
-        outcome: Future = Future(executor=self.executor)
-        entry = monotonic(), outcome
-        with self._triggers_lock:
-            self._triggers.append(entry)
-        timer = self.create_timer(timeout, lambda: self._expire(entry, timeout))
-        response.success, response.message = await outcome
-        self.destroy_timer(timer)
-        return response
 
-    def _expire(self, entry: tuple[float, Future], timeout: float) -> None:
-        with self._triggers_lock:
-            if entry not in self._triggers:
-                return
-            self._triggers.remove(entry)
-        topic = self._image_input.topic_name
-        entry[1].set_result((False, f"no frame on {topic} within {timeout:g} s: {self._heard(self._image_input)}"))
+        def why_none() -> str:
+            return f"no frame on {image_input.topic_name} within {timeout:g} s: {self._heard(image_input)}"
+
+        return await self._triggers.outcome(response, timeout, why_none)
 
     def _on_second(self) -> None:
+        image_input, parameters = self._image_input, self._settings.current
         silence = monotonic() - self._last_image
-        limit = self._settings.current.no_frame_warning
-        silent = 0 < limit < silence
-        if silent:
-            topic, publishers = self._image_input.topic_name, self._heard(self._image_input)
+        silent = image_input is not None and 0 < parameters.no_frame_warning < silence
+        if silent and image_input is not None:
+            topic, publishers = image_input.topic_name, self._heard(image_input)
             self._warn("silence", f"no depth image on {topic} for {silence:.0f} s: {publishers}")
         now = self._statistics.snapshot()
         message = DiagnosticArray()
         message.header.stamp = self.get_clock().now().to_msg()
-        tally = self._identity.tally if self._settings.current.tracking else None
-        name = self.get_fully_qualified_name()
-        message.status.append(report.status(name, now, self._last_level_counts, silent, self._enabled, tally))
-        self._last_level_counts = now
+        condition = report.Condition(
+            state=self.state,
+            fault=self.fault or self._engine.fault,
+            silent=silent,
+            enabled=self._enabled,
+            engine=self._engine.words,
+            tally=self._identity.tally if self.is_active and parameters.tracking else None,
+        )
+        message.status.append(report.status(self.get_fully_qualified_name(), now, self._last_counts, condition))
+        self._last_counts = now
         self._diagnostics.publish(message)
 
     # The worker
 
-    def _work(self) -> None:
-        while (arrival := self._inbox.take()) is not None:
+    def _work(self, inbox: Inbox) -> None:
+        while inbox.wait():
+            arrival: Arrival | None = None
             outcome: Outcome
             try:
-                outcome = True, self._process(arrival)
+                with TURNS.turn():
+                    # Taken when the turn has come: while others were computing, a newer one may have arrived.
+                    arrival = inbox.take()
+                    if arrival is None:
+                        continue
+                    started = monotonic()
+                    frame, recovery, stages = self._recovered(inbox, arrival)
+                outcome = True, self._published(frame, recovery, stages | {"wait": 1e3 * (started - arrival.time)})
+                self._defects = 0
             except ValueError as error:
                 outcome = False, str(error)
             except Exception as error:
@@ -227,25 +293,34 @@ class FrameNode(StoppableNode):
                 outcome = False, f"{type(error).__name__}: {error}"
                 if self._throttle.passes("defect") is not None:
                     self.get_logger().error(traceback.format_exc())
+                self._defects += 1
+                if self._defects == _DEFECTS:
+                    self._engine.discard()
+                    self._fail(f"{_DEFECTS} frames in a row failed, the last one by {outcome[1]}")
+            if arrival is None:
+                continue
             if not outcome[0]:
                 self._statistics.refuse(outcome[1])
-                self._warn(outcome[1].split(":")[0], f"refused a frame of {self._image_input.topic_name}: {outcome[1]}")
-            self._answer_triggers(arrival, outcome)
+                self._warn(outcome[1].split(":")[0], f"refused a frame: {outcome[1]}")
+            self._triggers.answer(outcome, arrival.time)
 
-    def _process(self, arrival: Arrival) -> str:
-        """Recover one frame and publish the results; its summary."""
+    def _recovered(self, inbox: Inbox, arrival: Arrival) -> tuple[Frame, FrameRecovery, dict[str, float]]:
+        """The frame of a message, its bodies, and how long that took by stage, milliseconds."""
         parameters = self._settings.current
         clock = perf_counter()
-        stages = {"wait": 1e3 * (monotonic() - arrival.time)}
-        frame = self._decoded(arrival.message, parameters)
-        stages["decode"] = 1e3 * (perf_counter() - clock)
-
-        recovery = self._recoverer.recover(frame.depth, frame.camera, frame.labels, self._options(parameters))
+        frame = self._decoded(inbox, arrival, parameters)
+        stages = {"decode": 1e3 * (perf_counter() - clock)}
+        recoverer, options = self._engine.options(parameters)
+        recovery = recoverer.recover(frame.depth, frame.camera, frame.labels, options)
         stages |= {f"recovery: {stage}": duration for stage, duration in recovery.milliseconds.items()}
+        return frame, recovery, stages
 
+    def _published(self, frame: Frame, recovery: FrameRecovery, stages: dict[str, float]) -> str:
+        """Follow the bodies and publish the results; the summary."""
+        parameters = self._settings.current
         clock = perf_counter()
         if parameters.tracking:
-            found = self._identity.tracked(recovery, frame, arrival.time)
+            found = self._identity.tracked(recovery, frame, monotonic())
             stages["tracking"] = 1e3 * (perf_counter() - clock)
         else:
             found = self._identity.untracked(recovery)
@@ -262,26 +337,26 @@ class FrameNode(StoppableNode):
         self._statistics.answer(stages)
         return report.summary(found.recovery, found.ids)
 
-    def _decoded(self, message: Image, parameters: FrameParameters) -> Frame:
+    def _decoded(self, inbox: Inbox, arrival: Arrival, parameters: FrameParameters) -> Frame:
+        message = arrival.message
         if parameters.projection == "orthographic":
             frame = decode(message, None)
         else:
             try:
-                frame = decode(message, lambda: self._inbox.camera_of(message, _COMPANION_PATIENCE))
+                frame = decode(message, lambda: inbox.camera_of(message))
             except Refused as error:
-                assert self._info_input is not None
-                topic = self._info_input.topic_name
-                raise Refused(f"{error}, on {topic}: {self._heard(self._info_input)}") from error
-        return frame.with_mask(self._mask(message, parameters.use_masks))
-
-    def _mask(self, message: Image, use: str) -> Image | None:
-        topic = self._mask_input.topic_name
-        if use == "never" or (use == "auto" and not self.count_publishers(topic)):
-            return None
-        mask = self._inbox.mask_of(message, _COMPANION_PATIENCE)
-        if mask is None and use == "always":
+                info_input = self._info_input
+                if info_input is None:
+                    raise
+                raise Refused(f"{error}, on {info_input.topic_name}: {self._heard(info_input)}") from error
+        if parameters.use_masks == "always" and arrival.mask is None:
+            topic = self._mask_input.topic_name
             raise Refused(f"mask: expected one with the stamp of the image (use_masks is always), none came on {topic}")
-        return mask
+        return frame.with_mask(arrival.mask if parameters.use_masks != "never" else None)
+
+    def _expects_mask(self, use: str) -> bool:
+        mask_input = self._mask_input
+        return use == "always" or (use == "auto" and bool(self.count_publishers(mask_input.topic_name)))
 
     def _publish_pictures(self, frame: Frame, found: Identified, parameters: FrameParameters) -> None:
         if self._markers.get_subscription_count():
@@ -292,17 +367,13 @@ class FrameNode(StoppableNode):
             depth, _ = render_recovery(found.recovery, frame.camera)
             self._rendered.publish(frame.encode(depth))
 
-    def _answer_triggers(self, arrival: Arrival, outcome: Outcome) -> None:
-        """Answer the triggers that were waiting when this frame arrived."""
-        with self._triggers_lock:
-            waiting = [entry for entry in self._triggers if entry[0] <= arrival.time]
-            self._triggers = [entry for entry in self._triggers if entry not in waiting]
-        for _, future in waiting:
-            future.set_result(outcome)
-        if waiting and self.executor is not None:
-            self.executor.wake()
-
     # Words
+
+    def _inform(self, text: str) -> None:
+        self.get_logger().info(text)
+
+    def _complain(self, text: str) -> None:
+        self.get_logger().error(text)
 
     def _warn(self, kind: str, text: str) -> None:
         remark = self._throttle.passes(kind)

@@ -1,8 +1,12 @@
-"""What has arrived and waits for the worker: the newest depth image, recent camera_infos and masks.
+"""What has arrived and waits for the worker: depth images with what belongs to them; the newest complete one wins.
 
-Callbacks of the executor put, one worker thread takes.  A newer depth image replaces one that nobody has taken yet.  A
-depth image is joined with the camera_info of its own stamp, or else the latest one of its size, and with the mask of
-its own stamp; either may arrive a moment later than the image, so that the worker waits for it a little.
+Callbacks of the executor put, one worker thread takes.  A depth image is complete with the camera_info of its own
+stamp, or else the latest one of its size, and, where masks are expected, with the mask of its own stamp.  What is missing may
+come a moment later: the image waits for it for ``patience`` seconds, beside newer images.  As soon as an image is
+complete, or its patience is at an end, it takes the place of every older one.
+
+So a frame is never computed without its mask only because the network that makes the mask is slower than the camera,
+and nobody who has the turn to compute waits for a message.
 """
 
 from __future__ import annotations
@@ -21,7 +25,9 @@ from sq_perception.imaging.camera import Camera
 Stamp = tuple[int, int]
 
 _INFOS = 16
-_MASKS = 4
+_MASKS = 8
+_WAITING = 64
+"""Images that wait for their companions at the same time; older ones are dropped."""
 
 
 class Refused(ValueError):  # noqa: N818 - a verdict on a frame rather than a defect
@@ -30,10 +36,11 @@ class Refused(ValueError):  # noqa: N818 - a verdict on a frame rather than a de
 
 @dataclass(frozen=True)
 class Arrival:
-    """A depth image and when it came, in seconds of the monotonic clock."""
+    """A depth image, when it came, in seconds of the monotonic clock, and its mask if one came."""
 
     message: Image
     time: float
+    mask: Image | None = None
 
 
 @dataclass(frozen=True)
@@ -45,22 +52,44 @@ class _Info:
 
 
 class Inbox:
-    """Thread-safe; see the module."""
+    """Thread-safe; see the module.
 
-    def __init__(self) -> None:
+    Parameters
+    ----------
+    needs_info
+        Whether images need a camera_info.
+    needs_mask
+        Asked for each image as it comes: whether to wait for its mask.
+    patience
+        Asked for each image as it comes: seconds to wait for what is missing.
+    dropped
+        Told how many images were replaced by newer ones.
+    """
+
+    def __init__(
+        self,
+        *,
+        needs_info: bool = True,
+        needs_mask: Callable[[], bool] = lambda: False,
+        patience: Callable[[], float] = lambda: 0.25,
+        dropped: Callable[[int], None] = lambda _: None,
+    ) -> None:
+        self._needs_info, self._needs_mask = needs_info, needs_mask
+        self._patience, self._dropped = patience, dropped
         self._changed = threading.Condition()
-        self._image: Arrival | None = None
+        self._waiting: deque[_Waiting] = deque()
+        self._ready: Arrival | None = None
         self._infos: deque[_Info] = deque(maxlen=_INFOS)
         self._masks: OrderedDict[Stamp, Image] = OrderedDict()
         self._closed = False
 
-    def put_image(self, message: Image) -> bool:
-        """Offer a depth image; True if it replaced one that had not been taken."""
+    def put_image(self, message: Image) -> None:
+        """Offer a depth image."""
+        now = monotonic()
+        waiting = _Waiting(message, now, now + self._patience(), self._needs_mask())
         with self._changed:
-            replaced = self._image is not None
-            self._image = Arrival(message, monotonic())
-            self._changed.notify_all()
-            return replaced
+            self._waiting.append(waiting)
+            self._promote(now)
 
     def put_info(self, message: CameraInfo) -> None:
         """Keep a camera_info; a useless one is kept as the reason for refusing frames of its size."""
@@ -73,7 +102,7 @@ class Inbox:
             fault = str(error)
         with self._changed:
             self._infos.append(_Info(stamp_of(message), size, camera, fault))
-            self._changed.notify_all()
+            self._promote(monotonic())
 
     def put_mask(self, message: Image) -> None:
         """Keep a label image for the depth image of the same stamp."""
@@ -81,34 +110,47 @@ class Inbox:
             self._masks[stamp_of(message)] = message
             while len(self._masks) > _MASKS:
                 self._masks.popitem(last=False)
-            self._changed.notify_all()
+            self._promote(monotonic())
 
-    def close(self) -> None:
-        """Let the worker go: every take from now on answers None."""
+    def close(self) -> int:
+        """Let the worker go, and how many images it leaves behind."""
         with self._changed:
             self._closed = True
+            left = len(self._waiting) + (self._ready is not None)
+            self._waiting.clear()
+            self._ready = None
             self._changed.notify_all()
+            return left
+
+    def wait(self) -> bool:
+        """Wait until an image can be taken; False once the inbox is closed."""
+        with self._changed:
+            while not self._closed:
+                now = monotonic()
+                self._promote(now)
+                if self._ready is not None:
+                    return True
+                deadline = min((one.deadline for one in self._waiting), default=None)
+                self._changed.wait(None if deadline is None else max(deadline - now, 0.0))
+            return False
 
     def take(self) -> Arrival | None:
-        """Wait for a depth image; None once the inbox is closed."""
+        """The image that :meth:`wait` waited for, or a newer one; None if there is none."""
         with self._changed:
-            self._changed.wait_for(lambda: self._closed or self._image is not None)
-            if self._closed:
-                return None
-            arrival, self._image = self._image, None
+            self._promote(monotonic())
+            arrival, self._ready = self._ready, None
             return arrival
 
-    def camera_of(self, image: Image, patience: float) -> Camera:
+    def camera_of(self, image: Image) -> Camera:
         """The camera of a depth image.
 
         Raises
         ------
         Refused
-            If no usable camera_info of the image's size has come, ``patience`` seconds included.
+            If no usable camera_info of the image's size has come.
         """
         size = int(image.width), int(image.height)
         with self._changed:
-            self._wait(lambda: self._info(size, stamp_of(image)) is not None, patience)
             info = self._info(size, stamp_of(image))
             if info is None:
                 raise Refused(self._why_no_info(size))
@@ -116,15 +158,30 @@ class Inbox:
                 raise Refused(info.fault)
             return info.camera
 
-    def mask_of(self, image: Image, patience: float) -> Image | None:
-        """The mask of a depth image; None if none came, ``patience`` seconds included."""
-        with self._changed:
-            self._wait(lambda: stamp_of(image) in self._masks, patience)
-            return self._masks.pop(stamp_of(image), None)
+    def _promote(self, now: float) -> None:
+        """Make the newest image ready that is complete or has waited long enough."""
+        chosen = -1
+        for k, one in enumerate(self._waiting):
+            if one.deadline <= now or self._is_complete(one):
+                chosen = k
+        dropped = 0
+        if chosen >= 0:
+            one = self._waiting[chosen]
+            dropped = chosen + (self._ready is not None)
+            self._ready = Arrival(one.message, one.time, self._masks.pop(stamp_of(one.message), None))
+            for _ in range(chosen + 1):
+                self._waiting.popleft()
+        while len(self._waiting) > _WAITING:
+            self._waiting.popleft()
+            dropped += 1
+        if dropped:
+            self._dropped(dropped)
+        self._changed.notify_all()
 
-    def _wait(self, arrived: Callable[[], bool], patience: float) -> None:
-        """Wait for a companion of the frame at hand, but not while a newer frame waits already."""
-        self._changed.wait_for(lambda: arrived() or self._closed or self._image is not None, patience)
+    def _is_complete(self, one: _Waiting) -> bool:
+        stamp, size = stamp_of(one.message), (int(one.message.width), int(one.message.height))
+        has_info = not self._needs_info or self._info(size, stamp) is not None
+        return has_info and (not one.needs_mask or stamp in self._masks)
 
     def _info(self, size: tuple[int, int], stamp: Stamp) -> _Info | None:
         fitting = [info for info in self._infos if info.size == size]
@@ -140,6 +197,14 @@ class Inbox:
         return f"{wanted}, the last one is for {last.size[0]} x {last.size[1]}" + (
             f" ({last.fault})" if last.fault else ""
         )
+
+
+@dataclass(frozen=True)
+class _Waiting:
+    message: Image
+    time: float
+    deadline: float
+    needs_mask: bool
 
 
 def stamp_of(message: Image | CameraInfo) -> Stamp:

@@ -12,6 +12,7 @@ accepts both.  The range is checked here for both, as the range of a descriptor 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import Field, asdict, dataclass, field, fields, replace
 from typing import Any, Generic, Literal, TypeVar, get_args
 
@@ -42,7 +43,7 @@ def setting(
     choices: tuple[str, ...] = (),
     live: bool = False,
 ) -> Any:
-    """A dataclass field that becomes a ROS parameter; read-only after the start unless ``live``."""
+    """A dataclass field that becomes a ROS parameter; ``live``: it may change at any time."""
     about = {"description": description, "unit": unit, "within": within, "choices": choices, "live": live}
     return field(default=default, metadata=about)
 
@@ -51,6 +52,11 @@ def setting(
 class FrameParameters:
     """What recover_node and fitter_node have in common."""
 
+    autostart: bool = setting(
+        True,
+        "Configure and activate at the start. Without, the node stays unconfigured until somebody asks: ros2 lifecycle "
+        "set, or a lifecycle manager.",
+    )
     projection: Projection = setting(  # noqa: RUF009 - a field
         "pinhole",
         "Camera model: pinhole takes 16UC1 and 32FC1 with camera_info; orthographic takes mono8 and mono16 images of "
@@ -62,6 +68,14 @@ class FrameParameters:
         "Label images on mask/image with the stamp of the depth image: auto uses them where they come and segments "
         "where none does, always refuses frames without, never does not look at them.",
         choices=("auto", "always", "never"),
+        live=True,
+    )
+    patience: float = setting(
+        0.25,
+        "How long an image waits for its camera_info or mask before it is processed, or refused, without. Masks of a "
+        "slow segmentation need more.",
+        unit="s",
+        within=(0.0, 10.0),
         live=True,
     )
     s: float = setting(
@@ -139,20 +153,37 @@ class FrameParameters:
 class RecoverParameters(FrameParameters):
     """recover_node: learned start, refined."""
 
-    model: str = setting("", "Network weights: a .safetensors file or the name of shipped ones; empty: the default.")
-    device: str = setting("cpu", "Where the network runs: cpu, cuda or cuda:N.")
+    model: str = setting(
+        "",
+        "Network weights: a .safetensors file or the name of shipped ones; empty: the default. Set while the node "
+        "runs, they are loaded beside the work and swapped; setting the same file again reads it again.",
+        live=True,
+    )
+    device: str = setting("cpu", "Where the network runs: cpu, cuda or cuda:N.", live=True)
     consensus: bool = setting(
-        False, "Average the network's answers to 8 positions of each view: better alone, and slower."
+        False, "Average the network's answers to 8 positions of each view: better alone, and slower.", live=True
+    )
+    threads: int = setting(
+        0,
+        "Objects of a frame that are worked on at the same time; 0: as many as there are cores.",
+        within=(0, 256),
+        live=True,
     )
     method: Method = setting(  # noqa: RUF009 - a field
         "auto",
         "Where the fit starts: network, symmetry, or auto (the best of them); classic is Solina and Bajcsy's method.",
         choices=get_args(Method),
+        live=True,
     )
     refine: Refine = setting(  # noqa: RUF009 - a field
         "surface",
         "Refinement: surface fits the measured depth, soft_render the soft-rendered image, none keeps the start.",
         choices=get_args(Refine),
+        live=True,
+    )
+    repair: bool = setting(
+        True,
+        "Join and split own segments where that describes the image better; masks from outside stay as they are.",
         live=True,
     )
 
@@ -235,14 +266,34 @@ P = TypeVar("P", bound="FrameParameters | SyntheticParameters")
 class LiveParameters(Generic[P]):
     """Declares the fields of a dataclass as parameters of a node and follows their changes.
 
+    Parameters
+    ----------
+    node, kind
+        The node and the dataclass.
+    locked
+        Why what is not live cannot change now; empty where it can.  None: it never can.
+    judge
+        Raises ValueError for a set of values that cannot work; gets the names of those that change as well.
+    changed
+        Told the new values and which of them were set.
+
     Raises
     ------
     ParameterError
         If a value given at the start has a wrong type, is out of range, or does not fit the others.
     """
 
-    def __init__(self, node: Node, kind: type[P]) -> None:
+    def __init__(
+        self,
+        node: Node,
+        kind: type[P],
+        *,
+        locked: Callable[[], str] | None = None,
+        judge: Callable[[Any, frozenset[str]], None] = lambda _, __: None,
+        changed: Callable[[Any, frozenset[str]], None] = lambda _, __: None,
+    ) -> None:
         self._fields: dict[str, Field[Any]] = {one.name: one for one in fields(kind)}
+        self._locked, self._judge, self._changed = locked, judge, changed
         values = {name: self._declare(node, one) for name, one in self._fields.items()}
         self._current: P = kind(**values)
         node.add_on_set_parameters_callback(self._check)
@@ -255,7 +306,7 @@ class LiveParameters(Generic[P]):
 
     def _declare(self, node: Node, one: Field[Any]) -> Any:
         try:
-            node.declare_parameter(one.name, one.default, describe(one))
+            node.declare_parameter(one.name, one.default, describe(one, self._locked is None))
         except InvalidParameterTypeException as error:
             raise ParameterError(f"{one.name}: expected a value like {one.default!r}, {error}") from error
         except InvalidParameterValueException as error:
@@ -264,17 +315,25 @@ class LiveParameters(Generic[P]):
 
     def _check(self, changes: list[Parameter]) -> SetParametersResult:
         try:
-            self._changed(changes)
-        except ParameterError as error:
+            candidate, names = self._merged(changes)
+            frozen = sorted(name for name in names if not self._fields[name].metadata["live"])
+            reason = self._locked() if frozen and self._locked is not None else ""
+            if reason:
+                raise ParameterError(f"{', '.join(frozen)}: {reason}")
+            if names:
+                self._judge(candidate, names)
+        except ValueError as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
     def _accept(self, changes: list[Parameter]) -> None:
-        self._current = self._changed(changes)
+        self._current, names = self._merged(changes)
+        if names:
+            self._changed(self._current, names)
 
-    def _changed(self, changes: list[Parameter]) -> P:
+    def _merged(self, changes: list[Parameter]) -> tuple[P, frozenset[str]]:
         values = {one.name: checked(self._fields[one.name], one.value) for one in changes if one.name in self._fields}
-        return replace(self._current, **values)
+        return replace(self._current, **values), frozenset(values)
 
 
 def checked(one: Field[Any], value: Any) -> Any:
@@ -300,11 +359,16 @@ def checked(one: Field[Any], value: Any) -> Any:
     return value
 
 
-def describe(one: Field[Any]) -> ParameterDescriptor:
-    """The descriptor of a field: its text with the unit, its range or choices, whether it is read-only."""
+def describe(one: Field[Any], is_fixed: bool = True) -> ParameterDescriptor:
+    """The descriptor of a field: its text with the unit, its range or choices.
+
+    It is read-only where the field is not live and ``is_fixed``, as in nodes without a lifecycle.
+    """
     about, kind = one.metadata, type(one.default)
     descriptor = ParameterDescriptor(
-        name=one.name, description=about["description"] + _unit(about, " [{}]"), read_only=not about["live"]
+        name=one.name,
+        description=about["description"] + _unit(about, " [{}]"),
+        read_only=is_fixed and not about["live"],
     )
     descriptor.dynamic_typing = kind is float
     if about["choices"]:

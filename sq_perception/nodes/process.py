@@ -1,13 +1,16 @@
-"""The life of a node's process: start, spin, stop, each without a traceback.
+"""The life of a process with one or several nodes: start, spin, stop, each without a traceback.
 
-Exit code 0 after Ctrl-C or SIGTERM, whether it comes once, twice, or while the node still starts; 1 with one line of
-explanation where the node cannot start.  The shipped Fast DDS profile is used unless the user has chosen one.
+Exit code 0 after Ctrl-C or SIGTERM, whether it comes once, twice, or while a node still starts; 1 with one line of
+explanation where a node cannot start.  The shipped Fast DDS profile is used unless the user has chosen one.
+
+One thread spins all nodes: their callbacks only store messages, the work is done in threads of their own.
 """
 
 from __future__ import annotations
 
 import os
 import signal
+import sys
 from collections.abc import Callable, Sequence
 from types import FrameType
 from typing import TYPE_CHECKING
@@ -42,15 +45,15 @@ class _Stop:
             raise KeyboardInterrupt
 
 
-def run(name: str, create: Callable[[], StoppableNode], arguments: Sequence[str] | None = None) -> int:
-    """Create a node and spin it until it is told to stop; the exit code.
+def run(name: str, create: Callable[[], Sequence[StoppableNode]], arguments: Sequence[str] | None = None) -> int:
+    """Create nodes and spin them until they are told to stop; the exit code.
 
-    ``create`` imports what the node needs, so that a signal during seconds of imports finds this function in charge.
+    ``create`` imports what the nodes need, so that a signal during seconds of imports finds this function in charge.
     """
     stop = _Stop()
     for number in SIGNALS:
         signal.signal(number, stop)
-    node: StoppableNode | None = None
+    nodes: list[StoppableNode] = []
     try:
         try:
             # Libraries read these when they are loaded, rclpy already loads numpy.
@@ -67,36 +70,41 @@ def run(name: str, create: Callable[[], StoppableNode], arguments: Sequence[str]
             # Before the node announces itself: an executor whose creation a signal interrupts complains when it is
             # deleted.
             executor = SingleThreadedExecutor()
-            node = create()
+            nodes.extend(create())
             stop.starting = False
-            _spin(node, executor, stop)
+            return _spin(nodes, executor, stop)
         except Exception as error:
             if stop.received:
                 # Whatever was going on has failed because of the signal.
                 return 0
             if not (stop.starting and isinstance(error, _start_errors())):
                 raise
-            _explain(name, error)
+            _explain(name, str(error))
             return 1
     except KeyboardInterrupt:
         # Around the handling of failures too.
         return 0
     finally:
         _ignore_signals()
-        _finish(node)
-    return 0
+        _finish(nodes)
 
 
-def _spin(node: StoppableNode, executor: Executor, stop: _Stop) -> None:
+def _spin(nodes: Sequence[StoppableNode], executor: Executor, stop: _Stop) -> int:
     import rclpy
     from rclpy.executors import ExternalShutdownException
 
-    executor.add_node(node)
+    for node in nodes:
+        executor.add_node(node)
     try:
         while rclpy.ok() and not stop.received:
             executor.spin_once(timeout_sec=_LOOK)
+            failed = next((node for node in nodes if node.start_failure), None)
+            if failed is not None:
+                _explain(failed.get_name(), failed.start_failure)
+                return 1
     except ExternalShutdownException:
-        return
+        pass
+    return 0
 
 
 def _start_errors() -> tuple[type[Exception], ...]:
@@ -107,17 +115,23 @@ def _start_errors() -> tuple[type[Exception], ...]:
     return (ValueError, OSError, RuntimeError, ParameterException, NameValidationException, InvalidQosOverridesError)
 
 
-def _explain(name: str, error: Exception) -> None:
+def _explain(name: str, reason: str) -> None:
     from rclpy.logging import get_logger
 
-    get_logger(name).fatal(f"cannot start: {' '.join(str(error).split())}")
+    get_logger(name).fatal(f"cannot start: {' '.join(reason.split())}")
 
 
-def _finish(node: StoppableNode | None) -> None:
+def _finish(nodes: Sequence[StoppableNode]) -> None:
     import rclpy
 
-    if node is not None:
-        node.close()
+    closed = [node.close() for node in nodes]
+    if not all(closed):
+        # A thread still compiles or loads, and nothing can interrupt it: to unload libraries under it would crash.
+        sys.stdout.flush()
+        sys.stderr.flush()
+        rclpy.try_shutdown()
+        os._exit(0)
+    for node in nodes:
         node.destroy_node()
     rclpy.try_shutdown()
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
@@ -14,17 +15,49 @@ from sq_perception.recovery import FrameRecovery
 from sq_perception.tracking.session import Tally
 
 
-def status(
-    name: str, now: Snapshot, before: Snapshot, silent: bool, enabled: bool, tally: Tally | None = None
-) -> DiagnosticStatus:
-    """The diagnostics of a node: WARN where frames stay away, get lost or were refused since the last report.
+@dataclass(frozen=True)
+class Condition:
+    """What a node is like, beside its counts.
 
-    ``tally`` is that of the tracking session, None where nothing is tracked.
+    Attributes
+    ----------
+    state
+        Of its lifecycle.
+    fault
+        Why a transition or a change of the model came to nothing; empty if all went well.
+    silent
+        Whether images are expected and stay away.
+    enabled
+        Whether images are processed.
+    engine
+        What computes, in a few words.
+    tally
+        Of the tracking session; None where nothing is tracked.
+    """
+
+    state: str = "active"
+    fault: str = ""
+    silent: bool = False
+    enabled: bool = True
+    engine: str = ""
+    tally: Tally | None = None
+
+
+def status(name: str, now: Snapshot, before: Snapshot, condition: Condition) -> DiagnosticStatus:
+    """The diagnostics of a node.
+
+    ERROR where it cannot work, WARN where frames stay away, get lost or were refused since the last report, or a
+    change came to nothing.
     """
     level, message = DiagnosticStatus.OK, f"{now.rate:.1f} Hz"
-    if not enabled:
+    if condition.state != "active":
+        level = DiagnosticStatus.ERROR if condition.fault else DiagnosticStatus.OK
+        message = condition.state + (f": {condition.fault}" if condition.fault else "")
+    elif condition.fault:
+        level, message = DiagnosticStatus.WARN, condition.fault
+    elif not condition.enabled:
         message = "disabled"
-    elif silent:
+    elif condition.silent:
         level, message = DiagnosticStatus.WARN, "no depth images arrive"
     elif now.refused > before.refused:
         level, message = DiagnosticStatus.WARN, f"refused a frame: {now.last_error}"
@@ -38,9 +71,12 @@ def status(
         "refused": str(now.refused),
         "in work": str(now.in_work),
         "lost": str(now.lost),
-        "enabled": str(enabled).lower(),
+        "state": condition.state,
+        "enabled": str(condition.enabled).lower(),
+        "engine": condition.engine,
         "last error": now.last_error,
     }
+    tally = condition.tally
     if tally is not None:
         values["tracks"] = str(tally.tracks)
         values["track ids given"] = str(tally.births)

@@ -1,4 +1,4 @@
-"""A node that has something to stop before it is destroyed."""
+"""A node that may fail to start, and has something to stop before it is destroyed."""
 
 from __future__ import annotations
 
@@ -8,5 +8,9 @@ from rclpy.node import Node
 class StoppableNode(Node):
     """What :func:`sq_perception.nodes.process.run` expects."""
 
-    def close(self) -> None:
-        """Stop threads; called once, before destroy_node."""
+    start_failure = ""
+    """Why the node cannot start, once it has found out; its process then ends."""
+
+    def close(self) -> bool:
+        """Stop threads; called once, before destroy_node.  False if one of them could not be stopped."""
+        return True

@@ -34,7 +34,7 @@ def create() -> SyntheticDepthNode:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Entry point; the exit code."""
-    return process.run(NAME, create, arguments)
+    return process.run(NAME, lambda: [create()], arguments)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,206 @@
+"""What computes in a frame node: a recoverer, made away from the frames, swapped as a whole, shared within a process.
+
+A change of the parameters that a recoverer is made of (model, device ...) makes another one in a thread of its own,
+warmed up before it is used.  Frames go on with the old one, and with those parameters as they were, until the new one
+is ready.  One that cannot be made leaves the old one at work, and :attr:`Engine.fault` says why.
+
+Nodes of one process that ask for equal recoverers get one: several cameras need the memory of one network.  One frame
+is computed at a time in a process, in the order of asking (:class:`Turns`): a frame already uses every core, two at
+once would each take twice as long, and a GPU serves one of them at a time anyway.
+"""
+
+from __future__ import annotations
+
+import threading
+import weakref
+from collections import deque
+from collections.abc import Callable, Hashable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from time import perf_counter
+from typing import Any, Generic, TypeVar
+
+from sq_perception.imaging.camera import Camera
+from sq_perception.recovery import Recoverer, RecoveryOptions
+
+P = TypeVar("P")
+
+
+class Turns:
+    """A lock that is given in the order in which it was asked for, so that no camera starves."""
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._waiting: deque[object] = deque()
+
+    @contextmanager
+    def turn(self) -> Iterator[None]:
+        """Wait for one's turn, and keep it for the block."""
+        ticket = object()
+        with self._changed:
+            self._waiting.append(ticket)
+            self._changed.wait_for(lambda: self._waiting[0] is ticket)
+        try:
+            yield
+        finally:
+            with self._changed:
+                self._waiting.popleft()
+                self._changed.notify_all()
+
+
+TURNS = Turns()
+"""Those of this process."""
+
+
+@dataclass(frozen=True)
+class Workshop(Generic[P]):
+    """How a kind of node makes its recoverer, and tells it what the parameters say.
+
+    Attributes
+    ----------
+    make
+        A recoverer of parameters.
+    options
+        What the parameters say to each frame.
+    ingredients
+        Names of the parameters that the recoverer is made of.
+    key
+        Equal for parameters whose recoverers are the same; None where they are never shared.
+    judge
+        Raises ValueError for parameters that :attr:`make` would refuse, as far as that can be told at once; it also
+        gets the names of those that change.
+    describe
+        In a few words, for diagnostics.
+    """
+
+    make: Callable[[P], Recoverer]
+    options: Callable[[P], RecoveryOptions]
+    ingredients: tuple[str, ...] = ()
+    key: Callable[[P], Hashable] = lambda _: None
+    judge: Callable[[P, frozenset[str]], None] = lambda _, __: None
+    describe: Callable[[P], str] = lambda _: ""
+
+
+_shared: weakref.WeakValueDictionary[Hashable, Recoverer] = weakref.WeakValueDictionary()
+_making = threading.Lock()
+
+
+@dataclass(frozen=True)
+class _Built(Generic[P]):
+    recoverer: Recoverer
+    parameters: P
+    key: Hashable
+
+
+class Engine(Generic[P]):
+    """The recoverer at work; see the module.
+
+    Parameters
+    ----------
+    workshop
+        What makes it.
+    inform, complain
+        Take texts for the log.
+    """
+
+    def __init__(self, workshop: Workshop[P], inform: Callable[[str], None], complain: Callable[[str], None]) -> None:
+        self._workshop, self._inform, self._complain = workshop, inform, complain
+        self._lock = threading.Lock()
+        self._built: _Built[P] | None = None
+        self._request = 0
+        self._is_making = False
+        self.fault = ""
+        """Why the last swap came to nothing; empty once one has succeeded."""
+
+    def build(self, parameters: P, camera: Camera) -> None:
+        """Make the recoverer and warm it up; what the workshop raises comes through."""
+        with self._lock:
+            self._request += 1
+        built = self._made(parameters, camera)
+        with self._lock:
+            self._built, self.fault = built, ""
+
+    def release(self) -> None:
+        """Let go of the recoverer, and of one that is being made."""
+        with self._lock:
+            self._request += 1
+            self._built = None
+
+    def discard(self) -> None:
+        """Let nobody else share the recoverer from now on: it has failed again and again."""
+        built = self._built
+        if built is not None:
+            with _making:
+                if _shared.get(built.key) is built.recoverer:
+                    del _shared[built.key]
+
+    def follow(self, parameters: P, changed: frozenset[str], camera: Camera) -> None:
+        """Swap the recoverer where a parameter that it is made of has been set, in the background.
+
+        A set that leaves the value as it is counts too: it is how a model file that was replaced is read again.
+        """
+        if not changed.intersection(self._workshop.ingredients) or self._built is None:
+            return
+        with self._lock:
+            self._request += 1
+            request = self._request
+            self._is_making = True
+        threading.Thread(
+            target=self._swap, args=(request, parameters, camera), name="recoverer in the making", daemon=True
+        ).start()
+
+    def options(self, parameters: P) -> tuple[Recoverer, RecoveryOptions]:
+        """The recoverer, and what it is to do by the parameters in force for it.
+
+        Raises
+        ------
+        RuntimeError
+            If there is none.
+        """
+        built = self._built
+        if built is None:
+            raise RuntimeError("the recoverer has been released")
+        made_of = {name: getattr(built.parameters, name) for name in self._workshop.ingredients}
+        in_force: Any = replace(parameters, **made_of)  # type: ignore[type-var]
+        return built.recoverer, self._workshop.options(in_force)
+
+    @property
+    def words(self) -> str:
+        """What is at work, for diagnostics."""
+        built = self._built
+        if built is None:
+            return "none"
+        return self._workshop.describe(built.parameters) + (", another one is being made" if self._is_making else "")
+
+    def _swap(self, request: int, parameters: P, camera: Camera) -> None:
+        started = perf_counter()
+        described = self._workshop.describe(parameters)
+        try:
+            built = self._made(parameters, camera)
+        except Exception as error:  # whatever it is: the old one goes on
+            with self._lock:
+                if request != self._request:
+                    return
+                self._is_making = False
+                self.fault = f"cannot change to {described}: {' '.join(str(error).split())}"
+            self._complain(f"{self.fault}; what was there before goes on")
+            return
+        with self._lock:
+            if request != self._request:
+                return
+            self._built, self.fault, self._is_making = built, "", False
+        self._inform(f"changed to {described} within {perf_counter() - started:.1f} s")
+
+    def _made(self, parameters: P, camera: Camera) -> _Built[P]:
+        """A recoverer, warm; one that is there already if its key is the same."""
+        key = self._workshop.key(parameters)
+        with _making:
+            known = None if key is None else _shared.get(key)
+            if known is not None:
+                return _Built(known, parameters, key)
+            recoverer = self._workshop.make(parameters)
+            if key is not None:
+                _shared[key] = recoverer
+        with TURNS.turn():
+            recoverer.warm_up(camera)
+        return _Built(recoverer, parameters, key)

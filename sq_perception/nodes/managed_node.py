@@ -1,0 +1,236 @@
+"""A lifecycle node that brings itself up, does its transitions in a thread of its own, and says why one failed.
+
+    unconfigured --configure--> inactive --activate--> active
+         ^  ^---------cleanup------'  ^----deactivate----'
+         '---- errorprocessing <---- whatever raises in a transition, or a fault while active
+
+``autostart`` (the default) configures and activates at the start, so that plain ``ros2 run`` works without a manager.
+A transition that takes seconds, such as loading a model, leaves the executor free: services answer meanwhile.  A
+transition that the state does not allow is refused; rclpy raises there, which would end the executor.
+
+What a subclass does in a transition it does in :meth:`_configure`, :meth:`_activate`, :meth:`_deactivate` and
+:meth:`_cleanup`; any exception leads through ``errorprocessing``, where everything is released, to ``unconfigured``,
+from where the node can be configured again.  :attr:`fault` is the reason until it succeeds.  A fault while active
+(:meth:`_fail`) takes the same way, and with ``autostart`` the node comes back by itself after a pause.
+
+Reference: https://design.ros2.org/articles/node_lifecycle.html
+"""
+
+from __future__ import annotations
+
+import queue
+import threading
+import traceback
+from collections.abc import Callable
+from typing import Any
+
+from lifecycle_msgs.msg import State, Transition
+from lifecycle_msgs.srv import ChangeState
+from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
+from rclpy.task import Future
+
+from sq_perception.nodes.stoppable_node import StoppableNode
+
+_SHUTDOWNS = (
+    Transition.TRANSITION_UNCONFIGURED_SHUTDOWN,
+    Transition.TRANSITION_INACTIVE_SHUTDOWN,
+    Transition.TRANSITION_ACTIVE_SHUTDOWN,
+)
+_NAMES = {
+    Transition.TRANSITION_CONFIGURE: "configure",
+    Transition.TRANSITION_CLEANUP: "cleanup",
+    Transition.TRANSITION_ACTIVATE: "activate",
+    Transition.TRANSITION_DEACTIVATE: "deactivate",
+    **dict.fromkeys(_SHUTDOWNS, "shutdown"),
+}
+_EXPECTED = (ValueError, OSError, RuntimeError)
+"""What a wrong file, parameter or device raises; anything else is a defect and leaves its trace in the log."""
+_PAUSE = 2.0
+"""Seconds before a node that failed while active tries again."""
+_END = 4.0
+"""Seconds that :meth:`ManagedNode.close` waits for a transition."""
+
+
+class ManagedNode(LifecycleNodeMixin, StoppableNode):
+    """See the module.
+
+    Parameters
+    ----------
+    name, namespace
+        Of the node.
+    context
+        rclpy's default if not given.
+    """
+
+    def __init__(self, name: str, *, namespace: str | None = None, context: Any = None) -> None:
+        StoppableNode.__init__(self, name, namespace=namespace, context=context)
+        LifecycleNodeMixin.__init__(self, callback_group=ReentrantCallbackGroup())
+        self._service_change_state.callback = self._on_change_state  # type: ignore[assignment]  # executors await it
+        self.fault = ""
+        """Why the last transition failed; empty once one has succeeded."""
+        self._closing = threading.Event()
+        self._errands: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self._bringer = threading.Thread(target=self._run_errands, name="transitions", daemon=True)
+        self._bringer.start()
+
+    @property
+    def state(self) -> str:
+        """Label of the lifecycle state: unconfigured, inactive, active, finalized, or one of the transitions."""
+        return str(self._state_machine.current_state[1])
+
+    @property
+    def is_active(self) -> bool:
+        """Whether the node is in the state ``active``."""
+        return bool(self._state_machine.current_state[0] == State.PRIMARY_STATE_ACTIVE)
+
+    @property
+    def is_configured(self) -> bool:
+        """Whether the node is beyond ``unconfigured``, transitions on the way there included."""
+        return bool(
+            self._state_machine.current_state[0]
+            not in (State.PRIMARY_STATE_UNCONFIGURED, State.PRIMARY_STATE_FINALIZED, State.PRIMARY_STATE_UNKNOWN)
+        )
+
+    def start(self) -> None:
+        """Configure and activate, in the thread of the transitions; :attr:`start_failure` tells of a failure."""
+        self._errands.put(self._bring_up)
+
+    def close(self) -> bool:
+        """Release everything; called once, before destroy_node.  False if a transition is still at work after a while.
+
+        The state becomes ``finalized`` where it was one that allows it.
+        """
+        self._closing.set()
+        self._errands.put(self._end)
+        self._errands.put(None)
+        self._bringer.join(_END)
+        return not self._bringer.is_alive()
+
+    def destroy_node(self) -> None:
+        """As rclpy's, which leaves the publisher of the transitions to the garbage collector."""
+        super().destroy_node()
+        self._state_machine.destroy_when_not_in_use()
+
+    # What a subclass does
+
+    def _configure(self) -> None:
+        """Make ready what takes time or memory."""
+
+    def _activate(self) -> None:
+        """Begin to listen."""
+
+    def _deactivate(self) -> None:
+        """Stop to listen."""
+
+    def _cleanup(self) -> None:
+        """Release what :meth:`_configure` made, if anything, also after a part of it; stops what is active."""
+
+    def _fail(self, reason: str) -> None:
+        """Leave the active state for a fault that further frames would only repeat; from any thread."""
+        self._errands.put(lambda: self._leave_by_fault(reason))
+
+    # Transitions, all in one thread
+
+    def on_configure(self, state: LifecycleState) -> TransitionCallbackReturn:
+        return self._attempt("configure", self._configure)
+
+    def on_activate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        return self._attempt("activate", self._activate)
+
+    def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
+        if self.fault:
+            return TransitionCallbackReturn.ERROR
+        return self._attempt("deactivate", self._deactivate)
+
+    def on_cleanup(self, state: LifecycleState) -> TransitionCallbackReturn:
+        return self._attempt("cleanup", self._cleanup)
+
+    def on_shutdown(self, state: LifecycleState) -> TransitionCallbackReturn:
+        return self._attempt("shutdown", self._cleanup)
+
+    def on_error(self, state: LifecycleState) -> TransitionCallbackReturn:
+        """Release everything, so that the node can be configured again; finalized where even that fails."""
+        fault = self.fault
+        answer = self._attempt("release", self._cleanup)
+        self.fault = fault
+        return TransitionCallbackReturn.SUCCESS if answer == TransitionCallbackReturn.SUCCESS else answer.FAILURE
+
+    def _attempt(self, name: str, action: Callable[[], None]) -> TransitionCallbackReturn:
+        try:
+            action()
+        except Exception as error:
+            reason = " ".join(str(error).split()) or type(error).__name__
+            if not isinstance(error, _EXPECTED):
+                self.get_logger().error(traceback.format_exc())
+                reason = f"{type(error).__name__}: {reason}"
+            self.fault = f"cannot {name}: {reason}"
+            if not self._closing.is_set():
+                self.get_logger().error(self.fault)
+            return TransitionCallbackReturn.ERROR
+        self.fault = ""
+        return TransitionCallbackReturn.SUCCESS
+
+    def _change(self, name: str) -> bool:
+        """One transition by its name; False if the state does not allow it, or it failed."""
+        before = self.state
+        try:
+            answer = getattr(self, f"trigger_{name}")()
+        except RuntimeError:
+            self.get_logger().warning(f"cannot {name}: the node is {before}")
+            return False
+        return bool(answer == TransitionCallbackReturn.SUCCESS)
+
+    def _bring_up(self) -> None:
+        if not (self._change("configure") and self._change("activate")) and not self._closing.is_set():
+            self.start_failure = self.fault or f"the node is {self.state}"
+
+    def _leave_by_fault(self, reason: str) -> None:
+        if not self.is_active or self._closing.is_set():
+            return
+        self.get_logger().error(f"{reason}: trying again in {_PAUSE:g} s" if self._comes_back() else reason)
+        self.fault = reason
+        self._change("deactivate")
+        if self._comes_back() and not self._closing.wait(_PAUSE) and self._change("configure"):
+            self._change("activate")
+
+    def _comes_back(self) -> bool:
+        """Whether nobody else brings the node up."""
+        return True
+
+    def _end(self) -> None:
+        if self.is_configured or self.state == "unconfigured":
+            self._change("shutdown")
+
+    def _run_errands(self) -> None:
+        while (errand := self._errands.get()) is not None:
+            try:
+                errand()
+            except Exception:
+                if not self._closing.is_set():
+                    self.get_logger().error(traceback.format_exc())
+
+    async def _on_change_state(
+        self, request: ChangeState.Request, response: ChangeState.Response
+    ) -> ChangeState.Response:
+        label = str(request.transition.label)
+        name = label if label in _NAMES.values() else "" if label else _NAMES.get(request.transition.id, "")
+        if not name:
+            asked = label or request.transition.id
+            self.get_logger().warning(f"expected one of {', '.join(dict.fromkeys(_NAMES.values()))}, got {asked!r}")
+            response.success = False
+            return response
+        done: Future = Future(executor=self.executor)
+
+        def errand() -> None:
+            succeeded = False
+            try:
+                succeeded = self._change(name)
+            finally:
+                done.set_result(succeeded)
+                if self.executor is not None:
+                    self.executor.wake()
+
+        self._errands.put(errand)
+        response.success = bool(await done)
+        return response

@@ -1,0 +1,142 @@
+"""The reference of every parameter, made from what the nodes declare: a page for people and YAML files for launches.
+
+    python -m sq_perception.nodes.parameter_reference       # in a source tree: docs/parameters.md and config/*.yaml
+
+One truth: the dataclasses of :mod:`sq_perception.nodes.parameters`.  A test holds the files to them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import textwrap
+from collections.abc import Sequence
+from dataclasses import Field, fields
+from pathlib import Path
+from typing import Any
+
+from sq_perception.nodes.parameters import (
+    FitterParameters,
+    FrameParameters,
+    RecoverParameters,
+    SyntheticParameters,
+    as_ros,
+)
+
+KINDS: dict[str, type[Any]] = {
+    "recover_node": RecoverParameters,
+    "fitter_node": FitterParameters,
+    "synthetic_depth_node": SyntheticParameters,
+}
+PAGE = Path("docs/parameters.md")
+COMMAND = "python -m sq_perception.nodes.parameter_reference"
+
+_HEAD = f"""\
+# Parameters
+
+Made by `{COMMAND}` from what the nodes declare; `ros2 param describe /recover_node s` tells the same.
+
+```sh
+ros2 param set /recover_node s 100             # while it runs; an integer is as good as 100.0
+ros2 run sq_perception recover_node --ros-args -p s:=100 -p model:=supervised
+ros2 run sq_perception recover_node --ros-args --params-file recover_node.yaml     # like the ones in config/
+```
+
+**Changes**: "live" parameters take effect with the next frame. Those that say "configure" are read when the node is
+configured; they are refused with the reason while it is up, and may be set while it is unconfigured
+(`ros2 lifecycle set /recover_node deactivate`, then `cleanup`). Those that say "start" are given at the start only. A
+value out of its range, of another type or that does not fit the others is refused with a reason and changes nothing.
+
+`model`, `device`, `method`, `consensus` and `threads` change what computes: the new one is made beside the work and
+swapped when it is warm; one that cannot be made leaves the old one at work, and `/diagnostics` says why. A model file
+is checked before the change is accepted. Setting the same file again reads it again.
+
+The quality of service of each subscription is a parameter too: `qos_overrides./depth/image.subscription.reliability`,
+`durability`, `depth`, `history`, at the start only. `use_sim_time` is that of every ROS 2 node.
+"""
+
+
+def page() -> str:
+    """The page, Markdown."""
+    shared = {one.name for one in fields(FrameParameters)}
+    parts = [_HEAD, "## recover_node and fitter_node\n", _table(list(fields(FrameParameters)), "configure")]
+    own = [one for one in fields(RecoverParameters) if one.name not in shared]
+    parts += ["## recover_node, and the nodes of recover_cameras\n", _table(own, "configure")]
+    parts += ["## synthetic_depth_node\n", _table(list(fields(SyntheticParameters)), "start")]
+    return "\n".join(parts)
+
+
+def yaml_text(name: str) -> str:
+    """A parameter file of a node with every default, each below its description."""
+    kind = KINDS[name]
+    values = as_ros(kind())
+    lines = [
+        f"# Parameters of {name} with their defaults: start it with --ros-args --params-file <this file>.",
+        f"# Those marked live also change while the node runs: ros2 param set /{name} <name> <value>.",
+    ]
+    if issubclass(kind, FrameParameters):
+        lines += [
+            "# Inputs are best effort, keep last 1; qos_overrides./depth/image.subscription.reliability: reliable, for",
+            "# instance, changes that (also .history and .depth, and the same for /depth/camera_info and /mask/image).",
+        ]
+    lines += ["/**:", "  ros__parameters:"]
+    for one in fields(kind):
+        choices = one.metadata["choices"]
+        remarks = [f"one of {', '.join(choices)}" if choices else _range(one).strip()]
+        remarks += ["live"] if one.metadata["live"] else []
+        remark = "; ".join(filter(None, remarks))
+        text = one.metadata["description"] + (f" [{remark}]" if remark else "")
+        lines += textwrap.wrap(text, 120, initial_indent="    # ", subsequent_indent="    # ", break_on_hyphens=False)
+        lines.append(f"    {one.name}: {json.dumps(values[one.name])}")
+    return "\n".join(lines) + "\n"
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Write the page and the files; the exit code."""
+    parser = argparse.ArgumentParser(description="Write docs/parameters.md and config/*.yaml of a source tree.")
+    parser.add_argument("root", nargs="?", type=Path, default=Path("."), help="of the source tree")
+    root = parser.parse_args(arguments).root
+    if not (root / PAGE.parent).is_dir() or not (root / "config").is_dir():
+        print(f"{root}: expected a source tree with docs/ and config/", file=sys.stderr)
+        return 2
+    (root / PAGE).write_text(page(), encoding="utf-8")
+    for name in KINDS:
+        (root / "config" / f"{name}.yaml").write_text(yaml_text(name), encoding="utf-8")
+    return 0
+
+
+def _table(rows: Sequence[Field[Any]], otherwise: str) -> str:
+    lines = ["| name | type | default | range | change | meaning |", "| --- | --- | --- | --- | --- | --- |"]
+    for one in rows:
+        about = one.metadata
+        when = "live" if about["live"] else "start" if one.name == "autostart" else otherwise
+        lines.append(
+            f"| `{one.name}` | {_kind(one)} | {_value(one.default)} | {_range(one)} | {when} | {about['description']} |"
+        )
+    return "\n".join(lines) + "\n"
+
+
+def _kind(one: Field[Any]) -> str:
+    return {float: "double or integer", int: "integer", bool: "bool", str: "string"}[type(one.default)]
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"`{value}`" if value != "" else "empty"
+
+
+def _range(one: Field[Any]) -> str:
+    about = one.metadata
+    unit = f" {about['unit']}" if about["unit"] else ""
+    if about["choices"]:
+        return ", ".join(f"`{choice}`" for choice in about["choices"])
+    if about["within"] is not None:
+        low, high = about["within"]
+        return f"{low:g} to {high:g}{unit}"
+    return unit.strip()
+
+
+if __name__ == "__main__":
+    sys.exit(main())
