@@ -1,9 +1,9 @@
 """What has arrived and waits for the worker: depth images with what belongs to them; the newest complete one wins.
 
-Callbacks of the executor put, one worker thread takes.  A depth image is complete with the camera_info of its own
-stamp, or else the latest one of its size, and, where masks are expected, with the mask of its own stamp.  What is missing may
-come a moment later: the image waits for it for ``patience`` seconds, beside newer images.  As soon as an image is
-complete, or its patience is at an end, it takes the place of every older one.
+Callbacks of the executor put, one worker thread takes. A depth image is complete with the camera_info of its own
+stamp, or else the latest one of its size, and, where masks are expected, with the mask of its own stamp. What is
+missing may come a moment later: the image waits for it for ``patience`` seconds, beside newer images. As soon as an
+image is complete, or its patience is at an end, it takes the place of every older one.
 
 So a frame is never computed without its mask only because the network that makes the mask is slower than the camera,
 and nobody who has the turn to compute waits for a message.
