@@ -386,6 +386,16 @@ class TestSwap:
         bench.until(lambda: bench.node._engine.words == "model 5")
         assert bench.answer() == 5.0
 
+    def test_a_model_that_is_set_while_another_one_is_loaded_follows_it(self, make_bench):
+        bench = make_bench("-p", "autostart:=false")
+        bench.gate.clear()
+        bench.node.start()
+        bench.until(lambda: bench.node.state == "configuring")
+        assert bench.node.set_parameters([Parameter("model", value="6")])[0].successful
+        bench.gate.set()
+        bench.until(lambda: bench.node._engine.words == "model 6")
+        assert bench.active().answer() == 6.0
+
     def test_what_does_not_concern_the_recoverer_swaps_nothing(self, make_bench):
         bench = make_bench().active()
         assert bench.node.set_parameters([Parameter("s", value=3)])[0].successful

@@ -27,6 +27,7 @@ import gc
 import threading
 import traceback
 from collections.abc import Callable
+from dataclasses import fields
 from time import monotonic, perf_counter
 from typing import Any
 
@@ -124,6 +125,9 @@ class FrameNode(ManagedNode):
         started = perf_counter()
         self.get_logger().info("warming up: loading compiled code, or compiling it on the first start")
         self._engine.build(parameters, self._warm_up_camera)
+        latest = self._settings.current
+        meanwhile = {one.name for one in fields(latest) if getattr(latest, one.name) != getattr(parameters, one.name)}
+        self._engine.follow(latest, frozenset(meanwhile), self._warm_up_camera)
         self.get_logger().info(f"warm after {perf_counter() - started:.1f} s")
         poses = CameraPoses(self, parameters.fixed_frame) if parameters.fixed_frame else None
         self._identity = Identity(poses, self._warn, self._inform)
