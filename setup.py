@@ -12,7 +12,7 @@ share = [
     ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
     (f"share/{NAME}", ["package.xml"]),
     (f"share/{NAME}/launch", sorted(glob("launch_scripts/*.py"))),
-    (f"share/{NAME}/config", sorted(glob("config/*.xml") + glob("config/*.yaml"))),
+    (f"share/{NAME}/config", sorted(glob("config/*.xml") + glob("config/*.yaml") + glob("config/*.rviz"))),
 ]
 # `ros2 run` looks for lib/<package>/<executable>.  colcon puts the scripts there itself (setup.cfg); pip puts them into
 # bin/, so that a wheel has to carry a way from the one to the other.
@@ -50,7 +50,7 @@ setup(
     ],
     package_dir={"sq_perception.config": "config"},
     package_data={
-        "sq_perception.config": ["*.xml", "*.yaml"],
+        "sq_perception.config": ["*.rviz", "*.xml", "*.yaml"],
         "sq_perception.learning": ["configurations/*.yaml"],
         "sq_perception.weights": ["*.safetensors", "*.json", "*.md"],
         "sq_perception": ["py.typed"],

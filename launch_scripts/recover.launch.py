@@ -1,15 +1,16 @@
-"""recover_node, and fitter_node if asked for, on the topics of a depth camera.
+"""recover_node, and fitter_node if asked for, on the topics of a depth camera; RViz2 if asked for.
 
 ros2 launch sq_perception recover.launch.py depth:=/camera/camera/depth/image_rect_raw \
-    camera_info:=/camera/camera/depth/camera_info
+    camera_info:=/camera/camera/depth/camera_info rviz:=true
 """
 
 from __future__ import annotations
 
 from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction, SetEnvironmentVariable
-from launch.substitutions import LaunchConfiguration
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
+from launch_ros.substitutions import FindPackageShare
 
 from sq_perception.nodes import fast_dds
 
@@ -19,7 +20,10 @@ ARGUMENTS = {
     "mask": ("mask/image", "topic of label images with the same stamps, if there are any"),
     "params_file": ("", "YAML file of parameters, like the one in share/sq_perception/config"),
     "fitter": ("false", "also start fitter_node, the classic method"),
+    "rviz": ("false", "also start RViz2 with share/sq_perception/config/superquadrics.rviz"),
+    "rviz_frame": ("camera_depth_optical_frame", "RViz2's fixed frame: the frame_id of the depth images"),
 }
+_YES = ("true", "1", "yes")
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -32,8 +36,8 @@ def generate_launch_description() -> LaunchDescription:
 
 def _nodes(context: LaunchContext) -> list[Node]:
     given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
-    executables = ["recover_node"] + ["fitter_node"] * (given["fitter"].lower() in ("true", "1", "yes"))
-    return [
+    executables = ["recover_node"] + ["fitter_node"] * (given["fitter"].lower() in _YES)
+    nodes = [
         Node(
             package="sq_perception",
             executable=executable,
@@ -48,3 +52,15 @@ def _nodes(context: LaunchContext) -> list[Node]:
         )
         for executable in executables
     ]
+    return nodes + [_rviz(given)] * (given["rviz"].lower() in _YES)
+
+
+def _rviz(given: dict[str, str]) -> Node:
+    """RViz2 on the camera's topics: its configuration names those of the demonstration."""
+    share = PathJoinSubstitution([FindPackageShare("sq_perception"), "config", "superquadrics.rviz"])
+    return Node(
+        package="rviz2",
+        executable="rviz2",
+        arguments=["-d", share, "-f", given["rviz_frame"]],
+        remappings=[("/depth/image", given["depth"]), ("/depth/camera_info", given["camera_info"])],
+    )

@@ -1,6 +1,6 @@
-"""A synthetic depth camera with recover_node and fitter_node behind it.
+"""A synthetic depth camera with recover_node and fitter_node behind it; RViz2 if asked for.
 
-ros2 launch sq_perception synthetic.launch.py scene:=table rate:=10.0
+ros2 launch sq_perception synthetic.launch.py scene:=table rate:=10.0 rviz:=true
 ros2 launch sq_perception synthetic.launch.py scene:=replay path:=/recordings/frame.npz
 """
 
@@ -8,8 +8,9 @@ from __future__ import annotations
 
 from launch import LaunchContext, LaunchDescription
 from launch.actions import DeclareLaunchArgument, OpaqueFunction, SetEnvironmentVariable
-from launch.substitutions import LaunchConfiguration
+from launch.substitutions import LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
+from launch_ros.substitutions import FindPackageShare
 
 from sq_perception.nodes import fast_dds
 
@@ -19,6 +20,7 @@ ARGUMENTS = {
     "projection": ("auto", "camera model of recorded frames, pinhole or orthographic; auto: by the scene"),
     "rate": ("10.0", "frames per second"),
     "seed": ("0", "seed of scenes and noise"),
+    "rviz": ("false", "also start RViz2 with share/sq_perception/config/superquadrics.rviz"),
 }
 
 
@@ -47,7 +49,12 @@ def _nodes(context: LaunchContext) -> list[Node]:
         "fitter_node": {"projection": projection},
         "synthetic_depth_node": camera,
     }
-    return [
+    started = [
         Node(package="sq_perception", executable=name, name=name, output="screen", parameters=[parameters])
         for name, parameters in nodes.items()
     ]
+    if given["rviz"].lower() in ("true", "1", "yes"):
+        share = PathJoinSubstitution([FindPackageShare("sq_perception"), "config", "superquadrics.rviz"])
+        frame = "unit_cube" if projection == "orthographic" else "camera_depth_optical_frame"
+        started.append(Node(package="rviz2", executable="rviz2", arguments=["-d", share, "-f", frame]))
+    return started

@@ -86,6 +86,7 @@ def test_share_is_complete(install: Path) -> None:
         "launch/recover.py",
         "launch/synthetic.py",
         "config/fast_dds.xml",
+        "config/superquadrics.rviz",
     ):
         assert (share / PACKAGE / name).is_file(), name
     assert list((share / PACKAGE / "config").glob("*.yaml"))

@@ -39,9 +39,10 @@ def launch(monkeypatch: pytest.MonkeyPatch) -> dict[str, type]:
     names = {
         "launch": ["LaunchContext", "LaunchDescription"],
         "launch.actions": ["DeclareLaunchArgument", "OpaqueFunction", "SetEnvironmentVariable"],
-        "launch.substitutions": ["LaunchConfiguration"],
+        "launch.substitutions": ["LaunchConfiguration", "PathJoinSubstitution"],
         "launch_ros": [],
         "launch_ros.actions": ["Node"],
+        "launch_ros.substitutions": ["FindPackageShare"],
     }
     made: dict[str, type] = {}
     for module, classes in names.items():
@@ -99,6 +100,33 @@ def test_the_synthetic_camera_and_its_readers_agree(
     nodes = nodes_of(repository / "launch_scripts" / "synthetic.launch.py", launch, scene=scene)
     assert {node.named["executable"] for node in nodes} == {"recover_node", "fitter_node", "synthetic_depth_node"}
     assert {node.named["parameters"][0]["projection"] for node in nodes} == {projection}
+
+
+def rviz_of(nodes: list[Any]) -> Any:
+    """The one RViz2 among nodes; its configuration is looked up where the package installs it."""
+    (rviz,) = (node for node in nodes if node.named["package"] == "rviz2")
+    flag, share, *frame = rviz.named["arguments"]
+    package, *path = share.positional[0]
+    assert (rviz.named["executable"], flag, frame[0]) == ("rviz2", "-d", "-f")
+    assert (package.positional[0], path) == ("sq_perception", ["config", "superquadrics.rviz"])
+    return rviz
+
+
+def test_rviz_looks_at_the_topics_of_the_camera(repository: Path, launch: dict[str, type]) -> None:
+    path = repository / "launch_scripts" / "recover.launch.py"
+    nodes = nodes_of(path, launch, rviz="true", depth="/zed/depth", camera_info="/zed/info", rviz_frame="zed_optical")
+    rviz = rviz_of(nodes)
+    assert [node.named["executable"] for node in nodes] == ["recover_node", "rviz2"]
+    assert dict(rviz.named["remappings"]) == {"/depth/image": "/zed/depth", "/depth/camera_info": "/zed/info"}
+    assert rviz.named["arguments"][-1] == "zed_optical"
+
+
+@pytest.mark.parametrize(("scene", "frame"), [("table", "camera_depth_optical_frame"), ("thesis", "unit_cube")])
+def test_rviz_is_fixed_to_the_frame_of_the_synthetic_camera(
+    scene: str, frame: str, repository: Path, launch: dict[str, type]
+) -> None:
+    nodes = nodes_of(repository / "launch_scripts" / "synthetic.launch.py", launch, scene=scene, rviz="true")
+    assert rviz_of(nodes).named["arguments"][-1] == frame
 
 
 @pytest.mark.parametrize("name", ["recover.py", "synthetic.py"])

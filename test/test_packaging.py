@@ -55,6 +55,7 @@ def test_the_wheel_carries_everything(wheel: Path) -> None:
         f"{data}/share/ament_index/resource_index/packages/{PACKAGE}",
         f"{data}/share/{PACKAGE}/package.xml",
         f"{data}/share/{PACKAGE}/config/fast_dds.xml",
+        f"{data}/share/{PACKAGE}/config/superquadrics.rviz",
         f"{data}/share/{PACKAGE}/launch/recover.launch.py",
         f"{data}/share/{PACKAGE}/launch/synthetic.launch.py",
         f"{data}/share/{PACKAGE}/launch/recover.py",
