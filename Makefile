@@ -1,5 +1,6 @@
 # make demo    watch superquadrics being recovered from a synthetic camera; FRAME=file for a recorded frame
 # make test    lint and the whole test suite, against the installed package
+# make docs    the pages of docs/ as a site: site/index.html
 # make clean   remove everything that these commands made
 #
 # PYTHON=python3.12     the interpreter, 3.10 to 3.13
@@ -25,7 +26,7 @@ SOURCES := setup.py setup.cfg pyproject.toml package.xml resource/sq_perception 
 	$(wildcard config/*) $(wildcard launch_scripts/*.py) $(wildcard sq_msgs_py/*.py) \
 	$(wildcard sq_perception/*.py) $(wildcard sq_perception/*/*.py) $(wildcard sq_perception/*/*/*.yaml) $(wildcard sq_perception/weights/*)
 
-.PHONY: demo test lint bench install clean
+.PHONY: demo test lint bench docs install clean
 .DEFAULT_GOAL := install
 
 install: $(VENV)/.package
@@ -67,6 +68,9 @@ test: lint
 bench: $(VENV)/.package
 	for script in benchmarks/*.py; do $(VENV)/bin/python "$$script" || exit 1; done
 
+docs: $(VENV)/.package
+	$(VENV)/bin/mkdocs build --strict
+
 clean:
-	rm -rf $(VENV) build install log dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
+	rm -rf $(VENV) build install log dist site *.egg-info .pytest_cache .mypy_cache .ruff_cache .hypothesis
 	rm -f demo.png demo.glb

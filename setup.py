@@ -25,6 +25,10 @@ bags = [
 train = [
     "tensorboard>=2.14",  # curves of a running training
 ]
+docs = [
+    "mkdocs>=1.6,<2",  # docs/ as a site; its hooks may change with 2
+    "mkdocs-material>=9.5,<10",  # search, navigation and code blocks without a script or font from elsewhere
+]
 
 setup(
     name=NAME,
@@ -80,9 +84,11 @@ setup(
         "ros": ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"],
         "bags": bags,
         "train": train,
+        "docs": docs,
         "test": [
             *bags,
             *train,
+            *docs,
             "pytest>=7,<8.4",  # later ones break the launch_testing plugins of a ROS installation
             "hypothesis>=6",
             "ruff>=0.6",

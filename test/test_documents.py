@@ -1,0 +1,135 @@
+"""Documents: links that lead somewhere in a checkout, and a site, built strictly, that loads nothing from elsewhere."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+import yaml
+
+_LINK = re.compile(r"(?<=\]\()(?P<path>[^)#\s:]*)(?:#(?P<anchor>[^)\s]*))?(?=\))")
+_FENCE = re.compile(r"^```.*?^```$", re.MULTILINE | re.DOTALL)
+_LOADING = {"script": "src", "img": "src", "link": "href", "iframe": "src", "source": "src", "use": "href"}
+"""Elements that a browser fetches by itself, and the attribute that says from where."""
+
+
+def documents(repository: Path) -> Iterator[Path]:
+    yield from sorted(repository.glob("*.md"))
+    yield from sorted((repository / "docs").glob("*.md"))
+    yield from sorted((repository / "benchmarks" / "results").glob("*.md"))
+
+
+def anchors(page: Path) -> set[str]:
+    """Of the headings, as GitHub and MkDocs make them."""
+    headings = re.findall(r"^#+ (.*)$", _FENCE.sub("", page.read_text(encoding="utf-8")), re.MULTILINE)
+    words = (re.sub(r"[^\w\s-]", "", heading.lower()).strip() for heading in headings)
+    return {re.sub(r"\s", "-", one) for one in words}
+
+
+def test_links_lead_somewhere_in_a_checkout(repository: Path) -> None:
+    broken = []
+    for page in documents(repository):
+        for match in _LINK.finditer(_FENCE.sub("", page.read_text(encoding="utf-8"))):
+            target = (page.parent / match["path"]).resolve() if match["path"] else page
+            if not target.exists():
+                broken.append(f"{page.name}: {match[0]}")
+            elif match["anchor"] and target.suffix == ".md" and match["anchor"] not in anchors(target):
+                broken.append(f"{page.name}: {match[0]}: no such heading")
+    assert not broken
+
+
+def test_the_workflow_pins_what_it_runs_and_may_only_read(repository: Path) -> None:
+    text = (repository / ".github" / "workflows" / "ci.yml").read_text(encoding="utf-8")
+    workflow = yaml.safe_load(text)
+    assert workflow["permissions"] == {"contents": "read"}
+    steps = [step for job in workflow["jobs"].values() for step in job["steps"]]
+    used = [step["uses"] for step in steps if "uses" in step]
+    assert used
+    assert all(re.fullmatch(r"actions/[a-z-]+@[0-9a-f]{40}", one) for one in used), used
+    assert any("make test" in step.get("run", "") for step in steps)
+
+
+def test_every_page_is_in_the_navigation(repository: Path) -> None:
+    text = (repository / "mkdocs.yml").read_text(encoding="utf-8")
+
+    def pages(entry: object) -> Iterator[str]:
+        if isinstance(entry, str):
+            yield entry
+        elif isinstance(entry, list):
+            for one in entry:
+                yield from pages(one)
+        elif isinstance(entry, dict):
+            yield from pages(list(entry.values()))
+
+    named = list(pages(yaml.safe_load(text)["nav"]))
+    assert {one for one in named if "/" not in one} == {page.name for page in (repository / "docs").glob("*.md")}
+    assert len(set(named)) == len(named)
+
+
+@pytest.fixture(scope="module")
+def site(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The built site; strict: what MkDocs warns of is an error."""
+    pytest.importorskip("mkdocs", reason="mkdocs is missing: install the extra 'docs'")
+    pytest.importorskip("material", reason="mkdocs-material is missing: install the extra 'docs'")
+    folder = tmp_path_factory.mktemp("site")
+    result = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)],
+        cwd=repository,
+        env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"},
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert result.returncode == 0, result.stdout + result.stderr
+    return folder
+
+
+class Loads(HTMLParser):
+    """Addresses that a page loads without being asked, and those that it links to."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.loaded: list[str] = []
+        self.linked: list[str] = []
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        values = dict(attrs)
+        address = values.get(_LOADING.get(tag, ""))
+        if address and not (tag == "link" and values.get("rel") in ("canonical", "next", "prev")):
+            self.loaded.append(address)
+        if tag == "a" and values.get("href"):
+            self.linked.append(str(values["href"]))
+
+
+def test_the_site_loads_nothing_from_elsewhere(site: Path) -> None:
+    pages = sorted(site.rglob("*.html"))
+    assert len(pages) > 20
+    for page in pages:
+        found = Loads()
+        found.feed(page.read_text(encoding="utf-8"))
+        assert found.loaded
+        outside = [one for one in found.loaded if re.match(r"(\w+:)?//", one)]
+        assert not outside, page.name
+    for sheet in site.rglob("*.css"):
+        assert not re.search(r"url\(\s*[\"']?(https?:)?//", sheet.read_text(encoding="utf-8")), sheet.name
+
+
+def test_pages_link_to_files_that_are_there(site: Path) -> None:
+    """Links out of docs/, to benchmarks and sources, are turned to what the site carries of them."""
+    for page in sorted(site.rglob("*.html")):
+        if page.name == "404.html":  # addressed from the root, wherever it is shown
+            continue
+        found = Loads()
+        found.feed(page.read_text(encoding="utf-8"))
+        for address in (*found.loaded, *found.linked):
+            if re.match(r"\w+:|//|#", address):
+                continue
+            target = page.parent / address.partition("#")[0].partition("?")[0]
+            assert target.exists(), f"{page.relative_to(site)}: {address}"
+    assert (site / "repository/benchmarks/results/tracking.html").is_file()
