@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import ast
 import os
+import re
 import stat
 import subprocess
 import sys
@@ -127,3 +129,32 @@ def test_the_found_executable_starts_the_node(prefix: Path, node: str, tmp_path:
 
 def test_the_command_line_is_installed(prefix: Path) -> None:
     assert os.access(prefix / "bin" / "sq-perception", os.X_OK)
+
+
+def imported(paths: list[Path]) -> set[str]:
+    """Top-level names that modules import, by statement or by importlib.import_module with a literal."""
+    found: set[str] = set()
+    for path in paths:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Import):
+                found |= {one.name for one in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
+                found.add(node.module)
+            elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module") and node.args:
+                literal = node.args[0]
+                found |= {literal.value} if isinstance(literal, ast.Constant) else set()
+    return {name.partition(".")[0] for name in found}
+
+
+def test_package_xml_names_every_ros_package_that_is_imported(repository: Path) -> None:
+    """rosdep installs what is declared; packages for outputs that few ask for are named in a comment."""
+    folders = [repository / name for name in (PACKAGE, "sq_msgs_py", "launch_scripts")]
+    names = imported([path for folder in folders for path in folder.rglob("*.py")])
+    ros = {one for one in names if one.endswith(("_msgs", "_srvs", "_interfaces"))} | (names & {"rclpy", "launch"})
+    ros |= {"launch_ros"} & names | {"tf2_ros_py" for one in names if one == "tf2_ros"}
+    text = (repository / "package.xml").read_text(encoding="utf-8")
+    declared = set(re.findall(r"<exec_depend>(.*?)</exec_depend>", text))
+    optional = {"vision_msgs", "moveit_msgs"}
+    assert ros - optional <= declared
+    assert not declared & optional
+    assert all(one in text for one in optional)
