@@ -28,6 +28,8 @@ _THREADS = {"OMP_WAIT_POLICY": "PASSIVE", "OPENBLAS_NUM_THREADS": "1"}
 with these settings and 50 to 150 ms without.  Small solves gain nothing from a second thread."""
 
 
+_SWITCH = 0.001
+"""Seconds after which Python lets another thread go on.  With its 5 ms, services waited behind the threads that fit."""
 _LOOK = 0.1
 """Seconds between two looks at whether a signal has arrived."""
 
@@ -59,6 +61,7 @@ def run(name: str, create: Callable[[], Sequence[StoppableNode]], arguments: Seq
             # Libraries read these when they are loaded, rclpy already loads numpy.
             for variable, value in {**_THREADS, **fast_dds.additions()}.items():
                 os.environ.setdefault(variable, value)
+            sys.setswitchinterval(_SWITCH)
             import rclpy
             from rclpy.executors import SingleThreadedExecutor
             from rclpy.signals import SignalHandlerOptions
