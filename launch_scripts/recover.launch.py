@@ -19,11 +19,16 @@ ARGUMENTS = {
     "camera_info": ("depth/camera_info", "topic of their camera_info"),
     "mask": ("mask/image", "topic of label images with the same stamps, if there are any"),
     "params_file": ("", "YAML file of parameters, like the one in share/sq_perception/config"),
+    "namespace": ("", "of the nodes; relative topics are in it too"),
+    "autostart": ("true", "false: stay unconfigured until a lifecycle manager asks"),
+    "respawn": ("true", "start a node again that has ended by itself"),
     "fitter": ("false", "also start fitter_node, the classic method"),
     "rviz": ("false", "also start RViz2 with share/sq_perception/config/superquadrics.rviz"),
     "rviz_frame": ("camera_depth_optical_frame", "RViz2's fixed frame: the frame_id of the depth images"),
 }
 _YES = ("true", "1", "yes")
+_RESPAWN_DELAY = 2.0
+"""Seconds: a model that is missing must not fill the log."""
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -42,8 +47,14 @@ def _nodes(context: LaunchContext) -> list[Node]:
             package="sq_perception",
             executable=executable,
             name=executable,
+            namespace=given["namespace"],
             output="screen",
-            parameters=[given["params_file"]] if given["params_file"] else [],
+            respawn=given["respawn"].lower() in _YES,
+            respawn_delay=_RESPAWN_DELAY,
+            parameters=[
+                *([given["params_file"]] if given["params_file"] else []),
+                {"autostart": given["autostart"].lower() in _YES},
+            ],
             remappings=[
                 ("depth/image", given["depth"]),
                 ("depth/camera_info", given["camera_info"]),

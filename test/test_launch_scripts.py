@@ -90,7 +90,11 @@ def test_recover_is_wired_to_the_camera(repository: Path, launch: dict[str, type
     }
     both = nodes_of(path, launch, fitter="true", params_file="mine.yaml")
     assert [node.named["executable"] for node in both] == ["recover_node", "fitter_node"]
-    assert both[0].named["parameters"] == ["mine.yaml"]
+    assert both[0].named["parameters"] == ["mine.yaml", {"autostart": True}]
+    assert both[0].named["respawn"]
+    (managed,) = nodes_of(path, launch, namespace="wrist", autostart="false", respawn="false")
+    assert (managed.named["namespace"], managed.named["respawn"]) == ("wrist", False)
+    assert managed.named["parameters"] == [{"autostart": False}]
 
 
 @pytest.mark.parametrize(("scene", "projection"), [("table", "pinhole"), ("thesis", "orthographic")])
