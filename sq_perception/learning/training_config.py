@@ -12,8 +12,8 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-import yaml
 
+from sq_perception import plain_yaml
 from sq_perception.learning.dataset import ViewSource
 from sq_perception.learning.disturbance import Disturbance
 from sq_perception.learning.objective import LOSSES, UNSUPERVISED, Objective
@@ -197,8 +197,8 @@ def _values(path: str | Path) -> dict[str, Any]:
     if not source.is_file():
         raise ValueError(f"{path}: no such configuration file; shipped ones are {', '.join(shipped())}")
     try:
-        values = yaml.safe_load(source.read_text(encoding="utf-8")) or {}
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        values = plain_yaml.read(source) or {}
+    except plain_yaml.YamlError as error:
         raise ValueError(f"{path}: not a YAML file: {error}") from error
     if not isinstance(values, dict):
         raise ValueError(f"{path}: expected 'name: value' lines")

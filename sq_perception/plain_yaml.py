@@ -1,0 +1,69 @@
+"""YAML files from outside: plain data only, bounded before it is read.
+
+PyYAML's safe loader makes no objects, but a file of a few hundred bytes can still unfold into more text than any memory
+holds (aliases), or nest deeper than the interpreter's stack.  Such files are refused here; no camera_info, bag or
+configuration has either.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+LARGEST = 2**20
+"""Bytes of a file."""
+DEEPEST = 32
+"""Levels of mappings and lists within each other."""
+
+
+class YamlError(ValueError):
+    """A file that cannot be read, or is no plain YAML; says why."""
+
+
+class _PlainLoader(yaml.SafeLoader):
+    """The safe loader, without aliases and deep nesting."""
+
+    def __init__(self, stream: str) -> None:
+        super().__init__(stream)
+        self._depth = 0
+
+    def compose_node(self, parent: yaml.Node | None, index: Any) -> yaml.Node | None:
+        if self.check_event(yaml.AliasEvent):
+            raise YamlError("expected plain data, got an alias (*)")
+        self._depth += 1
+        if self._depth > DEEPEST:
+            raise YamlError(f"expected at most {DEEPEST} levels of nesting")
+        try:
+            return super().compose_node(parent, index)
+        finally:
+            self._depth -= 1
+
+
+def read_all(path: Path) -> list[Any]:
+    """The documents of a file.
+
+    Raises
+    ------
+    YamlError
+        If it is missing, too large, not UTF-8, or no plain YAML.
+    """
+    try:
+        with path.open("rb") as file:
+            data = file.read(LARGEST + 1)
+        if len(data) > LARGEST:
+            raise YamlError(f"expected at most {LARGEST} bytes")
+        return list(yaml.load_all(data.decode("utf-8"), Loader=_PlainLoader))  # noqa: S506 - a safe loader
+    except (OSError, UnicodeDecodeError, yaml.YAMLError, ValueError, RecursionError) as error:
+        if isinstance(error, YamlError):
+            raise
+        raise YamlError(" ".join(str(error).split()) or type(error).__name__) from error
+
+
+def read(path: Path) -> Any:
+    """The one document of a file; None if it is empty.  Raises YamlError as :func:`read_all` does."""
+    documents = read_all(path)
+    if len(documents) > 1:
+        raise YamlError(f"expected one document, got {len(documents)}")
+    return documents[0] if documents else None
