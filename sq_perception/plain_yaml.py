@@ -54,7 +54,7 @@ def read_all(path: Path) -> list[Any]:
             data = file.read(LARGEST + 1)
         if len(data) > LARGEST:
             raise YamlError(f"expected at most {LARGEST} bytes")
-        return list(yaml.load_all(data.decode("utf-8"), Loader=_PlainLoader))  # noqa: S506 - a safe loader
+        return list(yaml.load_all(data.decode("utf-8"), Loader=_PlainLoader))
     except (OSError, UnicodeDecodeError, yaml.YAMLError, ValueError, RecursionError) as error:
         if isinstance(error, YamlError):
             raise
