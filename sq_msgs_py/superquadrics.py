@@ -25,7 +25,7 @@ equally right: compare bodies, never raw parameters.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -124,6 +124,12 @@ class SuperquadricArray:
 
     def __len__(self) -> int:
         return len(self.size)
+
+    @property
+    def recovered(self) -> SuperquadricArray:
+        """Those that did not fail, in their order."""
+        kept = self.status != FAILED
+        return replace(self, **{column.name: getattr(self, column.name)[kept] for column in fields(self)})
 
     @classmethod
     def empty(cls) -> SuperquadricArray:

@@ -26,7 +26,8 @@ FLOORS = (
     ("evaluation", "nodes", "cli", "recover_command"),
 )
 ROS = ("rclpy", "sensor_msgs", "std_msgs", "std_srvs", "visualization_msgs", "diagnostic_msgs", "geometry_msgs",
-       "rcl_interfaces", "builtin_interfaces", "tf2_ros")  # fmt: skip
+       "rcl_interfaces", "builtin_interfaces", "shape_msgs", "tf2_ros", "tf2_msgs", "vision_msgs",
+       "moveit_msgs")  # fmt: skip
 
 
 def sources() -> list[Path]:
@@ -100,9 +101,18 @@ def test_only_nodes_and_bags_join_the_two_packages() -> None:
 
 
 def test_messages_need_numpy_and_messages_only() -> None:
-    allowed = {"sq_msgs_py", "numpy", "sensor_msgs", "std_msgs", "geometry_msgs", "visualization_msgs"}
+    allowed = {"sq_msgs_py", "numpy", "sensor_msgs", "std_msgs", "geometry_msgs", "shape_msgs", "visualization_msgs"}
+    soft = {"vision_msgs", "moveit_msgs"}
     found = set().union(*(roots(path) for path in MESSAGES.rglob("*.py")))
-    assert found - set(sys.stdlib_module_names) <= allowed
+    assert found - set(sys.stdlib_module_names) <= allowed | soft
+
+
+def test_messages_that_a_robot_may_lack_are_imported_when_they_are_made() -> None:
+    pytest.importorskip("shape_msgs", reason="message packages missing: install the extra 'ros' or source ROS 2")
+    absent = "import sys; sys.modules.update(dict.fromkeys(('vision_msgs', 'moveit_msgs', 'tf2_msgs', 'tf2_ros')))"
+    modules = loaded_after(f"{absent}; import sq_msgs_py.detections, sq_msgs_py.collision_objects")
+    assert "sq_msgs_py.shapes" in modules
+    assert not modules & {"torch", "sq_perception", "scipy", "rclpy"}
 
 
 def test_only_the_command_line_reaches_ros_and_only_when_asked() -> None:

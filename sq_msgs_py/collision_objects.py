@@ -1,0 +1,103 @@
+"""moveit_msgs/CollisionObject of superquadrics, and the planning scene difference that carries them; needs moveit_msgs.
+
+The pose of an object is that of the body, its id ``<prefix><id>``.  Its one shape has the identity as pose and encloses
+the body (:mod:`sq_msgs_py.shapes`): the smallest of box, cylinder and sphere, or a mesh, grown to enclose.  Primitives
+are solid and quick to test; meshes fit closely, but FCL, MoveIt's usual collision checker, knows of a mesh only its
+surface.
+
+MoveIt takes objects on two topics, both with a queue of ten: ``collision_object``, one object a message, and
+``planning_scene``, any number.  A frame is one difference (``is_diff``) for the latter: it arrives whole or not at all,
+and leaves alone what others put into the scene.
+
+MoveIt looks at the frame of the header, not at its stamp: it places an object by the newest transform that it has.  A
+camera that moves therefore wants its results in a frame that does not (``target_frame`` of the nodes).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from geometry_msgs.msg import Pose, Quaternion
+
+from sq_msgs_py.poses import pose_messages
+from sq_msgs_py.shapes import enclosing_factor, mesh_message, primitive
+from sq_msgs_py.superquadrics import SuperquadricArray
+from sq_msgs_py.transforms import PREFIX, name
+
+if TYPE_CHECKING:
+    from moveit_msgs.msg import CollisionObject, PlanningScene
+
+
+def collision_objects(
+    superquadrics: SuperquadricArray,
+    header: Any,
+    *,
+    meshes: Sequence[tuple[np.ndarray, np.ndarray]] | None = None,
+    prefix: str = PREFIX,
+) -> list[CollisionObject]:
+    """One object to ADD for each body that did not fail; one of the same id that is there already is replaced.
+
+    Parameters
+    ----------
+    header
+        std_msgs/Header of the bodies.
+    meshes
+        Vertices (k, 3) and faces (m, 3) for each body that did not fail, on its surface and in its own frame; they are
+        grown by :func:`~sq_msgs_py.shapes.enclosing_factor`.  None: enclosing primitives.
+    prefix
+        Of the ids.
+
+    Raises
+    ------
+    ImportError
+        Without moveit_msgs.
+    ValueError
+        If the number of meshes is another, or a mesh or body is none.
+    """
+    from moveit_msgs.msg import CollisionObject
+
+    bodies = superquadrics.recovered
+    if meshes is not None and len(meshes) != len(bodies):
+        raise ValueError(f"meshes: expected one for each of {len(bodies)} bodies, got {len(meshes)}")
+    objects = []
+    for k, pose in enumerate(pose_messages(bodies)):
+        one = CollisionObject(header=header, id=name(bodies.id[k], prefix), pose=pose, operation=CollisionObject.ADD)
+        here = Pose(orientation=Quaternion(w=1.0))
+        if meshes is None:
+            one.primitives, one.primitive_poses = [primitive(bodies.size[k], bodies.shape[k]).message], [here]
+        else:
+            vertices, faces = meshes[k]
+            factor = enclosing_factor(vertices, faces, bodies.size[k], bodies.shape[k])
+            one.meshes, one.mesh_poses = [mesh_message(factor * np.asarray(vertices), faces)], [here]
+        objects.append(one)
+    return objects
+
+
+def removals(names: Iterable[str], header: Any) -> list[CollisionObject]:
+    """One object to REMOVE for each name.
+
+    Raises
+    ------
+    ImportError
+        Without moveit_msgs.
+    ValueError
+        For an empty name: MoveIt would remove every object of the scene.
+    """
+    from moveit_msgs.msg import CollisionObject
+
+    names = sorted(names)
+    if "" in names:
+        raise ValueError("names: expected none to be empty, as MoveIt would remove all objects")
+    return [CollisionObject(header=header, id=one, operation=CollisionObject.REMOVE) for one in names]
+
+
+def planning_scene(objects: Sequence[CollisionObject]) -> PlanningScene:
+    """The difference that applies the objects and changes nothing else; ImportError without moveit_msgs."""
+    from moveit_msgs.msg import PlanningScene
+
+    message = PlanningScene(is_diff=True)
+    message.robot_state.is_diff = True
+    message.world.collision_objects = list(objects)
+    return message

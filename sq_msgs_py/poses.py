@@ -1,0 +1,118 @@
+"""Poses of superquadrics as geometry_msgs/Pose, and whole arrays moved from one frame into another.
+
+A rigid motion is (rotation, translation): quaternion x y z w of any length but 0, metres; p_new = R p + t.  It is what
+tf2's ``lookup_transform(new_frame, header.frame_id, ...)`` answers.  Half sizes, exponents and their deviations belong
+to the body and do not change.
+
+Covariances of poses are (6, 6): x y z in metres, then small rotations about the x, y, z axes of the header's frame,
+radians; the order of geometry_msgs/PoseWithCovariance.  NaN where unknown.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import Point, Pose, Quaternion
+from std_msgs.msg import Header
+
+from sq_msgs_py.superquadrics import SuperquadricArray
+
+_LEAST_LENGTH = 1e-6
+
+
+def pose_messages(superquadrics: SuperquadricArray) -> list[Pose]:
+    """The pose of each of n bodies in the frame of their header, with unit quaternions.
+
+    Raises
+    ------
+    ValueError
+        If a quaternion names no rotation.
+    """
+    rotations = unit_quaternions(superquadrics.rotation)
+    return [
+        Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
+        for (x, y, z), (qx, qy, qz, qw) in zip(
+            superquadrics.translation.astype(float).tolist(), rotations.tolist(), strict=True
+        )
+    ]
+
+
+def moved(superquadrics: SuperquadricArray, rotation: np.ndarray, translation: np.ndarray) -> SuperquadricArray:
+    """The same bodies in another frame.
+
+    Columns are float32: 10 km from the origin of the new frame a centre is exact to 0.5 mm, at the 500 km of a UTM grid
+    to 16 mm.
+
+    Parameters
+    ----------
+    rotation : (4,)
+    translation : (3,)
+
+    Raises
+    ------
+    ValueError
+        If the motion is not finite or a quaternion names no rotation.
+    """
+    turn, shift = _motion(rotation, translation)
+    return replace(
+        superquadrics,
+        translation=superquadrics.translation.astype(float) @ matrices(turn).T + shift,
+        rotation=_product(turn, unit_quaternions(superquadrics.rotation)),
+    )
+
+
+def moved_covariances(covariances: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """Covariances (n, 6, 6) of poses in a frame that is turned by a quaternion (4,), p_new = R p."""
+    change = np.kron(np.eye(2), matrices(unit_quaternions(rotation)))
+    return change @ np.asarray(covariances, dtype=float) @ change.T
+
+
+def header_in(header: Any, frame_id: str) -> Header:
+    """A header of the same stamp in another frame."""
+    return Header(stamp=header.stamp, frame_id=frame_id)
+
+
+def unit_quaternions(quaternions: np.ndarray) -> np.ndarray:
+    """Quaternions (..., 4) as float64 of length 1.
+
+    Raises
+    ------
+    ValueError
+        If one is not finite or has a length near 0.
+    """
+    quaternions = np.asarray(quaternions, dtype=float)
+    if quaternions.shape[-1:] != (4,):
+        raise ValueError(f"rotation: expected quaternions (..., 4), got {quaternions.shape}")
+    length = np.linalg.norm(quaternions, axis=-1, keepdims=True)
+    if not (np.isfinite(length) & (length > _LEAST_LENGTH)).all():
+        raise ValueError(f"rotation: expected quaternions of a length above 0, got {quaternions.tolist()}")
+    return quaternions / length
+
+
+def matrices(quaternions: np.ndarray) -> np.ndarray:
+    """Rotation matrices (..., 3, 3) of unit quaternions (..., 4)."""
+    x, y, z, w = np.moveaxis(quaternions, -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def _motion(rotation: np.ndarray, translation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    turn, shift = unit_quaternions(rotation), np.asarray(translation, dtype=float)
+    if turn.shape != (4,) or shift.shape != (3,) or not np.isfinite(shift).all():
+        raise ValueError(
+            f"motion: expected a quaternion (4,) and a finite translation (3,), got {turn.shape} and {shift}"
+        )
+    return turn, shift
+
+
+def _product(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Quaternions (n, 4) of left (4,) after each of right (n, 4)."""
+    (x, y, z, w), vector, scalar = left, right[:, :3], right[:, 3:]
+    turned = w * vector + scalar * left[:3] + np.cross(left[:3], vector)
+    return np.concatenate([turned, w * scalar - vector @ np.array([[x], [y], [z]])], axis=1)

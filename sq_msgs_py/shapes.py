@@ -1,0 +1,204 @@
+"""Superquadrics as shape_msgs: triangle meshes, and the primitive solid that encloses a body most tightly.
+
+Everything is in the body's own frame, centred at its origin; the pose of the message is that of the body.  Metres.
+
+A planner must not be told that space is free where the body is.  The flat faces of a mesh cut through a curved body,
+and a body is hardly ever a primitive; so a mesh can be grown, and a primitive is chosen, to ENCLOSE the body.
+
+The points of the surface of a body with exponents at most 2 (all of these are convex) are x^2 + y^2 = (a1^2 u^e2 +
+a2^2 v^e2) s^e1 and z^2 = a3^2 t^e1, with u + v = 1 and s + t = 1, none below 0.  So the enclosing
+
+    box        has the half sizes a1 a2 a3, and touches the body with all six faces,
+    cylinder   has the height 2 a3, and as radius the largest sqrt(x^2 + y^2),
+    sphere     has as radius the largest |p|,
+
+and both radii have closed forms: the maximum of c u^e + d v^e is (c^k + d^k)^(1/k), k = 1/(1 - e), for e < 1 (Hölder's
+inequality), and max(c, d) otherwise.  For e > 1 the same formula is the minimum, which is min(c, d) otherwise.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import exp, expm1, gamma, hypot, log, pi, sqrt
+
+import numpy as np
+from geometry_msgs.msg import Point
+from shape_msgs.msg import Mesh, MeshTriangle, SolidPrimitive
+
+from sq_msgs_py.superquadrics import SuperquadricArray
+
+BOX, CYLINDER, SPHERE = "box", "cylinder", "sphere"
+_LEAST_AREA = 1e-12
+"""Of a triangle that counts, for a body of half sizes 1: smaller ones have no normal."""
+
+
+@dataclass(frozen=True)
+class Primitive:
+    """A solid that encloses a body; its pose is the body's.
+
+    Attributes
+    ----------
+    kind
+        BOX, CYLINDER (axis along the body's z) or SPHERE.
+    dimensions
+        As SolidPrimitive has them: box: full edges x y z; cylinder: height, radius; sphere: radius; metres.
+    overhang
+        No point of the solid is farther from the body than this, metres; 0 only where it is the body itself.
+    volume_ratio
+        Volume of the solid over that of the body, at least 1.
+    """
+
+    kind: str
+    dimensions: tuple[float, ...]
+    overhang: float
+    volume_ratio: float
+
+    @property
+    def message(self) -> SolidPrimitive:
+        """The solid as a message, centred at the origin of the body's pose."""
+        kinds = {BOX: SolidPrimitive.BOX, CYLINDER: SolidPrimitive.CYLINDER, SPHERE: SolidPrimitive.SPHERE}
+        return SolidPrimitive(type=kinds[self.kind], dimensions=list(self.dimensions))
+
+    def __str__(self) -> str:
+        return (
+            f"a {self.kind} that encloses the body, stands off it by up to {1e3 * self.overhang:.1f} mm and has "
+            f"{self.volume_ratio:.2f} times its volume"
+        )
+
+
+def primitive(size: np.ndarray, shape: np.ndarray) -> Primitive:
+    """The box, cylinder or sphere of the least volume that encloses a body.
+
+    Boxes with two small exponents become boxes; cylinders (e1 small, e2 near 1, a1 near a2) become cylinders; balls
+    become spheres; what is none of these mostly gets its bounding box.
+
+    Parameters
+    ----------
+    size : (3,)
+        Half sizes, metres.
+    shape : (2,)
+        e1, e2.
+
+    Raises
+    ------
+    ValueError
+        If a half size is not positive or an exponent not in (0, 2].
+    """
+    (a1, a2, a3), (e1, e2) = _checked(size, shape)
+    across = _extremes(a1**2, a2**2, e2)
+    nearest, radius = sqrt(across[0]), sqrt(across[1])
+    inner, outer = sqrt(_extremes(across[0], a3**2, e1)[0]), sqrt(_extremes(across[1], a3**2, e1)[1])
+    body = 2 * a1 * a2 * a3 * e1 * e2 * _beta(e1 / 2 + 1, e1) * _beta(e2 / 2, e2 / 2)
+    # The gauge is largest, and so the way back to the body longest, at a corner or on a rim.
+    corner = sqrt(a1**2 + a2**2 + a3**2) * _way_back(log(2) * e2 / e1, e1)
+    rim = hypot(radius, a3) * _way_back(2 / e1 * log(radius / nearest), e1)
+    candidates = (
+        (8 * a1 * a2 * a3, BOX, (2 * a1, 2 * a2, 2 * a3), corner),
+        (2 * pi * radius**2 * a3, CYLINDER, (2 * a3, radius), rim),
+        (4 / 3 * pi * outer**3, SPHERE, (outer,), max(outer - inner, 0.0)),
+    )
+    volume, kind, dimensions, overhang = min(candidates)
+    return Primitive(kind, dimensions, overhang, max(volume / body, 1.0))
+
+
+def primitives(superquadrics: SuperquadricArray) -> list[Primitive]:
+    """The enclosing primitive of each of n bodies; ValueError as :func:`primitive`."""
+    return [primitive(size, shape) for size, shape in zip(superquadrics.size, superquadrics.shape, strict=True)]
+
+
+def mesh_message(vertices: np.ndarray, faces: np.ndarray) -> Mesh:
+    """A mesh of vertices (k, 3) and faces (m, 3) of vertex indices, outwards.
+
+    Raises
+    ------
+    ValueError
+        If shapes or indices do not fit.
+    """
+    vertices, faces = _checked_mesh(vertices, faces)
+    return Mesh(
+        vertices=[Point(x=x, y=y, z=z) for x, y, z in vertices.tolist()],
+        triangles=[MeshTriangle(vertex_indices=corners) for corners in faces.astype(np.uint32)],
+    )
+
+
+def enclosing_factor(vertices: np.ndarray, faces: np.ndarray, size: np.ndarray, shape: np.ndarray) -> float:
+    """By how much a mesh of points on a body must grow about the centre to enclose it, at least 1.
+
+    The plane of a face, n.p = d, has the body behind it when d reaches the support function h(n), the dual of the
+    gauge; the factor is the largest h(n) / d.  Then every point of the body lies behind the face that its ray from the
+    centre passes: the body is inside.  For a mesh of 16 x 16 points it is below 1.03.
+
+    Parameters
+    ----------
+    vertices, faces
+        (k, 3) in the body's own frame and (m, 3), outwards, around the origin.
+    size, shape
+        (3,) and (2,) of the body.
+
+    Raises
+    ------
+    ValueError
+        If the mesh is not around the origin with its faces outwards, or the body is none.
+    """
+    size, (e1, e2) = _checked(size, shape)
+    vertices, faces = _checked_mesh(vertices, faces)
+    corners = (vertices / size)[faces]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = np.linalg.norm(normals, axis=1)
+    is_face = area > _LEAST_AREA
+    if not is_face.any():
+        raise ValueError("mesh: expected faces of an area above 0")
+    normals = normals[is_face] / area[is_face, None]
+    distance = np.einsum("ij,ij->i", normals, corners[is_face, 0])
+    if (distance <= 0).any():
+        raise ValueError("mesh: expected the origin inside and the faces outwards")
+    x, y, z = np.abs(normals).T
+    support = _dual(_dual(x, y, e2), z, e1)
+    return max(float((support / distance).max()), 1.0)
+
+
+def _extremes(c: float, d: float, e: float) -> tuple[float, float]:
+    """Least and largest of c u^e + d v^e for u, v >= 0 with u + v = 1."""
+    if e == 1:
+        return min(c, d), max(c, d)
+    k = 1 / (1 - e)
+    inside = exp(float(np.logaddexp(k * log(c), k * log(d))) / k)
+    return (min(c, d), inside) if e < 1 else (inside, max(c, d))
+
+
+def _way_back(log_ratio: float, e1: float) -> float:
+    """1 - 1/g of a point with z = a3, whose share of F in xy is exp(``log_ratio``)."""
+    return -expm1(-e1 / 2 * float(np.logaddexp(log_ratio, 0.0)))
+
+
+def _dual(u: np.ndarray, v: np.ndarray, e: float) -> np.ndarray:
+    """(u^q + v^q)^(1/q) of u, v >= 0 with q = 2 / (2 - e), the dual of the norm with p = 2 / e."""
+    larger, smaller = np.maximum(u, v), np.minimum(u, v)
+    ratio = np.divide(smaller, larger, out=np.zeros_like(larger), where=larger > 0)
+    if e == 2:
+        return larger
+    return larger * (1 + ratio ** (2 / (2 - e))) ** ((2 - e) / 2)
+
+
+def _beta(p: float, q: float) -> float:
+    return gamma(p) * gamma(q) / gamma(p + q)
+
+
+def _checked(size: np.ndarray, shape: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    size, shape = np.asarray(size, dtype=float), np.asarray(shape, dtype=float)
+    if size.shape != (3,) or not (np.isfinite(size) & (size > 0)).all():
+        raise ValueError(f"size: expected three half sizes above 0, got {size.tolist()}")
+    if shape.shape != (2,) or not ((shape > 0) & (shape <= 2)).all():
+        raise ValueError(f"shape: expected two exponents above 0, at most 2, got {shape.tolist()}")
+    return size, shape
+
+
+def _checked_mesh(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    vertices, faces = np.asarray(vertices, dtype=float), np.asarray(faces)
+    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
+        raise ValueError(f"mesh: expected vertices (k, 3) and faces (m, 3), got {vertices.shape} and {faces.shape}")
+    if not np.isfinite(vertices).all():
+        raise ValueError("mesh: expected finite vertices")
+    if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
+        raise ValueError(f"faces: expected indices 0 to {len(vertices) - 1}, got {faces.min()} to {faces.max()}")
+    return vertices, faces

@@ -1,0 +1,239 @@
+"""Solids and meshes that enclose superquadrics: closed forms, and thousands of surface points that lie inside."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip("shape_msgs", reason="message packages missing: install the extra 'ros' or source ROS 2")
+
+from shape_msgs.msg import SolidPrimitive
+
+from sq_msgs_py.shapes import (
+    BOX,
+    CYLINDER,
+    SPHERE,
+    Primitive,
+    _extremes,
+    enclosing_factor,
+    mesh_message,
+    primitive,
+    primitives,
+)
+from sq_msgs_py.superquadrics import SuperquadricArray
+from sq_perception.geometry.mesh import MARKER_RESOLUTION, mesh
+from sq_perception.geometry.superquadric import Superquadric
+
+SIZE = np.array([0.05, 0.04, 0.03])
+ROUND = np.array([0.04, 0.04, 0.09])
+HERE = np.array([0.0, 0.0, 0.0, 1.0])
+
+
+def body(size: np.ndarray, shape: np.ndarray | list[float]) -> Superquadric:
+    return Superquadric(size, np.asarray(shape, float), np.zeros(3), HERE)
+
+
+def random_bodies(count: int, seed: int = 5) -> list[Superquadric]:
+    rng = np.random.default_rng(seed)
+    sizes = np.exp(rng.uniform(np.log(0.01), np.log(0.3), (count, 3)))
+    sizes[::3, 1] = sizes[::3, 0]
+    shapes = rng.uniform(0.05, 2.0, (count, 2))
+    shapes[::4] = rng.choice([0.1, 0.5, 1.0, 1.5, 2.0], (len(shapes[::4]), 2))
+    return [body(size, shape) for size, shape in zip(sizes, shapes, strict=True)]
+
+
+def surface(one: Superquadric, rng: np.random.Generator) -> np.ndarray:
+    """Points of the surface, those of the parametric form among them, which crowd in edges and corners."""
+    eta, omega = rng.uniform(-np.pi / 2, np.pi / 2, 4000), rng.uniform(-np.pi, np.pi, 4000)
+    directions = rng.normal(size=(4000, 3)) * one.size
+    on_rays = directions / one.gauge(directions)[:, None]
+    return np.concatenate([one.parametric_points(eta, omega), on_rays])
+
+
+def overshoot(solid: Primitive, points: np.ndarray) -> float:
+    """How far points (n, 3) leave a solid, relative to its size; 0 where none does."""
+    if solid.kind == BOX:
+        return float((2 * np.abs(points) / solid.dimensions).max() - 1)
+    if solid.kind == CYLINDER:
+        height, radius = solid.dimensions
+        across = np.hypot(points[:, 0], points[:, 1]) / radius
+        return float(max(across.max(), (2 * np.abs(points[:, 2]) / height).max()) - 1)
+    return float(np.linalg.norm(points, axis=1).max() / solid.dimensions[0] - 1)
+
+
+def skin(solid: Primitive, rng: np.random.Generator, count: int = 4000) -> np.ndarray:
+    """Points of a solid's surface, its corners or rims among them."""
+    if solid.kind == BOX:
+        unit = rng.uniform(-1, 1, (count, 3))
+        unit /= np.abs(unit).max(axis=1, keepdims=True)
+        return np.concatenate([unit, [[1, 1, 1]]]) * solid.dimensions / 2
+    if solid.kind == CYLINDER:
+        height, radius = solid.dimensions
+        angle = np.concatenate([rng.uniform(0, 2 * np.pi, count), np.arange(8) * np.pi / 4])
+        z = np.where(rng.random(len(angle)) < 0.5, 1.0, rng.uniform(-1, 1, len(angle)))
+        z[-8:] = 1.0
+        return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), z * height / 2])
+    unit = np.concatenate([rng.normal(size=(count, 3)), np.eye(3)])
+    return solid.dimensions[0] * unit / np.linalg.norm(unit, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize(
+    ("size", "shape", "kind", "dimensions"),
+    [
+        (SIZE, (0.1, 0.1), BOX, (0.10, 0.08, 0.06)),
+        (SIZE, (0.2, 0.3), BOX, (0.10, 0.08, 0.06)),
+        (ROUND, (0.1, 1.0), CYLINDER, (0.18, 0.04)),
+        (ROUND, (0.3, 1.0), CYLINDER, (0.18, 0.04)),
+        (np.full(3, 0.07), (1.0, 1.0), SPHERE, (0.07,)),
+        (np.array([0.06, 0.03, 0.09]), (0.1, 1.0), BOX, (0.12, 0.06, 0.18)),
+        (np.array([0.02, 0.05, 0.09]), (1.0, 1.0), BOX, (0.04, 0.10, 0.18)),
+    ],
+)
+def test_each_body_gets_the_solid_that_it_looks_like(size, shape, kind, dimensions):
+    solid = primitive(size, shape)
+    assert solid.kind == kind
+    assert solid.dimensions == pytest.approx(dimensions, rel=1e-12)
+
+
+def test_messages_have_the_order_of_dimensions_that_shape_msgs_asks_for():
+    box, can, ball = (primitive(*one).message for one in ((SIZE, (0.1, 0.1)), (ROUND, (0.1, 1)), ([0.1] * 3, (1, 1))))
+    assert (box.type, can.type, ball.type) == (SolidPrimitive.BOX, SolidPrimitive.CYLINDER, SolidPrimitive.SPHERE)
+    edges = [box.dimensions[k] for k in (SolidPrimitive.BOX_X, SolidPrimitive.BOX_Y, SolidPrimitive.BOX_Z)]
+    assert edges == pytest.approx([0.10, 0.08, 0.06])
+    assert can.dimensions[SolidPrimitive.CYLINDER_HEIGHT] == pytest.approx(0.18)
+    assert can.dimensions[SolidPrimitive.CYLINDER_RADIUS] == pytest.approx(0.04)
+    assert ball.dimensions[SolidPrimitive.SPHERE_RADIUS] == pytest.approx(0.1)
+
+
+def test_a_ball_is_its_sphere_and_nothing_else_is_exact():
+    ball = primitive(np.full(3, 0.07), (1.0, 1.0))
+    assert ball.overhang == 0
+    assert ball.volume_ratio == pytest.approx(1, abs=1e-12)
+    assert "0.0 mm" in str(ball)
+    can = primitive(ROUND, (0.1, 1.0))
+    # The rim of a cylinder is at g = 2^(e1/2) of its superquadric.
+    assert can.overhang == pytest.approx(np.hypot(0.04, 0.09) * (1 - 2 ** (-0.05)))
+    assert 1.0 < can.volume_ratio < 1.1
+    assert str(can).startswith("a cylinder that encloses the body, stands off it by up to 3.4 mm")
+
+
+@pytest.mark.parametrize("e", [0.1, 0.7, 0.999999, 1.0, 1.000001, 1.5, 2.0])
+def test_extremes_are_those_of_a_fine_search(e):
+    u = np.linspace(0, 1, 200001)
+    values = 0.3 * u**e + 0.5 * (1 - u) ** e
+    assert _extremes(0.3, 0.5, e) == pytest.approx((values.min(), values.max()), rel=1e-6)
+
+
+def test_solids_enclose_their_bodies_and_touch_them():
+    rng = np.random.default_rng(6)
+    kinds = set()
+    for one in random_bodies(120):
+        solid = primitive(one.size, one.shape)
+        kinds.add(solid.kind)
+        over = overshoot(solid, surface(one, rng))
+        assert -0.01 < over <= 1e-12
+        ratio = {BOX: np.prod(2 * one.size)}
+        if solid.kind == CYLINDER:
+            ratio[CYLINDER] = np.pi * solid.dimensions[1] ** 2 * solid.dimensions[0]
+        if solid.kind == SPHERE:
+            ratio[SPHERE] = 4 / 3 * np.pi * solid.dimensions[0] ** 3
+        assert ratio[solid.kind] <= ratio[BOX] * (1 + 1e-12)
+        assert solid.volume_ratio == pytest.approx(ratio[solid.kind] / float(one.volume()), rel=1e-9)
+    assert kinds == {BOX, CYLINDER, SPHERE}
+
+
+def test_no_point_of_a_solid_is_farther_from_the_body_than_it_says():
+    """The way along the ray to the centre is an upper bound of the distance, and the overhang one of that way."""
+    rng = np.random.default_rng(7)
+    for one in random_bodies(60, seed=8):
+        solid = primitive(one.size, one.shape)
+        points = skin(solid, rng)
+        ways = np.linalg.norm(points, axis=1) * (1 - 1 / one.gauge(points))
+        assert ways.max() <= solid.overhang + 1e-12
+        if solid.kind == BOX:
+            assert ways.max() == pytest.approx(solid.overhang, rel=1e-9)
+
+
+def test_grown_meshes_enclose_their_bodies_and_hardly_grow():
+    rng = np.random.default_rng(9)
+    factors = []
+    for one in random_bodies(60, seed=10):
+        made = mesh(one, MARKER_RESOLUTION)
+        vertices, faces = np.asarray(made.vertices), np.asarray(made.faces)
+        factor = enclosing_factor(vertices, faces, one.size, one.shape)
+        factors.append(factor)
+        corners = (factor * vertices)[faces]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        kept = np.linalg.norm(normals, axis=1) > 1e-9 * one.size.max() ** 2
+        normals = normals[kept] / np.linalg.norm(normals[kept], axis=1, keepdims=True)
+        planes = np.einsum("ij,ij->i", normals, corners[kept, 0])
+        # The mesh is convex: what is behind every face is inside.
+        assert (surface(one, rng) @ normals.T <= planes + 1e-9 * one.size.max()).all()
+        if one.shape.max() < 2:
+            assert (one.support(normals) / planes).max() == pytest.approx(1, abs=1e-6)
+    assert max(factors) < 1.03
+
+
+def test_an_octahedron_is_its_own_mesh():
+    vertices = np.concatenate([np.diag(SIZE), -np.diag(SIZE)])
+    faces = [[0, 1, 2], [1, 3, 2], [3, 4, 2], [4, 0, 2], [1, 0, 5], [3, 1, 5], [4, 3, 5], [0, 4, 5]]
+    assert enclosing_factor(vertices, np.array(faces), SIZE, (2.0, 2.0)) == pytest.approx(1, abs=1e-12)
+    # The ball through its six corners reaches sqrt(3) beyond the middle of its faces.
+    factor = enclosing_factor(vertices, np.array(faces), SIZE, (1.0, 1.0))
+    assert factor == pytest.approx(np.sqrt(3))
+    with pytest.raises(ValueError, match="outwards"):
+        enclosing_factor(vertices, np.array(faces)[:, ::-1], SIZE, (2.0, 2.0))
+    with pytest.raises(ValueError, match="outwards"):
+        enclosing_factor(vertices + [1.0, 0, 0], np.array(faces), SIZE, (2.0, 2.0))
+
+
+def test_a_mesh_message_holds_what_it_was_made_of():
+    made = mesh(body(SIZE, (0.3, 0.7)), 8)
+    message = mesh_message(made.vertices, made.faces)
+    assert [[p.x, p.y, p.z] for p in message.vertices] == np.asarray(made.vertices).tolist()
+    assert [list(t.vertex_indices) for t in message.triangles] == np.asarray(made.faces).tolist()
+
+
+def test_arrays_get_one_solid_each():
+    array = SuperquadricArray(
+        size=np.stack([SIZE, ROUND]),
+        shape=np.array([[0.1, 0.1], [0.1, 1.0]]),
+        translation=np.zeros((2, 3)),
+        rotation=np.tile(HERE, (2, 1)),
+        score=np.ones(2),
+        residual=np.zeros(2),
+        sigma_size=np.zeros((2, 3)),
+        id=np.array([1, 2]),
+        status=np.array([0, 0]),
+    )
+    assert [solid.kind for solid in primitives(array)] == [BOX, CYLINDER]
+
+
+@pytest.mark.parametrize(
+    ("size", "shape", "words"),
+    [
+        ((0.1, 0.0, 0.1), (1, 1), "size: expected three half sizes above 0"),
+        ((0.1, np.nan, 0.1), (1, 1), "size"),
+        ((0.1, 0.1), (1, 1), "size"),
+        ((0.1, 0.1, 0.1), (0, 1), "shape: expected two exponents"),
+        ((0.1, 0.1, 0.1), (1, 2.1), "shape"),
+        ((0.1, 0.1, 0.1), (1, np.nan), "shape"),
+    ],
+)
+def test_what_is_no_body_is_refused(size, shape, words):
+    with pytest.raises(ValueError, match=words):
+        primitive(np.array(size), np.array(shape, float))
+
+
+@pytest.mark.parametrize(
+    ("vertices", "faces", "words"),
+    [
+        (np.zeros((3, 2)), [[0, 1, 2]], "vertices"),
+        (np.zeros((3, 3)), [[0, 1, 3]], "indices 0 to 2"),
+        (np.full((3, 3), np.nan), [[0, 1, 2]], "finite"),
+        (np.zeros((3, 3)), [[0, 1]], "faces"),
+    ],
+)
+def test_what_is_no_mesh_is_refused(vertices, faces, words):
+    with pytest.raises(ValueError, match=words):
+        mesh_message(vertices, np.array(faces))
