@@ -19,10 +19,11 @@ from sq_perception.tracking.session import FIRST_FAILED_ID, Tally, TrackingSessi
 
 @dataclass(frozen=True, eq=False)
 class Identified:
-    """The objects of a frame as they are published, and the id of each."""
+    """The objects of a frame as they are published, the id of each, and ids of tracks that the frame does not show."""
 
     recovery: FrameRecovery
     ids: tuple[int, ...]
+    hidden: tuple[int, ...] = ()
 
 
 class Identity:
@@ -31,7 +32,7 @@ class Identity:
     Parameters
     ----------
     poses
-        Of a camera that moves; None: it stands still.
+        Of a camera that moves; None: it stands still.  Their own frame is the fixed one unless a frame is told another.
     warn, inform
         What takes texts for the log; ``warn`` with a kind to throttle by.
     """
@@ -42,6 +43,7 @@ class Identity:
         self._poses, self._warn, self._inform = poses, warn, inform
         self._session = TrackingSession()
         self._frame_id = ""
+        self._fixed_frame = poses.frame if poses is not None else ""
 
     @property
     def tally(self) -> Tally:
@@ -53,23 +55,38 @@ class Identity:
         self._session.reset()
         return Identified(recovery, tuple(one.label for one in recovery.bodies))
 
-    def tracked(self, recovery: FrameRecovery, frame: Frame, arrival: float) -> Identified:
-        """Bodies and ids of their tracks; ``arrival`` is the time, seconds, of an image without stamp.
+    def tracked(
+        self, recovery: FrameRecovery, frame: Frame, arrival: float, fixed_frame: str | None = None
+    ) -> Identified:
+        """Bodies and ids of their tracks.
+
+        Parameters
+        ----------
+        arrival
+            The time, seconds, of an image without stamp.
+        fixed_frame
+            Where bodies rest, empty where the camera stands still; None: as with the frame before.  Another one than
+            before is another world.
 
         Raises
         ------
         ValueError
             If the tracker cannot go on; it begins anew with the next frame.
         """
-        if self._poses is None and frame.header.frame_id != self._frame_id:
+        if fixed_frame is not None and fixed_frame != self._fixed_frame:
+            self._session.reset()
+            self._fixed_frame = fixed_frame
+            self._inform(f"fixed_frame is {fixed_frame or 'none'} from now on: tracks are forgotten, ids go on")
+        poses = self._poses if self._fixed_frame else None
+        if poses is None and frame.header.frame_id != self._frame_id:
             self._session.reset()  # another camera: its world is another one
             self._frame_id = frame.header.frame_id
         stamp, resets = _seconds(frame.header) or arrival, self._session.tally.resets
         pose: Any = None
         is_known = True
-        if self._poses is not None:
+        if poses is not None:
             try:
-                pose = self._poses.at(frame.header)
+                pose = poses.at(frame.header, self._fixed_frame)
             except PoseError as error:
                 is_known = False
                 self._warn("camera pose", f"no camera pose in fixed_frame, nothing is fused: {error}")
@@ -96,7 +113,7 @@ class Identity:
             covariance, sigma = track.covariance, track.sigma_size
             bodies.append(replace(one, superquadric=track.superquadric, covariance=covariance, sigma_size=sigma))
             ids.append(track.id)
-        return Identified(replace(recovery, bodies=tuple(bodies)), tuple(ids))
+        return Identified(replace(recovery, bodies=tuple(bodies)), tuple(ids), self._session.hidden)
 
 
 def _seconds(header: Any) -> float:

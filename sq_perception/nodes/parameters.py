@@ -129,6 +129,37 @@ class FrameParameters:
     trigger_timeout: float = setting(
         5.0, "~/trigger answers with a failure when no frame came for so long.", unit="s", within=(0.1, 60.0), live=True
     )
+    target_frame: str = setting(
+        "",
+        "tf2 frame that results are published in, by the transform at the image's stamp; an image without it is "
+        "refused. ~/rendered_depth stays the camera's. Empty: the frame of the image.",
+        live=True,
+    )
+    publish_tf: bool = setting(
+        False, "Publish a frame for each body on /tf: tf_prefix and its id, below the results' frame.", live=True
+    )
+    tf_prefix: str = setting(
+        "superquadric_",
+        "Beginning of the names of bodies, before the id: of tf2 frames, detections and collision objects. Two nodes "
+        "need different ones.",
+        live=True,
+    )
+    publish_detections: bool = setting(
+        False, "Publish ~/detections (vision_msgs/Detection3DArray); needs vision_msgs.", live=True
+    )
+    publish_collision_objects: bool = setting(
+        False,
+        "Publish the bodies as collision objects on ~/planning_scene (moveit_msgs/PlanningScene, differences); needs "
+        "moveit_msgs.",
+        live=True,
+    )
+    collision_shapes: str = setting(
+        "mesh",
+        "Collision objects enclose their bodies: mesh fits closely; primitive, the smallest box, cylinder or sphere, "
+        "is solid and quicker to plan with.",
+        choices=("mesh", "primitive"),
+        live=True,
+    )
 
     @property
     def seconds(self) -> float:
@@ -147,6 +178,12 @@ class FrameParameters:
             )
         if self.fixed_frame and self.projection == "orthographic":
             raise ParameterError(f"fixed_frame: expected none for projection = orthographic, got {self.fixed_frame}")
+        if self.target_frame and self.projection == "orthographic":
+            raise ParameterError(f"target_frame: expected none for projection = orthographic, got {self.target_frame}")
+        for name in ("fixed_frame", "target_frame", "tf_prefix"):
+            frame = getattr(self, name)
+            if frame.startswith("/"):
+                raise ParameterError(f"{name}: expected no / at the beginning, as tf2 allows none, got {frame}")
 
 
 @dataclass(frozen=True)

@@ -102,6 +102,12 @@ class TrackingSession:
         self._stamp = -np.inf
         self._pose: tuple[np.ndarray, np.ndarray] = state.as_pose(None)
         self._tally = Tally()
+        self._hidden: tuple[int, ...] = ()
+
+    @property
+    def hidden(self) -> tuple[int, ...]:
+        """Ids of the tracks that the last frame did not show and that are not given up."""
+        return self._hidden
 
     @property
     def tally(self) -> Tally:
@@ -113,6 +119,7 @@ class TrackingSession:
         self._tracker.reset()
         self._stamp = -np.inf
         self._tally = replace(self._tally, tracks=0)
+        self._hidden = ()
 
     def follow(
         self,
@@ -153,6 +160,7 @@ class TrackingSession:
             without_pose=self._tally.without_pose + (not is_pose_known),
         )
         self._stamp, self._pose = stamp, (rotation, position)
+        self._hidden = tuple(one.id for one in tracks if one.observation is None)
 
         back = quaternions.conjugate(rotation)
         matrix = quaternions.to_matrix(back)

@@ -1,0 +1,158 @@
+"""What a frame node publishes for other stacks, beside its point cloud and its pictures.
+
+| parameter | name | type | package |
+| --- | --- | --- | --- |
+| `publish_tf` | `/tf` | tf2_msgs/TFMessage | tf2_msgs |
+| `publish_detections` | `~/detections` | vision_msgs/Detection3DArray | vision_msgs |
+| `publish_collision_objects` | `~/planning_scene` | moveit_msgs/PlanningScene, differences | moveit_msgs |
+
+Neither package is on PyPI, and a robot may lack each: it is imported only when its output is asked for, and one that is
+missing is named once in the log and stays in :attr:`Outputs.absent`.  Messages are made only while somebody listens.
+
+/tf is published as tf2_ros.TransformBroadcaster does it, with the same queue of 100; a publisher of our own needs
+tf2_msgs alone, knows whether anybody listens, and can be taken down again.
+
+An object of the planning scene is removed when its id is gone, that is neither in a frame nor that of a track which the
+frame does not show: what a robot's arm hides is still there.  Switching the output off removes all objects that were
+added.  A node that ends removes nothing: a planner must not lose its obstacles because a camera fails.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Collection
+from dataclasses import dataclass
+from typing import Any
+
+from rclpy.node import Node
+from rclpy.publisher import Publisher
+from rclpy.type_support import NoTypeSupportImportedException
+
+from sq_msgs_py import collision_objects
+from sq_msgs_py.detections import detections
+from sq_msgs_py.transforms import name, transforms
+from sq_perception.nodes.parameters import FrameParameters
+from sq_perception.nodes.results import Findings
+
+
+@dataclass(frozen=True)
+class _Kind:
+    package: str
+    type: str
+    topic: str
+    queue: int
+
+
+_KINDS = {
+    "publish_tf": _Kind("tf2_msgs", "TFMessage", "/tf", 100),
+    "publish_detections": _Kind("vision_msgs", "Detection3DArray", "~/detections", 10),
+    "publish_collision_objects": _Kind("moveit_msgs", "PlanningScene", "~/planning_scene", 10),
+}
+
+
+class Outputs:
+    """Publishes what the parameters ask for; used by one thread at a time, except for ``absent``."""
+
+    def __init__(self, node: Node, parameters: FrameParameters) -> None:
+        self._node = node
+        self._publishers: dict[str, tuple[type[Any], Publisher]] = {}
+        self._absent: dict[str, str] = {}
+        self._added: set[str] = set()
+        self._last_header: Any = None
+        self._said_no_frame = False
+        self.follow(parameters)
+
+    @property
+    def absent(self) -> tuple[str, ...]:
+        """Packages that are asked for and missing; may be read from another thread."""
+        return tuple(self._absent.values())
+
+    def follow(self, parameters: FrameParameters) -> None:
+        """Create the publishers that are asked for, and destroy the others."""
+        for parameter, kind in _KINDS.items():
+            if getattr(parameters, parameter):
+                if parameter not in self._publishers and parameter not in self._absent:
+                    self._create(parameter, kind)
+                continue
+            if parameter in self._absent:
+                self._absent = {other: package for other, package in self._absent.items() if other != parameter}
+            if parameter == "publish_collision_objects" and self._added:
+                self.withdraw()  # the publisher lasts until the next call, so that its last message arrives
+            elif parameter in self._publishers:
+                self._node.destroy_publisher(self._publishers.pop(parameter)[1])
+
+    def publish(self, found: Findings, parameters: FrameParameters, hidden: Collection[int] = ()) -> None:
+        """Publish what a frame showed, where it is asked for and somebody listens.
+
+        Parameters
+        ----------
+        hidden
+            Ids of bodies that the frame does not show and that are not given up.
+        """
+        self.follow(parameters)
+        has_frame = bool(found.header.frame_id)
+        if (
+            not has_frame
+            and not self._said_no_frame
+            and (parameters.publish_tf or parameters.publish_collision_objects)
+        ):
+            self._said_no_frame = True
+            self._node.get_logger().warning("expected images with a frame_id, got none: no transforms, no objects")
+        if parameters.publish_tf and has_frame and self._is_heard("publish_tf"):
+            self._publish_transforms(found, parameters)
+        if parameters.publish_detections and self._is_heard("publish_detections"):
+            message = detections(found.array, found.header, covariances=found.covariances, prefix=parameters.tf_prefix)
+            self._publishers["publish_detections"][1].publish(message)
+        if parameters.publish_collision_objects and has_frame and self._is_heard("publish_collision_objects"):
+            self._publish_collision_objects(found, parameters, hidden)
+
+    def withdraw(self) -> None:
+        """Remove every object that was added to the planning scene."""
+        if not self._added:
+            return
+        self._publish_scene(collision_objects.removals(self._added, self._last_header))
+        self._added = set()
+
+    def close(self) -> None:
+        """Destroy the publishers; what is in the planning scene stays there."""
+        for _, publisher in self._publishers.values():
+            self._node.destroy_publisher(publisher)
+        self._publishers = {}
+        self._added = set()
+
+    def _create(self, parameter: str, kind: _Kind) -> None:
+        try:
+            message_type: Any = getattr(importlib.import_module(f"{kind.package}.msg"), kind.type)
+            publisher = self._node.create_publisher(message_type, kind.topic, kind.queue)
+        except (ImportError, NoTypeSupportImportedException) as error:
+            self._absent = {**self._absent, parameter: kind.package}
+            self._node.get_logger().warning(
+                f"{parameter}: expected {kind.package}, which cannot be imported ({error}): {kind.topic} is not "
+                f"published; Debian package ros-$ROS_DISTRO-{kind.package.replace('_', '-')}"
+            )
+            return
+        self._publishers[parameter] = message_type, publisher
+
+    def _is_heard(self, parameter: str) -> bool:
+        return parameter in self._publishers and bool(self._publishers[parameter][1].get_subscription_count())
+
+    def _publish_transforms(self, found: Findings, parameters: FrameParameters) -> None:
+        message_type, publisher = self._publishers["publish_tf"]
+        frames = transforms(found.array, found.header, prefix=parameters.tf_prefix)
+        if frames:
+            publisher.publish(message_type(transforms=frames))
+
+    def _publish_collision_objects(self, found: Findings, parameters: FrameParameters, hidden: Collection[int]) -> None:
+        meshes = found.meshes if parameters.collision_shapes == "mesh" else None
+        objects = collision_objects.collision_objects(
+            found.array, found.header, meshes=meshes, prefix=parameters.tf_prefix
+        )
+        there = {one.id for one in objects}
+        kept = self._added & {name(number, parameters.tf_prefix) for number in hidden}
+        objects += collision_objects.removals(self._added - there - kept, found.header)
+        self._added, self._last_header = there | kept, found.header
+        if objects:
+            self._publish_scene(objects)
+
+    def _publish_scene(self, objects: list[Any]) -> None:
+        self._publishers["publish_collision_objects"][1].publish(collision_objects.planning_scene(objects))
