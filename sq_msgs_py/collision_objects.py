@@ -2,8 +2,8 @@
 
 The pose of an object is that of the body, its id ``<prefix><id>``.  Its one shape has the identity as pose and encloses
 the body (:mod:`sq_msgs_py.shapes`): the smallest of box, cylinder and sphere, or a mesh, grown to enclose.  Primitives
-are solid and quick to test; meshes fit closely, but FCL, MoveIt's usual collision checker, knows of a mesh only its
-surface.
+are solid and quick to make and to test.  Meshes fit closely, take a hundred times as long to make, and FCL, MoveIt's
+usual collision checker, knows of a mesh only its surface.
 
 MoveIt takes objects on two topics, both with a queue of ten: ``collision_object``, one object a message, and
 ``planning_scene``, any number.  A frame is one difference (``is_diff``) for the latter: it arrives whole or not at all,

@@ -161,7 +161,7 @@ class Tf2:
         self.asked: list[tuple[str, str]] = []
         self.cleared = 0
         self.module.Buffer = lambda: self
-        self.module.TransformListener = lambda buffer, node: (buffer, node)
+        self.module.TransformListener = lambda buffer, node: types.SimpleNamespace(unregister=lambda: None)
 
     def lookup_transform(self, target: str, source: str, time: Any, timeout: Any) -> TransformStamped:
         self.asked.append((target, source))

@@ -26,7 +26,6 @@ from typing import Any
 
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.type_support import NoTypeSupportImportedException
 
 from sq_msgs_py import collision_objects
 from sq_msgs_py.detections import detections
@@ -124,10 +123,10 @@ class Outputs:
         try:
             message_type: Any = getattr(importlib.import_module(f"{kind.package}.msg"), kind.type)
             publisher = self._node.create_publisher(message_type, kind.topic, kind.queue)
-        except (ImportError, NoTypeSupportImportedException) as error:
+        except Exception as error:  # a package that is there in part fails in other ways than ImportError
             self._absent = {**self._absent, parameter: kind.package}
             self._node.get_logger().warning(
-                f"{parameter}: expected {kind.package}, which cannot be imported ({error}): {kind.topic} is not "
+                f"{parameter}: expected {kind.package}, which cannot be used ({error}): {kind.topic} is not "
                 f"published; Debian package ros-$ROS_DISTRO-{kind.package.replace('_', '-')}"
             )
             return

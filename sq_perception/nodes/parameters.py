@@ -154,10 +154,10 @@ class FrameParameters:
         live=True,
     )
     collision_shapes: str = setting(
-        "mesh",
-        "Collision objects enclose their bodies: mesh fits closely; primitive, the smallest box, cylinder or sphere, "
-        "is solid and quicker to plan with.",
-        choices=("mesh", "primitive"),
+        "primitive",
+        "Collision objects enclose their bodies: primitive is the smallest box, cylinder or sphere, quick to make and "
+        "to plan with; mesh fits closely.",
+        choices=("primitive", "mesh"),
         live=True,
     )
 
