@@ -28,27 +28,13 @@ class PoseError(ValueError):
 
 
 class CameraPoses:
-    """Looks up poses of optical frames; without tf2 every look-up fails with that reason.
+    """Looks up poses of optical frames; without tf2 every look-up fails with that reason."""
 
-    Parameters
-    ----------
-    frame
-        What :meth:`at` looks in unless it is told otherwise; empty: nothing is listened to before another is named.
-    """
-
-    def __init__(self, node: Node, frame: str = "") -> None:
+    def __init__(self, node: Node) -> None:
         self._node = node
-        self._frame = frame
         self._buffer: Any = None
         self._listener: Any = None
         self._missing = ""
-        if frame:
-            self.listen()
-
-    @property
-    def frame(self) -> str:
-        """What :meth:`at` looks in unless it is told otherwise."""
-        return self._frame
 
     def listen(self) -> None:
         """Begin to listen to /tf, if that was not done yet; a buffer knows only what it has heard."""
@@ -62,7 +48,7 @@ class CameraPoses:
         self._buffer = tf2.Buffer()
         self._listener = tf2.TransformListener(self._buffer, self._node)
 
-    def at(self, header: Any, frame: str | None = None) -> Pose:
+    def at(self, header: Any, frame: str) -> Pose:
         """The pose of a header's frame in ``frame`` at its stamp, the newest for a stamp of 0.
 
         Raises
@@ -70,7 +56,6 @@ class CameraPoses:
         PoseError
             If it is not known.
         """
-        frame = self._frame if frame is None else frame
         if header.frame_id == frame:
             return np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3)
         self.listen()

@@ -18,7 +18,8 @@ subscribes, deactivating ends the subscriptions after the frame at hand, cleanin
 The executor's thread only stores messages; one worker thread takes the newest and does the work, so that services and
 parameters answer at once.  Stamp and frame of the input are copied to every output.  Bodies are followed from frame to
 frame (:mod:`sq_perception.nodes.identity`), and those that a frame shows are published.  Results of orthographic frames
-are in the cube frame of :mod:`sq_perception.imaging.unit_cube`, those of others in the optical frame.
+are in the cube frame of :mod:`sq_perception.imaging.unit_cube`, those of others in the optical frame, or in
+``target_frame``.  What else is published, for tf2, planners and vision pipelines: :mod:`sq_perception.nodes.outputs`.
 """
 
 from __future__ import annotations
@@ -53,7 +54,9 @@ from sq_perception.nodes.frame import Frame, decode
 from sq_perception.nodes.identity import Identified, Identity
 from sq_perception.nodes.inbox import Arrival, Inbox, Refused
 from sq_perception.nodes.managed_node import ManagedNode
+from sq_perception.nodes.outputs import Outputs
 from sq_perception.nodes.parameters import FrameParameters, LiveParameters
+from sq_perception.nodes.results import Findings
 from sq_perception.nodes.triggers import Outcome, Triggers
 from sq_perception.recovery import FrameRecovery, render_recovery
 
@@ -129,8 +132,11 @@ class FrameNode(ManagedNode):
         meanwhile = {one.name for one in fields(latest) if getattr(latest, one.name) != getattr(parameters, one.name)}
         self._engine.follow(latest, frozenset(meanwhile), self._warm_up_camera)
         self.get_logger().info(f"warm after {perf_counter() - started:.1f} s")
-        poses = CameraPoses(self, parameters.fixed_frame) if parameters.fixed_frame else None
-        self._identity = Identity(poses, self._warn, self._inform)
+        self._poses = CameraPoses(self)
+        if latest.fixed_frame or latest.target_frame:
+            self._poses.listen()
+        self._identity = Identity(self._poses, self._warn, self._inform, latest.fixed_frame)
+        self._outputs = Outputs(self, latest)
         self._superquadrics = self.create_publisher(PointCloud2, "~/superquadrics", 10)
         self._markers = self.create_publisher(MarkerArray, "~/markers", 1)
         self._rendered = self.create_publisher(Image, "~/rendered_depth", 1)
@@ -166,11 +172,16 @@ class FrameNode(ManagedNode):
             if self._worker.is_alive():
                 self.get_logger().warning("the frame at hand takes long; it is the last one")
         self._inbox = self._worker = None
+        self._outputs.withdraw()
         self._triggers.answer((False, "the node has been deactivated"))
 
     def _cleanup(self) -> None:
         if self._image_input is not None:
             self._deactivate()
+        for name in ("_outputs", "_poses"):
+            part = self.__dict__.pop(name, None)
+            if part is not None:
+                part.close()
         for name in ("_superquadrics", "_markers", "_rendered"):
             publisher = self.__dict__.pop(name, None)
             if publisher is not None:
@@ -266,6 +277,7 @@ class FrameNode(ManagedNode):
             silent=silent,
             enabled=self._enabled,
             engine=self._engine.words,
+            absent=self._outputs.absent if self.is_active else (),
             tally=self._identity.tally if self.is_active and parameters.tracking else None,
         )
         message.status.append(report.status(self.get_fully_qualified_name(), now, self._last_counts, condition))
@@ -324,19 +336,21 @@ class FrameNode(ManagedNode):
         parameters = self._settings.current
         clock = perf_counter()
         if parameters.tracking:
-            found = self._identity.tracked(recovery, frame, monotonic())
+            found = self._identity.tracked(recovery, frame, monotonic(), parameters.fixed_frame)
             stages["tracking"] = 1e3 * (perf_counter() - clock)
         else:
             found = self._identity.untracked(recovery)
 
         clock = perf_counter()
-        array = results.superquadric_array(found.recovery, found.ids, frame.is_cube)
-        self._superquadrics.publish(to_message(array, frame.header))
+        findings = results.findings(found.recovery, found.ids, frame)
+        findings = results.in_frame(findings, self._poses, parameters.target_frame)
+        self._superquadrics.publish(to_message(findings.array, findings.header))
+        self._outputs.publish(findings, parameters, found.hidden)
         stages["publish"] = 1e3 * (perf_counter() - clock)
         age = self.get_clock().now() - Time.from_msg(frame.header.stamp, clock_type=self.get_clock().clock_type)
         stages["stamp to result"] = age.nanoseconds * 1e-6
         clock = perf_counter()
-        self._publish_pictures(frame, found, parameters)
+        self._publish_pictures(frame, found, findings, parameters)
         stages["pictures"] = 1e3 * (perf_counter() - clock)
         self._statistics.answer(stages)
         return report.summary(found.recovery, found.ids)
@@ -362,11 +376,12 @@ class FrameNode(ManagedNode):
         mask_input = self._mask_input
         return use == "always" or (use == "auto" and bool(self.count_publishers(mask_input.topic_name)))
 
-    def _publish_pictures(self, frame: Frame, found: Identified, parameters: FrameParameters) -> None:
+    def _publish_pictures(
+        self, frame: Frame, found: Identified, findings: Findings, parameters: FrameParameters
+    ) -> None:
         if self._markers.get_subscription_count():
-            markers = results.marker_array(found.recovery, found.ids, frame, parameters, self._shown_ids)
-            self._shown_ids = results.shown_ids(found.recovery, found.ids)
-            self._markers.publish(markers)
+            self._markers.publish(findings.markers(parameters, self._shown_ids))
+            self._shown_ids = findings.shown_ids
         if self._rendered.get_subscription_count():
             depth, _ = render_recovery(found.recovery, frame.camera)
             self._rendered.publish(frame.encode(depth))

@@ -32,18 +32,24 @@ class Identity:
     Parameters
     ----------
     poses
-        Of a camera that moves; None: it stands still.  Their own frame is the fixed one unless a frame is told another.
+        Where the camera is; asked only while there is a fixed frame.
     warn, inform
         What takes texts for the log; ``warn`` with a kind to throttle by.
+    fixed_frame
+        Where bodies rest at first; empty where the camera stands still.
     """
 
     def __init__(
-        self, poses: CameraPoses | None, warn: Callable[[str, str], None], inform: Callable[[str], None]
+        self,
+        poses: CameraPoses,
+        warn: Callable[[str, str], None],
+        inform: Callable[[str], None],
+        fixed_frame: str = "",
     ) -> None:
         self._poses, self._warn, self._inform = poses, warn, inform
         self._session = TrackingSession()
         self._frame_id = ""
-        self._fixed_frame = poses.frame if poses is not None else ""
+        self._fixed_frame = fixed_frame
 
     @property
     def tally(self) -> Tally:
@@ -55,9 +61,7 @@ class Identity:
         self._session.reset()
         return Identified(recovery, tuple(one.label for one in recovery.bodies))
 
-    def tracked(
-        self, recovery: FrameRecovery, frame: Frame, arrival: float, fixed_frame: str | None = None
-    ) -> Identified:
+    def tracked(self, recovery: FrameRecovery, frame: Frame, arrival: float, fixed_frame: str = "") -> Identified:
         """Bodies and ids of their tracks.
 
         Parameters
@@ -65,15 +69,14 @@ class Identity:
         arrival
             The time, seconds, of an image without stamp.
         fixed_frame
-            Where bodies rest, empty where the camera stands still; None: as with the frame before.  Another one than
-            before is another world.
+            Where bodies rest, empty where the camera stands still.  Another one than before is another world.
 
         Raises
         ------
         ValueError
             If the tracker cannot go on; it begins anew with the next frame.
         """
-        if fixed_frame is not None and fixed_frame != self._fixed_frame:
+        if fixed_frame != self._fixed_frame:
             self._session.reset()
             self._fixed_frame = fixed_frame
             self._inform(f"fixed_frame is {fixed_frame or 'none'} from now on: tracks are forgotten, ids go on")
@@ -101,8 +104,7 @@ class Identity:
             raise ValueError(f"tracking: {error}") from error
         if self._session.tally.resets > resets:
             self._inform(f"the stamps jumped back to {stamp:.3f} s: tracks are forgotten, ids go on")
-            if self._poses is not None:
-                self._poses.clear()
+            self._poses.clear()
         bodies, ids = [], []
         for one in recovery.bodies:
             if one.status == Status.FAILED:

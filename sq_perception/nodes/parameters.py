@@ -111,7 +111,8 @@ class FrameParameters:
     fixed_frame: str = setting(
         "",
         "tf2 frame that the bodies rest in, for a camera that moves; its pose at the image's stamp is looked up. "
-        "Empty: the camera stands still.",
+        "Empty: the camera stands still. A change forgets the tracks; ids go on.",
+        live=True,
     )
     marker_colours: str = setting(
         "id",

@@ -31,6 +31,8 @@ class Condition:
         Whether images are processed.
     engine
         What computes, in a few words.
+    absent
+        Packages that outputs are asked for and that are not there.
     tally
         Of the tracking session; None where nothing is tracked.
     """
@@ -40,6 +42,7 @@ class Condition:
     silent: bool = False
     enabled: bool = True
     engine: str = ""
+    absent: tuple[str, ...] = ()
     tally: Tally | None = None
 
 
@@ -76,6 +79,8 @@ def status(name: str, now: Snapshot, before: Snapshot, condition: Condition) -> 
         "engine": condition.engine,
         "last error": now.last_error,
     }
+    if condition.absent:
+        values["missing packages"] = " ".join(condition.absent)
     tally = condition.tally
     if tally is not None:
         values["tracks"] = str(tally.tracks)

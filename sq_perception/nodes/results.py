@@ -17,7 +17,6 @@ from visualization_msgs.msg import MarkerArray
 from sq_msgs_py import poses
 from sq_msgs_py.markers import markers
 from sq_msgs_py.superquadrics import CONVERGED, SuperquadricArray
-from sq_perception.fitting.fit import Status
 from sq_perception.geometry.mesh import MARKER_RESOLUTION, mesh, outline
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
@@ -28,8 +27,6 @@ from sq_perception.nodes.parameters import FrameParameters
 from sq_perception.recovery import FrameRecovery
 
 _WORST, _BEST = np.array([0.80, 0.20, 0.15]), np.array([0.20, 0.65, 0.30])
-
-
 _CENTRE_AND_TURN = slice(5, 11)
 """Of a body's covariance: its centre in the optical frame and its rotation vector in its own."""
 
@@ -164,22 +161,6 @@ def truth_array(bodies: Superquadric) -> SuperquadricArray:
         id=np.arange(1, count + 1, dtype=np.uint32),
         status=np.full(count, CONVERGED, dtype=np.uint32),
     )
-
-
-def shown_ids(recovery: FrameRecovery, ids: Sequence[int]) -> list[int]:
-    """Ids of the bodies that have markers: those that did not fail."""
-    return [number for one, number in zip(recovery.bodies, ids, strict=True) if one.status != Status.FAILED]
-
-
-def marker_array(
-    recovery: FrameRecovery,
-    ids: Sequence[int],
-    frame: Frame,
-    parameters: FrameParameters,
-    previous_ids: Sequence[int],
-) -> MarkerArray:
-    """Markers of a frame in the frame of its image, see :meth:`Findings.markers`."""
-    return findings(recovery, ids, frame).markers(parameters, previous_ids)
 
 
 def _at_origin(size: np.ndarray, shape: np.ndarray) -> Superquadric:
