@@ -19,14 +19,14 @@ PACKAGES = (PERCEPTION, MESSAGES)
 
 # Floor by floor, from the ground up; a module may import from its own floor and from those below it.
 FLOORS = (
-    ("geometry", "provenance"),
+    ("geometry", "provenance", "plain_yaml"),
     ("imaging", "metrics", "tracking", "recorded_frame", "recorded_bag", "recorded_input"),
     ("learning", "fitting", "scene_description", "seen_object"),
     ("recovery", "recorded_tracks", "segment_repair", "warm_up"),
     ("evaluation", "nodes", "cli", "recover_command"),
 )
 ROS = ("rclpy", "sensor_msgs", "std_msgs", "std_srvs", "visualization_msgs", "diagnostic_msgs", "geometry_msgs",
-       "rcl_interfaces", "builtin_interfaces", "shape_msgs", "tf2_ros", "tf2_msgs", "vision_msgs",
+       "rcl_interfaces", "lifecycle_msgs", "builtin_interfaces", "shape_msgs", "tf2_ros", "tf2_msgs", "vision_msgs",
        "moveit_msgs")  # fmt: skip
 
 
