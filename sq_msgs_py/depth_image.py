@@ -181,11 +181,30 @@ class Intrinsics:
     cy: float
 
 
+@dataclass(frozen=True)
+class RawIntrinsics:
+    """What a camera_info says about the image before rectification.
+
+    Attributes
+    ----------
+    intrinsics : Intrinsics
+        Of K: the pixel of a ray whose image the lens puts at (x', y') is (fx x' + cx, fy y' + cy).
+    distortion_model : str
+        As it stands in the message.
+    distortion : tuple of float
+        D.
+    """
+
+    intrinsics: Intrinsics
+    distortion_model: str
+    distortion: tuple[float, ...]
+
+
 def intrinsics_from_message(message: CameraInfo) -> Intrinsics:
     """Intrinsics of the rectified image that travels with a camera_info; region of interest and binning are applied.
 
-    The projection matrix P counts, and K where P is not set; both describe the full resolution.  Distortion is not
-    applied: a depth image is expected to be rectified, as depth cameras deliver it.
+    The projection matrix P counts, and K where P is not set; both describe the full resolution.  For an image that is
+    not rectified see :func:`raw_intrinsics_from_message`.
 
     Raises
     ------
@@ -195,6 +214,44 @@ def intrinsics_from_message(message: CameraInfo) -> Intrinsics:
     fx, cx, fy, cy = (float(message.p[i]) for i in (0, 2, 5, 6))
     if fx == 0.0 and fy == 0.0:
         fx, cx, fy, cy = (float(message.k[i]) for i in (0, 2, 4, 5))
+    return _of_part(message, fx, fy, cx, cy)
+
+
+def raw_intrinsics_from_message(message: CameraInfo) -> RawIntrinsics:
+    """K and distortion of the raw image that travels with a camera_info; region of interest and binning are applied.
+
+    K describes the full resolution.  Distortion acts on rays before they become pixels, so that a part of the image or
+    binned pixels have the same.
+
+    Raises
+    ------
+    ImageError
+        If the camera is not calibrated (K zero or not finite), the image size is below 1 x 1, or D is not finite.
+    """
+    fx, cx, fy, cy = (float(message.k[i]) for i in (0, 2, 4, 5))
+    distortion = tuple(float(value) for value in message.d)
+    if not all(math.isfinite(value) for value in distortion):
+        raise ImageError(f"camera_info: expected finite d, got {' '.join(f'{value:g}' for value in distortion)}")
+    return RawIntrinsics(_of_part(message, fx, fy, cx, cy), str(message.distortion_model), distortion)
+
+
+def size_mismatch(image: tuple[int, int], info: tuple[int, int]) -> str:
+    """What to say where an image (width, height) has not the size that its camera_info speaks of; empty if it has."""
+    if image == info:
+        return ""
+    text = f"the image has {image[0]} x {image[1]} pixels, its camera_info is for {info[0]} x {info[1]}"
+    if image == info[::-1]:
+        return f"{text}: width and height are swapped, as if the image had been rotated and its camera_info had not"
+    for part in (2, 3, 4, 6, 8):
+        if image == (info[0] // part, info[1] // part):
+            return f"{text}: the image is {part} times smaller, which its camera_info should say as binning"
+    if image[0] <= info[0] and image[1] <= info[1]:
+        return f"{text}: an image that was cut out should have its region of interest (roi) in the camera_info"
+    return text
+
+
+def _of_part(message: CameraInfo, fx: float, fy: float, cx: float, cy: float) -> Intrinsics:
+    """Intrinsics of the region of interest in its binned pixels from those of the full resolution."""
     if not all(math.isfinite(number) for number in (fx, fy, cx, cy)):
         raise ImageError(f"camera_info: expected finite fx fy cx cy, got {fx} {fy} {cx} {cy}")
     if fx <= 0.0 or fy <= 0.0:

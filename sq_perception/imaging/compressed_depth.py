@@ -1,10 +1,13 @@
-"""Depth images as the compressedDepth transport of ROS packs them: a header of 12 bytes, then a 16 bit grey PNG.
+"""Depth images as the compressedDepth transport of ROS packs them: a header of 12 bytes, then a PNG or RVL.
 
 The header holds an enumeration (int32) and two numbers A and B (float32, little endian).  The message's ``format``
-names the encoding of the image before it was packed:
+names the encoding of the image before it was packed, and the packing; where it names none, it is PNG:
 
-    16UC1   the PNG holds millimetres, 0 = nothing
-    32FC1   the PNG holds q = A / z + B, a quantised inverse depth, so that z = A / (q - B) metres, 0 = nothing
+    16UC1; compressedDepth png    16 bit grey holds millimetres, 0 = nothing
+    32FC1; compressedDepth png    it holds q = A / z + B, a quantised inverse depth, so that z = A / (q - B) metres,
+                                  0 = nothing
+    ...; compressedDepth rvl      the same numbers as RVL (:mod:`sq_perception.imaging.rvl`), after width and height
+                                  (uint32, little endian)
 
 A PNG can unpack to a thousand times its own length; its size is therefore read and checked before it is decoded.
 
@@ -18,15 +21,23 @@ import struct
 import cv2
 import numpy as np
 
+from sq_perception.imaging import rvl
+
 TRANSPORT = "compressedDepth"
 MOST_PIXELS = 2**25
-"""Above any depth camera's, and 64 MB at 16 bit."""
+"""Of a PNG; above any depth camera's, and 64 MB at 16 bit."""
+FARTHEST = 10.0
+"""Metres that :func:`encode` gives quantised inverse depth to, and the precision at the far end; as in the reference."""
 
+_QUANTIZATION = 100.0
 _HEADER = struct.Struct("<iff")
 _PNG = b"\x89PNG\r\n\x1a\n"
 _IMAGE_HEADER = struct.Struct(">8xI4sIIBB")
 """Of a PNG: length and name of its first chunk, width, height, bits, colour type (0 is grey)."""
+_RVL_HEADER = struct.Struct("<II")
 _MILLIMETRES = np.float32(1000.0)
+_MOST_LEVELS = np.iinfo(np.uint16).max
+_FASTEST = (cv2.IMWRITE_PNG_COMPRESSION, 1)
 
 
 def encoding(image_format: str) -> str | None:
@@ -35,6 +46,19 @@ def encoding(image_format: str) -> str | None:
     if TRANSPORT not in transport or packed.strip() not in ("16UC1", "32FC1"):
         return None
     return packed.strip()
+
+
+def size(image_format: str, data: bytes | np.ndarray) -> tuple[int, int]:
+    """Width and height of a packed image, without unpacking it.
+
+    Raises
+    ------
+    ValueError
+        As :func:`decode`.
+    """
+    _known(image_format)
+    head = bytes(data[: _HEADER.size + _IMAGE_HEADER.size])
+    return _rvl_size(head) if _is_rvl(image_format) else _png_size(head)
 
 
 def decode(image_format: str, data: bytes | np.ndarray) -> np.ndarray:
@@ -50,14 +74,14 @@ def decode(image_format: str, data: bytes | np.ndarray) -> np.ndarray:
     ValueError
         For another format, or data that is no such image, saying what was expected.
     """
-    packed = encoding(image_format)
-    if packed is None:
-        raise ValueError(f"format: expected '16UC1; {TRANSPORT} png' or '32FC1; {TRANSPORT} png', got {image_format!r}")
+    packed = _known(image_format)
     message = bytes(data)
-    if len(message) < _HEADER.size + _IMAGE_HEADER.size:
-        raise ValueError(f"data: expected a header and a PNG, got {len(message)} bytes")
+    if _is_rvl(image_format):
+        width, height = _rvl_size(message)
+        grey = rvl.decode(message[_HEADER.size + _RVL_HEADER.size :], width, height)
+    else:
+        grey = _grey(message)
     _, a, b = _HEADER.unpack_from(message)
-    grey = _grey(message[_HEADER.size :])
     if packed == "16UC1":
         depth = grey / _MILLIMETRES
     else:
@@ -67,17 +91,77 @@ def decode(image_format: str, data: bytes | np.ndarray) -> np.ndarray:
     return depth
 
 
-def _grey(png: bytes) -> np.ndarray:
-    """The PNG's pixels, uint16 (height, width)."""
-    length, name, width, height, bits, colour = _IMAGE_HEADER.unpack_from(png)
-    if not png.startswith(_PNG) or (length, name) != (13, b"IHDR"):
-        raise ValueError("data: expected a PNG after the header of 12 bytes; RVL is not read")
+def encode(depth: np.ndarray, image_encoding: str = "16UC1") -> tuple[str, bytes]:
+    """``format`` and ``data`` of the message of a depth image (height, width) in metres, NaN or inf for nothing.
+
+    16UC1 keeps the nearest millimetre up to 65.535 m.  32FC1 keeps inverse depth of 0.16 to 10 m to the nearest of
+    10100 levels for each 1/m: 0.05 mm at 1 m and 5 mm at 10 m.  What is beyond becomes nothing.
+
+    Raises
+    ------
+    ValueError
+        For another encoding, or an array that is no image.
+    """
+    depth = np.asarray(depth, dtype=float)
+    if depth.ndim != 2 or depth.size == 0:
+        raise ValueError(f"depth: expected (height, width) with at least one pixel, got {depth.shape}")
+    a = b = 0.0
+    with np.errstate(divide="ignore", invalid="ignore"):
+        if image_encoding == "16UC1":
+            levels = 1e3 * depth
+        elif image_encoding == "32FC1":
+            a = _QUANTIZATION * (_QUANTIZATION + 1)
+            b = 1 - a / FARTHEST
+            levels = np.where(depth > 0, a / depth + b, 0)
+        else:
+            raise ValueError(f"encoding: expected 16UC1 or 32FC1, got {image_encoding!r}")
+        levels = np.rint(levels)
+        grey = np.where((levels >= 1) & (levels <= _MOST_LEVELS), levels, 0).astype(np.uint16)
+    _, png = cv2.imencode(".png", grey, _FASTEST)
+    return f"{image_encoding}; {TRANSPORT} png", _HEADER.pack(0, a, b) + png.tobytes()
+
+
+def _known(image_format: str) -> str:
+    packed = encoding(image_format)
+    if packed is None:
+        raise ValueError(
+            f"format: expected '16UC1; {TRANSPORT} png', 32FC1 or rvl instead of them, got {image_format!r}"
+        )
+    return packed
+
+
+def _is_rvl(image_format: str) -> bool:
+    return "rvl" in image_format.partition(";")[2]
+
+
+def _rvl_size(message: bytes) -> tuple[int, int]:
+    if len(message) < _HEADER.size + _RVL_HEADER.size:
+        raise ValueError(f"data: expected a header and a size, got {len(message)} bytes")
+    width, height = _RVL_HEADER.unpack_from(message, _HEADER.size)
+    if not (width >= 1 and height >= 1 and width * height <= rvl.MOST_PIXELS):
+        raise ValueError(f"RVL: expected at most {rvl.MOST_PIXELS} pixels, got {width} x {height}")
+    return width, height
+
+
+def _png_size(message: bytes) -> tuple[int, int]:
+    """Of the PNG after the header; only if it is 16 bit grey and not too large."""
+    if len(message) < _HEADER.size + _IMAGE_HEADER.size:
+        raise ValueError(f"data: expected a header and a PNG, got {len(message)} bytes")
+    length, name, width, height, bits, colour = _IMAGE_HEADER.unpack_from(message, _HEADER.size)
+    if message[_HEADER.size :][: len(_PNG)] != _PNG or (length, name) != (13, b"IHDR"):
+        raise ValueError(f"data: expected a PNG after the header of {_HEADER.size} bytes")
     if (bits, colour) != (16, 0):
         raise ValueError(f"PNG: expected 16 bit grey, got {bits} bit of colour type {colour}")
     if not (width >= 1 and height >= 1 and width * height <= MOST_PIXELS):
         raise ValueError(f"PNG: expected at most {MOST_PIXELS} pixels, got {width} x {height}")
+    return width, height
+
+
+def _grey(message: bytes) -> np.ndarray:
+    """The PNG's pixels, uint16 (height, width)."""
+    width, height = _png_size(message[: _HEADER.size + _IMAGE_HEADER.size])
     try:
-        image = cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
+        image = cv2.imdecode(np.frombuffer(message, np.uint8, offset=_HEADER.size), cv2.IMREAD_UNCHANGED)
     except cv2.error as error:
         raise ValueError(f"PNG: not readable: {error.err}") from error
     if image is None or image.shape != (height, width) or image.dtype != np.uint16:

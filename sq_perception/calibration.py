@@ -1,0 +1,191 @@
+"""The camera that a camera_info tells of: whether its images are raw, and the pinhole camera that they are made to fit.
+
+Everything behind expects images of an ideal pinhole camera.  A camera_info describes two images at once, the raw one (K
+and the distortion D) and the rectified one (P), and nothing in it says which of them it came with.  So ``distortion``
+decides:
+
+    apply     the image is raw
+    ignore    the image is rectified
+    auto      the image is raw if D is not all zero, unless its name says otherwise
+
+A name says that the image is rectified if one of its last two parts has the word ``rect`` or ``rectified`` in it; words
+are what is left between ``/``, ``_`` and other marks.  The transport's own part (``compressedDepth``) does not count.
+``image_rect``, ``image_rect_raw``, ``depth/rect/image`` and ``depth_registered/image_rect`` are rectified, ``image_raw``,
+``depth/image`` and ``direct/image`` do not say so.  A file's name is its folder's and its own.
+
+That depth was registered to a colour image changes nothing in this: it has the geometry of that image, and a
+camera_info that describes that image.  ``aligned_depth_to_color/image_raw`` and ``depth_to_rgb/image_raw`` are as
+distorted as their raw colour image, whose D they come with; ``depth_registered/image_rect`` lies on the rectified one.
+
+A rectified image has the intrinsics of P, or of K where P is not set; a raw one those of K, whatever P says, and is
+rectified here (:mod:`sq_perception.imaging.rectification`).
+
+A camera_info is whatever has the fields of the message: one of rclpy, of rosbags, or from a YAML file.
+
+Reference: sensor_msgs/CameraInfo; REP 104; image_geometry, which takes all zeros for no distortion in every model too.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from sq_msgs_py.depth_image import Intrinsics, intrinsics_from_message, raw_intrinsics_from_message, size_mismatch
+from sq_perception.imaging.camera import Camera
+from sq_perception.imaging.compressed_depth import TRANSPORT
+from sq_perception.imaging.distortion import FISHEYE, MODELS, NONE, Distortion
+from sq_perception.imaging.rectification import Rectification, rectification
+
+Treatment = Literal["auto", "apply", "ignore"]
+
+_NEGLIGIBLE = 1e-9
+"""Of a coefficient: a millionth of a pixel."""
+_WORDS = re.compile(r"[^0-9a-z]+")
+_RECTIFIED = re.compile(r"rect(ified)?[0-9]*")
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What is known of the camera of an image; :meth:`of` makes one from a camera_info.
+
+    Attributes
+    ----------
+    camera : Camera
+        The pinhole camera of the rectified images.
+    size : (int, int)
+        Width and height of the images as they are sent.
+    rectification : Rectification or None
+        Between the two; None where an image is rectified as it comes.
+    note : str
+        What auto has decided about distortion coefficients that are there, and how to change that; empty if it had
+        nothing to decide.
+    """
+
+    camera: Camera
+    size: tuple[int, int]
+    rectification: Rectification | None = None
+    note: str = ""
+
+    @classmethod
+    def of(cls, info: Any, name: str = "", distortion: Treatment = "auto") -> Calibration:
+        """The calibration of a camera_info.
+
+        Quick: tables are computed for the first image, and calibrations that are equal share them.
+
+        Parameters
+        ----------
+        info
+            Anything with the fields of sensor_msgs/CameraInfo.
+        name
+            Topic of the images, as it is after remapping, or the path of a file.
+        distortion
+            See the module.
+
+        Raises
+        ------
+        ValueError
+            If the camera_info is not usable; says why, and which setting might help.
+        """
+        if distortion not in get_args(Treatment):
+            raise ValueError(f"distortion: expected {', '.join(get_args(Treatment))}, got {distortion!r}")
+        note = ""
+        raw = distortion == "apply"
+        if distortion == "auto" and is_distorted(info.d):
+            raw = not is_rectified_name(name)
+            note = _note(info, name, raw)
+        if not raw:
+            camera = _camera(intrinsics_from_message(info))
+            return cls(camera, (camera.width, camera.height), note=note)
+        try:
+            known = raw_intrinsics_from_message(info)
+            camera = _camera(known.intrinsics)
+            lens = _lens(known.distortion_model, known.distortion)
+            if lens.is_identity:
+                return cls(camera, (camera.width, camera.height), note=note)
+            found = rectification(camera, lens)
+        except ValueError as error:
+            raise ValueError(f"{error} (of a raw image; distortion = ignore takes it for rectified)") from error
+        return cls(found.camera, (camera.width, camera.height), found, note)
+
+    def rectified(self, depth: np.ndarray) -> np.ndarray:
+        """The depth image (height, width) of ``camera`` from one as it was sent; metres, NaN for nothing.
+
+        Raises
+        ------
+        ValueError
+            If the image has not the size of ``size``; says what may be the reason.
+        """
+        self.check(depth)
+        return depth if self.rectification is None else self.rectification.rectified(depth)
+
+    def rectified_labels(self, labels: np.ndarray) -> np.ndarray:
+        """The label image of ``camera`` from one of the depth image as it was sent; raises as :meth:`rectified`."""
+        self.check(labels)
+        return labels if self.rectification is None else self.rectification.rectified_labels(labels)
+
+    def as_sent(self, depth: np.ndarray) -> np.ndarray:
+        """A depth image of ``camera`` with the pixels of the images as they are sent; metres, NaN or inf for nothing.
+
+        Raises
+        ------
+        ValueError
+            If the image has not the size of ``camera``.
+        """
+        self.camera.check_image(depth)
+        return depth if self.rectification is None else self.rectification.distorted(depth)
+
+    def labels_as_sent(self, labels: np.ndarray) -> np.ndarray:
+        """The same for a label image."""
+        self.camera.check_image(labels)
+        return labels if self.rectification is None else self.rectification.distorted_labels(labels)
+
+    def check(self, image: np.ndarray) -> None:
+        """Raise ValueError unless the image (height, width) has the size of those that are sent."""
+        fault = size_mismatch((image.shape[1], image.shape[0]), self.size)
+        if fault:
+            raise ValueError(f"camera_info: does not fit: {fault}")
+
+
+def is_rectified_name(name: str) -> bool:
+    """Whether the name of a topic or file says that its images are rectified; see the module."""
+    parts = [part for part in name.lower().split("/") if part and part != TRANSPORT.lower()]
+    return any(_RECTIFIED.fullmatch(word) for part in parts[-2:] for word in _WORDS.split(part))
+
+
+def is_distorted(coefficients: Sequence[float]) -> bool:
+    """Whether distortion coefficients are not all zero; one that is no number counts."""
+    return not all(abs(value) <= _NEGLIGIBLE for value in coefficients)
+
+
+def _camera(known: Intrinsics) -> Camera:
+    return Camera(known.width, known.height, known.fx, known.fy, known.cx, known.cy)
+
+
+def _lens(model: str, coefficients: tuple[float, ...]) -> Distortion:
+    if model != FISHEYE and not is_distorted(coefficients):
+        return Distortion()
+    if model not in MODELS or model == NONE:
+        expected = ", ".join(one for one in MODELS if one != NONE)
+        raise ValueError(f"camera_info: distortion_model: expected {expected}, got {model!r}")
+    try:
+        return Distortion(model, coefficients)
+    except ValueError as error:
+        raise ValueError(f"camera_info: {error}") from error
+
+
+def _note(info: Any, name: str, raw: bool) -> str:
+    numbers = " ".join(f"{value:g}" for value in info.d)
+    where = name or "the image"
+    if raw:
+        return (
+            f"the distortion ({info.distortion_model} {numbers}) is applied: the name of {where} does not say that its "
+            "images are rectified; if they are, set distortion = ignore"
+        )
+    return (
+        f"the distortion ({info.distortion_model} {numbers}) is not applied: the name of {where} says that its images "
+        "are rectified; if they are not, set distortion = apply"
+    )

@@ -1,0 +1,240 @@
+"""Raw images as an ideal pinhole camera in the same place would have taken them, and back.
+
+The optical frame stays that of the raw camera: nothing is turned (camera_info's R is for stereo pairs and not used), so
+that z stays z, and a rectified depth is a depth that was measured.  Per pixel of the one image a table holds the place
+in the other one; it is computed once, from the forward map of :mod:`sq_perception.imaging.distortion` for the way there
+and from its inverse for the way back.
+
+The pinhole camera has the focal lengths of K and its pixels on the raw grid, so that the middle of the image stays as
+sharp as it is, and an image without distortion stays what it is.  Its window is as large as all that the raw image
+sees, whether its edges bulge or are drawn in; only a window of more than twice the pixels of the raw image, as a
+fisheye of more than some 110 degrees would need, is cut to that, about the direction that the middle of the raw image
+looks in.  P is not used: it is the same camera with another zoom, chosen for a window that must not change its size.
+
+Depth between pixels is interpolated in 1/z, in which planes are flat, where the four neighbours show one surface; where
+they do not, or one measured nothing, it is that of the nearest pixel, so that no value lies in between two surfaces,
+where nothing is.  Neighbours show one surface if it would be seen at less than 84 degrees, a relative step of 10 / f,
+as in :mod:`sq_perception.imaging.inverse_depth`.  Below, a small step may still be the edge of something flat; then a
+pixel is wrong by at most half of that step, as it would be with the nearest pixel, if it is a slope.  Labels are those of
+the nearest pixel always.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from functools import cached_property, lru_cache
+
+import cv2
+import numpy as np
+
+from sq_perception.imaging.camera import Camera
+from sq_perception.imaging.distortion import Distortion
+
+LARGEST_SIDE = 2**15 - 2
+"""Pixels; what OpenCV can look up."""
+MOST_PIXELS = 2**25
+_KEPT = 16
+"""Calibrations whose tables are kept."""
+_GROWTH = 2.0
+"""Of the number of pixels, at most."""
+_BORDER = 64
+"""Places on each side of the raw image whose rays say how far it sees."""
+_STEEPEST = 10.0
+"""Tangent of the incidence beyond which a step between neighbours is a jump."""
+_OUTSIDE = -9.0
+"""A column and row that no image has."""
+
+
+@dataclass(frozen=True)
+class Rectification:
+    """From a raw camera to the pinhole camera in its place; :func:`rectification` gives one whose tables are kept.
+
+    Parameters
+    ----------
+    raw : Camera
+        Size and intrinsics (K) of the raw images; pinhole.
+    distortion : Distortion
+
+    Raises
+    ------
+    ValueError
+        If the camera is no pinhole, its images are too large, or the distortion cannot be undone in the middle of it.
+    """
+
+    raw: Camera
+    distortion: Distortion
+
+    def __post_init__(self) -> None:
+        raw = self.raw
+        if not raw.is_pinhole:
+            raise ValueError(f"camera: expected a pinhole camera, got an {raw.projection} one")
+        if max(raw.width, raw.height) > LARGEST_SIDE or raw.width * raw.height > MOST_PIXELS:
+            raise ValueError(
+                f"image size: expected at most {MOST_PIXELS} pixels and {LARGEST_SIDE} a side to undo distortion, "
+                f"got {raw.width} x {raw.height}"
+            )
+        _ = self.camera
+
+    @cached_property
+    def camera(self) -> Camera:
+        """The pinhole camera that the rectified images are of."""
+        left, top, right, bottom = _window(self.raw, self.distortion)
+        return self.raw.cropped(left, top, right - left + 1, bottom - top + 1)
+
+    @cached_property
+    def seen(self) -> float:
+        """Share of the raw pixels that the rectified image shows."""
+        u, v = self._back.u, self._back.v
+        return float(((u > -0.5) & (v > -0.5) & (u < self.camera.width - 0.5) & (v < self.camera.height - 0.5)).mean())
+
+    def rectified(self, depth: np.ndarray) -> np.ndarray:
+        """The depth image of :attr:`camera` from a raw one.
+
+        Depth is in metres, positive, NaN or +inf where there is nothing; the result is float32, NaN also where the raw
+        image does not see.
+
+        Raises
+        ------
+        ValueError
+            If the image has not the size of the raw camera.
+        """
+        self.raw.check_image(depth)
+        return self._there.depth(depth)
+
+    def rectified_labels(self, labels: np.ndarray) -> np.ndarray:
+        """The label image of :attr:`camera` from a raw one, int32; 0 where the raw image did not see."""
+        self.raw.check_image(labels)
+        return self._there.labels(labels)
+
+    def distorted(self, depth: np.ndarray) -> np.ndarray:
+        """The raw depth image from one of :attr:`camera`; as :meth:`rectified`.
+
+        Raises
+        ------
+        ValueError
+            If the image has not the size of :attr:`camera`.
+        """
+        self.camera.check_image(depth)
+        return self._back.depth(depth)
+
+    def distorted_labels(self, labels: np.ndarray) -> np.ndarray:
+        """The raw label image from one of :attr:`camera`, int32; 0 where there is nothing."""
+        self.camera.check_image(labels)
+        return self._back.labels(labels)
+
+    @cached_property
+    def _there(self) -> _Lookup:
+        rays = _rays(self.camera, *_grid(self.camera))
+        return _Lookup.of(_pixels(self.raw, self.distortion.forward(rays)), self.raw)
+
+    @cached_property
+    def _back(self) -> _Lookup:
+        images = _rays(self.raw, *_grid(self.raw))
+        return _Lookup.of(_pixels(self.camera, self.distortion.inverse(images)), self.camera)
+
+
+@lru_cache(maxsize=_KEPT)
+def rectification(raw: Camera, distortion: Distortion) -> Rectification:
+    """The one of this calibration: equal calibrations share one, and its tables.
+
+    Raises
+    ------
+    ValueError
+        As :class:`Rectification`.
+    """
+    return Rectification(raw, distortion)
+
+
+@dataclass(frozen=True, eq=False)
+class _Lookup:
+    """Where the pixels (height, width) of one image lie in another, the source.
+
+    Attributes
+    ----------
+    u, v : float32 (height, width)
+        Column and row in the source, far outside of it where it does not see the pixel.
+    corner : int16 (height, width, 2)
+        Column and row of the upper left one of the four neighbours.
+    step : float
+        Relative difference of depths beyond which neighbours show different surfaces.
+    """
+
+    u: np.ndarray
+    v: np.ndarray
+    corner: np.ndarray
+    step: float
+
+    @classmethod
+    def of(cls, places: np.ndarray, source: Camera) -> _Lookup:
+        """From places (height, width, 2) in the image of ``source``, NaN where it sees nothing."""
+        places = np.nan_to_num(places, nan=_OUTSIDE, posinf=_OUTSIDE, neginf=_OUTSIDE)
+        places = np.clip(places, _OUTSIDE, LARGEST_SIDE + 1).astype(np.float32)
+        u, v = np.ascontiguousarray(places[..., 0]), np.ascontiguousarray(places[..., 1])
+        step = math.sqrt(2.0) * _STEEPEST / min(source.fx, source.fy)
+        return cls(u, v, np.floor(places).astype(np.int16), min(step, 0.5))
+
+    def depth(self, source: np.ndarray) -> np.ndarray:
+        """Depth (height, width), NaN where there is none."""
+        source = np.ascontiguousarray(source, dtype=np.float32)
+        result = self._nearest(source, np.nan)
+        # Warnings for pixels without depth only.
+        with np.errstate(divide="ignore", invalid="ignore"):
+            inverse = cv2.patchNaNs(1 / source, 0)
+            # Of each pixel and its neighbours to the right, below, and across.
+            square = np.ones((2, 2), np.uint8)
+            least, most = (find(inverse, square, anchor=(0, 0)) for find in (cv2.erode, cv2.dilate))
+            smooth = (least > np.float32(1 - self.step) * most).view(np.uint8)
+            smooth[-1], smooth[:, -1] = 0, 0
+            smooth = cv2.remap(smooth, self.corner, None, cv2.INTER_NEAREST, borderValue=0)
+            between = 1 / cv2.remap(inverse, self.u, self.v, cv2.INTER_LINEAR, borderValue=0)
+        return cv2.copyTo(between, smooth, result)
+
+    def labels(self, source: np.ndarray) -> np.ndarray:
+        """Labels, int32 (height, width), 0 where there are none."""
+        # OpenCV looks up no int32; bits are moved as they are.
+        return self._nearest(np.ascontiguousarray(source, dtype=np.int32).view(np.float32), 0.0).view(np.int32)
+
+    def _nearest(self, source: np.ndarray, nothing: float) -> np.ndarray:
+        return cv2.remap(source, self.u, self.v, cv2.INTER_NEAREST, borderValue=nothing)
+
+
+def _grid(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
+    return np.arange(camera.width, dtype=float), np.arange(camera.height, dtype=float)
+
+
+def _rays(camera: Camera, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """Normalised points (len(v), len(u), 2) of columns and rows."""
+    x, y = np.meshgrid((u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy)
+    return np.stack([x, y], axis=-1)
+
+
+def _pixels(camera: Camera, points: np.ndarray) -> np.ndarray:
+    """Columns and rows of normalised points (..., 2)."""
+    return points * [camera.fx, camera.fy] + [camera.cx, camera.cy]
+
+
+def _window(raw: Camera, distortion: Distortion) -> tuple[int, int, int, int]:
+    """First and last column and row (left, top, right, bottom) of the pinhole image, on the grid of the raw one."""
+    width, height = float(raw.width), float(raw.height)
+    across, down = np.linspace(0, width - 1, _BORDER), np.linspace(0, height - 1, _BORDER)
+    ends = np.array([0.0, 1.0])
+    sides = _rays(raw, across, ends * (height - 1)), _rays(raw, ends * (width - 1), down)
+    border = np.concatenate([_pixels(raw, distortion.inverse(side)).reshape(-1, 2) for side in sides])
+    middle = _rays(raw, np.array([(width - 1) / 2]), np.array([(height - 1) / 2]))
+    centre = _pixels(raw, distortion.inverse(middle)).reshape(2)
+    if not np.isfinite(centre).all():
+        raise ValueError(f"distortion {distortion}: cannot be undone in the middle of the image")
+    if np.isfinite(border).all():
+        low, high = border.min(axis=0), border.max(axis=0)
+    else:
+        low, high = np.full(2, -np.inf), np.full(2, np.inf)
+    # Sides as distances from the middle: first no side endless, then the area.
+    size = np.array([width, height])
+    before, after = np.clip(centre - low, 0, 2 * size), np.clip(high - centre, 0, 2 * size)
+    area = np.prod(before + after + 1)
+    scale = min(1.0, math.sqrt(_GROWTH * width * height / area))
+    # A border that hits the grid must not gain a pixel by rounding.
+    left, top = np.floor(centre - scale * before + 1e-6).astype(int)
+    right, bottom = np.ceil(centre + scale * after - 1e-6).astype(int)
+    return int(left), int(top), int(right), int(bottom)
