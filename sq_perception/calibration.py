@@ -10,8 +10,8 @@ decides:
 
 A name says that the image is rectified if one of its last two parts has the word ``rect`` or ``rectified`` in it; words
 are what is left between ``/``, ``_`` and other marks.  The transport's own part (``compressedDepth``) does not count.
-``image_rect``, ``image_rect_raw``, ``depth/rect/image`` and ``depth_registered/image_rect`` are rectified, ``image_raw``,
-``depth/image`` and ``direct/image`` do not say so.  A file's name is its folder's and its own.
+``image_rect``, ``image_rect_raw``, ``depth/rect/image`` and ``depth_registered/image_rect`` are rectified,
+``image_raw``, ``depth/image`` and ``direct/image`` do not say so.  A file's name is its folder's and its own.
 
 That depth was registered to a colour image changes nothing in this: it has the geometry of that image, and a
 camera_info that describes that image.  ``aligned_depth_to_color/image_raw`` and ``depth_to_rgb/image_raw`` are as
@@ -45,7 +45,7 @@ Treatment = Literal["auto", "apply", "ignore"]
 _NEGLIGIBLE = 1e-9
 """Of a coefficient: a millionth of a pixel."""
 _WORDS = re.compile(r"[^0-9a-z]+")
-_RECTIFIED = re.compile(r"rect(ified)?[0-9]*")
+_RECTIFIED = re.compile(r"rect(ified)?")
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class Calibration:
         raw = distortion == "apply"
         if distortion == "auto" and is_distorted(info.d):
             raw = not is_rectified_name(name)
-            note = _note(info, name, raw)
+            note = _note(info, raw)
         if not raw:
             camera = _camera(intrinsics_from_message(info))
             return cls(camera, (camera.width, camera.height), note=note)
@@ -177,15 +177,14 @@ def _lens(model: str, coefficients: tuple[float, ...]) -> Distortion:
         raise ValueError(f"camera_info: {error}") from error
 
 
-def _note(info: Any, name: str, raw: bool) -> str:
-    numbers = " ".join(f"{value:g}" for value in info.d)
-    where = name or "the image"
+def _note(info: Any, raw: bool) -> str:
+    coefficients = " ".join([str(info.distortion_model), *(f"{value:g}" for value in info.d)])
     if raw:
         return (
-            f"the distortion ({info.distortion_model} {numbers}) is applied: the name of {where} does not say that its "
-            "images are rectified; if they are, set distortion = ignore"
+            f"the distortion ({coefficients}) is undone, as the name of the images does not say that they are "
+            "rectified; distortion = ignore takes them for rectified"
         )
     return (
-        f"the distortion ({info.distortion_model} {numbers}) is not applied: the name of {where} says that its images "
-        "are rectified; if they are not, set distortion = apply"
+        f"the distortion ({coefficients}) is not undone, as the name of the images says that they are rectified; "
+        "distortion = apply takes them for raw"
     )

@@ -154,7 +154,7 @@ def _render(options: argparse.Namespace) -> int:
     from sq_perception.geometry.superquadric import Superquadric
     from sq_perception.imaging import raycast, unit_cube
     from sq_perception.imaging.camera import Camera
-    from sq_perception.recorded_frame import read_camera_info
+    from sq_perception.recorded_frame import read_calibration
 
     try:
         body = Superquadric.from_flat(np.array([getattr(options, name) for name in PARAMETERS]))
@@ -165,7 +165,7 @@ def _render(options: argparse.Namespace) -> int:
         else:
             seen = body
             if options.camera_info:
-                camera = read_camera_info(options.camera_info)
+                camera = read_calibration(options.camera_info, distortion="ignore").camera
             else:
                 width, height = options.width or 640, options.height or 480
                 focal = options.focal

@@ -6,11 +6,12 @@ by type and encoding:
 | type | encoding | depth |
 | --- | --- | --- |
 | sensor_msgs/Image | 16UC1, 32FC1 | millimetres, metres (REP 118) |
-| sensor_msgs/CompressedImage | 16UC1, 32FC1 of the compressedDepth transport, PNG | likewise |
+| sensor_msgs/CompressedImage | 16UC1, 32FC1 of the compressedDepth transport, PNG or RVL | likewise |
 | sensor_msgs/Image, orthographic | mono8, mono16 | grey values of the unit cube |
 
 The camera is that of the sibling topic ``camera_info``, as image_transport pairs them: the message with the image's
-stamp; failing that, the last one before the image; failing that, the bag's first, however late.
+stamp; failing that, the last one before the image; failing that, the bag's first, however late.  The name of their
+topic decides whether images are raw and have to be rectified (:mod:`sq_perception.calibration`).
 
 A bag may be damaged or hostile.  Its message definitions are not used: they would become Python code, and the three
 types read here are the same in every ROS 2.  What unpacks is bounded before it unpacks, and pixels are only allocated
@@ -31,9 +32,10 @@ from typing import Any
 import yaml
 
 from sq_msgs_py import depth_image
+from sq_perception.calibration import Calibration, Treatment
 from sq_perception.imaging import compressed_depth, unit_cube
-from sq_perception.imaging.camera import Camera, Projection
-from sq_perception.recorded_frame import FrameError, RecordedFrame, Stamp, distortion_warning
+from sq_perception.imaging.camera import Projection
+from sq_perception.recorded_frame import FrameError, RecordedFrame, Stamp
 
 SUFFIXES = (".mcap", ".db3")
 LARGEST = 2**29
@@ -65,12 +67,14 @@ class RecordedBag:
         Of the folder or file.
     topic
         Of the images; needed where several show depth.
-    camera
-        Goes before the cameras in the bag.
+    camera_info
+        Anything with the fields of sensor_msgs/CameraInfo; goes before those in the bag.
     projection
         "orthographic" looks for grey images of the unit cube.
     every, limit
         Every n-th image only, and at most so many.
+    distortion
+        "auto", "apply" or "ignore", see :mod:`sq_perception.calibration`.
 
     Raises
     ------
@@ -82,16 +86,18 @@ class RecordedBag:
         self,
         path: str | Path,
         topic: str | None = None,
-        camera: Camera | None = None,
+        camera_info: Any = None,
         projection: Projection = "pinhole",
         every: int = 1,
         limit: int | None = None,
+        distortion: Treatment = "auto",
     ) -> None:
         if every < 1 or (limit is not None and limit < 1):
             raise ValueError(f"every, limit: expected at least 1, got {every} and {limit}")
         self._path = Path(path)
         self._name = self._path.resolve().name if self._path.is_dir() else self._path.stem
-        self._camera = camera
+        self._camera_info = camera_info
+        self._distortion: Treatment = distortion
         self._orthographic = projection == "orthographic"
         self._every, self._limit = every, limit
         self._reader, self._types = _open(self._path)
@@ -119,7 +125,7 @@ class RecordedBag:
         return count if self._limit is None else min(count, self._limit)
 
     def __iter__(self) -> Iterator[RecordedFrame | FrameError]:
-        needs_info = self._camera is None and not self._orthographic
+        needs_info = self._camera_info is None and not self._orthographic
         try:
             latest = self._first_info() if needs_info else None
             waiting: _Message | None = None
@@ -249,15 +255,13 @@ class RecordedBag:
             grey = depth_image.grey_from_message(message.content)
             depth, camera = unit_cube.depth_from_grey(grey), unit_cube.camera(grey.shape[1], grey.shape[0])
         else:
-            camera, warning = self._camera_of(info)
+            calibration = self._calibration(info)
             if message.is_packed:
                 depth = compressed_depth.decode(message.content.format, message.content.data)
             else:
                 depth = depth_image.depth_from_message(message.content)
-            try:
-                camera.check_image(depth)
-            except ValueError as error:
-                raise ValueError(f"the camera_info does not fit: {error}") from error
+            depth, camera = calibration.rectified(depth), calibration.camera
+            warning = f"{self._path}: {self.topic}: {calibration.note}" if calibration.note else ""
         return RecordedFrame(
             depth,
             camera,
@@ -270,15 +274,12 @@ class RecordedBag:
             warning=warning,
         )
 
-    def _camera_of(self, info: _Message | None) -> tuple[Camera, str]:
-        """The camera, and what to say about its distortion."""
-        if self._camera is not None:
-            return self._camera, ""
+    def _calibration(self, info: _Message | None) -> Calibration:
+        if self._camera_info is not None:
+            return Calibration.of(self._camera_info, self.topic, self._distortion)
         if info is None:
             raise ValueError(f"no camera_info on {self._info_topic}: name the camera with --camera-info")
-        found = depth_image.intrinsics_from_message(info.content)
-        camera = Camera(found.width, found.height, found.fx, found.fy, found.cx, found.cy)
-        return camera, distortion_warning(f"{self._path}: {self._info_topic}", info.content.d)
+        return Calibration.of(info.content, self.topic, self._distortion)
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,7 +3,7 @@
 | file | needs | depth |
 | --- | --- | --- |
 | ``.npz`` | ``depth`` float (h, w), ``K`` (3, 3) | metres, NaN = nothing |
-| 16 bit ``.png`` | a camera_info YAML | millimetres, 0 = nothing |
+| 16 bit ``.png`` | a camera_info YAML | millimetres, 0 = nothing; rectified where it is raw |
 | 8 or 16 bit ``.png``, ``.bmp``, orthographic | nothing | grey values of the cube, 0 = nothing |
 | ``.npz``, orthographic | ``depth`` | depth in the cube, 1 - z; NaN = nothing |
 
@@ -12,6 +12,8 @@ A file whose name is a time, such as 1305031102.160407.png, has that stamp in se
 The cube is the thesis' unit cube, :mod:`sq_perception.imaging.unit_cube`.  An NPZ may bring ``labels`` (h, w), a
 support ``plane`` (4,), and the text "orthographic" as ``projection``, which goes before what the caller says.  Nothing
 in a file is executed: no pickle, safe YAML only.
+
+Whether a PNG is raw and its distortion has to be undone is decided by :mod:`sq_perception.calibration`.
 
 Whole folders and rosbags are read by :mod:`sq_perception.recorded_input`, frame by frame, into the same class.
 """
@@ -29,13 +31,15 @@ import cv2
 import numpy as np
 import yaml
 
+from sq_perception.calibration import Calibration, Treatment
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera, Projection
 
 SUFFIXES = (".npz", ".png", ".bmp")
 _MILLIMETRES = np.float32(1000.0)
 _IMAGES = (".png", ".bmp")
-_NO_DISTORTION = 1e-9
+_SKEW = 1e-6
+"""Of fx; no depth camera in use has any."""
 _TIME = re.compile(r"(\d{1,18})\.(\d{1,9})")
 
 
@@ -90,7 +94,37 @@ class RecordedFrame:
     warning: str = ""
 
 
-def read(path: str | Path, camera_info: str | Path | None = None, projection: Projection = "pinhole") -> RecordedFrame:
+@dataclass(frozen=True)
+class Region:
+    """The fields of a sensor_msgs/RegionOfInterest that count."""
+
+    x_offset: int = 0
+    y_offset: int = 0
+    width: int = 0
+    height: int = 0
+
+
+@dataclass(frozen=True)
+class CameraInfo:
+    """The fields of a sensor_msgs/CameraInfo, from a file; matrices are flat."""
+
+    width: int
+    height: int
+    distortion_model: str
+    d: tuple[float, ...]
+    k: tuple[float, ...]
+    p: tuple[float, ...]
+    binning_x: int
+    binning_y: int
+    roi: Region
+
+
+def read(
+    path: str | Path,
+    camera_info: str | Path | None = None,
+    projection: Projection = "pinhole",
+    distortion: Treatment = "auto",
+) -> RecordedFrame:
     """Read one frame.
 
     Parameters
@@ -101,23 +135,28 @@ def read(path: str | Path, camera_info: str | Path | None = None, projection: Pr
         YAML with the intrinsics of a PNG, as camera_calibration writes it or as a camera_info message prints.
     projection
         "pinhole" or "orthographic".
+    distortion
+        Of a PNG: "auto", "apply" or "ignore", see :mod:`sq_perception.calibration`; auto looks at the names of the file
+        and its folder.
 
     Raises
     ------
     FrameError
         For anything wrong with a file.
     ValueError
-        For an unknown projection.
+        For an unknown projection or treatment of distortion.
     """
     if projection not in get_args(Projection):
         raise ValueError(f"projection: expected 'pinhole' or 'orthographic', got {projection!r}")
+    if distortion not in get_args(Treatment):
+        raise ValueError(f"distortion: expected {', '.join(get_args(Treatment))}, got {distortion!r}")
     path = Path(path)
     if not path.is_file():
         raise FrameError(f"{path}: no such file")
-    return replace(_read(path, camera_info, projection), stamp=_stamp(path))
+    return replace(_read(path, camera_info, projection, distortion), stamp=_stamp(path))
 
 
-def _read(path: Path, camera_info: str | Path | None, projection: Projection) -> RecordedFrame:
+def _read(path: Path, camera_info: str | Path | None, projection: Projection, distortion: Treatment) -> RecordedFrame:
     suffix = path.suffix.lower()
     if suffix == ".npz":
         return _read_npz(path, projection)
@@ -133,10 +172,14 @@ def _read(path: Path, camera_info: str | Path | None, projection: Projection) ->
         )
     if camera_info is None:
         raise FrameError(f"{path}: a 16 bit image needs a camera_info file with the camera's intrinsics")
-    camera, warning = read_camera(camera_info)
-    _check_size(path, image, camera)
+    calibration = calibrated(camera_info, read_camera_info(camera_info), path.with_suffix("").as_posix(), distortion)
     depth = np.where(image > 0, image / _MILLIMETRES, np.float32(np.nan))
-    return RecordedFrame(depth, camera, None, path.name, is_cube=False, warning=warning)
+    try:
+        depth = calibration.rectified(depth)
+    except ValueError as error:
+        raise FrameError(f"{path}: {error}") from error
+    warning = f"{camera_info}: {calibration.note}" if calibration.note else ""
+    return RecordedFrame(depth, calibration.camera, None, path.name, is_cube=False, warning=warning)
 
 
 def _stamp(path: Path) -> Stamp | None:
@@ -145,30 +188,34 @@ def _stamp(path: Path) -> Stamp | None:
     return Stamp(int(parts[1]), int(parts[2].ljust(9, "0"))) if parts else None
 
 
-def distortion_warning(where: str, coefficients: np.ndarray) -> str:
-    """What to say about a camera with these distortion coefficients; empty if all are zero."""
-    coefficients = np.asarray(coefficients, dtype=float)
-    if not np.abs(coefficients).max(initial=0.0) > _NO_DISTORTION:
-        return ""
-    numbers = " ".join(f"{value:g}" for value in coefficients)
-    return f"{where}: the distortion coefficients ({numbers}) are not applied: the image is taken for rectified"
+def calibrated(where: str | Path, info: Any, name: str, distortion: Treatment) -> Calibration:
+    """:meth:`Calibration.of <sq_perception.calibration.Calibration.of>` whose fault is a FrameError that says where."""
+    try:
+        return Calibration.of(info, name, distortion)
+    except ValueError as error:
+        raise FrameError(f"{where}: {error}") from error
 
 
-def read_camera_info(path: str | Path) -> Camera:
-    """The pinhole camera of a YAML file in the layout of camera_calibration, or of a printed camera_info message.
+def read_calibration(path: str | Path, name: str = "", distortion: Treatment = "auto") -> Calibration:
+    """The calibration that a YAML file tells of; ``name`` is that of the images.
 
-    Depth is only metric in a rectified image.  Where the file names distortion, the image's intrinsics are therefore
-    those of the projection matrix P, otherwise K.
+    Raises
+    ------
+    FrameError
+        As :func:`read_camera_info`, or if the camera is not calibrated or its distortion not known.
+    """
+    return calibrated(path, read_camera_info(path), name, distortion)
+
+
+def read_camera_info(path: str | Path) -> CameraInfo:
+    """A YAML file in the layout of camera_calibration, or of a printed camera_info message.
+
+    A file that does not name its distortion model means plumb_bob; what else it does not name is zero.
 
     Raises
     ------
     FrameError
     """
-    return read_camera(path)[0]
-
-
-def read_camera(path: str | Path) -> tuple[Camera, str]:
-    """As :func:`read_camera_info`, with the warning about its distortion; empty where there is none."""
     path = Path(path)
     try:
         text = path.read_text(encoding="utf-8")
@@ -181,22 +228,29 @@ def read_camera(path: str | Path) -> tuple[Camera, str]:
     if not documents or not isinstance(documents[0], dict):
         raise FrameError(f"{path}: expected a camera_info as a YAML mapping")
     info = documents[0]
-    width, height = (_integer(path, info, names) for names in (("image_width", "width"), ("image_height", "height")))
+    width, height = (_size(path, info, names) for names in (("image_width", "width"), ("image_height", "height")))
     matrix = _matrix(path, info, ("camera_matrix", "k", "K"), 9)
     distortion = _matrix(path, info, ("distortion_coefficients", "d", "D"), None)
     projection = _matrix(path, info, ("projection_matrix", "p", "P"), 12)
-    if matrix is None:
-        raise FrameError(f"{path}: expected a camera_matrix (or k) of 9 numbers")
-    k = matrix.reshape(3, 3)
-    warning = "" if distortion is None else distortion_warning(str(path), distortion)
-    if warning:
-        if projection is None or projection[0] <= 0:
-            raise FrameError(f"{path}: a distorted camera needs the projection_matrix (or p) of its rectified image")
-        k = projection.reshape(3, 4)[:, :3]
-    try:
-        return Camera.from_matrix(k, width, height), warning
-    except ValueError as error:
-        raise FrameError(f"{path}: {error}") from error
+    if matrix is None and projection is None:
+        raise FrameError(f"{path}: expected a camera_matrix (or k) of 9 numbers, or a projection_matrix (or p) of 12")
+    if matrix is not None and abs(matrix[1]) > _SKEW * abs(matrix[0]):
+        raise FrameError(f"{path}: camera matrix: expected no skew, got {matrix[1]:g}")
+    region = info.get("roi", {})
+    if not isinstance(region, dict):
+        raise FrameError(f"{path}: roi: expected a mapping, got {region!r}")
+    offsets = (_count(path, region, name) for name in ("x_offset", "y_offset", "width", "height"))
+    return CameraInfo(
+        width,
+        height,
+        str(info.get("distortion_model", info.get("camera_model", "plumb_bob"))),
+        () if distortion is None else tuple(distortion.tolist()),
+        (0.0,) * 9 if matrix is None else tuple(matrix.tolist()),
+        (0.0,) * 12 if projection is None else tuple(projection.tolist()),
+        _count(path, info, "binning_x"),
+        _count(path, info, "binning_y"),
+        Region(*offsets),
+    )
 
 
 def _read_npz(path: Path, projection: Projection) -> RecordedFrame:
@@ -284,21 +338,21 @@ def _cube_camera(path: Path, width: int, height: int) -> Camera:
         raise FrameError(f"{path}: {error}") from error
 
 
-def _check_size(path: Path, image: np.ndarray, camera: Camera) -> None:
-    try:
-        camera.check_image(image)
-    except ValueError as error:
-        raise FrameError(f"{path}: the camera_info does not fit: {error}") from error
-
-
-def _integer(path: Path, info: dict[Any, Any], names: tuple[str, ...]) -> int:
+def _size(path: Path, info: dict[Any, Any], names: tuple[str, ...]) -> int:
     for name in names:
         if name in info:
-            value = info[name]
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+            value = _count(path, info, name)
+            if value < 1:
                 raise FrameError(f"{path}: {name}: expected a positive integer, got {value!r}")
             return value
     raise FrameError(f"{path}: expected {names[0]} (or {names[1]})")
+
+
+def _count(path: Path, info: dict[Any, Any], name: str) -> int:
+    value = info.get(name, 0)
+    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+        raise FrameError(f"{path}: {name}: expected a positive integer or 0, got {value!r}")
+    return value
 
 
 def _matrix(path: Path, info: dict[Any, Any], names: tuple[str, ...], length: int | None) -> np.ndarray | None:

@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 from sq_perception import recorded_bag, recorded_frame
-from sq_perception.imaging.camera import Camera, Projection
+from sq_perception.calibration import Treatment
+from sq_perception.imaging.camera import Projection
 from sq_perception.recorded_bag import RecordedBag
-from sq_perception.recorded_frame import FrameError, RecordedFrame
+from sq_perception.recorded_frame import CameraInfo, FrameError, RecordedFrame
 
 CAMERA_FILES = ("camera_info.yaml", "camera_info.yml", "camera.yaml", "camera.yml")
 SUFFIXES = recorded_frame.SUFFIXES + recorded_bag.SUFFIXES
@@ -38,6 +38,8 @@ class RecordedInput:
         Of the images in bags.
     every, limit
         Of each folder and bag: every n-th frame only, and at most so many.
+    distortion
+        Of PNGs and bags: "auto", "apply" or "ignore", see :mod:`sq_perception.calibration`.
 
     Raises
     ------
@@ -53,12 +55,15 @@ class RecordedInput:
         topic: str | None = None,
         every: int = 1,
         limit: int | None = None,
+        distortion: Treatment = "auto",
     ) -> None:
         self._camera_info = camera_info
-        self._camera: Camera | None = None
-        self._warning = ""
+        self._info: CameraInfo | None = None
+        self._distortion: Treatment = distortion
         if camera_info is not None:
-            self._camera, self._warning = recorded_frame.read_camera(camera_info)
+            self._info = recorded_frame.read_camera_info(camera_info)
+            # Auto depends on what the images are called.
+            recorded_frame.calibrated(camera_info, self._info, "", "ignore" if distortion == "auto" else distortion)
         self._projection: Projection = projection
         self._topic, self._every, self._limit = topic, every, limit
         self._sources: list[tuple[Path, str | Path | None] | tuple[Path, FrameError]] = []
@@ -93,7 +98,7 @@ class RecordedInput:
 
     def _file(self, path: Path, camera_info: str | Path | None) -> RecordedFrame | FrameError:
         try:
-            return recorded_frame.read(path, camera_info, self._projection)
+            return recorded_frame.read(path, camera_info, self._projection, self._distortion)
         except FrameError as error:
             return error
         except (OSError, MemoryError) as error:
@@ -101,15 +106,15 @@ class RecordedInput:
 
     def _bag(self, path: Path) -> Iterator[tuple[str, RecordedFrame | FrameError]]:
         try:
-            bag = RecordedBag(path, self._topic, self._camera, self._projection, self._every, self._limit)
+            bag = RecordedBag(
+                path, self._topic, self._info, self._projection, self._every, self._limit, self._distortion
+            )
         except FrameError as error:
             yield str(path), error
             return
         with bag:
             self.total += max(len(bag), 1) - 1
             for frame in bag:
-                if self._warning and isinstance(frame, RecordedFrame):
-                    frame = replace(frame, warning=self._warning)
                 yield str(path), frame
 
 

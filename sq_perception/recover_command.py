@@ -66,6 +66,12 @@ output:
   measured points span; the rest is inferred.  A failed object is listed with its reason; its numbers only say where it
   is.  "label" is the mask's value, null without masks; "pixels" counts the measured ones.
 
+distortion:
+  Where a camera_info has distortion coefficients that are not zero, --distortion auto takes images for rectified if the
+  last two parts of their topic or path have the word rect or rectified in them (image_rect, image_rect_raw,
+  rect/image.png), and for raw otherwise.  Raw images are rectified: their camera is then that of K, in a window that
+  shows what the raw image shows.  models: plumb_bob, rational_polynomial, equidistant.
+
 tracking:
   --track follows bodies over the frames of each bag and folder, for a camera that stands still.  "track" is then
   {"id": ..., "seen": ..., "fused": true | false, "size": ..., "shape": ..., "translation": ..., "rotation": ...,
@@ -96,6 +102,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--camera-info",
         metavar="FILE",
         help="YAML with the intrinsics of 16 bit PNGs and bags; goes before what a folder or bag has",
+    )
+    parser.add_argument(
+        "--distortion",
+        choices=("auto", "apply", "ignore"),
+        default="auto",
+        help="of PNGs and bags: undo it (apply), take images for rectified (ignore), or go by their names, see below",
     )
     parser.add_argument("--topic", metavar="NAME", help="depth images of a bag, where it has several such topics")
     parser.add_argument("--every", type=int, default=1, metavar="N", help="only every Nth frame of a bag or folder")
@@ -157,7 +169,13 @@ def run(options: argparse.Namespace) -> int:
     )
     try:
         recorded = RecordedInput(
-            options.frames, options.camera_info, options.projection, options.topic, options.every, options.limit
+            options.frames,
+            options.camera_info,
+            options.projection,
+            options.topic,
+            options.every,
+            options.limit,
+            options.distortion,
         )
         recoverer = Recoverer(options.model, method=options.method, consensus=options.consensus)
     except (FrameError, CheckpointError) as error:

@@ -20,7 +20,7 @@ PACKAGES = (PERCEPTION, MESSAGES)
 # Floor by floor, from the ground up; a module may import from its own floor and from those below it.
 FLOORS = (
     ("geometry", "provenance", "plain_yaml"),
-    ("imaging", "metrics", "tracking", "recorded_frame", "recorded_bag", "recorded_input"),
+    ("imaging", "metrics", "tracking", "calibration", "recorded_frame", "recorded_bag", "recorded_input"),
     ("learning", "fitting", "scene_description", "seen_object"),
     ("recovery", "recorded_tracks", "segment_repair", "warm_up"),
     ("evaluation", "nodes", "cli", "recover_command"),
@@ -90,10 +90,10 @@ def test_only_nodes_know_ros() -> None:
     assert guilty == []
 
 
-def test_only_nodes_and_bags_join_the_two_packages() -> None:
+def test_only_nodes_bags_and_calibrations_join_the_two_packages() -> None:
     """What a recorded message says is decoded by the code that decodes a live one; that needs no ROS."""
     joining = {path for path in PERCEPTION.rglob("*.py") if not is_node(path) and "sq_msgs_py" in roots(path)}
-    assert joining == {PERCEPTION / "recorded_bag.py"}
+    assert joining == {PERCEPTION / "recorded_bag.py", PERCEPTION / "calibration.py"}
     absent = f"import sys; sys.modules.update(dict.fromkeys({ROS!r}))"
     modules = loaded_after(f"{absent}; import sq_perception.recorded_input, sq_perception.recover_command")
     assert "sq_msgs_py.depth_image" in modules

@@ -25,6 +25,8 @@ from sq_perception import cli, recorded_bag
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import compressed_depth, raycast, unit_cube
 from sq_perception.imaging.camera import Camera
+from sq_perception.imaging.distortion import Distortion
+from sq_perception.imaging.rectification import Rectification
 from sq_perception.recorded_bag import RecordedBag
 from sq_perception.recorded_frame import FrameError, RecordedFrame, Stamp
 
@@ -219,15 +221,27 @@ def test_a_missing_camera_info_is_named_and_can_be_given(tmp_path, grey):
     assert TOPIC in str(error)
     assert "1.000000000" in str(error)
     assert f"no camera_info on {INFO}" in str(error)
-    (frame,) = frames(bag, camera=CAMERA)
+    (frame,) = frames(bag, camera_info=info(0))
     assert frame.camera == CAMERA
 
 
-def test_distortion_is_said_not_to_be_applied(tmp_path, grey):
-    contents = [(INFO, 1, info(1, distortion=0.1)), (TOPIC, 1, image(grey, 1, "16UC1"))]
-    (frame,) = frames(write(tmp_path / "bag", contents))
-    assert "not applied" in frame.warning
-    assert "0.1 0 0 0 0" in frame.warning
+def test_distortion_is_undone_unless_the_topic_is_a_rectified_one(tmp_path, grey):
+    raw = "/camera/depth/image_raw"
+    contents = [(INFO, 1, info(1, distortion=0.1))] + [(one, 1, image(grey, 1, "16UC1")) for one in (TOPIC, raw)]
+    bag = write(tmp_path / "bag", contents)
+    for topic, treatment, applied in [
+        (TOPIC, "auto", False),
+        (TOPIC, "apply", True),
+        (raw, "auto", True),
+        (raw, "ignore", False),
+    ]:
+        (frame,) = frames(bag, topic=topic, distortion=treatment)
+        undone = Rectification(CAMERA, Distortion("plumb_bob", (0.1, 0, 0, 0, 0)))
+        assert frame.camera == (undone.camera if applied else CAMERA)
+        expected = undone.rectified(metres(grey)) if applied else metres(grey)
+        np.testing.assert_array_equal(frame.depth, expected)
+        assert frame.warning == "" if treatment != "auto" else "0.1 0 0 0 0" in frame.warning
+        assert ("not undone" in frame.warning) == (treatment == "auto" and not applied)
 
 
 def test_the_topic_is_found_by_encoding_and_several_must_be_chosen_from(tmp_path, grey):
@@ -495,7 +509,7 @@ def test_broken_bags_cost_the_exit_code_and_nothing_else(tmp_path, grey, capsys)
     errors = capsys.readouterr().err
     assert f"{cut}: not a readable bag" in errors
     assert f"{TOPIC} recorded at 2.000000000" in errors
-    assert errors.count("not applied") == 1
+    assert errors.count("not undone") == 1
     assert "2 frames, 0 objects (0 failed), 2 frames or sources unreadable, median" in errors
 
 

@@ -10,7 +10,9 @@ import yaml
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast, unit_cube
 from sq_perception.imaging.camera import Camera
-from sq_perception.recorded_frame import FrameError, read, read_camera_info
+from sq_perception.imaging.distortion import Distortion
+from sq_perception.imaging.rectification import Rectification
+from sq_perception.recorded_frame import FrameError, Region, read, read_calibration, read_camera_info
 
 K = np.array([[60.0, 0, 31.5], [0, 61.0, 23.5], [0, 0, 1]])
 
@@ -72,19 +74,33 @@ def test_a_printed_message_is_a_camera_info_too(tmp_path):
     path = tmp_path / "echo.yaml"
     message = {"width": 64, "height": 48, "d": [], "k": K.ravel().tolist(), "p": [0.0] * 12}
     path.write_text(yaml.safe_dump(message) + "---\n")
-    assert read_camera_info(path) == Camera(64, 48, 60.0, 61.0, 31.5, 23.5)
+    assert read_calibration(path).camera == Camera(64, 48, 60.0, 61.0, 31.5, 23.5)
+    part = {"x_offset": 10, "y_offset": 4, "width": 40, "height": 20, "do_rectify": True}
+    path.write_text(yaml.safe_dump({**message, "roi": part, "binning_x": 2, "binning_y": 2}))
+    assert read_camera_info(path).roi == Region(10, 4, 40, 20)
+    assert read_calibration(path).camera == Camera(20, 10, 30.0, 30.5, 10.75, 9.75)
 
 
-def test_a_distorted_camera_counts_as_rectified(tmp_path):
+def test_a_distorted_image_is_rectified_unless_a_name_says_that_it_is(tmp_path, rng):
     rectified = np.array([[55.0, 0, 30.0, 0], [0, 55.0, 22.0, 0], [0, 0, 1, 0]])
-    distortion = {"rows": 1, "cols": 5, "data": [0.1, 0, 0, 0, 0]}
-    path = camera_info(
-        tmp_path / "c.yaml", distortion_coefficients=distortion, projection_matrix={"data": rectified.ravel().tolist()}
-    )
-    assert read_camera_info(path) == Camera(64, 48, 55.0, 55.0, 30.0, 22.0)
-    camera_info(path, distortion_coefficients=distortion, projection_matrix=None)
-    with pytest.raises(FrameError, match="projection_matrix"):
-        read_camera_info(path)
+    changes = {"distortion_coefficients": {"data": [0.1, 0, 0, 0, 0]}, "projection_matrix": rectified.ravel().tolist()}
+    info = camera_info(tmp_path / "c.yaml", **changes)
+    image = rng.integers(1000, 1010, (48, 64)).astype(np.uint16)
+    (tmp_path / "depth_rect").mkdir()
+    for folder in (tmp_path, tmp_path / "depth_rect"):
+        cv2.imwrite(str(folder / "1.png"), image)
+    undone = Rectification(Camera(64, 48, 60.0, 61.0, 31.5, 23.5), Distortion("plumb_bob", (0.1, 0, 0, 0, 0)))
+    for frame in (read(tmp_path / "1.png", info), read(tmp_path / "depth_rect" / "1.png", info, distortion="apply")):
+        assert frame.camera == undone.camera
+        np.testing.assert_array_equal(frame.depth, undone.rectified(image / np.float32(1000)))
+    for frame in (read(tmp_path / "depth_rect" / "1.png", info), read(tmp_path / "1.png", info, distortion="ignore")):
+        assert frame.camera == Camera(64, 48, 55.0, 55.0, 30.0, 22.0)
+        np.testing.assert_array_equal(frame.depth, image / np.float32(1000))
+    with pytest.raises(ValueError, match="distortion: expected auto, apply, ignore"):
+        read(tmp_path / "1.png", info, distortion="perhaps")
+    camera_info(info, **changes, distortion_model="unified")
+    with pytest.raises(FrameError, match=r"expected plumb_bob, .*, got 'unified' .*distortion = ignore"):
+        read(tmp_path / "1.png", info)
 
 
 @pytest.mark.parametrize("suffix", ["png", "bmp"])
@@ -209,14 +225,19 @@ def test_bad_images_are_named(tmp_path, info):
         ("{image_width: 64, image_height: 48}", "camera_matrix"),
         ("{image_width: 64, image_height: 48, k: [1, 2]}", "9 finite numbers"),
         ("{image_width: 64, image_height: 48, k: [a, b]}", "expected numbers"),
-        ("{width: 64, height: 48, k: [0, 0, 0, 0, 0, 0, 0, 0, 0]}", "positive"),
+        ("{width: 64, height: 48, k: [0, 0, 0, 0, 0, 0, 0, 0, 0]}", "above 0"),
+        ("{width: 64, height: 48, k: [9, 1, 0, 0, 9, 0, 0, 0, 1]}", "no skew"),
+        ("{width: 64, height: 48, k: [9, 0, 0, 0, 9, 0, 0, 0, 1], binning_x: -1}", "binning_x"),
+        ("{width: 64, height: 48, k: [9, 0, 0, 0, 9, 0, 0, 0, 1], roi: {x_offset: a}}", "x_offset"),
+        ("{width: 64, height: 48, k: [9, 0, 0, 0, 9, 0, 0, 0, 1], roi: 3}", "roi"),
+        ("{width: 64, height: 48, k: [9, 0, 0, 0, 9, 0, 0, 0, 1], d: [.nan]}", "finite"),
     ],
 )
 def test_bad_camera_infos_are_named(tmp_path, text, reason):
     path = tmp_path / "info.yaml"
     path.write_text(text)
     with pytest.raises(FrameError, match=reason):
-        read_camera_info(path)
+        read_calibration(path)
 
 
 def test_shared_recordings_are_read(shared_data):

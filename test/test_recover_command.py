@@ -94,15 +94,23 @@ def test_bad_inputs_come_as_errors_in_their_place(tmp_path):
         RecordedInput(names, tmp_path / "none.yaml")
 
 
-def test_distortion_is_warned_of_once(tmp_path, capsys):
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ((), "(plumb_bob 0.3 0 0 0 0) is undone"),
+        (("--distortion", "apply"), ""),
+        (("--distortion", "ignore"), ""),
+    ],
+)
+def test_what_becomes_of_distortion_is_said_once_unless_it_was_asked_for(tmp_path, options, words, capsys):
     camera_yaml(tmp_path / "camera.yaml", distortion=0.3)
     for k in range(3):
         save_png(tmp_path / f"{k}.png")
-    assert len(recover(tmp_path, tmp_path)) == 3
+    assert len(recover(tmp_path, tmp_path, *options)) == 3
     errors = capsys.readouterr().err
-    assert errors.count("(0.3 0 0 0 0) are not applied") == 1
+    assert words in errors
     assert "3 frames, " in errors
-    assert errors.count("\n") == 2
+    assert errors.count("\n") == (2 if words else 1)
 
 
 @pytest.mark.parametrize("option", ["--every", "--limit"])

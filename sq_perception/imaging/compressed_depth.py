@@ -27,7 +27,7 @@ TRANSPORT = "compressedDepth"
 MOST_PIXELS = 2**25
 """Of a PNG; above any depth camera's, and 64 MB at 16 bit."""
 FARTHEST = 10.0
-"""Metres that :func:`encode` gives quantised inverse depth to, and the precision at the far end; as in the reference."""
+"""Metres up to which :func:`encode` quantises inverse depth; as in the reference."""
 
 _QUANTIZATION = 100.0
 _HEADER = struct.Struct("<iff")

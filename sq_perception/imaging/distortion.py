@@ -166,7 +166,7 @@ class Distortion:
 
     @cached_property
     def _table(self) -> tuple[np.ndarray, np.ndarray]:
-        """Radii r of rays and r' of their images without the tangential part, both rising, up to where r' turns back."""
+        """Radii r of rays and r' of their images, tangential part left out, both rising, up to where r' turns back."""
         radius = np.tan(np.linspace(0.0, _WIDEST, _SAMPLES))
         with np.errstate(all="ignore"):
             reached = radius * self._radial(radius * radius)[0]

@@ -11,12 +11,16 @@ sees, whether its edges bulge or are drawn in; only a window of more than twice 
 fisheye of more than some 110 degrees would need, is cut to that, about the direction that the middle of the raw image
 looks in.  P is not used: it is the same camera with another zoom, chosen for a window that must not change its size.
 
-Depth between pixels is interpolated in 1/z, in which planes are flat, where the four neighbours show one surface; where
-they do not, or one measured nothing, it is that of the nearest pixel, so that no value lies in between two surfaces,
-where nothing is.  Neighbours show one surface if it would be seen at less than 84 degrees, a relative step of 10 / f,
-as in :mod:`sq_perception.imaging.inverse_depth`.  Below, a small step may still be the edge of something flat; then a
-pixel is wrong by at most half of that step, as it would be with the nearest pixel, if it is a slope.  Labels are those of
-the nearest pixel always.
+Depth between pixels is interpolated in 1/z, in which planes are flat, where the four neighbours show one surface, and
+is nothing elsewhere: so no value lies between two surfaces, where nothing is, and none beside one.  The depth of the
+nearest pixel would be both measured and wrong: it puts points up to half a pixel outside of outlines, and as a ray that
+measured nothing contradicts nothing, bodies fitted to exact images came out up to 10 % too large, one of nine twice its
+length; now they are right to 0.6 %.  The price is a rim of half a pixel, and whatever is a single pixel wide.
+
+Neighbours show one surface if it would be seen at less than 84 degrees, a relative step of 10 / f, as in
+:mod:`sq_perception.imaging.inverse_depth`.  A smaller step may still be the edge of something flat; then a pixel is
+wrong by at most that step.  Single pixels without depth inside a surface are no edge: they are bridged for their
+neighbours' sake, and stay empty.  Labels are those of the nearest pixel.
 """
 
 from __future__ import annotations
@@ -42,6 +46,10 @@ _BORDER = 64
 """Places on each side of the raw image whose rays say how far it sees."""
 _STEEPEST = 10.0
 """Tangent of the incidence beyond which a step between neighbours is a jump."""
+_CLOSE = 0.01
+"""Pixels between two places that are as good as one."""
+_SQUARE = np.ones((2, 2), np.uint8)
+_CROSS = np.array([[0, 1, 0], [1, 1, 1], [0, 1, 0]], np.uint8)
 _OUTSIDE = -9.0
 """A column and row that no image has."""
 
@@ -154,15 +162,19 @@ class _Lookup:
     ----------
     u, v : float32 (height, width)
         Column and row in the source, far outside of it where it does not see the pixel.
-    corner : int16 (height, width, 2)
+    left, top : float32 (height, width)
         Column and row of the upper left one of the four neighbours.
+    close : uint8 (height, width)
+        1 where the place is as good as that of the nearest pixel.
     step : float
         Relative difference of depths beyond which neighbours show different surfaces.
     """
 
     u: np.ndarray
     v: np.ndarray
-    corner: np.ndarray
+    left: np.ndarray
+    top: np.ndarray
+    close: np.ndarray
     step: float
 
     @classmethod
@@ -171,24 +183,29 @@ class _Lookup:
         places = np.nan_to_num(places, nan=_OUTSIDE, posinf=_OUTSIDE, neginf=_OUTSIDE)
         places = np.clip(places, _OUTSIDE, LARGEST_SIDE + 1).astype(np.float32)
         u, v = np.ascontiguousarray(places[..., 0]), np.ascontiguousarray(places[..., 1])
+        left, top = np.floor(u), np.floor(v)
+        off = np.maximum(np.abs(u - np.rint(u)), np.abs(v - np.rint(v)))
         step = math.sqrt(2.0) * _STEEPEST / min(source.fx, source.fy)
-        return cls(u, v, np.floor(places).astype(np.int16), min(step, 0.5))
+        return cls(u, v, left, top, (off <= _CLOSE).view(np.uint8), min(step, 0.5))
 
     def depth(self, source: np.ndarray) -> np.ndarray:
         """Depth (height, width), NaN where there is none."""
         source = np.ascontiguousarray(source, dtype=np.float32)
-        result = self._nearest(source, np.nan)
+        nearest = self._nearest(source, np.nan)
         # Warnings for pixels without depth only.
         with np.errstate(divide="ignore", invalid="ignore"):
             inverse = cv2.patchNaNs(1 / source, 0)
+            closed = cv2.morphologyEx(inverse, cv2.MORPH_CLOSE, _CROSS)
+            inverse = cv2.copyTo(closed, (inverse == 0).view(np.uint8), inverse)
             # Of each pixel and its neighbours to the right, below, and across.
-            square = np.ones((2, 2), np.uint8)
-            least, most = (find(inverse, square, anchor=(0, 0)) for find in (cv2.erode, cv2.dilate))
+            least, most = (find(inverse, _SQUARE, anchor=(0, 0)) for find in (cv2.erode, cv2.dilate))
             smooth = (least > np.float32(1 - self.step) * most).view(np.uint8)
             smooth[-1], smooth[:, -1] = 0, 0
-            smooth = cv2.remap(smooth, self.corner, None, cv2.INTER_NEAREST, borderValue=0)
+            smooth = cv2.remap(smooth, self.left, self.top, cv2.INTER_NEAREST, borderValue=0)
+            smooth = cv2.bitwise_and(smooth, (nearest < np.inf).view(np.uint8))
             between = 1 / cv2.remap(inverse, self.u, self.v, cv2.INTER_LINEAR, borderValue=0)
-        return cv2.copyTo(between, smooth, result)
+        result = np.full(nearest.shape, np.nan, np.float32)
+        return cv2.copyTo(nearest, self.close, cv2.copyTo(between, smooth, result))
 
     def labels(self, source: np.ndarray) -> np.ndarray:
         """Labels, int32 (height, width), 0 where there are none."""

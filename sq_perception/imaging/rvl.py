@@ -37,22 +37,22 @@ def decode(data: bytes, width: int, height: int) -> np.ndarray:
     if len(data) > _MOST_BYTES * count + 64:
         raise ValueError(f"RVL: expected at most {_MOST_BYTES} bytes for each of {count} pixels, got {len(data)} bytes")
     numbers = _numbers(data)
-    is_difference = np.zeros(len(numbers), bool)
-    is_pixel = np.zeros(count, bool)
+    view = memoryview(numbers.data)  # whose elements are plain integers, six times faster than an array's
+    heads, runs = [], []
     at = pixel = 0
     while pixel < count:
-        if at + 2 > len(numbers):
+        if at + 2 > len(view):
             raise ValueError(f"RVL: expected {count} pixels, the data ends after {pixel}")
-        zeros, others = int(numbers[at]), int(numbers[at + 1])
-        first, end, following = pixel + zeros, pixel + zeros + others, at + 2 + others
-        if end == pixel or end > count or following > len(numbers):
+        zeros, others = view[at], view[at + 1]
+        if zeros + others == 0 or pixel + zeros + others > count or at + 2 + others > len(view):
             raise ValueError(f"RVL: not readable after {pixel} of {count} pixels")
-        is_difference[at + 2 : following] = True
-        is_pixel[first:end] = True
-        at, pixel = following, end
-    folded = numbers[is_difference]
+        heads += [at, at + 1]
+        runs += [zeros, others]
+        at, pixel = at + 2 + others, pixel + zeros + others
+    folded = np.delete(numbers[:at], heads)
     differences = (folded >> 1) ^ -(folded & 1)
     image = np.zeros(count, np.uint16)
+    is_pixel = np.repeat(np.arange(len(runs)) % 2 == 1, runs)
     # What leaves 16 bits comes back at the other end.
     image[is_pixel] = np.cumsum(differences, dtype=np.int64).astype(np.uint16)
     return image.reshape(height, width)

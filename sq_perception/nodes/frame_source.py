@@ -1,7 +1,8 @@
 """What synthetic_depth_node publishes: generated scenes or recorded frames, one after the other, with fresh noise.
 
 The k-th scene of a seed is always the same one.  A scene or recording stays for ``hold`` frames, in which only the
-noise changes.
+noise changes.  A camera_info_file with distortion gives generated scenes a raw camera: the scene is rendered and
+measured as its rectified camera sees it, and distorted when it is published.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from sq_perception import recorded_frame
+from sq_perception.calibration import Calibration
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
@@ -38,6 +40,8 @@ class SourceFrame:
         The bodies (n,) in the frame that results are published in: cube frame if ``is_cube``, else optical frame.
     is_cube : bool
     name : str
+    calibration : Calibration or None
+        Of the camera that publishes the image, where that distorts.
     """
 
     depth: np.ndarray
@@ -46,6 +50,7 @@ class SourceFrame:
     truth: Superquadric | None
     is_cube: bool
     name: str
+    calibration: Calibration | None = None
 
 
 class FrameSource:
@@ -62,9 +67,9 @@ class FrameSource:
     def __init__(self, parameters: SyntheticParameters) -> None:
         self._parameters = parameters
         self._files = _recordings(Path(parameters.path)) if parameters.scene == "replay" else []
-        self._camera = None
+        self._calibration = None
         if parameters.camera_info_file:
-            self._camera = recorded_frame.read_camera_info(parameters.camera_info_file)
+            self._calibration = recorded_frame.read_calibration(parameters.camera_info_file)
         self._noise = np.random.default_rng([parameters.seed, _NOISE])
         self._count = len(self._files) or parameters.scenes
         self._position, self._left = 0, parameters.hold
@@ -119,12 +124,15 @@ class FrameSource:
             scene = thesis_scene(rng, self._parameters.pixels)
             truth, is_cube = unit_cube.cube_from_optical(scene.bodies), True
         else:
-            options = {} if self._camera is None else {"camera": self._camera}
+            options = {} if self._calibration is None else {"camera": self._calibration.camera}
             scene = table_scene(rng, self._parameters.objects, **options)
             truth, is_cube = scene.bodies, False
         depth, labels = scene.render()
         wanted = labels if self._parameters.masks == "always" else None
-        return SourceFrame(depth, scene.camera, wanted, truth, is_cube, name)
+        distorting = None
+        if not is_cube and self._calibration is not None and self._calibration.rectification is not None:
+            distorting = self._calibration
+        return SourceFrame(depth, scene.camera, wanted, truth, is_cube, name, distorting)
 
     def _recorded(self, path: Path) -> SourceFrame:
         frame = recorded_frame.read(path, self._parameters.camera_info_file or None, self._parameters.projection)

@@ -22,6 +22,7 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from sq_perception.imaging.sensor_noise import PRESETS
+from sq_perception.nodes.transport import RAW, TRANSPORTS
 
 Method = Literal["auto", "network", "symmetry", "classic"]
 Refine = Literal["surface", "soft_render", "none"]
@@ -277,12 +278,19 @@ class SyntheticParameters:
     )
     path: str = setting("", "A recorded frame (NPZ, PNG, BMP) or a folder of them, for scene = replay.")
     camera_info_file: str = setting(
-        "", "camera_info YAML of recorded PNG depth images; also the camera of table scenes."
+        "",
+        "camera_info YAML of recorded PNG depth images; also the camera of table scenes, which are published raw where "
+        "it distorts.",
     )
     projection: Projection = setting(  # noqa: RUF009 - a field
         "pinhole",
         "Camera model of recorded images: 8 bit orthographic images look like depth images.",
         choices=get_args(Projection),
+    )
+    image_transport: str = setting(
+        RAW,
+        "compressedDepth: depth images are also published packed, on depth/image/compressedDepth.",
+        choices=TRANSPORTS,
     )
 
     def __post_init__(self) -> None:
@@ -294,6 +302,8 @@ class SyntheticParameters:
             raise ParameterError(f"encoding: expected {expected} for scene = {self.scene}, got {self.encoding}")
         if self.sensor != IDEAL and self.scene == "thesis":
             raise ParameterError(f"sensor: expected {IDEAL} for scene = thesis, got {self.sensor}")
+        if self.image_transport != RAW and (grey or self.scene == "thesis"):
+            raise ParameterError(f"image_transport: expected {RAW} for grey images, got {self.image_transport}")
         if self.sensor != IDEAL and self.noise != 0:
             raise ParameterError(f"noise: expected 0 for sensor = {self.sensor}, which has its own, got {self.noise:g}")
 

@@ -3,6 +3,7 @@
 | name | type | |
 | --- | --- | --- |
 | `depth/image` | sensor_msgs/Image | out: 32FC1 or 16UC1; mono8 or mono16 for orthographic frames |
+| `depth/image/compressedDepth` | sensor_msgs/CompressedImage | out, for `image_transport: compressedDepth`: packed |
 | `depth/camera_info` | sensor_msgs/CameraInfo | out: for pinhole frames |
 | `mask/image` | sensor_msgs/Image | out: label images (16UC1), where recordings have them or they are asked for |
 | `~/truth` | sensor_msgs/PointCloud2 | out: the bodies of generated scenes, in the message of the recovery |

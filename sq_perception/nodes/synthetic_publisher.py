@@ -7,18 +7,22 @@ from typing import Any
 import numpy as np
 from rclpy.qos import QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
-from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 from std_msgs.msg import Header
 
 from sq_msgs_py.depth_image import (
     Intrinsics,
+    RawIntrinsics,
     depth_to_message,
     grey_to_message,
     intrinsics_to_message,
     labels_to_message,
+    raw_intrinsics_to_message,
 )
 from sq_msgs_py.superquadrics import to_message
 from sq_perception.imaging import unit_cube
+from sq_perception.imaging.camera import Camera
+from sq_perception.nodes import transport
 from sq_perception.nodes.frame_source import FrameSource, SourceFrame
 from sq_perception.nodes.parameters import LiveParameters, SyntheticParameters
 from sq_perception.nodes.results import truth_array
@@ -44,6 +48,10 @@ class SyntheticDepthNode(StoppableNode):
         self._source = FrameSource(self._settings.current)
         replay = self._settings.current.scene == "replay"
         self._image = self._output(Image, "depth/image")
+        self._packed = None
+        if self._settings.current.image_transport != transport.RAW:
+            topic = transport.topic(self, "depth/image", self._settings.current.image_transport)
+            self._packed = self._output(CompressedImage, topic)
         self._info = None if self._source.is_cube else self._output(CameraInfo, "depth/camera_info")
         self._mask = self._output(Image, "mask/image") if self._source.has_masks else None
         self._truth = None if replay else self._output(PointCloud2, "~/truth")
@@ -78,18 +86,37 @@ class SyntheticDepthNode(StoppableNode):
         if self._truth is not None and frame.truth is not None:
             self._truth.publish(to_message(truth_array(frame.truth), header))
         if self._info is not None and not frame.is_cube:
-            camera = frame.camera
-            known = Intrinsics(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-            self._info.publish(intrinsics_to_message(known, header))
-        if frame.labels is not None:
+            self._info.publish(_camera_info(frame, header))
+        depth, labels = frame.depth, frame.labels
+        if frame.calibration is not None:
+            depth = frame.calibration.as_sent(depth)
+            labels = None if labels is None else frame.calibration.labels_as_sent(labels)
+        if labels is not None:
             if self._mask is None:
                 self._mask = self._output(Image, "mask/image")
-            self._mask.publish(labels_to_message(frame.labels, header))
-        self._image.publish(_image(frame, settings.encoding, header))
+            self._mask.publish(labels_to_message(labels, header))
+        if self._packed is not None and not frame.is_cube and self._packed.get_subscription_count():
+            self._packed.publish(transport.packed(depth, header, _encoding(settings.encoding)))
+        self._image.publish(_image(frame, depth, settings.encoding, header))
 
 
-def _image(frame: SourceFrame, encoding: str, header: Header) -> Image:
+def _camera_info(frame: SourceFrame, header: Header) -> CameraInfo:
+    if frame.calibration is None or frame.calibration.rectification is None:
+        return intrinsics_to_message(_intrinsics(frame.camera), header)
+    raw, lens = frame.calibration.rectification.raw, frame.calibration.rectification.distortion
+    return raw_intrinsics_to_message(RawIntrinsics(_intrinsics(raw), lens.model, lens.coefficients), header)
+
+
+def _intrinsics(camera: Camera) -> Intrinsics:
+    return Intrinsics(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+
+
+def _encoding(wanted: str) -> str:
+    return "16UC1" if wanted == "16UC1" else "32FC1"
+
+
+def _image(frame: SourceFrame, depth: np.ndarray, encoding: str, header: Header) -> Image:
     if frame.is_cube:
         kind = np.uint16 if encoding == "mono16" else np.uint8
-        return grey_to_message(unit_cube.grey_from_depth(frame.depth, kind), header)
-    return depth_to_message(frame.depth, header, "16UC1" if encoding == "16UC1" else "32FC1")
+        return grey_to_message(unit_cube.grey_from_depth(depth, kind), header)
+    return depth_to_message(depth, header, _encoding(encoding))
