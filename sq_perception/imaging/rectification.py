@@ -7,9 +7,10 @@ and from its inverse for the way back.
 
 The pinhole camera has the focal lengths of K and its pixels on the raw grid, so that the middle of the image stays as
 sharp as it is, and an image without distortion stays what it is.  Its window is as large as all that the raw image
-sees, whether its edges bulge or are drawn in; only a window of more than twice the pixels of the raw image, as a
-fisheye of more than some 110 degrees would need, is cut to that, about the direction that the middle of the raw image
-looks in.  P is not used: it is the same camera with another zoom, chosen for a window that must not change its size.
+sees, whether its edges bulge or are drawn in; only a window of more than twice the pixels of the raw image, as a 4:3
+fisheye that sees more than 90 degrees across would need, is cut to that, about the direction that the middle of the raw
+image looks in: 0.6 % of the raw pixels are lost at 90 degrees, 3 % at 100, 15 % at 120.  P is not used: it is the same
+camera with another zoom, chosen for a window that must not change its size.
 
 Depth between pixels is interpolated in 1/z, in which planes are flat, where the four neighbours show one surface, and
 is nothing elsewhere: so no value lies between two surfaces, where nothing is, and none beside one.  The depth of the
