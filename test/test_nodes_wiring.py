@@ -19,7 +19,7 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, QoSReliabilityPolicy
-from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import Marker, MarkerArray
@@ -536,3 +536,51 @@ def test_silence_is_reported(make_bench):
     reports: list[DiagnosticArray] = []
     bench.peer.create_subscription(DiagnosticArray, "/diagnostics", reports.append, 5)
     bench.until(lambda: reports and reports[-1].status[0].message == "no depth images arrive")
+
+
+def test_packed_images_are_read_and_hostile_ones_refused(make_bench):
+    from sq_perception.imaging import compressed_depth
+
+    bench = make_bench("-p", "image_transport:=compressedDepth", "-r", "depth/image:=/camera/depth")
+    packed = bench.peer.create_publisher(CompressedImage, "/camera/depth/compressedDepth", 5)
+    bench.until(lambda: packed.get_subscription_count() == 1)
+    bench.send_info()
+    depth = np.full((48, 64), 0.731, np.float32)
+    depth[:5] = np.nan
+    for encoding in ("16UC1", "32FC1"):
+        form, data = compressed_depth.encode(depth, encoding)
+        header = bench.header()
+        packed.publish(CompressedImage(header=header, format=form, data=data))
+        bench.until(lambda header=header: any(one.header == header for one in bench.answers))
+        seen = bench.recoverer.asked[-1][0]
+        assert np.isnan(seen[:5]).all()
+        np.testing.assert_allclose(seen[5:], 0.731, atol=1e-3)
+    for number, (form, data) in enumerate(
+        [("", b""), ("16UC1; compressedDepth png", b""), (form, data[:40]), ("rgb8; jpeg", b"abc")], start=1
+    ):
+        packed.publish(CompressedImage(header=bench.header(), format=form, data=data))
+        bench.until(lambda number=number: bench.counts.refused == number)
+        assert bench.counts.last_error
+    packed.publish(CompressedImage(header=header, format=form, data=data))
+    form, data = compressed_depth.encode(depth, "16UC1")
+    header = bench.header()
+    packed.publish(CompressedImage(header=header, format=form, data=data))
+    bench.until(lambda: any(one.header == header for one in bench.answers))
+
+
+def test_raw_images_of_a_lens_are_rectified_and_rendered_as_they_were_sent(make_bench):
+    bench = make_bench()
+    bench.until(lambda: bench.infos.get_subscription_count() == 1)
+    info = CameraInfo(width=64, height=48, distortion_model="plumb_bob", d=[-0.2, 0.05, 0.001, -0.001, 0.0])
+    info.k = [60.0, 0.0, 31.5, 0.0, 60.0, 23.5, 0.0, 0.0, 1.0]
+    bench.put_info(info)
+    rendered: list[Image] = []
+    bench.peer.create_subscription(Image, "recover_node/rendered_depth", rendered.append, 5)
+    bench.until(lambda: bench.node._rendered.get_subscription_count())
+    bench.answer(bench.depth())
+    depth, camera, _, _ = bench.recoverer.asked[-1]
+    assert depth.shape == (camera.height, camera.width)
+    assert (camera.width, camera.height) > (64, 48), "a barrel's corners lie farther out in the ideal image"
+    assert np.nanmax(np.abs(depth - 0.5)) < 1e-6
+    bench.until(lambda: rendered)
+    assert (rendered[-1].width, rendered[-1].height) == (64, 48)

@@ -12,9 +12,9 @@ from rclpy.node import Node
 from rclpy.qos import QoSProfile, QoSReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
-from sq_msgs_py.depth_image import GREY_ENCODINGS, intrinsics_from_message
+from sq_msgs_py.depth_image import GREY_ENCODINGS
 from sq_msgs_py.superquadrics import SuperquadricArray, from_message
-from sq_perception.imaging.camera import Camera
+from sq_perception.calibration import Calibration
 from sq_perception.nodes.frame import Frame, decode
 
 RESULTS = ("recover_node", "fitter_node")
@@ -74,13 +74,12 @@ class Watch(Node):
         assert shot.image is not None
         if shot.image.encoding in GREY_ENCODINGS:
             return decode(shot.image, None)
-        return decode(shot.image, self._camera)
+        return decode(shot.image, self._calibration)
 
-    def _camera(self) -> Camera:
+    def _calibration(self) -> Calibration:
         if self._info is None:
             raise ValueError("no camera_info came with the depth image")
-        seen = intrinsics_from_message(self._info)
-        return Camera(seen.width, seen.height, seen.fx, seen.fy, seen.cx, seen.cy)
+        return Calibration.of(self._info, self.resolve_topic_name("depth/image"))
 
     def _on_info(self, message: CameraInfo) -> None:
         self._info = message

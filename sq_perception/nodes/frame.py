@@ -7,20 +7,21 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from sensor_msgs.msg import Image
+from sensor_msgs.msg import CompressedImage, Image
 
 from sq_msgs_py.depth_image import (
     DEPTH_ENCODINGS,
     GREY_ENCODINGS,
-    depth_from_message,
     depth_to_message,
     grey_from_message,
     grey_to_message,
     labels_from_message,
 )
+from sq_perception.calibration import Calibration
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.nodes.inbox import Refused
+from sq_perception.nodes.transport import depth_of
 
 _GREY_TYPES: dict[str, type[np.unsignedinteger]] = {"mono8": np.uint8, "mono16": np.uint16}
 
@@ -34,18 +35,24 @@ class Frame:
     header
         std_msgs/Header of the message: stamp and frame of every output.
     encoding
-        Of the message.
+        Of the message, before it was packed.
     depth : float32 (height, width)
-        Metres in the optical frame, NaN where nothing was measured.
-    camera : Camera
+        Metres in the optical frame, NaN where nothing was measured; rectified.
+    calibration : Calibration
     labels : int32 (height, width) or None
+        Rectified as well.
     """
 
     header: Any
     encoding: str
     depth: np.ndarray
-    camera: Camera
+    calibration: Calibration
     labels: np.ndarray | None = None
+
+    @property
+    def camera(self) -> Camera:
+        """The pinhole or orthographic camera of the depth."""
+        return self.calibration.camera
 
     @property
     def is_cube(self) -> bool:
@@ -63,34 +70,36 @@ class Frame:
         if message is None:
             return self
         labels = labels_from_message(message)
-        if labels.shape != self.depth.shape:
-            (height, width), (rows, columns) = self.depth.shape, labels.shape
+        (rows, columns), (width, height) = labels.shape, self.calibration.size
+        if (columns, rows) != (width, height):
             raise Refused(f"mask: expected the size of the depth image, {width} x {height}, got {columns} x {rows}")
-        return replace(self, labels=labels)
+        return replace(self, labels=self.calibration.rectified_labels(labels))
 
     def encode(self, depth: np.ndarray) -> Image:
         """A message like the frame's own with another depth (height, width), NaN or inf for nothing."""
         if self.is_cube:
             return grey_to_message(unit_cube.grey_from_depth(depth, _GREY_TYPES[self.encoding]), self.header)
+        depth = self.calibration.as_sent(depth)
         return depth_to_message(np.where(np.isfinite(depth), depth, np.nan), self.header, self.encoding)
 
 
-def decode(message: Image, camera_of: Callable[[], Camera] | None) -> Frame:
+def decode(message: Image | CompressedImage, calibration_of: Callable[[], Calibration] | None) -> Frame:
     """The frame of a depth image message.
 
     Parameters
     ----------
     message
-        16UC1 or 32FC1 where there is a camera; mono8 or mono16, an image of the unit cube, where there is none.
-    camera_of
-        Looks up the pinhole camera; only called for an image that is sound itself.  None for orthographic images.
+        16UC1 or 32FC1, plain or packed, where there is a camera; mono8 or mono16, an image of the unit cube, where
+        there is none.
+    calibration_of
+        Looks up the calibration; only called for an image that is sound itself.  None for orthographic images.
 
     Raises
     ------
     Refused, ImageError
         For anything that keeps the image from being processed.
     """
-    if camera_of is None:
+    if calibration_of is None:
         if message.encoding in DEPTH_ENCODINGS:
             raise Refused(
                 f"encoding: expected mono8 or mono16 for projection = orthographic, got {message.encoding!r}; "
@@ -98,11 +107,13 @@ def decode(message: Image, camera_of: Callable[[], Camera] | None) -> Frame:
             )
         grey = grey_from_message(message)
         height, width = grey.shape
-        return Frame(message.header, message.encoding, unit_cube.depth_from_grey(grey), unit_cube.camera(width, height))
-    if message.encoding in GREY_ENCODINGS:
+        calibration = Calibration(unit_cube.camera(width, height), (width, height))
+        return Frame(message.header, message.encoding, unit_cube.depth_from_grey(grey), calibration)
+    if isinstance(message, Image) and message.encoding in GREY_ENCODINGS:
         raise Refused(
             f"encoding: expected 16UC1 or 32FC1 for projection = pinhole, got {message.encoding!r}; "
             "grey images of the unit cube need projection = orthographic"
         )
-    depth = depth_from_message(message)
-    return Frame(message.header, message.encoding, depth, camera_of())
+    depth, encoding = depth_of(message)
+    calibration = calibration_of()
+    return Frame(message.header, encoding, calibration.rectified(depth), calibration)

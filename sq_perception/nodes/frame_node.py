@@ -3,6 +3,7 @@
 | name | type | |
 | --- | --- | --- |
 | `depth/image` | sensor_msgs/Image | in: 16UC1 mm, 32FC1 m; mono8 and mono16 for orthographic frames |
+| `depth/image/compressedDepth` | sensor_msgs/CompressedImage | in, instead, for `image_transport: compressedDepth` |
 | `depth/camera_info` | sensor_msgs/CameraInfo | in: not needed for orthographic frames |
 | `mask/image` | sensor_msgs/Image | in, optional: label image with the stamp of the depth image |
 | `~/superquadrics` | sensor_msgs/PointCloud2 | out: one point per body, see sq_msgs_py.superquadrics |
@@ -39,14 +40,15 @@ from rclpy.qos import QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from rclpy.time import Time
-from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray
 
 from sq_msgs_py.superquadrics import to_message
+from sq_perception.calibration import Calibration
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
-from sq_perception.nodes import report, results
+from sq_perception.nodes import report, results, transport
 from sq_perception.nodes.camera_poses import CameraPoses
 from sq_perception.nodes.counters import Statistics, Throttle
 from sq_perception.nodes.engine import TURNS, Engine, Workshop
@@ -107,6 +109,7 @@ class FrameNode(ManagedNode):
         self._enabled = True
         self._triggers = Triggers(self)
         self._shown_ids: list[int] = []
+        self._note = ""
         self._defects = 0
         self._inbox: Inbox | None = None
         self._worker: threading.Thread | None = None
@@ -145,8 +148,10 @@ class FrameNode(ManagedNode):
         pinhole = self._settings.current.projection == "pinhole"
         self._defects = 0
         self._last_image = monotonic()
+        packing = self._settings.current.image_transport
+        image_topic = transport.topic(self, "depth/image", packing)
         self._inbox = inbox = Inbox(
-            needs_info=pinhole,
+            (lambda info: self._calibrated(info, image_topic)) if pinhole else None,
             needs_mask=lambda: self._expects_mask(self._settings.current.use_masks),
             patience=lambda: self._settings.current.patience,
             dropped=lambda number: self._statistics.count("dropped", number),
@@ -156,7 +161,7 @@ class FrameNode(ManagedNode):
         # Subscriptions are served in this order: what an image needs is there before the image.
         self._info_input = self._listen(CameraInfo, "depth/camera_info", inbox.put_info) if pinhole else None
         self._mask_input = self._listen(Image, "mask/image", inbox.put_mask)
-        self._image_input = self._listen(Image, "depth/image", self._on_image)
+        self._image_input = self._listen(transport.message_type(packing), image_topic, self._on_image)
         self.get_logger().info(f"ready, listening to {self._image_input.topic_name}")
 
     def _deactivate(self) -> None:
@@ -223,7 +228,7 @@ class FrameNode(ManagedNode):
 
     # Callbacks, in the executor's thread: quick, and nothing in them can fail on a message's content
 
-    def _on_image(self, message: Image) -> None:
+    def _on_image(self, message: Image | CompressedImage) -> None:
         inbox = self._inbox
         if inbox is None:
             return
@@ -233,6 +238,13 @@ class FrameNode(ManagedNode):
             inbox.put_image(message)
         else:
             self._statistics.count("dropped")
+
+    def _calibrated(self, info: CameraInfo, image_topic: str) -> Calibration:
+        calibration = Calibration.of(info, image_topic, self._settings.current.distortion)
+        if calibration.note != self._note:
+            self._note = calibration.note
+            self._inform(f"{image_topic}: {calibration.note or 'no distortion'}")
+        return calibration
 
     def _on_lost(self, event: Any) -> None:
         self._statistics.count("lost", event.total_count_change)
@@ -361,7 +373,7 @@ class FrameNode(ManagedNode):
             frame = decode(message, None)
         else:
             try:
-                frame = decode(message, lambda: inbox.camera_of(message))
+                frame = decode(message, lambda: inbox.calibration_of(message))
             except Refused as error:
                 info_input = self._info_input
                 if info_input is None:

@@ -17,10 +17,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from time import monotonic
 
-from sensor_msgs.msg import CameraInfo, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
-from sq_msgs_py.depth_image import intrinsics_from_message
-from sq_perception.imaging.camera import Camera
+from sq_msgs_py.depth_image import size_mismatch
+from sq_perception.calibration import Calibration
+from sq_perception.nodes.transport import size_of
 
 Stamp = tuple[int, int]
 
@@ -38,7 +39,7 @@ class Refused(ValueError):  # noqa: N818 - a verdict on a frame rather than a de
 class Arrival:
     """A depth image, when it came, in seconds of the monotonic clock, and its mask if one came."""
 
-    message: Image
+    message: Image | CompressedImage
     time: float
     mask: Image | None = None
 
@@ -47,7 +48,7 @@ class Arrival:
 class _Info:
     stamp: Stamp
     size: tuple[int, int]
-    camera: Camera | None
+    calibration: Calibration | None
     fault: str
 
 
@@ -56,8 +57,8 @@ class Inbox:
 
     Parameters
     ----------
-    needs_info
-        Whether images need a camera_info.
+    calibrate
+        Makes the calibration of a camera_info, or raises ValueError.  None: images need no camera_info.
     needs_mask
         Asked for each image as it comes: whether to wait for its mask.
     patience
@@ -68,13 +69,13 @@ class Inbox:
 
     def __init__(
         self,
+        calibrate: Callable[[CameraInfo], Calibration] | None,
         *,
-        needs_info: bool = True,
         needs_mask: Callable[[], bool] = lambda: False,
         patience: Callable[[], float] = lambda: 0.25,
         dropped: Callable[[int], None] = lambda _: None,
     ) -> None:
-        self._needs_info, self._needs_mask = needs_info, needs_mask
+        self._calibrate, self._needs_mask = calibrate, needs_mask
         self._patience, self._dropped = patience, dropped
         self._changed = threading.Condition()
         self._waiting: deque[_Waiting] = deque()
@@ -83,25 +84,26 @@ class Inbox:
         self._masks: OrderedDict[Stamp, Image] = OrderedDict()
         self._closed = False
 
-    def put_image(self, message: Image) -> None:
+    def put_image(self, message: Image | CompressedImage) -> None:
         """Offer a depth image."""
         now = monotonic()
-        waiting = _Waiting(message, now, now + self._patience(), self._needs_mask())
+        waiting = _Waiting(message, _size(message), now, now + self._patience(), self._needs_mask())
         with self._changed:
             self._waiting.append(waiting)
             self._promote(now)
 
     def put_info(self, message: CameraInfo) -> None:
         """Keep a camera_info; a useless one is kept as the reason for refusing frames of its size."""
-        size, camera, fault = (int(message.width), int(message.height)), None, ""
+        if self._calibrate is None:
+            return
+        size, calibration, fault = (int(message.width), int(message.height)), None, ""
         try:
-            known = intrinsics_from_message(message)
-            size = known.width, known.height
-            camera = Camera(known.width, known.height, known.fx, known.fy, known.cx, known.cy)
+            calibration = self._calibrate(message)
+            size = calibration.size
         except ValueError as error:
             fault = str(error)
         with self._changed:
-            self._infos.append(_Info(stamp_of(message), size, camera, fault))
+            self._infos.append(_Info(stamp_of(message), size, calibration, fault))
             self._promote(monotonic())
 
     def put_mask(self, message: Image) -> None:
@@ -141,22 +143,22 @@ class Inbox:
             arrival, self._ready = self._ready, None
             return arrival
 
-    def camera_of(self, image: Image) -> Camera:
-        """The camera of a depth image.
+    def calibration_of(self, image: Image | CompressedImage) -> Calibration:
+        """The calibration of a depth image.
 
         Raises
         ------
         Refused
             If no usable camera_info of the image's size has come.
         """
-        size = int(image.width), int(image.height)
+        size = size_of(image)
         with self._changed:
             info = self._info(size, stamp_of(image))
             if info is None:
                 raise Refused(self._why_no_info(size))
-            if info.camera is None:
+            if info.calibration is None:
                 raise Refused(info.fault)
-            return info.camera
+            return info.calibration
 
     def _promote(self, now: float) -> None:
         """Make the newest image ready that is complete or has waited long enough."""
@@ -179,8 +181,10 @@ class Inbox:
         self._changed.notify_all()
 
     def _is_complete(self, one: _Waiting) -> bool:
-        stamp, size = stamp_of(one.message), (int(one.message.width), int(one.message.height))
-        has_info = not self._needs_info or self._info(size, stamp) is not None
+        stamp = stamp_of(one.message)
+        if one.size is None:  # no image: to be refused at once
+            return True
+        has_info = self._calibrate is None or self._info(one.size, stamp) is not None
         return has_info and (not one.needs_mask or stamp in self._masks)
 
     def _info(self, size: tuple[int, int], stamp: Stamp) -> _Info | None:
@@ -194,19 +198,26 @@ class Inbox:
         if not self._infos:
             return f"{wanted}, none came"
         last = self._infos[-1]
-        return f"{wanted}, the last one is for {last.size[0]} x {last.size[1]}" + (
-            f" ({last.fault})" if last.fault else ""
-        )
+        why = last.fault or size_mismatch(size, last.size)
+        return f"{wanted}, the last one is for {last.size[0]} x {last.size[1]} ({why})"
 
 
 @dataclass(frozen=True)
 class _Waiting:
-    message: Image
+    message: Image | CompressedImage
+    size: tuple[int, int] | None
     time: float
     deadline: float
     needs_mask: bool
 
 
-def stamp_of(message: Image | CameraInfo) -> Stamp:
+def stamp_of(message: Image | CompressedImage | CameraInfo) -> Stamp:
     """Seconds and nanoseconds of the header."""
     return int(message.header.stamp.sec), int(message.header.stamp.nanosec)
+
+
+def _size(message: Image | CompressedImage) -> tuple[int, int] | None:
+    try:
+        return size_of(message)
+    except ValueError:
+        return None

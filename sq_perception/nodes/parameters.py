@@ -21,6 +21,7 @@ from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValu
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from sq_perception.calibration import Treatment
 from sq_perception.imaging.sensor_noise import PRESETS
 from sq_perception.nodes.transport import RAW, TRANSPORTS
 
@@ -78,6 +79,19 @@ class FrameParameters:
         unit="s",
         within=(0.0, 10.0),
         live=True,
+    )
+    image_transport: str = setting(
+        RAW,
+        "How depth images come: raw on depth/image, or compressedDepth (16 bit PNG or RVL) on "
+        "depth/image/compressedDepth.",
+        choices=TRANSPORTS,
+    )
+    distortion: Treatment = setting(  # noqa: RUF009 - a field
+        "auto",
+        "What a camera_info with distortion coefficients means: apply takes images for raw and rectifies them, ignore "
+        "takes them for rectified, auto takes them for raw unless the last two parts of their topic have the word rect "
+        "or rectified in them.",
+        choices=get_args(Treatment),
     )
     s: float = setting(
         117.3,
@@ -177,6 +191,10 @@ class FrameParameters:
         if not self.depth_min < self.depth_max:
             raise ParameterError(
                 f"depth_min, depth_max: expected depth_min < depth_max, got {self.depth_min:g} and {self.depth_max:g}"
+            )
+        if self.image_transport != RAW and self.projection == "orthographic":
+            raise ParameterError(
+                f"image_transport: expected {RAW} for projection = orthographic, got {self.image_transport}"
             )
         if self.fixed_frame and self.projection == "orthographic":
             raise ParameterError(f"fixed_frame: expected none for projection = orthographic, got {self.fixed_frame}")
