@@ -93,7 +93,9 @@ class Bench:
         self.executor.add_node(self.peer)
         self.thread = threading.Thread(target=self._spin, daemon=True)
         self.thread.start()
-        self.until(lambda: self.images.get_subscription_count() == 1)
+        self.until(lambda: self.node.is_active)
+        if self.node._settings.current.image_transport == "raw":
+            self.until(lambda: self.images.get_subscription_count() == 1)
         self.until(lambda: self.node._superquadrics.get_subscription_count() == 1)
         self.stamps = 0
 
