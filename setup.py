@@ -21,6 +21,7 @@ if "bdist_wheel" in sys.argv:
 
 bags = [
     "rosbags>=0.11.9,<0.12",  # rosbag2 without ROS; its tables of decompressors are no promise beyond
+    "mcap>=1.2,<2",  # the records of MCAP files, by the authors of the format
 ]
 train = [
     "tensorboard>=2.14",  # curves of a running training
@@ -91,6 +92,7 @@ setup(
             *docs,
             "pytest>=7,<8.4",  # later ones break the launch_testing plugins of a ROS installation
             "hypothesis>=6",
+            "mcap-ros2-support>=0.5",  # reads bags independently of the code that wrote them
             "ruff>=0.6",
             "mypy>=1.11",
             "types-PyYAML",

@@ -5,7 +5,7 @@ image is always float32 (height, width) in metres, NaN where nothing was measure
 their row stride (``step``) and byte order (``is_bigendian``); only the conversion to metres copies.
 
 What reads a message only looks at its fields, so that messages of rosbags, which come without a ROS installation, are
-read by the same code; only what makes messages imports their classes.
+read by the same code.  What makes one takes its class from ``types``, by default that of the ROS installation.
 
 Reference: REP 118, Depth Images, https://www.ros.org/reps/rep-0118.html
 """
@@ -18,6 +18,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from sq_msgs_py.message_types import MessageTypes, installed
 
 if TYPE_CHECKING:
     from sensor_msgs.msg import CameraInfo, Image
@@ -109,7 +111,7 @@ def labels_from_message(message: Image) -> np.ndarray:
     return np.maximum(labels, 0, out=labels)
 
 
-def depth_to_message(depth: np.ndarray, header: Any, encoding: str = "32FC1") -> Image:
+def depth_to_message(depth: np.ndarray, header: Any, encoding: str = "32FC1", types: MessageTypes = installed) -> Image:
     """An image message of depth (height, width) in metres.
 
     32FC1 holds the values as they are.  16UC1 holds the nearest millimetre; what is not finite, below half a
@@ -125,15 +127,15 @@ def depth_to_message(depth: np.ndarray, header: Any, encoding: str = "32FC1") ->
     if not np.issubdtype(depth.dtype, np.floating):
         raise ImageError(f"depth: expected floating point metres, got {depth.dtype}")
     if encoding == "32FC1":
-        return _to_message(depth.astype(np.float32, copy=False), header, encoding)
+        return _to_message(depth.astype(np.float32, copy=False), header, encoding, types)
     if encoding == "16UC1":
         millimetres = np.rint(depth.astype(np.float64) * 1000.0)
         valid = (millimetres > 0) & (millimetres <= np.iinfo(np.uint16).max)
-        return _to_message(np.where(valid, millimetres, 0).astype(np.uint16), header, encoding)
+        return _to_message(np.where(valid, millimetres, 0).astype(np.uint16), header, encoding, types)
     raise ImageError(f"encoding: expected {' or '.join(DEPTH_ENCODINGS)}, got {encoding!r}")
 
 
-def grey_to_message(grey: np.ndarray, header: Any) -> Image:
+def grey_to_message(grey: np.ndarray, header: Any, types: MessageTypes = installed) -> Image:
     """A mono8 or mono16 message of uint8 or uint16 grey values (height, width).
 
     Raises
@@ -145,10 +147,12 @@ def grey_to_message(grey: np.ndarray, header: Any) -> Image:
     encoding = {np.dtype(np.uint8): "mono8", np.dtype(np.uint16): "mono16"}.get(grey.dtype)
     if encoding is None:
         raise ImageError(f"grey image: expected uint8 or uint16, got {grey.dtype}")
-    return _to_message(grey, header, encoding)
+    return _to_message(grey, header, encoding, types)
 
 
-def labels_to_message(labels: np.ndarray, header: Any, encoding: str = "16UC1") -> Image:
+def labels_to_message(
+    labels: np.ndarray, header: Any, encoding: str = "16UC1", types: MessageTypes = installed
+) -> Image:
     """A label image message of integer labels (height, width).
 
     Raises
@@ -166,7 +170,7 @@ def labels_to_message(labels: np.ndarray, header: Any, encoding: str = "16UC1") 
         raise ImageError(
             f"labels: expected {limits.min} to {limits.max} for {encoding}, got {labels.min()} to {labels.max()}"
         )
-    return _to_message(labels.astype(_DTYPES[encoding]), header, encoding)
+    return _to_message(labels.astype(_DTYPES[encoding]), header, encoding, types)
 
 
 @dataclass(frozen=True)
@@ -276,17 +280,19 @@ def _of_part(message: CameraInfo, fx: float, fy: float, cx: float, cy: float) ->
     )
 
 
-def intrinsics_to_message(intrinsics: Intrinsics, header: Any) -> CameraInfo:
+def intrinsics_to_message(intrinsics: Intrinsics, header: Any, types: MessageTypes = installed) -> CameraInfo:
     """A camera_info without distortion: K, R = I and P of the intrinsics."""
-    from sensor_msgs.msg import CameraInfo
-
-    message = CameraInfo(header=header, width=intrinsics.width, height=intrinsics.height)
-    message.distortion_model = "plumb_bob"
-    message.d = [0.0] * 5
     fx, fy, cx, cy = (float(x) for x in (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy))
-    message.k = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
-    message.r = [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0]
-    message.p = [fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0]
+    message: CameraInfo = types("sensor_msgs/msg/CameraInfo")(
+        header=header,
+        width=intrinsics.width,
+        height=intrinsics.height,
+        distortion_model="plumb_bob",
+        d=[0.0] * 5,
+        k=[fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0],
+        r=[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
+        p=[fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0],
+    )
     return message
 
 
@@ -305,16 +311,20 @@ def byte_array(pixels: np.ndarray) -> array.array[int]:
     return data
 
 
-def _to_message(pixels: np.ndarray, header: Any, encoding: str) -> Image:
+def _to_message(pixels: np.ndarray, header: Any, encoding: str, types: MessageTypes) -> Image:
     if pixels.ndim != 2 or pixels.size == 0:
         raise ImageError(f"image: expected (height, width) with at least one pixel, got {pixels.shape}")
-    from sensor_msgs.msg import Image
-
     little = pixels.astype(pixels.dtype.newbyteorder("<"), copy=False)
     height, width = pixels.shape
-    message = Image(header=header, height=height, width=width, encoding=encoding, is_bigendian=0)
-    message.step = width * pixels.dtype.itemsize
-    message.data = byte_array(little)
+    message: Image = types("sensor_msgs/msg/Image")(
+        header=header,
+        height=height,
+        width=width,
+        encoding=encoding,
+        is_bigendian=0,
+        step=width * pixels.dtype.itemsize,
+    )
+    message.data = byte_array(little)  # the constructor of rclpy's class would copy it twice
     return message
 
 

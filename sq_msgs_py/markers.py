@@ -8,12 +8,18 @@ A 32 x 32 mesh costs 148 KB and 5 ms to serialise; 16 x 16 is enough to look at.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from geometry_msgs.msg import Point
-from std_msgs.msg import ColorRGBA
-from visualization_msgs.msg import Marker, MarkerArray
+
+from sq_msgs_py.message_types import MessageTypes, installed
+
+if TYPE_CHECKING:
+    from visualization_msgs.msg import MarkerArray
+
+_LINE_LIST, _TRIANGLE_LIST = 5, 11
+_ADD, _DELETE = 0, 2
+"""Constants of visualization_msgs/Marker."""
 
 Mesh = tuple[np.ndarray, np.ndarray, np.ndarray]
 """Vertices (k, 3), faces (m, 3) of vertex indices, outline (j, 2, 3) of line segments."""
@@ -42,6 +48,7 @@ def markers(
     line_width: float = 0.002,
     namespace: str = "superquadrics",
     previous_ids: Iterable[int] = (),
+    types: MessageTypes = installed,
 ) -> MarkerArray:
     """Markers of n bodies; those of ``previous_ids`` that are not among ``ids`` any more are deleted.
 
@@ -57,6 +64,8 @@ def markers(
         Opacity of surfaces whose colour does not say it.
     line_width
         Width of the outline, metres.
+    types
+        Where the classes of messages come from.
 
     Raises
     ------
@@ -74,30 +83,40 @@ def markers(
     if paint.shape[1] == 3:
         paint = np.column_stack([paint, np.full(len(ids), alpha)])
 
-    array = MarkerArray()
+    make_marker, make_scale = types("visualization_msgs/msg/Marker"), types("geometry_msgs/msg/Vector3")
+    point = types("geometry_msgs/msg/Point")
+    upright = types("geometry_msgs/msg/Quaternion")(w=1.0)
+    nowhere = types("geometry_msgs/msg/Pose")(orientation=upright)
+
+    def marker(kind: str, number: int, shape: int, colour: np.ndarray, scale: Any, points: list[Any]) -> Any:
+        red, green, blue, opacity = (float(channel) for channel in colour)
+        return make_marker(
+            header=header,
+            ns=f"{namespace}/{kind}",
+            id=number,
+            type=shape,
+            action=_ADD,
+            pose=nowhere,
+            scale=scale,
+            color=types("std_msgs/msg/ColorRGBA")(r=red, g=green, b=blue, a=opacity),
+            points=points,
+        )
+
+    as_it_is, as_wide = make_scale(x=1.0, y=1.0, z=1.0), make_scale(x=float(line_width))
+    line_colour = np.asarray(outline_colour, float)
+    found = []
     for number, mesh, colour in zip(ids, meshes, paint, strict=True):
         vertices, faces, outline = _checked(mesh)
-        corners = [Point(x=x, y=y, z=z) for x, y, z in vertices.tolist()]
-        surface = _marker(header, f"{namespace}/surface", number, Marker.TRIANGLE_LIST, colour)
-        surface.scale.x = surface.scale.y = surface.scale.z = 1.0
-        surface.points = [corners[index] for index in faces.reshape(-1).tolist()]
-        array.markers.append(surface)
-        lines = _marker(header, f"{namespace}/outline", number, Marker.LINE_LIST, np.asarray(outline_colour, float))
-        lines.scale.x = float(line_width)
-        lines.points = [Point(x=x, y=y, z=z) for x, y, z in outline.reshape(-1, 3).tolist()]
-        array.markers.append(lines)
+        corners = [point(x=x, y=y, z=z) for x, y, z in vertices.tolist()]
+        surface = [corners[index] for index in faces.reshape(-1).tolist()]
+        found.append(marker("surface", number, _TRIANGLE_LIST, colour, as_it_is, surface))
+        lines = [point(x=x, y=y, z=z) for x, y, z in outline.reshape(-1, 3).tolist()]
+        found.append(marker("outline", number, _LINE_LIST, line_colour, as_wide, lines))
     for number in sorted({int(previous) for previous in previous_ids} - set(ids)):
         for kind in ("surface", "outline"):
-            array.markers.append(Marker(header=header, ns=f"{namespace}/{kind}", id=number, action=Marker.DELETE))
+            found.append(make_marker(header=header, ns=f"{namespace}/{kind}", id=number, action=_DELETE))
+    array: MarkerArray = types("visualization_msgs/msg/MarkerArray")(markers=found)
     return array
-
-
-def _marker(header: Any, namespace: str, number: int, kind: int, colour: np.ndarray) -> Marker:
-    marker = Marker(header=header, ns=namespace, id=number, type=kind, action=Marker.ADD)
-    marker.pose.orientation.w = 1.0
-    red, green, blue, alpha = (float(channel) for channel in colour)
-    marker.color = ColorRGBA(r=red, g=green, b=blue, a=alpha)
-    return marker
 
 
 def _checked(mesh: Mesh) -> Mesh:

@@ -11,13 +11,14 @@ radians; the order of geometry_msgs/PoseWithCovariance.  NaN where unknown.
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from geometry_msgs.msg import Point, Pose, Quaternion
-from std_msgs.msg import Header
 
 from sq_msgs_py.superquadrics import SuperquadricArray
+
+if TYPE_CHECKING:
+    from geometry_msgs.msg import Pose
 
 _LEAST_LENGTH = 1e-6
 
@@ -30,6 +31,8 @@ def pose_messages(superquadrics: SuperquadricArray) -> list[Pose]:
     ValueError
         If a quaternion names no rotation.
     """
+    from geometry_msgs.msg import Point, Pose, Quaternion
+
     rotations = unit_quaternions(superquadrics.rotation)
     return [
         Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
@@ -69,9 +72,9 @@ def moved_covariances(covariances: np.ndarray, rotation: np.ndarray) -> np.ndarr
     return change @ np.asarray(covariances, dtype=float) @ change.T
 
 
-def header_in(header: Any, frame_id: str) -> Header:
+def header_in(header: Any, frame_id: str) -> Any:
     """A header of the same stamp in another frame."""
-    return Header(stamp=header.stamp, frame_id=frame_id)
+    return type(header)(stamp=header.stamp, frame_id=frame_id)
 
 
 def unit_quaternions(quaternions: np.ndarray) -> np.ndarray:

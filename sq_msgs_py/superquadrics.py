@@ -26,35 +26,32 @@ equally right: compare bodies, never raw parameters.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from sensor_msgs.msg import PointCloud2, PointField
 
 from sq_msgs_py.depth_image import byte_array
+from sq_msgs_py.message_types import MessageTypes, installed
+
+if TYPE_CHECKING:
+    from sensor_msgs.msg import PointCloud2
 
 VERSION = 1
 CONVERGED, WEAK, FAILED = 0, 1, 2
 
+_NUMPY_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+"""By the datatypes of sensor_msgs/PointField."""
+_UINT32, _FLOAT32 = 6, 7
+
 FIELDS: tuple[tuple[str, int], ...] = tuple(
-    (name, PointField.FLOAT32)
+    (name, _FLOAT32)
     for name in (
         *("x", "y", "z", "qx", "qy", "qz", "qw", "a1", "a2", "a3", "e1", "e2"),
         *("score", "residual", "sigma_a1", "sigma_a2", "sigma_a3"),
     )
-) + (("id", PointField.UINT32), ("status", PointField.UINT32))
+) + (("id", _UINT32), ("status", _UINT32))
 """Name and PointField datatype of every field, in the order of the message."""
 
-_NUMPY_TYPES = {
-    PointField.INT8: "i1",
-    PointField.UINT8: "u1",
-    PointField.INT16: "i2",
-    PointField.UINT16: "u2",
-    PointField.INT32: "i4",
-    PointField.UINT32: "u4",
-    PointField.FLOAT32: "f4",
-    PointField.FLOAT64: "f8",
-}
 _COLUMNS = {
     "size": ("a1", "a2", "a3"),
     "shape": ("e1", "e2"),
@@ -141,27 +138,33 @@ class SuperquadricArray:
         )
 
 
-def to_message(superquadrics: SuperquadricArray, header: Any) -> PointCloud2:
-    """The message of n superquadrics (n may be 0) with the given std_msgs/Header."""
+def to_message(superquadrics: SuperquadricArray, header: Any, types: MessageTypes = installed) -> PointCloud2:
+    """The message of n superquadrics (n may be 0) with the given std_msgs/Header, of the classes in ``types``."""
     layout = np.dtype([(name, "<" + _NUMPY_TYPES[datatype]) for name, datatype in FIELDS])
     points = np.zeros(len(superquadrics), layout)
     for column, names in _COLUMNS.items():
         values = getattr(superquadrics, column).reshape(len(superquadrics), len(names))
         for k, name in enumerate(names):
             points[name] = values[:, k]
-    message = PointCloud2(header=header, height=1, width=len(points), is_bigendian=False)
-    message.fields = [
-        PointField(name=name, offset=int(layout.fields[name][1]), datatype=datatype, count=1)  # type: ignore[index]
-        for name, datatype in FIELDS
-    ]
-    message.point_step = layout.itemsize
-    message.row_step = layout.itemsize * len(points)
-    message.is_dense = bool(
-        np.isfinite(superquadrics.sigma_size).all()
-        and np.isfinite(superquadrics.score).all()
-        and np.isfinite(superquadrics.residual).all()
+    field = types("sensor_msgs/msg/PointField")
+    message: PointCloud2 = types("sensor_msgs/msg/PointCloud2")(
+        header=header,
+        height=1,
+        width=len(points),
+        fields=[
+            field(name=name, offset=int(layout.fields[name][1]), datatype=datatype, count=1)  # type: ignore[index]
+            for name, datatype in FIELDS
+        ],
+        is_bigendian=False,
+        point_step=layout.itemsize,
+        row_step=layout.itemsize * len(points),
+        data=byte_array(points),
+        is_dense=bool(
+            np.isfinite(superquadrics.sigma_size).all()
+            and np.isfinite(superquadrics.score).all()
+            and np.isfinite(superquadrics.residual).all()
+        ),
     )
-    message.data = byte_array(points)
     return message
 
 

@@ -55,6 +55,16 @@ def is_bag(path: str | Path) -> bool:
     return (path / "metadata.yaml").is_file() if path.is_dir() else path.suffix.lower() in SUFFIXES
 
 
+def raw_topic(topic: str) -> str:
+    """The topic that shows the images of a compressedDepth topic as they are; any other topic itself."""
+    return topic.removesuffix(f"/{compressed_depth.TRANSPORT}")
+
+
+def camera_info_topic(topic: str) -> str:
+    """The camera_info topic of an image topic."""
+    return raw_topic(topic).rpartition("/")[0] + "/camera_info"
+
+
 class RecordedBag:
     """One depth topic of a bag; iterating gives its frames once, in the order they were recorded.
 
@@ -106,7 +116,7 @@ class RecordedBag:
         except BaseException:
             self.close()
             raise
-        self._info_topic = _sibling(self.topic)
+        self._info_topic = camera_info_topic(self.topic)
 
     def __enter__(self) -> RecordedBag:
         return self
@@ -239,7 +249,7 @@ class RecordedBag:
                     f"{_said(error)}"
                 )
                 continue
-            yield _Message(content, stamp, is_info, is_packed=connection.msgtype == _COMPRESSED)
+            yield _Message(content, stamp, nanoseconds, is_info, is_packed=connection.msgtype == _COMPRESSED)
 
     # frames
 
@@ -251,6 +261,7 @@ class RecordedBag:
 
     def _decoded(self, message: _Message, info: _Message | None) -> RecordedFrame:
         warning = ""
+        encoding = str(getattr(message.content, "encoding", ""))
         if self._orthographic:
             grey = depth_image.grey_from_message(message.content)
             depth, camera = unit_cube.depth_from_grey(grey), unit_cube.camera(grey.shape[1], grey.shape[0])
@@ -258,6 +269,7 @@ class RecordedBag:
             calibration = self._calibration(info)
             if message.is_packed:
                 depth = compressed_depth.decode(message.content.format, message.content.data)
+                encoding = compressed_depth.encoding(message.content.format) or ""
             else:
                 depth = depth_image.depth_from_message(message.content)
             depth, camera = calibration.rectified(depth), calibration.camera
@@ -272,6 +284,8 @@ class RecordedBag:
             topic=self.topic,
             frame_id=message.content.header.frame_id,
             warning=warning,
+            encoding=encoding,
+            received=message.received,
         )
 
     def _calibration(self, info: _Message | None) -> Calibration:
@@ -288,6 +302,7 @@ class _Message:
 
     content: Any
     stamp: Stamp
+    received: int
     is_info: bool
     is_packed: bool
 
@@ -362,12 +377,6 @@ def _bounded(decompressor: Any, data: bytes, size: int) -> bytes:
     if len(unpacked) > size or not decompressor.eof:
         raise ValueError(f"expected at most {size} bytes unpacked and a whole stream")
     return unpacked
-
-
-def _sibling(topic: str) -> str:
-    """The camera_info topic of an image topic."""
-    base = topic.removesuffix(f"/{compressed_depth.TRANSPORT}")
-    return base.rpartition("/")[0] + "/camera_info"
 
 
 def _said(error: Exception) -> str:

@@ -80,6 +80,10 @@ class RecordedFrame:
         Where it was published, and the name of its optical frame; empty for files.
     warning : str
         What should be known about the frame before its results are believed; empty if nothing.
+    encoding : str
+        Of the depth where it came from, as messages name it (16UC1, 32FC1, mono8, mono16); empty where it has none.
+    received : int or None
+        When a bag received it, nanoseconds.
     """
 
     depth: np.ndarray
@@ -92,6 +96,8 @@ class RecordedFrame:
     topic: str = ""
     frame_id: str = ""
     warning: str = ""
+    encoding: str = ""
+    received: int | None = None
 
 
 @dataclass(frozen=True)
@@ -179,7 +185,7 @@ def _read(path: Path, camera_info: str | Path | None, projection: Projection, di
     except ValueError as error:
         raise FrameError(f"{path}: {error}") from error
     warning = f"{camera_info}: {calibration.note}" if calibration.note else ""
-    return RecordedFrame(depth, calibration.camera, None, path.name, is_cube=False, warning=warning)
+    return RecordedFrame(depth, calibration.camera, None, path.name, is_cube=False, warning=warning, encoding="16UC1")
 
 
 def _stamp(path: Path) -> Stamp | None:
@@ -282,7 +288,8 @@ def _read_npz(path: Path, projection: Projection) -> RecordedFrame:
         raise FrameError(f"{path}: K: {error}") from error
     with np.errstate(invalid="ignore"):
         depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.nan).astype(np.float32)
-    return RecordedFrame(depth, camera, labels, path.name, is_cube=False, plane=_plane(path, fields.get("plane")))
+    plane = _plane(path, fields.get("plane"))
+    return RecordedFrame(depth, camera, labels, path.name, is_cube=False, plane=plane, encoding="32FC1")
 
 
 def _labels(path: Path, labels: np.ndarray | None, depth: np.ndarray) -> np.ndarray | None:
@@ -326,9 +333,9 @@ def _read_image(path: Path) -> np.ndarray:
 
 def _from_grey(path: Path, image: np.ndarray) -> RecordedFrame:
     height, width = image.shape
-    return RecordedFrame(
-        unit_cube.depth_from_grey(image), _cube_camera(path, width, height), None, path.name, is_cube=True
-    )
+    depth, camera = unit_cube.depth_from_grey(image), _cube_camera(path, width, height)
+    encoding = "mono8" if image.dtype == np.uint8 else "mono16"
+    return RecordedFrame(depth, camera, None, path.name, is_cube=True, encoding=encoding)
 
 
 def _cube_camera(path: Path, width: int, height: int) -> Camera:

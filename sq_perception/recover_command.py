@@ -1,4 +1,4 @@
-"""``sq-perception recover``: recorded frames in; JSON, meshes, pictures and a table out.
+"""``sq-perception recover``: recorded frames in; JSON, meshes, pictures, a bag and a table out.
 
 Files appear whole or not at all, also where the command is interrupted: it then writes what it has.  Heavy imports
 happen inside, so that ``--help`` answers at once.
@@ -11,17 +11,16 @@ import json
 import math
 import statistics
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sq_perception.geometry.superquadric import Superquadric
     from sq_perception.recorded_frame import RecordedFrame
     from sq_perception.recorded_input import RecordedInput
     from sq_perception.recovery import FrameRecovery, Recoverer, RecoveryOptions
-    from sq_perception.tracking.session import Followed
+    from sq_perception.result_bag import ResultBag
 
 SUCCESS, FAILURE, USAGE, INTERRUPTED = 0, 1, 2, 130
 JSON_VERSION = 1
@@ -52,6 +51,7 @@ examples:
   sq-perception recover depth_*.png --camera-info camera.yaml --json out.json
   sq-perception recover recording/ --topic /camera/depth/image_rect_raw --every 10 --meshes meshes/
   sq-perception recover recording/ --track --json tracks.json
+  sq-perception recover recording/ --track --mcap results.mcap
   sq-perception recover views/*.bmp --projection orthographic --method network --json -
   sq-perception recover table.npz --ignore-masks --refine soft_render
 
@@ -77,6 +77,11 @@ tracking:
   {"id": ..., "seen": ..., "fused": true | false, "size": ..., "shape": ..., "translation": ..., "rotation": ...,
   "sigma_size": ...}: the same body keeps its id and the names of its axes; fused numbers are those of all frames so
   far, others the frame's own.  It is null without --track and for failed objects.
+
+bags:
+  --mcap writes what recover_node would have published, and what it would have read, with stamps, frame ids and times of
+  the input: for Foxglove, ros2 bag play, RViz (docs/bags.md).  It is named when it is whole, also after Ctrl-C and on a
+  full disk, with the frames until then.
 
 meshes:
   One file a frame with all its bodies, in metres, coloured as in the pictures; a frame without a body gets none.  PLY
@@ -115,6 +120,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--pictures", metavar="DIR", help="draw a picture per frame into this folder")
     parser.add_argument("--meshes", metavar="DIR", help="write the bodies of each frame as a mesh into this folder")
     parser.add_argument("--mesh-format", choices=("glb", "ply"), default="glb", help="of --meshes (default glb)")
+    parser.add_argument("--mcap", metavar="OUT", help="write results and depth as a bag (extra 'bags'), see below")
+    parser.add_argument(
+        "--mcap-images",
+        metavar="LIST",
+        default="depth",
+        help="which images it has: depth, rendered, labels, with commas, or none (default depth)",
+    )
     parser.add_argument("--model", metavar="FILE", help="weights: a .safetensors file, or the name of shipped ones")
     parser.add_argument(
         "--consensus", action="store_true", help="average the network's answers to 8 positions of each view"
@@ -146,6 +158,8 @@ def run(options: argparse.Namespace) -> int:
     to_stdout = options.json == "-"
     if options.json and not to_stdout and not Path(options.json).resolve().parent.is_dir():
         return misused(f"--json: the folder of {options.json} does not exist")
+    if options.mcap and (problem := _bag_misuse(options.mcap, options.frames)):
+        return misused(f"--mcap: {options.mcap}: {problem}")
     for name in ("pictures", "meshes"):
         if folder := getattr(options, name):
             try:
@@ -182,8 +196,27 @@ def run(options: argparse.Namespace) -> int:
         complain(str(error))
         return FAILURE
 
-    run = _Run(options, recoverer, settings)
+    bag = None
+    if options.mcap:
+        try:
+            from sq_perception.result_bag import ResultBag
+
+            images = [one.strip() for one in options.mcap_images.split(",")]
+            bag = ResultBag(options.mcap, [] if images == ["none"] else images)
+        except ValueError as error:
+            return misused(f"--mcap: {error}")
+        except (OSError, ImportError) as error:
+            complain(f"--mcap: {error}")
+            return FAILURE
+
+    run = _Run(options, recoverer, settings, bag)
     code = run.over(recorded)
+    try:
+        if bag is not None:
+            bag.close()
+    except OSError as error:
+        complain(f"--mcap: {error}")
+        code = code or FAILURE
     document = {"format": "sq_perception.recovery", "version": JSON_VERSION, "frames": run.results}
     if to_stdout:
         print(json.dumps(document, indent=1, allow_nan=False))
@@ -203,12 +236,14 @@ def run(options: argparse.Namespace) -> int:
 class _Run:
     """One pass over the frames, and what it has come to so far."""
 
-    def __init__(self, options: argparse.Namespace, recoverer: Recoverer, settings: RecoveryOptions) -> None:
+    def __init__(
+        self, options: argparse.Namespace, recoverer: Recoverer, settings: RecoveryOptions, bag: ResultBag | None
+    ) -> None:
         from sq_perception.recorded_tracks import RecordedTracks
 
         self.results: list[dict[str, Any]] = []
         self.unreadable = 0
-        self._options, self._recoverer, self._settings = options, recoverer, settings
+        self._options, self._recoverer, self._settings, self._bag = options, recoverer, settings, bag
         self._tracks = RecordedTracks(lambda text: complain(f"warning: {text}")) if options.track else None
         self._warm: set[Any] = set()
         self._stems: set[str] = set()
@@ -227,7 +262,7 @@ class _Run:
                 except FrameError as error:
                     complain(str(error))
                     self.unreadable += 1
-                except OSError as error:  # of a picture or mesh: the disk is full, and will be for the next frame
+                except OSError as error:  # of a picture, mesh or bag: the disk is full, and will be for the next frame
                     complain(str(error))
                     return FAILURE
         except KeyboardInterrupt:
@@ -247,6 +282,7 @@ class _Run:
         return ", ".join(parts)
 
     def _frame(self, file: str, frame: RecordedFrame) -> None:
+        from sq_perception.frame_entry import frame_entry
         from sq_perception.recorded_frame import FrameError
 
         if frame.warning and frame.warning not in self._warnings:
@@ -261,83 +297,24 @@ class _Run:
         except (ValueError, ArithmeticError) as error:  # a camera that no image can have come from
             raise FrameError(f"{file}: {frame.name}: {error}") from error
         tracks = self._tracks.follow(file, frame, recovery) if self._tracks else [None] * len(recovery.bodies)
-        self.results.append(_frame_entry(file, frame, recovery, tracks, has_masks=labels is not None))
+        self.results.append(frame_entry(file, frame, recovery, tracks, has_masks=labels is not None))
         stem = _free_stem(frame.name if frame.topic else Path(frame.name).stem, self._stems)
         if self._options.pictures:
             _draw(Path(self._options.pictures) / f"{stem}.png", frame, recovery)
         if self._options.meshes:
             _write_mesh(Path(self._options.meshes) / f"{stem}.{self._options.mesh_format}", frame, recovery)
+        if self._bag is not None:
+            self._bag.add(frame, recovery, tracks if self._tracks else None)
 
 
-def _frame_entry(
-    file: str, frame: RecordedFrame, recovery: FrameRecovery, tracks: Sequence[Followed | None], has_masks: bool
-) -> dict[str, Any]:
-    """One element of ``frames`` in the output."""
-    bodies = []
-    for body, track in zip(recovery.bodies, tracks, strict=True):
-        superquadric = _in_result_frame(body.superquadric, frame.is_cube)
-        bodies.append(
-            {
-                "size": _numbers(superquadric.size),
-                "shape": _numbers(superquadric.shape),
-                "translation": _numbers(superquadric.translation),
-                "rotation": _numbers(superquadric.rotation),
-                "score": _number(body.score),
-                "residual": _number(body.residual),
-                "sigma_size": _numbers(body.sigma_size),
-                "seen": _numbers(body.seen),
-                "status": body.status.name.lower(),
-                "message": body.message,
-                "label": int(body.label) if has_masks else None,
-                "pixels": int(body.pixels),
-                "track": None if track is None else _track_entry(track, frame.is_cube),
-            }
-        )
-    return {
-        "file": file,
-        "ms": _number(recovery.milliseconds["total"]),
-        "superquadrics": bodies,
-        "coordinates": "cube" if frame.is_cube else "optical",
-        "message": recovery.message,
-        "ms_by_stage": {stage: _number(value) for stage, value in recovery.milliseconds.items()},
-        "plane": None if recovery.plane is None else _numbers(recovery.plane),
-        "stamp": None if frame.stamp is None else frame.stamp._asdict(),
-        "topic": frame.topic or None,
-        "frame_id": frame.frame_id or None,
-    }
-
-
-def _track_entry(track: Followed, is_cube: bool) -> dict[str, Any]:
-    body = track.superquadric
-    if is_cube:
-        from sq_perception.imaging import unit_cube
-
-        body = unit_cube.cube_from_optical(body)  # not its canonical form: the track keeps its own
-    return {
-        "id": track.id,
-        "seen": track.seen,
-        "fused": track.is_fused,
-        "size": _numbers(body.size),
-        "shape": _numbers(body.shape),
-        "translation": _numbers(body.translation),
-        "rotation": _numbers(body.rotation),
-        "sigma_size": _numbers(track.sigma_size),
-    }
-
-
-def _in_result_frame(body: Superquadric, is_cube: bool) -> Superquadric:
-    from sq_perception.imaging import unit_cube
-
-    return unit_cube.cube_from_optical(body).canonical_form() if is_cube else body
-
-
-def _numbers(values: Iterable[float]) -> list[float | None]:
-    return [_number(value) for value in values]
-
-
-def _number(value: float) -> float | None:
-    """JSON knows neither NaN nor infinity."""
-    return float(value) if math.isfinite(value) else None
+def _bag_misuse(out: str, inputs: Sequence[str]) -> str:
+    """What is wrong with the name of a bag to write; empty if nothing."""
+    path = Path(out)
+    if not path.resolve().parent.is_dir():
+        return "its folder does not exist"
+    if path.exists() and any(Path(one).exists() and path.samefile(one) for one in inputs):
+        return "this is an input"
+    return ""
 
 
 def _count(number: int, one: str, many: str | None = None) -> str:
@@ -365,6 +342,7 @@ def _draw(path: Path, frame: RecordedFrame, recovery: FrameRecovery) -> None:
 
 def _write_mesh(path: Path, frame: RecordedFrame, recovery: FrameRecovery) -> None:
     from sq_perception.fitting.fit import Status
+    from sq_perception.frame_entry import in_result_frame
     from sq_perception.geometry import mesh
 
     shown = [k for k, body in enumerate(recovery.bodies) if body.status != Status.FAILED]
@@ -372,7 +350,7 @@ def _write_mesh(path: Path, frame: RecordedFrame, recovery: FrameRecovery) -> No
         return
     with _whole(path) as partial:
         mesh.export(
-            [_in_result_frame(recovery.bodies[k].superquadric, frame.is_cube) for k in shown],
+            [in_result_frame(recovery.bodies[k].superquadric, frame.is_cube) for k in shown],
             partial,
             colours=mesh.COLOURS[[k % len(mesh.COLOURS) for k in shown]],
             names=[f"body_{k}" for k in shown],

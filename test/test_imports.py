@@ -20,9 +20,10 @@ PACKAGES = (PERCEPTION, MESSAGES)
 # Floor by floor, from the ground up; a module may import from its own floor and from those below it.
 FLOORS = (
     ("geometry", "provenance", "plain_yaml"),
-    ("imaging", "metrics", "tracking", "calibration", "recorded_frame", "recorded_bag", "recorded_input"),
+    ("imaging", "metrics", "tracking", "calibration", "recorded_frame", "recorded_bag", "recorded_input",
+     "bag_messages", "mcap_file"),
     ("learning", "fitting", "scene_description", "seen_object"),
-    ("recovery", "recorded_tracks", "segment_repair", "warm_up"),
+    ("recovery", "recorded_tracks", "segment_repair", "warm_up", "publication", "result_bag", "frame_entry"),
     ("evaluation", "nodes", "cli", "recover_command"),
 )
 ROS = ("rclpy", "sensor_msgs", "std_msgs", "std_srvs", "visualization_msgs", "diagnostic_msgs", "geometry_msgs",
@@ -93,11 +94,14 @@ def test_only_nodes_know_ros() -> None:
 def test_only_nodes_bags_and_calibrations_join_the_two_packages() -> None:
     """What a recorded message says is decoded by the code that decodes a live one; that needs no ROS."""
     joining = {path for path in PERCEPTION.rglob("*.py") if not is_node(path) and "sq_msgs_py" in roots(path)}
-    assert joining == {PERCEPTION / "recorded_bag.py", PERCEPTION / "calibration.py"}
+    names = ("recorded_bag", "calibration", "result_bag", "publication")
+    assert joining == {PERCEPTION / f"{name}.py" for name in names}
     absent = f"import sys; sys.modules.update(dict.fromkeys({ROS!r}))"
     modules = loaded_after(f"{absent}; import sq_perception.recorded_input, sq_perception.recover_command")
     assert "sq_msgs_py.depth_image" in modules
     assert not modules & {"rosbags", "torch"}
+    modules = loaded_after(f"{absent}; import sq_perception.result_bag, sq_msgs_py.superquadrics, sq_msgs_py.markers")
+    assert "mcap" in modules
 
 
 def test_messages_need_numpy_and_messages_only() -> None:

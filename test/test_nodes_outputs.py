@@ -53,11 +53,11 @@ def recovery(*bodies: Recovery) -> FrameRecovery:
     return FrameRecovery(bodies, {"total": 1.0}, np.zeros((48, 64), np.int32), None, "")
 
 
-def found(*ids: int, header: Header = HEADER) -> results.Findings:
+def found(*ids: int, header: Header = HEADER) -> publication.Findings:
     """Boxes and cans with these ids, and a failed body."""
     bodies = [one((BOX, CAN)[number % 2], number) for number in ids]
     failed = one(BOX, 99, Status.FAILED)
-    return results.findings(recovery(*bodies, failed), (*ids, 2**31 + 99), frame(header))
+    return publication.findings(Identified(recovery(*bodies, failed), (*ids, 2**31 + 99)), header, is_cube=False)
 
 
 class Publisher:
@@ -336,7 +336,7 @@ def test_covariances_of_poses_are_about_the_axes_of_their_frame(node, tf2):
 def test_findings_of_a_cube_are_in_its_frame():
     camera = unit_cube.camera(64, 48)
     body = Superquadric([0.2, 0.15, 0.1], [0.3, 0.6], [0.5, 0.5, 0.5], [0.1, 0.2, 0.3, 0.9])
-    made = results.findings(recovery(one(body, 1)), (1,), frame(HEADER, camera))
+    made = publication.findings(Identified(recovery(one(body, 1)), (1,)), HEADER, not camera.is_pinhole)
     expected = unit_cube.cube_from_optical(body)
     np.testing.assert_allclose(made.array.translation[0], expected.translation, atol=1e-7)
     flip = np.diag([1.0, -1, -1])

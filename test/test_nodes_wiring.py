@@ -557,14 +557,11 @@ def test_packed_images_are_read_and_hostile_ones_refused(make_bench):
         seen = bench.recoverer.asked[-1][0]
         assert np.isnan(seen[:5]).all()
         np.testing.assert_allclose(seen[5:], 0.731, atol=1e-3)
-    for number, (form, data) in enumerate(
-        [("", b""), ("16UC1; compressedDepth png", b""), (form, data[:40]), ("rgb8; jpeg", b"abc")], start=1
-    ):
-        packed.publish(CompressedImage(header=bench.header(), format=form, data=data))
+    hostile = [("", b""), ("16UC1; compressedDepth png", b""), (form, data[:40]), ("rgb8; jpeg", b"abc")]
+    for number, (bad_form, bad_data) in enumerate(hostile, start=1):
+        packed.publish(CompressedImage(header=bench.header(), format=bad_form, data=bad_data))
         bench.until(lambda number=number: bench.counts.refused == number)
         assert bench.counts.last_error
-    packed.publish(CompressedImage(header=header, format=form, data=data))
-    form, data = compressed_depth.encode(depth, "16UC1")
     header = bench.header()
     packed.publish(CompressedImage(header=header, format=form, data=data))
     bench.until(lambda: any(one.header == header for one in bench.answers))

@@ -12,18 +12,15 @@ from sensor_msgs.msg import CompressedImage, Image
 from sq_msgs_py.depth_image import (
     DEPTH_ENCODINGS,
     GREY_ENCODINGS,
-    depth_to_message,
     grey_from_message,
-    grey_to_message,
     labels_from_message,
 )
+from sq_perception import publication
 from sq_perception.calibration import Calibration
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.nodes.inbox import Refused
 from sq_perception.nodes.transport import depth_of
-
-_GREY_TYPES: dict[str, type[np.unsignedinteger]] = {"mono8": np.uint8, "mono16": np.uint16}
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,10 +74,10 @@ class Frame:
 
     def encode(self, depth: np.ndarray) -> Image:
         """A message like the frame's own with another depth (height, width), NaN or inf for nothing."""
-        if self.is_cube:
-            return grey_to_message(unit_cube.grey_from_depth(depth, _GREY_TYPES[self.encoding]), self.header)
-        depth = self.calibration.as_sent(depth)
-        return depth_to_message(np.where(np.isfinite(depth), depth, np.nan), self.header, self.encoding)
+        image: Image = publication.depth_message(
+            self.calibration.as_sent(depth), self.header, self.encoding, self.is_cube
+        )
+        return image
 
 
 def decode(message: Image | CompressedImage, calibration_of: Callable[[], Calibration] | None) -> Frame:

@@ -45,6 +45,7 @@ from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray
 
 from sq_msgs_py.superquadrics import to_message
+from sq_perception import publication
 from sq_perception.calibration import Calibration
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
@@ -53,13 +54,13 @@ from sq_perception.nodes.camera_poses import CameraPoses
 from sq_perception.nodes.counters import Statistics, Throttle
 from sq_perception.nodes.engine import TURNS, Engine, Workshop
 from sq_perception.nodes.frame import Frame, decode
-from sq_perception.nodes.identity import Identified, Identity
+from sq_perception.nodes.identity import Identity
 from sq_perception.nodes.inbox import Arrival, Inbox, Refused
 from sq_perception.nodes.managed_node import ManagedNode
 from sq_perception.nodes.outputs import Outputs
 from sq_perception.nodes.parameters import FrameParameters, LiveParameters
-from sq_perception.nodes.results import Findings
 from sq_perception.nodes.triggers import Outcome, Triggers
+from sq_perception.publication import Findings, Identified
 from sq_perception.recovery import FrameRecovery, render_recovery
 
 WARM_UP_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
@@ -354,7 +355,7 @@ class FrameNode(ManagedNode):
             found = self._identity.untracked(recovery)
 
         clock = perf_counter()
-        findings = results.findings(found.recovery, found.ids, frame)
+        findings = publication.findings(found, frame.header, frame.is_cube)
         findings = results.in_frame(findings, self._poses, parameters.target_frame)
         self._superquadrics.publish(to_message(findings.array, findings.header))
         self._outputs.publish(findings, parameters, found.hidden)
@@ -392,7 +393,7 @@ class FrameNode(ManagedNode):
         self, frame: Frame, found: Identified, findings: Findings, parameters: FrameParameters
     ) -> None:
         if self._markers.get_subscription_count():
-            self._markers.publish(findings.markers(parameters, self._shown_ids))
+            self._markers.publish(findings.markers(self._shown_ids, results.marker_style(parameters)))
             self._shown_ids = findings.shown_ids
         if self._rendered.get_subscription_count():
             depth, _ = render_recovery(found.recovery, frame.camera)

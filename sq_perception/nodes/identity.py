@@ -1,29 +1,16 @@
-"""What a node publishes as the id of each body, and the bodies themselves: with tracking those of the tracks.
-
-Without tracking ids are mask labels and the bodies are those of the frame.  Residual, score and status are always the
-frame's own.
-"""
+"""Which track of a node's session each body of a frame belongs to, and what is therefore published of it."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
 from typing import Any
 
-from sq_perception.fitting.fit import Status
+from sq_perception import publication
 from sq_perception.nodes.camera_poses import CameraPoses, PoseError
 from sq_perception.nodes.frame import Frame
+from sq_perception.publication import Identified
 from sq_perception.recovery import FrameRecovery
-from sq_perception.tracking.session import FIRST_FAILED_ID, Tally, TrackingSession
-
-
-@dataclass(frozen=True, eq=False)
-class Identified:
-    """The objects of a frame as they are published, the id of each, and ids of tracks that the frame does not show."""
-
-    recovery: FrameRecovery
-    ids: tuple[int, ...]
-    hidden: tuple[int, ...] = ()
+from sq_perception.tracking.session import Tally, TrackingSession
 
 
 class Identity:
@@ -59,7 +46,7 @@ class Identity:
     def untracked(self, recovery: FrameRecovery) -> Identified:
         """Ids are labels; what was tracked is forgotten."""
         self._session.reset()
-        return Identified(recovery, tuple(one.label for one in recovery.bodies))
+        return publication.untracked(recovery)
 
     def tracked(self, recovery: FrameRecovery, frame: Frame, arrival: float, fixed_frame: str = "") -> Identified:
         """Bodies and ids of their tracks.
@@ -94,10 +81,8 @@ class Identity:
                 is_known = False
                 self._warn("camera pose", f"no camera pose in fixed_frame, nothing is fused: {error}")
         try:
-            tracks = iter(
-                self._session.follow(
-                    recovery.recovered, stamp, pose, is_pose_known=is_known, camera=frame.camera, depth=frame.depth
-                )
+            tracks = self._session.follow(
+                recovery.recovered, stamp, pose, is_pose_known=is_known, camera=frame.camera, depth=frame.depth
             )
         except (ValueError, ArithmeticError) as error:
             self._session.reset()
@@ -105,17 +90,7 @@ class Identity:
         if self._session.tally.resets > resets:
             self._inform(f"the stamps jumped back to {stamp:.3f} s: tracks are forgotten, ids go on")
             self._poses.clear()
-        bodies, ids = [], []
-        for one in recovery.bodies:
-            if one.status == Status.FAILED:
-                bodies.append(one)
-                ids.append(FIRST_FAILED_ID + one.label)
-                continue
-            track = next(tracks)
-            covariance, sigma = track.covariance, track.sigma_size
-            bodies.append(replace(one, superquadric=track.superquadric, covariance=covariance, sigma_size=sigma))
-            ids.append(track.id)
-        return Identified(replace(recovery, bodies=tuple(bodies)), tuple(ids), self._session.hidden)
+        return publication.tracked(recovery, list(tracks), self._session.hidden)
 
 
 def _seconds(header: Any) -> float:

@@ -25,12 +25,9 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.nodes import transport
 from sq_perception.nodes.frame_source import FrameSource, SourceFrame
 from sq_perception.nodes.parameters import LiveParameters, SyntheticParameters
-from sq_perception.nodes.results import truth_array
 from sq_perception.nodes.stoppable_node import StoppableNode
+from sq_perception.publication import CAMERA_FRAME, CUBE_FRAME, truth_array
 from sq_perception.recorded_frame import FrameError
-
-CAMERA_FRAME = "camera_depth_optical_frame"
-CUBE_FRAME = "unit_cube"
 
 
 class SyntheticDepthNode(StoppableNode):

@@ -1,0 +1,30 @@
+"""Where the classes of messages come from.
+
+What makes a message asks for its class by the full name ``package/msg/Name`` and gives every field by keyword; fields
+left out take ROS's defaults.  Any classes with the names and fields of ROS will do: those of an installation, which is
+the default, or those of a library that writes recordings without one.  Both then hold the same numbers, as the same
+code computed them.
+
+Sequences of numbers are given as lists or array.array, whatever the class at hand would rather have.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Callable
+from typing import Any
+
+MessageTypes = Callable[[str], Callable[..., Any]]
+
+
+def installed(name: str) -> Callable[..., Any]:
+    """The class of ``package/msg/Name`` from the message packages of a ROS installation.
+
+    Raises
+    ------
+    ImportError
+        Where that package is not installed.
+    """
+    package, folder, short = name.split("/")
+    found: Callable[..., Any] = getattr(importlib.import_module(f"{package}.{folder}"), short)
+    return found
