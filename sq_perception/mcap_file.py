@@ -3,7 +3,7 @@
 What was added between two moments is one group: a reader finds all of it or nothing.  Groups wait in memory until they
 fill a chunk.  A chunk that could not be written whole, because the disk is full or Ctrl-C came, is as if it had never
 been begun: its groups still wait, what lies behind the last whole chunk is cut off, and ``flush`` may be tried again.
-``finish`` writes the index of what is there.
+``finish`` writes the index of what is there; room for it is set aside before each chunk, where the file system can.
 
 The package ``mcap`` lays out the records.  Its Writer is not used, because it cannot take back a chunk that failed, and
 its file could then not be closed; the writer of ``rosbags`` writes folders, without checksums, and cannot either.
@@ -51,6 +51,7 @@ if sys.version_info >= (3, 14):
 else:
     from backports.zstd import compress
 
+_FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 _MAGIC = b"\x89MCAP0\r\n"
 
 
@@ -107,6 +108,11 @@ class McapFile:
         """How many groups a reader of the finished file will find."""
         return self._state.groups
 
+    @property
+    def waiting(self) -> int:
+        """How many groups are not in the file."""
+        return len(self._state.waiting)
+
     def channel(self, topic: str, type_name: str, definition: str) -> int:
         """The id of a new channel: a topic, the name of its type ``package/msg/Name``, and the text that defines it."""
         schema = next((one for one in self._schemas if one.name == type_name), None)
@@ -124,15 +130,16 @@ class McapFile:
         now = self._state
         size = now.waiting_bytes + sum(len(one.data) for one in group)
         self._state = replace(now, waiting=(*now.waiting, group), waiting_bytes=size)
-        if size >= CHUNK_BYTES or len(self._state.waiting) >= CHUNK_GROUPS:
+        if size >= CHUNK_BYTES or self.waiting >= CHUNK_GROUPS:
             self.flush()
 
-    def flush(self) -> None:
-        """Write what waits as a chunk."""
+    def flush(self, most: int | None = None) -> None:
+        """Write what waits as a chunk: all of it, or at most so many groups."""
         now = self._state
         if not now.waiting:
             return
-        messages = [message for group in now.waiting for message in group]
+        groups, rest = now.waiting[:most], now.waiting[len(now.waiting[:most]) :]
+        messages = [message for group in groups for message in group]
         content, places = self._content(messages)
         packed = compress(content)
         times = [message.log_time for message in messages]
@@ -164,17 +171,19 @@ class McapFile:
             message_start_time=min(times),
             uncompressed_size=len(content),
         )
-        end = self._put(chunk + tail.end())
+        end = self._put(chunk + tail.end(), self._index_room())
         self._indexes[now.chunks :] = [_records([index])]
         self._state = _State(
             end=end,
             schemas=len(self._schemas),
             channels=len(self._channels),
             chunks=now.chunks + 1,
-            groups=now.groups + len(now.waiting),
+            groups=now.groups + len(groups),
             counts=now.counts | {one: now.counts.get(one, 0) + len(entries) for one, entries in places.items()},
             start=min(now.start, *times),
             stop=max(now.stop, *times),
+            waiting=rest,
+            waiting_bytes=sum(len(message.data) for group in rest for message in group),
         )
 
     def finish(self) -> None:
@@ -229,19 +238,33 @@ class McapFile:
             schema_count=now.schemas,
         )
 
-    def _put(self, data: bytes) -> int:
-        """Write behind what counts, over whatever an attempt before left there; the end of the file."""
-        stale = self._file.seek(0, SEEK_END) > self._state.end
-        self._file.seek(self._state.end)
-        if stale:
-            self._file.truncate()  # which frees what a failed attempt took of a full disk
+    def _index_room(self) -> int:
+        """Bytes that suffice for the index with another chunk."""
+        channels = len(self._channels)
+        names = sum(len(one.data) + 500 for one in self._schemas) + sum(4 * len(one.topic) for one in self._channels)
+        return 1000 + names + 500 * channels + (self._state.chunks + 1) * (200 + 10 * channels)
+
+    def _put(self, data: bytes, room: int = 0) -> int:
+        """Write behind what counts, over whatever an attempt before left there; the end of the file.
+
+        Fails before anything is written if there is no ``room`` for so many bytes more.
+        """
+        end = self._state.end
+        if self._file.seek(0, SEEK_END) > end:
+            self._file.truncate(end)
+        try:
+            os.posix_fallocate(self._file.fileno(), end, len(data) + room)
+        except OSError as error:  # others: of files and file systems that do not know it
+            if error.errno in _FULL:
+                raise
+        self._file.seek(end)
         rest = memoryview(data)
         while rest:
             written = self._file.write(rest)
             if not written:
                 raise OSError(errno.EIO, os.strerror(errno.EIO))
             rest = rest[written:]
-        return self._state.end + len(data)
+        return end + len(data)
 
 
 def _records(records: Iterable[McapRecord]) -> bytes:

@@ -210,7 +210,10 @@ class ResultBag:
     # the end
 
     def _close_after(self, error: OSError) -> NoReturn:
-        """Close the file with what it has, and say so."""
+        """Close the file with as many frames as it can hold, and say so."""
+        with suppress(OSError):
+            while self._file.waiting:
+                self._file.flush(1)
         self._end()
         written = self._file.groups
         kept = f"the first {written} of {self._frames} frames are kept" if written else "nothing is kept"
