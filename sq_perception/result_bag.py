@@ -178,7 +178,8 @@ class ResultBag:
             messages.append((topic, depth))
         if "labels" in self._images:
             labels = np.maximum(found.recovery.labels, 0)
-            encoding = "16UC1" if labels.max(initial=0) <= np.iinfo(np.uint16).max else "32SC1"
+            # Not 16UC1, which would look like depth to whoever reads the file.
+            encoding = "mono16" if labels.max(initial=0) <= np.iinfo(np.uint16).max else "32SC1"
             messages.append((LABELS, depth_image.labels_to_message(labels, header, encoding, types)))
         messages.append((SUPERQUADRICS, to_message(shown.array, header, types)))
         messages.append((MARKERS, shown.markers(self._shown_ids, types=types)))
