@@ -46,9 +46,8 @@ try:
     from sq_perception import bag_messages
     from sq_perception.mcap_file import LATEST, McapFile
 except ImportError as missing:
-    raise ImportError(
-        f"writing bags needs the module {missing.name!r}: pip install 'sq_perception[bags]'", name=missing.name
-    ) from missing
+    module = (missing.name or "").partition(".")[0]
+    raise ImportError(f"writing bags needs the module {module!r}: pip install 'sq_perception[bags]'") from missing
 
 BagImage = Literal["depth", "rendered", "labels"]
 SUFFIX = ".mcap"

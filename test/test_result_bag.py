@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 import tracemalloc
 from dataclasses import replace
 
@@ -276,6 +277,17 @@ def test_a_name_that_cannot_be_written_is_said_at_once(tmp_path, capsys):
         recover(source, *arguments, code=2)
         assert said in capsys.readouterr().err
     assert not leftovers(tmp_path)
+
+
+def test_without_mcap_one_sentence_says_so(tmp_path, monkeypatch, capsys):
+    for name in ("mcap_file", "result_bag"):
+        monkeypatch.delitem(sys.modules, f"sq_perception.{name}")
+        monkeypatch.delattr(f"sq_perception.{name}")
+    for name in [name for name in sys.modules if name.partition(".")[0] == "mcap"]:
+        monkeypatch.setitem(sys.modules, name, None)
+    recover(tmp_path / "missing.npz", "--mcap", tmp_path / "results.mcap", code=1)
+    message = "sq-perception: --mcap: writing bags needs the module 'mcap': pip install 'sq_perception[bags]'"
+    assert capsys.readouterr().err.splitlines() == [message]
 
 
 def test_a_run_without_a_frame_leaves_no_file(tmp_path, capsys):
