@@ -18,6 +18,8 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import TransformStamped
 from std_msgs.msg import Header
 
+from sq_perception import publication
+from sq_perception.calibration import Calibration
 from sq_perception.fitting.fit import Status
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
@@ -30,6 +32,7 @@ from sq_perception.nodes.identity import Identity
 from sq_perception.nodes.inbox import Refused
 from sq_perception.nodes.outputs import Outputs
 from sq_perception.nodes.parameters import FrameParameters, ParameterError
+from sq_perception.publication import Identified
 from sq_perception.recovery import FrameRecovery, Recovery
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
@@ -46,7 +49,12 @@ def one(body: Superquadric, label: int, status: Status = Status.CONVERGED) -> Re
 
 
 def frame(header: Header = HEADER, camera: Camera = CAMERA) -> Frame:
-    return Frame(header, "32FC1", np.full((camera.height, camera.width), np.nan, np.float32), camera)
+    return Frame(
+        header,
+        "32FC1",
+        np.full((camera.height, camera.width), np.nan, np.float32),
+        Calibration(camera, (camera.width, camera.height)),
+    )
 
 
 def recovery(*bodies: Recovery) -> FrameRecovery:
