@@ -309,7 +309,7 @@ def test_markers_follow_the_frame(node, tf2):
     here = found(1, 2)
     there = results.in_frame(here, CameraPoses(node), "map")
     turn, shift = tf2.frames["map"]
-    one, other = (findings.markers(FrameParameters(), ()) for findings in (here, there))
+    one, other = (findings.markers() for findings in (here, there))
     assert {marker.header.frame_id for marker in other.markers} == {"map"}
     for k in range(4):
         near, far = (np.array([[p.x, p.y, p.z] for p in array.markers[k].points]) for array in (one, other))
@@ -318,7 +318,7 @@ def test_markers_follow_the_frame(node, tf2):
 
 def test_markers_lie_on_the_bodies(node):
     """Meshes in the body's frame and back again are those of the body in the frame of the image."""
-    array = found(1, 2).markers(FrameParameters(), (1, 2, 8))
+    array = found(1, 2).markers((1, 2, 8))
     assert [(marker.id, marker.ns.split("/")[1], marker.action) for marker in array.markers] == [
         *((1, "surface", 0), (1, "outline", 0), (2, "surface", 0), (2, "outline", 0)),
         *((8, "surface", 2), (8, "outline", 2)),
