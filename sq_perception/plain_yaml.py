@@ -58,7 +58,8 @@ def read_all(path: Path) -> list[Any]:
     except (OSError, UnicodeDecodeError, yaml.YAMLError, ValueError, RecursionError) as error:
         if isinstance(error, YamlError):
             raise
-        raise YamlError(" ".join(str(error).split()) or type(error).__name__) from error
+        said = " ".join(str(error).split()) or type(error).__name__
+        raise YamlError(f"not YAML: {said}" if isinstance(error, yaml.YAMLError) else said) from error
 
 
 def read(path: Path) -> Any:

@@ -29,9 +29,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
-import yaml
-
 from sq_msgs_py import depth_image
+from sq_perception import plain_yaml
 from sq_perception.calibration import Calibration, Treatment
 from sq_perception.imaging import compressed_depth, unit_cube
 from sq_perception.imaging.camera import Projection
@@ -340,8 +339,8 @@ def _open(path: Path) -> tuple[Any, Any]:
 def _refuse_packed_files(folder: Path) -> None:
     """rosbags would unpack a bag that was packed as a whole into a temporary folder, whatever its size."""
     try:
-        document = yaml.safe_load((folder / "metadata.yaml").read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, RecursionError) as error:
+        document = plain_yaml.read(folder / "metadata.yaml")
+    except plain_yaml.YamlError as error:
         raise FrameError(f"{folder}: metadata.yaml: {_said(error)}") from error
     information = document.get("rosbag2_bagfile_information") if isinstance(document, dict) else None
     if not isinstance(information, dict):

@@ -11,7 +11,7 @@ A file whose name is a time, such as 1305031102.160407.png, has that stamp in se
 
 The cube is the thesis' unit cube, :mod:`sq_perception.imaging.unit_cube`.  An NPZ may bring ``labels`` (h, w), a
 support ``plane`` (4,), and the text "orthographic" as ``projection``, which goes before what the caller says.  Nothing
-in a file is executed: no pickle, safe YAML only.
+in a file is executed: no pickle, plain YAML only; and nothing is unpacked that is larger than any camera's image.
 
 Whether a PNG is raw and its distortion has to be undone is decided by :mod:`sq_perception.calibration`.
 
@@ -21,19 +21,18 @@ Whole folders and rosbags are read by :mod:`sq_perception.recorded_input`, frame
 from __future__ import annotations
 
 import re
-import zipfile
-import zlib
+import reprlib
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, NamedTuple, get_args
 
-import cv2
 import numpy as np
-import yaml
 
+from sq_perception import plain_yaml
 from sq_perception.calibration import Calibration, Treatment
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera, Projection
+from sq_perception.unpacking import UnpackingError, grey_image, npz_arrays
 
 SUFFIXES = (".npz", ".png", ".bmp")
 _MILLIMETRES = np.float32(1000.0)
@@ -168,7 +167,10 @@ def _read(path: Path, camera_info: str | Path | None, projection: Projection, di
         return _read_npz(path, projection)
     if suffix not in _IMAGES:
         raise FrameError(f"{path}: expected a name that ends in .npz, .png or .bmp")
-    image = _read_image(path)
+    try:
+        image = grey_image(path)
+    except UnpackingError as error:
+        raise FrameError(f"{path}: {error}") from error
     if projection == "orthographic":
         return _from_grey(path, image)
     if image.dtype != np.uint16:
@@ -224,13 +226,9 @@ def read_camera_info(path: str | Path) -> CameraInfo:
     """
     path = Path(path)
     try:
-        text = path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
+        documents = [entry for entry in plain_yaml.read_all(path) if entry is not None]
+    except plain_yaml.YamlError as error:
         raise FrameError(f"{path}: cannot read the camera_info: {error}") from error
-    try:
-        documents = [entry for entry in yaml.safe_load_all(text) if entry is not None]
-    except yaml.YAMLError as error:
-        raise FrameError(f"{path}: not YAML: {' '.join(str(error).split())}") from error
     if not documents or not isinstance(documents[0], dict):
         raise FrameError(f"{path}: expected a camera_info as a YAML mapping")
     info = documents[0]
@@ -244,7 +242,7 @@ def read_camera_info(path: str | Path) -> CameraInfo:
         raise FrameError(f"{path}: camera matrix: expected no skew, got {matrix[1]:g}")
     region = info.get("roi", {})
     if not isinstance(region, dict):
-        raise FrameError(f"{path}: roi: expected a mapping, got {region!r}")
+        raise FrameError(f"{path}: roi: expected a mapping, got {reprlib.repr(region)}")
     offsets = (_count(path, region, name) for name in ("x_offset", "y_offset", "width", "height"))
     return CameraInfo(
         width,
@@ -261,15 +259,9 @@ def read_camera_info(path: str | Path) -> CameraInfo:
 
 def _read_npz(path: Path, projection: Projection) -> RecordedFrame:
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            if not isinstance(archive, np.lib.npyio.NpzFile):
-                raise FrameError(f"{path}: expected an NPZ archive, got a single array")
-            known = ("depth", "K", "labels", "plane", "projection")
-            fields = {name: archive[name] for name in known if name in archive.files}
-    except FrameError:
-        raise
-    except (OSError, ValueError, EOFError, NotImplementedError, zipfile.BadZipFile, zlib.error) as error:
-        raise FrameError(f"{path}: not a readable NPZ archive: {error}") from error
+        fields = npz_arrays(path, ("depth", "K", "labels", "plane", "projection"))
+    except UnpackingError as error:
+        raise FrameError(f"{path}: {error}") from error
     if "depth" not in fields:
         raise FrameError(f"{path}: expected a field 'depth' in metres")
     depth = fields["depth"]
@@ -308,27 +300,6 @@ def _plane(path: Path, plane: np.ndarray | None) -> np.ndarray | None:
     if plane.shape != (4,) or plane.dtype.kind not in "fiu" or not np.isfinite(plane).all():
         raise FrameError(f"{path}: plane: expected four finite numbers, got {plane.dtype} {plane.shape}")
     return plane.astype(float)
-
-
-def _read_image(path: Path) -> np.ndarray:
-    """A grey image (height, width), uint8 or uint16."""
-    encoded = np.fromfile(path, dtype=np.uint8)
-    image = None
-    if encoded.size:
-        try:
-            image = cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED)
-        except cv2.error as error:
-            raise FrameError(f"{path}: not a readable image: {error.err}") from error
-    if image is None:
-        raise FrameError(f"{path}: not a readable image")
-    if image.ndim == 3:
-        colours = image[..., :3]
-        if not (colours == colours[..., :1]).all():
-            raise FrameError(f"{path}: expected a grey image, got a colour image")
-        image = np.ascontiguousarray(colours[..., 0])
-    if image.dtype not in (np.uint8, np.uint16):
-        raise FrameError(f"{path}: expected 8 or 16 bit, got {image.dtype}")
-    return image
 
 
 def _from_grey(path: Path, image: np.ndarray) -> RecordedFrame:
@@ -371,9 +342,9 @@ def _matrix(path: Path, info: dict[Any, Any], names: tuple[str, ...], length: in
         try:
             numbers = np.array(values, dtype=float).ravel()
         except (TypeError, ValueError) as error:
-            raise FrameError(f"{path}: {name}: expected numbers, got {values!r}") from error
+            raise FrameError(f"{path}: {name}: expected numbers, got {reprlib.repr(values)}") from error
         if not np.isfinite(numbers).all() or (length is not None and numbers.size != length):
             wanted = "finite numbers" if length is None else f"{length} finite numbers"
-            raise FrameError(f"{path}: {name}: expected {wanted}, got {values!r}")
+            raise FrameError(f"{path}: {name}: expected {wanted}, got {reprlib.repr(values)}")
         return numbers
     return None

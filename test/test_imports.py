@@ -19,7 +19,7 @@ PACKAGES = (PERCEPTION, MESSAGES)
 
 # Floor by floor, from the ground up; a module may import from its own floor and from those below it.
 FLOORS = (
-    ("geometry", "provenance", "plain_yaml"),
+    ("geometry", "provenance", "plain_yaml", "unpacking"),
     ("imaging", "metrics", "tracking", "calibration", "recorded_frame", "recorded_bag", "recorded_input",
      "bag_messages", "mcap_file"),
     ("learning", "fitting", "scene_description", "seen_object"),

@@ -1,0 +1,112 @@
+"""Arrays and images out of files from outside, whose size is known before anything is unpacked.
+
+A file of a megabyte can claim, or unpack to, any number of gigabytes.  So the size that it claims is read first, must
+be bounded, and for arrays must be what the file really holds; only then is memory taken.
+
+References: https://numpy.org/doc/stable/reference/generated/numpy.lib.format.html (an NPZ is a ZIP of such arrays);
+PNG's IHDR chunk, https://www.w3.org/TR/png-3/#11IHDR; BMP's information header, the size from byte 18 on.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zipfile
+import zlib
+from collections.abc import Iterable
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+MOST_PIXELS = 2**25
+"""Of an image, or numbers of an array: no depth camera has more."""
+MOST_BYTES = 2**28
+"""Of a packed file."""
+_PNG, _BMP = b"\x89PNG\r\n\x1a\n", b"BM"
+_PNG_SIZE, _BMP_SIZE = struct.Struct(">II"), struct.Struct("<ii")
+_PNG_AT, _BMP_AT = 16, 18
+
+
+class UnpackingError(ValueError):
+    """A file that cannot be unpacked, or would become too large; says what was expected."""
+
+
+def npz_arrays(path: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
+    """Those of the named arrays that an NPZ archive holds.
+
+    Raises
+    ------
+    UnpackingError
+        If it is no readable archive of plain arrays, or one of them is larger than MOST_PIXELS numbers.
+    """
+    try:
+        with zipfile.ZipFile(path) as archive:
+            held = {info.filename: info for info in archive.infolist()}
+            return {name: _array(archive, held[f"{name}.npy"]) for name in names if f"{name}.npy" in held}
+    except UnpackingError as error:
+        raise UnpackingError(f"not a readable NPZ archive: {error}") from error
+    except (OSError, ValueError, EOFError, NotImplementedError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
+        raise UnpackingError(f"not a readable NPZ archive: {error}") from error
+
+
+def grey_image(path: Path) -> np.ndarray:
+    """A grey PNG or BMP, uint8 or uint16 (height, width); three equal channels are grey too.
+
+    Raises
+    ------
+    UnpackingError
+        If it cannot be read, is no grey image of 8 or 16 bit, or has more than MOST_PIXELS pixels.
+    """
+    if path.stat().st_size > MOST_BYTES:
+        raise UnpackingError(f"expected at most {MOST_BYTES} bytes, got {path.stat().st_size}")
+    encoded = np.fromfile(path, dtype=np.uint8)
+    width, height = _image_size(encoded[:64].tobytes())
+    if not (width >= 1 and height >= 1 and width * height <= MOST_PIXELS):
+        raise UnpackingError(f"not a readable image: expected 1 to {MOST_PIXELS} pixels, got {width} x {height}")
+    try:
+        image = cv2.imdecode(encoded, cv2.IMREAD_UNCHANGED)
+    except cv2.error as error:
+        raise UnpackingError(f"not a readable image: {error.err}") from error
+    if image is None:
+        raise UnpackingError("not a readable image")
+    if image.ndim == 3:
+        colours = image[..., :3]
+        if not (colours == colours[..., :1]).all():
+            raise UnpackingError("expected a grey image, got a colour image")
+        image = np.ascontiguousarray(colours[..., 0])
+    if image.dtype not in (np.uint8, np.uint16):
+        raise UnpackingError(f"expected 8 or 16 bit, got {image.dtype}")
+    return image
+
+
+def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
+    with archive.open(info) as file:
+        version = np.lib.format.read_magic(file)
+        header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, is_fortran, dtype = header(file)
+        if dtype.hasobject:
+            raise UnpackingError(f"{info.filename}: expected numbers, got objects")
+        count = math.prod(shape)
+        if count > MOST_PIXELS or count * dtype.itemsize > 16 * MOST_PIXELS:
+            raise UnpackingError(f"{info.filename}: expected at most {MOST_PIXELS} numbers, got {count}")
+        size = count * dtype.itemsize
+        if info.file_size != file.tell() + size:
+            raise UnpackingError(
+                f"{info.filename}: expected {size} bytes of numbers, got {info.file_size - file.tell()}"
+            )
+        data = file.read(size)
+    if len(data) != size:
+        raise UnpackingError(f"{info.filename}: expected {size} bytes of numbers, got {len(data)}")
+    return np.frombuffer(data, dtype).reshape(shape, order="F" if is_fortran else "C").copy()
+
+
+def _image_size(head: bytes) -> tuple[int, int]:
+    if head.startswith(_PNG) and len(head) >= _PNG_AT + _PNG_SIZE.size:
+        width, height = _PNG_SIZE.unpack_from(head, _PNG_AT)
+    elif head.startswith(_BMP) and len(head) >= _BMP_AT + _BMP_SIZE.size:
+        width, height = _BMP_SIZE.unpack_from(head, _BMP_AT)
+        height = abs(height)  # negative where rows are listed from the top
+    else:
+        raise UnpackingError("not a readable image: expected a PNG or BMP")
+    return int(width), int(height)
