@@ -23,6 +23,9 @@ bags = [
     "rosbags>=0.11.9,<0.12",  # rosbag2 without ROS; its tables of decompressors are no promise beyond
     "mcap>=1.2,<2",  # the records of MCAP files, by the authors of the format
 ]
+view = [
+    "viser>=1.1.1,<1.2",  # the page of `sq-perception view`, all of it local; its server is guarded by a way of calling
+]
 train = [
     "tensorboard>=2.14",  # curves of a running training
 ]
@@ -48,6 +51,7 @@ setup(
         "sq_perception.learning",
         "sq_perception.evaluation",
         "sq_perception.nodes",
+        "sq_perception.viewing",
         "sq_perception.tracking",
         "sq_perception.config",
         "sq_perception.weights",
@@ -85,10 +89,12 @@ setup(
         "ros": ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"],
         "bags": bags,
         "train": train,
+        "view": view,
         "docs": docs,
         "test": [
             *bags,
             *train,
+            *view,
             *docs,
             "pytest>=7,<8.4",  # later ones break the launch_testing plugins of a ROS installation
             "hypothesis>=6",

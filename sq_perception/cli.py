@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 PARAMETERS = ("a1", "a2", "a3", "e1", "e2", "t1", "t2", "t3", "qx", "qy", "qz", "qw")
 _OTHER_COMMANDS = {
     "demo": ("sq_perception.nodes.demo", "live demonstration with real ROS 2 nodes (extra 'ros')"),
+    "view": ("sq_perception.nodes.view", "a page in the browser: depth, bodies, parameters (extras 'ros', 'view')"),
     "train": ("sq_perception.learning.train", "train a network"),
     "dataset": ("sq_perception.learning.fixed_set_writer", "write a fixed set of training and test images"),
     "evaluate": ("sq_perception.evaluation.evaluate", "the thesis' tables and plots, for networks and fits"),

@@ -23,7 +23,8 @@ FLOORS = (
     ("imaging", "metrics", "tracking", "calibration", "recorded_frame", "recorded_bag", "recorded_input",
      "bag_messages", "mcap_file"),
     ("learning", "fitting", "scene_description", "seen_object"),
-    ("recovery", "recorded_tracks", "segment_repair", "warm_up", "publication", "result_bag", "frame_entry"),
+    ("recovery", "recorded_tracks", "segment_repair", "warm_up", "publication", "result_bag", "frame_entry",
+     "viewing"),
     ("evaluation", "nodes", "cli", "recover_command"),
 )
 ROS = ("rclpy", "sensor_msgs", "std_msgs", "std_srvs", "visualization_msgs", "diagnostic_msgs", "geometry_msgs",

@@ -1,0 +1,336 @@
+"""The node behind ``sq-perception view``: listens to a camera and some frame nodes, and keeps what a page shows.
+
+| name | type | |
+| --- | --- | --- |
+| depth topic | sensor_msgs/Image | in: 16UC1 mm, 32FC1 m; mono8 and mono16 images of the unit cube |
+| camera_info topic | sensor_msgs/CameraInfo | in: not needed for images of the unit cube |
+| `<node>/superquadrics` | sensor_msgs/PointCloud2 | in, of each frame node |
+| `/diagnostics`, `/parameter_events` | | in |
+| `<node>/...parameters`, `get_state`, `change_state` | services | asked, see :mod:`sq_perception.nodes.remote_node` |
+
+The executor's thread stores messages and talks to services; one drawing thread decodes the newest and draws them, at a
+limited rate and only while a browser shows the page.  While none does, images and results are not even subscribed to.
+"""
+
+from __future__ import annotations
+
+import threading
+import traceback
+from collections import OrderedDict, deque
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from time import monotonic
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray
+from rcl_interfaces.msg import ParameterEvent
+from rclpy.qos import QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
+from rclpy.subscription import Subscription
+from rclpy.time import Time
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+
+from sq_msgs_py.depth_image import GREY_ENCODINGS, depth_from_message, grey_from_message, intrinsics_from_message
+from sq_msgs_py.markers import PALETTE
+from sq_msgs_py.superquadrics import FAILED, WEAK, SuperquadricArray, from_message
+from sq_perception.geometry import rotation
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging import unit_cube
+from sq_perception.imaging.camera import Camera
+from sq_perception.nodes.camera_poses import CameraPoses, PoseError
+from sq_perception.nodes.counters import Throttle
+from sq_perception.nodes.remote_node import RemoteNode
+from sq_perception.nodes.stoppable_node import StoppableNode
+from sq_perception.viewing import tables
+from sq_perception.viewing.page import Change, Page, Transition
+from sq_perception.viewing.scene import Bodies
+from sq_perception.viewing.tables import NodeState
+
+_IMAGES = 8
+"""Depth images that are kept until the result of their stamp comes."""
+_WORDS_PERIOD = 0.5
+"""Seconds between two looks at states and ages where nothing new has come."""
+_SERVICE_PERIOD = 0.1
+_RATE_SECONDS = 3.0
+_CAMERA_PATIENCE = 2.0
+_DRAWER_END = 5.0
+
+
+@dataclass(frozen=True)
+class Result:
+    """Superquadrics as they came, and when, in seconds of the monotonic clock."""
+
+    message: PointCloud2
+    time: float
+    latency: float | None
+
+
+class ViewNode(StoppableNode):
+    """See the module.
+
+    Parameters
+    ----------
+    page
+        Shows the nodes named ``nodes``; closed with the node.
+    depth, camera_info
+        Topics, resolved and remapped as those of a node are.
+    nodes
+        Fully qualified names of frame nodes.
+    rate
+        Of drawing, Hz, at most.
+    """
+
+    def __init__(
+        self,
+        name: str,
+        page: Page,
+        depth: str,
+        camera_info: str,
+        nodes: Sequence[str],
+        rate: float = 10.0,
+        context: Any = None,
+    ) -> None:
+        super().__init__(name, context=context)
+        self._page, self._period = page, 1.0 / rate
+        self._topics = self.resolve_topic_name(depth), self.resolve_topic_name(camera_info)
+        self._lock = threading.Lock()
+        self._images: OrderedDict[int, Image] = OrderedDict()
+        self._arrivals: deque[float] = deque(maxlen=1000)
+        self._info: CameraInfo | None = None
+        self._results: dict[str, Result] = {}
+        self._diagnosed: dict[str, dict[str, str]] = {}
+        self._poses: dict[str, CameraPoses] = {}
+        self._throttle = Throttle()
+        self._inputs: list[Subscription] = []
+        self._remote = {one: RemoteNode(self, one) for one in nodes}
+        self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
+        self.create_subscription(ParameterEvent, "/parameter_events", self._on_parameter_event, 1000)
+        self.create_timer(_SERVICE_PERIOD, self._on_tick)
+        self._closed = threading.Event()
+        self._drawer = threading.Thread(target=self._draw_on, name="drawer", daemon=True)
+        self._drawer.start()
+
+    def close(self) -> None:
+        """Stop drawing and serving."""
+        self._closed.set()
+        self._drawer.join(_DRAWER_END)
+        self._page.close()
+
+    # Callbacks, in the executor's thread
+
+    def _on_tick(self) -> None:
+        """Listen while somebody watches; pass wishes of the page on, and answers back."""
+        watched = self._page.watched
+        if watched and not self._inputs:
+            self._listen()
+        elif not watched and self._inputs:
+            for one in self._inputs:
+                self.destroy_subscription(one)
+            self._inputs = []
+        for request in self._page.requests():
+            remote = self._remote[request.node]
+            if isinstance(request, Change):
+                remote.change(request.name, request.value)
+            elif isinstance(request, Transition):
+                remote.transit(request.label)
+        for remote in self._remote.values():
+            remote.tick()
+
+    def _listen(self) -> None:
+        newest = QoSProfile(depth=1, history=QoSHistoryPolicy.KEEP_LAST, reliability=QoSReliabilityPolicy.BEST_EFFORT)
+        depth, camera_info = self._topics
+        self._inputs = [
+            self.create_subscription(CameraInfo, camera_info, self._on_info, newest),
+            self.create_subscription(Image, depth, self._on_image, newest),
+        ]
+        for name in self._remote:
+            topic = f"{name}/superquadrics"
+            self._inputs.append(self.create_subscription(PointCloud2, topic, partial(self._on_result, name), newest))
+
+    def _on_info(self, message: CameraInfo) -> None:
+        self._info = message
+
+    def _on_image(self, message: Image) -> None:
+        with self._lock:
+            self._arrivals.append(monotonic())
+            self._images[_stamp(message)] = message
+            while len(self._images) > _IMAGES:
+                self._images.popitem(last=False)
+
+    def _on_result(self, name: str, message: PointCloud2) -> None:
+        age = self.get_clock().now() - Time.from_msg(message.header.stamp, clock_type=self.get_clock().clock_type)
+        milliseconds = 1e-6 * age.nanoseconds
+        latency = milliseconds if 0 <= milliseconds < 60e3 else None
+        self._results[name] = Result(message, monotonic(), latency)
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            for name in self._remote:
+                if status.hardware_id == name or status.name.split(":")[0].strip() == name.lstrip("/"):
+                    self._diagnosed[name] = {pair.key: pair.value for pair in status.values}
+
+    def _on_parameter_event(self, event: ParameterEvent) -> None:
+        remote = self._remote.get(event.node)
+        if remote is not None:
+            remote.on_event(event)
+
+    # The drawing thread
+
+    def _draw_on(self) -> None:
+        drawer = _Drawer(self)
+        while not self._closed.wait(self._period):
+            try:
+                drawer.draw()
+            except Exception:
+                # A defect of ours or of a message: it costs this picture, and the page goes on.
+                if self._throttle.passes("defect") is not None and not self._closed.is_set():
+                    self.get_logger().error(traceback.format_exc())
+
+    def newest_images(self) -> tuple[list[Image], float]:
+        """Kept depth images, oldest first, and how many come per second."""
+        with self._lock:
+            now = monotonic()
+            count = sum(1 for time in self._arrivals if now - time <= _RATE_SECONDS)
+            return list(self._images.values()), count / _RATE_SECONDS
+
+    def pose(self, header: Any, frame: str) -> tuple[np.ndarray, np.ndarray]:
+        """Quaternion and translation from the frame of a header to ``frame``.
+
+        Raises
+        ------
+        PoseError
+            If it is not known.
+        """
+        if frame not in self._poses:
+            self._poses[frame] = CameraPoses(self, frame)
+        return self._poses[frame].at(header)
+
+
+class _Drawer:
+    """What the drawing thread knows of what it has drawn; uses the node's stores."""
+
+    def __init__(self, node: ViewNode) -> None:
+        self._node, self._page = node, node._page
+        self._image: Image | None = None
+        self._bodies: dict[str, tuple[Result, Bodies | None, str]] = {}
+        self._words_due = 0.0
+        self._was_watched = False
+
+    def draw(self) -> None:
+        if not self._page.watched:
+            self._was_watched = False
+            return
+        if not self._was_watched:
+            # Controls have changed, perhaps, while nobody looked.
+            self._was_watched, self._words_due = True, 0.0
+        for remote in self._node._remote.values():
+            remote.show(self._page)
+        words_due = monotonic() >= self._words_due
+        results = dict(self._node._results)
+        images, rate = self._node.newest_images()
+        header = self._draw_depth(images, rate, results, words_due)
+        for name in self._node._remote:
+            self._draw_node(name, results.get(name), header, words_due)
+        if words_due:
+            self._words_due = monotonic() + _WORDS_PERIOD
+
+    def _draw_depth(self, images: list[Image], rate: float, results: dict[str, Result], words_due: bool) -> Any:
+        """Draw the image that belongs to the newest results, else the newest; the header of what is drawn."""
+        topic = self._node._topics[0]
+        if not images:
+            if words_due:
+                self._page.show_source(tables.source_status(topic, None, 0.0, "", "no depth image has come yet"))
+            return None
+        stamps = {_stamp(one.message) for one in results.values() if monotonic() - one.time < tables.SILENT_SECONDS}
+        image = next((one for one in reversed(images) if _stamp(one) in stamps), images[-1])
+        remark = "" if rate > 0 else "no depth images come any more"
+        if image is not self._image:
+            try:
+                depth, camera = self._decoded(image)
+                self._page.show_depth(depth, camera)
+                self._image = image
+            except ValueError as error:
+                remark = str(error)
+        if words_due or remark:
+            size = int(image.width), int(image.height)
+            self._page.show_source(tables.source_status(topic, size, rate, image.header.frame_id, remark))
+        return image.header
+
+    def _decoded(self, image: Image) -> tuple[np.ndarray, Camera]:
+        if image.encoding in GREY_ENCODINGS:
+            grey = grey_from_message(image)
+            height, width = grey.shape
+            return unit_cube.depth_from_grey(grey), unit_cube.camera(width, height)
+        depth = depth_from_message(image)
+        info = self._node._info
+        if info is None:
+            raise ValueError(f"no camera_info has come on {self._node._topics[1]}")
+        known = intrinsics_from_message(info)
+        camera = Camera(known.width, known.height, known.fx, known.fy, known.cx, known.cy)
+        camera.check_image(depth)
+        return depth, camera
+
+    def _draw_node(self, name: str, result: Result | None, header: Any, words_due: bool) -> None:
+        last = self._bodies.get(name)
+        is_new = result is not None and (last is None or last[0] is not result)
+        if not (is_new or words_due):
+            return
+        bodies, remark = (last[1], last[2]) if last is not None else (None, "")
+        if result is not None and is_new:
+            bodies, remark = self._converted(result.message, header)
+            self._bodies[name] = result, bodies, remark
+        remote = self._node._remote[name]
+        state = NodeState(
+            name,
+            None if result is None else monotonic() - result.time,
+            None if result is None else result.latency,
+            remote.lifecycle,
+            self._node._diagnosed.get(name, {}) if remote.is_there else {},
+            remote.is_there,
+            remark,
+        )
+        stamp = 0.0 if result is None else 1e-9 * _stamp(result.message)
+        self._page.show_bodies(name, bodies, stamp, state)
+        if words_due:
+            self._page.show_state(state)
+
+    def _converted(self, message: PointCloud2, header: Any) -> tuple[Bodies | None, str]:
+        """The bodies in the frame of the depth image, and why they cannot be drawn."""
+        try:
+            array = from_message(message)
+            kept = array.status != FAILED
+            bodies = Superquadric(
+                array.size[kept].astype(float),
+                array.shape[kept].astype(float),
+                array.translation[kept].astype(float),
+                array.rotation[kept].astype(float),
+            )
+            if self._image is not None and self._image.encoding in GREY_ENCODINGS:
+                bodies = unit_cube.optical_from_cube(bodies)
+            elif header is not None and message.header.frame_id != header.frame_id:
+                turn, shift = self._node.pose(header, message.header.frame_id)
+                back = rotation.conjugate(turn)
+                bodies = bodies.transformed(back, -(rotation.to_matrix(back) @ shift))
+            return _bodies(array, kept, bodies), ""
+        except PoseError as error:
+            return None, f"bodies are in {message.header.frame_id}, the image in {header.frame_id}: {error}"
+        except ValueError as error:
+            return None, str(error)
+
+
+def _bodies(array: SuperquadricArray, kept: np.ndarray, bodies: Superquadric) -> Bodies:
+    ids = [int(number) for number in array.id[kept]]
+    return Bodies(
+        superquadrics=bodies,
+        sigma_size=array.sigma_size[kept].astype(float),
+        score=array.score[kept].astype(float),
+        ids=ids,
+        is_weak=[bool(status == WEAK) for status in array.status[kept]],
+        colours=PALETTE[np.array(ids, dtype=int) % len(PALETTE)].reshape(-1, 3),
+        failed=[int(number) % 2**31 for number in array.id[~kept]],
+    )
+
+
+def _stamp(message: Any) -> int:
+    return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)

@@ -1,0 +1,174 @@
+"""How a parameter is shown: the control that fits what its descriptor says, and the value as the node wants it.
+
+A control is made from plain values, so that this module needs no ROS.  The rules:
+
+    bool                                          a check box
+    string with "one of: a, b" as constraint      a list to choose from
+    other string                                  a line of text
+    number in a short range                       a slider
+    other number                                  a field for numbers
+    read-only, arrays, names with a dot           shown, not to be changed
+
+A number with a floating point range is a float even where its value has come as an integer, as `ros2 param set` sends
+it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+Kind = Literal["bool", "choice", "text", "slider", "number", "fixed"]
+Group = Literal["live", "start", "other"]
+GROUPS: dict[Group, str] = {
+    "live": "Changes at once",
+    "start": "Fixed at the start",
+    "other": "Of ROS",
+}
+_CHOICES = "one of:"
+_OF_EVERY_NODE = ("use_sim_time", "start_type_description_service")
+_SLIDER_STEPS = 100
+_SLIDER_SPAN = 1.0
+QUICK, TYPED = 0.0, 0.8
+"""Seconds without another change before a value is sent: at once, or when the typing has ended."""
+
+
+@dataclass(frozen=True)
+class Description:
+    """A parameter as its node describes it.
+
+    Attributes
+    ----------
+    value
+        bool, int, float, str, or a list; None where it has not been set.
+    low, high, step
+        Of its range; None where there is none, a step of 0 for any.
+    is_float_range
+        Whether that range is one of floats.
+    """
+
+    name: str
+    value: Any
+    text: str = ""
+    constraints: str = ""
+    read_only: bool = False
+    low: float | None = None
+    high: float | None = None
+    step: float = 0.0
+    is_float_range: bool = False
+
+
+@dataclass(frozen=True)
+class Control:
+    """What the page shows for a parameter.
+
+    Attributes
+    ----------
+    patience : float
+        Seconds to wait for further changes before the value is sent.
+    """
+
+    name: str
+    kind: Kind
+    value: Any
+    hint: str
+    group: Group
+    is_float: bool = False
+    low: float | None = None
+    high: float | None = None
+    step: float | None = None
+    choices: tuple[str, ...] = ()
+    patience: float = QUICK
+
+    @property
+    def can_change(self) -> bool:
+        return self.kind != "fixed"
+
+    def shown(self, value: Any) -> Any:
+        """A value of the node in the type of the control."""
+        if self.kind == "fixed":
+            return _plain(value)
+        if self.kind == "bool":
+            return bool(value)
+        if self.kind in ("slider", "number"):
+            return float(value) if self.is_float else int(value)
+        return str(value)
+
+    def wanted(self, value: Any) -> Any:
+        """A value of the page in the type of the parameter; None for what is no value, such as half a number."""
+        if self.kind == "bool":
+            return bool(value)
+        if self.kind in ("slider", "number"):
+            number = float(value)
+            if not math.isfinite(number):
+                return None
+            return number if self.is_float else round(number)
+        return str(value)
+
+
+def control(about: Description) -> Control:
+    """The control of a parameter; see the module for the rules."""
+    hint = " ".join(part for part in (about.text, f"({about.constraints})" if about.constraints else "") if part)
+    group: Group = "start" if about.read_only else "live"
+    if "." in about.name or about.name in _OF_EVERY_NODE:
+        group = "other"
+    made = Control(about.name, "fixed", _plain(about.value), hint, group)
+    if about.read_only or group == "other":
+        return made
+    if isinstance(about.value, bool):
+        return replace(made, kind="bool", value=about.value)
+    if isinstance(about.value, str):
+        choices = _choices(about.constraints)
+        if choices:
+            choices = choices if about.value in choices else (*choices, about.value)
+            return replace(made, kind="choice", value=about.value, choices=choices)
+        return replace(made, kind="text", value=about.value, patience=TYPED)
+    if isinstance(about.value, (int, float)) and math.isfinite(about.value):
+        return _number(about, made)
+    return made
+
+
+def arranged(descriptions: Sequence[Description]) -> list[Control]:
+    """Controls by group, in the order of GROUPS, and in the given order within each."""
+    controls = [control(about) for about in descriptions]
+    return [one for group in GROUPS for one in controls if one.group == group]
+
+
+def _number(about: Description, made: Control) -> Control:
+    is_float = about.is_float_range or isinstance(about.value, float)
+    value = float(about.value) if is_float else int(about.value)
+    low, high = about.low, about.high
+    if low is None or high is None or not low < high:
+        return replace(made, kind="number", value=value, is_float=is_float, patience=TYPED)
+    # What the node holds is shown, even where its descriptor rules it out.
+    low, high = min(low, value), max(high, value)
+    short = high - low <= (_SLIDER_SPAN if is_float else _SLIDER_STEPS)
+    step = about.step or (10.0 ** (math.floor(math.log10(high - low)) - 2) if is_float else 1)
+    if short and step <= high - low:
+        return replace(
+            made, kind="slider", value=value, is_float=is_float, low=low, high=high, step=step, patience=0.15
+        )
+    return replace(made, kind="number", value=value, is_float=is_float, low=low, high=high, patience=TYPED)
+
+
+def _choices(constraints: str) -> tuple[str, ...]:
+    if not constraints.startswith(_CHOICES):
+        return ()
+    return tuple(word.strip() for word in constraints[len(_CHOICES) :].split(",") if word.strip())
+
+
+def _plain(value: Any) -> str:
+    if value is None:
+        return "(not set)"
+    if isinstance(value, bool):
+        return str(value).lower()
+    if isinstance(value, float):
+        return f"{value:g}"
+    if isinstance(value, (str, int)):
+        return str(value)
+    try:
+        return ", ".join(_plain(one) for one in value)
+    except TypeError:
+        return str(value)

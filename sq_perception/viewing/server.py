@@ -1,0 +1,181 @@
+"""The web server of the page: viser's, on a port that is ours, closed to other web pages and to the internet.
+
+viser accepts a WebSocket from everywhere and offers to open a tunnel to a public server.  A page on the internet that
+the user has open could so change the parameters of a node on this machine.  Here
+
+- the port is bound before viser starts, so that one that is taken is an error in words and never another port;
+- a request whose Host is a name that is neither localhost nor this machine's is refused: a name of the internet that
+  resolves to this machine (DNS rebinding) is of no use to anybody;
+- a WebSocket whose Origin is another page than the one that was served here is refused;
+- the page is served with a policy that keeps the browser from loading anything from elsewhere;
+- no tunnel is opened, whoever asks.
+
+The one place where viser is not taken as it comes is its call of ``websockets.asyncio.server.serve``: there is no
+option for these checks.  If a later viser does not make that call, nothing is served (:class:`ServerError`).
+"""
+
+from __future__ import annotations
+
+import errno
+import http
+import ipaddress
+import re
+import socket
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+from urllib.parse import urlsplit
+
+import rich
+import viser
+import websockets.asyncio.server
+from websockets.datastructures import Headers
+from websockets.http11 import Response
+
+PORT = 8080
+PORTS_TRIED = 10
+"""Where no port was asked for: PORT and those after it."""
+_POLICY = (
+    "default-src 'self' data: blob:; script-src 'self' 'unsafe-inline' 'unsafe-eval' 'wasm-unsafe-eval' data: blob:; "
+    "style-src 'self' 'unsafe-inline' data: blob:; connect-src 'self' {sockets} data: blob:; "
+    "worker-src 'self' data: blob:; frame-ancestors 'none'; form-action 'none'; base-uri 'none'"
+)
+_HOST = re.compile(r"(?P<name>[A-Za-z0-9_.-]+|\[[0-9A-Fa-f:.]+\])(:\d{1,5})?")
+_starting = threading.Lock()
+
+
+class ServerError(OSError):
+    """The page cannot be served; says why."""
+
+
+class PageServer(viser.ViserServer):
+    """viser's server; see the module."""
+
+    def request_share_url(self, verbose: bool = True) -> str | None:
+        """None: no tunnel to the internet."""
+        return None
+
+
+def listening_socket(host: str, port: int | None) -> socket.socket:
+    """A socket bound to the address; port None: PORT or one of the next, 0: any free one.
+
+    Raises
+    ------
+    ServerError
+        If the port is taken or must not be used, or the host is not an address of this machine.
+    """
+    tried = range(PORT, PORT + PORTS_TRIED) if port is None else (port,)
+    last: OSError | None = None
+    for one in tried:
+        try:
+            family, kind, protocol, _, address = socket.getaddrinfo(
+                host, one, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+            )[0]
+        except (OSError, OverflowError, UnicodeError) as error:
+            raise ServerError(f"--host: expected an address of this machine, got {host!r} ({error})") from error
+        bound = socket.socket(family, kind, protocol)
+        try:
+            bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            bound.bind(address)
+            # A port in use by somebody who also reuses addresses is only noticed here.
+            bound.listen()
+            return bound
+        except OSError as error:
+            bound.close()
+            if error.errno == errno.EADDRNOTAVAIL:
+                raise ServerError(f"--host: expected an address of this machine, got {host!r}") from error
+            last = error
+    what = f"{PORT} to {PORT + PORTS_TRIED - 1}" if port is None else str(port)
+    hint = "give another --port" if port is None else f"give another --port, or none to take the first free from {PORT}"
+    raise ServerError(f"--port: {what} of {host} cannot be used ({last.strerror if last else ''}); {hint}") from last
+
+
+def serve(bound: socket.socket) -> PageServer:
+    """Start the server on a bound socket.
+
+    Raises
+    ------
+    ServerError
+        If viser could not be guarded; then nothing is served.
+    """
+    # viser prints a panel at the start and a line at the end.
+    rich.get_console().quiet = True
+    host, port = bound.getsockname()[:2]
+    with _guarding(bound) as was_called:
+        server = PageServer(host=host, port=port, verbose=False)
+    if not was_called():
+        server.stop()
+        raise ServerError(f"viser {viser.__version__} starts its server in another way than is guarded here")
+    return server
+
+
+def refusal(headers: Mapping[str, str], own_names: frozenset[str]) -> str:
+    """Why a request with these headers is refused; empty if it is not.
+
+    ``own_names`` are names of this machine, in lower case, besides localhost and addresses.
+    """
+    host = headers.get("Host", "")
+    found = _HOST.fullmatch(host)
+    name = "" if found is None else found["name"].strip("[]").lower()
+    if not (name == "localhost" or name in own_names or _is_address(name)):
+        return f"Host {host!r} is no name of this machine"
+    origin = headers.get("Origin")
+    if origin is not None and urlsplit(origin).netloc.lower() != host.lower():
+        return f"a page of {origin!r} must not talk to this one"
+    return ""
+
+
+def is_local(host: str) -> bool:
+    """Whether an address to bind to can only be reached from this machine."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
+
+
+def own_names() -> frozenset[str]:
+    """Names that this machine gives itself, with and without .local."""
+    name = socket.gethostname().lower()
+    return frozenset({name, name.split(".")[0], f"{name.split('.')[0]}.local"} - {""})
+
+
+@contextmanager
+def _guarding(bound: socket.socket) -> Iterator[Callable[[], bool]]:
+    """While this lasts, a WebSocket server that is started takes ``bound`` and checks its requests."""
+    original = websockets.asyncio.server.serve
+    called = threading.Event()
+    names = own_names()
+
+    def guarded(handler: Any, _host: Any, _port: Any, *, process_request: Any, **options: Any) -> Any:
+        def process(connection: Any, request: Any) -> Any:
+            why = refusal(request.headers, names)
+            if why:
+                words = f"Refused: {why}.\n".encode()
+                fields = Headers({"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(words))})
+                return Response(http.HTTPStatus.FORBIDDEN, "Forbidden", fields, words)
+            response = process_request(connection, request)
+            if isinstance(response, Response):
+                host = request.headers["Host"]
+                response.headers["Content-Security-Policy"] = _POLICY.format(sockets=f"ws://{host} wss://{host}")
+                response.headers["X-Content-Type-Options"] = "nosniff"
+                response.headers["Referrer-Policy"] = "no-referrer"
+            return response
+
+        called.set()
+        return original(handler, sock=bound, process_request=process, **options)
+
+    with _starting:
+        websockets.asyncio.server.serve = guarded  # type: ignore[assignment, misc]
+        try:
+            yield called.is_set
+        finally:
+            websockets.asyncio.server.serve = original  # type: ignore[misc]
+
+
+def _is_address(name: str) -> bool:
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
