@@ -35,16 +35,16 @@ _BODY_ALPHA, _FADED_ALPHA, _SHELL_ALPHA = 0.85, 0.2, 0.2
 _FRUSTUM = (150, 160, 175)
 _CAMERA = "camera"
 _PLACES = {
-    "behind": np.array([0.28, -0.38, -1.25]),
-    _CAMERA: np.zeros(3),
-    "above": np.array([0.0, -1.2, -0.02]),
-    "side": np.array([1.2, -0.25, -0.1]),
+    "behind": (1.0, np.array([0.28, -0.38, -1.25])),
+    _CAMERA: (1.0, np.zeros(3)),
+    "above": (0.6, np.array([0.0, -1.7, -0.03])),
+    "side": (0.55, np.array([1.6, -0.4, -0.2])),
 }
-"""Where to look from: offsets from the target in units of its distance."""
+"""Where to look from: at what share of the way to the middle of the scene, and from where, in units of that way."""
 _MUTED = "muted"
 _FIRST_DISTANCE = 1.0
 """What the start view looks at, metres, until an image tells."""
-_NEAR_SHARE = 0.25
+_NEAR_SHARE = 0.8
 """Length of the view volume that is drawn, of the nearest depth."""
 
 
@@ -440,10 +440,11 @@ class Page:
         """Position and target: from behind the camera, a little above and to the right of its axis."""
         return self._from(_PLACES["behind"])
 
-    def _from(self, offset: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Position and target, from an offset in units of the target's distance."""
-        target = np.array([0.0, 0.0, _FIRST_DISTANCE]) if self._target is None else self._target
-        return target + float(np.linalg.norm(target)) * offset, target
+    def _from(self, place: tuple[float, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """Position and target, from an entry of _PLACES."""
+        share, offset = place
+        middle = np.array([0.0, 0.0, _FIRST_DISTANCE]) if self._target is None else self._target
+        return share * middle + float(np.linalg.norm(middle)) * offset, share * middle
 
     def _set_start_view(self) -> None:
         start = self._server.initial_camera

@@ -16,20 +16,22 @@ option for these checks.  If a later viser does not make that call, nothing is s
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import http
 import ipaddress
 import re
 import socket
 import threading
+import weakref
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
 from typing import Any
 from urllib.parse import urlsplit
 
 import rich
 import viser
 import websockets.asyncio.server
+from websockets.asyncio.server import ServerConnection
 from websockets.datastructures import Headers
 from websockets.http11 import Response
 
@@ -52,9 +54,21 @@ class ServerError(OSError):
 class PageServer(viser.ViserServer):
     """viser's server; see the module."""
 
+    connections: weakref.WeakSet[Any]
+    """Of websockets; set by :func:`serve`."""
+
     def request_share_url(self, verbose: bool = True) -> str | None:
         """None: no tunnel to the internet."""
         return None
+
+    def stop(self) -> None:
+        """Stop serving, at once: viser would wait for a browser to take what was drawn, or to ask for something."""
+        loop = self.get_event_loop()
+        for connection in list(self.connections):
+            # The loop may have ended.
+            with contextlib.suppress(RuntimeError):
+                loop.call_soon_threadsafe(connection.transport.abort)
+        super().stop()
 
 
 def listening_socket(host: str, port: int | None) -> socket.socket:
@@ -102,8 +116,9 @@ def serve(bound: socket.socket) -> PageServer:
     # viser prints a panel at the start and a line at the end.
     rich.get_console().quiet = True
     host, port = bound.getsockname()[:2]
-    with _guarding(bound) as was_called:
+    with _guarding(bound) as (was_called, connections):
         server = PageServer(host=host, port=port, verbose=False)
+    server.connections = connections
     if not was_called():
         server.stop()
         raise ServerError(f"viser {viser.__version__} starts its server in another way than is guarded here")
@@ -140,12 +155,22 @@ def own_names() -> frozenset[str]:
     return frozenset({name, name.split(".")[0], f"{name.split('.')[0]}.local"} - {""})
 
 
-@contextmanager
-def _guarding(bound: socket.socket) -> Iterator[Callable[[], bool]]:
-    """While this lasts, a WebSocket server that is started takes ``bound`` and checks its requests."""
+@contextlib.contextmanager
+def _guarding(bound: socket.socket) -> Iterator[tuple[Callable[[], bool], weakref.WeakSet[Any]]]:
+    """While this lasts, a WebSocket server that is started takes ``bound`` and checks its requests.
+
+    Gives whether one was started, and a set that its connections will be in.
+    """
+    connections: weakref.WeakSet[Any] = weakref.WeakSet()
     original = websockets.asyncio.server.serve
     called = threading.Event()
     names = own_names()
+
+    class Noted(ServerConnection):
+        def connection_made(self, transport: Any) -> None:
+            # Browsers also open connections on which they may never ask for anything.
+            super().connection_made(transport)
+            connections.add(self)
 
     def guarded(handler: Any, _host: Any, _port: Any, *, process_request: Any, **options: Any) -> Any:
         def process(connection: Any, request: Any) -> Any:
@@ -163,12 +188,12 @@ def _guarding(bound: socket.socket) -> Iterator[Callable[[], bool]]:
             return response
 
         called.set()
-        return original(handler, sock=bound, process_request=process, **options)
+        return original(handler, sock=bound, process_request=process, create_connection=Noted, **options)
 
     with _starting:
         websockets.asyncio.server.serve = guarded  # type: ignore[assignment, misc]
         try:
-            yield called.is_set
+            yield called.is_set, connections
         finally:
             websockets.asyncio.server.serve = original  # type: ignore[misc]
 

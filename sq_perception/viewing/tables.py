@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import html
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from sq_perception.viewing.scene import Bodies, colour_scale
@@ -99,10 +99,10 @@ def node_status(state: NodeState) -> str:
     values = state.diagnostics
     facts = []
     if values.get("rate [Hz]"):
-        facts.append(("rate", f"{html.escape(values['rate [Hz]'])} Hz"))
+        facts.append(("rate", f"{_rounded(values['rate [Hz]'], 1)} Hz"))
     median, high = values.get("stamp to result: median [ms]"), values.get("stamp to result: p95 [ms]")
     if median:
-        facts.append(("stamp to result", f"{html.escape(median)} ms, p95 {html.escape(high or '-')}"))
+        facts.append(("stamp to result", f"{_rounded(median)} ms, p95 {_rounded(high or '-')} ms"))
     elif state.latency is not None:
         facts.append(("stamp to result", f"{state.latency:.0f} ms"))
     counts = [
@@ -174,6 +174,13 @@ def _size(half: float, sigma: float) -> str:
     return f'<td style="{_NUMBERS}">{1e3 * half:.{digits}f}<br><span style="{_SMALL}">{deviation}</span></td>'
 
 
+def _rounded(text: str, digits: int = 0) -> str:
+    try:
+        return f"{float(text):.{digits}f}"
+    except ValueError:
+        return html.escape(text)
+
+
 def _verdict(state: NodeState) -> tuple[str, str]:
     state_words = f"{state.lifecycle}, " if state.lifecycle else ""
     if state.age is None:
@@ -189,8 +196,3 @@ def duration(seconds: float) -> str:
     if seconds < 120:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.0f} h"
-
-
-def names(words: Sequence[str]) -> str:
-    """a, b and c."""
-    return " and ".join([", ".join(words[:-1]), words[-1]]) if len(words) > 1 else "".join(words)
