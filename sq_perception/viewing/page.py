@@ -12,7 +12,7 @@ import contextlib
 import queue
 import socket
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import monotonic
 from typing import Any
 
@@ -206,8 +206,13 @@ class Page:
     # The controls
 
     def show_controls(self, node: str, controls: Sequence[Control]) -> None:
-        """Replace the controls of a node."""
+        """Replace the controls of a node; where only values differ, only these."""
         part = self._nodes[node]
+        if [replace(one, value=None) for one in controls] == [
+            replace(one, value=None) for one in part.controls.values()
+        ]:
+            self.show_values(node, {one.name: one.value for one in controls})
+            return
         for folder in part.folders:
             folder.remove()
         part.folders, part.handles, part.controls = [], {}, {one.name: one for one in controls}

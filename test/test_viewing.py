@@ -1,0 +1,344 @@
+"""What the page of ``sq-perception view`` is made of, without ROS and without a browser."""
+
+from __future__ import annotations
+
+import re
+import socket
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import trimesh
+
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging import unit_cube
+from sq_perception.imaging.camera import Camera
+from sq_perception.nodes import view
+from sq_perception.viewing import controls, scene, tables
+from sq_perception.viewing.controls import Control, Description
+from sq_perception.viewing.scene import Bodies
+from sq_perception.viewing.tables import NodeState
+
+CAMERA = Camera(64, 48, 60.0, 61.0, 31.0, 24.5)
+IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
+
+
+def body(size: tuple[float, float, float] = (0.1, 0.07, 0.05), shape: tuple[float, float] = (0.4, 0.9)) -> Superquadric:
+    turn = np.array([0.1, -0.2, 0.3, 0.9])
+    return Superquadric(np.array(size), np.array(shape), np.array([0.1, 0.2, 0.8]), turn / np.linalg.norm(turn))
+
+
+def bodies(sigma: float = 0.001, weak: bool = False) -> Bodies:
+    one = body()
+    return Bodies(Superquadric.stack([one]), np.full((1, 3), sigma), np.ones(1), [7], [weak], np.ones((1, 3)))
+
+
+# The scene
+
+
+@pytest.mark.parametrize("most", [1, 7, 100, 64 * 48, 10**6])
+def test_the_cloud_is_the_image_thinned(most: int, rng: np.random.Generator) -> None:
+    depth = rng.uniform(0.5, 2.0, (48, 64)).astype(np.float32)
+    depth[rng.random((48, 64)) < 0.3] = np.nan
+    points = scene.cloud(depth, CAMERA, (0.5, 2.0), most)
+    assert len(points.points) <= most
+    assert points.points.dtype == np.float32
+    assert points.colours.shape == points.points.shape
+    pixels = CAMERA.project(points.points)
+    columns, rows = np.rint(pixels).astype(int).T
+    np.testing.assert_allclose(pixels, np.rint(pixels), atol=1e-3)
+    np.testing.assert_allclose(depth[rows, columns], points.points[:, 2], rtol=1e-6)
+    if most >= depth.size:
+        assert len(points.points) == np.isfinite(depth).sum()
+
+
+def test_an_image_without_a_reading_has_no_points() -> None:
+    depth = np.full((48, 64), np.nan, np.float32)
+    assert scene.depth_span(depth) is None
+    assert scene.cloud(depth, CAMERA, (0.0, 1.0), 100).points.shape == (0, 3)
+    assert scene.cloud(depth, CAMERA, (0.0, 1.0), 100, is_muted=True).colours.shape == (0, 3)
+    assert scene.picture(depth, (0.0, 1.0)).shape == (288, 384, 3)
+
+
+def test_colours_go_with_depth_and_holes_are_dark() -> None:
+    colours = scene.coloured(np.array([[0.5, 1.0, np.nan, 0.1, 9.0]], np.float32), (0.5, 1.0))[0].astype(int)
+    assert colours[0][0] > colours[0][2] + 50, "near is red"
+    assert colours[1][2] > colours[1][0] + 50, "far is blue"
+    assert colours[2].max() < 50
+    np.testing.assert_array_equal(colours[3:], colours[:2])
+
+
+def test_the_span_is_steady() -> None:
+    assert scene.steady_span(None, (0.5, 1.0)) == (0.5, 1.0)
+    assert scene.steady_span((0.5, 1.0), (0.51, 1.02)) == (0.5, 1.0)
+    assert scene.steady_span((0.5, 1.0), (0.5, 1.2)) == (0.5, 1.2)
+
+
+@pytest.mark.parametrize("shape", [(0.1, 0.1), (1.0, 1.0), (0.1, 1.0), (1.9, 0.5)])
+def test_a_mesh_is_closed_outwards_and_on_the_surface(shape: tuple[float, float]) -> None:
+    one = body(shape=shape)
+    vertices, faces = scene.mesh_vertices(one).astype(float), scene.mesh_faces()
+    assert faces.max() == len(vertices) - 1
+    mesh = trimesh.Trimesh(vertices, faces, process=False)
+    assert mesh.is_watertight
+    assert mesh.is_winding_consistent
+    assert 0.9 * float(one.volume()) < mesh.volume <= float(one.volume())
+    centred = Superquadric(one.size, one.shape, np.zeros(3), IDENTITY)
+    np.testing.assert_allclose(centred.gauge(vertices), 1.0, atol=1e-5)
+    np.testing.assert_allclose(np.abs(vertices).max(axis=0), one.size, rtol=1e-6)
+
+
+def test_a_shell_is_two_deviations_larger_but_never_huge() -> None:
+    one = body()
+    around = scene.shell(one, np.array([0.01, np.nan, 5.0]))
+    assert around is not None
+    np.testing.assert_allclose(around.size, [0.12, 0.07, 0.15])
+    assert scene.shell(one, np.full(3, np.nan)) is None
+    assert scene.shell(one, np.zeros(3)) is None
+
+
+def test_error_bars_straddle_the_surface() -> None:
+    bars = scene.error_bars(body(), np.array([0.01, np.nan, 5.0]))
+    assert bars.shape == (4, 2, 3)
+    np.testing.assert_allclose(bars[1], [[0.08, 0, 0], [0.12, 0, 0]], atol=1e-7)
+    np.testing.assert_allclose(bars[2], [[0, 0, 0], [0, 0, -0.15]], atol=1e-7)
+
+
+def test_a_label_stands_above_its_body() -> None:
+    one = body()
+    place = scene.label_position(one)
+    vertices = one.to_parent(scene.mesh_vertices(one).astype(float))
+    assert place[1] < vertices[:, 1].min()
+    assert place[1] > vertices[:, 1].min() - 0.02
+
+
+@pytest.mark.parametrize("camera", [CAMERA, unit_cube.camera(32)], ids=["pinhole", "orthographic"])
+def test_the_view_volume_ends_at_the_corners_of_the_image(camera: Camera) -> None:
+    lines = scene.view_volume(camera, 0.5)
+    assert lines.shape == ((8 if camera.is_pinhole else 12), 2, 3)
+    pixels = camera.project(lines[:4, 1])
+    np.testing.assert_allclose(pixels.min(axis=0), [-0.5, -0.5], atol=1e-4)
+    np.testing.assert_allclose(pixels.max(axis=0), [camera.width - 0.5, camera.height - 0.5], atol=1e-4)
+
+
+def test_misuse_is_refused() -> None:
+    with pytest.raises(ValueError, match="number of points"):
+        scene.cloud(np.ones((48, 64), np.float32), CAMERA, (0, 1), 0)
+    with pytest.raises(ValueError, match="does not fit"):
+        scene.cloud(np.ones((4, 6), np.float32), CAMERA, (0, 1), 9)
+    with pytest.raises(ValueError, match="ids: expected one for each of 1"):
+        Bodies(Superquadric.stack([body()]), np.ones((1, 3)), np.ones(1), [], [False], np.ones((1, 3)))
+
+
+# Controls
+
+
+@pytest.mark.parametrize(
+    ("about", "kind", "value"),
+    [
+        (Description("tracking", True), "bool", True),
+        (Description("refine", "surface", "", "one of: surface, none"), "choice", "surface"),
+        (Description("frame", "map"), "text", "map"),
+        (Description("s", 117.3, low=0.1, high=1000.0, is_float_range=True), "number", 117.3),
+        (Description("alpha", 0.7, low=0.0, high=1.0, is_float_range=True), "slider", 0.7),
+        (Description("alpha", 1, low=0.0, high=1.0, is_float_range=True), "slider", 1.0),
+        (Description("objects", 20, low=1, high=100), "slider", 20),
+        (Description("seed", 0, low=0, high=2**31 - 1), "number", 0),
+        (Description("free", 2.5), "number", 2.5),
+        (Description("model", "", read_only=True), "fixed", ""),
+        (Description("list", [1, 2]), "fixed", "1, 2"),
+        (Description("unset", None), "fixed", "(not set)"),
+        (Description("odd", float("nan")), "fixed", "nan"),
+        (Description("use_sim_time", False), "fixed", "false"),
+        (Description("qos_overrides./depth/image.subscription.depth", 1), "fixed", "1"),
+    ],
+)
+def test_a_control_fits_its_parameter(about: Description, kind: str, value: object) -> None:
+    made = controls.control(about)
+    assert (made.kind, made.value) == (kind, value)
+    assert type(made.value) is type(value)
+    if made.can_change:
+        again = made.wanted(made.shown(about.value))
+        assert again == about.value
+        assert type(again) is type(value)
+
+
+def test_what_the_node_holds_is_shown_even_outside_of_its_range() -> None:
+    made = controls.control(Description("s", 5.0, low=0.0, high=1.0, is_float_range=True))
+    assert (made.low, made.high) == (0.0, 5.0)
+    made = controls.control(Description("refine", "new", "", "one of: a, b"))
+    assert made.choices == ("a", "b", "new")
+
+
+def test_half_a_number_is_no_wish() -> None:
+    assert controls.control(Description("s", 1.0)).wanted(float("nan")) is None
+
+
+def test_controls_that_change_come_first() -> None:
+    given = [Description("model", "", read_only=True), Description("a.b", 1), Description("s", 1.0)]
+    assert [one.name for one in controls.arranged(given)] == ["s", "model", "a.b"]
+
+
+def test_every_parameter_of_the_nodes_has_a_control() -> None:
+    """Through the descriptors that the nodes really declare."""
+    pytest.importorskip("rclpy", reason="needs the extra 'ros'")
+    from dataclasses import fields
+
+    from sq_perception.nodes.parameters import RecoverParameters, describe
+    from sq_perception.nodes.remote_node import _description
+
+    made: dict[str, Control] = {
+        one.name: controls.control(_description(describe(one), one.default)) for one in fields(RecoverParameters)
+    }
+    for one in fields(RecoverParameters):
+        assert made[one.name].can_change == one.metadata["live"], one.name
+        if one.metadata["choices"] and one.metadata["live"]:
+            assert made[one.name].choices == one.metadata["choices"]
+        if one.metadata["within"] and one.metadata["live"]:
+            assert (made[one.name].low, made[one.name].high) == one.metadata["within"]
+        assert one.metadata["description"] in made[one.name].hint
+
+
+# Words
+
+
+def test_a_table_has_a_row_for_every_body_and_says_what_failed() -> None:
+    state = NodeState("/recover_node", 0.1)
+    text = tables.bodies_table("/recover_node", bodies(np.nan, weak=True), 1.5, state)
+    assert text.count("<tr") == 2
+    assert "± ?" in text
+    assert ">weak<" in text
+    assert 'data-stamp="1.500000000"' in text
+    none = Bodies(
+        Superquadric.stack([]), np.empty((0, 3)), np.empty(0), [], [], np.empty((0, 3)), failed=list(range(1, 9))
+    )
+    text = tables.bodies_table("/recover_node", none, 0.0, state)
+    assert "no bodies" in text
+    assert "no fit: 1, 2, 3, 4, 5 and 3 more" in text
+    assert "No result" in tables.bodies_table("/recover_node", None, 0.0, state)
+
+
+@pytest.mark.parametrize(
+    ("state", "words"),
+    [
+        (NodeState("/n"), "not there"),
+        (NodeState("/n", is_there=True), "no result yet"),
+        (NodeState("/n", is_there=True, lifecycle="inactive"), "inactive, no result yet"),
+        (NodeState("/n", age=0.2, is_there=True, lifecycle="active"), "active, alive"),
+        (NodeState("/n", age=65.0), "silent for 65 s"),
+        (NodeState("/n", age=600.0), "silent for 10 min"),
+        (NodeState("/n", age=9000.0), "silent for 2 h"),
+    ],
+)
+def test_a_state_in_words(state: NodeState, words: str) -> None:
+    assert words in tables.node_status(state)
+
+
+def test_words_from_outside_are_escaped() -> None:
+    evil = "<script>alert(1)</script>"
+    values = dict.fromkeys(("rate [Hz]", "stamp to result: median [ms]", "dropped", "tracks", "last error"), evil)
+    state = NodeState(evil, 0.1, 1.0, evil, values, True, evil)
+    texts = [
+        tables.node_status(state),
+        tables.bodies_table(evil, bodies(), 0.0, state),
+        tables.source_status(evil, (1, 1), 1.0, evil, ""),
+        tables.source_status(evil, None, 1.0, evil, evil),
+        tables.answer(evil, False),
+    ]
+    for text in texts:
+        assert "<script" not in text
+        assert "alert(1)" in text or "data-node" in text
+
+
+# The server
+
+
+@pytest.fixture
+def taken() -> Iterator[int]:
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        one.listen()
+        yield one.getsockname()[1]
+
+
+def test_requests_of_strangers_are_refused() -> None:
+    pytest.importorskip("viser", reason="needs the extra 'view'")
+    from sq_perception.viewing.server import refusal
+
+    names = frozenset({"robot", "robot.local"})
+    for host in ("localhost:8080", "127.0.0.1:8080", "[::1]:8080", "192.168.1.7:9000", "robot.local:8080", "Robot"):
+        assert refusal({"Host": host}, names) == ""
+        assert refusal({"Host": host, "Origin": f"http://{host}"}, names) == ""
+        assert "must not talk" in refusal({"Host": host, "Origin": "https://evil.example"}, names)
+        assert "must not talk" in refusal({"Host": host, "Origin": "null"}, names)
+    for host in ("evil.example", "evil.example:8080", "", "localhost.evil.example", "localhost@evil.example", "a b"):
+        assert "no name of this machine" in refusal({"Host": host, "Origin": f"http://{host}"}, names)
+
+
+def test_the_running_server_refuses_strangers_and_opens_no_tunnel() -> None:
+    pytest.importorskip("viser", reason="needs the extra 'view'")
+    from websockets.exceptions import InvalidStatus
+    from websockets.sync.client import connect
+
+    from sq_perception.viewing import server
+
+    bound = server.listening_socket("127.0.0.1", 0)
+    made = server.serve(bound)
+    try:
+        address = f"127.0.0.1:{bound.getsockname()[1]}"
+        assert made.get_port() == bound.getsockname()[1]
+        assert made.request_share_url() is None
+        with pytest.raises(InvalidStatus, match="403"):
+            connect(f"ws://{address}", origin="http://evil.example", proxy=None)
+        connect(f"ws://{address}", origin=f"http://{address}", proxy=None).close()
+    finally:
+        made.stop()
+
+
+def test_a_port_that_is_taken_is_an_error_in_words(taken: int) -> None:
+    pytest.importorskip("viser", reason="needs the extra 'view'")
+    from sq_perception.viewing.server import ServerError, listening_socket
+
+    with pytest.raises(ServerError, match=f"--port: {taken} of 127.0.0.1 cannot be used.*in use.*another --port"):
+        listening_socket("127.0.0.1", taken)
+    with pytest.raises(ServerError, match="--host: expected an address of this machine"):
+        listening_socket("203.0.113.1", 0)
+    with listening_socket("127.0.0.1", 0) as free:
+        assert free.getsockname()[1] > 0
+
+
+# The command
+
+
+def test_the_command_says_what_is_wrong(taken: int, capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
+    for arguments, words in (
+        (["--node", "no node!"], "--node: expected a name like /recover_node"),
+        (["--max-points", "0"], "--max-points: expected at least 1"),
+        (["--rate", "nan"], "--rate: expected"),
+        (["--port", "70000"], "--port: expected 0 to 65535"),
+    ):
+        with pytest.raises(SystemExit) as stop:
+            view.main(arguments)
+        assert stop.value.code == 2
+        assert words in capsys.readouterr().err
+    pytest.importorskip("rclpy", reason="needs the extra 'ros'")
+    pytest.importorskip("viser", reason="needs the extra 'view'")
+    assert view.main(["--port", str(taken)]) == 1
+    said = capsys.readouterr().err
+    assert said.startswith("--port: ")
+    assert said.count("\n") == 1
+    monkeypatch.setattr(view, "_NEEDED", (("no_such_module", "this: pip install 'sq_perception[view]'"),))
+    assert view.main([]) == 1
+    assert capsys.readouterr().err == "view needs this: pip install 'sq_perception[view]'\n"
+
+
+def test_the_camera_info_is_beside_the_image() -> None:
+    assert view.camera_info_beside("depth/image") == "depth/camera_info"
+    assert view.camera_info_beside("/camera/depth/image_rect_raw") == "/camera/depth/camera_info"
+    assert view.camera_info_beside("image") == "camera_info"
+
+
+def test_the_help_names_every_option() -> None:
+    text = view._parser().format_help()
+    for option in ("--node", "--depth", "--camera-info", "--host", "--port", "--max-points", "--rate"):
+        assert re.search(rf"^  {option}\b", text, re.MULTILINE)
