@@ -53,7 +53,7 @@ _WORDS_PERIOD = 0.5
 """Seconds between two looks at states and ages where nothing new has come."""
 _SERVICE_PERIOD = 0.1
 _RATE_SECONDS = 3.0
-_CAMERA_PATIENCE = 2.0
+_RESULT_PATIENCE = 1.0
 _DRAWER_END = 5.0
 
 
@@ -108,12 +108,14 @@ class ViewNode(StoppableNode):
         self.create_subscription(ParameterEvent, "/parameter_events", self._on_parameter_event, 1000)
         self.create_timer(_SERVICE_PERIOD, self._on_tick)
         self._closed = threading.Event()
+        self._news = threading.Event()
         self._drawer = threading.Thread(target=self._draw_on, name="drawer", daemon=True)
         self._drawer.start()
 
     def close(self) -> None:
         """Stop drawing and serving."""
         self._closed.set()
+        self._news.set()
         self._drawer.join(_DRAWER_END)
         self._page.close()
 
@@ -157,12 +159,16 @@ class ViewNode(StoppableNode):
             self._images[_stamp(message)] = message
             while len(self._images) > _IMAGES:
                 self._images.popitem(last=False)
+        # The image waits for its result, where results come at all.
+        if not any(monotonic() - one.time < _RESULT_PATIENCE for one in self._results.values()):
+            self._news.set()
 
     def _on_result(self, name: str, message: PointCloud2) -> None:
         age = self.get_clock().now() - Time.from_msg(message.header.stamp, clock_type=self.get_clock().clock_type)
         milliseconds = 1e-6 * age.nanoseconds
         latency = milliseconds if 0 <= milliseconds < 60e3 else None
         self._results[name] = Result(message, monotonic(), latency)
+        self._news.set()
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
@@ -178,8 +184,13 @@ class ViewNode(StoppableNode):
     # The drawing thread
 
     def _draw_on(self) -> None:
-        drawer = _Drawer(self)
-        while not self._closed.wait(self._period):
+        drawer, due = _Drawer(self), 0.0
+        while not self._closed.is_set():
+            self._news.wait(_WORDS_PERIOD)
+            self._news.clear()
+            if self._closed.wait(max(0.0, due - monotonic())):
+                return
+            due = monotonic() + self._period
             try:
                 drawer.draw()
             except Exception:
