@@ -105,8 +105,9 @@ class RemoteNode:
 
         def answered(response: SetParameters.Response) -> None:
             result = response.results[0]
-            words = f"{name} is now {_shown(value)}" if result.successful else result.reason or f"{name}: refused"
-            self._say(words, result.successful)
+            # Not every reason of rclpy's own says which parameter it is about.
+            reason = result.reason if name in result.reason else f"{name}: {result.reason or 'refused'}"
+            self._say(f"{name} is now {_shown(value)}" if result.successful else reason, result.successful)
             self._read([name])
 
         self._call(self._set, request, answered, lambda: self._unanswered(name))
