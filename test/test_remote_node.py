@@ -23,7 +23,6 @@ from rclpy.context import Context
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.node import Node
-from rclpy.parameter import Parameter
 
 from sq_perception.nodes.parameters import FitterParameters, LiveParameters
 from sq_perception.nodes.remote_node import RemoteNode
@@ -149,7 +148,7 @@ def test_lifecycle_and_parameters_are_followed(bench: Bench) -> None:
     bench.until(lambda: not bench.page.answers[-1][1] and "read-only" in bench.page.answers[-1][0])
     bench.asked(bench.remote.change, "no_such_parameter", 1)
     bench.until(lambda: not bench.page.answers[-1][1] and "no_such_parameter" in bench.page.answers[-1][0])
-    assert node.get_parameter("projection") == Parameter("projection", value="pinhole")
+    assert node.get_parameter("projection").value == "pinhole"
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
