@@ -50,8 +50,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if importlib.util.find_spec(module) is None:
             print(f"view needs {remedy}", file=sys.stderr)
             return 1
-    from sq_perception.viewing import server
-
+    try:
+        from sq_perception.viewing import server
+    except ImportError as error:
+        print(f"view: viser cannot be imported, {error}: pip install 'sq_perception[view]'", file=sys.stderr)
+        return 1
     try:
         bound = server.listening_socket(options.host, options.port)
     except server.ServerError as error:

@@ -44,7 +44,7 @@ _PLACES = {
 _MUTED = "muted"
 _FIRST_DISTANCE = 1.0
 """What the start view looks at, metres, until an image tells."""
-_NEAR_SHARE = 0.8
+_NEAR_SHARE = 0.4
 """Length of the view volume that is drawn, of the nearest depth."""
 
 
