@@ -181,7 +181,8 @@ class Page:
         if bodies is not None and len(bodies) and not state.remark and not self._aimed_at_bodies:
             self._aimed_at_bodies = True
             self._aim(bodies.superquadrics.translation.mean(axis=0))
-        drawn = bodies if bodies is not None and not state.remark else None
+        is_wanted = part.wanted is None or part.wanted.value
+        drawn = bodies if bodies is not None and not state.remark and is_wanted else None
         wanted = {} if drawn is None else {int(number): k for k, number in enumerate(drawn.ids)}
         with self._server.atomic():
             for key in [key for key in self._drawn if key[0] == node and key[1] not in wanted]:
@@ -189,7 +190,8 @@ class Page:
             if drawn is not None:
                 for number, k in wanted.items():
                     self._draw_body(node, number, drawn, k, state.is_silent)
-        part.table.content = tables.bodies_table(node, bodies, stamp, state)
+        is_cube = self._camera is not None and not self._camera.is_pinhole
+        part.table.content = tables.bodies_table(node, bodies, stamp, state, is_cube=is_cube)
 
     def show_state(self, state: NodeState) -> None:
         """Write how a node is doing; its lifecycle buttons appear with its state."""
@@ -293,6 +295,9 @@ class Page:
         self._bars_wanted = gui.add_checkbox(
             "Error bars", True, hint=f"± {scene.SHELL_SIGMAS:g} standard deviations of each half size"
         )
+        if len(self._nodes) > 1:
+            for part in self._nodes.values():
+                part.wanted = gui.add_checkbox(part.name, True, hint="The bodies of this node")
         self._volume_wanted = gui.add_checkbox("Camera", True, hint="What the camera sees, and its optical frame")
         self._picture_wanted = gui.add_checkbox("Depth image", True)
 
@@ -389,7 +394,7 @@ class Page:
             )
             label = world.add_label(
                 f"{path}/id",
-                str(number),
+                self._title(node, number),
                 position=scene.label_position(body),
                 anchor="bottom-center",
                 font_screen_scale=1.4,
@@ -404,6 +409,10 @@ class Page:
         drawn.label.visible = self._labels_wanted.value
         drawn.shell = self._draw_shell(drawn.shell, f"{path}/shell", around, colour, pose)
         drawn.bars = self._draw_bars(drawn.bars, f"{path}/bars", bars, pose)
+
+    def _title(self, node: str, number: int) -> str:
+        """What a label says; the same id of two nodes is not the same body."""
+        return str(number) if len(self._nodes) == 1 else f"{node.rsplit('/', 1)[-1]} {number}"
 
     def _draw_shell(
         self, drawn: Any, path: str, around: Superquadric | None, colour: tuple[int, int, int], pose: dict[str, Any]
@@ -480,6 +489,7 @@ class _NodePart:
         self.table: Any = None
         self.tab: Any = None
         self.answer: Any = None
+        self.wanted: Any = None
         self.buttons: dict[str, Any] = {}
         self.folders: list[Any] = []
         self.controls: dict[str, Control] = {}

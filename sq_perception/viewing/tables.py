@@ -1,6 +1,7 @@
 """Numbers and words of the page, as HTML: a table of bodies, the state of a node, the legend of the colours.
 
-Half sizes in millimetres with their standard deviations.  Every word that comes from outside is escaped.
+Half sizes in millimetres, or thousandths of the unit cube, with their standard deviations.  Every word that comes from
+outside is escaped.
 """
 
 from __future__ import annotations
@@ -55,8 +56,8 @@ class NodeState:
         return self.age is None or self.age > SILENT_SECONDS
 
 
-def bodies_table(name: str, bodies: Bodies | None, stamp: float, state: NodeState) -> str:
-    """The bodies of a node; ``stamp`` is that of their image, seconds."""
+def bodies_table(name: str, bodies: Bodies | None, stamp: float, state: NodeState, *, is_cube: bool = False) -> str:
+    """The bodies of a node; ``stamp`` is that of their image, seconds; ``is_cube`` if it shows the unit cube."""
     if bodies is None:
         return _note("No result has come yet.")
     faded = ";opacity:0.45" if state.is_silent else ""
@@ -80,6 +81,7 @@ def bodies_table(name: str, bodies: Bodies | None, stamp: float, state: NodeStat
     )
     count = len(bodies)
     heading = f"{count} {'body' if count == 1 else 'bodies'}" if count else "no bodies"
+    unit = "thousandths of the cube" if is_cube else "mm"
     failed = ""
     if bodies.failed:
         shown = ", ".join(str(one) for one in bodies.failed[:_MOST_FAILED])
@@ -88,7 +90,7 @@ def bodies_table(name: str, bodies: Bodies | None, stamp: float, state: NodeStat
     table = f'<table style="{_TABLE}"><thead><tr>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table>'
     return (
         f'<div data-node="{html.escape(name)}" data-stamp="{stamp:.9f}" style="padding:2px 12px 6px 12px{faded}">'
-        f'<div style="{_SMALL};padding:2px 5px">{heading}; half sizes in mm ± standard deviation</div>'
+        f'<div style="{_SMALL};padding:2px 5px">{heading}; half sizes in {unit} ± standard deviation</div>'
         f'<div style="overflow-x:auto;overflow-y:auto;max-height:340px">{table if count else ""}</div>{failed}</div>'
     )
 
