@@ -64,7 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         return process.run(
             NAME,
-            lambda: _node(bound, options.depth, camera_info, nodes, options.max_points, options.rate),
+            lambda: [_node(bound, options.depth, camera_info, nodes, options.max_points, options.rate)],
             given[cut:],
         )
     finally:

@@ -31,15 +31,17 @@ from rclpy.subscription import Subscription
 from rclpy.time import Time
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
-from sq_msgs_py.depth_image import GREY_ENCODINGS, depth_from_message, grey_from_message, intrinsics_from_message
+from sq_msgs_py.depth_image import GREY_ENCODINGS, size_mismatch
 from sq_msgs_py.markers import PALETTE
 from sq_msgs_py.superquadrics import FAILED, WEAK, SuperquadricArray, from_message
+from sq_perception.calibration import Calibration
 from sq_perception.geometry import rotation
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.nodes.camera_poses import CameraPoses, PoseError
 from sq_perception.nodes.counters import Throttle
+from sq_perception.nodes.frame import decode
 from sq_perception.nodes.remote_node import RemoteNode
 from sq_perception.nodes.stoppable_node import StoppableNode
 from sq_perception.viewing import tables
@@ -100,7 +102,7 @@ class ViewNode(StoppableNode):
         self._info: CameraInfo | None = None
         self._results: dict[str, Result] = {}
         self._diagnosed: dict[str, dict[str, str]] = {}
-        self._poses: dict[str, CameraPoses] = {}
+        self._poses = CameraPoses(self)
         self._throttle = Throttle()
         self._inputs: list[Subscription] = []
         self._remote = {one: RemoteNode(self, one) for one in nodes}
@@ -112,12 +114,13 @@ class ViewNode(StoppableNode):
         self._drawer = threading.Thread(target=self._draw_on, name="drawer", daemon=True)
         self._drawer.start()
 
-    def close(self) -> None:
+    def close(self) -> bool:
         """Stop drawing and serving."""
         self._closed.set()
         self._news.set()
         self._drawer.join(_DRAWER_END)
         self._page.close()
+        return not self._drawer.is_alive()
 
     # Callbacks, in the executor's thread
 
@@ -213,9 +216,7 @@ class ViewNode(StoppableNode):
         PoseError
             If it is not known.
         """
-        if frame not in self._poses:
-            self._poses[frame] = CameraPoses(self, frame)
-        return self._poses[frame].at(header)
+        return self._poses.at(header, frame)
 
 
 class _Drawer:
@@ -269,18 +270,17 @@ class _Drawer:
         return image.header
 
     def _decoded(self, image: Image) -> tuple[np.ndarray, Camera]:
-        if image.encoding in GREY_ENCODINGS:
-            grey = grey_from_message(image)
-            height, width = grey.shape
-            return unit_cube.depth_from_grey(grey), unit_cube.camera(width, height)
-        depth = depth_from_message(image)
-        info = self._node._info
+        frame = decode(image, None if image.encoding in GREY_ENCODINGS else lambda: self._calibration(image))
+        return frame.depth, frame.camera
+
+    def _calibration(self, image: Image) -> Calibration:
+        info, (image_topic, info_topic) = self._node._info, self._node._topics
         if info is None:
-            raise ValueError(f"no camera_info has come on {self._node._topics[1]}")
-        known = intrinsics_from_message(info)
-        camera = Camera(known.width, known.height, known.fx, known.fy, known.cx, known.cy)
-        camera.check_image(depth)
-        return depth, camera
+            raise ValueError(f"no camera_info has come on {info_topic}")
+        calibration = Calibration.of(info, image_topic)
+        if calibration.size != (int(image.width), int(image.height)):
+            raise ValueError(size_mismatch((int(image.width), int(image.height)), calibration.size))
+        return calibration
 
     def _draw_node(self, name: str, result: Result | None, header: Any, words_due: bool) -> None:
         last = self._bodies.get(name)
