@@ -22,7 +22,7 @@ from sq_msgs_py.markers import markers
 from sq_msgs_py.message_types import MessageTypes, installed
 from sq_msgs_py.superquadrics import CONVERGED, SuperquadricArray
 from sq_perception.fitting.fit import Status
-from sq_perception.geometry.mesh import MARKER_RESOLUTION, mesh, outline
+from sq_perception.geometry.mesh import MARKER_RESOLUTION, outline, triangles
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
 from sq_perception.recovery import FrameRecovery
@@ -130,8 +130,9 @@ class Findings:
     def meshes(self) -> tuple[Mesh, ...]:
         """Surface of each body that did not fail, in the body's own frame; made when it is first asked for."""
         shown = self.array.recovered
-        surfaces = [mesh(_at_origin(*one), MARKER_RESOLUTION) for one in zip(shown.size, shown.shape, strict=True)]
-        return tuple((np.asarray(one.vertices), np.asarray(one.faces)) for one in surfaces)
+        return tuple(
+            triangles(_at_origin(*one), MARKER_RESOLUTION) for one in zip(shown.size, shown.shape, strict=True)
+        )
 
     def moved(self, frame_id: str, rotation: np.ndarray, translation: np.ndarray) -> Findings:
         """The same in another frame, p_new = R(rotation) p + translation; the stamp stays."""

@@ -170,6 +170,13 @@ def test_recovery_neither_trains_nor_draws_and_knows_no_ros() -> None:
     assert not modules & (forbidden | {"matplotlib", "trimesh"})
 
 
+def test_a_node_that_starts_again_waits_for_nothing_that_it_does_not_need() -> None:
+    pytest.importorskip("rclpy", reason="needs the extra 'ros'")
+    modules = loaded_after("import sq_perception.nodes.frame_node")
+    assert "torch" in modules
+    assert not modules & {"scipy.stats", "trimesh", "matplotlib", "rich", "onnx", "onnxruntime"}
+
+
 def test_importing_recovery_reads_no_weights() -> None:
     statement = (
         "opened = []; sys.addaudithook(lambda event, args: opened.append(str(args[0])) if event == 'open' else None); "

@@ -12,12 +12,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
-import trimesh
 from scipy.spatial import ConvexHull
 
 from sq_perception.geometry.superquadric import Superquadric
+
+if TYPE_CHECKING:
+    import trimesh
 
 MARKER_RESOLUTION = 16
 """Coarse enough to be serialised at camera rate: about 35 kB per body."""
@@ -40,8 +43,8 @@ _HALF_TURN_ABOUT_X = np.diag([1.0, -1.0, -1.0, 1.0])
 _SAME_POINT_DIGITS = 12
 
 
-def mesh(body: Superquadric, resolution: int = 32) -> trimesh.Trimesh:
-    """The closed triangle mesh of one body.
+def triangles(body: Superquadric, resolution: int = 32) -> tuple[np.ndarray, np.ndarray]:
+    """The closed triangle mesh of one body as arrays.
 
     Parameters
     ----------
@@ -52,8 +55,10 @@ def mesh(body: Superquadric, resolution: int = 32) -> trimesh.Trimesh:
 
     Returns
     -------
-    trimesh.Trimesh
-        Watertight and convex, faces outwards, vertices on the surface, in the body's parent frame.
+    vertices : (n, 3)
+        On the surface, in the body's parent frame.
+    faces : (m, 3)
+        Indices of vertices; watertight and convex, faces outwards.
     """
     _check_single(body)
     if resolution < 8 or resolution % 8:
@@ -75,7 +80,15 @@ def mesh(body: Superquadric, resolution: int = 32) -> trimesh.Trimesh:
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     inwards = np.einsum("ij,ij->i", normals, hull.equations[:, :3]) < 0
     faces[inwards] = faces[inwards][:, ::-1]
-    return trimesh.Trimesh(body.to_parent(vertices * body.size), faces, process=False)
+    return body.to_parent(vertices * body.size), faces
+
+
+def mesh(body: Superquadric, resolution: int = 32) -> trimesh.Trimesh:
+    """The mesh of :func:`triangles`, which has the parameters, as an object that measures and writes itself."""
+    # Imported where it is needed: a node that starts again and needs only the arrays does not wait for it.
+    import trimesh
+
+    return trimesh.Trimesh(*triangles(body, resolution), process=False)
 
 
 def outline(body: Superquadric, resolution: int = MARKER_RESOLUTION) -> np.ndarray:
@@ -129,6 +142,8 @@ def export(
     ValueError
         For another suffix, where there is no body to write, or not one name a body.
     """
+    import trimesh
+
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix not in (".glb", ".ply"):

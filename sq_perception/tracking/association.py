@@ -28,7 +28,6 @@ from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
-from scipy.stats import chi2
 
 from sq_perception.tracking import forms, state
 from sq_perception.tracking.state import CENTRE, LENGTH, SIZE_AND_SHAPE
@@ -74,7 +73,7 @@ def in_place(
         return Pairs.none()
     between, apart = _apart(track, observed)
     centres = track_covariance[:, None, CENTRE, CENTRE] + covariance[None, :, CENTRE, CENTRE]
-    agree = state.mahalanobis(centres, between) < chi2.ppf(gate, 3)
+    agree = state.mahalanobis(centres, between) < state.chi2_limit(gate, 3)
     deep = apart < _DEEP
     i, j = np.nonzero(deep | ((apart < 1) & agree))
     if not len(i):
@@ -118,7 +117,7 @@ def elsewhere(
     match = forms.nearest(track[i], free, observed[j], covariance[j], exchange)
     total = (track_covariance[i] + match.covariance)[:, SIZE_AND_SHAPE, SIZE_AND_SHAPE]
     error = state.difference(track[i], match.state)[:, SIZE_AND_SHAPE]
-    alike = state.mahalanobis(total, error) < chi2.ppf(gate, 5)
+    alike = state.mahalanobis(total, error) < state.chi2_limit(gate, 5)
     pairs = Pairs(i[alike], j[alike], match.state[alike], match.covariance[alike])
     if not alike.any():
         return Pairs.none()

@@ -13,7 +13,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import chi2
 
 from sq_perception.tracking import state
 from sq_perception.tracking.state import CENTRE, LENGTH, SIZE_AND_SHAPE, TURN
@@ -38,7 +37,7 @@ class Judgement(NamedTuple):
 
 def judged(size: np.ndarray, total: np.ndarray, error: np.ndarray, gate: float) -> Judgement:
     """Judge errors (n, 11) with covariances (n, 11, 11) of bodies with half sizes (n, 3)."""
-    limit, limit_five, limit_three = chi2.ppf(gate, [LENGTH, 5, 3])
+    limit, limit_five, limit_three = state.chi2_limit(gate, np.array([LENGTH, 5, 3]))
 
     def outside(part: slice, bound: float) -> np.ndarray:
         return state.mahalanobis(total[:, part, part], error[:, part]) > bound

@@ -18,6 +18,7 @@ from __future__ import annotations
 from typing import Protocol
 
 import numpy as np
+from scipy.special import gammaincinv
 
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import FLAT_LENGTH, Superquadric
@@ -92,6 +93,14 @@ def mahalanobis(covariance: np.ndarray, error: np.ndarray) -> np.ndarray:
     """Squared Mahalanobis distance (...) of errors (..., n) with covariances (..., n, n)."""
     solved = np.linalg.solve(covariance, error[..., None])[..., 0]
     return np.einsum("...i,...i->...", error, solved)
+
+
+def chi2_limit(probability: float, freedom: np.ndarray | int) -> np.ndarray:
+    """What a chi-squared number of ``freedom`` dimensions stays below with this probability.
+
+    scipy.stats has it too, but takes a quarter of a second to import, which a restarted node does not have.
+    """
+    return np.asarray(2 * gammaincinv(np.asarray(freedom) / 2, probability))
 
 
 def diagonal(log_size: float, shape: float, centre: float, turn: float) -> np.ndarray:
