@@ -1,0 +1,328 @@
+"""Hours in the life of a node: synthetic_depth_node -> recover_node -> this program, watched each second.
+
+    python benchmarks/soak.py [--minutes 30] [--rate 30] [--objects 5] [--offered 90] [--node recover_node]
+
+Three phases with the same node.  First the camera is slow, so that each frame is alone: the latency of one frame.  Then
+it runs at ``rate`` for ``minutes``; memory, latency, services and diagnostics are judged here.  Then it offers more
+than anybody could answer.  The camera shows the same scenes in all three, over and over; it runs at low priority on one
+thread, as a real camera takes next to no processor time.
+
+Latency goes from the stamp, the clock at the camera's publish call, to the arrival here.  A scene with an overlap takes
+longer than one without, so that a spread over scenes says nothing about regularity: latencies are also divided by the
+median of their own scene.  Memory is resident memory; its growth is a straight line fitted to all seconds after the
+first minute.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+import tempfile
+import time
+import zlib
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import report
+
+os.environ.setdefault("ROS_DOMAIN_ID", "78")
+os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+sys.path.append(str(Path(__file__).resolve().parent.parent / "test"))
+
+from rcl_interfaces.srv import GetParameters
+from running_nodes import Answer, Diagnosis, Peer, Usage, arguments, environment, proportional, until, usage
+from sensor_msgs.msg import PointCloud2
+from std_srvs.srv import SetBool
+
+from sq_perception.nodes.children import Child, Children
+
+CAMERA_NODE = "synthetic_depth_node"
+SCENES = 8
+SCENE_SECONDS = 10.0
+_ALONE_RATE, _ALONE_FRAMES = 3.0, 6
+_WARM = 60.0
+"""Seconds after which memory is judged."""
+_SHORTEST_WARM = 0.25
+"""Share of a run that is shorter than four minutes."""
+_MEMORY_EVERY = 30
+
+ASKED = {"growth": 3.0, "p99 to median": 2.0, "services": 50.0, "drift": 10.0, "best rate": 0.9}
+"""Per cent, ratio, milliseconds, per cent, share."""
+
+
+@dataclass
+class Phase:
+    """What was seen while the camera ran at one rate."""
+
+    rate: float
+    began: float
+    ended: float = 0.0
+    answers: list[Answer] = field(default_factory=list)
+    diagnoses: list[Diagnosis] = field(default_factory=list)
+    usage: list[tuple[float, Usage]] = field(default_factory=list)
+    camera: list[tuple[float, Usage]] = field(default_factory=list)
+    memory: list[tuple[float, float, float]] = field(default_factory=list)
+    calls: dict[str, list[float]] = field(default_factory=dict)
+
+    @property
+    def seconds(self) -> float:
+        return self.ended - self.began
+
+
+class Soak:
+    """A node that stays, a camera that is started anew for each phase, and the peer that watches them."""
+
+    def __init__(self, node: str, objects: int, size: str, peer: Peer, nodes: Children, cameras: Children) -> None:
+        self.name, self.objects, self.size = f"/{node}", objects, size
+        self.peer, self.cameras = peer, cameras
+        self.scenes: dict[int, int] = {}
+        peer.listen(PointCloud2, f"/{CAMERA_NODE}/truth", self._on_truth)
+        self.answers, self.diagnoses = peer.answers(self.name), peer.diagnoses(self.name)
+        self.node = nodes.start(node, ["--ros-args", "--log-level", "warn"])
+
+    def _on_truth(self, message: PointCloud2) -> None:
+        stamp = message.header.stamp
+        self.scenes[int(stamp.sec) * 10**9 + int(stamp.nanosec)] = zlib.crc32(bytes(message.data))
+
+    def phase(self, rate: float, seconds: float, hold: int, *, services: bool = True) -> Phase:
+        """Run the camera at a rate and watch."""
+        parameters = [f"rate:={rate}", f"objects:={self.objects}", f"hold:={hold}", f"scenes:={SCENES}"]
+        with tempfile.TemporaryDirectory() as folder:
+            if self.size:
+                parameters.append(f"camera_info_file:={_camera_file(Path(folder), self.size)}")
+            camera = self.cameras.start(CAMERA_NODE, [*arguments(*parameters), "--log-level", "warn"])
+            os.setpriority(os.PRIO_PROCESS, camera.pid, 15)
+            seen = len(self.answers)
+            until(lambda: len(self.answers) >= seen + 3, (self.node, camera))
+        first, diagnosed = len(self.answers), len(self.diagnoses)
+        phase = Phase(rate, time.monotonic())
+        second = 0
+        while time.monotonic() < phase.began + seconds:
+            self._look(phase, camera, second, services)
+            second += 1
+            time.sleep(max(0.0, phase.began + second - time.monotonic()))
+        phase.ended = time.monotonic()
+        phase.answers, phase.diagnoses = self.answers[first:], self.diagnoses[diagnosed:]
+        self.cameras.stop()
+        return phase
+
+    def _look(self, phase: Phase, camera: Child, second: int, services: bool) -> None:
+        now = time.monotonic() - phase.began
+        phase.usage.append((now, usage(self.node.pid)))
+        phase.camera.append((now, usage(camera.pid)))
+        if second % _MEMORY_EVERY == 0:
+            phase.memory.append((now, *proportional(self.node.pid)))
+        if not services:
+            return
+        for name, kind, request in (
+            ("get_parameters", GetParameters, GetParameters.Request(names=["s", "max_objects"])),
+            ("enable", SetBool, SetBool.Request(data=True)),
+        ):
+            took = self.peer.call(kind, f"{self.name}/{name}", request, (self.node,)).milliseconds
+            phase.calls.setdefault(name, []).append(took)
+
+    def final(self) -> Diagnosis:
+        """The node's own account after the last frame."""
+        after = time.monotonic()
+        until(lambda: self.diagnoses[-1].time > after + 2.0, (self.node,))
+        return self.diagnoses[-1]
+
+    def by_scene(self, phase: Phase) -> dict[int, np.ndarray]:
+        """Ages in milliseconds by scene."""
+        found: dict[int, list[float]] = {}
+        for answer in phase.answers:
+            if answer.stamp in self.scenes:
+                found.setdefault(self.scenes[answer.stamp], []).append(answer.age)
+        return {scene: np.array(ages) for scene, ages in found.items()}
+
+
+def _camera_file(folder: Path, size: str) -> Path:
+    width, height = (int(part) for part in size.split("x"))
+    focal = 525.0 * width / 640
+    path = folder / "camera.yaml"
+    path.write_text(
+        f"image_width: {width}\nimage_height: {height}\ncamera_name: soak\ncamera_matrix:\n  rows: 3\n  cols: 3\n"
+        f"  data: [{focal}, 0, {(width - 1) / 2}, 0, {focal}, {(height - 1) / 2}, 0, 0, 1]\n"
+    )
+    return path
+
+
+def line(phase: Phase, what: str, begin: float) -> dict[str, float]:
+    """A straight line through a quantity of all seconds after ``begin``: MB, and per hour and per 1000 answers."""
+    points = np.array([(when, getattr(one, what)) for when, one in phase.usage if when >= begin])
+    if len(points) < 3:
+        return {
+            "mean": float(points[:, 1].mean()),
+            "slope_per_hour": 0.0,
+            "growth_percent": 0.0,
+            "per_1000_answers": 0.0,
+        }
+    (slope, offset), covariance = np.polyfit(points[:, 0], points[:, 1], 1, cov=True)
+    span = points[-1, 0] - points[0, 0]
+    frames = max(sum(answer.time - phase.began >= begin for answer in phase.answers), 1)
+    return {
+        "mean": float(points[:, 1].mean()),
+        "min": float(points[:, 1].min()),
+        "max": float(points[:, 1].max()),
+        "slope_per_hour": float(3600 * slope),
+        "slope_error_per_hour": float(3600 * np.sqrt(covariance[0, 0])),
+        "growth_percent": float(100 * slope * span / (offset + slope * points[0, 0])),
+        "per_1000_answers": float(1000 * slope * span / frames),
+    }
+
+
+def latencies(soak: Soak, phase: Phase) -> dict[str, Any]:
+    """Ages as they are, and divided by the median of their scene."""
+    ages = np.array([answer.age for answer in phase.answers])
+    scenes = soak.by_scene(phase)
+    relative = np.concatenate([found / np.median(found) for found in scenes.values()])
+    third = max(len(ages) // 3, 1)
+    first, last = np.median(ages[:third]), np.median(ages[-third:])
+    times = np.array([answer.time for answer in phase.answers])
+    return {
+        "milliseconds": {**report.spread(ages), "p99": float(np.percentile(ages, 99))},
+        "p99_to_median": float(np.percentile(ages, 99) / np.median(ages)),
+        "p99_to_median_of_scene": float(np.percentile(relative, 99)),
+        "largest_to_median_of_scene": float(relative.max()),
+        "scene_medians_ms": sorted(float(np.median(found)) for found in scenes.values()),
+        "drift_percent": float(100 * (last - first) / first),
+        "results_per_second": len(ages) / phase.seconds,
+        "longest_gap_ms": float(1e3 * np.diff(times).max()) if len(times) > 1 else None,
+    }
+
+
+def account(soak: Soak, phase: Phase) -> dict[str, Any]:
+    """Everything that is known of a phase, as JSON."""
+    begin = min(_WARM, _SHORTEST_WARM * phase.seconds)
+    reports = np.array([phase.began, *(one.time for one in phase.diagnoses), phase.ended])
+    first, last = phase.usage[0], phase.usage[-1]
+    settled = next(one for when, one in phase.usage if when >= begin)
+    calls = {
+        name: {**report.spread(np.array(took)), "p99": float(np.percentile(took, 99))}
+        for name, took in phase.calls.items()
+    }
+    return {
+        "rate": phase.rate,
+        "seconds": phase.seconds,
+        "latency": latencies(soak, phase),
+        "memory": {what: line(phase, what, begin) for what in ("rss", "anonymous", "shared")},
+        "proportional_mb": [list(one) for one in phase.memory],
+        "cpu_share": (last[1].cpu - first[1].cpu) / max(last[0] - first[0], 1e-9),
+        "camera_cpu_share": (phase.camera[-1][1].cpu - phase.camera[0][1].cpu) / max(last[0] - first[0], 1e-9),
+        "after_first_minute": asdict(settled),
+        "at_the_end": asdict(last[1]),
+        "diagnoses": {"received": len(phase.diagnoses), "longest_gap_s": float(np.diff(reports).max())},
+        "most_in_work": max((one.count("in work") for one in phase.diagnoses), default=0),
+        "services": calls,
+        "stages": {key: value for key, value in phase.diagnoses[-1].values.items() if "[ms]" in key},
+    }
+
+
+def verdicts(alone: dict[str, Any], asked: dict[str, Any], offered: dict[str, Any] | None, final: Diagnosis,
+             ratios: Sequence[float]) -> list[list[str]]:  # fmt: skip
+    """Rows: what, asked, reached, whether."""
+
+    def row(what: str, wanted: str, reached: str, met: bool) -> list[str]:
+        return [what, wanted, reached, "yes" if met else "NO"]
+
+    latency, memory = asked["latency"], asked["memory"]["rss"]
+    ms, growth = latency["milliseconds"], memory["growth_percent"]
+    before, after = asked["after_first_minute"], asked["at_the_end"]
+    counts = {key: after[key] - before[key] for key in ("threads", "files", "segments")}
+    diagnoses = asked["diagnoses"]
+    rows = [
+        row("resident memory after the first minute", f"+-{ASKED['growth']:g} %",
+            f"{growth:+.2f} % of {memory['mean']:.0f} MB ({memory['slope_per_hour']:+.1f} +- "
+            f"{memory.get('slope_error_per_hour', 0):.1f} MB/h)", abs(growth) <= ASKED["growth"]),
+        row("threads, open files, segments since then", "as many", ", ".join(f"{k} {v:+d}" for k, v in counts.items()),
+            all(number <= 0 for number in counts.values())),
+        row("latency p99 / median", f"<= {ASKED['p99 to median']:g}",
+            f"{latency['p99_to_median']:.2f} ({ms['p99']:.0f} / {ms['median']:.0f} ms)",
+            latency["p99_to_median"] <= ASKED["p99 to median"]),
+        row("the same within scenes", f"<= {ASKED['p99 to median']:g}", f"{latency['p99_to_median_of_scene']:.2f}",
+            latency["p99_to_median_of_scene"] <= ASKED["p99 to median"]),
+        row("latency, last third against first", f"< {ASKED['drift']:g} %", f"{latency['drift_percent']:+.1f} %",
+            latency["drift_percent"] < ASKED["drift"]),
+        row("frames in work", "<= 2", str(asked["most_in_work"]), asked["most_in_work"] <= 2),
+        row("diagnoses", "one a second", f"{diagnoses['received']} in {asked['seconds']:.0f} s, longest gap "
+            f"{diagnoses['longest_gap_s']:.2f} s", diagnoses["longest_gap_s"] < 1.5),
+    ]  # fmt: skip
+    for name, took in asked["services"].items():
+        rows.append(
+            row(f"{name} answers", f"p99 < {ASKED['services']:g} ms",
+                f"{took['median']:.1f} / {took['p99']:.1f} / {took['max']:.1f} ms (median, p99, max)",
+                took["p99"] < ASKED["services"])
+        )  # fmt: skip
+    counted = ", ".join(f"{key} {final.count(key)}" for key in ("received", "answered", "dropped", "refused", "lost"))
+    rows.append(row("every frame has a verdict", "received = sum", counted, final.is_balanced))
+    if offered is not None:
+        best = asked["latency"]["results_per_second"]
+        rate, period = offered["latency"]["results_per_second"], 1e3 / offered["rate"]
+        least = ASKED["best rate"] * best
+        rows.append(
+            row(f"results / s at {offered['rate']:g} Hz offered", f">= {least:.1f}", f"{rate:.1f}", rate >= least)
+        )
+        ratio = float(np.median(ratios))
+        single = alone["latency"]["milliseconds"]["median"]
+        rows.append(
+            row(f"latency at {offered['rate']:g} Hz, of one frame", "that of a frame alone + its period, within 25 %",
+                f"{offered['latency']['milliseconds']['median']:.0f} ms, alone {single:.0f} ms, x {ratio:.2f} scene by "
+                "scene", ratio <= 1.25 + period / single)
+        )  # fmt: skip
+    return rows
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("--minutes", type=float, default=30.0)
+    parser.add_argument("--rate", type=float, default=30.0)
+    parser.add_argument("--objects", type=int, default=5)
+    parser.add_argument("--offered", type=float, default=90.0, help="Hz of the last phase; 0 leaves it out")
+    parser.add_argument("--node", choices=("recover_node", "fitter_node"), default="recover_node")
+    parser.add_argument("--size", default="", metavar="WxH", help="of the image; 640x480 if not given")
+    parser.add_argument("--name", default="soak", help="of the results' files")
+    options = parser.parse_args()
+    with (
+        Peer("soak") as peer,
+        Children(environment()) as nodes,
+        Children(environment(NUMBA_NUM_THREADS="1")) as cameras,
+    ):
+        soak = Soak(options.node, options.objects, options.size, peer, nodes, cameras)
+        alone = soak.phase(_ALONE_RATE, SCENES * _ALONE_FRAMES / _ALONE_RATE, _ALONE_FRAMES, services=False)
+        hold = round(SCENE_SECONDS * options.rate)
+        asked = soak.phase(options.rate, 60 * options.minutes, hold)
+        phases = {"alone": alone, "asked": asked}
+        if options.offered:
+            seconds = max(30.0, min(120.0, 10 * options.minutes))
+            phases["offered"] = soak.phase(options.offered, seconds, round(options.offered * seconds / SCENES))
+        final = soak.final()
+        warnings = soak.node.last_lines()
+        accounts = {name: account(soak, phase) for name, phase in phases.items()}
+        single = soak.by_scene(alone)
+        most = soak.by_scene(phases.get("offered", asked))
+        ratios = [float(np.median(most[scene]) / np.median(single[scene])) for scene in most if scene in single]
+    rows = verdicts(accounts["alone"], accounts["asked"], accounts.get("offered"), final, ratios)
+    seconds = [
+        {"second": round(when, 2), **{key: round(value, 3) for key, value in asdict(one).items()}}
+        for when, one in asked.usage[:: max(1, len(asked.usage) // 200)]
+    ]
+    result = {
+        "options": vars(options),
+        "phases": accounts,
+        "verdicts": rows,
+        "final": final.values,
+        "said": warnings,
+        "course": seconds,
+    }
+    table = report.table(["what", "asked", "reached", "met"], rows)
+    report.write(options.name, result, f"{options.node}, {options.objects} objects, {options.rate:g} Hz for "
+                 f"{options.minutes:g} minutes\n\n{table}")  # fmt: skip
+    sys.exit(0 if all(row[-1] == "yes" for row in rows) else 1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,340 @@
+"""Nodes as processes of their own and a peer beside them: what tests and benchmarks of running nodes share.
+
+Nothing here knows the inside of a node: topics, services, diagnostics and /proc are all that is looked at.  Times are
+seconds of the monotonic clock, ages milliseconds from the stamp of an image to the arrival of its result in the peer.
+"""
+
+from __future__ import annotations
+
+import os
+import threading
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from rcl_interfaces.srv import GetParameters, SetParameters
+from rclpy.context import Context
+from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
+from rclpy.node import Node
+from rclpy.parameter import Parameter, parameter_value_to_python
+from rclpy.task import Future
+from rclpy.time import Time
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from std_msgs.msg import Header
+
+from sq_msgs_py.depth_image import Intrinsics, depth_to_message, intrinsics_to_message
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging.camera import Camera
+from sq_perception.imaging.scene import Scene
+from sq_perception.nodes import fast_dds
+from sq_perception.nodes.children import Child
+
+PATIENCE = 90.0
+"""Seconds; a loaded machine compiles on the first start."""
+CAMERA = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)
+BODIES = Superquadric(
+    np.array([[0.06, 0.05, 0.08], [0.04, 0.05, 0.06]]),
+    np.array([[0.4, 0.6], [0.2, 0.9]]),
+    np.array([[0.08, 0.01, 0.6], [-0.1, -0.02, 0.65]]),
+    np.array([[0.4, 0.3, 0.1, 0.85], [0.1, 0.5, 0.2, 0.8]]),
+)
+"""Two bodies in the optical frame, one to the right and one to the left."""
+
+
+def environment(**more: str) -> dict[str, str]:
+    """What the processes of nodes get: this one's environment, the shipped Fast DDS profile, and ``more``."""
+    return {**fast_dds.environment(), "RCUTILS_COLORIZED_OUTPUT": "0", **more}
+
+
+def arguments(*parameters: str, remap: Sequence[str] = ()) -> list[str]:
+    """The command line of parameters ("name:=value") and remappings ("from:=to")."""
+    parts = [word for parameter in parameters for word in ("-p", parameter)]
+    return ["--ros-args", *parts, *(word for one in remap for word in ("-r", one))]
+
+
+def until(condition: Callable[[], Any], alive: Sequence[Child] = (), patience: float = PATIENCE) -> Any:
+    """The first true value of ``condition``; fails where a process of ``alive`` ends, or nothing comes in time."""
+    deadline = time.monotonic() + patience
+    while not (result := condition()):
+        for child in alive:
+            assert child.exit_code is None, f"{child.name} ended:\n" + "\n".join(child.last_lines())
+        said = "\n".join(line for child in alive for line in child.last_lines())
+        assert time.monotonic() < deadline, f"waited {patience:g} s in vain\n{said}"
+        time.sleep(0.002)
+    return result
+
+
+@dataclass(frozen=True)
+class Answer:
+    """One result: when it arrived, how old its image was then, and the message."""
+
+    time: float
+    age: float
+    message: PointCloud2
+
+    @property
+    def stamp(self) -> int:
+        """Nanoseconds."""
+        stamp = self.message.header.stamp
+        return int(stamp.sec) * 10**9 + int(stamp.nanosec)
+
+
+@dataclass(frozen=True)
+class Diagnosis:
+    """One report of a node: when it arrived, its level and message, and its values by key."""
+
+    time: float
+    level: int
+    message: str
+    values: dict[str, str] = field(default_factory=dict)
+
+    def count(self, key: str) -> int:
+        """A counter of frames."""
+        return int(self.values[key])
+
+    @property
+    def is_balanced(self) -> bool:
+        """Whether every received frame has exactly one verdict or is in work."""
+        parts = ("answered", "dropped", "refused", "in work")
+        return self.count("received") == sum(self.count(key) for key in parts)
+
+
+@dataclass(frozen=True)
+class Call:
+    """One answer of a service and the milliseconds that it took."""
+
+    response: Any
+    milliseconds: float
+
+
+class Peer:
+    """A node in this process, spun in the background, that publishes, listens and calls."""
+
+    def __init__(self, name: str = "peer") -> None:
+        os.environ.update(fast_dds.additions())
+        self.context = Context()
+        self.context.init(args=[])
+        self.node = Node(name, context=self.context)
+        self._publishers: dict[str, Any] = {}
+        self._clients: dict[str, Any] = {}
+        self._answers: dict[str, list[Answer]] = {}
+        self._diagnoses: dict[str, list[Diagnosis]] = {}
+        self._executor = SingleThreadedExecutor(context=self.context)
+        self._executor.add_node(self.node)
+        self.listen(DiagnosticArray, "/diagnostics", self._on_diagnostics)
+        self._thread = threading.Thread(target=self._spin, daemon=True)
+        self._thread.start()
+
+    def __enter__(self) -> Peer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Leave ROS."""
+        self.context.try_shutdown()
+        self._thread.join(PATIENCE)
+        self.node.destroy_node()
+
+    def _spin(self) -> None:
+        try:
+            while self.context.ok():
+                self._executor.spin_once(timeout_sec=0.2)
+        except ExternalShutdownException:
+            return
+
+    # Listening
+
+    def listen(self, kind: type[Any], topic: str, callback: Callable[[Any], None], depth: int = 50) -> None:
+        """Subscribe; the callback runs in the background thread."""
+        self.node.create_subscription(kind, topic, callback, depth)
+        self._executor.wake()
+
+    def answers(self, node: str) -> list[Answer]:
+        """The results of a node ("/recover_node"), growing from the first call on."""
+        if node not in self._answers:
+            found = self._answers[node] = []
+
+            def heard(message: PointCloud2) -> None:
+                age = (self.node.get_clock().now() - Time.from_msg(message.header.stamp)).nanoseconds * 1e-6
+                found.append(Answer(time.monotonic(), age, message))
+
+            self.listen(PointCloud2, f"{node}/superquadrics", heard)
+        return self._answers[node]
+
+    def diagnoses(self, node: str) -> list[Diagnosis]:
+        """The reports about a node's frames, growing."""
+        return self._diagnoses.setdefault(node, [])
+
+    def _on_diagnostics(self, message: DiagnosticArray) -> None:
+        for status in message.status:
+            values = {pair.key: pair.value for pair in status.values}
+            if "received" in values:
+                self.diagnoses(_owner(status)).append(
+                    Diagnosis(time.monotonic(), int.from_bytes(status.level, "big"), status.message, values)
+                )
+
+    # Speaking
+
+    def publisher(self, kind: type[Any], topic: str, depth: int = 5) -> Any:
+        """The publisher of a topic, made at the first call."""
+        if topic not in self._publishers:
+            self._publishers[topic] = self.node.create_publisher(kind, topic, depth)
+        return self._publishers[topic]
+
+    def silence(self, topic: str) -> None:
+        """Destroy the publisher of a topic."""
+        self.node.destroy_publisher(self._publishers.pop(topic))
+
+    def header(self, frame_id: str = "a_camera") -> Header:
+        """A header of now."""
+        return Header(stamp=self.node.get_clock().now().to_msg(), frame_id=frame_id)
+
+    def start_call(self, kind: type[Any], name: str, request: Any, alive: Sequence[Child] = ()) -> Future:
+        """Call a service; the future holds the response."""
+        if name not in self._clients:
+            self._clients[name] = self.node.create_client(kind, name)
+            self._executor.wake()
+        until(self._clients[name].service_is_ready, alive)
+        return self._clients[name].call_async(request)
+
+    def call(self, kind: type[Any], name: str, request: Any, alive: Sequence[Child] = ()) -> Call:
+        """Call a service and wait for its answer."""
+        done: list[float] = []
+        began = time.perf_counter()
+        future = self.start_call(kind, name, request, alive)
+        future.add_done_callback(lambda _: done.append(time.perf_counter()))
+        until(lambda: done, alive)
+        return Call(future.result(), 1e3 * (done[0] - began))
+
+    def set(self, node: str, alive: Sequence[Child] = (), **values: Any) -> list[Any]:
+        """Set parameters one by one; the results (successful, reason)."""
+        changes = [Parameter(name, value=value).to_parameter_msg() for name, value in values.items()]
+        request = SetParameters.Request(parameters=changes)
+        return list(self.call(SetParameters, f"{node}/set_parameters", request, alive).response.results)
+
+    def get(self, node: str, *names: str, alive: Sequence[Child] = ()) -> list[Any]:
+        """Values of parameters."""
+        request = GetParameters.Request(names=list(names))
+        found = self.call(GetParameters, f"{node}/get_parameters", request, alive).response.values
+        return [parameter_value_to_python(one) for one in found]
+
+    # Frames
+
+    def frame(
+        self, bodies: Superquadric = BODIES, camera: Camera = CAMERA, frame_id: str = "a_camera"
+    ) -> tuple[Image, CameraInfo]:
+        """The image of bodies with a stamp of now, and its camera_info."""
+        header = self.header(frame_id)
+        known = Intrinsics(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+        return depth_to_message(_rendered(bodies, camera), header), intrinsics_to_message(known, header)
+
+    def ask(
+        self,
+        node: str,
+        image: Image,
+        info: CameraInfo,
+        alive: Sequence[Child] = (),
+        space: str = "/",
+        every: float = 1.0,
+    ) -> Answer:
+        """Publish a frame in a namespace, again ``every`` so often as best effort may lose it, until it is answered."""
+        heard = self.answers(node)
+        images, infos = (
+            self.publisher(Image, f"{space}depth/image"),
+            self.publisher(CameraInfo, f"{space}depth/camera_info"),
+        )
+        until(lambda: images.get_subscription_count() and infos.get_subscription_count(), alive)
+        until(lambda: self.node.count_publishers(f"{node}/superquadrics"), alive)
+        sent: list[float] = []
+        seen = len(heard)
+
+        def answered() -> Answer | None:
+            if not sent or time.monotonic() - sent[-1] > every:
+                infos.publish(info)
+                images.publish(image)
+                sent.append(time.monotonic())
+            return next((one for one in heard[seen:] if one.message.header == image.header), None)
+
+        return until(answered, alive)
+
+
+_IMAGES: dict[tuple[int, Camera], np.ndarray] = {}
+
+
+def _rendered(bodies: Superquadric, camera: Camera) -> np.ndarray:
+    key = id(bodies), camera
+    if key not in _IMAGES:
+        _IMAGES[key] = Scene(bodies, camera, None).render()[0]
+    return _IMAGES[key]
+
+
+def _owner(status: DiagnosticStatus) -> str:
+    """The full name of the node that a status is about."""
+    return "/" + status.name.split(":")[0].strip().lstrip("/")
+
+
+# Processes
+
+
+@dataclass(frozen=True)
+class Usage:
+    """What a process holds at one moment.
+
+    Attributes
+    ----------
+    rss, anonymous, shared
+        Resident memory, its private part, and that in shared-memory segments; MB.
+    cpu
+        Seconds so far.
+    threads, files, segments
+        Counts; segments are the files of Fast DDS that it maps.
+    """
+
+    rss: float
+    anonymous: float
+    shared: float
+    cpu: float
+    threads: int
+    files: int
+    segments: int
+
+
+def usage(pid: int) -> Usage:
+    """Read from /proc.
+
+    Raises
+    ------
+    OSError
+        If there is no such process.
+    """
+    place = Path("/proc") / str(pid)
+    lines = (line.split(":", 1) for line in (place / "status").read_text().splitlines())
+    status = {key: value.split() for key, value in lines}
+    mega = {key: int(status[key][0]) / 1024 for key in ("VmRSS", "RssAnon", "RssShmem")}
+    words = (place / "stat").read_text().rsplit(")", 1)[1].split()
+    ticks = int(words[11]) + int(words[12])
+    maps = (place / "maps").read_text().splitlines()
+    mapped = {line.rsplit("/", 1)[1] for line in maps if "/fastrtps_" in line}
+    return Usage(
+        rss=mega["VmRSS"],
+        anonymous=mega["RssAnon"],
+        shared=mega["RssShmem"],
+        cpu=ticks / os.sysconf("SC_CLK_TCK"),
+        threads=int(status["Threads"][0]),
+        files=len(os.listdir(place / "fd")),
+        segments=len(mapped),
+    )
+
+
+def proportional(pid: int) -> tuple[float, float]:
+    """Proportional and unique set size, MB; costs the process a few milliseconds, so that it is asked for rarely."""
+    lines = (line.split() for line in (Path("/proc") / str(pid) / "smaps_rollup").read_text().splitlines()[1:])
+    kilobytes = {words[0]: int(words[1]) for words in lines}
+    unique = kilobytes["Private_Clean:"] + kilobytes["Private_Dirty:"]
+    return kilobytes["Pss:"] / 1024, unique / 1024
