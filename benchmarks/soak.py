@@ -34,7 +34,18 @@ os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 sys.path.append(str(Path(__file__).resolve().parent.parent / "test"))
 
 from rcl_interfaces.srv import GetParameters
-from running_nodes import Answer, Diagnosis, Peer, Usage, arguments, environment, proportional, until, usage
+from running_nodes import (
+    Answer,
+    Diagnosis,
+    Peer,
+    Usage,
+    arguments,
+    environment,
+    nanoseconds,
+    proportional,
+    until,
+    usage,
+)
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import SetBool
 
@@ -85,8 +96,7 @@ class Soak:
         self.node = nodes.start(node, ["--ros-args", "--log-level", "warn"])
 
     def _on_truth(self, message: PointCloud2) -> None:
-        stamp = message.header.stamp
-        self.scenes[int(stamp.sec) * 10**9 + int(stamp.nanosec)] = zlib.crc32(bytes(message.data))
+        self.scenes[nanoseconds(message)] = zlib.crc32(bytes(message.data))
 
     def phase(self, rate: float, seconds: float, hold: int, *, services: bool = True) -> Phase:
         """Run the camera at a rate and watch."""

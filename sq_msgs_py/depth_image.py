@@ -36,6 +36,8 @@ _DTYPES: dict[str, type[Any]] = {
     "32SC1": np.int32,
     "32FC1": np.float32,
 }
+_LEAST_FOCAL_LENGTH, _MOST_PIXELS = 1e-2, 1e6
+"""What no camera goes beyond; lines of sight computed with less or more are no longer numbers."""
 _MILLIMETRES = np.float32(1000.0)
 
 
@@ -213,7 +215,8 @@ def intrinsics_from_message(message: CameraInfo) -> Intrinsics:
     Raises
     ------
     ImageError
-        If the camera is not calibrated (K and P zero or not finite) or the image size is below 1 x 1.
+        If the camera is not calibrated (K and P zero or not finite), no camera could have such intrinsics, or the image
+        size is below 1 x 1.
     """
     fx, cx, fy, cy = (float(message.p[i]) for i in (0, 2, 5, 6))
     if fx == 0.0 and fy == 0.0:
@@ -262,6 +265,11 @@ def _of_part(message: CameraInfo, fx: float, fy: float, cx: float, cy: float) ->
         raise ImageError(
             f"camera_info: expected focal lengths above 0, got fx = {fx:g}, fy = {fy:g}"
             + (" (the camera is not calibrated)" if fx == 0.0 and fy == 0.0 else "")
+        )
+    if min(fx, fy) < _LEAST_FOCAL_LENGTH or max(fx, fy, abs(cx), abs(cy)) > _MOST_PIXELS:
+        raise ImageError(
+            f"camera_info: expected focal lengths of {_LEAST_FOCAL_LENGTH:g} to {_MOST_PIXELS:g} pixels and a "
+            f"principal point within {_MOST_PIXELS:g}, got fx = {fx:g}, fy = {fy:g}, cx = {cx:g}, cy = {cy:g}"
         )
     width, height = int(message.width), int(message.height)
     region = message.roi

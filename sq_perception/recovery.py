@@ -58,6 +58,8 @@ _VIEW_PIXELS = 64
 _SCORE_STRIDE = 3
 """22 x 22 lines of sight of 64 voxels: few enough for torch not to spread them over threads, which would cost more."""
 _FEWEST_PIXELS = 12
+_NEAREST, _FARTHEST = 1e-4, 1e5
+"""Metres; no sensor measures beyond, and numbers beyond make squares and products that are none."""
 _LEAST_BUDGET = 1e-6
 """Seconds; an object whose turn comes too late is still fitted, from one start."""
 _UNKNOWN = np.full((11, 11), np.nan)
@@ -298,7 +300,7 @@ class Recoverer:
         network = self._load_network() if options.method in _NEEDS_NETWORK else None
 
         with _timed(milliseconds, "segmentation"):
-            depth = np.asarray(depth)
+            depth = _plausible(np.asarray(depth), camera)
             if labels is None:
                 found = segmentation.segment(depth, camera, options.segmentation_options())
             else:
@@ -373,6 +375,16 @@ def checked_device(device: str) -> str:
         count = torch.cuda.device_count()
         raise ValueError(f"device: {device!r} was asked for, but torch sees {count} CUDA devices here")
     return device
+
+
+def _plausible(depth: np.ndarray, camera: Camera) -> np.ndarray:
+    """The image without readings that are none; what is no depth image at all is for the segmentation to refuse."""
+    if depth.dtype.kind != "f":
+        return depth
+    wild = np.abs(depth) > _FARTHEST
+    if camera.is_pinhole:
+        wild |= (depth > 0) & (depth < _NEAREST)
+    return np.where(wild, depth.dtype.type(np.nan), depth) if wild.any() else depth
 
 
 def _cleaned(depth: np.ndarray, camera: Camera) -> np.ndarray:

@@ -22,7 +22,6 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.task import Future
-from rclpy.time import Time
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from std_msgs.msg import Header
 
@@ -68,6 +67,12 @@ def until(condition: Callable[[], Any], alive: Sequence[Child] = (), patience: f
     return result
 
 
+def nanoseconds(message: Any) -> int:
+    """The stamp of a message."""
+    stamp = message.header.stamp
+    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
+
+
 @dataclass(frozen=True)
 class Answer:
     """One result: when it arrived, how old its image was then, and the message."""
@@ -79,8 +84,7 @@ class Answer:
     @property
     def stamp(self) -> int:
         """Nanoseconds."""
-        stamp = self.message.header.stamp
-        return int(stamp.sec) * 10**9 + int(stamp.nanosec)
+        return nanoseconds(self.message)
 
 
 @dataclass(frozen=True)
@@ -161,7 +165,8 @@ class Peer:
             found = self._answers[node] = []
 
             def heard(message: PointCloud2) -> None:
-                age = (self.node.get_clock().now() - Time.from_msg(message.header.stamp)).nanoseconds * 1e-6
+                # Not with rclpy's Time, which a stamp before 1970 does not fit into.
+                age = 1e-6 * (self.node.get_clock().now().nanoseconds - nanoseconds(message))
                 found.append(Answer(time.monotonic(), age, message))
 
             self.listen(PointCloud2, f"{node}/superquadrics", heard)
@@ -183,13 +188,14 @@ class Peer:
 
     def publisher(self, kind: type[Any], topic: str, depth: int = 5) -> Any:
         """The publisher of a topic, made at the first call."""
-        if topic not in self._publishers:
-            self._publishers[topic] = self.node.create_publisher(kind, topic, depth)
-        return self._publishers[topic]
+        full = _absolute(topic)
+        if full not in self._publishers:
+            self._publishers[full] = self.node.create_publisher(kind, full, depth)
+        return self._publishers[full]
 
     def silence(self, topic: str) -> None:
         """Destroy the publisher of a topic."""
-        self.node.destroy_publisher(self._publishers.pop(topic))
+        self.node.destroy_publisher(self._publishers.pop(_absolute(topic)))
 
     def header(self, frame_id: str = "a_camera") -> Header:
         """A header of now."""
@@ -277,6 +283,10 @@ def _rendered(bodies: Superquadric, camera: Camera) -> np.ndarray:
 def _owner(status: DiagnosticStatus) -> str:
     """The full name of the node that a status is about."""
     return "/" + status.name.split(":")[0].strip().lstrip("/")
+
+
+def _absolute(topic: str) -> str:
+    return "/" + topic.lstrip("/")
 
 
 # Processes

@@ -317,3 +317,32 @@ def test_a_frame_of_nothing_has_no_bodies(recoverer: Recoverer, name: str) -> No
 def test_masks_in_a_frame_of_nothing_make_no_wild_bodies(recoverer: Recoverer, name: str, masks: str) -> None:
     frame = FRAMES[name]()
     check(recoverer.recover(frame.depth, frame.camera, MASKS[masks](frame)), frame)
+
+
+@pytest.mark.parametrize("size", [(3, 7), (33, 21), (64, 48)])
+@pytest.mark.parametrize("seed", range(4))
+def test_bits_that_are_no_depth_raise_nothing_and_make_no_infinite_body(
+    recoverer: Recoverer, size: tuple[int, int], seed: int
+) -> None:
+    """Random bits are readings from 1e-45 to 3e38 m, whose squares are no numbers."""
+    width, height = size
+    camera = Camera(width, height, 60.0, 60.0, (width - 1) / 2, (height - 1) / 2)
+    bits = np.random.default_rng(seed).bytes(4 * width * height)
+    depth = np.frombuffer(bits, np.float32).reshape(height, width)
+    for labels in (None, np.ones(depth.shape, np.int32)):
+        for body in recoverer.recover(depth, camera, labels).bodies:
+            assert np.isfinite(body.superquadric.to_flat()).all()
+
+
+def test_readings_that_no_sensor_makes_count_as_none(recoverer: Recoverer) -> None:
+    ball = Superquadric(np.full(3, 0.1), np.ones(2), np.array([0.0, 0.0, 0.6]), np.array([0.0, 0.0, 0.0, 1.0]))
+    depth = np.where(np.isfinite(rendered := raycast.render(ball, COARSE)[0]), rendered, np.nan).astype(np.float32)
+    labels = np.isfinite(depth).astype(np.int32)
+    holes = np.random.default_rng(1).random(depth.shape) < 0.2
+    wild = np.where(holes, np.resize(np.array([1e30, 1e-30, 3e38, 1e6], np.float32), depth.shape), depth)
+    known, found = (
+        recoverer.recover(image, COARSE, labels).bodies[0]
+        for image in (np.where(holes, np.float32(np.nan), depth), wild)
+    )
+    assert found.pixels == known.pixels
+    np.testing.assert_array_equal(found.superquadric.to_flat(), known.superquadric.to_flat())

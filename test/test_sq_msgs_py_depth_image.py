@@ -208,6 +208,9 @@ def test_a_cut_out_and_binned_image_sees_the_same_ray() -> None:
         ({"k": [-5.0, 0.0, 2.0, 0.0, 6.0, 1.0, 0.0, 0.0, 1.0]}, "above 0"),
         ({"k": [np.nan, 0.0, 2.0, 0.0, 6.0, 1.0, 0.0, 0.0, 1.0]}, "finite"),
         ({"k": [5.0, 0.0, 2.0, 0.0, 6.0, 1.0, 0.0, 0.0, 1.0], "width": 0}, "at least 1 x 1"),
+        ({"k": [1e-9, 0.0, 2.0, 0.0, 6.0, 1.0, 0.0, 0.0, 1.0]}, "0.01 to 1e\\+06 pixels"),
+        ({"k": [5.0, 0.0, 2.0, 0.0, 1e300, 1.0, 0.0, 0.0, 1.0]}, "0.01 to 1e\\+06 pixels"),
+        ({"k": [5.0, 0.0, -1e20, 0.0, 6.0, 1.0, 0.0, 0.0, 1.0]}, "principal point"),
     ],
 )
 def test_a_camera_info_that_says_nothing_is_refused(change: dict, words: str) -> None:
