@@ -1,0 +1,111 @@
+"""kill -9 of camera, node and viewer in any order: does the rest go on, how soon is the killed one back at work?
+
+    python benchmarks/kills.py [--kills 50] [--seed 0] [--rate 30] [--objects 1]
+
+A supervisor starts the killed process again at once, as a launch file with ``respawn`` does.  The time goes from that
+start to the first result that needs the process: of an image that was taken after it.  Meanwhile the others must not
+fall silent: results where the viewer was killed, camera_infos where the node was, diagnoses where the camera was.
+Shared-memory segments are counted after each kill, those of dead owners separately.  They are freed by the next start
+of one of this package's nodes, not by the viewer's, and not before they are ten seconds old.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import shlex
+import sys
+import time
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+import report
+
+os.environ.setdefault("ROS_DOMAIN_ID", "80")
+os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+sys.path.append(str(Path(__file__).resolve().parent.parent / "test"))
+
+from respawned_nodes import CAMERA, MEMBERS, NODE, VIEWER, Kill, Robot
+from running_nodes import Peer
+
+from sq_perception.nodes.shared_memory import orphans, remove_orphans
+
+ASKED = 5.0
+"""Seconds to the first result after a restart."""
+_GAP = {CAMERA: 2.0, NODE: 0.5, VIEWER: 1.0}
+"""Seconds of silence that the kill of a process may cause in what does not need it; diagnoses come once a second."""
+_CALM = (0.5, 2.0)
+"""Seconds between two kills."""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("--kills", type=int, default=50)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--rate", type=float, default=30.0)
+    parser.add_argument("--objects", type=int, default=1)
+    parser.add_argument("--node", choices=("recover_node", "fitter_node"), default="recover_node")
+    parser.add_argument("--viewer", default="", help="command that prints a line for each result; a plain subscriber")
+    parser.add_argument("--name", default="kills", help="of the results' files")
+    options = parser.parse_args()
+    rng = np.random.default_rng(options.seed)
+    # An equal share of each, in a random order.
+    order = rng.permutation(np.resize(MEMBERS, options.kills))
+    freed = remove_orphans()
+    before = set(orphans())
+    kills: list[Kill] = []
+    with (
+        Peer("kills") as peer,
+        Robot(
+            peer,
+            camera=(f"rate:={options.rate}", f"objects:={options.objects}", "hold:=15"),
+            node=options.node,
+            viewer=shlex.split(options.viewer),
+        ) as robot,
+    ):
+        for member in order:
+            time.sleep(rng.uniform(*_CALM))
+            kills.append(robot.kill(str(member)))
+            print(kills[-1], flush=True)
+    left = robot.left()
+    time.sleep(1.0)
+    dead = set(orphans()) - before
+    rows = []
+    for member in MEMBERS:
+        chosen = [kill for kill in kills if kill.member == member]
+        if not chosen:
+            continue
+        back, silence = (np.array([getattr(kill, what) for kill in chosen]) for what in ("back", "silence"))
+        good = back.max() < ASKED and silence.max() < _GAP[member]
+        rows.append(
+            [member, str(len(chosen)), f"{np.median(back):.2f} / {back.max():.2f}", f"{np.median(silence):.2f} / "
+             f"{silence.max():.2f}", f"{_GAP[member]:g}", "yes" if good else "NO"]
+        )  # fmt: skip
+    header = [
+        "killed",
+        "times",
+        f"back after s, median / max (< {ASKED:g})",
+        "others silent s, median / max",
+        "<",
+        "met",
+    ]
+    most = max(kill.orphans for kill in kills)
+    words = (
+        f"Processes left: {len(left)}. Segments of dead owners: {len(before)} before, at most {most} during, "
+        f"{len(dead)} new ones after the end."
+    )
+    result = {
+        "options": vars(options),
+        "kills": [asdict(kill) for kill in kills],
+        "processes_left": left,
+        "orphans": {"before": len(before), "at_most": most, "after": len(dead)},
+        "freed_before": asdict(freed),
+    }
+    report.write(options.name, result, f"{report.table(header, rows)}\n\n{words}")
+    remove_orphans()
+    sys.exit(0 if not left and all(row[-1] == "yes" for row in rows) else 1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,185 @@
+"""A camera, a node and a viewer that are killed without warning and started again, as a robot's launch file does.
+
+The viewer is a plain subscriber in a process of its own, or any command that prints a line for each result.  What is
+measured of a kill: the time from the new start to the first result that needs the killed process, and the longest
+silence of those that live on.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+from running_nodes import Peer, arguments, environment, until
+from sensor_msgs.msg import CameraInfo
+
+from sq_perception.nodes.children import Child
+from sq_perception.nodes.shared_memory import FOLDER, orphans
+
+CAMERA, NODE, VIEWER = "camera", "node", "viewer"
+MEMBERS = (CAMERA, NODE, VIEWER)
+_VIEWER = """
+import rclpy
+from sensor_msgs.msg import PointCloud2
+rclpy.init()
+node = rclpy.create_node("viewer")
+node.create_subscription(PointCloud2, {topic!r}, lambda message: print(message.width, flush=True), 10)
+rclpy.spin(node)
+"""
+_SETTLE = 1.0
+"""Seconds after a recovery in which the others are still watched."""
+
+
+class Viewer:
+    """A process that prints a line for each result it sees."""
+
+    def __init__(self, command: Sequence[str]) -> None:
+        self.times: list[float] = []
+        self._process = subprocess.Popen(
+            list(command),
+            env=environment(PYTHONUNBUFFERED="1"),
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.DEVNULL,
+            text=True,
+            start_new_session=True,
+        )
+        self._reader = threading.Thread(target=self._read, daemon=True)
+        self._reader.start()
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    @property
+    def exit_code(self) -> int | None:
+        """None while it runs."""
+        return self._process.poll()
+
+    def kill(self) -> None:
+        """End it and all that it started."""
+        if self.exit_code is None:
+            os.killpg(self.pid, signal.SIGKILL)
+        self._process.wait()
+        self._reader.join()
+
+    def _read(self) -> None:
+        assert self._process.stdout is not None
+        with self._process.stdout as lines:
+            for _ in lines:
+                self.times.append(time.monotonic())
+
+
+@dataclass(frozen=True)
+class Kill:
+    """One kill: who, how long until it was back at work, and the longest silence of the others, in seconds."""
+
+    member: str
+    back: float
+    silence: float
+    segments: int
+    orphans: int
+
+
+class Robot:
+    """Three processes and the peer that watches them; leaves nothing behind."""
+
+    def __init__(
+        self,
+        peer: Peer,
+        camera: Sequence[str] = (),
+        node: str = "recover_node",
+        parameters: Sequence[str] = (),
+        viewer: Sequence[str] = (),
+    ) -> None:
+        self._peer, self._node = peer, node
+        self._camera, self._parameters = tuple(camera), tuple(parameters)
+        topic = f"/{node}/superquadrics"
+        self._viewer = tuple(viewer) or (sys.executable, "-c", _VIEWER.format(topic=topic))
+        self.running: dict[str, Any] = {}
+        self.answers, self.diagnoses = peer.answers(f"/{node}"), peer.diagnoses(f"/{node}")
+        self.infos: list[float] = []
+        peer.listen(CameraInfo, "/depth/camera_info", lambda _: self.infos.append(time.monotonic()))
+        self.pids: list[int] = []
+
+    def __enter__(self) -> Robot:
+        for member in MEMBERS:
+            self.start(member)
+        until(lambda: self.answers and self.running[VIEWER].times, (self.running[NODE],))
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for member in MEMBERS:
+            if member in self.running:
+                self.running[member].kill()
+
+    def start(self, member: str) -> None:
+        """Start one of the three."""
+        if member == VIEWER:
+            self.running[member] = Viewer(self._viewer)
+        elif member == CAMERA:
+            words = [*arguments(*self._camera), "--log-level", "warn"]
+            self.running[member] = Child("synthetic_depth_node", words, environment(NUMBA_NUM_THREADS="1"))
+        else:
+            words = [*arguments(*self._parameters), "--log-level", "warn"]
+            self.running[member] = Child(self._node, words, environment())
+        self.pids.append(self.running[member].pid)
+
+    def kill(self, member: str) -> Kill:
+        """SIGKILL, a new start at once, and what came of it."""
+        others = {name: process.pid for name, process in self.running.items() if name != member}
+        began = time.monotonic()
+        self.running[member].kill()
+        self.start(member)
+        back = self._wait(member, time.monotonic())
+        ended = time.monotonic()
+        time.sleep(_SETTLE)
+        assert {name: self.running[name].pid for name in others} == others
+        for name in others:
+            assert self.running[name].exit_code is None, f"the {name} ended with the {member}"
+        return Kill(member, back, self._silence(member, began, ended), len(segments()), len(orphans()))
+
+    def _wait(self, member: str, started: float) -> float:
+        wall = time.time() - (time.monotonic() - started)
+        if member == VIEWER:
+            times = self.running[VIEWER].times
+            return until(lambda: times and times[0]) - started
+        seen = len(self.answers)
+
+        def answered() -> float:
+            # The first result of an image that did not exist before the new start.
+            return next((one.time for one in self.answers[seen:] if 1e-9 * one.stamp > wall), 0.0)
+
+        back = until(answered, (self.running[NODE], self.running[CAMERA]))
+        watched = self.running[VIEWER]
+        until(lambda: watched.times and watched.times[-1] >= back - 1.0, (self.running[NODE],))
+        return back - started
+
+    def _silence(self, member: str, began: float, ended: float) -> float:
+        """The longest gap in what does not need the killed process."""
+        heard = {
+            CAMERA: [one.time for one in self.diagnoses],
+            NODE: self.infos,
+            VIEWER: [one.time for one in self.answers],
+        }[member]
+        times = [began, *(one for one in heard if began < one < ended + _SETTLE), ended + _SETTLE]
+        return max(later - earlier for earlier, later in pairwise(times))
+
+    def left(self) -> list[int]:
+        """Processes that were ever started and still exist."""
+        return [pid for pid in self.pids if Path(f"/proc/{pid}").exists()]
+
+
+def segments() -> list[str]:
+    """Names of the segments of all participants of this machine."""
+    names = os.listdir(FOLDER) if FOLDER.is_dir() else []
+    return [name for name in names if name.startswith("fastrtps_") and len(name) == len("fastrtps_") + 16]
