@@ -1,7 +1,8 @@
 """The life of a process with one or several nodes: start, spin, stop, each without a traceback.
 
 Exit code 0 after Ctrl-C or SIGTERM, whether it comes once, twice, or while a node still starts; 1 with one line of
-explanation where a node cannot start.  The shipped Fast DDS profile is used unless the user has chosen one.
+explanation where a node cannot start.  The shipped Fast DDS profile is used unless the user has chosen one, and shared
+memory that killed processes left behind is freed (:mod:`sq_perception.nodes.shared_memory`).
 
 One thread spins all nodes: their callbacks only store messages, the work is done in threads of their own.
 """
@@ -15,7 +16,7 @@ from collections.abc import Callable, Sequence
 from types import FrameType
 from typing import TYPE_CHECKING
 
-from sq_perception.nodes import fast_dds
+from sq_perception.nodes import fast_dds, shared_memory
 
 if TYPE_CHECKING:
     from rclpy.executors import Executor
@@ -62,6 +63,7 @@ def run(name: str, create: Callable[[], Sequence[StoppableNode]], arguments: Seq
             for variable, value in {**_THREADS, **fast_dds.additions()}.items():
                 os.environ.setdefault(variable, value)
             sys.setswitchinterval(_SWITCH)
+            freed = shared_memory.remove_orphans()
             import rclpy
             from rclpy.executors import SingleThreadedExecutor
             from rclpy.signals import SignalHandlerOptions
@@ -74,6 +76,8 @@ def run(name: str, create: Callable[[], Sequence[StoppableNode]], arguments: Seq
             # deleted.
             executor = SingleThreadedExecutor()
             nodes.extend(create())
+            if freed.segments:
+                nodes[0].get_logger().info(f"freed {freed}")
             stop.starting = False
             return _spin(nodes, executor, stop)
         except Exception as error:
