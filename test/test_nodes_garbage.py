@@ -1,0 +1,55 @@
+"""The start of a node is not searched for garbage, neither while it lasts nor afterwards."""
+
+from __future__ import annotations
+
+import gc
+import weakref
+from collections.abc import Iterator
+
+import pytest
+
+from sq_perception.nodes import garbage
+
+
+class Ring:
+    """Refers to itself: only a collection can free it."""
+
+    def __init__(self) -> None:
+        self.itself = self
+
+
+@pytest.fixture(autouse=True)
+def thawed() -> Iterator[None]:
+    yield
+    gc.unfreeze()
+    gc.enable()
+
+
+def collections() -> int:
+    return sum(one["collections"] for one in gc.get_stats())
+
+
+def test_nothing_is_collected_within_and_new_garbage_is_afterwards():
+    assert gc.isenabled()
+    with garbage.postponed():
+        before = collections()
+        kept = [Ring() for _ in range(20_000)]
+        assert collections() == before
+        assert not gc.isenabled()
+    assert gc.isenabled()
+    assert gc.get_freeze_count() > len(kept)
+    seen = gc.get_objects()
+    assert not any(one is kept[0] for one in seen)
+    ghost = weakref.ref(Ring())
+    gc.collect()
+    assert ghost() is None
+
+
+def test_a_failure_and_a_process_without_collection_are_left_as_they_were():
+    with pytest.raises(ZeroDivisionError), garbage.postponed():
+        raise ZeroDivisionError
+    assert gc.isenabled()
+    gc.disable()
+    with garbage.postponed():
+        pass
+    assert not gc.isenabled()
