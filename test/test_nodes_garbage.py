@@ -53,3 +53,14 @@ def test_a_failure_and_a_process_without_collection_are_left_as_they_were():
     with garbage.postponed():
         pass
     assert not gc.isenabled()
+
+
+def test_what_is_kept_is_not_looked_at_until_it_is_released():
+    ring = Ring()
+    ghost = weakref.ref(ring)
+    garbage.keep()
+    del ring
+    gc.collect()
+    assert ghost() is not None
+    garbage.release()
+    assert ghost() is None

@@ -25,7 +25,6 @@ are in the cube frame of :mod:`sq_perception.imaging.unit_cube`, those of others
 
 from __future__ import annotations
 
-import gc
 import threading
 import traceback
 from collections.abc import Callable
@@ -49,7 +48,7 @@ from sq_perception import publication
 from sq_perception.calibration import Calibration
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
-from sq_perception.nodes import report, results, transport
+from sq_perception.nodes import garbage, report, results, transport
 from sq_perception.nodes.camera_poses import CameraPoses
 from sq_perception.nodes.counters import Statistics, Throttle
 from sq_perception.nodes.engine import TURNS, Engine, Workshop
@@ -144,6 +143,7 @@ class FrameNode(ManagedNode):
         self._superquadrics = self.create_publisher(PointCloud2, "~/superquadrics", 10)
         self._markers = self.create_publisher(MarkerArray, "~/markers", 1)
         self._rendered = self.create_publisher(Image, "~/rendered_depth", 1)
+        garbage.keep()
 
     def _activate(self) -> None:
         pinhole = self._settings.current.projection == "pinhole"
@@ -194,7 +194,7 @@ class FrameNode(ManagedNode):
                 self.destroy_publisher(publisher)
         self._engine.release()
         self._shown_ids = []
-        gc.collect()  # a network's weights hang in reference cycles
+        garbage.release()  # a network's weights hang in reference cycles
 
     def _comes_back(self) -> bool:
         return bool(self._settings.current.autostart)

@@ -26,3 +26,15 @@ def postponed() -> Iterator[None]:
         gc.freeze()
         if was_enabled:
             gc.enable()
+
+
+def keep() -> None:
+    """Collect once, and leave what is left alone from now on: it lives as long as the node is configured."""
+    gc.collect()
+    gc.freeze()
+
+
+def release() -> None:
+    """Collect everything that cannot be reached, what was left alone included."""
+    gc.unfreeze()
+    gc.collect()

@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 from types import FrameType
 from typing import TYPE_CHECKING
 
-from sq_perception.nodes import fast_dds, shared_memory
+from sq_perception.nodes import fast_dds, garbage, shared_memory
 
 if TYPE_CHECKING:
     from rclpy.executors import Executor
@@ -64,18 +64,19 @@ def run(name: str, create: Callable[[], Sequence[StoppableNode]], arguments: Seq
                 os.environ.setdefault(variable, value)
             sys.setswitchinterval(_SWITCH)
             freed = shared_memory.remove_orphans()
-            import rclpy
-            from rclpy.executors import SingleThreadedExecutor
-            from rclpy.signals import SignalHandlerOptions
+            with garbage.postponed():
+                import rclpy
+                from rclpy.executors import SingleThreadedExecutor
+                from rclpy.signals import SignalHandlerOptions
 
-            # rclpy's own handlers end the context from another thread, and give way to the default action for an
-            # instant when they go: a second Ctrl-C then killed the process.
-            quietly = SignalHandlerOptions.NO
-            rclpy.init(args=None if arguments is None else list(arguments), signal_handler_options=quietly)
-            # Before the node announces itself: an executor whose creation a signal interrupts complains when it is
-            # deleted.
-            executor = SingleThreadedExecutor()
-            nodes.extend(create())
+                # rclpy's own handlers end the context from another thread, and give way to the default action for an
+                # instant when they go: a second Ctrl-C then killed the process.
+                quietly = SignalHandlerOptions.NO
+                rclpy.init(args=None if arguments is None else list(arguments), signal_handler_options=quietly)
+                # Before the node announces itself: an executor whose creation a signal interrupts complains when it is
+                # deleted.
+                executor = SingleThreadedExecutor()
+                nodes.extend(create())
             if freed.segments:
                 nodes[0].get_logger().info(f"freed {freed}")
             stop.starting = False
