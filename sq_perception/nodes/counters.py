@@ -77,8 +77,16 @@ class Statistics:
         with self._lock:
             self._counts["answered"] += 1
             self._answers.append(monotonic())
-            for stage, duration in milliseconds.items():
-                self._stages.setdefault(stage, deque(maxlen=_WINDOW)).append(duration)
+            self._keep(milliseconds)
+
+    def note(self, milliseconds: Mapping[str, float]) -> None:
+        """Keep the duration of stages that follow the answer."""
+        with self._lock:
+            self._keep(milliseconds)
+
+    def _keep(self, milliseconds: Mapping[str, float]) -> None:
+        for stage, duration in milliseconds.items():
+            self._stages.setdefault(stage, deque(maxlen=_WINDOW)).append(duration)
 
     def snapshot(self) -> Snapshot:
         """The state of affairs now."""

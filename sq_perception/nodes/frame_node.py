@@ -38,7 +38,6 @@ from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
-from rclpy.time import Time
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import MarkerArray
@@ -358,15 +357,27 @@ class FrameNode(ManagedNode):
         findings = publication.findings(found, frame.header, frame.is_cube)
         findings = results.in_frame(findings, self._poses, parameters.target_frame)
         self._superquadrics.publish(to_message(findings.array, findings.header))
-        self._outputs.publish(findings, parameters, found.hidden)
         stages["publish"] = 1e3 * (perf_counter() - clock)
-        age = self.get_clock().now() - Time.from_msg(frame.header.stamp, clock_type=self.get_clock().clock_type)
-        stages["stamp to result"] = age.nanoseconds * 1e-6
-        clock = perf_counter()
-        self._publish_pictures(frame, found, findings, parameters)
-        stages["pictures"] = 1e3 * (perf_counter() - clock)
+        stages["stamp to result"] = 1e-6 * (self.get_clock().now().nanoseconds - _nanoseconds(frame.header.stamp))
         self._statistics.answer(stages)
+        self._publish_beside(frame, found, findings, parameters)
         return report.summary(found.recovery, found.ids)
+
+    def _publish_beside(self, frame: Frame, found: Identified, findings: Findings, parameters: FrameParameters) -> None:
+        """Publish what goes with a result; the frame is answered already, and stays so whatever goes wrong here."""
+        clock = perf_counter()
+        try:
+            self._outputs.publish(findings, parameters, found.hidden)
+            outputs = perf_counter()
+            self._publish_pictures(frame, found, findings, parameters)
+        except Exception as error:
+            if not self.context.ok():
+                return
+            self._warn(
+                "beside", f"a result was published without all that goes with it: {type(error).__name__}: {error}"
+            )
+            return
+        self._statistics.note({"outputs": 1e3 * (outputs - clock), "pictures": 1e3 * (perf_counter() - outputs)})
 
     def _decoded(self, inbox: Inbox, arrival: Arrival, parameters: FrameParameters) -> Frame:
         message = arrival.message
@@ -415,3 +426,8 @@ class FrameNode(ManagedNode):
     def _heard(self, subscription: Subscription) -> str:
         offered = self.get_publishers_info_by_topic(subscription.topic_name)
         return report.publishers(offered, subscription.qos_profile)
+
+
+def _nanoseconds(stamp: Any) -> int:
+    """Of a header; rclpy's Time refuses stamps before 1970, which a message can hold."""
+    return int(stamp.sec) * 10**9 + int(stamp.nanosec)
