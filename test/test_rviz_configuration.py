@@ -14,6 +14,8 @@ import numpy as np
 import pytest
 import yaml
 
+from sq_perception.publication import CAMERA_FRAME
+
 PROPERTIES = {
     "rviz_default_plugins/Axes": {"Length", "Radius", "Reference Frame"},
     "rviz_default_plugins/DepthCloud": {
@@ -99,7 +101,7 @@ def test_topics_and_frame_are_those_of_the_nodes(
         literal = f'"~/{name}"' if node in ("recover_node", "fitter_node") else f'"{node}/{name}"'
         assert literal in code, topic
     frame = configuration["Visualization Manager"]["Global Options"]["Fixed Frame"]
-    assert f'CAMERA_FRAME = "{frame}"' in code
+    assert frame == CAMERA_FRAME
 
 
 def test_the_view_looks_along_the_camera_and_stands_upright(configuration: dict[str, Any]) -> None:

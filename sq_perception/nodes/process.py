@@ -78,7 +78,7 @@ def run(name: str, create: Callable[[], Sequence[StoppableNode]], arguments: Seq
                 executor = SingleThreadedExecutor()
                 nodes.extend(create())
             if freed.segments:
-                nodes[0].get_logger().info(f"freed {freed}")
+                nodes[0].get_logger().debug(f"freed {freed}")
             stop.starting = False
             return _spin(nodes, executor, stop)
         except Exception as error:
