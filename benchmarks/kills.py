@@ -5,8 +5,9 @@
 A supervisor starts the killed process again at once, as a launch file with ``respawn`` does.  The time goes from that
 start to the first result that needs the process: of an image that was taken after it.  Meanwhile the others must not
 fall silent: results where the viewer was killed, camera_infos where the node was, diagnoses where the camera was.
-Shared-memory segments are counted after each kill, those of dead owners separately.  They are freed by the next start
-of one of this package's nodes, not by the viewer's, and not before they are ten seconds old.
+A process that does not come back within 30 s counts as never back (test/respawned_nodes.py says why that may happen).
+Shared-memory segments are counted after each kill, those of dead owners separately.  They are freed by the next start of
+one of this package's nodes, not by the viewer's, and not before they are ten seconds old.
 """
 
 from __future__ import annotations
@@ -97,7 +98,7 @@ def main() -> None:
     )
     result = {
         "options": vars(options),
-        "kills": [asdict(kill) for kill in kills],
+        "kills": [{**asdict(kill), "back": kill.back if np.isfinite(kill.back) else None} for kill in kills],
         "processes_left": left,
         "orphans": {"before": len(before), "at_most": most, "after": len(dead)},
         "freed_before": asdict(freed),
