@@ -6,8 +6,8 @@ A supervisor starts the killed process again at once, as a launch file with ``re
 start to the first result that needs the process: of an image that was taken after it.  Meanwhile the others must not
 fall silent: results where the viewer was killed, camera_infos where the node was, diagnoses where the camera was.
 A process that does not come back within 30 s counts as never back (test/respawned_nodes.py says why that may happen).
-Shared-memory segments are counted after each kill, those of dead owners separately.  They are freed by the next start of
-one of this package's nodes, not by the viewer's, and not before they are ten seconds old.
+Shared-memory segments are counted after each kill, those of dead owners separately.  They are freed by the next start
+of one of this package's nodes, not by the viewer's, and not before they are ten seconds old.
 """
 
 from __future__ import annotations
