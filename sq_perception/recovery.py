@@ -244,6 +244,7 @@ class Recoverer:
         self._lock = threading.Lock()
         self._blas = ThreadpoolController()
         self._beside = ThreadPoolExecutor(1, thread_name_prefix="network")
+        self._pool = ThreadPoolExecutor(self._threads, thread_name_prefix="fit")
         if method in _NEEDS_NETWORK:
             self._load_network()
 
@@ -309,7 +310,7 @@ class Recoverer:
             objects = seen_object.objects(depth, found, camera, options.depth_range)
 
         with _timed(milliseconds, "network"):
-            _mapped(lambda one: _view(one, depth, camera, found, options, network), objects, self._threads)
+            self._mapped(lambda one: _view(one, depth, camera, found, options, network), objects)
             if network is not None and objects:
                 views = np.stack([one.shown.marked for one in objects if one.shown is not None])
                 predictions: Future[Superquadric] = Future()
@@ -322,17 +323,23 @@ class Recoverer:
 
         with _timed(milliseconds, "fit"):
             deadline = started + options.time_budget
-            fits = _mapped(lambda one: _fitted(one, depth, camera, options, deadline), objects, self._threads)
+            fits = self._mapped(lambda one: _fitted(one, depth, camera, options, deadline), objects)
         with _timed(milliseconds, "repair"):
             if labels is None and options.repair and options.method in _FITTED and options.refine == "surface":
                 found, objects, fits = _repaired(found, objects, fits, depth, camera, options, deadline)
         with _timed(milliseconds, "score"):
             pairs = list(zip(objects, fits, strict=True))
-            scores = _mapped(lambda pair: _score(pair[0].view, pair[1].superquadric, options), pairs, self._threads)
+            scores = self._mapped(lambda pair: _score(pair[0].view, pair[1].superquadric, options), pairs)
         bodies = tuple(_recovery(one, fit, score) for one, fit, score in zip(objects, fits, scores, strict=True))
         milliseconds["total"] = 1e3 * (time.perf_counter() - started)
         message = "" if bodies else _why_empty(depth, found)
         return FrameRecovery(bodies, milliseconds, found.labels, found.plane, message)
+
+    def _mapped(self, function: Callable[[_Item], _Answer], items: Sequence[_Item]) -> list[_Answer]:
+        """The function of each item; several at a time in threads that stay, as new ones cost memory and time."""
+        if len(items) < 2 or self._threads < 2:
+            return [function(one) for one in items]
+        return list(self._pool.map(function, items))
 
     def _load_network(self) -> inference.Predictor:
         with self._lock:
@@ -394,14 +401,6 @@ def _cleaned(depth: np.ndarray, camera: Camera) -> np.ndarray:
     if camera.is_pinhole:
         bad |= depth <= 0
     return np.where(bad, np.float32(np.nan), depth)
-
-
-def _mapped(function: Callable[[_Item], _Answer], items: Sequence[_Item], threads: int) -> list[_Answer]:
-    workers = min(len(items), threads)
-    if workers < 2:
-        return [function(one) for one in items]
-    with ThreadPoolExecutor(workers, thread_name_prefix="fit") as pool:
-        return list(pool.map(function, items))
 
 
 def _view(

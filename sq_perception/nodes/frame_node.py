@@ -53,7 +53,7 @@ from sq_perception.nodes.counters import Statistics, Throttle
 from sq_perception.nodes.engine import TURNS, Engine, Workshop
 from sq_perception.nodes.frame import Frame, decode
 from sq_perception.nodes.identity import Identity
-from sq_perception.nodes.inbox import Arrival, Inbox, Refused
+from sq_perception.nodes.inbox import Arrival, Inbox, NoCameraInfo, Refused
 from sq_perception.nodes.managed_node import ManagedNode
 from sq_perception.nodes.outputs import Outputs
 from sq_perception.nodes.parameters import FrameParameters, LiveParameters
@@ -64,6 +64,8 @@ from sq_perception.recovery import FrameRecovery, render_recovery
 WARM_UP_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 _WORKER_END = 3.0
 """Seconds that a deactivation waits for the frame at hand."""
+_OLDEST = 3600.0
+"""Seconds; the age of an older frame, or one from the future, says nothing about latency: a bag, or another clock."""
 _DEFECTS = 10
 """Frames in a row that end in a defect of ours or of the device, after which the node starts anew."""
 
@@ -358,7 +360,9 @@ class FrameNode(ManagedNode):
         findings = results.in_frame(findings, self._poses, parameters.target_frame)
         self._superquadrics.publish(to_message(findings.array, findings.header))
         stages["publish"] = 1e3 * (perf_counter() - clock)
-        stages["stamp to result"] = 1e-6 * (self.get_clock().now().nanoseconds - _nanoseconds(frame.header.stamp))
+        age = 1e-9 * (self.get_clock().now().nanoseconds - _nanoseconds(frame.header.stamp))
+        if abs(age) < _OLDEST:
+            stages["stamp to result"] = 1e3 * age
         self._statistics.answer(stages)
         self._publish_beside(frame, found, findings, parameters)
         return report.summary(found.recovery, found.ids)
@@ -386,7 +390,7 @@ class FrameNode(ManagedNode):
         else:
             try:
                 frame = decode(message, lambda: inbox.calibration_of(message))
-            except Refused as error:
+            except NoCameraInfo as error:
                 info_input = self._info_input
                 if info_input is None:
                     raise

@@ -35,6 +35,10 @@ class Refused(ValueError):  # noqa: N818 - a verdict on a frame rather than a de
     """A frame that cannot be processed; says what was expected and what arrived."""
 
 
+class NoCameraInfo(Refused):
+    """A frame without a usable camera_info."""
+
+
 @dataclass(frozen=True)
 class Arrival:
     """A depth image, when it came, in seconds of the monotonic clock, and its mask if one came."""
@@ -148,16 +152,16 @@ class Inbox:
 
         Raises
         ------
-        Refused
-            If no usable camera_info of the image's size has come.
+        NoCameraInfo
+            If no usable one of the image's size has come.
         """
         size = size_of(image)
         with self._changed:
             info = self._info(size, stamp_of(image))
             if info is None:
-                raise Refused(self._why_no_info(size))
+                raise NoCameraInfo(self._why_no_info(size))
             if info.calibration is None:
-                raise Refused(info.fault)
+                raise NoCameraInfo(info.fault)
             return info.calibration
 
     def _promote(self, now: float) -> None:
