@@ -507,16 +507,21 @@ def test_diagnostics_count_and_warn(bench):
     reports: list[DiagnosticArray] = []
     bench.peer.create_subscription(DiagnosticArray, "/diagnostics", reports.append, 5)
     bench.answer(bench.depth())
+    long_ago = bench.node._statistics.snapshot().latency
+    assert "stamp to result" not in long_ago, "the stamp of an old recording says nothing about latency"
+    image = bench.depth()
+    image.header.stamp = bench.node.get_clock().now().to_msg()
+    bench.answer(image)
     bench.send(broken("encoding", bench.depth()))
 
     def latest() -> tuple[DiagnosticStatus, dict[str, str]]:
         status = reports[-1].status[0]
         return status, {pair.key: pair.value for pair in status.values}
 
-    bench.until(lambda: reports and latest()[1]["received"] == "2")
+    bench.until(lambda: reports and latest()[1]["received"] == "3")
     status, values = latest()
     assert status.hardware_id == "/recover_node"
-    assert (values["answered"], values["dropped"], values["refused"], values["lost"]) == ("1", "0", "1", "0")
+    assert (values["answered"], values["dropped"], values["refused"], values["lost"]) == ("2", "0", "1", "0")
     assert "yuv422" in values["last error"]
     assert float(values["stamp to result: median [ms]"]) > 0
     assert {"wait: p95 [ms]", "recovery: total: median [ms]", "publish: median [ms]"} <= set(values)
