@@ -1,11 +1,13 @@
 # make demo    watch superquadrics being recovered from a synthetic camera; FRAME=file for a recorded frame
 # make test    lint and the whole test suite, against the installed package
+# make lint    ruff and mypy alone
+# make bench   every benchmark, hours
 # make docs    the pages of docs/ as a site: site/index.html
 # make clean   remove everything that these commands made
 #
 # PYTHON=python3.12     the interpreter, 3.10 to 3.13
 # VENV=folder           where to install; .venv, or .venv-<distro> where a ROS 2 installation is sourced
-# PIP_FLAGS='...'       options for pip, for instance --index-url of a CPU build of torch, or --find-links
+# PIP_FLAGS='...'       options for pip, for instance --extra-index-url with PyTorch's index of CPU builds
 
 PYTHON ?= python3
 FRAME ?=

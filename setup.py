@@ -36,7 +36,7 @@ docs = [
 
 setup(
     name=NAME,
-    version="0.1.0",
+    version="0.2.0",
     description="Superquadrics from depth images: a network, exact fits and ROS 2 nodes",
     long_description="Depth images in, superquadrics with pose, shape, score and uncertainty out; see README.md.",
     author="sq_perception maintainers",

@@ -73,5 +73,19 @@ def _rviz(given: dict[str, str]) -> Node:
         package="rviz2",
         executable="rviz2",
         arguments=["-d", share, "-f", given["rviz_frame"]],
-        remappings=[("/depth/image", given["depth"]), ("/depth/camera_info", given["camera_info"])],
+        remappings=[
+            ("/depth/image", _within(given["namespace"], given["depth"])),
+            ("/depth/camera_info", _within(given["namespace"], given["camera_info"])),
+            *(
+                (f"/{node}/{name}", _within(given["namespace"], f"{node}/{name}"))
+                for node in ("recover_node", "fitter_node")
+                for name in ("markers", "rendered_depth")
+                if given["namespace"]
+            ),
+        ],
     )
+
+
+def _within(namespace: str, topic: str) -> str:
+    """A topic as a node of the namespace means it."""
+    return f"/{namespace.strip('/')}/{topic}" if namespace and not topic.startswith("/") else topic

@@ -278,8 +278,8 @@ def test_a_child_that_does_not_listen_is_killed_and_named(monkeypatch: pytest.Mo
 
 
 def test_the_profile_is_only_set_where_the_user_has_not_chosen_one() -> None:
-    name = fast_dds.VARIABLES[0]
+    name = fast_dds.VARIABLE
     assert fast_dds.profile_path().is_file()
     assert fast_dds.environment({})[name] == str(fast_dds.profile_path())
     assert fast_dds.environment({name: "mine.xml"}) == {name: "mine.xml"}
-    assert fast_dds.environment({fast_dds.VARIABLES[1]: "mine.xml"}) == {fast_dds.VARIABLES[1]: "mine.xml"}
+    assert fast_dds.environment({name: "mine.xml"}) == {name: "mine.xml"}

@@ -52,8 +52,7 @@ def launch(monkeypatch: pytest.MonkeyPatch) -> dict[str, type]:
             made[name] = type(name, (base,), {})
             setattr(stand_in, name, made[name])
         monkeypatch.setitem(sys.modules, module, stand_in)
-    for variable in fast_dds.VARIABLES:
-        monkeypatch.delenv(variable, raising=False)
+    monkeypatch.delenv(fast_dds.VARIABLE, raising=False)
     return made
 
 
@@ -74,7 +73,7 @@ def nodes_of(path: Path, made: dict[str, type], **given: str) -> list[Any]:
     }
     assert set(given) <= set(declared)
     variables = [e.positional for e in entities if isinstance(e, made["SetEnvironmentVariable"])]
-    assert variables == [(fast_dds.VARIABLES[0], str(fast_dds.profile_path()))]
+    assert variables == [(fast_dds.VARIABLE, str(fast_dds.profile_path()))]
     (opaque,) = (e for e in entities if isinstance(e, made["OpaqueFunction"]))
     return opaque.named["function"]({**declared, **given})
 

@@ -1,7 +1,8 @@
 """The Fast DDS profile that keeps large images from getting lost, and where it lies.
 
-Fast DDS reads FASTRTPS_DEFAULT_PROFILES_FILE (or FASTDDS_DEFAULT_PROFILES_FILE) when the first participant of a process
-is created, so that the variable must be set before rclpy.init.  A file that the user has chosen is left alone.
+Fast DDS 2, that of Jazzy, reads FASTRTPS_DEFAULT_PROFILES_FILE when the first participant of a process is created, so
+that the variable must be set before rclpy.init.  A file that the user has chosen is left alone.  Its successor's name,
+FASTDDS_DEFAULT_PROFILES_FILE, means nothing to it.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import os
 from collections.abc import Mapping
 from pathlib import Path
 
-VARIABLES = ("FASTRTPS_DEFAULT_PROFILES_FILE", "FASTDDS_DEFAULT_PROFILES_FILE")
+VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
 _FILE = "fast_dds.xml"
 
 
@@ -32,7 +33,7 @@ def profile_path() -> Path:
 def additions(base: Mapping[str, str] | None = None) -> dict[str, str]:
     """What ``base`` (os.environ by default) lacks: the variable of the shipped profile, or nothing if it names one."""
     present = os.environ if base is None else base
-    return {} if any(present.get(name) for name in VARIABLES) else {VARIABLES[0]: str(profile_path())}
+    return {} if present.get(VARIABLE) else {VARIABLE: str(profile_path())}
 
 
 def environment(base: Mapping[str, str] | None = None) -> dict[str, str]:

@@ -52,8 +52,10 @@ value out of its range, of another type or that does not fit the others is refus
 swapped when it is warm; one that cannot be made leaves the old one at work, and `/diagnostics` says why. A model file
 is checked before the change is accepted. Setting the same file again reads it again.
 
-The quality of service of each subscription is a parameter too: `qos_overrides./depth/image.subscription.reliability`,
-`durability`, `depth`, `history`, at the start only. `use_sim_time` is that of every ROS 2 node.
+The quality of service of each subscription is a parameter too, at the start only:
+`qos_overrides.<topic>.subscription.reliability`, `.depth`, `.history`, with the topic as it is after remapping, such as
+`/camera/camera/depth/image_rect_raw`.
+`use_sim_time` is that of every ROS 2 node.
 """
 
 
@@ -78,7 +80,7 @@ def yaml_text(name: str) -> str:
     if issubclass(kind, FrameParameters):
         lines += [
             "# Inputs are best effort, keep last 1; qos_overrides./depth/image.subscription.reliability: reliable, for",
-            "# instance, changes that (also .history and .depth, and the same for /depth/camera_info and /mask/image).",
+            "# instance, changes that (also .history and .depth; the topic's name is the one after remapping).",
         ]
     lines += ["/**:", "  ros__parameters:"]
     for one in fields(kind):
@@ -134,7 +136,8 @@ def _range(one: Field[Any]) -> str:
         return ", ".join(f"`{choice}`" for choice in about["choices"])
     if about["within"] is not None:
         low, high = about["within"]
-        return f"{low:g} to {high:g}{unit}"
+        whole = isinstance(one.default, int)
+        return f"{low} to {high}{unit}" if whole else f"{low:g} to {high:g}{unit}"
     return unit.strip()
 
 

@@ -5,9 +5,12 @@
 makes /front/recover_node and /wrist/recover_node, which take /front/depth/image, /wrist/depth/image and so on.
 Parameters are those of recover_node, by node name or by wildcard:
 
-    /**:                      /front/recover_node:
-      ros__parameters:          ros__parameters:
-        max_objects: 5            depth_max: 1.5
+    /**:
+      ros__parameters:
+        max_objects: 5
+    /wrist/recover_node:
+      ros__parameters:
+        depth_max: 1.0
 
 Frames are computed one after the other, in the order in which they ask (:mod:`sq_perception.nodes.engine`): a process
 per camera would hold the network once each and let them compete for the same cores.

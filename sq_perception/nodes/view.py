@@ -26,7 +26,7 @@ _NODE_NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 _ROS = "--ros-args"
 _NEEDED = (
     ("rclpy", "ROS 2 in Python: pip install 'sq_perception[ros]', or source a ROS 2 Jazzy installation"),
-    ("viser", "the viewer's library: pip install 'sq_perception[view]'"),
+    ("viser", "the viewer's library: pip install '.[view]' in a checkout"),
 )
 
 
@@ -53,7 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         from sq_perception.viewing import server
     except ImportError as error:
-        print(f"view: viser cannot be imported, {error}: pip install 'sq_perception[view]'", file=sys.stderr)
+        print(f"view: viser cannot be imported, {error}: pip install '.[view]' in a checkout", file=sys.stderr)
         return 1
     try:
         bound = server.listening_socket(options.host, options.port)
