@@ -242,6 +242,8 @@ class TestCheckpoint:
         path = tmp_path / "m.safetensors"
         with pytest.raises(checkpoint.CheckpointError, match="no such model file"):
             checkpoint.load(path)
+        with pytest.raises(checkpoint.CheckpointError, match=r"no such model file|cannot be read"):
+            checkpoint.check(tmp_path / ("m" * 5000) / "x.safetensors")
         path.write_bytes(b"not a model")
         with pytest.raises(checkpoint.CheckpointError, match="not a readable safetensors"):
             checkpoint.load(path)

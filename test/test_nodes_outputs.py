@@ -119,7 +119,8 @@ def objects(publisher: Publisher, which: int = -1) -> dict[str, bytes]:
 
 
 def test_nothing_is_created_before_it_is_asked_for(node):
-    outputs = Outputs(node, FrameParameters())
+    outputs = Outputs(node)
+    outputs.follow(FrameParameters())
     outputs.publish(found(1), FrameParameters())
     assert not node.all
     assert outputs.absent == ()
@@ -136,7 +137,8 @@ def test_nothing_is_created_before_it_is_asked_for(node):
 
 def test_all_outputs_agree_on_names_poses_and_headers(node):
     parameters = replace(ALL, tf_prefix="thing")
-    outputs = Outputs(node, parameters)
+    outputs = Outputs(node)
+    outputs.follow(parameters)
     outputs.publish(found(3, 4), parameters)
     (tree,), (seen,), (scene,) = (node.publishers[topic].sent for topic in (TF, DETECTIONS, SCENE))
     for k, body in enumerate((CAN, BOX)):
@@ -152,7 +154,8 @@ def test_all_outputs_agree_on_names_poses_and_headers(node):
 
 
 def test_only_what_is_heard_is_made(node):
-    outputs = Outputs(node, ALL)
+    outputs = Outputs(node)
+    outputs.follow(ALL)
     for publisher in node.all:
         publisher.listeners = 0
     made = found(1, 2)
@@ -165,7 +168,8 @@ def test_only_what_is_heard_is_made(node):
 
 
 def test_gone_objects_are_removed_and_hidden_ones_stay(node):
-    outputs = Outputs(node, ALL)
+    outputs = Outputs(node)
+    outputs.follow(ALL)
     scene = node.publishers[SCENE]
     add, remove = soft("moveit_msgs").CollisionObject.ADD, soft("moveit_msgs").CollisionObject.REMOVE
     outputs.publish(found(1, 2), ALL)
@@ -192,7 +196,8 @@ def test_gone_objects_are_removed_and_hidden_ones_stay(node):
 
 
 def test_switching_off_removes_and_ending_does_not(node):
-    outputs = Outputs(node, ALL)
+    outputs = Outputs(node)
+    outputs.follow(ALL)
     scene = node.publishers[SCENE]
     outputs.publish(found(1, 2), ALL)
     off = replace(ALL, publish_collision_objects=False)
@@ -207,7 +212,8 @@ def test_switching_off_removes_and_ending_does_not(node):
     scene = node.publishers[SCENE]
     outputs.close()
     assert len(scene.sent) == 1
-    outputs = Outputs(node, ALL)
+    outputs = Outputs(node)
+    outputs.follow(ALL)
     outputs.publish(found(1), ALL)
     outputs.withdraw()
     outputs.withdraw()
@@ -216,7 +222,8 @@ def test_switching_off_removes_and_ending_does_not(node):
 
 def test_meshes_are_of_the_bodies_and_larger_than_they_are(node):
     parameters = replace(ALL, collision_shapes="mesh")
-    outputs = Outputs(node, parameters)
+    outputs = Outputs(node)
+    outputs.follow(parameters)
     outputs.publish(found(3, 4), parameters)
     for thing, body in zip(node.publishers[SCENE].sent[0].world.collision_objects, (CAN, BOX), strict=True):
         points = np.array([[p.x, p.y, p.z] for p in thing.meshes[0].vertices])
@@ -227,7 +234,8 @@ def test_meshes_are_of_the_bodies_and_larger_than_they_are(node):
 @pytest.mark.parametrize(("package", "topic"), [("tf2_msgs", TF), ("vision_msgs", DETECTIONS), ("moveit_msgs", SCENE)])
 def test_absent_packages_are_named_once_and_the_others_go_on(node, monkeypatch, package, topic):
     soft_messages.remove(monkeypatch, package)
-    outputs = Outputs(node, ALL)
+    outputs = Outputs(node)
+    outputs.follow(ALL)
     for _ in range(3):
         outputs.publish(found(1), ALL)
     assert outputs.absent == (package,)
@@ -241,7 +249,8 @@ def test_absent_packages_are_named_once_and_the_others_go_on(node, monkeypatch, 
 
 
 def test_images_without_frame_have_no_transforms_and_no_objects(node):
-    outputs = Outputs(node, ALL)
+    outputs = Outputs(node)
+    outputs.follow(ALL)
     for _ in range(2):
         outputs.publish(found(1, header=Header()), ALL)
     assert [len(node.publishers[topic].sent) for topic in (TF, DETECTIONS, SCENE)] == [0, 2, 0]
@@ -411,7 +420,7 @@ def test_tracks_that_a_frame_does_not_show_are_hidden(node):
     assert (first.ids, first.hidden) == ((1, 2), ())
     second = identity.tracked(recovery(one(CAN, 1)), frame(), 10.0)
     assert (second.ids, second.hidden) == ((2,), (1,))
-    assert identity.untracked(recovery(one(CAN, 1))).hidden == ()
+    assert identity.untracked(recovery(one(CAN, 1)), frame()).hidden == ()
 
 
 # Parameters

@@ -424,6 +424,29 @@ def test_a_bad_parameter_ends_the_start_with_a_reason(start, node, parameter, wo
     assert "Traceback" not in process.output()
 
 
+def test_cameras_that_would_have_one_name_are_refused(tmp_path):
+    done = subprocess.run(
+        [
+            sys.executable,
+            "-m",
+            "sq_perception.nodes.recover_cameras",
+            "front",
+            "wrist",
+            "--ros-args",
+            "-r",
+            "__ns:=/arm",
+        ],
+        cwd=Path(__file__).resolve().parent.parent,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parent.parent)},
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+    )
+    assert done.returncode == 1
+    assert "front and wrist are both /arm/recover_node" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
 def test_ctrl_c_during_the_start_leaves_no_traceback(start):
     process = start("recover_node")
     process.says("warming up")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import suppress
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,6 +16,7 @@ pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
 from builtin_interfaces.msg import Time
 from rclpy.context import Context
+from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
@@ -96,19 +98,21 @@ class Bench:
         self.until(lambda: self.node.is_active)
         if self.node._settings.current.image_transport == "raw":
             self.until(lambda: self.images.get_subscription_count() == 1)
-        self.until(lambda: self.node._superquadrics.get_subscription_count() == 1)
+        self.until(lambda: self.node._publisher.superquadrics.get_subscription_count() == 1)
         self.stamps = 0
 
     def _spin(self) -> None:
         try:
             while self.context.ok():
-                self.executor.spin_once(timeout_sec=0.2)
-        except ExternalShutdownException:
-            return
+                with suppress(InvalidHandle):  # as sq_perception.nodes.process
+                    self.executor.spin_once(timeout_sec=0.2)
+        except (ExternalShutdownException, RuntimeError):
+            if self.context.ok():
+                raise
 
     def close(self) -> None:
         self.recoverer.gate.set()
-        self.node.close()
+        assert self.node.close()
         self.context.try_shutdown()
         self.thread.join(PATIENCE)
         self.node.destroy_node()
@@ -410,6 +414,59 @@ def test_a_trigger_without_a_frame_answers_in_time_and_nothing_else_waits(make_b
     assert len(bench.answer(bench.depth())[1]) == 1
 
 
+def test_after_disable_nothing_is_published_any_more(bench):
+    bench.answer(bench.depth())
+    bench.recoverer.gate.clear()
+    bench.images.publish(bench.depth())
+    bench.until(lambda: len(bench.recoverer.asked) == 2)
+    bench.images.publish(bench.depth())
+    bench.until(lambda: bench.counts.received == 3)
+    assert bench.call(SetBool, "/recover_node/enable", SetBool.Request(data=False)).success
+    bench.recoverer.gate.set()
+    bench.until(lambda: bench.counts.in_work == 0)
+    assert (bench.counts.answered, bench.counts.dropped) == (1, 2)
+    assert len(bench.answers) == 1
+
+
+def test_a_clock_that_stands_still_stops_neither_diagnostics_nor_triggers(make_bench):
+    from diagnostic_msgs.msg import DiagnosticArray
+
+    bench = make_bench("-p", "use_sim_time:=true", "-p", "trigger_timeout:=0.5")
+    reports: list[DiagnosticArray] = []
+    bench.peer.create_subscription(DiagnosticArray, "/diagnostics", reports.append, 5)
+    answer = bench.call(Trigger, "/recover_node/trigger", Trigger.Request())
+    assert (answer.success, answer.message.split(":")[0]) == (False, "no frame on /depth/image within 0.5 s")
+    bench.until(lambda: reports)
+
+
+def test_triggers_leave_nothing_behind(bench):
+    bench.answer(bench.depth())
+    client = bench.peer.create_client(Trigger, "/recover_node/trigger")
+    bench.until(client.service_is_ready)
+
+    def entities() -> int:
+        return len(bench.node.default_callback_group.entities) + len(list(bench.node.timers))
+
+    before = entities()
+    for _ in range(20):
+        future = client.call_async(Trigger.Request())
+        bench.until(lambda: len(bench.node._triggers) == 1)
+        bench.send(bench.depth())
+        bench.until(future.done)
+        assert future.result().success
+    assert entities() == before
+
+
+def test_masks_without_a_stamp_belong_to_no_image(bench):
+    masks = bench.peer.create_publisher(Image, "mask/image", 5)
+    bench.until(lambda: masks.get_subscription_count() == 1)
+    bench.node._inbox.put_mask(labels_to_message(np.ones((48, 64), np.int32), Header()))
+    image = bench.depth()
+    image.header = Header(frame_id=FRAME_ID)
+    bench.answer(image)
+    assert bench.recoverer.asked[-1][2] is None
+
+
 def test_masks_of_the_same_stamp_are_used(bench):
     masks = bench.peer.create_publisher(Image, "mask/image", 5)
     bench.until(lambda: masks.get_subscription_count() == 1 and bench.node.count_publishers("/mask/image"))
@@ -446,7 +503,12 @@ def test_pictures_are_made_while_somebody_listens_and_stale_markers_go(bench):
     rendered: list[Image] = []
     bench.peer.create_subscription(MarkerArray, "recover_node/markers", shown.append, 5)
     bench.peer.create_subscription(Image, "recover_node/rendered_depth", rendered.append, 5)
-    bench.until(lambda: bench.node._markers.get_subscription_count() and bench.node._rendered.get_subscription_count())
+    bench.until(
+        lambda: (
+            bench.node._publisher.markers.get_subscription_count()
+            and bench.node._publisher.rendered_depth.get_subscription_count()
+        )
+    )
     assert not shown
     image = bench.depth()
     bench.answer(image)
@@ -470,7 +532,7 @@ def test_orthographic_frames_need_no_camera_info_and_answer_in_the_cube_frame(ma
     assert bench.recoverer.warm == unit_cube.camera()
     rendered: list[Image] = []
     bench.peer.create_subscription(Image, "recover_node/rendered_depth", rendered.append, 5)
-    bench.until(lambda: bench.node._rendered.get_subscription_count())
+    bench.until(lambda: bench.node._publisher.rendered_depth.get_subscription_count())
     for dtype in (np.uint8, np.uint16):
         grey = np.zeros((32, 32), dtype)
         grey[8:20, 8:20] = 0.75 * np.iinfo(dtype).max
@@ -580,7 +642,7 @@ def test_raw_images_of_a_lens_are_rectified_and_rendered_as_they_were_sent(make_
     bench.put_info(info)
     rendered: list[Image] = []
     bench.peer.create_subscription(Image, "recover_node/rendered_depth", rendered.append, 5)
-    bench.until(lambda: bench.node._rendered.get_subscription_count())
+    bench.until(lambda: bench.node._publisher.rendered_depth.get_subscription_count())
     bench.answer(bench.depth())
     depth, camera, _, _ = bench.recoverer.asked[-1]
     assert depth.shape == (camera.height, camera.width)

@@ -187,3 +187,22 @@ def test_a_judge_may_refuse_and_a_listener_hears_what_was_set(make_node):
     assert heard == [(live.current, frozenset({"model", "s"}))]
     assert node.set_parameters([Parameter("use_sim_time", value=False)])[0].successful
     assert len(heard) == 1
+
+
+def test_parameters_of_others_change_nothing(make_node):
+    node = make_node()
+    live = LiveParameters(node, RecoverParameters)
+    kept = live.current
+    node.declare_parameter("qos_overrides.somewhere", "reliable")
+    assert live.current is kept
+
+
+def test_a_file_that_cannot_be_looked_at_is_a_reason(make_node):
+    def judge(candidate, names):
+        raise PermissionError(13, "Permission denied", candidate.model)
+
+    node = make_node()
+    LiveParameters(node, RecoverParameters, judge=judge)
+    refused = node.set_parameters([Parameter("model", value="/root/secret.safetensors")])[0]
+    assert not refused.successful
+    assert "Permission denied" in refused.reason

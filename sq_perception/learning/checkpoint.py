@@ -120,9 +120,9 @@ def check(path: Path | str | None = None) -> None:
 
 def _bytes(path: Path, header_only: bool = False) -> tuple[bytes, int]:
     """What the file holds, or no more than its header, and how many bytes it has."""
-    if not path.is_file():
-        raise CheckpointError(f"{path}: no such model file")
     try:
+        if not path.is_file():
+            raise CheckpointError(f"{path}: no such model file")
         with path.open("rb") as file:
             size = path.stat().st_size
             if size > _MAX_BYTES:

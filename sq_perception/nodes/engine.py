@@ -85,6 +85,10 @@ _shared: weakref.WeakValueDictionary[Hashable, Recoverer] = weakref.WeakValueDic
 _making = threading.Lock()
 
 
+class _Superseded(Exception):  # noqa: N818 - no fault
+    """Another request came meanwhile."""
+
+
 @dataclass(frozen=True)
 class _Built(Generic[P]):
     recoverer: Recoverer
@@ -108,7 +112,8 @@ class Engine(Generic[P]):
         self._lock = threading.Lock()
         self._built: _Built[P] | None = None
         self._request = 0
-        self._is_making = False
+        self.is_making = False
+        """Whether another one is being made."""
         self.fault = ""
         """Why the last swap came to nothing; empty once one has succeeded."""
 
@@ -118,13 +123,13 @@ class Engine(Generic[P]):
             self._request += 1
         built = self._made(parameters, camera)
         with self._lock:
-            self._built, self.fault = built, ""
+            self._built, self.fault, self.is_making = built, "", False
 
     def release(self) -> None:
         """Let go of the recoverer, and of one that is being made."""
         with self._lock:
             self._request += 1
-            self._built = None
+            self._built, self.fault, self.is_making = None, "", False
 
     def discard(self) -> None:
         """Let nobody else share the recoverer from now on: it has failed again and again."""
@@ -144,12 +149,12 @@ class Engine(Generic[P]):
         with self._lock:
             self._request += 1
             request = self._request
-            self._is_making = True
+            self.is_making = True
         threading.Thread(
             target=self._swap, args=(request, parameters, camera), name="recoverer in the making", daemon=True
         ).start()
 
-    def options(self, parameters: P) -> tuple[Recoverer, RecoveryOptions]:
+    def at_work(self, parameters: P) -> tuple[Recoverer, RecoveryOptions]:
         """The recoverer, and what it is to do by the parameters in force for it.
 
         Raises
@@ -170,31 +175,41 @@ class Engine(Generic[P]):
         built = self._built
         if built is None:
             return "none"
-        return self._workshop.describe(built.parameters) + (", another one is being made" if self._is_making else "")
+        return self._workshop.describe(built.parameters) + (", another one is being made" if self.is_making else "")
 
     def _swap(self, request: int, parameters: P, camera: Camera) -> None:
         started = perf_counter()
         described = self._workshop.describe(parameters)
         try:
-            built = self._made(parameters, camera)
+            built = self._made(parameters, camera, lambda: request == self._request)
+        except _Superseded:
+            return
         except Exception as error:  # whatever it is: the old one goes on
             with self._lock:
                 if request != self._request:
                     return
-                self._is_making = False
+                self.is_making = False
                 self.fault = f"cannot change to {described}: {' '.join(str(error).split())}"
             self._complain(f"{self.fault}; what was there before goes on")
             return
         with self._lock:
             if request != self._request:
                 return
-            self._built, self.fault, self._is_making = built, "", False
+            self._built, self.fault, self.is_making = built, "", False
         self._inform(f"changed to {described} within {perf_counter() - started:.1f} s")
 
-    def _made(self, parameters: P, camera: Camera) -> _Built[P]:
-        """A recoverer, warm; one that is there already if its key is the same."""
+    def _made(self, parameters: P, camera: Camera, is_wanted: Callable[[], bool] = lambda: True) -> _Built[P]:
+        """A recoverer, warm; one that is there already if its key is the same.
+
+        Raises
+        ------
+        _Superseded
+            If nobody wants it any more.
+        """
         key = self._workshop.key(parameters)
         with _making:
+            if not is_wanted():
+                raise _Superseded
             known = None if key is None else _shared.get(key)
             if known is not None:
                 return _Built(known, parameters, key)
@@ -202,5 +217,7 @@ class Engine(Generic[P]):
             if key is not None:
                 _shared[key] = recoverer
         with TURNS.turn():
+            if not is_wanted():
+                raise _Superseded
             recoverer.warm_up(camera)
         return _Built(recoverer, parameters, key)

@@ -28,38 +28,33 @@ from __future__ import annotations
 import threading
 import traceback
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import dataclass, fields
 from time import monotonic, perf_counter
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.callback_groups import ReentrantCallbackGroup
+from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.qos import QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_srvs.srv import SetBool, Trigger
-from visualization_msgs.msg import MarkerArray
 
-from sq_msgs_py.superquadrics import to_message
-from sq_perception import publication
 from sq_perception.calibration import Calibration
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
-from sq_perception.nodes import garbage, report, results, transport
-from sq_perception.nodes.camera_poses import CameraPoses
+from sq_perception.nodes import garbage, report, transport
 from sq_perception.nodes.counters import Statistics, Throttle
 from sq_perception.nodes.engine import TURNS, Engine, Workshop
 from sq_perception.nodes.frame import Frame, decode
-from sq_perception.nodes.identity import Identity
+from sq_perception.nodes.frame_publisher import FramePublisher
 from sq_perception.nodes.inbox import Arrival, Inbox, NoCameraInfo, Refused
 from sq_perception.nodes.managed_node import ManagedNode
-from sq_perception.nodes.outputs import Outputs
 from sq_perception.nodes.parameters import FrameParameters, LiveParameters
 from sq_perception.nodes.triggers import Outcome, Triggers
-from sq_perception.publication import Findings, Identified
-from sq_perception.recovery import FrameRecovery, render_recovery
+from sq_perception.recovery import FrameRecovery
 
 WARM_UP_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 _WORKER_END = 3.0
@@ -68,6 +63,15 @@ _OLDEST = 3600.0
 """Seconds; the age of an older frame, or one from the future, says nothing about latency: a bag, or another clock."""
 _DEFECTS = 10
 """Frames in a row that end in a defect of ours or of the device, after which the node starts anew."""
+
+
+@dataclass(frozen=True)
+class _Input:
+    """A subscription, and what is said about it, also after it has been destroyed."""
+
+    subscription: Subscription
+    topic: str
+    profile: QoSProfile
 
 
 class FrameNode(ManagedNode):
@@ -109,19 +113,22 @@ class FrameNode(ManagedNode):
         self._throttle = Throttle()
         self._enabled = True
         self._triggers = Triggers(self)
-        self._shown_ids: list[int] = []
+        self._publisher = FramePublisher(self, self._warn, self._inform)
         self._note = ""
         self._defects = 0
         self._inbox: Inbox | None = None
         self._worker: threading.Thread | None = None
-        self._image_input: Subscription | None = None
+        self._image_input: _Input | None = None
+        self._info_input: _Input | None = None
+        self._mask_input: _Input | None = None
         self._last_image = monotonic()
         self._last_counts = self._statistics.snapshot()
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.create_service(SetBool, "~/enable", self._on_enable)
         # Its answer waits for a frame; in the default group nothing else would run meanwhile.
         self.create_service(Trigger, "~/trigger", self._on_trigger, callback_group=ReentrantCallbackGroup())
-        self.create_timer(1.0, self._on_second)
+        # On a steady clock: simulated time may stand still, and the node still has to say so.
+        self.create_timer(1.0, self._on_second, clock=Clock(clock_type=ClockType.STEADY_TIME))
         if self._settings.current.autostart:
             self.start()
 
@@ -136,14 +143,7 @@ class FrameNode(ManagedNode):
         meanwhile = {one.name for one in fields(latest) if getattr(latest, one.name) != getattr(parameters, one.name)}
         self._engine.follow(latest, frozenset(meanwhile), self._warm_up_camera)
         self.get_logger().info(f"warm after {perf_counter() - started:.1f} s")
-        self._poses = CameraPoses(self)
-        if latest.fixed_frame or latest.target_frame:
-            self._poses.listen()
-        self._identity = Identity(self._poses, self._warn, self._inform, latest.fixed_frame)
-        self._outputs = Outputs(self, latest)
-        self._superquadrics = self.create_publisher(PointCloud2, "~/superquadrics", 10)
-        self._markers = self.create_publisher(MarkerArray, "~/markers", 1)
-        self._rendered = self.create_publisher(Image, "~/rendered_depth", 1)
+        self._publisher.open(latest)
         garbage.keep()
 
     def _activate(self) -> None:
@@ -164,38 +164,38 @@ class FrameNode(ManagedNode):
         self._info_input = self._listen(CameraInfo, "depth/camera_info", inbox.put_info) if pinhole else None
         self._mask_input = self._listen(Image, "mask/image", inbox.put_mask)
         self._image_input = self._listen(transport.message_type(packing), image_topic, self._on_image)
-        self.get_logger().info(f"ready, listening to {self._image_input.topic_name}")
+        self.get_logger().info(f"ready, listening to {self._image_input.topic}")
 
     def _deactivate(self) -> None:
-        inputs = (self._image_input, self._mask_input, self._info_input)
-        self._image_input = None
-        for one in inputs:
-            if one is not None:
-                self.destroy_subscription(one)
-        if self._inbox is not None:
-            self._statistics.count("dropped", self._inbox.close())
-        if self._worker is not None and self._worker is not threading.current_thread():
-            self._worker.join(_WORKER_END)
-            if self._worker.is_alive():
-                self.get_logger().warning("the frame at hand takes long; it is the last one")
-        self._inbox = self._worker = None
-        self._outputs.withdraw()
-        self._triggers.answer((False, "the node has been deactivated"))
+        self._stop()
+        self._publisher.withdraw()
 
     def _cleanup(self) -> None:
-        if self._image_input is not None:
-            self._deactivate()
-        for name in ("_outputs", "_poses"):
-            part = self.__dict__.pop(name, None)
-            if part is not None:
-                part.close()
-        for name in ("_superquadrics", "_markers", "_rendered"):
-            publisher = self.__dict__.pop(name, None)
-            if publisher is not None:
-                self.destroy_publisher(publisher)
+        self._stop()
+        self._publisher.close()
         self._engine.release()
-        self._shown_ids = []
-        garbage.release()  # a network's weights hang in reference cycles
+        garbage.release()  # nothing of a network may hang on in a cycle of references
+
+    def _stop(self) -> None:
+        """End subscriptions and worker.  What planners were told of stays: a camera that fails takes no obstacles."""
+        inputs = (self._image_input, self._mask_input, self._info_input)
+        self._image_input = self._mask_input = self._info_input = None
+        for one in inputs:
+            if one is not None:
+                self.destroy_subscription(one.subscription)
+        inbox, self._inbox = self._inbox, None
+        if inbox is not None:
+            self._statistics.count("dropped", inbox.close())
+        self._triggers.answer((False, "the node has been deactivated"))
+        if self._worker is not None:
+            self._worker.join(_WORKER_END)
+            if self._worker.is_alive():
+                self.get_logger().warning("the frame at hand takes long; it is the last one, and is not published")
+
+    def close(self) -> bool:
+        """As :meth:`ManagedNode.close`; False also while a frame or a swap of the model is still at work."""
+        is_still = super().close()
+        return is_still and not self._engine.is_making and (self._worker is None or not self._worker.is_alive())
 
     def _comes_back(self) -> bool:
         return bool(self._settings.current.autostart)
@@ -217,9 +217,9 @@ class FrameNode(ManagedNode):
     def _on_changed(self, parameters: Any, names: frozenset[str]) -> None:
         self._engine.follow(parameters, names, self._warm_up_camera)
 
-    def _listen(self, kind: type[Any], topic: str, callback: Callable[[Any], None]) -> Subscription:
+    def _listen(self, kind: type[Any], topic: str, callback: Callable[[Any], None]) -> _Input:
         profile = QoSProfile(depth=1, history=QoSHistoryPolicy.KEEP_LAST, reliability=QoSReliabilityPolicy.BEST_EFFORT)
-        return self.create_subscription(
+        made = self.create_subscription(
             kind,
             topic,
             callback,
@@ -227,6 +227,7 @@ class FrameNode(ManagedNode):
             event_callbacks=SubscriptionEventCallbacks(message_lost=self._on_lost),
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )
+        return _Input(made, made.topic_name, made.qos_profile)
 
     # Callbacks, in the executor's thread: quick, and nothing in them can fail on a message's content
 
@@ -236,14 +237,14 @@ class FrameNode(ManagedNode):
             return
         self._last_image = monotonic()
         self._statistics.count("received")
-        if self._enabled or len(self._triggers):
+        if self._is_wanted:
             inbox.put_image(message)
         else:
             self._statistics.count("dropped")
 
     def _calibrated(self, info: CameraInfo, image_topic: str) -> Calibration:
         calibration = Calibration.of(info, image_topic, self._settings.current.distortion)
-        if calibration.note != self._note:
+        if calibration.note != self._note and self._throttle.passes("distortion") is not None:
             self._note = calibration.note
             self._inform(f"{image_topic}: {calibration.note or 'no distortion'}")
         return calibration
@@ -271,7 +272,7 @@ class FrameNode(ManagedNode):
         timeout = self._settings.current.trigger_timeout
 
         def why_none() -> str:
-            return f"no frame on {image_input.topic_name} within {timeout:g} s: {self._heard(image_input)}"
+            return f"no frame on {image_input.topic} within {timeout:g} s: {self._heard(image_input)}"
 
         return await self._triggers.outcome(response, timeout, why_none)
 
@@ -280,7 +281,7 @@ class FrameNode(ManagedNode):
         silence = monotonic() - self._last_image
         silent = image_input is not None and 0 < parameters.no_frame_warning < silence
         if silent and image_input is not None:
-            topic, publishers = image_input.topic_name, self._heard(image_input)
+            topic, publishers = image_input.topic, self._heard(image_input)
             self._warn("silence", f"no depth image on {topic} for {silence:.0f} s: {publishers}")
         now = self._statistics.snapshot()
         message = DiagnosticArray()
@@ -291,8 +292,8 @@ class FrameNode(ManagedNode):
             silent=silent,
             enabled=self._enabled,
             engine=self._engine.words,
-            absent=self._outputs.absent if self.is_active else (),
-            tally=self._identity.tally if self.is_active and parameters.tracking else None,
+            absent=self._publisher.absent,
+            tally=self._publisher.tally if self.is_active and parameters.tracking else None,
         )
         message.status.append(report.status(self.get_fully_qualified_name(), now, self._last_counts, condition))
         self._last_counts = now
@@ -310,14 +311,20 @@ class FrameNode(ManagedNode):
                     arrival = inbox.take()
                     if arrival is None:
                         continue
-                    started = monotonic()
+                    if not self._is_wanted:
+                        self._statistics.count("dropped")
+                        continue
                     frame, recovery, stages = self._recovered(inbox, arrival)
-                outcome = True, self._published(frame, recovery, stages | {"wait": 1e3 * (started - arrival.time)})
+                if self._inbox is not inbox or not self._is_wanted:
+                    # Deactivated or disabled meanwhile: nothing is published any more, least of all a grasped body.
+                    self._statistics.count("dropped")
+                    continue
+                outcome = True, self._published(frame, recovery, arrival, stages)
                 self._defects = 0
             except ValueError as error:
                 outcome = False, str(error)
             except Exception as error:
-                if not self.context.ok():
+                if not self.context.ok() or self._inbox is not inbox:
                     return
                 # A defect of ours: it costs this frame and leaves its trace in the log, and the node goes on.
                 outcome = False, f"{type(error).__name__}: {error}"
@@ -334,54 +341,32 @@ class FrameNode(ManagedNode):
                 self._warn(outcome[1].split(":")[0], f"refused a frame: {outcome[1]}")
             self._triggers.answer(outcome, arrival.time)
 
+    @property
+    def _is_wanted(self) -> bool:
+        """Whether frames are processed, or one is asked for."""
+        return self._enabled or len(self._triggers) > 0
+
     def _recovered(self, inbox: Inbox, arrival: Arrival) -> tuple[Frame, FrameRecovery, dict[str, float]]:
         """The frame of a message, its bodies, and how long that took by stage, milliseconds."""
         parameters = self._settings.current
+        stages = {"wait": 1e3 * (monotonic() - arrival.time)}
         clock = perf_counter()
         frame = self._decoded(inbox, arrival, parameters)
-        stages = {"decode": 1e3 * (perf_counter() - clock)}
-        recoverer, options = self._engine.options(parameters)
+        stages["decode"] = 1e3 * (perf_counter() - clock)
+        recoverer, options = self._engine.at_work(parameters)
         recovery = recoverer.recover(frame.depth, frame.camera, frame.labels, options)
-        stages |= {f"recovery: {stage}": duration for stage, duration in recovery.milliseconds.items()}
-        return frame, recovery, stages
+        return frame, recovery, stages | {f"recovery: {name}": took for name, took in recovery.milliseconds.items()}
 
-    def _published(self, frame: Frame, recovery: FrameRecovery, stages: dict[str, float]) -> str:
-        """Follow the bodies and publish the results; the summary."""
+    def _published(self, frame: Frame, recovery: FrameRecovery, arrival: Arrival, stages: dict[str, float]) -> str:
+        """Publish the results; the summary."""
         parameters = self._settings.current
-        clock = perf_counter()
-        if parameters.tracking:
-            found = self._identity.tracked(recovery, frame, monotonic(), parameters.fixed_frame)
-            stages["tracking"] = 1e3 * (perf_counter() - clock)
-        else:
-            found = self._identity.untracked(recovery)
-
-        clock = perf_counter()
-        findings = publication.findings(found, frame.header, frame.is_cube)
-        findings = results.in_frame(findings, self._poses, parameters.target_frame)
-        self._superquadrics.publish(to_message(findings.array, findings.header))
-        stages["publish"] = 1e3 * (perf_counter() - clock)
+        found, findings, took = self._publisher.answer(frame, recovery, arrival.time, parameters)
         age = 1e-9 * (self.get_clock().now().nanoseconds - _nanoseconds(frame.header.stamp))
         if abs(age) < _OLDEST:
-            stages["stamp to result"] = 1e3 * age
-        self._statistics.answer(stages)
-        self._publish_beside(frame, found, findings, parameters)
+            took["stamp to result"] = 1e3 * age
+        self._statistics.answer(stages | took)
+        self._statistics.note(self._publisher.accompany(frame, found, findings, parameters))
         return report.summary(found.recovery, found.ids)
-
-    def _publish_beside(self, frame: Frame, found: Identified, findings: Findings, parameters: FrameParameters) -> None:
-        """Publish what goes with a result; the frame is answered already, and stays so whatever goes wrong here."""
-        clock = perf_counter()
-        try:
-            self._outputs.publish(findings, parameters, found.hidden)
-            outputs = perf_counter()
-            self._publish_pictures(frame, found, findings, parameters)
-        except Exception as error:
-            if not self.context.ok():
-                return
-            self._warn(
-                "beside", f"a result was published without all that goes with it: {type(error).__name__}: {error}"
-            )
-            return
-        self._statistics.note({"outputs": 1e3 * (outputs - clock), "pictures": 1e3 * (perf_counter() - outputs)})
 
     def _decoded(self, inbox: Inbox, arrival: Arrival, parameters: FrameParameters) -> Frame:
         message = arrival.message
@@ -394,25 +379,18 @@ class FrameNode(ManagedNode):
                 info_input = self._info_input
                 if info_input is None:
                     raise
-                raise Refused(f"{error}, on {info_input.topic_name}: {self._heard(info_input)}") from error
+                raise Refused(f"{error}, on {info_input.topic}: {self._heard(info_input)}") from error
         if parameters.use_masks == "always" and arrival.mask is None:
-            topic = self._mask_input.topic_name
-            raise Refused(f"mask: expected one with the stamp of the image (use_masks is always), none came on {topic}")
+            mask_input = self._mask_input
+            where = f" on {mask_input.topic}" if mask_input is not None else ""
+            raise Refused(f"mask: expected one with the stamp of the image (use_masks is always), none came{where}")
         return frame.with_mask(arrival.mask if parameters.use_masks != "never" else None)
 
     def _expects_mask(self, use: str) -> bool:
         mask_input = self._mask_input
-        return use == "always" or (use == "auto" and bool(self.count_publishers(mask_input.topic_name)))
-
-    def _publish_pictures(
-        self, frame: Frame, found: Identified, findings: Findings, parameters: FrameParameters
-    ) -> None:
-        if self._markers.get_subscription_count():
-            self._markers.publish(findings.markers(self._shown_ids, results.marker_style(parameters)))
-            self._shown_ids = findings.shown_ids
-        if self._rendered.get_subscription_count():
-            depth, _ = render_recovery(found.recovery, frame.camera)
-            self._rendered.publish(frame.encode(depth))
+        if mask_input is None:
+            return False
+        return use == "always" or (use == "auto" and bool(self.count_publishers(mask_input.topic)))
 
     # Words
 
@@ -427,9 +405,8 @@ class FrameNode(ManagedNode):
         if remark is not None:
             self.get_logger().warning(text + remark)
 
-    def _heard(self, subscription: Subscription) -> str:
-        offered = self.get_publishers_info_by_topic(subscription.topic_name)
-        return report.publishers(offered, subscription.qos_profile)
+    def _heard(self, listened: _Input) -> str:
+        return report.publishers(self.get_publishers_info_by_topic(listened.topic), listened.profile)
 
 
 def _nanoseconds(stamp: Any) -> int:

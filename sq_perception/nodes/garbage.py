@@ -35,6 +35,6 @@ def keep() -> None:
 
 
 def release() -> None:
-    """Collect everything that cannot be reached, what was left alone included."""
+    """Collect everything that cannot be reached, what was left alone included; leave what is left alone again."""
     gc.unfreeze()
-    gc.collect()
+    keep()

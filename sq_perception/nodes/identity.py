@@ -22,30 +22,27 @@ class Identity:
         Where the camera is; asked only while there is a fixed frame.
     warn, inform
         What takes texts for the log; ``warn`` with a kind to throttle by.
-    fixed_frame
-        Where bodies rest at first; empty where the camera stands still.
     """
 
-    def __init__(
-        self,
-        poses: CameraPoses,
-        warn: Callable[[str, str], None],
-        inform: Callable[[str], None],
-        fixed_frame: str = "",
-    ) -> None:
+    def __init__(self, poses: CameraPoses, warn: Callable[[str, str], None], inform: Callable[[str], None]) -> None:
         self._poses, self._warn, self._inform = poses, warn, inform
         self._session = TrackingSession()
         self._frame_id = ""
-        self._fixed_frame = fixed_frame
+        self._fixed_frame: str | None = None
+        self._untracked_stamp = 0.0
 
     @property
     def tally(self) -> Tally:
         """Counts of the tracking session."""
         return self._session.tally
 
-    def untracked(self, recovery: FrameRecovery) -> Identified:
+    def untracked(self, recovery: FrameRecovery, frame: Frame) -> Identified:
         """Ids are labels; what was tracked is forgotten."""
         self._session.reset()
+        stamp = _seconds(frame.header)
+        if stamp < self._untracked_stamp:
+            self._poses.clear()  # a recording begins again
+        self._untracked_stamp = stamp
         return publication.untracked(recovery)
 
     def tracked(self, recovery: FrameRecovery, frame: Frame, arrival: float, fixed_frame: str = "") -> Identified:
@@ -64,9 +61,10 @@ class Identity:
             If the tracker cannot go on; it begins anew with the next frame.
         """
         if fixed_frame != self._fixed_frame:
-            self._session.reset()
-            self._fixed_frame = fixed_frame
-            self._inform(f"fixed_frame is {fixed_frame or 'none'} from now on: tracks are forgotten, ids go on")
+            is_first, self._fixed_frame = self._fixed_frame is None, fixed_frame
+            if not is_first:
+                self._session.reset()
+                self._inform(f"fixed_frame is {fixed_frame or 'none'} from now on: tracks are forgotten, ids go on")
         poses = self._poses if self._fixed_frame else None
         if poses is None and frame.header.frame_id != self._frame_id:
             self._session.reset()  # another camera: its world is another one

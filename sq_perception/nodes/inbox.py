@@ -93,6 +93,9 @@ class Inbox:
         now = monotonic()
         waiting = _Waiting(message, _size(message), now, now + self._patience(), self._needs_mask())
         with self._changed:
+            if self._closed:
+                self._dropped(1)
+                return
             self._waiting.append(waiting)
             self._promote(now)
 
@@ -111,7 +114,9 @@ class Inbox:
             self._promote(monotonic())
 
     def put_mask(self, message: Image) -> None:
-        """Keep a label image for the depth image of the same stamp."""
+        """Keep a label image for the depth image of the same stamp; one without a stamp belongs to none."""
+        if stamp_of(message) == (0, 0):
+            return
         with self._changed:
             self._masks[stamp_of(message)] = message
             while len(self._masks) > _MASKS:

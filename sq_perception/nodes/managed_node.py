@@ -11,7 +11,12 @@ transition that the state does not allow is refused; rclpy raises there, which w
 What a subclass does in a transition it does in :meth:`_configure`, :meth:`_activate`, :meth:`_deactivate` and
 :meth:`_cleanup`; any exception leads through ``errorprocessing``, where everything is released, to ``unconfigured``,
 from where the node can be configured again.  :attr:`fault` is the reason until it succeeds.  A fault while active
-(:meth:`_fail`) takes the same way, and with ``autostart`` the node comes back by itself after a pause.
+(:meth:`_fail`) takes the same way, and with ``autostart`` the node comes back by itself after a pause, or ends its
+process if it cannot.
+
+Transitions create and destroy publishers and subscriptions outside of the executor's thread.  rclpy's executors may
+raise InvalidHandle then (ros2/rclpy issue 1284), which :mod:`sq_perception.nodes.process` takes for nothing; a program
+with an executor of its own does the same.
 
 Reference: https://design.ros2.org/articles/node_lifecycle.html
 """
@@ -154,7 +159,8 @@ class ManagedNode(LifecycleNodeMixin, StoppableNode):
         fault = self.fault
         answer = self._attempt("release", self._cleanup)
         self.fault = fault
-        return TransitionCallbackReturn.SUCCESS if answer == TransitionCallbackReturn.SUCCESS else answer.FAILURE
+        succeeded = answer == TransitionCallbackReturn.SUCCESS
+        return TransitionCallbackReturn.SUCCESS if succeeded else TransitionCallbackReturn.FAILURE
 
     def _attempt(self, name: str, action: Callable[[], None]) -> TransitionCallbackReturn:
         try:
@@ -191,8 +197,8 @@ class ManagedNode(LifecycleNodeMixin, StoppableNode):
         self.get_logger().error(f"{reason}: trying again in {_PAUSE:g} s" if self._comes_back() else reason)
         self.fault = reason
         self._change("deactivate")
-        if self._comes_back() and not self._closing.wait(_PAUSE) and self._change("configure"):
-            self._change("activate")
+        if self._comes_back() and not self._closing.wait(_PAUSE):
+            self._bring_up()
 
     def _comes_back(self) -> bool:
         """Whether nobody else brings the node up."""

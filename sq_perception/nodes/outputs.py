@@ -52,14 +52,13 @@ _KINDS = {
 class Outputs:
     """Publishes what the parameters ask for; used by one thread at a time, except for ``absent``."""
 
-    def __init__(self, node: Node, parameters: FrameParameters) -> None:
+    def __init__(self, node: Node) -> None:
         self._node = node
         self._publishers: dict[str, tuple[type[Any], Publisher]] = {}
         self._absent: dict[str, str] = {}
         self._added: set[str] = set()
         self._last_header: Any = None
         self._said_no_frame = False
-        self.follow(parameters)
 
     @property
     def absent(self) -> tuple[str, ...]:
@@ -113,11 +112,10 @@ class Outputs:
         self._added = set()
 
     def close(self) -> None:
-        """Destroy the publishers; what is in the planning scene stays there."""
+        """Destroy the publishers; what is in the planning scene stays there, and is remembered."""
         for _, publisher in self._publishers.values():
             self._node.destroy_publisher(publisher)
         self._publishers = {}
-        self._added = set()
 
     def _create(self, parameter: str, kind: _Kind) -> None:
         try:

@@ -388,14 +388,16 @@ class LiveParameters(Generic[P]):
                 raise ParameterError(f"{', '.join(frozen)}: {reason}")
             if names:
                 self._judge(candidate, names)
-        except ValueError as error:
+        except (ValueError, OSError) as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
     def _accept(self, changes: list[Parameter]) -> None:
-        self._current, names = self._merged(changes)
-        if names:
-            self._changed(self._current, names)
+        merged, names = self._merged(changes)
+        if not names:  # parameters of rclpy's own, which another thread may declare
+            return
+        self._current = merged
+        self._changed(merged, names)
 
     def _merged(self, changes: list[Parameter]) -> tuple[P, frozenset[str]]:
         values = {one.name: checked(self._fields[one.name], one.value) for one in changes if one.name in self._fields}

@@ -12,7 +12,10 @@ from __future__ import annotations
 import os
 import signal
 import sys
-from collections.abc import Callable, Sequence
+import traceback
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from types import FrameType
 from typing import TYPE_CHECKING
 
@@ -48,15 +51,17 @@ class _Stop:
             raise KeyboardInterrupt
 
 
-def run(name: str, create: Callable[[], Sequence[StoppableNode]], arguments: Sequence[str] | None = None) -> int:
+def run(name: str, create: Callable[[], Iterable[StoppableNode]], arguments: Sequence[str] | None = None) -> int:
     """Create nodes and spin them until they are told to stop; the exit code.
 
     ``create`` imports what the nodes need, so that a signal during seconds of imports finds this function in charge.
+    It may make them one by one: those that were made are closed also where a later one cannot be.
     """
     stop = _Stop()
     for number in SIGNALS:
         signal.signal(number, stop)
     nodes: list[StoppableNode] = []
+    code = 1
     try:
         try:
             # Libraries read these when they are loaded, rclpy already loads numpy.
@@ -80,32 +85,36 @@ def run(name: str, create: Callable[[], Sequence[StoppableNode]], arguments: Seq
             if freed.segments:
                 nodes[0].get_logger().debug(f"freed {freed}")
             stop.starting = False
-            return _spin(nodes, executor, stop)
+            code = _spin(nodes, executor, stop)
         except Exception as error:
             if stop.received:
                 # Whatever was going on has failed because of the signal.
-                return 0
-            if not (stop.starting and isinstance(error, _start_errors())):
-                raise
-            _explain(name, str(error))
-            return 1
+                code = 0
+            elif stop.starting and isinstance(error, _start_errors()):
+                _explain(name, str(error))
+            else:
+                # Here and not by the interpreter, which may not come to it: see _finish.
+                traceback.print_exc()
     except KeyboardInterrupt:
         # Around the handling of failures too.
-        return 0
+        code = 0
     finally:
         _ignore_signals()
-        _finish(nodes)
+        _finish(nodes, code)
+    return code
 
 
 def _spin(nodes: Sequence[StoppableNode], executor: Executor, stop: _Stop) -> int:
     import rclpy
+    from rclpy.exceptions import InvalidHandle
     from rclpy.executors import ExternalShutdownException
 
     for node in nodes:
         executor.add_node(node)
     try:
         while rclpy.ok() and not stop.received:
-            executor.spin_once(timeout_sec=_LOOK)
+            with suppress(InvalidHandle):  # ros2/rclpy issue 1284: an entity was destroyed by another thread
+                executor.spin_once(timeout_sec=_LOOK)
             failed = next((node for node in nodes if node.start_failure), None)
             if failed is not None:
                 _explain(failed.get_name(), failed.start_failure)
@@ -129,16 +138,17 @@ def _explain(name: str, reason: str) -> None:
     get_logger(name).fatal(f"cannot start: {' '.join(reason.split())}")
 
 
-def _finish(nodes: Sequence[StoppableNode]) -> None:
+def _finish(nodes: Sequence[StoppableNode], code: int) -> None:
     import rclpy
 
-    closed = [node.close() for node in nodes]
+    with ThreadPoolExecutor(max(len(nodes), 1)) as pool:  # each may wait for a transition
+        closed = list(pool.map(lambda node: node.close(), nodes))
     if not all(closed):
         # A thread still compiles or loads, and nothing can interrupt it: to unload libraries under it would crash.
         sys.stdout.flush()
         sys.stderr.flush()
         rclpy.try_shutdown()
-        os._exit(0)
+        os._exit(code)
     for node in nodes:
         node.destroy_node()
     rclpy.try_shutdown()

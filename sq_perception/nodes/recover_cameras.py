@@ -21,7 +21,7 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING
 
 from sq_perception.nodes import process, recover_node
@@ -45,8 +45,17 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if len(set(cameras)) != len(cameras):
         parser.error(f"expected different cameras, got {' '.join(cameras)}")
 
-    def create() -> list[FrameNode]:
-        return [recover_node.create(camera) for camera in cameras]
+    def create() -> Iterator[FrameNode]:
+        names: dict[str, str] = {}
+        for camera in cameras:
+            node = recover_node.create(camera)
+            yield node
+            other = names.setdefault(node.get_fully_qualified_name(), camera)
+            if other != camera:
+                raise ValueError(
+                    f"{other} and {camera} are both {node.get_fully_qualified_name()}: a namespace for the process "
+                    f"(__ns) replaces those of the cameras; say robot/{other} robot/{camera} instead"
+                )
 
     return process.run(NAME, create, given[cut:])
 
@@ -54,7 +63,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 def _namespace(text: str) -> str:
     if not _NAMESPACE.fullmatch(text):
         raise argparse.ArgumentTypeError(f"expected a ROS name such as front or arm/wrist, got {text!r}")
-    return text
+    return text.strip("/")
 
 
 if __name__ == "__main__":
