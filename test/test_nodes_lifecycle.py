@@ -148,7 +148,12 @@ class Bench:
         self.context.try_shutdown()
         self.thread.join(PATIENCE)
         for node in (*self.nodes, self.peer):
+            self.executor.remove_node(node)
             node.destroy_node()
+        self.executor.shutdown()
+        # An events executor keeps what it was waiting for until it is collected, and the next bench would hear of it.
+        del self.executor
+        gc.collect()
 
     @staticmethod
     def until(condition: Callable[[], Any]) -> None:
@@ -174,9 +179,9 @@ class Bench:
     def active(self) -> Bench:
         for space, node in zip(self.answers, self.nodes, strict=True):
             self.until(lambda node=node: node.is_active)
-            self.until(lambda space=space: self.images[space].get_subscription_count() == 1)
-            self.until(lambda space=space: self.infos[space].get_subscription_count() == 1)
-            self.until(lambda node=node: node._publisher.superquadrics.get_subscription_count() == 1)
+            self.until(lambda space=space: self.images[space].get_subscription_count() >= 1)
+            self.until(lambda space=space: self.infos[space].get_subscription_count() >= 1)
+            self.until(lambda node=node: node._publisher.superquadrics.get_subscription_count() >= 1)
         return self
 
     def publish(self, space: str = "", value: float = 0.5) -> Header:
