@@ -46,7 +46,7 @@ class Benchmark:
 
     def __init__(self, node: str, peer: Peer, children: Children) -> None:
         self.name, self.peer = f"/{node}", peer
-        self.child = children.start(node, arguments("no_frame_warning:=0.0"))
+        self.child = children.start(node, arguments("no_frame_warning:=0.0", "patience:=0.02"))
         self.siege = Siege(peer, self.name, (self.child,))
         self.answers, self.reports = peer.answers(self.name), peer.diagnoses(self.name)
         self.first = from_message(self._good()[0].message)
