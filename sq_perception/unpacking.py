@@ -46,7 +46,7 @@ def npz_arrays(path: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
             return {name: _array(archive, held[f"{name}.npy"]) for name in names if f"{name}.npy" in held}
     except UnpackingError as error:
         raise UnpackingError(f"not a readable NPZ archive: {error}") from error
-    except (OSError, ValueError, EOFError, NotImplementedError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
+    except (OSError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
         raise UnpackingError(f"not a readable NPZ archive: {error}") from error
 
 

@@ -7,7 +7,6 @@ import threading
 import time
 import weakref
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -19,13 +18,11 @@ from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from lifecycle_msgs.msg import Transition, TransitionEvent
 from lifecycle_msgs.srv import ChangeState, GetState
-from rclpy.context import Context
-from rclpy.exceptions import InvalidHandle
-from rclpy.executors import ExternalShutdownException, MultiThreadedExecutor, SingleThreadedExecutor
+from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
 from rclpy.experimental.events_executor import EventsExecutor
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from spun_nodes import PATIENCE, SpunNodes
 from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 
@@ -41,7 +38,6 @@ from sq_perception.nodes.parameters import RecoverParameters
 from sq_perception.nodes.recover_node import _options
 from sq_perception.recovery import FrameRecovery, Recovery
 
-PATIENCE = 30.0
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
 
 
@@ -73,12 +69,11 @@ class Recoverer:
         return FrameRecovery((one,), {"total": 1.0}, np.zeros(depth.shape, np.int32), None, "")
 
 
-class Bench:
+class Bench(SpunNodes):
     """Frame nodes whose recoverers the test makes, and a peer, spun by an executor of the test's choice."""
 
     def __init__(self, *arguments: str, namespaces: tuple[str, ...] = ("",), executor: Any = None) -> None:
-        self.context = Context()
-        self.context.init(args=["--ros-args", "-p", "tracking:=false", *arguments])
+        super().__init__("-p", "tracking:=false", *arguments)
         self.made: list[Recoverer] = []
         self.fault: Exception | None = None
         self.gate = threading.Event()
@@ -91,7 +86,6 @@ class Bench:
             judge=self._judge,
             describe=lambda parameters: f"model {parameters.model}",
         )
-        self.peer = Node("peer", context=self.context)
         self.events: list[str] = []
         self.reports: list[DiagnosticStatus] = []
         self.peer.create_subscription(
@@ -114,11 +108,7 @@ class Bench:
             for space in namespaces
         ]
         self.node = self.nodes[0]
-        self.executor = (executor or SingleThreadedExecutor)(context=self.context)
-        for node in (*self.nodes, self.peer):
-            self.executor.add_node(node)
-        self.thread = threading.Thread(target=self._spin, daemon=True)
-        self.thread.start()
+        self.spin(self.nodes, executor)
         self.stamps = 0
 
     def _judge(self, parameters: Any, names: frozenset[str]) -> None:
@@ -132,42 +122,11 @@ class Bench:
         self.made.append(Recoverer(parameters.model))
         return self.made[-1]
 
-    def _spin(self) -> None:
-        try:
-            while self.context.ok():
-                with suppress(InvalidHandle):  # as sq_perception.nodes.process
-                    self.executor.spin_once(timeout_sec=0.2)
-        except (ExternalShutdownException, RuntimeError):
-            if self.context.ok():
-                raise
-
     def close(self) -> None:
         self.gate.set()
         for node in self.nodes:
             assert node.close() or not node.is_configured
-        self.context.try_shutdown()
-        self.thread.join(PATIENCE)
-        for node in (*self.nodes, self.peer):
-            self.executor.remove_node(node)
-            node.destroy_node()
-        self.executor.shutdown()
-        # An events executor keeps what it was waiting for until it is collected, and the next bench would hear of it.
-        del self.executor
-        gc.collect()
-
-    @staticmethod
-    def until(condition: Callable[[], Any]) -> None:
-        deadline = time.monotonic() + PATIENCE
-        while not condition():
-            assert time.monotonic() < deadline, "waited in vain"
-            time.sleep(0.005)
-
-    def call(self, kind: Any, name: str, request: Any) -> Any:
-        client = self.peer.create_client(kind, name)
-        self.until(client.service_is_ready)
-        future = client.call_async(request)
-        self.until(future.done)
-        return future.result()
+        self.finish()
 
     def change(self, transition: int, label: str = "") -> bool:
         request = ChangeState.Request(transition=Transition(id=transition, label=label))

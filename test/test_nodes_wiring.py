@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable, Iterator
-from contextlib import suppress
 from types import SimpleNamespace
 from typing import Any
 
@@ -15,13 +13,10 @@ import pytest
 pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
 from builtin_interfaces.msg import Time
-from rclpy.context import Context
-from rclpy.exceptions import InvalidHandle
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, QoSReliabilityPolicy
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from spun_nodes import PATIENCE, SpunNodes
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import Marker, MarkerArray
@@ -45,7 +40,6 @@ from sq_perception.nodes.parameters import RecoverParameters
 from sq_perception.nodes.recover_node import _options
 from sq_perception.recovery import FrameRecovery, Recovery
 
-PATIENCE = 30.0
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
 FRAME_ID = "some_camera_optical_frame"
 
@@ -76,54 +70,29 @@ class Recoverer:
         return FrameRecovery(self.bodies, {"total": 1.0}, np.zeros(depth.shape, np.int32), None, "")
 
 
-class Bench:
+class Bench(SpunNodes):
     """A frame node and a peer that publishes to it and listens, spun in the background."""
 
     def __init__(self, *arguments: str) -> None:
-        self.context = Context()
-        self.context.init(args=["--ros-args", *arguments])
+        super().__init__(*arguments)
         self.recoverer = Recoverer()
         workshop = Workshop(make=lambda _: self.recoverer, options=_options)
         self.node = FrameNode("recover_node", RecoverParameters, workshop, context=self.context)
-        self.peer = Node("peer", context=self.context)
         self.images = self.peer.create_publisher(Image, "depth/image", 5)
         self.infos = self.peer.create_publisher(CameraInfo, "depth/camera_info", 5)
         self.answers: list[PointCloud2] = []
         self.peer.create_subscription(PointCloud2, "recover_node/superquadrics", self.answers.append, 10)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
-        self.executor.add_node(self.peer)
-        self.thread = threading.Thread(target=self._spin, daemon=True)
-        self.thread.start()
+        self.spin([self.node])
         self.until(lambda: self.node.is_active)
         if self.node._settings.current.image_transport == "raw":
             self.until(lambda: self.images.get_subscription_count() == 1)
         self.until(lambda: self.node._publisher.superquadrics.get_subscription_count() == 1)
         self.stamps = 0
 
-    def _spin(self) -> None:
-        try:
-            while self.context.ok():
-                with suppress(InvalidHandle):  # as sq_perception.nodes.process
-                    self.executor.spin_once(timeout_sec=0.2)
-        except (ExternalShutdownException, RuntimeError):
-            if self.context.ok():
-                raise
-
     def close(self) -> None:
         self.recoverer.gate.set()
         assert self.node.close()
-        self.context.try_shutdown()
-        self.thread.join(PATIENCE)
-        self.node.destroy_node()
-        self.peer.destroy_node()
-
-    @staticmethod
-    def until(condition: Callable[[], Any]) -> None:
-        deadline = time.monotonic() + PATIENCE
-        while not condition():
-            assert time.monotonic() < deadline, "waited in vain"
-            time.sleep(0.005)
+        self.finish()
 
     @property
     def counts(self) -> Any:
@@ -161,13 +130,6 @@ class Bench:
         self.send(message)
         self.until(lambda: len(self.answers) > before)
         return self.answers[-1], from_message(self.answers[-1])
-
-    def call(self, kind: Any, name: str, request: Any) -> Any:
-        client = self.peer.create_client(kind, name)
-        self.until(client.service_is_ready)
-        future = client.call_async(request)
-        self.until(future.done)
-        return future.result()
 
 
 @pytest.fixture
@@ -605,48 +567,3 @@ def test_silence_is_reported(make_bench):
     reports: list[DiagnosticArray] = []
     bench.peer.create_subscription(DiagnosticArray, "/diagnostics", reports.append, 5)
     bench.until(lambda: reports and reports[-1].status[0].message == "no depth images arrive")
-
-
-def test_packed_images_are_read_and_hostile_ones_refused(make_bench):
-    from sq_perception.imaging import compressed_depth
-
-    bench = make_bench("-p", "image_transport:=compressedDepth", "-r", "depth/image:=/camera/depth")
-    packed = bench.peer.create_publisher(CompressedImage, "/camera/depth/compressedDepth", 5)
-    bench.until(lambda: packed.get_subscription_count() == 1)
-    bench.send_info()
-    depth = np.full((48, 64), 0.731, np.float32)
-    depth[:5] = np.nan
-    for encoding in ("16UC1", "32FC1"):
-        form, data = compressed_depth.encode(depth, encoding)
-        header = bench.header()
-        packed.publish(CompressedImage(header=header, format=form, data=data))
-        bench.until(lambda header=header: any(one.header == header for one in bench.answers))
-        seen = bench.recoverer.asked[-1][0]
-        assert np.isnan(seen[:5]).all()
-        np.testing.assert_allclose(seen[5:], 0.731, atol=1e-3)
-    hostile = [("", b""), ("16UC1; compressedDepth png", b""), (form, data[:40]), ("rgb8; jpeg", b"abc")]
-    for number, (bad_form, bad_data) in enumerate(hostile, start=1):
-        packed.publish(CompressedImage(header=bench.header(), format=bad_form, data=bad_data))
-        bench.until(lambda number=number: bench.counts.refused == number)
-        assert bench.counts.last_error
-    header = bench.header()
-    packed.publish(CompressedImage(header=header, format=form, data=data))
-    bench.until(lambda: any(one.header == header for one in bench.answers))
-
-
-def test_raw_images_of_a_lens_are_rectified_and_rendered_as_they_were_sent(make_bench):
-    bench = make_bench()
-    bench.until(lambda: bench.infos.get_subscription_count() == 1)
-    info = CameraInfo(width=64, height=48, distortion_model="plumb_bob", d=[-0.2, 0.05, 0.001, -0.001, 0.0])
-    info.k = [60.0, 0.0, 31.5, 0.0, 60.0, 23.5, 0.0, 0.0, 1.0]
-    bench.put_info(info)
-    rendered: list[Image] = []
-    bench.peer.create_subscription(Image, "recover_node/rendered_depth", rendered.append, 5)
-    bench.until(lambda: bench.node._publisher.rendered_depth.get_subscription_count())
-    bench.answer(bench.depth())
-    depth, camera, _, _ = bench.recoverer.asked[-1]
-    assert depth.shape == (camera.height, camera.width)
-    assert (camera.width, camera.height) > (64, 48), "a barrel's corners lie farther out in the ideal image"
-    assert np.nanmax(np.abs(depth - 0.5)) < 1e-6
-    bench.until(lambda: rendered)
-    assert (rendered[-1].width, rendered[-1].height) == (64, 48)

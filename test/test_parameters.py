@@ -203,6 +203,6 @@ def test_a_file_that_cannot_be_looked_at_is_a_reason(make_node):
 
     node = make_node()
     LiveParameters(node, RecoverParameters, judge=judge)
-    refused = node.set_parameters([Parameter("model", value="/root/secret.safetensors")])[0]
+    refused = node.set_parameters([Parameter("model", value="secret.safetensors")])[0]
     assert not refused.successful
     assert "Permission denied" in refused.reason

@@ -22,10 +22,9 @@ import cv2
 import numpy as np
 
 from sq_perception.imaging import rvl
+from sq_perception.unpacking import MOST_PIXELS
 
 TRANSPORT = "compressedDepth"
-MOST_PIXELS = 2**25
-"""Of a PNG; above any depth camera's, and 64 MB at 16 bit."""
 FARTHEST = 10.0
 """Metres up to which :func:`encode` quantises inverse depth; as in the reference."""
 

@@ -35,10 +35,10 @@ import numpy as np
 
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.distortion import Distortion
+from sq_perception.unpacking import MOST_PIXELS
 
 LARGEST_SIDE = 2**15 - 2
 """Pixels; what OpenCV can look up."""
-MOST_PIXELS = 2**25
 _KEPT = 16
 """Calibrations whose tables are kept."""
 _GROWTH = 2.0
