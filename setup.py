@@ -8,6 +8,23 @@ from setuptools import setup
 NAME = "sq_perception"
 NODES = ("recover_node", "recover_cameras", "fitter_node", "synthetic_depth_node")
 
+ROOMS = (
+    "geometry",
+    "files",
+    "imaging",
+    "segmentation",
+    "simulation",
+    "fitting",
+    "learning",
+    "tracking",
+    "recovery",
+    "recordings",
+    "viewing",
+    "evaluation",
+    "nodes",
+    "commands",
+)
+
 share = [
     ("share/ament_index/resource_index/packages", [f"resource/{NAME}"]),
     (f"share/{NAME}", ["package.xml"]),
@@ -45,14 +62,7 @@ setup(
     python_requires=">=3.10",
     packages=[
         "sq_perception",
-        "sq_perception.geometry",
-        "sq_perception.imaging",
-        "sq_perception.fitting",
-        "sq_perception.learning",
-        "sq_perception.evaluation",
-        "sq_perception.nodes",
-        "sq_perception.viewing",
-        "sq_perception.tracking",
+        *(f"sq_perception.{room}" for room in ROOMS),
         "sq_perception.config",
         "sq_perception.weights",
         "sq_msgs_py",
@@ -116,7 +126,7 @@ setup(
     },
     entry_points={
         "console_scripts": [
-            "sq-perception = sq_perception.cli:main",
+            "sq-perception = sq_perception.commands.main:main",
             *(f"{node} = sq_perception.nodes.{node}:main" for node in NODES),
         ],
     },

@@ -4,7 +4,7 @@
 
 Superquadrics of 2 to 4 cm half size stand apart on a table, seen from 0.9 m at 45 to 55 degrees; scene k of n bodies
 comes from the seed (``SEED``, n, k) alone and is the same in all images, which are 63 degrees wide.  Sensors: those of
-sq_perception.imaging.sensor_noise.
+sq_perception.simulation.sensor_noise.
 
     own       Recoverer().recover(depth, camera)
     given     Recoverer().recover(depth, camera, labels), the true masks
@@ -38,10 +38,11 @@ from synthetic_tabletop import STAGES, Frame, scored
 
 from sq_perception.geometry import Superquadric
 from sq_perception.geometry import rotation as quaternions
-from sq_perception.imaging import raycast, sensor_noise
+from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
-from sq_perception.imaging.scene import Scene
-from sq_perception.recovery import Recoverer, RecoveryOptions
+from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
+from sq_perception.simulation import sensor_noise
+from sq_perception.simulation.scenes import Scene
 
 SEED = 8100
 GOALS = {1: 25.0, 5: 50.0, 20: 150.0}

@@ -53,8 +53,8 @@ from sq_perception.evaluation.plots import (
     new_figure,
 )
 from sq_perception.fitting.fit import Status
-from sq_perception.imaging import sensor_noise
-from sq_perception.recovery import FrameRecovery, Recovery
+from sq_perception.recovery.recoverer import FrameRecovery, Recovery
+from sq_perception.simulation import sensor_noise
 from sq_perception.tracking.session import Followed, TrackingSession
 
 TRACKED = (1, 10, 30)

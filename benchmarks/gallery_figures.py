@@ -35,7 +35,7 @@ from sq_perception.evaluation.plots import (
 )
 from sq_perception.geometry import Superquadric
 from sq_perception.geometry import rotation as quaternions
-from sq_perception.recovery import FrameRecovery, Recoverer, Recovery
+from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, Recovery
 
 SENSORS = {"realsense_d435": "stereo, RealSense D435", "kinect_v1": "structured light, Kinect v1"}
 DOTS = 100

@@ -16,9 +16,9 @@ import numpy as np
 import tabletop
 from household import Thing
 
-from sq_perception.imaging import sensor_noise
 from sq_perception.imaging.camera import Camera
-from sq_perception.imaging.scene import plane_depth
+from sq_perception.simulation import sensor_noise
+from sq_perception.simulation.scenes import plane_depth
 
 _CONTACT = 3e-4
 

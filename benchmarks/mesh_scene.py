@@ -21,7 +21,7 @@ import trimesh
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.kernels import kernel
 from sq_perception.imaging.camera import Camera
-from sq_perception.imaging.scene import plane_depth
+from sq_perception.simulation.scenes import plane_depth
 
 CAMERA = Camera(640, 480, 320 / np.tan(np.deg2rad(30)), 320 / np.tan(np.deg2rad(30)), 319.5, 239.5)
 DISTANCE = (0.5, 1.0)

@@ -147,8 +147,8 @@ def measure_networks(names: list[str], seconds: float, compile_too: bool) -> dic
 def measure_recovery(images: int) -> dict[str, Any]:
     """Times of whole recoveries by method, in milliseconds by stage."""
     from sq_perception.imaging import raycast, unit_cube
-    from sq_perception.imaging.scene import thesis_bodies
-    from sq_perception.recovery import Recoverer, RecoveryOptions
+    from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
+    from sq_perception.simulation.scenes import thesis_bodies
 
     camera = unit_cube.camera()
     frames = []

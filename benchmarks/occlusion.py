@@ -26,11 +26,10 @@ import report
 import single_body
 import torch
 
-from sq_perception import metrics
 from sq_perception.fitting.fit import Status
-from sq_perception.geometry import Superquadric
+from sq_perception.geometry import Superquadric, metrics
 from sq_perception.learning import checkpoint
-from sq_perception.recovery import Recoverer, RecoveryOptions
+from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
 
 SEED = 7400
 SHARES = (0.0, 0.1, 0.2, 0.3, 0.4)

@@ -35,12 +35,12 @@ import numpy as np
 import report
 from both_fits import Both, both
 
-from sq_perception import metrics, recorded_frame
 from sq_perception.fitting import surface_fit
 from sq_perception.fitting.covariance import undetermined
 from sq_perception.fitting.fit import Status
-from sq_perception.geometry import Superquadric
+from sq_perception.geometry import Superquadric, metrics
 from sq_perception.imaging import unit_cube
+from sq_perception.recordings import frame_file
 
 AGREEMENT = 4.0
 DISTANCE = 3.0
@@ -58,7 +58,7 @@ def carton(folder: Path) -> tuple[dict[str, Any], str]:
     rows = []
     known_edges: list[list[float]] = [[], [], []]
     for path in sorted(folder.glob("felix_*.npz")):
-        frame = recorded_frame.read(path)
+        frame = frame_file.read(path)
         assert frame.labels is not None
         found = both(frame.depth, frame.labels == 1, frame.camera, surface_fit.Options(plane=frame.plane))
         size, sigma = found.fit.superquadric.size, found.fit.sigma_size
@@ -150,7 +150,7 @@ def things(folder: Path, frames: int) -> list[Thing]:
         seen[category] = seen.get(category, 0) + 1
         if seen[category] > frames:
             continue
-        frame = recorded_frame.read(path)
+        frame = frame_file.read(path)
         assert frame.labels is not None
         assert frame.plane is not None
         plane = frame.plane / np.linalg.norm(frame.plane[:3])
@@ -259,7 +259,7 @@ def renders(folder: Path) -> tuple[dict[str, Any], str]:
     truth = Superquadric(numbers[:, 0:3] / 255, numbers[:, 3:5], numbers[:, 5:8] / 255, numbers[:, 17:21])
     found = []
     for name in names:
-        frame = recorded_frame.read(folder / name, projection="orthographic")
+        frame = frame_file.read(folder / name, projection="orthographic")
         found.append(both(frame.depth, np.isfinite(frame.depth), frame.camera, surface_fit.Options()))
     ours, classic = (
         100 * metrics.volume_iou(unit_cube.cube_from_optical(Superquadric.stack(bodies)), truth)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from sq_perception import provenance
+from sq_perception.files import provenance
 
 RESULTS = Path(__file__).resolve().parent / "results"
 

@@ -36,7 +36,7 @@ from sq_perception.fitting import solina_bajcsy
 from sq_perception.fitting.fit import Status
 from sq_perception.geometry import Superquadric
 from sq_perception.geometry import rotation as quaternions
-from sq_perception.recovery import FrameRecovery, Recoverer
+from sq_perception.recovery.recoverer import FrameRecovery, Recoverer
 
 METHODS = ("given", "own", "classic", "oriented box", "standing box")
 FEWEST_PIXELS = 200

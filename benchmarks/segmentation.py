@@ -39,8 +39,8 @@ import numpy as np
 import report
 from scipy.optimize import linear_sum_assignment
 
-from sq_perception import recorded_frame
-from sq_perception.imaging.segmentation import SegmentationOptions, segment
+from sq_perception.recordings import frame_file
+from sq_perception.segmentation.segments import SegmentationOptions, segment
 
 IOU_GOAL = 0.85
 F1_GOAL = {"boxes": 0.9, "stacked_boxes": 0.9, "cylindric": 0.9, "occluded": 0.8}
@@ -59,7 +59,7 @@ class Instances:
 
     name: str
     category: str
-    frame: recorded_frame.RecordedFrame
+    frame: frame_file.RecordedFrame
     truth: np.ndarray
     """int32 (height, width), objects 1..n, 0 where there is none or no depth."""
     held_out: bool
@@ -108,7 +108,7 @@ def frames(folders: list[Path], most: int) -> list[Instances]:
     found = []
     for folder in folders:
         for k, path in enumerate(sorted(folder.glob("*.npz"))[:most]):
-            frame = recorded_frame.read(path)
+            frame = frame_file.read(path)
             if frame.labels is None:
                 continue
             with np.load(path, allow_pickle=False) as archive:

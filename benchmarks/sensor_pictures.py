@@ -13,8 +13,8 @@ from matplotlib import colormaps
 from PIL import Image
 
 from sq_perception.evaluation.plots import INK, NOTHING, draw_depth, new_figure, save
-from sq_perception.imaging import sensor_noise
-from sq_perception.imaging.scene import table_scene
+from sq_perception.simulation import sensor_noise
+from sq_perception.simulation.scenes import table_scene
 
 SEED = 3
 BODIES = 4

@@ -30,13 +30,12 @@ import numpy as np
 import report
 from scipy.optimize import linear_sum_assignment
 
-from sq_perception import metrics
 from sq_perception.fitting import solina_bajcsy, surface_fit
 from sq_perception.fitting.fit import Fit, Status
-from sq_perception.geometry import Superquadric, rotation
+from sq_perception.geometry import Superquadric, metrics, rotation
 from sq_perception.imaging import raycast, unit_cube
 from sq_perception.imaging.camera import Camera
-from sq_perception.imaging.scene import thesis_bodies
+from sq_perception.simulation.scenes import thesis_bodies
 
 SEED = 7000
 GREY = 1 / 255

@@ -2,8 +2,9 @@
 
     python benchmarks/synthetic_tabletop.py [--scenes 60] [--sensors realsense_d435 ...] [--name synthetic_tabletop]
 
-Scenes: sq_perception.imaging.scene.crowded_scene, 640 x 480 pixels, from 0.5 to 1.2 m, scene k from the seed
-(``SEED``, k) alone.  Sensors: those of sq_perception.imaging.sensor_noise, and ``plain``: sigma = 1.5 mm z^2 for each
+Scenes: sq_perception.simulation.scenes.crowded_scene, 640 x 480 pixels, from 0.5 to 1.2 m, scene k from
+the seed (``SEED``, k) alone.  Sensors: those of sq_perception.simulation.sensor_noise,
+and ``plain``: sigma = 1.5 mm z^2 for each
 pixel by itself, then millimetres.
 
     matched IoU   volume IoU (64^3 points) of the best one-to-one assignment of recovered to true bodies, mean over the
@@ -33,11 +34,11 @@ import report
 import torch
 from scipy.optimize import linear_sum_assignment
 
-from sq_perception import metrics
-from sq_perception.geometry import Superquadric
-from sq_perception.imaging import raycast, sensor_noise
-from sq_perception.imaging.scene import Scene, crowded_scene
-from sq_perception.recovery import FrameRecovery, Recoverer, RecoveryOptions
+from sq_perception.geometry import Superquadric, metrics
+from sq_perception.imaging import raycast
+from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, RecoveryOptions
+from sq_perception.simulation import sensor_noise
+from sq_perception.simulation.scenes import Scene, crowded_scene
 
 SEED = 7500
 BODIES = (2, 12)

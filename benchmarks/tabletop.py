@@ -24,9 +24,9 @@ import numpy as np
 from household import Thing
 from scipy.spatial import ConvexHull
 
-from sq_perception.imaging import sensor_noise
 from sq_perception.imaging.camera import Camera
-from sq_perception.imaging.scene import plane_depth
+from sq_perception.simulation import sensor_noise
+from sq_perception.simulation.scenes import plane_depth
 
 SENSORS = {"stereo": "realsense_d435", "structured light": "kinect_v1"}
 """Scenes of even seeds are seen by the first, those of odd seeds by the second."""

@@ -2,8 +2,9 @@
 
     python benchmarks/tracking.py [--scenes 2] [--frames 300] [--seed 1] [--name tracking]
 
-Scenes of :func:`sq_perception.imaging.scene.table_scene`, all bodies 0.6 to 1.0 m away, 640 x 480 pixels, 30 frames a
-second.  The camera goes 90 degrees about the table's normal through the point it looks at, its pose known, or stands
+Scenes of :func:`sq_perception.simulation.scenes.table_scene`, all bodies 0.6 to 1.0 m away, 640 x 480 pixels, 30
+frames a second.
+The camera goes 90 degrees about the table's normal through the point it looks at, its pose known, or stands
 still.  Rows:
 
     moving    sensor_noise's realsense_d435
@@ -48,10 +49,10 @@ import torch
 from sq_perception.geometry import Superquadric
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.imaging import raycast
-from sq_perception.imaging.scene import Scene, table_scene
-from sq_perception.imaging.sensor_model import Ideal
-from sq_perception.imaging.sensor_noise import SensorNoise, preset
-from sq_perception.recovery import FrameRecovery, Recoverer
+from sq_perception.recovery.recoverer import FrameRecovery, Recoverer
+from sq_perception.simulation.scenes import Scene, table_scene
+from sq_perception.simulation.sensor_model import Ideal
+from sq_perception.simulation.sensor_noise import SensorNoise, preset
 from sq_perception.tracking.forms import TURNS
 from sq_perception.tracking.session import TrackingSession
 

@@ -25,10 +25,10 @@ import tabletop
 from rich.progress import track
 from scene_verdict import Answer
 
-from sq_perception import seen_object
 from sq_perception.fitting import revolution, search
 from sq_perception.fitting.observation import Observation
-from sq_perception.recovery import RecoveryOptions
+from sq_perception.recovery import seen_object
+from sq_perception.recovery.recoverer import RecoveryOptions
 
 HALF = 0.5
 Switch = Callable[[], AbstractContextManager[Any]]

@@ -14,8 +14,8 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from sq_perception.geometry import rotation as quaternions
+from sq_perception.geometry.metrics import volume_iou
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.metrics import volume_iou
 
 
 @dataclass(frozen=True, eq=False)

@@ -29,7 +29,7 @@ from sq_perception.learning import checkpoint, inference
 from sq_perception.learning.consensus import Consensus
 from sq_perception.learning.inference import Predictor
 from sq_perception.learning.objective import LOSSES, Objective
-from sq_perception.recovery import Method, Recoverer, RecoveryOptions
+from sq_perception.recovery.recoverer import Method, Recoverer, RecoveryOptions
 
 FITS = ("auto", "symmetry", "classic")
 TIMED_IMAGES = 300

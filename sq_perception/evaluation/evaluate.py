@@ -20,11 +20,11 @@ from pathlib import Path
 import numba
 import torch
 
-from sq_perception import provenance
 from sq_perception.evaluation import report
 from sq_perception.evaluation.contest import Advance, compare
 from sq_perception.evaluation.contestants import FITS, Contestant, Fit, Network, unique_names
 from sq_perception.evaluation.thesis_images import DEFAULT_SEED, ThesisImages
+from sq_perception.files import provenance
 from sq_perception.learning.checkpoint import CheckpointError, shipped
 
 BODIES, FIT_BODIES = 20_000, 2000

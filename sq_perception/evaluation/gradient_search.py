@@ -36,16 +36,17 @@ import torch
 
 from sq_perception.fitting import solina_bajcsy
 from sq_perception.geometry import rotation as quaternions
+from sq_perception.geometry.metrics import volume_iou
 from sq_perception.geometry.superquadric import FLAT_LENGTH, Superquadric
-from sq_perception.imaging import canonical_view, raycast, segmentation, unit_cube
+from sq_perception.imaging import canonical_view, raycast, unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.canonical_view import CanonicalView
-from sq_perception.imaging.scene import thesis_bodies
 from sq_perception.learning import checkpoint
 from sq_perception.learning.objective import LOSSES, UNSUPERVISED, Objective
 from sq_perception.learning.regressor import RegressorConfig
-from sq_perception.metrics import volume_iou
-from sq_perception.recorded_frame import FrameError, read
+from sq_perception.recordings.frame_file import FrameError, read
+from sq_perception.segmentation import segments
+from sq_perception.simulation.scenes import thesis_bodies
 
 STARTS = ("network", "disturbed", "moments", "truth")
 WITHOUT_SHARPNESS = ("parameters", "least_squares", "least_squares_free")
@@ -221,7 +222,7 @@ class Subject:
         ValueError
             If there is no object.
         """
-        found = segmentation.segment(depth, camera)
+        found = segments.segment(depth, camera)
         if not found.ids:
             raise ValueError("the image shows no object")
         view = canonical_view.from_mask(depth, found.labels == found.ids[0], camera, pixels)

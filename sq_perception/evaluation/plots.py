@@ -31,7 +31,7 @@ from sq_perception.geometry.mesh import COLOURS, mesh, outline
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
-from sq_perception.recovery import FrameRecovery
+from sq_perception.recovery.recoverer import FrameRecovery
 
 INK = "#22303c"
 WIRE = "#d1006c"

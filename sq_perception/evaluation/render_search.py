@@ -27,7 +27,7 @@ from matplotlib.figure import Figure
 from sq_perception.evaluation import plots
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast, soft_render, unit_cube
-from sq_perception.imaging.scene import thesis_bodies
+from sq_perception.simulation.scenes import thesis_bodies
 
 SHARPNESS = (10.0, 1000.0)
 TAU = (0.25, 32.0)

@@ -1,7 +1,7 @@
 """The test set: bodies of the thesis' protocol and their 8 bit images, which no training has seen.
 
-Protocol (thesis, chapter 5.1; :mod:`sq_perception.imaging.scene`): half sizes 25 to 75 of 255, exponents 0.1 to 1, the
-centre at 128 +- 40, uniform rotations; images of 256 x 256 pixels whose grey value is the floor of 255 z.
+Protocol (thesis, chapter 5.1; :mod:`sq_perception.simulation.scenes`): half sizes 25 to 75 of 255, exponents 0.1 to 1,
+the centre at 128 +- 40, uniform rotations; images of 256 x 256 pixels whose grey value is the floor of 255 z.
 
 Seeds.  Bodies come in blocks of 500, block b from the generator of ``SeedSequence(seed, spawn_key=(6, b))``, so that
 the first n bodies are the same however many are drawn.  Training draws from ``[seed, step]`` and validates on ``0``: no
@@ -19,11 +19,12 @@ from functools import cached_property
 import numpy as np
 
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.imaging import raycast, segmentation, unit_cube
+from sq_perception.imaging import raycast, unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.canonical_view import CanonicalView
-from sq_perception.imaging.scene import thesis_bodies
 from sq_perception.learning.regressor import RegressorConfig
+from sq_perception.segmentation import segments
+from sq_perception.simulation.scenes import thesis_bodies
 
 DEFAULT_SEED = 2020
 CHUNK = 200
@@ -74,7 +75,7 @@ class ImageChunk:
 
     @cached_property
     def _masks(self) -> list[np.ndarray | None]:
-        found = [segmentation.segment(depth, self.camera) for depth in self.depth]
+        found = [segments.segment(depth, self.camera) for depth in self.depth]
         return [one.labels == one.ids[0] if one.ids else None for one in found]
 
 

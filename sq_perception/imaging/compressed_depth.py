@@ -21,8 +21,8 @@ import struct
 import cv2
 import numpy as np
 
+from sq_perception.files.unpacking import MOST_PIXELS
 from sq_perception.imaging import rvl
-from sq_perception.unpacking import MOST_PIXELS
 
 TRANSPORT = "compressedDepth"
 FARTHEST = 10.0

@@ -33,9 +33,9 @@ from functools import cached_property, lru_cache
 import cv2
 import numpy as np
 
+from sq_perception.files.unpacking import MOST_PIXELS
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.distortion import Distortion
-from sq_perception.unpacking import MOST_PIXELS
 
 LARGEST_SIDE = 2**15 - 2
 """Pixels; what OpenCV can look up."""

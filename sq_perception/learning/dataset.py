@@ -1,6 +1,7 @@
 """Training data drawn and rendered on the fly: bodies of the thesis' protocol in their canonical views.
 
-The protocol itself is in :mod:`sq_perception.imaging.scene`; depth comes in 255 integer steps a unit, as in its images.
+The protocol itself is in :mod:`sq_perception.simulation.scenes`; depth comes in 255 integer steps a unit, as in its
+images.
 """
 
 from __future__ import annotations
@@ -11,11 +12,11 @@ import numpy as np
 
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast, unit_cube
-from sq_perception.imaging.scene import THESIS_SIZE, thesis_bodies
-from sq_perception.imaging.view_rendering import Occluder, render_views
 from sq_perception.learning import dihedral
 from sq_perception.learning.disturbance import Disturbance
 from sq_perception.learning.regressor import Framing
+from sq_perception.simulation.scenes import THESIS_SIZE, thesis_bodies
+from sq_perception.simulation.view_rendering import Occluder, render_views
 
 GREY_LEVELS = 255.0
 CAMERA_DISTANCE = (1.5, 12.0)

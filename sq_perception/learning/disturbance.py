@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sq_perception.imaging.canonical_view import HIDDEN
-from sq_perception.imaging.view_rendering import Occluder
+from sq_perception.simulation.view_rendering import Occluder
 
 _LEAST_NOISE = 1 / 2000
 _STEPS = (1 / 400, 1 / 25)

@@ -1,11 +1,12 @@
 """Fixed sets of training and test images on disk: the thesis' way, beside the drawing on the fly of `dataset`.
 
-A set is a folder of shards and a manifest.  Bodies follow the thesis' protocol (:mod:`sq_perception.imaging.scene`).
+A set is a folder of shards and a manifest.  Bodies follow the thesis' protocol
+(:mod:`sq_perception.simulation.scenes`).
 
 | framing | image | value of a pixel from its grey level v | bodies in |
 | --- | --- | --- | --- |
 | full | the cube, :mod:`sq_perception.imaging.unit_cube` | (v + 1/2) / (2^bits - 1) | the cube frame |
-| cropped | :func:`sq_perception.imaging.view_rendering.render_views` | v / (2^bits - 1) | the frame of the view |
+| cropped | :func:`sq_perception.simulation.view_rendering.render_views` | v / (2^bits - 1) | the frame of the view |
 
 In both 0 is background, and a value is the z of what is seen.  Full frames of 8 bit and 256 x 256 pixels are the
 thesis'.  The depths of a view lie between its grey levels; hence 16 bit there by default, half a level off at most.

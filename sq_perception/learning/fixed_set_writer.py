@@ -28,7 +28,6 @@ from safetensors.numpy import save
 
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
-from sq_perception.imaging.scene import thesis_bodies
 from sq_perception.learning import dataset
 from sq_perception.learning.fixed_set import (
     FORMAT,
@@ -43,6 +42,7 @@ from sq_perception.learning.fixed_set import (
     verify,
 )
 from sq_perception.learning.regressor import Framing
+from sq_perception.simulation.scenes import thesis_bodies
 
 _PNG_LEVEL = 6
 

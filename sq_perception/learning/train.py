@@ -9,7 +9,7 @@ model.safetensors (the best one so far).
 
     sq-perception train --steps 20000 --output runs/compact
     sq-perception train --config render --output runs/render
-    torchrun --nproc-per-node 2 -m sq_perception.cli train --device cuda --output runs/two
+    torchrun --nproc-per-node 2 -m sq_perception.commands.main train --device cuda --output runs/two
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file
 
-from sq_perception import provenance
+from sq_perception.files import provenance
+from sq_perception.geometry.metrics import volume_iou
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.learning import checkpoint, training_config
 from sq_perception.learning.dataset import ViewPool, ViewSource, draw_views
@@ -42,7 +43,6 @@ from sq_perception.learning.regressor import Regressor, RegressorConfig, load_im
 from sq_perception.learning.training_config import TrainingConfig
 from sq_perception.learning.training_log import TrainingLog
 from sq_perception.learning.training_state import TrainingState, recalibrate
-from sq_perception.metrics import volume_iou
 
 CALIBRATION_VIEWS = 2048
 VALIDATION_HIDDEN = 0.3

@@ -12,7 +12,7 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
-from sq_perception import plain_yaml
+from sq_perception.files import plain_yaml
 from sq_perception.learning.dataset import ViewSource
 from sq_perception.learning.disturbance import Disturbance
 from sq_perception.learning.objective import LOSSES, UNSUPERVISED, Objective

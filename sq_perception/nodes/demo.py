@@ -34,7 +34,7 @@ from sq_perception.imaging.camera import Projection
 from sq_perception.nodes import demo_table, fast_dds
 from sq_perception.nodes.children import Children, interruptible, parameter_arguments
 from sq_perception.nodes.demo_watch import RESULTS, TRUTH, Shot, Watch
-from sq_perception.recorded_frame import FrameError, read
+from sq_perception.recordings.frame_file import FrameError, read
 
 DEFAULT_SECONDS = 20.0
 _RATE = 10.0
@@ -235,7 +235,7 @@ def draw(watch: Watch, shot: Shot, folder: Path) -> tuple[Path, Path | None]:
     from sq_perception.evaluation.demo_figure import demo_figure
     from sq_perception.evaluation.plots import save
     from sq_perception.geometry.mesh import export
-    from sq_perception.imaging.segmentation import segment
+    from sq_perception.segmentation.segments import segment
 
     frame = watch.frame(shot)
     unit = "" if frame.is_cube else "m"

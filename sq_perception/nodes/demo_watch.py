@@ -14,7 +14,7 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
 from sq_msgs_py.depth_image import GREY_ENCODINGS
 from sq_msgs_py.superquadrics import SuperquadricArray, from_message
-from sq_perception.calibration import Calibration
+from sq_perception.imaging.calibration import Calibration
 from sq_perception.nodes.frame import Frame, decode
 
 RESULTS = ("recover_node", "fitter_node")

@@ -21,7 +21,7 @@ from time import perf_counter
 from typing import Any, Generic, TypeVar
 
 from sq_perception.imaging.camera import Camera
-from sq_perception.recovery import Recoverer, RecoveryOptions
+from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
 
 P = TypeVar("P")
 

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from sq_perception.nodes.engine import Workshop
     from sq_perception.nodes.frame_node import FrameNode
     from sq_perception.nodes.parameters import FitterParameters
-    from sq_perception.recovery import Recoverer, RecoveryOptions
+    from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
 
 NAME = "fitter_node"
 
@@ -40,13 +40,13 @@ def workshop() -> Workshop[FitterParameters]:
 
 
 def _recoverer(parameters: FitterParameters) -> Recoverer:
-    from sq_perception.recovery import Recoverer
+    from sq_perception.recovery.recoverer import Recoverer
 
     return Recoverer(method="classic")
 
 
 def _options(parameters: FitterParameters) -> RecoveryOptions:
-    from sq_perception.recovery import RecoveryOptions
+    from sq_perception.recovery.recoverer import RecoveryOptions
 
     return RecoveryOptions(
         method="classic",

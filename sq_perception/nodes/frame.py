@@ -15,12 +15,12 @@ from sq_msgs_py.depth_image import (
     grey_from_message,
     labels_from_message,
 )
-from sq_perception import publication
-from sq_perception.calibration import Calibration
 from sq_perception.imaging import unit_cube
+from sq_perception.imaging.calibration import Calibration
 from sq_perception.imaging.camera import Camera
 from sq_perception.nodes.inbox import Refused
 from sq_perception.nodes.transport import depth_of
+from sq_perception.recordings import publication
 
 
 @dataclass(frozen=True, eq=False)

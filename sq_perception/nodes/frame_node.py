@@ -42,8 +42,8 @@ from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_srvs.srv import SetBool, Trigger
 
-from sq_perception.calibration import Calibration
 from sq_perception.imaging import unit_cube
+from sq_perception.imaging.calibration import Calibration
 from sq_perception.imaging.camera import Camera
 from sq_perception.nodes import garbage, report, transport
 from sq_perception.nodes.counters import Statistics, Throttle
@@ -54,7 +54,7 @@ from sq_perception.nodes.inbox import Arrival, Inbox, NoCameraInfo, Refused
 from sq_perception.nodes.managed_node import ManagedNode
 from sq_perception.nodes.parameters import FrameParameters, LiveParameters
 from sq_perception.nodes.triggers import Outcome, Triggers
-from sq_perception.recovery import FrameRecovery
+from sq_perception.recovery.recoverer import FrameRecovery
 
 WARM_UP_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 _WORKER_END = 3.0

@@ -16,15 +16,15 @@ from sensor_msgs.msg import Image, PointCloud2
 from visualization_msgs.msg import MarkerArray
 
 from sq_msgs_py.superquadrics import to_message
-from sq_perception import publication
 from sq_perception.nodes import results
 from sq_perception.nodes.camera_poses import CameraPoses
 from sq_perception.nodes.frame import Frame
 from sq_perception.nodes.identity import Identity
 from sq_perception.nodes.outputs import Outputs
 from sq_perception.nodes.parameters import FrameParameters
-from sq_perception.publication import Findings, Identified
-from sq_perception.recovery import FrameRecovery, render_recovery
+from sq_perception.recordings import publication
+from sq_perception.recordings.publication import Findings, Identified
+from sq_perception.recovery.recoverer import FrameRecovery, render_recovery
 from sq_perception.tracking.session import Tally
 
 

@@ -12,14 +12,14 @@ from pathlib import Path
 
 import numpy as np
 
-from sq_perception import recorded_frame
-from sq_perception.calibration import Calibration
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
+from sq_perception.imaging.calibration import Calibration
 from sq_perception.imaging.camera import Camera
-from sq_perception.imaging.scene import table_scene, thesis_scene
-from sq_perception.imaging.sensor_noise import Ideal, preset
 from sq_perception.nodes.parameters import IDEAL, ParameterError, SyntheticParameters
+from sq_perception.recordings import frame_file
+from sq_perception.simulation.scenes import table_scene, thesis_scene
+from sq_perception.simulation.sensor_noise import Ideal, preset
 
 SUFFIXES = (".npz", ".png", ".bmp")
 _SCENES, _NOISE = 1, 2
@@ -69,7 +69,7 @@ class FrameSource:
         self._files = _recordings(Path(parameters.path)) if parameters.scene == "replay" else []
         self._calibration = None
         if parameters.camera_info_file:
-            self._calibration = recorded_frame.read_calibration(parameters.camera_info_file)
+            self._calibration = frame_file.read_calibration(parameters.camera_info_file)
         self._noise = np.random.default_rng([parameters.seed, _NOISE])
         self._count = len(self._files) or parameters.scenes
         self._position, self._left = 0, parameters.hold
@@ -135,7 +135,7 @@ class FrameSource:
         return SourceFrame(depth, scene.camera, wanted, truth, is_cube, name, distorting)
 
     def _recorded(self, path: Path) -> SourceFrame:
-        frame = recorded_frame.read(path, self._parameters.camera_info_file or None, self._parameters.projection)
+        frame = frame_file.read(path, self._parameters.camera_info_file or None, self._parameters.projection)
         labels = None if self._parameters.masks == "never" else frame.labels
         return SourceFrame(frame.depth, frame.camera, labels, None, frame.is_cube, frame.name)
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from sq_perception import publication
 from sq_perception.nodes.camera_poses import CameraPoses, PoseError
 from sq_perception.nodes.frame import Frame
-from sq_perception.publication import Identified
-from sq_perception.recovery import FrameRecovery
+from sq_perception.recordings import publication
+from sq_perception.recordings.publication import Identified
+from sq_perception.recovery.recoverer import FrameRecovery
 from sq_perception.tracking.session import Tally, TrackingSession
 
 

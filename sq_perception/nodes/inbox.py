@@ -20,7 +20,7 @@ from time import monotonic
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from sq_msgs_py.depth_image import size_mismatch
-from sq_perception.calibration import Calibration
+from sq_perception.imaging.calibration import Calibration
 from sq_perception.nodes.transport import size_of
 
 Stamp = tuple[int, int]

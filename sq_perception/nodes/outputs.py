@@ -31,7 +31,7 @@ from sq_msgs_py import collision_objects
 from sq_msgs_py.detections import detections
 from sq_msgs_py.transforms import name, transforms
 from sq_perception.nodes.parameters import FrameParameters
-from sq_perception.publication import Findings
+from sq_perception.recordings.publication import Findings
 
 
 @dataclass(frozen=True)

@@ -21,9 +21,9 @@ from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValu
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from sq_perception.calibration import Treatment
-from sq_perception.imaging.sensor_noise import PRESETS
+from sq_perception.imaging.calibration import Treatment
 from sq_perception.nodes.transport import RAW, TRANSPORTS
+from sq_perception.simulation.sensor_noise import PRESETS
 
 Method = Literal["auto", "network", "symmetry", "classic"]
 Refine = Literal["surface", "soft_render", "none"]

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from sq_perception.nodes.engine import Workshop
     from sq_perception.nodes.frame_node import FrameNode
     from sq_perception.nodes.parameters import RecoverParameters
-    from sq_perception.recovery import Recoverer, RecoveryOptions
+    from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
 
 NAME = "recover_node"
 
@@ -47,7 +47,7 @@ def workshop() -> Workshop[RecoverParameters]:
 def _recoverer(parameters: RecoverParameters) -> Recoverer:
     import torch
 
-    from sq_perception.recovery import Recoverer
+    from sq_perception.recovery.recoverer import Recoverer
 
     # On a robot's busy cores the slowest of several threads sets the time; one image is too small to gain from them.
     torch.set_num_threads(1)
@@ -61,7 +61,7 @@ def _recoverer(parameters: RecoverParameters) -> Recoverer:
 
 
 def _options(parameters: RecoverParameters) -> RecoveryOptions:
-    from sq_perception.recovery import RecoveryOptions
+    from sq_perception.recovery.recoverer import RecoveryOptions
 
     return RecoveryOptions(
         method=parameters.method,
@@ -90,7 +90,7 @@ def _key(parameters: RecoverParameters) -> Hashable:
 
 def _judge(parameters: RecoverParameters, names: frozenset[str]) -> None:
     from sq_perception.learning import checkpoint
-    from sq_perception.recovery import checked_device
+    from sq_perception.recovery.recoverer import checked_device
 
     if "model" in names:
         try:

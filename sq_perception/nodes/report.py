@@ -11,7 +11,7 @@ from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from sq_perception.fitting.fit import Status
 from sq_perception.nodes.counters import Snapshot
-from sq_perception.recovery import FrameRecovery
+from sq_perception.recovery.recoverer import FrameRecovery
 from sq_perception.tracking.session import Tally
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from sq_perception.nodes.camera_poses import CameraPoses, PoseError
 from sq_perception.nodes.inbox import Refused
 from sq_perception.nodes.parameters import FrameParameters
-from sq_perception.publication import Findings, MarkerStyle
+from sq_perception.recordings.publication import Findings, MarkerStyle
 
 
 def marker_style(parameters: FrameParameters) -> MarkerStyle:

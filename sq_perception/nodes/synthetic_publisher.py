@@ -26,8 +26,8 @@ from sq_perception.nodes import transport
 from sq_perception.nodes.frame_source import FrameSource, SourceFrame
 from sq_perception.nodes.parameters import LiveParameters, SyntheticParameters
 from sq_perception.nodes.stoppable_node import StoppableNode
-from sq_perception.publication import CAMERA_FRAME, CUBE_FRAME, truth_array
-from sq_perception.recorded_frame import FrameError
+from sq_perception.recordings.frame_file import FrameError
+from sq_perception.recordings.publication import CAMERA_FRAME, CUBE_FRAME, truth_array
 
 
 class SyntheticDepthNode(StoppableNode):

@@ -34,10 +34,10 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from sq_msgs_py.depth_image import GREY_ENCODINGS, size_mismatch
 from sq_msgs_py.markers import PALETTE
 from sq_msgs_py.superquadrics import FAILED, WEAK, SuperquadricArray, from_message
-from sq_perception.calibration import Calibration
 from sq_perception.geometry import rotation
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
+from sq_perception.imaging.calibration import Calibration
 from sq_perception.imaging.camera import Camera
 from sq_perception.nodes.camera_poses import CameraPoses, PoseError
 from sq_perception.nodes.counters import Throttle

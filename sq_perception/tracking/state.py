@@ -31,7 +31,7 @@ _SHAPE_LIMITS = (0.01, 2.0)
 
 
 class Observed(Protocol):
-    """What the tracker reads of a body recovered from one frame; :class:`sq_perception.recovery.Recovery` is one.
+    """What the tracker reads of a body of one frame, as :class:`~sq_perception.recovery.recoverer.Recovery` is.
 
     ``superquadric`` is a single body in the optical frame.  ``covariance`` is (11, 11), of a1 a2 a3 e1 e2 t1 t2 t3 and
     the rotation vector in the object frame, metres and radians; NaN where unknown.

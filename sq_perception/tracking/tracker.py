@@ -116,7 +116,7 @@ class Tracker:
         ----------
         recoveries
             Bodies of the frame in the optical frame, without failed ones, of pieces in one place the most important
-            first: :attr:`~sq_perception.recovery.FrameRecovery.recovered`.
+            first: :attr:`~sq_perception.recovery.recoverer.FrameRecovery.recovered`.
         stamp
             Seconds; a stamp before the last one resets the tracker.
         camera_pose

@@ -1,0 +1,415 @@
+"""``sq-perception recover``: recorded frames in; JSON, meshes, pictures, a bag and a table out.
+
+Files appear whole or not at all, also where the command is interrupted: it then writes what it has.  Heavy imports
+happen inside, so that ``--help`` answers at once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+import statistics
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sq_perception.recordings.frame_file import RecordedFrame
+    from sq_perception.recordings.inputs import RecordedInput
+    from sq_perception.recordings.result_bag import ResultBag
+    from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, RecoveryOptions
+
+SUCCESS, FAILURE, USAGE, INTERRUPTED = 0, 1, 2, 130
+JSON_VERSION = 1
+
+HELP = """\
+Recover superquadrics from recorded depth images.
+
+A FRAME is
+  .npz           depth (float, metres, NaN = no reading) and K (3 x 3); optional labels = instance masks, which are
+                 then used instead of an own segmentation
+  .png, 16 bit   millimetres, 0 = no reading, with --camera-info
+  .png, .bmp     with --projection orthographic: grey images of the unit cube, larger is nearer, 0 = background
+  a folder       all frames in it, in natural order; camera_info.yaml or camera.yaml in it is the camera of its PNGs
+  a rosbag2      a folder with metadata.yaml, or a .mcap or .db3 file: 16UC1 and 32FC1 images, raw or compressedDepth,
+                 with the camera_info beside their topic; needs no ROS, but the extra 'bags'
+
+What cannot be read is reported and skipped; the exit code is then 1.
+"""
+EPILOG = """\
+methods:
+  auto       the network and central symmetry start an exact surface fit (best)
+  symmetry   the same fit, without the network
+  network    the network alone, unrefined (fastest)
+  classic    Solina and Bajcsy's fit to the points
+
+examples:
+  sq-perception recover table.npz --json out.json --pictures pictures/
+  sq-perception recover depth_*.png --camera-info camera.yaml --json out.json
+  sq-perception recover recording/ --topic /camera/depth/image_rect_raw --every 10 --meshes meshes/
+  sq-perception recover recording/ --track --json tracks.json
+  sq-perception recover recording/ --track --mcap results.mcap
+  sq-perception recover views/*.bmp --projection orthographic --method network --json -
+  sq-perception recover table.npz --ignore-masks --refine soft_render
+
+output:
+  {"frames": [{"file": ..., "ms": ..., "superquadrics": [{"size": [a1, a2, a3], "shape": [e1, e2],
+   "translation": [x, y, z], "rotation": [x, y, z, w], "score": ..., "residual": ..., "sigma_size": [...],
+   "seen": [...], "status": "converged" | "weak" | "failed", "message": ..., "label": ..., "pixels": ...,
+   "track": ...}, ...], "stamp": {"sec": ..., "nanosec": ...}, "topic": ..., "frame_id": ...}, ...]}
+  Half sizes and positions are metres in the optical frame (x right, y down, z forward); for orthographic frames the
+  unit cube (x right, y up, z to the viewer).  What is unknown is null: topic and frame_id of anything but a bag,
+  and stamp, unless a file's name is its time (1305031102.160407.png).  "seen" is the share of each size that the
+  measured points span; the rest is inferred.  A failed object is listed with its reason; its numbers only say where it
+  is.  "label" is the mask's value, null without masks; "pixels" counts the measured ones.
+
+distortion:
+  Where a camera_info has distortion coefficients that are not zero, --distortion auto takes images for rectified if the
+  last two parts of their topic or path have the word rect or rectified in them (image_rect, image_rect_raw,
+  rect/image.png), and for raw otherwise.  Raw images are rectified: their camera is then that of K, in a window that
+  shows what the raw image shows.  models: plumb_bob, rational_polynomial, equidistant.
+
+tracking:
+  --track follows bodies over the frames of each bag and folder, for a camera that stands still.  "track" is then
+  {"id": ..., "seen": ..., "fused": true | false, "size": ..., "shape": ..., "translation": ..., "rotation": ...,
+  "sigma_size": ...}: the same body keeps its id and the names of its axes; fused numbers are those of all frames so
+  far, others the frame's own.  It is null without --track and for failed objects.
+
+bags:
+  --mcap writes what recover_node would have published, and what it would have read, with stamps, frame ids and times of
+  the input: for Foxglove, ros2 bag play, RViz (docs/bags.md).  It is named when it is whole, also after Ctrl-C and on a
+  full disk, with the frames until then.
+
+meshes:
+  One file a frame with all its bodies, in metres, coloured as in the pictures; a frame without a body gets none.  PLY
+  has the coordinates of the JSON.  GLB turns the optical frame half about x, as its y axis points up, and names each
+  body by its position in "superquadrics": body_0, body_1, ...
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """The command's own."""
+    parser.add_argument("frames", nargs="+", metavar="FRAME", help="recorded depth images, folders or bags of them")
+    parser.add_argument("--json", metavar="OUT", help="write the results there; - is the standard output")
+    parser.add_argument("--projection", choices=("pinhole", "orthographic"), default="pinhole")
+    methods = ("auto", "network", "symmetry", "classic")
+    parser.add_argument("--method", choices=methods, default="auto", help="see below")
+    parser.add_argument(
+        "--refine",
+        choices=("surface", "soft_render", "none"),
+        default="surface",
+        help="what follows the start: the exact fit, descent on the soft-rendered depth, or nothing",
+    )
+    parser.add_argument(
+        "--camera-info",
+        metavar="FILE",
+        help="YAML with the intrinsics of 16 bit PNGs and bags; goes before what a folder or bag has",
+    )
+    parser.add_argument(
+        "--distortion",
+        choices=("auto", "apply", "ignore"),
+        default="auto",
+        help="of PNGs and bags: undo it (apply), take images for rectified (ignore), or go by their names, see below",
+    )
+    parser.add_argument("--topic", metavar="NAME", help="depth images of a bag, where it has several such topics")
+    parser.add_argument("--every", type=int, default=1, metavar="N", help="only every Nth frame of a bag or folder")
+    parser.add_argument("--limit", type=int, metavar="N", help="at most N frames of each bag or folder")
+    parser.add_argument("--pictures", metavar="DIR", help="draw a picture per frame into this folder")
+    parser.add_argument("--meshes", metavar="DIR", help="write the bodies of each frame as a mesh into this folder")
+    parser.add_argument("--mesh-format", choices=("glb", "ply"), default="glb", help="of --meshes (default glb)")
+    parser.add_argument("--mcap", metavar="OUT", help="write results and depth as a bag (extra 'bags'), see below")
+    parser.add_argument(
+        "--mcap-images",
+        metavar="LIST",
+        default="depth",
+        help="which images it has: depth, rendered, labels, with commas, or none (default depth)",
+    )
+    parser.add_argument("--model", metavar="FILE", help="weights: a .safetensors file, or the name of shipped ones")
+    parser.add_argument(
+        "--consensus", action="store_true", help="average the network's answers to 8 positions of each view"
+    )
+    parser.add_argument("--ignore-masks", action="store_true", help="segment, even where a frame brings labels")
+    parser.add_argument(
+        "--track",
+        action="store_true",
+        help="follow bodies over the frames of each bag or folder, see below; not for folders of unrelated frames",
+    )
+    parser.add_argument(
+        "--time-budget",
+        type=float,
+        default=math.inf,
+        metavar="S",
+        help="seconds per frame after which no further start is tried; the largest and nearest objects come first",
+    )
+    parser.add_argument("--max-objects", type=int, default=20, metavar="N", help="largest ones first (default 20)")
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run the command; returns the exit code."""
+    for name in ("max_objects", "every", "limit"):
+        value = getattr(options, name)
+        if value is not None and value < 1:
+            return misused(f"--{name.replace('_', '-')}: expected at least 1, got {value}")
+    if not options.time_budget > 0:
+        return misused(f"--time-budget: expected a positive number of seconds, got {options.time_budget:g}")
+    to_stdout = options.json == "-"
+    if options.json and not to_stdout and not Path(options.json).resolve().parent.is_dir():
+        return misused(f"--json: the folder of {options.json} does not exist")
+    if options.mcap and (problem := _bag_misuse(options.mcap, options.frames)):
+        return misused(f"--mcap: {options.mcap}: {problem}")
+    for name in ("pictures", "meshes"):
+        if folder := getattr(options, name):
+            try:
+                Path(folder).mkdir(parents=True, exist_ok=True)
+            except OSError as error:
+                return misused(f"--{name}: {error}")
+
+    import torch
+
+    from sq_perception.learning.checkpoint import CheckpointError
+    from sq_perception.recordings.frame_file import FrameError
+    from sq_perception.recordings.inputs import RecordedInput
+    from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
+
+    torch.set_num_threads(1)  # the network's layers are so small that threads cost more than they save
+    settings = RecoveryOptions(
+        method=options.method,
+        refine=options.refine,
+        max_objects=options.max_objects,
+        time_budget=options.time_budget,
+    )
+    try:
+        recorded = RecordedInput(
+            options.frames,
+            options.camera_info,
+            options.projection,
+            options.topic,
+            options.every,
+            options.limit,
+            options.distortion,
+        )
+        recoverer = Recoverer(options.model, method=options.method, consensus=options.consensus)
+    except (FrameError, CheckpointError) as error:
+        complain(str(error))
+        return FAILURE
+
+    bag = None
+    if options.mcap:
+        try:
+            from sq_perception.recordings.result_bag import ResultBag
+
+            images = [one.strip() for one in options.mcap_images.split(",")]
+            bag = ResultBag(options.mcap, [] if images == ["none"] else images)
+        except ValueError as error:
+            return misused(f"--mcap: {error}")
+        except (OSError, ImportError) as error:
+            complain(f"--mcap: {error}")
+            return FAILURE
+
+    run = _Run(options, recoverer, settings, bag)
+    code = run.over(recorded)
+    try:
+        if bag is not None:
+            bag.close()
+    except OSError as error:
+        complain(f"--mcap: {error}")
+        code = code or FAILURE
+    document = {"format": "sq_perception.recovery.recoverer", "version": JSON_VERSION, "frames": run.results}
+    if to_stdout:
+        print(json.dumps(document, indent=1, allow_nan=False))
+    else:
+        if options.json:
+            try:
+                with _whole(Path(options.json)) as partial:
+                    partial.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
+            except OSError as error:
+                complain(f"--json: {error}")
+                code = code or FAILURE
+        _print_table(run.results)
+    complain(run.summary())
+    return code
+
+
+class _Run:
+    """One pass over the frames, and what it has come to so far."""
+
+    def __init__(
+        self, options: argparse.Namespace, recoverer: Recoverer, settings: RecoveryOptions, bag: ResultBag | None
+    ) -> None:
+        from sq_perception.recordings.tracks import RecordedTracks
+
+        self.results: list[dict[str, Any]] = []
+        self.unreadable = 0
+        self._options, self._recoverer, self._settings, self._bag = options, recoverer, settings, bag
+        self._tracks = RecordedTracks(lambda text: complain(f"warning: {text}")) if options.track else None
+        self._warm: set[Any] = set()
+        self._stems: set[str] = set()
+        self._warnings: set[str] = set()
+
+    def over(self, recorded: RecordedInput) -> int:
+        """All frames; the exit code."""
+        from sq_perception.recordings.frame_file import FrameError
+
+        try:
+            for file, frame in _progress(recorded):
+                try:
+                    if isinstance(frame, FrameError):
+                        raise frame
+                    self._frame(file, frame)
+                except FrameError as error:
+                    complain(str(error))
+                    self.unreadable += 1
+                except OSError as error:  # of a picture, mesh or bag: the disk is full, and will be for the next frame
+                    complain(str(error))
+                    return FAILURE
+        except KeyboardInterrupt:
+            complain("interrupted; what is done so far is kept")
+            return INTERRUPTED
+        return FAILURE if self.unreadable else SUCCESS
+
+    def summary(self) -> str:
+        """The run in one line."""
+        bodies = [body for entry in self.results for body in entry["superquadrics"]]
+        failed = sum(body["status"] == "failed" for body in bodies)
+        parts = [_count(len(self.results), "frame"), f"{_count(len(bodies), 'object')} ({failed} failed)"]
+        if self.unreadable:
+            parts.append(f"{_count(self.unreadable, 'frame or source', 'frames or sources')} unreadable")
+        if self.results:
+            parts.append(f"median {statistics.median(entry['ms'] for entry in self.results):.0f} ms")
+        return ", ".join(parts)
+
+    def _frame(self, file: str, frame: RecordedFrame) -> None:
+        from sq_perception.recordings.frame_entry import frame_entry
+        from sq_perception.recordings.frame_file import FrameError
+
+        if frame.warning and frame.warning not in self._warnings:
+            complain(f"warning: {frame.warning}")
+            self._warnings.add(frame.warning)
+        labels = None if self._options.ignore_masks else frame.labels
+        try:
+            if frame.camera not in self._warm:
+                self._recoverer.warm_up(frame.camera)
+                self._warm.add(frame.camera)
+            recovery = self._recoverer.recover(frame.depth, frame.camera, labels, self._settings)
+        except (ValueError, ArithmeticError) as error:  # a camera that no image can have come from
+            raise FrameError(f"{file}: {frame.name}: {error}") from error
+        tracks = self._tracks.follow(file, frame, recovery) if self._tracks else [None] * len(recovery.bodies)
+        self.results.append(frame_entry(file, frame, recovery, tracks, has_masks=labels is not None))
+        stem = _free_stem(frame.name if frame.topic else Path(frame.name).stem, self._stems)
+        if self._options.pictures:
+            _draw(Path(self._options.pictures) / f"{stem}.png", frame, recovery)
+        if self._options.meshes:
+            _write_mesh(Path(self._options.meshes) / f"{stem}.{self._options.mesh_format}", frame, recovery)
+        if self._bag is not None:
+            self._bag.add(frame, recovery, tracks if self._tracks else None)
+
+
+def _bag_misuse(out: str, inputs: Sequence[str]) -> str:
+    """What is wrong with the name of a bag to write; empty if nothing."""
+    path = Path(out)
+    if not path.resolve().parent.is_dir():
+        return "its folder does not exist"
+    if path.exists() and any(Path(one).exists() and path.samefile(one) for one in inputs):
+        return "this is an input"
+    return ""
+
+
+def _count(number: int, one: str, many: str | None = None) -> str:
+    return f"{number} {one if number == 1 else many or one + 's'}"
+
+
+@contextmanager
+def _whole(path: Path) -> Iterator[Path]:
+    """Where to write a file that shall appear whole or not at all."""
+    partial = path.with_name(f".{path.name}.partial{path.suffix}")
+    try:
+        yield partial
+        partial.replace(path)
+    finally:
+        partial.unlink(missing_ok=True)
+
+
+def _draw(path: Path, frame: RecordedFrame, recovery: FrameRecovery) -> None:
+    from sq_perception.evaluation import plots
+
+    unit = "of the cube" if frame.is_cube else "m"
+    with _whole(path) as partial:
+        plots.save(plots.recovery_figure(frame.depth, frame.camera, recovery, frame.name, unit), partial)
+
+
+def _write_mesh(path: Path, frame: RecordedFrame, recovery: FrameRecovery) -> None:
+    from sq_perception.fitting.fit import Status
+    from sq_perception.geometry import mesh
+    from sq_perception.recordings.frame_entry import in_result_frame
+
+    shown = [k for k, body in enumerate(recovery.bodies) if body.status != Status.FAILED]
+    if not shown:
+        return
+    with _whole(path) as partial:
+        mesh.export(
+            [in_result_frame(recovery.bodies[k].superquadric, frame.is_cube) for k in shown],
+            partial,
+            colours=mesh.COLOURS[[k % len(mesh.COLOURS) for k in shown]],
+            names=[f"body_{k}" for k in shown],
+            optical=not frame.is_cube,
+        )
+
+
+def _free_stem(stem: str, taken: set[str]) -> str:
+    """A name for a frame's files that no other frame of this call has."""
+    name, k = stem, 2
+    while name in taken:
+        name, k = f"{stem}_{k}", k + 1
+    taken.add(name)
+    return name
+
+
+def _progress(recorded: RecordedInput) -> Iterator[tuple[str, Any]]:
+    """The frames, with a bar on a terminal where there are several."""
+    if not sys.stderr.isatty():
+        yield from recorded
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("recovering"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("", total=recorded.total, visible=recorded.total > 1)
+        for pair in recorded:
+            bar.update(task, total=recorded.total, visible=recorded.total > 1)
+            yield pair
+            bar.advance(task)
+
+
+def _print_table(results: list[dict[str, Any]]) -> None:
+    for entry in results:
+        cube = entry["coordinates"] == "cube"
+        stamp = entry["stamp"]
+        taken = "" if stamp is None else f"  {stamp['sec']}.{stamp['nanosec']:09d}"
+        print(f"{entry['file']}{taken}  {entry['ms']:.0f} ms  {entry['message']}".rstrip())
+        scale, unit, digits = (1.0, "", 4) if cube else (1e3, " mm", 1)
+        for body in entry["superquadrics"]:
+            label = "" if body["label"] is None else f"mask {body['label']}: "
+            label += "" if body["track"] is None else f"id {body['track']['id']}: "
+            if body["status"] == "failed":
+                print(f"  {label}failed: {body['message']}")
+                continue
+            size = " x ".join(f"{scale * value:.{digits}f}" for value in body["size"])
+            shape = " ".join(f"{value:.2f}" for value in body["shape"])
+            note = f"  ({body['message']})" if body["status"] == "weak" else ""
+            print(f"  {label}half sizes {size}{unit}, exponents {shape}, score {body['score']:.3f}{note}")
+
+
+def complain(message: str) -> None:
+    """One line on the standard error; what a recording says of itself must not steer the terminal."""
+    line = "".join(c if c.isprintable() else "?" for c in " ".join(message.split()))
+    print(f"sq-perception: {line}", file=sys.stderr)
+
+
+def misused(message: str) -> int:
+    """The exit code of wrong usage, with the reason."""
+    complain(message)
+    return USAGE

@@ -1,0 +1,1 @@
+"""Files from outside, read within bounds; files for the user, and where figures in them come from."""

@@ -1,0 +1,1 @@
+"""Recorded frames and bags in, results out; no ROS installation needed."""

@@ -1,0 +1,88 @@
+"""One recorded frame and what was recovered from it, as an element of ``frames`` in the JSON of ``recover``.
+
+Coordinates are metres in the optical frame, or those of the unit cube.  ``sq-perception recover --help`` explains every
+name.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging import unit_cube
+from sq_perception.recordings.frame_file import RecordedFrame
+from sq_perception.recovery.recoverer import FrameRecovery
+from sq_perception.tracking.session import Followed
+
+
+def frame_entry(
+    file: str, frame: RecordedFrame, recovery: FrameRecovery, tracks: Sequence[Followed | None], has_masks: bool
+) -> dict[str, Any]:
+    """The element; ``tracks`` has one entry for each body, None where it is not tracked.
+
+    ``has_masks`` says whether labels are those of masks that came with the frame.
+    """
+    bodies = []
+    for body, track in zip(recovery.bodies, tracks, strict=True):
+        superquadric = in_result_frame(body.superquadric, frame.is_cube)
+        bodies.append(
+            {
+                "size": _numbers(superquadric.size),
+                "shape": _numbers(superquadric.shape),
+                "translation": _numbers(superquadric.translation),
+                "rotation": _numbers(superquadric.rotation),
+                "score": _number(body.score),
+                "residual": _number(body.residual),
+                "sigma_size": _numbers(body.sigma_size),
+                "seen": _numbers(body.seen),
+                "status": body.status.name.lower(),
+                "message": body.message,
+                "label": int(body.label) if has_masks else None,
+                "pixels": int(body.pixels),
+                "track": None if track is None else _track_entry(track, frame.is_cube),
+            }
+        )
+    return {
+        "file": file,
+        "ms": _number(recovery.milliseconds["total"]),
+        "superquadrics": bodies,
+        "coordinates": "cube" if frame.is_cube else "optical",
+        "message": recovery.message,
+        "ms_by_stage": {stage: _number(value) for stage, value in recovery.milliseconds.items()},
+        "plane": None if recovery.plane is None else _numbers(recovery.plane),
+        "stamp": None if frame.stamp is None else frame.stamp._asdict(),
+        "topic": frame.topic or None,
+        "frame_id": frame.frame_id or None,
+    }
+
+
+def _track_entry(track: Followed, is_cube: bool) -> dict[str, Any]:
+    body = track.superquadric
+    if is_cube:
+        body = unit_cube.cube_from_optical(body)  # not its canonical form: the track keeps its own
+    return {
+        "id": track.id,
+        "seen": track.seen,
+        "fused": track.is_fused,
+        "size": _numbers(body.size),
+        "shape": _numbers(body.shape),
+        "translation": _numbers(body.translation),
+        "rotation": _numbers(body.rotation),
+        "sigma_size": _numbers(track.sigma_size),
+    }
+
+
+def in_result_frame(body: Superquadric, is_cube: bool) -> Superquadric:
+    """A body in the coordinates that results are given in."""
+    return unit_cube.cube_from_optical(body).canonical_form() if is_cube else body
+
+
+def _numbers(values: Iterable[float]) -> list[float | None]:
+    return [_number(value) for value in values]
+
+
+def _number(value: float) -> float | None:
+    """JSON knows neither NaN nor infinity."""
+    return float(value) if math.isfinite(value) else None

@@ -1,0 +1,350 @@
+"""Depth images from files: what one camera saw once, in metres of its optical frame.
+
+| file | needs | depth |
+| --- | --- | --- |
+| ``.npz`` | ``depth`` float (h, w), ``K`` (3, 3) | metres, NaN = nothing |
+| 16 bit ``.png`` | a camera_info YAML | millimetres, 0 = nothing; rectified where it is raw |
+| 8 or 16 bit ``.png``, ``.bmp``, orthographic | nothing | grey values of the cube, 0 = nothing |
+| ``.npz``, orthographic | ``depth`` | depth in the cube, 1 - z; NaN = nothing |
+
+A file whose name is a time, such as 1305031102.160407.png, has that stamp in seconds.
+
+The cube is the thesis' unit cube, :mod:`sq_perception.imaging.unit_cube`.  An NPZ may bring ``labels`` (h, w), a
+support ``plane`` (4,), and the text "orthographic" as ``projection``, which goes before what the caller says.  Nothing
+in a file is executed: no pickle, plain YAML only; and nothing is unpacked that is larger than any camera's image.
+
+Whether a PNG is raw and its distortion has to be undone is decided by :mod:`sq_perception.imaging.calibration`.
+
+Whole folders and rosbags are read by :mod:`sq_perception.recordings.inputs`, frame by frame, into the same class.
+"""
+
+from __future__ import annotations
+
+import re
+import reprlib
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple, get_args
+
+import numpy as np
+
+from sq_perception.files import plain_yaml
+from sq_perception.files.unpacking import UnpackingError, grey_image, npz_arrays
+from sq_perception.imaging import unit_cube
+from sq_perception.imaging.calibration import Calibration, Treatment
+from sq_perception.imaging.camera import Camera, Projection
+
+SUFFIXES = (".npz", ".png", ".bmp")
+_MILLIMETRES = np.float32(1000.0)
+_IMAGES = (".png", ".bmp")
+_SKEW = 1e-6
+"""Of fx; no depth camera in use has any."""
+_TIME = re.compile(r"(\d{1,18})\.(\d{1,9})")
+
+
+class FrameError(ValueError):
+    """A file that is missing, damaged, or does not hold what it should; the message says what was expected."""
+
+
+class Stamp(NamedTuple):
+    """Seconds and nanoseconds, as ROS keeps a time: a float would lose the last digits."""
+
+    sec: int
+    nanosec: int
+
+    def __str__(self) -> str:
+        return f"{self.sec}.{self.nanosec:09d}"
+
+
+@dataclass(frozen=True, eq=False)
+class RecordedFrame:
+    """One depth image with its camera.
+
+    Attributes
+    ----------
+    depth : float32 (height, width)
+        Metres in the optical frame, NaN where nothing was measured.
+    camera : Camera
+    labels : int32 (height, width) or None
+        Instance masks, 0 for background.
+    name : str
+        The file's name; of a frame in a bag, the bag's and the stamp.
+    is_cube : bool
+        A view of the unit cube: results belong in the cube frame (:func:`unit_cube.cube_from_optical`).
+    plane : (4,) or None
+        Support plane of the recording, height above it = n.p + d.
+    stamp : Stamp or None
+        When it was taken, where the recording knows.
+    topic, frame_id : str
+        Where it was published, and the name of its optical frame; empty for files.
+    warning : str
+        What should be known about the frame before its results are believed; empty if nothing.
+    encoding : str
+        Of the depth where it came from, as messages name it (16UC1, 32FC1, mono8, mono16); empty where it has none.
+    received : int or None
+        When a bag received it, nanoseconds.
+    """
+
+    depth: np.ndarray
+    camera: Camera
+    labels: np.ndarray | None
+    name: str
+    is_cube: bool
+    plane: np.ndarray | None = None
+    stamp: Stamp | None = None
+    topic: str = ""
+    frame_id: str = ""
+    warning: str = ""
+    encoding: str = ""
+    received: int | None = None
+
+
+@dataclass(frozen=True)
+class Region:
+    """The fields of a sensor_msgs/RegionOfInterest that count."""
+
+    x_offset: int = 0
+    y_offset: int = 0
+    width: int = 0
+    height: int = 0
+
+
+@dataclass(frozen=True)
+class CameraInfo:
+    """The fields of a sensor_msgs/CameraInfo, from a file; matrices are flat."""
+
+    width: int
+    height: int
+    distortion_model: str
+    d: tuple[float, ...]
+    k: tuple[float, ...]
+    p: tuple[float, ...]
+    binning_x: int
+    binning_y: int
+    roi: Region
+
+
+def read(
+    path: str | Path,
+    camera_info: str | Path | None = None,
+    projection: Projection = "pinhole",
+    distortion: Treatment = "auto",
+) -> RecordedFrame:
+    """Read one frame.
+
+    Parameters
+    ----------
+    path
+        See the table above.
+    camera_info
+        YAML with the intrinsics of a PNG, as camera_calibration writes it or as a camera_info message prints.
+    projection
+        "pinhole" or "orthographic".
+    distortion
+        Of a PNG: "auto", "apply" or "ignore", see :mod:`sq_perception.imaging.calibration`; auto looks at the
+        names of the file and its folder.
+
+    Raises
+    ------
+    FrameError
+        For anything wrong with a file.
+    ValueError
+        For an unknown projection or treatment of distortion.
+    """
+    if projection not in get_args(Projection):
+        raise ValueError(f"projection: expected 'pinhole' or 'orthographic', got {projection!r}")
+    if distortion not in get_args(Treatment):
+        raise ValueError(f"distortion: expected {', '.join(get_args(Treatment))}, got {distortion!r}")
+    path = Path(path)
+    if not path.is_file():
+        raise FrameError(f"{path}: no such file")
+    return replace(_read(path, camera_info, projection, distortion), stamp=_stamp(path))
+
+
+def _read(path: Path, camera_info: str | Path | None, projection: Projection, distortion: Treatment) -> RecordedFrame:
+    suffix = path.suffix.lower()
+    if suffix == ".npz":
+        return _read_npz(path, projection)
+    if suffix not in _IMAGES:
+        raise FrameError(f"{path}: expected a name that ends in .npz, .png or .bmp")
+    try:
+        image = grey_image(path)
+    except UnpackingError as error:
+        raise FrameError(f"{path}: {error}") from error
+    if projection == "orthographic":
+        return _from_grey(path, image)
+    if image.dtype != np.uint16:
+        raise FrameError(
+            f"{path}: a pinhole depth image has 16 bit (millimetres), this one has 8; "
+            "for grey images of the thesis' kind choose the orthographic projection"
+        )
+    if camera_info is None:
+        raise FrameError(f"{path}: a 16 bit image needs a camera_info file with the camera's intrinsics")
+    calibration = calibrated(camera_info, read_camera_info(camera_info), path.with_suffix("").as_posix(), distortion)
+    depth = np.where(image > 0, image / _MILLIMETRES, np.float32(np.nan))
+    try:
+        depth = calibration.rectified(depth)
+    except ValueError as error:
+        raise FrameError(f"{path}: {error}") from error
+    warning = f"{camera_info}: {calibration.note}" if calibration.note else ""
+    return RecordedFrame(depth, calibration.camera, None, path.name, is_cube=False, warning=warning, encoding="16UC1")
+
+
+def _stamp(path: Path) -> Stamp | None:
+    """The time that a name says, seconds and their fraction."""
+    parts = _TIME.fullmatch(path.stem)
+    return Stamp(int(parts[1]), int(parts[2].ljust(9, "0"))) if parts else None
+
+
+def calibrated(where: str | Path, info: Any, name: str, distortion: Treatment) -> Calibration:
+    """:meth:`Calibration.of <sq_perception.imaging.calibration.Calibration.of>` whose fault is a FrameError."""
+    try:
+        return Calibration.of(info, name, distortion)
+    except ValueError as error:
+        raise FrameError(f"{where}: {error}") from error
+
+
+def read_calibration(path: str | Path, name: str = "", distortion: Treatment = "auto") -> Calibration:
+    """The calibration that a YAML file tells of; ``name`` is that of the images.
+
+    Raises
+    ------
+    FrameError
+        As :func:`read_camera_info`, or if the camera is not calibrated or its distortion not known.
+    """
+    return calibrated(path, read_camera_info(path), name, distortion)
+
+
+def read_camera_info(path: str | Path) -> CameraInfo:
+    """A YAML file in the layout of camera_calibration, or of a printed camera_info message.
+
+    A file that does not name its distortion model means plumb_bob; what else it does not name is zero.
+
+    Raises
+    ------
+    FrameError
+    """
+    path = Path(path)
+    try:
+        documents = [entry for entry in plain_yaml.read_all(path) if entry is not None]
+    except plain_yaml.YamlError as error:
+        raise FrameError(f"{path}: cannot read the camera_info: {error}") from error
+    if not documents or not isinstance(documents[0], dict):
+        raise FrameError(f"{path}: expected a camera_info as a YAML mapping")
+    info = documents[0]
+    width, height = (_size(path, info, names) for names in (("image_width", "width"), ("image_height", "height")))
+    matrix = _matrix(path, info, ("camera_matrix", "k", "K"), 9)
+    distortion = _matrix(path, info, ("distortion_coefficients", "d", "D"), None)
+    projection = _matrix(path, info, ("projection_matrix", "p", "P"), 12)
+    if matrix is None and projection is None:
+        raise FrameError(f"{path}: expected a camera_matrix (or k) of 9 numbers, or a projection_matrix (or p) of 12")
+    if matrix is not None and abs(matrix[1]) > _SKEW * abs(matrix[0]):
+        raise FrameError(f"{path}: camera matrix: expected no skew, got {matrix[1]:g}")
+    region = info.get("roi", {})
+    if not isinstance(region, dict):
+        raise FrameError(f"{path}: roi: expected a mapping, got {reprlib.repr(region)}")
+    offsets = (_count(path, region, name) for name in ("x_offset", "y_offset", "width", "height"))
+    return CameraInfo(
+        width,
+        height,
+        str(info.get("distortion_model", info.get("camera_model", "plumb_bob"))),
+        () if distortion is None else tuple(distortion.tolist()),
+        (0.0,) * 9 if matrix is None else tuple(matrix.tolist()),
+        (0.0,) * 12 if projection is None else tuple(projection.tolist()),
+        _count(path, info, "binning_x"),
+        _count(path, info, "binning_y"),
+        Region(*offsets),
+    )
+
+
+def _read_npz(path: Path, projection: Projection) -> RecordedFrame:
+    try:
+        fields = npz_arrays(path, ("depth", "K", "labels", "plane", "projection"))
+    except UnpackingError as error:
+        raise FrameError(f"{path}: {error}") from error
+    if "depth" not in fields:
+        raise FrameError(f"{path}: expected a field 'depth' in metres")
+    depth = fields["depth"]
+    if depth.ndim != 2 or depth.dtype.kind != "f" or depth.size == 0:
+        raise FrameError(f"{path}: depth: expected floats (height, width) in metres, got {depth.dtype} {depth.shape}")
+    labels = _labels(path, fields.get("labels"), depth)
+    height, width = depth.shape
+    if projection == "orthographic" or str(fields.get("projection", "")) == "orthographic":
+        depth = np.where(np.isfinite(depth), depth, np.nan).astype(np.float32)
+        return RecordedFrame(depth, _cube_camera(path, width, height), labels, path.name, is_cube=True)
+    if "K" not in fields:
+        raise FrameError(f"{path}: expected a field 'K', the 3 x 3 camera matrix")
+    try:
+        camera = Camera.from_matrix(fields["K"], width, height)
+    except (ValueError, TypeError) as error:
+        raise FrameError(f"{path}: K: {error}") from error
+    with np.errstate(invalid="ignore"):
+        depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.nan).astype(np.float32)
+    plane = _plane(path, fields.get("plane"))
+    return RecordedFrame(depth, camera, labels, path.name, is_cube=False, plane=plane, encoding="32FC1")
+
+
+def _labels(path: Path, labels: np.ndarray | None, depth: np.ndarray) -> np.ndarray | None:
+    if labels is None:
+        return None
+    if labels.shape != depth.shape or labels.dtype.kind not in "iub":
+        raise FrameError(
+            f"{path}: labels: expected integers of the depth's shape {depth.shape}, got {labels.dtype} {labels.shape}"
+        )
+    return labels.astype(np.int32)
+
+
+def _plane(path: Path, plane: np.ndarray | None) -> np.ndarray | None:
+    if plane is None:
+        return None
+    if plane.shape != (4,) or plane.dtype.kind not in "fiu" or not np.isfinite(plane).all():
+        raise FrameError(f"{path}: plane: expected four finite numbers, got {plane.dtype} {plane.shape}")
+    return plane.astype(float)
+
+
+def _from_grey(path: Path, image: np.ndarray) -> RecordedFrame:
+    height, width = image.shape
+    depth, camera = unit_cube.depth_from_grey(image), _cube_camera(path, width, height)
+    encoding = "mono8" if image.dtype == np.uint8 else "mono16"
+    return RecordedFrame(depth, camera, None, path.name, is_cube=True, encoding=encoding)
+
+
+def _cube_camera(path: Path, width: int, height: int) -> Camera:
+    try:
+        return unit_cube.camera(width, height)
+    except ValueError as error:
+        raise FrameError(f"{path}: {error}") from error
+
+
+def _size(path: Path, info: dict[Any, Any], names: tuple[str, ...]) -> int:
+    for name in names:
+        if name in info:
+            value = _count(path, info, name)
+            if value < 1:
+                raise FrameError(f"{path}: {name}: expected a positive integer, got {value!r}")
+            return value
+    raise FrameError(f"{path}: expected {names[0]} (or {names[1]})")
+
+
+def _count(path: Path, info: dict[Any, Any], name: str) -> int:
+    value = info.get(name, 0)
+    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+        raise FrameError(f"{path}: {name}: expected a positive integer or 0, got {value!r}")
+    return value
+
+
+def _matrix(path: Path, info: dict[Any, Any], names: tuple[str, ...], length: int | None) -> np.ndarray | None:
+    for name in names:
+        if name not in info:
+            continue
+        entry = info[name]
+        values = entry.get("data") if isinstance(entry, dict) else entry
+        try:
+            numbers = np.array(values, dtype=float).ravel()
+        except (TypeError, ValueError) as error:
+            raise FrameError(f"{path}: {name}: expected numbers, got {reprlib.repr(values)}") from error
+        if not np.isfinite(numbers).all() or (length is not None and numbers.size != length):
+            wanted = "finite numbers" if length is None else f"{length} finite numbers"
+            raise FrameError(f"{path}: {name}: expected {wanted}, got {reprlib.repr(values)}")
+        return numbers
+    return None

@@ -1,0 +1,137 @@
+"""All frames that a user names: files, folders of files, and bags, one frame after the other.
+
+A folder gives its frames and bags in natural order (frame_2 before frame_10); the camera of its PNGs is
+``camera_info.yaml`` or ``camera.yaml`` in it.  What cannot be read comes as the error that says why, in its place, and
+the rest follows.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from sq_perception.imaging.calibration import Treatment
+from sq_perception.imaging.camera import Projection
+from sq_perception.recordings import bag_file, frame_file
+from sq_perception.recordings.bag_file import RecordedBag
+from sq_perception.recordings.frame_file import CameraInfo, FrameError, RecordedFrame
+
+CAMERA_FILES = ("camera_info.yaml", "camera_info.yml", "camera.yaml", "camera.yml")
+SUFFIXES = frame_file.SUFFIXES + bag_file.SUFFIXES
+
+_DIGITS = re.compile(r"(\d+)")
+
+
+class RecordedInput:
+    """Frames of the named files, folders and bags; iterating gives pairs of where each came from and what it is.
+
+    Parameters
+    ----------
+    names
+        As the user gave them.
+    camera_info
+        YAML with the intrinsics of PNGs and bags; goes before what a folder or bag brings.
+    projection
+        "pinhole" or "orthographic".
+    topic
+        Of the images in bags.
+    every, limit
+        Of each folder and bag: every n-th frame only, and at most so many.
+    distortion
+        Of PNGs and bags: "auto", "apply" or "ignore", see :mod:`sq_perception.imaging.calibration`.
+
+    Raises
+    ------
+    FrameError
+        If there is something wrong with the camera_info.
+    """
+
+    def __init__(
+        self,
+        names: Sequence[str],
+        camera_info: str | Path | None = None,
+        projection: Projection = "pinhole",
+        topic: str | None = None,
+        every: int = 1,
+        limit: int | None = None,
+        distortion: Treatment = "auto",
+    ) -> None:
+        self._camera_info = camera_info
+        self._info: CameraInfo | None = None
+        self._distortion: Treatment = distortion
+        if camera_info is not None:
+            self._info = frame_file.read_camera_info(camera_info)
+            # Auto depends on what the images are called.
+            frame_file.calibrated(camera_info, self._info, "", "ignore" if distortion == "auto" else distortion)
+        self._projection: Projection = projection
+        self._topic, self._every, self._limit = topic, every, limit
+        self._sources: list[tuple[Path, str | Path | None] | tuple[Path, FrameError]] = []
+        for name in names:
+            self._add(Path(name))
+        self.total = len(self._sources)
+        """Frames to expect; a bag counts as one until it is opened."""
+
+    def __iter__(self) -> Iterator[tuple[str, RecordedFrame | FrameError]]:
+        for path, rest in self._sources:
+            if isinstance(rest, FrameError):
+                yield str(path), rest
+            elif bag_file.is_bag(path):
+                yield from self._bag(path)
+            else:
+                yield str(path), self._file(path, rest)
+
+    def _add(self, path: Path) -> None:
+        if not path.is_dir() or bag_file.is_bag(path):
+            self._sources.append((path, self._camera_info))
+            return
+        try:
+            found = in_folder(path)[:: self._every][: self._limit]
+        except OSError as error:
+            self._sources.append((path, FrameError(f"{path}: {error}")))
+            return
+        if found:
+            camera_info = self._camera_info or _camera_file(path)
+            self._sources += [(one, camera_info) for one in found]
+        else:
+            self._sources.append((path, FrameError(f"{path}: no frames in it ({', '.join(SUFFIXES)})")))
+
+    def _file(self, path: Path, camera_info: str | Path | None) -> RecordedFrame | FrameError:
+        try:
+            return frame_file.read(path, camera_info, self._projection, self._distortion)
+        except FrameError as error:
+            return error
+        except (OSError, MemoryError) as error:
+            return FrameError(f"{path}: {error}")
+
+    def _bag(self, path: Path) -> Iterator[tuple[str, RecordedFrame | FrameError]]:
+        try:
+            bag = RecordedBag(
+                path, self._topic, self._info, self._projection, self._every, self._limit, self._distortion
+            )
+        except FrameError as error:
+            yield str(path), error
+            return
+        with bag:
+            self.total += max(len(bag), 1) - 1
+            for frame in bag:
+                yield str(path), frame
+
+
+def in_folder(folder: Path) -> list[Path]:
+    """The frames and bags in a folder, in natural order."""
+
+    def is_frame(path: Path) -> bool:
+        return path.suffix.lower() in frame_file.SUFFIXES and path.is_file()
+
+    return sorted((one for one in folder.iterdir() if is_frame(one) or bag_file.is_bag(one)), key=_natural)
+
+
+def _natural(path: Path) -> tuple[list[str | int], str]:
+    """Numbers in a name count as numbers: every second part is one."""
+    parts = _DIGITS.split(path.name.lower())
+    return [int(part) if k % 2 else part for k, part in enumerate(parts)], path.name
+
+
+def _camera_file(folder: Path) -> Path | None:
+    return next((folder / name for name in CAMERA_FILES if (folder / name).is_file()), None)

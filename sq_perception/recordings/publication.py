@@ -1,0 +1,229 @@
+"""What is published of a recovered frame: bodies, ids, meshes, images.  By a node, and into a recording, alike.
+
+With tracking ids are those of the tracks, and bodies the tracks' own numbers; without, ids are mask labels and bodies
+those of the frame.  Residual, score and status are always the frame's.
+
+Metres in the optical frame; for frames of the unit cube (``is_cube``) the cube frame of
+:mod:`sq_perception.imaging.unit_cube`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from sq_msgs_py import poses
+from sq_msgs_py.depth_image import depth_to_message, grey_to_message
+from sq_msgs_py.markers import markers
+from sq_msgs_py.message_types import MessageTypes, installed
+from sq_msgs_py.superquadrics import CONVERGED, SuperquadricArray
+from sq_perception.fitting.fit import Status
+from sq_perception.geometry.mesh import MARKER_RESOLUTION, outline, triangles
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging import unit_cube
+from sq_perception.recovery.recoverer import FrameRecovery
+from sq_perception.tracking.session import FIRST_FAILED_ID, Followed
+
+CAMERA_FRAME, CUBE_FRAME = "camera_depth_optical_frame", "unit_cube"
+"""Frame ids of images that bring none."""
+
+_GREY_TYPES: dict[str, type[np.unsignedinteger]] = {"mono8": np.uint8, "mono16": np.uint16}
+_CENTRE_AND_TURN = slice(5, 11)
+"""Of a body's covariance: its centre in the optical frame and its rotation vector in its own."""
+_WORST, _BEST = np.array([0.80, 0.20, 0.15]), np.array([0.20, 0.65, 0.30])
+
+
+Mesh = tuple[np.ndarray, np.ndarray]
+"""Vertices (k, 3) and faces (m, 3) of vertex indices."""
+
+
+@dataclass(frozen=True, eq=False)
+class Identified:
+    """The objects of a frame as they are published, the id of each, and ids of tracks that the frame does not show."""
+
+    recovery: FrameRecovery
+    ids: tuple[int, ...]
+    hidden: tuple[int, ...] = ()
+
+
+@dataclass(frozen=True)
+class MarkerStyle:
+    """How markers look.
+
+    Attributes
+    ----------
+    colours
+        By id, or by score from red (0) to green (1).
+    alpha
+        Opacity of the surfaces.
+    line_width
+        Of the outlines, metres.
+
+    Raises
+    ------
+    ValueError
+        For colours by anything else.
+    """
+
+    colours: str = "id"
+    alpha: float = 0.7
+    line_width: float = 0.002
+
+    def __post_init__(self) -> None:
+        if self.colours not in ("id", "score"):
+            raise ValueError(f"colours: expected id or score, got {self.colours!r}")
+
+
+DEFAULT_STYLE = MarkerStyle()
+"""A node's, unless its parameters say otherwise."""
+
+
+def untracked(recovery: FrameRecovery) -> Identified:
+    """Ids are labels."""
+    return Identified(recovery, tuple(one.label for one in recovery.bodies))
+
+
+def tracked(recovery: FrameRecovery, tracks: Sequence[Followed], hidden: tuple[int, ...] = ()) -> Identified:
+    """Bodies and ids of their tracks, of which there is one for each body that did not fail, in their order."""
+    found = iter(tracks)
+    bodies, ids = [], []
+    for one in recovery.bodies:
+        if one.status == Status.FAILED:
+            bodies.append(one)
+            ids.append(FIRST_FAILED_ID + one.label)
+            continue
+        track = next(found)
+        covariance, sigma = track.covariance, track.sigma_size
+        bodies.append(replace(one, superquadric=track.superquadric, covariance=covariance, sigma_size=sigma))
+        ids.append(track.id)
+    return Identified(replace(recovery, bodies=tuple(bodies)), tuple(ids), hidden)
+
+
+@dataclass(frozen=True, eq=False)
+class Findings:
+    """What one image showed, as every output but the rendered depth is made of it.
+
+    Attributes
+    ----------
+    array
+        Every object, failed ones included.
+    covariances : (n, 6, 6)
+        Of their poses, as in :mod:`sq_msgs_py.poses`; NaN where unknown.
+    header
+        std_msgs/Header: the stamp of the image, and the frame that all this is in.
+    """
+
+    array: SuperquadricArray
+    covariances: np.ndarray
+    header: Any
+
+    @property
+    def shown_ids(self) -> list[int]:
+        """Ids of the bodies that did not fail, those of the meshes."""
+        return [int(number) for number in self.array.recovered.id]
+
+    @cached_property
+    def meshes(self) -> tuple[Mesh, ...]:
+        """Surface of each body that did not fail, in the body's own frame; made when it is first asked for."""
+        shown = self.array.recovered
+        return tuple(
+            triangles(_at_origin(*one), MARKER_RESOLUTION) for one in zip(shown.size, shown.shape, strict=True)
+        )
+
+    def moved(self, frame_id: str, rotation: np.ndarray, translation: np.ndarray) -> Findings:
+        """The same in another frame, p_new = R(rotation) p + translation; the stamp stays."""
+        return Findings(
+            array=poses.moved(self.array, rotation, translation),
+            covariances=poses.moved_covariances(self.covariances, rotation),
+            header=poses.header_in(self.header, frame_id),
+        )
+
+    def markers(
+        self, previous_ids: Iterable[int] = (), style: MarkerStyle = DEFAULT_STYLE, types: MessageTypes = installed
+    ) -> Any:
+        """A MarkerArray of the bodies that did not fail; markers of ``previous_ids`` that are gone are deleted."""
+        shown = self.array.recovered
+        turns = poses.matrices(poses.unit_quaternions(shown.rotation))
+        surfaces = []
+        for k, (vertices, faces) in enumerate(self.meshes):
+            turn, centre = turns[k].T, shown.translation[k].astype(float)
+            lines = outline(_at_origin(shown.size[k], shown.shape[k]))
+            surfaces.append((vertices @ turn + centre, faces, lines @ turn + centre))
+        colours = None
+        if style.colours == "score" and len(shown):
+            share = np.clip(np.nan_to_num(shown.score), 0, 1)[:, None]
+            colours = (1 - share) * _WORST + share * _BEST
+        return markers(
+            surfaces,
+            self.shown_ids,
+            self.header,
+            colours=colours,
+            alpha=style.alpha,
+            line_width=style.line_width,
+            previous_ids=previous_ids,
+            types=types,
+        )
+
+
+def findings(found: Identified, header: Any, is_cube: bool) -> Findings:
+    """What a frame showed, in the frame of its image, whose header it is."""
+    recovery = found.recovery
+    array = superquadric_array(recovery, found.ids, is_cube)
+    covariances = np.full((len(array), 6, 6), np.nan)
+    for k, one in enumerate(recovery.bodies):
+        covariances[k] = one.covariance[_CENTRE_AND_TURN, _CENTRE_AND_TURN]
+    change = np.zeros((len(array), 6, 6))
+    change[:, :3, :3] = np.diag([1.0, -1.0, -1.0]) if is_cube else np.eye(3)
+    change[:, 3:, 3:] = poses.matrices(poses.unit_quaternions(array.rotation))
+    return Findings(array, change @ covariances @ np.swapaxes(change, 1, 2), header)
+
+
+def superquadric_array(recovery: FrameRecovery, ids: Sequence[int], is_cube: bool) -> SuperquadricArray:
+    """Every object of a frame, failed ones included; in the cube frame if ``is_cube``, else in the optical frame."""
+    if not recovery.bodies:
+        return SuperquadricArray.empty()
+    bodies = Superquadric.stack([one.superquadric for one in recovery.bodies])
+    if is_cube:
+        bodies = unit_cube.cube_from_optical(bodies)
+    return SuperquadricArray(
+        size=bodies.size,
+        shape=bodies.shape,
+        translation=bodies.translation,
+        rotation=bodies.rotation,
+        score=np.array([one.score for one in recovery.bodies]),
+        residual=np.array([one.residual for one in recovery.bodies]),
+        sigma_size=np.stack([one.sigma_size for one in recovery.bodies]),
+        id=np.array(ids, dtype=np.uint32),
+        status=np.array([one.status for one in recovery.bodies], dtype=np.uint32),
+    )
+
+
+def truth_array(bodies: Superquadric) -> SuperquadricArray:
+    """A batch (n,) of known bodies: score 1, residual and deviations 0, ids 1 to n."""
+    count = len(bodies)
+    return SuperquadricArray(
+        size=bodies.size,
+        shape=bodies.shape,
+        translation=bodies.translation,
+        rotation=bodies.rotation,
+        score=np.ones(count),
+        residual=np.zeros(count),
+        sigma_size=np.zeros((count, 3)),
+        id=np.arange(1, count + 1, dtype=np.uint32),
+        status=np.full(count, CONVERGED, dtype=np.uint32),
+    )
+
+
+def depth_message(depth: np.ndarray, header: Any, encoding: str, is_cube: bool, types: MessageTypes = installed) -> Any:
+    """An Image of depth (height, width) in metres, NaN or inf for nothing; of the cube as grey values."""
+    if is_cube:
+        return grey_to_message(unit_cube.grey_from_depth(depth, _GREY_TYPES[encoding]), header, types)
+    return depth_to_message(np.where(np.isfinite(depth), depth, np.nan), header, encoding, types)
+
+
+def _at_origin(size: np.ndarray, shape: np.ndarray) -> Superquadric:
+    return Superquadric(size.astype(float), shape.astype(float), np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))

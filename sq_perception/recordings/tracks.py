@@ -1,0 +1,43 @@
+"""Ids for bodies of recorded frames: a tracking session over each sequence that a user names.
+
+A sequence is a topic of a bag, or the frames of one folder, in their order, of a camera that stands still.  Where
+frames have no stamp they are taken to be INTERVAL apart.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+from sq_perception.fitting.fit import Status
+from sq_perception.recordings.frame_file import RecordedFrame
+from sq_perception.recovery.recoverer import FrameRecovery
+from sq_perception.tracking.session import Followed, TrackingSession
+
+INTERVAL = 0.1
+"""Seconds."""
+
+
+class RecordedTracks:
+    """Follows the bodies of one sequence after the other; ``warn`` is told once where stamps are missing."""
+
+    def __init__(self, warn: Callable[[str], None]) -> None:
+        self._warn = warn
+        self._session = TrackingSession()
+        self._sequence: tuple[str, str] | None = None
+        self._number = 0
+        self._warned = False
+
+    def follow(self, file: str, frame: RecordedFrame, recovery: FrameRecovery) -> list[Followed | None]:
+        """For each of the frame's bodies what is known of its track, None for failed ones; ``file`` is its source."""
+        sequence = (file, frame.topic) if frame.topic else (str(Path(file).parent), "")
+        if sequence != self._sequence:
+            self._session.reset()
+            self._sequence, self._number = sequence, 0
+        stamp = self._number * INTERVAL if frame.stamp is None else frame.stamp.sec + 1e-9 * frame.stamp.nanosec
+        self._number += 1
+        if frame.stamp is None and not self._warned:
+            self._warn(f"{file}: no stamp; such frames are taken to be {INTERVAL:g} s apart")
+            self._warned = True
+        tracks = iter(self._session.follow(recovery.recovered, stamp, camera=frame.camera, depth=frame.depth))
+        return [None if one.status == Status.FAILED else next(tracks) for one in recovery.bodies]

@@ -1,0 +1,1 @@
+"""Depth image and camera in, superquadrics out: the only place that chains the stages."""

@@ -1,0 +1,137 @@
+"""One object of a frame on its way to a body: its pixels, what it stands on, and which of its pixels measured it.
+
+Masks are sorted by size before they come here.  Crops are windows of the image with a camera of their own; metres,
+optical frame.
+"""
+
+from __future__ import annotations
+
+from concurrent.futures import Future
+from dataclasses import dataclass
+
+import numpy as np
+
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging.camera import Camera
+from sq_perception.imaging.canonical_view import CanonicalView
+from sq_perception.imaging.coherence import coherent
+from sq_perception.segmentation import segments
+
+_POINTS = 2000
+_LOWEST, _HOVERING = 0.02, 0.02
+"""An object this many metres above its plane, by its lowest points, may stand on another one."""
+_HIGHEST_STACK = 0.5
+"""Higher above its plane, metres, an object does not even stand on others that stand on it."""
+_ON_TABLE = 0.003
+_JUMP_PIXELS, _JUMP = 10.0, 0.002
+"""What a network is shown, and a score is measured on: metres above the table; steps in pixel widths, and metres."""
+
+
+@dataclass(eq=False)
+class SeenObject:
+    """One object on its way through the stages."""
+
+    label: int
+    pixels: int
+    mask: np.ndarray
+    depth_crop: np.ndarray
+    mask_crop: np.ndarray
+    camera_crop: Camera
+    window: tuple[slice, slice]
+    plane: np.ndarray | None = None
+    """What it stands on."""
+    shown: CanonicalView | None = None
+    """To the network, where there is one."""
+    view: CanonicalView | None = None
+    """What its score is measured on."""
+    predictions: Future[Superquadric] | None = None
+    """Of all objects of the frame, each in the frame of what was shown; still being computed, perhaps."""
+    number: int = 0
+    """Of this object among them."""
+
+    def predicted(self) -> Superquadric:
+        """The network's prediction in the optical frame; waits for it."""
+        if self.predictions is None or self.shown is None:
+            raise ValueError("no prediction")
+        return self.shown.from_canonical(self.predictions.result()[self.number]).canonical_form()
+
+    @property
+    def points(self) -> np.ndarray:
+        """At most some thousand measured points (n, 3), evenly taken."""
+        rows, columns = np.nonzero(self.mask_crop)
+        step = max(1, rows.size // _POINTS)
+        rows, columns = rows[::step], columns[::step]
+        return self.camera_crop.unproject(columns, rows, self.depth_crop[rows, columns])
+
+
+def objects(
+    depth: np.ndarray, found: segments.Segmentation, camera: Camera, depth_range: tuple[float, float]
+) -> list[SeenObject]:
+    """The objects of a segmentation, in its order, as far as they were measured within the range of depth."""
+    measured = np.isfinite(depth)
+    near, far = depth_range
+    if near > 0 or np.isfinite(far):
+        measured &= (depth >= near) & (depth <= far)
+    seen = []
+    for label in found.ids:
+        mask = (found.labels == label) & measured
+        rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
+        window = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+        crop = mask[window]
+        camera_crop = camera.cropped(int(columns[0]), int(rows[0]), crop.shape[1], crop.shape[0])
+        seen.append(SeenObject(label, int(np.count_nonzero(crop)), mask, depth[window], crop, camera_crop, window))
+    return seen
+
+
+def support(
+    one: SeenObject,
+    depth: np.ndarray,
+    camera: Camera,
+    found: segments.Segmentation,
+    options: segments.SegmentationOptions,
+) -> np.ndarray | None:
+    """What the object stands on: the frame's plane, or another one that its surroundings show right below it.
+
+    An object behind the frame's plane does not stand on it, and one high above it neither: held before a wall,
+    say.  One less high above it, without any such surroundings, stands on other objects.
+    """
+    if found.plane is None:
+        return None
+    points = one.points
+    heights = points @ found.plane[:3] + found.plane[3]
+    behind = float(np.median(heights)) <= 0
+    if not behind and np.quantile(heights, _LOWEST) < _HOVERING:
+        return found.plane
+    other = segments.support_under(found, one.label, depth, camera, options)
+    if other is not None:
+        lowest, middle = np.quantile(points @ other[:3] + other[3], [_LOWEST, 0.5])
+        if abs(lowest) < _HOVERING < middle + _HOVERING:
+            return other
+    far_above = float(np.quantile(heights, _LOWEST)) > _HIGHEST_STACK
+    return None if behind or far_above else found.plane
+
+
+def core(one: SeenObject, depth: np.ndarray, camera: Camera) -> np.ndarray:
+    """The mask (height, width) without pixels that measured the table or the background: a view is framed by all.
+
+    Sensors widen what is near, masks from colour what they like.  A thin thing on the table keeps its pixels.
+    """
+    if not camera.is_pinhole:
+        return one.mask
+    inner = one.mask_crop
+    if one.plane is not None:
+        rows, columns = np.nonzero(inner)
+        points = one.camera_crop.unproject(columns, rows, one.depth_crop[rows, columns])
+        above = inner.copy()
+        above[rows, columns] = points @ one.plane[:3] + one.plane[3] > _ON_TABLE
+        inner = above if 2 * np.count_nonzero(above) > rows.size else inner
+    footprint = float(np.median(one.depth_crop[one.mask_crop])) / np.sqrt(camera.fx * camera.fy)
+    whole = np.zeros_like(one.mask)
+    whole[one.window] = inner
+    # With a margin, as a part that goes on beyond the mask is something else.
+    down, across = one.window
+    around = slice(max(down.start - 1, 0), down.stop + 1), slice(max(across.start - 1, 0), across.stop + 1)
+    whole[around] &= coherent(
+        np.ascontiguousarray(depth[around]), np.ascontiguousarray(whole[around]), _JUMP_PIXELS * footprint + _JUMP
+    )
+    return whole

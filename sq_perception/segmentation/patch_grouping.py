@@ -1,0 +1,226 @@
+"""Which patches of surface belong to one body.
+
+Every pair of patches that touch in the image gets a score, a sum over the samples of their common border, in samples:
+
+    convex edge  +1      concave edge  -1      depth step  0 to -1      flat  +0.3      not told  +0.1
+
+Convex bodies never show a concave edge or a depth step of their own, so that these say two bodies; a step counts fully
+from twice the difference at which it is one, as noise makes small ones.  Two exceptions:
+
+* a hollow patch (a bowl's inner wall) belongs to what it is seen over, and to other hollow ones: its steps down from a
+  nearer patch count +1, and so do its concave edges with another hollow patch,
+* two patches in one plane between whose centres nothing farther was seen, but something nearer, go on behind that: the
+  root of the smaller one's samples counts.
+
+The best partition of such a signed graph is the multicut or correlation clustering; it is approached greedily, the
+pair of bodies with the best sum being joined and their scores added until no pair has a positive sum.  A leak in a
+border is so outvoted by the rest of it.
+
+Reference: M. Keuper et al., Efficient Decomposition of Image and Mesh Graphs by Lifted Multicuts, ICCV 2015 (greedy
+additive edge contraction).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from sq_perception.imaging.camera import Camera
+from sq_perception.segmentation.surface_patches import Patches
+
+_FLAT = 0.3
+_CLEARLY = 1.0
+_UNKNOWN = 0.1
+_SIGHT_SAMPLES = 24
+_SEEN_THROUGH = 0.1
+
+
+@dataclass(frozen=True)
+class GroupingOptions:
+    """What makes one body of several patches.
+
+    Attributes
+    ----------
+    hollow_radius
+        A patch is hollow if the curvatures of its two directions sum up to more than one by this, metres.
+    hollow_depth
+        A step down into a hollow is not deeper, metres.
+    plane_angle, plane_distance
+        Two patches lie in one plane if their normals, and each centre from the other's plane, are no farther apart,
+        radians and metres.
+    least_area
+        A body that shows less, square metres across the line of sight, and is attached to another, is a part of that.
+    attached
+        Surfaces no farther apart than this along the line of sight are attached, metres.
+    """
+
+    hollow_radius: float = 0.1
+    hollow_depth: float = 0.3
+    plane_angle: float = float(np.deg2rad(12))
+    plane_distance: float = 0.02
+    least_area: float = 1.6e-3
+    attached: float = 0.03
+
+    def __post_init__(self) -> None:
+        for name in ("hollow_radius", "hollow_depth", "plane_angle", "plane_distance", "least_area", "attached"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}")
+
+
+def bodies(patches: Patches, camera: Camera, options: GroupingOptions | None = None) -> np.ndarray:
+    """Body (count + 1,) of each patch, from 1; 0 for 0."""
+    options = options or GroupingOptions()
+    n = patches.count + 1
+    weights, dents, over, joint = _borders(patches, options)
+    hollow = patches.curvature > 1 / options.hollow_radius
+    gain = 2 * over * hollow[:, None]
+    weights += gain + gain.T + 2 * dents * (hollow[:, None] & hollow[None, :])
+    areas = np.bincount(patches.labels.ravel(), minlength=n) * _sample_area(patches, camera)
+    body = _contracted(weights)
+    member = (body[None, :] == np.arange(int(body.max()) + 1)[:, None]).astype(float)
+    weights += _continued(patches, body, camera, options)
+    body = _contracted(member @ weights @ member.T)[body]
+    return _without_fragments(body, areas, joint, options.least_area)
+
+
+def hollow_share(patches: Patches, body: np.ndarray, options: GroupingOptions | None = None) -> np.ndarray:
+    """Share (bodies + 1,) of each body's samples that lie on hollow patches; ``body`` is what :func:`bodies` found."""
+    options = options or GroupingOptions()
+    samples = np.bincount(patches.labels.ravel(), minlength=patches.count + 1).astype(float)
+    hollow = np.bincount(body, samples * (patches.curvature > 1 / options.hollow_radius))
+    return hollow / np.maximum(np.bincount(body, samples), 1)
+
+
+def _sample_area(patches: Patches, camera: Camera) -> float:
+    """Square metres of a sample in the image plane at the bodies' depth."""
+    z = float(np.median(patches.depth[patches.labels > 0]))
+    return (z * patches.stride) ** 2 / (camera.fx * camera.fy)
+
+
+def _borders(patches: Patches, options: GroupingOptions) -> tuple[np.ndarray, ...]:
+    """Of each pair of patches (n, n): sum of the scores, what concave edges took from it, samples at which the first
+    lies a step behind, and samples of attached border.
+
+    Samples without a depth count to the nearest one that has some, as a body throws a shadow beside itself in which a
+    triangulating camera measures nothing.
+    """
+    n = patches.count + 1
+    labels, depth, gap = _bridged(patches)
+    known = np.nan_to_num(patches.fold)
+    square = np.ones((5, 5), np.uint8)
+    concave, convex = cv2.dilate(known, square), -cv2.erode(known, square)
+    fold = np.where((concave > convex) | (concave > _CLEARLY), concave, -convex)
+    weights, dents, over, joint = np.zeros((4, n * n))
+    for here, there in (
+        ((slice(None), slice(None, -1)), (slice(None), slice(1, None))),
+        ((slice(None, -1), slice(None)), (slice(1, None), slice(None))),
+    ):
+        rows, columns = np.nonzero((labels[here] != labels[there]) & (labels[here] > 0) & (labels[there] > 0))
+        a, b = labels[here][rows, columns], labels[there][rows, columns]
+        za, zb = depth[here][rows, columns], depth[there][rows, columns]
+        far = gap[here][rows, columns] | gap[there][rows, columns]
+        beyond = np.abs(za - zb) / (patches.depth_step * np.minimum(za, zb)) - 1
+        step = beyond > 0
+        s = fold[here][rows, columns]
+        score = np.where(s != 0, np.clip(_FLAT - s, -1, 1), _UNKNOWN)
+        score = np.where(step, -np.minimum(beyond, 1), np.where(far, 0.0, score))
+        weights += np.bincount(a * n + b, score, n * n)
+        dents += np.bincount(a * n + b, np.where(step, 0.0, np.maximum(-score, 0)), n * n)
+        joint += np.bincount((a * n + b)[np.abs(za - zb) < options.attached], minlength=n * n)
+        behind = np.where(za > zb, a * n + b, b * n + a)
+        over += np.bincount(behind[step & (np.abs(za - zb) < options.hollow_depth)], minlength=n * n)
+    scores, bent, behind_of, attached = (each.reshape(n, n) for each in (weights, dents, over, joint))
+    return scores + scores.T, bent + bent.T, behind_of, attached + attached.T
+
+
+def _bridged(patches: Patches) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Labels and depth with holes filled by the nearest measured sample, and where the holes are."""
+    gap = patches.depth == 0
+    if not gap.any() or gap.all():
+        return patches.labels, patches.depth, gap
+    _, nearest = cv2.distanceTransformWithLabels(gap.view(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
+    measured = np.flatnonzero(~gap)
+    source = np.zeros(int(nearest.max()) + 1, np.int64)
+    source[nearest.ravel()[measured]] = measured
+    return patches.labels.ravel()[source[nearest]], patches.depth.ravel()[source[nearest]], gap
+
+
+def _continued(patches: Patches, body: np.ndarray, camera: Camera, options: GroupingOptions) -> np.ndarray:
+    """Scores (n, n) of patches in one plane between which only nearer things, or nothing at all, were measured."""
+    n = patches.count + 1
+    rows, columns = np.nonzero(patches.labels)
+    numbers = patches.labels[rows, columns]
+    counts = np.bincount(numbers, minlength=n)
+    total = np.stack([np.bincount(numbers, rows, n), np.bincount(numbers, columns, n)], -1)
+    middle = total / np.maximum(counts, 1)[:, None]
+    rays = _rays(middle, patches.stride, camera)
+    length = np.linalg.norm(patches.planes, axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        normals = patches.planes / length[:, None]
+        z = 1 / np.einsum("ij,ij->i", rays, patches.planes)
+        distance = np.abs(1 - z[None, :] * (patches.planes @ rays.T)) / length[:, None]
+        one = (normals @ normals.T > np.cos(options.plane_angle)) & (
+            np.maximum(distance, distance.T) < options.plane_distance
+        )
+    a, b = np.nonzero(np.triu(one & (body[:, None] != body[None, :]), 1))
+    weights = np.zeros((n, n))
+    if a.size == 0:
+        return weights
+    t = np.linspace(0, 1, _SIGHT_SAMPLES)[:, None]
+    way = middle[a][:, None] * (1 - t) + middle[b][:, None] * t
+    r, c = np.rint(way).astype(int).transpose(2, 0, 1)
+    expected = np.einsum(
+        "pki,pi->pk", _rays(way, patches.stride, camera), 0.5 * (patches.planes[a] + patches.planes[b])
+    )
+    measured = patches.depth[r, c] * expected
+    farther = np.mean(measured > 1 + patches.depth_step, axis=1)
+    other = body[patches.labels[r, c]]
+    other = (other > 0) & (other != body[a][:, None]) & (other != body[b][:, None])
+    hidden = np.mean(other & (measured < 1 - patches.depth_step), axis=1)
+    goes_on = (farther < _SEEN_THROUGH) & (hidden > _SEEN_THROUGH)
+    weights[a, b] = goes_on * np.sqrt(np.minimum(counts[a], counts[b]))
+    return weights + weights.T
+
+
+def _rays(grid: np.ndarray, stride: int, camera: Camera) -> np.ndarray:
+    """Directions (..., 3) with z = 1 of samples (..., 2) given by row and column."""
+    x, y = (grid[..., 1] * stride - camera.cx) / camera.fx, (grid[..., 0] * stride - camera.cy) / camera.fy
+    return np.stack([x, y, np.ones_like(x)], axis=-1)
+
+
+def _without_fragments(body: np.ndarray, areas: np.ndarray, joint: np.ndarray, least: float) -> np.ndarray:
+    """Bodies too small to be one join the one that they have most of their continuous border with."""
+    body = body.copy()
+    while True:
+        n = int(body.max()) + 1
+        area = np.bincount(body, areas, n)
+        member = np.zeros((n, len(body)))
+        member[body, np.arange(len(body))] = 1
+        border = member @ joint @ member.T
+        np.fill_diagonal(border, 0)
+        border[0], border[:, 0] = 0, 0
+        small = np.flatnonzero((area < least) & (area > 0) & (border.max(1) > 0))
+        if small.size == 0:
+            return body
+        least_one = small[np.argmin(area[small])]
+        body[body == least_one] = np.argmax(border[least_one])
+
+
+def _contracted(weights: np.ndarray) -> np.ndarray:
+    """Greedy additive contraction of a symmetric signed graph (n, n); node 0 is nothing."""
+    weights = weights.copy()
+    np.fill_diagonal(weights, 0)
+    weights[0], weights[:, 0] = 0, 0
+    parent = np.arange(len(weights))
+    while True:
+        i, j = divmod(int(np.argmax(weights)), len(weights))
+        if weights[i, j] <= 0:
+            break
+        weights[i] += weights[j]
+        weights[:, i] = weights[i]
+        weights[j], weights[:, j] = 0, 0
+        weights[i, i] = 0
+        parent[parent == j] = i
+    return np.unique(parent, return_inverse=True)[1]

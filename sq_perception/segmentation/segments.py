@@ -1,0 +1,399 @@
+"""Objects on a table: the support plane away, what stands on it taken apart.
+
+Steps
+-----
+1. The support plane (:mod:`sq_perception.segmentation.support_plane`) and what is clearly above it.
+2. Smooth patches of surface, cut at depth steps and folds (:mod:`sq_perception.segmentation.surface_patches`).
+3. Patches that belong to one body: convex edges join, concave edges and steps part, with exceptions for vessels and
+   for bodies that go on behind others (:mod:`sq_perception.segmentation.patch_grouping`).
+4. Where lines of sight within a body cross empty space it is several, and where none do so between two they are one
+   (:mod:`sq_perception.segmentation.convex_parts`): that holds where noise hides folds, or makes some.
+5. Each body back to full resolution, beside a step with the pixels whose depth is like its own, and down to the edge of
+   the noise on the table.
+
+Bodies are taken to be convex, or vessels.  Two bodies whose faces lie flush cannot be told apart by their depth.
+Things on a higher table are found as well, those on a lower one are not.  An orthographic camera sees the thesis'
+world: there is no plane, and every connected set of pixels is an object.
+
+Metres and pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from sq_perception.imaging import depth_steps
+from sq_perception.imaging.camera import Camera
+from sq_perception.segmentation import convex_parts, patch_grouping, support_plane, surface_patches
+from sq_perception.segmentation.convex_parts import SightOptions
+from sq_perception.segmentation.patch_grouping import GroupingOptions
+from sq_perception.segmentation.support_plane import Plane, noise_growth
+from sq_perception.segmentation.surface_patches import FoldOptions
+
+_FOOT_PIXELS = 3
+_LEAST_SIGMA = 5e-4
+_BUMP, _ON_WALL = 6.0, 3.5
+"""An object rises so many deviations of the plane's own points above it; what lies within so many of another plane is a
+part of that,"""
+_FACE_SHARE = 0.5
+"""unless it makes up this share of its points: then the plane is a face of the object."""
+_UNKNOWN_SIGMA = 1.5e-3
+_VESSEL = 0.15
+"""A segment with more hollow surface than this share may be a vessel."""
+
+
+@dataclass(frozen=True)
+class SegmentationOptions:
+    """What counts as an object.
+
+    Attributes
+    ----------
+    depth_range
+        Nearest and farthest depth that is looked at, metres.
+    max_objects
+        The largest ones are kept.
+    min_pixels
+        Smaller components are dropped; None: 0.05 % of the image, at least 30.
+    min_height
+        An object reaches at least this far above the plane, metres.
+    depth_step
+        Neighbouring pixels whose depths differ by more than this share of the depth belong to different objects.
+    plane_tolerance
+        Half thickness of a plane while it is searched, metres at a depth of one metre.
+    min_plane_share
+        Share of the valid pixels that a support plane has at least.
+    folds, grouping, sight
+        What parts touching bodies, what holds one body together, and what corrects both.
+    seed
+        Of the random sample; the same image gives the same result.
+    """
+
+    depth_range: tuple[float, float] = (0.0, np.inf)
+    max_objects: int = 20
+    min_pixels: int | None = None
+    min_height: float = 0.012
+    depth_step: float = 0.015
+    plane_tolerance: float = 0.008
+    min_plane_share: float = 0.1
+    seed: int = 0
+    folds: FoldOptions = field(default_factory=FoldOptions)
+    grouping: GroupingOptions = field(default_factory=GroupingOptions)
+    sight: SightOptions = field(default_factory=SightOptions)
+
+    def __post_init__(self) -> None:
+        near, far = self.depth_range
+        if not (0 <= near < far):
+            raise ValueError(f"depth_range: expected 0 <= nearest < farthest, got {self.depth_range}")
+        if self.max_objects < 1:
+            raise ValueError(f"max_objects: expected at least 1, got {self.max_objects}")
+        for name in ("min_height", "depth_step", "plane_tolerance"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}")
+
+
+@dataclass(frozen=True, eq=False)
+class Segmentation:
+    """Objects of one image.
+
+    Attributes
+    ----------
+    labels : int32 (height, width)
+        0 for background; own labels run from 1, largest object first, labels given from outside keep their values.
+    plane : (4,) or None
+        n and d of the support plane, height above it = n.p + d; None where there is none.
+    ids : tuple of int
+        Labels in the image, the one with most pixels first.
+    truncated : tuple of int
+        Those of ``ids`` that reach the border of what the camera measures, so that a part of them may be missing.
+    too_far : tuple of int
+        Those of ``ids`` at whose distance the noise or the pixels are too coarse to part touching bodies.
+    sigma
+        Noise of the depth at one metre as measured on the plane, or a guess where there is none, metres.
+    """
+
+    labels: np.ndarray
+    plane: np.ndarray | None
+    ids: tuple[int, ...]
+    truncated: tuple[int, ...] = ()
+    too_far: tuple[int, ...] = ()
+    sigma: float = _UNKNOWN_SIGMA
+
+
+def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | None = None) -> Segmentation:
+    """Find the objects in a depth image.
+
+    Parameters
+    ----------
+    depth : float (height, width)
+        Metres in the optical frame, not finite where nothing was measured.
+    camera : Camera
+
+    Returns
+    -------
+    Segmentation
+        Without objects for an empty table, a wall, or an image without depth.
+
+    Raises
+    ------
+    ValueError
+        If the image does not fit the camera.
+    """
+    options = options or SegmentationOptions()
+    depth, valid = _checked(depth, camera, options.depth_range)
+    least = _least_pixels(options, depth)
+    if not camera.is_pinhole:
+        labels, ids = _ordered(depth_steps.components(valid), least, options.max_objects)
+        return Segmentation(labels, None, ids)
+    if np.count_nonzero(valid) < least:
+        return Segmentation(np.zeros(depth.shape, np.int32), None, ())
+    planes = support_plane.planes(depth, valid, camera, _search(options))
+    support = support_plane.support(planes, depth, valid, camera, options.depth_step)
+    if support is None:
+        known = np.where(valid, depth, np.float32(0))
+        labels, ids = _ordered(_bodies(known, valid, camera, _UNKNOWN_SIGMA, options), least, options.max_objects)
+        return _marked(labels, None, ids, depth, valid, camera, _UNKNOWN_SIGMA, options)
+    labels = _above(depth, valid, camera, support, options)
+    walls = [plane for plane in planes if plane is not support]
+    labels, ids = _ordered(labels, least, options.max_objects, _object_test(depth, camera, support, walls, options))
+    return _marked(labels, support.equation, ids, depth, valid, camera, support.sigma, options)
+
+
+def from_labels(
+    labels: np.ndarray, depth: np.ndarray, camera: Camera, options: SegmentationOptions | None = None
+) -> Segmentation:
+    """Objects given from outside as a label image; the support plane comes from the pixels around them.
+
+    Parameters
+    ----------
+    labels : integer (height, width)
+        0 (and anything negative) is background; other values are kept as they are.
+    depth, camera
+        As in :func:`segment`.
+
+    Returns
+    -------
+    Segmentation
+        Labels without a valid depth pixel, or with fewer than ``min_pixels`` where that is given, are left out.
+
+    Raises
+    ------
+    ValueError
+        If either image does not fit the camera, or labels are no integers.
+    """
+    options = options or SegmentationOptions()
+    labels = np.asarray(labels)
+    if labels.dtype.kind not in "iub":
+        raise ValueError(f"labels: expected an integer image, got {labels.dtype}")
+    if labels.ndim != 2:
+        raise ValueError(f"labels: expected shape (height, width), got {labels.shape}")
+    camera.check_image(labels)
+    depth, valid = _checked(depth, camera, options.depth_range)
+    labels = np.maximum(labels, 0).astype(np.int32)
+    values, counts = np.unique(labels[valid], return_counts=True)
+    order = np.argsort(-counts, kind="stable")
+    least = options.min_pixels or 1
+    ids = tuple(int(values[k]) for k in order if values[k] > 0 and counts[k] >= least)[: options.max_objects]
+    plane = None
+    if ids and camera.is_pinhole:
+        plane = support_plane.around(labels, ids, depth, valid, camera, _search(options))
+    return _marked(labels, plane, ids, depth, valid, camera, _UNKNOWN_SIGMA, options)
+
+
+def support_under(
+    found: Segmentation, label: int, depth: np.ndarray, camera: Camera, options: SegmentationOptions | None = None
+) -> np.ndarray | None:
+    """The plane (4,) that the surroundings of one object show below it; None where they show none.
+
+    For objects that do not stand on the plane of the segmentation: a frame may show a table, a shelf and the floor.
+    ``depth`` and ``camera`` are those of the segmentation.
+    """
+    options = options or SegmentationOptions()
+    depth, valid = _checked(depth, camera, options.depth_range)
+    if not camera.is_pinhole or not ((found.labels == label) & valid).any():
+        return None
+    return support_plane.around(found.labels, (label,), depth, valid, camera, _search(options))
+
+
+def _marked(
+    labels: np.ndarray,
+    plane: np.ndarray | None,
+    ids: tuple[int, ...],
+    depth: np.ndarray,
+    valid: np.ndarray,
+    camera: Camera,
+    sigma: float,
+    options: SegmentationOptions,
+) -> Segmentation:
+    """The result, with the bodies cut by the border and those too far away."""
+    left, top, width, height = cv2.boundingRect(valid.view(np.uint8))
+    part = labels[top : top + height, left : left + width]
+    border = np.concatenate([part[:1].ravel(), part[-1:].ravel(), part[:, :1].ravel(), part[:, -1:].ravel()])
+    truncated = tuple(k for k in ids if k in set(border.tolist()))
+    far = []
+    if camera.is_pinhole and ids:
+        some = (slice(None, None, 2), slice(None, None, 2))
+        for k in ids:
+            z = depth[some][(labels[some] == k) & valid[some]]
+            if z.size and not options.folds.resolved_at(float(np.median(z)), sigma, camera):
+                far.append(k)
+    return Segmentation(labels, plane, ids, truncated, tuple(far), max(sigma, _LEAST_SIGMA))
+
+
+def _search(options: SegmentationOptions) -> support_plane.Search:
+    return support_plane.Search(options.plane_tolerance, options.min_plane_share, options.seed)
+
+
+def _checked(depth: np.ndarray, camera: Camera, limits: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
+    depth = np.asarray(depth)
+    if depth.ndim != 2 or depth.dtype.kind != "f":
+        raise ValueError(f"depth: expected a float image (height, width), got {depth.dtype} {depth.shape}")
+    camera.check_image(depth)
+    depth = depth.astype(np.float32, copy=False)
+    valid = np.isfinite(depth) & (depth >= limits[0]) & (depth <= limits[1])
+    if camera.is_pinhole:
+        valid &= depth > 0
+    return depth, valid
+
+
+def _least_pixels(options: SegmentationOptions, depth: np.ndarray) -> int:
+    if options.min_pixels is not None:
+        return max(1, options.min_pixels)
+    return max(30, round(5e-4 * depth.size))
+
+
+# The objects on it
+
+
+def _above(
+    depth: np.ndarray, valid: np.ndarray, camera: Camera, plane: Plane, options: SegmentationOptions
+) -> np.ndarray:
+    """Bodies (labels from 1, unordered) of what is above the plane."""
+    labels = np.zeros(depth.shape, np.int32)
+    known = np.where(valid, depth, np.float32(0))
+    relative = plane.image_height(known, camera) / noise_growth(known)
+    relative *= valid
+    # Half of the tolerance band is a compromise: bent depth of real cameras stays below, thin objects stay above.
+    clear = cv2.blur(relative, (3, 3)) > max(0.5 * options.plane_tolerance, 4 * plane.sigma)
+    # The mean beside a tall body is that of its height: the pixel itself decides there.
+    standing = relative > max(0.25 * options.plane_tolerance, 2 * plane.sigma)
+    clear &= standing
+    left, top, width, height = cv2.boundingRect(clear.view(np.uint8))
+    if width == 0:
+        return labels
+    top, left = max(top - _FOOT_PIXELS, 0), max(left - _FOOT_PIXELS, 0)
+    window = slice(top, top + height + 2 * _FOOT_PIXELS), slice(left, left + width + 2 * _FOOT_PIXELS)
+    known = known[window]
+    seen = camera.cropped(left, top, known.shape[1], known.shape[0])
+    inside = _bodies(known, clear[window], seen, plane.sigma, options)
+    foot = standing[window] & (inside == 0)
+    labels[window] = depth_steps.grown(inside, foot, known, _FOOT_PIXELS, options.depth_step)
+    return labels
+
+
+def _bodies(
+    depth: np.ndarray, wanted: np.ndarray, camera: Camera, sigma: float, options: SegmentationOptions
+) -> np.ndarray:
+    """Bodies (labels from 1, unordered) of the wanted pixels, taken apart at steps and concave edges."""
+    sigma = max(sigma, _LEAST_SIGMA)
+    patches = surface_patches.find(depth, wanted, camera, sigma, options.depth_step, options.folds)
+    if patches is None:
+        return depth_steps.separated(depth, wanted, options.depth_step)
+    body = patch_grouping.bodies(patches, camera, options.grouping)
+    vessels = patch_grouping.hollow_share(patches, body, options.grouping) > _VESSEL
+    labels = _refined(body[patches.labels].astype(np.int32), patches, depth, wanted, options.depth_step)
+    labels = convex_parts.corrected(labels, depth, camera, sigma, vessels, options.sight)
+    # What is too small for a patch stays what the steps made of it.
+    rest = cv2.morphologyEx((wanted & (labels == 0)).view(np.uint8), cv2.MORPH_OPEN, depth_steps.CROSS)
+    rest = depth_steps.components(rest)
+    return np.where(rest > 0, rest + labels.max(), labels).astype(np.int32)
+
+
+def _refined(
+    body: np.ndarray, patches: surface_patches.Patches, depth: np.ndarray, wanted: np.ndarray, step: float
+) -> np.ndarray:
+    """Labels (height, width) from those of the samples; beside a step, of the one whose depth is most alike."""
+    k = patches.stride
+    labels = np.repeat(np.repeat(body, k, axis=0), k, axis=1)[: depth.shape[0], : depth.shape[1]]
+    near = np.repeat(np.repeat(patches.stepped | (body == 0), k, axis=0), k, axis=1)
+    near = near[: depth.shape[0], : depth.shape[1]] & wanted
+    labels = np.where(wanted, labels, 0)
+    rows, columns = np.nonzero(near)
+    here = depth[rows, columns]
+    known = np.where(body > 0, patches.depth, np.float32(np.inf))
+    known, body = np.pad(known, (1, 2), constant_values=np.inf), np.pad(body, (1, 2))
+    best, chosen = step * here, np.zeros(rows.size, np.int32)
+    r, c = (rows + k // 2) // k + 1, (columns + k // 2) // k + 1
+    for down in (-1, 0, 1):
+        for right in (-1, 0, 1):
+            off = np.abs(known[r + down, c + right] - here)
+            closer = off < best
+            best = np.where(closer, off, best)
+            chosen = np.where(closer, body[r + down, c + right], chosen)
+    labels[rows, columns] = chosen
+    return labels
+
+
+_ObjectTest = Callable[[np.ndarray, np.ndarray], bool]
+
+
+def _object_test(
+    depth: np.ndarray, camera: Camera, support: Plane, walls: list[Plane], options: SegmentationOptions
+) -> _ObjectTest:
+    """Whether a component, given by its pixels, is an object on the table and not the room behind it."""
+    last_row, last_column = camera.height - 1, camera.width - 1
+    measured = np.count_nonzero(np.isfinite(depth) & (depth > 0))
+
+    def is_object(rows: np.ndarray, columns: np.ndarray) -> bool:
+        step = max(1, rows.size // 2000)
+        points = camera.unproject(columns[::step], rows[::step], depth[rows[::step], columns[::step]])
+        heights = support.height(points)
+        growth = noise_growth(points[:, 2])
+        if np.quantile(heights, 0.95) < options.min_height:
+            return False
+        # Noise that is alike over a window makes bumps; walls fall apart into pieces where things hide parts of them.
+        if np.quantile(heights / growth, 0.95) < _BUMP * support.sigma:
+            return False
+        for wall in walls:
+            on_it = rows.size < _FACE_SHARE * wall.share * measured
+            if on_it and np.quantile(np.abs(wall.height(points)) / growth, 0.95) < _ON_WALL * wall.sigma:
+                return False
+        at_border = rows.min() == 0 or columns.min() == 0 or rows.max() == last_row or columns.max() == last_column
+        if not at_border:
+            return True
+        reach = options.plane_tolerance * growth
+        on_wall = [np.mean(np.abs(wall.height(points)) < 2 * reach) for wall in walls]
+        return not any(share > 0.5 for share in on_wall)
+
+    return is_object
+
+
+def _ordered(
+    labels: np.ndarray, least: int, most: int, accept: _ObjectTest | None = None
+) -> tuple[np.ndarray, tuple[int, ...]]:
+    """Components with at least ``least`` pixels, renumbered from 1 by falling size, at most ``most`` of them."""
+    left, top, width, height = cv2.boundingRect((labels > 0).view(np.uint8))
+    window = slice(top, top + height), slice(left, left + width)
+    part = np.ascontiguousarray(labels[window])
+    counts = np.bincount(part.ravel(), minlength=1)
+    counts[0] = 0
+    order = [int(k) for k in np.argsort(-counts, kind="stable") if counts[k] >= least]
+    pixels = np.flatnonzero(part)
+    short = np.uint16 if len(counts) < 2**16 else np.int32  # 16 bit integers are sorted by radix, ten times as fast
+    pixels = pixels[np.argsort(part.ravel()[pixels].astype(short), kind="stable")]
+    ends = np.cumsum(counts)
+    number = np.zeros(len(counts), np.int32)
+    kept = 0
+    for label in order:
+        if kept == most:
+            break
+        rows, columns = np.divmod(pixels[ends[label] - counts[label] : ends[label]], max(width, 1))
+        if accept is None or accept(rows + top, columns + left):
+            kept += 1
+            number[label] = kept
+    result = np.zeros(labels.shape, np.int32)
+    result[window] = number[part]
+    return result, tuple(range(1, kept + 1))

@@ -1,0 +1,1 @@
+"""Scenes with known truth, and what real sensors make of them."""

@@ -1,0 +1,126 @@
+"""What every model of a depth sensor offers; see :mod:`sq_perception.simulation.sensor_noise` for the sensors."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.optimize import nnls
+
+from sq_perception.imaging.camera import Camera
+
+_LAW_TOLERANCE = 0.25
+
+
+@dataclass(frozen=True)
+class SensorNoise(ABC):
+    """A sensor; see the module."""
+
+    def measured(self, depth: np.ndarray, camera: Camera, rng: np.random.Generator) -> np.ndarray:
+        """What the sensor reports, float32 (height, width) metres, NaN where nothing is measured.
+
+        Parameters
+        ----------
+        depth : floating (height, width)
+            True depth in metres, +inf or NaN where nothing is seen.
+        camera : Camera
+            Of the image; a pinhole for all sensors but :class:`Ideal`.
+        rng : numpy.random.Generator
+            The same state gives the same image.
+
+        Raises
+        ------
+        ValueError, TypeError
+            If the image is not of floating numbers or not of the camera's size, shows depths that are not positive to
+            a pinhole camera, or the camera or the generator are of another kind.
+        """
+        if not isinstance(rng, np.random.Generator):
+            raise TypeError(f"rng: expected a numpy.random.Generator, got {type(rng).__name__}")
+        depth = np.asarray(depth)
+        if depth.ndim != 2 or not np.issubdtype(depth.dtype, np.floating):
+            raise ValueError(f"depth: expected a floating image (height, width), got {depth.dtype} {depth.shape}")
+        camera.check_image(depth)
+        return self._measured(depth, camera, rng)
+
+    def sigma(self, z: Any, cosine: Any = 1.0) -> np.ndarray:
+        """Standard deviation, metres, of a reading at depth z metres where the incidence has this cosine; broadcasts.
+
+        Raises
+        ------
+        ValueError
+            If a depth is not positive or a cosine not in (0, 1].
+        """
+        z, cosine = np.asarray(z, dtype=float), np.asarray(cosine, dtype=float)
+        if not (np.isfinite(z) & (z > 0)).all():
+            raise ValueError("z: expected positive metres")
+        if not ((cosine > 0) & (cosine <= 1)).all():
+            raise ValueError("cosine: expected more than 0 and at most 1")
+        return self._sigma(z, cosine) + np.zeros(np.broadcast_shapes(z.shape, cosine.shape))
+
+    def dropout(self, z: Any, cosine: Any = 1.0) -> np.ndarray:
+        """Share of the readings of a surface that are missing; arguments as of :meth:`sigma`."""
+        return np.zeros(np.broadcast_shapes(np.shape(z), np.shape(cosine)))
+
+    def quadratic_law(self, near: float, far: float, cosine: float = 1.0) -> tuple[float, float]:
+        """``constant`` and ``quadratic`` of sigma(z)^2 = constant^2 + (quadratic z^2)^2 between two depths.
+
+        ``fitting.depth_noise.DepthNoise(*law)`` is what the fit is told of this sensor.  Least squares of relative
+        variances.
+
+        Raises
+        ------
+        ValueError
+            If depths are not 0 < near < far, or the law is wrong by more than 25 % of sigma somewhere between.
+        """
+        if not 0 < near < far < np.inf:
+            raise ValueError(f"near, far: expected 0 < near < far, got {near} and {far}")
+        z = np.linspace(near, far, 64)
+        sigma = self.sigma(z, cosine)
+        if not sigma.any():
+            return 0.0, 0.0
+        parts, _ = nnls(np.stack([np.ones_like(z), z**4], axis=1) / sigma[:, None] ** 2, np.ones_like(z))
+        parts[parts * [1.0, far**4] < 1e-8 * sigma.max() ** 2] = 0.0
+        wrong = np.abs(np.sqrt(parts[0] + parts[1] * z**4) / sigma - 1).max()
+        if wrong > _LAW_TOLERANCE:
+            raise ValueError(f"{self}: no constant and quadratic noise from {near} to {far} m, off by {wrong:.0%}")
+        return float(np.sqrt(parts[0])), float(np.sqrt(parts[1]))
+
+    @abstractmethod
+    def _measured(self, depth: np.ndarray, camera: Camera, rng: np.random.Generator) -> np.ndarray: ...
+
+    @abstractmethod
+    def _sigma(self, z: np.ndarray, cosine: np.ndarray) -> np.ndarray: ...
+
+
+@dataclass(frozen=True)
+class Ideal(SensorNoise):
+    """Independent Gaussian noise of ``deviation`` metres everywhere, nothing else; for any camera and any depth."""
+
+    deviation: float = 0.0
+
+    def __post_init__(self) -> None:
+        check(self, deviation=(0.0, np.inf))
+
+    def _measured(self, depth: np.ndarray, camera: Camera, rng: np.random.Generator) -> np.ndarray:
+        seen = np.where(np.isfinite(depth), depth, np.nan).astype(np.float32)
+        if self.deviation == 0:
+            return seen
+        return seen + np.float32(self.deviation) * rng.standard_normal(depth.shape, dtype=np.float32)
+
+    def _sigma(self, z: np.ndarray, cosine: np.ndarray) -> np.ndarray:
+        return np.full_like(z, self.deviation)
+
+
+def check(model: SensorNoise, **limits: tuple[float, float]) -> None:
+    for name, (low, high) in limits.items():
+        value = getattr(model, name)
+        if not (np.isfinite(value) and low <= value <= high):
+            raise ValueError(f"{name}: expected {low:g} to {high:g}, got {value}")
+
+
+def steepness(cosine: np.ndarray) -> np.ndarray:
+    """theta / (pi/2 - theta)."""
+    theta = np.arccos(np.minimum(cosine, 1))
+    return theta / (np.pi / 2 - theta)

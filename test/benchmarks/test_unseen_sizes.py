@@ -1,0 +1,216 @@
+"""What tells the size that a camera did not see: symmetry of revolution, a prediction, and how much was seen at all."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from sq_perception.fitting import revolution, surface_fit
+from sq_perception.fitting.fit import Fit
+from sq_perception.fitting.levenberg_marquardt import State
+from sq_perception.fitting.surface_fit import Options
+from sq_perception.fitting.visibility import seen_extents
+from sq_perception.geometry import rotation as quaternions
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging import raycast
+from sq_perception.imaging.camera import Camera
+from sq_perception.imaging.coherence import coherent
+from sq_perception.simulation.scenes import plane_depth
+
+CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)
+NORMAL = np.array([0.0, -math.sin(math.radians(40)), -math.cos(math.radians(40))])
+PLANE = np.append(NORMAL, 0.62)
+UPRIGHT = np.stack([[1.0, 0.0, 0.0], np.cross(NORMAL, [1.0, 0.0, 0.0]), NORMAL], axis=1)
+NOISE = 0.0015
+
+
+def standing(size: list[float], shape: list[float], turn: float = 0.0) -> Superquadric:
+    """A body on the plane in the middle of the image, turned about the normal."""
+    foot = np.array([0.0, 0.0, -PLANE[3] / NORMAL[2]])
+    rotation = quaternions.from_matrix(UPRIGHT)
+    spin = quaternions.from_rotation_vector(np.array([0.0, 0.0, turn]))
+    return Superquadric(size, shape, foot + size[2] * NORMAL, quaternions.multiply(rotation, spin))
+
+
+def fitted(body: Superquadric, seed: int = 3, **options: object) -> Fit:
+    """The fit of a body on the plane as a noisy sensor sees it; real objects stray, so a model error is tolerated."""
+    shown, _ = raycast.render(body, CAMERA)
+    mask = np.isfinite(shown)
+    depth = np.where(mask, shown, plane_depth(PLANE, CAMERA))
+    depth = depth + np.random.default_rng(seed).normal(0, NOISE, depth.shape)
+    settings = Options(plane=PLANE, model_error=0.0025, **options)  # type: ignore[arg-type]
+    return surface_fit.fit(depth.astype(np.float32), mask, CAMERA, options=settings)
+
+
+def extent(body: Superquadric, direction: np.ndarray) -> float:
+    return float(body.support(direction[None])[0])
+
+
+# Bodies of revolution
+
+
+def test_a_bottle_that_no_superquadric_explains_is_as_deep_as_it_is_wide() -> None:
+    foot = standing([0.04, 0.04, 0.06], [0.1, 1.0])
+    neck = Superquadric([0.015, 0.015, 0.11], [0.1, 1.0], foot.translation + 0.05 * NORMAL, foot.rotation)
+    fit = fitted(Superquadric.stack([foot, neck]))
+    assert "revolution" in fit.message
+    assert fit.as_hull
+    first, second, _ = fit.superquadric.size
+    assert first == pytest.approx(second, rel=0.02)
+    assert fit.superquadric.shape[1] > 0.95
+
+
+def test_what_is_seen_to_be_square_is_not_round() -> None:
+    fit = fitted(standing([0.05, 0.05, 0.06], [0.1, 0.1], 0.6))
+    assert "revolution" not in fit.message
+    assert fit.superquadric.shape.max() < 0.5
+
+
+def test_an_oval_that_shows_both_of_its_sides_stays_oval() -> None:
+    fit = fitted(standing([0.06, 0.03, 0.04], [0.3, 1.0], 0.6))
+    size = np.sort(fit.superquadric.size)
+    np.testing.assert_allclose(size, [0.03, 0.04, 0.06], rtol=0.12)
+
+
+def test_the_simpler_family_wins_ties_and_loses_against_evidence() -> None:
+    weight = 50.0
+    bonus = 3 * math.log(weight) + 2 * math.log(revolution.ODDS)
+    assert revolution.gain(30.0, 30.0, weight) == pytest.approx(bonus)
+    assert revolution.gain(10.0, 10.0 + bonus, weight) == pytest.approx(0.0)
+    # Where neither explains the object, a difference counts in units of what both leave over.
+    assert revolution.gain(300.0, 330.0, weight) == pytest.approx(bonus - weight * math.log(1.1))
+    # The deviance has neither a step nor a kink where the variance begins to be estimated.
+    below, above = revolution.gain(weight - 1e-6, 10.0, weight), revolution.gain(weight + 1e-6, 10.0, weight)
+    assert above - below == pytest.approx(2e-6, rel=1e-3)
+
+
+def test_round_starts_from_a_body_keep_its_seen_face() -> None:
+    body = standing([0.05, 0.02, 0.07], [0.3, 0.8])
+    for start in revolution.from_body(State.of(body)):
+        assert start.parameters[0] == start.parameters[1]
+        assert start.parameters[4] == 1.0
+    upright = revolution.from_body(State.of(body))[2]
+    towards = -np.cross(NORMAL, [1.0, 0.0, 0.0]) * np.sign(np.cross(NORMAL, [1.0, 0.0, 0.0])[2])
+    front = extent(body, towards) + towards @ body.translation
+    assert towards @ upright.parameters[5:8] + upright.parameters[0] == pytest.approx(front, abs=1e-9)
+
+
+def test_starts_on_the_plane_are_the_can_that_is_seen() -> None:
+    truth = standing([0.04, 0.04, 0.07], [0.1, 1.0])
+    shown, _ = raycast.render(truth, CAMERA)
+    rows, columns = np.nonzero(np.isfinite(shown))
+    start = revolution.on_plane(CAMERA.unproject(columns, rows, shown[rows, columns]), PLANE)[0]
+    np.testing.assert_allclose(start.parameters[:3], truth.size, rtol=0.06)
+    np.testing.assert_allclose(start.parameters[5:8], truth.translation, atol=0.005)
+
+
+# A prediction
+
+
+def face_on(**options: object) -> Fit:
+    """A box in the air that shows one face only."""
+    body = Superquadric([0.06, 0.05, 0.04], [0.1, 0.1], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0, 1.0])
+    shown, _ = raycast.render(body, CAMERA)
+    depth = np.where(np.isfinite(shown), shown, 1.2) + np.random.default_rng(5).normal(0, 0.001, shown.shape)
+    settings = Options(model_error=0.0025, **options)  # type: ignore[arg-type]
+    return surface_fit.fit(depth.astype(np.float32), np.isfinite(shown), CAMERA, options=settings)
+
+
+@pytest.mark.parametrize("depth", [0.04, 0.09])
+def test_an_open_size_follows_the_prediction_and_the_seen_face_stays(depth: float) -> None:
+    asked = []
+
+    def predicted() -> Superquadric:
+        asked.append(1)
+        # The same box with its axes in another order.
+        quarter = quaternions.from_rotation_vector(np.array([0.0, np.pi / 2, 0.0]))
+        return Superquadric([depth, 0.05, 0.06], [0.2, 0.2], [0.0, 0.0, 0.5], quarter)
+
+    fit = face_on(expected=predicted)
+    assert asked == [1]
+    view = np.array([0.0, 0.0, 1.0])
+    assert extent(fit.superquadric, view) == pytest.approx(depth, rel=0.15)
+    assert fit.superquadric.translation[2] - extent(fit.superquadric, view) == pytest.approx(0.46, abs=0.003)
+    assert "prediction" in fit.message
+    hidden = int(np.argmax(np.abs(fit.superquadric.rotation_matrix[2])))
+    assert 0.05 * depth < fit.sigma_size[hidden] < depth
+
+
+def test_what_the_image_tells_a_wrong_prediction_does_not_change() -> None:
+    wrong = Superquadric([0.3, 0.3, 0.3], [0.2, 0.2], [0.0, 0.0, 0.7], [0.0, 0.0, 0.0, 1.0])
+    fit = face_on(expected=wrong)
+    for k, truth in ((0, 0.06), (1, 0.05)):
+        assert extent(fit.superquadric, np.eye(3)[k]) == pytest.approx(truth, rel=0.06)
+
+
+def test_nothing_is_asked_where_nothing_is_open() -> None:
+    def never() -> Superquadric:
+        raise AssertionError("asked for a prediction")
+
+    body = Superquadric([0.05, 0.04, 0.03], [0.5, 0.7], [0.0, 0.0, 0.45], [0.3, 0.4, 0.2, 0.8])
+    shown, _ = raycast.render(body, CAMERA)
+    depth = np.where(np.isfinite(shown), shown, 1.0).astype(np.float32)
+    surface_fit.fit(depth, np.isfinite(shown), CAMERA, options=Options(expected=never))
+
+
+# Seen and inferred
+
+
+def test_the_seen_share_of_each_size() -> None:
+    body = standing([0.05, 0.03, 0.08], [0.4, 0.6])
+    local = np.random.default_rng(1).uniform(-1, 1, (4000, 3)) * body.size
+    local[:, 1] = np.abs(local[:, 1])
+    points = local @ body.rotation_matrix.T + body.translation
+    np.testing.assert_allclose(seen_extents(body, points), [1.0, 0.5, 1.0], atol=0.03)
+
+
+def test_points_outside_count_as_the_face_they_lie_beyond() -> None:
+    body = Superquadric([0.05, 0.03, 0.08], [0.4, 0.6], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
+    points = np.random.default_rng(2).uniform(-1, 1, (2000, 3)) * 0.2
+    np.testing.assert_allclose(seen_extents(body, points), 1.0)
+
+
+def test_a_can_from_above_shows_all_of_its_width() -> None:
+    fit = fitted(standing([0.04, 0.04, 0.05], [0.1, 1.0]))
+    assert fit.seen.shape == (3,)
+    assert (fit.seen > 0.85).all()
+    assert (face_on().seen > 0.9).sum() == 2
+    assert face_on().seen.min() < 0.2
+
+
+# What a mask holds beside the body
+
+
+def test_the_fringe_of_an_occluder_is_no_part_of_the_body() -> None:
+    depth = np.full((40, 60), 1.0)
+    depth[:, 40:] = 0.6
+    depth[:, 34:40] = np.nan
+    mask = np.zeros(depth.shape, dtype=bool)
+    mask[5:35, 10:43] = True
+    core = coherent(depth, mask, 0.02)
+    assert not core[:, 40:].any()
+    assert core[5:35, 10:40].all()
+
+
+def test_the_far_end_of_a_body_behind_a_bar_stays() -> None:
+    depth = np.full((40, 60), 1.5)
+    depth[5:35, 10:50] = 1.0
+    depth[:, 36:40] = 0.6
+    mask = depth == 1.0
+    np.testing.assert_array_equal(coherent(depth, mask, 0.02), mask)
+
+
+def test_a_hidden_foot_is_thought_to_reach_the_plane() -> None:
+    truth = standing([0.04, 0.03, 0.07], [0.1, 0.1], 0.4)
+    shown, _ = raycast.render(truth, CAMERA)
+    mask = np.isfinite(shown)
+    depth = np.where(mask, shown, plane_depth(PLANE, CAMERA))
+    rows = np.flatnonzero(mask.any(axis=1))
+    hidden = np.arange(CAMERA.height)[:, None] > rows[0] + 0.6 * len(rows)
+    depth = np.where(hidden, 0.3, depth) + np.random.default_rng(4).normal(0, NOISE, depth.shape)
+    settings = Options(plane=PLANE, model_error=0.0025)
+    fit = surface_fit.fit(depth.astype(np.float32), mask & ~hidden, CAMERA, options=settings)
+    lowest = NORMAL @ fit.superquadric.translation + PLANE[3] - extent(fit.superquadric, NORMAL)
+    assert abs(lowest) < 0.006

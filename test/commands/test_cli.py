@@ -1,0 +1,238 @@
+"""The command line: the public contract of its files, its exit codes, and a help that answers at once."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+
+import cv2
+import numpy as np
+import pytest
+
+from sq_perception.commands import main
+from sq_perception.geometry.metrics import thesis_iou, volume_iou
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging import unit_cube
+from sq_perception.recordings.frame_file import read
+
+CUBE_BODY = ["0.25", "0.15", "0.1", "0.2", "0.8", "0.5", "0.45", "0.5", "0.2", "-0.3", "0.1", "0.9"]
+CAN = ["0.05", "0.05", "0.08", "0.1", "1.0", "-5e-2", "0", "0.8", "0.7", "0.2", "0", "0.7"]
+KEYS = {"size", "shape", "translation", "rotation", "score", "residual", "sigma_size", "seen", "status", "message"}
+KEYS |= {"label", "pixels", "track"}
+
+
+def strict(text):
+    def refuse(constant):
+        raise AssertionError(f"{constant} is no JSON")
+
+    return json.loads(text, parse_constant=refuse)
+
+
+def body_of(entry):
+    return Superquadric(entry["size"], entry["shape"], entry["translation"], entry["rotation"])
+
+
+def flat(parameters):
+    return Superquadric.from_flat(np.array([float(value) for value in parameters]))
+
+
+def batch(body):
+    return Superquadric.stack([body])
+
+
+@pytest.fixture
+def view(tmp_path):
+    path = tmp_path / "view.png"
+    assert main.main(["render", *CUBE_BODY, "--output", str(path)]) == 0
+    return path
+
+
+@pytest.mark.parametrize("suffix", ["png", "bmp", "npz"])
+def test_rendered_cube_images_come_back(tmp_path, suffix):
+    path, out = tmp_path / f"view.{suffix}", tmp_path / "out.json"
+    assert main.main(["render", *CUBE_BODY, "-o", str(path)]) == 0
+    command = ["recover", str(path), "--projection", "orthographic", "--method", "symmetry", "--json", str(out)]
+    assert main.main([*command, "--ignore-masks"]) == 0
+    frame = strict(out.read_text())["frames"][0]
+    assert frame["file"] == str(path)
+    assert frame["coordinates"] == "cube"
+    assert frame["ms"] > 0
+    (entry,) = frame["superquadrics"]
+    assert set(entry) == KEYS
+    assert entry["label"] is None
+    assert entry["status"] in ("converged", "weak")
+    assert thesis_iou(batch(body_of(entry)), batch(flat(CUBE_BODY)))[0] > 0.98
+    assert len(entry["sigma_size"]) == 3
+    assert len(entry["seen"]) == 3
+    assert all(0 <= share <= 1 for share in entry["seen"])
+    assert entry["track"] is None
+
+
+def test_pinhole_round_trips(tmp_path):
+    for name in ("can.png", "can.npz"):
+        path, out = tmp_path / name, tmp_path / "out.json"
+        assert main.main(["render", *CAN, "--projection", "pinhole", "-o", str(path)]) == 0
+        info = ["--camera-info", str(tmp_path / "can.yaml")] if name.endswith("png") else []
+        assert main.main(["recover", str(path), *info, "--method", "symmetry", "--json", str(out)]) == 0
+        frame = strict(out.read_text())["frames"][0]
+        assert frame["coordinates"] == "optical"
+        (entry,) = frame["superquadrics"]
+        assert entry["label"] == (1 if name.endswith("npz") else None)
+        assert volume_iou(batch(body_of(entry)), batch(flat(CAN)))[0] > 0.95
+    with np.load(tmp_path / "can.npz") as archive:
+        np.testing.assert_allclose(archive["superquadrics"][0], flat(CAN).to_flat())
+
+
+def test_sixteen_bits_and_sizes(tmp_path):
+    path = tmp_path / "fine.png"
+    assert main.main(["render", *CUBE_BODY, "-o", str(path), "--bits", "16", "--width", "100", "--height", "80"]) == 0
+    image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    assert image.dtype == np.uint16
+    assert image.shape == (80, 100)
+    assert read(path, projection="orthographic").camera == unit_cube.camera(100, 80)
+
+
+def test_masks_name_the_bodies_and_unknown_is_null(tmp_path, view):
+    frame = read(view, projection="orthographic")
+    path, out = tmp_path / "masked.npz", tmp_path / "out.json"
+    labels = np.where(np.isfinite(frame.depth), 200, 0).astype(np.uint8)
+    labels[:2, :2] = 7
+    depth = frame.depth.copy()
+    depth[0, :2] = 0.5
+    np.savez(path, depth=depth, labels=labels, projection="orthographic")
+    assert main.main(["recover", str(path), "--method", "classic", "--json", str(out)]) == 0
+    first, second = strict(out.read_text())["frames"][0]["superquadrics"]
+    assert (first["label"], second["label"]) == (200, 7)
+    assert second["status"] == "failed"
+    assert second["residual"] is None
+    assert second["sigma_size"] == [None, None, None]
+    assert second["score"] == 0
+
+
+def test_bad_frames_are_named_and_skipped(tmp_path, view, capsys):
+    bad, out = tmp_path / "bad.npz", tmp_path / "out.json"
+    bad.write_bytes(b"nothing")
+    command = ["recover", str(bad), str(view), str(tmp_path / "missing.png"), "--projection", "orthographic"]
+    assert main.main([*command, "--method", "symmetry", "--json", str(out)]) == 1
+    errors = capsys.readouterr().err
+    assert "bad.npz" in errors
+    assert "missing.png" in errors
+    assert "Traceback" not in errors
+    assert [frame["file"] for frame in strict(out.read_text())["frames"]] == [str(view)]
+
+
+def test_json_on_the_standard_output_is_only_json(view, capsys):
+    command = ["recover", str(view), "--projection", "orthographic", "--method", "symmetry", "--json", "-"]
+    assert main.main(command) == 0
+    assert len(strict(capsys.readouterr().out)["frames"]) == 1
+
+
+def test_without_json_a_table_is_printed(view, capsys):
+    assert main.main(["recover", str(view), "--projection", "orthographic", "--method", "symmetry"]) == 0
+    assert "half sizes 0.2" in capsys.readouterr().out
+
+
+def test_pictures_are_drawn_one_a_frame(tmp_path, view):
+    empty = tmp_path / "other" / "view.png"
+    empty.parent.mkdir()
+    cv2.imwrite(str(empty), np.zeros((64, 64), np.uint8))
+    folder = tmp_path / "new" / "pictures"
+    command = ["recover", str(view), str(empty), "--projection", "orthographic", "--method", "symmetry"]
+    assert main.main([*command, "--pictures", str(folder)]) == 0
+    assert sorted(path.name for path in folder.iterdir()) == ["view.png", "view_2.png"]
+    picture = cv2.imread(str(folder / "view.png"))
+    assert picture.shape[0] > 600
+    assert picture.std() > 20
+
+
+def test_a_missing_model_is_one_clear_line(tmp_path, view, capsys):
+    command = ["recover", str(view), "--projection", "orthographic", "--model", str(tmp_path / "none.safetensors")]
+    assert main.main(command) == 1
+    assert "no such model file" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        [],
+        ["recover"],
+        ["fly"],
+        ["recover", "a.npz", "--method", "magic"],
+        ["recover", "a.npz", "--projection", "fisheye"],
+        ["recover", "a.npz", "--json", "no/such/folder/out.json"],
+        ["recover", "a.npz", "--max-objects", "0"],
+        ["render", "1", "2", "3", "--output", "x.png"],
+        ["render", *CUBE_BODY],
+        ["render", *CUBE_BODY, "--output", "x.jpg"],
+        ["render", *CAN, "--projection", "pinhole", "--output", "x.bmp"],
+        ["render", *CUBE_BODY, "--output", "x.bmp", "--bits", "16"],
+        ["render", "-1", *CUBE_BODY[1:], "--output", "x.png"],
+        ["render", *CUBE_BODY[:8], "0", "0", "0", "0", "--output", "x.png"],
+        ["render", *CUBE_BODY, "--output", "x.png", "--width", "1"],
+        ["render", *CUBE_BODY, "--output", "no/such/folder/x.png"],
+    ],
+)
+def test_wrong_usage_is_code_two_and_no_traceback(arguments, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert main.main(arguments) == 2
+    assert capsys.readouterr().err
+    assert not list(tmp_path.iterdir())
+
+
+def test_help_is_quick_and_teaches():
+    started = time.perf_counter()
+    done = subprocess.run(
+        [sys.executable, "-m", "sq_perception.commands.main", "recover", "--help"],
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.returncode == 0
+    assert "examples:" in done.stdout
+    assert time.perf_counter() - started < 5
+    code = "import sys, sq_perception.commands.main; assert not {'torch', 'numpy', 'cv2'} & set(sys.modules)"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+
+
+def test_demo_without_ros_says_what_is_missing():
+    """In a process in which rclpy cannot be imported, whether it is installed or not."""
+    code = (
+        "import sys; sys.modules['rclpy'] = None; "
+        "from sq_perception.commands import main; sys.exit(main.main(['demo', '--x']))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert "Traceback" not in done.stderr
+    assert done.returncode in (1, 2)
+
+
+def test_train_has_its_own_help(capsys):
+    with pytest.raises(SystemExit) as stop:
+        main.main(["train", "--help"])
+    assert stop.value.code == 0
+    help_text = capsys.readouterr().out
+    assert "--steps" in help_text
+    assert "least_squares_free" in help_text
+
+
+def test_evaluate_has_its_own_help(capsys):
+    with pytest.raises(SystemExit) as stop:
+        main.main(["evaluate", "--help"])
+    assert stop.value.code == 0
+    help_text = capsys.readouterr().out
+    assert "--fit-bodies" in help_text
+    assert "report.html" in help_text
+
+
+def test_author_renders(shared_data, tmp_path):
+    """The renders of the thesis' author come back with IoU above 0.97 (8 bit depth)."""
+    out = tmp_path / "out.json"
+    folder = shared_data / "author_renders"
+    names = sorted(str(path) for path in folder.glob("*.bmp"))
+    command = ["recover", *names, "--projection", "orthographic", "--method", "symmetry", "--json", str(out)]
+    assert main.main(command) == 0
+    rows = np.loadtxt(folder / "labels.txt", delimiter=",", skiprows=1, usecols=range(1, 22))
+    found = [body_of(frame["superquadrics"][0]) for frame in strict(out.read_text())["frames"]]
+    truth = Superquadric(rows[:, 0:3] / 255, rows[:, 3:5], rows[:, 5:8] / 255, rows[:, -4:])
+    assert (thesis_iou(Superquadric.stack(found), truth) > 0.97).all()

@@ -1,0 +1,244 @@
+"""sq-perception recover on many frames: order, meshes, and what stays whole when it is interrupted."""
+
+from __future__ import annotations
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+import trimesh
+import yaml
+
+from sq_perception.commands import main
+from sq_perception.commands.recover import complain
+from sq_perception.geometry.mesh import COLOURS
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging import raycast
+from sq_perception.imaging.camera import Camera
+from sq_perception.recordings.frame_file import FrameError
+from sq_perception.recordings.inputs import RecordedInput, in_folder
+
+CAMERA = Camera(160, 120, 200.0, 200.0, 79.5, 59.5)
+BODIES = Superquadric(
+    [[0.05, 0.04, 0.08], [0.03, 0.03, 0.05]],
+    [[0.2, 0.9], [0.5, 1.0]],
+    [[-0.08, 0.01, 0.7], [0.1, 0.0, 0.6]],
+    [[0.4, 0.2, 0.1, 0.8], [0.7, 0.1, 0.3, 0.6]],
+)
+
+
+def save_npz(path, depth=None):
+    rendered, index = raycast.render(BODIES, CAMERA)
+    depth = np.where(np.isfinite(rendered), rendered, np.nan).astype(np.float32) if depth is None else depth
+    np.savez(path, depth=depth, K=CAMERA.matrix, labels=index + 1)
+    return path
+
+
+def save_png(path, millimetres=1000):
+    cv2.imwrite(str(path), np.full((120, 160), millimetres, np.uint16))
+    return path
+
+
+def camera_yaml(path, focal=200.0, distortion=0.0):
+    k = [focal, 0, 79.5, 0, focal, 59.5, 0, 0, 1]
+    info = {
+        "image_width": 160,
+        "image_height": 120,
+        "camera_matrix": {"data": k},
+        "distortion_coefficients": {"data": [distortion, 0, 0, 0, 0]},
+        "projection_matrix": {"data": [focal, 0, 79.5, 0, 0, focal, 59.5, 0, 0, 0, 1, 0]},
+    }
+    path.write_text(yaml.safe_dump(info))
+    return path
+
+
+def recover(tmp_path, *arguments, code=0):
+    out = tmp_path / "out.json"
+    assert main.main(["recover", *map(str, arguments), "--method", "symmetry", "--json", str(out)]) == code
+    return json.loads(out.read_text())["frames"]
+
+
+# inputs
+
+
+def test_a_folder_gives_its_frames_in_natural_order_with_its_camera(tmp_path):
+    names = ["f2.png", "f10.png", "f1.npz", "F3.PNG", "g.png"]
+    for k, name in enumerate(names):
+        (save_npz if name.endswith("npz") else save_png)(tmp_path / name, *([] if name.endswith("npz") else [500 + k]))
+    camera_yaml(tmp_path / "camera.yaml", 300.0)
+    (tmp_path / "notes.txt").touch()
+    order = ["f1.npz", "f2.png", "F3.PNG", "f10.png", "g.png"]
+    assert [path.name for path in in_folder(tmp_path)] == order
+    recorded = RecordedInput([str(tmp_path)])
+    found = list(recorded)
+    assert recorded.total == 5
+    assert [file for file, _ in found] == [str(tmp_path / name) for name in order]
+    assert [frame.camera.fx for _, frame in found] == [200, 300, 300, 300, 300]
+    camera_yaml(tmp_path / "camera_info.yaml", 400.0)
+    assert next(iter(RecordedInput([str(tmp_path / ".")], every=2, limit=2)))[1].name == "f1.npz"
+    assert [frame.camera.fx for _, frame in RecordedInput([str(tmp_path)], every=2, limit=2)] == [200, 400]
+    given = camera_yaml(tmp_path / "mine.yaml", 500.0)
+    assert [frame.camera.fx for _, frame in RecordedInput([str(tmp_path)], given)] == [200] + 4 * [500]
+
+
+def test_bad_inputs_come_as_errors_in_their_place(tmp_path):
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    good, bad = save_npz(tmp_path / "good.npz"), tmp_path / "bad.npz"
+    bad.write_bytes(b"nothing")
+    names = [str(path) for path in (empty, bad, good, tmp_path / "missing", save_png(tmp_path / "lone.png"))]
+    found = [frame for _, frame in RecordedInput(names)]
+    assert [isinstance(frame, FrameError) for frame in found] == [True, True, False, True, True]
+    assert "no frames in it" in str(found[0])
+    with pytest.raises(FrameError, match=r"none\.yaml"):
+        RecordedInput(names, tmp_path / "none.yaml")
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ((), "(plumb_bob 0.3 0 0 0 0) is undone"),
+        (("--distortion", "apply"), ""),
+        (("--distortion", "ignore"), ""),
+    ],
+)
+def test_what_becomes_of_distortion_is_said_once_unless_it_was_asked_for(tmp_path, options, words, capsys):
+    camera_yaml(tmp_path / "camera.yaml", distortion=0.3)
+    for k in range(3):
+        save_png(tmp_path / f"{k}.png")
+    assert len(recover(tmp_path, tmp_path, *options)) == 3
+    errors = capsys.readouterr().err
+    assert words in errors
+    assert "3 frames, " in errors
+    assert errors.count("\n") == (2 if words else 1)
+
+
+@pytest.mark.parametrize("option", ["--every", "--limit"])
+def test_counts_are_at_least_one(tmp_path, option, capsys):
+    assert main.main(["recover", str(tmp_path), option, "0"]) == 2
+    assert option in capsys.readouterr().err
+
+
+# outputs
+
+
+@pytest.mark.parametrize("kind", ["glb", "ply"])
+def test_meshes_are_the_bodies(tmp_path, kind):
+    save_npz(tmp_path / "a.npz")
+    save_npz(tmp_path / "empty.npz", np.full((120, 160), np.nan, np.float32))
+    frames = recover(
+        tmp_path, tmp_path / "a.npz", tmp_path / "empty.npz", "--meshes", tmp_path / "new", "--mesh-format", kind
+    )
+    assert [path.name for path in (tmp_path / "new").iterdir()] == [f"a.{kind}"]
+    path = tmp_path / "new" / f"a.{kind}"
+    entries = frames[0]["superquadrics"]
+    assert len(entries) == 2
+    bodies = [Superquadric(one["size"], one["shape"], one["translation"], one["rotation"]) for one in entries]
+    turn = np.diag([1.0, -1.0, -1.0]) if kind == "glb" else np.eye(3)
+    if kind == "glb":
+        scene = trimesh.load_scene(path)
+        parts = [part for _, part in sorted((part.metadata["name"], part) for part in scene.dump())]
+    else:
+        parts = trimesh.load_mesh(path).split()
+        parts = sorted(parts, key=lambda part: np.linalg.norm(part.centroid - bodies[0].translation))
+    for k, (part, body) in enumerate(zip(parts, bodies, strict=True)):
+        np.testing.assert_allclose(abs(part.volume), body.volume(), rtol=0.02)
+        np.testing.assert_allclose(part.bounds.mean(axis=0), turn @ body.translation, atol=2e-3)
+        colour = np.round(255 * COLOURS[k % len(COLOURS)])
+        np.testing.assert_array_equal(np.asarray(part.visual.vertex_colors)[0, :3], colour)
+
+
+def test_an_interruption_leaves_whole_files(tmp_path, monkeypatch, capsys):
+    """Ctrl-C while the second frame's mesh is being written: the first frame's files are there, and nothing half."""
+    from sq_perception.geometry import mesh
+
+    for name in ("a", "b", "c"):
+        save_npz(tmp_path / f"{name}.npz")
+    export = mesh.export
+
+    def interrupted(bodies, path, **options):
+        export(bodies, path, **options)
+        if "b.glb" in path.name:
+            raise KeyboardInterrupt
+
+    monkeypatch.setattr(mesh, "export", interrupted)
+    names = [tmp_path / f"{name}.npz" for name in ("a", "b", "c")]
+    frames = recover(tmp_path, *names, "--meshes", tmp_path / "meshes", code=130)
+    assert [frame["file"] for frame in frames] == [str(name) for name in names[:2]]
+    assert [path.name for path in (tmp_path / "meshes").iterdir()] == ["a.glb"]
+    assert not [path for path in tmp_path.iterdir() if "partial" in path.name]
+    errors = capsys.readouterr().err
+    assert "interrupted" in errors
+    assert "2 frames, 4 objects (0 failed), median" in errors
+
+
+def test_a_full_disk_ends_the_run_with_what_is_done(tmp_path, monkeypatch, capsys):
+    from sq_perception.geometry import mesh
+
+    def full(bodies, path, **options):
+        path.write_bytes(b"half a mesh")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(mesh, "export", full)
+    names = [save_npz(tmp_path / f"{name}.npz") for name in ("a", "b")]
+    assert len(recover(tmp_path, *names, "--meshes", tmp_path / "meshes", code=1)) == 1
+    assert not list((tmp_path / "meshes").iterdir())
+    assert "No space left" in capsys.readouterr().err
+
+
+def save_grown(path, share):
+    """The two bodies, grown by a share, with labels that say which way."""
+    bodies = Superquadric((1 + share) * BODIES.size, BODIES.shape, BODIES.translation, BODIES.rotation)
+    rendered, index = raycast.render(bodies, CAMERA)
+    labels = np.array([0, 1, 2] if share > 0 else [0, 2, 1])[index + 1]
+    depth = np.where(np.isfinite(rendered), rendered, np.nan).astype(np.float32)
+    np.savez(path, depth=depth, K=CAMERA.matrix, labels=labels)
+
+
+def test_track_puts_ids_into_the_json(tmp_path, capsys):
+    """Masks change their labels and bodies their sizes from frame to frame; names that are times are stamps."""
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    for k in range(4):
+        save_grown(folder / f"1305031102.{k}.npz", 0.02 * (-1) ** k)
+    frames = recover(tmp_path, folder, "--track", "--time-budget", "10")
+    assert [frame["stamp"] for frame in frames] == [{"sec": 1305031102, "nanosec": k * 10**8} for k in range(4)]
+    assert "no stamp" not in capsys.readouterr().err
+    by_id = {}
+    for frame in frames:
+        for one in frame["superquadrics"]:
+            by_id.setdefault(one["track"]["id"], []).append(one)
+    assert sorted(by_id) == [1, 2]
+    for entries in by_id.values():
+        assert [one["track"]["seen"] for one in entries] == [1, 2, 3, 4]
+        assert {one["label"] for one in entries} == {1, 2}
+        last = entries[-1]["track"]
+        assert last["fused"]
+        truth = min(BODIES.size, key=lambda size: abs(np.prod(size) / np.prod(last["size"]) - 1))
+        np.testing.assert_allclose(np.sort(last["size"]), np.sort(truth), rtol=0.019)
+
+
+def test_track_is_asked_for_and_says_where_stamps_are_missing(tmp_path, capsys):
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        for k in range(2):
+            save_npz(tmp_path / folder / f"f{k}.npz")
+    plain = recover(tmp_path, tmp_path / "a")
+    assert all(one["track"] is None for frame in plain for one in frame["superquadrics"])
+    assert plain[0]["stamp"] is None
+    capsys.readouterr()
+    frames = recover(tmp_path, tmp_path / "a", tmp_path / "b", "--track")
+    ids = [sorted(one["track"]["id"] for one in frame["superquadrics"]) for frame in frames]
+    assert ids == [[1, 2], [1, 2], [3, 4], [3, 4]]
+    assert capsys.readouterr().err.count("taken to be 0.1 s apart") == 1
+
+
+def test_a_budget_is_positive(tmp_path, capsys):
+    assert main.main(["recover", str(tmp_path), "--time-budget", "0"]) == 2
+    assert "--time-budget" in capsys.readouterr().err
+
+
+def test_a_message_is_one_printable_line(capsys):
+    complain("a\x1b[2J\nb")
+    assert capsys.readouterr().err == "sq-perception: a?[2J b\n"

@@ -1,0 +1,110 @@
+"""Pictures: outlines where the bodies are, views from where they say, and no global Matplotlib state."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+
+import cv2
+import numpy as np
+import pytest
+
+from sq_perception.evaluation import plots
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging import raycast, unit_cube
+from sq_perception.imaging.camera import Camera
+from sq_perception.recovery.recoverer import Recoverer
+
+CAMERA = Camera(160, 120, 135.0, 135.0, 79.5, 59.5)
+BODY = Superquadric([0.08, 0.06, 0.1], [0.3, 0.8], [0.02, 0.01, 0.7], [0.4, 0.2, 0.1, 0.9])
+PLANE = np.array([0.0, -1.0, 0.0, 0.15])
+
+
+def shot(body=BODY, camera=CAMERA):
+    depth, index = raycast.render(body, camera)
+    return np.where(np.isfinite(depth), depth, np.nan).astype(np.float32), (index + 1).astype(np.int32)
+
+
+@pytest.mark.parametrize("camera", [CAMERA, unit_cube.camera(96), Camera(2000, 1500, 1700, 1700, 999.5, 749.5)])
+def test_the_silhouette_encloses_the_pixels_of_the_body(camera):
+    body = (
+        BODY
+        if camera.is_pinhole
+        else unit_cube.optical_from_cube(Superquadric([0.3, 0.2, 0.1], BODY.shape, [0.5, 0.5, 0.5], BODY.rotation))
+    )
+    _, index = raycast.render(body, camera)
+    (loop,) = plots.silhouettes(body, camera)
+    filled = np.zeros(index.shape, np.uint8)
+    cv2.fillPoly(filled, [np.round(16 * loop).astype(np.int32)], 1, shift=4)
+    assert np.sum((filled > 0) != (index >= 0)) < 2.5 * len(np.unique(np.round(loop), axis=0))
+    assert not plots.silhouettes(Superquadric(body.size, body.shape, [0, 0, -5.0], body.rotation), CAMERA)
+
+
+def drawn(figure):
+    figure.canvas.draw()
+    return np.asarray(figure.canvas.buffer_rgba())[..., :3].astype(float)
+
+
+def test_outlines_lie_on_the_depth_picture():
+    depth, labels = shot()
+    figure = plots.new_figure(6.4, 4.8)
+    ax = figure.add_axes((0, 0, 1, 1))
+    plots.draw_depth(ax, np.where(np.isfinite(depth), depth, 1.2))
+    before = drawn(figure)
+    plots.draw_outlines(ax, [BODY], CAMERA, edges=False)
+    changed = np.abs(drawn(figure) - before).sum(axis=2) > 60
+    changed = cv2.resize(changed.astype(np.uint8), (160, 120), interpolation=cv2.INTER_AREA) > 0
+    edge = cv2.morphologyEx((labels > 0).astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((5, 5), np.uint8)) > 0
+    assert changed.sum() > 100
+    assert (edge[changed]).mean() > 0.95
+
+
+def test_a_view_from_the_camera_s_side_looks_like_the_image():
+    """A ball left of a box stays on the left from the front; from the right the box hides it."""
+    left = Superquadric([0.05] * 3, [1.0, 1.0], [-0.2, 0, 1.0], [0, 0, 0, 1.0])
+    right = Superquadric([0.05] * 3, [0.1, 0.1], [0.2, 0, 1.0], [0, 0, 0, 1.0])
+    red, blue = np.array([1.0, 0, 0]), np.array([0, 0, 1.0])
+
+    def middle(azimuth):
+        figure = plots.new_figure(4, 4)
+        ax = figure.add_axes((0, 0, 1, 1))
+        plots.draw_bodies_3d(ax, [left, right], colours=[red, blue], elevation=0, azimuth=azimuth)
+        picture = drawn(figure)
+        difference = picture[..., 0] - picture[..., 2]
+        return np.nonzero(difference > 60)[1], np.nonzero(difference < -60)[1]
+
+    reddish, bluish = middle(0)
+    assert reddish.mean() < bluish.mean() - 100
+    reddish, bluish = middle(180)
+    assert reddish.mean() > bluish.mean() + 100
+    reddish, bluish = middle(90)
+    assert reddish.size < 0.02 * bluish.size
+
+
+def test_figures_of_full_and_empty_frames(tmp_path):
+    depth, labels = shot()
+    recoverer = Recoverer(method="symmetry")
+    found = recoverer.recover(depth, CAMERA, labels)
+    full = cv2.imread(str(plots.save(plots.recovery_figure(depth, CAMERA, found, "one"), tmp_path / "one.png")))
+    nothing = np.full_like(depth, np.nan)
+    empty_frame = recoverer.recover(nothing, CAMERA)
+    empty = cv2.imread(str(plots.save(plots.recovery_figure(nothing, CAMERA, empty_frame), tmp_path / "none.png")))
+    assert full.shape == empty.shape
+    assert full.std() > 20
+
+
+def test_draw_on_a_plane_with_points_and_true_wires():
+    figure = plots.new_figure(4, 4)
+    ax = figure.add_axes((0, 0, 1, 1))
+    depth, labels = shot()
+    v, u = np.nonzero(labels)
+    plots.draw_bodies_3d(ax, [BODY], [CAMERA.unproject(u, v, depth[v, u])], PLANE, wires=[BODY])
+    assert drawn(figure).std() > 20
+    empty = plots.new_figure(2, 2)
+    plots.draw_bodies_3d(empty.add_axes((0, 0, 1, 1)), [])
+    assert drawn(empty).min() == 255
+
+
+def test_pyplot_is_not_imported():
+    code = "import sys, sq_perception.evaluation.plots; assert 'matplotlib.pyplot' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)

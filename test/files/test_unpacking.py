@@ -1,0 +1,130 @@
+"""Files that lie about their size: what is whole is read, what would fill the memory is refused before it does."""
+
+from __future__ import annotations
+
+import io
+import struct
+import zipfile
+import zlib
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from sq_perception.files import unpacking
+from sq_perception.files.unpacking import UnpackingError, grey_image, npz_arrays
+from sq_perception.recordings.frame_file import FrameError, read
+
+
+def npy(array: np.ndarray, version: tuple[int, int] = (1, 0)) -> bytes:
+    file = io.BytesIO()
+    np.lib.format.write_array(file, array, version)
+    return file.getvalue()
+
+
+def header(shape: tuple[int, ...], dtype: str = "<f8") -> bytes:
+    file = io.BytesIO()
+    np.lib.format.write_array_header_1_0(file, {"descr": dtype, "fortran_order": False, "shape": shape})
+    return file.getvalue()
+
+
+def archive(tmp_path: Path, **members: bytes) -> Path:
+    path = tmp_path / "frame.npz"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as file:
+        for name, data in members.items():
+            file.writestr(f"{name}.npy", data)
+    return path
+
+
+def png(width: int, height: int, rows: bytes) -> bytes:
+    """A PNG whose header says what it is told, 8 bit grey."""
+    parts = b"\x89PNG\r\n\x1a\n"
+    for name, data in (
+        (b"IHDR", struct.pack(">IIBBBBB", width, height, 8, 0, 0, 0, 0)),
+        (b"IDAT", zlib.compress(rows)),
+        (b"IEND", b""),
+    ):
+        parts += struct.pack(">I", len(data)) + name + data + struct.pack(">I", zlib.crc32(name + data))
+    return parts
+
+
+@pytest.mark.parametrize("save", [np.savez, np.savez_compressed])
+def test_what_numpy_saves_is_read(tmp_path, save):
+    rng = np.random.default_rng(0)
+    arrays = {
+        "depth": rng.random((7, 5)).astype(np.float32),
+        "K": np.asfortranarray(rng.random((3, 3))),
+        "labels": rng.integers(0, 9, (7, 5)).astype(">i2"),
+        "projection": np.array("orthographic"),
+        "empty": np.zeros((0, 4)),
+    }
+    save(tmp_path / "frame.npz", **arrays)
+    found = npz_arrays(tmp_path / "frame.npz", (*arrays, "missing"))
+    assert set(found) == set(arrays)
+    for name, array in arrays.items():
+        np.testing.assert_array_equal(found[name], array)
+        assert found[name].dtype == array.dtype
+    wide = archive(tmp_path, depth=npy(arrays["depth"], (2, 0)))
+    np.testing.assert_array_equal(npz_arrays(wide, ["depth"])["depth"], arrays["depth"])
+
+
+@pytest.mark.parametrize(
+    ("member", "words"),
+    [
+        (header((100_000, 200_000)) + bytes(64), "at most"),
+        (header((2**40, 2**40)), "at most"),
+        (header((2**24,)) + bytes(64), "bytes of numbers, got 64"),
+        (header((4,)) + bytes(2**20), "expected 32 bytes of numbers"),
+        (header((3,), "|O") + bytes(24), "objects"),
+        (header((2**20,), "<U64"), "at most|bytes"),
+        (npy(np.zeros(3))[:-1], "bytes of numbers"),
+        (b"\x93NUMPY\x09\x00", "not a readable NPZ"),
+        (b"nonsense", "not a readable NPZ"),
+        (b"", "not a readable NPZ"),
+    ],
+    ids=["160 GB", "overflow", "short", "long", "objects", "text", "cut", "version", "no array", "nothing"],
+)
+def test_arrays_that_are_not_what_they_claim_are_refused(tmp_path, member, words):
+    path = archive(tmp_path, depth=member)
+    with pytest.raises(UnpackingError, match=words):
+        npz_arrays(path, ["depth"])
+    with pytest.raises(FrameError, match=str(path)):
+        read(path)
+
+
+def test_an_archive_that_unpacks_to_far_more_than_it_weighs_is_refused(tmp_path, monkeypatch):
+    monkeypatch.setattr(unpacking, "MOST_PIXELS", 2**16)
+    path = archive(tmp_path, depth=npy(np.zeros((2**9, 2**9))))
+    assert path.stat().st_size < 2**13
+    with pytest.raises(UnpackingError, match="at most 65536 numbers, got 262144"):
+        npz_arrays(path, ["depth"])
+
+
+def test_grey_images_are_read(tmp_path):
+    rng = np.random.default_rng(1)
+    for name, dtype in (("a.png", np.uint8), ("b.png", np.uint16), ("c.bmp", np.uint8)):
+        grey = rng.integers(0, np.iinfo(dtype).max, (6, 9)).astype(dtype)
+        assert cv2.imwrite(str(tmp_path / name), grey)
+        np.testing.assert_array_equal(grey_image(tmp_path / name), grey)
+    (tmp_path / "d.png").write_bytes(png(3, 2, b"\x00\x01\x02\x03\x00\x04\x05\x06"))
+    np.testing.assert_array_equal(grey_image(tmp_path / "d.png"), [[1, 2, 3], [4, 5, 6]])
+
+
+@pytest.mark.parametrize(
+    ("data", "words"),
+    [
+        (png(20_000, 20_000, bytes(2000)), "1 to 33554432 pixels, got 20000 x 20000"),
+        (png(2**31 - 1, 2**31 - 1, b""), "pixels"),
+        (png(0, 5, b""), "pixels"),
+        (b"BM" + bytes(16) + struct.pack("<ii", 50_000, -50_000) + bytes(32), "pixels"),
+        (b"\x89PNG\r\n\x1a\n", "PNG or BMP"),
+        (b"GIF89a", "PNG or BMP"),
+        (b"", "PNG or BMP"),
+    ],
+    ids=["large", "overflow", "none", "bmp", "cut", "other", "nothing"],
+)
+def test_images_that_would_fill_the_memory_are_refused(tmp_path, data, words):
+    (tmp_path / "some.png").write_bytes(data)
+    with pytest.raises(UnpackingError, match=words):
+        grey_image(tmp_path / "some.png")

@@ -1,0 +1,459 @@
+"""The surface fit: exact on clean images of both cameras, robust on bad ones, honest about what it cannot know."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from sq_perception.fitting import surface_fit
+from sq_perception.fitting.bounds import Bounds
+from sq_perception.fitting.fit import Fit, Status
+from sq_perception.fitting.surface_fit import Options
+from sq_perception.geometry import metrics
+from sq_perception.geometry import rotation as quaternions
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging import raycast, unit_cube
+from sq_perception.imaging.camera import Camera
+
+GREY = 1 / 255
+
+
+def thesis_body(rng: np.random.Generator) -> Superquadric:
+    """A body of the thesis' protocol, in the optical frame."""
+    body = Superquadric(
+        rng.uniform(25, 75, 3) / 255,
+        rng.uniform(0.1, 1.0, 2),
+        (128 + rng.uniform(-40, 40, 3)) / 255,
+        quaternions.random(1, rng)[0],
+    )
+    return unit_cube.optical_from_cube(body)
+
+
+def thesis_image(body: Superquadric) -> np.ndarray:
+    depth, _ = raycast.render(body, unit_cube.camera())
+    return unit_cube.grey_from_depth(depth)
+
+
+def fit_grey(image: np.ndarray, **options: object) -> Fit:
+    depth = unit_cube.depth_from_grey(image)
+    return surface_fit.fit(depth, image > 0, unit_cube.camera(), options=Options(**options))  # type: ignore[arg-type]
+
+
+CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)
+
+
+def pinhole_body(rng: np.random.Generator) -> Superquadric:
+    size = rng.uniform(0.03, 0.08, 3)
+    centre = np.array([rng.uniform(-0.05, 0.05), rng.uniform(-0.05, 0.05), rng.uniform(0.35, 0.6)])
+    return Superquadric(size, rng.uniform(0.1, 1.0, 2), centre, quaternions.random(1, rng)[0])
+
+
+def pinhole_image(body: Superquadric, behind: float = 1.5) -> tuple[np.ndarray, np.ndarray]:
+    """Depth in whole millimetres, with a wall behind, and the mask."""
+    depth, _ = raycast.render(body, CAMERA)
+    mask = np.isfinite(depth)
+    return np.round(np.where(mask, depth, behind) * 1000).astype(np.float32) / np.float32(1000), mask
+
+
+def iou(fit: Fit, truth: Superquadric) -> float:
+    return float(np.squeeze(metrics.volume_iou(fit.superquadric, truth)))
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_clean_thesis_images(seed: int) -> None:
+    truth = thesis_body(np.random.default_rng(seed))
+    fit = fit_grey(thesis_image(truth))
+    assert iou(fit, truth) > 0.985
+    assert fit.status == Status.CONVERGED
+    assert fit.residual < 0.6 * GREY
+    assert fit.inlier_share > 0.97
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_clean_pinhole_images(seed: int) -> None:
+    truth = pinhole_body(np.random.default_rng(seed))
+    depth, mask = pinhole_image(truth)
+    fit = surface_fit.fit(depth, mask, CAMERA)
+    assert iou(fit, truth) > 0.97
+    assert fit.noise == pytest.approx(1e-3 / np.sqrt(12), rel=0.5)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_noise_of_two_grey_levels(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    truth = thesis_body(rng)
+    image = thesis_image(truth)
+    noisy = np.clip(np.round(image + rng.normal(0, 2, image.shape)), 1, 255)
+    fit = fit_grey(np.where(image > 0, noisy, 0).astype(np.uint8))
+    assert iou(fit, truth) > 0.9
+    assert fit.noise == pytest.approx(2 * GREY, rel=0.15)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("damage", ["dropout", "outliers", "eroded", "grown"])
+def test_damaged_images(damage: str, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    truth = thesis_body(rng)
+    image = thesis_image(truth)
+    depth, mask = unit_cube.depth_from_grey(image), image > 0
+    square = np.ones((5, 5), np.uint8)
+    if damage == "dropout":
+        mask &= rng.random(mask.shape) > 0.1
+        depth = np.where(mask, depth, np.float32(np.nan))
+    elif damage == "outliers":
+        stray = mask & (rng.random(mask.shape) < 0.02)
+        depth = np.where(stray, rng.uniform(0, 1, mask.shape), depth).astype(np.float32)
+    elif damage == "eroded":
+        mask = cv2.erode(mask.astype(np.uint8), square, borderValue=1) > 0
+        depth = np.where(mask, depth, np.float32(np.nan))
+    else:
+        depth = np.where(mask, depth, np.float32(1.0))
+        mask = cv2.dilate(mask.astype(np.uint8), square) > 0
+    fit = surface_fit.fit(depth, mask, unit_cube.camera())
+    assert iou(fit, truth) > 0.93
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_nearer_body_hides_a_part(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    truth = pinhole_body(rng)
+    depth, mask = pinhole_image(truth)
+    columns = np.flatnonzero(mask.any(axis=0))
+    hidden = np.arange(CAMERA.width) < columns[int(0.2 * len(columns))]
+    depth[:, hidden] = 0.2
+    fit = surface_fit.fit(depth, mask & ~hidden, CAMERA)
+    assert iou(fit, truth) > 0.85
+
+
+@pytest.mark.parametrize("form", range(8))
+def test_all_forms_of_a_start_lead_to_the_same_body(form: int) -> None:
+    rng = np.random.default_rng(3)
+    truth = thesis_body(rng)
+    image = thesis_image(truth)
+    near = Superquadric(
+        truth.size * 1.1,
+        np.clip(truth.shape + 0.1, 0.1, 1.0),
+        truth.translation + 0.01,
+        quaternions.multiply(truth.rotation, quaternions.from_rotation_vector(np.array([0.1, -0.1, 0.1]))),
+    )
+    start = near.equivalent_forms()[form]
+    depth = unit_cube.depth_from_grey(image)
+    fit = surface_fit.fit(depth, image > 0, unit_cube.camera(), start=start)
+    assert iou(fit, truth) > 0.99
+    reference = surface_fit.fit(depth, image > 0, unit_cube.camera(), start=near)
+    assert fit.superquadric.to_flat() == pytest.approx(reference.superquadric.to_flat(), abs=2e-3)
+    assert fit.sigma_size == pytest.approx(reference.sigma_size, rel=0.1)
+
+
+def test_the_best_of_several_starts_wins() -> None:
+    truth = thesis_body(np.random.default_rng(5))
+    image = thesis_image(truth)
+    nonsense = Superquadric([0.01, 0.3, 0.01], [0.1, 1.0], [0.0, 0.0, 3.0], [0.0, 0.0, 0.0, 1.0])
+    depth = unit_cube.depth_from_grey(image)
+    options = Options(fall_back=False)
+    fit = surface_fit.fit(depth, image > 0, unit_cube.camera(), start=[nonsense, truth], options=options)
+    assert iou(fit, truth) > 0.99
+    rescued = surface_fit.fit(depth, image > 0, unit_cube.camera(), start=nonsense)
+    assert iou(rescued, truth) > 0.98
+
+
+def test_a_quarter_turn_of_the_image_turns_the_body() -> None:
+    truth = thesis_body(np.random.default_rng(8))
+    image = thesis_image(truth)
+    upright, turned = fit_grey(image), fit_grey(np.ascontiguousarray(np.rot90(image)))
+    assert np.sort(turned.superquadric.size) == pytest.approx(np.sort(upright.superquadric.size), rel=0.01)
+    about_view = np.array([0.0, 0.0, -np.sqrt(0.5), np.sqrt(0.5)])
+    centre = np.array([0.5, 0.5, 0.0])
+    moved = upright.superquadric.transformed(about_view, centre - quaternions.to_matrix(about_view) @ centre)
+    assert iou(turned, moved) > 0.99
+
+
+def table_scene(truth: Superquadric, plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    body, _ = raycast.render(truth, CAMERA)
+    v, u = np.indices(body.shape)
+    _, direction = CAMERA.rays(u, v)
+    table = -plane[3] / (direction @ plane[:3])
+    mask = np.isfinite(body) & (body < np.where(table > 0, table, np.inf))
+    depth = np.where(mask, body, np.where(table > 0, table, np.nan))
+    return np.round(depth * 1000).astype(np.float32) / np.float32(1000), mask
+
+
+def resting_body(rng: np.random.Generator) -> tuple[Superquadric, np.ndarray]:
+    """A box-like body standing on a table seen from above at 40 degrees."""
+    tilt = np.radians(40)
+    normal = np.array([0.0, -np.cos(tilt), -np.sin(tilt)])
+    size = rng.uniform(0.03, 0.07, 3)
+    foot = np.array([0.0, 0.03, 0.5])
+    x = np.array([1.0, 0.0, 0.0])
+    turn = quaternions.from_rotation_vector(normal * rng.uniform(0, 3))
+    axes = np.stack([x, np.cross(normal, x), normal], axis=1)
+    rotation = quaternions.multiply(turn, quaternions.from_matrix(axes))
+    body = Superquadric(size, np.array([0.2, 0.3]), foot + normal * size[2], rotation)
+    return body, np.append(normal, -normal @ foot)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_bodies_on_a_table_do_not_sink_into_it(seed: int) -> None:
+    truth, plane = resting_body(np.random.default_rng(seed))
+    depth, mask = table_scene(truth, plane)
+    fit = surface_fit.fit(depth, mask, CAMERA, options=Options(plane=plane))
+    assert iou(fit, truth) > 0.88
+    body = fit.superquadric
+    lowest = plane[:3] @ body.translation + plane[3] - body.support(plane[None, :3])[0]
+    assert lowest > -0.003
+    assert np.abs(plane[:3] @ body.rotation_matrix).max() > 0.995
+
+
+def test_a_box_seen_face_on_is_weak_and_says_what_is_missing() -> None:
+    truth = Superquadric([0.06, 0.05, 0.04], [0.1, 0.1], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0, 1.0])
+    camera = Camera(160, 120, 800.0, 800.0, 79.5, 59.5, "orthographic")
+    flat, _ = raycast.render(truth, camera)
+    noisy = flat + np.random.default_rng(0).normal(0, 4e-3, flat.shape)
+    depth = np.where(np.isfinite(flat), noisy, np.nan).astype(np.float32)
+    fit = surface_fit.fit(depth, np.isfinite(depth), camera)
+    assert fit.status == Status.WEAK
+    assert "half size along" in fit.message
+    assert "undetermined" in fit.message
+    hidden = int(np.argmax(fit.sigma_size))
+    assert abs(fit.superquadric.rotation_matrix[2, hidden]) > 0.9
+    assert abs(fit.superquadric.size[hidden] - 0.04) < 3 * fit.sigma_size[hidden]
+
+
+def test_reported_deviations_cover_the_errors() -> None:
+    within, total = 0, 0
+    for seed in range(12):
+        rng = np.random.default_rng(100 + seed)
+        truth = thesis_body(rng)
+        image = thesis_image(truth)
+        noisy = np.clip(np.round(image + rng.normal(0, 2, image.shape)), 1, 255)
+        fit = fit_grey(np.where(image > 0, noisy, 0).astype(np.uint8))
+        order = np.argsort(fit.superquadric.size)
+        error = np.abs(fit.superquadric.size[order] - np.sort(truth.size))
+        within += int((error < 2 * fit.sigma_size[order]).sum())
+        total += 3
+        assert fit.covariance == pytest.approx(fit.covariance.T)
+        assert np.linalg.eigvalsh(fit.covariance).min() > 0
+    assert within / total > 0.75
+
+
+def test_more_noise_means_less_certainty() -> None:
+    rng = np.random.default_rng(11)
+    truth = thesis_body(rng)
+    image = thesis_image(truth)
+    previous = fit_grey(image).sigma_size.max()
+    for sigma in (2, 6):
+        noisy = np.clip(np.round(image + rng.normal(0, sigma, image.shape)), 1, 255)
+        sure = fit_grey(np.where(image > 0, noisy, 0).astype(np.uint8)).sigma_size.max()
+        assert sure > previous
+        previous = sure
+
+
+def test_the_result_is_in_canonical_form() -> None:
+    truth = thesis_body(np.random.default_rng(2))
+    body = fit_grey(thesis_image(truth)).superquadric
+    assert body.canonical_form().to_flat() == pytest.approx(body.to_flat())
+    assert body.size[0] >= body.size[1]
+
+
+def test_bounds_are_kept() -> None:
+    truth = thesis_body(np.random.default_rng(6))
+    limits = Bounds(shape=(0.3, 0.5), size=(0.12, 0.2))
+    body = fit_grey(thesis_image(truth), bounds=limits).superquadric
+    assert body.shape.min() >= 0.3 - 1e-12
+    assert body.shape.max() <= 0.5 + 1e-12
+    assert body.size.min() >= 0.12 - 1e-12
+    assert body.size.max() <= 0.2 + 1e-12
+
+
+def test_a_time_budget_ends_the_search() -> None:
+    image = thesis_image(thesis_body(np.random.default_rng(4)))
+    patient, hasty = fit_grey(image), fit_grey(image, time_budget=1e-9)
+    assert hasty.iterations < 100
+    assert patient.inlier_share > 0.97
+    assert np.isfinite(hasty.superquadric.to_flat()).all()
+
+
+FLAT = np.full((240, 320), 0.5, np.float32)
+
+
+def square_mask(rows: int, columns: int) -> np.ndarray:
+    mask = np.zeros((240, 320), bool)
+    mask[100 : 100 + rows, 150 : 150 + columns] = True
+    return mask
+
+
+@pytest.mark.parametrize(
+    ("depth", "mask", "reason"),
+    [
+        (FLAT, square_mask(1, 1), "1 pixels"),
+        (FLAT, square_mask(1, 11), "11 pixels"),
+        (FLAT, square_mask(1, 40), "line"),
+    ],
+)
+def test_too_few_pixels_fail_with_a_reason(depth: np.ndarray, mask: np.ndarray, reason: str) -> None:
+    fit = surface_fit.fit(depth, mask, CAMERA)
+    assert fit.status == Status.FAILED
+    assert reason in fit.message
+    assert np.isfinite(fit.superquadric.to_flat()).all()
+    assert (fit.superquadric.size > 0).all()
+
+
+def test_noise_does_not_pull_bodies_on_a_plane_towards_the_camera() -> None:
+    """Points before and behind the surface weigh alike where a superquadric explains the image; 2 mm of noise."""
+    shift = []
+    for seed in range(12):
+        truth, plane = resting_body(np.random.default_rng(seed))
+        depth, mask = table_scene(truth, plane)
+        noisy = depth + 0.002 * np.random.default_rng(100 + seed).standard_normal(depth.shape)
+        body = surface_fit.fit(noisy, mask, CAMERA, options=Options(plane=plane)).superquadric
+        sight = truth.translation / np.linalg.norm(truth.translation)
+        shift.append(sight @ (body.translation - truth.translation))
+    assert abs(np.median(shift)) < 0.0003
+
+
+@pytest.mark.parametrize("plane", [None, np.array([0.0, -1.0, 0.0, 0.1])])
+def test_one_depth_everywhere_gives_a_finite_body(plane: np.ndarray | None) -> None:
+    fit = surface_fit.fit(FLAT, square_mask(30, 40), CAMERA, options=Options(plane=plane))
+    assert np.isfinite(fit.superquadric.to_flat()).all()
+    assert fit.status in (Status.WEAK, Status.FAILED, Status.CONVERGED)
+
+
+def test_noise_images_give_a_finite_body(rng: np.random.Generator) -> None:
+    depth = rng.uniform(0.1, 5.0, FLAT.shape).astype(np.float32)
+    depth[rng.random(FLAT.shape) < 0.3] = np.nan
+    fit = surface_fit.fit(depth, rng.random(FLAT.shape) < 0.5, CAMERA)
+    assert np.isfinite(fit.superquadric.to_flat()).all()
+    assert np.isfinite([fit.residual, fit.noise, fit.inlier_share]).all()
+
+
+def test_a_mask_that_fills_the_image() -> None:
+    fit = surface_fit.fit(FLAT, np.ones(FLAT.shape, bool), CAMERA)
+    assert np.isfinite(fit.superquadric.to_flat()).all()
+
+
+def test_misuse_raises() -> None:
+    mask = square_mask(30, 40)
+    body = Superquadric([0.1] * 3, [0.5, 0.5], [0, 0, 0.5], [0, 0, 0, 1.0])
+    with pytest.raises(ValueError, match="mask"):
+        surface_fit.fit(FLAT, mask[:100], CAMERA)
+    with pytest.raises(ValueError, match="bool"):
+        surface_fit.fit(FLAT, mask.astype(np.uint8), CAMERA)
+    with pytest.raises(ValueError, match="does not fit a camera"):
+        surface_fit.fit(FLAT[:100], mask[:100], CAMERA)
+    with pytest.raises(ValueError, match="float"):
+        surface_fit.fit(FLAT.astype(np.uint16), mask, CAMERA)
+    with pytest.raises(ValueError, match="start"):
+        surface_fit.fit(FLAT, mask, CAMERA, start="guess")  # type: ignore[arg-type]
+    with pytest.raises(ValueError, match="start"):
+        surface_fit.fit(FLAT, mask, CAMERA, start=[body, 3])  # type: ignore[list-item]
+    with pytest.raises(ValueError, match="nothing to fit"):
+        surface_fit.fit(np.full_like(FLAT, np.nan), mask, CAMERA)
+    with pytest.raises(ValueError, match="nothing to fit"):
+        surface_fit.fit(FLAT, np.zeros_like(mask), CAMERA)
+    for wrong in ({"noise": -1.0}, {"plane": np.zeros(4)}, {"pixels": 3}, {"time_budget": 0.0}, {"max_iterations": 0}):
+        with pytest.raises(ValueError, match=next(iter(wrong))):
+            Options(**wrong)  # type: ignore[arg-type]
+
+
+def test_author_renders(shared_data: Path) -> None:
+    lines = (shared_data / "author_renders" / "labels.txt").read_text().splitlines()[1:]
+    for line in lines:
+        name, *numbers = line.split(",")
+        values = np.array([float(x) for x in numbers])
+        truth = Superquadric(values[0:3] / 255, values[3:5], values[5:8] / 255, values[17:21])
+        image = cv2.imread(str(shared_data / "author_renders" / name), cv2.IMREAD_GRAYSCALE)
+        fit = fit_grey(image)
+        assert iou(fit, unit_cube.optical_from_cube(truth)) > 0.99
+
+
+def test_recorded_box_on_a_table(shared_data: Path) -> None:
+    """One box, two frames of a moving camera: the same sizes."""
+    sizes = []
+    for name in ("pcl_grab0", "pcl_grab1"):
+        frame = np.load(shared_data / "frames" / f"{name}.npz")
+        camera = Camera.from_matrix(frame["K"], frame["depth"].shape[1], frame["depth"].shape[0])
+        fit = surface_fit.fit(frame["depth"], frame["labels"] == 2, camera, options=Options(plane=frame["plane"]))
+        assert fit.status != Status.FAILED
+        sizes.append(np.sort(fit.superquadric.size))
+    assert np.abs(sizes[0] - sizes[1]).max() < 0.004
+
+
+HARD_SENSOR = {
+    "wrong order of the axes, half again as deep": [
+        [0.0572, 0.1074, 0.0585, 0.3235, 0.2392, -0.2553, -0.0206, 1.4608, 0.8913, -0.3293, 0.1179, 0.2886]
+    ],
+    "a slab taken for a block": [
+        [0.0375, 0.1122, 0.1108, 0.2937, 0.4964, 0.328, 0.1772, 1.4751, 0.5716, -0.6366, -0.4077, -0.319]
+    ],
+    "a slab far away": [
+        [0.1124, 0.0872, 0.0347, 0.6613, 0.3403, -0.2296, -0.3932, 2.1054, -0.1787, -0.1988, -0.8346, 0.4816]
+    ],
+    "a stick with a square end": [
+        [0.0326, 0.0326, 0.0921, 0.3072, 0.5984, -0.3748, 0.0872, 1.8106, 0.0852, 0.7379, 0.4299, 0.5132]
+    ],
+}
+
+
+@pytest.mark.parametrize("name", HARD_SENSOR)
+def test_hard_bodies_through_a_sensor(name: str) -> None:
+    """Bodies that an earlier search left in a wrong valley, at IoU 0.3 to 0.7, as both explain the image well."""
+    focal = 320 / np.tan(np.deg2rad(30))
+    camera = Camera(640, 480, focal, focal, 319.5, 239.5)
+    rng = np.random.default_rng(5)
+    for flat in HARD_SENSOR[name]:
+        body = Superquadric.from_flat(np.array(flat))
+        depth, index = raycast.render(body, camera)
+        mask = index >= 0
+        depth = np.where(mask, depth, np.nan)
+        noisy = np.round((depth + rng.standard_normal(depth.shape) * 0.0015 * depth**2) * 1000) / 1000
+        assert iou(surface_fit.fit(noisy, mask, camera), body) > 0.85
+
+
+@pytest.mark.parametrize(
+    "flat",
+    [
+        [0.2233, 0.2067, 0.1212, 0.33, 0.7848, 0.3657, 0.4311, 0.6132, 0.5732, 0.4275, 0.0861, -0.6938],
+        [0.1085, 0.247, 0.2471, 0.5249, 0.3061, 0.3565, 0.445, 0.5274, 0.1896, 0.9345, 0.2959, 0.0559],
+    ],
+)
+def test_hard_bodies_under_heavy_noise(flat: list[float]) -> None:
+    """Eight grey levels: an earlier search read the outline from a body that noise had swollen (IoU 0.3 to 0.6)."""
+    body = Superquadric.from_flat(np.array(flat))
+    depth, index = raycast.render(body, unit_cube.camera())
+    grey = (1 - depth) / GREY - 0.5 + np.random.default_rng(6).normal(0, 8, depth.shape)
+    depth = 1 - (np.clip(np.round(grey), 1, 255) + 0.5) * GREY
+    assert iou(surface_fit.fit(depth, index >= 0, unit_cube.camera()), body) > 0.8
+
+
+def test_a_hollow_body_is_taken_for_its_hull() -> None:
+    """Points behind the surface, as in a box without a lid, do not pull it in."""
+    body = Superquadric([0.1, 0.08, 0.06], [0.1, 0.1], [0.0, 0.0, 0.6], [0.3, 0.25, 0.0, 0.92])
+    depth, mask = pinhole_image(body)
+    notch = np.zeros_like(mask)
+    notch[100:125, 140:175] = True
+    depth = np.where(notch & mask, depth + 0.03, depth).astype(np.float32)
+    assert (notch & mask).sum() > 500
+    assert iou(surface_fit.fit(depth, mask, CAMERA), body) > 0.9
+
+
+@pytest.mark.parametrize("behind", [1.5, np.nan])
+def test_a_hole_that_the_sensor_left_is_no_hole_in_the_body(behind: float) -> None:
+    """Shiny and black surfaces give no depth, and masks made from depth leave them out."""
+    truth = pinhole_body(np.random.default_rng(1))
+    depth, mask = pinhole_image(truth, behind)
+    rows, columns = np.nonzero(mask)
+    v, u = int(rows.mean()), int(columns.mean())
+    depth[v - 8 : v + 9, u - 12 : u + 7] = np.nan
+    mask &= np.isfinite(depth)
+    assert iou(surface_fit.fit(depth, mask, CAMERA), truth) > 0.97
+
+
+def test_a_longer_body_is_not_taken_for_a_smaller_mask() -> None:
+    """A body that covers free pixels on one side only is too long; the mask is right."""
+    truth = pinhole_body(np.random.default_rng(3))
+    depth, mask = pinhole_image(truth)
+    start = Superquadric(truth.size * np.array([1.0, 1.0, 1.3]), truth.shape, truth.translation, truth.rotation)
+    assert iou(surface_fit.fit(depth, mask, CAMERA, start=start), truth) > 0.97

@@ -1,0 +1,300 @@
+"""The superquadric: closed forms against each other, against sampling, and NumPy against torch and numba."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from sq_perception.geometry import Superquadric, kernels, rotation
+
+IDENTITY = np.array([0.0, 0, 0, 1])
+
+
+def random_bodies(count: int, seed: int, e_low: float = 0.1, e_high: float = 1.9) -> Superquadric:
+    rng = np.random.default_rng(seed)
+    return Superquadric(
+        rng.uniform(0.02, 0.4, (count, 3)),
+        rng.uniform(e_low, e_high, (count, 2)),
+        rng.uniform(-1, 1, (count, 3)),
+        rotation.random(count, rng),
+    )
+
+
+def local(size: list[float], shape: list[float]) -> Superquadric:
+    return Superquadric(np.array(size), np.array(shape), np.zeros(3), IDENTITY)
+
+
+class TestEquation:
+    def test_is_the_thesis_formula(self) -> None:
+        """Equation 3.7, written out, where no term is extreme."""
+        body = local([0.2, 0.3, 0.5], [0.4, 0.8])
+        x, y, z = points = np.array([[0.1, 0.2, 0.3], [-0.3, 0.1, -0.2], [0.05, -0.4, 0.6]]).T
+        expected = ((x / 0.2) ** 2) ** (1 / 0.8) + ((y / 0.3) ** 2) ** (1 / 0.8)
+        expected = expected ** (0.8 / 0.4) + ((z / 0.5) ** 2) ** (1 / 0.4)
+        np.testing.assert_allclose(body.inside_outside(points.T), expected, rtol=1e-12)
+        np.testing.assert_allclose(body.adjusted_inside_outside(points.T), expected**0.4, rtol=1e-12)
+
+    def test_sphere_and_box_limits(self) -> None:
+        sphere = local([2, 2, 2], [1, 1])
+        points = np.random.default_rng(0).standard_normal((50, 3))
+        np.testing.assert_allclose(sphere.gauge(points), np.linalg.norm(points, axis=1) / 2, rtol=1e-12)
+        box = local([1, 2, 3], [0.01, 0.01])
+        np.testing.assert_allclose(box.gauge(points), np.abs(points / [1, 2, 3]).max(axis=1), rtol=0.02)
+
+    def test_degree_one(self) -> None:
+        bodies = random_bodies(20, 1)
+        points = np.random.default_rng(1).standard_normal((20, 30, 3))
+        away = bodies.translation[:, None] + 3 * (points - bodies.translation[:, None])
+        np.testing.assert_allclose(bodies.gauge(away), 3 * bodies.gauge(points), rtol=1e-9)
+
+    def test_no_overflow_at_the_smallest_exponents(self) -> None:
+        body = local([0.1, 0.1, 0.1], [0.01, 0.01])
+        with np.errstate(over="raise", invalid="raise", divide="raise"):
+            g = body.gauge(np.array([[1e3, 1.0, -2.0], [0.0, 0.0, 0.0], [0.0, 0.0, 5.0], [0.1, 0.1, 0.1]]))
+        np.testing.assert_allclose(g, [1e4, 0, 50, 1], rtol=0.01)
+
+
+class TestSurface:
+    @pytest.mark.parametrize(("e_low", "e_high"), [(0.1, 1.0), (0.01, 0.1), (1.0, 2.0)])
+    def test_parametric_points_satisfy_the_equation(self, e_low: float, e_high: float) -> None:
+        bodies = random_bodies(20, 2, e_low, e_high)
+        rng = np.random.default_rng(3)
+        points = bodies.parametric_points(rng.uniform(-np.pi / 2, np.pi / 2, 100), rng.uniform(-np.pi, np.pi, 100))
+        np.testing.assert_allclose(bodies.gauge(points), 1, atol=1e-9)
+
+    def test_samples_lie_on_the_surface(self) -> None:
+        bodies = random_bodies(6, 4)
+        points = bodies.sample_surface(300, np.random.default_rng(5))
+        assert points.shape == (6, 300, 3)
+        np.testing.assert_allclose(bodies.gauge(points), 1, atol=1e-9)
+
+    def test_samples_are_uniform_in_area(self) -> None:
+        """Every face of a long, sharp box gets its share of the area, every octant of a body the same count."""
+        box = local([0.1, 0.2, 0.8], [0.02, 0.02])
+        points = np.abs(box.sample_surface(20000, np.random.default_rng(6)) / box.size)
+        on = np.argmax(points, axis=1)
+        area = np.array([0.2 * 0.8, 0.1 * 0.8, 0.1 * 0.2])
+        np.testing.assert_allclose(np.bincount(on) / len(on), area / area.sum(), atol=0.01)
+        octant = (local([0.1, 0.3, 0.2], [0.3, 0.9]).sample_surface(16000, np.random.default_rng(7)) > 0) @ [1, 2, 4]
+        np.testing.assert_allclose(np.bincount(octant) / 2000, 1, atol=0.1)
+
+    def test_normals_are_gradients_of_the_gauge(self) -> None:
+        bodies = random_bodies(10, 8, 0.3, 1.7)
+        points = bodies.sample_surface(40, np.random.default_rng(9))
+        step, numeric = 1e-6, []
+        for axis in np.eye(3):
+            numeric.append((bodies.gauge(points + step * axis) - bodies.gauge(points - step * axis)) / (2 * step))
+        np.testing.assert_allclose(bodies.gauge_gradient(points), np.stack(numeric, axis=-1), rtol=1e-3, atol=1e-3)
+        np.testing.assert_allclose(np.linalg.norm(bodies.normals(points), axis=-1), 1, atol=1e-12)
+
+    def test_sampson_distance_is_the_distance_nearby(self) -> None:
+        bodies = random_bodies(10, 10, 0.5, 1.0)
+        points = bodies.sample_surface(40, np.random.default_rng(11))
+        away = points + 1e-5 * bodies.normals(points)
+        np.testing.assert_allclose(bodies.sampson_distance(away), 1e-5, rtol=0.05)
+
+
+class TestClosedForms:
+    @pytest.mark.parametrize(
+        ("shape", "expected"),
+        [([1, 1], 4 / 3 * np.pi), ([2, 2], 4 / 3), ([1e-3, 1e-3], 8), ([1e-3, 1], 2 * np.pi), ([1e-3, 2], 4)],
+    )
+    def test_known_volumes(self, shape: list[float], expected: float) -> None:
+        """Ellipsoid, octahedron, box, cylinder and square prism."""
+        assert local([0.2, 0.3, 0.5], shape).volume() == pytest.approx(expected * 0.03, rel=3e-3)
+
+    def test_volume_and_moments_are_integrals(self) -> None:
+        bodies = random_bodies(8, 12)
+        axis = (np.arange(80) + 0.5) / 40 - 1
+        unit = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
+        for body in bodies:
+            inside = body.gauge(body.to_parent(unit * body.size)) <= 1
+            cell = np.prod(body.size) / 40**3
+            assert body.volume() == pytest.approx(inside.sum() * cell, rel=0.01)
+            moments = ((unit[inside] * body.size) ** 2).sum(axis=0) * cell
+            np.testing.assert_allclose(body.second_moments(), moments, rtol=0.02)
+
+    def test_support_is_the_farthest_surface_point(self) -> None:
+        bodies = random_bodies(12, 13)
+        rng = np.random.default_rng(14)
+        directions = rng.standard_normal((12, 20, 3))
+        directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
+        angles = np.linspace(-np.pi, np.pi, 721)
+        eta, omega = (g.ravel() for g in np.meshgrid(angles[180:541:3], angles[::3]))
+        points = bodies.parametric_points(eta, omega) - bodies.translation[:, None]
+        farthest = (points @ np.swapaxes(directions, 1, 2)).max(axis=1)
+        support = bodies.support(directions)
+        assert (farthest <= support + 1e-12).all()
+        np.testing.assert_allclose(farthest, support, rtol=0.01)
+
+    def test_bounding_box_holds_the_samples(self) -> None:
+        bodies = random_bodies(10, 15)
+        points = bodies.sample_surface(2000, np.random.default_rng(16))
+        lower, upper = bodies.bounding_box()
+        assert (points >= lower[:, None] - 1e-12).all()
+        assert (points <= upper[:, None] + 1e-12).all()
+
+
+class TestSymmetry:
+    def test_eight_forms_are_one_body(self) -> None:
+        bodies = random_bodies(20, 17)
+        forms = bodies.equivalent_forms()
+        assert forms.batch_shape == (8, 20)
+        points = np.random.default_rng(18).uniform(-1, 1, (20, 100, 3))
+        expected = np.broadcast_to(bodies.gauge(points), (8, 20, 100))
+        np.testing.assert_allclose(forms.gauge(points), expected, rtol=1e-9)
+        flat = np.round(forms.to_flat() * np.sign(forms.rotation[..., 3:]), 9)
+        assert all(len(np.unique(flat[:, k], axis=0)) == 8 for k in range(20))
+
+    def test_canonical_form_is_the_same_for_all_eight(self) -> None:
+        bodies = random_bodies(50, 19)
+        expected = bodies.canonical_form().to_flat()
+        for form in bodies.equivalent_forms():
+            np.testing.assert_allclose(form.canonical_form().to_flat(), expected, atol=1e-9)
+        assert (expected[:, 0] >= expected[:, 1]).all()
+        assert (expected[:, 11] >= 0).all()
+
+    def test_rigid_motion_and_scale_move_the_gauge_along(self) -> None:
+        bodies = random_bodies(10, 20)
+        rng = np.random.default_rng(21)
+        q, t = rotation.random(1, rng)[0], rng.standard_normal(3)
+        points = rng.uniform(-1, 1, (10, 30, 3))
+        moved = 2.5 * points @ rotation.to_matrix(q).T + t
+        np.testing.assert_allclose(bodies.transformed(q, t, 2.5).gauge(moved), bodies.gauge(points), rtol=1e-9)
+
+
+class TestTorch:
+    def test_equals_numpy(self) -> None:
+        bodies = random_bodies(10, 22)
+        tensors = Superquadric.from_flat(torch.tensor(bodies.to_flat()))
+        points = np.random.default_rng(23).uniform(-1, 1, (10, 40, 3))
+        for name in ("gauge", "inside_outside", "gauge_gradient", "support"):
+            value = getattr(tensors, name)(torch.tensor(points)).numpy()
+            np.testing.assert_allclose(value, getattr(bodies, name)(points), rtol=1e-9, err_msg=name)
+
+    def test_gradcheck(self) -> None:
+        bodies = random_bodies(4, 24, 0.3, 1.7)
+        flat = torch.tensor(bodies.to_flat(), requires_grad=True)
+        points = torch.tensor(bodies.sample_surface(5, np.random.default_rng(25)))
+        assert torch.autograd.gradcheck(lambda f: Superquadric.from_flat(f).gauge(points), flat)
+
+    @pytest.mark.parametrize("e", [0.01, 0.1, 1.0, 2.0])
+    def test_gradients_are_finite_on_axes_planes_and_centre(self, e: float) -> None:
+        flat = torch.tensor([[0.2, 0.2, 0.2, e, e, 0, 0, 0, 0, 0, 0, 1.0]], requires_grad=True)
+        grid = torch.tensor([-0.2, 0.0, 0.2, 5.0])
+        points = torch.cartesian_prod(grid, grid, grid)[None].requires_grad_()
+        Superquadric.from_flat(flat).occupancy(points, 10.0).sum().backward()
+        assert torch.isfinite(flat.grad).all()
+        assert torch.isfinite(points.grad).all()
+
+
+class TestKernels:
+    """The compiled copies say what the array statement says."""
+
+    def test_gauge_and_derivatives(self) -> None:
+        bodies = random_bodies(50, 26, 0.1, 1.9)
+        rng = np.random.default_rng(27)
+        for body in bodies:
+            for p in rng.uniform(-0.6, 0.6, (5, 3)) * rng.choice([0.0, 1.0, 1.0], (5, 3)):
+                if not p.any():
+                    continue
+                flat = torch.tensor([*body.size, *body.shape, 0, 0, 0, *IDENTITY], requires_grad=True)
+                point = torch.tensor(p[None], requires_grad=True)
+                g = Superquadric.from_flat(flat).gauge(point)[0]
+                g.backward()
+                compiled = kernels.gauge_derivatives(*p, *body.size, *body.shape)
+                by_size = -p * np.array(compiled[1:4]) / body.size
+                assert compiled[0] == pytest.approx(g.item(), rel=1e-9)
+                assert kernels.gauge(*p, *body.size, *body.shape) == pytest.approx(g.item(), rel=1e-9)
+                nonzero = p != 0
+                np.testing.assert_allclose(np.array(compiled[1:4])[nonzero], point.grad[0].numpy()[nonzero], rtol=1e-7)
+                np.testing.assert_allclose(compiled[4:], flat.grad[3:5].numpy(), rtol=1e-6, atol=1e-9)
+                np.testing.assert_allclose(by_size, flat.grad[:3].numpy(), rtol=1e-7, atol=1e-9)
+
+    def test_rays_meet_the_surface(self) -> None:
+        rng = np.random.default_rng(28)
+        hits = 0
+        for body in random_bodies(200, 29, 0.05, 2.0):
+            origin, direction = rng.standard_normal(3), rng.standard_normal(3)
+            direction -= 0.8 * (origin + direction)
+            hit, first, last = kernels.ray_interval(*origin, *direction, *body.size, *body.shape)
+            t = np.linspace(-5, 10, 4001)
+            moved = Superquadric(body.size, body.shape, np.zeros(3), IDENTITY)
+            g = moved.gauge(origin + t[:, None] * direction)
+            if not hit:
+                assert g.min() > 1 - 1e-3
+                continue
+            hits += 1
+            ends = moved.gauge(origin + np.array([[first], [last]]) * direction)
+            np.testing.assert_allclose(ends, 1, atol=1e-6)
+            assert first <= last
+            assert ((g < 1 - 1e-9) <= ((t >= first) & (t <= last))).all()
+        assert hits > 20
+
+    def test_ray_minimum_is_the_minimum(self) -> None:
+        rng = np.random.default_rng(30)
+        for body in random_bodies(100, 31, 0.1, 1.5):
+            origin, direction = rng.uniform(-0.5, 0.5, 3), rng.standard_normal(3)
+            low, high = np.sort(rng.uniform(-1, 1, 2))
+            g, t = kernels.ray_minimum(low, high, *origin, *direction, *body.size, *body.shape)
+            moved = Superquadric(body.size, body.shape, np.zeros(3), IDENTITY)
+            sampled = moved.gauge(origin + np.linspace(low, high, 2001)[:, None] * direction).min()
+            if sampled < 1 - 1e-6:
+                assert g == pytest.approx(sampled, rel=1e-3)
+                assert low - 1e-9 <= t <= high + 1e-9
+            else:
+                assert g > 1 - 1e-6
+
+
+class TestMisuse:
+    @pytest.mark.parametrize(
+        ("field", "value", "message"),
+        [
+            ("size", [1, 2], r"size: expected shape"),
+            ("size", [1, 2, 0], "positive half sizes"),
+            ("size", [1, 2, np.nan], "finite"),
+            ("shape", [0.5, 2.5], "exponents"),
+            ("rotation", [0, 0, 0, 0], "non-zero length"),
+        ],
+    )
+    def test_says_what_was_expected(self, field: str, value: list[float], message: str) -> None:
+        good = {"size": [1, 1, 1], "shape": [1, 1], "translation": [0, 0, 0], "rotation": [0, 0, 0, 1]}
+        with pytest.raises(ValueError, match=message):
+            Superquadric(**{**good, field: np.array(value, dtype=float)})
+
+    def test_flat_vectors_have_twelve_numbers(self) -> None:
+        with pytest.raises(ValueError, match=r"\(\.\.\., 12\)"):
+            Superquadric.from_flat(np.zeros(11))
+
+
+def test_kept_machine_code_is_bound_to_all_kernel_sources(tmp_path: Path) -> None:
+    """A kernel compiled into another module's function: after an edit of its file alone, the new code must run."""
+    package = tmp_path / "sq_perception"
+    source = Path(kernels.__file__).parents[1]
+    for name in ("__init__.py", "geometry"):
+        target = package / name
+        if (source / name).is_dir():
+            shutil.copytree(source / name, target, ignore=shutil.ignore_patterns("__pycache__"))
+        else:
+            target.parent.mkdir(exist_ok=True)
+            shutil.copy(source / name, target)
+    program = (
+        "import numpy as np; from sq_perception.geometry.metrics import _column;"
+        "body = np.array([1.0, 1, 1, 1, 1, 0, 0, 0]);"
+        "print(_column(body, np.eye(3), 0.0, 0.0, -2.0, 0.5, 9))"
+    )
+    edited = package / "geometry" / "kernels.py"
+    answers = []
+    for _ in range(2):
+        done = subprocess.run(
+            [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, text=True, check=True, timeout=120
+        )
+        answers.append(done.stdout.strip())
+        edited.write_text(edited.read_text().replace("return True, first, -last", "return True, first, first"))
+    assert answers == ["(2, 6)", "(2, 2)"]

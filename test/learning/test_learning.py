@@ -1,0 +1,289 @@
+"""Learning: losses that compare bodies, data that is what it says, a network that learns, files that are safe."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from sq_perception.geometry import Superquadric
+from sq_perception.learning import checkpoint, losses
+from sq_perception.learning.dataset import ViewPool, ViewSource, draw_views
+from sq_perception.learning.dihedral import MIRROR, TURNS, moved_back, moved_bodies, moved_images
+from sq_perception.learning.disturbance import any_occluder
+from sq_perception.learning.objective import UNSUPERVISED, Objective
+from sq_perception.learning.regressor import Regressor, RegressorConfig
+from sq_perception.learning.train import train, validate
+from sq_perception.learning.training_config import TrainingConfig
+from sq_perception.learning.training_state import recalibrate
+from sq_perception.simulation import view_rendering
+from sq_perception.simulation.scenes import thesis_bodies
+
+SMALL = RegressorConfig(pixels=32, widths=(4, 8, 8), blocks=1, hidden=32)
+
+
+def tensors(bodies: Superquadric) -> Superquadric:
+    return Superquadric.from_flat(torch.tensor(bodies.to_flat()))
+
+
+class TestOccupancyLoss:
+    def test_hand_computed(self) -> None:
+        """One point: at the centre of the truth (G = sigma(s)) and on the prediction's surface (G = 1/2)."""
+        q = [0.0, 0, 0, 1]
+        truth = Superquadric.from_flat(torch.tensor([[0.2, 0.2, 0.2, 1, 1, 0, 0, 0, *q]]))
+        moved = Superquadric.from_flat(torch.tensor([[0.2, 0.2, 0.2, 1, 1, 0.2, 0, 0, *q]]))
+        loss = losses.occupancy_loss(moved, truth, torch.zeros(1, 1, 3), 3.0)
+        assert loss.item() == pytest.approx((1 / (1 + np.exp(-3)) - 0.5) ** 2, rel=1e-5)
+
+    def test_zero_for_all_eight_forms(self) -> None:
+        bodies = thesis_bodies(5, np.random.default_rng(0))
+        points = losses.grid(10, dtype=torch.float64)
+        for form in bodies.equivalent_forms():
+            assert losses.occupancy_loss(tensors(form), tensors(bodies), points, 10.0).max() < 1e-18
+
+    def test_full_turn_has_the_period_of_the_body(self) -> None:
+        """Figure 6.2: zero at 0, 180 and 360 degrees, largest at 90; about y (0.1 against 0.3) more than about x."""
+        body = Superquadric(np.array([0.1, 0.2, 0.3]), np.ones(2), np.full(3, 0.5), np.array([0, 0, 0, 1.0]))
+        points = losses.grid(32, dtype=torch.float64)
+        angles = np.deg2rad(np.arange(0, 361, 15))
+        peaks = []
+        for axis in np.eye(3):
+            q = np.concatenate([np.sin(angles / 2)[:, None] * axis, np.cos(angles / 2)[:, None]], axis=1)
+            turned = Superquadric(
+                *(np.broadcast_to(x, (25, len(x))) for x in (body.size, body.shape, body.translation)), q
+            )
+            still = tensors(Superquadric.from_flat(np.broadcast_to(body.to_flat(), (25, 12))))
+            curve = losses.occupancy_loss(tensors(turned), still, points, 20.0).numpy()
+            np.testing.assert_allclose(curve[[0, 12, 24]], 0, atol=1e-12)
+            assert abs(curve[:13].argmax() - 6) <= 1
+            assert abs(curve[12:].argmax() - 6) <= 1
+            peaks.append(curve.max())
+        assert peaks[1] > peaks[2] > peaks[0]
+
+    def test_gradcheck(self) -> None:
+        truth, guess = thesis_bodies(2, np.random.default_rng(1)), thesis_bodies(2, np.random.default_rng(2))
+        points = losses.points_around(tensors(truth), 20, torch.Generator().manual_seed(0)).double()
+        flat = torch.tensor(guess.to_flat(), requires_grad=True)
+        assert torch.autograd.gradcheck(
+            lambda f: losses.occupancy_loss(Superquadric.from_flat(f), tensors(truth), points, 8.0), flat
+        )
+
+
+class TestData:
+    def test_bodies_follow_the_protocol(self) -> None:
+        bodies = thesis_bodies(4000, np.random.default_rng(3))
+        for values, low, high in (
+            (bodies.size * 255, 25, 75),
+            (bodies.shape, 0.1, 1.0),
+            (bodies.translation * 255, 88, 168),
+        ):
+            assert low <= values.min() < low + 0.01 * high
+            assert high - 0.01 * high < values.max() <= high
+            np.testing.assert_allclose(values.mean(axis=0), (low + high) / 2, rtol=0.03)
+
+    def test_dihedral_images_are_images_of_the_dihedral_bodies(self) -> None:
+        rng = np.random.default_rng(4)
+        images, bodies = draw_views(48, rng)
+        turns, mirror = np.arange(48) % 4, np.arange(48) // 4 % 2 == 0
+        turned, moved = moved_images(images, turns, mirror), moved_bodies(bodies, turns, mirror)
+        again, _ = view_rendering.render_views(moved)
+        assert ((again > 0) != (turned > 0)).mean() < 0.001
+        assert np.abs(again - turned)[(again > 0) & (turned > 0)].mean() < 0.004
+
+    def test_every_position_has_a_way_back(self) -> None:
+        bodies = thesis_bodies(8, np.random.default_rng(11))
+        back = moved_back(moved_bodies(bodies, TURNS, MIRROR), TURNS, MIRROR)
+        np.testing.assert_allclose(back.size, bodies.size)
+        np.testing.assert_allclose(back.translation, bodies.translation, atol=1e-12)
+        assert np.abs(np.abs(np.sum(back.rotation * bodies.rotation, axis=-1)) - 1).max() < 1e-12
+
+    def test_pool_pairs_views_with_their_bodies(self) -> None:
+        pool = ViewPool(np.random.default_rng(5), ViewSource(32), capacity=32)
+        images, bodies = pool.batch(16)
+        again, _ = view_rendering.render_views(bodies, 32)
+        assert np.abs(again - images).mean() < 0.01
+
+
+class TestNetwork:
+    def test_outputs_are_bodies_within_bounds(self) -> None:
+        torch.manual_seed(0)
+        bodies = Regressor(SMALL).predict(np.random.default_rng(6).random((5, 32, 32)))
+        assert bodies.batch_shape == (5,)
+        assert (bodies.size >= 0.039).all()
+        assert (bodies.shape >= 0.1).all()
+        assert (bodies.shape <= 1).all()
+        np.testing.assert_allclose(np.linalg.norm(bodies.rotation, axis=1), 1)
+
+    def test_folded_copy_predicts_the_same(self) -> None:
+        torch.manual_seed(2)
+        model = Regressor(SMALL)
+        views = torch.rand(64, 1, 32, 32)
+        model.train()(views)
+        expected = model.eval()(views).to_flat().detach().numpy()
+        np.testing.assert_allclose(model.for_inference().predict(views[:, 0].numpy()).to_flat(), expected, atol=1e-4)
+        np.testing.assert_allclose(model.predict(views[:, 0].numpy()).to_flat(), expected, atol=1e-5)
+
+    @pytest.mark.parametrize("views", [np.zeros((32, 32)), np.zeros((1, 31, 32)), np.full((1, 32, 32), np.nan)])
+    def test_refuses_other_views(self, views: np.ndarray) -> None:
+        with pytest.raises(ValueError, match="expected"):
+            Regressor(SMALL).predict(views)
+
+    @pytest.mark.parametrize(
+        ("name", "source", "hidden", "least", "over_85"),
+        [
+            ("supervised", ViewSource(), 0.0, 0.935, 0.96),
+            ("robust", ViewSource(), 0.0, 0.915, 0.93),
+            ("robust", ViewSource(pinhole_share=1.0), 0.0, 0.905, 0.92),
+            ("robust", ViewSource(), 0.3, 0.85, 0.6),
+        ],
+    )
+    def test_shipped_models_read_unseen_bodies(
+        self, name: str, source: ViewSource, hidden: float, least: float, over_85: float
+    ) -> None:
+        """Networks alone, on bodies of seeds that no training uses."""
+        rng = np.random.default_rng(123456)
+        views, truth = draw_views(300, rng, source, any_occluder(np.full(300, hidden), rng) if hidden else None)
+        iou = validate(checkpoint.load(name), views, truth)
+        assert iou.mean() > least
+        assert (iou > 0.85).mean() > over_85
+
+    def test_names_of_shipped_weights_stand_for_their_files(self, tmp_path: Path) -> None:
+        assert set(checkpoint.shipped()) == {"robust", "supervised"}
+        assert checkpoint.resolve() == checkpoint.shipped()[checkpoint.DEFAULT]
+        assert checkpoint.resolve("supervised").is_file()
+        assert checkpoint.resolve(tmp_path / "supervised.safetensors") == tmp_path / "supervised.safetensors"
+        with pytest.raises(checkpoint.CheckpointError, match="no such model file"):
+            checkpoint.load("unheard-of")
+
+    def test_shipped_weights_say_where_they_come_from(self) -> None:
+        for path in checkpoint.shipped().values():
+            header = checkpoint.read_header(path)
+            made, training = json.loads(header["made"]), json.loads(header["training"])
+            assert made["hours"] > 0
+            assert made["commit"]
+            assert training["seed"]
+            assert json.loads(header["metrics"])["iou"] > 0.9
+            assert path.stat().st_size < 8_000_000
+
+
+class TestTraining:
+    CONFIG = TrainingConfig(steps=40, batch=16, points=64, validation=20, warm_up=5, threads=1)
+
+    def test_learns_and_goes_on_after_a_kill(self, tmp_path: Path) -> None:
+        views, truth = draw_views(60, np.random.default_rng(7), ViewSource(32))
+        before = validate(Regressor(SMALL), views, truth).mean()
+        model = train(self.CONFIG, tmp_path / "whole", SMALL)
+        assert validate(model, views, truth).mean() > before + 0.05
+        records = [json.loads(line) for line in (tmp_path / "whole" / "log.jsonl").read_text().splitlines()]
+        assert [r["step"] for r in records] == [20, 40]
+
+        state = tmp_path / "whole" / "state.safetensors"
+        longer = TrainingConfig(**{**vars(self.CONFIG), "steps": 60})
+        train(longer, tmp_path / "whole", SMALL)
+        records = [json.loads(line) for line in (tmp_path / "whole" / "log.jsonl").read_text().splitlines()]
+        assert [r["step"] for r in records] == [20, 40, 60]
+        assert records[1]["seconds"] < records[2]["seconds"]
+        assert int(load_file(str(state))["step"]) == 60
+
+    @pytest.mark.parametrize("loss", ["dual", "render"])
+    def test_labels_go_to_the_losses_that_need_them_and_to_no_other(
+        self, loss: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        given = []
+        compute = Objective.loss
+
+        def watched(self: Objective, prediction: Superquadric, views: torch.Tensor, truth: Any, *rest: Any) -> Any:
+            given.append(truth is not None)
+            return compute(self, prediction, views, truth, *rest)
+
+        monkeypatch.setattr(Objective, "loss", watched)
+        config = TrainingConfig(**{**vars(self.CONFIG), "loss": loss, "steps": 2})
+        train(config, tmp_path, SMALL)
+        assert given == [loss not in UNSUPERVISED] * 2
+        header = checkpoint.read_header(tmp_path / "model.safetensors")
+        assert json.loads(header["training"])["loss"] == loss
+
+    def test_a_few_views_are_learned_without_labels(self) -> None:
+        """Overfit: 8 views, no labels, and the network's bodies become those of the views."""
+        torch.manual_seed(3)
+        views, truth = draw_views(8, np.random.default_rng(9), ViewSource(32))
+        batch = torch.from_numpy(views)[:, None]
+        model, generator = Regressor(SMALL), torch.Generator().manual_seed(0)
+        objective = Objective("least_squares_free")
+        before = validate(model, views, truth).mean()
+        optimizer = torch.optim.AdamW(model.parameters(), 3e-3)
+        for step in range(200):
+            model.train()
+            optimizer.zero_grad()
+            objective.loss(model(batch), batch, None, step / 200, generator).mean().backward()
+            optimizer.step()
+        recalibrate(model, batch, 8)
+        assert validate(model, views, truth).mean() > max(before + 0.2, 0.7)
+
+
+class TestCheckpoint:
+    def test_round_trip(self, tmp_path: Path) -> None:
+        torch.manual_seed(1)
+        model = Regressor(SMALL)
+        checkpoint.save(tmp_path / "m.safetensors", model, {"metrics": {"iou": 0.5}}, torch.float32)
+        views = np.random.default_rng(8).random((3, 32, 32))
+        again = checkpoint.load(tmp_path / "m.safetensors")
+        assert again.config == SMALL
+        np.testing.assert_array_equal(again.predict(views).to_flat(), model.predict(views).to_flat())
+        assert json.loads(checkpoint.read_header(tmp_path / "m.safetensors")["metrics"]) == {"iou": 0.5}
+
+    def test_says_what_is_wrong_with_a_file(self, tmp_path: Path) -> None:
+        path = tmp_path / "m.safetensors"
+        with pytest.raises(checkpoint.CheckpointError, match="no such model file"):
+            checkpoint.load(path)
+        with pytest.raises(checkpoint.CheckpointError, match=r"no such model file|cannot be read"):
+            checkpoint.check(tmp_path / ("m" * 5000) / "x.safetensors")
+        path.write_bytes(b"not a model")
+        with pytest.raises(checkpoint.CheckpointError, match="not a readable safetensors"):
+            checkpoint.load(path)
+        save_file({"x": torch.zeros(1)}, str(path))
+        with pytest.raises(checkpoint.CheckpointError, match="format"):
+            checkpoint.load(path)
+        checkpoint.save(path, Regressor(SMALL))
+        header, state = checkpoint.read_header(path), load_file(str(path))
+        state.pop("size_head.bias")
+        save_file(state, str(path), metadata=header)
+        with pytest.raises(checkpoint.CheckpointError, match=r"size_head\.bias"):
+            checkpoint.load(path)
+        save_file(state, str(path), metadata={**header, "config": '{"pixels": 100000000, "widths": [9]}'})
+        with pytest.raises(checkpoint.CheckpointError, match="config"):
+            checkpoint.load(path)
+        cut = path.read_bytes()[:-100]
+        path.write_bytes(cut)
+        for reads in (checkpoint.load, checkpoint.check):
+            with pytest.raises(checkpoint.CheckpointError, match="not a readable safetensors"):
+                reads(path)
+        checkpoint.save(path, Regressor(SMALL))
+        checkpoint.check(path)
+
+    def test_the_length_of_a_header_is_believed_only_where_the_file_is_as_long(self, tmp_path: Path) -> None:
+        path = tmp_path / "m.safetensors"
+        for length in (0, 2**20 + 1, 2**40, 2**64 - 1):
+            path.write_bytes(struct.pack("<Q", length) + b"{}")
+            for reads in (checkpoint.load, checkpoint.check, checkpoint.read_header):
+                with pytest.raises(checkpoint.CheckpointError, match="not a readable safetensors"):
+                    reads(path)
+        with path.open("wb") as file:
+            file.truncate(2**34)  # a hole, no bytes
+        with pytest.raises(checkpoint.CheckpointError, match="expected at most"):
+            checkpoint.load(path)
+
+    def test_a_file_that_is_overwritten_leaves_the_network_as_it_was(self, tmp_path: Path) -> None:
+        path, views = tmp_path / "m.safetensors", np.random.default_rng(8).random((2, 32, 32))
+        checkpoint.save(path, Regressor(SMALL))
+        model = checkpoint.load(path)
+        before = model.predict(views).to_flat()
+        with path.open("r+b") as file:
+            file.truncate(100)
+        np.testing.assert_array_equal(model.predict(views).to_flat(), before)

@@ -1,0 +1,298 @@
+"""The network: two backbones with one face, ImageNet weights that fit or are refused, precision, hostile headers."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+from torch.nn import functional
+
+from sq_perception.geometry.metrics import volume_iou
+from sq_perception.learning import checkpoint
+from sq_perception.learning.backbone import ResNet18
+from sq_perception.learning.dataset import draw_views
+from sq_perception.learning.regressor import Regressor, RegressorConfig, load_imagenet
+
+COMPACT = RegressorConfig(pixels=32, widths=(4, 8, 8), blocks=1, hidden=32)
+THESIS = replace(RegressorConfig.thesis(), pixels=64)
+STAGES = {1: (64, 64, 1), 2: (64, 128, 2), 3: (128, 256, 2), 4: (256, 512, 2)}
+"""Channels in, channels out, first stride (He et al. 2016, table 1)."""
+
+
+def torchvision_state(rng: np.random.Generator) -> dict[str, torch.Tensor]:
+    """Random weights under the names and in the shapes of torchvision's resnet18, classifier and counters included."""
+    state = {}
+
+    def convolution(name: str, out: int, into: int, side: int) -> None:
+        spread = np.sqrt(2 / (into * side * side))
+        state[f"{name}.weight"] = torch.tensor(spread * rng.standard_normal((out, into, side, side))).float()
+
+    def norm(name: str, channels: int) -> None:
+        for what, low, high in (
+            ("weight", 0.5, 1),
+            ("bias", -0.1, 0.1),
+            ("running_mean", -1, 1),
+            ("running_var", 1, 2),
+        ):
+            state[f"{name}.{what}"] = torch.tensor(rng.uniform(low, high, channels)).float()
+        state[f"{name}.num_batches_tracked"] = torch.tensor(7)
+
+    convolution("conv1", 64, 3, 7)
+    norm("bn1", 64)
+    for stage, (into, out, stride) in STAGES.items():
+        for block, channels in enumerate((into, out)):
+            name = f"layer{stage}.{block}"
+            convolution(f"{name}.conv1", out, channels, 3)
+            norm(f"{name}.bn1", out)
+            convolution(f"{name}.conv2", out, out, 3)
+            norm(f"{name}.bn2", out)
+        if stride == 2:
+            convolution(f"layer{stage}.0.downsample.0", out, into, 1)
+            norm(f"layer{stage}.0.downsample.1", out)
+    state["fc.weight"], state["fc.bias"] = torch.zeros(1000, 512), torch.zeros(1000)
+    return state
+
+
+def colour_features(state: dict[str, torch.Tensor], images: torch.Tensor) -> torch.Tensor:
+    """Features (n, 512) of colour images (n, 3, p, p): ResNet-18 written down from its weights alone."""
+
+    def norm(name: str, x: torch.Tensor) -> torch.Tensor:
+        mean, var = state[f"{name}.running_mean"], state[f"{name}.running_var"]
+        return functional.batch_norm(x, mean, var, state[f"{name}.weight"], state[f"{name}.bias"])
+
+    x = functional.relu(norm("bn1", functional.conv2d(images, state["conv1.weight"], stride=2, padding=3)))
+    x = functional.max_pool2d(x, 3, stride=2, padding=1)
+    for stage, (_, _, first) in STAGES.items():
+        for block, stride in enumerate((first, 1)):
+            name = f"layer{stage}.{block}"
+            y = functional.conv2d(x, state[f"{name}.conv1.weight"], stride=stride, padding=1)
+            y = functional.conv2d(functional.relu(norm(f"{name}.bn1", y)), state[f"{name}.conv2.weight"], padding=1)
+            if stride == 2:
+                x = norm(f"{name}.downsample.1", functional.conv2d(x, state[f"{name}.downsample.0.weight"], stride=2))
+            x = functional.relu(x + norm(f"{name}.bn2", y))
+    return functional.adaptive_avg_pool2d(x, 1).flatten(1)
+
+
+@pytest.fixture
+def state(rng: np.random.Generator) -> dict[str, torch.Tensor]:
+    return torchvision_state(rng)
+
+
+class TestConfig:
+    def test_the_thesis_network(self) -> None:
+        """Chapter 5.2: 11.2 million weights of ResNet-18 less two colours of the stem, then two layers of 256."""
+        config = RegressorConfig.thesis()
+        assert (config.backbone, config.pixels, config.framing) == ("resnet18", 256, "full")
+        for low, high, (least, most) in ((25, 75, config.size_range), (88, 168, config.translation_range)):
+            assert least < low / 255
+            assert high / 255 < most
+        with torch.device("meta"):
+            model = Regressor(config)
+        count = sum(parameter.numel() for parameter in model.features.parameters())
+        assert count == 11_689_512 - 513 * 1000 - 2 * 64 * 49
+        assert [tuple(layer.weight.shape) for layer in model.mixer if hasattr(layer, "weight")] == [
+            (256, 512),
+            (256, 256),
+        ]
+
+    @pytest.mark.parametrize(
+        ("field", "value"),
+        [
+            ("backbone", "vgg"),
+            ("framing", "round"),
+            ("pixels", 0),
+            ("pixels", 40),
+            ("size_range", (0.0, 1.0)),
+            ("shape_range", (1.0, 0.1)),
+            ("translation_range", (0.0, float("inf"))),
+        ],
+    )
+    def test_refuses_what_no_network_can_be(self, field: str, value: Any) -> None:
+        with pytest.raises(ValueError, match=field):
+            replace(RegressorConfig.thesis(), **{field: value})
+
+    @pytest.mark.parametrize("pixels", [32, 96])
+    def test_any_multiple_of_32_is_a_view_of_resnet18(self, pixels: int) -> None:
+        model = Regressor(replace(THESIS, pixels=pixels))
+        bodies = model.predict(np.random.default_rng(0).random((2, pixels, pixels)))
+        assert bodies.batch_shape == (2,)
+        assert (bodies.size >= 0.049).all()
+        assert (bodies.size <= 0.401).all()
+
+
+class TestImagenet:
+    def test_a_grey_view_is_a_colour_image_of_three_equal_colours(
+        self, state: dict[str, torch.Tensor], rng: np.random.Generator
+    ) -> None:
+        model = Regressor(THESIS).eval()
+        load_imagenet(model, state)
+        views = torch.tensor(rng.random((3, 1, 64, 64))).float()
+        with torch.inference_mode():
+            features = model.features(views)
+            expected = colour_features(state, views.expand(-1, 3, -1, -1))
+            folded = model.for_inference().features(views)
+        assert expected.std() > 0.1
+        torch.testing.assert_close(features, expected, rtol=1e-4, atol=1e-4)
+        torch.testing.assert_close(folded, expected, rtol=1e-3, atol=1e-3)
+
+    def test_through_a_file_and_without_counters(self, state: dict[str, torch.Tensor], tmp_path: Path) -> None:
+        """Torchvision's own files are from before normalisations counted their batches."""
+        kept = {name: tensor for name, tensor in state.items() if "num_batches" not in name}
+        save_file(kept, str(tmp_path / "resnet18.safetensors"))
+        model = Regressor(THESIS)
+        load_imagenet(model, load_file(str(tmp_path / "resnet18.safetensors")))
+        torch.testing.assert_close(model.features.layer4[1].conv2.weight.data, state["layer4.1.conv2.weight"])
+
+    def test_heads_and_mixer_stay(self, state: dict[str, torch.Tensor]) -> None:
+        model = Regressor(THESIS)
+        before = {k: v.clone() for k, v in model.state_dict().items() if not k.startswith("features.")}
+        load_imagenet(model, state)
+        assert all(torch.equal(model.state_dict()[name], tensor) for name, tensor in before.items())
+
+    @pytest.mark.parametrize(
+        ("name", "tensor", "said"),
+        [
+            ("layer2.0.downsample.0.weight", None, r"misses layer2\.0\.downsample\.0\.weight"),
+            ("layer1.2.conv1.weight", torch.zeros(64, 64, 3, 3), r"does not know layer1\.2\.conv1\.weight"),
+            ("conv1.weight", torch.zeros(64, 1, 7, 7), r"conv1\.weight: expected shape \(64, 3, 7, 7\)"),
+            ("layer3.0.bn1.bias", torch.zeros(128), r"layer3\.0\.bn1\.bias: expected shape \(256,\), got \(128,\)"),
+            ("bn1.weight", torch.full((64,), torch.nan), r"bn1\.weight: expected finite"),
+        ],
+    )
+    def test_all_must_fit_or_nothing_changes(
+        self, name: str, tensor: torch.Tensor | None, said: str, state: dict[str, torch.Tensor]
+    ) -> None:
+        state.pop(name, None)
+        if tensor is not None:
+            state[name] = tensor
+        model = Regressor(THESIS)
+        before = {k: v.clone() for k, v in model.state_dict().items()}
+        with pytest.raises(ValueError, match=said):
+            load_imagenet(model, state)
+        assert all(torch.equal(model.state_dict()[k], v) for k, v in before.items())
+
+    def test_only_for_resnet18(self, state: dict[str, torch.Tensor]) -> None:
+        with pytest.raises(ValueError, match="resnet18, got compact"):
+            load_imagenet(Regressor(COMPACT), state)
+
+
+class TestPrecision:
+    @pytest.mark.parametrize("config", [COMPACT, THESIS], ids=["compact", "resnet18"])
+    def test_folded_copies_predict_the_same(self, config: RegressorConfig) -> None:
+        torch.manual_seed(2)
+        model = Regressor(config)
+        views = torch.rand(16, 1, config.pixels, config.pixels)
+        model.train()(views)
+        expected = model.eval()(views).to_flat().detach().numpy()
+        folded = model.for_inference()
+        assert not any(isinstance(module, torch.nn.BatchNorm2d) for module in folded.modules())
+        assert any(isinstance(module, torch.nn.BatchNorm2d) for module in model.modules())
+        np.testing.assert_allclose(folded.predict(views[:, 0].numpy()).to_flat(), expected, atol=2e-4)
+        np.testing.assert_allclose(model.predict(views[:, 0].numpy()).to_flat(), expected, atol=1e-5)
+
+    @pytest.mark.parametrize(("dtype", "mean", "worst"), [(torch.bfloat16, 0.97, 0.9), (torch.float16, 0.99, 0.97)])
+    def test_lower_precision_means_the_same_bodies(self, dtype: torch.dtype, mean: float, worst: float) -> None:
+        model = checkpoint.load()
+        views, _ = draw_views(64, np.random.default_rng(11))
+        lower = model.for_inference(dtype)
+        assert {parameter.dtype for parameter in lower.features.parameters()} == {dtype}
+        assert lower.rotation_head.weight.dtype == torch.float32
+        iou = volume_iou(lower.predict(views), model.for_inference().predict(views))
+        assert iou.mean() > mean
+        assert iou.min() > worst
+
+    @pytest.mark.parametrize("dtype", [torch.float64, torch.int8])
+    def test_refuses_other_types(self, dtype: torch.dtype) -> None:
+        with pytest.raises(ValueError, match="dtype: expected one of"):
+            Regressor(COMPACT).for_inference(dtype)
+
+
+class TestCheckpoint:
+    def test_the_thesis_network_round_trips(self, tmp_path: Path) -> None:
+        torch.manual_seed(1)
+        model = Regressor(THESIS)
+        checkpoint.save(tmp_path / "m.safetensors", model, dtype=torch.float32)
+        again = checkpoint.load(tmp_path / "m.safetensors")
+        assert again.config == THESIS
+        assert isinstance(again.features, ResNet18)
+        assert all(parameter.requires_grad for parameter in again.parameters())
+        views = np.random.default_rng(8).random((2, 64, 64))
+        np.testing.assert_array_equal(again.predict(views).to_flat(), model.predict(views).to_flat())
+
+    def test_files_from_before_there_were_backbones(self, tmp_path: Path) -> None:
+        path = tmp_path / "m.safetensors"
+        model = Regressor(COMPACT)
+        checkpoint.save(path, model, dtype=torch.float32)
+        header, state = checkpoint.read_header(path), load_file(str(path))
+        config = json.loads(header["config"])
+        for name in ("backbone", "framing"):
+            config.pop(name)
+        save_file(state, str(path), metadata={**header, "config": json.dumps(config)})
+        assert checkpoint.load(path).config == COMPACT
+        assert {"features.0.weight", "features.3.first_norm.running_mean", "features.3.shortcut.0.weight"} <= set(state)
+
+    def test_a_loaded_network_does_not_live_in_its_file(self, tmp_path: Path) -> None:
+        path = tmp_path / "m.safetensors"
+        checkpoint.save(path, Regressor(COMPACT), dtype=torch.float32)
+        model = checkpoint.load(path)
+        before = model.size_head.weight.detach().clone()
+        with path.open("r+b") as file:
+            file.seek(-4096, 2)
+            file.write(bytes(4096))
+        assert torch.equal(model.size_head.weight, before)
+
+    @pytest.mark.parametrize("config", [COMPACT, THESIS], ids=["compact", "resnet18"])
+    @pytest.mark.parametrize(
+        "change",
+        [
+            {"hidden": 60_000},
+            {"hidden": 10**30},
+            {"hidden": -3},
+            {"pixels": 2**25},
+            {"pixels": "64"},
+            {"blocks": 10**9},
+            {"widths": [30_000] * 4, "backbone": "compact"},
+            {"widths": [1] * 100_000, "backbone": "compact"},
+            {"widths": [], "backbone": "compact"},
+            {"widths": 4, "backbone": "compact"},
+            {"backbone": "resnet152"},
+            {"framing": None},
+            {"size_range": [0.1]},
+            {"size_range": ["a", "b"]},
+            {"unknown": 1},
+        ],
+        ids=lambda change: " ".join(change) + " " + str(next(iter(change.values())))[:12],
+    )
+    def test_hostile_headers_are_refused_before_they_cost_memory(
+        self, config: RegressorConfig, change: dict[str, Any], tmp_path: Path
+    ) -> None:
+        """Any of these networks in full would take gigabytes, or never end."""
+        header = {"format": checkpoint.FORMAT, "version": checkpoint.VERSION}
+        header["config"] = json.dumps({**asdict(config), **change})
+        save_file({"x": torch.zeros(1)}, str(tmp_path / "m.safetensors"), metadata=header)
+        with pytest.raises(checkpoint.CheckpointError, match="the header's config describes no network"):
+            checkpoint.load(tmp_path / "m.safetensors")
+
+    def test_no_memory_is_taken_that_the_file_does_not_hold(self, tmp_path: Path) -> None:
+        """The largest network that the header may describe, in a file of a few bytes."""
+        config = RegressorConfig(widths=(8, 8, 8, 8), hidden=14_000)
+        header = {"format": checkpoint.FORMAT, "version": checkpoint.VERSION, "config": json.dumps(asdict(config))}
+        save_file({"x": torch.zeros(1)}, str(tmp_path / "m.safetensors"), metadata=header)
+        allocated: list[torch.device] = []
+        linear = torch.nn.Linear.reset_parameters
+
+        def watched(layer: torch.nn.Linear) -> None:
+            allocated.append(layer.weight.device)
+            linear(layer)
+
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(torch.nn.Linear, "reset_parameters", watched)
+            with pytest.raises(checkpoint.CheckpointError, match="the weights do not fit"):
+                checkpoint.load(tmp_path / "m.safetensors")
+        assert {device.type for device in allocated} == {"meta"}

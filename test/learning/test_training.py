@@ -1,0 +1,313 @@
+"""Training runs: configuration, schedules, what is left after a kill or a divergence, several processes."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file, save_file
+
+from sq_perception.geometry.metrics import volume_iou
+from sq_perception.imaging import unit_cube
+from sq_perception.imaging.camera import Camera
+from sq_perception.learning import checkpoint, train, training_config, training_log
+from sq_perception.learning.dataset import full_frames
+from sq_perception.learning.fixed_set import Settings
+from sq_perception.learning.fixed_set_writer import generate
+from sq_perception.learning.regressor import Regressor, RegressorConfig
+from sq_perception.learning.schedule import Cosine, Plateau
+from sq_perception.learning.training_config import TrainingConfig
+from sq_perception.recovery.recoverer import Recoverer
+from sq_perception.simulation.scenes import thesis_bodies
+
+SMALL = RegressorConfig(pixels=32, widths=(4, 8, 8), blocks=1, hidden=32)
+RUN = TrainingConfig(steps=40, batch=16, points=64, validation=20, warm_up=5, threads=1)
+
+
+class TestConfig:
+    @pytest.mark.parametrize("name", training_config.shipped())
+    def test_shipped_files_are_configurations(self, name: str) -> None:
+        assert isinstance(training_config.read(name), TrainingConfig)
+
+    def test_thesis_setting_is_that_of_the_thesis(self) -> None:
+        config = training_config.read("thesis")
+        assert (config.optimizer, config.learning_rate, config.batch) == ("adam", 1e-4, 32)
+        assert isinstance(config.learning_schedule(), Plateau)
+        form = config.regressor()
+        assert (form.backbone, form.pixels, form.framing) == ("resnet18", 256, "full")
+
+    def test_command_line_wins_over_the_file(self, tmp_path: Path) -> None:
+        path = tmp_path / "run.yaml"
+        path.write_text("steps: 10\nlearning_rate: 1e-4\nbatch: 8\n")
+        config = training_config.from_arguments({"config": str(path), "steps": 20})
+        assert (config.steps, config.learning_rate, config.batch) == (20, 1e-4, 8)
+
+    @pytest.mark.parametrize(
+        ("text", "complaint"),
+        [
+            ("stepps: 3", "no setting 'stepps'"),
+            ("steps: many", "steps: expected int"),
+            ("steps: 2.5", "steps: expected int"),
+            ("bfloat16: 1", "bfloat16: expected bool"),
+            ("steps: 0", "at least 1"),
+            ("loss: magic", "loss: expected one of"),
+            ("[1, 2]", "name: value"),
+            ("a: [", "not a YAML file"),
+            ("loss: render\noccluded_share: 0.5", "need a loss with labels"),
+            ("framing: full\npinhole_share: 0.5", "orthographic"),
+            ("!!python/object/apply:os.system ['true']", "not a YAML file"),
+        ],
+    )
+    def test_says_what_is_wrong(self, text: str, complaint: str, tmp_path: Path) -> None:
+        path = tmp_path / "run.yaml"
+        path.write_text(text)
+        with pytest.raises(ValueError, match=complaint):
+            training_config.read(path)
+
+    def test_command_refuses_with_usage(self, capsys: pytest.CaptureFixture[str]) -> None:
+        with pytest.raises(SystemExit) as stop:
+            train.main(["--config", "nowhere.yaml"])
+        assert stop.value.code == 2
+        assert "no such configuration file" in capsys.readouterr().err
+
+
+class TestSchedule:
+    def test_cosine_rises_and_falls_to_zero(self) -> None:
+        schedule = Cosine(2.0, 10, 100)
+        assert schedule.at(0) == pytest.approx(0.2)
+        assert schedule.at(50) == pytest.approx(1.0)
+        assert schedule.at(100) == pytest.approx(0.0, abs=1e-12)
+
+    def test_plateau_divides_after_ten_and_ends_after_twenty(self) -> None:
+        schedule = Plateau(1.0)
+        for loss in (3.0, 2.0):
+            schedule.validated(loss)
+        for _ in range(9):
+            schedule.validated(2.0)
+        assert schedule.at(0) == 1.0
+        schedule.validated(2.5)
+        assert schedule.at(0) == pytest.approx(0.1)
+        continued = Plateau(1.0)
+        continued.restore(schedule.state())
+        for _ in range(10):
+            assert not continued.exhausted
+            continued.validated(2.0)
+        assert continued.exhausted
+        assert continued.at(0) == pytest.approx(0.01)
+        schedule.validated(1.0)
+        assert not schedule.exhausted
+
+    def test_plateau_ends_a_run(self, tmp_path: Path) -> None:
+        """With a rate of almost nothing there is no progress, and a run of a million steps ends soon."""
+        config = replace(RUN, schedule="plateau", learning_rate=1e-12, steps=10**6, validation=2, batch=4, average=0.0)
+        train.train(config, tmp_path, SMALL)
+        records = training_log.read(tmp_path)
+        assert 42 <= records[-1]["step"] < 120
+
+
+class TestInterruptions:
+    def test_terminated_run_goes_on_where_it_stopped(self, tmp_path: Path) -> None:
+        command = [
+            sys.executable,
+            "-m",
+            "sq_perception.commands.main",
+            "train",
+            "--output",
+            str(tmp_path),
+            "--pixels",
+            "16",
+        ]
+        command += ["--batch", "4", "--points", "16", "--validation", "50", "--threads", "1", "--steps", "100000"]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        assert process.stdout is not None
+        first = json.loads(process.stdout.readline())
+        process.send_signal(signal.SIGTERM)
+        _, complaint = process.communicate(timeout=60)
+        assert process.returncode == 130
+        assert "the same command goes on" in complaint
+        state = load_file(str(tmp_path / "state.safetensors"))
+        assert int(state["step"]) >= first["step"] == 50
+        done = int(state["step"])
+        finish = [*command[:-1], str(done + 3)]
+        subprocess.run(finish, check=True, capture_output=True, timeout=120)
+        assert int(load_file(str(tmp_path / "state.safetensors"))["step"]) == done + 3
+
+    def test_killed_run_leaves_whole_files(self, tmp_path: Path) -> None:
+        command = [
+            sys.executable,
+            "-m",
+            "sq_perception.commands.main",
+            "train",
+            "--output",
+            str(tmp_path),
+            "--pixels",
+            "16",
+        ]
+        command += ["--batch", "4", "--points", "16", "--validation", "2", "--threads", "1", "--steps", "100000"]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+        assert process.stdout is not None
+        for _ in range(2):  # what the first line tells of is on disk before the second is said
+            process.stdout.readline()
+        process.kill()
+        process.wait(timeout=30)
+        process.stdout.close()
+        load_file(str(tmp_path / "state.safetensors"))
+        assert json.loads(checkpoint.read_header(tmp_path / "last.safetensors")["metrics"])["step"] >= 2
+        checkpoint.load(tmp_path / "last.safetensors")
+
+    def test_divergence_keeps_the_last_good_state_and_says_so(
+        self, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    ) -> None:
+        train.train(RUN, tmp_path, SMALL)
+        before = (tmp_path / "state.safetensors").read_bytes()
+        draw = train.ViewPool.batch
+
+        def poisoned(self, count):  # type: ignore[no-untyped-def]
+            images, bodies = draw(self, count)
+            return images * float("nan"), bodies
+
+        monkeypatch.setattr(train.ViewPool, "batch", poisoned)
+        with pytest.raises(train.DivergedError, match=r"step 40.*state\.safetensors is the last good one"):
+            train.train(replace(RUN, steps=60), tmp_path, SMALL)
+        assert (tmp_path / "state.safetensors").read_bytes() == before
+        checkpoint.load(tmp_path / "model.safetensors")
+
+    @pytest.mark.parametrize("content", [b"not a state", None])
+    def test_foreign_state_is_refused(self, content: bytes | None, tmp_path: Path) -> None:
+        path = tmp_path / "state.safetensors"
+        if content is None:
+            save_file({"step": torch.tensor(1)}, str(path))
+        else:
+            path.write_bytes(content)
+        with pytest.raises(checkpoint.CheckpointError, match="not the state of such a run"):
+            train.train(RUN, tmp_path, SMALL)
+
+
+class TestLog:
+    def test_of_a_step_validated_twice_the_later_counts(self, tmp_path: Path) -> None:
+        for loss in (2.0, 1.0):
+            log = training_log.TrainingLog(tmp_path, 10, 0)
+            log.record({"step": 5, "loss": loss})
+            log.record({"step": 10, "loss": loss})
+            log.close()
+        assert training_log.read(tmp_path) == [{"step": 5, "loss": 1.0}, {"step": 10, "loss": 1.0}]
+        assert training_log.read(tmp_path / "nowhere") == []
+
+    def test_tensorboard_gets_the_same_numbers(self, tmp_path: Path) -> None:
+        events = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator", reason="no tensorboard")
+        log = training_log.TrainingLog(tmp_path, 10, 0)
+        log.record({"step": 5, "loss": 0.25, "iou": 0.5})
+        log.close()
+        written = events.EventAccumulator(str(tmp_path))
+        written.Reload()
+        assert [(e.step, e.value) for e in written.Scalars("iou")] == [(5, 0.5)]
+        assert [(e.step, e.value) for e in written.Scalars("loss")] == [(5, 0.25)]
+
+
+class TestContinuation:
+    def test_average_follows_and_is_what_is_saved(self, tmp_path: Path) -> None:
+        model = train.train(replace(RUN, average=0.0), tmp_path, SMALL)
+        saved = checkpoint.load(tmp_path / "last.safetensors")
+        state = load_file(str(tmp_path / "state.safetensors"))
+        weight = "size_head.weight"
+        torch.testing.assert_close(saved.state_dict()[weight], model.state_dict()[weight], rtol=0, atol=1e-3)
+        torch.testing.assert_close(state[f"average.{weight}"], state[f"model.{weight}"])
+
+    def test_best_network_is_kept(self, tmp_path: Path) -> None:
+        train.train(RUN, tmp_path, SMALL)
+        records = training_log.read(tmp_path)
+        kept = json.loads(checkpoint.read_header(tmp_path / "model.safetensors")["metrics"])
+        assert kept["iou"] == max(r["iou"] for r in records)
+        header = checkpoint.read_header(tmp_path / "model.safetensors")
+        assert json.loads(header["training"])["steps"] == 40
+        assert json.loads(header["made"])["versions"]["torch"]
+
+    def test_start_from_a_file_keeps_its_form_and_learns_what_hidden_means(self, tmp_path: Path) -> None:
+        checkpoint.save(tmp_path / "start.safetensors", Regressor(SMALL))
+        config = replace(RUN, steps=2, start=str(tmp_path / "start.safetensors"), occluded_share=0.5, noisy_share=0.5)
+        model = train.train(config, tmp_path / "run")
+        assert model.config == replace(SMALL, marks_hidden=True)
+        record = training_log.read(tmp_path / "run")[-1]
+        assert {"iou", "iou_hidden", "iou_worn"} <= set(record)
+
+
+class TestThesisSetting:
+    """ResNet-18 on full frames, here of 64 pixels; drawn on the fly, and from a fixed set."""
+
+    FORM = replace(RegressorConfig.thesis(), pixels=64)
+    RUN = replace(training_config.read("thesis"), steps=3, batch=4, points=32, validation=3, threads=1)
+
+    def test_runs_and_is_recovered_with(self, tmp_path: Path) -> None:
+        train.train(self.RUN, tmp_path, self.FORM)
+        frame = full_frames(thesis_bodies(1, np.random.default_rng(3)))[0]
+        depth = np.where(frame > 0, 1 - frame, np.nan).astype(np.float32)
+        recoverer = Recoverer(tmp_path / "model.safetensors", method="network")
+        body = recoverer.recover(depth, unit_cube.camera()).bodies[0].superquadric
+        model = checkpoint.load(tmp_path / "model.safetensors")
+        # Pixels of both sizes lie at column / (n - 1); nearest neighbours make the small frame of the large one.
+        chosen = np.rint(np.linspace(0, 255, 64)).astype(int)
+        expected = unit_cube.optical_from_cube(model.predict(frame[None][:, chosen][:, :, chosen]))[0]
+        assert volume_iou(body, expected) > 0.999
+
+    def test_a_full_frame_has_no_perspective(self, tmp_path: Path) -> None:
+        checkpoint.save(tmp_path / "model.safetensors", Regressor(self.FORM))
+        recoverer = Recoverer(tmp_path / "model.safetensors", method="network")
+        depth, labels = np.full((48, 64), 0.8, np.float32), np.ones((48, 64), np.int32)
+        with pytest.raises(ValueError, match="orthographic"):
+            recoverer.recover(depth, Camera(64, 48, 50, 50, 32, 24), labels)
+
+    def test_from_a_fixed_set(self, tmp_path: Path) -> None:
+        generate(tmp_path / "set", Settings("full", 64, 8, train=24, test=0, shard=10))
+        train.train(replace(self.RUN, data=str(tmp_path / "set")), tmp_path / "run", self.FORM)
+        assert training_log.read(tmp_path / "run")[-1]["step"] == 3
+        other = replace(RUN, data=str(tmp_path / "set"))
+        with pytest.raises(ValueError, match="expected cropped views of 32 pixels, got full ones of 64"):
+            train.train(other, tmp_path / "other", SMALL)
+
+
+def test_two_processes_learn_one_network(tmp_path: Path) -> None:
+    """torchrun with two processes on the CPU: gradients are averaged, so that both have the same weights all along."""
+    script = tmp_path / "run.py"
+    script.write_text(
+        "import sys\n"
+        "from pathlib import Path\n"
+        "import torch\n"
+        "from safetensors.torch import save_file\n"
+        "from sq_perception.learning import train\n"
+        "from sq_perception.learning.regressor import RegressorConfig\n"
+        "from sq_perception.learning.training_config import TrainingConfig\n"
+        "import os\n"
+        "kept = []\n"
+        "step = torch.optim.AdamW.step\n"
+        "def watched(self, *rest):\n"
+        "    result = step(self, *rest)\n"
+        "    kept[:] = [w.detach().clone().contiguous() for g in self.param_groups for w in g['params']]\n"
+        "    return result\n"
+        "torch.optim.AdamW.step = watched\n"
+        "small = RegressorConfig(pixels=32, widths=(4, 8, 8), blocks=1, hidden=32)\n"
+        "config = TrainingConfig(steps=6, batch=8, points=32, validation=6, warm_up=2, threads=1)\n"
+        "train.train(config, Path(sys.argv[1]) / 'run', small)\n"
+        "save_file({str(k): w for k, w in enumerate(kept)}, f'{sys.argv[1]}/rank{os.environ[\"RANK\"]}.safetensors')\n"
+    )
+    command = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", "--standalone"]
+    done = subprocess.run(
+        [*command, str(script), str(tmp_path)],
+        capture_output=True,
+        text=True,
+        timeout=240,
+        env={**os.environ, "OMP_NUM_THREADS": "1"},
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    weights = [load_file(str(tmp_path / f"rank{rank}.safetensors")) for rank in (0, 1)]
+    for name, first in weights[0].items():
+        torch.testing.assert_close(weights[1][name], first, rtol=0, atol=0)
+    assert len(training_log.read(tmp_path / "run")) == 1

@@ -1,0 +1,285 @@
+"""The demonstration from its parts to real processes: who is paired with whom, what is printed, what is left behind."""
+
+from __future__ import annotations
+
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+import uuid
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="rclpy missing: install the extra 'ros' or source ROS 2")
+
+import sq_perception
+from sq_msgs_py.superquadrics import SuperquadricArray
+from sq_perception.evaluation.comparison import alike, pair
+from sq_perception.evaluation.demo_figure import demo_figure
+from sq_perception.fitting.fit import Status
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging import raycast, unit_cube
+from sq_perception.imaging.camera import Camera
+from sq_perception.nodes import demo_table, fast_dds
+from sq_perception.nodes.children import Children, parameter_arguments
+
+ROOT = str(Path(sq_perception.__file__).parent.parent)
+IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])
+
+
+def boxes(*centres: float) -> Superquadric:
+    """Like boxes of different length beside each other on the x axis."""
+    count = len(centres)
+    size = np.array([[0.03, 0.04, 0.05 + 0.01 * k] for k in range(count)]).reshape(count, 3)
+    translation = np.array([[x, 0.0, 1.0] for x in centres]).reshape(count, 3)
+    return Superquadric(size, np.full((count, 2), 0.3), translation, np.tile(IDENTITY, (count, 1)))
+
+
+def found(bodies: Superquadric, status: int = Status.CONVERGED) -> SuperquadricArray:
+    count = len(bodies)
+    return SuperquadricArray(
+        bodies.size,
+        bodies.shape,
+        bodies.translation,
+        bodies.rotation,
+        np.ones(count),
+        np.full(count, 0.0012),
+        np.zeros((count, 3)),
+        np.arange(1, count + 1),
+        np.full(count, status, dtype=int),
+    )
+
+
+# Pairs
+
+
+def test_the_same_bodies_in_another_order_are_paired_with_full_overlap() -> None:
+    truth = boxes(0.0, 0.3, 0.6)
+    order = np.array([2, 0, 1])
+    pairs = pair(truth, truth[order])
+    assert [(one.truth, one.recovered) for one in pairs] == [(0, 1), (1, 2), (2, 0)]
+    assert [one.iou for one in pairs] == [1.0, 1.0, 1.0]
+
+
+def test_what_is_missing_and_what_is_too_much_is_said() -> None:
+    pairs = pair(boxes(0.0, 0.5), boxes(0.0, 5.0))
+    assert [(one.truth, one.recovered) for one in pairs] == [(0, 0), (1, None), (None, 1)]
+    assert pairs[1].iou is None
+    assert pair(boxes(), boxes(0.0))[0].truth is None
+    assert pair(boxes(0.0), boxes())[0].recovered is None
+
+
+def test_two_blocks_that_overlap_by_half_have_an_iou_of_a_third() -> None:
+    block = Superquadric(np.full((1, 3), 0.1), np.full((1, 2), 0.02), np.zeros((1, 3)), IDENTITY[None])
+    moved = Superquadric(block.size, block.shape, np.array([[0.1, 0.0, 0.0]]), block.rotation)
+    assert pair(block, moved, 96)[0].iou == pytest.approx(1 / 3, abs=0.02)
+
+
+def test_of_the_eight_forms_the_one_like_the_truth_is_shown(rng: np.random.Generator) -> None:
+    body = Superquadric(np.array([0.03, 0.05, 0.04]), np.array([0.4, 0.7]), np.zeros(3), rng.normal(size=4))
+    for form in body.equivalent_forms():
+        shown = alike(form, body)
+        np.testing.assert_allclose(shown.size, body.size)
+        np.testing.assert_allclose(np.abs(shown.rotation @ body.rotation), 1.0)
+
+
+# Table
+
+
+def test_the_lines_say_sizes_overlap_and_delay() -> None:
+    truth = boxes(0.0, 0.3)
+    comparison = demo_table.compare(found(truth), {"recover_node": found(truth), "fitter_node": found(truth[:1])}, "mm")
+    text = demo_table.lines(comparison, "image 7", {"recover_node": [10.0, 20.0, 90.0], "fitter_node": []})
+    assert text.splitlines() == [
+        "image 7",
+        "  1  truth 30 40 50 mm e 0.30 0.30 | CNN + fit 30 40 50 mm e 0.30 0.30 100.0 % "
+        "| classic fit 30 40 50 mm e 0.30 0.30 100.0 %",
+        "  2  truth 30 40 60 mm e 0.30 0.30 | CNN + fit 30 40 60 mm e 0.30 0.30 100.0 % | classic fit not found",
+        "  stamp to result, median: CNN + fit 20 ms, classic fit -",
+    ]
+    assert comparison.overlaps == {"recover_node": [1.0, 1.0], "fitter_node": [1.0, 0.0]}
+
+
+def test_a_failed_body_counts_as_not_found() -> None:
+    truth = boxes(0.0)
+    results = {"recover_node": found(truth, Status.FAILED), "fitter_node": found(boxes())}
+    comparison = demo_table.compare(found(truth), results, "mm")
+    assert [cell.size for cell in comparison.rows[0].methods] == ["not found", "not found"]
+
+
+def test_without_truth_the_residual_stands_in() -> None:
+    results = {"recover_node": found(boxes(0.0)), "fitter_node": found(boxes(0.0, 3.0))}
+    comparison = demo_table.compare(None, results, "mm")
+    assert not comparison.has_truth
+    assert [cell.quality for cell in comparison.rows[0].methods] == ["1.2 mm", "1.2 mm"]
+    assert len(comparison.rows) == 2
+    assert "truth" not in demo_table.lines(comparison, "", {})
+
+
+def test_an_image_without_any_body_has_an_empty_table() -> None:
+    empty = SuperquadricArray.empty()
+    assert demo_table.compare(empty, {"recover_node": empty, "fitter_node": empty}, "mm").rows == ()
+
+
+@pytest.mark.parametrize("count", [0, 2])
+def test_the_figure_is_drawn_whatever_was_found(count: int) -> None:
+    camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+    bodies = list(boxes(*(0.25 * k - 0.1 for k in range(count))))
+    depth = np.full((48, 64), np.nan)
+    if bodies:
+        depth, _ = raycast.render(Superquadric.stack(bodies), camera)
+    figure = demo_figure(depth, camera, bodies, [("a", bodies, ""), ("b", bodies[:1], "")], None, "heading")
+    figure.canvas.draw()
+
+
+# Processes
+
+
+def environment() -> tuple[dict[str, str], str]:
+    """An environment with a mark that all children inherit."""
+    mark = f"SQ_DEMO_TEST={uuid.uuid4().hex}"
+    name, value = mark.split("=")
+    return {**os.environ, name: value, "COLUMNS": "160"}, mark
+
+
+def marked(mark: str) -> dict[int, str]:
+    """Process ids and command lines of all living processes with the mark."""
+    living = {}
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            if mark.encode() in (folder / "environ").read_bytes():
+                living[int(folder.name)] = (folder / "cmdline").read_text()
+        except OSError:
+            continue
+    return living
+
+
+def demo(*arguments: str, env: dict[str, str], cwd: Path) -> subprocess.Popen[str]:
+    code = f"import sys; sys.path[:1] = [{ROOT!r}]; from sq_perception.commands.main import main; sys.exit(main())"
+    return subprocess.Popen(
+        [sys.executable, "-c", code, "demo", *arguments],
+        cwd=cwd,
+        env=env,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+def wait_for(condition: object, seconds: float = 90.0) -> None:
+    assert callable(condition)
+    deadline = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < deadline, "waited in vain"
+        time.sleep(0.1)
+
+
+def test_the_demonstration_shows_draws_and_leaves_nothing_running(tmp_path: Path) -> None:
+    env, mark = environment()
+    process = demo("--seconds", "4", "--output-dir", "out", env=env, cwd=tmp_path)
+    said, _ = process.communicate(timeout=180)
+    assert process.returncode == 0, said
+    assert "Traceback" not in said
+    rows = re.findall(r"truth [\d ]+ mm e .*CNN \+ fit (?:[\d ]+ mm e [\d. ]+ ([\d.]+) %|not found) \| classic", said)
+    assert rows, said
+    assert np.median([float(overlap or 0) for overlap in rows]) > 80, said
+    assert "demo.png" in said
+    picture = cv2.imread(str(tmp_path / "out" / "demo.png"))
+    assert picture.shape[1] > 1000
+    assert (tmp_path / "out" / "demo.glb").read_bytes()[:4] == b"glTF"
+    assert marked(mark) == {}
+
+
+def test_a_recorded_grey_image_is_recognised_and_recovered(tmp_path: Path) -> None:
+    body = Superquadric(np.array([0.2, 0.15, 0.25]), np.array([0.3, 0.5]), np.array([0.5, 0.5, 0.5]),
+                        np.array([0.3, 0.2, 0.1, 0.9]))  # fmt: skip
+    depth, _ = raycast.render(unit_cube.optical_from_cube(body), unit_cube.camera())
+    cv2.imwrite(str(tmp_path / "body.bmp"), unit_cube.grey_from_depth(depth))
+    env, mark = environment()
+    process = demo("--frame", "body.bmp", "--seconds", "1", env=env, cwd=tmp_path)
+    said, _ = process.communicate(timeout=180)
+    assert process.returncode == 0, said
+    sizes = re.search(r"CNN \+ fit ([\d.]+) ([\d.]+) ([\d.]+) e", said)
+    assert sizes is not None, said
+    assert sorted(map(float, sizes.groups())) == pytest.approx([0.15, 0.2, 0.25], abs=0.01)
+    assert (tmp_path / "demo.png").is_file()
+    assert marked(mark) == {}
+
+
+def test_ctrl_c_ends_it_at_any_time_without_a_trace(tmp_path: Path) -> None:
+    env, mark = environment()
+    process = demo("--seconds", "60", env=env, cwd=tmp_path)
+    wait_for(lambda: len(marked(mark)) >= 4)
+    process.send_signal(signal.SIGINT)
+    said, _ = process.communicate(timeout=60)
+    assert process.returncode == 0, said
+    assert "Traceback" not in said
+    assert marked(mark) == {}
+
+
+def test_a_node_that_dies_is_named_and_ends_the_demonstration(tmp_path: Path) -> None:
+    env, mark = environment()
+    process = demo("--seconds", "60", env=env, cwd=tmp_path)
+
+    def victims() -> list[int]:
+        return [pid for pid, command in marked(mark).items() if "nodes.fitter_node" in command]
+
+    wait_for(victims)
+    os.kill(victims()[0], signal.SIGKILL)
+    said, _ = process.communicate(timeout=90)
+    assert process.returncode == 1, said
+    assert "fitter_node has ended with exit code -9" in said
+    assert "Traceback" not in said
+    assert marked(mark) == {}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["--frame", "missing.npz"], "missing.npz: no such file"),
+        (["--frame", "text.npz"], "text.npz"),
+        (["--seconds", "0"], "--seconds: expected a number above 0"),
+    ],
+)
+def test_a_frame_that_cannot_be_read_is_refused_before_anything_starts(
+    arguments: list[str], words: str, tmp_path: Path
+) -> None:
+    (tmp_path / "text.npz").write_text("not a frame")
+    env, _ = environment()
+    process = demo(*arguments, env=env, cwd=tmp_path)
+    said, _ = process.communicate(timeout=60)
+    assert process.returncode == 2, said
+    assert words in said
+    assert "Traceback" not in said
+
+
+def test_a_child_that_cannot_start_says_why() -> None:
+    with Children(fast_dds.environment()) as children:
+        children.start("synthetic_depth_node", parameter_arguments({"rate": -1.0}))
+        wait_for(lambda: children.dead() is not None)
+        ended = children.dead()
+        assert ended is not None
+        assert ended.exit_code == 1
+        assert "rate" in "\n".join(ended.last_lines())
+
+
+def test_a_child_that_does_not_listen_is_killed_and_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    children = Children(fast_dds.environment(), patience=0.5)
+    child = children.start("synthetic_depth_node")
+    monkeypatch.setattr(child, "interrupt", lambda: None)
+    children.stop()
+    assert children.killed == ["synthetic_depth_node"]
+    assert child.exit_code == -signal.SIGKILL
+
+
+def test_the_profile_is_only_set_where_the_user_has_not_chosen_one() -> None:
+    name = fast_dds.VARIABLE
+    assert fast_dds.profile_path().is_file()
+    assert fast_dds.environment({})[name] == str(fast_dds.profile_path())
+    assert fast_dds.environment({name: "mine.xml"}) == {name: "mine.xml"}
+    assert fast_dds.environment({name: "mine.xml"}) == {name: "mine.xml"}

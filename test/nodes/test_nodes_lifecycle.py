@@ -1,0 +1,465 @@
+"""Lifecycle, swaps and several nodes: what an integrator's manager, operator and launch file do to a frame node."""
+
+from __future__ import annotations
+
+import gc
+import threading
+import time
+import weakref
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs the extra 'ros'")
+
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from lifecycle_msgs.msg import Transition, TransitionEvent
+from lifecycle_msgs.srv import ChangeState, GetState
+from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
+from rclpy.experimental.events_executor import EventsExecutor
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from spun_nodes import PATIENCE, SpunNodes
+from std_msgs.msg import Header
+from std_srvs.srv import Trigger
+
+from sq_msgs_py.depth_image import Intrinsics, depth_to_message, intrinsics_to_message
+from sq_msgs_py.superquadrics import from_message
+from sq_perception.fitting.fit import Status
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging.camera import Camera
+from sq_perception.nodes import managed_node
+from sq_perception.nodes.engine import Workshop
+from sq_perception.nodes.frame_node import FrameNode
+from sq_perception.nodes.parameters import RecoverParameters
+from sq_perception.nodes.recover_node import _options
+from sq_perception.recovery.recoverer import FrameRecovery, Recovery
+
+CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+
+
+class Recoverer:
+    """Answers one ball of the size that its model's name says, in centimetres."""
+
+    def __init__(self, model: str) -> None:
+        self.model = model
+        self.error: Exception | None = None
+        self.asked = 0
+        self.at_work = 0
+        self.most_at_work = 0
+        self.duration = 0.0
+
+    def warm_up(self, camera: Camera) -> None:
+        self.warm = camera
+
+    def recover(self, depth: np.ndarray, camera: Camera, labels: Any, options: Any) -> FrameRecovery:
+        self.asked += 1
+        self.at_work += 1
+        self.most_at_work = max(self.most_at_work, self.at_work)
+        time.sleep(self.duration)
+        self.at_work -= 1
+        if self.error is not None:
+            raise self.error
+        size = 0.01 * float(self.model or 1)
+        body = Superquadric(np.full(3, size), np.ones(2), np.array([0.0, 0.0, 0.5]), np.array([0, 0, 0, 1.0]))
+        one = Recovery(body, 0.9, 0.001, np.full(3, 0.001), Status.CONVERGED, "", 1, 100)
+        return FrameRecovery((one,), {"total": 1.0}, np.zeros(depth.shape, np.int32), None, "")
+
+
+class Bench(SpunNodes):
+    """Frame nodes whose recoverers the test makes, and a peer, spun by an executor of the test's choice."""
+
+    def __init__(self, *arguments: str, namespaces: tuple[str, ...] = ("",), executor: Any = None) -> None:
+        super().__init__("-p", "tracking:=false", *arguments)
+        self.made: list[Recoverer] = []
+        self.fault: Exception | None = None
+        self.gate = threading.Event()
+        self.gate.set()
+        workshop = Workshop(
+            make=self._make,
+            options=_options,
+            ingredients=("model", "device", "method"),
+            key=lambda parameters: (id(self), parameters.model, parameters.device),
+            judge=self._judge,
+            describe=lambda parameters: f"model {parameters.model}",
+        )
+        self.events: list[str] = []
+        self.reports: list[DiagnosticStatus] = []
+        self.peer.create_subscription(
+            TransitionEvent, "/recover_node/transition_event", lambda e: self.events.append(e.goal_state.label), 50
+        )
+        self.peer.create_subscription(DiagnosticArray, "/diagnostics", lambda m: self.reports.extend(m.status), 50)
+        self.answers: dict[str, list[PointCloud2]] = {}
+        self.images: dict[str, Any] = {}
+        self.infos: dict[str, Any] = {}
+        for space in namespaces:
+            self.answers[space] = []
+            at = f"/{space}" if space else ""
+            self.images[space] = self.peer.create_publisher(Image, f"{at}/depth/image", 5)
+            self.infos[space] = self.peer.create_publisher(CameraInfo, f"{at}/depth/camera_info", 5)
+            self.peer.create_subscription(
+                PointCloud2, f"{at}/recover_node/superquadrics", self.answers[space].append, 50
+            )
+        self.nodes = [
+            FrameNode("recover_node", RecoverParameters, workshop, namespace=space or None, context=self.context)
+            for space in namespaces
+        ]
+        self.node = self.nodes[0]
+        self.spin(self.nodes, executor)
+        self.stamps = 0
+
+    def _judge(self, parameters: Any, names: frozenset[str]) -> None:
+        if "model" in names and not parameters.model.isdigit():
+            raise ValueError(f"model: {parameters.model} is no model")
+
+    def _make(self, parameters: Any) -> Recoverer:
+        assert self.gate.wait(PATIENCE)
+        if self.fault is not None:
+            raise self.fault
+        self.made.append(Recoverer(parameters.model))
+        return self.made[-1]
+
+    def close(self) -> None:
+        self.gate.set()
+        for node in self.nodes:
+            assert node.close() or not node.is_configured
+        self.finish()
+
+    def change(self, transition: int, label: str = "") -> bool:
+        request = ChangeState.Request(transition=Transition(id=transition, label=label))
+        return bool(self.call(ChangeState, "/recover_node/change_state", request).success)
+
+    def state(self) -> str:
+        return str(self.call(GetState, "/recover_node/get_state", GetState.Request()).current_state.label)
+
+    def active(self) -> Bench:
+        for space, node in zip(self.answers, self.nodes, strict=True):
+            self.until(lambda node=node: node.is_active)
+            self.until(lambda space=space: self.images[space].get_subscription_count() >= 1)
+            self.until(lambda space=space: self.infos[space].get_subscription_count() >= 1)
+            self.until(lambda node=node: node._publisher.superquadrics.get_subscription_count() >= 1)
+        return self
+
+    def publish(self, space: str = "", value: float = 0.5) -> Header:
+        self.stamps += 1
+        header = Header(stamp=Time(sec=1000 + self.stamps), frame_id=f"{space}_camera")
+        known = Intrinsics(CAMERA.width, CAMERA.height, CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy)
+        self.infos[space].publish(intrinsics_to_message(known, header))
+        self.images[space].publish(depth_to_message(np.full((48, 64), value), header))
+        return header
+
+    def answer(self, space: str = "") -> float:
+        """Publish frames until one is answered: the half size of the body, centimetres.
+
+        More than one, as a subscription that has just been made may not be matched yet.
+        """
+        sent: list[Header] = []
+        last = -1.0
+
+        def answered() -> PointCloud2 | None:
+            nonlocal last
+            if time.monotonic() - last > 1.0:
+                sent.append(self.publish(space))
+                last = time.monotonic()
+            return next((one for one in self.answers[space] if one.header in sent), None)
+
+        self.until(answered)
+        message = answered()
+        assert message is not None
+        return round(100 * float(from_message(message).size[0, 0]), 6)
+
+    def report(self, condition: Callable[[DiagnosticStatus], bool]) -> None:
+        self.until(lambda: any(condition(one) for one in self.reports[-3:]))
+
+    def refused(self) -> int:
+        return int(self.node._statistics.snapshot().refused)
+
+
+@pytest.fixture
+def make_bench() -> Iterator[Callable[..., Bench]]:
+    benches: list[Bench] = []
+
+    def make(*arguments: str, **options: Any) -> Bench:
+        benches.append(Bench(*arguments, **options))
+        return benches[-1]
+
+    yield make
+    for bench in benches:
+        bench.close()
+
+
+class TestLifecycle:
+    def test_it_brings_itself_up_and_may_be_led_through_every_state(self, make_bench):
+        bench = make_bench().active()
+        assert bench.answer() == 1.0
+        bench.until(lambda: bench.peer.count_publishers("/recover_node/transition_event") == 1)
+        assert bench.change(Transition.TRANSITION_DEACTIVATE)
+        assert bench.state() == "inactive"
+        bench.until(lambda: bench.events[-2:] == ["deactivating", "inactive"])
+        bench.until(lambda: bench.images[""].get_subscription_count() == 0)
+        refused = bench.call(Trigger, "/recover_node/trigger", Trigger.Request())
+        assert (refused.success, refused.message) == (False, "the node is inactive, not active")
+        assert bench.change(Transition.TRANSITION_ACTIVATE)
+        assert bench.active().answer() == 1.0
+
+        watched = weakref.ref(bench.made[-1])
+        assert bench.change(0, "deactivate")
+        assert bench.change(0, "cleanup")
+        assert bench.state() == "unconfigured"
+        bench.made.clear()
+        gc.collect()
+        assert watched() is None, "the network is still in memory after the cleanup"
+        assert bench.change(Transition.TRANSITION_CONFIGURE)
+        assert bench.change(Transition.TRANSITION_ACTIVATE)
+        assert bench.active().answer() == 1.0
+        assert len(bench.made) == 1
+        assert bench.change(Transition.TRANSITION_ACTIVE_SHUTDOWN)
+        assert bench.state() == "finalized"
+
+    def test_without_autostart_it_waits_and_every_parameter_may_be_set(self, make_bench):
+        bench = make_bench("-p", "autostart:=false")
+        assert bench.state() == "unconfigured"
+        assert not bench.made
+        assert bench.node.set_parameters([Parameter("projection", value="orthographic")])[0].successful
+        assert bench.node.set_parameters([Parameter("projection", value="pinhole")])[0].successful
+        bench.report(lambda one: one.level == DiagnosticStatus.OK and one.message == "unconfigured")
+        assert bench.change(Transition.TRANSITION_CONFIGURE)
+        assert bench.state() == "inactive"
+        refused = bench.node.set_parameters([Parameter("projection", value="orthographic")])[0]
+        assert not refused.successful
+        assert "it is inactive: ros2 lifecycle set /recover_node deactivate, then cleanup" in refused.reason
+        assert bench.change(Transition.TRANSITION_ACTIVATE)
+        assert bench.active().answer() == 1.0
+
+    @pytest.mark.parametrize(
+        ("transition", "label"),
+        [
+            (Transition.TRANSITION_CONFIGURE, ""),
+            (Transition.TRANSITION_ACTIVATE, ""),
+            (Transition.TRANSITION_CLEANUP, ""),
+            (99, ""),
+            (0, ""),
+            (0, "nonsense"),
+            (0, "destroy"),
+        ],
+    )
+    def test_a_transition_that_is_not_allowed_is_refused_and_the_node_goes_on(self, make_bench, transition, label):
+        bench = make_bench().active()
+        assert not bench.change(transition, label)
+        assert bench.state() == "active"
+        assert bench.answer() == 1.0
+
+    def test_services_answer_while_the_model_loads(self, make_bench):
+        bench = make_bench("-p", "autostart:=false")
+        bench.gate.clear()
+        client = bench.peer.create_client(ChangeState, "/recover_node/change_state")
+        bench.until(client.service_is_ready)
+        request = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_CONFIGURE))
+        future = client.call_async(request)
+        bench.until(lambda: bench.node.state == "configuring")
+        started = time.monotonic()
+        assert bench.state() == "configuring"
+        assert time.monotonic() - started < 2.0
+        assert not future.done()
+        bench.gate.set()
+        bench.until(future.done)
+        assert future.result().success
+
+    def test_a_configuration_that_fails_goes_through_the_error_state_and_says_why(self, make_bench):
+        bench = make_bench("-p", "autostart:=false")
+        bench.until(lambda: bench.peer.count_publishers("/recover_node/transition_event") == 1)
+        bench.fault = ValueError("weights.safetensors: no such model file")
+        assert bench.state() == "unconfigured"
+        assert not bench.change(Transition.TRANSITION_CONFIGURE)
+        assert bench.state() == "unconfigured"
+        bench.until(lambda: "unconfigured" in bench.events)
+        assert bench.events == ["configuring", "errorprocessing", "unconfigured"]
+        reason = "cannot configure: weights.safetensors: no such model file"
+        bench.report(lambda one: one.level == DiagnosticStatus.ERROR and one.message == f"unconfigured: {reason}")
+        bench.fault = None
+        assert bench.change(Transition.TRANSITION_CONFIGURE)
+        assert bench.change(Transition.TRANSITION_ACTIVATE)
+        assert bench.active().answer() == 1.0
+        bench.report(lambda one: one.level == DiagnosticStatus.OK)
+
+    def test_an_autostart_that_fails_is_told_to_the_process(self, make_bench):
+        bench = make_bench("-p", "autostart:=false")
+        bench.fault = ValueError("no such file")
+        bench.node.start()
+        bench.until(lambda: bench.node.start_failure)
+        assert bench.node.start_failure == "cannot configure: no such file"
+
+    def test_a_device_that_fails_frame_after_frame_is_started_anew(self, make_bench, monkeypatch):
+        monkeypatch.setattr(managed_node, "_PAUSE", 0.1)
+        bench = make_bench().active()
+        assert bench.answer() == 1.0
+        bench.made[0].error = ZeroDivisionError("device lost")
+        for _ in range(10):
+            before = bench.refused()
+            bench.publish()
+            bench.until(lambda before=before: bench.refused() > before)
+        bench.until(lambda: len(bench.made) == 2)  # another one, though the first is still there to be shared
+        assert bench.active().answer() == 1.0
+        assert bench.node.fault == ""
+
+    def test_a_device_that_does_not_come_back_ends_the_process(self, make_bench, monkeypatch):
+        monkeypatch.setattr(managed_node, "_PAUSE", 0.1)
+        bench = make_bench().active()
+        bench.answer()
+        bench.made[0].error = ZeroDivisionError("device lost")
+        bench.fault = RuntimeError("no device")
+        for _ in range(10):
+            before = bench.refused()
+            bench.publish()
+            bench.until(lambda before=before: bench.refused() > before)
+        bench.until(lambda: bench.node.start_failure)
+        assert bench.node.start_failure == "cannot configure: no device"
+
+    def test_planners_keep_their_obstacles_when_the_camera_fails_but_not_when_it_is_switched_off(
+        self, make_bench, monkeypatch
+    ):
+        monkeypatch.setattr(managed_node, "_PAUSE", 0.1)
+        bench = make_bench().active()
+        withdrawn = []
+        monkeypatch.setattr(bench.node._publisher, "withdraw", lambda: withdrawn.append(bench.node.state))
+        bench.node._fail("device lost")
+        bench.until(lambda: len(bench.made) == 1 and bench.node.state == "unconfigured")
+        bench.active()
+        assert withdrawn == []
+        assert bench.change(Transition.TRANSITION_DEACTIVATE)
+        assert withdrawn == ["deactivating"]
+        assert bench.change(Transition.TRANSITION_ACTIVATE)
+        bench.active()
+        assert bench.node.close()
+        assert bench.node.state == "finalized"
+        assert withdrawn == ["deactivating"]
+
+    def test_bad_frames_are_no_reason_to_start_anew(self, make_bench):
+        bench = make_bench().active()
+        bench.answer()
+        bench.made[-1].error = ValueError("a hard frame")
+        for _ in range(12):
+            before = bench.refused()
+            bench.publish()
+            bench.until(lambda before=before: bench.refused() > before)
+        bench.made[-1].error = None
+        assert bench.answer() == 1.0
+        assert len(bench.made) == 1
+
+
+class TestSwap:
+    def test_a_model_is_swapped_beside_the_work(self, make_bench):
+        bench = make_bench().active()
+        assert bench.answer() == 1.0
+        bench.gate.clear()
+        assert bench.node.set_parameters([Parameter("model", value="3")])[0].successful
+        assert bench.answer() == 1.0, "the old one goes on until the new one is ready"
+        bench.gate.set()
+        bench.until(lambda: bench.node._engine.words == "model 3")
+        assert bench.answer() == 3.0
+        assert bench.made[-1].warm is not None
+
+    def test_a_model_that_cannot_work_is_refused_or_leaves_the_old_one(self, make_bench):
+        bench = make_bench().active()
+        refused = bench.node.set_parameters([Parameter("model", value="bad")])[0]
+        assert (refused.successful, refused.reason) == (False, "model: bad is no model")
+        bench.fault = MemoryError("no room for weights")
+        assert bench.node.set_parameters([Parameter("model", value="4")])[0].successful
+        reason = "cannot change to model 4: no room for weights"
+        bench.report(lambda one: one.level == DiagnosticStatus.WARN and one.message == reason)
+        assert bench.answer() == 1.0
+        bench.fault = None
+        assert bench.node.set_parameters([Parameter("model", value="4")])[0].successful
+        bench.until(lambda: bench.node._engine.words == "model 4")
+        assert bench.answer() == 4.0
+        assert bench.node._engine.fault == ""
+
+    def test_the_last_of_several_swaps_wins(self, make_bench):
+        bench = make_bench().active()
+        bench.gate.clear()
+        for model in ("2", "3", "4", "5"):
+            assert bench.node.set_parameters([Parameter("model", value=model)])[0].successful
+        bench.gate.set()
+        bench.until(lambda: bench.node._engine.words == "model 5")
+        assert bench.answer() == 5.0
+        assert len(bench.made) <= 3, "the first one, the one that was begun, and the last one"
+
+    def test_a_model_that_is_set_while_another_one_is_loaded_follows_it(self, make_bench):
+        bench = make_bench("-p", "autostart:=false")
+        bench.gate.clear()
+        bench.node.start()
+        bench.until(lambda: bench.node.state == "configuring")
+        assert bench.node.set_parameters([Parameter("model", value="6")])[0].successful
+        bench.gate.set()
+        bench.until(lambda: bench.node._engine.words == "model 6")
+        assert bench.active().answer() == 6.0
+
+    def test_what_does_not_concern_the_recoverer_swaps_nothing(self, make_bench):
+        bench = make_bench().active()
+        assert bench.node.set_parameters([Parameter("s", value=3)])[0].successful
+        bench.answer()
+        assert len(bench.made) == 1
+
+
+class TestSeveralCameras:
+    @pytest.mark.parametrize("executor", [SingleThreadedExecutor, MultiThreadedExecutor, EventsExecutor])
+    def test_two_cameras_in_one_process_share_a_recoverer_and_do_not_mix(self, make_bench, executor):
+        if executor is EventsExecutor:
+
+            def made(context: Any) -> Any:
+                return EventsExecutor(context=context)
+        else:
+            made = executor
+        bench = make_bench(namespaces=("front", "wrist"), executor=made).active()
+        assert len(bench.made) == 1
+        bench.made[0].duration = 0.02
+        for _ in range(5):
+            for space in ("front", "wrist"):
+                assert bench.answer(space) == 1.0
+        for space in ("front", "wrist"):
+            assert {one.header.frame_id for one in bench.answers[space]} == {f"{space}_camera"}
+
+    def test_one_frame_at_a_time_and_nobody_starves(self, make_bench):
+        bench = make_bench(namespaces=("front", "wrist")).active()
+        for space in ("front", "wrist"):
+            bench.answer(space)
+        recoverer = bench.made[0]
+        recoverer.duration = 0.02
+        counted = {space: len(bench.answers[space]) for space in bench.answers}
+        answered = dict.fromkeys(counted, 0)
+        deadline = time.monotonic() + PATIENCE
+        while sum(answered.values()) < 40:
+            assert time.monotonic() < deadline, answered
+            for space in ("front", "wrist"):
+                bench.publish(space)
+            time.sleep(0.004)
+            answered = {space: len(bench.answers[space]) - counted[space] for space in bench.answers}
+        assert recoverer.most_at_work == 1
+        assert min(answered.values()) >= 12, answered
+
+    def test_a_swap_on_one_camera_leaves_the_other_alone(self, make_bench):
+        bench = make_bench(namespaces=("front", "wrist")).active()
+        assert bench.nodes[1].set_parameters([Parameter("model", value="7")])[0].successful
+        bench.until(lambda: bench.nodes[1]._engine.words == "model 7")
+        assert (bench.answer("front"), bench.answer("wrist")) == (1.0, 7.0)
+
+
+def test_masks_that_come_later_than_newer_images_are_waited_for(make_bench):
+    from sq_msgs_py.depth_image import labels_to_message
+
+    bench = make_bench("-p", "use_masks:=always", "-p", "patience:=5.0").active()
+    masks = bench.peer.create_publisher(Image, "mask/image", 5)
+    bench.until(lambda: masks.get_subscription_count() == 1)
+    headers = []
+    for number in range(4):
+        headers.append(bench.publish())
+        bench.until(lambda number=number: bench.node._statistics.snapshot().received == number + 1)
+    masks.publish(labels_to_message(np.ones((48, 64), np.int32), headers[1]))
+    bench.until(lambda: [one.header for one in bench.answers[""]] == [headers[1]])
+    masks.publish(labels_to_message(np.ones((48, 64), np.int32), headers[3]))
+    bench.until(lambda: [one.header for one in bench.answers[""]] == [headers[1], headers[3]])
+    counts = bench.node._statistics.snapshot()
+    assert (counts.dropped, counts.refused) == (2, 0)

@@ -1,0 +1,440 @@
+"""What a frame node publishes for other stacks, when, and in which frame."""
+
+from __future__ import annotations
+
+import sys
+import types
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs the extra 'ros'")
+
+import soft_messages
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import TransformStamped
+from std_msgs.msg import Header
+
+from sq_perception.fitting.fit import Status
+from sq_perception.geometry import rotation as quaternions
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging import unit_cube
+from sq_perception.imaging.calibration import Calibration
+from sq_perception.imaging.camera import Camera
+from sq_perception.nodes import results
+from sq_perception.nodes.camera_poses import CameraPoses, PoseError
+from sq_perception.nodes.frame import Frame
+from sq_perception.nodes.identity import Identity
+from sq_perception.nodes.inbox import Refused
+from sq_perception.nodes.outputs import Outputs
+from sq_perception.nodes.parameters import FrameParameters, ParameterError
+from sq_perception.recordings import publication
+from sq_perception.recordings.publication import Identified
+from sq_perception.recovery.recoverer import FrameRecovery, Recovery
+
+CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+HEADER = Header(stamp=Time(sec=10, nanosec=500_000_000), frame_id="camera")
+DEVIATIONS = np.diag(np.square([0.002] * 3 + [0.03] * 2 + [0.001, 0.002, 0.003] + [0.02, 0.03, 0.04]))
+BOX = Superquadric([0.05, 0.04, 0.03], [0.3, 0.6], [0.01, 0.02, 0.6], [0.1, 0.2, 0.3, 0.9])
+CAN = Superquadric([0.03, 0.03, 0.06], [0.1, 1.0], [-0.15, 0.02, 0.7], [0.5, 0.0, 0.1, 0.8])
+TF, DETECTIONS, SCENE = "/tf", "~/detections", "~/planning_scene"
+ALL = FrameParameters(publish_tf=True, publish_detections=True, publish_collision_objects=True)
+
+
+def one(body: Superquadric, label: int, status: Status = Status.CONVERGED) -> Recovery:
+    return Recovery(body, 0.9, 0.001, np.full(3, 0.002), status, "", label, 100, DEVIATIONS)
+
+
+def frame(header: Header = HEADER, camera: Camera = CAMERA) -> Frame:
+    return Frame(
+        header,
+        "32FC1",
+        np.full((camera.height, camera.width), np.nan, np.float32),
+        Calibration(camera, (camera.width, camera.height)),
+    )
+
+
+def recovery(*bodies: Recovery) -> FrameRecovery:
+    return FrameRecovery(bodies, {"total": 1.0}, np.zeros((48, 64), np.int32), None, "")
+
+
+def found(*ids: int, header: Header = HEADER) -> publication.Findings:
+    """Boxes and cans with these ids, and a failed body."""
+    bodies = [one((BOX, CAN)[number % 2], number) for number in ids]
+    failed = one(BOX, 99, Status.FAILED)
+    return publication.findings(Identified(recovery(*bodies, failed), (*ids, 2**31 + 99)), header, is_cube=False)
+
+
+class Publisher:
+    """Notes what is published while ``listeners`` is above 0 or not."""
+
+    def __init__(self, kind: type[Any], topic: str, queue: int) -> None:
+        self.kind, self.topic, self.queue, self.listeners = kind, topic, queue, 1
+        self.sent: list[Any] = []
+
+    def get_subscription_count(self) -> int:
+        return self.listeners
+
+    def publish(self, message: Any) -> None:
+        assert isinstance(message, self.kind)
+        self.sent.append(message)
+
+
+class Node:
+    """The part of a node that outputs and poses touch."""
+
+    def __init__(self) -> None:
+        self.publishers: dict[str, Publisher] = {}
+        self.all: list[Publisher] = []
+        self.warnings: list[str] = []
+
+    def create_publisher(self, kind: type[Any], topic: str, queue: int) -> Publisher:
+        assert topic not in self.publishers
+        self.publishers[topic] = Publisher(kind, topic, queue)
+        self.all.append(self.publishers[topic])
+        return self.publishers[topic]
+
+    def destroy_publisher(self, publisher: Publisher) -> None:
+        assert self.publishers.pop(publisher.topic) is publisher
+
+    def get_logger(self) -> Any:
+        return SimpleNamespace(warning=self.warnings.append)
+
+
+@pytest.fixture
+def node(monkeypatch: pytest.MonkeyPatch) -> Node:
+    soft_messages.install(monkeypatch)
+    return Node()
+
+
+def objects(publisher: Publisher, which: int = -1) -> dict[str, bytes]:
+    """Operation by id of a scene."""
+    return {one.id: one.operation for one in publisher.sent[which].world.collision_objects}
+
+
+# Outputs
+
+
+def test_nothing_is_created_before_it_is_asked_for(node):
+    outputs = Outputs(node)
+    outputs.follow(FrameParameters())
+    outputs.publish(found(1), FrameParameters())
+    assert not node.all
+    assert outputs.absent == ()
+    outputs.publish(found(1), replace(ALL, publish_tf=False))
+    assert {(one.topic, one.queue) for one in node.all} == {(DETECTIONS, 10), (SCENE, 10)}
+    outputs.publish(found(1), ALL)
+    assert node.publishers[TF].queue == 100
+    outputs.publish(found(1), replace(ALL, publish_detections=False))
+    assert set(node.publishers) == {TF, SCENE}
+    outputs.close()
+    assert not node.publishers
+    outputs.close()
+
+
+def test_all_outputs_agree_on_names_poses_and_headers(node):
+    parameters = replace(ALL, tf_prefix="thing")
+    outputs = Outputs(node)
+    outputs.follow(parameters)
+    outputs.publish(found(3, 4), parameters)
+    (tree,), (seen,), (scene,) = (node.publishers[topic].sent for topic in (TF, DETECTIONS, SCENE))
+    for k, body in enumerate((CAN, BOX)):
+        transform, detection, thing = tree.transforms[k], seen.detections[k], scene.world.collision_objects[k]
+        assert transform.child_frame_id == detection.id == thing.id == f"thing{3 + k}"
+        assert transform.header == detection.header == thing.header == HEADER
+        shift, centre = transform.transform.translation, detection.bbox.center.position
+        assert (shift.x, shift.y, shift.z) == (centre.x, centre.y, centre.z)
+        np.testing.assert_allclose([shift.x, shift.y, shift.z], body.translation, atol=1e-7)
+        assert transform.transform.rotation == detection.bbox.center.orientation == thing.pose.orientation
+        assert np.asarray(detection.results[0].pose.covariance)[0] == pytest.approx(1e-6)
+    assert [len(part) for part in (tree.transforms, seen.detections, scene.world.collision_objects)] == [2, 2, 2]
+
+
+def test_only_what_is_heard_is_made(node):
+    outputs = Outputs(node)
+    outputs.follow(ALL)
+    for publisher in node.all:
+        publisher.listeners = 0
+    made = found(1, 2)
+    outputs.publish(made, replace(ALL, collision_shapes="mesh"))
+    assert not any(publisher.sent for publisher in node.all)
+    assert "meshes" not in vars(made), "a mesh costs 1.5 ms"
+    node.publishers[TF].listeners = 2
+    outputs.publish(made, ALL)
+    assert [len(publisher.sent) for publisher in node.all] == [1, 0, 0]
+
+
+def test_gone_objects_are_removed_and_hidden_ones_stay(node):
+    outputs = Outputs(node)
+    outputs.follow(ALL)
+    scene = node.publishers[SCENE]
+    add, remove = soft("moveit_msgs").CollisionObject.ADD, soft("moveit_msgs").CollisionObject.REMOVE
+    outputs.publish(found(1, 2), ALL)
+    assert objects(scene) == {"superquadric_1": add, "superquadric_2": add}
+    outputs.publish(found(1), ALL, hidden=(2, 7))
+    assert objects(scene) == {"superquadric_1": add}
+    outputs.publish(found(1), ALL)
+    assert objects(scene) == {"superquadric_1": add, "superquadric_2": remove}
+    outputs.publish(found(1), ALL)
+    assert objects(scene) == {"superquadric_1": add}
+    # Nobody hears that 1 is gone and that 5 came and went: what the planner may have is removed as soon as one listens.
+    scene.listeners = 0
+    outputs.publish(found(5), ALL)
+    scene.listeners = 1
+    outputs.publish(found(6), ALL)
+    assert objects(scene) == {"superquadric_6": add, "superquadric_1": remove}
+    outputs.publish(found(6), replace(ALL, tf_prefix="new"))
+    assert objects(scene) == {"new6": add, "superquadric_6": remove}
+    count = len(scene.sent)
+    outputs.publish(found(), ALL)
+    outputs.publish(found(), ALL)
+    assert objects(scene) == {"new6": remove}
+    assert len(scene.sent) == count + 1, "no empty scenes"
+
+
+def test_switching_off_removes_and_ending_does_not(node):
+    outputs = Outputs(node)
+    outputs.follow(ALL)
+    scene = node.publishers[SCENE]
+    outputs.publish(found(1, 2), ALL)
+    off = replace(ALL, publish_collision_objects=False)
+    outputs.publish(found(1, 2), off)
+    assert set(objects(scene).values()) == {soft("moveit_msgs").CollisionObject.REMOVE}
+    assert len(objects(scene)) == 2
+    assert SCENE in node.publishers, "the message is still on its way"
+    outputs.publish(found(1, 2), off)
+    assert SCENE not in node.publishers
+    assert len(scene.sent) == 2
+    outputs.publish(found(1), ALL)
+    scene = node.publishers[SCENE]
+    outputs.close()
+    assert len(scene.sent) == 1
+    outputs = Outputs(node)
+    outputs.follow(ALL)
+    outputs.publish(found(1), ALL)
+    outputs.withdraw()
+    outputs.withdraw()
+    assert len(node.publishers[SCENE].sent) == 2
+
+
+def test_meshes_are_of_the_bodies_and_larger_than_they_are(node):
+    parameters = replace(ALL, collision_shapes="mesh")
+    outputs = Outputs(node)
+    outputs.follow(parameters)
+    outputs.publish(found(3, 4), parameters)
+    for thing, body in zip(node.publishers[SCENE].sent[0].world.collision_objects, (CAN, BOX), strict=True):
+        points = np.array([[p.x, p.y, p.z] for p in thing.meshes[0].vertices])
+        gauge = Superquadric(body.size, body.shape, np.zeros(3), [0, 0, 0, 1]).gauge(points)
+        assert 1 < gauge.min() < gauge.max() < 1.03
+
+
+@pytest.mark.parametrize(("package", "topic"), [("tf2_msgs", TF), ("vision_msgs", DETECTIONS), ("moveit_msgs", SCENE)])
+def test_absent_packages_are_named_once_and_the_others_go_on(node, monkeypatch, package, topic):
+    soft_messages.remove(monkeypatch, package)
+    outputs = Outputs(node)
+    outputs.follow(ALL)
+    for _ in range(3):
+        outputs.publish(found(1), ALL)
+    assert outputs.absent == (package,)
+    (warning,) = node.warnings
+    assert f"expected {package}, which cannot be used" in warning
+    assert f"ros-$ROS_DISTRO-{package.replace('_', '-')}" in warning
+    assert set(node.publishers) == {TF, DETECTIONS, SCENE} - {topic}
+    assert all(len(publisher.sent) == 3 for publisher in node.all)
+    outputs.publish(found(1), FrameParameters())
+    assert outputs.absent == (), "nobody asks for it any more"
+
+
+def test_images_without_frame_have_no_transforms_and_no_objects(node):
+    outputs = Outputs(node)
+    outputs.follow(ALL)
+    for _ in range(2):
+        outputs.publish(found(1, header=Header()), ALL)
+    assert [len(node.publishers[topic].sent) for topic in (TF, DETECTIONS, SCENE)] == [0, 2, 0]
+    assert len(node.warnings) == 1
+
+
+def soft(package: str) -> Any:
+    return sys.modules[f"{package}.msg"]
+
+
+# Findings and their frame
+
+
+class Tf2:
+    """Stands for tf2_ros: one transform for each target frame."""
+
+    def __init__(self, **frames: tuple[np.ndarray, np.ndarray]) -> None:
+        self.frames, self.listeners, self.closed = frames, 0, 0
+        self.module: Any = types.ModuleType("tf2_ros")
+        self.module.Buffer = lambda: self
+        self.module.TransformListener = self.listen
+
+    def listen(self, buffer: Any, node: Any) -> Any:
+        self.listeners += 1
+        return SimpleNamespace(unregister=self.unregister)
+
+    def unregister(self) -> None:
+        self.closed += 1
+
+    def lookup_transform(self, target: str, source: str, time: Any, timeout: Any) -> TransformStamped:
+        if target not in self.frames or time.nanoseconds != 10_500_000_000:
+            raise LookupError(f"{target} does not exist")
+        turn, shift = self.frames[target]
+        result = TransformStamped()
+        part = result.transform.rotation
+        part.x, part.y, part.z, part.w = turn
+        result.transform.translation.x, result.transform.translation.y, result.transform.translation.z = shift
+        return result
+
+
+@pytest.fixture
+def tf2(monkeypatch: pytest.MonkeyPatch) -> Tf2:
+    turn = quaternions.from_rotation_vector(np.array([0.3, -1.1, 0.7]))
+    stand_in = Tf2(map=(turn, np.array([1.0, -2.0, 0.5])), base=(np.array([0, 0, 0, 1.0]), np.zeros(3)))
+    monkeypatch.setitem(sys.modules, "tf2_ros", stand_in.module)
+    return stand_in
+
+
+def test_findings_in_another_frame_are_the_bodies_seen_from_there(node, tf2):
+    here = found(1, 2)
+    there = results.in_frame(here, CameraPoses(node), "map")
+    turn, shift = tf2.frames["map"]
+    assert (there.header.frame_id, there.header.stamp) == ("map", HEADER.stamp)
+    assert here.header.frame_id == "camera"
+    for k, body in enumerate((CAN, BOX)):
+        expected = body.transformed(turn, shift)
+        np.testing.assert_allclose(there.array.translation[k], expected.translation, atol=1e-6)
+        assert quaternions.geodesic_angle(there.array.rotation[k].astype(float), expected.rotation) < 1e-5
+        np.testing.assert_array_equal(there.array.size[k], here.array.size[k])
+    np.testing.assert_array_equal(there.array.sigma_size, here.array.sigma_size)
+    assert results.in_frame(here, CameraPoses(node), "") is here
+
+
+def test_markers_follow_the_frame(node, tf2):
+    here = found(1, 2)
+    there = results.in_frame(here, CameraPoses(node), "map")
+    turn, shift = tf2.frames["map"]
+    one, other = (findings.markers() for findings in (here, there))
+    assert {marker.header.frame_id for marker in other.markers} == {"map"}
+    for k in range(4):
+        near, far = (np.array([[p.x, p.y, p.z] for p in array.markers[k].points]) for array in (one, other))
+        np.testing.assert_allclose(near @ quaternions.to_matrix(turn).T + shift, far, atol=1e-6)
+
+
+def test_markers_lie_on_the_bodies(node):
+    """Meshes in the body's frame and back again are those of the body in the frame of the image."""
+    array = found(1, 2).markers((1, 2, 8))
+    assert [(marker.id, marker.ns.split("/")[1], marker.action) for marker in array.markers] == [
+        *((1, "surface", 0), (1, "outline", 0), (2, "surface", 0), (2, "outline", 0)),
+        *((8, "surface", 2), (8, "outline", 2)),
+    ]
+    for marker, body in zip(array.markers[:4], (CAN, CAN, BOX, BOX), strict=True):
+        points = np.array([[p.x, p.y, p.z] for p in marker.points])
+        np.testing.assert_allclose(body.gauge(points), 1, atol=1e-4)
+
+
+def test_covariances_of_poses_are_about_the_axes_of_their_frame(node, tf2):
+    """A body's own rotation vector w is R w about the axes of the frame that R leads to."""
+    here = found(2)
+    assert np.diag(here.covariances[0])[:3] == pytest.approx([1e-6, 4e-6, 9e-6])
+    own = np.diag(np.square([0.02, 0.03, 0.04]))
+    turn = quaternions.to_matrix(BOX.rotation)
+    np.testing.assert_allclose(here.covariances[0][3:, 3:], turn @ own @ turn.T, atol=1e-9)
+    there = results.in_frame(here, CameraPoses(node), "map").covariances[0]
+    matrix = quaternions.to_matrix(tf2.frames["map"][0])
+    np.testing.assert_allclose(there[:3, :3], matrix @ np.diag([1e-6, 4e-6, 9e-6]) @ matrix.T, atol=1e-12)
+    np.testing.assert_allclose(there[3:, 3:], matrix @ turn @ own @ turn.T @ matrix.T, atol=1e-9)
+
+
+def test_findings_of_a_cube_are_in_its_frame():
+    camera = unit_cube.camera(64, 48)
+    body = Superquadric([0.2, 0.15, 0.1], [0.3, 0.6], [0.5, 0.5, 0.5], [0.1, 0.2, 0.3, 0.9])
+    made = publication.findings(Identified(recovery(one(body, 1)), (1,)), HEADER, not camera.is_pinhole)
+    expected = unit_cube.cube_from_optical(body)
+    np.testing.assert_allclose(made.array.translation[0], expected.translation, atol=1e-7)
+    flip = np.diag([1.0, -1, -1])
+    own = np.diag(np.square([0.02, 0.03, 0.04]))
+    turn = flip @ quaternions.to_matrix(body.rotation)
+    np.testing.assert_allclose(made.covariances[0][3:, 3:], turn @ own @ turn.T, atol=1e-9)
+
+
+def test_a_missing_transform_refuses_the_frame(node, tf2, monkeypatch):
+    camera_poses = CameraPoses(node)
+    with pytest.raises(Refused, match="target_frame: expected a transform from 'camera' to 'moon': moon does not"):
+        results.in_frame(found(1), camera_poses, "moon")
+    late = Header(stamp=Time(sec=11), frame_id="camera")
+    with pytest.raises(Refused, match="target_frame"):
+        results.in_frame(found(1, header=late), camera_poses, "map")
+    monkeypatch.setitem(sys.modules, "tf2_ros", None)
+    with pytest.raises(Refused, match="tf2_ros cannot be imported"):
+        results.in_frame(found(1), CameraPoses(node), "map")
+    assert results.in_frame(found(1), CameraPoses(node), "camera").header.frame_id == "camera", "needs no tf2"
+
+
+# Poses of the camera
+
+
+def test_all_frames_share_one_listener_and_none_is_there_before(node, tf2):
+    camera_poses = CameraPoses(node)
+    assert tf2.listeners == 0
+    np.testing.assert_array_equal(camera_poses.at(HEADER, "camera")[1], np.zeros(3))
+    assert tf2.listeners == 0
+    for frame_id in ("map", "base", "map"):
+        turn, shift = camera_poses.at(HEADER, frame_id)
+        np.testing.assert_allclose(turn, tf2.frames[frame_id][0])
+        np.testing.assert_allclose(shift, tf2.frames[frame_id][1])
+    assert tf2.listeners == 1
+    camera_poses.close()
+    camera_poses.close()
+    assert tf2.closed == 1
+    np.testing.assert_allclose(camera_poses.at(HEADER, "map")[1], [1.0, -2.0, 0.5])
+    assert tf2.listeners == 2
+    tf2.frames["map"] = (np.full(4, np.nan), np.zeros(3))
+    with pytest.raises(PoseError, match="no rigid motion"):
+        camera_poses.at(HEADER, "map")
+
+
+def test_another_fixed_frame_is_another_world(node, tf2):
+    said: list[str] = []
+    identity = Identity(CameraPoses(node), lambda *_: None, said.append)
+
+    def ids(fixed: str) -> tuple[int, ...]:
+        return identity.tracked(recovery(one(BOX, 1)), frame(), 0.0, fixed).ids
+
+    assert [ids(fixed) for fixed in ("", "", "map", "map", "base", "")] == [(1,), (1,), (2,), (2,), (3,), (4,)]
+    assert [text.split(":")[0] for text in said] == [
+        *("fixed_frame is map from now on", "fixed_frame is base from now on", "fixed_frame is none from now on")
+    ]
+    assert identity.tally.without_pose == 0
+    identity.tracked(recovery(one(BOX, 1)), frame(), 0.0, "moon")
+    assert identity.tally.without_pose == 1
+
+
+def test_tracks_that_a_frame_does_not_show_are_hidden(node):
+    identity = Identity(CameraPoses(node), lambda *_: None, lambda _: None)
+    first = identity.tracked(recovery(one(BOX, 1), one(CAN, 2)), frame(), 10.0)
+    assert (first.ids, first.hidden) == ((1, 2), ())
+    second = identity.tracked(recovery(one(CAN, 1)), frame(), 10.0)
+    assert (second.ids, second.hidden) == ((2,), (1,))
+    assert identity.untracked(recovery(one(CAN, 1)), frame()).hidden == ()
+
+
+# Parameters
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"target_frame": "/map"},
+        {"fixed_frame": "/map"},
+        {"tf_prefix": "/body"},
+        {"target_frame": "map", "projection": "orthographic"},
+    ],
+)
+def test_frames_that_tf2_would_not_take_are_refused(values):
+    with pytest.raises(ParameterError, match=f"{next(iter(values))}: expected no"):
+        FrameParameters(**values)

@@ -1,0 +1,224 @@
+"""Tracking in a frame node, between real publishers and subscribers: ids, resets, failed bodies, moving cameras."""
+
+from __future__ import annotations
+
+import sys
+import types
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs the extra 'ros'")
+
+from builtin_interfaces.msg import Time
+from diagnostic_msgs.msg import DiagnosticArray
+from geometry_msgs.msg import TransformStamped
+from rclpy.parameter import Parameter
+from std_msgs.msg import Header
+from test_nodes_wiring import CAMERA, FRAME_ID, Bench
+from visualization_msgs.msg import Marker, MarkerArray
+
+from sq_msgs_py.depth_image import depth_to_message
+from sq_perception.fitting.fit import Status
+from sq_perception.geometry import rotation as quaternions
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.nodes.parameters import FrameParameters, ParameterError
+from sq_perception.recovery.recoverer import Recovery
+
+DEVIATIONS = np.diag(np.square([0.002] * 3 + [0.03] * 2 + [0.001] * 3 + [0.02] * 3))
+BOX = Superquadric([0.05, 0.04, 0.03], [0.3, 0.6], [0.01, 0.02, 0.6], [0.1, 0.2, 0.3, 0.9])
+CAN = Superquadric([0.03, 0.03, 0.06], [0.2, 0.9], [-0.15, 0.02, 0.7], [0.5, 0.0, 0.1, 0.8])
+
+
+def recovery(body: Superquadric, label: int, status: Status = Status.CONVERGED) -> Recovery:
+    sigma = np.sqrt(np.diag(DEVIATIONS)[:3])
+    return Recovery(body, 0.9, 0.001, sigma, status, "", label, 100, DEVIATIONS)
+
+
+def grown(body: Superquadric, share: float) -> Superquadric:
+    return Superquadric(body.size * (1 + share), body.shape, body.translation, body.rotation)
+
+
+@pytest.fixture
+def make_bench() -> Iterator[Callable[..., Bench]]:
+    benches: list[Bench] = []
+
+    def make(*arguments: str) -> Bench:
+        benches.append(Bench(*arguments))
+        benches[-1].send_info()
+        return benches[-1]
+
+    yield make
+    for bench in benches:
+        bench.close()
+
+
+def image(sec: float, frame_id: str = FRAME_ID) -> Any:
+    stamp = Time(sec=int(sec), nanosec=round(1e9 * (sec - int(sec))))
+    return depth_to_message(np.full((CAMERA.height, CAMERA.width), np.nan), Header(stamp=stamp, frame_id=frame_id))
+
+
+def diagnostics(bench: Bench) -> Callable[[], dict[str, str]]:
+    reports: list[DiagnosticArray] = []
+    bench.peer.create_subscription(DiagnosticArray, "/diagnostics", reports.append, 5)
+
+    def newest() -> dict[str, str]:
+        before = len(reports)
+        bench.until(lambda: len(reports) > before + 1)
+        return {pair.key: pair.value for pair in reports[-1].status[0].values}
+
+    return newest
+
+
+def test_ids_and_forms_last_and_numbers_are_fused(make_bench):
+    """Labels change places, the fit names the axes anew, a body fails: ids, axes and markers stay."""
+    bench = make_bench()
+    shown: list[MarkerArray] = []
+    bench.peer.create_subscription(MarkerArray, "recover_node/markers", shown.append, 5)
+    bench.until(lambda: bench.node._publisher.markers.get_subscription_count())
+    report = diagnostics(bench)
+
+    bench.recoverer.bodies = (recovery(BOX, 1), recovery(CAN, 2))
+    _, first = bench.answer(image(10.0))
+    assert first.id.tolist() == [1, 2]
+    for k in range(1, 8):
+        other = grown(BOX, 0.03 * (-1) ** k).equivalent_forms()[k]
+        bench.recoverer.bodies = (recovery(CAN, 1), recovery(BOX, 7, Status.FAILED), recovery(other, 2))
+        _, found = bench.answer(image(10 + 0.1 * k))
+        assert found.id.tolist() == [2, 2**31 + 7, 1]
+        assert found.status.tolist() == [0, 2, 0]
+        assert quaternions.geodesic_angle(found.rotation[2].astype(float), first.rotation[0].astype(float)) < 0.01
+        np.testing.assert_allclose(found.size[2], BOX.size, rtol=0.021)
+    assert (found.sigma_size[2] < first.sigma_size[0]).all()
+    bench.until(lambda: len(shown) == 8)
+    colours = {(marker.id, marker.color.r) for array in shown for marker in array.markers if "surface" in marker.ns}
+    assert len(colours) == 2
+    assert {marker.id for marker in shown[-1].markers} == {1, 2}
+
+    bench.recoverer.bodies = (recovery(CAN, 1),)
+    bench.answer(image(11.0))
+    bench.until(lambda: len(shown) == 9)
+    assert {(m.id, m.action) for m in shown[-1].markers} == {(2, Marker.ADD), (1, Marker.DELETE)}
+    values = report()
+    assert [values[name] for name in ("track ids given", "track resets", "frames without camera pose")] == [
+        *("2", "0", "0")
+    ]
+    assert float(values["tracking: median [ms]"]) < 100
+
+
+def test_a_bag_that_begins_again_resets_once(make_bench, capfd):
+    bench = make_bench()
+    report = diagnostics(bench)
+    bench.recoverer.bodies = (recovery(BOX, 1),)
+    assert [bench.answer(image(sec))[1].id.tolist() for sec in (10.0, 10.1, 3.0, 3.1)] == [[1], [1], [2], [2]]
+    values = report()
+    assert (values["tracks"], values["track ids given"], values["track resets"]) == ("1", "2", "1")
+    assert capfd.readouterr().err.count("stamps jumped back to 3.000 s") == 1
+
+
+def test_another_optical_frame_is_another_world_and_no_stamp_is_now(make_bench):
+    bench = make_bench()
+    bench.recoverer.bodies = (recovery(BOX, 1),)
+    assert bench.answer(image(10.0))[1].id.tolist() == [1]
+    assert bench.answer(image(10.1, "another_camera"))[1].id.tolist() == [2]
+    unstamped = [bench.answer(image(0.0, "another_camera"))[1].id.tolist() for _ in range(3)]
+    assert unstamped[0] == unstamped[1] == unstamped[2]
+
+
+def test_without_tracking_ids_are_labels_and_each_frame_stands_for_itself(make_bench):
+    bench = make_bench()
+    bench.recoverer.bodies = (recovery(BOX, 5), recovery(CAN, 9, Status.FAILED))
+    assert bench.answer(image(10.0))[1].id.tolist() == [1, 2**31 + 9]
+    assert bench.node.set_parameters([Parameter("tracking", value=False)])[0].successful
+    bench.recoverer.bodies = (recovery(grown(BOX, 0.05), 5), recovery(CAN, 9, Status.FAILED))
+    _, found = bench.answer(image(10.1))
+    assert found.id.tolist() == [5, 9]
+    np.testing.assert_allclose(found.size[0], 1.05 * BOX.size, rtol=1e-6)
+    assert bench.node.set_parameters([Parameter("tracking", value=True)])[0].successful
+    assert bench.answer(image(10.2))[1].id.tolist() == [2, 2**31 + 9]
+
+
+def test_a_tracker_that_cannot_go_on_costs_one_frame(make_bench):
+    bench = make_bench()
+    bench.recoverer.bodies = (recovery(BOX, 1),)
+    bench.answer(image(10.0))
+    broken = recovery(BOX, 1)
+    object.__setattr__(broken, "covariance", np.eye(3))
+    bench.recoverer.bodies = (broken,)
+    assert "tracking: covariance" in bench.send(image(10.1)).last_error
+    bench.recoverer.bodies = (recovery(BOX, 1),)
+    assert bench.answer(image(10.2))[1].id.tolist() == [2]
+
+
+class Tf2:
+    """Stands for tf2_ros: poses by stamp."""
+
+    def __init__(self) -> None:
+        self.module: Any = types.ModuleType("tf2_ros")
+        self.poses: dict[float, tuple[np.ndarray, np.ndarray]] = {}
+        self.asked: list[tuple[str, str]] = []
+        self.cleared = 0
+        self.module.Buffer = lambda: self
+        self.module.TransformListener = lambda buffer, node: types.SimpleNamespace(unregister=lambda: None)
+
+    def lookup_transform(self, target: str, source: str, time: Any, timeout: Any) -> TransformStamped:
+        self.asked.append((target, source))
+        seconds = time.nanoseconds * 1e-9
+        known = next((pose for stamp, pose in self.poses.items() if abs(stamp - seconds) < 1e-6), None)
+        if known is None:
+            raise RuntimeError("would require extrapolation into the future")
+        result = TransformStamped()
+        result.transform.rotation.x, result.transform.rotation.y, result.transform.rotation.z, _ = known[0]
+        result.transform.rotation.w = known[0][3]
+        result.transform.translation.x, result.transform.translation.y, result.transform.translation.z = known[1]
+        return result
+
+    def clear(self) -> None:
+        self.cleared += 1
+
+
+def test_a_camera_that_moves_is_looked_up(make_bench, monkeypatch, capfd):
+    """Bodies at rest in the fixed frame: fused where the pose is known, ids alone where it is not."""
+    tf2 = Tf2()
+    monkeypatch.setitem(sys.modules, "tf2_ros", tf2.module)
+    bench = make_bench("-p", "fixed_frame:=map")
+    report = diagnostics(bench)
+    for k in range(6):
+        turn, shift = quaternions.from_rotation_vector(np.array([0.0, 0.03 * k, 0.0])), np.array([0.02 * k, 0.0, 0.0])
+        if k != 4:
+            tf2.poses[10 + 0.1 * k] = turn, shift
+        back = quaternions.conjugate(turn)
+        seen = grown(BOX, 0.03 * (-1) ** k).transformed(back, -quaternions.to_matrix(back) @ shift)
+        bench.recoverer.bodies = (recovery(seen, 1),)
+        _, found = bench.answer(image(10 + 0.1 * k))
+        assert found.id.tolist() == [1]
+        np.testing.assert_allclose(found.translation[0], seen.translation, atol=2e-3)
+        error = np.abs(found.size[0] / BOX.size - 1).max()
+        assert error == pytest.approx(0.03, abs=1e-4) if k in (0, 4) else error < 0.029
+    assert tf2.asked[0] == ("map", FRAME_ID)
+    values = report()
+    assert (values["frames without camera pose"], values["track ids given"]) == ("1", "1")
+    assert capfd.readouterr().err.count("no camera pose in fixed_frame, nothing is fused: would require") == 1
+    bench.answer(image(5.0))
+    assert tf2.cleared == 1
+
+
+def test_without_tf2_ids_remain(make_bench, monkeypatch, capfd):
+    monkeypatch.setitem(sys.modules, "tf2_ros", None)
+    bench = make_bench("-p", "fixed_frame:=map")
+    for k, share in enumerate((0.0, 0.05)):
+        bench.recoverer.bodies = (recovery(grown(BOX, share), 4),)
+        _, found = bench.answer(image(10 + k))
+        assert found.id.tolist() == [1]
+        np.testing.assert_allclose(found.size[0], (1 + share) * BOX.size, rtol=1e-6)
+    assert bench.node._publisher.tally.without_pose == 2
+    assert "tf2_ros cannot be imported" in capfd.readouterr().err
+
+
+def test_a_cube_has_no_fixed_frame_and_no_budget_is_endless():
+    with pytest.raises(ParameterError, match="fixed_frame"):
+        FrameParameters(projection="orthographic", fixed_frame="map")
+    assert FrameParameters().seconds == np.inf
+    assert FrameParameters(time_budget=0.05).seconds == 0.05

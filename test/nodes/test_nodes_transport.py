@@ -1,0 +1,171 @@
+"""Packed images between nodes: topics as image_transport names them, and the synthetic camera that sends them."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+import yaml
+
+pytest.importorskip("rclpy", reason="needs the extra 'ros'")
+
+from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from std_msgs.msg import Header
+
+from sq_msgs_py.depth_image import depth_from_message, depth_to_message, labels_from_message
+from sq_perception.imaging.calibration import Calibration
+from sq_perception.imaging.camera import Camera
+from sq_perception.imaging.distortion import Distortion
+from sq_perception.imaging.rectification import Rectification
+from sq_perception.nodes import transport
+from sq_perception.nodes.frame_source import FrameSource
+from sq_perception.nodes.parameters import ParameterError, SyntheticParameters
+from sq_perception.nodes.synthetic_publisher import SyntheticDepthNode
+
+PATIENCE = 20.0
+LENS = Distortion("plumb_bob", (-0.2, 0.05, 0.001, -0.001, 0.0))
+
+
+@pytest.fixture
+def distorted_camera(tmp_path):
+    path = tmp_path / "lens.yaml"
+    k = [262.0, 0, 159.5, 0, 262.0, 119.5, 0, 0, 1]
+    path.write_text(yaml.safe_dump({"width": 320, "height": 240, "k": k, "d": list(LENS.coefficients)}))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("rules", "packed"),
+    [
+        ([], "/depth/image/compressedDepth"),
+        (["-r", "depth/image:=/camera/depth/image_rect_raw"], "/camera/depth/image_rect_raw/compressedDepth"),
+        (["-r", "depth/image:=/camera/image_rect/compressedDepth"], "/camera/image_rect/compressedDepth"),
+        (["-r", "__ns:=/robot"], "/robot/depth/image/compressedDepth"),
+    ],
+)
+def test_topics_follow_the_image_s(rules, packed):
+    context = Context()
+    context.init(args=["--ros-args", *rules])
+    node = Node("listener", context=context)
+    try:
+        assert transport.topic(node, "depth/image", "compressedDepth") == packed
+        assert transport.topic(node, "depth/image", "raw") == node.resolve_topic_name("depth/image")
+    finally:
+        node.destroy_node()
+        context.try_shutdown()
+    assert transport.message_type("raw") is Image
+    assert transport.message_type("compressedDepth") is CompressedImage
+
+
+def test_packed_and_plain_are_read_alike(rng):
+    depth = (rng.integers(300, 3000, (12, 16)) / 1000).astype(np.float32)
+    depth[3, 4] = np.nan
+    header = Header(frame_id="camera")
+    for message in (depth_to_message(depth, header, "16UC1"), transport.packed(depth, header, "16UC1")):
+        found, encoding = transport.depth_of(message)
+        np.testing.assert_array_equal(found, depth)
+        assert found.dtype == np.float32
+        assert encoding == "16UC1"
+        assert transport.size_of(message) == (16, 12)
+        assert message.header == header
+    hostile = transport.packed(depth, header)
+    hostile.data = hostile.data[:40]
+    with pytest.raises(ValueError, match="not readable"):
+        transport.depth_of(hostile)
+    hostile.format = "jpeg"
+    for read in (transport.depth_of, transport.size_of):
+        with pytest.raises(ValueError, match="format: expected"):
+            read(hostile)
+
+
+class Heard:
+    """Everything that a synthetic camera with these parameters sends, by stamp."""
+
+    def __init__(self, **parameters) -> None:
+        self.context = Context()
+        rules = [argument for name, value in parameters.items() for argument in ("-p", f"{name}:={value}")]
+        self.context.init(args=["--ros-args", *rules])
+        self.peer = Node("peer", context=self.context)
+        self.messages: dict[str, dict] = {}
+        topics = {
+            "depth/image": Image,
+            "depth/image/compressedDepth": CompressedImage,
+            "depth/camera_info": CameraInfo,
+            "mask/image": Image,
+        }
+        for topic, kind in topics.items():
+            self.messages[topic] = {}
+            self.peer.create_subscription(kind, topic, lambda message, topic=topic: self.keep(topic, message), 20)
+        self.node = SyntheticDepthNode("synthetic", context=self.context)
+        self.executor = SingleThreadedExecutor(context=self.context)
+        self.executor.add_node(self.node)
+        self.executor.add_node(self.peer)
+
+    def keep(self, topic, message) -> None:
+        self.messages[topic][message.header.stamp.sec, message.header.stamp.nanosec] = message
+
+    def together(self, *topics):
+        """The first messages of the topics with a common stamp."""
+        deadline = time.monotonic() + PATIENCE
+        while time.monotonic() < deadline:
+            self.executor.spin_once(timeout_sec=0.2)
+            common = set.intersection(*(set(self.messages[topic]) for topic in topics))
+            if common:
+                return [self.messages[topic][min(common)] for topic in topics]
+        raise AssertionError("waited in vain")
+
+    def close(self) -> None:
+        self.executor.shutdown()
+        self.node.destroy_node()
+        self.peer.destroy_node()
+        self.context.try_shutdown()
+
+
+@pytest.fixture
+def hear() -> Iterator:
+    opened = []
+
+    def make(**parameters) -> Heard:
+        opened.append(Heard(**parameters))
+        return opened[-1]
+
+    yield make
+    for one in opened:
+        one.close()
+
+
+def test_a_distorting_synthetic_camera_sends_raw_images_packed_and_plain(hear, distorted_camera):
+    """Read back by the rule, they are what the rectified camera saw."""
+    parameters = {"camera_info_file": str(distorted_camera), "masks": "always", "rate": 5.0}
+    heard = hear(**parameters, image_transport="compressedDepth", encoding="16UC1")
+    topics = ("depth/image", "depth/image/compressedDepth", "depth/camera_info", "mask/image")
+    image, packed, info, mask = heard.together(*topics)
+    np.testing.assert_array_equal(transport.depth_of(packed)[0], depth_from_message(image))
+    calibration = Calibration.of(info, "/depth/image")
+    assert calibration.rectification == Rectification(Camera(320, 240, 262.0, 262.0, 159.5, 119.5), LENS)
+    assert transport.size_of(packed) == calibration.size == (320, 240)
+    true = FrameSource(SyntheticParameters(**parameters)).next(0.0)
+    found = calibration.rectified(depth_from_message(image))
+    both = np.isfinite(found) & np.isfinite(true.depth)
+    assert both.mean() > 0.85
+    assert np.median(np.abs(found - true.depth)[both]) < 1e-3
+    labels = calibration.rectified_labels(labels_from_message(mask))
+    assert (labels == true.labels).mean() > 0.99
+
+
+def test_a_plain_synthetic_camera_packs_nothing(hear):
+    heard = hear(rate=5.0)
+    _, info = heard.together("depth/image", "depth/camera_info")
+    assert not any(info.d)
+    assert not heard.messages["depth/image/compressedDepth"]
+    assert not heard.peer.get_publishers_info_by_topic("/depth/image/compressedDepth")
+
+
+def test_grey_images_are_not_packed():
+    with pytest.raises(ParameterError, match="image_transport: expected raw for grey images"):
+        SyntheticParameters(scene="thesis", image_transport="compressedDepth")

@@ -1,0 +1,569 @@
+"""The frame node between real publishers and subscribers, around a recoverer that does what the test says."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs the extra 'ros'")
+
+from builtin_interfaces.msg import Time
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSProfile, QoSReliabilityPolicy
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from spun_nodes import PATIENCE, SpunNodes
+from std_msgs.msg import Header
+from std_srvs.srv import SetBool, Trigger
+from visualization_msgs.msg import Marker, MarkerArray
+
+from sq_msgs_py.depth_image import (
+    Intrinsics,
+    depth_from_message,
+    depth_to_message,
+    grey_to_message,
+    intrinsics_to_message,
+    labels_to_message,
+)
+from sq_msgs_py.superquadrics import SuperquadricArray, from_message
+from sq_perception.fitting.fit import Status
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging import unit_cube
+from sq_perception.imaging.camera import Camera
+from sq_perception.nodes.engine import Workshop
+from sq_perception.nodes.frame_node import FrameNode
+from sq_perception.nodes.parameters import RecoverParameters
+from sq_perception.nodes.recover_node import _options
+from sq_perception.recovery.recoverer import FrameRecovery, Recovery
+
+CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+FRAME_ID = "some_camera_optical_frame"
+
+
+def ball(label: int = 1, status: Status = Status.CONVERGED) -> Recovery:
+    body = Superquadric(np.full(3, 0.1), np.ones(2), np.array([0.01, 0.02, 0.5]), np.array([0, 0, 0, 1.0]))
+    return Recovery(body, 0.9, 0.001, np.full(3, np.nan), status, "", label, 100)
+
+
+class Recoverer:
+    """Notes what it is asked, and answers ``bodies``, or raises, once ``gate`` is open."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[np.ndarray, Camera, np.ndarray | None, Any]] = []
+        self.bodies: tuple[Recovery, ...] = (ball(),)
+        self.error: Exception | None = None
+        self.gate = threading.Event()
+        self.gate.set()
+
+    def warm_up(self, camera: Camera) -> None:
+        self.warm = camera
+
+    def recover(self, depth: np.ndarray, camera: Camera, labels: np.ndarray | None, options: Any) -> FrameRecovery:
+        self.asked.append((depth, camera, labels, options))
+        assert self.gate.wait(PATIENCE)
+        if self.error is not None:
+            raise self.error
+        return FrameRecovery(self.bodies, {"total": 1.0}, np.zeros(depth.shape, np.int32), None, "")
+
+
+class Bench(SpunNodes):
+    """A frame node and a peer that publishes to it and listens, spun in the background."""
+
+    def __init__(self, *arguments: str) -> None:
+        super().__init__(*arguments)
+        self.recoverer = Recoverer()
+        workshop = Workshop(make=lambda _: self.recoverer, options=_options)
+        self.node = FrameNode("recover_node", RecoverParameters, workshop, context=self.context)
+        self.images = self.peer.create_publisher(Image, "depth/image", 5)
+        self.infos = self.peer.create_publisher(CameraInfo, "depth/camera_info", 5)
+        self.answers: list[PointCloud2] = []
+        self.peer.create_subscription(PointCloud2, "recover_node/superquadrics", self.answers.append, 10)
+        self.spin([self.node])
+        self.until(lambda: self.node.is_active)
+        if self.node._settings.current.image_transport == "raw":
+            self.until(lambda: self.images.get_subscription_count() == 1)
+        self.until(lambda: self.node._publisher.superquadrics.get_subscription_count() == 1)
+        self.stamps = 0
+
+    def close(self) -> None:
+        self.recoverer.gate.set()
+        assert self.node.close()
+        self.finish()
+
+    @property
+    def counts(self) -> Any:
+        return self.node._statistics.snapshot()
+
+    def header(self) -> Header:
+        self.stamps += 1
+        return Header(stamp=Time(sec=1000 + self.stamps, nanosec=7), frame_id=FRAME_ID)
+
+    def depth(self, camera: Camera = CAMERA, value: float = 0.5) -> Image:
+        return depth_to_message(np.full((camera.height, camera.width), value), self.header())
+
+    def send_info(self, camera: Camera = CAMERA) -> None:
+        """Publish a camera_info and wait until the node has it."""
+        known = Intrinsics(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+        self.put_info(intrinsics_to_message(known, self.header()))
+
+    def put_info(self, message: CameraInfo) -> None:
+        self.until(lambda: self.infos.get_subscription_count() == 1)
+        before = sum(1 for _ in self.node._inbox._infos)
+        assert before < self.node._inbox._infos.maxlen
+        self.infos.publish(message)
+        self.until(lambda: len(self.node._inbox._infos) > before)
+
+    def send(self, message: Image) -> Any:
+        """Publish an image and wait for its verdict: the counts after it."""
+        before = self.counts
+        self.images.publish(message)
+        self.until(lambda: self.counts.received > before.received and self.counts.in_work == 0)
+        return self.counts
+
+    def answer(self, message: Image) -> tuple[PointCloud2, SuperquadricArray]:
+        """Publish a good image; the published result."""
+        before = len(self.answers)
+        self.send(message)
+        self.until(lambda: len(self.answers) > before)
+        return self.answers[-1], from_message(self.answers[-1])
+
+
+@pytest.fixture
+def make_bench() -> Iterator[Callable[..., Bench]]:
+    benches: list[Bench] = []
+
+    def make(*arguments: str) -> Bench:
+        benches.append(Bench(*arguments))
+        return benches[-1]
+
+    yield make
+    for bench in benches:
+        bench.close()
+
+
+@pytest.fixture
+def bench(make_bench: Callable[..., Bench]) -> Bench:
+    one = make_bench()
+    one.send_info()
+    return one
+
+
+def test_stamp_frame_and_numbers_arrive(bench):
+    image = bench.depth()
+    message, found = bench.answer(image)
+    assert message.header == image.header
+    np.testing.assert_allclose(found.translation, [[0.01, 0.02, 0.5]])
+    np.testing.assert_allclose(found.size, 0.1)
+    assert np.isnan(found.sigma_size).all()
+    assert (found.id.tolist(), found.status.tolist()) == ([1], [0])
+    depth, camera, labels, options = bench.recoverer.asked[-1]
+    assert camera == CAMERA
+    assert labels is None
+    assert (depth == np.float32(0.5)).all()
+    assert (options.method, options.refine, options.sharpness, options.tau) == ("auto", "surface", 117.3, 4.82)
+
+
+def test_millimetres_become_metres_and_zero_is_no_reading(bench):
+    depth = np.full((48, 64), 0.731)
+    depth[0] = np.nan
+    bench.answer(depth_to_message(depth, bench.header(), "16UC1"))
+    seen = bench.recoverer.asked[-1][0]
+    assert np.isnan(seen[0]).all()
+    np.testing.assert_allclose(seen[1:], 0.731, atol=1e-6)
+
+
+def test_big_endian_and_padded_rows_are_read(bench):
+    depth = np.random.default_rng(0).uniform(0.3, 2, (48, 64)).astype(np.float32)
+    rows = np.zeros((48, 64 + 3), ">f4")
+    rows[:, :64] = depth
+    message = bench.depth()
+    message.is_bigendian, message.step, message.data = 1, 4 * 67, rows.tobytes()
+    bench.answer(message)
+    np.testing.assert_array_equal(bench.recoverer.asked[-1][0], depth)
+
+
+def broken(name: str, message: Image) -> Image:
+    """The image with one thing wrong."""
+    if name == "encoding":
+        message.encoding = "yuv422"
+    elif name == "empty encoding":
+        message.encoding = ""
+    elif name == "colour":
+        message.encoding, message.step = "rgb8", 192
+    elif name == "grey":
+        message.encoding, message.step, message.data = "mono8", 64, bytes(64 * 48)
+    elif name == "short step":
+        message.step -= 1
+    elif name == "long step":
+        message.step += 4
+    elif name == "zero step":
+        message.step = 0
+    elif name == "short data":
+        message.data = message.data[:-1]
+    elif name == "no data":
+        message.data = []
+    elif name == "height":
+        message.height += 1
+    elif name == "huge":
+        message.height = message.width = message.step = 2**32 - 1
+    elif name == "empty":
+        message.height = message.width = message.step = 0
+        message.data = []
+    return message
+
+
+BROKEN = {
+    "encoding": "encoding: expected 16UC1 or 32FC1, got 'yuv422'",
+    "empty encoding": "encoding",
+    "colour": "encoding",
+    "grey": "projection = orthographic",
+    "short step": "step",
+    "long step": "data",
+    "zero step": "step",
+    "short data": "data",
+    "no data": "data",
+    "height": "data",
+    "huge": "step",
+    "empty": "image size",
+}
+
+
+def test_broken_images_are_refused_with_a_reason_and_the_node_goes_on(bench):
+    for number, (name, words) in enumerate(BROKEN.items(), start=1):
+        counts = bench.send(broken(name, bench.depth()))
+        assert counts.refused == number, name
+        assert words in counts.last_error, name
+    assert not bench.recoverer.asked
+    assert not bench.answers
+    _, found = bench.answer(bench.depth())
+    assert len(found) == 1
+    assert bench.counts.answered == 1
+
+
+def test_without_camera_info_the_reason_names_the_topic_and_who_publishes_it(make_bench):
+    bench = make_bench()
+    counts = bench.send(bench.depth())
+    assert counts.refused == 1
+    assert "/depth/camera_info" in counts.last_error
+    assert "none came" in counts.last_error
+    assert "1 publisher: /peer" in counts.last_error
+
+
+def test_a_useless_camera_info_refuses_frames_until_a_good_one_comes(make_bench):
+    bench = make_bench()
+    bench.put_info(CameraInfo())
+    assert "is for 0 x 0" in bench.send(bench.depth()).last_error
+    zero = CameraInfo(width=64, height=48)
+    bench.put_info(zero)
+    assert "not calibrated" in bench.send(bench.depth()).last_error
+    zero.k = [float("nan")] * 9
+    bench.put_info(zero)
+    assert "finite" in bench.send(bench.depth()).last_error
+    bench.send_info(Camera(32, 24, 30.0, 30.0, 15.5, 11.5))
+    bench.send_info()
+    assert len(bench.answer(bench.depth())[1]) == 1
+    assert bench.counts.refused == 3
+
+
+def test_frames_may_change_their_size(bench):
+    small = Camera(20, 10, 33.0, 33.0, 9.5, 4.5)
+    bench.send_info(small)
+    for camera in (CAMERA, small, CAMERA, small):
+        bench.answer(bench.depth(camera))
+        assert bench.recoverer.asked[-1][1] == camera
+    other = Camera(21, 10, 33.0, 33.0, 9.5, 4.5)
+    assert "expected one for 21 x 10 pixels, the last one is for 20 x 10" in bench.send(bench.depth(other)).last_error
+
+
+def test_a_camera_info_that_comes_after_its_image_is_waited_for(make_bench):
+    bench = make_bench()
+    bench.node._on_image(bench.depth())
+    bench.send_info()
+    bench.until(lambda: bench.counts.answered == 1)
+    assert bench.counts.refused == 0
+
+
+def test_the_newest_frame_wins_and_every_frame_is_accounted_for(bench):
+    bench.recoverer.gate.clear()
+    bench.images.publish(bench.depth())
+    bench.until(lambda: len(bench.recoverer.asked) == 1)
+    for number in range(2, 8):
+        bench.images.publish(bench.depth(value=0.1 * number))
+        bench.until(lambda number=number: bench.counts.received == number)
+    assert bench.counts.in_work == 2
+    bench.recoverer.gate.set()
+    bench.until(lambda: bench.counts.in_work == 0)
+    counts = bench.counts
+    assert (counts.received, counts.answered, counts.dropped, counts.refused) == (7, 2, 5, 0)
+    assert bench.recoverer.asked[-1][0][0, 0] == np.float32(0.7)
+
+
+def test_a_defect_costs_one_frame_and_not_the_node(bench):
+    bench.recoverer.error = ZeroDivisionError("made up")
+    counts = bench.send(bench.depth())
+    assert (counts.refused, counts.last_error) == (1, "ZeroDivisionError: made up")
+    bench.recoverer.error = ValueError("no good")
+    assert bench.send(bench.depth()).last_error == "no good"
+    bench.recoverer.error = None
+    assert len(bench.answer(bench.depth())[1]) == 1
+
+
+def test_no_bodies_is_an_answer(bench):
+    bench.recoverer.bodies = ()
+    message, found = bench.answer(bench.depth(value=float("nan")))
+    assert len(found) == 0
+    assert message.width == 0
+
+
+def test_parameters_take_effect_with_the_next_frame(bench):
+    bench.answer(bench.depth())
+    values = {"s": 3, "tau": 2.5, "refine": "none", "depth_min": 0.2, "depth_max": 3, "max_objects": 4}
+    values["time_budget"] = 0.5
+    for result in bench.node.set_parameters([Parameter(name, value=value) for name, value in values.items()]):
+        assert result.successful, result.reason
+    assert not bench.node.set_parameters([Parameter("s", value=-1.0)])[0].successful
+    bench.answer(bench.depth())
+    before, after = (asked[3] for asked in bench.recoverer.asked)
+    assert (before.sharpness, before.depth_range) == (117.3, (0.0, np.inf))
+    assert (after.sharpness, after.tau, after.refine) == (3.0, 2.5, "none")
+    assert (after.depth_range, after.max_objects, after.time_budget) == ((0.2, 3.0), 4, 0.5)
+    assert before.time_budget == np.inf
+
+
+def test_enable_and_trigger(bench):
+    answer = bench.call(SetBool, "/recover_node/enable", SetBool.Request(data=False))
+    assert answer.success
+    counts = bench.send(bench.depth())
+    assert (counts.answered, counts.dropped) == (0, 1)
+
+    client = bench.peer.create_client(Trigger, "/recover_node/trigger")
+    bench.until(client.service_is_ready)
+    first, second = client.call_async(Trigger.Request()), client.call_async(Trigger.Request())
+    bench.until(lambda: len(bench.node._triggers) == 2)
+    bench.send(bench.depth())
+    bench.until(lambda: first.done() and second.done())
+    assert first.result().success
+    assert first.result().message.startswith("1 body in 1 ms; 1: a = 0.1000 0.1000 0.1000, e = 1.00 1.00, score 0.90")
+    assert bench.send(bench.depth()).dropped == 2
+
+    refused = client.call_async(Trigger.Request())
+    bench.until(lambda: bench.node._triggers)
+    bench.send(broken("short data", bench.depth()))
+    bench.until(refused.done)
+    assert not refused.result().success
+    assert "data" in refused.result().message
+
+    assert bench.call(SetBool, "/recover_node/enable", SetBool.Request(data=True)).success
+    assert len(bench.answer(bench.depth())[1]) == 1
+
+
+def test_a_trigger_without_a_frame_answers_in_time_and_nothing_else_waits(make_bench):
+    bench = make_bench("-p", "trigger_timeout:=1.0")
+    bench.send_info()
+    client = bench.peer.create_client(Trigger, "/recover_node/trigger")
+    bench.until(client.service_is_ready)
+    future = client.call_async(Trigger.Request())
+    bench.until(lambda: bench.node._triggers)
+    assert bench.call(SetBool, "/recover_node/enable", SetBool.Request(data=True)).success
+    bench.until(future.done)
+    assert not future.result().success
+    assert "no frame on /depth/image within 1 s" in future.result().message
+    assert "/peer" in future.result().message
+    assert len(bench.answer(bench.depth())[1]) == 1
+
+
+def test_after_disable_nothing_is_published_any_more(bench):
+    bench.answer(bench.depth())
+    bench.recoverer.gate.clear()
+    bench.images.publish(bench.depth())
+    bench.until(lambda: len(bench.recoverer.asked) == 2)
+    bench.images.publish(bench.depth())
+    bench.until(lambda: bench.counts.received == 3)
+    assert bench.call(SetBool, "/recover_node/enable", SetBool.Request(data=False)).success
+    bench.recoverer.gate.set()
+    bench.until(lambda: bench.counts.in_work == 0)
+    assert (bench.counts.answered, bench.counts.dropped) == (1, 2)
+    assert len(bench.answers) == 1
+
+
+def test_a_clock_that_stands_still_stops_neither_diagnostics_nor_triggers(make_bench):
+    from diagnostic_msgs.msg import DiagnosticArray
+
+    bench = make_bench("-p", "use_sim_time:=true", "-p", "trigger_timeout:=0.5")
+    reports: list[DiagnosticArray] = []
+    bench.peer.create_subscription(DiagnosticArray, "/diagnostics", reports.append, 5)
+    answer = bench.call(Trigger, "/recover_node/trigger", Trigger.Request())
+    assert (answer.success, answer.message.split(":")[0]) == (False, "no frame on /depth/image within 0.5 s")
+    bench.until(lambda: reports)
+
+
+def test_triggers_leave_nothing_behind(bench):
+    bench.answer(bench.depth())
+    client = bench.peer.create_client(Trigger, "/recover_node/trigger")
+    bench.until(client.service_is_ready)
+
+    def entities() -> int:
+        return len(bench.node.default_callback_group.entities) + len(list(bench.node.timers))
+
+    before = entities()
+    for _ in range(20):
+        future = client.call_async(Trigger.Request())
+        bench.until(lambda: len(bench.node._triggers) == 1)
+        bench.send(bench.depth())
+        bench.until(future.done)
+        assert future.result().success
+    assert entities() == before
+
+
+def test_masks_without_a_stamp_belong_to_no_image(bench):
+    masks = bench.peer.create_publisher(Image, "mask/image", 5)
+    bench.until(lambda: masks.get_subscription_count() == 1)
+    bench.node._inbox.put_mask(labels_to_message(np.ones((48, 64), np.int32), Header()))
+    image = bench.depth()
+    image.header = Header(frame_id=FRAME_ID)
+    bench.answer(image)
+    assert bench.recoverer.asked[-1][2] is None
+
+
+def test_masks_of_the_same_stamp_are_used(bench):
+    masks = bench.peer.create_publisher(Image, "mask/image", 5)
+    bench.until(lambda: masks.get_subscription_count() == 1 and bench.node.count_publishers("/mask/image"))
+    image = bench.depth()
+    labels = np.zeros((48, 64), np.int32)
+    labels[3:9, 4:8] = 7
+    masks.publish(labels_to_message(labels, image.header))
+    bench.answer(image)
+    np.testing.assert_array_equal(bench.recoverer.asked[-1][2], labels)
+
+    masks.publish(labels_to_message(labels, bench.header()))
+    bench.answer(bench.depth())
+    assert bench.recoverer.asked[-1][2] is None
+
+    image = bench.depth()
+    masks.publish(labels_to_message(labels[:10], image.header))
+    assert "mask: expected the size of the depth image, 64 x 48, got 64 x 10" in bench.send(image).last_error
+
+    assert bench.node.set_parameters([Parameter("use_masks", value="always")])[0].successful
+    assert "use_masks is always" in bench.send(bench.depth()).last_error
+
+    assert bench.node.set_parameters([Parameter("use_masks", value="never")])[0].successful
+    image = bench.depth()
+    masks.publish(labels_to_message(labels, image.header))
+    bench.answer(image)
+    assert bench.recoverer.asked[-1][2] is None
+
+
+def test_pictures_are_made_while_somebody_listens_and_stale_markers_go(bench):
+    assert bench.node.set_parameters([Parameter("tracking", value=False)])[0].successful
+    bench.recoverer.bodies = (ball(1), ball(5), ball(6, Status.FAILED))
+    assert len(bench.answer(bench.depth())[1]) == 3
+    shown: list[MarkerArray] = []
+    rendered: list[Image] = []
+    bench.peer.create_subscription(MarkerArray, "recover_node/markers", shown.append, 5)
+    bench.peer.create_subscription(Image, "recover_node/rendered_depth", rendered.append, 5)
+    bench.until(
+        lambda: (
+            bench.node._publisher.markers.get_subscription_count()
+            and bench.node._publisher.rendered_depth.get_subscription_count()
+        )
+    )
+    assert not shown
+    image = bench.depth()
+    bench.answer(image)
+    bench.until(lambda: shown and rendered)
+    assert sorted({marker.id for marker in shown[0].markers}) == [1, 5]
+    assert all(marker.header == image.header for marker in shown[0].markers)
+    depth = depth_from_message(rendered[0])
+    assert rendered[0].header == image.header
+    assert np.nanmin(depth) == pytest.approx(0.4, abs=2e-3)
+    assert np.isnan(depth).any()
+
+    bench.recoverer.bodies = (ball(5),)
+    bench.answer(bench.depth())
+    bench.until(lambda: len(shown) == 2)
+    actions = {(marker.id, marker.action) for marker in shown[1].markers}
+    assert actions == {(5, Marker.ADD), (1, Marker.DELETE)}
+
+
+def test_orthographic_frames_need_no_camera_info_and_answer_in_the_cube_frame(make_bench):
+    bench = make_bench("-p", "projection:=orthographic")
+    assert bench.recoverer.warm == unit_cube.camera()
+    rendered: list[Image] = []
+    bench.peer.create_subscription(Image, "recover_node/rendered_depth", rendered.append, 5)
+    bench.until(lambda: bench.node._publisher.rendered_depth.get_subscription_count())
+    for dtype in (np.uint8, np.uint16):
+        grey = np.zeros((32, 32), dtype)
+        grey[8:20, 8:20] = 0.75 * np.iinfo(dtype).max
+        image = grey_to_message(grey, bench.header())
+        before = len(rendered)
+        message, found = bench.answer(image)
+        assert message.header == image.header
+        np.testing.assert_allclose(found.translation, [[0.01, 1 - 0.02, 1 - 0.5]], rtol=1e-6)
+        depth, camera, _, _ = bench.recoverer.asked[-1]
+        assert camera == unit_cube.camera(32)
+        assert np.nanmax(depth) == pytest.approx(0.25, abs=4e-3)
+        assert np.isnan(depth[0]).all()
+        bench.until(lambda before=before: len(rendered) > before)
+        assert rendered[-1].encoding == image.encoding
+    assert "projection = pinhole" in bench.send(bench.depth()).last_error
+    one = grey_to_message(np.ones((1, 1), np.uint8), bench.header())
+    assert "2 x 2 pixels" in bench.send(one).last_error
+
+
+def test_a_publisher_that_cannot_be_heard_is_named(make_bench):
+    bench = make_bench("-p", "qos_overrides./depth/image.subscription.reliability:=reliable")
+    deaf = QoSProfile(depth=1, reliability=QoSReliabilityPolicy.BEST_EFFORT)
+    bench.peer.create_publisher(Image, "depth/image", deaf)
+    bench.until(lambda: bench.node.count_publishers("/depth/image") == 2)
+    words = bench.node._heard(bench.node._image_input)
+    assert words.startswith("2 publishers: ")
+    assert words.count("INCOMPATIBLE") == 1
+    assert "best effort" in words
+
+
+def test_diagnostics_count_and_warn(bench):
+    from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+
+    reports: list[DiagnosticArray] = []
+    bench.peer.create_subscription(DiagnosticArray, "/diagnostics", reports.append, 5)
+    bench.answer(bench.depth())
+    long_ago = bench.node._statistics.snapshot().latency
+    assert "stamp to result" not in long_ago, "the stamp of an old recording says nothing about latency"
+    image = bench.depth()
+    image.header.stamp = bench.node.get_clock().now().to_msg()
+    bench.answer(image)
+    bench.send(broken("encoding", bench.depth()))
+
+    def latest() -> tuple[DiagnosticStatus, dict[str, str]]:
+        status = reports[-1].status[0]
+        return status, {pair.key: pair.value for pair in status.values}
+
+    bench.until(lambda: reports and latest()[1]["received"] == "3")
+    status, values = latest()
+    assert status.hardware_id == "/recover_node"
+    assert (values["answered"], values["dropped"], values["refused"], values["lost"]) == ("2", "0", "1", "0")
+    assert "yuv422" in values["last error"]
+    assert float(values["stamp to result: median [ms]"]) > 0
+    assert {"wait: p95 [ms]", "recovery: total: median [ms]", "publish: median [ms]"} <= set(values)
+    assert any(report.status[0].level == DiagnosticStatus.WARN for report in reports)
+
+
+def test_lost_messages_are_counted_and_the_remedy_is_named(bench, capfd):
+    bench.node._on_lost(SimpleNamespace(total_count=3, total_count_change=3))
+    bench.node._on_lost(SimpleNamespace(total_count=5, total_count_change=2))
+    assert bench.counts.lost == 5
+    said = capfd.readouterr().err
+    assert said.count("FASTRTPS_DEFAULT_PROFILES_FILE") == 1
+
+
+def test_silence_is_reported(make_bench):
+    from diagnostic_msgs.msg import DiagnosticArray
+
+    bench = make_bench("-p", "no_frame_warning:=0.5")
+    reports: list[DiagnosticArray] = []
+    bench.peer.create_subscription(DiagnosticArray, "/diagnostics", reports.append, 5)
+    bench.until(lambda: reports and reports[-1].status[0].message == "no depth images arrive")

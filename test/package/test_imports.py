@@ -1,0 +1,190 @@
+"""The house rules: imports run one way, and importing does nothing but import."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+import sq_msgs_py
+import sq_perception
+
+PERCEPTION = Path(sq_perception.__file__).parent
+MESSAGES = Path(sq_msgs_py.__file__).parent
+PACKAGES = (PERCEPTION, MESSAGES)
+
+# Floor by floor, from the ground up; a module may import from its own floor and from those below it.
+FLOORS = (
+    ("geometry", "files"),
+    ("imaging", "tracking"),
+    ("segmentation", "simulation"),
+    ("learning", "fitting"),
+    ("recovery", "viewing"),
+    ("recordings",),
+    ("evaluation",),
+    ("nodes",),
+    ("commands",),
+)
+ROS = ("rclpy", "sensor_msgs", "std_msgs", "std_srvs", "visualization_msgs", "diagnostic_msgs", "geometry_msgs",
+       "rcl_interfaces", "lifecycle_msgs", "builtin_interfaces", "shape_msgs", "tf2_ros", "tf2_msgs", "vision_msgs",
+       "moveit_msgs")  # fmt: skip
+
+
+def sources() -> list[Path]:
+    return [path for package in PACKAGES for path in sorted(package.rglob("*.py"))]
+
+
+def imports(path: Path) -> Iterator[tuple[str, bool]]:
+    """Full names a file imports, wherever in it, and whether the statement runs when the module is imported."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    inner = {node for scope in ast.walk(tree) if isinstance(scope, ast.FunctionDef) for node in ast.walk(scope)}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                yield alias.name, node not in inner
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            for alias in node.names:
+                yield f"{node.module}.{alias.name}", node not in inner
+
+
+def roots(path: Path) -> set[str]:
+    return {name.split(".")[0] for name, _ in imports(path)}
+
+
+def is_node(path: Path) -> bool:
+    return (PERCEPTION / "nodes") in path.parents
+
+
+def room(name: str) -> str:
+    """The module or subpackage of sq_perception that a dotted name leads into; '' for the package itself."""
+    parts = name.split(".")
+    if parts[0] != "sq_perception" or len(parts) == 1:
+        return ""
+    return parts[1]
+
+
+def floor(name: str) -> int:
+    (level,) = (k for k, names in enumerate(FLOORS) if name in names)
+    return level
+
+
+def test_every_room_has_its_floor() -> None:
+    rooms = {path.stem for path in PERCEPTION.glob("*.py")} | {path.parent.name for path in PERCEPTION.glob("*/*.py")}
+    assert rooms - {"__init__", "__main__", "__pycache__"} <= {name for names in FLOORS for name in names}
+
+
+@pytest.mark.parametrize("path", sorted(PERCEPTION.rglob("*.py")), ids=lambda path: str(path.relative_to(PERCEPTION)))
+def test_imports_run_one_way(path: Path) -> None:
+    here = path.relative_to(PERCEPTION).with_suffix("").parts[0]
+    if here in ("__init__", "__main__"):
+        return
+    for name, _ in imports(path):
+        there = room(name)
+        if there and any(there in names for names in FLOORS):
+            assert floor(there) <= floor(here), f"{path.relative_to(PERCEPTION)} imports {name}"
+
+
+def test_only_nodes_know_ros() -> None:
+    guilty = [path for path in PERCEPTION.rglob("*.py") if not is_node(path) and roots(path) & set(ROS)]
+    assert guilty == []
+
+
+def test_only_nodes_bags_and_calibrations_join_the_two_packages() -> None:
+    """What a recorded message says is decoded by the code that decodes a live one; that needs no ROS."""
+    joining = {path for path in PERCEPTION.rglob("*.py") if not is_node(path) and "sq_msgs_py" in roots(path)}
+    names = ("recordings/bag_file", "imaging/calibration", "recordings/result_bag", "recordings/publication")
+    assert joining == {PERCEPTION / f"{name}.py" for name in names}
+    absent = f"import sys; sys.modules.update(dict.fromkeys({ROS!r}))"
+    modules = loaded_after(f"{absent}; import sq_perception.recordings.inputs, sq_perception.commands.recover")
+    assert "sq_msgs_py.depth_image" in modules
+    assert not modules & {"rosbags", "torch"}
+    modules = loaded_after(
+        f"{absent}; import sq_perception.recordings.result_bag, sq_msgs_py.superquadrics, sq_msgs_py.markers"
+    )
+    assert "mcap" in modules
+
+
+def test_messages_need_numpy_and_messages_only() -> None:
+    allowed = {"sq_msgs_py", "numpy", "sensor_msgs", "std_msgs", "geometry_msgs", "shape_msgs", "visualization_msgs"}
+    soft = {"vision_msgs", "moveit_msgs"}
+    found = set().union(*(roots(path) for path in MESSAGES.rglob("*.py")))
+    assert found - set(sys.stdlib_module_names) <= allowed | soft
+
+
+def test_messages_that_a_robot_may_lack_are_imported_when_they_are_made() -> None:
+    pytest.importorskip("shape_msgs", reason="message packages missing: install the extra 'ros' or source ROS 2")
+    absent = "import sys; sys.modules.update(dict.fromkeys(('vision_msgs', 'moveit_msgs', 'tf2_msgs', 'tf2_ros')))"
+    modules = loaded_after(f"{absent}; import sq_msgs_py.detections, sq_msgs_py.collision_objects")
+    assert "sq_msgs_py.shapes" in modules
+    assert not modules & {"torch", "sq_perception", "scipy", "rclpy"}
+
+
+def test_only_the_command_line_reaches_ros_and_only_when_asked() -> None:
+    """Outside of nodes/, nothing imports nodes but the command line, and that inside a function."""
+    for path in PERCEPTION.rglob("*.py"):
+        for name, at_import in imports(path):
+            if room(name) == "nodes" and not is_node(path):
+                assert path == PERCEPTION / "cli.py", f"{path} imports {name}"
+                assert not at_import, f"{path} imports {name} while being imported"
+
+
+@pytest.mark.parametrize("path", sources(), ids=lambda path: f"{path.parent.name}/{path.name}")
+def test_nothing_dangerous_is_called(path: Path) -> None:
+    """No code from data: pickle, torch.load, eval, exec, a YAML loader that builds objects, a shell."""
+    tree = ast.parse(path.read_text(encoding="utf-8"))
+    assert not roots(path) & {"pickle", "marshal", "shelve"}
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Call):
+            called = ast.unparse(node.func)
+            assert called not in ("eval", "exec", "torch.load", "yaml.load", "yaml.unsafe_load", "os.system"), called
+            for keyword in node.keywords:
+                is_true = isinstance(keyword.value, ast.Constant) and keyword.value.value is True
+                assert not (keyword.arg in ("shell", "allow_pickle") and is_true), ast.unparse(node)
+
+
+def loaded_after(statement: str) -> set[str]:
+    """Names of the modules that a fresh interpreter holds after a statement; it must not print anything itself."""
+    places = [str(package.parent) for package in PACKAGES]
+    code = f"import sys; sys.path[:1] = {places!r}; {statement}; print(*sorted(sys.modules))"
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
+    assert result.stdout.count("\n") == 1, result.stdout
+    return set(result.stdout.split())
+
+
+def test_a_consumer_loads_neither_torch_nor_the_package() -> None:
+    pytest.importorskip("sensor_msgs", reason="message packages missing: install the extra 'ros' or source ROS 2")
+    modules = loaded_after("import sq_msgs_py.depth_image, sq_msgs_py.superquadrics, sq_msgs_py.markers")
+    assert "numpy" in modules
+    assert not modules & {"torch", "sq_perception", "scipy", "cv2", "numba", "rclpy"}
+
+
+def test_importing_the_package_loads_next_to_nothing() -> None:
+    assert not loaded_after("import sq_perception") & {"torch", "numba", "scipy", "cv2", "matplotlib", "rclpy"}
+
+
+def test_recovery_neither_trains_nor_draws_and_knows_no_ros() -> None:
+    modules = loaded_after("import sq_perception.recovery.recoverer")
+    assert "torch" in modules
+    forbidden = {"sq_perception.learning.train", "sq_perception.learning.dataset", "rclpy", "sensor_msgs", "sq_msgs_py"}
+    assert not modules & (forbidden | {"matplotlib", "trimesh"})
+
+
+def test_a_node_that_starts_again_waits_for_nothing_that_it_does_not_need() -> None:
+    pytest.importorskip("rclpy", reason="needs the extra 'ros'")
+    modules = loaded_after("import sq_perception.nodes.frame_node")
+    assert "torch" in modules
+    assert not modules & {"scipy.stats", "trimesh", "matplotlib", "rich", "onnx", "onnxruntime"}
+
+
+def test_importing_recovery_reads_no_weights() -> None:
+    statement = (
+        "opened = []; sys.addaudithook(lambda event, args: opened.append(str(args[0])) if event == 'open' else None); "
+        "import sq_perception.recovery.recoverer; "
+        "assert opened and not any(name.endswith('.safetensors') for name in opened)"
+    )
+    assert "sq_perception.recovery.recoverer" in loaded_after(statement)

@@ -1,0 +1,535 @@
+"""Bags: what was recorded is what is read, whatever the storage and encoding; what is broken is named and skipped."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+import struct
+import subprocess
+import sys
+import tracemalloc
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+pytest.importorskip("rosbags", reason="rosbags is missing: install the extra 'bags'")
+
+from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+from rosbags.typesys import Stores, get_typestore
+
+from sq_perception.commands import main
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging import compressed_depth, raycast, unit_cube
+from sq_perception.imaging.camera import Camera
+from sq_perception.imaging.distortion import Distortion
+from sq_perception.imaging.rectification import Rectification
+from sq_perception.recordings import bag_file
+from sq_perception.recordings.bag_file import RecordedBag
+from sq_perception.recordings.frame_file import FrameError, RecordedFrame, Stamp
+
+TYPES = get_typestore(Stores.ROS2_JAZZY)
+T = {name.rpartition("/")[2]: kind for name, kind in TYPES.types.items()}
+SECOND = 10**9
+TOPIC, INFO = "/camera/depth/image_rect_raw", "/camera/depth/camera_info"
+CAMERA = Camera(160, 120, 200.0, 200.0, 79.5, 59.5)
+STORAGES = (StoragePlugin.MCAP, StoragePlugin.SQLITE3)
+K = np.array([[200.0, 0, 79.5], [0, 200.0, 59.5], [0, 0, 1]])
+
+
+def header(stamp: float) -> Any:
+    sec = int(stamp)
+    time = T["Time"](sec=sec, nanosec=round((stamp - sec) * SECOND))
+    return T["Header"](stamp=time, frame_id="depth_optical")
+
+
+def image(pixels: np.ndarray, stamp: float, encoding: str, *, big: bool = False, padding: int = 0) -> Any:
+    height, width = pixels.shape
+    kinds = {"16UC1": "u2", "32FC1": "f4", "mono8": "u1", "8UC1": "u1"}
+    rows = pixels.astype((">" if big else "<") + kinds[encoding]).view(np.uint8).reshape(height, -1)
+    rows = np.pad(rows, ((0, 0), (0, padding)), constant_values=255)
+    return T["Image"](
+        header=header(stamp),
+        height=height,
+        width=width,
+        encoding=encoding,
+        is_bigendian=int(big),
+        step=rows.shape[1],
+        data=rows.reshape(-1),
+    )
+
+
+def packed(grey: np.ndarray, stamp: float, encoding: str, a: float = 0.0, b: float = 0.0) -> Any:
+    png = cv2.imencode(".png", grey)[1].tobytes()
+    data = np.frombuffer(struct.pack("<iff", 0, a, b) + png, np.uint8)
+    return T["CompressedImage"](header=header(stamp), format=f"{encoding}; compressedDepth png", data=data)
+
+
+def info(stamp: float, k: np.ndarray = K, size: tuple[int, int] = (160, 120), distortion: float = 0.0) -> Any:
+    return T["CameraInfo"](
+        header=header(stamp),
+        height=size[1],
+        width=size[0],
+        distortion_model="plumb_bob",
+        d=np.array([distortion, 0, 0, 0, 0.0]),
+        k=k.ravel(),
+        r=np.eye(3).ravel(),
+        p=np.hstack([k, np.zeros((3, 1))]).ravel(),
+        binning_x=0,
+        binning_y=0,
+        roi=T["RegionOfInterest"](x_offset=0, y_offset=0, height=0, width=0, do_rectify=False),
+    )
+
+
+def write(
+    path: Path,
+    messages: list[tuple[str, float, Any]],
+    storage: StoragePlugin = StoragePlugin.MCAP,
+    mode: CompressionMode = CompressionMode.NONE,
+) -> Path:
+    """A bag of (topic, second of recording, message); where the message is bytes, the topic is one of images."""
+    writer = Writer(path, version=9, storage_plugin=storage)
+    if mode is not CompressionMode.NONE:
+        writer.set_compression(mode, CompressionFormat.ZSTD)
+    with writer:
+        connections: dict[str, Any] = {}
+        for topic, second, message in messages:
+            kind = "sensor_msgs/msg/Image" if isinstance(message, bytes) else message.__msgtype__
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, kind, typestore=TYPES)
+            data = message if isinstance(message, bytes) else TYPES.serialize_cdr(message, kind)
+            writer.write(connections[topic], round(second * SECOND), data)
+    return path
+
+
+@pytest.fixture
+def grey(rng):
+    """Millimetres, 0 for nothing."""
+    return np.where(rng.random((120, 160)) < 0.1, 0, rng.integers(300, 4000, (120, 160))).astype(np.uint16)
+
+
+def metres(grey):
+    return np.where(grey > 0, grey / np.float32(1000), np.float32(np.nan)).astype(np.float32)
+
+
+def frames(path, *arguments, **options):
+    with RecordedBag(path, *arguments, **options) as bag:
+        return list(bag)
+
+
+def lone(folder):
+    """The one storage file of a bag."""
+    (path,) = [one for one in folder.iterdir() if one.suffix in (".mcap", ".db3")]
+    return path
+
+
+@pytest.mark.parametrize("storage", STORAGES, ids=lambda storage: storage.name)
+@pytest.mark.parametrize("big", [False, True])
+@pytest.mark.parametrize("padding", [0, 7])
+def test_every_encoding_is_the_same_depth(tmp_path, grey, storage, big, padding):
+    truth = metres(grey)
+    seconds = (1.5, 2.5, 3.5)
+    messages = [
+        image(grey, 1.5, "16UC1", big=big, padding=padding),
+        image(truth, 2.5, "32FC1", big=big, padding=padding),
+        image(np.where(grey > 0, truth, np.inf), 3.5, "32FC1", big=big, padding=padding),
+    ]
+    contents = [(INFO, 1.5, info(1.5))] + [(TOPIC, at, one) for at, one in zip(seconds, messages, strict=True)]
+    bag = write(tmp_path / "bag", contents, storage)
+    for path in (bag, lone(bag)):
+        found = frames(path)
+        assert [frame.stamp for frame in found] == [Stamp(k, 500_000_000) for k in (1, 2, 3)]
+        for frame in found:
+            np.testing.assert_array_equal(frame.depth, truth)
+            assert frame.depth.dtype == np.float32
+            assert frame.camera == CAMERA
+            assert (frame.topic, frame.frame_id, frame.warning) == (TOPIC, "depth_optical", "")
+        assert found[0].name == "bag_1.500000000"
+
+
+def test_packed_millimetres_are_the_same_depth(tmp_path, grey):
+    topic = TOPIC + "/compressedDepth"
+    bag = write(tmp_path / "bag", [(INFO, 1, info(1)), (topic, 1, packed(grey, 1, "16UC1"))])
+    (frame,) = frames(bag)
+    assert frame.topic == topic
+    np.testing.assert_array_equal(frame.depth, metres(grey))
+
+
+def test_packed_inverse_depth_comes_back_within_its_quantum(grey):
+    truth = metres(grey)
+    a, b = 100.0 * 101.0, 1 - 100.0 * 101.0 / 10.0
+    levels = np.where(np.isfinite(truth), np.round(a / truth + b), 0).astype(np.uint16)
+    message = packed(levels, 1, "32FC1", a, b)
+    depth = compressed_depth.decode(message.format, message.data)
+    np.testing.assert_array_equal(np.isnan(depth), np.isnan(truth))
+    seen = np.isfinite(truth)
+    assert (np.abs(depth - truth)[seen] <= 0.51 * truth[seen] ** 2 / a + 1e-6).all()
+
+
+@pytest.mark.parametrize("storage", STORAGES, ids=lambda storage: storage.name)
+@pytest.mark.parametrize("mode", [CompressionMode.MESSAGE, CompressionMode.STORAGE], ids=lambda mode: mode.name)
+def test_compressed_bags(tmp_path, grey, storage, mode):
+    if (storage, mode) == (StoragePlugin.SQLITE3, CompressionMode.STORAGE):
+        pytest.skip("sqlite3 has no compression of its own")
+    bag = write(tmp_path / "bag", [(INFO, 1, info(1)), (TOPIC, 1, image(grey, 1, "16UC1"))], storage, mode)
+    for path in (bag, lone(bag)):
+        (frame,) = frames(path)
+        np.testing.assert_array_equal(frame.depth, metres(grey))
+
+
+def test_a_bag_packed_as_a_whole_says_what_to_do(tmp_path, grey):
+    messages = [(TOPIC, 1, image(grey, 1, "16UC1"))]
+    bag = write(tmp_path / "bag", messages, StoragePlugin.SQLITE3, CompressionMode.FILE)
+    with pytest.raises(FrameError, match="zstd -d"):
+        RecordedBag(bag)
+
+
+def widened(focal):
+    return np.array([[focal, 0, 79.5], [0, focal, 59.5], [0, 0, 1]])
+
+
+def test_a_camera_info_belongs_to_the_image_of_its_stamp(tmp_path, grey):
+    """Whether it lies before or after it in the bag; and without one of its stamp, the last one before the image."""
+    contents = [
+        (INFO, 1.0, info(1, widened(201.0))),
+        (TOPIC, 1.1, image(grey, 1, "16UC1")),
+        (TOPIC, 2.0, image(grey, 2, "16UC1")),
+        (INFO, 2.1, info(2, widened(202.0))),
+        (TOPIC, 3.0, image(grey, 3, "16UC1")),
+        (INFO, 4.0, info(4, widened(204.0))),
+        (TOPIC, 4.1, image(grey, 4, "16UC1")),
+        (TOPIC, 5.0, image(grey, 5, "16UC1")),
+    ]
+    found = frames(write(tmp_path / "bag", contents))
+    assert [frame.camera.fx for frame in found] == [201, 202, 202, 204, 204]
+    assert [frame.stamp.sec for frame in found] == [1, 2, 3, 4, 5]
+
+
+@pytest.mark.parametrize("storage", STORAGES, ids=lambda storage: storage.name)
+def test_a_late_camera_info_serves_all(tmp_path, grey, storage):
+    contents = [(TOPIC, second, image(grey, second, "16UC1")) for second in (1, 2, 3)] + [(INFO, 9, info(0))]
+    assert [frame.camera for frame in frames(write(tmp_path / "bag", contents, storage))] == [CAMERA] * 3
+
+
+def test_a_missing_camera_info_is_named_and_can_be_given(tmp_path, grey):
+    other = [("/colour/camera_info", 1, info(1)), (TOPIC, 1, image(grey, 1, "16UC1"))]
+    bag = write(tmp_path / "bag", other)
+    (error,) = frames(bag)
+    assert isinstance(error, FrameError)
+    assert TOPIC in str(error)
+    assert "1.000000000" in str(error)
+    assert f"no camera_info on {INFO}" in str(error)
+    (frame,) = frames(bag, camera_info=info(0))
+    assert frame.camera == CAMERA
+
+
+def test_distortion_is_undone_unless_the_topic_is_a_rectified_one(tmp_path, grey):
+    raw = "/camera/depth/image_raw"
+    contents = [(INFO, 1, info(1, distortion=0.1))] + [(one, 1, image(grey, 1, "16UC1")) for one in (TOPIC, raw)]
+    bag = write(tmp_path / "bag", contents)
+    for topic, treatment, applied in [
+        (TOPIC, "auto", False),
+        (TOPIC, "apply", True),
+        (raw, "auto", True),
+        (raw, "ignore", False),
+    ]:
+        (frame,) = frames(bag, topic=topic, distortion=treatment)
+        undone = Rectification(CAMERA, Distortion("plumb_bob", (0.1, 0, 0, 0, 0)))
+        assert frame.camera == (undone.camera if applied else CAMERA)
+        expected = undone.rectified(metres(grey)) if applied else metres(grey)
+        np.testing.assert_array_equal(frame.depth, expected)
+        assert frame.warning == "" if treatment != "auto" else "0.1 0 0 0 0" in frame.warning
+        assert ("not undone" in frame.warning) == (treatment == "auto" and not applied)
+
+
+def test_the_topic_is_found_by_encoding_and_several_must_be_chosen_from(tmp_path, grey):
+    colour = image(np.zeros((4, 4)), 1, "8UC1")
+    colour.encoding = "mono8"
+    other = "/aligned/image_raw"
+    contents = [
+        ("/infra/image", 1, colour),
+        (INFO, 1, info(1)),
+        ("/aligned/camera_info", 1, info(1)),
+        (TOPIC + "/compressedDepth", 1, packed(grey, 1, "16UC1")),
+        (TOPIC, 1, image(grey, 1, "16UC1")),
+    ]
+    (frame,) = frames(write(tmp_path / "one", contents))
+    assert frame.topic == TOPIC  # not its packed copy
+    (frame,) = frames(tmp_path / "one", topic=TOPIC + "/compressedDepth")
+    assert frame.topic == TOPIC + "/compressedDepth"
+    two = write(tmp_path / "two", [*contents, (other, 1, image(metres(grey) + 1, 1, "32FC1"))])
+    with pytest.raises(FrameError, match=f"several depth topics.*{other}, {TOPIC}"):
+        RecordedBag(two)
+    (frame,) = frames(two, topic=other.lstrip("/"))
+    np.testing.assert_array_equal(frame.depth, metres(grey) + 1)
+    with pytest.raises(FrameError, match=f"no images on /nowhere.*{TOPIC}"):
+        RecordedBag(two, topic="/nowhere")
+    none = write(tmp_path / "none", contents[:3])
+    with pytest.raises(FrameError, match=r"no topic with 16UC1 or 32FC1.*/infra/image \(mono8\)"):
+        RecordedBag(none)
+
+
+def test_orthographic_images(tmp_path):
+    grey = np.zeros((64, 64), np.uint8)
+    grey[20:40, 20:40] = 100
+    bag = write(tmp_path / "bag", [("/view", 1, image(grey, 1, "mono8"))])
+    (frame,) = frames(bag, projection="orthographic")
+    assert frame.is_cube
+    np.testing.assert_array_equal(frame.depth, unit_cube.depth_from_grey(grey))
+
+
+@pytest.mark.parametrize(("every", "limit", "wanted"), [(1, None, 7), (3, None, 3), (2, 2, 2), (1, 9, 7), (8, 1, 1)])
+def test_every_and_limit(tmp_path, grey, every, limit, wanted):
+    contents = [(INFO, 0, info(0))] + [(TOPIC, second, image(grey, second, "16UC1")) for second in range(1, 8)]
+    write(tmp_path / "bag", contents)
+    with RecordedBag(tmp_path / "bag", every=every, limit=limit) as bag:
+        assert len(bag) == wanted
+        assert [frame.stamp.sec for frame in bag] == list(range(1, 8, every))[:limit]
+    with pytest.raises(ValueError, match="at least 1"):
+        RecordedBag(tmp_path / "bag", every=0)
+
+
+def hostile(grey):
+    """Images that are none: name -> message, and what is said about it."""
+    sound = bytes(TYPES.serialize_cdr(image(grey, 2, "16UC1"), "sensor_msgs/msg/Image"))
+    short = image(grey, 2, "16UC1")
+    short.data = short.data[:-1]
+    huge = image(grey, 2, "16UC1")
+    huge.height = huge.width = 2**32 - 1
+    wide = image(grey, 2, "16UC1")
+    wide.width = 2**31
+    colour = image(grey, 2, "16UC1")
+    colour.encoding = "rgb8"
+    return {
+        "half a message": (sound[:100], "recorded at 2.000000000"),
+        "no message": (b"", "recorded at 2.000000000"),
+        "noise": (bytes(range(256)), "recorded at 2.000000000"),
+        "a length of 4 GB": (sound[:60].replace(b"16UC1", b"\xff" * 5) + b"\xff" * 60, "recorded at 2.000000000"),
+        "a byte missing": (short, "at 2.000000000: data: expected height x step"),
+        "a size of 2^64 pixels": (huge, "step: expected"),
+        "a row beyond its step": (wide, "step: expected"),
+        "colour": (colour, "encoding: expected 16UC1"),
+        "another size": (image(grey[:50], 2, "16UC1"), "does not fit"),
+    }
+
+
+@pytest.mark.parametrize("what", hostile(np.zeros((120, 160), np.uint16)))
+@pytest.mark.parametrize("storage", STORAGES, ids=lambda storage: storage.name)
+def test_broken_messages_are_named_and_skipped(tmp_path, grey, storage, what):
+    message, reason = hostile(grey)[what]
+    contents = [(INFO, 1, info(1))] + [(TOPIC, 1, image(grey, 1, "16UC1"))] + [(TOPIC, 2, message)]
+    contents += [(TOPIC, 3, image(grey, 3, "16UC1"))]
+    first, error, last = frames(write(tmp_path / "bag", contents, storage))
+    assert (first.stamp.sec, last.stamp.sec) == (1, 3)
+    assert isinstance(error, FrameError)
+    assert TOPIC in str(error)
+    assert reason in str(error)
+
+
+def test_a_broken_camera_info_is_named_and_the_last_good_one_serves(tmp_path, grey):
+    bag = write(tmp_path / "bag", [(INFO, 1, info(1)), (TOPIC, 2, image(grey, 2, "16UC1"))], StoragePlugin.SQLITE3)
+    with sqlite3.connect(lone(bag)) as database:
+        ((topic_id, data),) = database.execute("SELECT topic_id, data FROM messages WHERE timestamp = 1000000000")
+        database.execute("INSERT INTO messages VALUES (9, ?, 1500000000, ?)", (topic_id, data[:40]))
+    error, frame = frames(bag)
+    assert INFO in str(error)
+    assert frame.camera == CAMERA
+    uncalibrated = info(1, np.zeros((3, 3)))
+    (error,) = frames(write(tmp_path / "zero", [(INFO, 1, uncalibrated), (TOPIC, 1, image(grey, 1, "16UC1"))]))
+    assert "not calibrated" in str(error)
+
+
+def small_png(width, height):
+    """A PNG that says it is larger than it is."""
+    png = bytearray(cv2.imencode(".png", np.zeros((2, 2), np.uint16))[1].tobytes())
+    png[16:24] = struct.pack(">II", width, height)
+    return bytes(12) + bytes(png)
+
+
+@pytest.mark.parametrize(
+    ("data", "reason"),
+    [
+        (b"", "got 0 bytes"),
+        (bytes(100), "expected a PNG"),
+        (small_png(2**16, 2**16), "at most"),
+        (small_png(0, 2), "at most"),
+        (small_png(2000, 2000), "not readable"),
+        (bytes(12) + cv2.imencode(".png", np.zeros((4, 4), np.uint8))[1].tobytes(), "16 bit grey, got 8"),
+        (bytes(12) + cv2.imencode(".png", np.zeros((4, 4, 3), np.uint16))[1].tobytes(), "colour type 2"),
+    ],
+)
+def test_hostile_pngs_are_refused(data, reason):
+    with pytest.raises(ValueError, match=reason):
+        compressed_depth.decode("16UC1; compressedDepth png", data)
+
+
+def test_other_packings_are_refused():
+    for text in ("rgb8; jpeg compressed bgr8", "", "8UC1; compressedDepth png"):
+        assert compressed_depth.encoding(text) is None
+        with pytest.raises(ValueError, match="format"):
+            compressed_depth.decode(text, bytes(100))
+
+
+def test_bombs_do_not_unpack():
+    """64 MB of zeros in some kilobytes, where 1000 bytes were announced."""
+    zstd = pytest.importorskip("compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd")
+    import lz4.frame
+
+    zeros = bytes(2**26)
+    for unpack, pack in ((bag_file._unpacked, zstd.compress), (bag_file._unpacked_lz4, lz4.frame.compress)):
+        bomb = pack(zeros)
+        assert unpack(bomb, 2**26) == zeros
+        tracemalloc.start()
+        with pytest.raises(ValueError, match="at most 1000"):
+            unpack(bomb, 1000)
+        with pytest.raises(ValueError, match="announced"):
+            unpack(bomb, 2**40)
+        assert tracemalloc.get_traced_memory()[1] < 2**22
+        tracemalloc.stop()
+        with pytest.raises((ValueError, RuntimeError)):
+            unpack(bomb[: len(bomb) // 2], 2**26)
+
+
+@pytest.mark.parametrize("storage", STORAGES, ids=lambda storage: storage.name)
+@pytest.mark.parametrize("kept", [0.0, 0.001, 0.4, 0.9, 0.999])
+def test_truncated_files_are_named(tmp_path, grey, storage, kept):
+    contents = [(INFO, 1, info(1))] + [(TOPIC, second, image(grey, second, "16UC1")) for second in range(1, 9)]
+    path = lone(write(tmp_path / "bag", contents, storage))
+    content = path.read_bytes()
+    path.write_bytes(content[: int(kept * len(content))])
+    for bag in (tmp_path / "bag", path):
+        try:
+            found = frames(bag)
+        except FrameError as error:
+            found = [error]
+        assert any(isinstance(one, FrameError) for one in found)
+        assert all(str(bag) in str(one) for one in found if isinstance(one, FrameError))
+        for frame in found:
+            if isinstance(frame, RecordedFrame):
+                np.testing.assert_array_equal(frame.depth, metres(grey))
+
+
+@pytest.mark.parametrize("storage", STORAGES, ids=lambda storage: storage.name)
+def test_damaged_files_never_raise_anything_else(tmp_path, grey, storage, rng):
+    contents = [(INFO, 1, info(1))] + [(TOPIC, second, image(grey[:12, :16], second, "16UC1")) for second in (1, 2)]
+    path = lone(write(tmp_path / "bag", contents, storage))
+    content = np.frombuffer(path.read_bytes(), np.uint8)
+    for _ in range(60):
+        damaged = content.copy()
+        places = rng.integers(0, content.size, 8)
+        damaged[places] = rng.integers(0, 256, 8)
+        path.write_bytes(damaged.tobytes())
+        try:
+            found = frames(path)
+        except FrameError:
+            continue
+        assert all(isinstance(one, RecordedFrame | FrameError) for one in found)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "[]", "{", "rosbag2_bagfile_information: 3", "rosbag2_bagfile_information: {version: 9}"]
+)
+def test_bad_metadata_is_named(tmp_path, text):
+    (tmp_path / "metadata.yaml").write_text(text)
+    with pytest.raises(FrameError, match=str(tmp_path)):
+        RecordedBag(tmp_path)
+
+
+def test_what_is_a_bag(tmp_path):
+    assert not bag_file.is_bag(tmp_path)
+    (tmp_path / "metadata.yaml").touch()
+    assert bag_file.is_bag(tmp_path)
+    assert bag_file.is_bag("any.mcap")
+    assert bag_file.is_bag("any.DB3")
+    assert not bag_file.is_bag("any.npz")
+    with pytest.raises(FrameError, match=r"none\.mcap"):
+        RecordedBag(tmp_path / "none.mcap")
+
+
+def test_without_rosbags_one_sentence_says_so():
+    code = (
+        "import sys; sys.modules['rosbags'] = None; from sq_perception.commands import main; "
+        "sys.exit(main.main(['recover', 'x.mcap', '--method', 'classic']))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 1
+    assert "pip install 'sq_perception[bags]'" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+def recovered(tmp_path, *arguments, code=0):
+    out = tmp_path / "out.json"
+    assert main.main(["recover", *map(str, arguments), "--method", "symmetry", "--json", str(out)]) == code
+    return json.loads(out.read_text())["frames"]
+
+
+def without_times(frame, *also):
+    return {name: value for name, value in frame.items() if name not in ("ms", "ms_by_stage", "file", *also)}
+
+
+def test_a_frame_has_the_same_numbers_from_every_kind_of_recording(tmp_path):
+    body = Superquadric([0.05, 0.04, 0.08], [0.2, 0.9], [0.02, 0.01, 0.7], [0.4, 0.2, 0.1, 0.8])
+    depth, _ = raycast.render(body, CAMERA)
+    grey = np.where(np.isfinite(depth), np.round(1e3 * depth), 0).astype(np.uint16)
+    np.savez(tmp_path / "frame.npz", depth=metres(grey), K=K)
+    png = tmp_path / "frames" / "frame.png"
+    png.parent.mkdir()
+    cv2.imwrite(str(png), grey)
+    (png.parent / "camera.yaml").write_text(
+        yaml.safe_dump({"image_width": 160, "image_height": 120, "camera_matrix": {"data": K.ravel().tolist()}})
+    )
+    messages = {
+        "bag": [(INFO, 1, info(1)), (TOPIC, 1, image(grey, 1, "16UC1"))],
+        "metric": [(INFO, 1, info(1)), (TOPIC, 1, image(metres(grey), 1, "32FC1", big=True, padding=3))],
+        "packed": [(INFO, 1, info(1)), (TOPIC + "/compressedDepth", 1, packed(grey, 1, "16UC1"))],
+    }
+    bags = [write(tmp_path / name, content) for name, content in messages.items()]
+    reference, *others = recovered(tmp_path, tmp_path / "frame.npz", png.parent, *bags)
+    assert reference["stamp"] is None
+    (entry,) = reference["superquadrics"]
+    assert 0.99 * np.count_nonzero(grey) < entry["pixels"] <= np.count_nonzero(grey)
+    np.testing.assert_allclose(sorted(entry["size"]), sorted(body.size), atol=2e-3)
+    origin = ("stamp", "topic", "frame_id")
+    for other in others:
+        assert without_times(other, *origin) == without_times(reference, *origin)
+    assert [other["stamp"] for other in others] == [None] + 3 * [{"sec": 1, "nanosec": 0}]
+    assert {other["frame_id"] for other in others[1:]} == {"depth_optical"}
+
+
+def test_broken_bags_cost_the_exit_code_and_nothing_else(tmp_path, grey, capsys):
+    grey[:] = 0
+    contents = [(INFO, 1, info(1, distortion=0.2)), (TOPIC, 1, image(grey, 1, "16UC1")), (TOPIC, 2, b"\x1b[2Jnoise")]
+    bag = write(tmp_path / "bag", [*contents, (TOPIC, 3, image(grey, 3, "16UC1"))])
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(lone(bag).read_bytes()[:-50])
+    found = recovered(tmp_path, cut, bag, code=1)
+    assert [frame["stamp"]["sec"] for frame in found] == [1, 3]
+    errors = capsys.readouterr().err
+    assert f"{cut}: not a readable bag" in errors
+    assert f"{TOPIC} recorded at 2.000000000" in errors
+    assert errors.count("not undone") == 1
+    assert "2 frames, 0 objects (0 failed), 2 frames or sources unreadable, median" in errors
+
+
+@pytest.mark.filterwarnings("ignore::RuntimeWarning")
+@pytest.mark.parametrize("focal", [1e-300, 1e-6, 1e300])
+@pytest.mark.parametrize("size", [(160, 120), (1, 1)])
+def test_absurd_cameras_are_no_crash(tmp_path, grey, focal, size, capsys):
+    grey = grey[: size[1], : size[0]] | 1
+    k = np.array([[focal, 0, 0], [0, focal, 0], [0, 0, 1]])
+    bag = write(tmp_path / "bag", [(INFO, 1, info(1, k, size)), (TOPIC, 1, image(grey, 1, "16UC1"))])
+    assert main.main(["recover", str(bag), "--method", "symmetry"]) in (0, 1)
+    assert "Traceback" not in capsys.readouterr().err
+
+
+def test_a_database_cannot_make_up_large_messages(tmp_path, grey):
+    """A computed column is a blob of a gigabyte that takes no room in the file."""
+    bag = write(tmp_path / "bag", [(INFO, 1, info(1)), (TOPIC, 1, image(grey, 1, "16UC1"))], StoragePlugin.SQLITE3)
+    with sqlite3.connect(lone(bag)) as database:
+        database.execute("ALTER TABLE messages RENAME COLUMN data TO stored")
+        database.execute(f"ALTER TABLE messages ADD COLUMN data AS (zeroblob({bag_file.LARGEST + 1}))")
+    with pytest.raises(FrameError, match="TooBig"):
+        RecordedBag(bag)

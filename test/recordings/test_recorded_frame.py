@@ -1,0 +1,252 @@
+"""Frames from files: what is read is what was recorded, and what cannot be read says why."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+import yaml
+
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging import raycast, unit_cube
+from sq_perception.imaging.camera import Camera
+from sq_perception.imaging.distortion import Distortion
+from sq_perception.imaging.rectification import Rectification
+from sq_perception.recordings.frame_file import FrameError, Region, read, read_calibration, read_camera_info
+
+K = np.array([[60.0, 0, 31.5], [0, 61.0, 23.5], [0, 0, 1]])
+
+
+def camera_info(path, **changes):
+    info = {
+        "image_width": 64,
+        "image_height": 48,
+        "camera_name": "depth",
+        "camera_matrix": {"rows": 3, "cols": 3, "data": K.ravel().tolist()},
+        "distortion_model": "plumb_bob",
+        "distortion_coefficients": {"rows": 1, "cols": 5, "data": [0.0] * 5},
+        "rectification_matrix": {"rows": 3, "cols": 3, "data": np.eye(3).ravel().tolist()},
+        "projection_matrix": {"rows": 3, "cols": 4, "data": np.hstack([K, np.zeros((3, 1))]).ravel().tolist()},
+    }
+    info.update(changes)
+    path.write_text(yaml.safe_dump({name: value for name, value in info.items() if value is not None}))
+    return path
+
+
+@pytest.fixture
+def info(tmp_path):
+    return camera_info(tmp_path / "camera.yaml")
+
+
+def save_npz(path, **fields):
+    depth = np.full((48, 64), 0.8, np.float32)
+    depth[0, 0], depth[0, 1], depth[0, 2] = np.nan, 0, np.inf
+    np.savez(path, **{"depth": depth, "K": K, **fields})
+    return path
+
+
+def test_npz_with_labels_and_plane(tmp_path):
+    labels = np.zeros((48, 64), np.int16)
+    labels[10:20, 10:20] = 7
+    frame = read(save_npz(tmp_path / "frame.npz", labels=labels, plane=np.array([0, -1, 0, 0.5])))
+    assert frame.camera == Camera(64, 48, 60.0, 61.0, 31.5, 23.5)
+    assert frame.depth.dtype == np.float32
+    assert frame.labels.dtype == np.int32
+    assert np.isnan(frame.depth[0, :3]).all()
+    assert np.isfinite(frame.depth).sum() == 48 * 64 - 3
+    assert set(np.unique(frame.labels)) == {0, 7}
+    np.testing.assert_array_equal(frame.plane, [0, -1, 0, 0.5])
+    assert frame.name == "frame.npz"
+    assert not frame.is_cube
+
+
+def test_sixteen_bit_png_is_millimetres(tmp_path, info):
+    image = np.full((48, 64), 1234, np.uint16)
+    image[5, 6] = 0
+    cv2.imwrite(str(tmp_path / "depth.png"), image)
+    frame = read(tmp_path / "depth.png", info)
+    assert frame.depth[0, 0] == pytest.approx(1.234, abs=1e-6)
+    assert np.isnan(frame.depth[5, 6])
+    assert frame.camera == Camera(64, 48, 60.0, 61.0, 31.5, 23.5)
+
+
+def test_a_printed_message_is_a_camera_info_too(tmp_path):
+    path = tmp_path / "echo.yaml"
+    message = {"width": 64, "height": 48, "d": [], "k": K.ravel().tolist(), "p": [0.0] * 12}
+    path.write_text(yaml.safe_dump(message) + "---\n")
+    assert read_calibration(path).camera == Camera(64, 48, 60.0, 61.0, 31.5, 23.5)
+    part = {"x_offset": 10, "y_offset": 4, "width": 40, "height": 20, "do_rectify": True}
+    path.write_text(yaml.safe_dump({**message, "roi": part, "binning_x": 2, "binning_y": 2}))
+    assert read_camera_info(path).roi == Region(10, 4, 40, 20)
+    assert read_calibration(path).camera == Camera(20, 10, 30.0, 30.5, 10.75, 9.75)
+
+
+def test_a_distorted_image_is_rectified_unless_a_name_says_that_it_is(tmp_path, rng):
+    rectified = np.array([[55.0, 0, 30.0, 0], [0, 55.0, 22.0, 0], [0, 0, 1, 0]])
+    changes = {"distortion_coefficients": {"data": [0.1, 0, 0, 0, 0]}, "projection_matrix": rectified.ravel().tolist()}
+    info = camera_info(tmp_path / "c.yaml", **changes)
+    image = rng.integers(1000, 1010, (48, 64)).astype(np.uint16)
+    (tmp_path / "depth_rect").mkdir()
+    for folder in (tmp_path, tmp_path / "depth_rect"):
+        cv2.imwrite(str(folder / "1.png"), image)
+    undone = Rectification(Camera(64, 48, 60.0, 61.0, 31.5, 23.5), Distortion("plumb_bob", (0.1, 0, 0, 0, 0)))
+    for frame in (read(tmp_path / "1.png", info), read(tmp_path / "depth_rect" / "1.png", info, distortion="apply")):
+        assert frame.camera == undone.camera
+        np.testing.assert_array_equal(frame.depth, undone.rectified(image / np.float32(1000)))
+    for frame in (read(tmp_path / "depth_rect" / "1.png", info), read(tmp_path / "1.png", info, distortion="ignore")):
+        assert frame.camera == Camera(64, 48, 55.0, 55.0, 30.0, 22.0)
+        np.testing.assert_array_equal(frame.depth, image / np.float32(1000))
+    with pytest.raises(ValueError, match="distortion: expected auto, apply, ignore"):
+        read(tmp_path / "1.png", info, distortion="perhaps")
+    camera_info(info, **changes, distortion_model="unified")
+    with pytest.raises(FrameError, match=r"expected plumb_bob, .*, got 'unified' .*distortion = ignore"):
+        read(tmp_path / "1.png", info)
+
+
+@pytest.mark.parametrize("suffix", ["png", "bmp"])
+def test_grey_images_are_views_of_the_cube(tmp_path, suffix):
+    body = Superquadric([0.2, 0.15, 0.1], [0.5, 0.5], [0.5, 0.5, 0.5], [0.1, 0.2, 0.3, 0.9])
+    depth, _ = raycast.render(unit_cube.optical_from_cube(body), unit_cube.camera(64))
+    cv2.imwrite(str(tmp_path / f"view.{suffix}"), unit_cube.grey_from_depth(depth))
+    frame = read(tmp_path / f"view.{suffix}", projection="orthographic")
+    assert frame.is_cube
+    assert frame.camera == unit_cube.camera(64)
+    np.testing.assert_array_equal(np.isfinite(frame.depth), np.isfinite(depth))
+    seen = np.isfinite(depth)
+    assert np.abs(frame.depth[seen] - depth[seen]).max() <= 0.5 / 255 + 1e-6
+    fine = unit_cube.grey_from_depth(depth, np.uint16)
+    cv2.imwrite(str(tmp_path / "fine.png"), fine)
+    np.testing.assert_allclose(
+        read(tmp_path / "fine.png", projection="orthographic").depth[seen], depth[seen], atol=1 / 65535
+    )
+
+
+def test_an_orthographic_archive_says_so_itself(tmp_path):
+    depth = np.full((32, 32), 0.5, np.float32)
+    np.savez(tmp_path / "cube.npz", depth=depth, projection="orthographic")
+    frame = read(tmp_path / "cube.npz")
+    assert frame.is_cube
+    assert frame.camera == unit_cube.camera(32)
+
+
+def test_grey_saved_as_colour_is_accepted_and_colour_is_not(tmp_path):
+    grey = np.zeros((16, 16, 3), np.uint8)
+    grey[4:9, 4:9] = 100
+    cv2.imwrite(str(tmp_path / "grey.png"), grey)
+    assert np.isfinite(read(tmp_path / "grey.png", projection="orthographic").depth).sum() == 25
+    grey[0, 0] = 1, 2, 3
+    cv2.imwrite(str(tmp_path / "colour.png"), grey)
+    with pytest.raises(FrameError, match="colour"):
+        read(tmp_path / "colour.png", projection="orthographic")
+
+
+def npz_without(path, name):
+    fields = {"depth": np.ones((4, 4), np.float32), "K": K}
+    del fields[name]
+    np.savez(path, **fields)
+    return path
+
+
+BAD_NPZ = {
+    "no depth": (lambda p: npz_without(p, "depth"), "field 'depth'"),
+    "no K": (lambda p: npz_without(p, "K"), "field 'K'"),
+    "integers": (lambda p: save_npz(p, depth=np.ones((48, 64), np.uint16)), "floats"),
+    "a volume": (lambda p: save_npz(p, depth=np.ones((48, 64, 2))), "floats"),
+    "no pixel": (lambda p: save_npz(p, depth=np.ones((0, 64))), "floats"),
+    "zero K": (lambda p: save_npz(p, K=np.zeros((3, 3))), "positive"),
+    "NaN K": (lambda p: save_npz(p, K=np.full((3, 3), np.nan)), "finite"),
+    "text K": (lambda p: save_npz(p, K=np.full((3, 3), "x")), "K:"),
+    "skewed K": (lambda p: save_npz(p, K=K + np.eye(3, k=1)), "skew"),
+    "other labels": (lambda p: save_npz(p, labels=np.zeros((3, 3), np.int32)), "labels"),
+    "float labels": (lambda p: save_npz(p, labels=np.zeros((48, 64))), "labels"),
+    "bad plane": (lambda p: save_npz(p, plane=np.zeros(3)), "plane"),
+    "objects": (lambda p: save_npz(p, depth=np.array([[{}]], dtype=object)), "readable NPZ"),
+    "not a zip": (lambda p: p.write_bytes(b"not a zip") and p, "readable NPZ"),
+    "empty": (lambda p: p.write_bytes(b"") or p, "readable NPZ"),
+}
+
+
+@pytest.mark.parametrize("what", BAD_NPZ)
+def test_bad_archives_are_named(tmp_path, what):
+    make, reason = BAD_NPZ[what]
+    path = tmp_path / "bad.npz"
+    make(path)
+    with pytest.raises(FrameError, match=reason) as caught:
+        read(path)
+    assert "bad.npz" in str(caught.value)
+
+
+def test_truncated_archives_are_named(tmp_path):
+    path = save_npz(tmp_path / "cut.npz")
+    path.write_bytes(path.read_bytes()[:-600])
+    with pytest.raises(FrameError, match="readable NPZ"):
+        read(path)
+
+
+def test_bad_images_are_named(tmp_path, info):
+    cv2.imwrite(str(tmp_path / "eight.png"), np.ones((48, 64), np.uint8))
+    with pytest.raises(FrameError, match="orthographic"):
+        read(tmp_path / "eight.png", info)
+    cv2.imwrite(str(tmp_path / "depth.png"), np.ones((48, 64), np.uint16))
+    with pytest.raises(FrameError, match="camera_info"):
+        read(tmp_path / "depth.png")
+    cv2.imwrite(str(tmp_path / "other.png"), np.ones((10, 10), np.uint16))
+    with pytest.raises(FrameError, match="does not fit"):
+        read(tmp_path / "other.png", info)
+    (tmp_path / "no.png").write_bytes(b"\x89PNG nothing")
+    with pytest.raises(FrameError, match="readable image"):
+        read(tmp_path / "no.png", info)
+    (tmp_path / "empty.bmp").touch()
+    with pytest.raises(FrameError, match="readable image"):
+        read(tmp_path / "empty.bmp", projection="orthographic")
+    cv2.imwrite(str(tmp_path / "dot.png"), np.ones((1, 1), np.uint8))
+    with pytest.raises(FrameError, match="at least 2 x 2"):
+        read(tmp_path / "dot.png", projection="orthographic")
+    with pytest.raises(FrameError, match="no such file"):
+        read(tmp_path / "missing.npz")
+    with pytest.raises(FrameError, match="no such file"):
+        read(tmp_path)
+    (tmp_path / "depth.txt").write_text("1 2 3")
+    with pytest.raises(FrameError, match=r"\.npz, \.png or \.bmp"):
+        read(tmp_path / "depth.txt")
+    with pytest.raises(ValueError, match="projection"):
+        read(tmp_path / "eight.png", projection="fisheye")
+
+
+@pytest.mark.parametrize(
+    ("text", "reason"),
+    [
+        ("", "mapping"),
+        ("[1, 2", "not YAML"),
+        ("just text", "mapping"),
+        ("!!python/object/apply:os.system ['true']", "not YAML"),
+        ("image_width: 64", "image_height"),
+        ("{image_width: wide, image_height: 48}", "positive integer"),
+        ("{image_width: 64, image_height: 48}", "camera_matrix"),
+        ("{image_width: 64, image_height: 48, k: [1, 2]}", "9 finite numbers"),
+        ("{image_width: 64, image_height: 48, k: [a, b]}", "expected numbers"),
+        ("{width: 64, height: 48, k: [0, 0, 0, 0, 0, 0, 0, 0, 0]}", "above 0"),
+        ("{width: 64, height: 48, k: [9, 1, 0, 0, 9, 0, 0, 0, 1]}", "no skew"),
+        ("{width: 64, height: 48, k: [9, 0, 0, 0, 9, 0, 0, 0, 1], binning_x: -1}", "binning_x"),
+        ("{width: 64, height: 48, k: [9, 0, 0, 0, 9, 0, 0, 0, 1], roi: {x_offset: a}}", "x_offset"),
+        ("{width: 64, height: 48, k: [9, 0, 0, 0, 9, 0, 0, 0, 1], roi: 3}", "roi"),
+        ("{width: 64, height: 48, k: [9, 0, 0, 0, 9, 0, 0, 0, 1], d: [.nan]}", "finite"),
+    ],
+)
+def test_bad_camera_infos_are_named(tmp_path, text, reason):
+    path = tmp_path / "info.yaml"
+    path.write_text(text)
+    with pytest.raises(FrameError, match=reason):
+        read_calibration(path)
+
+
+def test_shared_recordings_are_read(shared_data):
+    for path in sorted((shared_data / "frames").glob("*.npz")):
+        frame = read(path)
+        assert frame.depth.shape == (480, 640)
+        assert frame.labels is not None
+        assert frame.labels.max() >= 1
+    for path in sorted((shared_data / "author_renders").glob("*.bmp")):
+        frame = read(path, projection="orthographic")
+        assert frame.depth.shape == (256, 256)
+        assert np.isfinite(frame.depth).any()

@@ -1,0 +1,144 @@
+"""Lines of sight: free within a convex body, crossed between two; segments follow, whatever the noise bends."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging import raycast
+from sq_perception.imaging.camera import Camera
+from sq_perception.segmentation import convex_parts
+from sq_perception.segmentation.convex_parts import SightOptions
+from sq_perception.segmentation.segments import segment
+from sq_perception.simulation import sensor_noise
+from sq_perception.simulation.scenes import crowded_scene, table_scene
+
+CAMERA = Camera(320, 240, 262.5, 262.5, 159.5, 119.5)
+UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
+TILTED = np.array([0.3, 0.2, 0.1, 0.9])
+NOISE = 0.001
+
+
+def body(x, size=(0.05, 0.05, 0.05), shape=(1.0, 1.0), z=0.7, rotation=UPRIGHT):
+    return Superquadric(np.array(size), np.array(shape), np.array([x, 0.0, z]), rotation / np.linalg.norm(rotation))
+
+
+def seen(bodies, noise=NOISE, background=1.2):
+    """Depth float32, 0 for none, before a wall; labels from 1."""
+    depth, index = raycast.render(Superquadric.stack(bodies), CAMERA)
+    depth = np.where(index >= 0, depth, background)
+    depth += noise * depth**2 * np.random.default_rng(0).standard_normal(depth.shape)
+    return depth.astype(np.float32), (index + 1).astype(np.int32)
+
+
+def names(labels):
+    return sorted(set(np.unique(labels)) - {0})
+
+
+def ious(labels, truth):
+    return [
+        max(np.sum((labels == k) & one) / np.sum((labels == k) | one) for k in names(labels))
+        for one in (truth == k for k in names(truth))
+    ]
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.001, 0.004])
+@pytest.mark.parametrize("shape", [(1.0, 1.0), (0.1, 0.1), (0.1, 1.0), (0.6, 0.3)])
+def test_a_convex_body_has_one_part(shape, noise):
+    depth, truth = seen([body(0, (0.08, 0.05, 0.04), shape, rotation=TILTED)], noise)
+    assert convex_parts.parts(truth > 0, depth, CAMERA, max(noise, 5e-4)) == []
+    np.testing.assert_array_equal(convex_parts.corrected(truth, depth, CAMERA, max(noise, 5e-4)) > 0, truth > 0)
+
+
+@pytest.mark.parametrize("noise", [0.0005, 0.003])
+def test_bodies_that_touch_are_parted(noise):
+    bodies = [body(-0.1), body(0.0), body(0.1, shape=(0.2, 0.2), rotation=TILTED, size=(0.05, 0.04, 0.04))]
+    depth, truth = seen(bodies, noise)
+    found = convex_parts.corrected((truth > 0).astype(np.int32), depth, CAMERA, noise)
+    assert len(names(found)) == 3
+    assert min(ious(found, truth)) > 0.9
+
+
+def test_pieces_of_one_body_are_joined_and_those_of_two_are_not():
+    depth, truth = seen([body(-0.05), body(0.05)])
+    v, u = np.indices(truth.shape)
+    pieces = np.where(truth > 0, 1 + (u // 20) + 100 * (v // 20) + 10000 * truth, 0)
+    pieces = np.unique(pieces, return_inverse=True)[1].reshape(truth.shape).astype(np.int32)
+    found = convex_parts.corrected(pieces, depth, CAMERA, NOISE)
+    assert pieces.max() >= 8
+    assert len(names(found)) == 2
+    assert min(ious(found, truth)) > 0.99
+
+
+def test_what_an_occluder_leaves_visible_is_a_free_pair():
+    """A long body behind a bar: its two ends; with the wall seen between two bodies there is no such pair."""
+    bar = body(0.0, (0.015, 0.09, 0.015), (0.1, 0.1), z=0.55)
+    u = np.arange(CAMERA.width)[None, :]
+    depth, truth = seen([body(0, (0.12, 0.04, 0.04), (0.2, 0.2)), bar])
+    ends = np.where((truth == 1) & (u > 160), 3, truth).astype(np.int32)
+    assert convex_parts.free_pairs(ends, depth, CAMERA, NOISE) == [(1, 3)]
+    depth, truth = seen([body(-0.08, (0.04, 0.04, 0.04)), body(0.08, (0.04, 0.04, 0.04)), bar])
+    assert convex_parts.free_pairs(truth, depth, CAMERA, NOISE) == []
+
+
+def test_a_bowl_has_no_convex_parts():
+    """The inside of a hemisphere: every line through it is crossed, and no part of it is convex."""
+    v, u = np.indices((CAMERA.height, CAMERA.width))
+    x, y = (u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy
+    radius = np.hypot(x, y) * 0.7
+    depth = np.where(radius < 0.08, 0.7 + np.sqrt(np.maximum(0.09**2 - radius**2, 0)), 1.0).astype(np.float32)
+    mask = radius < 0.08
+    assert convex_parts.parts(mask, depth, CAMERA, NOISE) == []
+    labels = mask.astype(np.int32)
+    np.testing.assert_array_equal(convex_parts.corrected(labels, depth, CAMERA, NOISE), labels)
+
+
+def test_other_names_give_the_same_segments():
+    depth, truth = seen([body(-0.1), body(0.0), body(0.1)])
+    one = np.where(truth == 3, 2, np.minimum(truth, 1)).astype(np.int32)
+    two = np.array([0, 9, 4], np.int32)[one]
+    first, second = (convex_parts.corrected(labels, depth, CAMERA, NOISE) for labels in (one, two))
+    pairs = np.unique(np.stack([first.ravel(), second.ravel()]), axis=1)
+    assert pairs.shape[1] == len(names(first)) + 1 == 4
+
+
+@pytest.mark.parametrize("depth", [0.0, 1.0])
+def test_nothing_to_say_changes_nothing(depth):
+    labels = np.zeros((240, 320), np.int32)
+    image = np.full(labels.shape, depth, np.float32)
+    np.testing.assert_array_equal(convex_parts.corrected(labels, image, CAMERA, NOISE), labels)
+    labels[50:100, 50:100] = 3
+    np.testing.assert_array_equal(convex_parts.corrected(labels, image, CAMERA, NOISE) > 0, labels > 0)
+    assert convex_parts.free_pairs(labels, image, CAMERA, NOISE) == []
+
+
+def test_options_are_checked():
+    with pytest.raises(ValueError, match="least_gap"):
+        SightOptions(least_gap=0.0)
+    with pytest.raises(ValueError, match="apart"):
+        SightOptions(apart=1.5)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_crowd_seen_by_a_stereo_camera_is_parted(seed):
+    """Noise that is alike over windows of pixels makes folds and hides them; lines of sight are longer than windows."""
+    rng = np.random.default_rng(seed)
+    scene = crowded_scene(rng, 6)
+    depth, truth = scene.render()
+    found = segment(sensor_noise.preset("realsense_d435").measured(depth, scene.camera, rng), scene.camera)
+    visible = [k for k in names(truth) if np.sum(truth == k) > 1500]
+    assert len(visible) - 1 <= len(found.ids) <= 6
+    good = [
+        max(np.sum((found.labels == j) & (truth == k)) / np.sum((found.labels == j) | (truth == k)) for j in found.ids)
+        for k in visible
+    ]
+    assert np.mean(good) > 0.8
+
+
+def test_bodies_apart_keep_their_segments():
+    scene = table_scene(np.random.default_rng(3), 4)
+    depth, truth = scene.render()
+    found = segment(depth, scene.camera)
+    assert len(found.ids) == 4
+    assert min(ious(found.labels, truth)) > 0.95

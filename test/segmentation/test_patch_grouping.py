@@ -1,0 +1,109 @@
+"""Joining patches: signs of borders, steps, vessels and what goes on behind, on images of a few samples."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sq_perception.imaging.camera import Camera
+from sq_perception.segmentation.patch_grouping import GroupingOptions, bodies
+from sq_perception.segmentation.surface_patches import Patches
+
+CAMERA = Camera(60, 40, 50.0, 50.0, 29.5, 19.5)
+"""A sample is 2 cm wide at a depth of one metre: a body shows at least 4 samples."""
+LEFT, RIGHT = (slice(None), slice(0, 30)), (slice(None), slice(30, 60))
+
+
+def patches(labels, depth=1.0, fold=0.0, curvature=(), planes=None):
+    labels = np.asarray(labels, np.int32)
+    count = int(labels.max())
+    curved = np.zeros(count + 1)
+    curved[1 : 1 + len(curvature)] = curvature
+    return Patches(
+        labels,
+        count,
+        np.broadcast_to(np.asarray(depth, np.float32), labels.shape).copy(),
+        np.zeros(labels.shape, bool),
+        np.broadcast_to(np.asarray(fold, np.float32), labels.shape).copy(),
+        curved,
+        np.full((count + 1, 3), np.nan) if planes is None else np.asarray(planes, float),
+        1,
+        0.02,
+    )
+
+
+def halves():
+    labels = np.ones((40, 60), int)
+    labels[RIGHT] = 2
+    return labels
+
+
+def edge(value):
+    fold = np.zeros((40, 60))
+    fold[:, 28:32] = value
+    return fold
+
+
+@pytest.mark.parametrize(("fold", "count"), [(-1.5, 1), (0.0, 1), (1.5, 2), (np.nan, 1)])
+def test_convex_edges_join_and_concave_ones_part(fold, count):
+    assert bodies(patches(halves(), fold=edge(fold)), CAMERA).max() == count
+
+
+def test_a_leak_is_outvoted():
+    fold = edge(1.5)
+    fold[:8] = -1.5
+    assert bodies(patches(halves(), fold=fold), CAMERA).max() == 2
+    assert bodies(patches(halves(), fold=-fold), CAMERA).max() == 1
+
+
+def test_a_concave_edge_counts_where_a_convex_one_is_beside_it():
+    fold = edge(1.2)
+    fold[:, 31:33] = -3
+    assert bodies(patches(halves(), fold=fold), CAMERA).max() == 2
+
+
+def test_a_step_parts_but_not_a_hollow_from_its_rim():
+    depth = np.ones((40, 60))
+    depth[RIGHT] = 1.1
+    assert bodies(patches(halves(), depth), CAMERA).max() == 2
+    assert bodies(patches(halves(), depth, curvature=(0, 20)), CAMERA).max() == 1
+    assert bodies(patches(halves(), depth, curvature=(20, 0)), CAMERA).max() == 2, "the hollow lies behind its rim"
+    depth[RIGHT] = 1.5
+    assert bodies(patches(halves(), depth, curvature=(0, 20)), CAMERA).max() == 2, "no vessel is that deep"
+
+
+def occluded(tilt=0.0, between=0.8):
+    """Two parts of a wall at z = 1, the second one turned by a tilt, behind a post."""
+    labels = np.zeros((40, 60), int)
+    labels[:, :20], labels[:, 20:40], labels[:, 40:] = 1, 2, 3
+    depth = np.ones((40, 60))
+    depth[:, 20:40] = between
+    planes = [[np.nan] * 3, [0, 0, 1], [0, 0, 1 / between], [np.tan(tilt), 0, 1 - 0.4 * np.tan(tilt)]]
+    return patches(labels, depth, planes=planes)
+
+
+def test_a_plane_goes_on_behind_a_nearer_body():
+    first, post, second = bodies(occluded(), CAMERA)[1:]
+    assert first == second != post
+    first, post, second = bodies(occluded(tilt=0.5), CAMERA)[1:]
+    assert len({first, post, second}) == 3
+    # The gap shows what lies behind: these are two.
+    first, gap, second = bodies(occluded(between=1.3), CAMERA)[1:]
+    assert len({first, gap, second}) == 3
+
+
+def test_attached_fragments_join_and_free_ones_stay():
+    labels = np.zeros((40, 60), int)
+    labels[LEFT] = 1
+    labels[10:11, 30:32] = 2
+    labels[30:31, 50:52] = 3
+    fold = np.full((40, 60), 1.5)
+    body = bodies(patches(labels, fold=fold), CAMERA)
+    assert body[2] == body[1] != body[3]
+    kept = bodies(patches(labels, fold=fold), CAMERA, GroupingOptions(least_area=1e-4))
+    assert len(set(kept[1:].tolist())) == 3
+
+
+def test_misuse_is_refused():
+    with pytest.raises(ValueError, match="least_area"):
+        GroupingOptions(least_area=0.0)

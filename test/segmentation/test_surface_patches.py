@@ -1,0 +1,103 @@
+"""Folds against closed forms: planes, edges between two planes, spheres; patches of rendered bodies."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sq_perception.geometry import rotation
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging import raycast
+from sq_perception.imaging.camera import Camera
+from sq_perception.segmentation.surface_patches import FoldOptions, find
+
+CAMERA = Camera(320, 240, 525.0, 525.0, 159.5, 119.5)
+STEP = 0.015
+
+
+def plane_depth(normal, distance):
+    """Depth of the plane n.p = distance."""
+    v, u = np.indices((CAMERA.height, CAMERA.width))
+    return distance / (CAMERA.rays(u, v)[1] @ np.asarray(normal, float))
+
+
+def patches(depth, wanted=None, sigma=1e-4, **options):
+    depth = np.where(np.isfinite(depth), depth, 0).astype(np.float32)
+    return find(depth, depth > 0 if wanted is None else wanted, CAMERA, sigma, STEP, FoldOptions(**options))
+
+
+def turned(angle):
+    return np.array([np.sin(angle), 0.0, np.cos(angle)])
+
+
+@pytest.mark.parametrize("normal", [(0, 0, 1), (0.5, 0, 1), (-0.3, 0.8, 1), (0, -1.2, 1)])
+def test_a_plane_has_no_fold_however_it_is_turned(normal):
+    found = patches(plane_depth(np.array(normal) / np.linalg.norm(normal), 0.7))
+    assert found.count == 1
+    assert np.nanmax(np.abs(found.fold)) < 0.01
+    assert found.curvature[1] == 0
+    # w = n.ray / distance
+    np.testing.assert_allclose(found.planes[1], np.array(normal) / np.linalg.norm(normal) / 0.7, rtol=1e-3, atol=1e-3)
+
+
+@pytest.mark.parametrize("half", np.deg2rad([20, 30, 45]))
+@pytest.mark.parametrize("sign", [-1, 1], ids=["convex", "concave"])
+def test_an_edge_folds_by_the_tangent_of_half_its_angle(half, sign):
+    left, right = (plane_depth(turned(side * half), 0.7 * np.cos(half)) for side in (-1, 1))
+    # Both pass through (0, 0, 0.7): the nearer one of them makes a valley, the farther one a ridge.
+    found = patches(np.minimum(left, right) if sign > 0 else np.maximum(left, right))
+    assert found.count == 2
+    middle = found.fold.shape[1] // 2
+    s = found.fold[20:-20, middle - 1 : middle + 2] * np.tan(FoldOptions().angle / 2)
+    # The mean over a square blunts the edge by up to a quarter of the chord's radius.
+    assert 0.7 * np.tan(half) < np.nanmax(sign * s) < 1.05 * np.tan(half)
+
+
+@pytest.mark.parametrize("inside", [False, True])
+def test_curvature_of_a_sphere(inside):
+    radius, centre = 0.08, np.array([0, 0, 0.7])
+    v, u = np.indices((CAMERA.height, CAMERA.width))
+    d = CAMERA.rays(u, v)[1]
+    a, b = (d * d).sum(-1), d @ centre
+    rest = b * b - a * (centre @ centre - radius**2)
+    near = np.hypot(*(CAMERA.unproject(u, v, np.full(u.shape, 0.7))[..., :2].transpose(2, 0, 1))) < 0.02
+    depth = np.where(near, (b + (1 if inside else -1) * np.sqrt(np.maximum(rest, 0))) / a, 0)
+    found = patches(depth)
+    assert found.count == 1
+    assert found.curvature[1] == pytest.approx((2 if inside else -2) / radius, rel=0.25)
+
+
+def test_faces_of_a_box_are_patches():
+    turn = rotation.from_rotation_vector(np.array([0.5, 0.6, 0.0]))
+    body = Superquadric([0.05, 0.05, 0.05], [0.1, 0.1], [0, 0, 0.6], turn)
+    found = patches(raycast.render(body, CAMERA)[0])
+    large = np.bincount(found.labels.ravel())[1:]
+    assert np.count_nonzero(large > 100) == 3
+    assert np.nanmax(found.fold) < 0.8, "a convex body has no concave edge"
+
+
+def test_no_patch_reaches_over_a_depth_step():
+    depth = np.where(np.arange(320) < 160, 0.7, 0.8) + np.zeros((240, 1))
+    found = patches(depth)
+    assert found.count == 2
+    for label in (1, 2):
+        assert np.ptp(found.depth[found.labels == label]) == 0
+
+
+def test_more_noise_needs_longer_chords_until_too_far():
+    options = FoldOptions()
+    assert options.radius_at(0.7, 1e-4) == options.radius
+    assert options.radius_at(3.0, 2e-3) > 2 * options.radius
+    assert options.resolved_at(0.7, 1e-3, CAMERA)
+    assert not options.resolved_at(6.0, 2e-3, CAMERA)
+    assert patches(np.full((240, 320), 50.0)) is None
+
+
+def test_nothing_wanted():
+    assert patches(np.full((240, 320), np.nan)) is None
+
+
+@pytest.mark.parametrize("wrong", [{"radius": 0.0}, {"angle": 2.0}, {"steepest": 0.0}, {"least_area": -1.0}])
+def test_misuse_is_refused(wrong):
+    with pytest.raises(ValueError, match=next(iter(wrong))):
+        FoldOptions(**wrong)
