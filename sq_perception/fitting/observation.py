@@ -4,9 +4,12 @@ Object pixels: those of the mask with a depth.  Drawn systematically with weight
 area instead of by pixel, since the steep parts of a body are the ones that fix its hidden extent.
 
 Free pixels: those beside the mask.  One that measured something farther says "empty up to there"; one that measured
-something nearer says so up to its own depth only, which binds nothing (what lies behind an occluder is unknown).  One
-that measured nothing is no pixel of the object either: it says "empty" too, unless told otherwise, or within the
-convex hull of the mask, where it is a hole that the sensor left.
+something nearer says so up to its own depth only, which binds nothing (what lies behind an occluder is unknown).
+
+A pixel without a reading says nothing where the pixels around the object were measured at all: beside a real thing it
+is the shadow of a baseline, a side seen at a grazing angle, a dark or shiny label, on the thing or beside it.  Where
+nothing around the object was measured, as in an orthographic image of the thesis, or before a background out of range,
+it is no pixel of the object and says "empty", unless it lies within the convex hull of the mask.
 
 Both become rays, rows (o_x, o_y, d_x, d_y, z, 1/sigma, weight, z) of :mod:`sq_perception.fitting.residuals`, when a
 stage of the fit draws them.
@@ -35,6 +38,8 @@ _HOLE = 5
 """Holes and notches of the mask up to this width, pixels, are closed: the outline of a convex body has none."""
 _JUMP_PIXELS, _JUMP_NOISE = 10.0, 6.0
 """A depth step between neighbours above so many pixel widths, plus so many noise levels, ends a surface."""
+_BACKGROUND_SHARE = 0.1
+"""Of the pixels next to the object: if fewer were measured, there is no background within range."""
 _COARSE = 3
 """Far from the mask, only every third pixel in each direction is a free pixel."""
 _FREE_MARGIN, _FREE_MODEL_MARGIN = 3.0, 2.0
@@ -156,7 +161,7 @@ def observe(
     camera: Camera,
     noise: float | DepthNoise | None,
     model_error: float,
-    nan_is_empty: bool,
+    nan_is_empty: bool | None,
 ) -> Observation | None:
     """Sort the pixels of an image; None if the mask holds no depth at all.
 
@@ -192,6 +197,9 @@ def observe(
     filled = cv2.morphologyEx(inside.view(np.uint8), cv2.MORPH_CLOSE, np.ones((_HOLE, _HOLE), np.uint8))
     claimed = cv2.bitwise_or(filled, np.ascontiguousarray(mask[window]).view(np.uint8))
     near = cv2.dilate(filled, np.ones((2 * band + 1, 2 * band + 1), np.uint8))
+    if nan_is_empty is None:
+        beside = np.isfinite(crop[(near > 0) & (claimed == 0)])
+        nan_is_empty = beside.size == 0 or float(beside.mean()) < _BACKGROUND_SHARE
     lost = _convex_hull(claimed) if nan_is_empty else np.ones_like(claimed)
     pixels, areas, free, free_pixels = _sort(crop, inside, claimed, near, lost, footprint)
     return Observation(

@@ -38,7 +38,7 @@ class Options:
         image does not: the prediction of a network.  A wide prior with long tails; asked for only where it matters.
     nan_is_empty
         Whether a pixel without depth, outside the mask's convex hull, belongs to no part of the body, like one that saw
-        farther; if not, it says nothing.
+        farther; if not, it says nothing.  None: as the image has it, see :mod:`sq_perception.fitting.observation`.
     pixels
         Budget of object rays in the last stage; a fifth as many free rays come on top.  None: enough that noise
         averages out.
@@ -55,7 +55,7 @@ class Options:
     model_error: float | None = None
     plane: np.ndarray | None = None
     expected: Superquadric | Callable[[], Superquadric] | None = None
-    nan_is_empty: bool = True
+    nan_is_empty: bool | None = None
     pixels: int | None = None
     max_iterations: int = 15
     time_budget: float = math.inf

@@ -41,10 +41,10 @@ class ResidualBlock(nn.Module):
         return torch.relu(self.second_norm(self.second(y)) + self.shortcut(x))
 
 
-def compact_backbone(widths: tuple[int, ...], blocks: int) -> nn.Sequential:
-    """Views (n, 1, p, p) to cells (n, widths[-1], k, k) with k = p / 2^len(widths)."""
+def compact_backbone(widths: tuple[int, ...], blocks: int, channels_in: int = 1) -> nn.Sequential:
+    """Views (n, channels_in, p, p) to cells (n, widths[-1], k, k) with k = p / 2^len(widths)."""
     stem, *stages = widths
-    layers: list[nn.Module] = [nn.Conv2d(1, stem, 5, 2, 2, bias=False), nn.BatchNorm2d(stem), nn.ReLU()]
+    layers: list[nn.Module] = [nn.Conv2d(channels_in, stem, 5, 2, 2, bias=False), nn.BatchNorm2d(stem), nn.ReLU()]
     channels = stem
     for width in stages:
         layers.append(ResidualBlock(channels, width, 2))

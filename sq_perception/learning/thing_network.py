@@ -1,0 +1,168 @@
+"""The network that tells the unseen side of a thing: view and support plane in, support function of its hull out.
+
+Equation
+--------
+The support function h(n) = max over the thing of n.(p - c) is what boxes, widths, resting and grasps are made of; it
+exists for every shape and asks for no order of axes.  For the J directions n_j of
+:data:`sq_perception.geometry.support_directions.DIRECTIONS` the network says h ~ t_nu(mu, S), a multivariate t
+distribution with
+
+    S = diag(sigma^2) + L L^T,    L (J, K),
+
+as directions that look at the same unseen side err alike.  It is trained by the likelihood of the true h,
+
+    -log p = 1/2 log det S + (nu + J)/2 log(1 + m / nu) + const,    m = (h - mu)^T S^-1 (h - mu),
+
+with det and m by the matrices of K x K that follow from Woodbury's identity.  Beside that it says a superquadric, whose
+own support function (closed form) is drawn to the true one: where a fit begins.
+
+Frames and units
+----------------
+Those of the canonical view (:mod:`sq_perception.imaging.canonical_view`): the unit cube, y up, z towards the viewer;
+c = (1/2, 1/2, z0) is where the middle of the silhouette meets the nearest depth.  Planes are (n, d), n.p + d the height
+above the support; all zeros where none is known.
+
+Input   views (b, p, p) with HIDDEN wherever nothing was measured, planes (b, 4)
+Output  :class:`HullPrediction`
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import nn
+
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.geometry.support_directions import DIRECTIONS
+from sq_perception.imaging.canonical_view import NEAREST
+from sq_perception.learning.backbone import compact_backbone
+from sq_perception.learning.regressor import RegressorConfig
+
+MIDDLE = (0.5, 0.5, NEAREST)
+"""c: what h is measured from."""
+FREEDOM = 10.0
+"""nu of the t distribution: one view in twenty errs by a half more than it says."""
+_HALF_WAY = 0.5
+"""Depth at which a pixel without a surface is given its height above the plane."""
+_LEAST_LOG, _MOST_LOG = -5.0, 0.5
+"""Limits of log sigma: 0.7 % of the view's side, what a mask's pixel is, and more than the side."""
+_SIZE, _FLAT = 14, 4
+_FIRST_SUPPORT, _FIRST_LOG = 0.4, -2.5
+
+
+@dataclass(frozen=True)
+class ThingConfig:
+    """Everything that fixes the network's form; travels in the checkpoint's header."""
+
+    pixels: int = 64
+    widths: tuple[int, ...] = (32, 64, 128, 256)
+    """Channels of the stem and of each stage; every stage halves the resolution."""
+    blocks: int = 2
+    """Residual blocks a stage."""
+    hidden: int = 256
+    factors: int = 8
+    """K, the columns of L."""
+
+    def regressor(self) -> RegressorConfig:
+        """How the superquadric's parameters are encoded."""
+        return RegressorConfig(pixels=self.pixels, widths=self.widths, blocks=self.blocks, hidden=self.hidden)
+
+
+@dataclass(frozen=True, eq=False)
+class HullPrediction:
+    """What the network says of a batch of views, in the views' frames; arrays of torch.
+
+    Attributes
+    ----------
+    body : Superquadric
+        Batch (b,).
+    support : (b, J)
+        mu, in sides of the view.
+    log_sigma : (b, J)
+    factors : (b, J, K)
+        L.
+    """
+
+    body: Superquadric
+    support: torch.Tensor
+    log_sigma: torch.Tensor
+    factors: torch.Tensor
+
+    def covariance(self) -> torch.Tensor:
+        """S (b, J, J)."""
+        spread = torch.diag_embed(torch.exp(2 * self.log_sigma))
+        return spread + self.factors @ self.factors.transpose(1, 2)
+
+    def negative_log_likelihood(self, truth: torch.Tensor) -> torch.Tensor:
+        """Of true support functions (b, J); (b,), a constant left out."""
+        count = truth.shape[1]
+        weight = torch.exp(-2 * self.log_sigma)
+        error = truth - self.support
+        weighted = self.factors * weight[..., None]
+        inner = torch.eye(self.factors.shape[2], device=truth.device) + self.factors.transpose(1, 2) @ weighted
+        root = torch.linalg.cholesky(inner)
+        along = torch.linalg.solve_triangular(root, (weighted.transpose(1, 2) @ error[..., None]), upper=False)[..., 0]
+        distance = (weight * error * error).sum(1) - (along * along).sum(1)
+        log_det = 2 * self.log_sigma.sum(1) + 2 * torch.log(torch.diagonal(root, dim1=1, dim2=2)).sum(1)
+        return 0.5 * log_det + 0.5 * (FREEDOM + count) * torch.log1p(distance.clamp_min(0) / FREEDOM)
+
+
+class ThingNetwork(nn.Module):
+    """See the module."""
+
+    def __init__(self, config: ThingConfig | None = None) -> None:
+        super().__init__()
+        self.config = config = config or ThingConfig()
+        self._encoding = config.regressor()
+        count = len(DIRECTIONS)
+        self.features = compact_backbone(config.widths, config.blocks, channels_in=2)
+        inputs = config.widths[-1] * (config.pixels // self._encoding.stride) ** 2
+        self.mixer = nn.Sequential(
+            nn.Linear(inputs + _FLAT, config.hidden), nn.ReLU(), nn.Linear(config.hidden, config.hidden), nn.ReLU()
+        )
+        self.body_head = nn.Linear(config.hidden, _SIZE)
+        self.support_head = nn.Linear(config.hidden, count)
+        self.sigma_head = nn.Linear(config.hidden, count)
+        self.factor_head = nn.Linear(config.hidden, count * config.factors)
+        with torch.no_grad():
+            self.body_head.bias[8:].copy_(torch.tensor([1.0, 0, 0, 0, 1, 0]))
+            self.support_head.bias.fill_(_FIRST_SUPPORT)
+            self.sigma_head.bias.fill_(_FIRST_LOG)
+            self.factor_head.weight.mul_(0.1)
+
+    def forward(self, views: torch.Tensor, planes: torch.Tensor) -> HullPrediction:
+        h = self.features(torch.stack([views, self._heights(views, planes)], dim=1)).flatten(1)
+        h = self.mixer(torch.cat([h, planes.to(h.dtype)], dim=1)).float()
+        with torch.autocast(views.device.type, enabled=False):  # eight bits of mantissa are too few for a size
+            body = self._encoding.decode(self.body_head(h))
+            log_sigma = _LEAST_LOG + nn.functional.softplus(self.sigma_head(h) - _LEAST_LOG)
+            factors = self.factor_head(h).unflatten(1, (len(DIRECTIONS), self.config.factors))
+            return HullPrediction(body, self.support_head(h), log_sigma.clamp_max(_MOST_LOG), factors)
+
+    def _heights(self, views: torch.Tensor, planes: torch.Tensor) -> torch.Tensor:
+        """Height above the plane of what each pixel shows, of a point half way down where it shows nothing."""
+        pixels = views.shape[-1]
+        across = (torch.arange(pixels, device=views.device) + 0.5) / pixels
+        n = planes[:, :, None, None]
+        flat = n[:, 0] * across[None, None, :] + n[:, 1] * (1 - across)[None, :, None] + n[:, 3]
+        return flat + n[:, 2] * torch.where(views > 0, views, torch.full_like(views, _HALF_WAY))
+
+
+def support_of(body: Superquadric) -> torch.Tensor:
+    """The support function (b, J) of torch bodies (b,) in the frame of their views, from :data:`MIDDLE`."""
+    directions = torch.as_tensor(DIRECTIONS, dtype=body.size.dtype, device=body.size.device)
+    middle = torch.tensor(MIDDLE, dtype=body.size.dtype, device=body.size.device)
+    reach = body.support(directions.expand(len(body), -1, -1))
+    return (body.translation - middle) @ directions.T + reach
+
+
+def body_loss(body: Superquadric, truth: torch.Tensor) -> torch.Tensor:
+    """Mean distance (b,) between the support functions of bodies and the true ones (b, J), in sides of the view."""
+    return (support_of(body) - truth).abs().mean(dim=1)
+
+
+def mirrored_planes(planes: np.ndarray) -> np.ndarray:
+    """Planes (b, 4) of views whose x runs the other way."""
+    return np.stack([-planes[:, 0], planes[:, 1], planes[:, 2], planes[:, 3] + planes[:, 0]], axis=1)
