@@ -13,8 +13,8 @@ Families and their measures (ranges are wider than the sources: things differ)
 | kind | what | measures |
 | --- | --- | --- |
 | box | cartons, bricks, small packets, soap; books | longest edge 4.5 to 34 cm; ISO 216 A4 to A6, B5 (books) |
-| can | drink, food and spray cans, jars with lids, rolls | drink 66 x 115 mm and 53 to 58 mm slim, food 54 to 105 mm wide |
-| bottle | round, oval, with shoulders, caps, pumps, triggers, handles; tubes | caps 24 to 50 mm: PCO 1881 28 mm, 38 mm |
+| can | cans, spray cans, jars with lids, rolls | drink 66 x 115 mm, 53 to 58 mm slim, food 54 to 105 mm wide |
+| bottle | round, oval; shoulders, caps, pumps, triggers, handles; tubes | caps 24 to 50 mm: PCO 1881 28 mm, 38 mm |
 | vessel | bowls, cups, mugs, plates, tubs, pots | cups 55 to 100 mm wide, bowls 9 to 24 cm, plates 14 to 28 cm |
 | round | fruit, balls, eggs | 3 to 12 cm (UNECE fruit standards: apples 60 to 90 mm, citrus 45 to 110 mm) |
 | tool | pens, handles with heads, clamps, drills | pens 8 to 20 mm by 11 to 16 cm; handles 10 to 25 cm |
@@ -38,7 +38,16 @@ from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 
 KINDS = ("box", "can", "bottle", "vessel", "round", "tool", "union", "soft")
-LIKELY = {"box": 0.29, "can": 0.18, "bottle": 0.24, "vessel": 0.10, "round": 0.06, "tool": 0.05, "union": 0.04, "soft": 0.04}
+LIKELY = {
+    "box": 0.29,
+    "can": 0.18,
+    "bottle": 0.24,
+    "vessel": 0.10,
+    "round": 0.06,
+    "tool": 0.05,
+    "union": 0.04,
+    "soft": 0.04,
+}
 """How often each comes where nothing else is asked for."""
 
 _STRAIGHT = (0.0, 0.0, 0.0, 1.0)
@@ -144,15 +153,16 @@ def draw_thing(rng: np.random.Generator, kinds: Sequence[str] | None = None) -> 
     return maker(rng)
 
 
+_Numbers = Sequence[float] | np.ndarray
 _Row = tuple[float, ...]
 """A part: a1 a2 a3 e1 e2 x y z qx qy qz qw."""
 
 
 def _part(
-    size: Sequence[float],
-    shape: Sequence[float],
-    at: Sequence[float] = (0.0, 0.0, 0.0),
-    turn: Sequence[float] = _STRAIGHT,
+    size: _Numbers,
+    shape: _Numbers,
+    at: _Numbers = (0.0, 0.0, 0.0),
+    turn: _Numbers = _STRAIGHT,
 ) -> _Row:
     return (*size, *shape, *at, *turn)
 
@@ -384,7 +394,7 @@ def _tube(rng: np.random.Generator) -> Thing:
     return _thing("bottle", "tube", rows, (("lying", ON_Y, 0.75), ("standing", UPRIGHT, 0.25)))
 
 
-def _revolved(radii: Sequence[float], height: float, e1: float, e2: float = 1.0, flat: float = 1.0) -> list[_Row]:
+def _revolved(radii: _Numbers, height: float, e1: float, e2: float = 1.0, flat: float = 1.0) -> list[_Row]:
     """A stack of slabs with these radii from the base to the top."""
     count = len(radii)
     return [
@@ -493,7 +503,9 @@ def _handled(rng: np.random.Generator) -> Thing:
     rows = [_part((thick, flat * thick, long / 2), (rng.uniform(0.1, 0.4), rng.uniform(0.5, 1.0)), (0, 0, long / 2))]
     choice = rng.random()
     if choice < 0.35:  # across, as a hammer
-        rows.append(_part((rng.uniform(0.03, 0.06), 0.6 * thick + 0.008, 0.6 * thick + 0.008), (0.3, 0.3), (0, 0, long)))
+        rows.append(
+            _part((rng.uniform(0.03, 0.06), 0.6 * thick + 0.008, 0.6 * thick + 0.008), (0.3, 0.3), (0, 0, long))
+        )
     elif choice < 0.7:  # a blade, a spoon, a brush
         wide, far = rng.uniform(0.012, 0.045), rng.uniform(0.03, 0.07)
         blade = (wide, rng.uniform(0.002, 0.012), far)
@@ -529,7 +541,9 @@ def _toy(rng: np.random.Generator) -> Thing:
         way /= np.linalg.norm(way)
         at = np.array(other[5:8]) + way * np.array(other[:3]) * rng.uniform(0.6, 1.1)
         rows.append(_part(size, rng.uniform(0.1, 1.0, 2), at, quaternions.random(1, rng)[0]))
-    return _thing("union", "toy", rows, (("standing", UPRIGHT, 0.5), ("lying", ON_X, 0.25), ("on its side", ON_Y, 0.25)))
+    return _thing(
+        "union", "toy", rows, (("standing", UPRIGHT, 0.5), ("lying", ON_X, 0.25), ("on its side", ON_Y, 0.25))
+    )
 
 
 def _bag(rng: np.random.Generator) -> Thing:

@@ -6,7 +6,7 @@ follows.
 
     pose        standing, lying, leaning (:meth:`Thing.pose`), on the table, on top of something, or free in any pose
     camera      5 to 85 degrees above the table, most 20 to 70; a roll of some degrees; off the image's middle by up to
-                27 degrees; 0.35 to 2 m away; the thing is 24 to 96 pixels wide
+                27 degrees; 0.35 to 2 m away; the thing is 24 to 80 pixels wide
     around it   up to three neighbours on the table, something before it, the table's end, a wall or nothing behind it
     sensor      one of :mod:`sensor_noise` with random parameters: noise of a window, steps, the shadow of the baseline
                 on either side, fattened or mixed or wandering edges, lost grazing sides; besides a side that is lost as
@@ -22,6 +22,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -32,6 +33,7 @@ from sq_perception.geometry.support_directions import DIRECTIONS
 from sq_perception.imaging import canonical_view
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.canonical_view import NEAREST, CanonicalView
+from sq_perception.imaging.coherence import coherent
 from sq_perception.simulation.household import KINDS, Thing, about_z, draw_thing, support_of_union
 from sq_perception.simulation.scenes import plane_depth
 from sq_perception.simulation.sensor_noise import Ideal, SensorNoise, Stereo, StructuredLight, TimeOfFlight
@@ -43,17 +45,19 @@ PLANE_GIVEN = 0.8
 PLANE_TILT, PLANE_SHIFT = float(np.deg2rad(0.7)), 0.002
 """Standard deviations of the given plane: of its tilt in both directions, and of its distance from the thing."""
 
-_DISTANCE = (0.35, 2.0)
+_DISTANCE = (0.35, 1.3, 2.0)
 _FOCALS = (425.0, 525.0, 580.0, 615.0, 700.0, 920.0)
 """Pixels: depth cameras at VGA to HD."""
-_PIXELS_ACROSS = (24.0, 96.0)
+_PIXELS_ACROSS = (24.0, 80.0)
 _OFF_AXIS = (0.5, 0.4)
 _AROUND = 0.75
 """Half of the image's side over the thing's width."""
 _LEAST_SEEN = 40
-_LARGEST_SUPPORT = 3.0
+_LARGEST_SUPPORT, _LEAST_WIDTH = 3.0, 0.6
+_OPPOSITE = np.argmin(DIRECTIONS @ DIRECTIONS.T, axis=1)
 _ATTEMPTS = 50
-_ON_TABLE = 0.004
+_ON_TABLE = 0.003
+_JUMP_PIXELS, _JUMP = 10.0, 0.002
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,13 +161,15 @@ def _draw_one(
         plane = None
         if setting.table is not None and rng.random() < PLANE_GIVEN:
             plane = _imprecise(setting.table, setting.parts.translation.mean(axis=0), rng)
+        if np.count_nonzero(seen & np.isfinite(measured)) < _LEAST_SEEN:
+            continue
         mask = _masked(measured, seen, setting.camera, setting.table if plane is None else plane, rng)
         measured, mask, camera = _cut(measured, mask, setting.camera, rng)
         if np.count_nonzero(mask & np.isfinite(measured)) < _LEAST_SEEN:
             continue
         view = canonical_view.from_mask(measured, mask, camera, pixels, plane=plane, missing_is_hidden=True)
         reach = support_in_view(setting.parts, view)
-        if np.abs(reach).max() > _LARGEST_SUPPORT:
+        if np.abs(reach).max() > _LARGEST_SUPPORT or (reach + reach[_OPPOSITE]).max() < _LEAST_WIDTH:
             continue
         return thing, view.marked, np.zeros(4) if plane is None else plane_in_view(plane, view), reach
     raise RuntimeError(f"no view of a thing shows {_LEAST_SEEN} pixels of it in {_ATTEMPTS} attempts")
@@ -187,7 +193,8 @@ def draw_setting(thing: Thing, rng: np.random.Generator) -> Setting:
     roll = rng.normal(0, np.deg2rad(4.0)) if rng.random() < 0.93 else rng.uniform(-np.pi, np.pi)
     aside, below = rng.uniform(-1, 1, 2) * _OFF_AXIS
     optical_from_table = about_z(roll) @ _looking_down(elevation - np.arctan(below))
-    distance = np.exp(rng.uniform(*np.log(_DISTANCE)))
+    near, usual, far = _DISTANCE
+    distance = np.exp(rng.uniform(np.log(near), np.log(usual if rng.random() < 0.85 else far)))
     ray = np.array([aside, below, 1.0])
     middle = lift + 0.5 * (reach[:3] - reach[3:])
     shift = distance * ray / np.linalg.norm(ray) - optical_from_table @ middle
@@ -253,11 +260,9 @@ def _neighbours(parts: Superquadric, floor: float, rng: np.random.Generator) -> 
     return rows
 
 
-def _something_before(
-    depth: np.ndarray, seen: np.ndarray, rng: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
+def _something_before(depth: np.ndarray, seen: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
     """In some images something nearer that comes in from one side: a straight edge, a corner or a round thing."""
-    if rng.random() > 0.2 or not seen.any():
+    if rng.random() > 0.15 or not seen.any():
         return depth, seen
     v, u = np.nonzero(seen)
     side = max(np.ptp(u), np.ptp(v)) + 1
@@ -283,17 +288,17 @@ def draw_sensor(camera: Camera, rng: np.random.Generator) -> SensorNoise:
         near = rng.uniform(0.1, 0.3)
         return TimeOfFlight(near, rng.uniform(3.0, 5.0), rng.uniform(0.0, 2.0), rng.uniform(0.0, 1.0))
     grazing = rng.uniform(55, 80)
-    shared = dict(
-        focal=camera.fx,
-        baseline=rng.choice([-1.0, 1.0]) * rng.uniform(0.02, 0.12),
-        step=rng.choice([0.0, 1 / 32, 1 / 8]),
-        window=(int(rng.choice([1, 3, 5, 7])), int(rng.choice([1, 3, 5]))),
-        near=0.1,
-        far=10.0,
-        edge_wander=rng.uniform(0.0, 1.2),
-        grazing=grazing,
-        blind=rng.uniform(grazing, 89),
-    )
+    shared: dict[str, Any] = {
+        "focal": camera.fx,
+        "baseline": rng.choice([-1.0, 1.0]) * rng.uniform(0.02, 0.12),
+        "step": rng.choice([0.0, 1 / 32, 1 / 8]),
+        "window": (int(rng.choice([1, 3, 5, 7])), int(rng.choice([1, 3, 5]))),
+        "near": 0.1,
+        "far": 10.0,
+        "edge_wander": rng.uniform(0.0, 1.2),
+        "grazing": grazing,
+        "blind": rng.uniform(grazing, 89),
+    }
     if choice < 0.65:
         return StructuredLight(**shared)
     return Stereo(**shared, subpixel=rng.uniform(0.02, 0.15), fattening=int(rng.integers(0, 3)))
@@ -305,7 +310,7 @@ def _measured(depth: np.ndarray, seen: np.ndarray, camera: Camera, rng: np.rando
     measured = sensor.measured(depth, camera, rng)
     if rng.random() < 0.35:
         measured[seen & _turned_aside(depth, camera, rng)] = np.nan
-    if rng.random() < 0.2:
+    if rng.random() < 0.15:
         measured[seen & _blob(seen, rng)] = np.nan
     if rng.random() < 0.3:
         measured = _smoothed(measured, int(rng.choice([3, 5])), seen if rng.random() < 0.5 else None)
@@ -358,7 +363,7 @@ def _masked(
 ) -> np.ndarray:
     """The mask that a segmentation or a person draws, less what measured the table, as the views of images have it."""
     error = rng.choice([-2, -1, 0, 1, 2], p=[0.08, 0.3, 0.32, 0.2, 0.1])
-    mask = seen.astype(np.uint8)
+    mask: np.ndarray = seen.astype(np.uint8)
     if error:
         brush = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * abs(error) + 1, 2 * abs(error) + 1))
         mask = cv2.dilate(mask, brush) if error > 0 else cv2.erode(mask, brush)
@@ -369,9 +374,11 @@ def _masked(
         rows, columns = np.nonzero(inner)
         points = camera.unproject(columns, rows, measured[rows, columns])
         above = inner.copy()
+        # A pixel without a reading stays: its comparison is False.
         above[rows, columns] = ~(points @ table[:3] + table[3] <= _ON_TABLE)
         inner = above if 2 * np.count_nonzero(above) > rows.size else inner
-    return inner
+    footprint = float(np.median(measured[seen][np.isfinite(measured[seen])], axis=0)) / camera.fx
+    return coherent(measured, inner, _JUMP_PIXELS * footprint + _JUMP)
 
 
 def _cut(
