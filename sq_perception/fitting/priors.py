@@ -7,6 +7,8 @@ rest        the two components of R^T n across the axis nearest to the normal, o
 proportion  log a_k minus the mean of the three, over sigma: what the image leaves open resembles what it shows.
 expectation log a_k minus that of a predicted half size, over sigma, Cauchy: a prediction may be altogether wrong.
 roundness   log(a1 / a2) and 1 - e2, over sigma: a body of revolution about its z axis.
+hull        W (n_j.t + h(R^T n_j) - b_j): the support function in J directions beside a predicted one b, whitened by
+            W^T W = S^-1; all J together by the loss of a t distribution, (nu + J) log(1 + |r|^2 / nu).
 volume      a linear price on log(a1 a2 a3), for the smaller of two bodies that explain the image alike.
 
 Each function returns its share of the cost and adds its derivatives to the normal equations ``sums``; the unknowns are
@@ -39,6 +41,8 @@ def prior_cost(scene: Scene, parameters: np.ndarray, rotation: np.ndarray, sums:
         cost += _expectation_cost(scene, parameters, sums)
     if scene.roundness_stiffness > 0.0:
         cost += _roundness_cost(scene, parameters, sums)
+    if scene.hull_directions.shape[0] > 0:
+        cost += _hull_cost(scene, parameters, rotation, sums)
     if scene.volume_price > 0.0:
         for k in range(3):
             cost += scene.volume_price * math.log(parameters[k])
@@ -111,6 +115,35 @@ def _support_cost(scene: Scene, parameters: np.ndarray, rotation: np.ndarray, su
             row[STEP_LENGTH] = scale * n[k]
             add_row(row, sums)
     return cost
+
+
+@kernel
+def _hull_cost(scene: Scene, parameters: np.ndarray, rotation: np.ndarray, sums: np.ndarray) -> float:
+    a1, a2, a3, e1, e2, t1, t2, t3 = parameters
+    count = scene.hull_directions.shape[0]
+    rows = np.empty((count, STEP_LENGTH + 1))
+    n = np.zeros(3)
+    for j in range(count):
+        d0, d1, d2 = scene.hull_directions[j]
+        for k in range(3):
+            n[k] = rotation[0, k] * d0 + rotation[1, k] * d1 + rotation[2, k] * d2
+        h, hx, hy, hz, h1, h2 = support_derivatives(n[0], n[1], n[2], a1, a2, a3, e1, e2)
+        rows[j, 0], rows[j, 1], rows[j, 2] = hx * n[0], hy * n[1], hz * n[2]
+        rows[j, 3], rows[j, 4] = h1, h2
+        rows[j, 5], rows[j, 6], rows[j, 7] = d0, d1, d2
+        rows[j, 8] = hy * n[2] - hz * n[1]
+        rows[j, 9] = hz * n[0] - hx * n[2]
+        rows[j, 10] = hx * n[1] - hy * n[0]
+        rows[j, STEP_LENGTH] = d0 * t1 + d1 * t2 + d2 * t3 + h - scene.hull_support[j]
+    whitened = scene.hull_root @ rows
+    square = 0.0
+    for j in range(count):
+        square += whitened[j, STEP_LENGTH] * whitened[j, STEP_LENGTH]
+    freedom = scene.hull_freedom
+    whitened *= math.sqrt((freedom + count) / (freedom + square))
+    for j in range(count):
+        add_row(whitened[j], sums)
+    return (freedom + count) * math.log1p(square / freedom)
 
 
 @kernel

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import numpy as np
+
 
 class Scene(NamedTuple):
     """Constants of the residuals; see :mod:`sq_perception.fitting.residuals` and :mod:`sq_perception.fitting.priors`.
@@ -12,7 +14,7 @@ class Scene(NamedTuple):
     not 0, all others by Huber's.  A rendered depth is found by Newton's method until |g - 1| < ``hit_tolerance``,
     then in first order. Rendered residuals up to ``dead_zone`` noise levels count as 0: what rounding may do.
     ``outline_stiffness`` is 1/sigma_o; the plane is n.x + d = height; a stiffness or price of 0 switches its term
-    off.
+    off.  The rows of ``hull_directions`` are n_j, of ``hull_root`` those of W; no rows switch that term off.
     """
 
     huber: float = 3.0
@@ -37,3 +39,7 @@ class Scene(NamedTuple):
     expected_3: float = 1.0
     expectation_stiffness: float = 0.0
     volume_price: float = 0.0
+    hull_directions: np.ndarray = np.empty((0, 3))
+    hull_support: np.ndarray = np.empty(0)
+    hull_root: np.ndarray = np.empty((0, 0))
+    hull_freedom: float = 0.0

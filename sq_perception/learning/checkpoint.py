@@ -27,11 +27,15 @@ from safetensors.torch import load as tensors_of
 from safetensors.torch import save_file
 
 from sq_perception.learning.regressor import Regressor, RegressorConfig
+from sq_perception.learning.thing_network import ThingConfig, ThingNetwork
 
-FORMAT = "sq_perception.regressor"
+FORMAT, THING_FORMAT = "sq_perception.regressor", "sq_perception.things"
+_FORMATS = {Regressor: FORMAT, ThingNetwork: THING_FORMAT}
 VERSION = "1"
 DEFAULT = "robust"
 """Name of the weights that are used where none are named."""
+THINGS = "things"
+"""Name of the weights that tell the unseen side of things."""
 _MAX_PARAMETERS = 200_000_000
 _MAX_BYTES = 4 * _MAX_PARAMETERS + 2**20
 _MAX_HEADER_BYTES = 2**20
@@ -59,14 +63,17 @@ def resolve(model: Path | str | None = None) -> Path:
 
 
 def save(
-    path: Path | str, model: Regressor, notes: dict[str, Any] | None = None, dtype: torch.dtype = torch.float16
+    path: Path | str,
+    model: Regressor | ThingNetwork,
+    notes: dict[str, Any] | None = None,
+    dtype: torch.dtype = torch.float16,
 ) -> None:
     """Write a network and ``notes`` (JSON values) to ``path``; replaced at once, never half written."""
     path = Path(path)
     state = {}
     for name, tensor in model.state_dict().items():
         state[name] = (tensor.to(dtype) if tensor.is_floating_point() else tensor).contiguous().cpu()
-    header = {"format": FORMAT, "version": VERSION, "config": json.dumps(asdict(model.config))}
+    header = {"format": _FORMATS[type(model)], "version": VERSION, "config": json.dumps(asdict(model.config))}
     header.update({key: json.dumps(value) for key, value in (notes or {}).items()})
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_suffix(path.suffix + ".partial")
@@ -83,9 +90,21 @@ def load(path: Path | str | None = None, device: str | torch.device = "cpu") -> 
     CheckpointError
         If the file is missing, no safetensors file, of another format or version, or does not fit its own config.
     """
-    path = resolve(path)
+    model = _loaded(resolve(path), FORMAT)
+    assert isinstance(model, Regressor)
+    return model.to(device).eval()
+
+
+def load_things(path: Path | str | None = None, device: str | torch.device = "cpu") -> ThingNetwork:
+    """The network of things, None for the one that ships; otherwise as :func:`load`."""
+    model = _loaded(resolve(THINGS if path is None else path), THING_FORMAT)
+    assert isinstance(model, ThingNetwork)
+    return model.to(device).eval()
+
+
+def _loaded(path: Path, form: str) -> Regressor | ThingNetwork:
     data, _ = _bytes(path)
-    model = _described(path, _strings(path, data, len(data)))
+    model = _described(path, _strings(path, data, len(data)), form)
     try:
         state = tensors_of(data)
     except (SafetensorError, ValueError, KeyError) as error:
@@ -99,7 +118,7 @@ def load(path: Path | str | None = None, device: str | torch.device = "cpu") -> 
         raise CheckpointError(f"{path}: the weights do not fit the config: {error}") from error
     if not all(bool(torch.isfinite(t).all()) for t in model.state_dict().values()):
         raise CheckpointError(f"{path}: the weights are not all finite")
-    return model.to(device).eval()
+    return model
 
 
 def read_header(path: Path | str | None = None) -> dict[str, str]:
@@ -115,7 +134,7 @@ def check(path: Path | str | None = None) -> None:
     Reads a megabyte at most, whatever the file.
     """
     path = resolve(path)
-    _described(path, read_header(path))
+    _described(path, read_header(path), FORMAT)
 
 
 def _bytes(path: Path, header_only: bool = False) -> tuple[bytes, int]:
@@ -156,7 +175,7 @@ def _strings(path: Path, data: bytes, size: int) -> dict[str, str]:
     return strings
 
 
-def _described(path: Path, header: dict[str, str]) -> Regressor:
+def _described(path: Path, header: dict[str, str], form: str) -> Regressor | ThingNetwork:
     """The network that a header describes, without weights.
 
     Raises
@@ -164,28 +183,28 @@ def _described(path: Path, header: dict[str, str]) -> Regressor:
     CheckpointError
         If it describes none.
     """
-    if header.get("format") != FORMAT:
-        raise CheckpointError(f"{path}: expected a header 'format: {FORMAT}', got {header.get('format')!r}")
+    if header.get("format") != form:
+        raise CheckpointError(f"{path}: expected a header 'format: {form}', got {header.get('format')!r}")
     if header.get("version") != VERSION:
         raise CheckpointError(f"{path}: expected format version {VERSION}, got {header.get('version')!r}")
     try:
-        return _network(_config(json.loads(header["config"])))
+        return _network(_config(json.loads(header["config"]), form))
     except (KeyError, TypeError, ValueError, RuntimeError, ArithmeticError, AttributeError, RecursionError) as error:
         raise CheckpointError(f"{path}: the header's config describes no network: {error}") from error
 
 
-def _config(values: dict[str, Any]) -> RegressorConfig:
+def _config(values: dict[str, Any], form: str) -> RegressorConfig | ThingConfig:
     arguments: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
-    config = RegressorConfig(**arguments)
+    config = RegressorConfig(**arguments) if form == FORMAT else ThingConfig(**arguments)
     if config.pixels > _MAX_PIXELS or config.blocks > _MAX_BLOCKS:
         raise ValueError(f"expected at most {_MAX_PIXELS} pixels and {_MAX_BLOCKS} blocks a stage")
     return config
 
 
-def _network(config: RegressorConfig) -> Regressor:
+def _network(config: RegressorConfig | ThingConfig) -> Regressor | ThingNetwork:
     """The network without memory of its own: only what the file really holds is ever allocated."""
     with torch.device("meta"):
-        model = Regressor(config)
+        model = Regressor(config) if isinstance(config, RegressorConfig) else ThingNetwork(config)
     if sum(parameter.numel() for parameter in model.parameters()) > _MAX_PARAMETERS:
         raise ValueError("the network would be larger than any this package trains")
     return model

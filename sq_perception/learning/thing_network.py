@@ -48,7 +48,7 @@ _HALF_WAY = 0.5
 """Depth at which a pixel without a surface is given its height above the plane."""
 _LEAST_LOG, _MOST_LOG = -5.0, 0.5
 """Limits of log sigma: 0.7 % of the view's side, what a mask's pixel is, and more than the side."""
-_SIZE, _FLAT = 14, 4
+_PARAMETERS, _PLANE = 14, 4
 _FIRST_SUPPORT, _FIRST_LOG = 0.4, -2.5
 
 
@@ -120,14 +120,14 @@ class ThingNetwork(nn.Module):
         self.features = compact_backbone(config.widths, config.blocks, channels_in=2)
         inputs = config.widths[-1] * (config.pixels // self._encoding.stride) ** 2
         self.mixer = nn.Sequential(
-            nn.Linear(inputs + _FLAT, config.hidden), nn.ReLU(), nn.Linear(config.hidden, config.hidden), nn.ReLU()
+            nn.Linear(inputs + _PLANE, config.hidden), nn.ReLU(), nn.Linear(config.hidden, config.hidden), nn.ReLU()
         )
-        self.body_head = nn.Linear(config.hidden, _SIZE)
+        self.body_head = nn.Linear(config.hidden, _PARAMETERS)
         self.support_head = nn.Linear(config.hidden, count)
         self.sigma_head = nn.Linear(config.hidden, count)
         self.factor_head = nn.Linear(config.hidden, count * config.factors)
         with torch.no_grad():
-            self.body_head.bias[8:].copy_(torch.tensor([1.0, 0, 0, 0, 1, 0]))
+            self.body_head.bias[_PARAMETERS - 6 :].copy_(torch.tensor([1.0, 0, 0, 0, 1, 0]))
             self.support_head.bias.fill_(_FIRST_SUPPORT)
             self.sigma_head.bias.fill_(_FIRST_LOG)
             self.factor_head.weight.mul_(0.1)
@@ -152,7 +152,7 @@ class ThingNetwork(nn.Module):
 
 def support_of(body: Superquadric) -> torch.Tensor:
     """The support function (b, J) of torch bodies (b,) in the frame of their views, from :data:`MIDDLE`."""
-    directions = torch.as_tensor(DIRECTIONS, dtype=body.size.dtype, device=body.size.device)
+    directions = torch.tensor(DIRECTIONS, dtype=body.size.dtype, device=body.size.device)
     middle = torch.tensor(MIDDLE, dtype=body.size.dtype, device=body.size.device)
     reach = body.support(directions.expand(len(body), -1, -1))
     return (body.translation - middle) @ directions.T + reach

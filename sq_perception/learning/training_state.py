@@ -13,9 +13,9 @@ from pathlib import Path
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
+from torch import nn
 
 from sq_perception.learning.checkpoint import CheckpointError
-from sq_perception.learning.regressor import Regressor
 from sq_perception.learning.schedule import Cosine, Plateau
 
 
@@ -23,8 +23,8 @@ from sq_perception.learning.schedule import Cosine, Plateau
 class TrainingState:
     """What a training holds between two steps."""
 
-    model: Regressor
-    average: Regressor
+    model: nn.Module
+    average: nn.Module
     optimizer: torch.optim.Optimizer
     schedule: Cosine | Plateau
     step: int = 0
@@ -87,7 +87,7 @@ class TrainingState:
 
 
 @torch.no_grad()
-def recalibrate(model: Regressor, views: torch.Tensor, batch: int) -> None:
+def recalibrate(model: nn.Module, views: torch.Tensor, batch: int) -> None:
     """Measure the means and variances of all normalisations anew, on ``views`` (n, 1, p, p).
 
     An average of weights has activations of its own: those recorded while the moving weights trained do not fit it.

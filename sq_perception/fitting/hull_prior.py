@@ -1,0 +1,48 @@
+"""What is known of a thing's convex hull before its pixels are looked at: its support function, and how well.
+
+    h(n) = max over the thing of n.p,     h(n_j) ~ t_nu(b_j, S),     j = 1 .. J
+
+n_j, b and S are in the optical frame of the camera, metres.  A superquadric is no thing: what the best one leaves over
+joins S as an error of each direction by itself, ``MODEL_SHARE`` of the thing's extent.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+MODEL_SHARE = 0.01
+"""Root mean square difference between a household thing's support function and that of the nearest superquadric, as a
+share of the thing's extent; measured on simulation/household.py."""
+
+
+@dataclass(frozen=True, eq=False)
+class HullPrior:
+    """A predicted support function.
+
+    Attributes
+    ----------
+    directions : (J, 3)
+        Unit vectors n_j, optical frame.
+    support : (J,)
+        b_j, metres from the origin of the optical frame.
+    covariance : (J, J)
+        S, square metres.
+    freedom : float
+        nu.
+    extent : float
+        The thing's size as far as it was seen, metres.
+    """
+
+    directions: np.ndarray
+    support: np.ndarray
+    covariance: np.ndarray
+    freedom: float
+    extent: float
+
+    def root(self) -> np.ndarray:
+        """W (J, J) with W^T W = S^-1."""
+        model = MODEL_SHARE * self.extent
+        factor = np.linalg.cholesky(self.covariance + model**2 * np.eye(len(self.support)))
+        return np.ascontiguousarray(np.linalg.inv(factor))

@@ -1,0 +1,271 @@
+"""Train the network of things (:mod:`sq_perception.learning.thing_network`) on views that a folder holds.
+
+Making a view takes as long as learning from it (:mod:`sq_perception.simulation.thing_views`), and each is worth being
+seen several times; so views are written into a folder first, or meanwhile by another process, and this script reads
+what it finds there, again and again.  Half of them are shown as in a mirror.
+
+    loss = mean over views of  -log p(h) / J  +  BODY |h_body - h|  +  CENTRE |mu - h|
+
+The likelihood alone makes the first steps wild; the last term leads.  The learning rate falls as a cosine over the time
+that the run is given, as on a CPU the time is what is known beforehand.  A run that was stopped goes on where it was
+when the same command is given again.
+
+Views of the ``held`` first shards are never trained on; the log tells of them, by kind: the mean error of h, and the
+standard deviation of error / sigma, which an honest network has at 1.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors.numpy import load_file as load_arrays
+from safetensors.numpy import save_file as save_arrays
+
+from sq_perception.files import provenance
+from sq_perception.geometry.support_directions import mirrored
+from sq_perception.learning import checkpoint, thing_network
+from sq_perception.learning.checkpoint import CheckpointError
+from sq_perception.learning.schedule import Cosine
+from sq_perception.learning.thing_network import HullPrediction, ThingConfig, ThingNetwork
+from sq_perception.learning.training_state import TrainingState
+from sq_perception.simulation.household import KINDS
+from sq_perception.simulation.thing_views import ThingViews, draw_thing_views
+
+BODY, CENTRE = 2.0, 1.0
+"""Weights of the losses beside the likelihood, which is of order 1 where they are of order 0.05."""
+_CLIP = 1.0
+_WARM_UP = 100
+_AVERAGE = 0.998
+"""The averaged weights, which are what is kept, remember some 500 steps."""
+
+
+@dataclass(frozen=True)
+class ThingTraining:
+    """What fixes a run."""
+
+    minutes: float = 120.0
+    """Training time, that of all parts of a stopped run together."""
+    batch: int = 128
+    rate: float = 1e-3
+    weight_decay: float = 1e-4
+    seed: int = 0
+    threads: int = 0
+    """Of torch; 0 leaves its own choice."""
+    held: int = 4
+    """Shards that are kept for validation."""
+    validation: int = 200
+    """Steps between two validations."""
+    start: str = ""
+    """Weights to begin with, as names of torch parameters: a safetensors file of this network or of a Regressor."""
+
+
+def write_views(folder: Path, shards: int, views: int, seed: int, said: Callable[[str], None]) -> None:
+    """Write shards of freshly drawn views that are not there yet; shard k follows from (seed, k) alone."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for k in range(shards):
+        path = folder / f"{k:05d}.safetensors"
+        if path.exists():
+            continue
+        drawn = draw_thing_views(views, np.random.default_rng([seed, k]))
+        arrays = {
+            "images": drawn.images.astype(np.float16),
+            "planes": drawn.planes,
+            "support": drawn.support,
+            "kinds": drawn.kinds,
+        }
+        partial = path.with_suffix(".partial")
+        save_arrays(arrays, str(partial))
+        partial.replace(path)
+        said(f"{path}: {views} views")
+
+
+def read_views(paths: list[Path]) -> ThingViews:
+    """All views of some shards."""
+    shards = [load_arrays(str(path)) for path in paths]
+    images, planes, support, kinds = (
+        np.concatenate([shard[name] for shard in shards]) for name in ("images", "planes", "support", "kinds")
+    )
+    return ThingViews(images, planes, support, kinds)
+
+
+def train(config: ThingTraining, views: Path, output: Path, form: ThingConfig | None = None) -> ThingNetwork:
+    """Run, or continue, a training; returns the averaged network, also kept in ``output``/things.safetensors.
+
+    Raises
+    ------
+    ValueError
+        If the folder holds no more shards than are kept for validation.
+    CheckpointError
+        If a file to begin or to go on with does not fit.
+    ArithmeticError
+        If the loss is no longer finite; the last state that was saved stays.
+    """
+    if config.threads:
+        torch.set_num_threads(config.threads)
+    torch.manual_seed(config.seed)
+    output.mkdir(parents=True, exist_ok=True)
+    network = ThingNetwork(form)
+    if config.start:
+        begin_with(network, Path(config.start))
+    network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    optimizer = torch.optim.AdamW(network.parameters(), lr=config.rate, weight_decay=config.weight_decay)
+    state = TrainingState(network, copy.deepcopy(network), optimizer, Cosine(config.rate, _WARM_UP, 1))
+    path = output / "state.safetensors"
+    if path.exists():
+        state.restore(path)
+    rng = np.random.default_rng([config.seed, state.step])
+    shards: list[Path] = []
+    pool = held = read_views(_shards(views, config.held)[: config.held])
+    began, losses = time.monotonic() - state.seconds, []
+    while (progress := (time.monotonic() - began) / (60 * config.minutes)) < 1:
+        if state.step % config.validation == 0 or not shards:
+            found = _shards(views, config.held)[config.held :]
+            if len(found) > len(shards):
+                shards, pool = found, read_views(found)
+        rate = config.rate * min(1.0, (state.step + 1) / _WARM_UP) * (0.5 * (1 + math.cos(math.pi * progress)) + 0.01)
+        for group in optimizer.param_groups:
+            group["lr"] = rate
+        images, planes, truth = _batch(pool, rng.integers(len(pool.images), size=config.batch), rng)
+        network.train()
+        said = network(images, planes)
+        loss = (
+            said.negative_log_likelihood(truth).mean() / truth.shape[1]
+            + BODY * thing_network.body_loss(said.body, truth).mean()
+            + CENTRE * (said.support - truth).abs().mean()
+        )
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(network.parameters(), _CLIP)
+        if not bool(torch.isfinite(loss)):
+            raise ArithmeticError(f"step {state.step}: the loss is {loss.item()}; {path} is the last good state")
+        optimizer.step()
+        state.follow(_AVERAGE)
+        state.step += 1
+        losses.append(loss.item())
+        if state.step % config.validation == 0:
+            state.seconds = time.monotonic() - began
+            record = {"step": state.step, "loss": float(np.mean(losses)), "rate": rate, "views": len(pool.images)}
+            _keep(output, state, {**record, "seconds": state.seconds, **validate(_average(state), held)}, config)
+            losses.clear()
+    state.seconds = time.monotonic() - began
+    _keep(output, state, {"step": state.step, "seconds": state.seconds, **validate(_average(state), held)}, config)
+    return _average(state)
+
+
+def validate(network: ThingNetwork, views: ThingViews, batch: int = 256) -> dict[str, Any]:
+    """Mean errors of h and of the body's h in sides of the view, and the deviation of error / sigma, by kind."""
+    errors, body_errors, ratios = [], [], []
+    network.eval()
+    for i in range(0, len(views.images), batch):
+        part = slice(i, i + batch)
+        truth = torch.from_numpy(views.support[part])
+        with torch.inference_mode():
+            said: HullPrediction = network(
+                torch.from_numpy(views.images[part].astype(np.float32)), torch.from_numpy(views.planes[part])
+            )
+            error = (said.support - truth).numpy()
+            sigma = np.sqrt(np.diagonal(said.covariance().numpy(), axis1=1, axis2=2))
+            body_errors.append(thing_network.body_loss(said.body, truth).numpy())
+        errors.append(np.abs(error).mean(axis=1))
+        ratios.append(error / sigma)
+    error, body_error, ratio = np.concatenate(errors), np.concatenate(body_errors), np.concatenate(ratios)
+    found: dict[str, Any] = {
+        "error": float(error.mean()),
+        "body": float(body_error.mean()),
+        "ratio": float(ratio.std()),
+    }
+    for k, kind in enumerate(KINDS):
+        mine = views.kinds == k
+        if mine.any():
+            found[kind] = [float(error[mine].mean()), float(np.sqrt(np.mean(ratio[mine] ** 2)))]
+    return found
+
+
+def begin_with(network: ThingNetwork, path: Path) -> None:
+    """Take over the weights that fit by name and shape; those of a Regressor's first layers among them.
+
+    Raises
+    ------
+    CheckpointError
+        If the file cannot be read, or nothing in it fits.
+    """
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    try:
+        given = load_file(str(path))
+    except (OSError, SafetensorError) as error:
+        raise CheckpointError(f"{path}: not a readable safetensors file: {error}") from error
+    # A Regressor flattens in its mixer's first layer, and has one channel in and no plane.
+    given = {_mixer_without_flatten(name): tensor.float() for name, tensor in given.items()}
+    taken = 0
+    with torch.no_grad():
+        for name, mine in network.state_dict().items():
+            theirs = given.get(name)
+            if theirs is None or theirs.ndim != mine.ndim:
+                continue
+            if theirs.shape == mine.shape:
+                mine.copy_(theirs)
+            elif mine.ndim > 1 and theirs.shape[1] < mine.shape[1] and theirs.shape[0] == mine.shape[0]:
+                mine.zero_()
+                mine[:, : theirs.shape[1]].copy_(theirs)
+            else:
+                continue
+            taken += 1
+        heads = [given.get(f"{part}_head.weight") for part in ("size", "shape", "translation", "rotation")]
+        biases = [given.get(f"{part}_head.bias") for part in ("size", "shape", "translation", "rotation")]
+        if all(head is not None for head in heads):
+            network.body_head.weight.copy_(torch.cat([h for h in heads if h is not None]))
+            network.body_head.bias.copy_(torch.cat([b for b in biases if b is not None]))
+    if taken == 0:
+        raise CheckpointError(f"{path}: none of its weights fits the network")
+
+
+def _mixer_without_flatten(name: str) -> str:
+    parts = name.split(".")
+    if parts[0] == "mixer":
+        parts[1] = str(int(parts[1]) - 1)
+    return ".".join(parts)
+
+
+def _shards(folder: Path, held: int) -> list[Path]:
+    found = sorted(folder.glob("*.safetensors"))
+    if len(found) <= held:
+        raise ValueError(f"{folder}: expected more than {held} shards of views, found {len(found)}")
+    return found
+
+
+def _batch(
+    views: ThingViews, chosen: np.ndarray, rng: np.random.Generator
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Images (b, p, p), planes (b, 4) and support functions (b, J) of some views, half of them mirrored."""
+    images = views.images[chosen].astype(np.float32)
+    planes, support = views.planes[chosen], views.support[chosen]
+    turned = rng.random(len(chosen)) < 0.5
+    images[turned] = images[turned][:, :, ::-1]
+    planes = np.where(turned[:, None], thing_network.mirrored_planes(planes), planes)
+    support = np.where(turned[:, None], support[:, mirrored(0)], support)
+    return torch.from_numpy(images), torch.from_numpy(planes), torch.from_numpy(support)
+
+
+def _average(state: TrainingState) -> ThingNetwork:
+    assert isinstance(state.average, ThingNetwork)
+    return state.average
+
+
+def _keep(output: Path, state: TrainingState, record: dict[str, Any], config: ThingTraining) -> None:
+    """Log, state and network of this moment."""
+    with (output / "log.jsonl").open("a", encoding="utf-8") as file:
+        file.write(json.dumps(record) + "\n")
+    state.save(output / "state.safetensors")
+    made = provenance.facts("sq-perception train-things")
+    checkpoint.save(output / "things.safetensors", _average(state), {"training": asdict(config), "made": made})
