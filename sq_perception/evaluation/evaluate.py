@@ -22,7 +22,7 @@ import torch
 
 from sq_perception.evaluation import report
 from sq_perception.evaluation.contest import Advance, compare
-from sq_perception.evaluation.contestants import FITS, Contestant, Fit, Network, unique_names
+from sq_perception.evaluation.contestants import FITS, Contestant, FittingMethod, Network, unique_names
 from sq_perception.evaluation.thesis_images import DEFAULT_SEED, ThesisImages
 from sq_perception.files import provenance
 from sq_perception.learning.checkpoint import CheckpointError, shipped
@@ -90,7 +90,7 @@ def main(arguments: list[str] | None = None) -> int:
             failures.append(str(error))
     for method in methods:
         try:
-            contestants.append((Fit.of(method), min(options.fit_bodies, options.bodies)))
+            contestants.append((FittingMethod.of(method), min(options.fit_bodies, options.bodies)))
         except CheckpointError as error:
             failures.append(f"{method}: {error}")
     for failure in failures:

@@ -84,6 +84,12 @@ class CanonicalView:
         shift = np.array([0.5, 0.5, NEAREST]) - rotated / self.extent
         return body.transformed(self.rotation, shift, 1 / self.extent)
 
+    def plane_to_canonical(self, plane: np.ndarray) -> np.ndarray:
+        """A plane (4,) n.p + d = 0 of the optical frame, metres, in the canonical frame and its unit."""
+        normal = quaternions.to_matrix(self.rotation) @ plane[:3]
+        offset = (plane[:3] @ self.anchor + plane[3]) / self.extent - normal @ np.array([0.5, 0.5, NEAREST])
+        return np.append(normal, offset)
+
     def from_canonical(self, body: Superquadric) -> Superquadric:
         """A NumPy body of the canonical frame in the optical frame."""
         inverse = quaternions.conjugate(self.rotation)

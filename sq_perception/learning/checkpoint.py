@@ -128,6 +128,11 @@ def read_header(path: Path | str | None = None) -> dict[str, str]:
     return _strings(path, data, size)
 
 
+def tells_hulls(path: Path | str | None = None) -> bool:
+    """Whether a file holds a network of things; raises CheckpointError where it holds no header."""
+    return path is not None and read_header(path).get("format") == THING_FORMAT
+
+
 def check(path: Path | str | None = None) -> None:
     """Raise CheckpointError where a look at the header is enough to tell that :func:`load` would.
 

@@ -11,15 +11,23 @@ half of torch's time (``benchmarks/network_speed.py``), and the bodies are the s
 
 from __future__ import annotations
 
+import copy
+from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Literal, Protocol, get_args
 
 import numpy as np
 import torch
 
+from sq_perception.fitting.hull_prior import HullPrior
+from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.learning import onnx_export
+from sq_perception.geometry.support_directions import DIRECTIONS
+from sq_perception.imaging.canonical_view import CanonicalView
+from sq_perception.learning import onnx_export, thing_network
+from sq_perception.learning.backbone import fold
 from sq_perception.learning.regressor import Regressor, RegressorConfig, checked_views
+from sq_perception.learning.thing_network import ThingNetwork
 
 Engine = Literal["auto", "torch", "onnxruntime"]
 
@@ -31,6 +39,59 @@ class Predictor(Protocol):
 
     def predict(self, views: np.ndarray) -> Superquadric:
         """NumPy superquadrics (n,) of NumPy views (n, p, p); see :meth:`Regressor.predict`."""
+
+
+@dataclass(frozen=True, eq=False)
+class HullAnswers:
+    """What the network of things says of a batch of views, each in the frame of its view; NumPy.
+
+    Attributes
+    ----------
+    bodies : Superquadric
+        Batch (n,).
+    support : (n, J)
+        Support functions in sides of the view, from its middle (:data:`thing_network.MIDDLE`).
+    covariance : (n, J, J)
+    """
+
+    bodies: Superquadric
+    support: np.ndarray
+    covariance: np.ndarray
+
+    def hull(self, number: int, view: CanonicalView) -> HullPrior:
+        """The prediction of one view in the optical frame."""
+        directions = DIRECTIONS @ quaternions.to_matrix(view.rotation)
+        support = directions @ view.anchor + view.extent * self.support[number]
+        covariance = view.extent**2 * self.covariance[number]
+        return HullPrior(directions, support, covariance, thing_network.FREEDOM, view.extent)
+
+
+class ThingPredictor:
+    """The network of things, made ready to predict."""
+
+    def __init__(self, model: ThingNetwork) -> None:
+        self.config = model.config
+        self._model = copy.deepcopy(model).eval()
+        fold(self._model.features)
+        self._device = next(self._model.parameters()).device
+
+    def predict(self, views: np.ndarray, planes: np.ndarray) -> HullAnswers:
+        """Answers to views (n, p, p) whose supports are planes (n, 4) in their frames, zeros where there is none.
+
+        Raises
+        ------
+        ValueError
+            For views or planes of another form, or not finite.
+        """
+        views = checked_views(views, self.config.regressor())
+        if planes.shape != (len(views), 4) or not np.isfinite(planes).all():
+            raise ValueError(f"expected finite planes of shape ({len(views)}, 4), got {planes.shape}")
+        with torch.inference_mode():
+            said = self._model(
+                torch.from_numpy(views).to(self._device), torch.from_numpy(planes.astype(np.float32)).to(self._device)
+            )
+            bodies = Superquadric.from_flat(said.body.to_flat().double().cpu().numpy())
+            return HullAnswers(bodies, said.support.double().cpu().numpy(), said.covariance().double().cpu().numpy())
 
 
 class OnnxPredictor:

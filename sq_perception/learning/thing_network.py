@@ -36,7 +36,9 @@ from torch import nn
 
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.support_directions import DIRECTIONS
-from sq_perception.imaging.canonical_view import NEAREST
+from sq_perception.imaging import canonical_view
+from sq_perception.imaging.camera import Camera
+from sq_perception.imaging.canonical_view import NEAREST, CanonicalView
 from sq_perception.learning.backbone import compact_backbone
 from sq_perception.learning.regressor import RegressorConfig
 
@@ -64,6 +66,12 @@ class ThingConfig:
     hidden: int = 256
     factors: int = 8
     """K, the columns of L."""
+
+    def view_of(
+        self, depth: np.ndarray, mask: np.ndarray, camera: Camera, plane: np.ndarray | None = None
+    ) -> CanonicalView:
+        """What the network is shown of the object under a mask, as :meth:`RegressorConfig.view_of`."""
+        return canonical_view.from_mask(depth, mask, camera, self.pixels, plane=plane, missing_is_hidden=True)
 
     def regressor(self) -> RegressorConfig:
         """How the superquadric's parameters are encoded."""

@@ -154,11 +154,11 @@ def train(config: ThingTraining, views: Path, output: Path, form: ThingConfig | 
         if state.step % config.validation == 0:
             state.seconds = time.monotonic() - began
             record = {"step": state.step, "loss": float(np.mean(losses)), "rate": rate, "views": len(pool.images)}
-            _keep(output, state, {**record, "seconds": state.seconds, **validate(_average(state), held)}, config)
+            _keep(output, state, {**record, "seconds": state.seconds, **validate(state.average, held)}, config)
             losses.clear()
     state.seconds = time.monotonic() - began
-    _keep(output, state, {"step": state.step, "seconds": state.seconds, **validate(_average(state), held)}, config)
-    return _average(state)
+    _keep(output, state, {"step": state.step, "seconds": state.seconds, **validate(state.average, held)}, config)
+    return state.average
 
 
 def validate(network: ThingNetwork, views: ThingViews, batch: int = 256) -> dict[str, Any]:
@@ -257,15 +257,10 @@ def _batch(
     return torch.from_numpy(images), torch.from_numpy(planes), torch.from_numpy(support)
 
 
-def _average(state: TrainingState) -> ThingNetwork:
-    assert isinstance(state.average, ThingNetwork)
-    return state.average
-
-
-def _keep(output: Path, state: TrainingState, record: dict[str, Any], config: ThingTraining) -> None:
+def _keep(output: Path, state: TrainingState[ThingNetwork], record: dict[str, Any], config: ThingTraining) -> None:
     """Log, state and network of this moment."""
     with (output / "log.jsonl").open("a", encoding="utf-8") as file:
         file.write(json.dumps(record) + "\n")
     state.save(output / "state.safetensors")
     made = provenance.facts("sq-perception train-things")
-    checkpoint.save(output / "things.safetensors", _average(state), {"training": asdict(config), "made": made})
+    checkpoint.save(output / "things.safetensors", state.average, {"training": asdict(config), "made": made})

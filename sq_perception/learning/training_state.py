@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Generic, TypeVar
 
 import torch
 from safetensors import SafetensorError
@@ -19,12 +20,15 @@ from sq_perception.learning.checkpoint import CheckpointError
 from sq_perception.learning.schedule import Cosine, Plateau
 
 
+Network = TypeVar("Network", bound=nn.Module)
+
+
 @dataclass(eq=False)
-class TrainingState:
+class TrainingState(Generic[Network]):
     """What a training holds between two steps."""
 
-    model: nn.Module
-    average: nn.Module
+    model: Network
+    average: Network
     optimizer: torch.optim.Optimizer
     schedule: Cosine | Plateau
     step: int = 0

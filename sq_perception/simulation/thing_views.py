@@ -32,7 +32,7 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.support_directions import DIRECTIONS
 from sq_perception.imaging import canonical_view
 from sq_perception.imaging.camera import Camera
-from sq_perception.imaging.canonical_view import NEAREST, CanonicalView
+from sq_perception.imaging.canonical_view import CanonicalView
 from sq_perception.imaging.coherence import coherent
 from sq_perception.simulation.household import KINDS, Thing, about_z, draw_thing, support_of_union
 from sq_perception.simulation.scenes import plane_depth
@@ -140,13 +140,6 @@ def support_in_view(parts: Superquadric, view: CanonicalView) -> np.ndarray:
     return (support_of_union(parts, directions) - directions @ view.anchor) / view.extent
 
 
-def plane_in_view(plane: np.ndarray, view: CanonicalView) -> np.ndarray:
-    """A plane (4,) of the optical frame in the view's frame and unit."""
-    normal = quaternions.to_matrix(view.rotation) @ plane[:3]
-    offset = (plane[:3] @ view.anchor + plane[3]) / view.extent - normal @ np.array([0.5, 0.5, NEAREST])
-    return np.append(normal, offset)
-
-
 def _draw_one(
     rng: np.random.Generator, pixels: int, kinds: Sequence[str] | None
 ) -> tuple[Thing, np.ndarray, np.ndarray, np.ndarray]:
@@ -171,7 +164,7 @@ def _draw_one(
         reach = support_in_view(setting.parts, view)
         if np.abs(reach).max() > _LARGEST_SUPPORT or (reach + reach[_OPPOSITE]).max() < _LEAST_WIDTH:
             continue
-        return thing, view.marked, np.zeros(4) if plane is None else plane_in_view(plane, view), reach
+        return thing, view.marked, np.zeros(4) if plane is None else view.plane_to_canonical(plane), reach
     raise RuntimeError(f"no view of a thing shows {_LEAST_SEEN} pixels of it in {_ATTEMPTS} attempts")
 
 

@@ -28,7 +28,7 @@ from std_srvs.srv import Trigger
 
 from sq_msgs_py.depth_image import Intrinsics, depth_to_message, intrinsics_to_message
 from sq_msgs_py.superquadrics import from_message
-from sq_perception.fitting.fit import Status
+from sq_perception.fitting.fit import Fit, Status
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
 from sq_perception.nodes import managed_node
@@ -65,7 +65,7 @@ class Recoverer:
             raise self.error
         size = 0.01 * float(self.model or 1)
         body = Superquadric(np.full(3, size), np.ones(2), np.array([0.0, 0.0, 0.5]), np.array([0, 0, 0, 1.0]))
-        one = Recovery(body, 0.9, 0.001, np.full(3, 0.001), Status.CONVERGED, "", 1, 100)
+        one = Recovery(Fit(body, 0.001, Status.CONVERGED, ""), 0.9, 1, 100)
         return FrameRecovery((one,), {"total": 1.0}, np.zeros(depth.shape, np.int32), None, "")
 
 

@@ -18,7 +18,7 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import TransformStamped
 from std_msgs.msg import Header
 
-from sq_perception.fitting.fit import Status
+from sq_perception.fitting.fit import Fit, Status
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
@@ -45,7 +45,7 @@ ALL = FrameParameters(publish_tf=True, publish_detections=True, publish_collisio
 
 
 def one(body: Superquadric, label: int, status: Status = Status.CONVERGED) -> Recovery:
-    return Recovery(body, 0.9, 0.001, np.full(3, 0.002), status, "", label, 100, DEVIATIONS)
+    return Recovery(Fit(body, 0.001, status, "", covariance=DEVIATIONS), 0.9, label, 100)
 
 
 def frame(header: Header = HEADER, camera: Camera = CAMERA) -> Frame:

@@ -21,7 +21,7 @@ from test_nodes_wiring import CAMERA, FRAME_ID, Bench
 from visualization_msgs.msg import Marker, MarkerArray
 
 from sq_msgs_py.depth_image import depth_to_message
-from sq_perception.fitting.fit import Status
+from sq_perception.fitting.fit import Fit, Status
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.nodes.parameters import FrameParameters, ParameterError
@@ -33,8 +33,7 @@ CAN = Superquadric([0.03, 0.03, 0.06], [0.2, 0.9], [-0.15, 0.02, 0.7], [0.5, 0.0
 
 
 def recovery(body: Superquadric, label: int, status: Status = Status.CONVERGED) -> Recovery:
-    sigma = np.sqrt(np.diag(DEVIATIONS)[:3])
-    return Recovery(body, 0.9, 0.001, sigma, status, "", label, 100, DEVIATIONS)
+    return Recovery(Fit(body, 0.001, status, "", covariance=DEVIATIONS), 0.9, label, 100)
 
 
 def grown(body: Superquadric, share: float) -> Superquadric:

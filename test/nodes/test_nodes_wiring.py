@@ -30,7 +30,7 @@ from sq_msgs_py.depth_image import (
     labels_to_message,
 )
 from sq_msgs_py.superquadrics import SuperquadricArray, from_message
-from sq_perception.fitting.fit import Status
+from sq_perception.fitting.fit import Fit, Status
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
@@ -46,7 +46,7 @@ FRAME_ID = "some_camera_optical_frame"
 
 def ball(label: int = 1, status: Status = Status.CONVERGED) -> Recovery:
     body = Superquadric(np.full(3, 0.1), np.ones(2), np.array([0.01, 0.02, 0.5]), np.array([0, 0, 0, 1.0]))
-    return Recovery(body, 0.9, 0.001, np.full(3, np.nan), status, "", label, 100)
+    return Recovery(Fit(body, 0.001, status, ""), 0.9, label, 100)
 
 
 class Recoverer:

@@ -1,4 +1,4 @@
-"""What holds for all rays of a fit: losses, stiffnesses, and what is known beyond the image."""
+"""The terms of a fit's cost: losses, stiffnesses, and what is known beyond the image."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 
-class Scene(NamedTuple):
+class Terms(NamedTuple):
     """Constants of the residuals; see :mod:`sq_perception.fitting.residuals` and :mod:`sq_perception.fitting.priors`.
 
     Points that lie inside the body, behind its surface, count by Cauchy's loss of scale ``inner_cauchy`` if that is
