@@ -32,10 +32,10 @@ from sq_perception.fitting.fit import Status
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
 from sq_perception.nodes import managed_node
-from sq_perception.nodes.engine import Workshop
+from sq_perception.nodes.engine import RecovererFactory
 from sq_perception.nodes.frame_node import FrameNode
 from sq_perception.nodes.parameters import RecoverParameters
-from sq_perception.nodes.recover_node import _options
+from sq_perception.nodes.recover_node import options
 from sq_perception.recovery.recoverer import FrameRecovery, Recovery
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
@@ -78,12 +78,12 @@ class Bench(SpunNodes):
         self.fault: Exception | None = None
         self.gate = threading.Event()
         self.gate.set()
-        workshop = Workshop(
+        factory = RecovererFactory(
             make=self._make,
-            options=_options,
-            ingredients=("model", "device", "method"),
+            options=options,
+            made_of=("model", "device", "method"),
             key=lambda parameters: (id(self), parameters.model, parameters.device),
-            judge=self._judge,
+            check=self._check,
             describe=lambda parameters: f"model {parameters.model}",
         )
         self.events: list[str] = []
@@ -104,14 +104,14 @@ class Bench(SpunNodes):
                 PointCloud2, f"{at}/recover_node/superquadrics", self.answers[space].append, 50
             )
         self.nodes = [
-            FrameNode("recover_node", RecoverParameters, workshop, namespace=space or None, context=self.context)
+            FrameNode("recover_node", RecoverParameters, factory, namespace=space or None, context=self.context)
             for space in namespaces
         ]
         self.node = self.nodes[0]
         self.spin(self.nodes, executor)
         self.stamps = 0
 
-    def _judge(self, parameters: Any, names: frozenset[str]) -> None:
+    def _check(self, parameters: Any, names: frozenset[str]) -> None:
         if "model" in names and not parameters.model.isdigit():
             raise ValueError(f"model: {parameters.model} is no model")
 
@@ -140,7 +140,7 @@ class Bench(SpunNodes):
             self.until(lambda node=node: node.is_active)
             self.until(lambda space=space: self.images[space].get_subscription_count() >= 1)
             self.until(lambda space=space: self.infos[space].get_subscription_count() >= 1)
-            self.until(lambda node=node: node._publisher.superquadrics.get_subscription_count() >= 1)
+            self.until(lambda node=node: node._outputs.superquadrics.get_subscription_count() >= 1)
         return self
 
     def publish(self, space: str = "", value: float = 0.5) -> Header:
@@ -324,7 +324,7 @@ class TestLifecycle:
         monkeypatch.setattr(managed_node, "_PAUSE", 0.1)
         bench = make_bench().active()
         withdrawn = []
-        monkeypatch.setattr(bench.node._publisher, "withdraw", lambda: withdrawn.append(bench.node.state))
+        monkeypatch.setattr(bench.node._outputs, "withdraw", lambda: withdrawn.append(bench.node.state))
         bench.node._fail("device lost")
         bench.until(lambda: len(bench.made) == 1 and bench.node.state == "unconfigured")
         bench.active()

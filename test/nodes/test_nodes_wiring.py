@@ -34,10 +34,10 @@ from sq_perception.fitting.fit import Status
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
-from sq_perception.nodes.engine import Workshop
+from sq_perception.nodes.engine import RecovererFactory
 from sq_perception.nodes.frame_node import FrameNode
 from sq_perception.nodes.parameters import RecoverParameters
-from sq_perception.nodes.recover_node import _options
+from sq_perception.nodes.recover_node import options
 from sq_perception.recovery.recoverer import FrameRecovery, Recovery
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
@@ -76,8 +76,8 @@ class Bench(SpunNodes):
     def __init__(self, *arguments: str) -> None:
         super().__init__(*arguments)
         self.recoverer = Recoverer()
-        workshop = Workshop(make=lambda _: self.recoverer, options=_options)
-        self.node = FrameNode("recover_node", RecoverParameters, workshop, context=self.context)
+        factory = RecovererFactory(make=lambda _: self.recoverer, options=options)
+        self.node = FrameNode("recover_node", RecoverParameters, factory, context=self.context)
         self.images = self.peer.create_publisher(Image, "depth/image", 5)
         self.infos = self.peer.create_publisher(CameraInfo, "depth/camera_info", 5)
         self.answers: list[PointCloud2] = []
@@ -86,7 +86,7 @@ class Bench(SpunNodes):
         self.until(lambda: self.node.is_active)
         if self.node._settings.current.image_transport == "raw":
             self.until(lambda: self.images.get_subscription_count() == 1)
-        self.until(lambda: self.node._publisher.superquadrics.get_subscription_count() == 1)
+        self.until(lambda: self.node._outputs.superquadrics.get_subscription_count() == 1)
         self.stamps = 0
 
     def close(self) -> None:
@@ -112,10 +112,10 @@ class Bench(SpunNodes):
 
     def put_info(self, message: CameraInfo) -> None:
         self.until(lambda: self.infos.get_subscription_count() == 1)
-        before = sum(1 for _ in self.node._inbox._infos)
-        assert before < self.node._inbox._infos.maxlen
+        before = sum(1 for _ in self.node._input.inbox._infos)
+        assert before < self.node._input.inbox._infos.maxlen
         self.infos.publish(message)
-        self.until(lambda: len(self.node._inbox._infos) > before)
+        self.until(lambda: len(self.node._input.inbox._infos) > before)
 
     def send(self, message: Image) -> Any:
         """Publish an image and wait for its verdict: the counts after it."""
@@ -281,7 +281,7 @@ def test_frames_may_change_their_size(bench):
 
 def test_a_camera_info_that_comes_after_its_image_is_waited_for(make_bench):
     bench = make_bench()
-    bench.node._on_image(bench.depth())
+    bench.node._input._on_image(bench.depth())
     bench.send_info()
     bench.until(lambda: bench.counts.answered == 1)
     assert bench.counts.refused == 0
@@ -422,7 +422,7 @@ def test_triggers_leave_nothing_behind(bench):
 def test_masks_without_a_stamp_belong_to_no_image(bench):
     masks = bench.peer.create_publisher(Image, "mask/image", 5)
     bench.until(lambda: masks.get_subscription_count() == 1)
-    bench.node._inbox.put_mask(labels_to_message(np.ones((48, 64), np.int32), Header()))
+    bench.node._input.inbox.put_mask(labels_to_message(np.ones((48, 64), np.int32), Header()))
     image = bench.depth()
     image.header = Header(frame_id=FRAME_ID)
     bench.answer(image)
@@ -467,8 +467,8 @@ def test_pictures_are_made_while_somebody_listens_and_stale_markers_go(bench):
     bench.peer.create_subscription(Image, "recover_node/rendered_depth", rendered.append, 5)
     bench.until(
         lambda: (
-            bench.node._publisher.markers.get_subscription_count()
-            and bench.node._publisher.rendered_depth.get_subscription_count()
+            bench.node._outputs.markers.get_subscription_count()
+            and bench.node._outputs.rendered_depth.get_subscription_count()
         )
     )
     assert not shown
@@ -494,7 +494,7 @@ def test_orthographic_frames_need_no_camera_info_and_answer_in_the_cube_frame(ma
     assert bench.recoverer.warm == unit_cube.camera()
     rendered: list[Image] = []
     bench.peer.create_subscription(Image, "recover_node/rendered_depth", rendered.append, 5)
-    bench.until(lambda: bench.node._publisher.rendered_depth.get_subscription_count())
+    bench.until(lambda: bench.node._outputs.rendered_depth.get_subscription_count())
     for dtype in (np.uint8, np.uint16):
         grey = np.zeros((32, 32), dtype)
         grey[8:20, 8:20] = 0.75 * np.iinfo(dtype).max
@@ -519,7 +519,7 @@ def test_a_publisher_that_cannot_be_heard_is_named(make_bench):
     deaf = QoSProfile(depth=1, reliability=QoSReliabilityPolicy.BEST_EFFORT)
     bench.peer.create_publisher(Image, "depth/image", deaf)
     bench.until(lambda: bench.node.count_publishers("/depth/image") == 2)
-    words = bench.node._heard(bench.node._image_input)
+    words = bench.node._input.heard
     assert words.startswith("2 publishers: ")
     assert words.count("INCOMPATIBLE") == 1
     assert "best effort" in words
@@ -553,8 +553,8 @@ def test_diagnostics_count_and_warn(bench):
 
 
 def test_lost_messages_are_counted_and_the_remedy_is_named(bench, capfd):
-    bench.node._on_lost(SimpleNamespace(total_count=3, total_count_change=3))
-    bench.node._on_lost(SimpleNamespace(total_count=5, total_count_change=2))
+    bench.node._input._on_lost(SimpleNamespace(total_count=3, total_count_change=3))
+    bench.node._input._on_lost(SimpleNamespace(total_count=5, total_count_change=2))
     assert bench.counts.lost == 5
     said = capfd.readouterr().err
     assert said.count("FASTRTPS_DEFAULT_PROFILES_FILE") == 1
