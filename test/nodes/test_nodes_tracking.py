@@ -14,10 +14,10 @@ pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
+from frame_node_bench import CAMERA, FRAME_ID, Bench
 from geometry_msgs.msg import TransformStamped
 from rclpy.parameter import Parameter
 from std_msgs.msg import Header
-from test_nodes_wiring import CAMERA, FRAME_ID, Bench
 from visualization_msgs.msg import Marker, MarkerArray
 
 from sq_msgs_py.depth_image import depth_to_message
