@@ -358,7 +358,7 @@ class TestSwap:
         assert bench.node.set_parameters([Parameter("model", value="3")])[0].successful
         assert bench.answer() == 1.0, "the old one goes on until the new one is ready"
         bench.gate.set()
-        bench.until(lambda: bench.node._engine.words == "model 3")
+        bench.until(lambda: bench.node._engine.description == "model 3")
         assert bench.answer() == 3.0
         assert bench.made[-1].warm is not None
 
@@ -373,7 +373,7 @@ class TestSwap:
         assert bench.answer() == 1.0
         bench.fault = None
         assert bench.node.set_parameters([Parameter("model", value="4")])[0].successful
-        bench.until(lambda: bench.node._engine.words == "model 4")
+        bench.until(lambda: bench.node._engine.description == "model 4")
         assert bench.answer() == 4.0
         assert bench.node._engine.fault == ""
 
@@ -383,7 +383,7 @@ class TestSwap:
         for model in ("2", "3", "4", "5"):
             assert bench.node.set_parameters([Parameter("model", value=model)])[0].successful
         bench.gate.set()
-        bench.until(lambda: bench.node._engine.words == "model 5")
+        bench.until(lambda: bench.node._engine.description == "model 5")
         assert bench.answer() == 5.0
         assert len(bench.made) <= 3, "the first one, the one that was begun, and the last one"
 
@@ -394,7 +394,7 @@ class TestSwap:
         bench.until(lambda: bench.node.state == "configuring")
         assert bench.node.set_parameters([Parameter("model", value="6")])[0].successful
         bench.gate.set()
-        bench.until(lambda: bench.node._engine.words == "model 6")
+        bench.until(lambda: bench.node._engine.description == "model 6")
         assert bench.active().answer() == 6.0
 
     def test_what_does_not_concern_the_recoverer_swaps_nothing(self, make_bench):
@@ -443,7 +443,7 @@ class TestSeveralCameras:
     def test_a_swap_on_one_camera_leaves_the_other_alone(self, make_bench):
         bench = make_bench(namespaces=("front", "wrist")).active()
         assert bench.nodes[1].set_parameters([Parameter("model", value="7")])[0].successful
-        bench.until(lambda: bench.nodes[1]._engine.words == "model 7")
+        bench.until(lambda: bench.nodes[1]._engine.description == "model 7")
         assert (bench.answer("front"), bench.answer("wrist")) == (1.0, 7.0)
 
 
