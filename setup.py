@@ -127,7 +127,10 @@ setup(
     entry_points={
         "console_scripts": [
             "sq-perception = sq_perception.commands.main:main",
-            *(f"{node} = sq_perception.nodes.{node}:main" for node in NODES),
+            "recover_node = sq_perception.nodes.executables:recover_node",
+            "recover_cameras = sq_perception.nodes.executables:recover_cameras",
+            "fitter_node = sq_perception.nodes.executables:fitter_node",
+            "synthetic_depth_node = sq_perception.nodes.executables:synthetic_depth_node",
         ],
     },
     classifiers=[
