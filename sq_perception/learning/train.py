@@ -6,18 +6,12 @@ where it stopped when the same command is given again.  An unsupervised loss is 
 
 The output folder holds state.safetensors, log.jsonl, last.safetensors (the newest validated network) and
 model.safetensors (the best one so far).
-
-    sq-perception train --steps 20000 --output runs/compact
-    sq-perception train --config render --output runs/render
-    torchrun --nproc-per-node 2 -m sq_perception.commands.main train --device cuda --output runs/two
 """
 
 from __future__ import annotations
 
-import argparse
 import copy
 import signal
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -33,7 +27,7 @@ from safetensors.torch import load_file
 from sq_perception.files import provenance
 from sq_perception.geometry.metrics import volume_iou
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.learning import checkpoint, training_config
+from sq_perception.learning import checkpoint
 from sq_perception.learning.dataset import ViewPool, ViewSource, draw_views
 from sq_perception.learning.disturbance import Disturbance, any_occluder
 from sq_perception.learning.fixed_set import FixedSet, ShuffledBatches
@@ -278,33 +272,3 @@ def _stop_requests() -> Iterator[Callable[[], bool]]:
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Entry of ``sq-perception train``."""
-    parser = argparse.ArgumentParser(
-        prog="sq-perception train",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("--output", type=Path, default=Path("runs/compact"), help="folder of the run")
-    training_config.add_arguments(parser)
-    options = vars(parser.parse_args(arguments))
-    output = options.pop("output")
-    try:
-        config = training_config.from_arguments(options)
-    except ValueError as error:
-        parser.error(str(error))
-    try:
-        train(config, output)
-    except Stopped as stopped:
-        print(stopped, file=sys.stderr)
-        return 130
-    except (DivergedError, checkpoint.CheckpointError, ValueError) as error:
-        print(f"sq-perception train: {error}", file=sys.stderr)
-        return 1
-    return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
