@@ -77,6 +77,7 @@ def site(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The built site; strict: what MkDocs warns of is an error."""
     pytest.importorskip("mkdocs", reason="mkdocs is missing: install the extra 'docs'")
     pytest.importorskip("material", reason="mkdocs-material is missing: install the extra 'docs'")
+    pytest.importorskip("mkdocstrings_handlers.python", reason="mkdocstrings is missing: install the extra 'docs'")
     folder = tmp_path_factory.mktemp("site")
     result = subprocess.run(
         [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)],

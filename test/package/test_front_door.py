@@ -45,6 +45,11 @@ def test_nothing_else_is_offered() -> None:
         _ = sq_perception.Recoverers
 
 
+def test_every_name_is_in_the_reference(repository: Path) -> None:
+    page = (repository / "docs" / "api.md").read_text(encoding="utf-8")
+    assert set(offered_to_type_checkers().values()) <= set(re.findall(r"^::: (\S+)$", page, re.MULTILINE))
+
+
 def test_names_are_loaded_when_they_are_used() -> None:
     """A clock would measure the machine: what takes time is counted instead."""
     code = (
