@@ -19,6 +19,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Protocol
 
+import numba
 import numpy as np
 import torch
 from safetensors import SafetensorError
@@ -80,9 +81,7 @@ def train(config: TrainingConfig, output: Path, network: RegressorConfig | None 
     ValueError
         For a device that this machine does not have, or data of another form.
     """
-    if config.threads:
-        torch.set_num_threads(config.threads)
-    with joined(config.device) as processes, _stop_requests() as stop_requested:
+    with _threads(config.threads), joined(config.device) as processes, _stop_requests() as stop_requested:
         return _train(config, output, network, processes, stop_requested)
 
 
@@ -257,6 +256,25 @@ def _keep(output: Path, state: TrainingState, record: dict[str, Any], notes: dic
         names.append("model.safetensors")
     for name in names:
         checkpoint.save(output / name, state.average, {**notes, "metrics": record})
+
+
+@contextmanager
+def _threads(count: int) -> Iterator[None]:
+    """So many threads for the network and for the rendering of its views; 0 leaves both their own choice.
+
+    Each has a pool of its own, and OpenMP's threads wait by spinning.  Beside other work on all cores, a renderer's
+    second thread, which got its turn late and held a core while it had nothing to do, made a run of one torch thread
+    more than seven times as slow.
+    """
+    before = torch.get_num_threads(), numba.get_num_threads()
+    if count:
+        torch.set_num_threads(count)
+        numba.set_num_threads(min(count, numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before[0])
+        numba.set_num_threads(before[1])
 
 
 @contextmanager

@@ -113,7 +113,7 @@ class TrainingConfig:
     """Longest time between two saved states."""
     seed: int = 1
     threads: int = 0
-    """CPU threads; 0 leaves torch's own choice."""
+    """CPU threads of the network, and of the rendering of its views; 0 leaves both their own choice."""
     device: str = "cpu"
     """cpu or cuda; under torchrun each process takes its own device."""
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import re
 import subprocess
@@ -42,6 +43,24 @@ def test_links_lead_somewhere_in_a_checkout(repository: Path) -> None:
             elif match["anchor"] and target.suffix == ".md" and match["anchor"] not in anchors(target):
                 broken.append(f"{page.name}: {match[0]}: no such heading")
     assert not broken
+
+
+def test_figures_and_the_house_are_what_was_measured(repository: Path) -> None:
+    """Blocks between markers equal what docs_build/blocks.py makes of results, floors and imports."""
+    path = repository / "docs_build" / "blocks.py"
+    spec = importlib.util.spec_from_file_location("blocks", path)
+    assert spec is not None
+    assert spec.loader is not None
+    blocks = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(blocks)
+    texts = {page: page.read_text(encoding="utf-8") for page in blocks.documents()}
+    stale = [page.name for page, text in texts.items() if blocks.renewed(text) != text]
+    assert not stale, f"run python docs_build/blocks.py: {stale}"
+    used = {name for text in texts.values() for name in re.findall(r"docs_build/blocks\.py: (\w+)", text)}
+    assert used == set(blocks.BLOCKS)
+    for room, floor in [(room, k) for k, floor in enumerate(blocks.floors()) for room in floor]:
+        below = {other for floor in blocks.floors()[: floor + 1] for other in floor}
+        assert blocks.imported(room) <= below, room
 
 
 def test_the_workflow_pins_what_it_runs_and_may_only_read(repository: Path) -> None:
