@@ -13,6 +13,7 @@ import ast
 import json
 import re
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -200,9 +201,10 @@ def purpose(room: str) -> str:
     return " ".join(docstring.partition("\n\n")[0].split())
 
 
-def imported(room: str) -> set[str]:
+@cache
+def imported(room: str) -> frozenset[str]:
     """Other rooms that modules of one import, wherever in them."""
-    return {there for path in (PACKAGE / room).rglob("*.py") for there in _rooms_of(path)} - {room}
+    return frozenset({there for path in (PACKAGE / room).rglob("*.py") for there in _rooms_of(path)}) - {room}
 
 
 def _rooms_of(path: Path) -> Iterator[str]:
