@@ -49,6 +49,7 @@ train = [
 docs = [
     "mkdocs>=1.6,<2",  # docs/ as a site; its hooks may change with 2
     "mkdocs-material>=9.5,<10",  # search, navigation and code blocks without a script or font from elsewhere
+    "mkdocstrings[python]>=0.26,<2",  # the Python reference, from the docstrings
 ]
 
 setup(

@@ -13,13 +13,10 @@ The file's metadata is the header of the weights (:mod:`sq_perception.learning.c
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import json
-import sys
 from collections.abc import Mapping
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -206,30 +203,3 @@ def _quaternion(graph: _Graph, first: str, second: str) -> str:
 
 def _array(tensor: Any) -> np.ndarray:
     return np.asarray(tensor.detach().float().cpu().contiguous().numpy())
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Entry of ``sq-perception export``."""
-    parser = argparse.ArgumentParser(
-        prog="sq-perception export",
-        description="Write a network as ONNX: views (n, 1, p, p) in, the 12 parameters of n bodies out.",
-    )
-    parser.add_argument("--model", metavar="FILE", help="weights: a .safetensors file, or the name of shipped ones")
-    parser.add_argument("--output", "-o", type=Path, required=True, metavar="FILE", help="the .onnx file")
-    options = parser.parse_args(arguments)
-    if not options.output.resolve().parent.is_dir():
-        parser.error(f"--output: the folder of {options.output} does not exist")
-    path = checkpoint.resolve(options.model)
-    try:
-        content = build(checkpoint.load(path), checkpoint.read_header(path)).SerializeToString()
-        partial = options.output.with_name(options.output.name + ".partial")
-        partial.write_bytes(content)
-        partial.replace(options.output)
-    except (MissingPackageError, checkpoint.CheckpointError, OSError) as error:
-        print(f"sq-perception export: {error}", file=sys.stderr)
-        return 1
-    return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
