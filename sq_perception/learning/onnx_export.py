@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 import importlib
 import json
+import os
 import sys
 from collections.abc import Mapping
 from dataclasses import asdict
@@ -25,6 +26,7 @@ from typing import Any
 import numpy as np
 from torch import nn
 
+from sq_perception.files import output_file
 from sq_perception.learning import checkpoint
 from sq_perception.learning.backbone import BasicBlock, ResidualBlock, ResNet18
 from sq_perception.learning.regressor import Regressor, RegressorConfig
@@ -35,12 +37,21 @@ OPSET, IR_VERSION = 18, 8
 """Of ONNX 1.13 (2022): runtimes of any age read it."""
 
 
+TELEMETRY_OFF = "ORT_DISABLE_TELEMETRY"
+"""https://github.com/microsoft/onnxruntime/blob/main/docs/Privacy.md; processes started from here inherit it."""
+
+
 class MissingPackageError(ImportError):
     """onnx or onnxruntime is not installed; the message says what to do."""
 
 
 def require(name: str) -> Any:
-    """Import ``onnx`` or ``onnxruntime``; raises MissingPackageError where it is not installed."""
+    """Import ``onnx`` or ``onnxruntime``; raises MissingPackageError where it is not installed.
+
+    The one way by which this package imports onnxruntime: since 1.29 its wheels report their use to their maker, and
+    keep a number for the user under HOME, unless they are told not to before they are loaded.
+    """
+    os.environ[TELEMETRY_OFF] = "1"
     try:
         return importlib.import_module(name)
     except ModuleNotFoundError as error:
@@ -217,14 +228,14 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--model", metavar="FILE", help="weights: a .safetensors file, or the name of shipped ones")
     parser.add_argument("--output", "-o", type=Path, required=True, metavar="FILE", help="the .onnx file")
     options = parser.parse_args(arguments)
-    if not options.output.resolve().parent.is_dir():
-        parser.error(f"--output: the folder of {options.output} does not exist")
+    try:
+        output_file.check(options.output)
+    except OSError as error:
+        parser.error(f"--output: {error}")
     path = checkpoint.resolve(options.model)
     try:
         content = build(checkpoint.load(path), checkpoint.read_header(path)).SerializeToString()
-        partial = options.output.with_name(options.output.name + ".partial")
-        partial.write_bytes(content)
-        partial.replace(options.output)
+        output_file.write(options.output, content)
     except (MissingPackageError, checkpoint.CheckpointError, OSError) as error:
         print(f"sq-perception export: {error}", file=sys.stderr)
         return 1
