@@ -13,13 +13,11 @@ The file's metadata is the header of the weights (:mod:`sq_perception.learning.c
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import json
-import sys
+import os
 from collections.abc import Mapping
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -35,12 +33,21 @@ OPSET, IR_VERSION = 18, 8
 """Of ONNX 1.13 (2022): runtimes of any age read it."""
 
 
+TELEMETRY_OFF = "ORT_DISABLE_TELEMETRY"
+"""https://github.com/microsoft/onnxruntime/blob/main/docs/Privacy.md; processes started from here inherit it."""
+
+
 class MissingPackageError(ImportError):
     """onnx or onnxruntime is not installed; the message says what to do."""
 
 
 def require(name: str) -> Any:
-    """Import ``onnx`` or ``onnxruntime``; raises MissingPackageError where it is not installed."""
+    """Import ``onnx`` or ``onnxruntime``; raises MissingPackageError where it is not installed.
+
+    The one way by which this package imports onnxruntime: since 1.29 its wheels report their use to their maker, and
+    keep a number for the user under HOME, unless they are told not to before they are loaded.
+    """
+    os.environ[TELEMETRY_OFF] = "1"
     try:
         return importlib.import_module(name)
     except ModuleNotFoundError as error:
@@ -206,30 +213,3 @@ def _quaternion(graph: _Graph, first: str, second: str) -> str:
 
 def _array(tensor: Any) -> np.ndarray:
     return np.asarray(tensor.detach().float().cpu().contiguous().numpy())
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Entry of ``sq-perception export``."""
-    parser = argparse.ArgumentParser(
-        prog="sq-perception export",
-        description="Write a network as ONNX: views (n, 1, p, p) in, the 12 parameters of n bodies out.",
-    )
-    parser.add_argument("--model", metavar="FILE", help="weights: a .safetensors file, or the name of shipped ones")
-    parser.add_argument("--output", "-o", type=Path, required=True, metavar="FILE", help="the .onnx file")
-    options = parser.parse_args(arguments)
-    if not options.output.resolve().parent.is_dir():
-        parser.error(f"--output: the folder of {options.output} does not exist")
-    path = checkpoint.resolve(options.model)
-    try:
-        content = build(checkpoint.load(path), checkpoint.read_header(path)).SerializeToString()
-        partial = options.output.with_name(options.output.name + ".partial")
-        partial.write_bytes(content)
-        partial.replace(options.output)
-    except (MissingPackageError, checkpoint.CheckpointError, OSError) as error:
-        print(f"sq-perception export: {error}", file=sys.stderr)
-        return 1
-    return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

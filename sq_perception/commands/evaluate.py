@@ -1,35 +1,24 @@
-"""Tables 6.1 to 6.3 and 7.1 to 7.4 of the thesis and its plots, for every network and every fit, in one run.
-
-All contestants see the same images (:mod:`sq_perception.evaluation.thesis_images`), fits the first ``--fit-bodies`` of
-them.  What is counted is in :mod:`sq_perception.evaluation.figures_of_merit`, who takes part in
-:mod:`sq_perception.evaluation.contestants`, and how to read the result in docs/evaluation.md.
-
-    sq-perception evaluate
-    sq-perception evaluate --models runs/*/model.safetensors --methods classic --bodies 2000 --output runs/losses
-"""
+"""``sq-perception evaluate``: tables 6.1 to 6.3 and 7.1 to 7.4 of the thesis, for every network and every fit."""
 
 from __future__ import annotations
 
 import argparse
 import shlex
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import numba
-import torch
+from sq_perception.commands.console import FAILURE, SUCCESS, complain, failed, parser
+from sq_perception.evaluation.protocol import BODIES, DEFAULT_SEED, FIT_BODIES, FITS
 
-from sq_perception.evaluation import report
-from sq_perception.evaluation.contest import Advance, compare
-from sq_perception.evaluation.contestants import FITS, Contestant, FittingMethod, Network, unique_names
-from sq_perception.evaluation.thesis_images import DEFAULT_SEED, ThesisImages
-from sq_perception.files import provenance
-from sq_perception.learning.checkpoint import CheckpointError, shipped
+if TYPE_CHECKING:
+    from sq_perception.evaluation.contest import Advance
+    from sq_perception.evaluation.contestants import Contestant
+    from sq_perception.recovery.recoverer import Method
 
-BODIES, FIT_BODIES = 20_000, 2000
-
-_DESCRIPTION = """\
+_HELP = """\
 Compare networks and fits on one test set of the thesis' protocol, and write its tables 6.1 to 6.3 and 7.1 to 7.4 with
 the thesis' figures beside ours, IoU histograms, angles of the rotations (figure 6.3), examples, and training curves.
 
@@ -54,33 +43,63 @@ examples:
 """
 
 
-def default_models() -> list[Path]:
-    """All weights that ship with the package."""
-    return list(shipped().values())
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Entry of ``sq-perception evaluate``; 0, or 1 if a model could not be read."""
-    given = list(sys.argv[1:] if arguments is None else arguments)
-    parser = _parser()
-    options = parser.parse_args(given)
+def main(arguments: Sequence[str]) -> int:
+    """Entry of ``sq-perception evaluate``; the exit code, which is that of a failure if a model could not be read."""
+    command = _parser()
+    options = command.parse_args(arguments)
     for name in ("bodies", "fit_bodies"):
         if getattr(options, name) < 1:
-            parser.error(f"--{name.replace('_', '-')}: expected at least 1, got {getattr(options, name)}")
+            command.error(f"--{name.replace('_', '-')}: expected at least 1, got {getattr(options, name)}")
     if options.seed < 0:
-        parser.error(f"--seed: expected a number of at least 0, got {options.seed}")
-    paths = default_models() if options.models is None else options.models
-    methods = list(dict.fromkeys(FITS if options.methods is None else options.methods))
-    if not paths and not methods:
-        parser.error("nothing to evaluate: --models and --methods are both empty")
+        command.error(f"--seed: expected a number of at least 0, got {options.seed}")
+    methods: list[Method] = list(dict.fromkeys(FITS if options.methods is None else options.methods))
+    if options.models == [] and not methods:
+        command.error("nothing to evaluate: --models and --methods are both empty")
     try:
         options.output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        parser.error(f"--output: {error}")
+        command.error(f"--output: {error}")
+    return _evaluate(options, methods, ["sq-perception", "evaluate", *arguments])
+
+
+def _evaluate(options: argparse.Namespace, methods: list[Method], words: list[str]) -> int:
+    import numba
+    import torch
+
+    from sq_perception.evaluation import report
+    from sq_perception.evaluation.contest import compare
+    from sq_perception.evaluation.thesis_images import ThesisImages
+    from sq_perception.files import provenance
 
     torch.set_num_threads(1)  # the network's layers are so small that threads cost more than they save
+    contestants, failures = _contestants(options, methods)
+    for failure in failures:
+        complain(failure)
+    if not contestants:
+        return failed("nothing is left to evaluate")
+    images = ThesisImages(max(count for _, count in contestants), options.seed)
+    with _progress() as advance:
+        outcomes = compare(contestants, images, advance=advance)
+    facts = {
+        **provenance.facts(shlex.join(words)),
+        "threads": {"torch": torch.get_num_threads(), "numba": numba.get_num_threads()},
+        "seed": options.seed,
+        "spawn_key": "(6, block), blocks of 500 bodies",
+    }
+    written = report.write(options.output, outcomes, images, facts, failures)
+    print("\n\n".join(table.markdown() for table in report.overview(outcomes)))
+    print(f"written: {written}")
+    return FAILURE if failures else SUCCESS
+
+
+def _contestants(options: argparse.Namespace, methods: list[Method]) -> tuple[list[tuple[Contestant, int]], list[str]]:
+    """Who takes part, with the number of bodies, and what is wrong with those who cannot."""
+    from sq_perception.evaluation.contestants import FittingMethod, Network, unique_names
+    from sq_perception.learning.checkpoint import CheckpointError, shipped
+
     contestants: list[tuple[Contestant, int]] = []
     failures: list[str] = []
+    paths = list(shipped().values()) if options.models is None else options.models
     for path, name in zip(paths, unique_names(paths), strict=True):
         try:
             contestants.append((Network.read(path, name), options.bodies))
@@ -93,52 +112,29 @@ def main(arguments: list[str] | None = None) -> int:
             contestants.append((FittingMethod.of(method), min(options.fit_bodies, options.bodies)))
         except CheckpointError as error:
             failures.append(f"{method}: {error}")
-    for failure in failures:
-        print(f"sq-perception: {failure}", file=sys.stderr)
-    if not contestants:
-        print("sq-perception: nothing is left to evaluate", file=sys.stderr)
-        return 1
-
-    images = ThesisImages(max(count for _, count in contestants), options.seed)
-    with _progress() as advance:
-        outcomes = compare(contestants, images, advance=advance)
-    facts = {
-        **provenance.facts(shlex.join(["sq-perception", "evaluate", *given])),
-        "threads": {"torch": torch.get_num_threads(), "numba": numba.get_num_threads()},
-        "seed": options.seed,
-        "spawn_key": "(6, block), blocks of 500 bodies",
-    }
-    written = report.write(options.output, outcomes, images, facts, failures)
-    print("\n\n".join(table.markdown() for table in report.overview(outcomes)))
-    print(f"written: {written}")
-    return 1 if failures else 0
+    return contestants, failures
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="sq-perception evaluate",
-        description=_DESCRIPTION,
-        epilog=_EPILOG,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument(
+    command = parser("evaluate", _HELP, _EPILOG)
+    command.add_argument(
         "--consensus", action="store_true", help="each network a second time, asked in 8 positions of each view"
     )
-    parser.add_argument(
+    command.add_argument(
         "--models", type=Path, nargs="*", metavar="FILE", help="weights to compare (default: all that are shipped)"
     )
-    parser.add_argument(
+    command.add_argument(
         "--methods", nargs="*", choices=FITS, metavar="FIT", help=f"fits to compare (default: {' '.join(FITS)})"
     )
-    parser.add_argument("--bodies", type=int, default=BODIES, metavar="N", help=f"bodies for networks ({BODIES})")
-    parser.add_argument(
+    command.add_argument("--bodies", type=int, default=BODIES, metavar="N", help=f"bodies for networks ({BODIES})")
+    command.add_argument(
         "--fit-bodies", type=int, default=FIT_BODIES, metavar="N", help=f"the first N of them for fits ({FIT_BODIES})"
     )
-    parser.add_argument("--seed", type=int, default=DEFAULT_SEED, help=f"of the test set ({DEFAULT_SEED})")
-    parser.add_argument(
+    command.add_argument("--seed", type=int, default=DEFAULT_SEED, help=f"of the test set ({DEFAULT_SEED})")
+    command.add_argument(
         "--output", type=Path, default=Path("runs/evaluation"), metavar="DIR", help="folder (runs/evaluation)"
     )
-    return parser
+    return command
 
 
 @contextmanager
