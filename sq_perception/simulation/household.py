@@ -36,6 +36,7 @@ import numpy as np
 
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.geometry.union import flat_support, support_of_union
 
 KINDS = ("box", "can", "bottle", "vessel", "round", "tool", "union", "soft")
 LIKELY = {
@@ -53,17 +54,20 @@ LIKELY = {
 _STRAIGHT = (0.0, 0.0, 0.0, 1.0)
 _LEAN = (np.deg2rad(4.0), np.deg2rad(35.0))
 
-UPRIGHT = np.eye(3)
-ON_X = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
-"""The thing's x axis is vertical: it lies on a side."""
-ON_Y = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-"""The thing's y axis, of an oval bottle the shorter one, is vertical."""
-INVERTED = np.diag([1.0, -1.0, -1.0])
+UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
+ON_X = np.array([0.0, -np.sqrt(0.5), 0.0, np.sqrt(0.5)])
+"""The thing's x axis points up: it lies on a side."""
+ON_Y = np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
+"""The thing's y axis, of an oval bottle the shorter one, points up."""
+INVERTED = np.array([1.0, 0.0, 0.0, 0.0])
+
+SIX_WAYS = np.concatenate([np.eye(3), -np.eye(3)])
+_NO_CAVITY = Superquadric.stack([])
 
 
 @dataclass(frozen=True, eq=False)
 class Rest:
-    """A way to rest: the rotation (3, 3) from the thing's frame to one with z up, and its probability."""
+    """A way to rest: the rotation, a quaternion (4,), from the thing's frame to one with z up, and its probability."""
 
     name: str
     turn: np.ndarray
@@ -101,7 +105,7 @@ class Thing:
     @cached_property
     def box(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper corner (3,) of the box around the thing in its own frame."""
-        reach = self.support(np.concatenate([np.eye(3), -np.eye(3)]))
+        reach = self.support(SIX_WAYS)
         return -reach[3:], reach[:3]
 
     @property
@@ -110,29 +114,27 @@ class Thing:
         return float(self.box[1][2] - self.box[0][2])
 
     def pose(self, rng: np.random.Generator, leaning: float = 0.06) -> tuple[str, np.ndarray]:
-        """A way to rest, turned about the vertical by any angle: its name and the rotation (3, 3) to a frame with z up.
+        """A way to rest, turned about the vertical by any angle: its name and the quaternion (4,) to a frame with z up.
 
         ``leaning`` is the share of things that are tilted by 4 to 35 degrees, as by something under or beside them.
         """
-        rest = self.rests[rng.choice(len(self.rests), p=[rest.likely for rest in self.rests])]
+        rest = self.rests[_one_of([rest.likely for rest in self.rests], rng)]
         name, turn = rest.name, rest.turn
         if rng.random() < leaning:
             tilt, way = rng.uniform(*_LEAN), rng.uniform(0, 2 * np.pi)
-            tilted = quaternions.from_rotation_vector(tilt * np.array([np.cos(way), np.sin(way), 0.0]))
-            name, turn = "leaning", quaternions.to_matrix(tilted) @ turn
-        return name, about_z(rng.uniform(0, 2 * np.pi)) @ turn
+            name, turn = "leaning", quaternions.multiply(_turn(np.cos(way), np.sin(way), 0.0, tilt), turn)
+        return name, quaternions.multiply(_turn(0.0, 0.0, 1.0, rng.uniform(0, 2 * np.pi)), turn)
 
 
-def support_of_union(parts: Superquadric, directions: np.ndarray) -> np.ndarray:
-    """max n.p over a union (k,) of bodies and so over its hull, for unit directions (J, 3), shape (J,)."""
-    reach = parts.support(directions) + parts.translation @ np.asarray(directions).T
-    return np.asarray(reach.max(axis=0))
+def _turn(x: float, y: float, z: float, angle: float) -> np.ndarray:
+    """The quaternion of a turn about a unit axis by an angle in radians."""
+    s = np.sin(angle / 2)
+    return np.array([x * s, y * s, z * s, np.cos(angle / 2)])
 
 
-def about_z(angle: float) -> np.ndarray:
-    """The rotation (3, 3) about z by an angle in radians."""
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+def _one_of(weights: Sequence[float], rng: np.random.Generator) -> int:
+    """A random index with these weights."""
+    return min(int(np.searchsorted(np.cumsum(weights), rng.random() * sum(weights), side="right")), len(weights) - 1)
 
 
 def draw_thing(rng: np.random.Generator, kinds: Sequence[str] | None = None) -> Thing:
@@ -146,11 +148,8 @@ def draw_thing(rng: np.random.Generator, kinds: Sequence[str] | None = None) -> 
     names = list(KINDS if kinds is None else kinds)
     if not names or not set(names) <= set(KINDS):
         raise ValueError(f"kinds: expected some of {', '.join(KINDS)}, got {names}")
-    weights = np.array([LIKELY[name] for name in names])
-    kind = names[rng.choice(len(names), p=weights / weights.sum())]
-    makers, likely = zip(*_MAKERS[kind], strict=True)
-    maker = makers[rng.choice(len(makers), p=np.array(likely) / sum(likely))]
-    return maker(rng)
+    makers = _MAKERS[names[_one_of([LIKELY[name] for name in names], rng)]]
+    return makers[_one_of([likely for _, likely in makers], rng)][0](rng)
 
 
 _Numbers = Sequence[float] | np.ndarray
@@ -179,15 +178,15 @@ def _thing(
     kind: str, name: str, rows: list[_Row], rests: Sequence[tuple[str, np.ndarray, float]], cut: Sequence[_Row] = ()
 ) -> Thing:
     flat = np.array(rows)
-    parts = Superquadric.from_flat(flat)
-    reach = support_of_union(parts, np.concatenate([np.eye(3), -np.eye(3)]))
+    reach = flat_support(flat, SIX_WAYS)
     middle = 0.5 * (reach[:3] - reach[3:])
     flat[:, 5:8] -= middle
-    holes = np.array(cut).reshape(-1, 12)
-    holes[:, 5:8] -= middle
+    cavities = _NO_CAVITY
+    if cut:
+        cavities = Superquadric.from_flat(np.array(cut) - [*[0.0] * 5, *middle, *[0.0] * 4])
     total = sum(likely for _, _, likely in rests)
     ways = tuple(Rest(name, turn, likely / total) for name, turn, likely in rests)
-    return Thing(kind, name, Superquadric.from_flat(flat), ways, Superquadric.from_flat(holes))
+    return Thing(kind, name, Superquadric.from_flat(flat), ways, cavities)
 
 
 def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
@@ -403,15 +402,30 @@ def _revolved(radii: _Numbers, height: float, e1: float, e2: float = 1.0, flat: 
     ]
 
 
+def _cavity(radii: np.ndarray, height: float, wall: float, e2: float = 1.0, flat: float = 1.0) -> _Row:
+    """The widest of some superquadrics about the middle of the rim that stays within a stack of slabs."""
+    count = len(radii)
+    # Depth below the rim of each slab's lower end, in depths of the cavity.
+    depth = np.minimum(height * (1 - np.arange(count) / count) / (height - wall), 0.97)
+    widest, best = 0.0, 1.0
+    for e1 in (0.15, 0.4, 0.7, 1.0):
+        radius = float(((radii - wall) / (1 - depth ** (2 / e1)) ** (e1 / 2)).min())
+        radius = min(radius, radii[-1] - wall)
+        if radius > widest + 1e-4:
+            widest, best = radius, e1
+    widest = max(widest, 0.3 * float(radii[-1]))
+    return _part((widest, flat * widest, height - wall), (best, e2), (0, 0, height))
+
+
 def _cup(rng: np.random.Generator) -> Thing:
     """Cups, tumblers and mugs, straight or tapered."""
     top, height = rng.uniform(0.055, 0.1) / 2, rng.uniform(0.05, 0.15)
     bottom = top * (1.0 if rng.random() < 0.45 else rng.uniform(0.6, 0.95))
     wall = rng.uniform(0.002, 0.006)
     count = 1 if bottom == top else 6
-    rows = _revolved(np.linspace(bottom, top, count + 2)[1:-1], height, 0.08 if count == 1 else 0.2)
-    inner = 0.5 * (bottom + top) - wall
-    cut = [_part((inner, inner, height), (0.15, 1.0), (0, 0, height + wall))]
+    radii = np.linspace(bottom, top, count + 2)[1:-1]
+    rows = _revolved(radii, height, 0.08 if count == 1 else 0.2)
+    cut = [_cavity(radii, height, wall)]
     name = "cup"
     if rng.random() < 0.55:
         name, thick = "mug", rng.uniform(0.004, 0.009)
@@ -434,9 +448,9 @@ def _bowl(rng: np.random.Generator) -> Thing:
     foot = top * rng.uniform(0.4, 0.7)
     count = 3 if height < 0.03 else 6
     share = (np.arange(count) + 0.75) / count
-    rows = _revolved(foot + (top - foot) * share ** rng.uniform(0.4, 0.9), height, 0.2)
-    wall = rng.uniform(0.003, 0.006)
-    cut = [_part((0.97 * top - wall, 0.97 * top - wall, height - wall), (rng.uniform(0.6, 1.0), 1.0), (0, 0, height))]
+    radii = foot + (top - foot) * share ** rng.uniform(0.4, 0.9)
+    rows = _revolved(radii, height, 0.2)
+    cut = [_cavity(radii, height, rng.uniform(0.003, 0.006))]
     return _thing("vessel", "bowl", rows, (("standing", UPRIGHT, 0.93), ("inverted", INVERTED, 0.07)), cut)
 
 
@@ -445,14 +459,14 @@ def _tub(rng: np.random.Generator) -> Thing:
     top, height = rng.uniform(0.06, 0.2) / 2, rng.uniform(0.03, 0.14)
     bottom = top * rng.uniform(0.7, 1.0)
     e2, flat = (1.0, 1.0) if rng.random() < 0.6 else (rng.uniform(0.15, 0.6), rng.uniform(0.55, 1.0))
-    rows = _revolved(np.linspace(bottom, top, 6)[1:-1], height, 0.2, e2, flat)
+    radii = np.linspace(bottom, top, 6)[1:-1]
+    rows = _revolved(radii, height, 0.2, e2, flat)
     lid = rng.uniform(0.003, 0.01)
     cut = []
     if rng.random() < 0.7:
         rows.append(_part((1.04 * top, 1.04 * flat * top, lid), (0.2, e2), (0, 0, height)))
     else:
-        inner = (0.5 * (bottom + top) - 0.004) / top
-        cut = [_part((inner * top, inner * flat * top, height), (0.15, e2), (0, 0, height + 0.004))]
+        cut = [_cavity(radii, height, 0.004, e2, flat)]
     rests = (("standing", UPRIGHT, 0.85), ("inverted", INVERTED, 0.08), ("on its side", ON_Y, 0.07))
     return _thing("vessel", "tub", rows, rests, cut)
 
