@@ -446,10 +446,10 @@ def _bowl(rng: np.random.Generator) -> Thing:
     top = _log_uniform(rng, 0.09, 0.28) / 2
     height = min(2 * top * rng.uniform(0.07, 0.6), 0.12)
     foot = top * rng.uniform(0.4, 0.7)
-    count = 3 if height < 0.03 else 6
+    count = 4 if height < 0.03 else 8
     share = (np.arange(count) + 0.75) / count
     radii = foot + (top - foot) * share ** rng.uniform(0.4, 0.9)
-    rows = _revolved(radii, height, 0.2)
+    rows = _revolved(radii, height, 0.35)
     cut = [_cavity(radii, height, rng.uniform(0.003, 0.006))]
     return _thing("vessel", "bowl", rows, (("standing", UPRIGHT, 0.93), ("inverted", INVERTED, 0.07)), cut)
 

@@ -9,9 +9,9 @@ follows.
                 27 degrees; 0.35 to 2 m away; the thing is 30 to 80 pixels wide
     around it   up to three neighbours on the table, something before it, the table's end, a wall or nothing behind it
     sensor      one of :mod:`sensor_noise` with random parameters: noise of a window, steps, the shadow of the baseline
-                on either side, fattened or mixed or wandering edges, lost grazing sides; besides a side that is lost as
-                one eye hardly sees it, dark blobs and bands without reading, smoothing; in half of the views what is
-                missing beside the thing is filled with what is there
+                on either side, fattened or mixed or wandering edges, lost grazing sides; besides waves, a side that is
+                lost as one eye hardly sees it, lost edges, contours, dark blobs and bands, smoothing; in half of the
+                views what is missing beside the thing is filled with what is there
     mask        too small or too large by up to two pixels, with or without what measured the table
     image       a border that cuts the thing
 
@@ -46,6 +46,8 @@ PLANE_TILT, PLANE_SHIFT = float(np.deg2rad(0.7)), 0.002
 """Standard deviations of the given plane: of its tilt in both directions, and of its distance from the thing."""
 
 _DISTANCE = (0.35, 1.3, 2.0)
+_FARTHEST = 12.0
+"""Diagonals of its box, more than which no thing is away."""
 _FOCALS = (425.0, 525.0, 580.0, 615.0, 700.0, 920.0)
 """Pixels: depth cameras at VGA to HD."""
 _PIXELS_ACROSS = (30.0, 80.0)
@@ -189,6 +191,7 @@ def draw_setting(thing: Thing, rng: np.random.Generator) -> Setting:
     matrix = quaternions.to_matrix(look)
     near, usual, far = _DISTANCE
     distance = np.exp(rng.uniform(np.log(near), np.log(usual if rng.random() < 0.85 else far)))
+    distance = min(distance, _FARTHEST * float(np.linalg.norm(reach[:3] + reach[3:])))
     ray = np.array([aside, below, 1.0])
     # The table's frame has its origin below the thing, at the height of its lowest point.
     lift = np.array([0.0, 0.0, reach[5]])
@@ -300,22 +303,55 @@ def _measured(depth: np.ndarray, seen: np.ndarray, camera: Camera, rng: np.rando
     """What a random sensor reports of a true depth image."""
     sensor = draw_sensor(camera, rng)
     measured = sensor.measured(depth, camera, rng)
+    if rng.random() < 0.4:
+        measured += _waves(measured.shape, rng) * np.square(measured)
     if rng.random() < 0.35:
         measured[seen & _turned_aside(depth, camera, rng)] = np.nan
+    if rng.random() < 0.35:
+        measured[_edges(depth, rng)] = np.nan
+    if rng.random() < 0.1:
+        measured[seen & _contours(depth, seen, rng)] = np.nan
     if rng.random() < 0.15:
         measured[seen & _blob(seen, rng)] = np.nan
     if rng.random() < 0.3:
-        measured = _smoothed(measured, int(rng.choice([3, 5])), seen if rng.random() < 0.5 else None)
+        measured = _smoothed(measured, int(rng.choice((3, 5))), seen if rng.random() < 0.5 else None)
     if rng.random() < 0.5:
         filled = ~seen & np.isnan(measured) & np.isfinite(depth)
         measured[filled] = depth[filled]
     return measured
 
 
+def _waves(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
+    """Smooth errors, metres at 1 m: what calibration and the interpolation of disparities leave."""
+    coarse = rng.standard_normal((int(rng.integers(4, 14)), int(rng.integers(4, 14))), dtype=np.float32)
+    sigma = np.float32(0.0005 * 8.0 ** rng.random())
+    return sigma * cv2.resize(coarse, (shape[1], shape[0]), interpolation=cv2.INTER_CUBIC)
+
+
+def _edges(depth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Most pixels within one to three pixels of a step in depth."""
+    inverse = (1 / depth).astype(np.float32)
+    brush = np.ones((3, 3), np.uint8)
+    highest = cv2.dilate(inverse, brush)
+    step = (highest - cv2.erode(inverse, brush) > 0.06 * highest).astype(np.uint8)
+    wider = int(rng.integers(0, 3))
+    if wider:
+        step = cv2.dilate(step, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * wider + 1, 2 * wider + 1)))
+    return (step > 0) & (rng.random(depth.shape, dtype=np.float32) < rng.uniform(0.4, 1.0))
+
+
+def _contours(depth: np.ndarray, seen: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Thin lines of equal disparity, at which some sensors that measure in steps find no match."""
+    inverse = 1 / depth
+    near, far = inverse[seen].max(), inverse[seen].min()
+    lines = rng.uniform(1.5, 6.0) / max(near - far, 1e-6)
+    return (inverse * lines + rng.random()) % 1.0 < rng.uniform(0.03, 0.12)
+
+
 def _turned_aside(depth: np.ndarray, camera: Camera, rng: np.random.Generator) -> np.ndarray:
     """Surfaces that turn away to one side of the image by more than a random angle."""
     with np.errstate(invalid="ignore"):
-        slope = np.gradient(depth, axis=1) * camera.fx / depth
+        slope = cv2.Sobel(depth, cv2.CV_64F, 1, 0, ksize=1) * (0.5 * camera.fx) / depth
         return rng.choice([-1.0, 1.0]) * slope > np.tan(np.deg2rad(rng.uniform(45, 82)))
 
 
@@ -377,13 +413,13 @@ def _cut(
     measured: np.ndarray, mask: np.ndarray, camera: Camera, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, Camera]:
     """Some images end within the thing or near to it."""
-    if rng.random() > 0.12:
+    if rng.random() > 0.1:
         return measured, mask, camera
     v, u = np.nonzero(mask)
     if not v.size:
         return measured, mask, camera
     left, top, right, bottom = 0, 0, camera.width, camera.height
-    share, side = rng.uniform(-0.1, 0.45), rng.integers(4)
+    share, side = rng.uniform(-0.1, 0.4), rng.integers(4)
     if side == 0:
         left = int(np.clip(u.min() + share * np.ptp(u), 0, right - 2))
     elif side == 1:
