@@ -187,7 +187,7 @@ def draw_setting(thing: Thing, rng: np.random.Generator) -> Setting:
     elevation = np.deg2rad(rng.uniform(20, 70) if rng.random() < 0.75 else rng.uniform(5, 85))
     roll = rng.normal(0, np.deg2rad(4.0)) if rng.random() < 0.93 else rng.uniform(-np.pi, np.pi)
     aside, below = rng.uniform(-1, 1, 2) * _OFF_AXIS
-    look = _looking_down(elevation - np.arctan(below), roll)
+    look = looking_down(elevation - np.arctan(below), roll)
     matrix = quaternions.to_matrix(look)
     near, usual, far = _DISTANCE
     distance = np.exp(rng.uniform(np.log(near), np.log(usual if rng.random() < 0.85 else far)))
@@ -209,7 +209,7 @@ def draw_setting(thing: Thing, rng: np.random.Generator) -> Setting:
     return Setting(Superquadric.from_flat(parts), cavities, Superquadric.from_flat(around), table, behind, camera)
 
 
-def _looking_down(pitch: float, roll: float) -> np.ndarray:
+def looking_down(pitch: float, roll: float) -> np.ndarray:
     """Optical from table frame, a quaternion: the axis ``pitch`` radians below the horizon, towards the table's y."""
     half, other = 0.5 * (np.pi / 2 + pitch), 0.5 * roll
     c, s = np.cos(half), np.sin(half)
