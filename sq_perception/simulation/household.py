@@ -300,7 +300,7 @@ def _bottle(rng: np.random.Generator) -> Thing:
         for middle, share in ((0.2, 0.22), (0.8, 0.22)):
             rows.append(_part((a, b, share * straight), (rng.uniform(0.3, 0.8), e2), (0, 0, middle * straight)))
     rows += _shoulders(rng, a, b, e2, straight, height)
-    rows += _closure(rng, a, b, height)
+    rows += _closure(rng, a, b, straight, height)
     if oval and height > 0.16 and rng.random() < 0.18:
         rows += _grip(rng, a, straight, height)
     return _thing("bottle", "oval bottle" if flat < 1 else "round bottle", rows, _OVAL_RESTS if oval else _ROUND_RESTS)
@@ -325,27 +325,28 @@ def _shoulders(rng: np.random.Generator, a: float, b: float, e2: float, low: flo
     return rows
 
 
-def _closure(rng: np.random.Generator, a: float, b: float, top: float) -> list[_Row]:
-    """Neck and what closes it, above the height ``top``."""
+def _closure(rng: np.random.Generator, a: float, b: float, low: float, top: float) -> list[_Row]:
+    """The neck, from within the shoulders at the height ``low`` to ``top``, and what closes it above."""
     radius = min(rng.uniform(0.024, 0.05) / 2, 0.95 * b)
     tall = rng.uniform(0.012, 0.045)
     aside = rng.uniform(-0.35, 0.35) * a if rng.random() < 0.12 else 0.0
     base = top - 0.012
     choice = rng.random()
-    if choice < 0.5:  # a neck and a screw cap
-        neck = radius * rng.uniform(0.75, 1.0)
-        long = rng.uniform(0.0, 0.06) if rng.random() < 0.5 else 0.0
-        return [
-            _part((neck, neck, (0.014 + long) / 2), (0.1, 1.0), (aside, 0, base + long / 2)),
-            _part((radius, radius, tall / 2), (rng.uniform(0.05, 0.4), 1.0), (aside, 0, base + long + tall / 2)),
-        ]
-    if choice < 0.68:  # a wide flip cap, oval as the bottle or round
-        wide = rng.uniform(0.5, 0.95)
+    wide = rng.uniform(0.5, 0.95)
+    flip = 0.5 <= choice < 0.68
+    neck = rng.uniform(0.75, 1.0) * (wide * b if flip else radius)
+    long = rng.uniform(0.0, 0.06) if choice < 0.25 else 0.0
+    middle = aside if choice < 0.82 and not flip else 0.0
+    rows = [_part((neck, neck, (top + long - low) / 2), (0.1, 1.0), (middle, 0, (top + long + low) / 2))]
+    if choice < 0.5:  # a screw cap
+        size = (radius, radius, tall / 2)
+        return [*rows, _part(size, (rng.uniform(0.05, 0.4), 1.0), (aside, 0, base + long + tall / 2))]
+    if flip:  # a wide cap, oval as the bottle or round
         size = (wide * a, wide * b, tall / 2) if rng.random() < 0.6 else (wide * b, wide * b, tall / 2)
-        return [_part(size, (rng.uniform(0.1, 0.5), rng.uniform(0.6, 1.0)), (0, 0, base + tall / 2))]
+        return [*rows, _part(size, (rng.uniform(0.1, 0.5), rng.uniform(0.6, 1.0)), (0, 0, base + tall / 2))]
     if choice < 0.82:  # a nozzle that tapers
         long, tip = rng.uniform(0.02, 0.06), rng.uniform(0.004, 0.008)
-        rows = [_part((radius, radius, 0.009), (0.15, 1.0), (aside, 0, base + 0.006))]
+        rows.append(_part((radius, radius, 0.009), (0.15, 1.0), (aside, 0, base + 0.006)))
         for k in range(3):
             r = radius * 0.8 + (tip - radius * 0.8) * (k + 0.5) / 3
             rows.append(_part((r, r, 0.65 * long / 3), (0.3, 1.0), (aside, 0, base + 0.012 + long * (k + 0.5) / 3)))
@@ -354,6 +355,7 @@ def _closure(rng: np.random.Generator, a: float, b: float, top: float) -> list[_
         stem, reach = rng.uniform(0.02, 0.05), rng.uniform(0.018, 0.045)
         side = rng.choice([-1.0, 1.0])
         return [
+            *rows,
             _part((radius, radius, 0.01), (0.15, 1.0), (0, 0, base + 0.008)),
             _part((0.005, 0.005, stem / 2), (0.2, 1.0), (0, 0, base + 0.015 + stem / 2)),
             _part((0.011, 0.011, 0.007), (0.4, 1.0), (0, 0, base + 0.015 + stem)),
@@ -362,6 +364,7 @@ def _closure(rng: np.random.Generator, a: float, b: float, top: float) -> list[_
     long = rng.uniform(0.07, 0.11)  # a spray head with a trigger
     side = rng.choice([-1.0, 1.0])
     return [
+        *rows,
         _part((radius, radius, 0.014), (0.15, 1.0), (0, 0, base + 0.01)),
         _part((0.012, 0.012, 0.02), (0.3, 0.6), (0, 0, base + 0.035)),
         _part((long / 2, 0.013, 0.014), (0.4, 0.3), (side * 0.15 * long, 0, base + 0.06), _about(1, side * 8.0)),

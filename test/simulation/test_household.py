@@ -124,3 +124,20 @@ def test_unknown_kinds_are_refused() -> None:
     for kinds in ([], ["elephant"]):
         with pytest.raises(ValueError, match="kinds: expected some of box, can"):
             draw_thing(rng, kinds)
+
+
+def test_parts_hold_together() -> None:
+    """From every part one gets to every other one through parts that overlap or touch."""
+    rng = np.random.default_rng(8)
+    for _ in range(80):
+        parts = draw_thing(rng, ["bottle", "can", "vessel", "tool", "union", "round"]).parts
+        points = parts.sample_surface(150, rng, oversampling=2)
+        points = np.concatenate([points, parts.translation[:, None]], axis=1)
+        near = np.array(
+            [part.gauge(points.reshape(-1, 3)).reshape(len(parts), -1).min(axis=1) < 1.02 for part in parts]
+        )
+        near |= near.T
+        reached = np.arange(len(parts)) == 0
+        for _ in parts:
+            reached = near[reached].any(axis=0)
+        assert reached.all()
