@@ -43,7 +43,7 @@ _GAP = 0.003
 _LEAN = tuple(np.deg2rad([8.0, 35.0]))
 _NEAREST = 0.35
 _TRIES = 60
-_SCENES = 40
+_SCENES = 15
 _MARGIN = 2.0
 _GRID = (33, 64)
 _BEARINGS = np.linspace(0, 2 * np.pi, 32, endpoint=False)
@@ -167,13 +167,16 @@ def _arranged(
 ) -> list[_Resting] | None:
     resting: list[_Resting] = []
     spread = rng.uniform(0.08, 0.3)
-    for _ in range(_TRIES * count):
+    failed = 0
+    while failed < _TRIES:
+        failed += 1
         how = str(rng.choice(_HOW)) if resting else "apart"
         placed = _drawn(draw_thing(rng), how, resting, spread, rng)
         if placed is None or not _in_view(placed, look, eye, camera):
             continue
         if all(placed.apart(other, _GAP if how == "apart" else -1e-6) for other in resting):
             resting.append(placed)
+            failed = 0
         if len(resting) == count:
             return resting
     return None
