@@ -57,7 +57,8 @@ class CanonicalView:
         z of the visible surface, 0 for background.
     hidden : bool (n, n)
         Background pixels at which the object may go on unseen: something nearer stands there, or nothing was measured
-        within the object's convex hull.  All False where :func:`from_mask` was not asked for it.
+        within the object's convex hull, or nothing was measured at all; see :func:`from_mask`.  All False where it was
+        not asked for it.
     rotation : (4,)
         Quaternion, optical frame to canonical frame.
     anchor : (3,)
@@ -98,6 +99,7 @@ def from_mask(
     *,
     find_hidden: bool = False,
     plane: np.ndarray | None = None,
+    missing_is_hidden: bool = False,
 ) -> CanonicalView:
     """The canonical view of the object under a mask.
 
@@ -113,6 +115,10 @@ def from_mask(
         Whether to look at the object's surroundings for what may hide a part of it.
     plane : (4,), optional
         What the object stands on, n.p + d = 0: seen in front of the object it hides nothing.
+    missing_is_hidden : bool
+        Whether the object may go on at every pixel without a reading, on it and beside it, and beyond the image; asks
+        for ``find_hidden`` too.  By default a pixel that measured nothing hides something within the object's convex
+        hull only.
 
     Raises
     ------
@@ -124,6 +130,8 @@ def from_mask(
     left, top, width, height = cv2.boundingRect((mask & np.isfinite(depth)).view(np.uint8))
     if width == 0:
         raise ValueError("a canonical view needs at least one pixel with a depth under the mask")
+    find_hidden |= missing_is_hidden
+    whole = camera
     look = np.eye(3)
     if camera.is_pinhole:
         _, toward = camera.rays(left + 0.5 * (width - 1), top + 0.5 * (height - 1))
@@ -158,7 +166,12 @@ def from_mask(
     if find_hidden:
         assert filled is not None
         covered = _covered(depth, mask, filled, camera, matrix, plane, _NEARER * extent)
-        hidden = (_read(covered.astype(np.float32), points, camera, cv2.BORDER_CONSTANT) > 0) & (value == 0)
+        if missing_is_hidden:
+            covered |= ~np.isfinite(depth)
+        hidden = _read(covered.astype(np.float32), points, camera, cv2.BORDER_CONSTANT) > 0
+        if missing_is_hidden:
+            hidden |= ~_within(points, whole)
+        hidden &= value == 0
     return CanonicalView(value, hidden, quaternions.from_matrix(matrix), matrix.T @ anchor, float(extent))
 
 
@@ -265,6 +278,12 @@ def _read(image: np.ndarray, points: np.ndarray, camera: Camera, border: int) ->
     """The image at the projections of points (n, n, 3); NaN beyond a constant border."""
     uv = camera.project(points).astype(np.float32)
     return cv2.remap(image, uv[..., 0], uv[..., 1], cv2.INTER_NEAREST, borderMode=border, borderValue=float("nan"))
+
+
+def _within(points: np.ndarray, camera: Camera) -> np.ndarray:
+    """Whether points (n, n, 3) are projected into the image."""
+    u, v = np.moveaxis(camera.project(points), -1, 0)
+    return (u >= -0.5) & (u < camera.width - 0.5) & (v >= -0.5) & (v < camera.height - 0.5)
 
 
 def _filled(image: np.ndarray) -> np.ndarray:

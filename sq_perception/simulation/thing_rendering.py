@@ -1,0 +1,107 @@
+"""Depth images of things: unions of superquadrics, some of them with cavities.
+
+A ray sees of a union the nearest part.  Where it meets the union inside of a cavity, it goes on to where it leaves that
+cavity; what the cavity's far wall consists of is the thing again.  Cavities are open towards the outside and lie within
+the union otherwise.  Table and wall are behind.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+
+from sq_perception.geometry.kernels import gauge, kernel, parallel_kernel, ray_interval
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging.camera import Camera
+from sq_perception.imaging.raycast import render
+
+
+def render_things(
+    parts: Superquadric,
+    owner: np.ndarray,
+    cavities: Superquadric,
+    cavity_owner: np.ndarray,
+    camera: Camera,
+    table: np.ndarray | None = None,
+    behind: float = np.inf,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Depth and visible thing of every pixel.
+
+    Parameters
+    ----------
+    parts, cavities : Superquadric
+        Batches (k,) and (m,) in the optical frame of a pinhole camera.
+    owner, cavity_owner : int (k,), (m,)
+        The thing that each belongs to.
+    table : (4,), optional
+        A plane n.p + d = 0, n up, that things stand on.
+    behind : float
+        Depth of a wall across the whole image, metres.
+
+    Returns
+    -------
+    depth : float64 (height, width)
+        Metres, +inf where there is nothing.
+    thing : int32 (height, width)
+        Owner of the visible part, -1 where there is none.
+    """
+    depth, index = render(parts, camera)
+    thing = np.where(index >= 0, np.asarray(owner, dtype=np.int32)[index], np.int32(-1))
+    intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
+    if len(cavities):
+        matrices = np.ascontiguousarray(cavities.rotation_matrix, dtype=float)
+        flat = np.ascontiguousarray(cavities.to_flat(), dtype=float)
+        _hollow_out(flat, matrices, np.asarray(cavity_owner, dtype=np.int32), intrinsics, depth, thing)
+    plane = np.array([0.0, 0.0, 0.0, 1.0]) if table is None else np.asarray(table, dtype=float)
+    _add_background(plane, float(behind), intrinsics, depth, thing)
+    return depth, thing
+
+
+@kernel
+def _add_background(
+    plane: np.ndarray, behind: float, intrinsics: np.ndarray, depth: np.ndarray, thing: np.ndarray
+) -> None:
+    """Table and wall where they are nearer than the things, in place."""
+    fx, fy, cx, cy = intrinsics
+    for v in range(depth.shape[0]):
+        for u in range(depth.shape[1]):
+            z = behind
+            slope = plane[0] * (u - cx) / fx + plane[1] * (v - cy) / fy + plane[2]
+            if slope < 0.0 and plane[3] > 0.0:
+                z = min(z, -plane[3] / slope)
+            if z < depth[v, u]:
+                depth[v, u] = z
+                thing[v, u] = -1
+
+
+@parallel_kernel
+def _hollow_out(
+    flat: np.ndarray,
+    matrices: np.ndarray,
+    owner: np.ndarray,
+    intrinsics: np.ndarray,
+    depth: np.ndarray,
+    thing: np.ndarray,
+) -> None:
+    fx, fy, cx, cy = intrinsics
+    for v in numba.prange(depth.shape[0]):
+        for u in range(depth.shape[1]):
+            if thing[v, u] < 0:
+                continue
+            for k in range(flat.shape[0]):
+                if owner[k] != thing[v, u]:
+                    continue
+                a1, a2, a3, e1, e2, t1, t2, t3 = flat[k, :8]
+                m = matrices[k]
+                x, y = (u - cx) / fx, (v - cy) / fy
+                ox = -(m[0, 0] * t1 + m[1, 0] * t2 + m[2, 0] * t3)
+                oy = -(m[0, 1] * t1 + m[1, 1] * t2 + m[2, 1] * t3)
+                oz = -(m[0, 2] * t1 + m[1, 2] * t2 + m[2, 2] * t3)
+                dx = m[0, 0] * x + m[1, 0] * y + m[2, 0]
+                dy = m[0, 1] * x + m[1, 1] * y + m[2, 1]
+                dz = m[0, 2] * x + m[1, 2] * y + m[2, 2]
+                z = depth[v, u]
+                if gauge(ox + z * dx, oy + z * dy, oz + z * dz, a1, a2, a3, e1, e2) < 1.0:
+                    hit, _, last = ray_interval(ox, oy, oz, dx, dy, dz, a1, a2, a3, e1, e2)
+                    if hit and last > z:
+                        depth[v, u] = last
