@@ -106,7 +106,7 @@ def main() -> None:
     judge = partial(scene_verdict.verdict, kinds=kinds, scans=scans, sensor=options.sensor)
     verdicts = list(judged(judge, range(options.first, options.first + options.scenes), options.jobs))
     if options.each is not None:
-        everything = [_facts(one) for each in verdicts for one in each.judged]
+        everything = [thing_facts(one) for each in verdicts for one in each.judged]
         options.each.write_text(json.dumps(everything, indent=1) + "\n")
     result, text = tables(verdicts)
     facts = {name: str(value) if isinstance(value, Path) else value for name, value in vars(options).items()}
@@ -298,7 +298,7 @@ def _numbers(values: np.ndarray, form: str = ".0f") -> str:
     return " ".join(f"{x:{form}}" for x in values) if np.isfinite(values).all() else "-"
 
 
-def _facts(one: Judged) -> dict[str, Any]:
+def thing_facts(one: Judged) -> dict[str, Any]:
     """One thing, for whoever wants other figures."""
     return {
         "seed": one.seed,

@@ -153,6 +153,14 @@ def gauge_slope(
 
 
 @kernel
+def support(nx: float, ny: float, nz: float, a1: float, a2: float, a3: float, e1: float, e2: float) -> float:
+    """max n.p over the body, for a direction of any length: the dual norm, see :meth:`Superquadric.support`."""
+    h, _, _, _ = p_norm(a1 * abs(nx), a2 * abs(ny), max(2.0 - e2, 1e-3))
+    h, _, _, _ = p_norm(h, a3 * abs(nz), max(2.0 - e1, 1e-3))
+    return h
+
+
+@kernel
 def box_interval(
     ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, a1: float, a2: float, a3: float
 ) -> tuple[float, float]:

@@ -12,7 +12,7 @@ import numba
 import numpy as np
 import torch
 
-from sq_perception.geometry.kernels import RAY_TOLERANCE, parallel_kernel, ray_entry
+from sq_perception.geometry.kernels import RAY_TOLERANCE, box_interval, kernel, parallel_kernel, ray_entry, support
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
 
@@ -41,25 +41,43 @@ def render(bodies: Superquadric, camera: Camera) -> tuple[np.ndarray, np.ndarray
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     matrices = np.ascontiguousarray(bodies.rotation_matrix, dtype=float)
     flat = np.ascontiguousarray(bodies.to_flat(), dtype=float)
-    windows = np.array([_window(body, camera) for body in bodies], dtype=np.int64).reshape(-1, 4)
+    windows = _windows(flat, matrices, intrinsics, camera.is_pinhole, camera.width, camera.height)
     _render_bodies(flat, matrices, windows, intrinsics, camera.is_pinhole, depth, index)
     return depth, index
 
 
-def _window(body: Superquadric, camera: Camera) -> tuple[int, int, int, int]:
-    """Pixels (left, top, right, bottom; the last two exclusive) outside of which the body cannot be seen."""
-    lower, upper = body.bounding_box()
-    corners = np.stack(np.meshgrid(*np.stack([lower, upper], axis=-1), indexing="ij"), axis=-1).reshape(-1, 3)
-    if camera.is_pinhole:
-        if upper[2] <= 0:
-            return 0, 0, 0, 0
-        if lower[2] <= 1e-6:
-            return 0, 0, camera.width, camera.height
-    pixels = camera.project(corners)
-    low, high = np.floor(pixels.min(axis=0)), np.ceil(pixels.max(axis=0)) + 1
-    left, top = np.clip(low, 0, [camera.width, camera.height]).astype(int)
-    right, bottom = np.clip(high, 0, [camera.width, camera.height]).astype(int)
-    return left, top, right, bottom
+@kernel
+def _windows(
+    flat: np.ndarray, matrices: np.ndarray, intrinsics: np.ndarray, pinhole: bool, width: int, height: int
+) -> np.ndarray:
+    """Pixels (n, 4): left, top, right, bottom, the last two exclusive, outside of which no part of a body is seen.
+
+    Those of the corners of the box around each body.
+    """
+    fx, fy, cx, cy = intrinsics
+    windows = np.zeros((flat.shape[0], 4), np.int64)
+    reach = np.empty(3)
+    for k in range(flat.shape[0]):
+        a1, a2, a3, e1, e2, t1, t2, t3 = flat[k, :8]
+        for axis in range(3):
+            m = matrices[k, axis]
+            reach[axis] = support(m[0], m[1], m[2], a1, a2, a3, e1, e2)
+        if pinhole and t3 + reach[2] <= 0.0:
+            continue
+        left, top, right, bottom = 0.0, 0.0, float(width), float(height)
+        if not pinhole or t3 - reach[2] > 1e-6:
+            least_u, most_u, least_v, most_v = np.inf, -np.inf, np.inf, -np.inf
+            for corner in range(8):
+                x = t1 + (reach[0] if corner & 1 else -reach[0])
+                y = t2 + (reach[1] if corner & 2 else -reach[1])
+                scale = 1.0 / (t3 + (reach[2] if corner & 4 else -reach[2])) if pinhole else 1.0
+                u, v = fx * x * scale + cx, fy * y * scale + cy
+                least_u, most_u, least_v, most_v = min(least_u, u), max(most_u, u), min(least_v, v), max(most_v, v)
+            left, right = max(left, np.floor(least_u)), min(right, np.ceil(most_u) + 1.0)
+            top, bottom = max(top, np.floor(least_v)), min(bottom, np.ceil(most_v) + 1.0)
+        if left < right and top < bottom:
+            windows[k, 0], windows[k, 1], windows[k, 2], windows[k, 3] = int(left), int(top), int(right), int(bottom)
+    return windows
 
 
 @parallel_kernel
@@ -86,19 +104,17 @@ def _render_bodies(
                     px, py, rx, ry = -t1, -t2, x, y
                 else:
                     px, py, rx, ry = x - t1, y - t2, 0.0, 0.0
-                hit, t = ray_entry(
-                    m[0, 0] * px + m[1, 0] * py - m[2, 0] * t3,
-                    m[0, 1] * px + m[1, 1] * py - m[2, 1] * t3,
-                    m[0, 2] * px + m[1, 2] * py - m[2, 2] * t3,
-                    m[0, 0] * rx + m[1, 0] * ry + m[2, 0],
-                    m[0, 1] * rx + m[1, 1] * ry + m[2, 1],
-                    m[0, 2] * rx + m[1, 2] * ry + m[2, 2],
-                    a1,
-                    a2,
-                    a3,
-                    e1,
-                    e2,
-                )
+                ox = m[0, 0] * px + m[1, 0] * py - m[2, 0] * t3
+                oy = m[0, 1] * px + m[1, 1] * py - m[2, 1] * t3
+                oz = m[0, 2] * px + m[1, 2] * py - m[2, 2] * t3
+                dx = m[0, 0] * rx + m[1, 0] * ry + m[2, 0]
+                dy = m[0, 1] * rx + m[1, 1] * ry + m[2, 1]
+                dz = m[0, 2] * rx + m[1, 2] * ry + m[2, 2]
+                # What begins behind something nearer needs no search.
+                t_in, _ = box_interval(ox, oy, oz, dx, dy, dz, a1, a2, a3)
+                if t_in >= depth[v, u]:
+                    continue
+                hit, t = ray_entry(ox, oy, oz, dx, dy, dz, a1, a2, a3, e1, e2)
                 if hit and t < depth[v, u] and (t > 0.0 or not pinhole):
                     depth[v, u] = t
                     index[v, u] = k

@@ -36,6 +36,7 @@ import numpy as np
 
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.geometry.union import flat_support, support_of_union
 
 KINDS = ("box", "can", "bottle", "vessel", "round", "tool", "union", "soft")
 LIKELY = {
@@ -53,17 +54,20 @@ LIKELY = {
 _STRAIGHT = (0.0, 0.0, 0.0, 1.0)
 _LEAN = (np.deg2rad(4.0), np.deg2rad(35.0))
 
-UPRIGHT = np.eye(3)
-ON_X = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
-"""The thing's x axis is vertical: it lies on a side."""
-ON_Y = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
-"""The thing's y axis, of an oval bottle the shorter one, is vertical."""
-INVERTED = np.diag([1.0, -1.0, -1.0])
+UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
+ON_X = np.array([0.0, -np.sqrt(0.5), 0.0, np.sqrt(0.5)])
+"""The thing's x axis points up: it lies on a side."""
+ON_Y = np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
+"""The thing's y axis, of an oval bottle the shorter one, points up."""
+INVERTED = np.array([1.0, 0.0, 0.0, 0.0])
+
+SIX_WAYS = np.concatenate([np.eye(3), -np.eye(3)])
+_NO_CAVITY = Superquadric.stack([])
 
 
 @dataclass(frozen=True, eq=False)
 class Rest:
-    """A way to rest: the rotation (3, 3) from the thing's frame to one with z up, and its probability."""
+    """A way to rest: the rotation, a quaternion (4,), from the thing's frame to one with z up, and its probability."""
 
     name: str
     turn: np.ndarray
@@ -101,7 +105,7 @@ class Thing:
     @cached_property
     def box(self) -> tuple[np.ndarray, np.ndarray]:
         """Lower and upper corner (3,) of the box around the thing in its own frame."""
-        reach = self.support(np.concatenate([np.eye(3), -np.eye(3)]))
+        reach = self.support(SIX_WAYS)
         return -reach[3:], reach[:3]
 
     @property
@@ -110,29 +114,27 @@ class Thing:
         return float(self.box[1][2] - self.box[0][2])
 
     def pose(self, rng: np.random.Generator, leaning: float = 0.06) -> tuple[str, np.ndarray]:
-        """A way to rest, turned about the vertical by any angle: its name and the rotation (3, 3) to a frame with z up.
+        """A way to rest, turned about the vertical by any angle: its name and the quaternion (4,) to a frame with z up.
 
         ``leaning`` is the share of things that are tilted by 4 to 35 degrees, as by something under or beside them.
         """
-        rest = self.rests[rng.choice(len(self.rests), p=[rest.likely for rest in self.rests])]
+        rest = self.rests[_one_of([rest.likely for rest in self.rests], rng)]
         name, turn = rest.name, rest.turn
         if rng.random() < leaning:
             tilt, way = rng.uniform(*_LEAN), rng.uniform(0, 2 * np.pi)
-            tilted = quaternions.from_rotation_vector(tilt * np.array([np.cos(way), np.sin(way), 0.0]))
-            name, turn = "leaning", quaternions.to_matrix(tilted) @ turn
-        return name, about_z(rng.uniform(0, 2 * np.pi)) @ turn
+            name, turn = "leaning", quaternions.multiply(_turn(np.cos(way), np.sin(way), 0.0, tilt), turn)
+        return name, quaternions.multiply(_turn(0.0, 0.0, 1.0, rng.uniform(0, 2 * np.pi)), turn)
 
 
-def support_of_union(parts: Superquadric, directions: np.ndarray) -> np.ndarray:
-    """max n.p over a union (k,) of bodies and so over its hull, for unit directions (J, 3), shape (J,)."""
-    reach = parts.support(directions) + parts.translation @ np.asarray(directions).T
-    return np.asarray(reach.max(axis=0))
+def _turn(x: float, y: float, z: float, angle: float) -> np.ndarray:
+    """The quaternion of a turn about a unit axis by an angle in radians."""
+    s = np.sin(angle / 2)
+    return np.array([x * s, y * s, z * s, np.cos(angle / 2)])
 
 
-def about_z(angle: float) -> np.ndarray:
-    """The rotation (3, 3) about z by an angle in radians."""
-    c, s = np.cos(angle), np.sin(angle)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+def _one_of(weights: Sequence[float], rng: np.random.Generator) -> int:
+    """A random index with these weights."""
+    return min(int(np.searchsorted(np.cumsum(weights), rng.random() * sum(weights), side="right")), len(weights) - 1)
 
 
 def draw_thing(rng: np.random.Generator, kinds: Sequence[str] | None = None) -> Thing:
@@ -146,11 +148,8 @@ def draw_thing(rng: np.random.Generator, kinds: Sequence[str] | None = None) -> 
     names = list(KINDS if kinds is None else kinds)
     if not names or not set(names) <= set(KINDS):
         raise ValueError(f"kinds: expected some of {', '.join(KINDS)}, got {names}")
-    weights = np.array([LIKELY[name] for name in names])
-    kind = names[rng.choice(len(names), p=weights / weights.sum())]
-    makers, likely = zip(*_MAKERS[kind], strict=True)
-    maker = makers[rng.choice(len(makers), p=np.array(likely) / sum(likely))]
-    return maker(rng)
+    makers = _MAKERS[names[_one_of([LIKELY[name] for name in names], rng)]]
+    return makers[_one_of([likely for _, likely in makers], rng)][0](rng)
 
 
 _Numbers = Sequence[float] | np.ndarray
@@ -179,15 +178,15 @@ def _thing(
     kind: str, name: str, rows: list[_Row], rests: Sequence[tuple[str, np.ndarray, float]], cut: Sequence[_Row] = ()
 ) -> Thing:
     flat = np.array(rows)
-    parts = Superquadric.from_flat(flat)
-    reach = support_of_union(parts, np.concatenate([np.eye(3), -np.eye(3)]))
+    reach = flat_support(flat, SIX_WAYS)
     middle = 0.5 * (reach[:3] - reach[3:])
     flat[:, 5:8] -= middle
-    holes = np.array(cut).reshape(-1, 12)
-    holes[:, 5:8] -= middle
+    cavities = _NO_CAVITY
+    if cut:
+        cavities = Superquadric.from_flat(np.array(cut) - [*[0.0] * 5, *middle, *[0.0] * 4])
     total = sum(likely for _, _, likely in rests)
     ways = tuple(Rest(name, turn, likely / total) for name, turn, likely in rests)
-    return Thing(kind, name, Superquadric.from_flat(flat), ways, Superquadric.from_flat(holes))
+    return Thing(kind, name, Superquadric.from_flat(flat), ways, cavities)
 
 
 def _log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
@@ -301,7 +300,7 @@ def _bottle(rng: np.random.Generator) -> Thing:
         for middle, share in ((0.2, 0.22), (0.8, 0.22)):
             rows.append(_part((a, b, share * straight), (rng.uniform(0.3, 0.8), e2), (0, 0, middle * straight)))
     rows += _shoulders(rng, a, b, e2, straight, height)
-    rows += _closure(rng, a, b, height)
+    rows += _closure(rng, a, b, straight, height)
     if oval and height > 0.16 and rng.random() < 0.18:
         rows += _grip(rng, a, straight, height)
     return _thing("bottle", "oval bottle" if flat < 1 else "round bottle", rows, _OVAL_RESTS if oval else _ROUND_RESTS)
@@ -326,27 +325,28 @@ def _shoulders(rng: np.random.Generator, a: float, b: float, e2: float, low: flo
     return rows
 
 
-def _closure(rng: np.random.Generator, a: float, b: float, top: float) -> list[_Row]:
-    """Neck and what closes it, above the height ``top``."""
+def _closure(rng: np.random.Generator, a: float, b: float, low: float, top: float) -> list[_Row]:
+    """The neck, from within the shoulders at the height ``low`` to ``top``, and what closes it above."""
     radius = min(rng.uniform(0.024, 0.05) / 2, 0.95 * b)
     tall = rng.uniform(0.012, 0.045)
     aside = rng.uniform(-0.35, 0.35) * a if rng.random() < 0.12 else 0.0
     base = top - 0.012
     choice = rng.random()
-    if choice < 0.5:  # a neck and a screw cap
-        neck = radius * rng.uniform(0.75, 1.0)
-        long = rng.uniform(0.0, 0.06) if rng.random() < 0.5 else 0.0
-        return [
-            _part((neck, neck, (0.014 + long) / 2), (0.1, 1.0), (aside, 0, base + long / 2)),
-            _part((radius, radius, tall / 2), (rng.uniform(0.05, 0.4), 1.0), (aside, 0, base + long + tall / 2)),
-        ]
-    if choice < 0.68:  # a wide flip cap, oval as the bottle or round
-        wide = rng.uniform(0.5, 0.95)
+    wide = rng.uniform(0.5, 0.95)
+    flip = 0.5 <= choice < 0.68
+    neck = rng.uniform(0.75, 1.0) * (wide * b if flip else radius)
+    long = rng.uniform(0.0, 0.06) if choice < 0.25 else 0.0
+    middle = aside if choice < 0.82 and not flip else 0.0
+    rows = [_part((neck, neck, (top + long - low) / 2), (0.1, 1.0), (middle, 0, (top + long + low) / 2))]
+    if choice < 0.5:  # a screw cap
+        size = (radius, radius, tall / 2)
+        return [*rows, _part(size, (rng.uniform(0.05, 0.4), 1.0), (aside, 0, base + long + tall / 2))]
+    if flip:  # a wide cap, oval as the bottle or round
         size = (wide * a, wide * b, tall / 2) if rng.random() < 0.6 else (wide * b, wide * b, tall / 2)
-        return [_part(size, (rng.uniform(0.1, 0.5), rng.uniform(0.6, 1.0)), (0, 0, base + tall / 2))]
+        return [*rows, _part(size, (rng.uniform(0.1, 0.5), rng.uniform(0.6, 1.0)), (0, 0, base + tall / 2))]
     if choice < 0.82:  # a nozzle that tapers
         long, tip = rng.uniform(0.02, 0.06), rng.uniform(0.004, 0.008)
-        rows = [_part((radius, radius, 0.009), (0.15, 1.0), (aside, 0, base + 0.006))]
+        rows.append(_part((radius, radius, 0.009), (0.15, 1.0), (aside, 0, base + 0.006)))
         for k in range(3):
             r = radius * 0.8 + (tip - radius * 0.8) * (k + 0.5) / 3
             rows.append(_part((r, r, 0.65 * long / 3), (0.3, 1.0), (aside, 0, base + 0.012 + long * (k + 0.5) / 3)))
@@ -355,6 +355,7 @@ def _closure(rng: np.random.Generator, a: float, b: float, top: float) -> list[_
         stem, reach = rng.uniform(0.02, 0.05), rng.uniform(0.018, 0.045)
         side = rng.choice([-1.0, 1.0])
         return [
+            *rows,
             _part((radius, radius, 0.01), (0.15, 1.0), (0, 0, base + 0.008)),
             _part((0.005, 0.005, stem / 2), (0.2, 1.0), (0, 0, base + 0.015 + stem / 2)),
             _part((0.011, 0.011, 0.007), (0.4, 1.0), (0, 0, base + 0.015 + stem)),
@@ -363,6 +364,7 @@ def _closure(rng: np.random.Generator, a: float, b: float, top: float) -> list[_
     long = rng.uniform(0.07, 0.11)  # a spray head with a trigger
     side = rng.choice([-1.0, 1.0])
     return [
+        *rows,
         _part((radius, radius, 0.014), (0.15, 1.0), (0, 0, base + 0.01)),
         _part((0.012, 0.012, 0.02), (0.3, 0.6), (0, 0, base + 0.035)),
         _part((long / 2, 0.013, 0.014), (0.4, 0.3), (side * 0.15 * long, 0, base + 0.06), _about(1, side * 8.0)),
@@ -403,15 +405,30 @@ def _revolved(radii: _Numbers, height: float, e1: float, e2: float = 1.0, flat: 
     ]
 
 
+def _cavity(radii: np.ndarray, height: float, wall: float, e2: float = 1.0, flat: float = 1.0) -> _Row:
+    """The widest of some superquadrics about the middle of the rim that stays within a stack of slabs."""
+    count = len(radii)
+    # Depth below the rim of each slab's lower end, in depths of the cavity.
+    depth = np.minimum(height * (1 - np.arange(count) / count) / (height - wall), 0.97)
+    widest, best = 0.0, 1.0
+    for e1 in (0.15, 0.4, 0.7, 1.0):
+        radius = float(((radii - wall) / (1 - depth ** (2 / e1)) ** (e1 / 2)).min())
+        radius = min(radius, radii[-1] - wall)
+        if radius > widest + 1e-4:
+            widest, best = radius, e1
+    widest = max(widest, 0.3 * float(radii[-1]))
+    return _part((widest, flat * widest, height - wall), (best, e2), (0, 0, height))
+
+
 def _cup(rng: np.random.Generator) -> Thing:
     """Cups, tumblers and mugs, straight or tapered."""
     top, height = rng.uniform(0.055, 0.1) / 2, rng.uniform(0.05, 0.15)
     bottom = top * (1.0 if rng.random() < 0.45 else rng.uniform(0.6, 0.95))
     wall = rng.uniform(0.002, 0.006)
     count = 1 if bottom == top else 6
-    rows = _revolved(np.linspace(bottom, top, count + 2)[1:-1], height, 0.08 if count == 1 else 0.2)
-    inner = 0.5 * (bottom + top) - wall
-    cut = [_part((inner, inner, height), (0.15, 1.0), (0, 0, height + wall))]
+    radii = np.linspace(bottom, top, count + 2)[1:-1]
+    rows = _revolved(radii, height, 0.08 if count == 1 else 0.2)
+    cut = [_cavity(radii, height, wall)]
     name = "cup"
     if rng.random() < 0.55:
         name, thick = "mug", rng.uniform(0.004, 0.009)
@@ -432,11 +449,11 @@ def _bowl(rng: np.random.Generator) -> Thing:
     top = _log_uniform(rng, 0.09, 0.28) / 2
     height = min(2 * top * rng.uniform(0.07, 0.6), 0.12)
     foot = top * rng.uniform(0.4, 0.7)
-    count = 3 if height < 0.03 else 6
+    count = 4 if height < 0.03 else 8
     share = (np.arange(count) + 0.75) / count
-    rows = _revolved(foot + (top - foot) * share ** rng.uniform(0.4, 0.9), height, 0.2)
-    wall = rng.uniform(0.003, 0.006)
-    cut = [_part((0.97 * top - wall, 0.97 * top - wall, height - wall), (rng.uniform(0.6, 1.0), 1.0), (0, 0, height))]
+    radii = foot + (top - foot) * share ** rng.uniform(0.4, 0.9)
+    rows = _revolved(radii, height, 0.35)
+    cut = [_cavity(radii, height, rng.uniform(0.003, 0.006))]
     return _thing("vessel", "bowl", rows, (("standing", UPRIGHT, 0.93), ("inverted", INVERTED, 0.07)), cut)
 
 
@@ -445,14 +462,14 @@ def _tub(rng: np.random.Generator) -> Thing:
     top, height = rng.uniform(0.06, 0.2) / 2, rng.uniform(0.03, 0.14)
     bottom = top * rng.uniform(0.7, 1.0)
     e2, flat = (1.0, 1.0) if rng.random() < 0.6 else (rng.uniform(0.15, 0.6), rng.uniform(0.55, 1.0))
-    rows = _revolved(np.linspace(bottom, top, 6)[1:-1], height, 0.2, e2, flat)
+    radii = np.linspace(bottom, top, 6)[1:-1]
+    rows = _revolved(radii, height, 0.2, e2, flat)
     lid = rng.uniform(0.003, 0.01)
     cut = []
     if rng.random() < 0.7:
         rows.append(_part((1.04 * top, 1.04 * flat * top, lid), (0.2, e2), (0, 0, height)))
     else:
-        inner = (0.5 * (bottom + top) - 0.004) / top
-        cut = [_part((inner * top, inner * flat * top, height), (0.15, e2), (0, 0, height + 0.004))]
+        cut = [_cavity(radii, height, 0.004, e2, flat)]
     rests = (("standing", UPRIGHT, 0.85), ("inverted", INVERTED, 0.08), ("on its side", ON_Y, 0.07))
     return _thing("vessel", "tub", rows, rests, cut)
 

@@ -2,7 +2,7 @@
 
 A ray sees of a union the nearest part.  Where it meets the union inside of a cavity, it goes on to where it leaves that
 cavity; what the cavity's far wall consists of is the thing again.  Cavities are open towards the outside and lie within
-the union otherwise.
+the union otherwise.  Table and wall are behind.
 """
 
 from __future__ import annotations
@@ -10,14 +10,20 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from sq_perception.geometry.kernels import gauge, parallel_kernel, ray_interval
+from sq_perception.geometry.kernels import gauge, kernel, parallel_kernel, ray_interval
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.raycast import render
 
 
-def render_parts(
-    parts: Superquadric, owner: np.ndarray, cavities: Superquadric, cavity_owner: np.ndarray, camera: Camera
+def render_things(
+    parts: Superquadric,
+    owner: np.ndarray,
+    cavities: Superquadric,
+    cavity_owner: np.ndarray,
+    camera: Camera,
+    table: np.ndarray | None = None,
+    behind: float = np.inf,
 ) -> tuple[np.ndarray, np.ndarray]:
     """Depth and visible thing of every pixel.
 
@@ -27,6 +33,10 @@ def render_parts(
         Batches (k,) and (m,) in the optical frame of a pinhole camera.
     owner, cavity_owner : int (k,), (m,)
         The thing that each belongs to.
+    table : (4,), optional
+        A plane n.p + d = 0, n up, that things stand on.
+    behind : float
+        Depth of a wall across the whole image, metres.
 
     Returns
     -------
@@ -37,12 +47,31 @@ def render_parts(
     """
     depth, index = render(parts, camera)
     thing = np.where(index >= 0, np.asarray(owner, dtype=np.int32)[index], np.int32(-1))
+    intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     if len(cavities):
         matrices = np.ascontiguousarray(cavities.rotation_matrix, dtype=float)
         flat = np.ascontiguousarray(cavities.to_flat(), dtype=float)
-        intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
         _hollow_out(flat, matrices, np.asarray(cavity_owner, dtype=np.int32), intrinsics, depth, thing)
+    plane = np.array([0.0, 0.0, 0.0, 1.0]) if table is None else np.asarray(table, dtype=float)
+    _add_background(plane, float(behind), intrinsics, depth, thing)
     return depth, thing
+
+
+@kernel
+def _add_background(
+    plane: np.ndarray, behind: float, intrinsics: np.ndarray, depth: np.ndarray, thing: np.ndarray
+) -> None:
+    """Table and wall where they are nearer than the things, in place."""
+    fx, fy, cx, cy = intrinsics
+    for v in range(depth.shape[0]):
+        for u in range(depth.shape[1]):
+            z = behind
+            slope = plane[0] * (u - cx) / fx + plane[1] * (v - cy) / fy + plane[2]
+            if slope < 0.0 and plane[3] > 0.0:
+                z = min(z, -plane[3] / slope)
+            if z < depth[v, u]:
+                depth[v, u] = z
+                thing[v, u] = -1
 
 
 @parallel_kernel

@@ -6,12 +6,12 @@ follows.
 
     pose        standing, lying, leaning (:meth:`Thing.pose`), on the table, on top of something, or free in any pose
     camera      5 to 85 degrees above the table, most 20 to 70; a roll of some degrees; off the image's middle by up to
-                27 degrees; 0.35 to 2 m away; the thing is 24 to 80 pixels wide
+                27 degrees; 0.35 to 2 m away; the thing is 30 to 80 pixels wide
     around it   up to three neighbours on the table, something before it, the table's end, a wall or nothing behind it
     sensor      one of :mod:`sensor_noise` with random parameters: noise of a window, steps, the shadow of the baseline
-                on either side, fattened or mixed or wandering edges, lost grazing sides; besides a side that is lost as
-                one eye hardly sees it, dark blobs and bands without reading, smoothing; in half of the views what is
-                missing beside the thing is filled with what is there
+                on either side, fattened or mixed or wandering edges, lost grazing sides; besides waves, a side that is
+                lost as one eye hardly sees it, lost edges, contours, dark blobs and bands, smoothing; in half of the
+                views what is missing beside the thing is filled with what is there
     mask        too small or too large by up to two pixels, with or without what measured the table
     image       a border that cuts the thing
 
@@ -30,14 +30,14 @@ import numpy as np
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.support_directions import DIRECTIONS
+from sq_perception.geometry.union import flat_support, moved, support_of_union
 from sq_perception.imaging import canonical_view
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.canonical_view import CanonicalView
 from sq_perception.imaging.coherence import coherent
-from sq_perception.simulation.household import KINDS, Thing, about_z, draw_thing, support_of_union
-from sq_perception.simulation.scenes import plane_depth
+from sq_perception.simulation.household import KINDS, SIX_WAYS, Thing, draw_thing
 from sq_perception.simulation.sensor_noise import Ideal, SensorNoise, Stereo, StructuredLight, TimeOfFlight
-from sq_perception.simulation.thing_rendering import render_parts
+from sq_perception.simulation.thing_rendering import render_things
 
 ON_TOP, FREE = 0.10, 0.05
 """Shares of the views in which the thing stands on something on the table, and in which there is no table."""
@@ -46,11 +46,13 @@ PLANE_TILT, PLANE_SHIFT = float(np.deg2rad(0.7)), 0.002
 """Standard deviations of the given plane: of its tilt in both directions, and of its distance from the thing."""
 
 _DISTANCE = (0.35, 1.3, 2.0)
+_FARTHEST = 12.0
+"""Diagonals of its box, more than which no thing is away."""
 _FOCALS = (425.0, 525.0, 580.0, 615.0, 700.0, 920.0)
 """Pixels: depth cameras at VGA to HD."""
-_PIXELS_ACROSS = (24.0, 80.0)
+_PIXELS_ACROSS = (30.0, 80.0)
 _OFF_AXIS = (0.5, 0.4)
-_AROUND = 0.75
+_AROUND = 0.7
 """Half of the image's side over the thing's width."""
 _LEAST_SEEN = 40
 _LARGEST_SUPPORT, _LEAST_WIDTH = 3.0, 0.6
@@ -89,9 +91,9 @@ class Setting:
     Attributes
     ----------
     parts, cavities : Superquadric
-        Of the thing.
+        Of the thing, (k,) and (m,).
     others : Superquadric
-        Batch (k,), k >= 0: neighbours, and what it stands on.
+        Batch (j,), j >= 0: neighbours, and what it stands on.
     table : (4,) or None
         n.p + d = 0, n up.
     behind : float
@@ -108,17 +110,11 @@ class Setting:
 
     def render(self) -> tuple[np.ndarray, np.ndarray]:
         """Depth (height, width), +inf where there is nothing, and where the thing is seen."""
-        count = len(self.parts)
-        bodies = self.parts
-        if len(self.others):
-            bodies = Superquadric.from_flat(np.concatenate([self.parts.to_flat(), self.others.to_flat()]))
-        owner = np.where(np.arange(len(bodies)) < count, 0, 1)
-        depth, index = render_parts(bodies, owner, self.cavities, np.zeros(len(self.cavities)), self.camera)
-        behind = np.full_like(depth, self.behind)
-        if self.table is not None:
-            behind = np.minimum(behind, plane_depth(self.table, self.camera))
-        seen = (index == 0) & (depth < behind)
-        return np.minimum(depth, behind), seen
+        bodies = Superquadric.from_flat(np.concatenate([self.parts.to_flat(), self.others.to_flat()]))
+        owner = np.arange(len(bodies)) >= len(self.parts)
+        whose = np.zeros(len(self.cavities))
+        depth, index = render_things(bodies, owner, self.cavities, whose, self.camera, self.table, self.behind)
+        return depth, index == 0
 
 
 def draw_thing_views(
@@ -171,10 +167,9 @@ def _draw_one(
 def draw_setting(thing: Thing, rng: np.random.Generator) -> Setting:
     """The thing in a random pose before a random camera; see the module."""
     free = rng.random() < FREE
-    turn = quaternions.to_matrix(quaternions.random(1, rng)[0]) if free else thing.pose(rng)[1]
-    parts = _placed(thing.parts, turn, np.zeros(3))
-    reach = support_of_union(parts, np.concatenate([np.eye(3), -np.eye(3)]))
-    lift = np.array([0.0, 0.0, reach[5]])
+    turn = quaternions.random(1, rng)[0] if free else thing.pose(rng)[1]
+    parts = moved(thing.parts.to_flat(), turn, np.zeros(3))
+    reach = flat_support(parts, SIX_WAYS)
     others, floor = [], 0.0
     if not free:
         if rng.random() < ON_TOP:
@@ -185,45 +180,45 @@ def draw_setting(thing: Thing, rng: np.random.Generator) -> Setting:
     elevation = np.deg2rad(rng.uniform(20, 70) if rng.random() < 0.75 else rng.uniform(5, 85))
     roll = rng.normal(0, np.deg2rad(4.0)) if rng.random() < 0.93 else rng.uniform(-np.pi, np.pi)
     aside, below = rng.uniform(-1, 1, 2) * _OFF_AXIS
-    optical_from_table = about_z(roll) @ _looking_down(elevation - np.arctan(below))
+    look = looking_down(elevation - np.arctan(below), roll)
+    matrix = quaternions.to_matrix(look)
     near, usual, far = _DISTANCE
     distance = np.exp(rng.uniform(np.log(near), np.log(usual if rng.random() < 0.85 else far)))
+    distance = min(distance, _FARTHEST * float(np.linalg.norm(reach[:3] + reach[3:])))
     ray = np.array([aside, below, 1.0])
-    middle = lift + 0.5 * (reach[:3] - reach[3:])
-    shift = distance * ray / np.linalg.norm(ray) - optical_from_table @ middle
-    parts = _placed(thing.parts, optical_from_table @ turn, shift + optical_from_table @ lift)
-    cavities = _placed(thing.cavities, optical_from_table @ turn, shift + optical_from_table @ lift)
-    around = Superquadric.from_flat(np.array(others).reshape(-1, 12))
-    table = None
-    if not free:
-        normal = optical_from_table[:, 2]
-        table = np.append(normal, -(normal @ shift) - floor)
+    # The table's frame has its origin below the thing, at the height of its lowest point.
+    lift = np.array([0.0, 0.0, reach[5]])
+    shift = distance * ray / np.linalg.norm(ray) - matrix @ (lift + 0.5 * (reach[:3] - reach[3:]))
+    parts = moved(parts, look, shift + matrix @ lift)
+    cavities = thing.cavities
+    if len(cavities):
+        cavities = Superquadric.from_flat(
+            moved(cavities.to_flat(), quaternions.multiply(look, turn), shift + matrix @ lift)
+        )
+    table = None if free else np.append(matrix[:, 2], -(matrix[:, 2] @ shift) - floor)
     behind = distance * rng.uniform(1.3, 3.0) if rng.random() < 0.85 else np.inf
+    around = moved(np.array(others).reshape(-1, 12), look, shift)
     camera = _camera(parts, rng)
-    return Setting(parts, cavities, _placed(around, optical_from_table, shift), table, behind, camera)
+    return Setting(Superquadric.from_flat(parts), cavities, Superquadric.from_flat(around), table, behind, camera)
 
 
-def _placed(bodies: Superquadric, turn: np.ndarray, shift: np.ndarray) -> Superquadric:
-    return bodies.transformed(quaternions.from_matrix(turn), shift)
+def looking_down(pitch: float, roll: float) -> np.ndarray:
+    """Optical from table frame, a quaternion: the axis ``pitch`` radians below the horizon, towards the table's y."""
+    half, other = 0.5 * (np.pi / 2 + pitch), 0.5 * roll
+    c, s = np.cos(half), np.sin(half)
+    return np.array([s * np.cos(other), s * np.sin(other), c * np.sin(other), c * np.cos(other)])
 
 
-def _looking_down(pitch: float) -> np.ndarray:
-    """Optical from table frame (3, 3): x along x, the axis below the horizon by ``pitch`` radians, towards y."""
-    c, s = np.cos(pitch), np.sin(pitch)
-    return np.array([[1.0, 0, 0], [0, -s, -c], [0, c, -s]])
-
-
-def _camera(parts: Superquadric, rng: np.random.Generator) -> Camera:
+def _camera(parts: np.ndarray, rng: np.random.Generator) -> Camera:
     """A camera whose image is the thing and what is around it."""
-    axes = np.eye(3)[:2]
-    far, near = support_of_union(parts, axes), -support_of_union(parts, -axes)
-    z = float(parts.translation[:, 2].mean())
-    width = max(far - near)
+    right, down, _, left, up, _ = flat_support(parts, SIX_WAYS)
+    z = float(parts[:, 7].mean())
+    width = max(right + left, down + up)
     focal = rng.choice(_FOCALS) * rng.uniform(0.9, 1.1)
-    across = float(np.clip(focal * width / z, *_PIXELS_ACROSS))
+    across = min(max(focal * width / z, _PIXELS_ACROSS[0]), rng.uniform(*_PIXELS_ACROSS))
     focal = across * z / width
     half = int(np.ceil(_AROUND * across)) + 4
-    u, v = focal * 0.5 * (far + near) / z
+    u, v = focal * 0.5 * (right - left) / z, focal * 0.5 * (down - up) / z
     return Camera(2 * half, 2 * half, focal, focal, half - u, half - v)
 
 
@@ -235,21 +230,21 @@ def _stand(reach: np.ndarray, floor: float, rng: np.random.Generator) -> np.ndar
     return np.array([*half, -floor / 2, 0.05, e2, *middle, floor / 2, 0.0, 0.0, 0.0, 1.0])
 
 
-def _neighbours(parts: Superquadric, floor: float, rng: np.random.Generator) -> list[np.ndarray]:
+def _neighbours(parts: np.ndarray, floor: float, rng: np.random.Generator) -> list[np.ndarray]:
     """Up to three parts (12,) beside the thing, as seen from above; many between it and the camera, many touch it."""
     rows = []
-    for _ in range(rng.choice(4, p=[0.4, 0.3, 0.2, 0.1])):
+    for _ in range(rng.choice((0, 0, 0, 0, 1, 1, 1, 2, 2, 3))):
         size = np.exp(rng.uniform(np.log(0.02), np.log(0.1), 3))
         shape = rng.uniform(0.1, 1.0, 2) ** [1.0, 0.7]
         turn = rng.uniform(0, np.pi)
         bearing = rng.uniform(-np.pi, np.pi) if rng.random() < 0.6 else rng.normal(-np.pi / 2, 0.7)
         way = np.array([np.cos(bearing), np.sin(bearing), 0.0])
         rotation = np.array([0.0, 0.0, np.sin(turn / 2), np.cos(turn / 2)])
-        body = Superquadric(size, shape, np.zeros(3), rotation)
+        row = np.array([*size, *shape, 0.0, 0.0, floor + size[2], *rotation])
         gap = 0.0 if rng.random() < 0.3 else rng.uniform(0, 0.08)
-        far = support_of_union(parts, way[None])[0] + body.support(way[None])[0] + gap
-        along = np.cross([0.0, 0.0, 1.0], way) * rng.normal(0, 0.02)
-        rows.append(np.array([*size, *shape, *(far * way + along)[:2], floor + size[2], *rotation]))
+        far = flat_support(parts, way[None])[0] + flat_support(row[None], -way[None])[0] + gap
+        row[5:7] = far * way[:2] + rng.normal(0, 0.02) * np.array([-way[1], way[0]])
+        rows.append(row)
     return rows
 
 
@@ -301,22 +296,55 @@ def _measured(depth: np.ndarray, seen: np.ndarray, camera: Camera, rng: np.rando
     """What a random sensor reports of a true depth image."""
     sensor = draw_sensor(camera, rng)
     measured = sensor.measured(depth, camera, rng)
+    if rng.random() < 0.4:
+        measured += _waves(measured.shape, rng) * np.square(measured)
     if rng.random() < 0.35:
         measured[seen & _turned_aside(depth, camera, rng)] = np.nan
+    if rng.random() < 0.35:
+        measured[_edges(depth, rng)] = np.nan
+    if rng.random() < 0.1:
+        measured[seen & _contours(depth, seen, rng)] = np.nan
     if rng.random() < 0.15:
         measured[seen & _blob(seen, rng)] = np.nan
     if rng.random() < 0.3:
-        measured = _smoothed(measured, int(rng.choice([3, 5])), seen if rng.random() < 0.5 else None)
+        measured = _smoothed(measured, int(rng.choice((3, 5))), seen if rng.random() < 0.5 else None)
     if rng.random() < 0.5:
         filled = ~seen & np.isnan(measured) & np.isfinite(depth)
         measured[filled] = depth[filled]
     return measured
 
 
+def _waves(shape: tuple[int, ...], rng: np.random.Generator) -> np.ndarray:
+    """Smooth errors, metres at 1 m: what calibration and the interpolation of disparities leave."""
+    coarse = rng.standard_normal((int(rng.integers(4, 14)), int(rng.integers(4, 14))), dtype=np.float32)
+    sigma = np.float32(0.0005 * 8.0 ** rng.random())
+    return sigma * cv2.resize(coarse, (shape[1], shape[0]), interpolation=cv2.INTER_CUBIC)
+
+
+def _edges(depth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Most pixels within one to three pixels of a step in depth."""
+    inverse = (1 / depth).astype(np.float32)
+    brush = np.ones((3, 3), np.uint8)
+    highest = cv2.dilate(inverse, brush)
+    step = (highest - cv2.erode(inverse, brush) > 0.06 * highest).astype(np.uint8)
+    wider = int(rng.integers(0, 3))
+    if wider:
+        step = cv2.dilate(step, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * wider + 1, 2 * wider + 1)))
+    return (step > 0) & (rng.random(depth.shape, dtype=np.float32) < rng.uniform(0.4, 1.0))
+
+
+def _contours(depth: np.ndarray, seen: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Thin lines of equal disparity, at which some sensors that measure in steps find no match."""
+    inverse = 1 / depth
+    near, far = inverse[seen].max(), inverse[seen].min()
+    lines = rng.uniform(1.5, 6.0) / max(near - far, 1e-6)
+    return (inverse * lines + rng.random()) % 1.0 < rng.uniform(0.03, 0.12)
+
+
 def _turned_aside(depth: np.ndarray, camera: Camera, rng: np.random.Generator) -> np.ndarray:
     """Surfaces that turn away to one side of the image by more than a random angle."""
     with np.errstate(invalid="ignore"):
-        slope = np.gradient(depth, axis=1) * camera.fx / depth
+        slope = cv2.Sobel(depth, cv2.CV_64F, 1, 0, ksize=1) * (0.5 * camera.fx) / depth
         return rng.choice([-1.0, 1.0]) * slope > np.tan(np.deg2rad(rng.uniform(45, 82)))
 
 
@@ -355,7 +383,7 @@ def _masked(
     measured: np.ndarray, seen: np.ndarray, camera: Camera, table: np.ndarray | None, rng: np.random.Generator
 ) -> np.ndarray:
     """The mask that a segmentation or a person draws, less what measured the table, as the views of images have it."""
-    error = rng.choice([-2, -1, 0, 1, 2], p=[0.08, 0.3, 0.32, 0.2, 0.1])
+    error = rng.choice((-2, -1, -1, -1, 0, 0, 0, 1, 1, 2))
     mask: np.ndarray = seen.astype(np.uint8)
     if error:
         brush = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * abs(error) + 1, 2 * abs(error) + 1))
@@ -378,13 +406,13 @@ def _cut(
     measured: np.ndarray, mask: np.ndarray, camera: Camera, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray, Camera]:
     """Some images end within the thing or near to it."""
-    if rng.random() > 0.12:
+    if rng.random() > 0.1:
         return measured, mask, camera
     v, u = np.nonzero(mask)
     if not v.size:
         return measured, mask, camera
     left, top, right, bottom = 0, 0, camera.width, camera.height
-    share, side = rng.uniform(-0.1, 0.45), rng.integers(4)
+    share, side = rng.uniform(-0.1, 0.4), rng.integers(4)
     if side == 0:
         left = int(np.clip(u.min() + share * np.ptp(u), 0, right - 2))
     elif side == 1:

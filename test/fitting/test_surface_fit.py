@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
-from sq_perception.fitting import surface_fit
+from sq_perception.fitting import covariance, surface_fit
 from sq_perception.fitting.bounds import Bounds
 from sq_perception.fitting.fit import Fit, Status
 from sq_perception.fitting.surface_fit import FitOptions
@@ -331,6 +332,30 @@ def test_noise_images_give_a_finite_body(rng: np.random.Generator) -> None:
 def test_a_mask_that_fills_the_image() -> None:
     fit = surface_fit.fit(FLAT, np.ones(FLAT.shape, bool), CAMERA)
     assert np.isfinite(fit.superquadric.to_flat()).all()
+
+
+@pytest.mark.parametrize(("width", "height"), [(640, 3), (3, 480)])
+@pytest.mark.parametrize("model_error", [None, 0.0025])
+def test_a_strip_of_a_wall_has_a_covariance(width: int, height: int, model_error: float | None) -> None:
+    """Rounding of one part in 10^16 of what it measures exactly must not make variances of the rest negative."""
+    camera = Camera(width, height, 270.0, 270.0, (width - 1) / 2, (height - 1) / 2)
+    depth = np.full((height, width), 0.7, np.float32)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        fit = surface_fit.fit(
+            depth, np.ones_like(depth, dtype=bool), camera, options=FitOptions(model_error=model_error)
+        )
+        assert (fit.sigma_size > 0).all()
+
+
+def test_an_inverse_of_information_is_a_covariance(rng: np.random.Generator) -> None:
+    """One direction known 10^10 times as well as another that is known from the prior alone."""
+    axes, _ = np.linalg.qr(rng.normal(size=(11, 11)))
+    values = np.r_[1e20, 1e12, np.full(9, 1.0)]
+    found = covariance._inverse((axes * values) @ axes.T, 1.0)
+    deviations = np.linalg.eigvalsh((found + found.T) / 2)
+    assert deviations.min() > -1e-12
+    assert deviations.max() <= 1 + 1e-9
 
 
 def test_misuse_raises() -> None:

@@ -1,0 +1,257 @@
+"""Scenes of household things on a table: standing, lying, leaning on each other, stacked, close together.
+
+The table's frame has x to the right, y away from the camera, z up; its origin is the point that the camera looks at,
+from 0.5 to 1.2 m and 20 to 70 degrees above the table.  Things rest in it:
+
+    apart       somewhere on the table, at least 3 mm from all others
+    beside      pushed along the table against another one until they touch
+    leaning     tilted towards another one and pushed against it: its lowest edge is on the table, the other one, which
+                is high enough, holds its upper edge
+    stacked     on a box or an upright can, its middle over the face that carries it
+
+Two convex bodies are apart if some plane lies between them; planes that stand on the table, in 32 directions, and the
+level ones between storeys are tried, so that nothing that is accepted penetrates.
+
+Metres; depth is the z coordinate, +inf where nothing is.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sq_perception.geometry import rotation as quaternions
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.geometry.union import flat_support, moved
+from sq_perception.imaging.camera import Camera
+from sq_perception.simulation.household import SIX_WAYS, Thing, draw_thing
+from sq_perception.simulation.thing_rendering import render_things
+from sq_perception.simulation.thing_views import looking_down
+
+MOST_THINGS = 8
+TABLE_CAMERA = Camera(640, 480, 554.3, 554.3, 319.5, 239.5)
+"""VGA, 60 degrees wide."""
+
+_DISTANCE = (0.5, 1.2)
+_ELEVATION = tuple(np.deg2rad([20.0, 70.0]))
+_ROLL = float(np.deg2rad(5.0))
+_WALL = (1.8, 3.5)
+_HOW = ("apart", "beside", "leaning", "leaning", "stacked", "stacked")
+"""Tried; many a thing can neither lean nor be stacked where it is tried."""
+_GAP = 0.003
+_LEAN = tuple(np.deg2rad([8.0, 35.0]))
+_NEAREST = 0.35
+_TRIES = 60
+_SCENES = 15
+_MARGIN = 2.0
+_GRID = (33, 64)
+_BEARINGS = np.linspace(0, 2 * np.pi, 32, endpoint=False)
+_WAYS = np.concatenate([np.stack([np.cos(_BEARINGS), np.sin(_BEARINGS), 0 * _BEARINGS], axis=1), SIX_WAYS[[2, 5]]])
+_BACK = np.argmin(_WAYS @ _WAYS.T, axis=1)
+_UP, _DOWN = 32, 33
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedThing:
+    """One thing of a scene.
+
+    Attributes
+    ----------
+    rest
+        How it lies, and how it came there.
+    rotation, translation : (4,), (3,)
+        Optical from the thing's frame.
+    label
+        Its value in the label image.
+    pixels, alone
+        How many pixels show it, and would if it were alone.
+    """
+
+    thing: Thing
+    rest: str
+    rotation: np.ndarray
+    translation: np.ndarray
+    label: int
+    pixels: int
+    alone: int
+
+    @property
+    def parts(self) -> Superquadric:
+        """In the optical frame."""
+        return Superquadric.from_flat(moved(self.thing.parts.to_flat(), self.rotation, self.translation))
+
+
+@dataclass(frozen=True, eq=False)
+class ThingsOnTable:
+    """A scene, its true image and its truth.
+
+    Attributes
+    ----------
+    depth : float64 (height, width)
+        +inf where nothing is; a sensor of :mod:`sensor_noise` makes a measured image of it.
+    labels : int32 (height, width)
+        True masks, 0 for what is no thing.
+    plane : (4,)
+        Height above the table = n.p + d.
+    table : (3, 3)
+        Optical from table frame.
+    """
+
+    camera: Camera
+    depth: np.ndarray
+    labels: np.ndarray
+    plane: np.ndarray
+    table: np.ndarray
+    placed: tuple[PlacedThing, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class _Resting:
+    """A thing in the table's frame, its support in ``_WAYS`` and whether something may stand on it."""
+
+    thing: Thing
+    rest: str
+    turn: np.ndarray
+    shift: np.ndarray
+    reach: np.ndarray
+    carries: bool
+
+    def at(self, shift: np.ndarray) -> _Resting:
+        by = np.asarray(shift) - self.shift
+        return _Resting(self.thing, self.rest, self.turn, self.shift + by, self.reach + _WAYS @ by, self.carries)
+
+    def named(self, rest: str) -> _Resting:
+        return _Resting(self.thing, rest, self.turn, self.shift, self.reach, self.carries)
+
+    def apart(self, other: _Resting, gap: float) -> bool:
+        """Whether a tried plane lies between both, ``gap`` wide; level ones need none."""
+        free = -(self.reach + other.reach[_BACK])
+        return bool((free[:_UP] >= gap).any() or (free[_UP:] >= -1e-9).any())
+
+
+def hull_points(parts: Superquadric) -> np.ndarray:
+    """Points (n, 3) whose convex hull is that of a union, to some thousandths of its size.
+
+    Angles at even distances crowd where a sharp body has its edges.
+    """
+    eta, omega = np.linspace(-np.pi / 2, np.pi / 2, _GRID[0]), np.linspace(-np.pi, np.pi, _GRID[1], endpoint=False)
+    grid = np.stack(np.meshgrid(eta, omega, indexing="ij"), axis=-1).reshape(-1, 2)
+    return np.asarray(parts.parametric_points(grid[:, 0], grid[:, 1])).reshape(-1, 3)
+
+
+def things_on_table(rng: np.random.Generator, count: int | None = None, camera: Camera = TABLE_CAMERA) -> ThingsOnTable:
+    """``count`` things, or 1 to 8, on a table, all of them wholly inside the image.
+
+    Raises
+    ------
+    ValueError
+        If ``count`` is not 1 to 8, the camera is no pinhole, or the things find no room in its image.
+    """
+    if count is not None and not 1 <= count <= MOST_THINGS:
+        raise ValueError(f"count: expected 1 to {MOST_THINGS} things, got {count}")
+    if not camera.is_pinhole:
+        raise ValueError("camera: expected a pinhole camera, got an orthographic one")
+    wanted = int(rng.integers(1, MOST_THINGS + 1)) if count is None else count
+    for _ in range(_SCENES):
+        look = looking_down(rng.uniform(*_ELEVATION), rng.uniform(-_ROLL, _ROLL))
+        eye = np.array([0.0, 0.0, rng.uniform(*_DISTANCE)])
+        resting = _arranged(wanted, look, eye, camera, rng)
+        if resting is not None:
+            return _seen(resting, look, eye, camera, rng)
+    raise ValueError(f"no room for {wanted} things in an image of {camera.width} x {camera.height} pixels")
+
+
+def _arranged(
+    count: int, look: np.ndarray, eye: np.ndarray, camera: Camera, rng: np.random.Generator
+) -> list[_Resting] | None:
+    resting: list[_Resting] = []
+    spread = rng.uniform(0.08, 0.3)
+    failed = 0
+    while failed < _TRIES:
+        failed += 1
+        how = str(rng.choice(_HOW)) if resting else "apart"
+        placed = _drawn(draw_thing(rng), how, resting, spread, rng)
+        if placed is None or not _in_view(placed, look, eye, camera):
+            continue
+        if all(placed.apart(other, _GAP if how == "apart" else -1e-6) for other in resting):
+            resting.append(placed)
+            failed = 0
+        if len(resting) == count:
+            return resting
+    return None
+
+
+def _drawn(thing: Thing, how: str, others: list[_Resting], spread: float, rng: np.random.Generator) -> _Resting | None:
+    """A thing placed in one of the ways of the module; None where that way is not possible."""
+    rest, turn = thing.pose(rng, leaning=0.0)
+    bearing = rng.uniform(0, 2 * np.pi)
+    way = np.array([np.cos(bearing), np.sin(bearing), 0.0])
+    if how == "leaning":
+        # Tilted about a level axis, so that the upper end goes towards ``way``.
+        half = 0.5 * rng.uniform(*_LEAN)
+        tilt = np.array([-way[1] * np.sin(half), way[0] * np.sin(half), 0.0, np.cos(half)])
+        turn = quaternions.multiply(tilt, turn)
+    flat_top = thing.kind == "box" or (thing.kind == "can" and rest == "standing" and len(thing.parts) == 1)
+    turned = moved(thing.parts.to_flat(), turn, np.zeros(3))
+    body = _Resting(thing, rest, turn, np.zeros(3), flat_support(turned, _WAYS), flat_top and how != "leaning")
+    floor = body.reach[_DOWN]
+    if how == "apart":
+        return body.at(np.array([*(rng.normal(0, spread, 2)), floor]))
+    able = [other for other in others if other.carries] if how == "stacked" else others
+    if not able:
+        return None
+    other = able[rng.integers(len(able))]
+    middle = 0.5 * (other.reach - other.reach[_BACK]) @ _WAYS / 16
+    if how == "stacked":
+        face = 0.5 * np.array([other.reach[0] + other.reach[16], other.reach[8] + other.reach[24]])
+        at = middle[:2] + rng.uniform(-0.25, 0.25, 2) * face.min()
+        return body.at(np.array([*at, other.reach[_UP] + floor])).named(f"stacked, {rest}")
+    if other.reach[_DOWN] < -1e-3:  # itself not on the table
+        return None
+    reach = flat_support(turned, way[None])[0]
+    where = flat_support(moved(other.thing.parts.to_flat(), other.turn, other.shift), -way[None])[0]
+    along = np.array([-way[1], way[0], 0.0])
+    aside = rng.normal(0, 0.01) if how == "leaning" else rng.normal(0, 0.03)
+    # The plane across ``way`` that touches the other one, and this one from the other side.
+    shift = way * (-where - reach) + along * (middle @ along + aside)
+    placed = body.at(np.array([*shift[:2], floor]))
+    if how == "leaning":
+        if placed.reach[_UP] > other.reach[_UP] + 0.01 or thing.kind in ("round", "soft", "union"):
+            return None
+        return placed.named(f"leaning, {rest}")
+    return placed
+
+
+def _in_view(body: _Resting, look: np.ndarray, eye: np.ndarray, camera: Camera) -> bool:
+    parts = moved(moved(body.thing.parts.to_flat(), body.turn, body.shift), look, eye)
+    reach = flat_support(parts, SIX_WAYS)
+    if -reach[5] < _NEAREST:
+        return False
+    corners = np.array([[x, y, -reach[5]] for x in (reach[0], -reach[3]) for y in (reach[1], -reach[4])])
+    pixels = camera.project(corners)
+    limit = np.array([camera.width, camera.height]) - 1 - _MARGIN
+    return bool((pixels > _MARGIN).all() and (pixels < limit).all())
+
+
+def _seen(
+    resting: list[_Resting], look: np.ndarray, eye: np.ndarray, camera: Camera, rng: np.random.Generator
+) -> ThingsOnTable:
+    table = quaternions.to_matrix(look)
+    plane = np.append(table[:, 2], -table[:, 2] @ eye)
+    poses = [(quaternions.multiply(look, body.turn), table @ body.shift + eye) for body in resting]
+    owner = np.concatenate([np.full(len(body.thing.parts), k) for k, body in enumerate(resting)])
+    whose = np.concatenate([np.full(len(body.thing.cavities), k) for k, body in enumerate(resting)])
+    parts = [moved(body.thing.parts.to_flat(), *pose) for body, pose in zip(resting, poses, strict=True)]
+    holes = [moved(body.thing.cavities.to_flat(), *pose) for body, pose in zip(resting, poses, strict=True)]
+    everything, cavities = (Superquadric.from_flat(np.concatenate(flat)) for flat in (parts, holes))
+    depth, index = render_things(everything, owner, cavities, whose, camera, plane, rng.uniform(*_WALL))
+    placed = []
+    for k, (body, (rotation, translation)) in enumerate(zip(resting, poses, strict=True)):
+        none = np.zeros(len(parts[k]))
+        _, alone = render_things(
+            Superquadric.from_flat(parts[k]), none, Superquadric.stack([]), none[:0], camera, plane
+        )
+        pixels, whole = int(np.count_nonzero(index == k)), int(np.count_nonzero(alone == 0))
+        placed.append(PlacedThing(body.thing, body.rest, rotation, translation, k + 1, pixels, max(whole, 1)))
+    return ThingsOnTable(camera, depth, (index + 1).astype(np.int32), plane, table, tuple(placed))

@@ -1,0 +1,248 @@
+"""Views of things: what the code for images makes of them, poses on the table, and the truth that comes with them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sq_perception.geometry import rotation as quaternions
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.geometry.support_directions import DIRECTIONS, mirrored
+from sq_perception.geometry.union import support_of_union
+from sq_perception.imaging import canonical_view
+from sq_perception.imaging.camera import Camera
+from sq_perception.imaging.canonical_view import HIDDEN, NEAREST
+from sq_perception.imaging.raycast import render
+from sq_perception.simulation import thing_views
+from sq_perception.simulation.household import KINDS, draw_thing
+from sq_perception.simulation.thing_rendering import render_things
+from sq_perception.simulation.thing_views import Setting, draw_setting, draw_thing_views, plane_in_view, support_in_view
+
+NOTHING = Superquadric.stack([])
+
+
+def alone(setting: Setting, camera: Camera | None = None) -> Setting:
+    """The thing without anything around it but the wall."""
+    return Setting(setting.parts, setting.cavities, NOTHING, None, 10.0, camera or setting.camera)
+
+
+def finer(camera: Camera, times: int) -> Camera:
+    """The same image with more pixels: centres are those of the pixels' middles."""
+    return Camera(
+        camera.width * times,
+        camera.height * times,
+        camera.fx * times,
+        camera.fy * times,
+        (camera.cx + 0.5) * times - 0.5,
+        (camera.cy + 0.5) * times - 0.5,
+    )
+
+
+def flipped(bodies: Superquadric) -> Superquadric:
+    """The mirror image of bodies, x to -x: each is symmetric, so that a rotation does it."""
+    sign = np.array([-1.0, 1.0, 1.0])
+    return Superquadric(bodies.size, bodies.shape, bodies.translation * sign, bodies.rotation * [1.0, -1.0, -1.0, 1.0])
+
+
+def test_views_look_as_promised() -> None:
+    views = draw_thing_views(30, np.random.default_rng(0))
+    assert views.images.shape == (30, 64, 64)
+    assert views.images.dtype == np.float32
+    assert views.planes.shape == (30, 4)
+    assert views.support.shape == (30, len(DIRECTIONS))
+    assert views.planes.dtype == views.support.dtype == np.float32
+    hidden = views.images == HIDDEN
+    assert ((views.images >= 0) | hidden).all()
+    assert (views.images <= 1).all()
+    assert (views.images > 0).any(axis=(1, 2)).all()
+    assert hidden.any(axis=(1, 2)).mean() > 0.5
+    assert np.isfinite(views.support).all()
+    assert np.abs(views.support).max() <= 3
+    given = views.planes.any(axis=1)
+    assert 0.6 < given.mean() < 0.95
+    np.testing.assert_allclose(np.linalg.norm(views.planes[given, :3], axis=1), 1, atol=1e-6)
+    assert set(views.kinds) <= set(range(len(KINDS)))
+
+
+def test_the_same_seed_draws_the_same_views() -> None:
+    first, second = (draw_thing_views(6, np.random.default_rng(11), 32, ["bottle"]) for _ in range(2))
+    for name in ("images", "planes", "support", "kinds"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(second, name))
+    assert (first.kinds == KINDS.index("bottle")).all()
+
+
+def test_the_plane_touches_what_stands_on_it() -> None:
+    """The lowest point of a thing that nothing lifts is in the plane, which faces the camera."""
+    rng = np.random.default_rng(1)
+    touching = 0
+    for _ in range(60):
+        setting = draw_setting(draw_thing(rng), rng)
+        if setting.table is None:
+            continue
+        normal, offset = setting.table[:3], setting.table[3]
+        gap = offset - support_of_union(setting.parts, -normal[None])[0]
+        assert offset > 0
+        assert gap > -1e-9
+        touching += gap < 1e-9
+        if gap > 1e-9:  # on something
+            assert len(setting.others)
+            assert gap <= 0.2
+    assert touching > 40
+
+
+def test_a_view_is_that_of_a_large_image() -> None:
+    """Three times the pixels show the same thing, framed alike; the renderer agrees with the plain ray caster."""
+    rng = np.random.default_rng(2)
+    for kind in ("box", "can", "bottle", "round", "tool"):
+        setting = alone(draw_setting(draw_thing(rng, [kind]), rng))
+        depth, seen = setting.render()
+        fine = finer(setting.camera, 3)
+        plain, index = render(setting.parts, fine)
+        plain = np.where(np.isfinite(plain), plain, 10.0)
+        coarse_view = canonical_view.from_mask(depth, seen, setting.camera, missing_is_hidden=True)
+        fine_view = canonical_view.from_mask(plain, index >= 0, fine, missing_is_hidden=True)
+        assert coarse_view.extent == pytest.approx(fine_view.extent, rel=0.06)
+        both = (coarse_view.image > 0) & (fine_view.image > 0)
+        either = (coarse_view.image > 0) | (fine_view.image > 0)
+        assert both.sum() > 0.8 * either.sum()
+        assert np.median(np.abs(coarse_view.image - fine_view.image)[both]) < 0.02
+        reaches = [support_in_view(setting.parts, view) for view in (coarse_view, fine_view)]
+        assert np.abs(reaches[0] - reaches[1]).max() < 0.06
+
+
+def test_the_truth_holds_what_the_view_shows() -> None:
+    """Every point that a view shows is within the hull, and the nearest one touches it."""
+    rng = np.random.default_rng(3)
+    for kind in KINDS:
+        setting = alone(draw_setting(draw_thing(rng, [kind]), rng))
+        depth, seen = setting.render()
+        view = canonical_view.from_mask(depth, seen, setting.camera, 48)
+        rows, columns = np.nonzero(view.image > 0)
+        points = np.stack([(columns + 0.5) / 48, 1 - (rows + 0.5) / 48, view.image[rows, columns]], axis=1)
+        points -= [0.5, 0.5, NEAREST]
+        reach = support_in_view(setting.parts, view)
+        # A view pixel shows the image pixel next to it, so that steep sides are off by about a pixel of either.
+        pixel = float(np.median(depth[seen])) / setting.camera.fx / view.extent
+        assert ((points @ DIRECTIONS.T).max(axis=0) < reach + 1.5 * pixel + 1 / 48).all()
+        along = np.argmax(DIRECTIONS @ [0.0, 0.0, 1.0])
+        assert reach[along] > -0.02
+
+
+def test_a_mirrored_thing_has_the_mirrored_view() -> None:
+    rng = np.random.default_rng(4)
+    for kind in ("bottle", "union", "vessel"):
+        setting = alone(draw_setting(draw_thing(rng, [kind]), rng))
+        camera = setting.camera
+        other = Setting(
+            flipped(setting.parts),
+            flipped(setting.cavities) if len(setting.cavities) else NOTHING,
+            NOTHING,
+            None,
+            10.0,
+            Camera(camera.width, camera.height, camera.fx, camera.fy, camera.width - 1 - camera.cx, camera.cy),
+        )
+        images, reaches = [], []
+        for one in (setting, other):
+            depth, seen = one.render()
+            view = canonical_view.from_mask(depth, seen, one.camera)
+            images.append(view.image)
+            reaches.append(support_in_view(one.parts, view))
+        np.testing.assert_allclose(reaches[1], reaches[0][mirrored(0)], atol=1e-4)
+        # Nearest pixels may differ where two are as near.
+        assert (np.abs(images[1][:, ::-1] - images[0]) < 1e-3).mean() > 0.97
+
+
+def test_planes_move_into_the_view_with_their_points() -> None:
+    rng = np.random.default_rng(5)
+    setting = draw_setting(draw_thing(rng, ["box"]), np.random.default_rng(6))
+    assert setting.table is not None
+    depth, seen = alone(setting).render()
+    view = canonical_view.from_mask(depth, seen, setting.camera)
+    across = np.linalg.svd(setting.table[None, :3])[2][1:]
+    foot = -setting.table[3] * setting.table[:3]
+    points = foot + rng.uniform(-0.1, 0.1, (20, 2)) @ across
+    matrix = quaternions.to_matrix(view.rotation)
+    moved = (points - view.anchor) @ matrix.T / view.extent + [0.5, 0.5, NEAREST]
+    plane = plane_in_view(setting.table, view)
+    np.testing.assert_allclose(moved @ plane[:3] + plane[3], 0, atol=1e-9)
+    height = 0.03
+    raised = (points + height * setting.table[:3] - view.anchor) @ matrix.T / view.extent + [0.5, 0.5, NEAREST]
+    np.testing.assert_allclose(raised @ plane[:3] + plane[3], height / view.extent, atol=1e-9)
+
+
+def test_one_sees_into_a_cup() -> None:
+    """From above, the middle of an open cup is its floor; beside the cavity nothing changes."""
+    body = Superquadric([[0.04, 0.04, 0.05]], [[0.1, 1.0]], [[0.0, 0.0, 0.5]], [[0.0, 0.0, 0.0, 1.0]])
+    hole = Superquadric([[0.035, 0.035, 0.09]], [[0.1, 1.0]], [[0.0, 0.0, 0.45]], [[0.0, 0.0, 0.0, 1.0]])
+    camera = Camera(81, 81, 300.0, 300.0, 40.0, 40.0)
+    closed, _ = render_things(body, np.zeros(1), NOTHING, np.zeros(0), camera)
+    opened, thing = render_things(body, np.zeros(1), hole, np.zeros(1), camera, behind=2.0)
+    assert closed[40, 40] == pytest.approx(0.45)
+    assert opened[40, 40] == pytest.approx(0.54)
+    assert opened[40, 15] == pytest.approx(closed[40, 15])
+    assert thing[40, 15] == 0
+    assert opened[0, 0] == 2.0
+    assert thing[0, 0] == -1
+
+
+def test_table_and_wall_hide_what_is_behind_them() -> None:
+    ball = Superquadric([[0.05, 0.05, 0.05]], [[1.0, 1.0]], [[0.0, 0.0, 1.0]], [[0.0, 0.0, 0.0, 1.0]])
+    camera = Camera(41, 41, 200.0, 200.0, 20.0, 20.0)
+    table = np.array([0.0, -1.0, 0.0, 0.0]) + [0, 0, 0, 0.02]  # y = 0.02, seen from above
+    depth, thing = render_things(ball, np.zeros(1), NOTHING, np.zeros(0), camera, table, behind=3.0)
+    assert thing[20, 20] == 0
+    assert depth[0, 0] == 3.0
+    below = (np.arange(41) - 20) / 200
+    assert thing[40, 20] == -1
+    assert depth[40, 20] == pytest.approx(0.02 / below[40])
+
+
+@pytest.mark.parametrize("columns", [2, 6])
+def test_pixels_without_a_reading_are_hidden_where_asked_for(columns: int) -> None:
+    """Beside the object, on it and beyond the image; else the view stays as it was."""
+    camera = Camera(60, 60, 100.0, 100.0, 30.0, 30.0)
+    body = Superquadric([[0.05, 0.05, 0.05]], [[1.0, 1.0]], [[0.0, 0.0, 0.5]], [[0.0, 0.0, 0.0, 1.0]])
+    depth, index = render(body, camera)
+    depth = np.where(np.isfinite(depth), depth, 1.0)
+    mask = index >= 0
+    left = int(np.nonzero(mask)[1].min())
+    depth[:, : left + columns] = np.nan
+    plain = canonical_view.from_mask(depth, mask, camera, find_hidden=True)
+    marked = canonical_view.from_mask(depth, mask, camera, missing_is_hidden=True)
+    np.testing.assert_array_equal(plain.image, marked.image)
+    assert (plain.hidden <= marked.hidden).all()
+    assert marked.hidden.sum() > plain.hidden.sum()
+    assert not (marked.hidden & (marked.image > 0)).any()
+    # What the image does not show at all.
+    window = np.s_[:, left + 3 :]
+    cut = canonical_view.from_mask(
+        depth[window], mask[window], camera.cropped(left + 3, 0, 57 - left, 60), missing_is_hidden=True
+    )
+    assert cut.hidden[:, 0].all()
+    assert not canonical_view.from_mask(
+        depth[window], mask[window], camera.cropped(left + 3, 0, 57 - left, 60)
+    ).hidden.any()
+
+
+def test_a_shadow_lies_on_one_side() -> None:
+    """Stereo loses the background on the side away from the second eye."""
+    rng = np.random.default_rng(8)
+    found = []
+    for _ in range(30):
+        setting = draw_setting(draw_thing(rng, ["can"]), rng)
+        sensor = thing_views.draw_sensor(setting.camera, rng)
+        baseline = getattr(sensor, "baseline", 0.0)
+        if not baseline or setting.table is None or len(setting.others):
+            continue
+        depth, mask = setting.render()
+        lost = np.isnan(sensor.measured(depth, setting.camera, rng)) & ~mask
+        # A stereo sensor's own border band is beyond this: between the thing's columns and ten pixels more.
+        rows, columns = np.nonzero(mask)
+        left, right = columns.min(), columns.max()
+        inside = slice(rows.min(), rows.max())
+        sides = lost[inside, max(left - 10, 0) : left].sum(), lost[inside, right : right + 10].sum()
+        if baseline > 0:
+            sides = sides[::-1]
+        found.append(int(sides[1] >= sides[0]))
+    assert len(found) > 3
+    assert np.mean(found) > 0.8

@@ -1,0 +1,80 @@
+"""Scenes of household things: what touches, what carries, what is seen."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial import ConvexHull
+
+from sq_perception.geometry.support_directions import DIRECTIONS
+from sq_perception.geometry.union import support_of_union
+from sq_perception.imaging.camera import Camera
+from sq_perception.simulation.things_on_table import TABLE_CAMERA, ThingsOnTable, hull_points, things_on_table
+
+SMALL = Camera(160, 120, 138.6, 138.6, 79.5, 59.5)
+
+
+@pytest.fixture(scope="module")
+def scenes() -> list[ThingsOnTable]:
+    return [things_on_table(np.random.default_rng([5, seed]), 5, SMALL) for seed in range(12)]
+
+
+def test_things_rest_on_the_table_or_on_each_other(scenes: list[ThingsOnTable]) -> None:
+    rests = [placed.rest for scene in scenes for placed in scene.placed]
+    assert {"standing", "lying"} <= set(rests)
+    assert any(rest.startswith("stacked") for rest in rests)
+    for scene in scenes:
+        normal, offset = scene.plane[:3], scene.plane[3]
+        for placed in scene.placed:
+            lowest = offset - support_of_union(placed.parts, -normal[None])[0]
+            if placed.rest.startswith("stacked"):
+                assert lowest > 0.005
+            else:
+                assert abs(lowest) < 1e-9
+
+
+def test_things_do_not_penetrate(scenes: list[ThingsOnTable]) -> None:
+    """No point of one hull's parts is inside of another thing's parts."""
+    rng = np.random.default_rng(1)
+    for scene in scenes[:6]:
+        surfaces = [placed.parts.sample_surface(300, rng, oversampling=2).reshape(-1, 3) for placed in scene.placed]
+        for i, placed in enumerate(scene.placed):
+            for j, points in enumerate(surfaces):
+                if i != j:
+                    assert placed.parts.gauge(points).min() > 1 - 1e-3
+
+
+def test_labels_are_those_of_things_in_the_image(scenes: list[ThingsOnTable]) -> None:
+    for scene in scenes:
+        assert scene.depth.shape == scene.labels.shape == (120, 160)
+        for placed in scene.placed:
+            mask = scene.labels == placed.label
+            assert placed.pixels == mask.sum() <= placed.alone
+            rows, columns = np.nonzero(mask)
+            points = SMALL.unproject(columns, rows, scene.depth[mask])
+            if len(points):
+                reach = support_of_union(placed.parts, DIRECTIONS)
+                assert ((points @ DIRECTIONS.T).max(axis=0) < reach + 1e-6).all()
+
+
+def test_hull_points_span_the_hull() -> None:
+    scene = things_on_table(np.random.default_rng(3), 4)
+    assert (scene.camera.width, scene.camera.height) == (TABLE_CAMERA.width, TABLE_CAMERA.height)
+    for placed in scene.placed:
+        points = hull_points(placed.thing.parts)
+        reach = placed.thing.support(DIRECTIONS)
+        spanned = (points[ConvexHull(points).vertices] @ DIRECTIONS.T).max(axis=0)
+        assert (spanned <= reach + 1e-9).all()
+        assert (reach - spanned).max() < 0.02 * np.linalg.norm(placed.thing.box[1] - placed.thing.box[0])
+
+
+def test_a_seed_is_a_scene_and_misuse_is_told() -> None:
+    first, second = (things_on_table(np.random.default_rng(9), 3, SMALL) for _ in range(2))
+    np.testing.assert_array_equal(first.depth, second.depth)
+    rng = np.random.default_rng(0)
+    with pytest.raises(ValueError, match="expected 1 to 8 things, got 9"):
+        things_on_table(rng, 9)
+    with pytest.raises(ValueError, match="expected a pinhole camera"):
+        things_on_table(rng, 2, Camera(64, 64, 64.0, 64.0, 31.5, 31.5, "orthographic"))
+    with pytest.raises(ValueError, match="no room for 8 things"):
+        things_on_table(rng, 8, Camera(16, 16, 400.0, 400.0, 7.5, 7.5))
