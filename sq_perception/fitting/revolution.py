@@ -38,8 +38,9 @@ from sq_perception.fitting.problem import (
 from sq_perception.fitting.rivals import resized
 from sq_perception.fitting.symmetry_start import three_orders
 
-SPARED = 3
-"""Parameters that a body of revolution has less."""
+SPARED, SPARED_OF_PREDICTED = 3, 1
+"""Parameters that a body of revolution has less; and where a prediction of the hull weighs the half size and the turn
+of a free body already, which leaves the exponent."""
 ODDS = 3.0
 """Of the things whose unseen side is in question, so many more are round than any other one oval shape."""
 HOPELESS = 15.0
@@ -69,10 +70,11 @@ def weighed(solution: Solution) -> Solution:
     few = draw(problem, BASIN_RAYS, 0.7)
     settled = by_cost(settle(round_, state, few) for state in promising)
     reference = settle(problem, free, few, FIRST_STEPS)
-    if gain(reference.cost, settled[0].cost, few.weight) < -HOPELESS:
+    spared = SPARED if len(problem.terms.hull_directions) == 0 else SPARED_OF_PREDICTED
+    if gain(reference.cost, settled[0].cost, few.weight, spared) < -HOPELESS:
         return solution
     best = refined_best(round_, settled, rays)
-    better = gain(free.cost, best.cost, rays.weight)
+    better = gain(free.cost, best.cost, rays.weight, spared)
     weight = math.exp(-0.5 * abs(better))
     other = Alternative(free if better > 0 else best, weight / (1 + weight))
     solution = replace(solution, alternatives=(*solution.alternatives, other))
@@ -82,9 +84,9 @@ def weighed(solution: Solution) -> Solution:
     return replace(solution, problem=round_, state=best, notes=notes)
 
 
-def gain(free_cost: float, round_cost: float, weight: float) -> float:
+def gain(free_cost: float, round_cost: float, weight: float, spared: int = SPARED) -> float:
     """How much better a body of revolution describes rays of a total weight than a free body; see the module."""
-    simpler = SPARED * math.log(max(weight, 1.0)) + 2 * math.log(ODDS)
+    simpler = spared * math.log(max(weight, 1.0)) + 2 * math.log(ODDS)
     return _deviance(free_cost, weight) - _deviance(round_cost, weight) + simpler
 
 

@@ -14,7 +14,8 @@ are drawn.  Free rays weigh less still, as an outline errs as a whole.
 
 1. Starts: the given bodies (the prediction), and boxes on the plane, or along the points' axes without one.
 2. A few steps from each on few rays; more from the best; to the end, on all rays, from the best one or two.
-3. The same as a body of revolution, chosen by evidence (:mod:`sq_perception.fitting.revolution`).
+3. What is hollow or notched, once more as its convex hull.
+4. The same as a body of revolution, chosen by evidence (:mod:`sq_perception.fitting.revolution`).
 
 Metres, radians, optical frame.
 """
@@ -50,8 +51,16 @@ _FIRST_STEPS, _MORE_STEPS, _LAST_STEPS = 5, 12, 40
 _LEFT_OVER_RAYS = 3000
 _MEDIAN_TO_SIGMA = 1.4826
 """Of absolute values of a normal distribution."""
-_HUBER = 2.0
-"""Noise levels; what strays farther from a superquadric is another part of the thing."""
+_HOLLOW = 3.0**2
+"""Mean squared residual, in noise levels, of the body of a solid thing at the most.  A thing that is hollow or notched,
+such as a bowl or a pair of pliers, is fitted as its hull instead: points may lie behind the surface of the body that
+encloses it, and the space within its outline's hull may be empty."""
+_INNER_CAUCHY = 1.0
+"""Noise levels behind the surface of a hull, beyond which a point hardly counts."""
+_SPREAD = 2.5**2
+"""Factor of the covariance for things that are no superquadrics, whose errors are alike."""
+_HUBER = 1.0
+"""Noise levels; what strays farther from a superquadric is another part of the thing: a neck, a handle."""
 
 
 def solve(problem: Problem, given: Sequence[State]) -> Solution:
@@ -59,13 +68,22 @@ def solve(problem: Problem, given: Sequence[State]) -> Solution:
     problem = _with_priors(problem)
     observation, plane = problem.observation, problem.options.plane
     boxes = box_start.principal(observation.points) if plane is None else box_start.on_plane(observation.points, plane)
+    starts = [*given, *boxes]
+    solution = _best(problem, starts)
+    hollow = solution.state.cost > _HOLLOW * INDEPENDENT_RAYS
+    if hollow and not problem.late:
+        as_hull = replace(problem.with_terms(inner_cauchy=_INNER_CAUCHY), observation=observation.of_hull())
+        notes = ("like the convex hull of the object",)
+        solution = replace(_best(as_hull, [solution.state, *starts]), notes=notes, as_hull=True)
+    return solution if problem.late else revolution.weighed(solution)
+
+
+def _best(problem: Problem, starts: Sequence[State]) -> Solution:
     few = _drawn(problem, _FEW, 0.7)
-    begun = _tried(problem, [*given, *boxes], few, _FIRST_STEPS)
+    begun = _tried(problem, starts, few, _FIRST_STEPS)
     settled = _tried(problem, begun[:_KEPT], few, _MORE_STEPS)
     rays = _drawn(problem, problem.options.pixels or _RAYS, 0.3)
-    best = refined_best(problem, settled, rays, _LAST_STEPS)
-    solution = Solution(problem, best, rays)
-    return solution if problem.late else revolution.weighed(solution)
+    return Solution(problem, refined_best(problem, settled, rays, _LAST_STEPS), rays, spread_factor=_SPREAD)
 
 
 def take_over(problem: Problem, best: State, given: Sequence[State]) -> Solution:

@@ -228,7 +228,7 @@ class Recoverer:
         return list(self._pool.map(function, items))
 
     def _load_network(self, pinhole: bool) -> Network:
-        """The network for the images of a kind of camera; both kinds have the same one if a file of weights was named."""
+        """The network for a kind of camera; the same one for both if a file of weights was named."""
         with self._lock:
             if pinhole not in self._networks:
                 network = self._loaded(pinhole)
