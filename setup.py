@@ -86,7 +86,9 @@ setup(
         "trimesh>=4",  # meshes and GLB
         "torch==2.13.0",  # the network; an open range may fetch several GB
         "onnx>=1.16",  # the network as a graph for other runtimes
-        "onnxruntime>=1.18",  # computes that graph in less than half of torch's time for a single view
+        # Computes that graph in half of torch's time for a single view.  Its wheels send telemetry from 1.29 on unless
+        # they are told not to (learning/onnx_export.py); a newer one has to be looked at before it is let in.
+        "onnxruntime>=1.18,<1.32",
         "safetensors>=0.4",  # weights that cannot carry code
         "array-api-compat>=1.9",  # one geometry for NumPy and torch
         "threadpoolctl>=3",  # keeps BLAS from threading products of 2000 x 3, which took the second core from the fits
@@ -128,7 +130,10 @@ setup(
     entry_points={
         "console_scripts": [
             "sq-perception = sq_perception.commands.main:main",
-            *(f"{node} = sq_perception.nodes.{node}:main" for node in NODES),
+            "recover_node = sq_perception.nodes.executables:recover_node",
+            "recover_cameras = sq_perception.nodes.executables:recover_cameras",
+            "fitter_node = sq_perception.nodes.executables:fitter_node",
+            "synthetic_depth_node = sq_perception.nodes.executables:synthetic_depth_node",
         ],
     },
     classifiers=[

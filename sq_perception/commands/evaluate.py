@@ -94,7 +94,7 @@ def _evaluate(options: argparse.Namespace, methods: list[Method], words: list[st
 
 def _contestants(options: argparse.Namespace, methods: list[Method]) -> tuple[list[tuple[Contestant, int]], list[str]]:
     """Who takes part, with the number of bodies, and what is wrong with those who cannot."""
-    from sq_perception.evaluation.contestants import Fit, Network, unique_names
+    from sq_perception.evaluation.contestants import FittingMethod, Network, unique_names
     from sq_perception.learning.checkpoint import CheckpointError, shipped
 
     contestants: list[tuple[Contestant, int]] = []
@@ -109,7 +109,7 @@ def _contestants(options: argparse.Namespace, methods: list[Method]) -> tuple[li
             failures.append(str(error))
     for method in methods:
         try:
-            contestants.append((Fit.of(method), min(options.fit_bodies, options.bodies)))
+            contestants.append((FittingMethod.of(method), min(options.fit_bodies, options.bodies)))
         except CheckpointError as error:
             failures.append(f"{method}: {error}")
     return contestants, failures

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sq_perception.commands.console import SUCCESS, failed, parser
+from sq_perception.files import output_file
 
 _HELP = "Write a network as ONNX: views (n, 1, p, p) in, the 12 parameters of n bodies out."
 _EPILOG = "example:\n  sq-perception export --model supervised --output network.onnx"
@@ -17,8 +18,10 @@ def main(arguments: Sequence[str]) -> int:
     command.add_argument("--model", metavar="FILE", help="weights: a .safetensors file, or the name of shipped ones")
     command.add_argument("--output", "-o", type=Path, required=True, metavar="FILE", help="the .onnx file")
     options = command.parse_args(arguments)
-    if not options.output.resolve().parent.is_dir():
-        command.error(f"--output: the folder of {options.output} does not exist")
+    try:
+        output_file.check(options.output)
+    except OSError as error:
+        command.error(f"--output: {error}")
 
     from sq_perception.learning import checkpoint
     from sq_perception.learning.onnx_export import MissingPackageError, build
@@ -26,9 +29,7 @@ def main(arguments: Sequence[str]) -> int:
     path = checkpoint.resolve(options.model)
     try:
         content = build(checkpoint.load(path), checkpoint.read_header(path)).SerializeToString()
-        partial = options.output.with_name(options.output.name + ".partial")
-        partial.write_bytes(content)
-        partial.replace(options.output)
+        output_file.write(options.output, content)
     except (MissingPackageError, checkpoint.CheckpointError, OSError) as error:
         return failed(f"export: {error}")
     return SUCCESS

@@ -1,30 +1,30 @@
 """``sq-perception recover``: recorded frames in; JSON, meshes, pictures, a bag and a table out.
 
-Files appear whole or not at all, also where the command is interrupted: it then writes what it has.  Heavy imports
-happen inside, so that ``--help`` answers at once.
+Whether everything can be written is known before the first frame is read, and what was there before is kept until there
+is something better (:mod:`sq_perception.commands.recover_outputs`).  Heavy imports happen inside, so that ``--help``
+answers at once.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import math
 import statistics
 import sys
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sq_perception.commands import recover_outputs
 from sq_perception.commands.console import FAILURE, INTERRUPTED, SUCCESS, complain, misused, parser
 
 if TYPE_CHECKING:
     from sq_perception.recordings.frame_file import RecordedFrame
     from sq_perception.recordings.inputs import RecordedInput
     from sq_perception.recordings.result_bag import ResultBag
-    from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, RecoveryOptions
+    from sq_perception.recordings.result_json import ResultLines
+    from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
 
-JSON_VERSION = 1
 
 HELP = """\
 Recover superquadrics from recorded depth images.
@@ -51,13 +51,20 @@ examples:
   sq-perception recover table.npz --json out.json --pictures pictures/
   sq-perception recover depth_*.png --camera-info camera.yaml --json out.json
   sq-perception recover recording/ --topic /camera/depth/image_rect_raw --every 10 --meshes meshes/
+  sq-perception recover thousand_frames/ --jsonl out.jsonl             # again after Ctrl-C: goes on
   sq-perception recover recording/ --track --json tracks.json
   sq-perception recover recording/ --track --mcap results.mcap
   sq-perception recover views/*.bmp --projection orthographic --method network --json -
   sq-perception recover table.npz --ignore-masks --refine soft_render
 
+files:
+  What is there stays until something better can take its place: a result that was interrupted, or of no frame at all,
+  does not replace a file but is put beside it as NAME.partial.SUFFIX.  Devices, FIFOs and links are written through.
+  --jsonl FILE grows by a line a frame; the same command with the same file skips the frames that are in it.
+
 output:
-  {"frames": [{"file": ..., "ms": ..., "superquadrics": [{"size": [a1, a2, a3], "shape": [e1, e2],
+  {"format": ..., "version": ..., "options": {...},
+   "frames": [{"file": ..., "ms": ..., "superquadrics": [{"size": [a1, a2, a3], "shape": [e1, e2],
    "translation": [x, y, z], "rotation": [x, y, z, w], "score": ..., "residual": ..., "sigma_size": [...],
    "seen": [...], "status": "converged" | "weak" | "failed", "message": ..., "label": ..., "pixels": ...,
    "track": ...}, ...], "stamp": {"sec": ..., "nanosec": ...}, "topic": ..., "frame_id": ...}, ...]}
@@ -102,6 +109,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """The command's own."""
     parser.add_argument("frames", nargs="+", metavar="FRAME", help="recorded depth images, folders or bags of them")
     parser.add_argument("--json", metavar="OUT", help="write the results there; - is the standard output")
+    parser.add_argument(
+        "--jsonl",
+        metavar="OUT",
+        help="add a line there for each frame when it is done, and skip those it has; see below",
+    )
     parser.add_argument("--projection", choices=("pinhole", "orthographic"), default="pinhole")
     methods = ("auto", "network", "symmetry", "classic")
     parser.add_argument("--method", choices=methods, default="auto", help="see below")
@@ -163,23 +175,15 @@ def run(options: argparse.Namespace) -> int:
             return misused(f"--{name.replace('_', '-')}: expected at least 1, got {value}")
     if not options.time_budget > 0:
         return misused(f"--time-budget: expected a positive number of seconds, got {options.time_budget:g}")
-    to_stdout = options.json == "-"
-    if options.json and not to_stdout and not Path(options.json).resolve().parent.is_dir():
-        return misused(f"--json: the folder of {options.json} does not exist")
-    if options.mcap and (problem := _bag_misuse(options.mcap, options.frames)):
-        return misused(f"--mcap: {options.mcap}: {problem}")
-    for name in ("pictures", "meshes"):
-        if folder := getattr(options, name):
-            try:
-                Path(folder).mkdir(parents=True, exist_ok=True)
-            except OSError as error:
-                return misused(f"--{name}: {error}")
+    if problem := recover_outputs.misuse(options):
+        return misused(problem)
 
     import torch
 
     from sq_perception.learning.checkpoint import CheckpointError
     from sq_perception.recordings.frame_file import FrameError
     from sq_perception.recordings.inputs import RecordedInput
+    from sq_perception.recordings.result_json import Recovered, ResultLines
     from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
 
     torch.set_num_threads(1)  # the network's layers are so small that threads cost more than they save
@@ -189,6 +193,7 @@ def run(options: argparse.Namespace) -> int:
         max_objects=options.max_objects,
         time_budget=options.time_budget,
     )
+    done = Recovered()
     try:
         recorded = RecordedInput(
             options.frames,
@@ -198,44 +203,37 @@ def run(options: argparse.Namespace) -> int:
             options.every,
             options.limit,
             options.distortion,
+            is_done=done,
         )
+        if problem := recover_outputs.replaced_input(options, recorded.files):
+            return misused(problem)
         recoverer = Recoverer(options.model, method=options.method, consensus=options.consensus)
     except (FrameError, CheckpointError) as error:
         complain(str(error))
         return FAILURE
 
-    bag = None
-    if options.mcap:
-        try:
-            from sq_perception.recordings.result_bag import ResultBag
-
-            images = [one.strip() for one in options.mcap_images.split(",")]
-            bag = ResultBag(options.mcap, [] if images == ["none"] else images)
-        except ValueError as error:
-            return misused(f"--mcap: {error}")
-        except (OSError, ImportError) as error:
-            complain(f"--mcap: {error}")
-            return FAILURE
-
-    run = _Run(options, recoverer, settings, bag)
-    code = run.over(recorded)
+    lines, bag = None, None
     try:
-        if bag is not None:
-            bag.close()
-    except OSError as error:
-        complain(f"--mcap: {error}")
+        if options.jsonl:
+            lines = ResultLines(recover_outputs.place(options.jsonl), recover_outputs.decisive(options))
+            if lines.done and (options.track or options.mcap):
+                name = "--track" if options.track else "--mcap"
+                return misused(f"--jsonl: {options.jsonl} has {len(lines.done)} frames already, and {name} needs all")
+            done.add(lines.done)
+        bag = recover_outputs.bag(options)
+    except ValueError as error:
+        return misused(str(error))
+    except (OSError, ImportError) as error:
+        complain(str(error))
+        return FAILURE
+
+    run = _Run(options, recoverer, settings, lines, bag)
+    code = run.over(recorded)
+    entries = [*(lines.done if lines else []), *run.results]
+    for problem in recover_outputs.finish(options, entries, bag, run.is_whole):
+        complain(problem)
         code = code or FAILURE
-    document = {"format": "sq_perception.recovery.recoverer", "version": JSON_VERSION, "frames": run.results}
-    if to_stdout:
-        print(json.dumps(document, indent=1, allow_nan=False))
-    else:
-        if options.json:
-            try:
-                with _whole(Path(options.json)) as partial:
-                    partial.write_text(json.dumps(document, indent=1, allow_nan=False) + "\n", encoding="utf-8")
-            except OSError as error:
-                complain(f"--json: {error}")
-                code = code or FAILURE
+    if "-" not in (options.json, options.jsonl):
         _print_table(run.results)
     complain(run.summary())
     return code
@@ -245,16 +243,24 @@ class _Run:
     """One pass over the frames, and what it has come to so far."""
 
     def __init__(
-        self, options: argparse.Namespace, recoverer: Recoverer, settings: RecoveryOptions, bag: ResultBag | None
+        self,
+        options: argparse.Namespace,
+        recoverer: Recoverer,
+        settings: RecoveryOptions,
+        lines: ResultLines | None,
+        bag: ResultBag | None,
     ) -> None:
         from sq_perception.recordings.tracks import RecordedTracks
 
         self.results: list[dict[str, Any]] = []
         self.unreadable = 0
-        self._options, self._recoverer, self._settings, self._bag = options, recoverer, settings, bag
+        self.is_whole = False
+        """Whether all frames were tried."""
+        self._options, self._recoverer, self._settings = options, recoverer, settings
+        self._lines, self._bag = lines, bag
         self._tracks = RecordedTracks(lambda text: complain(f"warning: {text}")) if options.track else None
         self._warm: set[Any] = set()
-        self._stems: set[str] = set()
+        self._stems = {Path(one["file"]).stem for one in lines.done if not one.get("topic")} if lines else set()
         self._warnings: set[str] = set()
 
     def over(self, recorded: RecordedInput) -> int:
@@ -270,12 +276,13 @@ class _Run:
                 except FrameError as error:
                     complain(str(error))
                     self.unreadable += 1
-                except OSError as error:  # of a picture, mesh or bag: the disk is full, and will be for the next frame
+                except OSError as error:  # of a file that is written: the disk is full, and will be for the next frame
                     complain(str(error))
                     return FAILURE
         except KeyboardInterrupt:
             complain("interrupted; what is done so far is kept")
             return INTERRUPTED
+        self.is_whole = True
         return FAILURE if self.unreadable else SUCCESS
 
     def summary(self) -> str:
@@ -305,65 +312,22 @@ class _Run:
         except (ValueError, ArithmeticError) as error:  # a camera that no image can have come from
             raise FrameError(f"{file}: {frame.name}: {error}") from error
         tracks = self._tracks.follow(file, frame, recovery) if self._tracks else [None] * len(recovery.bodies)
-        self.results.append(frame_entry(file, frame, recovery, tracks, has_masks=labels is not None))
+        entry = frame_entry(file, frame, recovery, tracks, has_masks=labels is not None)
+        self.results.append(entry)
         stem = _free_stem(frame.name if frame.topic else Path(frame.name).stem, self._stems)
         if self._options.pictures:
-            _draw(Path(self._options.pictures) / f"{stem}.png", frame, recovery)
+            recover_outputs.draw(Path(self._options.pictures) / f"{stem}.png", frame, recovery)
         if self._options.meshes:
-            _write_mesh(Path(self._options.meshes) / f"{stem}.{self._options.mesh_format}", frame, recovery)
+            path = Path(self._options.meshes) / f"{stem}.{self._options.mesh_format}"
+            recover_outputs.write_mesh(path, frame, recovery)
         if self._bag is not None:
             self._bag.add(frame, recovery, tracks if self._tracks else None)
-
-
-def _bag_misuse(out: str, inputs: Sequence[str]) -> str:
-    """What is wrong with the name of a bag to write; empty if nothing."""
-    path = Path(out)
-    if not path.resolve().parent.is_dir():
-        return "its folder does not exist"
-    if path.exists() and any(Path(one).exists() and path.samefile(one) for one in inputs):
-        return "this is an input"
-    return ""
+        if self._lines is not None:  # last: what has a line has all its files
+            self._lines.add(entry)
 
 
 def _count(number: int, one: str, many: str | None = None) -> str:
     return f"{number} {one if number == 1 else many or one + 's'}"
-
-
-@contextmanager
-def _whole(path: Path) -> Iterator[Path]:
-    """Where to write a file that shall appear whole or not at all."""
-    partial = path.with_name(f".{path.name}.partial{path.suffix}")
-    try:
-        yield partial
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
-
-
-def _draw(path: Path, frame: RecordedFrame, recovery: FrameRecovery) -> None:
-    from sq_perception.evaluation import plots
-
-    unit = "of the cube" if frame.is_cube else "m"
-    with _whole(path) as partial:
-        plots.save(plots.recovery_figure(frame.depth, frame.camera, recovery, frame.name, unit), partial)
-
-
-def _write_mesh(path: Path, frame: RecordedFrame, recovery: FrameRecovery) -> None:
-    from sq_perception.fitting.fit import Status
-    from sq_perception.geometry import mesh
-    from sq_perception.recordings.frame_entry import in_result_frame
-
-    shown = [k for k, body in enumerate(recovery.bodies) if body.status != Status.FAILED]
-    if not shown:
-        return
-    with _whole(path) as partial:
-        mesh.export(
-            [in_result_frame(recovery.bodies[k].superquadric, frame.is_cube) for k in shown],
-            partial,
-            colours=mesh.COLOURS[[k % len(mesh.COLOURS) for k in shown]],
-            names=[f"body_{k}" for k in shown],
-            optical=not frame.is_cube,
-        )
 
 
 def _free_stem(stem: str, taken: set[str]) -> str:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sq_perception.commands.console import SUCCESS, complain, failed, misused, parser
+from sq_perception.files import output_file
 
 if TYPE_CHECKING:
     import numpy as np
@@ -66,8 +67,10 @@ def _render(options: argparse.Namespace) -> int:
     if suffix not in ((".png", ".npz") if pinhole else (".png", ".bmp", ".npz")):
         kinds = ".png or .npz" if pinhole else ".png, .bmp or .npz"
         return misused(f"--output: {output.name}: an image of this projection is a {kinds}")
-    if not output.resolve().parent.is_dir():
-        return misused(f"--output: the folder of {output} does not exist")
+    try:
+        output_file.check(output)
+    except OSError as error:
+        return misused(f"--output: {error}")
     if options.bits == 16 and (pinhole or suffix != ".png"):
         return misused("--bits: only orthographic PNGs have a choice")
 
@@ -121,7 +124,7 @@ def _write_depth(
         }
         if camera.is_pinhole:
             fields["K"] = camera.matrix
-        with output.open("wb") as file:
+        with output_file.writing(output) as partial, partial.open("wb") as file:
             np.savez_compressed(file, **fields)
         return
     if camera.is_pinhole:
@@ -130,7 +133,7 @@ def _write_depth(
     else:
         image = unit_cube.grey_from_depth(depth, np.uint16 if bits == 16 else np.uint8)
     _, encoded = cv2.imencode(output.suffix.lower(), image)
-    output.write_bytes(encoded.tobytes())
+    output_file.write(output, encoded.tobytes())
 
 
 def _write_camera_info(path: Path, camera: Camera) -> None:
@@ -148,4 +151,4 @@ def _write_camera_info(path: Path, camera: Camera) -> None:
         "rectification_matrix": {"rows": 3, "cols": 3, "data": np.eye(3).ravel().tolist()},
         "projection_matrix": {"rows": 3, "cols": 4, "data": np.hstack([k, np.zeros((3, 1))]).ravel().tolist()},
     }
-    path.write_text(yaml.safe_dump(info, sort_keys=False), encoding="utf-8")
+    output_file.write(path, yaml.safe_dump(info, sort_keys=False).encode())

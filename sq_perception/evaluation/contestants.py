@@ -170,14 +170,14 @@ class Network:
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class FittingMethod:
     """A method of the recovery with a fit: auto, symmetry or classic."""
 
     name: str
     recoverer: Recoverer
 
     @classmethod
-    def of(cls, method: Method) -> Fit:
+    def of(cls, method: Method) -> FittingMethod:
         """Raises CheckpointError if the method needs the shipped network and it cannot be read."""
         if method not in FITS:
             raise ValueError(f"method: expected one of {', '.join(FITS)}, got {method!r}")

@@ -18,6 +18,7 @@ from typing import Any, TypeVar, cast
 
 import numba
 
+from sq_perception.geometry import kernel_cache
 from sq_perception.geometry.elementary import exp2, exp2_to_half, log2, log2_from_1_to_2
 
 _F = TypeVar("_F", bound=Callable[..., Any])
@@ -44,7 +45,24 @@ def inline_kernel(function: _F) -> _F:
 def _compiled(function: _F, **more: bool) -> _F:
     function.__qualname__ += f"_{_FINGERPRINT}"
     options: dict[str, Any] = {"nogil": True, "fastmath": FAST, "error_model": "numpy", **more}
-    return cast(_F, numba.njit(cache=True, **options)(function))
+    try:
+        return cast(_F, numba.njit(cache=True, **options)(function))
+    except RuntimeError:  # there is no place to keep it
+        return _compiled_elsewhere(function, options)
+
+
+def _compiled_elsewhere(function: _F, options: dict[str, Any]) -> _F:
+    """The same, kept in a folder of this user's own; not at all if there is none."""
+    folder = kernel_cache.temporary_folder()
+    if folder is None:
+        return cast(_F, numba.njit(**options)(function))
+    settings: Any = numba.config
+    before = settings.CACHE_DIR
+    settings.CACHE_DIR = str(folder)  # read when a function is decorated; other packages keep theirs where they did
+    try:
+        return cast(_F, numba.njit(cache=True, **options)(function))
+    finally:
+        settings.CACHE_DIR = before
 
 
 def _fingerprint() -> str:
@@ -238,58 +256,3 @@ def _newton(
         if step <= enough:
             return True, t
     return False, 0.0
-
-
-@kernel
-def ray_minimum(
-    t_from: float,
-    t_to: float,
-    ox: float,
-    oy: float,
-    oz: float,
-    dx: float,
-    dy: float,
-    dz: float,
-    a1: float,
-    a2: float,
-    a3: float,
-    e1: float,
-    e2: float,
-) -> tuple[float, float]:
-    """The smallest g on the ray between t_from and t_to, as far as it matters: (g, t).
-
-    Convexity brackets the minimum between the two tangents; their intersection is both the next guess and a lower
-    bound.  The search stops once that bound is above 1 (the ray certainly misses: a g above 1 is returned) or the
-    bracket is small.
-    """
-    t_in, t_out = box_interval(ox, oy, oz, dx, dy, dz, a1, a2, a3)
-    lo, hi = max(t_in, t_from), min(t_out, t_to)
-    if lo >= hi:
-        return 2.0, t_from
-    g_lo, s_lo = gauge_slope(ox + lo * dx, oy + lo * dy, oz + lo * dz, dx, dy, dz, a1, a2, a3, e1, e2)
-    if s_lo >= 0.0:
-        return g_lo, lo
-    g_hi, s_hi = gauge_slope(ox + hi * dx, oy + hi * dy, oz + hi * dz, dx, dy, dz, a1, a2, a3, e1, e2)
-    if s_hi <= 0.0:
-        return g_hi, hi
-    width = hi - lo
-    best, t_best = (g_lo, lo) if g_lo < g_hi else (g_hi, hi)
-    for step in range(24):
-        t = (g_hi - s_hi * hi - g_lo + s_lo * lo) / (s_lo - s_hi)
-        bound = g_lo + s_lo * (t - lo)
-        if bound > 1.0:
-            return max(bound, 1.0 + 1e-12), t
-        if step % 3 == 2:
-            t = 0.5 * (lo + hi)
-        margin = 0.02 * (hi - lo)
-        t = min(max(t, lo + margin), hi - margin)
-        g, slope = gauge_slope(ox + t * dx, oy + t * dy, oz + t * dz, dx, dy, dz, a1, a2, a3, e1, e2)
-        if g < best:
-            best, t_best = g, t
-        if slope > 0.0:
-            hi, g_hi, s_hi = t, g, slope
-        else:
-            lo, g_lo, s_lo = t, g, slope
-        if hi - lo < 1e-6 * width or best - bound < 1e-9:
-            break
-    return best, t_best

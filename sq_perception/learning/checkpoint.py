@@ -24,8 +24,9 @@ from typing import Any
 import torch
 from safetensors import SafetensorError
 from safetensors.torch import load as tensors_of
-from safetensors.torch import save_file
+from safetensors.torch import save as bytes_of
 
+from sq_perception.files import output_file
 from sq_perception.learning.regressor import Regressor, RegressorConfig
 
 FORMAT = "sq_perception.regressor"
@@ -69,10 +70,7 @@ def save(
     header = {"format": FORMAT, "version": VERSION, "config": json.dumps(asdict(model.config))}
     header.update({key: json.dumps(value) for key, value in (notes or {}).items()})
     path.parent.mkdir(parents=True, exist_ok=True)
-    partial = path.with_suffix(path.suffix + ".partial")
-    save_file(state, str(partial), metadata=header)
-    partial.chmod(0o644)  # safetensors writes for the owner alone; an installed model is for everybody
-    partial.replace(path)
+    output_file.write(path, bytes_of(state, metadata=header))
 
 
 def load(path: Path | str | None = None, device: str | torch.device = "cpu") -> Regressor:

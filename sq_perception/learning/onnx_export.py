@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
 from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
@@ -32,12 +33,21 @@ OPSET, IR_VERSION = 18, 8
 """Of ONNX 1.13 (2022): runtimes of any age read it."""
 
 
+TELEMETRY_OFF = "ORT_DISABLE_TELEMETRY"
+"""https://github.com/microsoft/onnxruntime/blob/main/docs/Privacy.md; processes started from here inherit it."""
+
+
 class MissingPackageError(ImportError):
     """onnx or onnxruntime is not installed; the message says what to do."""
 
 
 def require(name: str) -> Any:
-    """Import ``onnx`` or ``onnxruntime``; raises MissingPackageError where it is not installed."""
+    """Import ``onnx`` or ``onnxruntime``; raises MissingPackageError where it is not installed.
+
+    The one way by which this package imports onnxruntime: since 1.29 its wheels report their use to their maker, and
+    keep a number for the user under HOME, unless they are told not to before they are loaded.
+    """
+    os.environ[TELEMETRY_OFF] = "1"
     try:
         return importlib.import_module(name)
     except ModuleNotFoundError as error:

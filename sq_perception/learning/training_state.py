@@ -12,8 +12,10 @@ from pathlib import Path
 
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load_file
+from safetensors.torch import save as bytes_of
 
+from sq_perception.files import output_file
 from sq_perception.learning.checkpoint import CheckpointError
 from sq_perception.learning.regressor import Regressor
 from sq_perception.learning.schedule import Cosine, Plateau
@@ -46,9 +48,7 @@ class TrainingState:
             tensors.update({f"{prefix}.{k}": v.contiguous() for k, v in network.state_dict().items()})
         for index, slots in self.optimizer.state_dict()["state"].items():
             tensors.update({f"optimizer.{index}.{k}": torch.as_tensor(v).contiguous() for k, v in slots.items()})
-        partial = path.with_suffix(".partial")
-        save_file(tensors, str(partial))
-        partial.replace(path)
+        output_file.write(path, bytes_of(tensors))
 
     def restore(self, path: Path) -> None:
         """Go on from :meth:`save`.

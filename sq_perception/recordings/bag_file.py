@@ -22,7 +22,7 @@ Reference: rosbags, https://ternaris.gitlab.io/rosbags; MCAP, https://mcap.dev/s
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -84,6 +84,8 @@ class RecordedBag:
         Every n-th image only, and at most so many.
     distortion
         "auto", "apply" or "ignore", see :mod:`sq_perception.imaging.calibration`.
+    is_done
+        Asked with the stamp of each image that counts; where it says yes, the image is neither decoded nor given.
 
     Raises
     ------
@@ -100,6 +102,7 @@ class RecordedBag:
         every: int = 1,
         limit: int | None = None,
         distortion: Treatment = "auto",
+        is_done: Callable[[Stamp], bool] = lambda stamp: False,
     ) -> None:
         if every < 1 or (limit is not None and limit < 1):
             raise ValueError(f"every, limit: expected at least 1, got {every} and {limit}")
@@ -109,6 +112,7 @@ class RecordedBag:
         self._distortion: Treatment = distortion
         self._orthographic = projection == "orthographic"
         self._every, self._limit = every, limit
+        self._is_done = is_done
         self._reader, self._types = _open(self._path)
         try:
             self.topic = self._chosen(topic)
@@ -143,19 +147,19 @@ class RecordedBag:
                     yield message
                 elif message.is_info:
                     if waiting is not None and waiting.stamp <= message.stamp:
-                        yield self._frame(waiting, message if waiting.stamp == message.stamp else latest)
+                        yield from self._frame(waiting, message if waiting.stamp == message.stamp else latest)
                         waiting = None
                     latest = message
                 else:
                     if waiting is not None:
-                        yield self._frame(waiting, latest)
+                        yield from self._frame(waiting, latest)
                         waiting = None
                     if not needs_info or (latest is not None and latest.stamp == message.stamp):
-                        yield self._frame(message, latest)
+                        yield from self._frame(message, latest)
                     else:  # the camera_info of its stamp may come right after it
                         waiting = message
             if waiting is not None:
-                yield self._frame(waiting, latest)
+                yield from self._frame(waiting, latest)
         except FrameError as error:
             yield error
 
@@ -252,11 +256,14 @@ class RecordedBag:
 
     # frames
 
-    def _frame(self, message: _Message, info: _Message | None) -> RecordedFrame | FrameError:
+    def _frame(self, message: _Message, info: _Message | None) -> Iterator[RecordedFrame | FrameError]:
+        """The frame of an image, unless it is done."""
+        if self._is_done(message.stamp):
+            return
         try:
-            return self._decoded(message, info)
+            yield self._decoded(message, info)
         except (ValueError, MemoryError) as error:
-            return FrameError(f"{self._path}: {self.topic} at {message.stamp}: {_said(error)}")
+            yield FrameError(f"{self._path}: {self.topic} at {message.stamp}: {_said(error)}")
 
     def _decoded(self, message: _Message, info: _Message | None) -> RecordedFrame:
         warning = ""

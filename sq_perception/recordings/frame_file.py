@@ -158,7 +158,7 @@ def read(
     path = Path(path)
     if not path.is_file():
         raise FrameError(f"{path}: no such file")
-    return replace(_read(path, camera_info, projection, distortion), stamp=_stamp(path))
+    return replace(_read(path, camera_info, projection, distortion), stamp=stamp_of(path))
 
 
 def _read(path: Path, camera_info: str | Path | None, projection: Projection, distortion: Treatment) -> RecordedFrame:
@@ -190,7 +190,7 @@ def _read(path: Path, camera_info: str | Path | None, projection: Projection, di
     return RecordedFrame(depth, calibration.camera, None, path.name, is_cube=False, warning=warning, encoding="16UC1")
 
 
-def _stamp(path: Path) -> Stamp | None:
+def stamp_of(path: Path) -> Stamp | None:
     """The time that a name says, seconds and their fraction."""
     parts = _TIME.fullmatch(path.stem)
     return Stamp(int(parts[1]), int(parts[2].ljust(9, "0"))) if parts else None

@@ -8,14 +8,14 @@ the rest follows.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from sq_perception.imaging.calibration import Treatment
 from sq_perception.imaging.camera import Projection
 from sq_perception.recordings import bag_file, frame_file
 from sq_perception.recordings.bag_file import RecordedBag
-from sq_perception.recordings.frame_file import CameraInfo, FrameError, RecordedFrame
+from sq_perception.recordings.frame_file import CameraInfo, FrameError, RecordedFrame, Stamp
 
 CAMERA_FILES = ("camera_info.yaml", "camera_info.yml", "camera.yaml", "camera.yml")
 SUFFIXES = frame_file.SUFFIXES + bag_file.SUFFIXES
@@ -40,6 +40,9 @@ class RecordedInput:
         Of each folder and bag: every n-th frame only, and at most so many.
     distortion
         Of PNGs and bags: "auto", "apply" or "ignore", see :mod:`sq_perception.imaging.calibration`.
+    is_done
+        Asked with file, topic and stamp of each frame that counts; where it says yes, the frame is neither read nor
+        given.
 
     Raises
     ------
@@ -56,6 +59,7 @@ class RecordedInput:
         every: int = 1,
         limit: int | None = None,
         distortion: Treatment = "auto",
+        is_done: Callable[[str, str, Stamp | None], bool] = lambda file, topic, stamp: False,
     ) -> None:
         self._camera_info = camera_info
         self._info: CameraInfo | None = None
@@ -66,11 +70,18 @@ class RecordedInput:
             frame_file.calibrated(camera_info, self._info, "", "ignore" if distortion == "auto" else distortion)
         self._projection: Projection = projection
         self._topic, self._every, self._limit = topic, every, limit
+        self._is_done = is_done
         self._sources: list[tuple[Path, str | Path | None] | tuple[Path, FrameError]] = []
         for name in names:
             self._add(Path(name))
         self.total = len(self._sources)
         """Frames to expect; a bag counts as one until it is opened."""
+
+    @property
+    def files(self) -> list[Path]:
+        """Files and bags that are read."""
+        given = [] if self._camera_info is None else [Path(self._camera_info)]
+        return given + [path for path, rest in self._sources if not isinstance(rest, FrameError)]
 
     def __iter__(self) -> Iterator[tuple[str, RecordedFrame | FrameError]]:
         for path, rest in self._sources:
@@ -78,6 +89,8 @@ class RecordedInput:
                 yield str(path), rest
             elif bag_file.is_bag(path):
                 yield from self._bag(path)
+            elif self._is_done(str(path), "", frame_file.stamp_of(path)):
+                self.total -= 1
             else:
                 yield str(path), self._file(path, rest)
 
@@ -107,7 +120,14 @@ class RecordedInput:
     def _bag(self, path: Path) -> Iterator[tuple[str, RecordedFrame | FrameError]]:
         try:
             bag = RecordedBag(
-                path, self._topic, self._info, self._projection, self._every, self._limit, self._distortion
+                path,
+                self._topic,
+                self._info,
+                self._projection,
+                self._every,
+                self._limit,
+                self._distortion,
+                lambda stamp: self._is_done(str(path), bag.topic, stamp),
             )
         except FrameError as error:
             yield str(path), error

@@ -14,10 +14,10 @@ before, the first one at INTERVAL, as time 0 means "unknown" in ROS: the same in
 was no message has the frame id of the synthetic camera.  Messages are logged when the bag received the image; failing
 that, at the stamp.
 
-The file is written as ``<name>.partial`` and takes its name when it is whole.  It is closed properly with what there is
-where the run is interrupted or the disk is full; if there is no room for the index either, the partial file stays, up
-to its last whole chunk, from which ``mcap recover`` makes a file.  Frames are held in memory until they fill a chunk,
-whatever the length of the recording.
+The file is written as ``<name>.partial`` and takes its name when it is whole (:mod:`sq_perception.files.output_file`).
+It is closed properly with what there is where the run is interrupted or the disk is full, and then leaves an older file
+alone; if there is no room for the index either, the partial file stays, up to its last whole chunk, from which ``mcap
+recover`` makes a file.  Frames are held in memory until they fill a chunk, whatever the length of the recording.
 """
 
 from __future__ import annotations
@@ -34,6 +34,7 @@ import numpy as np
 from sq_msgs_py import depth_image
 from sq_msgs_py.depth_image import Intrinsics
 from sq_msgs_py.superquadrics import to_message
+from sq_perception.files.output_file import OutputFile
 from sq_perception.recordings import publication
 from sq_perception.recordings.bag_file import camera_info_topic, raw_topic
 from sq_perception.recordings.frame_file import FrameError, RecordedFrame, Stamp
@@ -87,13 +88,13 @@ class ResultBag:
         self._path = Path(path)
         if self._path.suffix.lower() != SUFFIX or self._path.is_dir():
             raise ValueError(f"{path}: expected the name of a file that ends in {SUFFIX}")
-        self._partial = self._path.with_name(f"{self._path.name}.partial")
         self._images = set(images)
         self._frames = 0
         self._channels: dict[tuple[str, str], int] = {}
         self._shown_ids: list[int] = []
         self._last = Stamp(0, 0)
-        self._raw = self._partial.open("wb", buffering=0)
+        self._output = OutputFile(self._path, f"{self._path.name}.partial")
+        self._raw = self._output.partial.open("wb", buffering=0)
         try:
             self._file = McapFile(self._raw, "sq_perception")
         except BaseException:
@@ -104,7 +105,7 @@ class ResultBag:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self.close()
+        self.close(whole=error is None)
 
     @property
     def frames(self) -> int:
@@ -145,8 +146,14 @@ class ResultBag:
         except OSError as error:
             self._close_after(error)
 
-    def close(self) -> None:
-        """Finish the file and give it its name; without a frame there is none.
+    def close(self, whole: bool = True) -> Path | None:
+        """Finish the file and give it its name; returns where it is, None without a frame.
+
+        Parameters
+        ----------
+        whole
+            Whether these are all frames that were to be; if not, a file that is there stays and this one is put beside
+            it.
 
         Raises
         ------
@@ -154,12 +161,12 @@ class ResultBag:
             As :meth:`add`.
         """
         if self._raw.closed:
-            return
+            return None
         try:
             self._file.flush()
         except OSError as error:
             self._close_after(error)
-        self._end()
+        return self._end(whole)
 
     # frames
 
@@ -214,16 +221,16 @@ class ResultBag:
         with suppress(OSError):
             while self._file.waiting:
                 self._file.flush(1)
-        self._end()
+        place = self._end(whole=False)
         written = self._file.groups
         kept = f"the first {written} of {self._frames} frames are kept" if written else "nothing is kept"
-        raise OSError(error.errno, f"{_said(error)}; {kept}", str(self._path)) from error
+        raise OSError(error.errno, f"{_said(error)}; {kept}", str(place or self._path)) from error
 
-    def _end(self) -> None:
+    def _end(self, whole: bool) -> Path | None:
         """Close the file and name it; no file where there is no frame."""
         if not self._file.groups:
             self._discard()
-            return
+            return None
         try:
             self._file.finish()
             self._raw.close()
@@ -232,12 +239,12 @@ class ResultBag:
                 self._file.cut()
             self._raw.close()
             text = f"{_said(error)}; kept without an index, from which 'mcap recover' makes a file"
-            raise OSError(error.errno, text, str(self._partial)) from error
-        self._partial.replace(self._path)
+            raise OSError(error.errno, text, str(self._output.keep())) from error
+        return self._output.commit(whole)
 
     def _discard(self) -> None:
         self._raw.close()
-        self._partial.unlink(missing_ok=True)
+        self._output.discard()
 
 
 def _said(error: OSError) -> str:

@@ -242,3 +242,101 @@ def test_a_budget_is_positive(tmp_path, capsys):
 def test_a_message_is_one_printable_line(capsys):
     complain("a\x1b[2J\nb")
     assert capsys.readouterr().err == "sq-perception: a?[2J b\n"
+
+
+# what is there already
+
+
+def run(*arguments):
+    return main.main(["recover", *map(str, arguments), "--method", "symmetry"])
+
+
+def interrupt_after(frames, monkeypatch):
+    """Ctrl-C while the frame after so many is worked on."""
+    from sq_perception.recordings import frame_entry as module
+
+    entry, calls = module.frame_entry, []
+
+    def interrupted(*arguments, **options):
+        if len(calls) == frames:
+            raise KeyboardInterrupt
+        calls.append(0)
+        return entry(*arguments, **options)
+
+    monkeypatch.setattr(module, "frame_entry", interrupted)
+
+
+def test_a_good_document_outlives_a_run_without_a_frame_and_an_interrupted_one(tmp_path, monkeypatch, capsys):
+    out = tmp_path / "keep.json"
+    out.write_text("good")
+    assert run(tmp_path / "missing.npz", "--json", out) == 1
+    assert out.read_text() == "good"
+    assert f"{out} stays as it is" in capsys.readouterr().err
+    names = [save_npz(tmp_path / f"{name}.npz") for name in ("a", "b")]
+    interrupt_after(1, monkeypatch)
+    assert run(*names, "--json", out) == 130
+    assert out.read_text() == "good"
+    assert len(json.loads((tmp_path / "keep.partial.json").read_text())["frames"]) == 1
+    assert "keep.partial.json" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("option", ["--json", "--jsonl"])
+def test_links_and_devices_are_written_through(tmp_path, option):
+    frame = save_npz(tmp_path / "a.npz")
+    for name, target in (("null", "/dev/null"), ("link", "target")):
+        (tmp_path / name).symlink_to(target)
+        assert run(frame, option, tmp_path / name) == 0
+        assert (tmp_path / name).is_symlink()
+    first = (tmp_path / "target").read_text()
+    assert json.loads(first if option == "--json" else first.splitlines()[0])["format"] == "sq_perception.recovery"
+
+
+@pytest.mark.parametrize("option", ["--json", "--jsonl", "--mcap", "--pictures", "--meshes"])
+def test_what_cannot_be_written_is_known_before_a_frame_is_computed(tmp_path, option, monkeypatch, capsys):
+    from sq_perception.recovery.recoverer import Recoverer
+
+    monkeypatch.setattr(Recoverer, "recover", None)
+    frame = save_npz(tmp_path / "a.npz")
+    assert run(frame, option, "/proc/sys/out.mcap") == 2
+    assert option in capsys.readouterr().err
+
+
+def test_inputs_are_not_replaced(tmp_path, capsys):
+    frame, png = save_npz(tmp_path / "a.npz"), save_png(tmp_path / "b.png")
+    camera = camera_yaml(tmp_path / "camera.yaml")
+    before = {path: path.read_bytes() for path in (frame, png, camera)}
+    for arguments in (
+        (frame, "--json", frame),
+        (frame, "--jsonl", frame),
+        (png, "--camera-info", camera, "--json", camera),
+        (tmp_path, "--pictures", tmp_path),
+    ):
+        assert run(*arguments) == 2
+        assert "input" in capsys.readouterr().err
+    assert {path: path.read_bytes() for path in before} == before
+
+
+def test_a_folder_is_resumed_where_it_ended(tmp_path, monkeypatch):
+    """Interrupted after two of five frames, then again to the end: every frame once, in order, computed once."""
+    from sq_perception.recovery.recoverer import Recoverer
+
+    folder = tmp_path / "frames"
+    folder.mkdir()
+    for k in range(5):
+        save_npz(folder / f"f{k}.npz")
+    lines, out, meshes = tmp_path / "out.jsonl", tmp_path / "out.json", tmp_path / "meshes"
+    with monkeypatch.context() as context:
+        interrupt_after(2, context)
+        assert run(folder, "--jsonl", lines, "--meshes", meshes) == 130
+    first = lines.read_text()
+    assert len(first.splitlines()) == 3
+    assert run(folder, "--jsonl", lines, "--meshes", meshes, "--json", out) == 0
+    assert lines.read_text().startswith(first), "what is done is not done again"
+    frames = [json.loads(line) for line in lines.read_text().splitlines()[1:]]
+    assert [frame["file"] for frame in frames] == [str(folder / f"f{k}.npz") for k in range(5)]
+    assert json.loads(out.read_text())["frames"] == frames
+    assert sorted(path.name for path in meshes.iterdir()) == [f"f{k}.glb" for k in range(5)]
+    monkeypatch.setattr(Recoverer, "recover", None)
+    assert run(folder, "--jsonl", lines) == 0, "nothing is left to do"
+    assert run(folder, "--jsonl", lines, "--max-objects", "3") == 2
+    assert run(folder, "--jsonl", lines, "--mcap", tmp_path / "out.mcap") == 2

@@ -283,8 +283,8 @@ def test_a_name_that_cannot_be_written_is_said_at_once(tmp_path, capsys):
 
 def test_without_mcap_one_sentence_says_so(tmp_path, monkeypatch, capsys):
     for name in ("mcap_file", "result_bag"):
-        monkeypatch.delitem(sys.modules, f"sq_perception.{name}")
-        monkeypatch.delattr(f"sq_perception.{name}")
+        monkeypatch.delitem(sys.modules, f"sq_perception.recordings.{name}")
+        monkeypatch.delattr(f"sq_perception.recordings.{name}")
     for name in [name for name in sys.modules if name.partition(".")[0] == "mcap"]:
         monkeypatch.setitem(sys.modules, name, None)
     recover(tmp_path / "missing.npz", "--mcap", tmp_path / "results.mcap", code=1)
@@ -325,13 +325,38 @@ def test_ctrl_c_leaves_a_whole_file(tmp_path, monkeypatch, capsys, where):
 
 def test_a_full_device_is_one_line(tmp_path, capsys):
     bag, out = record(tmp_path / "bag", [depth_of()]), tmp_path / "results.mcap"
-    (tmp_path / "results.mcap.partial").symlink_to("/dev/full")
+    out.symlink_to("/dev/full")
     recover(bag, "--mcap", out, code=1)
     errors = capsys.readouterr().err
     assert "No space left on device" in errors
-    assert errors.count("\n") == 1
-    assert not out.exists()
+    assert errors.count("\n") == 2, "and the summary"
+    assert out.is_symlink()
     assert not leftovers(tmp_path)
+
+
+@pytest.mark.parametrize("how", ["interrupted", "full"])
+def test_a_good_file_outlives_a_bag_that_is_not_whole(tmp_path, scene, monkeypatch, how):
+    out = tmp_path / "results.mcap"
+    out.write_bytes(b"good")
+    bag = ResultBag(out)
+    bag.add(*scene, None)
+    if how == "interrupted":
+        assert bag.close(whole=False) == tmp_path / "results.partial.mcap"
+    else:
+        write, calls = bag._file.flush, []
+
+        def full(*arguments):
+            calls.append(0)
+            if len(calls) == 1:
+                raise OSError(28, "No space left on device")
+            write(*arguments)
+
+        monkeypatch.setattr(bag._file, "flush", full)
+        with pytest.raises(OSError, match=r"the first 1 of 1 frames are kept.*results\.partial\.mcap"):
+            bag.close()
+    assert out.read_bytes() == b"good"
+    assert len(messages(tmp_path / "results.partial.mcap")[SUPERQUADRICS]) == 1
+    assert leftovers(tmp_path) == ["results.partial.mcap"]
 
 
 @pytest.mark.parametrize("chunk", [1, 2**30])
@@ -408,8 +433,8 @@ def test_the_file_holds_what_the_node_publishes(tmp_path, scene):
 
     from sq_msgs_py import superquadrics
     from sq_perception.imaging.calibration import Calibration
-    from sq_perception.nodes import results
     from sq_perception.nodes.frame import Frame
+    from sq_perception.nodes.outputs import marker_style
     from sq_perception.nodes.parameters import FrameParameters
     from sq_perception.recordings import publication
     from sq_perception.recovery.recoverer import render_recovery
@@ -421,7 +446,7 @@ def test_the_file_holds_what_the_node_publishes(tmp_path, scene):
     shown = publication.findings(publication.Identified(recovery, ids), live.header, is_cube=False)
     expected = {
         SUPERQUADRICS: superquadrics.to_message(shown.array, live.header),
-        MARKERS: shown.markers(style=results.marker_style(FrameParameters())),
+        MARKERS: shown.markers(style=marker_style(FrameParameters())),
         RENDERED: live.encode(render_recovery(recovery, frame.camera)[0]),
         "/a/image": live.encode(frame.depth),
     }

@@ -1,9 +1,9 @@
-"""What has arrived and waits for the worker: depth images with what belongs to them; the newest complete one wins.
+"""The input of a frame node: its subscriptions, and what has come and waits for the worker.
 
-Callbacks of the executor put, one worker thread takes. A depth image is complete with the camera_info of its own
-stamp, or else the latest one of its size, and, where masks are expected, with the mask of its own stamp. What is
-missing may come a moment later: the image waits for it for ``patience`` seconds, beside newer images. As soon as an
-image is complete, or its patience is at an end, it takes the place of every older one.
+Callbacks of the executor put, one worker thread takes; the newest complete depth image wins. One is complete with the
+camera_info of its own stamp, or else the latest one of its size, and, where masks are expected, with the mask of its
+own stamp. What is missing may come a moment later: the image waits for it for ``patience`` seconds, beside newer
+images. As soon as an image is complete, or its patience is at an end, it takes the place of every older one.
 
 So a frame is never computed without its mask only because the network that makes the mask is slower than the camera,
 and nobody who has the turn to compute waits for a message.
@@ -16,12 +16,20 @@ from collections import OrderedDict, deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from time import monotonic
+from typing import Any
 
+from rclpy.event_handler import SubscriptionEventCallbacks
+from rclpy.node import Node
+from rclpy.qos import QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
+from rclpy.qos_overriding_options import QoSOverridingOptions
+from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
 from sq_msgs_py.depth_image import size_mismatch
 from sq_perception.imaging.calibration import Calibration
-from sq_perception.nodes.transport import size_of
+from sq_perception.nodes.frame import Frame, Refused, decode, image_topic, size_of
+from sq_perception.nodes.parameters import RAW, FrameParameters
+from sq_perception.nodes.statistics import THROTTLE, Statistics, publishers
 
 Stamp = tuple[int, int]
 
@@ -29,10 +37,6 @@ _INFOS = 16
 _MASKS = 8
 _WAITING = 64
 """Images that wait for their companions at the same time; older ones are dropped."""
-
-
-class Refused(ValueError):  # noqa: N818 - a verdict on a frame rather than a defect
-    """A frame that cannot be processed; says what was expected and what arrived."""
 
 
 class NoCameraInfo(Refused):
@@ -57,7 +61,7 @@ class _Info:
 
 
 class Inbox:
-    """Thread-safe; see the module.
+    """What has come and waits; thread-safe.
 
     Parameters
     ----------
@@ -230,3 +234,142 @@ def _size(message: Image | CompressedImage) -> tuple[int, int] | None:
         return size_of(message)
     except ValueError:
         return None
+
+
+class Input:
+    """The subscriptions of an active node, whose messages go into an inbox, and the frames that are made of them.
+
+    Inputs are best effort, keep last 1: a slow subscriber with a queue answers old images.
+
+    Parameters
+    ----------
+    node
+        Subscribes.
+    parameters
+        Asked for those in force.
+    is_wanted
+        Asked for each image: whether it is processed, or dropped at once.
+    statistics
+        Counts received, dropped and lost messages.
+    """
+
+    def __init__(
+        self,
+        node: Node,
+        parameters: Callable[[], FrameParameters],
+        is_wanted: Callable[[], bool],
+        statistics: Statistics,
+    ) -> None:
+        self._node, self._parameters, self._is_wanted, self._statistics = node, parameters, is_wanted, statistics
+        self._note = ""
+        self._last_image = monotonic()
+        self._is_pinhole = parameters().projection == "pinhole"
+        self._transport = parameters().image_transport
+        self.topic = image_topic(node, "depth/image", self._transport)
+        """Of the depth images."""
+        self.inbox = Inbox(
+            self._calibrated if self._is_pinhole else None,
+            needs_mask=self._expects_mask,
+            patience=lambda: self._parameters().patience,
+            dropped=lambda number: statistics.count("dropped", number),
+        )
+        self._info: Subscription | None = None
+        self._mask: Subscription | None = None
+        self._image: Subscription | None = None
+
+    def open(self) -> None:
+        """Subscribe."""
+        # Subscriptions are served in this order: what an image needs is there before the image.
+        if self._is_pinhole:
+            self._info = self._listen(CameraInfo, "depth/camera_info", self.inbox.put_info)
+        self._mask = self._listen(Image, "mask/image", self.inbox.put_mask)
+        kind = Image if self._transport == RAW else CompressedImage
+        self._image = self._listen(kind, self.topic, self._on_image)
+
+    @property
+    def silence(self) -> float:
+        """Seconds since the last depth image."""
+        return monotonic() - self._last_image
+
+    @property
+    def heard(self) -> str:
+        """Who publishes depth images, and whether they can be heard."""
+        return self._publishers_of(self._image)
+
+    def close(self) -> None:
+        """Listen no more, and let the worker go; what waits is dropped."""
+        for one in (self._image, self._mask, self._info):
+            if one is not None:
+                self._node.destroy_subscription(one)
+        self._statistics.count("dropped", self.inbox.close())
+
+    def frame(self, arrival: Arrival, parameters: FrameParameters) -> Frame:
+        """The frame of an image with what belongs to it.
+
+        Raises
+        ------
+        ValueError
+            For anything that keeps it from being processed.
+        """
+        message = arrival.message
+        if parameters.projection == "orthographic":
+            frame = decode(message, None)
+        else:
+            try:
+                frame = decode(message, lambda: self.inbox.calibration_of(message))
+            except NoCameraInfo as error:
+                topic = self._info.topic_name if self._info is not None else "depth/camera_info"
+                raise Refused(f"{error}, on {topic}: {self._publishers_of(self._info)}") from error
+        if parameters.use_masks == "always" and arrival.mask is None:
+            where = f" on {self._mask.topic_name}" if self._mask is not None else ""
+            raise Refused(f"mask: expected one with the stamp of the image (use_masks is always), none came{where}")
+        return frame.with_mask(arrival.mask if parameters.use_masks != "never" else None)
+
+    # Callbacks, in the executor's thread: quick, and nothing in them can fail on a message's content
+
+    def _on_image(self, message: Image | CompressedImage) -> None:
+        self._last_image = monotonic()
+        self._statistics.count("received")
+        if self._is_wanted():
+            self.inbox.put_image(message)
+        else:
+            self._statistics.count("dropped")
+
+    def _calibrated(self, info: CameraInfo) -> Calibration:
+        calibration = Calibration.of(info, self.topic, self._parameters().distortion)
+        if calibration.note != self._note:
+            self._note = calibration.note
+            said = f"{self.topic}: {calibration.note or 'no distortion'}"
+            self._node.get_logger().info(said, throttle_duration_sec=THROTTLE)
+        return calibration
+
+    def _expects_mask(self) -> bool:
+        if self._mask is None:
+            return False
+        use = self._parameters().use_masks
+        return use == "always" or (use == "auto" and bool(self._node.count_publishers(self._mask.topic_name)))
+
+    def _on_lost(self, event: Any) -> None:
+        self._statistics.count("lost", event.total_count_change)
+        self._node.get_logger().warning(
+            f"{event.total_count} messages lost before they arrived: best effort images need more shared memory than "
+            "Fast DDS reserves by default. Remedy: start the PUBLISHER (the camera driver) with "
+            "FASTRTPS_DEFAULT_PROFILES_FILE set to the profile that ships in this package's config folder",
+            throttle_duration_sec=THROTTLE,
+        )
+
+    def _listen(self, kind: type[Any], topic: str, callback: Callable[[Any], None]) -> Subscription:
+        return self._node.create_subscription(
+            kind,
+            topic,
+            callback,
+            QoSProfile(depth=1, history=QoSHistoryPolicy.KEEP_LAST, reliability=QoSReliabilityPolicy.BEST_EFFORT),
+            event_callbacks=SubscriptionEventCallbacks(message_lost=self._on_lost),
+            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
+        )
+
+    def _publishers_of(self, subscription: Subscription | None) -> str:
+        if subscription is None:
+            return "nothing is subscribed to"
+        offered = self._node.get_publishers_info_by_topic(subscription.topic_name)
+        return publishers(offered, subscription.qos_profile)

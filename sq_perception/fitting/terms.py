@@ -1,11 +1,11 @@
-"""What holds for all rays of a fit: losses, stiffnesses, and what is known beyond the image."""
+"""The terms of a fit's cost: losses, stiffnesses, and what is known beyond the image."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 
-class Scene(NamedTuple):
+class Terms(NamedTuple):
     """Constants of the residuals; see :mod:`sq_perception.fitting.residuals` and :mod:`sq_perception.fitting.priors`.
 
     Points that lie inside the body, behind its surface, count by Cauchy's loss of scale ``inner_cauchy`` if that is

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 
 import pytest
 
-from sq_perception.nodes import garbage
+from sq_perception.nodes import process
 
 
 class Ring:
@@ -31,7 +31,7 @@ def collections() -> int:
 
 def test_nothing_is_collected_within_and_new_garbage_is_afterwards():
     assert gc.isenabled()
-    with garbage.postponed():
+    with process.garbage_postponed():
         before = collections()
         kept = [Ring() for _ in range(20_000)]
         assert collections() == before
@@ -46,11 +46,11 @@ def test_nothing_is_collected_within_and_new_garbage_is_afterwards():
 
 
 def test_a_failure_and_a_process_without_collection_are_left_as_they_were():
-    with pytest.raises(ZeroDivisionError), garbage.postponed():
+    with pytest.raises(ZeroDivisionError), process.garbage_postponed():
         raise ZeroDivisionError
     assert gc.isenabled()
     gc.disable()
-    with garbage.postponed():
+    with process.garbage_postponed():
         pass
     assert not gc.isenabled()
 
@@ -58,9 +58,9 @@ def test_a_failure_and_a_process_without_collection_are_left_as_they_were():
 def test_what_is_kept_is_not_looked_at_until_it_is_released():
     ring = Ring()
     ghost = weakref.ref(ring)
-    garbage.keep()
+    process.keep_objects()
     del ring
     gc.collect()
     assert ghost() is not None
-    garbage.release()
+    process.release_objects()
     assert ghost() is None

@@ -8,9 +8,10 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
+
 from sq_perception.imaging import unit_cube
-from sq_perception.nodes.frame_source import FrameSource
 from sq_perception.nodes.parameters import ParameterError, SyntheticParameters
+from sq_perception.nodes.synthetic_depth_node import FrameSource
 from sq_perception.recordings.frame_file import FrameError
 
 

@@ -6,58 +6,66 @@ import time
 
 import numpy as np
 
-from sq_perception.fitting.covariance import carried_over, covariance_at, spread, undetermined
+from sq_perception.fitting.covariance import carried_over, spread, undetermined
 from sq_perception.fitting.fit import Fit, Status
-from sq_perception.fitting.levenberg_marquardt import State
-from sq_perception.fitting.normal_equations import STEP_LENGTH
 from sq_perception.fitting.observation import Observation
+from sq_perception.fitting.problem import Solution
 from sq_perception.fitting.residuals import surface_distance
-from sq_perception.fitting.search import Search
-from sq_perception.fitting.visibility import seen_extents, visible_share
 from sq_perception.geometry.superquadric import Superquadric
 
 _INLIER = 3.0
-_JUDGED_RAYS = 800
+"""Noise levels: noise alone stays within for 99.7 % of the pixels."""
+_RAYS = 800
+"""Enough for a share to one or two percent."""
 _FAILED_SHARE = 0.25
+"""Of the smallest half size: a body that half of the points miss by more is none."""
 _REACHED = 0.9
 """Of the points of a thing that was fitted as a hull: what the rest sticks out tells whether the body encloses it."""
+_TAIL = 0.01
+"""Of the points, at either end of an axis: outliers."""
 _AXES = "xyz"
 
 
-def judged(state: State, search: Search, began: float) -> Fit:
-    """The result of a search, with everything that can be said about its quality."""
-    observation = search.observation
+def verdict(solution: Solution, began: float) -> Fit:
+    """The result of a fit, with everything that can be said about its quality."""
+    observation, state = solution.problem.observation, solution.state
     body = state.body
-    covariance = covariance_at(state, search.rays, search.free, search.scene, search.outline)
-    covariance = covariance * search.spread_factor + spread(state, search.alternatives)
+    covariance = solution.covariance() + spread(state, solution.alternatives)
     canonical = body.canonical_form()
     covariance = carried_over(covariance, body, canonical)
-    everything = observation.object_rays(_JUDGED_RAYS)
+    everything = observation.object_rays(_RAYS)
     distance = surface_distance(everything, state.parameters, state.rotation)
     inlying = distance < _INLIER * observation.sigma
     typical = float(np.median(distance))
     kept = distance < max(_INLIER * observation.sigma, _INLIER * typical)
     residual = float(np.sqrt(np.mean(distance[kept] ** 2))) if kept.any() else typical
-    if search.as_hull:
+    if solution.as_hull:
         # A hollow thing lies inside its hull: only what sticks out speaks against the body.
         outside = body.gauge(observation.points) > 1
         sticking_out = np.where(outside, np.abs(body.sampson_distance(observation.points)), 0.0)
         typical = float(np.quantile(sticking_out, _REACHED))
-    status, message = _verdict(canonical, covariance, typical)
+    status, message = _status(canonical, covariance, typical)
     return Fit(
         superquadric=canonical,
         residual=residual,
+        status=status,
+        message="; ".join([message, *solution.notes]),
         noise=observation.sigma,
         inlier_share=float(inlying.mean()),
-        visible_share=visible_share(state, observation),
         seen=seen_extents(canonical, observation.points),
         covariance=covariance,
-        status=status,
-        message="; ".join([message, *search.notes]),
         iterations=state.iterations,
         milliseconds=(time.perf_counter() - began) * 1e3,
-        as_hull=search.as_hull,
+        as_hull=solution.as_hull,
     )
+
+
+def seen_extents(body: Superquadric, points: np.ndarray) -> np.ndarray:
+    """Share (3,) of each full size of a single body that points (n, 3) span along its axis, 0 to 1."""
+    local = (points - body.translation) @ body.rotation_matrix
+    low, high = np.quantile(local, [_TAIL, 1 - _TAIL], axis=0)
+    low, high = np.maximum(low, -body.size), np.minimum(high, body.size)
+    return np.clip((high - low) / (2 * body.size * (1 - 2 * _TAIL)), 0.0, 1.0)
 
 
 def failed(body: Superquadric, observation: Observation, reason: str, began: float) -> Fit:
@@ -67,19 +75,15 @@ def failed(body: Superquadric, observation: Observation, reason: str, began: flo
     return Fit(
         superquadric=body.canonical_form(),
         residual=float(np.sqrt(np.mean(distance**2))),
-        noise=observation.sigma,
-        inlier_share=0.0,
-        visible_share=float("nan"),
-        seen=np.full(3, np.nan),
-        covariance=np.full((STEP_LENGTH, STEP_LENGTH), np.nan),
         status=Status.FAILED,
         message=reason,
-        iterations=0,
+        noise=observation.sigma,
+        inlier_share=0.0,
         milliseconds=(time.perf_counter() - began) * 1e3,
     )
 
 
-def _verdict(body: Superquadric, covariance: np.ndarray, typical: float) -> tuple[Status, str]:
+def _status(body: Superquadric, covariance: np.ndarray, typical: float) -> tuple[Status, str]:
     if typical > _FAILED_SHARE * float(body.size.min()):
         return Status.FAILED, (
             f"no superquadric found: {1e3 * typical:.1f} mm and more between many of the points and the best one"

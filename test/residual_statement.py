@@ -1,9 +1,8 @@
 """The residuals of the fits once more, in torch: short to read, any device, autograd.
 
-This is the tested truth that the kernels of :mod:`sq_perception.fitting.residuals` are compared with, and the seam for
-fitting many objects at once on a GPU.  Bodies are single torch :class:`Superquadric` objects, rays are origins and
-directions (n, 3) in the optical frame.  Scales that the kernels hold fixed in their derivatives are detached here.
-Symbols as in that module.
+The kernels of :mod:`sq_perception.fitting.residuals` are compared with this; symbols as there.  Bodies are single torch
+:class:`Superquadric` objects, rays are origins and directions (n, 3) in the optical frame.  Scales that the kernels
+hold fixed in their derivatives are detached here.
 """
 
 from __future__ import annotations

@@ -1,0 +1,178 @@
+"""Results of recorded frames as JSON: one document when all is done, or a line a frame as it goes, to be resumed.
+
+A document is ``{"format": ..., "version": ..., "options": {...}, "frames": [...]}``.  A file of JSON lines has the same
+head without ``frames`` in its first line, and in each line that follows an element of ``frames``
+(:mod:`sq_perception.recordings.frame_entry`).  Such a file grows; a line that an end of the program cut short is taken
+away when it is opened again, and nothing is added to what other options have found.
+"""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+from sq_perception.files import output_file
+from sq_perception.recordings.frame_file import Stamp
+
+FORMAT, VERSION = "sq_perception.recovery", 1
+LARGEST = 2**30
+"""Bytes of a file of lines that is resumed: some 10^5 frames."""
+
+
+class ResumeError(ValueError):
+    """A file of lines that cannot be gone on with; says why."""
+
+
+def head(options: Mapping[str, Any]) -> dict[str, Any]:
+    """What both forms begin with; ``options`` are those that decide what is found."""
+    return {"format": FORMAT, "version": VERSION, "options": dict(options)}
+
+
+def document(options: Mapping[str, Any], frames: Sequence[Mapping[str, Any]]) -> str:
+    """The whole document."""
+    return json.dumps({**head(options), "frames": frames}, indent=1, allow_nan=False) + "\n"
+
+
+class ResultLines:
+    """A file of JSON lines that grows frame by frame; close it when all is done.
+
+    Parameters
+    ----------
+    path
+        Of the file.  A device or FIFO is written to as it is.
+    options
+        Those that decide what is found.
+
+    Attributes
+    ----------
+    done : list of dict
+        Elements of ``frames`` that were there at the beginning.
+
+    Raises
+    ------
+    ResumeError
+        If there is a file of something else, or of other options.
+    OSError
+        If it cannot be written, or another program is writing it.
+    """
+
+    def __init__(self, path: str | Path, options: Mapping[str, Any]) -> None:
+        self._path = Path(path)
+        self.done: list[dict[str, Any]] = []
+        beginning = _line(head(options))
+        if output_file.is_passage(self._path):
+            self._can_go_back, self._descriptor = False, output_file.open_passage(self._path)
+        else:
+            self._can_go_back, self._descriptor = True, output_file.opened(self._path)
+        try:
+            self._end = self._found(json.loads(beginning)) if self._can_go_back else 0
+            if not self._end:
+                self._put(beginning)
+        except BaseException:
+            self.close()
+            raise
+
+    def add(self, entry: Mapping[str, Any]) -> None:
+        """Write the element of a frame; a line that cannot be written whole is taken back."""
+        self._put(_line(entry))
+
+    def close(self) -> None:
+        """End; more than once does no harm."""
+        if self._descriptor >= 0:
+            os.close(self._descriptor)
+            self._descriptor = -1
+
+    def _put(self, data: bytes) -> None:
+        rest = memoryview(data)
+        try:
+            while rest:
+                rest = rest[os.write(self._descriptor, rest) :]
+        except BaseException:
+            if self._can_go_back:
+                with suppress(OSError):
+                    self._go_to(self._end)
+            raise
+        self._end += len(data)
+
+    def _found(self, expected: Mapping[str, Any]) -> int:
+        """Read what is there; leaves the file at the end of its last whole line, which it returns."""
+        size = os.fstat(self._descriptor).st_size
+        if size > LARGEST:
+            raise OSError(errno.EFBIG, f"expected at most {LARGEST} bytes to go on with", str(self._path))
+        with open(self._descriptor, "rb", closefd=False) as file:
+            data = file.read()
+        lines = data.split(b"\n")[:-1]
+        entries = [self._entry(k + 1, line) for k, line in enumerate(lines)]
+        if entries:
+            self._compare(entries[0], expected)
+        elif data.strip() and not _line(expected).startswith(data):
+            raise ResumeError(f"{self._path}: expected a file of JSON lines that this command wrote")
+        for k, entry in enumerate(entries[1:]):
+            if not isinstance(entry.get("file"), str) or not isinstance(entry.get("superquadrics"), list):
+                raise ResumeError(f"{self._path}: line {k + 2}: expected what was recovered from a frame")
+        self.done = entries[1:]
+        end = sum(len(line) + 1 for line in lines)
+        self._go_to(end)
+        return end
+
+    def _go_to(self, end: int) -> None:
+        os.ftruncate(self._descriptor, end)
+        os.lseek(self._descriptor, end, os.SEEK_SET)
+
+    def _entry(self, number: int, line: bytes) -> dict[str, Any]:
+        try:
+            entry = json.loads(line, parse_constant=_refused)
+        except (ValueError, RecursionError) as error:
+            raise ResumeError(f"{self._path}: line {number}: expected JSON: {error}") from error
+        if not isinstance(entry, dict):
+            raise ResumeError(f"{self._path}: line {number}: expected a JSON object")
+        return entry
+
+    def _compare(self, found: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
+        if (found.get("format"), found.get("version")) != (expected["format"], expected["version"]):
+            raise ResumeError(f"{self._path}: expected a file of JSON lines that this command wrote")
+        theirs, ours = found.get("options"), expected["options"]
+        if not isinstance(theirs, dict):
+            raise ResumeError(f"{self._path}: expected 'options' in its first line")
+        other = [
+            f"{name} was {theirs.get(name)}, is {value}" for name, value in ours.items() if theirs.get(name) != value
+        ]
+        if other:
+            raise ResumeError(f"{self._path}: found with other options ({'; '.join(other)}); choose another file")
+
+
+class Recovered:
+    """Which frames are done: asked for each one before it is decoded; equal ones count one by one."""
+
+    def __init__(self) -> None:
+        self._left: Counter[str] = Counter()
+
+    def add(self, entries: Sequence[Mapping[str, Any]]) -> None:
+        """Elements of ``frames`` whose frames are done."""
+        self._left.update(_key(one["file"], one.get("topic"), one.get("stamp")) for one in entries)
+
+    def __call__(self, file: str, topic: str, stamp: Stamp | None) -> bool:
+        """Whether this frame is one of them; it is then ticked off."""
+        key = _key(file, topic, None if stamp is None else stamp._asdict())
+        found = self._left[key] > 0
+        if found:
+            self._left[key] -= 1
+        return found
+
+
+def _refused(constant: str) -> None:
+    raise ValueError(f"{constant} is no JSON")
+
+
+def _key(file: str, topic: Any, stamp: Any) -> str:
+    return json.dumps([file, topic or None, stamp], sort_keys=True)
+
+
+def _line(value: Mapping[str, Any]) -> bytes:
+    return json.dumps(value, allow_nan=False).encode() + b"\n"

@@ -1,0 +1,79 @@
+"""A read-only installation of a user without a home starts, and keeps its kernels where nobody else can write."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import sq_perception
+
+PATIENCE = 600
+READ_ONLY = 'mount --bind "$0" "$0" && mount -o remount,bind,ro "$0" && exec "$@"'
+CODE = """
+import sq_perception.recovery.recoverer
+from sq_perception.geometry import kernels
+print(kernels.__file__, kernels.gauge(0.1, 0.0, 0.0, 0.1, 0.1, 0.1, 1.0, 1.0), len(kernels.gauge.stats.cache_hits))
+"""
+"""All modules with kernels, one of which is used."""
+
+
+@pytest.fixture(scope="module")
+def installation(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A copy of the package; skips where a folder cannot be made read-only for root too."""
+    folder = tmp_path_factory.mktemp("installation")
+    if (
+        not shutil.which("unshare")
+        or subprocess.run(
+            ["unshare", "-rm", "sh", "-ec", READ_ONLY, str(folder), "true"], capture_output=True, check=False
+        ).returncode
+    ):
+        pytest.skip("no mounts of one's own: unshare -rm is missing or not permitted")
+    source = Path(sq_perception.__file__).parent
+    shutil.copytree(source, folder / source.name, ignore=shutil.ignore_patterns("__pycache__"))
+    return folder
+
+
+def run(installation: Path, folder: Path, **more: str) -> subprocess.CompletedProcess[str]:
+    """The code in a process that can write neither to the package nor to a home."""
+    kept = {name: value for name, value in os.environ.items() if not name.startswith(("NUMBA_CACHE", "XDG_"))}
+    places = {"HOME": "/proc/nobody", "PYTHONPATH": str(installation), "TMPDIR": str(folder)}
+    command = ["unshare", "-rm", "sh", "-ec", READ_ONLY, str(installation), sys.executable, "-c", CODE]
+    environment = {**kept, **places, **more}
+    return subprocess.run(
+        command, env=environment, capture_output=True, text=True, timeout=PATIENCE, check=False, cwd=folder
+    )
+
+
+def test_it_starts_and_starts_again_with_what_it_compiled(installation: Path, tmp_path: Path) -> None:
+    file = installation / "sq_perception" / "geometry" / "kernels.py"
+    first, second = run(installation, tmp_path), run(installation, tmp_path)
+    assert (first.returncode, second.returncode) == (0, 0), first.stderr + second.stderr
+    assert first.stdout.split() == [str(file), "1.0", "0"]
+    assert second.stdout.split() == [str(file), "1.0", "1"]
+    assert first.stderr.count("\n") == 1
+    assert "NUMBA_CACHE_DIR" in first.stderr
+    (folder,) = tmp_path.iterdir()
+    assert folder.stat().st_mode & 0o777 == 0o700
+
+
+def test_a_folder_that_others_can_write_is_not_read(installation: Path, tmp_path: Path) -> None:
+    """Whoever may write there can run code."""
+    uid = 0  # unshare -r
+    (tmp_path / f"sq_perception-kernels-{uid}").mkdir()
+    (tmp_path / f"sq_perception-kernels-{uid}").chmod(0o777)
+    done = run(installation, tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "expected a folder of this user alone" in done.stderr
+    assert not list((tmp_path / f"sq_perception-kernels-{uid}").iterdir())
+
+
+def test_a_named_place_goes_first(installation: Path, tmp_path: Path) -> None:
+    done = run(installation, tmp_path, NUMBA_CACHE_DIR=str(tmp_path / "named"))
+    assert done.returncode == 0, done.stderr
+    assert not done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["named"]

@@ -1,0 +1,109 @@
+"""JSON lines: whole lines only, resumed where they end, and nothing of anybody else's is touched."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from sq_perception.recordings.frame_file import Stamp
+from sq_perception.recordings.result_json import Recovered, ResultLines, ResumeError
+
+OPTIONS = {"method": "auto", "model": None}
+
+
+def entry(k):
+    return {"file": f"{k}.npz", "superquadrics": [], "topic": None, "stamp": None}
+
+
+@pytest.fixture
+def path(tmp_path):
+    path = tmp_path / "out.jsonl"
+    lines = ResultLines(path, OPTIONS)
+    for k in range(2):
+        lines.add(entry(k))
+        assert len(path.read_text().splitlines()) == k + 2, "there at once"
+    lines.close()
+    return path
+
+
+def test_a_head_and_a_line_a_frame(path):
+    head, *frames = map(json.loads, path.read_text().splitlines())
+    assert head == {"format": "sq_perception.recovery", "version": 1, "options": OPTIONS}
+    assert frames == [entry(0), entry(1)]
+
+
+@pytest.mark.parametrize("cut", [1, 5, 30])
+def test_a_line_that_was_cut_short_is_written_again(path, cut):
+    whole = path.read_bytes()
+    path.write_bytes(whole[:-cut])
+    lines = ResultLines(path, OPTIONS)
+    assert lines.done == [entry(0)]
+    lines.add(entry(1))
+    lines.close()
+    assert path.read_bytes() == whole
+
+
+def test_a_head_that_was_cut_short_is_written_again(path):
+    whole = path.read_bytes()
+    path.write_bytes(whole[:10])
+    lines = ResultLines(path, OPTIONS)
+    assert lines.done == []
+    lines.close()
+    assert path.read_bytes() == whole.splitlines(keepends=True)[0]
+
+
+@pytest.mark.parametrize(
+    "content",
+    ["important notes\n", "important notes", '{"format": "another"}\n', "[1]\n", "[" * 100_000 + "\n", "\n"],
+    ids=["text", "no line", "JSON", "list", "deep", "blank"],
+)
+def test_what_is_not_ours_is_refused_and_stays(tmp_path, content):
+    path = tmp_path / "notes.txt"
+    path.write_text(content)
+    with pytest.raises(ResumeError):
+        ResultLines(path, OPTIONS)
+    assert path.read_text() == content
+
+
+def test_other_options_are_refused_by_name(path):
+    before = path.read_bytes()
+    with pytest.raises(ResumeError, match="method was auto, is network"):
+        ResultLines(path, {**OPTIONS, "method": "network"})
+    assert path.read_bytes() == before
+
+
+def test_a_damaged_line_is_named(path):
+    lines = path.read_text().splitlines(keepends=True)
+    path.write_text(lines[0] + "damaged\n" + lines[2])
+    with pytest.raises(ResumeError, match="line 2"):
+        ResultLines(path, OPTIONS)
+    path.write_text(lines[0] + '{"file": 3}\n')
+    with pytest.raises(ResumeError, match="line 2"):
+        ResultLines(path, OPTIONS)
+
+
+def test_two_programs_do_not_share_a_file(path):
+    lines = ResultLines(path, OPTIONS)
+    with pytest.raises(OSError, match="another program is writing it"):
+        ResultLines(path, OPTIONS)
+    lines.close()
+
+
+def test_a_full_disk_leaves_whole_lines(path, file_size_limit):
+    lines, before = ResultLines(path, OPTIONS), path.read_bytes()
+    with file_size_limit(len(before) + 20), pytest.raises(OSError, match="large"):
+        lines.add(entry(2))
+    assert path.read_bytes() == before
+    lines.add(entry(2))
+    lines.close()
+    assert json.loads(path.read_text().splitlines()[-1]) == entry(2)
+
+
+def test_equal_frames_count_one_by_one():
+    done = Recovered()
+    stamped = {"file": "bag", "topic": "/depth", "stamp": {"sec": 1, "nanosec": 2}}
+    done.add([entry(0), entry(0), stamped])
+    assert [done("0.npz", "", None) for _ in range(3)] == [True, True, False]
+    assert [done("bag", "/depth", Stamp(1, 2)), done("bag", "/depth", Stamp(1, 2))] == [True, False]
+    assert not done("1.npz", "", None)
