@@ -62,7 +62,7 @@ def test_names_are_loaded_when_they_are_used() -> None:
         "from sq_perception import *\n"
         "assert Recoverer.__module__ == 'sq_perception.recovery.recoverer'\n"
     )
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=600)
 
 
 def snippets(page: Path) -> list[str]:
@@ -90,7 +90,7 @@ def test_the_reader_of_the_readme_runs(repository: Path) -> None:
     pytest.importorskip("rclpy", reason="needs the extra 'ros'")
     script = snippets(repository / "README.md")[1]
     code = f"import rclpy; rclpy.spin = lambda node: print(node.get_name())\n{script}\nprint(read.__name__)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600, check=True)
     assert done.stdout.split() == ["reader", "read"]
 
 
