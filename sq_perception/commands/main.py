@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 
 from sq_perception.commands import recover
 from sq_perception.commands.recover import FAILURE, INTERRUPTED, SUCCESS, USAGE, complain, misused
+from sq_perception.files import output_file
 
 if TYPE_CHECKING:
     import numpy as np
@@ -145,8 +146,10 @@ def _render(options: argparse.Namespace) -> int:
     if suffix not in ((".png", ".npz") if pinhole else (".png", ".bmp", ".npz")):
         kinds = ".png or .npz" if pinhole else ".png, .bmp or .npz"
         return misused(f"--output: {output.name}: an image of this projection is a {kinds}")
-    if not output.resolve().parent.is_dir():
-        return misused(f"--output: the folder of {output} does not exist")
+    try:
+        output_file.check(output)
+    except OSError as error:
+        return misused(f"--output: {error}")
     if options.bits == 16 and (pinhole or suffix != ".png"):
         return misused("--bits: only orthographic PNGs have a choice")
 
@@ -201,8 +204,8 @@ def _write_depth(
         }
         if camera.is_pinhole:
             fields["K"] = camera.matrix
-        with output.open("wb") as file:
-            np.savez_compressed(file, **fields)
+        with output_file.writing(output) as partial:
+            np.savez_compressed(partial, **fields)
         return
     if camera.is_pinhole:
         image = np.where(np.isfinite(depth), np.clip(np.round(1e3 * depth), 0, 65535), 0).astype(np.uint16)
@@ -210,7 +213,7 @@ def _write_depth(
     else:
         image = unit_cube.grey_from_depth(depth, np.uint16 if bits == 16 else np.uint8)
     _, encoded = cv2.imencode(output.suffix.lower(), image)
-    output.write_bytes(encoded.tobytes())
+    output_file.write(output, encoded.tobytes())
 
 
 def _write_camera_info(path: Path, camera: Camera) -> None:
@@ -228,7 +231,7 @@ def _write_camera_info(path: Path, camera: Camera) -> None:
         "rectification_matrix": {"rows": 3, "cols": 3, "data": np.eye(3).ravel().tolist()},
         "projection_matrix": {"rows": 3, "cols": 4, "data": np.hstack([k, np.zeros((3, 1))]).ravel().tolist()},
     }
-    path.write_text(yaml.safe_dump(info, sort_keys=False), encoding="utf-8")
+    output_file.write(path, yaml.safe_dump(info, sort_keys=False).encode())
 
 
 # all other commands
