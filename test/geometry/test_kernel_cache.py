@@ -16,7 +16,8 @@ PATIENCE = 600
 READ_ONLY = 'mount --bind "$0" "$0" && mount -o remount,bind,ro "$0" && exec "$@"'
 CODE = """
 from sq_perception.geometry import kernels
-print(kernels.__file__, round(kernels.gauge(0.1, 0.0, 0.0, 0.1, 0.1, 0.1, 1.0, 1.0), 9), len(kernels.gauge.stats.cache_hits))
+value = kernels.gauge(0.1, 0.0, 0.0, 0.1, 0.1, 0.1, 1.0, 1.0)
+print(kernels.__file__, round(value, 9), len(kernels.gauge.stats.cache_hits))
 """
 
 
