@@ -52,7 +52,7 @@ $(VENV)/.dependencies: setup.py | $(VENV)/bin/python
 $(VENV)/.package: $(VENV)/.dependencies $(SOURCES)
 	$(PIP) install --quiet --no-deps --no-build-isolation --force-reinstall .
 	rm -rf build/lib build/bdist.* *.egg-info
-	$(VENV)/bin/python -c "import sys; sys.path.pop(0); from sq_perception.recovery.warm_up import main; sys.exit(main())"
+	$(VENV)/bin/sq-perception warm-up
 	touch $@
 
 demo: $(VENV)/.package

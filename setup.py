@@ -49,6 +49,7 @@ train = [
 docs = [
     "mkdocs>=1.6,<2",  # docs/ as a site; its hooks may change with 2
     "mkdocs-material>=9.5,<10",  # search, navigation and code blocks without a script or font from elsewhere
+    "mkdocstrings[python]>=0.26,<2",  # the Python reference, from the docstrings
 ]
 
 setup(
@@ -129,7 +130,10 @@ setup(
     entry_points={
         "console_scripts": [
             "sq-perception = sq_perception.commands.main:main",
-            *(f"{node} = sq_perception.nodes.{node}:main" for node in NODES),
+            "recover_node = sq_perception.nodes.executables:recover_node",
+            "recover_cameras = sq_perception.nodes.executables:recover_cameras",
+            "fitter_node = sq_perception.nodes.executables:fitter_node",
+            "synthetic_depth_node = sq_perception.nodes.executables:synthetic_depth_node",
         ],
     },
     classifiers=[

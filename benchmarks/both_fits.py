@@ -35,7 +35,7 @@ class Both:
         return f"{self.fit.status.name.lower()}: {self.fit.message}"
 
 
-def both(depth: np.ndarray, mask: np.ndarray, camera: Camera, options: surface_fit.Options) -> Both:
+def both(depth: np.ndarray, mask: np.ndarray, camera: Camera, options: surface_fit.FitOptions) -> Both:
     """Fit one object of an image with both methods."""
     began = time.perf_counter()
     fit = surface_fit.fit(depth, mask, camera, options=options)

@@ -30,7 +30,7 @@ sys.path.append(str(Path(__file__).resolve().parent.parent / "test"))
 from respawned_nodes import CAMERA, MEMBERS, NODE, VIEWER, Kill, Robot
 from running_nodes import Peer
 
-from sq_perception.nodes.shared_memory import orphans, remove_orphans
+from sq_perception.nodes.fast_dds import orphans, remove_orphans
 
 ASKED = 5.0
 """Seconds to the first result after a restart."""
@@ -62,6 +62,7 @@ def main() -> None:
             peer,
             camera=(f"rate:={options.rate}", f"objects:={options.objects}", "hold:=15"),
             node=options.node,
+            parameters=("free_shared_memory:=true",),
             viewer=shlex.split(options.viewer),
         ) as robot,
     ):
@@ -101,7 +102,7 @@ def main() -> None:
         "kills": [{**asdict(kill), "back": kill.back if np.isfinite(kill.back) else None} for kill in kills],
         "processes_left": left,
         "orphans": {"before": len(before), "at_most": most, "after": len(dead)},
-        "freed_before": asdict(freed),
+        "freed_before": len(freed),
     }
     report.write(options.name, result, f"{report.table(header, rows)}\n\n{words}")
     remove_orphans()

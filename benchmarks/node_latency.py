@@ -16,13 +16,14 @@ import argparse
 import os
 import signal
 import subprocess
-import sys
 import time
 from collections import Counter
 from typing import Any
 
 import numpy as np
 import report
+
+from sq_perception.nodes import children
 
 os.environ.setdefault("ROS_DOMAIN_ID", "77")
 os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
@@ -42,7 +43,7 @@ CASES: dict[str, dict[str, list[str]]] = {
 def node(name: str, parameters: list[str], *, background: bool = False) -> subprocess.Popen[bytes]:
     """A node of this package in a process of its own; in the background: one thread, and last in the queue."""
     arguments = [argument for parameter in parameters for argument in ("-p", parameter)]
-    command = [sys.executable, "-m", f"sq_perception.nodes.{name}", "--ros-args", "--log-level", "warn", *arguments]
+    command = children.command(name, ["--ros-args", "--log-level", "warn", *arguments])
     if not background:
         return subprocess.Popen(command)
     return subprocess.Popen(["nice", "-n", "10", *command], env={**os.environ, "NUMBA_NUM_THREADS": "1"})

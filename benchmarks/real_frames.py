@@ -60,7 +60,7 @@ def carton(folder: Path) -> tuple[dict[str, Any], str]:
     for path in sorted(folder.glob("felix_*.npz")):
         frame = frame_file.read(path)
         assert frame.labels is not None
-        found = both(frame.depth, frame.labels == 1, frame.camera, surface_fit.Options(plane=frame.plane))
+        found = both(frame.depth, frame.labels == 1, frame.camera, surface_fit.FitOptions(plane=frame.plane))
         size, sigma = found.fit.superquadric.size, found.fit.sigma_size
         order = np.argsort(size)
         edges, margins = 2e3 * size[order], 4e3 * sigma[order]
@@ -156,7 +156,7 @@ def things(folder: Path, frames: int) -> list[Thing]:
         plane = frame.plane / np.linalg.norm(frame.plane[:3])
         for label in ids:
             mask = frame.labels == label
-            result = both(frame.depth, mask, frame.camera, surface_fit.Options(plane=plane))
+            result = both(frame.depth, mask, frame.camera, surface_fit.FitOptions(plane=plane))
             ours, classic = result.fit.superquadric, result.classic.superquadric
             found.append(
                 Thing(
@@ -260,7 +260,7 @@ def renders(folder: Path) -> tuple[dict[str, Any], str]:
     found = []
     for name in names:
         frame = frame_file.read(folder / name, projection="orthographic")
-        found.append(both(frame.depth, np.isfinite(frame.depth), frame.camera, surface_fit.Options()))
+        found.append(both(frame.depth, np.isfinite(frame.depth), frame.camera, surface_fit.FitOptions()))
     ours, classic = (
         100 * metrics.volume_iou(unit_cube.cube_from_optical(Superquadric.stack(bodies)), truth)
         for bodies in ([each.fit.superquadric for each in found], [each.classic.superquadric for each in found])

@@ -121,7 +121,7 @@ def in_mesh_frame(body: Superquadric, view: mesh_scene.View) -> Superquadric:
 
 def outcome(scan: Scan, setting: Setting, pose: int, view: mesh_scene.View) -> Outcome:
     """Fit one image with both methods."""
-    options = surface_fit.Options(plane=view.plane, nan_is_empty=setting.nan_is_empty)
+    options = surface_fit.FitOptions(plane=view.plane, nan_is_empty=setting.nan_is_empty)
     found = both(view.depth, view.mask, view.camera, options)
     body = in_mesh_frame(found.fit.superquadric, view)
     classic = in_mesh_frame(found.classic.superquadric, view)

@@ -200,7 +200,7 @@ def run(name: str, row: Row, count: int) -> dict[str, Any]:
     """Fit every image of a row with both methods."""
     rng = np.random.default_rng(SEED + list(ROWS).index(name))
     truth = row.bodies(count, rng)
-    options = surface_fit.Options() if row.pixels is None else surface_fit.Options(pixels=row.pixels)
+    options = surface_fit.FitOptions() if row.pixels is None else surface_fit.FitOptions(pixels=row.pixels)
     fits: list[Fit] = []
     classic: list[Fit] = []
     milliseconds = np.empty((count, 2))

@@ -23,7 +23,7 @@ import report
 import torch
 
 from sq_perception.evaluation.contest import compare
-from sq_perception.evaluation.contestants import Fit, Network
+from sq_perception.evaluation.contestants import FittingMethod, Network
 from sq_perception.evaluation.thesis_images import ThesisImages
 from sq_perception.learning.checkpoint import resolve
 
@@ -36,7 +36,12 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=2020)
     options = parser.parse_args()
     torch.set_num_threads(1)
-    methods = [Fit.of("auto"), Fit.of("symmetry"), Network.read(resolve("supervised"), "network"), Fit.of("classic")]
+    methods = [
+        FittingMethod.of("auto"),
+        FittingMethod.of("symmetry"),
+        Network.read(resolve("supervised"), "network"),
+        FittingMethod.of("classic"),
+    ]
     result, rows = {}, []
     for outcome in compare([(one, options.bodies) for one in methods], ThesisImages(options.bodies, options.seed)):
         method, figures, summary = outcome.contestant.name, outcome.figures, outcome.figures.summary()

@@ -25,7 +25,7 @@ import tabletop
 from rich.progress import track
 from scene_verdict import Answer
 
-from sq_perception.fitting import revolution, search
+from sq_perception.fitting import problem, revolution
 from sq_perception.fitting.observation import Observation
 from sq_perception.recovery import seen_object
 from sq_perception.recovery.recoverer import RecoveryOptions
@@ -58,7 +58,7 @@ SETTINGS = {
         switch=constant(seen_object, "core", lambda one, depth, camera: one.mask)
     ),
     "without bodies of revolution": Setting(switch=constant(revolution, "ODDS", 1e-300)),
-    "bodies may hover": Setting(switch=constant(search, "GAP_SIGMA", np.inf)),
+    "bodies may hover": Setting(switch=constant(problem, "GAP_SIGMA", np.inf)),
     "without the plane": Setting(RecoveryOptions(use_plane=False)),
     "without free space": Setting(switch=constant(Observation, "free_rays", _no_rays)),
 }

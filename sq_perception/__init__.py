@@ -1,3 +1,72 @@
-"""Superquadrics from depth images: geometry, imaging, fitting, learning and ROS 2 nodes."""
+"""Superquadrics from depth images: geometry, imaging, fitting, learning and ROS 2 nodes.
+
+What a script needs is offered here by name and imported when it is first used: ``import sq_perception`` alone loads
+neither torch nor anything else that takes time.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from sq_perception.evaluation.plots import recovery_figure
+    from sq_perception.fitting.fit import Fit, Status
+    from sq_perception.fitting.surface_fit import fit
+    from sq_perception.geometry.mesh import export as write_mesh
+    from sq_perception.geometry.superquadric import Superquadric
+    from sq_perception.imaging.camera import Camera
+    from sq_perception.imaging.raycast import render
+    from sq_perception.recordings.frame_file import RecordedFrame
+    from sq_perception.recordings.frame_file import read as read_frame
+    from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, Recovery, RecoveryOptions
 
 __version__ = "0.2.0"
+
+__all__ = [
+    "Camera",
+    "Fit",
+    "FrameRecovery",
+    "RecordedFrame",
+    "Recoverer",
+    "Recovery",
+    "RecoveryOptions",
+    "Status",
+    "Superquadric",
+    "__version__",
+    "fit",
+    "read_frame",
+    "recovery_figure",
+    "render",
+    "write_mesh",
+]
+
+_HOMES = {
+    "Camera": "imaging.camera",
+    "Fit": "fitting.fit",
+    "FrameRecovery": "recovery.recoverer",
+    "RecordedFrame": "recordings.frame_file",
+    "Recoverer": "recovery.recoverer",
+    "Recovery": "recovery.recoverer",
+    "RecoveryOptions": "recovery.recoverer",
+    "Status": "fitting.fit",
+    "Superquadric": "geometry.superquadric",
+    "fit": "fitting.surface_fit",
+    "read_frame": "recordings.frame_file:read",
+    "recovery_figure": "evaluation.plots",
+    "render": "imaging.raycast",
+    "write_mesh": "geometry.mesh:export",
+}
+"""The module of every name, and what it is called there if it is called otherwise."""
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    module, _, there = _HOMES[name].partition(":")
+    globals()[name] = value = getattr(importlib.import_module(f"{__name__}.{module}"), there or name)
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

@@ -24,7 +24,7 @@ from running_nodes import Peer, arguments, environment, until
 from sensor_msgs.msg import CameraInfo
 
 from sq_perception.nodes.children import Child
-from sq_perception.nodes.shared_memory import FOLDER, orphans
+from sq_perception.nodes.fast_dds import FOLDER, orphans
 
 CAMERA, NODE, VIEWER = "camera", "node", "viewer"
 MEMBERS = (CAMERA, NODE, VIEWER)

@@ -12,12 +12,13 @@ import logging
 import math
 import statistics
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sq_perception.commands import recover_outputs
+from sq_perception.commands.console import FAILURE, INTERRUPTED, SUCCESS, complain, misused, parser
 
 if TYPE_CHECKING:
     from sq_perception.recordings.frame_file import RecordedFrame
@@ -26,7 +27,6 @@ if TYPE_CHECKING:
     from sq_perception.recordings.result_json import ResultLines
     from sq_perception.recovery.recoverer import Recoverer, Recovery, RecoveryOptions
 
-SUCCESS, FAILURE, USAGE, INTERRUPTED = 0, 1, 2, 130
 
 HELP = """\
 Recover superquadrics from recorded depth images.
@@ -100,6 +100,13 @@ meshes:
   has the coordinates of the JSON.  GLB turns the optical frame half about x, as its y axis points up, and names each
   body by its position in "superquadrics": body_0, body_1, ...
 """
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Entry of ``sq-perception recover``; the exit code."""
+    command = parser("recover", HELP, EPILOG)
+    add_arguments(command)
+    return run(command.parse_args(arguments))
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -420,15 +427,3 @@ def _print_table(results: list[dict[str, Any]], verbose: bool) -> None:
             shape = " ".join(f"{value:.2f}" for value in body["shape"])
             note = f"  ({body['message']})" if body["status"] == "weak" else ""
             print(f"  {label}half sizes {size}{unit}, exponents {shape}, score {body['score']:.3f}{note}")
-
-
-def complain(message: str) -> None:
-    """One line on the standard error; what a recording says of itself must not steer the terminal."""
-    line = "".join(c if c.isprintable() else "?" for c in " ".join(message.split()))
-    print(f"sq-perception: {line}", file=sys.stderr)
-
-
-def misused(message: str) -> int:
-    """The exit code of wrong usage, with the reason."""
-    complain(message)
-    return USAGE

@@ -21,17 +21,18 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from sq_perception.evaluation.protocol import FITS
 from sq_perception.evaluation.thesis_images import ImageChunk
 from sq_perception.fitting.fit import Status
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
 from sq_perception.learning import checkpoint, inference
+from sq_perception.learning.choices import LOSSES
 from sq_perception.learning.consensus import Consensus
 from sq_perception.learning.inference import Predictor
-from sq_perception.learning.objective import LOSSES, Objective
+from sq_perception.learning.objective import Objective
 from sq_perception.recovery.recoverer import Method, Recoverer, RecoveryOptions
 
-FITS = ("auto", "symmetry", "classic")
 TIMED_IMAGES = 300
 _IDENTITY = (0.0, 0.0, 0.0, 1.0)
 _NOBODY = np.array([1e-3, 1e-3, 1e-3, 1.0, 1.0, -1.0, -1.0, -1.0, *_IDENTITY])
@@ -169,14 +170,14 @@ class Network:
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
+class FittingMethod:
     """A method of the recovery with a fit: auto, symmetry or classic."""
 
     name: str
     recoverer: Recoverer
 
     @classmethod
-    def of(cls, method: Method) -> Fit:
+    def of(cls, method: Method) -> FittingMethod:
         """Raises CheckpointError if the method needs the shipped network and it cannot be read."""
         if method not in FITS:
             raise ValueError(f"method: expected one of {', '.join(FITS)}, got {method!r}")

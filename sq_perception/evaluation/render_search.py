@@ -8,15 +8,11 @@ and by the soft renderer (equations 7.8 to 7.10) on a grid of r^3 voxels.  The s
 and its least value.  The thesis found 0.0056 at s = 117.3, tau = 4.82 on its own range.  With images as exact as these
 the error falls with s as far as one looks, down to the half step of a voxel: nothing but the gradient, which a sharp
 boundary has in a thin layer only, speaks for a softer one.
-
-    sq-perception render-search --picture render_search.png
 """
 
 from __future__ import annotations
 
-import argparse
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -27,7 +23,6 @@ from matplotlib.figure import Figure
 from sq_perception.evaluation import plots
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast, soft_render, unit_cube
-from sq_perception.simulation.scenes import thesis_bodies
 
 SHARPNESS = (10.0, 1000.0)
 TAU = (0.25, 32.0)
@@ -88,32 +83,9 @@ def draw(ax: Axes, found: RenderSearch) -> None:
     ax.legend(loc="lower right", facecolor=plots.INK, labelcolor="white", fontsize=8)
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Entry of ``sq-perception render-search``."""
-    parser = argparse.ArgumentParser(prog="sq-perception render-search", description=__doc__.split("\n\n")[0])
-    parser.add_argument("--bodies", type=int, default=20, help="random bodies (default 20)")
-    parser.add_argument("--resolution", type=int, default=64, help="pixels and voxels a side (default 64)")
-    parser.add_argument("--steps", type=int, default=21, help="values of s and of tau (default 21)")
-    parser.add_argument("--seed", type=int, default=2020)
-    parser.add_argument("--picture", type=Path, metavar="FILE", help="draw the heat map there")
-    options = parser.parse_args(arguments)
-    for name in ("bodies", "resolution", "steps"):
-        if getattr(options, name) < 2:
-            parser.error(f"--{name}: expected at least 2, got {getattr(options, name)}")
-    if options.picture and not options.picture.resolve().parent.is_dir():
-        parser.error(f"--picture: the folder of {options.picture} does not exist")
-    bodies = thesis_bodies(options.bodies, np.random.default_rng(options.seed))
-    sharpness, tau_values = (np.geomspace(*limits, options.steps) for limits in (SHARPNESS, TAU))
-    found = search(bodies, sharpness, tau_values, options.resolution)
-    s, tau, error = found.best
-    thesis = search(
-        bodies, np.array([soft_render.THESIS_SHARPNESS]), np.array([soft_render.THESIS_TAU]), options.resolution
-    )
-    print(f"least MAE {error:.4f} at s = {s:.1f}, tau = {tau:.2f}")
-    print(f"at the thesis' s = 117.3, tau = 4.82: {thesis.best[2]:.4f} (the thesis reports 0.0056)")
-    if options.picture:
-        figure = Figure(figsize=(6.4, 4.8), layout="constrained")
-        FigureCanvasAgg(figure)
-        draw(figure.add_subplot(), found)
-        plots.save(figure, options.picture)
-    return 0
+def figure(found: RenderSearch) -> Figure:
+    """The heat map alone."""
+    sheet = Figure(figsize=(6.4, 4.8), layout="constrained")
+    FigureCanvasAgg(sheet)
+    draw(sheet.add_subplot(), found)
+    return sheet

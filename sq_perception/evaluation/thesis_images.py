@@ -18,6 +18,7 @@ from functools import cached_property
 
 import numpy as np
 
+from sq_perception.evaluation.protocol import DEFAULT_SEED
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast, unit_cube
 from sq_perception.imaging.camera import Camera
@@ -26,7 +27,6 @@ from sq_perception.learning.regressor import RegressorConfig
 from sq_perception.segmentation import segments
 from sq_perception.simulation.scenes import thesis_bodies
 
-DEFAULT_SEED = 2020
 CHUNK = 200
 _BLOCK = 500
 _SPAWN_KEY = 6

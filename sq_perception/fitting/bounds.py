@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sq_perception.geometry.superquadric import Superquadric
-
 SMALLEST_SIZE = 0.02
 """Smallest half size, as a share of the observed extent, when the data set the bounds."""
 LARGEST_SIZE = 2.0
@@ -56,9 +54,3 @@ class Bounds:
         lower = np.concatenate([np.full(3, size[0]), np.full(2, self.shape[0]), low - reach])
         upper = np.concatenate([np.full(3, size[1]), np.full(2, self.shape[1]), high + reach])
         return lower, upper
-
-    def clamped(self, body: Superquadric, lower: np.ndarray, upper: np.ndarray) -> Superquadric:
-        """The body with sizes, shape and centre moved into the limits."""
-        flat = np.array(body.to_flat(), dtype=float)
-        flat[..., :8] = np.clip(flat[..., :8], lower, upper)
-        return Superquadric.from_flat(flat)

@@ -11,14 +11,16 @@ That describes one valley of the cost.  Other bodies that the image allows add t
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
 
 from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.normal_equations import STEP_LENGTH
+from sq_perception.fitting.rays import WEIGHT, Rays
 from sq_perception.fitting.residuals import RENDERED, evaluate
-from sq_perception.fitting.scene import Scene
+from sq_perception.fitting.terms import Terms
 from sq_perception.geometry.superquadric import Superquadric
 
 WEAK_SHARE = 0.15
@@ -29,20 +31,19 @@ _PRIOR_ANGLE = 1.0
 _RAYS = 800
 
 
-def covariance_at(state: State, rays: np.ndarray, free: np.ndarray, scene: Scene, outline: float) -> np.ndarray:
+def covariance_at(state: State, rays: Rays, terms: Terms, outline: float) -> np.ndarray:
     """(11, 11) of a1 a2 a3 e1 e2 t1 t2 t3 and the rotation vector in the object frame; metres and radians.
 
     ``outline`` is the standard deviation of the outline, metres.
     """
-    stride = max(1, len(rays) // _RAYS)
-    rays, free = np.ascontiguousarray(rays[::stride]), np.ascontiguousarray(free[::stride])
-    rays[:, 6] *= stride
-    if len(free):
-        free[:, 6] *= stride
+    stride = max(1, len(rays.hits) // _RAYS)
+    hits, free = (np.ascontiguousarray(part[::stride]) for part in rays)
+    hits[:, WEIGHT] *= stride
+    free[:, WEIGHT] *= stride
     sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
-    scene = scene._replace(outline_stiffness=1 / outline)
-    cost = evaluate(RENDERED, rays, free, scene, state.parameters, state.rotation, sums)
-    variance = max(1.0, cost / float(rays[:, 6].sum()))
+    terms = terms._replace(outline_stiffness=1 / outline)
+    cost = evaluate(RENDERED, hits, free, terms, state.parameters, state.rotation, sums)
+    variance = max(1.0, cost / float(hits[:, WEIGHT].sum()))
     lower = np.tril(sums[:STEP_LENGTH, :STEP_LENGTH])
     full = lower + np.tril(lower, -1).T
     length = float(np.mean(state.parameters[:3]))
@@ -60,7 +61,7 @@ class Alternative(NamedTuple):
     weight: float
 
 
-def spread(state: State, alternatives: list[Alternative]) -> np.ndarray:
+def spread(state: State, alternatives: Iterable[Alternative]) -> np.ndarray:
     """(11, 11) second moments of the alternatives about a body: what several valleys of the cost add to its covariance.
 
     Sizes are compared along the axes of the body, exponents between bodies with the same z axis.

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import math
+from dataclasses import dataclass, field
 from enum import IntEnum
 
 import numpy as np
@@ -20,9 +21,9 @@ class Status(IntEnum):
     """No body: too few points, no convergence, or a residual far above the noise."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Fit:
-    """One fitted superquadric.
+    """One fitted superquadric; NaN stands for what a method does not compute.
 
     Attributes
     ----------
@@ -30,20 +31,17 @@ class Fit:
         A single body in the optical frame of the camera, in its canonical form.
     residual
         Root mean square distance of the inlying object points to the surface, metres.
+    status, message
+        The verdict and the reason for it in words.
     noise
         Standard deviation of the depth noise, estimated or given, metres.
     inlier_share
         Share of the object's pixels within three noise levels of the surface, 0 to 1.
-    visible_share
-        Share of the body's surface that the camera saw, 0 to 1; NaN for methods that do not compute it.
     seen
         (3,) share of each full size that the measured points span along its axis, 0 to 1: the rest is inferred, from
-        free space, the support plane, symmetry and what bodies mostly are.  NaN for methods that do not compute it.
+        free space, the support plane, symmetry and what bodies mostly are.
     covariance
         (11, 11) of a1 a2 a3 e1 e2 t1 t2 t3 and the rotation vector in the object frame; metres and radians.
-        NaN for methods that do not compute it.
-    status, message
-        The verdict and the reason for it in words.
     iterations, milliseconds
         What it cost.
     as_hull
@@ -53,15 +51,14 @@ class Fit:
 
     superquadric: Superquadric
     residual: float
-    noise: float
-    inlier_share: float
-    visible_share: float
-    seen: np.ndarray
-    covariance: np.ndarray
     status: Status
     message: str
-    iterations: int
-    milliseconds: float
+    noise: float = math.nan
+    inlier_share: float = math.nan
+    seen: np.ndarray = field(default_factory=lambda: np.full(3, np.nan))
+    covariance: np.ndarray = field(default_factory=lambda: np.full((11, 11), np.nan))
+    iterations: int = 0
+    milliseconds: float = 0.0
     as_hull: bool = False
 
     @property

@@ -17,16 +17,19 @@ import numpy as np
 
 from sq_perception.fitting.normal_equations import STEP_LENGTH
 from sq_perception.fitting.residuals import evaluate
-from sq_perception.fitting.scene import Scene
+from sq_perception.fitting.terms import Terms
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.superquadric import Superquadric
 
-_LONGEST_LOG_SIZE = 0.5
-_LONGEST_SHAPE = 0.3
-_LONGEST_TURN = 0.5
+_LONGEST_LOG_SIZE, _LONGEST_SHAPE, _LONGEST_TURN = 0.5, 0.3, 0.5
+"""Of one step: beyond, residuals are no longer linear.  A shift is limited to the largest half size."""
 _FIRST_DAMPING = 1e-3
+"""Times the diagonal: tau of Madsen et al. for starts that are believed to be good."""
+_WORSE, _BETTER = 7.0, 0.12
+"""Factors of the damping after a step that was refused and one that was taken."""
 _ATTEMPTS = 6
+"""Steps refused in a row, damping growing 10^5 fold, before the search ends."""
 
 
 class State(NamedTuple):
@@ -58,7 +61,7 @@ def minimize(
     stage: int,
     rays: np.ndarray,
     free: np.ndarray,
-    scene: Scene,
+    terms: Terms,
     start: State,
     limits: tuple[np.ndarray, np.ndarray],
     max_iterations: int,
@@ -69,7 +72,7 @@ def minimize(
     Stops when a step lowers the cost by less than ``tolerance`` of it, or when no step lowers it.
     """
     parameters, rotation, cost, iterations = _minimize(
-        stage, rays, free, scene, start.parameters, start.rotation, limits[0], limits[1], max_iterations, tolerance
+        stage, rays, free, terms, start.parameters, start.rotation, limits[0], limits[1], max_iterations, tolerance
     )
     return State(parameters, rotation, cost, start.iterations + iterations)
 
@@ -79,7 +82,7 @@ def _minimize(
     stage: int,
     rays: np.ndarray,
     free: np.ndarray,
-    scene: Scene,
+    terms: Terms,
     parameters: np.ndarray,
     rotation: np.ndarray,
     lower: np.ndarray,
@@ -96,7 +99,7 @@ def _minimize(
     held = np.zeros(STEP_LENGTH, dtype=np.bool_)
     next_parameters = parameters.copy()
     next_rotation = rotation.copy()
-    cost = evaluate(stage, rays, free, scene, parameters, rotation, sums)
+    cost = evaluate(stage, rays, free, terms, parameters, rotation, sums)
     damping = _FIRST_DAMPING
     iterations = 0
     while iterations < max_iterations:
@@ -106,11 +109,11 @@ def _minimize(
         for _ in range(_ATTEMPTS):
             if solve_damped(sums, damping, held, factor, step):
                 move(parameters, rotation, step, lower, upper, next_parameters, next_rotation)
-                next_cost = evaluate(stage, rays, free, scene, next_parameters, next_rotation, next_sums)
+                next_cost = evaluate(stage, rays, free, terms, next_parameters, next_rotation, next_sums)
                 if next_cost < cost:
                     accepted = True
                     break
-            damping = max(damping * 7.0, 1e-6)
+            damping = max(damping * _WORSE, 1e-6)
         if not accepted:
             break
         gain = cost - next_cost
@@ -118,7 +121,7 @@ def _minimize(
         parameters, next_parameters = next_parameters, parameters
         rotation, next_rotation = next_rotation, rotation
         sums, next_sums = next_sums, sums
-        damping = max(damping * 0.12, 1e-9)
+        damping = max(damping * _BETTER, 1e-9)
         if gain <= tolerance * max(abs(cost), 1e-12):
             break
     return parameters, rotation, cost, iterations

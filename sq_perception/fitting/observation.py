@@ -8,8 +8,7 @@ something nearer says so up to its own depth only, which binds nothing (what lie
 that measured nothing is no pixel of the object either: it says "empty" too, unless told otherwise, or within the
 convex hull of the mask, where it is a hole that the sensor left.
 
-Both become rays, rows (o_x, o_y, d_x, d_y, z, 1/sigma, weight, z) of :mod:`sq_perception.fitting.residuals`, when a
-stage of the fit draws them.
+Both become rays (:mod:`sq_perception.fitting.rays`) when a stage of the fit draws them.
 """
 
 from __future__ import annotations
@@ -22,15 +21,27 @@ import numpy as np
 
 from sq_perception.fitting import depth_noise
 from sq_perception.fitting.depth_noise import DepthNoise
-from sq_perception.fitting.residuals import RAY_COLUMNS
+from sq_perception.fitting.rays import (
+    DEPTH,
+    DIRECTION_X,
+    DIRECTION_Y,
+    LAST,
+    ORIGIN_X,
+    ORIGIN_Y,
+    RAY_COLUMNS,
+    STIFFNESS,
+    WEIGHT,
+)
 from sq_perception.geometry.kernels import kernel
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.coherence import coherent
 
 _STEEPEST = 6.0
-_BAND_PIXELS = 4
-_BAND_SHARE = 0.03
+"""Slopes above this, 80 degrees, count as this: there a pixel tells little of the depth."""
+_BAND_PIXELS, _BAND_SHARE = 4, 0.03
+"""Width of the band around the mask whose every pixel counts, at least, and as a share of the mask's extent."""
 _WIDER = 0.5
+"""Of the mask's extent: what the crop adds around it on both sides together."""
 _HOLE = 5
 """Holes and notches of the mask up to this width, pixels, are closed: the outline of a convex body has none."""
 _JUMP_PIXELS, _JUMP_NOISE = 10.0, 6.0
@@ -40,6 +51,7 @@ _COARSE = 3
 _FREE_MARGIN, _FREE_MODEL_MARGIN = 3.0, 2.0
 """Free space ends this many noise levels, or model errors, in front of the measured depth."""
 _POINTS = 2000
+"""Enough for moments, boxes and quantiles of the object to settle."""
 _NO_NOISE = 1e-6
 """The least noise, as a share of the distance: what single precision can tell."""
 
@@ -88,8 +100,10 @@ class Observation:
     @cached_property
     def points(self) -> np.ndarray:
         """Some 2000 measured points (k, 3) of the object in the optical frame, evenly over its surface."""
-        r = self.object_rays(_POINTS)
-        return np.stack([r[:, 0] + r[:, 4] * r[:, 2], r[:, 1] + r[:, 4] * r[:, 3], r[:, 4]], axis=1)
+        rays = self.object_rays(_POINTS).T
+        depth = rays[DEPTH]
+        x, y = rays[ORIGIN_X] + depth * rays[DIRECTION_X], rays[ORIGIN_Y] + depth * rays[DIRECTION_Y]
+        return np.stack([x, y, depth], axis=1)
 
     def object_rays(self, count: int, offset: float = 0.5) -> np.ndarray:
         """About ``count`` rays (k, 8) of the object, systematically by area; each weighs 1.
@@ -245,19 +259,19 @@ def _rays(
         v, u = pixels[i] // width, pixels[i] % width
         x, y = (u - cx) / fx, (v - cy) / fy
         if pinhole:
-            rays[i, 2], rays[i, 3] = x, y
+            rays[i, DIRECTION_X], rays[i, DIRECTION_Y] = x, y
         else:
-            rays[i, 0], rays[i, 1] = x, y
+            rays[i, ORIGIN_X], rays[i, ORIGIN_Y] = x, y
         z = np.float64(depth[v, u])
-        rays[i, 5] = rays[i, 6] = 1.0
+        rays[i, STIFFNESS] = rays[i, WEIGHT] = 1.0
         if not np.isfinite(z):
-            rays[i, 4] = 1e300
+            rays[i, DEPTH] = 1e300
             continue
         growing = quadratic * z * z
         sigma = np.sqrt(constant * constant + growing * growing + model_error * model_error)
-        rays[i, 4] = rays[i, 7] = z - max(margins[0] * sigma, margins[1] * model_error)
+        rays[i, DEPTH] = rays[i, LAST] = z - max(margins[0] * sigma, margins[1] * model_error)
         if margins[0] == 0.0:
-            rays[i, 5] = 1.0 / sigma
+            rays[i, STIFFNESS] = 1.0 / sigma
     return rays
 
 

@@ -13,12 +13,13 @@ from sq_perception.fitting.depth_noise import DepthNoise
 from sq_perception.geometry.superquadric import Superquadric
 
 MIN_PIXELS = 12
+"""A body has 11 parameters."""
 MODEL_ERROR_ON_PLANE = 0.0025
 """Real objects are no superquadrics; on tables of everyday things this is how far they stray, metres."""
 
 
 @dataclass(frozen=True)
-class Options:
+class FitOptions:
     """Options of the surface fit.
 
     Attributes
@@ -40,14 +41,10 @@ class Options:
         Whether a pixel without depth, outside the mask's convex hull, belongs to no part of the body, like one that saw
         farther; if not, it says nothing.
     pixels
-        Budget of object rays in the last stage; a fifth as many free rays come on top.  None: enough that noise
+        Budget of object rays in the last stage; a quarter as many free rays come on top.  None: enough that noise
         averages out.
-    max_iterations
-        Levenberg-Marquardt steps in the last stage.
     time_budget
         Seconds after which no further start is tried; the best body so far is returned.
-    fall_back
-        Whether given starts whose result stays above the noise floor are joined by the automatic ones.
     """
 
     bounds: Bounds = field(default_factory=Bounds)
@@ -57,9 +54,7 @@ class Options:
     expected: Superquadric | Callable[[], Superquadric] | None = None
     nan_is_empty: bool = True
     pixels: int | None = None
-    max_iterations: int = 15
     time_budget: float = math.inf
-    fall_back: bool = True
 
     def __post_init__(self) -> None:
         if isinstance(self.noise, (int, float)):
@@ -73,8 +68,6 @@ class Options:
             object.__setattr__(self, "plane", plane / np.linalg.norm(plane[:3]))
         if self.pixels is not None and self.pixels < MIN_PIXELS:
             raise ValueError(f"pixels: expected {MIN_PIXELS} or more, got {self.pixels}")
-        if self.max_iterations < 1:
-            raise ValueError(f"max_iterations: expected 1 or more, got {self.max_iterations}")
         if not self.time_budget > 0:
             raise ValueError(f"time_budget: expected positive seconds, got {self.time_budget}")
 

@@ -10,7 +10,7 @@ roundness   log(a1 / a2) and 1 - e2, over sigma: a body of revolution about its 
 volume      a linear price on log(a1 a2 a3), for the smaller of two bodies that explain the image alike.
 
 Each function returns its share of the cost and adds its derivatives to the normal equations ``sums``; the unknowns are
-those of :mod:`sq_perception.fitting.residuals`, the sizes of the terms those of its :class:`Scene`.
+those of :mod:`sq_perception.fitting.residuals`, the sizes of the terms in :class:`~sq_perception.fitting.terms.Terms`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import math
 import numpy as np
 
 from sq_perception.fitting.normal_equations import STEP_LENGTH, add_row
-from sq_perception.fitting.scene import Scene
+from sq_perception.fitting.terms import Terms
 from sq_perception.geometry.kernels import kernel, p_norm
 
 Derivatives = tuple[float, float, float, float, float, float]
@@ -28,21 +28,21 @@ Derivatives = tuple[float, float, float, float, float, float]
 
 
 @kernel
-def prior_cost(scene: Scene, parameters: np.ndarray, rotation: np.ndarray, sums: np.ndarray) -> float:
+def prior_cost(terms: Terms, parameters: np.ndarray, rotation: np.ndarray, sums: np.ndarray) -> float:
     """All terms together."""
     cost = 0.0
-    if scene.plane_stiffness > 0.0 or scene.rest_stiffness > 0.0:
-        cost += _support_cost(scene, parameters, rotation, sums)
-    if scene.proportion_stiffness > 0.0:
-        cost += _proportion_cost(scene, parameters, sums)
-    if scene.expectation_stiffness > 0.0:
-        cost += _expectation_cost(scene, parameters, sums)
-    if scene.roundness_stiffness > 0.0:
-        cost += _roundness_cost(scene, parameters, sums)
-    if scene.volume_price > 0.0:
+    if terms.plane_stiffness > 0.0 or terms.rest_stiffness > 0.0:
+        cost += _support_cost(terms, parameters, rotation, sums)
+    if terms.proportion_stiffness > 0.0:
+        cost += _proportion_cost(terms, parameters, sums)
+    if terms.expectation_stiffness > 0.0:
+        cost += _expectation_cost(terms, parameters, sums)
+    if terms.roundness_stiffness > 0.0:
+        cost += _roundness_cost(terms, parameters, sums)
+    if terms.volume_price > 0.0:
         for k in range(3):
-            cost += scene.volume_price * math.log(parameters[k])
-            sums[STEP_LENGTH, k] += 0.5 * scene.volume_price
+            cost += terms.volume_price * math.log(parameters[k])
+            sums[STEP_LENGTH, k] += 0.5 * terms.volume_price
     return cost
 
 
@@ -64,17 +64,17 @@ def support_derivatives(
 
 
 @kernel
-def _support_cost(scene: Scene, parameters: np.ndarray, rotation: np.ndarray, sums: np.ndarray) -> float:
+def _support_cost(terms: Terms, parameters: np.ndarray, rotation: np.ndarray, sums: np.ndarray) -> float:
     a1, a2, a3, e1, e2, t1, t2, t3 = parameters
-    normal = np.array([scene.normal_x, scene.normal_y, scene.normal_z])
+    normal = np.array([terms.normal_x, terms.normal_y, terms.normal_z])
     n = np.zeros(3)
     for k in range(3):
         n[k] = rotation[0, k] * normal[0] + rotation[1, k] * normal[1] + rotation[2, k] * normal[2]
     cost = 0.0
     row = np.zeros(STEP_LENGTH + 1)
     h, hx, hy, hz, h1, h2 = support_derivatives(n[0], n[1], n[2], a1, a2, a3, e1, e2)
-    lowest = normal[0] * t1 + normal[1] * t2 + normal[2] * t3 + scene.offset - h
-    s = scene.plane_stiffness if lowest < 0.0 else scene.gap_stiffness
+    lowest = normal[0] * t1 + normal[1] * t2 + normal[2] * t3 + terms.offset - h
+    s = terms.plane_stiffness if lowest < 0.0 else terms.gap_stiffness
     if s > 0.0:
         residual = s * lowest
         if lowest < 0.0:
@@ -92,8 +92,8 @@ def _support_cost(scene: Scene, parameters: np.ndarray, rotation: np.ndarray, su
         row[10] = -s * (hx * n[1] - hy * n[0])
         row[STEP_LENGTH] = residual
         add_row(row, sums)
-    if scene.rest_stiffness > 0.0:
-        s = scene.rest_stiffness
+    if terms.rest_stiffness > 0.0:
+        s = terms.rest_stiffness
         upright = 0
         for k in range(1, 3):
             if abs(n[k]) > abs(n[upright]):
@@ -114,15 +114,15 @@ def _support_cost(scene: Scene, parameters: np.ndarray, rotation: np.ndarray, su
 
 
 @kernel
-def _proportion_cost(scene: Scene, parameters: np.ndarray, sums: np.ndarray) -> float:
+def _proportion_cost(terms: Terms, parameters: np.ndarray, sums: np.ndarray) -> float:
     mean = (math.log(parameters[0]) + math.log(parameters[1]) + math.log(parameters[2])) / 3.0
     cost = 0.0
     row = np.zeros(STEP_LENGTH + 1)
     for k in range(3):
         row[:] = 0.0
         for j in range(3):
-            row[j] = scene.proportion_stiffness * ((1.0 if j == k else 0.0) - 1.0 / 3.0)
-        residual = scene.proportion_stiffness * (math.log(parameters[k]) - mean)
+            row[j] = terms.proportion_stiffness * ((1.0 if j == k else 0.0) - 1.0 / 3.0)
+        residual = terms.proportion_stiffness * (math.log(parameters[k]) - mean)
         row[STEP_LENGTH] = residual
         cost += residual * residual
         add_row(row, sums)
@@ -130,24 +130,24 @@ def _proportion_cost(scene: Scene, parameters: np.ndarray, sums: np.ndarray) -> 
 
 
 @kernel
-def _expectation_cost(scene: Scene, parameters: np.ndarray, sums: np.ndarray) -> float:
-    expected = (scene.expected_1, scene.expected_2, scene.expected_3)
+def _expectation_cost(terms: Terms, parameters: np.ndarray, sums: np.ndarray) -> float:
+    expected = (terms.expected_1, terms.expected_2, terms.expected_3)
     cost = 0.0
     row = np.zeros(STEP_LENGTH + 1)
     for k in range(3):
-        residual = scene.expectation_stiffness * math.log(parameters[k] / expected[k])
+        residual = terms.expectation_stiffness * math.log(parameters[k] / expected[k])
         scale = 1.0 / math.sqrt(1.0 + residual * residual)
         cost += math.log1p(residual * residual)
         row[:] = 0.0
-        row[k] = scale * scene.expectation_stiffness
+        row[k] = scale * terms.expectation_stiffness
         row[STEP_LENGTH] = scale * residual
         add_row(row, sums)
     return cost
 
 
 @kernel
-def _roundness_cost(scene: Scene, parameters: np.ndarray, sums: np.ndarray) -> float:
-    s = scene.roundness_stiffness
+def _roundness_cost(terms: Terms, parameters: np.ndarray, sums: np.ndarray) -> float:
+    s = terms.roundness_stiffness
     row = np.zeros(STEP_LENGTH + 1)
     oval = s * (math.log(parameters[0]) - math.log(parameters[1]))
     row[0], row[1], row[STEP_LENGTH] = s, -s, oval

@@ -10,9 +10,7 @@ point p of the optical frame, with q = R^T (p - t) in the object frame, the gaug
 
 Residuals
 ---------
-A pixel is a ray p = o + z d with o_z = 0 and d_z = 1; its row is (o_x, o_y, d_x, d_y, z, 1/sigma, weight,
-last).  ``last`` is the pixel's index for a free ray; for an object ray it is the depth at which the ray met the body
-last time, where the next search for the intersection starts.
+A pixel is a ray p = o + z d with o_z = 0 and d_z = 1; :mod:`sq_perception.fitting.rays` names the columns of its row.
 
 classic     sqrt(a1 a2 a3) (g^2 - 1) / sigma at the measured point: Solina and Bajcsy's, as g^2 = F^e1.
 Sampson     (g - 1) / (|grad g| sigma) at the measured point: first order distance; wide basin of attraction.
@@ -39,11 +37,11 @@ import numpy as np
 
 from sq_perception.fitting.normal_equations import LANES, STEP_LENGTH, add_block, cauchy_loss, huber_loss
 from sq_perception.fitting.priors import prior_cost
-from sq_perception.fitting.scene import Scene
+from sq_perception.fitting.rays import DEPTH, DIRECTION_X, DIRECTION_Y, LAST, ORIGIN_X, ORIGIN_Y, STIFFNESS, WEIGHT
+from sq_perception.fitting.terms import Terms
 from sq_perception.geometry.kernels import box_interval, gauge_derivatives, inline_kernel, kernel
 
 CLASSIC, SAMPSON, RENDERED = 0, 1, 2
-RAY_COLUMNS = 8
 
 _QX, _QY, _QZ, _EX, _EY, _EZ, _SHIFT = range(7)
 """A ray in the object frame, q + shift e;"""
@@ -56,13 +54,15 @@ _LOW, _HIGH, _G_LOW, _G_HIGH, _S_LOW, _S_HIGH = range(18, 24)
 _ROWS = 24
 
 _HIT_STEPS = 12
-_LOWEST_STEPS = 20
-_LOWEST_TOLERANCE = 1e-9
+"""Of Newton's method on a convex function; it converges quadratically, most rays need 2."""
+_LOWEST_STEPS, _LOWEST_TOLERANCE = 20, 1e-9
+"""Most steps to the smallest gauge on a ray, and how near to a lower bound it ends."""
 _NEAREST = 1e-3
 """A free ray starts this far in front of a pinhole camera, metres."""
 _FAR_OUTSIDE = 2.0
 """From a gauge above this, Newton's method starts where the ray enters the bounding box instead."""
 _TINY = 1e-12
+"""Keeps a division by a squared gradient of the gauge, 1 / metres^2, finite."""
 
 
 @kernel
@@ -70,14 +70,14 @@ def evaluate(
     stage: int,
     rays: np.ndarray,
     free: np.ndarray,
-    scene: Scene,
+    terms: Terms,
     parameters: np.ndarray,
     rotation: np.ndarray,
     sums: np.ndarray,
 ) -> float:
     """Cost at a body; fills ``sums`` (12, 12), lower triangle: J^T J in rows 0 to 10, J^T r in row 11.
 
-    The RENDERED stage keeps in the last column of ``rays`` where each ray met the body.
+    The RENDERED stage keeps in the column LAST of ``rays`` where each ray met the body.
     """
     sums[:] = 0.0
     block = np.empty((STEP_LENGTH + 1, LANES))
@@ -89,11 +89,11 @@ def evaluate(
         part = rays[begin : begin + filled]
         _place(part, stage == RENDERED, parameters, rotation, lanes)
         if stage == RENDERED:
-            _meet(filled, scene.hit_tolerance, parameters, lanes, missed)
-            cost += _rendered_rows(part, scene, lanes, missed, block)
+            _meet(filled, terms.hit_tolerance, parameters, lanes, missed)
+            cost += _rendered_rows(part, terms, lanes, missed, block)
         else:
             _gauge(filled, parameters, lanes)
-            cost += _measured_rows(filled, stage, scene, parameters, lanes, block)
+            cost += _measured_rows(filled, stage, terms, parameters, lanes, block)
         _differentiate(filled, rotation, lanes, block)
         if stage == CLASSIC:
             # The volume factor's own derivative by log a_k is half the residual.
@@ -103,13 +103,13 @@ def evaluate(
         add_block(block, filled, sums)
     filled = 0
     for i in range(free.shape[0]):
-        filled += _enter(free[i], scene, parameters, rotation, filled, lanes)
+        filled += _enter(free[i], terms, parameters, rotation, filled, lanes)
         if filled == LANES:
-            cost += _free_rows(filled, scene, parameters, rotation, lanes, missed, block, sums)
+            cost += _free_rows(filled, terms, parameters, rotation, lanes, missed, block, sums)
             filled = 0
     if filled > 0:
-        cost += _free_rows(filled, scene, parameters, rotation, lanes, missed, block, sums)
-    return cost + prior_cost(scene, parameters, rotation, sums)
+        cost += _free_rows(filled, terms, parameters, rotation, lanes, missed, block, sums)
+    return cost + prior_cost(terms, parameters, rotation, sums)
 
 
 @kernel
@@ -120,9 +120,9 @@ def _place(part: np.ndarray, resume: bool, parameters: np.ndarray, rotation: np.
     m21, m22, m23 = rotation[1]
     m31, m32, m33 = rotation[2]
     for i in range(part.shape[0]):
-        dx, dy = part[i, 2], part[i, 3]
-        start = part[i, 7] if resume else part[i, 4]
-        x, y, z = part[i, 0] - t1 + start * dx, part[i, 1] - t2 + start * dy, start - t3
+        dx, dy = part[i, DIRECTION_X], part[i, DIRECTION_Y]
+        start = part[i, LAST] if resume else part[i, DEPTH]
+        x, y, z = part[i, ORIGIN_X] - t1 + start * dx, part[i, ORIGIN_Y] - t2 + start * dy, start - t3
         lanes[_QX, i] = m11 * x + m21 * y + m31 * z
         lanes[_QY, i] = m12 * x + m22 * y + m32 * z
         lanes[_QZ, i] = m13 * x + m23 * y + m33 * z
@@ -130,7 +130,8 @@ def _place(part: np.ndarray, resume: bool, parameters: np.ndarray, rotation: np.
         lanes[_EY, i] = m12 * dx + m22 * dy + m32
         lanes[_EZ, i] = m13 * dx + m23 * dy + m33
         lanes[_SHIFT, i] = 0.0
-        lanes[_DEPTH, i], lanes[_STIFFNESS, i], lanes[_WEIGHT, i] = part[i, 4], part[i, 5], part[i, 6]
+        lanes[_DEPTH, i] = part[i, DEPTH]
+        lanes[_STIFFNESS, i], lanes[_WEIGHT, i] = part[i, STIFFNESS], part[i, WEIGHT]
         lanes[_START, i] = start
 
 
@@ -214,7 +215,7 @@ def _meet_from_box(i: int, tolerance: float, parameters: np.ndarray, lanes: np.n
 
 
 @kernel
-def _rendered_rows(part: np.ndarray, scene: Scene, lanes: np.ndarray, missed: np.ndarray, block: np.ndarray) -> float:
+def _rendered_rows(part: np.ndarray, terms: Terms, lanes: np.ndarray, missed: np.ndarray, block: np.ndarray) -> float:
     """Rendered and covered residuals: their cost, and in the block's first and last row their scale and value."""
     cost = 0.0
     for i in range(part.shape[0]):
@@ -222,30 +223,30 @@ def _rendered_rows(part: np.ndarray, scene: Scene, lanes: np.ndarray, missed: np
         ex, ey, ez = lanes[_EX, i], lanes[_EY, i], lanes[_EZ, i]
         square = gx * gx + gy * gy + gz * gz + _TINY
         over = lanes[_G, i] - 1.0
-        across = scene.grazing * square * (ex * ex + ey * ey + ez * ez)
-        covered = scene.outline_stiffness / math.sqrt(square)
+        across = terms.grazing * square * (ex * ex + ey * ey + ez * ez)
+        covered = terms.outline_stiffness / math.sqrt(square)
         factor = covered if missed[i] else lanes[_STIFFNESS, i] / math.sqrt(along * along + across)
         short = lanes[_DEPTH, i] - lanes[_START, i] - lanes[_SHIFT, i]
         residual = over * covered if missed[i] else (short * along + over) * factor
-        if scene.dead_zone > 0.0 and not missed[i]:
-            excess = max(abs(residual) - scene.dead_zone, 0.0)
+        if terms.dead_zone > 0.0 and not missed[i]:
+            excess = max(abs(residual) - terms.dead_zone, 0.0)
             factor = factor if excess > 0.0 else 0.0
             residual = math.copysign(excess, residual)
-        loss, scale = huber_loss(residual, scene.outline_huber if missed[i] else scene.huber, lanes[_WEIGHT, i])
-        if scene.inner_cauchy > 0.0 and residual < 0.0:
-            loss, scale = cauchy_loss(residual, scene.inner_cauchy, lanes[_WEIGHT, i])
+        loss, scale = huber_loss(residual, terms.outline_huber if missed[i] else terms.huber, lanes[_WEIGHT, i])
+        if terms.inner_cauchy > 0.0 and residual < 0.0:
+            loss, scale = cauchy_loss(residual, terms.inner_cauchy, lanes[_WEIGHT, i])
         cost += loss
         block[0, i] = scale * factor
         block[STEP_LENGTH, i] = scale * residual
     for i in range(part.shape[0]):
         reached = lanes[_START, i] + lanes[_SHIFT, i] - (lanes[_G, i] - 1.0) / lanes[_SLOPE, i]
-        part[i, 7] = lanes[_DEPTH, i] if missed[i] else reached
+        part[i, LAST] = lanes[_DEPTH, i] if missed[i] else reached
     return cost
 
 
 @kernel
 def _measured_rows(
-    filled: int, stage: int, scene: Scene, parameters: np.ndarray, lanes: np.ndarray, block: np.ndarray
+    filled: int, stage: int, terms: Terms, parameters: np.ndarray, lanes: np.ndarray, block: np.ndarray
 ) -> float:
     """Classic or Sampson residuals at the measured points, likewise."""
     root_of_volume = math.sqrt(parameters[0] * parameters[1] * parameters[2])
@@ -256,9 +257,9 @@ def _measured_rows(
         classic = (g + 1.0) * root_of_volume * lanes[_STIFFNESS, i]
         residual = (g - 1.0) * (classic if stage == CLASSIC else sampson)
         factor = 2.0 * g * root_of_volume * lanes[_STIFFNESS, i] if stage == CLASSIC else sampson
-        loss, scale = huber_loss(residual, scene.huber, lanes[_WEIGHT, i])
-        if scene.inner_cauchy > 0.0 and residual < 0.0:
-            loss, scale = cauchy_loss(residual, scene.inner_cauchy, lanes[_WEIGHT, i])
+        loss, scale = huber_loss(residual, terms.huber, lanes[_WEIGHT, i])
+        if terms.inner_cauchy > 0.0 and residual < 0.0:
+            loss, scale = cauchy_loss(residual, terms.inner_cauchy, lanes[_WEIGHT, i])
         cost += loss
         block[0, i] = scale * factor
         block[STEP_LENGTH, i] = scale * residual
@@ -289,12 +290,12 @@ def _differentiate(filled: int, rotation: np.ndarray, lanes: np.ndarray, block: 
 
 @inline_kernel
 def _enter(
-    ray: np.ndarray, scene: Scene, parameters: np.ndarray, rotation: np.ndarray, i: int, lanes: np.ndarray
+    ray: np.ndarray, terms: Terms, parameters: np.ndarray, rotation: np.ndarray, i: int, lanes: np.ndarray
 ) -> int:
     """Put a free ray into lane i if it crosses the bounding box in free space; 1 if so, 0 if not."""
     m = rotation
-    x, y, z = ray[0] - parameters[5], ray[1] - parameters[6], -parameters[7]
-    dx, dy = ray[2], ray[3]
+    x, y, z = ray[ORIGIN_X] - parameters[5], ray[ORIGIN_Y] - parameters[6], -parameters[7]
+    dx, dy = ray[DIRECTION_X], ray[DIRECTION_Y]
     ox = m[0, 0] * x + m[1, 0] * y + m[2, 0] * z
     oy = m[0, 1] * x + m[1, 1] * y + m[2, 1] * z
     oz = m[0, 2] * x + m[1, 2] * y + m[2, 2] * z
@@ -302,13 +303,13 @@ def _enter(
     ey = m[0, 1] * dx + m[1, 1] * dy + m[2, 1]
     ez = m[0, 2] * dx + m[1, 2] * dy + m[2, 2]
     t_in, t_out = box_interval(ox, oy, oz, ex, ey, ez, parameters[0], parameters[1], parameters[2])
-    low = max(t_in, _NEAREST if scene.pinhole > 0.0 else -1e300)
-    high = min(t_out, ray[4])
+    low = max(t_in, _NEAREST if terms.pinhole > 0.0 else -1e300)
+    high = min(t_out, ray[DEPTH])
     if low >= high:
         return 0
     lanes[_QX, i], lanes[_QY, i], lanes[_QZ, i], lanes[_EX, i], lanes[_EY, i], lanes[_EZ, i] = ox, oy, oz, ex, ey, ez
     lanes[_LOW, i], lanes[_HIGH, i] = low, high
-    lanes[_STIFFNESS, i], lanes[_WEIGHT, i] = ray[5], ray[6]
+    lanes[_STIFFNESS, i], lanes[_WEIGHT, i] = ray[STIFFNESS], ray[WEIGHT]
     return 1
 
 
@@ -375,7 +376,7 @@ def _lowest(filled: int, parameters: np.ndarray, lanes: np.ndarray, missed: np.n
 @kernel
 def _free_rows(
     filled: int,
-    scene: Scene,
+    terms: Terms,
     parameters: np.ndarray,
     rotation: np.ndarray,
     lanes: np.ndarray,
@@ -388,9 +389,9 @@ def _free_rows(
     cost = 0.0
     for i in range(filled):
         gx, gy, gz = lanes[_GX, i], lanes[_GY, i], lanes[_GZ, i]
-        factor = -scene.outline_stiffness * lanes[_STIFFNESS, i] / math.sqrt(gx * gx + gy * gy + gz * gz + _TINY)
+        factor = -terms.outline_stiffness * lanes[_STIFFNESS, i] / math.sqrt(gx * gx + gy * gy + gz * gz + _TINY)
         residual = 0.0 if missed[i] else max(0.0, (lanes[_G, i] - 1.0) * factor)
-        loss, scale = huber_loss(residual, scene.outline_huber, lanes[_WEIGHT, i])
+        loss, scale = huber_loss(residual, terms.outline_huber, lanes[_WEIGHT, i])
         cost += loss
         block[0, i] = scale * factor if residual > 0.0 else 0.0
         block[STEP_LENGTH, i] = scale * residual
@@ -417,7 +418,7 @@ def surface_distance(rays: np.ndarray, parameters: np.ndarray, rotation: np.ndar
 
 
 @kernel
-def penetration(free: np.ndarray, scene: Scene, parameters: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+def penetration(free: np.ndarray, terms: Terms, parameters: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     """How deep (n,) each free ray runs inside the body, metres: (1 - min g) / |grad g|, 0 for rays that miss it."""
     depth = np.zeros(free.shape[0])
     lanes = np.empty((_ROWS, LANES))
@@ -427,7 +428,7 @@ def penetration(free: np.ndarray, scene: Scene, parameters: np.ndarray, rotation
     for n in range(free.shape[0] + 1):
         if n < free.shape[0]:
             owner[filled] = n
-            filled += _enter(free[n], scene, parameters, rotation, filled, lanes)
+            filled += _enter(free[n], terms, parameters, rotation, filled, lanes)
         if filled == LANES or (n == free.shape[0] and filled > 0):
             _lowest(filled, parameters, lanes, missed)
             for i in range(filled):

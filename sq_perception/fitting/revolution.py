@@ -18,11 +18,23 @@ Metres, optical frame; costs are those of :mod:`sq_perception.fitting.residuals`
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
 from sq_perception.fitting.box_start import standing_axes
+from sq_perception.fitting.covariance import Alternative
 from sq_perception.fitting.levenberg_marquardt import State
+from sq_perception.fitting.problem import (
+    BASIN_RAYS,
+    FIRST_STEPS,
+    Solution,
+    by_cost,
+    coarse,
+    draw,
+    refined_best,
+    settle,
+)
 from sq_perception.fitting.rivals import resized
 from sq_perception.fitting.symmetry_start import three_orders
 
@@ -36,8 +48,38 @@ SIGMA = 0.01
 """Of log(a1 / a2) and of 1 - e2: how exactly round."""
 OPEN, EXPLAINED = 0.05, 0.5
 """Half sizes more certain than this share of them, of a body with a mean squared residual below that: not asked."""
+_FINALISTS = 2
+"""Round bodies that go on from the few steps on few rays."""
 _OUTLIER_SHARE = 0.01
+"""Of the points, at either end of an axis."""
 _START_EXPONENT = 0.4
+"""Of a start: between a can's and a fruit's."""
+
+
+def weighed(solution: Solution) -> Solution:
+    """The body of revolution where it describes the image better, unless the image leaves nothing open."""
+    problem, free, rays = solution.problem, solution.state, solution.rays
+    if (solution.unsure() < OPEN).all() and free.cost < EXPLAINED * rays.weight:
+        return solution
+    round_ = problem.with_terms(roundness_stiffness=1 / SIGMA)
+    starts = from_body(free)
+    if problem.options.plane is not None:
+        starts += on_plane(problem.observation.points, problem.options.plane)
+    promising = by_cost(coarse(round_, starts))[:_FINALISTS]
+    few = draw(problem, BASIN_RAYS, 0.7)
+    settled = by_cost(settle(round_, state, few) for state in promising)
+    reference = settle(problem, free, few, FIRST_STEPS)
+    if gain(reference.cost, settled[0].cost, few.weight) < -HOPELESS:
+        return solution
+    best = refined_best(round_, settled, rays)
+    better = gain(free.cost, best.cost, rays.weight)
+    weight = math.exp(-0.5 * abs(better))
+    other = Alternative(free if better > 0 else best, weight / (1 + weight))
+    solution = replace(solution, alternatives=(*solution.alternatives, other))
+    if better <= 0:
+        return solution
+    notes = (*solution.notes, "taken for a body of revolution")
+    return replace(solution, problem=round_, state=best, notes=notes)
 
 
 def gain(free_cost: float, round_cost: float, weight: float) -> float:

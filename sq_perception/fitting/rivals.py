@@ -14,7 +14,7 @@ from sq_perception.fitting import symmetry_start
 from sq_perception.fitting.levenberg_marquardt import State
 
 SIGNIFICANT = 0.5
-"""A difference of costs."""
+"""A difference of costs, by which one body is exp(0.25) = 1.3 times as likely as the other; smaller ones are ties."""
 _ALIKE = 0.01
 
 

@@ -15,14 +15,16 @@ membership uncertainty, Automatica 27(6), 1991.
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
 from sq_perception.fitting.covariance import Alternative
 from sq_perception.fitting.levenberg_marquardt import State, minimize
+from sq_perception.fitting.problem import Problem, Solution
+from sq_perception.fitting.rays import DEPTH, Rays
 from sq_perception.fitting.residuals import RENDERED
 from sq_perception.fitting.rivals import other_orders, resized
-from sq_perception.fitting.scene import Scene
 
 _FACE_SHARE = 0.04
 """A depth that this share of all rays has in common is that of a face."""
@@ -39,26 +41,41 @@ _CERTAIN = 0.02
 """A standard deviation of the log size below this leaves nothing open."""
 _OPEN = 0.1
 """Above this, the mean of all bodies replaces the one of least squares."""
-FACE_SPREAD = 1.5
+_VERY_OPEN = 0.1
+"""Without rounding, a half size less certain than this share of it is walked along."""
+_FACE_SPREAD = 1.5
 """Of the other standard deviations: all readings of a face err alike."""
 
 
-def faces_camera(rays: np.ndarray, quantum: float) -> bool:
+def spread_along_view(solution: Solution) -> Solution:
+    """Ask for all half sizes along the view that the image allows, where readings are rounded or say little."""
+    quantum = solution.problem.observation.noise.quantum
+    if quantum > 0 and faces_camera(solution.rays.hits, quantum):
+        best, allowed = plausible(solution)
+        solution = replace(solution, state=best)
+        if allowed:
+            solution = replace(solution, alternatives=tuple(allowed), spread_factor=_FACE_SPREAD**2)
+    elif quantum == 0 and (solution.unsure() > _VERY_OPEN).any():
+        solution = replace(solution, alternatives=tuple(uncertain(solution)))
+    return solution
+
+
+def faces_camera(hits: np.ndarray, quantum: float) -> bool:
     """Whether many rays (n, 8) read the same depth."""
-    level = np.rint((rays[:, 4] - rays[:, 4].min()) / quantum).astype(np.int64)
-    return bool(np.bincount(level).max() > _FACE_SHARE * len(rays))
+    depth = hits[:, DEPTH]
+    level = np.rint((depth - depth.min()) / quantum).astype(np.int64)
+    return bool(np.bincount(level).max() > _FACE_SHARE * len(hits))
 
 
-def plausible(
-    best: State, rays: np.ndarray, free: np.ndarray, scene: Scene, limits: tuple[np.ndarray, np.ndarray]
-) -> tuple[State, list[Alternative]]:
+def plausible(solution: Solution) -> tuple[State, list[Alternative]]:
     """The bodies that the rounded readings allow, none if no other than the given one; and the best of them.
 
     The best is the given one, which averages roundings out, as long as the readings hardly leave a size open, else the
     mean of all.
     """
-    stride = max(1, len(rays) // _RAYS)
-    walk = _Walk(rays[::stride].copy(), free[::stride].copy(), scene._replace(dead_zone=_DEAD_ZONE), limits)
+    best, rays = solution.state, solution.rays
+    rays = rays.every(max(1, len(rays.hits) // _RAYS))
+    walk = _Walk(solution.problem.with_terms(dead_zone=_DEAD_ZONE), rays)
     walk.along_view(best)
     if walk.least < _ALLOWED and walk.deviation() < _CERTAIN:
         return best, []
@@ -70,24 +87,19 @@ def plausible(
     return walk.mean(), walk.alternatives()
 
 
-def uncertain(
-    best: State, rays: np.ndarray, free: np.ndarray, scene: Scene, limits: tuple[np.ndarray, np.ndarray]
-) -> list[Alternative]:
+def uncertain(solution: Solution) -> list[Alternative]:
     """The bodies with other half sizes along the view that noise allows, where a covariance is too local to tell."""
-    stride = max(1, len(rays) // _RAYS)
-    rays, free = rays[::stride].copy(), free[::stride].copy()
-    rays[:, 6] *= stride
-    free[:, 6] *= stride
-    walk = _Walk(rays, free, scene, limits)
-    walk.along_view(best)
+    stride = max(1, len(solution.rays.hits) // _RAYS)
+    walk = _Walk(solution.problem, solution.rays.every(stride).weighing(stride))
+    walk.along_view(solution.state)
     return walk.alternatives()
 
 
 class _Walk:
     """Bodies held at one half size along the view after another, from starts outwards, and their weights."""
 
-    def __init__(self, rays: np.ndarray, free: np.ndarray, scene: Scene, limits: tuple[np.ndarray, np.ndarray]) -> None:
-        self.rays, self.free, self.scene, self.limits = rays, free, scene, limits
+    def __init__(self, problem: Problem, rays: Rays) -> None:
+        self.problem, self.rays = problem, rays
         self.states: list[State] = []
         self.sizes: list[float] = []
         self.paces: list[float] = []
@@ -100,7 +112,7 @@ class _Walk:
         here = self._held(start, log_size)
         found = {log_size: here}
         self.least = min(self.least, here.cost)
-        allowed = _ALLOWED if self.scene.dead_zone > 0 else math.inf
+        allowed = _ALLOWED if self.problem.terms.dead_zone > 0 else math.inf
         for direction in (1, -1):
             state, position, unlikely = here, log_size, 0
             for pace in _PACES:
@@ -139,11 +151,11 @@ class _Walk:
 
     def _held(self, start: State, log_size: float) -> State:
         axis = _view_axis(start)
-        lower, upper = self.limits[0].copy(), self.limits[1].copy()
+        lower, upper = (limit.copy() for limit in self.problem.limits)
         size = min(max(math.exp(log_size), lower[axis]), upper[axis])
         lower[axis] = upper[axis] = size
         start = resized(start, axis, size)
-        return minimize(RENDERED, self.rays, self.free, self.scene, start, (lower, upper), _STEPS, _TOLERANCE)
+        return minimize(RENDERED, *self.rays, self.problem.terms, start, (lower, upper), _STEPS, _TOLERANCE)
 
 
 def _view_axis(state: State) -> int:

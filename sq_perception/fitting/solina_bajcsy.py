@@ -30,9 +30,9 @@ import numpy as np
 from sq_perception.fitting.bounds import Bounds
 from sq_perception.fitting.fit import Fit, Status
 from sq_perception.fitting.levenberg_marquardt import State, minimize
-from sq_perception.fitting.normal_equations import STEP_LENGTH
-from sq_perception.fitting.residuals import CLASSIC, RAY_COLUMNS
-from sq_perception.fitting.scene import Scene
+from sq_perception.fitting.rays import DEPTH, LAST, ORIGIN_X, ORIGIN_Y, RAY_COLUMNS, STIFFNESS, WEIGHT
+from sq_perception.fitting.residuals import CLASSIC
+from sq_perception.fitting.terms import Terms
 from sq_perception.geometry import rotation as quaternions
 
 MIN_POINTS = 12
@@ -102,15 +102,15 @@ def fit(
     state = start
     if not reason:
         rays = np.zeros((len(points), RAY_COLUMNS))
-        rays[:, 0], rays[:, 1], rays[:, 4] = points.T
-        rays[:, 5], rays[:, 6], rays[:, 7] = 1 / (_UNIT * extent**1.5), 1.0, points[:, 2]
+        rays[:, ORIGIN_X], rays[:, ORIGIN_Y], rays[:, DEPTH] = points.T
+        rays[:, STIFFNESS], rays[:, WEIGHT], rays[:, LAST] = 1 / (_UNIT * extent**1.5), 1.0, points[:, 2]
         limits = (bounds or Bounds()).limits(points)
-        scene = Scene(huber=math.inf)
-        state = minimize(CLASSIC, rays, _NO_FREE_SPACE, scene, start, limits, max_iterations, tolerance)
+        terms = Terms(huber=math.inf)
+        state = minimize(CLASSIC, rays, _NO_FREE_SPACE, terms, start, limits, max_iterations, tolerance)
         rng = np.random.default_rng(seed)
         for _ in range(escapes):
             other = _disturbed(state, rng)
-            other = minimize(CLASSIC, rays, _NO_FREE_SPACE, scene, other, limits, max_iterations, tolerance)
+            other = minimize(CLASSIC, rays, _NO_FREE_SPACE, terms, other, limits, max_iterations, tolerance)
             state = min(state, other, key=lambda each: each.cost)
     body = state.body.canonical_form()
     distance = np.abs(body.sampson_distance(points))
@@ -120,13 +120,10 @@ def fit(
     return Fit(
         superquadric=body,
         residual=residual,
-        noise=residual,
-        inlier_share=float(np.mean(distance <= _INLIER * residual)),
-        visible_share=float("nan"),
-        seen=np.full(3, np.nan),
-        covariance=np.full((STEP_LENGTH, STEP_LENGTH), np.nan),
         status=Status.FAILED if reason else Status.CONVERGED,
         message=reason or "converged",
+        noise=residual,
+        inlier_share=float(np.mean(distance <= _INLIER * residual)),
         iterations=state.iterations,
         milliseconds=(time.perf_counter() - began) * 1e3,
     )

@@ -2,8 +2,9 @@
 
 Residuals run along the true rays of the pixels, so that one code serves orthographic and pinhole cameras: the object's
 pixels pull the surface onto what they measured, the pixels beside it keep the body out of the space they saw to be
-empty.  See :mod:`sq_perception.fitting.residuals` for the equations, :mod:`sq_perception.fitting.search` for the course
-of a fit and :mod:`sq_perception.fitting.uncertainty` for what it says about itself.
+empty.  See :mod:`sq_perception.fitting.residuals` for the equations, :mod:`sq_perception.fitting.problem` for a fit as
+data, :mod:`sq_perception.fitting.exact` and :mod:`sq_perception.fitting.tolerant` for its two courses, and
+:mod:`sq_perception.fitting.verdict` for what it says about itself.
 
 Frames and units: optical frame, metres, radians.
 """
@@ -13,21 +14,23 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import cache
 from typing import Literal
 
 import numpy as np
 
-from sq_perception.fitting import box_start, uncertainty
+from sq_perception.fitting import box_start, exact, tolerant
 from sq_perception.fitting.fit import Fit
 from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.observation import Observation, observe
-from sq_perception.fitting.options import MIN_PIXELS, Options
-from sq_perception.fitting.search import Search
+from sq_perception.fitting.options import MIN_PIXELS, FitOptions
+from sq_perception.fitting.problem import Problem
+from sq_perception.fitting.verdict import failed, verdict
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
 
-__all__ = ["Options", "fit", "warm_up"]
+__all__ = ["FitOptions", "fit", "warm_up"]
 
 
 def fit(
@@ -36,7 +39,7 @@ def fit(
     camera: Camera,
     *,
     start: Superquadric | Literal["auto"] | Sequence[Superquadric] | Callable[[], Superquadric] = "auto",
-    options: Options | None = None,
+    options: FitOptions | None = None,
 ) -> Fit:
     """The superquadric that explains the masked pixels of a depth image, and contradicts none beside them.
 
@@ -50,7 +53,7 @@ def fit(
     start : "auto", one body, a batch of bodies or a sequence of bodies, in the optical frame
         Where to begin.  A function that returns them is called only if the cheapest automatic starts leave something
         unexplained: for starts that cost time, or are still being computed.
-    options : Options
+    options : FitOptions
 
     Returns
     -------
@@ -65,31 +68,27 @@ def fit(
         object without a single measured pixel.
     """
     began = time.perf_counter()
-    options = options or Options()
+    options = options or FitOptions()
     depth, mask = _checked_images(depth, mask, camera)
+    later = cache(lambda: _checked_starts(start())) if callable(start) else None
     given = [] if callable(start) else _checked_starts(start)
-    if options.model_error is None and (options.plane is not None or callable(start)):
-        exact = observe(depth, mask, camera, options.noise, 0.0, options.nan_is_empty)
-        if exact is not None and not _hopeless(exact):
-            search = Search(exact, replace(options, model_error=0.0), began)
-            if search.explained(given):
-                return uncertainty.judged(search.decided(), search, began)
-            if callable(start):
-                given = _checked_starts(start())
-                if search.explained(given):
-                    return uncertainty.judged(search.decided(), search, began)
+    if options.model_error is None and (options.plane is not None or later is not None):
+        trusted = observe(depth, mask, camera, options.noise, 0.0, options.nan_is_empty)
+        if trusted is not None and not _hopeless(trusted):
+            problem = Problem.of(trusted, replace(options, model_error=0.0), began)
+            solution = exact.solve_cheaply(problem, given, later)
+            if solution is not None:
+                return verdict(solution, began)
     observation = observe(depth, mask, camera, options.noise, options.tolerated, options.nan_is_empty)
     if observation is None:
         raise ValueError("the mask holds no pixel with a depth: there is nothing to fit")
     reason = _hopeless(observation)
     if reason:
         body = box_start.enclosing_box(observation.points, observation.footprint)
-        return uncertainty.failed(body, observation, reason, began)
-    if callable(start) and not given:
-        given = _checked_starts(start())
-    search = Search(observation, options, began)
-    best = search.run(given)
-    return uncertainty.judged(best, search, began)
+        return failed(body, observation, reason, began)
+    course = tolerant if options.tolerated > 0 else exact
+    given = given if later is None else later()
+    return verdict(course.solve(Problem.of(observation, options, began), given), began)
 
 
 def warm_up() -> None:
@@ -101,7 +100,7 @@ def warm_up() -> None:
         mask = np.isfinite(rendered)
         depth = np.where(mask, rendered, 0.7).astype(np.float32)
         fit(depth, mask, camera)
-        fit(depth, mask, camera, options=Options(plane=np.array([0.0, 0.0, -1.0, 0.7])))
+        fit(depth, mask, camera, options=FitOptions(plane=np.array([0.0, 0.0, -1.0, 0.7])))
         fit(depth, mask, camera, start=body)
 
 

@@ -268,14 +268,6 @@ class Superquadric:
         a, e1, e2 = self._numpy()
         return 2 * np.prod(a, axis=-1) * e1 * e2 * beta(e1 / 2 + 1, e1) * beta(e2 / 2, e2 / 2)
 
-    def second_moments(self) -> np.ndarray:
-        """Integrals of x^2, y^2, z^2 over the body about its own axes, (..., 3), m^5."""
-        a, e1, e2 = self._numpy()
-        product = np.prod(a, axis=-1) * e1 * e2
-        across = 0.5 * product * beta(1.5 * e2, e2 / 2) * beta(e1 / 2, 2 * e1 + 1)
-        along = 2 * product * beta(e2 / 2, e2 / 2 + 1) * beta(1.5 * e1, e1 + 1)
-        return np.stack([across, across, along], axis=-1) * a**2
-
     def support(self, directions: Array) -> Array:
         """Support function: max of n.p over the body, minus n.t, for unit directions n (..., N, 3), shape (..., N).
 

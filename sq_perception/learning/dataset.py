@@ -13,8 +13,8 @@ import numpy as np
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast, unit_cube
 from sq_perception.learning import dihedral
+from sq_perception.learning.choices import Framing
 from sq_perception.learning.disturbance import Disturbance
-from sq_perception.learning.regressor import Framing
 from sq_perception.simulation.scenes import THESIS_SIZE, thesis_bodies
 from sq_perception.simulation.view_rendering import Occluder, render_views
 

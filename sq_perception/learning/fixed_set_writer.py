@@ -2,22 +2,15 @@
 
 Rendering runs on numba's threads, encoding on as many of its own.  A shard is written beside its place and renamed, and
 entered in the manifest only then: whatever is killed, and whenever, costs one shard.
-
-    sq-perception dataset sets/thesis --full-frame
-    sq-perception dataset sets/views --pixels 64 --train 50000 --test 2000
-    sq-perception dataset sets/thesis --verify
 """
 
 from __future__ import annotations
 
-import argparse
 import hashlib
 import json
-import sys
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,21 +20,17 @@ import numpy as np
 from safetensors.numpy import save
 
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.imaging import unit_cube
 from sq_perception.learning import dataset
 from sq_perception.learning.fixed_set import (
     FORMAT,
     MANIFEST,
-    SPLITS,
     VERSION,
     FixedSetError,
-    Settings,
     check_file,
     read_manifest,
     shard_name,
-    verify,
 )
-from sq_perception.learning.regressor import Framing
+from sq_perception.learning.fixed_set_settings import SPLITS, Settings
 from sq_perception.simulation.scenes import thesis_bodies
 
 _PNG_LEVEL = 6
@@ -87,7 +76,7 @@ def generate(
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    most = _most_threads()
+    most = most_threads()
     if not 0 <= threads <= most:
         raise ValueError(f"threads: expected 0 to {most} (NUMBA_NUM_THREADS), got {threads}")
     done: dict[str, dict[str, Any]] = {}
@@ -122,7 +111,8 @@ def _is_intact(path: Path, entry: dict[str, Any]) -> bool:
     return True
 
 
-def _most_threads() -> int:
+def most_threads() -> int:
+    """Threads that numba was given."""
     return int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
 
 
@@ -162,76 +152,3 @@ def _replace(path: Path, content: bytes) -> None:
     unfinished = path.with_name(path.name + ".partial")
     unfinished.write_bytes(content)
     unfinished.replace(path)
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Entry of ``sq-perception dataset``."""
-    parser = argparse.ArgumentParser(
-        prog="sq-perception dataset",
-        description="Make a fixed set of images on disk, go on with an interrupted one, or verify one.",
-        epilog="170 000 full frames take 0.5 GB, as many views of 64 pixels 0.35 GB.",
-    )
-    parser.add_argument("folder", type=Path, help="of the set")
-    parser.add_argument("--full-frame", action="store_true", help="images of the whole cube instead of cropped views")
-    parser.add_argument("--pixels", type=int, help="side of the images (64; 256 for full frames)")
-    parser.add_argument("--bits", type=int, choices=(8, 16), help="of a pixel (16; 8 for full frames)")
-    parser.add_argument("--train", type=int, default=Settings.train, help=f"bodies to train on ({Settings.train})")
-    parser.add_argument("--test", type=int, default=Settings.test, help=f"bodies to test on ({Settings.test})")
-    parser.add_argument("--shard", type=int, default=Settings.shard, help=f"bodies a file ({Settings.shard})")
-    parser.add_argument("--seed", type=int, default=Settings.seed, help=f"default {Settings.seed}")
-    parser.add_argument("--pinhole-share", type=float, default=0.0, help="share of views as a pinhole camera sees them")
-    parser.add_argument("--threads", type=int, default=0, help="default: all that numba may use")
-    parser.add_argument("--verify", action="store_true", help="check all checksums and make nothing")
-    given = parser.parse_args(arguments)
-    framing: Framing = "full" if given.full_frame else "cropped"
-    try:
-        settings = Settings(
-            framing,
-            (unit_cube.THESIS_PIXELS if given.full_frame else 64) if given.pixels is None else given.pixels,
-            (8 if given.full_frame else 16) if given.bits is None else given.bits,
-            given.train,
-            given.test,
-            given.shard,
-            given.seed,
-            given.pinhole_share,
-        )
-    except ValueError as error:
-        parser.error(f"--{str(error).replace('_', '-')}")
-    if not 0 <= given.threads <= _most_threads():
-        parser.error(f"--threads: expected 0 to {_most_threads()}, got {given.threads}")
-    try:
-        return _run(given, settings)
-    except FixedSetError as error:
-        return _failed(str(error))
-    except OSError as error:
-        return _failed(f"{given.folder}: {error}")
-
-
-def _run(given: argparse.Namespace, settings: Settings) -> int:
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    if given.verify:
-        settings, _ = read_manifest(given.folder)
-    total = settings.train + settings.test
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty()) as bar:
-        task = bar.add_task("verifying" if given.verify else "drawing", total=total)
-        advance = partial(bar.advance, task)
-        if given.verify:
-            complaints = verify(given.folder, advance)
-        else:
-            complaints = []
-            generate(given.folder, settings, given.threads, advance)
-    for complaint in complaints:
-        _failed(complaint)
-    if complaints:
-        return 1
-    size = sum(path.stat().st_size for path in given.folder.glob("*.safetensors"))
-    print(f"{given.folder}: {settings.train} + {settings.test} images, {size / 1e6:.1f} MB, all checksums right")
-    return 0
-
-
-def _failed(message: str) -> int:
-    print(f"sq-perception dataset: {message}", file=sys.stderr)
-    return 1

@@ -22,17 +22,14 @@ run, which keep bodies small until the residual can tell; what is minimised in t
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, get_args
 
 import torch
 
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import sight_lines
 from sq_perception.learning import depth_losses, losses
+from sq_perception.learning.choices import LOSSES, UNSUPERVISED
 
-Loss = Literal["occupancy", "occupancy_rotation", "parameters", "dual", "least_squares", "least_squares_free", "render"]
-LOSSES: tuple[str, ...] = get_args(Loss)
-UNSUPERVISED = ("least_squares", "least_squares_free", "render")
 _SHARPNESS = {"render": (6.0, 100.0)}
 _OTHER_SHARPNESS = (6.0, 25.0)
 _TYPICAL_VOLUME = 0.05

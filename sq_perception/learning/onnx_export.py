@@ -13,20 +13,16 @@ The file's metadata is the header of the weights (:mod:`sq_perception.learning.c
 
 from __future__ import annotations
 
-import argparse
 import importlib
 import json
 import os
-import sys
 from collections.abc import Mapping
 from dataclasses import asdict
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from torch import nn
 
-from sq_perception.files import output_file
 from sq_perception.learning import checkpoint
 from sq_perception.learning.backbone import BasicBlock, ResidualBlock, ResNet18
 from sq_perception.learning.regressor import Regressor, RegressorConfig
@@ -217,30 +213,3 @@ def _quaternion(graph: _Graph, first: str, second: str) -> str:
 
 def _array(tensor: Any) -> np.ndarray:
     return np.asarray(tensor.detach().float().cpu().contiguous().numpy())
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Entry of ``sq-perception export``."""
-    parser = argparse.ArgumentParser(
-        prog="sq-perception export",
-        description="Write a network as ONNX: views (n, 1, p, p) in, the 12 parameters of n bodies out.",
-    )
-    parser.add_argument("--model", metavar="FILE", help="weights: a .safetensors file, or the name of shipped ones")
-    parser.add_argument("--output", "-o", type=Path, required=True, metavar="FILE", help="the .onnx file")
-    options = parser.parse_args(arguments)
-    try:
-        output_file.check(options.output)
-    except OSError as error:
-        parser.error(f"--output: {error}")
-    path = checkpoint.resolve(options.model)
-    try:
-        content = build(checkpoint.load(path), checkpoint.read_header(path)).SerializeToString()
-        output_file.write(options.output, content)
-    except (MissingPackageError, checkpoint.CheckpointError, OSError) as error:
-        print(f"sq-perception export: {error}", file=sys.stderr)
-        return 1
-    return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -1,6 +1,6 @@
 """The processes of one training: a single one, or several that torchrun started, each with its own device and views.
 
-    torchrun --nproc-per-node 4 -m sq_perception.commands.main train --device cuda ...
+    torchrun --nproc-per-node 4 -m sq_perception train --device cuda ...
 
 Every process draws its own views; gradients are averaged, so that a step sees batch x processes views.  The first
 process alone validates, writes and speaks.

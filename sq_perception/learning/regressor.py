@@ -18,7 +18,7 @@ from __future__ import annotations
 import copy
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import numpy as np
 import torch
@@ -31,11 +31,10 @@ from sq_perception.imaging import canonical_view
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.canonical_view import CanonicalView
 from sq_perception.learning.backbone import ResNet18, compact_backbone, fold
+from sq_perception.learning.choices import SIZE_RANGE, Backbone, Framing
 
 Array = Any
 """A NumPy array or a torch tensor."""
-Backbone = Literal["compact", "resnet18"]
-Framing = Literal["cropped", "full"]
 INFERENCE_DTYPES = (torch.float32, torch.bfloat16, torch.float16)
 
 _EDGE = 1e-3
@@ -59,7 +58,7 @@ class RegressorConfig:
     blocks: int = 2
     """Of compact: residual blocks a stage."""
     hidden: int = 256
-    size_range: tuple[float, float] = (0.04, 1.2)
+    size_range: tuple[float, float] = SIZE_RANGE
     """Half sizes in sides of the cube; interpolated on a logarithmic scale."""
     shape_range: tuple[float, float] = (0.1, 1.0)
     translation_range: tuple[float, float] = (-0.4, 1.4)

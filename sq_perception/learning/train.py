@@ -6,18 +6,12 @@ where it stopped when the same command is given again.  An unsupervised loss is 
 
 The output folder holds state.safetensors, log.jsonl, last.safetensors (the newest validated network) and
 model.safetensors (the best one so far).
-
-    sq-perception train --steps 20000 --output runs/compact
-    sq-perception train --config render --output runs/render
-    torchrun --nproc-per-node 2 -m sq_perception.commands.main train --device cuda --output runs/two
 """
 
 from __future__ import annotations
 
-import argparse
 import copy
 import signal
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -25,6 +19,7 @@ from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, Protocol
 
+import numba
 import numpy as np
 import torch
 from safetensors import SafetensorError
@@ -33,7 +28,7 @@ from safetensors.torch import load_file
 from sq_perception.files import provenance
 from sq_perception.geometry.metrics import volume_iou
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.learning import checkpoint, training_config
+from sq_perception.learning import checkpoint
 from sq_perception.learning.dataset import ViewPool, ViewSource, draw_views
 from sq_perception.learning.disturbance import Disturbance, any_occluder
 from sq_perception.learning.fixed_set import FixedSet, ShuffledBatches
@@ -86,9 +81,7 @@ def train(config: TrainingConfig, output: Path, network: RegressorConfig | None 
     ValueError
         For a device that this machine does not have, or data of another form.
     """
-    if config.threads:
-        torch.set_num_threads(config.threads)
-    with joined(config.device) as processes, _stop_requests() as stop_requested:
+    with _threads(config.threads), joined(config.device) as processes, _stop_requests() as stop_requested:
         return _train(config, output, network, processes, stop_requested)
 
 
@@ -266,6 +259,25 @@ def _keep(output: Path, state: TrainingState, record: dict[str, Any], notes: dic
 
 
 @contextmanager
+def _threads(count: int) -> Iterator[None]:
+    """So many threads for the network and for the rendering of its views; 0 leaves both their own choice.
+
+    Each has a pool of its own, and OpenMP's threads wait by spinning.  Beside other work on all cores, a renderer's
+    second thread, which got its turn late and held a core while it had nothing to do, made a run of one torch thread
+    more than seven times as slow.
+    """
+    before = torch.get_num_threads(), numba.get_num_threads()
+    if count:
+        torch.set_num_threads(count)
+        numba.set_num_threads(min(count, numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before[0])
+        numba.set_num_threads(before[1])
+
+
+@contextmanager
 def _stop_requests() -> Iterator[Callable[[], bool]]:
     """Within it SIGINT and SIGTERM only note that the run should stop after its step."""
     asked: list[int] = []
@@ -278,33 +290,3 @@ def _stop_requests() -> Iterator[Callable[[], bool]]:
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)
-
-
-def main(arguments: list[str] | None = None) -> int:
-    """Entry of ``sq-perception train``."""
-    parser = argparse.ArgumentParser(
-        prog="sq-perception train",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("--output", type=Path, default=Path("runs/compact"), help="folder of the run")
-    training_config.add_arguments(parser)
-    options = vars(parser.parse_args(arguments))
-    output = options.pop("output")
-    try:
-        config = training_config.from_arguments(options)
-    except ValueError as error:
-        parser.error(str(error))
-    try:
-        train(config, output)
-    except Stopped as stopped:
-        print(stopped, file=sys.stderr)
-        return 130
-    except (DivergedError, checkpoint.CheckpointError, ValueError) as error:
-        print(f"sq-perception train: {error}", file=sys.stderr)
-        return 1
-    return 0
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -1,33 +1,38 @@
 """What a training run is made of, and where that is read from: a YAML file, the command line, or both.
 
 A file holds fields of :class:`TrainingConfig` by name; what the command line gives wins.  Some travel with the package,
-those of the shipped weights among them, and go by their name: ``sq-perception train --config robust``.
+those of the shipped weights among them, and go by their name: ``sq-perception train --config robust``.  What a run is
+made of is imported when it is made, so that the command's help need not wait for torch.
 """
 
 from __future__ import annotations
 
-import argparse
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from sq_perception.files import plain_yaml
-from sq_perception.learning.dataset import ViewSource
-from sq_perception.learning.disturbance import Disturbance
-from sq_perception.learning.objective import LOSSES, UNSUPERVISED, Objective
-from sq_perception.learning.regressor import Backbone, Framing, RegressorConfig
-from sq_perception.learning.schedule import Cosine, Plateau
+from sq_perception.learning.choices import LOSSES, SIZE_RANGE, UNSUPERVISED, Backbone, Framing
+
+if TYPE_CHECKING:
+    from sq_perception.learning.dataset import ViewSource
+    from sq_perception.learning.disturbance import Disturbance
+    from sq_perception.learning.objective import Objective
+    from sq_perception.learning.regressor import RegressorConfig
+    from sq_perception.learning.schedule import Cosine, Plateau
 
 Optimizer = Literal["adamw", "adam"]
 _SHIPPED = Path(__file__).with_name("configurations")
 ScheduleName = Literal["cosine", "plateau"]
-_CHOICES = {
+CHOICES: dict[str, tuple[str, ...]] = {
+    "loss": LOSSES,
     "backbone": get_args(Backbone),
     "framing": get_args(Framing),
     "optimizer": get_args(Optimizer),
     "schedule": get_args(ScheduleName),
 }
+"""Fields that name something, and the names there are."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +53,7 @@ class TrainingConfig:
     """What the network sees: cropped canonical views, or full frames of the unit cube as in the thesis."""
     pixels: int = 64
     """Side of the views: a multiple of 16 for compact, of 32 for resnet18; 256 in the thesis."""
-    largest: float = RegressorConfig().size_range[1]
+    largest: float = SIZE_RANGE[1]
     """Largest half size a network for cropped views can express, in their sides; the thesis' bodies reach 0.8."""
     start: str = ""
     """A model file whose weights the network begins with; empty begins at random."""
@@ -108,12 +113,12 @@ class TrainingConfig:
     """Longest time between two saved states."""
     seed: int = 1
     threads: int = 0
-    """CPU threads; 0 leaves torch's own choice."""
+    """CPU threads of the network, and of the rendering of its views; 0 leaves both their own choice."""
     device: str = "cpu"
     """cpu or cuda; under torchrun each process takes its own device."""
 
     def __post_init__(self) -> None:
-        for name, choices in (*_CHOICES.items(), ("loss", LOSSES)):
+        for name, choices in CHOICES.items():
             if getattr(self, name) not in choices:
                 raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {getattr(self, name)!r}")
         for name in ("steps", "batch", "points", "stride", "validation", "reuse"):
@@ -134,10 +139,14 @@ class TrainingConfig:
 
     def disturbance(self) -> Disturbance:
         """What happens to the views."""
+        from sq_perception.learning.disturbance import Disturbance
+
         return Disturbance(self.occluded_share, self.most_hidden, self.noisy_share)
 
     def objective(self) -> Objective:
         """What is minimised."""
+        from sq_perception.learning.objective import Objective
+
         return Objective(
             self.loss,
             self.points,
@@ -156,6 +165,8 @@ class TrainingConfig:
 
     def regressor(self) -> RegressorConfig:
         """The network's form, unless ``start`` brings its own."""
+        from sq_perception.learning.regressor import RegressorConfig
+
         form = RegressorConfig.thesis()
         if self.framing == "cropped":
             form = RegressorConfig(size_range=(RegressorConfig().size_range[0], self.largest))
@@ -164,10 +175,14 @@ class TrainingConfig:
 
     def views(self, network: RegressorConfig) -> ViewSource:
         """What is drawn for a network."""
+        from sq_perception.learning.dataset import ViewSource
+
         return ViewSource(network.pixels, self.pinhole_share, self.wide_share, self.disturbance(), network.framing)
 
     def learning_schedule(self) -> Cosine | Plateau:
         """How the learning rate goes."""
+        from sq_perception.learning.schedule import Cosine, Plateau
+
         if self.schedule == "plateau":
             return Plateau(self.learning_rate)
         return Cosine(self.learning_rate, self.warm_up, self.steps)
@@ -213,23 +228,3 @@ def _values(path: str | Path) -> dict[str, Any]:
         if type(value) is not wanted:
             raise ValueError(f"{path}: {name}: expected {wanted.__name__}, got {value!r}")
     return values
-
-
-def add_arguments(parser: argparse.ArgumentParser) -> None:
-    """``--config`` and one option for each field of :class:`TrainingConfig`; what is not given is not in the result."""
-    parser.add_argument("--config", metavar="FILE", help=f"YAML file, or one of {', '.join(shipped())}")
-    for field in fields(TrainingConfig):
-        name = "--" + field.name.replace("_", "-")
-        default, text = argparse.SUPPRESS, f"default {field.default!r}"
-        choices = _CHOICES.get(field.name, LOSSES if field.name == "loss" else None)
-        if isinstance(field.default, bool):
-            parser.add_argument(name, action=argparse.BooleanOptionalAction, default=default, help=text)
-        else:
-            parser.add_argument(name, type=type(field.default), choices=choices, default=default, help=text)
-
-
-def from_arguments(options: dict[str, Any]) -> TrainingConfig:
-    """The configuration that parsed arguments ask for; raises ValueError as :func:`read` does."""
-    options = dict(options)
-    path = options.pop("config", None)
-    return TrainingConfig(**options) if path is None else read(path, **options)

@@ -1,5 +1,8 @@
 """Nodes as child processes: started together, watched, and stopped without leftovers.
 
+Not `ros2 launch`: it is in no wheel, so that the demonstration of a pip installation would have none, and it does not
+hand its terminal to a live table.  Where there is one, launch_scripts/*.launch.py are for it.
+
 Every child leads a process group of its own, so that a Ctrl-C in the terminal reaches the parent alone, which then
 stops the children in order: SIGINT, patience, SIGKILL.  Children import the very package that the parent runs from,
 installed or source tree, whatever the working directory.
@@ -21,31 +24,24 @@ from pathlib import Path
 from types import FrameType, TracebackType
 
 NODES = ("recover_node", "recover_cameras", "fitter_node", "synthetic_depth_node")
+"""Of :mod:`sq_perception.nodes.executables`."""
 
 _KEPT_LINES = 40
 _ROOT = str(Path(__file__).resolve().parent.parent.parent)
-_CODE = "import sys; sys.path[:1] = [{root!r}]; from sq_perception.nodes.{node} import main; sys.exit(main())"
+_CODE = "import sys; sys.path[:1] = [{root!r}]; from sq_perception.nodes import executables as e; sys.exit(e.{node}())"
 
 
 class Child:
-    """One running node.
-
-    Raises
-    ------
-    ValueError
-        If there is no node of that name.
-    """
+    """One running node."""
 
     def __init__(
         self, node: str, arguments: Sequence[str], environment: Mapping[str, str], *, echo: bool = False
     ) -> None:
-        if node not in NODES:
-            raise ValueError(f"node: expected one of {', '.join(NODES)}, got {node!r}")
         self.name = node
         self._echo = echo
         self._lines: deque[str] = deque(maxlen=_KEPT_LINES)
         self._process = subprocess.Popen(
-            [sys.executable, "-c", _CODE.format(root=_ROOT, node=node), *arguments],
+            command(node, arguments),
             env={**environment, "PYTHONUNBUFFERED": "1"},
             stdin=subprocess.DEVNULL,
             stdout=subprocess.PIPE,
@@ -166,6 +162,19 @@ class Children:
         finally:
             for number, handler in previous.items():
                 signal.signal(number, handler)
+
+
+def command(node: str, arguments: Sequence[str] = ()) -> list[str]:
+    """The command line that runs a node by this interpreter, from this package.
+
+    Raises
+    ------
+    ValueError
+        If there is no node of that name.
+    """
+    if node not in NODES:
+        raise ValueError(f"node: expected one of {', '.join(NODES)}, got {node!r}")
+    return [sys.executable, "-c", _CODE.format(root=_ROOT, node=node), *arguments]
 
 
 @contextmanager

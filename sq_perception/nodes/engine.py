@@ -20,8 +20,11 @@ from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import Any, Generic, TypeVar
 
+from rclpy.node import Node
+
 from sq_perception.imaging.camera import Camera
-from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
+from sq_perception.nodes.frame import Frame
+from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, RecoveryOptions
 
 P = TypeVar("P")
 
@@ -53,7 +56,7 @@ TURNS = Turns()
 
 
 @dataclass(frozen=True)
-class Workshop(Generic[P]):
+class RecovererFactory(Generic[P]):
     """How a kind of node makes its recoverer, and tells it what the parameters say.
 
     Attributes
@@ -62,11 +65,11 @@ class Workshop(Generic[P]):
         A recoverer of parameters.
     options
         What the parameters say to each frame.
-    ingredients
+    made_of
         Names of the parameters that the recoverer is made of.
     key
         Equal for parameters whose recoverers are the same; None where they are never shared.
-    judge
+    check
         Raises ValueError for parameters that :attr:`make` would refuse, as far as that can be told at once; it also
         gets the names of those that change.
     describe
@@ -75,9 +78,9 @@ class Workshop(Generic[P]):
 
     make: Callable[[P], Recoverer]
     options: Callable[[P], RecoveryOptions]
-    ingredients: tuple[str, ...] = ()
+    made_of: tuple[str, ...] = ()
     key: Callable[[P], Hashable] = lambda _: None
-    judge: Callable[[P, frozenset[str]], None] = lambda _, __: None
+    check: Callable[[P, frozenset[str]], None] = lambda _, __: None
     describe: Callable[[P], str] = lambda _: ""
 
 
@@ -101,14 +104,14 @@ class Engine(Generic[P]):
 
     Parameters
     ----------
-    workshop
+    factory
         What makes it.
-    inform, complain
-        Take texts for the log.
+    node
+        Whose log hears of swaps.
     """
 
-    def __init__(self, workshop: Workshop[P], inform: Callable[[str], None], complain: Callable[[str], None]) -> None:
-        self._workshop, self._inform, self._complain = workshop, inform, complain
+    def __init__(self, factory: RecovererFactory[P], node: Node) -> None:
+        self._factory, self._node = factory, node
         self._lock = threading.Lock()
         self._built: _Built[P] | None = None
         self._request = 0
@@ -118,7 +121,7 @@ class Engine(Generic[P]):
         """Why the last swap came to nothing; empty once one has succeeded."""
 
     def build(self, parameters: P, camera: Camera) -> None:
-        """Make the recoverer and warm it up; what the workshop raises comes through."""
+        """Make the recoverer and warm it up; what the factory raises comes through."""
         with self._lock:
             self._request += 1
         built = self._made(parameters, camera)
@@ -144,7 +147,7 @@ class Engine(Generic[P]):
 
         A set that leaves the value as it is counts too: it is how a model file that was replaced is read again.
         """
-        if not changed.intersection(self._workshop.ingredients) or self._built is None:
+        if not changed.intersection(self._factory.made_of) or self._built is None:
             return
         with self._lock:
             self._request += 1
@@ -154,8 +157,8 @@ class Engine(Generic[P]):
             target=self._swap, args=(request, parameters, camera), name="recoverer in the making", daemon=True
         ).start()
 
-    def at_work(self, parameters: P) -> tuple[Recoverer, RecoveryOptions]:
-        """The recoverer, and what it is to do by the parameters in force for it.
+    def recover(self, frame: Frame, parameters: P) -> FrameRecovery:
+        """The bodies of a frame, by the parameters in force for the recoverer at work.
 
         Raises
         ------
@@ -165,21 +168,21 @@ class Engine(Generic[P]):
         built = self._built
         if built is None:
             raise RuntimeError("the recoverer has been released")
-        made_of = {name: getattr(built.parameters, name) for name in self._workshop.ingredients}
+        made_of = {name: getattr(built.parameters, name) for name in self._factory.made_of}
         in_force: Any = replace(parameters, **made_of)  # type: ignore[type-var]
-        return built.recoverer, self._workshop.options(in_force)
+        return built.recoverer.recover(frame.depth, frame.camera, frame.labels, self._factory.options(in_force))
 
     @property
-    def words(self) -> str:
+    def description(self) -> str:
         """What is at work, for diagnostics."""
         built = self._built
         if built is None:
             return "none"
-        return self._workshop.describe(built.parameters) + (", another one is being made" if self.is_making else "")
+        return self._factory.describe(built.parameters) + (", another one is being made" if self.is_making else "")
 
     def _swap(self, request: int, parameters: P, camera: Camera) -> None:
         started = perf_counter()
-        described = self._workshop.describe(parameters)
+        described = self._factory.describe(parameters)
         try:
             built = self._made(parameters, camera, lambda: request == self._request)
         except _Superseded:
@@ -190,13 +193,13 @@ class Engine(Generic[P]):
                     return
                 self.is_making = False
                 self.fault = f"cannot change to {described}: {' '.join(str(error).split())}"
-            self._complain(f"{self.fault}; what was there before goes on")
+            self._node.get_logger().error(f"{self.fault}; what was there before goes on")
             return
         with self._lock:
             if request != self._request:
                 return
             self._built, self.fault, self.is_making = built, "", False
-        self._inform(f"changed to {described} within {perf_counter() - started:.1f} s")
+        self._node.get_logger().info(f"changed to {described} within {perf_counter() - started:.1f} s")
 
     def _made(self, parameters: P, camera: Camera, is_wanted: Callable[[], bool] = lambda: True) -> _Built[P]:
         """A recoverer, warm; one that is there already if its key is the same.
@@ -206,14 +209,14 @@ class Engine(Generic[P]):
         _Superseded
             If nobody wants it any more.
         """
-        key = self._workshop.key(parameters)
+        key = self._factory.key(parameters)
         with _making:
             if not is_wanted():
                 raise _Superseded
             known = None if key is None else _shared.get(key)
             if known is not None:
                 return _Built(known, parameters, key)
-            recoverer = self._workshop.make(parameters)
+            recoverer = self._factory.make(parameters)
             if key is not None:
                 _shared[key] = recoverer
         with TURNS.turn():

@@ -1,18 +1,31 @@
-"""The Fast DDS profile that keeps large images from getting lost, and where it lies.
+"""Fast DDS: the profile that keeps large images from getting lost, and the shared memory that killed processes leave.
 
 Fast DDS 2, that of Jazzy, reads FASTRTPS_DEFAULT_PROFILES_FILE when the first participant of a process is created, so
 that the variable must be set before rclpy.init.  A file that the user has chosen is left alone.  Its successor's name,
 FASTDDS_DEFAULT_PROFILES_FILE, means nothing to it.
+
+It keeps one segment per participant in /dev/shm, ``fastrtps_<16 hex digits>``, 17 MB with this profile, whose owner
+holds a lock on ``fastrtps_<16 hex digits>_el`` for as long as it lives.  After kill -9 the kernel frees the lock, but
+nothing frees the segment: a node that is killed and started again for weeks would fill the memory
+(docs/reliability.md).  :func:`remove_orphans` deletes such segments, by the test that ``fastdds shm clean`` applies; as
+these are files of the middleware's, nodes call it only if ``free_shared_memory`` says so.
 """
 
 from __future__ import annotations
 
+import fcntl
 import os
+import re
+import time
 from collections.abc import Mapping
 from pathlib import Path
 
 VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
 _FILE = "fast_dds.xml"
+FOLDER = Path("/dev/shm")  # noqa: S108 - where Fast DDS puts them
+LEAST_AGE = 10.0
+"""Seconds; an owner locks its file a moment after it has created it."""
+_LOCK = re.compile(r"(fastrtps_[0-9a-f]{16})_el")
 
 
 def profile_path() -> Path:
@@ -39,3 +52,64 @@ def additions(base: Mapping[str, str] | None = None) -> dict[str, str]:
 def environment(base: Mapping[str, str] | None = None) -> dict[str, str]:
     """A copy of the environment ``base`` (os.environ by default) with the profile in it."""
     return {**(os.environ if base is None else base), **additions(base)}
+
+
+def orphans(folder: Path = FOLDER) -> tuple[str, ...]:
+    """Names of the segments whose owner is dead, of any age and user."""
+    return tuple(segment.name for lock, segment in _pairs(folder) if segment.exists() and not _owned(lock))
+
+
+def remove_orphans(folder: Path = FOLDER, least_age: float = LEAST_AGE) -> tuple[str, ...]:
+    """Delete this user's segments of dead owners that are older than ``least_age`` seconds; their names.
+
+    What cannot be read or removed stays, and nothing is raised for it.  Ports (``fastrtps_port<number>``) stay too:
+    they are few, small, and taken over by the next process with the same number.
+    """
+    return tuple(segment.name for lock, segment in _pairs(folder) if _removed(lock, segment, least_age))
+
+
+def _pairs(folder: Path) -> list[tuple[Path, Path]]:
+    try:
+        names = sorted(os.listdir(folder))
+    except OSError:
+        return []
+    found = ((name, _LOCK.fullmatch(name)) for name in names)
+    return [(folder / name, folder / match[1]) for name, match in found if match is not None]
+
+
+def _opened(lock: Path) -> int:
+    return os.open(lock, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
+
+
+def _owned(lock: Path) -> bool:
+    try:
+        descriptor = _opened(lock)
+    except OSError:
+        return True
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError:
+        return True
+    finally:
+        os.close(descriptor)
+    return False
+
+
+def _removed(lock: Path, segment: Path, least_age: float) -> bool:
+    try:
+        descriptor = _opened(lock)
+    except OSError:
+        return False
+    try:
+        about = os.fstat(descriptor)
+        if about.st_uid != os.geteuid() or time.time() - about.st_mtime < least_age:
+            return False
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        # Held until both names are gone: whoever asks meanwhile takes the owner for alive and leaves them alone.
+        segment.unlink(missing_ok=True)
+        lock.unlink(missing_ok=True)
+    except OSError:
+        return False
+    finally:
+        os.close(descriptor)
+    return True

@@ -1,26 +1,40 @@
-"""One depth image on its way through a node: decoded from its message, and back into messages like it."""
+"""A depth image on its way through a node: decoded from its message, and back into messages like it.
+
+| image_transport | topic | type |
+| --- | --- | --- |
+| `raw` | `<image topic>` | sensor_msgs/Image |
+| `compressedDepth` | `<image topic>/compressedDepth` | sensor_msgs/CompressedImage: PNG or RVL |
+
+Whoever decodes a message need not know which of the two it has.
+"""
 
 from __future__ import annotations
 
+import array
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+from rclpy.node import Node
 from sensor_msgs.msg import CompressedImage, Image
 
 from sq_msgs_py.depth_image import (
     DEPTH_ENCODINGS,
     GREY_ENCODINGS,
+    depth_from_message,
     grey_from_message,
     labels_from_message,
 )
-from sq_perception.imaging import unit_cube
+from sq_perception.imaging import compressed_depth, unit_cube
 from sq_perception.imaging.calibration import Calibration
 from sq_perception.imaging.camera import Camera
-from sq_perception.nodes.inbox import Refused
-from sq_perception.nodes.transport import depth_of
+from sq_perception.nodes.parameters import RAW
 from sq_perception.recordings import publication
+
+
+class Refused(ValueError):  # noqa: N818 - a verdict on a frame rather than a defect
+    """A frame that cannot be processed; says what was expected and what arrived."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,3 +128,48 @@ def decode(message: Image | CompressedImage, calibration_of: Callable[[], Calibr
     depth, encoding = depth_of(message)
     calibration = calibration_of()
     return Frame(message.header, encoding, calibration.rectified(depth), calibration)
+
+
+def image_topic(node: Node, name: str, transport: str) -> str:
+    """The topic to listen to for the images of ``name``, with the node's namespace and remappings.
+
+    A remapping holds for the image's topic, and the transport's part comes behind that; one that names it already is
+    left as it is.
+    """
+    resolved: str = node.resolve_topic_name(name)
+    if transport == RAW or resolved.endswith(f"/{transport}"):
+        return resolved
+    return f"{resolved}/{transport}"
+
+
+def size_of(message: Image | CompressedImage) -> tuple[int, int]:
+    """Width and height of a depth image; of a packed one from its header alone.
+
+    Raises
+    ------
+    ValueError
+        If a packed image is none.
+    """
+    if isinstance(message, CompressedImage):
+        return compressed_depth.size(message.format, message.data)
+    return int(message.width), int(message.height)
+
+
+def depth_of(message: Image | CompressedImage) -> tuple[np.ndarray, str]:
+    """Depth in metres, float32 (height, width), NaN for nothing, and its encoding, 16UC1 or 32FC1, before packing.
+
+    Raises
+    ------
+    ValueError
+        If the message is no depth image; says what was expected and what arrived.
+    """
+    if isinstance(message, CompressedImage):
+        depth = compressed_depth.decode(message.format, message.data)
+        return depth, compressed_depth.encoding(message.format) or ""
+    return depth_from_message(message), message.encoding
+
+
+def packed(depth: np.ndarray, header: Any, encoding: str = "16UC1") -> CompressedImage:
+    """A packed message of depth (height, width) in metres, NaN or inf for nothing; 16UC1 or 32FC1."""
+    image_format, data = compressed_depth.encode(depth, encoding)
+    return CompressedImage(header=header, format=image_format, data=array.array("B", data))

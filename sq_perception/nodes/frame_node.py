@@ -1,4 +1,4 @@
-"""What recover_node and fitter_node have in common: depth images in, superquadrics out.
+"""The node behind recover_node and fitter_node: depth images in, superquadrics out.
 
 | name | type | |
 | --- | --- | --- |
@@ -13,14 +13,17 @@
 | `~/enable` | std_srvs/SetBool | drop all frames, or process them again |
 | `~/trigger` | std_srvs/Trigger | process the next frame, also while disabled, and answer with a summary |
 
-A lifecycle node (:mod:`sq_perception.nodes.managed_node`): configuring loads the network and warms up, activating
-subscribes, deactivating ends the subscriptions after the frame at hand, cleaning up frees the network's memory.
+The way of an image, each room entered once:
+
+    input.Input -> frame.decode -> engine.Engine.recover -> tracking.Tracking.identify -> outputs.Outputs.answer
 
 The executor's thread only stores messages; one worker thread takes the newest and does the work, so that services and
-parameters answer at once.  Stamp and frame of the input are copied to every output.  Bodies are followed from frame to
-frame (:mod:`sq_perception.nodes.identity`), and those that a frame shows are published.  Results of orthographic frames
-are in the cube frame of :mod:`sq_perception.imaging.unit_cube`, those of others in the optical frame, or in
-``target_frame``.  What else is published, for tf2, planners and vision pipelines: :mod:`sq_perception.nodes.outputs`.
+parameters answer at once.  Stamp and frame of the input are copied to every output.  Results of orthographic frames are
+in the cube frame of :mod:`sq_perception.imaging.unit_cube`, those of others in the optical frame, or in
+``target_frame``.
+
+A lifecycle node (:mod:`sq_perception.nodes.managed_node`): configuring loads the network and warms up, activating
+subscribes, deactivating ends the subscriptions after the frame at hand, cleaning up frees the network's memory.
 """
 
 from __future__ import annotations
@@ -35,25 +38,21 @@ from typing import Any
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
-from rclpy.event_handler import SubscriptionEventCallbacks
-from rclpy.qos import QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
-from rclpy.qos_overriding_options import QoSOverridingOptions
-from rclpy.subscription import Subscription
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from rclpy.node import Node
+from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
 from sq_perception.imaging import unit_cube
-from sq_perception.imaging.calibration import Calibration
 from sq_perception.imaging.camera import Camera
-from sq_perception.nodes import garbage, report, transport
-from sq_perception.nodes.counters import Statistics, Throttle
-from sq_perception.nodes.engine import TURNS, Engine, Workshop
-from sq_perception.nodes.frame import Frame, decode
-from sq_perception.nodes.frame_publisher import FramePublisher
-from sq_perception.nodes.inbox import Arrival, Inbox, NoCameraInfo, Refused
+from sq_perception.nodes import fast_dds, process
+from sq_perception.nodes.engine import TURNS, Engine, RecovererFactory
+from sq_perception.nodes.frame import Frame
+from sq_perception.nodes.input import Arrival, Input
 from sq_perception.nodes.managed_node import ManagedNode
-from sq_perception.nodes.parameters import FrameParameters, LiveParameters
-from sq_perception.nodes.triggers import Outcome, Triggers
+from sq_perception.nodes.outputs import Outputs
+from sq_perception.nodes.parameters import LiveParameters
+from sq_perception.nodes.statistics import THROTTLE, Condition, Statistics, status, summary, timed
+from sq_perception.nodes.tracking import CameraPoses, Tracking
 from sq_perception.recovery.recoverer import FrameRecovery
 
 WARM_UP_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
@@ -63,15 +62,8 @@ _OLDEST = 3600.0
 """Seconds; the age of an older frame, or one from the future, says nothing about latency: a bag, or another clock."""
 _DEFECTS = 10
 """Frames in a row that end in a defect of ours or of the device, after which the node starts anew."""
-
-
-@dataclass(frozen=True)
-class _Input:
-    """A subscription, and what is said about it, also after it has been destroyed."""
-
-    subscription: Subscription
-    topic: str
-    profile: QoSProfile
+_TICK = 0.05
+"""Seconds between two looks at whether a caller of ~/trigger has waited long enough."""
 
 
 class FrameNode(ManagedNode):
@@ -83,7 +75,7 @@ class FrameNode(ManagedNode):
         Of the node.
     kind
         The dataclass of its parameters.
-    workshop
+    factory
         What makes the recoverer that does the work, and tells it what the parameters say.
     context
         rclpy's default if not given.
@@ -99,30 +91,26 @@ class FrameNode(ManagedNode):
         self,
         name: str,
         kind: type[Any],
-        workshop: Workshop[Any],
+        factory: RecovererFactory[Any],
         *,
         namespace: str | None = None,
         context: Any = None,
     ) -> None:
         super().__init__(name, namespace=namespace, context=context)
-        self._engine: Engine[Any] = Engine(workshop, self._inform, self._complain)
+        self._engine: Engine[Any] = Engine(factory, self)
         self._settings: LiveParameters[Any] = LiveParameters(
-            self, kind, locked=self._why_locked, judge=workshop.judge, changed=self._on_changed
+            self, kind, locked=self._why_locked, check=factory.check, changed=self._on_changed
         )
         self._statistics = Statistics()
-        self._throttle = Throttle()
-        self._enabled = True
-        self._triggers = Triggers(self)
-        self._publisher = FramePublisher(self, self._warn, self._inform)
-        self._note = ""
-        self._defects = 0
-        self._inbox: Inbox | None = None
-        self._worker: threading.Thread | None = None
-        self._image_input: _Input | None = None
-        self._info_input: _Input | None = None
-        self._mask_input: _Input | None = None
-        self._last_image = monotonic()
         self._last_counts = self._statistics.snapshot()
+        self._poses = CameraPoses(self)
+        self._tracking = Tracking(self, self._poses)
+        self._outputs = Outputs(self, self._poses)
+        self._input: Input | None = None
+        self._worker: threading.Thread | None = None
+        self._enabled = True
+        self._defects = 0
+        self._triggers = _Triggers(self)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.create_service(SetBool, "~/enable", self._on_enable)
         # Its answer waits for a frame; in the default group nothing else would run meanwhile.
@@ -136,6 +124,9 @@ class FrameNode(ManagedNode):
 
     def _configure(self) -> None:
         parameters = self._settings.current
+        if parameters.free_shared_memory:
+            freed = fast_dds.remove_orphans()
+            self.get_logger().info(f"freed {len(freed)} shared-memory segments of processes that were killed")
         started = perf_counter()
         self.get_logger().info("warming up: loading compiled code, or compiling it on the first start")
         self._engine.build(parameters, self._warm_up_camera)
@@ -143,49 +134,35 @@ class FrameNode(ManagedNode):
         meanwhile = {one.name for one in fields(latest) if getattr(latest, one.name) != getattr(parameters, one.name)}
         self._engine.follow(latest, frozenset(meanwhile), self._warm_up_camera)
         self.get_logger().info(f"warm after {perf_counter() - started:.1f} s")
-        self._publisher.open(latest)
-        garbage.keep()
+        self._outputs.open(latest)
+        if latest.fixed_frame or latest.target_frame:
+            self._poses.listen()
+        process.keep_objects()
 
     def _activate(self) -> None:
-        pinhole = self._settings.current.projection == "pinhole"
         self._defects = 0
-        self._last_image = monotonic()
-        packing = self._settings.current.image_transport
-        image_topic = transport.topic(self, "depth/image", packing)
-        self._inbox = inbox = Inbox(
-            (lambda info: self._calibrated(info, image_topic)) if pinhole else None,
-            needs_mask=lambda: self._expects_mask(self._settings.current.use_masks),
-            patience=lambda: self._settings.current.patience,
-            dropped=lambda number: self._statistics.count("dropped", number),
-        )
-        self._worker = threading.Thread(target=self._work, args=(inbox,), name="worker", daemon=True)
+        self._input = one = Input(self, lambda: self._settings.current, lambda: self._is_wanted, self._statistics)
+        self._worker = threading.Thread(target=self._work, args=(one,), name="worker", daemon=True)
         self._worker.start()
-        # Subscriptions are served in this order: what an image needs is there before the image.
-        self._info_input = self._listen(CameraInfo, "depth/camera_info", inbox.put_info) if pinhole else None
-        self._mask_input = self._listen(Image, "mask/image", inbox.put_mask)
-        self._image_input = self._listen(transport.message_type(packing), image_topic, self._on_image)
-        self.get_logger().info(f"ready, listening to {self._image_input.topic}")
+        one.open()
+        self.get_logger().info(f"ready, listening to {one.topic}")
 
     def _deactivate(self) -> None:
         self._stop()
-        self._publisher.withdraw()
+        self._outputs.withdraw()
 
     def _cleanup(self) -> None:
         self._stop()
-        self._publisher.close()
+        self._outputs.close()
+        self._poses.close()
         self._engine.release()
-        garbage.release()  # nothing of a network may hang on in a cycle of references
+        process.release_objects()  # nothing of a network may hang on in a cycle of references
 
     def _stop(self) -> None:
         """End subscriptions and worker.  What planners were told of stays: a camera that fails takes no obstacles."""
-        inputs = (self._image_input, self._mask_input, self._info_input)
-        self._image_input = self._mask_input = self._info_input = None
-        for one in inputs:
-            if one is not None:
-                self.destroy_subscription(one.subscription)
-        inbox, self._inbox = self._inbox, None
-        if inbox is not None:
-            self._statistics.count("dropped", inbox.close())
+        one, self._input = self._input, None
+        if one is not None:
+            one.close()
         self._triggers.answer((False, "the node has been deactivated"))
         if self._worker is not None:
             self._worker.join(_WORKER_END)
@@ -217,105 +194,23 @@ class FrameNode(ManagedNode):
     def _on_changed(self, parameters: Any, names: frozenset[str]) -> None:
         self._engine.follow(parameters, names, self._warm_up_camera)
 
-    def _listen(self, kind: type[Any], topic: str, callback: Callable[[Any], None]) -> _Input:
-        profile = QoSProfile(depth=1, history=QoSHistoryPolicy.KEEP_LAST, reliability=QoSReliabilityPolicy.BEST_EFFORT)
-        made = self.create_subscription(
-            kind,
-            topic,
-            callback,
-            profile,
-            event_callbacks=SubscriptionEventCallbacks(message_lost=self._on_lost),
-            qos_overriding_options=QoSOverridingOptions.with_default_policies(),
-        )
-        return _Input(made, made.topic_name, made.qos_profile)
-
-    # Callbacks, in the executor's thread: quick, and nothing in them can fail on a message's content
-
-    def _on_image(self, message: Image | CompressedImage) -> None:
-        inbox = self._inbox
-        if inbox is None:
-            return
-        self._last_image = monotonic()
-        self._statistics.count("received")
-        if self._is_wanted:
-            inbox.put_image(message)
-        else:
-            self._statistics.count("dropped")
-
-    def _calibrated(self, info: CameraInfo, image_topic: str) -> Calibration:
-        calibration = Calibration.of(info, image_topic, self._settings.current.distortion)
-        if calibration.note != self._note and self._throttle.passes("distortion") is not None:
-            self._note = calibration.note
-            self._inform(f"{image_topic}: {calibration.note or 'no distortion'}")
-        return calibration
-
-    def _on_lost(self, event: Any) -> None:
-        self._statistics.count("lost", event.total_count_change)
-        self._warn(
-            "lost",
-            f"{event.total_count} messages lost before they arrived: best effort images need more shared memory than "
-            "Fast DDS reserves by default. Remedy: start the PUBLISHER (the camera driver) with "
-            "FASTRTPS_DEFAULT_PROFILES_FILE set to the profile that ships in this package's config folder",
-        )
-
-    def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
-        self._enabled = bool(request.data)
-        response.success = True
-        response.message = "enabled" if self._enabled else "disabled: frames are dropped, ~/trigger still works"
-        return response
-
-    async def _on_trigger(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        image_input = self._image_input
-        if image_input is None:
-            response.success, response.message = False, f"the node is {self.state}, not active"
-            return response
-        timeout = self._settings.current.trigger_timeout
-
-        def why_none() -> str:
-            return f"no frame on {image_input.topic} within {timeout:g} s: {self._heard(image_input)}"
-
-        return await self._triggers.outcome(response, timeout, why_none)
-
-    def _on_second(self) -> None:
-        image_input, parameters = self._image_input, self._settings.current
-        silence = monotonic() - self._last_image
-        silent = image_input is not None and 0 < parameters.no_frame_warning < silence
-        if silent and image_input is not None:
-            topic, publishers = image_input.topic, self._heard(image_input)
-            self._warn("silence", f"no depth image on {topic} for {silence:.0f} s: {publishers}")
-        now = self._statistics.snapshot()
-        message = DiagnosticArray()
-        message.header.stamp = self.get_clock().now().to_msg()
-        condition = report.Condition(
-            state=self.state,
-            fault=self.fault or self._engine.fault,
-            silent=silent,
-            enabled=self._enabled,
-            engine=self._engine.words,
-            absent=self._publisher.absent,
-            tally=self._publisher.tally if self.is_active and parameters.tracking else None,
-        )
-        message.status.append(report.status(self.get_fully_qualified_name(), now, self._last_counts, condition))
-        self._last_counts = now
-        self._diagnostics.publish(message)
-
     # The worker
 
-    def _work(self, inbox: Inbox) -> None:
-        while inbox.wait():
+    def _work(self, source: Input) -> None:
+        while source.inbox.wait():
             arrival: Arrival | None = None
             outcome: Outcome
             try:
                 with TURNS.turn():
                     # Taken when the turn has come: while others were computing, a newer one may have arrived.
-                    arrival = inbox.take()
+                    arrival = source.inbox.take()
                     if arrival is None:
                         continue
                     if not self._is_wanted:
                         self._statistics.count("dropped")
                         continue
-                    frame, recovery, stages = self._recovered(inbox, arrival)
-                if self._inbox is not inbox or not self._is_wanted:
+                    frame, recovery, stages = self._recovered(source, arrival)
+                if self._input is not source or not self._is_wanted:
                     # Deactivated or disabled meanwhile: nothing is published any more, least of all a grasped body.
                     self._statistics.count("dropped")
                     continue
@@ -324,21 +219,15 @@ class FrameNode(ManagedNode):
             except ValueError as error:
                 outcome = False, str(error)
             except Exception as error:
-                if not self.context.ok() or self._inbox is not inbox:
+                if not self.context.ok() or self._input is not source:
                     return
-                # A defect of ours: it costs this frame and leaves its trace in the log, and the node goes on.
                 outcome = False, f"{type(error).__name__}: {error}"
-                if self._throttle.passes("defect") is not None:
-                    self.get_logger().error(traceback.format_exc())
-                self._defects += 1
-                if self._defects == _DEFECTS:
-                    self._engine.discard()
-                    self._fail(f"{_DEFECTS} frames in a row failed, the last one by {outcome[1]}")
+                self._note_defect(outcome[1])
             if arrival is None:
                 continue
             if not outcome[0]:
                 self._statistics.refuse(outcome[1])
-                self._warn(outcome[1].split(":")[0], f"refused a frame: {outcome[1]}")
+                self.get_logger().warning(f"refused a frame: {outcome[1]}", throttle_duration_sec=THROTTLE)
             self._triggers.answer(outcome, arrival.time)
 
     @property
@@ -346,67 +235,139 @@ class FrameNode(ManagedNode):
         """Whether frames are processed, or one is asked for."""
         return self._enabled or len(self._triggers) > 0
 
-    def _recovered(self, inbox: Inbox, arrival: Arrival) -> tuple[Frame, FrameRecovery, dict[str, float]]:
+    def _recovered(self, source: Input, arrival: Arrival) -> tuple[Frame, FrameRecovery, dict[str, float]]:
         """The frame of a message, its bodies, and how long that took by stage, milliseconds."""
         parameters = self._settings.current
         stages = {"wait": 1e3 * (monotonic() - arrival.time)}
-        clock = perf_counter()
-        frame = self._decoded(inbox, arrival, parameters)
-        stages["decode"] = 1e3 * (perf_counter() - clock)
-        recoverer, options = self._engine.at_work(parameters)
-        recovery = recoverer.recover(frame.depth, frame.camera, frame.labels, options)
+        with timed(stages, "decode"):
+            frame = source.frame(arrival, parameters)
+        recovery = self._engine.recover(frame, parameters)
         return frame, recovery, stages | {f"recovery: {name}": took for name, took in recovery.milliseconds.items()}
 
     def _published(self, frame: Frame, recovery: FrameRecovery, arrival: Arrival, stages: dict[str, float]) -> str:
-        """Publish the results; the summary."""
+        """Name the bodies and publish them; the summary."""
         parameters = self._settings.current
-        found, findings, took = self._publisher.answer(frame, recovery, arrival.time, parameters)
+        with timed(stages, "tracking"):
+            found = self._tracking.identify(recovery, frame, arrival.time, parameters)
+        with timed(stages, "publish"):
+            findings = self._outputs.answer(found, frame, parameters)
         age = 1e-9 * (self.get_clock().now().nanoseconds - _nanoseconds(frame.header.stamp))
         if abs(age) < _OLDEST:
-            took["stamp to result"] = 1e3 * age
-        self._statistics.answer(stages | took)
-        self._statistics.note(self._publisher.accompany(frame, found, findings, parameters))
-        return report.summary(found.recovery, found.ids)
+            stages["stamp to result"] = 1e3 * age
+        self._statistics.answer(stages)
+        self._statistics.note(self._outputs.accompany(found, findings, frame, parameters))
+        return summary(found.recovery, found.ids)
 
-    def _decoded(self, inbox: Inbox, arrival: Arrival, parameters: FrameParameters) -> Frame:
-        message = arrival.message
-        if parameters.projection == "orthographic":
-            frame = decode(message, None)
-        else:
-            try:
-                frame = decode(message, lambda: inbox.calibration_of(message))
-            except NoCameraInfo as error:
-                info_input = self._info_input
-                if info_input is None:
-                    raise
-                raise Refused(f"{error}, on {info_input.topic}: {self._heard(info_input)}") from error
-        if parameters.use_masks == "always" and arrival.mask is None:
-            mask_input = self._mask_input
-            where = f" on {mask_input.topic}" if mask_input is not None else ""
-            raise Refused(f"mask: expected one with the stamp of the image (use_masks is always), none came{where}")
-        return frame.with_mask(arrival.mask if parameters.use_masks != "never" else None)
+    def _note_defect(self, words: str) -> None:
+        """A defect of ours: it costs this frame and leaves its trace in the log, and the node goes on."""
+        self.get_logger().error(traceback.format_exc(), throttle_duration_sec=THROTTLE)
+        self._defects += 1
+        if self._defects == _DEFECTS:
+            self._engine.discard()
+            self._fail(f"{_DEFECTS} frames in a row failed, the last one by {words}")
 
-    def _expects_mask(self, use: str) -> bool:
-        mask_input = self._mask_input
-        if mask_input is None:
-            return False
-        return use == "always" or (use == "auto" and bool(self.count_publishers(mask_input.topic)))
+    # Services and diagnostics, in the executor's thread
 
-    # Words
+    def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
+        self._enabled = bool(request.data)
+        response.success = True
+        response.message = "enabled" if self._enabled else "disabled: frames are dropped, ~/trigger still works"
+        return response
 
-    def _inform(self, text: str) -> None:
-        self.get_logger().info(text)
+    async def _on_trigger(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        source = self._input
+        if source is None:
+            response.success, response.message = False, f"the node is {self.state}, not active"
+            return response
+        timeout = self._settings.current.trigger_timeout
 
-    def _complain(self, text: str) -> None:
-        self.get_logger().error(text)
+        def why_none() -> str:
+            return f"no frame on {source.topic} within {timeout:g} s: {source.heard}"
 
-    def _warn(self, kind: str, text: str) -> None:
-        remark = self._throttle.passes(kind)
-        if remark is not None:
-            self.get_logger().warning(text + remark)
+        response.success, response.message = await self._triggers.next_outcome(timeout, why_none)
+        return response
 
-    def _heard(self, listened: _Input) -> str:
-        return report.publishers(self.get_publishers_info_by_topic(listened.topic), listened.profile)
+    def _on_second(self) -> None:
+        source, parameters = self._input, self._settings.current
+        silent = source is not None and 0 < parameters.no_frame_warning < source.silence
+        if silent and source is not None:
+            self.get_logger().warning(
+                f"no depth image on {source.topic} for {source.silence:.0f} s: {source.heard}",
+                throttle_duration_sec=THROTTLE,
+            )
+        now = self._statistics.snapshot()
+        message = DiagnosticArray()
+        message.header.stamp = self.get_clock().now().to_msg()
+        condition = Condition(
+            state=self.state,
+            fault=self.fault or self._engine.fault,
+            silent=silent,
+            enabled=self._enabled,
+            engine=self._engine.description,
+            absent=self._outputs.absent,
+            tally=self._tracking.tally if self.is_active and parameters.tracking else None,
+        )
+        message.status.append(status(self.get_fully_qualified_name(), now, self._last_counts, condition))
+        self._last_counts = now
+        self._diagnostics.publish(message)
+
+
+Outcome = tuple[bool, str]
+"""Whether a frame was answered, and the summary or the reason."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Caller:
+    since: float
+    until: float
+    why_none: Callable[[], str]
+    outcome: Future
+
+
+class _Triggers:
+    """Lets service calls wait for the outcome of the next frame; asked in the executor, answered by the worker."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._lock = threading.Lock()
+        self._waiting: list[_Caller] = []
+        # One for all, and on a steady clock: simulated time may stand still.
+        self._timer = node.create_timer(_TICK, self._expire, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self._timer.cancel()
+
+    def __len__(self) -> int:
+        """How many callers wait."""
+        return len(self._waiting)
+
+    async def next_outcome(self, timeout: float, why_none: Callable[[], str]) -> Outcome:
+        """The outcome of the next frame, or what ``why_none()`` says if none comes in time."""
+        now = monotonic()
+        caller = _Caller(now, now + timeout, why_none, Future(executor=self._node.executor))
+        with self._lock:
+            self._waiting.append(caller)
+            self._timer.reset()
+        outcome: Outcome = await caller.outcome
+        return outcome
+
+    def answer(self, outcome: Outcome, arrived: float = float("inf")) -> None:
+        """Answer those that were waiting when the frame arrived, at ``arrived`` of the monotonic clock; or all."""
+        with self._lock:
+            waiting = [one for one in self._waiting if one.since <= arrived]
+            self._waiting = [one for one in self._waiting if one not in waiting]
+        for one in waiting:
+            one.outcome.set_result(outcome)
+        if waiting and self._node.executor is not None:
+            self._node.executor.wake()
+
+    def _expire(self) -> None:
+        now = monotonic()
+        with self._lock:
+            late = [one for one in self._waiting if one.until <= now]
+            self._waiting = [one for one in self._waiting if one not in late]
+            if not self._waiting:
+                self._timer.cancel()
+        for one in late:
+            one.outcome.set_result((False, one.why_none()))
 
 
 def _nanoseconds(stamp: Any) -> int:

@@ -29,13 +29,12 @@ import traceback
 from collections.abc import Callable
 from typing import Any
 
-from lifecycle_msgs.msg import State, Transition
+from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallbackReturn
+from rclpy.node import Node
 from rclpy.task import Future
-
-from sq_perception.nodes.stoppable_node import StoppableNode
 
 _SHUTDOWNS = (
     Transition.TRANSITION_UNCONFIGURED_SHUTDOWN,
@@ -57,7 +56,7 @@ _END = 4.0
 """Seconds that :meth:`ManagedNode.close` waits for a transition."""
 
 
-class ManagedNode(LifecycleNodeMixin, StoppableNode):
+class ManagedNode(LifecycleNodeMixin, Node):
     """See the module.
 
     Parameters
@@ -69,37 +68,41 @@ class ManagedNode(LifecycleNodeMixin, StoppableNode):
     """
 
     def __init__(self, name: str, *, namespace: str | None = None, context: Any = None) -> None:
-        StoppableNode.__init__(self, name, namespace=namespace, context=context)
+        Node.__init__(self, name, namespace=namespace, context=context)
+        # Not LifecycleNode, whose services share the default group: none would answer while a transition is awaited.
         LifecycleNodeMixin.__init__(self, callback_group=ReentrantCallbackGroup())
-        self._service_change_state.callback = self._on_change_state  # type: ignore[assignment]  # executors await it
+        # rclpy's own callback runs the transition in the executor's thread, where nothing else is served for the
+        # seconds that a model takes to load, and raises RCLError for one that the state does not allow, which ends it.
+        (service,) = (one for one in self.services if one.srv_type is ChangeState)
+        service.callback = self._on_change_state  # type: ignore[assignment]  # executors await it
         self.fault = ""
         """Why the last transition failed; empty once one has succeeded."""
+        self.start_failure = ""
+        """Why the node could not bring itself up; its process then ends."""
         self._closing = threading.Event()
-        self._errands: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
-        self._bringer = threading.Thread(target=self._run_errands, name="transitions", daemon=True)
-        self._bringer.start()
+        self._tasks: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
+        self._thread = threading.Thread(target=self._run_tasks, name="transitions", daemon=True)
+        self._thread.start()
 
     @property
     def state(self) -> str:
         """Label of the lifecycle state: unconfigured, inactive, active, finalized, or one of the transitions."""
+        # rclpy 7.1 tells the state to callers of ~/get_state only.
         return str(self._state_machine.current_state[1])
 
     @property
     def is_active(self) -> bool:
         """Whether the node is in the state ``active``."""
-        return bool(self._state_machine.current_state[0] == State.PRIMARY_STATE_ACTIVE)
+        return self.state == "active"
 
     @property
     def is_configured(self) -> bool:
         """Whether the node is beyond ``unconfigured``, transitions on the way there included."""
-        return bool(
-            self._state_machine.current_state[0]
-            not in (State.PRIMARY_STATE_UNCONFIGURED, State.PRIMARY_STATE_FINALIZED, State.PRIMARY_STATE_UNKNOWN)
-        )
+        return self.state not in ("unconfigured", "finalized", "unknown")
 
     def start(self) -> None:
         """Configure and activate, in the thread of the transitions; :attr:`start_failure` tells of a failure."""
-        self._errands.put(self._bring_up)
+        self._tasks.put(self._bring_up)
 
     def close(self) -> bool:
         """Release everything; called once, before destroy_node.  False if a transition is still at work after a while.
@@ -107,13 +110,16 @@ class ManagedNode(LifecycleNodeMixin, StoppableNode):
         The state becomes ``finalized`` where it was one that allows it.
         """
         self._closing.set()
-        self._errands.put(self._end)
-        self._errands.put(None)
-        self._bringer.join(_END)
-        return not self._bringer.is_alive()
+        self._tasks.put(self._end)
+        self._tasks.put(None)
+        self._thread.join(_END)
+        return not self._thread.is_alive()
 
     def destroy_node(self) -> None:
-        """As rclpy's, which leaves the publisher of the transitions to the garbage collector."""
+        """As rclpy's, and the publisher of the transitions goes too.
+
+        rclpy leaves it to the garbage collector: it stayed in the graph for as long as the process lived.
+        """
         super().destroy_node()
         self._state_machine.destroy_when_not_in_use()
 
@@ -133,7 +139,7 @@ class ManagedNode(LifecycleNodeMixin, StoppableNode):
 
     def _fail(self, reason: str) -> None:
         """Leave the active state for a fault that further frames would only repeat; from any thread."""
-        self._errands.put(lambda: self._leave_by_fault(reason))
+        self._tasks.put(lambda: self._leave_by_fault(reason))
 
     # Transitions, all in one thread
 
@@ -208,10 +214,10 @@ class ManagedNode(LifecycleNodeMixin, StoppableNode):
         if self.is_configured or self.state == "unconfigured":
             self._change("shutdown")
 
-    def _run_errands(self) -> None:
-        while (errand := self._errands.get()) is not None:
+    def _run_tasks(self) -> None:
+        while (task := self._tasks.get()) is not None:
             try:
-                errand()
+                task()
             except Exception:
                 if not self._closing.is_set():
                     self.get_logger().error(traceback.format_exc())
@@ -228,7 +234,7 @@ class ManagedNode(LifecycleNodeMixin, StoppableNode):
             return response
         done: Future = Future(executor=self.executor)
 
-        def errand() -> None:
+        def task() -> None:
             succeeded = False
             try:
                 succeeded = self._change(name)
@@ -237,6 +243,6 @@ class ManagedNode(LifecycleNodeMixin, StoppableNode):
                 if self.executor is not None:
                     self.executor.wake()
 
-        self._errands.put(errand)
+        self._tasks.put(task)
         response.success = bool(await done)
         return response

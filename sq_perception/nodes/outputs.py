@@ -1,4 +1,6 @@
-"""What a frame node publishes for other stacks, beside its point cloud and its pictures.
+"""What a frame node publishes of a frame's bodies: the point cloud, pictures, and what other stacks understand.
+
+The point cloud is the answer to a frame; what goes with it comes afterwards and cannot take the answer back.
 
 | parameter | name | type | package |
 | --- | --- | --- | --- |
@@ -7,14 +9,15 @@
 | `publish_collision_objects` | `~/planning_scene` | moveit_msgs/PlanningScene, differences | moveit_msgs |
 
 Neither package is on PyPI, and a robot may lack each: it is imported only when its output is asked for, and one that is
-missing is named once in the log and stays in :attr:`Outputs.absent`.  Messages are made only while somebody listens.
+missing is named once in the log and stays in ``absent``.  Messages are made only while somebody listens.
 
 /tf is published as tf2_ros.TransformBroadcaster does it, with the same queue of 100; a publisher of our own needs
 tf2_msgs alone, knows whether anybody listens, and can be taken down again.
 
 An object of the planning scene is removed when its id is gone, that is neither in a frame nor that of a track which the
 frame does not show: what a robot's arm hides is still there.  Switching the output off removes all objects that were
-added.  A node that ends removes nothing: a planner must not lose its obstacles because a camera fails.
+added.  A node that ends removes nothing: a planner must not lose its obstacles because a camera fails; and what
+planners were told of outlives a restart after a fault, so that an object that is gone is still removed.
 """
 
 from __future__ import annotations
@@ -26,12 +29,122 @@ from typing import Any
 
 from rclpy.node import Node
 from rclpy.publisher import Publisher
+from sensor_msgs.msg import Image, PointCloud2
+from visualization_msgs.msg import MarkerArray
 
 from sq_msgs_py import collision_objects
 from sq_msgs_py.detections import detections
+from sq_msgs_py.superquadrics import to_message
 from sq_msgs_py.transforms import name, transforms
+from sq_perception.nodes.frame import Frame, Refused
 from sq_perception.nodes.parameters import FrameParameters
-from sq_perception.recordings.publication import Findings
+from sq_perception.nodes.statistics import THROTTLE, timed
+from sq_perception.nodes.tracking import CameraPoses, PoseError
+from sq_perception.recordings import publication
+from sq_perception.recordings.publication import Findings, Identified, MarkerStyle
+from sq_perception.recovery.recoverer import render_recovery
+
+
+class Outputs:
+    """Publishes frames; used by one thread at a time, except for ``absent``.
+
+    Parameters
+    ----------
+    node
+        Whose publishers they are.
+    poses
+        Where the camera is in ``target_frame``.
+    """
+
+    def __init__(self, node: Node, poses: CameraPoses) -> None:
+        self._node, self._poses = node, poses
+        self._others = OptionalOutputs(node)
+        self._publishers: tuple[Publisher, ...] = ()
+        self._shown_ids: list[int] = []
+
+    @property
+    def absent(self) -> tuple[str, ...]:
+        """Packages that outputs are asked for and that are not there."""
+        return self._others.absent
+
+    def open(self, parameters: FrameParameters) -> None:
+        """Create what is published."""
+        self.superquadrics = self._node.create_publisher(PointCloud2, "~/superquadrics", 10)
+        self.markers = self._node.create_publisher(MarkerArray, "~/markers", 1)
+        self.rendered_depth = self._node.create_publisher(Image, "~/rendered_depth", 1)
+        self._publishers = self.superquadrics, self.markers, self.rendered_depth
+        self._others.follow(parameters)
+
+    def close(self) -> None:
+        """Destroy the publishers; what planners were told of stays with them."""
+        for publisher in self._publishers:
+            self._node.destroy_publisher(publisher)
+        self._publishers = ()
+        self._others.close()
+        self._shown_ids = []
+
+    def withdraw(self) -> None:
+        """Take back what planners were told of: nobody looks after it from now on."""
+        self._others.withdraw()
+
+    def answer(self, found: Identified, frame: Frame, parameters: FrameParameters) -> Findings:
+        """Publish the point cloud, in ``target_frame`` if there is one; what was found as every output shows it.
+
+        Raises
+        ------
+        Refused
+            If the transform to that frame is not known: nothing may be published in a wrong frame.
+        """
+        findings = publication.findings(found, frame.header, frame.is_cube)
+        findings = in_frame(findings, self._poses, parameters.target_frame)
+        self.superquadrics.publish(to_message(findings.array, findings.header))
+        return findings
+
+    def accompany(
+        self, found: Identified, findings: Findings, frame: Frame, parameters: FrameParameters
+    ) -> dict[str, float]:
+        """Publish what goes with the answer; milliseconds by stage.  Whatever goes wrong here is told, and no more."""
+        stages: dict[str, float] = {}
+        try:
+            with timed(stages, "outputs"):
+                self._others.publish(findings, parameters, found.hidden)
+            with timed(stages, "pictures"):
+                if self.markers.get_subscription_count():
+                    self.markers.publish(findings.markers(self._shown_ids, marker_style(parameters)))
+                    self._shown_ids = findings.shown_ids
+                if self.rendered_depth.get_subscription_count():
+                    self.rendered_depth.publish(frame.encode(render_recovery(found.recovery, frame.camera)[0]))
+        except Exception as error:
+            if self._node.context.ok():
+                self._node.get_logger().warning(
+                    f"a result was published without all that goes with it: {type(error).__name__}: {error}",
+                    throttle_duration_sec=THROTTLE,
+                )
+        return stages
+
+
+def marker_style(parameters: FrameParameters) -> MarkerStyle:
+    """How markers look."""
+    return MarkerStyle(parameters.marker_colours, parameters.marker_alpha, parameters.marker_line_width)
+
+
+def in_frame(found: Findings, poses: CameraPoses, frame_id: str) -> Findings:
+    """Findings in another tf2 frame, by the transform at their stamp; as they are for an empty ``frame_id``.
+
+    Raises
+    ------
+    Refused
+        If the transform is not known.
+    """
+    if not frame_id:
+        return found
+    try:
+        rotation, translation = poses.at(found.header, frame_id)
+    except PoseError as error:
+        raise Refused(
+            f"target_frame: expected a transform from {found.header.frame_id!r} to {frame_id!r}: {error}"
+        ) from error
+    return found.moved(frame_id, rotation, translation)
 
 
 @dataclass(frozen=True)
@@ -49,8 +162,8 @@ _KINDS = {
 }
 
 
-class Outputs:
-    """Publishes what the parameters ask for; used by one thread at a time, except for ``absent``."""
+class OptionalOutputs:
+    """What the parameters ask for, for other stacks; used by one thread at a time, except for ``absent``."""
 
     def __init__(self, node: Node) -> None:
         self._node = node

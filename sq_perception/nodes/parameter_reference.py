@@ -62,9 +62,10 @@ The quality of service of each subscription is a parameter too, at the start onl
 def page() -> str:
     """The page, Markdown."""
     shared = {one.name for one in fields(FrameParameters)}
-    parts = [_HEAD, "## recover_node and fitter_node\n", _table(list(fields(FrameParameters)), "configure")]
     own = [one for one in fields(RecoverParameters) if one.name not in shared]
-    parts += ["## recover_node, and the nodes of recover_cameras\n", _table(own, "configure")]
+    other = f"fitter_node is recover_node with `method: {FitterParameters.method}`.\n"
+    parts = [_HEAD, "## recover_node, recover_cameras, fitter_node\n", _table([*fields(FrameParameters)], "configure")]
+    parts += ["## What computes in them\n", other, _table(own, "configure")]
     parts += ["## synthetic_depth_node\n", _table(list(fields(SyntheticParameters)), "start")]
     return "\n".join(parts)
 

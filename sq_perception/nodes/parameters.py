@@ -21,13 +21,16 @@ from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValu
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from sq_perception.imaging import compressed_depth
 from sq_perception.imaging.calibration import Treatment
-from sq_perception.nodes.transport import RAW, TRANSPORTS
 from sq_perception.simulation.sensor_noise import PRESETS
 
 Method = Literal["auto", "network", "symmetry", "classic"]
 Refine = Literal["surface", "soft_render", "none"]
 Projection = Literal["pinhole", "orthographic"]
+RAW = "raw"
+TRANSPORTS = (RAW, compressed_depth.TRANSPORT)
+"""As image_transport names them."""
 IDEAL = "ideal"
 """The sensor with Gaussian noise and nothing else."""
 
@@ -50,14 +53,25 @@ def setting(
     return field(default=default, metadata=about)
 
 
+def replaced(name: str, kind: type[Any], default: Any) -> Any:
+    """The field of another dataclass with another default."""
+    (one,) = (one for one in fields(kind) if one.name == name)
+    return field(default=default, metadata=one.metadata)
+
+
 @dataclass(frozen=True)
 class FrameParameters:
-    """What recover_node and fitter_node have in common."""
+    """What every node that takes depth images and publishes bodies has."""
 
     autostart: bool = setting(
         True,
         "Configure and activate at the start. Without, the node stays unconfigured until somebody asks: ros2 lifecycle "
         "set, or a lifecycle manager.",
+    )
+    free_shared_memory: bool = setting(
+        False,
+        "Delete the shared memory that Fast DDS has left behind for killed processes of this user, 17 MB each. That of "
+        "living processes stays.",
     )
     projection: Projection = setting(  # noqa: RUF009 - a field
         "pinhole",
@@ -246,8 +260,10 @@ class RecoverParameters(FrameParameters):
 
 
 @dataclass(frozen=True)
-class FitterParameters(FrameParameters):
-    """fitter_node: nothing but what both have."""
+class FitterParameters(RecoverParameters):
+    """fitter_node: recover_node with another method."""
+
+    method: Method = replaced("method", RecoverParameters, "classic")  # noqa: RUF009 - a field
 
 
 @dataclass(frozen=True)
@@ -338,7 +354,7 @@ class LiveParameters(Generic[P]):
         The node and the dataclass.
     locked
         Why what is not live cannot change now; empty where it can.  None: it never can.
-    judge
+    check
         Raises ValueError for a set of values that cannot work; gets the names of those that change as well.
     changed
         Told the new values and which of them were set.
@@ -355,14 +371,14 @@ class LiveParameters(Generic[P]):
         kind: type[P],
         *,
         locked: Callable[[], str] | None = None,
-        judge: Callable[[Any, frozenset[str]], None] = lambda _, __: None,
+        check: Callable[[Any, frozenset[str]], None] = lambda _, __: None,
         changed: Callable[[Any, frozenset[str]], None] = lambda _, __: None,
     ) -> None:
         self._fields: dict[str, Field[Any]] = {one.name: one for one in fields(kind)}
-        self._locked, self._judge, self._changed = locked, judge, changed
+        self._locked, self._check, self._changed = locked, check, changed
         values = {name: self._declare(node, one) for name, one in self._fields.items()}
         self._current: P = kind(**values)
-        node.add_on_set_parameters_callback(self._check)
+        node.add_on_set_parameters_callback(self._on_set)
         node.add_post_set_parameters_callback(self._accept)
 
     @property
@@ -379,7 +395,7 @@ class LiveParameters(Generic[P]):
             raise ParameterError(str(error)) from error
         return checked(one, node.get_parameter(one.name).value)
 
-    def _check(self, changes: list[Parameter]) -> SetParametersResult:
+    def _on_set(self, changes: list[Parameter]) -> SetParametersResult:
         try:
             candidate, names = self._merged(changes)
             frozen = sorted(name for name in names if not self._fields[name].metadata["live"])
@@ -387,7 +403,7 @@ class LiveParameters(Generic[P]):
             if reason:
                 raise ParameterError(f"{', '.join(frozen)}: {reason}")
             if names:
-                self._judge(candidate, names)
+                self._check(candidate, names)
         except (ValueError, OSError) as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)

@@ -1,66 +1,67 @@
 """The life of a process with one or several nodes: start, spin, stop, each without a traceback.
 
 Exit code 0 after Ctrl-C or SIGTERM, whether it comes once, twice, or while a node still starts; 1 with one line of
-explanation where a node cannot start.  The shipped Fast DDS profile is used unless the user has chosen one, and shared
-memory that killed processes left behind is freed (:mod:`sq_perception.nodes.shared_memory`).
+explanation where a node cannot start.  The shipped Fast DDS profile is used unless the user has chosen one.  One thread
+spins all nodes: their callbacks only store messages, the work is done in threads of their own.
 
-One thread spins all nodes: their callbacks only store messages, the work is done in threads of their own.
+Garbage collection: torch, numba and SciPy make 300 000 objects that live as long as the process.  While they are
+imported, 690 collections find next to nothing and take 0.5 of 2.4 seconds; later each full collection would take
+200 ms, in the middle of some frame.  So there is none while a node starts, and afterwards none of what the start made.
 """
 
 from __future__ import annotations
 
+import gc
 import os
 import signal
 import sys
 import traceback
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from types import FrameType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, Protocol
 
-from sq_perception.nodes import fast_dds, garbage, shared_memory
+from sq_perception.nodes import fast_dds
 
 if TYPE_CHECKING:
     from rclpy.executors import Executor
 
-    from sq_perception.nodes.stoppable_node import StoppableNode
-
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+_SIGNALS = (signal.SIGINT, signal.SIGTERM)
 _THREADS = {"OMP_WAIT_POLICY": "PASSIVE", "OPENBLAS_NUM_THREADS": "1"}
 """Threads that spin while they wait take the cores from the nodes beside them: on two busy cores a frame took 30 ms
 with these settings and 50 to 150 ms without.  Small solves gain nothing from a second thread."""
-
-
 _SWITCH = 0.001
 """Seconds after which Python lets another thread go on.  With its 5 ms, services waited behind the threads that fit."""
 _LOOK = 0.1
 """Seconds between two looks at whether a signal has arrived."""
 
 
-class _Stop:
-    """Interrupts the start; while the node spins, says that it is to end."""
+class Stoppable(Protocol):
+    """An rclpy node that may fail to start, and has something to stop before it is destroyed."""
 
-    def __init__(self) -> None:
-        self.starting = True
-        self.received = False
+    @property
+    def start_failure(self) -> str:
+        """Why the node cannot start, once it has found out; its process then ends."""
 
-    def __call__(self, number: int, frame: FrameType | None) -> None:
-        first, self.received = not self.received, True
-        if self.starting and first:
-            raise KeyboardInterrupt
+    def close(self) -> bool:
+        """Stop threads; called once, before destroy_node.  False if one of them could not be stopped."""
+
+    def destroy_node(self) -> None: ...
+
+    def get_name(self) -> str: ...
 
 
-def run(name: str, create: Callable[[], Iterable[StoppableNode]], arguments: Sequence[str] | None = None) -> int:
+def run(name: str, create: Callable[[], Iterable[Stoppable]], arguments: Sequence[str] | None = None) -> int:
     """Create nodes and spin them until they are told to stop; the exit code.
 
     ``create`` imports what the nodes need, so that a signal during seconds of imports finds this function in charge.
     It may make them one by one: those that were made are closed also where a later one cannot be.
     """
     stop = _Stop()
-    for number in SIGNALS:
+    for number in _SIGNALS:
         signal.signal(number, stop)
-    nodes: list[StoppableNode] = []
+    nodes: list[Stoppable] = []
     code = 1
     try:
         try:
@@ -68,8 +69,7 @@ def run(name: str, create: Callable[[], Iterable[StoppableNode]], arguments: Seq
             for variable, value in {**_THREADS, **fast_dds.additions()}.items():
                 os.environ.setdefault(variable, value)
             sys.setswitchinterval(_SWITCH)
-            freed = shared_memory.remove_orphans()
-            with garbage.postponed():
+            with garbage_postponed():
                 import rclpy
                 from rclpy.executors import SingleThreadedExecutor
                 from rclpy.signals import SignalHandlerOptions
@@ -82,8 +82,6 @@ def run(name: str, create: Callable[[], Iterable[StoppableNode]], arguments: Seq
                 # deleted.
                 executor = SingleThreadedExecutor()
                 nodes.extend(create())
-            if freed.segments:
-                nodes[0].get_logger().debug(f"freed {freed}")
             stop.starting = False
             code = _spin(nodes, executor, stop)
         except Exception as error:
@@ -99,12 +97,55 @@ def run(name: str, create: Callable[[], Iterable[StoppableNode]], arguments: Seq
         # Around the handling of failures too.
         code = 0
     finally:
-        _ignore_signals()
+        # A second Ctrl-C (launch sends one) must not interrupt the end.
+        for number in _SIGNALS:
+            signal.signal(number, signal.SIG_IGN)
         _finish(nodes, code)
     return code
 
 
-def _spin(nodes: Sequence[StoppableNode], executor: Executor, stop: _Stop) -> int:
+@contextmanager
+def garbage_postponed() -> Iterator[None]:
+    """No collection within the block; what exists at its end is never collected again, new objects are as ever.
+
+    For the start of a process: what becomes unreachable within the block, or of its objects later, by a cycle stays.
+    """
+    was_enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.freeze()
+        if was_enabled:
+            gc.enable()
+
+
+def keep_objects() -> None:
+    """Collect garbage once, and leave what is left alone from now on: it lives as long as the node is configured."""
+    gc.collect()
+    gc.freeze()
+
+
+def release_objects() -> None:
+    """Collect everything that cannot be reached, what was left alone included; leave what is left alone again."""
+    gc.unfreeze()
+    keep_objects()
+
+
+class _Stop:
+    """Interrupts the start; while the node spins, says that it is to end."""
+
+    def __init__(self) -> None:
+        self.starting = True
+        self.received = False
+
+    def __call__(self, number: int, frame: FrameType | None) -> None:
+        first, self.received = not self.received, True
+        if self.starting and first:
+            raise KeyboardInterrupt
+
+
+def _spin(nodes: Sequence[Any], executor: Executor, stop: _Stop) -> int:
     import rclpy
     from rclpy.exceptions import InvalidHandle
     from rclpy.executors import ExternalShutdownException
@@ -138,7 +179,7 @@ def _explain(name: str, reason: str) -> None:
     get_logger(name).fatal(f"cannot start: {' '.join(reason.split())}")
 
 
-def _finish(nodes: Sequence[StoppableNode], code: int) -> None:
+def _finish(nodes: Sequence[Stoppable], code: int) -> None:
     import rclpy
 
     with ThreadPoolExecutor(max(len(nodes), 1)) as pool:  # each may wait for a transition
@@ -152,9 +193,3 @@ def _finish(nodes: Sequence[StoppableNode], code: int) -> None:
     for node in nodes:
         node.destroy_node()
     rclpy.try_shutdown()
-
-
-def _ignore_signals() -> None:
-    """A second Ctrl-C (launch sends one) must not interrupt the end."""
-    for number in SIGNALS:
-        signal.signal(number, signal.SIG_IGN)

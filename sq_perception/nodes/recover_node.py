@@ -1,68 +1,32 @@
-"""recover_node: superquadrics from depth images, started by a network and refined (see frame_node for the topics)."""
+"""recover_node and fitter_node: one node, whose method is auto in the one and classic in the other.
+
+The topics are in :mod:`sq_perception.nodes.frame_node`, the recoverer is made of the parameters here.
+"""
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Hashable, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Hashable
+from typing import Any
 
-from sq_perception.nodes import process
+import torch
 
-if TYPE_CHECKING:
-    from sq_perception.nodes.engine import Workshop
-    from sq_perception.nodes.frame_node import FrameNode
-    from sq_perception.nodes.parameters import RecoverParameters
-    from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
+from sq_perception.learning import checkpoint
+from sq_perception.nodes.engine import RecovererFactory
+from sq_perception.nodes.frame_node import FrameNode
+from sq_perception.nodes.parameters import FitterParameters, RecoverParameters
+from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions, checked_device
 
-NAME = "recover_node"
-
-
-def create(namespace: str | None = None) -> FrameNode:
-    """The node; imported here, as torch takes seconds to import and Ctrl-C must be heard meanwhile."""
-    from sq_perception.nodes.frame_node import FrameNode
-    from sq_perception.nodes.parameters import RecoverParameters
-
-    return FrameNode(NAME, RecoverParameters, workshop(), namespace=namespace)
+KINDS = {"recover_node": RecoverParameters, "fitter_node": FitterParameters}
+_NEEDS_NETWORK = ("auto", "network")
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Entry point; the exit code."""
-    return process.run(NAME, lambda: [create()], arguments)
+def create(namespace: str | None = None, name: str = "recover_node", context: Any = None) -> FrameNode:
+    """The node of that name, recover_node or fitter_node."""
+    return FrameNode(name, KINDS[name], FACTORY, namespace=namespace, context=context)
 
 
-def workshop() -> Workshop[RecoverParameters]:
-    """How the node's recoverer is made."""
-    from sq_perception.nodes.engine import Workshop
-
-    return Workshop(
-        make=_recoverer,
-        options=_options,
-        ingredients=("model", "device", "consensus", "threads", "method"),
-        key=_key,
-        judge=_judge,
-        describe=_describe,
-    )
-
-
-def _recoverer(parameters: RecoverParameters) -> Recoverer:
-    import torch
-
-    from sq_perception.recovery.recoverer import Recoverer
-
-    # On a robot's busy cores the slowest of several threads sets the time; one image is too small to gain from them.
-    torch.set_num_threads(1)
-    return Recoverer(
-        parameters.model or None,
-        parameters.device,
-        parameters.method,
-        parameters.consensus,
-        parameters.threads or None,
-    )
-
-
-def _options(parameters: RecoverParameters) -> RecoveryOptions:
-    from sq_perception.recovery.recoverer import RecoveryOptions
-
+def options(parameters: RecoverParameters) -> RecoveryOptions:
+    """What the parameters say to each frame."""
     return RecoveryOptions(
         method=parameters.method,
         refine=parameters.refine,
@@ -75,10 +39,20 @@ def _options(parameters: RecoverParameters) -> RecoveryOptions:
     )
 
 
+def _recoverer(parameters: RecoverParameters) -> Recoverer:
+    # On a robot's busy cores the slowest of several threads sets the time; one image is too small to gain from them.
+    torch.set_num_threads(1)
+    return Recoverer(
+        parameters.model or None,
+        parameters.device,
+        parameters.method,
+        parameters.consensus,
+        parameters.threads or None,
+    )
+
+
 def _key(parameters: RecoverParameters) -> Hashable:
     """What a recoverer is made of: the very file too, as another one may take its name."""
-    from sq_perception.learning import checkpoint
-
     path = checkpoint.resolve(parameters.model or None)
     try:
         known = path.stat()
@@ -88,10 +62,7 @@ def _key(parameters: RecoverParameters) -> Hashable:
     return file, parameters.device, parameters.consensus, parameters.threads, parameters.method
 
 
-def _judge(parameters: RecoverParameters, names: frozenset[str]) -> None:
-    from sq_perception.learning import checkpoint
-    from sq_perception.recovery.recoverer import checked_device
-
+def _check(parameters: RecoverParameters, names: frozenset[str]) -> None:
     if "model" in names:
         try:
             checkpoint.check(parameters.model or None)
@@ -102,9 +73,16 @@ def _judge(parameters: RecoverParameters, names: frozenset[str]) -> None:
 
 
 def _describe(parameters: RecoverParameters) -> str:
-    model = parameters.model or "default weights"
-    return f"method {parameters.method}, {model} on {parameters.device}"
+    if parameters.method not in _NEEDS_NETWORK:
+        return f"method {parameters.method}, no network"
+    return f"method {parameters.method}, {parameters.model or 'default weights'} on {parameters.device}"
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+FACTORY: RecovererFactory[RecoverParameters] = RecovererFactory(
+    make=_recoverer,
+    options=options,
+    made_of=("model", "device", "consensus", "threads", "method"),
+    key=_key,
+    check=_check,
+    describe=_describe,
+)

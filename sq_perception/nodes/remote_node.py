@@ -13,12 +13,11 @@ from collections.abc import Callable
 from time import monotonic
 from typing import Any
 
-from rcl_interfaces.msg import Parameter as ParameterMessage
-from rcl_interfaces.msg import ParameterDescriptor, ParameterEvent, ParameterType, ParameterValue
+from rcl_interfaces.msg import ParameterDescriptor, ParameterEvent
 from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParameters
 from rclpy.client import Client
 from rclpy.node import Node
-from rclpy.parameter import parameter_value_to_python
+from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.task import Future
 
 from sq_perception.viewing.controls import Control, Description, arranged
@@ -101,7 +100,7 @@ class RemoteNode:
         if not self.is_there:
             self._say(f"{name}: {self.name} is not there", False)
             return
-        request = SetParameters.Request(parameters=[ParameterMessage(name=name, value=_ros_value(value))])
+        request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
 
         def answered(response: SetParameters.Response) -> None:
             result = response.results[0]
@@ -250,16 +249,6 @@ def _description(about: ParameterDescriptor, value: Any) -> Description:
         step=step,
         is_float_range=is_float,
     )
-
-
-def _ros_value(value: Any) -> ParameterValue:
-    if isinstance(value, bool):
-        return ParameterValue(type=ParameterType.PARAMETER_BOOL, bool_value=value)
-    if isinstance(value, int):
-        return ParameterValue(type=ParameterType.PARAMETER_INTEGER, integer_value=value)
-    if isinstance(value, float):
-        return ParameterValue(type=ParameterType.PARAMETER_DOUBLE, double_value=value)
-    return ParameterValue(type=ParameterType.PARAMETER_STRING, string_value=str(value))
 
 
 def _shown(value: Any) -> str:

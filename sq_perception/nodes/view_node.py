@@ -26,6 +26,7 @@ from typing import Any
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import ParameterEvent
+from rclpy.node import Node
 from rclpy.qos import QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
 from rclpy.subscription import Subscription
 from rclpy.time import Time
@@ -39,11 +40,10 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.calibration import Calibration
 from sq_perception.imaging.camera import Camera
-from sq_perception.nodes.camera_poses import CameraPoses, PoseError
-from sq_perception.nodes.counters import Throttle
 from sq_perception.nodes.frame import decode
 from sq_perception.nodes.remote_node import RemoteNode
-from sq_perception.nodes.stoppable_node import StoppableNode
+from sq_perception.nodes.statistics import THROTTLE
+from sq_perception.nodes.tracking import CameraPoses, PoseError
 from sq_perception.viewing import tables
 from sq_perception.viewing.page import Change, Page, Transition
 from sq_perception.viewing.scene import Bodies
@@ -68,7 +68,7 @@ class Result:
     latency: float | None
 
 
-class ViewNode(StoppableNode):
+class ViewNode(Node):
     """See the module.
 
     Parameters
@@ -94,6 +94,7 @@ class ViewNode(StoppableNode):
         context: Any = None,
     ) -> None:
         super().__init__(name, context=context)
+        self.start_failure = ""
         self._page, self._period = page, 1.0 / rate
         self._topics = self.resolve_topic_name(depth), self.resolve_topic_name(camera_info)
         self._lock = threading.Lock()
@@ -103,7 +104,6 @@ class ViewNode(StoppableNode):
         self._results: dict[str, Result] = {}
         self._diagnosed: dict[str, dict[str, str]] = {}
         self._poses = CameraPoses(self)
-        self._throttle = Throttle()
         self._inputs: list[Subscription] = []
         self._remote = {one: RemoteNode(self, one) for one in nodes}
         self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
@@ -198,8 +198,8 @@ class ViewNode(StoppableNode):
                 drawer.draw()
             except Exception:
                 # A defect of ours or of a message: it costs this picture, and the page goes on.
-                if self._throttle.passes("defect") is not None and not self._closed.is_set():
-                    self.get_logger().error(traceback.format_exc())
+                if not self._closed.is_set():
+                    self.get_logger().error(traceback.format_exc(), throttle_duration_sec=THROTTLE)
 
     def newest_images(self) -> tuple[list[Image], float]:
         """Kept depth images, oldest first, and how many come per second."""

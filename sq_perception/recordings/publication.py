@@ -97,8 +97,8 @@ def tracked(recovery: FrameRecovery, tracks: Sequence[Followed], hidden: tuple[i
             ids.append(FIRST_FAILED_ID + one.label)
             continue
         track = next(found)
-        covariance, sigma = track.covariance, track.sigma_size
-        bodies.append(replace(one, superquadric=track.superquadric, covariance=covariance, sigma_size=sigma))
+        fit = replace(one.fit, superquadric=track.superquadric, covariance=track.covariance)
+        bodies.append(replace(one, fit=fit))
         ids.append(track.id)
     return Identified(replace(recovery, bodies=tuple(bodies)), tuple(ids), hidden)
 

@@ -30,174 +30,42 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Literal, TypeVar, get_args
+from typing import TypeVar
 
 import numpy as np
 import torch
 from threadpoolctl import ThreadpoolController
 
-from sq_perception.fitting import soft_render_fit, solina_bajcsy, surface_fit
+from sq_perception.fitting import surface_fit
 from sq_perception.fitting.fit import Fit, Status
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.imaging import canonical_view, raycast, soft_render
+from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
-from sq_perception.imaging.canonical_view import CanonicalView
 from sq_perception.learning import checkpoint, inference
 from sq_perception.learning.consensus import Consensus
-from sq_perception.recovery import seen_object, segment_repair
-from sq_perception.recovery.seen_object import SeenObject
+from sq_perception.recovery import methods, seen_object, segment_repair
+from sq_perception.recovery.options import FITTED, NEEDS_NETWORK, Method, RecoveryOptions, Refine
+from sq_perception.recovery.recovery import FrameRecovery, Recovery
+from sq_perception.recovery.seen_object import Prediction, SeenObject
 from sq_perception.segmentation import convex_parts, segments
+
+__all__ = [
+    "FrameRecovery",
+    "Method",
+    "Recoverer",
+    "Recovery",
+    "RecoveryOptions",
+    "Refine",
+    "checked_device",
+    "render_recovery",
+]
 
 _Item = TypeVar("_Item")
 _Answer = TypeVar("_Answer")
-Method = Literal["auto", "network", "symmetry", "classic"]
-Refine = Literal["surface", "soft_render", "none"]
-
-_VIEW_PIXELS = 64
-_SCORE_STRIDE = 3
-"""22 x 22 lines of sight of 64 voxels: few enough for torch not to spread them over threads, which would cost more."""
-_FEWEST_PIXELS = 12
 _NEAREST, _FARTHEST = 1e-4, 1e5
 """Metres; no sensor measures beyond, and numbers beyond make squares and products that are none."""
-_LEAST_BUDGET = 1e-6
-"""Seconds; an object whose turn comes too late is still fitted, from one start."""
-_UNKNOWN = np.full((11, 11), np.nan)
-_UNSEEN = np.full(3, np.nan)
-_NEEDS_NETWORK = ("auto", "network")
-_FITTED = ("auto", "symmetry")
-_HARD_IMAGE = (ValueError, ArithmeticError, np.linalg.LinAlgError)
-"""What numerical code may raise on degenerate data: reported with the object, never raised."""
-
-
-@dataclass(frozen=True)
-class RecoveryOptions:
-    """What may change from one frame to the next.
-
-    Attributes
-    ----------
-    method, refine
-        See the module.
-    sharpness, tau
-        s and tau of the soft renderer: of the score, and of the ``soft_render`` refinement.
-    depth_range
-        Nearest and farthest depth of an object, metres.
-    max_objects
-        The largest ones are recovered.
-    min_pixels
-        Smaller objects are ignored; None: 0.05 % of the image for own masks, any size for masks from outside.
-    use_plane
-        Let the fit know the support plane.
-    time_budget
-        Seconds per frame after which the surface fit tries no further start for any object, and the repair of segments
-        begins no further fit.  The objects with most pixels, large or near, come first.
-    repair
-        Join and split own segments where that describes the image in fewer words; masks from outside stay as they are.
-
-    Raises
-    ------
-    ValueError
-        For a value outside its range.
-    """
-
-    method: Method = "auto"
-    refine: Refine = "surface"
-    sharpness: float = soft_render.THESIS_SHARPNESS
-    tau: float = soft_render.THESIS_TAU
-    depth_range: tuple[float, float] = (0.0, np.inf)
-    max_objects: int = 20
-    min_pixels: int | None = None
-    use_plane: bool = True
-    time_budget: float = np.inf
-    repair: bool = True
-
-    def __post_init__(self) -> None:
-        for name, value, known in (("method", self.method, Method), ("refine", self.refine, Refine)):
-            if value not in get_args(known):
-                raise ValueError(f"{name}: expected one of {', '.join(get_args(known))}, got {value!r}")
-        for name, number in (("sharpness", self.sharpness), ("tau", self.tau)):
-            if not (np.isfinite(number) and number > 0):
-                raise ValueError(f"{name}: expected a positive number, got {number}")
-        if not self.time_budget > 0:
-            raise ValueError(f"time_budget: expected a positive number of seconds, got {self.time_budget}")
-        if self.min_pixels is not None and self.min_pixels < 1:
-            raise ValueError(f"min_pixels: expected at least 1, got {self.min_pixels}")
-        self.segmentation_options()
-
-    def segmentation_options(self) -> segments.SegmentationOptions:
-        return segments.SegmentationOptions(
-            depth_range=self.depth_range, max_objects=self.max_objects, min_pixels=self.min_pixels
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class Recovery:
-    """One recovered object.
-
-    Attributes
-    ----------
-    superquadric : Superquadric
-        A single body in the optical frame, in its canonical form.
-    score : float
-        Agreement of the soft-rendered body with the canonical view, 0 to 1 (:func:`soft_render.agreement`).
-    residual : float
-        Root mean square distance of the object's points to the surface, metres; NaN where there is no body.
-    sigma_size : (3,)
-        Standard deviations of the half sizes, metres; NaN for methods that do not compute them.
-    status, message
-        The verdict and the reason for it.
-    label : int
-        The object's value in the label image.
-    pixels : int
-        Measured pixels of the object.
-    covariance : (11, 11)
-        Of a1 a2 a3 e1 e2 t1 t2 t3 and the rotation vector in the object frame, metres and radians, as in
-        :class:`~sq_perception.fitting.fit.Fit`; NaN for methods that do not compute it.
-    seen : (3,)
-        Share of each size that was seen, as in :class:`~sq_perception.fitting.fit.Fit`; the rest is inferred.
-    """
-
-    superquadric: Superquadric
-    score: float
-    residual: float
-    sigma_size: np.ndarray
-    status: Status
-    message: str
-    label: int
-    pixels: int
-    covariance: np.ndarray = field(default_factory=_UNKNOWN.copy)
-    seen: np.ndarray = field(default_factory=_UNSEEN.copy)
-
-
-@dataclass(frozen=True, eq=False)
-class FrameRecovery:
-    """All objects of one frame.
-
-    Attributes
-    ----------
-    bodies
-        One entry per object, the one with most pixels first, failed ones among them.
-    milliseconds
-        By stage: segmentation, network, fit, repair, score, total.
-    labels : int32 (height, width)
-        The masks that were used.
-    plane : (4,) or None
-        Support plane, height above it = n.p + d.
-    message
-        Why there are no objects; empty otherwise.
-    """
-
-    bodies: tuple[Recovery, ...]
-    milliseconds: dict[str, float]
-    labels: np.ndarray
-    plane: np.ndarray | None
-    message: str
-
-    @property
-    def recovered(self) -> tuple[Recovery, ...]:
-        """The bodies that did not fail."""
-        return tuple(body for body in self.bodies if body.status != Status.FAILED)
 
 
 class Recoverer:
@@ -246,7 +114,7 @@ class Recoverer:
         self._blas = ThreadpoolController()
         self._beside = ThreadPoolExecutor(1, thread_name_prefix="network")
         self._pool = ThreadPoolExecutor(self._threads, thread_name_prefix="fit")
-        if method in _NEEDS_NETWORK:
+        if method in NEEDS_NETWORK:
             self._load_network()
 
     def warm_up(self, camera: Camera) -> None:
@@ -299,7 +167,7 @@ class Recoverer:
     ) -> FrameRecovery:
         started = time.perf_counter()
         milliseconds = dict.fromkeys(("segmentation", "network", "fit", "repair", "score", "total"), 0.0)
-        network = self._load_network() if options.method in _NEEDS_NETWORK else None
+        network = self._load_network() if options.method in NEEDS_NETWORK else None
 
         with _timed(milliseconds, "segmentation"):
             depth = _plausible(np.asarray(depth), camera)
@@ -311,30 +179,43 @@ class Recoverer:
             objects = seen_object.objects(depth, found, camera, options.depth_range)
 
         with _timed(milliseconds, "network"):
-            self._mapped(lambda one: _view(one, depth, camera, found, options, network), objects)
-            if network is not None and objects:
-                views = np.stack([one.shown.marked for one in objects if one.shown is not None])
-                predictions: Future[Superquadric] = Future()
-                if options.method == "auto" and options.refine == "surface":
-                    predictions = self._beside.submit(network.predict, views)
-                else:
-                    predictions.set_result(network.predict(views))
-                for k, one in enumerate(objects):
-                    one.predictions, one.number = predictions, k
+            objects = self._mapped(lambda one: _viewed(one, depth, camera, found, options, network), objects)
+            if network is not None:
+                objects = self._predicted(objects, network, options)
 
         with _timed(milliseconds, "fit"):
             deadline = started + options.time_budget
-            fits = self._mapped(lambda one: _fitted(one, depth, camera, options, deadline), objects)
+            fits = self._mapped(lambda one: methods.fitted(one, depth, camera, options, deadline), objects)
         with _timed(milliseconds, "repair"):
-            if labels is None and options.repair and options.method in _FITTED and options.refine == "surface":
+            if labels is None and options.repair and options.method in FITTED and options.refine == "surface":
                 found, objects, fits = _repaired(found, objects, fits, depth, camera, options, deadline)
         with _timed(milliseconds, "score"):
             pairs = list(zip(objects, fits, strict=True))
-            scores = self._mapped(lambda pair: _score(pair[0].view, pair[1].superquadric, options), pairs)
-        bodies = tuple(_recovery(one, fit, score) for one, fit, score in zip(objects, fits, scores, strict=True))
+            scores = self._mapped(lambda pair: methods.score(pair[0].view, pair[1], options), pairs)
+        bodies = tuple(
+            Recovery(fit, score, one.label, one.pixels) for (one, fit), score in zip(pairs, scores, strict=True)
+        )
         milliseconds["total"] = 1e3 * (time.perf_counter() - started)
         message = "" if bodies else _why_empty(depth, found)
         return FrameRecovery(bodies, milliseconds, found.labels, found.plane, message)
+
+    def _predicted(
+        self, objects: Sequence[SeenObject], network: inference.Predictor, options: RecoveryOptions
+    ) -> list[SeenObject]:
+        """The objects with their predictions, which may still be computed beside a fit that begins without them."""
+        shown = [one.shown for one in objects if one.shown is not None]
+        if not shown:
+            return []
+        views = np.stack([view.marked for view in shown])
+        bodies: Future[Superquadric] = Future()
+        if options.method == "auto" and options.refine == "surface":
+            bodies = self._beside.submit(network.predict, views)
+        else:
+            bodies.set_result(network.predict(views))
+        return [
+            replace(one, prediction=Prediction(view, bodies, k))
+            for k, (one, view) in enumerate(zip(objects, shown, strict=True))
+        ]
 
     def _mapped(self, function: Callable[[_Item], _Answer], items: Sequence[_Item]) -> list[_Answer]:
         """The function of each item; several at a time in threads that stay, as new ones cost memory and time."""
@@ -404,22 +285,18 @@ def _cleaned(depth: np.ndarray, camera: Camera) -> np.ndarray:
     return np.where(bad, np.float32(np.nan), depth)
 
 
-def _view(
+def _viewed(
     one: SeenObject,
     depth: np.ndarray,
     camera: Camera,
     found: segments.Segmentation,
     options: RecoveryOptions,
     network: inference.Predictor | None,
-) -> None:
-    """What the object stands on, what a network is shown of it, and what its score is measured on."""
-    one.plane = seen_object.support(one, depth, camera, found, options.segmentation_options())
-    core = seen_object.core(one, depth, camera)
-    if network is not None:
-        one.shown = network.config.view_of(depth, core, camera, one.plane)
-    one.view = one.shown
-    if network is None or network.config.framing == "full":
-        one.view = canonical_view.from_mask(one.depth_crop, core[one.window], one.camera_crop, _VIEW_PIXELS)
+) -> SeenObject:
+    """The object with what it stands on, what a network is shown of it, and what its score is measured on."""
+    plane = seen_object.support(one, depth, camera, found, options.segmentation_options())
+    config = None if network is None else network.config
+    return seen_object.viewed(replace(one, plane=plane), depth, camera, config)
 
 
 def _repaired(
@@ -437,8 +314,7 @@ def _repaired(
         label = int(found.labels.max()) + 1
         alone = replace(found, labels=np.where(mask, np.int32(label), found.labels), ids=(label,))
         one = seen_object.objects(depth, alone, camera, options.depth_range)[0]
-        _view(one, depth, camera, alone, options, None)
-        return one
+        return _viewed(one, depth, camera, alone, options, None)
 
     known = dict(zip((one.label for one in objects), fits, strict=True))
     repair = segment_repair.repaired(
@@ -447,7 +323,7 @@ def _repaired(
         found.labels,
         found.plane,
         known,
-        lambda mask: _fitted(prepared(mask), depth, camera, options, deadline),
+        lambda mask: methods.fitted(prepared(mask), depth, camera, options, deadline),
         found.sigma,
         deadline - time.perf_counter(),
     )
@@ -455,119 +331,10 @@ def _repaired(
         return found, objects, fits
     same = {one.label: one for one in objects if repair.fits.get(one.label) is known[one.label]}
     for label in repair.fits.keys() - same.keys():
-        same[label] = prepared(repair.labels == label)
-        same[label].label = label
+        same[label] = replace(prepared(repair.labels == label), label=label)
     ordered = sorted(same.values(), key=lambda one: (-one.pixels, one.label))
     ids = tuple(one.label for one in ordered)
     return replace(found, labels=repair.labels, ids=ids), ordered, [repair.fits[label] for label in ids]
-
-
-def _fitted(one: SeenObject, depth: np.ndarray, camera: Camera, options: RecoveryOptions, deadline: float) -> Fit:
-    """The body of one object by the chosen method; FAILED with a reason instead of any exception on hard data."""
-    if one.pixels < _FEWEST_PIXELS:
-        return _failed(one, f"{one.pixels} pixels with a depth are too few for a body")
-    try:
-        fit = _body(one, depth, camera, options, deadline)
-    except _HARD_IMAGE as error:
-        return _failed(one, f"{options.method}: {error}")
-    if not np.isfinite(fit.superquadric.to_flat()).all():
-        return _failed(one, f"{options.method}: the result is not finite")
-    return fit
-
-
-def _body(one: SeenObject, depth: np.ndarray, camera: Camera, options: RecoveryOptions, deadline: float) -> Fit:
-    if options.method == "classic":
-        return solina_bajcsy.fit(one.points)
-    if options.method == "network" or (options.method == "auto" and options.refine == "none"):
-        return _unfitted(one.predicted(), one, "prediction of the network, not refined")
-    if options.method == "auto" and options.refine == "soft_render":
-        return _soft_rendered(one.predicted(), one, options)
-    plane = one.plane if options.use_plane else None
-    fit = _surface_fit(one, depth, camera, plane, max(deadline - time.perf_counter(), _LEAST_BUDGET))
-    if options.refine == "soft_render" and fit.status != Status.FAILED:
-        return _soft_rendered(fit.superquadric, one, options)
-    return fit
-
-
-def _surface_fit(
-    one: SeenObject, depth: np.ndarray, camera: Camera, plane: np.ndarray | None, time_budget: float
-) -> Fit:
-    """From the cheapest starts of central symmetry; where those leave something, from the network's prediction too.
-
-    The network computes beside the fit.  What the image leaves open after all, such as the depth of a box seen
-    face-on, its prediction tells again.
-    """
-    if one.predictions is None:
-        return surface_fit.fit(
-            depth, one.mask, camera, options=surface_fit.Options(plane=plane, time_budget=time_budget)
-        )
-    settings = surface_fit.Options(plane=plane, time_budget=time_budget, expected=one.predicted)
-    return surface_fit.fit(depth, one.mask, camera, start=one.predicted, options=settings)
-
-
-def _soft_rendered(start: Superquadric, one: SeenObject, options: RecoveryOptions) -> Fit:
-    assert one.view is not None
-    body, before, after = soft_render_fit.refine(
-        one.view.image, one.view.to_canonical(start), options.sharpness, options.tau
-    )
-    refined = one.view.from_canonical(body).canonical_form()
-    return _unfitted(refined, one, f"soft-rendered residual {before:.4f} before, {after:.4f} after the refinement")
-
-
-def _unfitted(body: Superquadric, one: SeenObject, message: str) -> Fit:
-    """The answer of a method that is no least squares fit: distances measured, nothing known about uncertainty."""
-    distance = body.sampson_distance(one.points)
-    residual = float(np.sqrt(np.mean(distance**2)))
-    return Fit(
-        body,
-        residual,
-        np.nan,
-        np.nan,
-        np.nan,
-        _UNSEEN,
-        _UNKNOWN,
-        Status.CONVERGED,
-        message,
-        iterations=0,
-        milliseconds=0.0,
-    )
-
-
-def _failed(one: SeenObject, reason: str) -> Fit:
-    points = one.points
-    low, high = points.min(axis=0), points.max(axis=0)
-    size = np.maximum(0.5 * (high - low), 1e-3 * max(float((high - low).max()), 1e-3))
-    body = Superquadric(size, np.ones(2), 0.5 * (low + high), np.array([0.0, 0.0, 0.0, 1.0]))
-    return Fit(
-        body, np.nan, np.nan, 0.0, np.nan, _UNSEEN, _UNKNOWN, Status.FAILED, reason, iterations=0, milliseconds=0.0
-    )
-
-
-def _score(view: CanonicalView | None, body: Superquadric, options: RecoveryOptions) -> float:
-    assert view is not None
-    flat = np.array(view.to_canonical(body).to_flat())[None]
-    with torch.inference_mode():
-        image = torch.as_tensor(view.image)
-        axis = soft_render.cell_centres(image.shape[0], image)
-        single = Superquadric.from_flat(torch.as_tensor(flat, dtype=torch.float32))
-        rendered = soft_render.render_depth(single, axis, options.sharpness, options.tau, _SCORE_STRIDE)[0]
-        return float(soft_render.agreement(image[::_SCORE_STRIDE, ::_SCORE_STRIDE], rendered).clip(0, 1))
-
-
-def _recovery(one: SeenObject, fit: Fit, score: float) -> Recovery:
-    failed = fit.status == Status.FAILED
-    return Recovery(
-        fit.superquadric,
-        score if np.isfinite(score) and not failed else 0.0,
-        fit.residual,
-        fit.sigma_size,
-        fit.status,
-        fit.message,
-        one.label,
-        one.pixels,
-        fit.covariance,
-        fit.seen,
-    )
 
 
 def _why_empty(depth: np.ndarray, found: segments.Segmentation) -> str:

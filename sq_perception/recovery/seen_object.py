@@ -7,17 +7,22 @@ optical frame.
 from __future__ import annotations
 
 from concurrent.futures import Future
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging import canonical_view
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.canonical_view import CanonicalView
 from sq_perception.imaging.coherence import coherent
+from sq_perception.learning.regressor import RegressorConfig
 from sq_perception.segmentation import segments
 
 _POINTS = 2000
+"""Enough for quantiles of heights to settle."""
+_VIEW_PIXELS = 64
+"""Of the view of a score; those of a network are its own."""
 _LOWEST, _HOVERING = 0.02, 0.02
 """An object this many metres above its plane, by its lowest points, may stand on another one."""
 _HIGHEST_STACK = 0.5
@@ -27,9 +32,48 @@ _JUMP_PIXELS, _JUMP = 10.0, 0.002
 """What a network is shown, and a score is measured on: metres above the table; steps in pixel widths, and metres."""
 
 
-@dataclass(eq=False)
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """What a network says of one object; perhaps it is still being computed.
+
+    Attributes
+    ----------
+    view
+        What the network was shown.
+    bodies, number
+        Its answers for all objects of the frame, each in the frame of its view, and which of them is this one's.
+    """
+
+    view: CanonicalView
+    bodies: Future[Superquadric]
+    number: int
+
+    def body(self) -> Superquadric:
+        """The predicted body in the optical frame; waits for it."""
+        return self.view.from_canonical(self.bodies.result()[self.number]).canonical_form()
+
+
+@dataclass(frozen=True, eq=False)
 class SeenObject:
-    """One object on its way through the stages."""
+    """One object, and what is known of it before its body is sought.
+
+    Attributes
+    ----------
+    label
+        Its value in the label image.
+    pixels
+        Number of its measured pixels.
+    mask : bool (height, width)
+        These pixels; ``mask_crop``, ``depth_crop`` and ``camera_crop`` are their ``window`` of mask, depth and camera.
+    plane : (4,) or None
+        What it stands on.
+    shown
+        What a network is shown of it, where there is one.
+    view
+        What its score is measured on.
+    prediction
+        What the network says, where there is one.
+    """
 
     label: int
     pixels: int
@@ -39,21 +83,9 @@ class SeenObject:
     camera_crop: Camera
     window: tuple[slice, slice]
     plane: np.ndarray | None = None
-    """What it stands on."""
     shown: CanonicalView | None = None
-    """To the network, where there is one."""
     view: CanonicalView | None = None
-    """What its score is measured on."""
-    predictions: Future[Superquadric] | None = None
-    """Of all objects of the frame, each in the frame of what was shown; still being computed, perhaps."""
-    number: int = 0
-    """Of this object among them."""
-
-    def predicted(self) -> Superquadric:
-        """The network's prediction in the optical frame; waits for it."""
-        if self.predictions is None or self.shown is None:
-            raise ValueError("no prediction")
-        return self.shown.from_canonical(self.predictions.result()[self.number]).canonical_form()
+    prediction: Prediction | None = None
 
     @property
     def points(self) -> np.ndarray:
@@ -109,6 +141,16 @@ def support(
             return other
     far_above = float(np.quantile(heights, _LOWEST)) > _HIGHEST_STACK
     return None if behind or far_above else found.plane
+
+
+def viewed(one: SeenObject, depth: np.ndarray, camera: Camera, config: RegressorConfig | None) -> SeenObject:
+    """The object with its views: the one that a network of this configuration is shown, and that of its score."""
+    inner = core(one, depth, camera)
+    shown = None if config is None else config.view_of(depth, inner, camera, one.plane)
+    if shown is not None and config is not None and config.framing != "full":
+        return replace(one, shown=shown, view=shown)
+    view = canonical_view.from_mask(one.depth_crop, inner[one.window], one.camera_crop, _VIEW_PIXELS)
+    return replace(one, shown=shown, view=view)
 
 
 def core(one: SeenObject, depth: np.ndarray, camera: Camera) -> np.ndarray:

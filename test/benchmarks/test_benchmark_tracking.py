@@ -9,7 +9,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from sq_perception.fitting.fit import Status
+from sq_perception.fitting.fit import Fit, Status
 from sq_perception.geometry import Superquadric, rotation
 from sq_perception.recovery.recoverer import FrameRecovery, Recovery
 from sq_perception.tracking.forms import TURNS
@@ -37,7 +37,8 @@ def test_a_body_has_the_segment_that_overlaps_it_most(benchmark):
     truth, found = np.zeros((10, 40), np.int32), np.zeros((10, 40), np.int32)
     truth[:, :20], truth[:, 20:30] = 1, 2
     found[:, :13], found[:, 13:20], found[:, 20:29] = 3, 2, 1
-    bodies = tuple(Recovery(BODY, 1.0, 0.0, np.zeros(3), Status.CONVERGED, "", label, 10) for label in (3, 1, 2))
+    fit = Fit(BODY, 0.0, Status.CONVERGED, "")
+    bodies = tuple(Recovery(fit, 1.0, label, 10) for label in (3, 1, 2))
     owner, cut = benchmark.owners(truth, FrameRecovery(bodies, {}, found, None, ""))
     assert owner == {0: 0, 1: 1}
     assert cut == {0}

@@ -10,8 +10,8 @@ import pytest
 from sq_perception.fitting import revolution, surface_fit
 from sq_perception.fitting.fit import Fit
 from sq_perception.fitting.levenberg_marquardt import State
-from sq_perception.fitting.surface_fit import Options
-from sq_perception.fitting.visibility import seen_extents
+from sq_perception.fitting.surface_fit import FitOptions
+from sq_perception.fitting.verdict import seen_extents
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
@@ -40,7 +40,7 @@ def fitted(body: Superquadric, seed: int = 3, **options: object) -> Fit:
     mask = np.isfinite(shown)
     depth = np.where(mask, shown, plane_depth(PLANE, CAMERA))
     depth = depth + np.random.default_rng(seed).normal(0, NOISE, depth.shape)
-    settings = Options(plane=PLANE, model_error=0.0025, **options)  # type: ignore[arg-type]
+    settings = FitOptions(plane=PLANE, model_error=0.0025, **options)  # type: ignore[arg-type]
     return surface_fit.fit(depth.astype(np.float32), mask, CAMERA, options=settings)
 
 
@@ -114,7 +114,7 @@ def face_on(**options: object) -> Fit:
     body = Superquadric([0.06, 0.05, 0.04], [0.1, 0.1], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0, 1.0])
     shown, _ = raycast.render(body, CAMERA)
     depth = np.where(np.isfinite(shown), shown, 1.2) + np.random.default_rng(5).normal(0, 0.001, shown.shape)
-    settings = Options(model_error=0.0025, **options)  # type: ignore[arg-type]
+    settings = FitOptions(model_error=0.0025, **options)  # type: ignore[arg-type]
     return surface_fit.fit(depth.astype(np.float32), np.isfinite(shown), CAMERA, options=settings)
 
 
@@ -152,7 +152,7 @@ def test_nothing_is_asked_where_nothing_is_open() -> None:
     body = Superquadric([0.05, 0.04, 0.03], [0.5, 0.7], [0.0, 0.0, 0.45], [0.3, 0.4, 0.2, 0.8])
     shown, _ = raycast.render(body, CAMERA)
     depth = np.where(np.isfinite(shown), shown, 1.0).astype(np.float32)
-    surface_fit.fit(depth, np.isfinite(shown), CAMERA, options=Options(expected=never))
+    surface_fit.fit(depth, np.isfinite(shown), CAMERA, options=FitOptions(expected=never))
 
 
 # Seen and inferred
@@ -210,7 +210,7 @@ def test_a_hidden_foot_is_thought_to_reach_the_plane() -> None:
     rows = np.flatnonzero(mask.any(axis=1))
     hidden = np.arange(CAMERA.height)[:, None] > rows[0] + 0.6 * len(rows)
     depth = np.where(hidden, 0.3, depth) + np.random.default_rng(4).normal(0, NOISE, depth.shape)
-    settings = Options(plane=PLANE, model_error=0.0025)
+    settings = FitOptions(plane=PLANE, model_error=0.0025)
     fit = surface_fit.fit(depth.astype(np.float32), mask & ~hidden, CAMERA, options=settings)
     lowest = NORMAL @ fit.superquadric.translation + PLANE[3] - extent(fit.superquadric, NORMAL)
     assert abs(lowest) < 0.006

@@ -14,7 +14,7 @@ import torch
 
 from sq_perception.commands import main
 from sq_perception.evaluation import contest, evaluation_pictures, report, thesis_tables
-from sq_perception.evaluation.contestants import Answers, Fit, Network, unique_names
+from sq_perception.evaluation.contestants import Answers, FittingMethod, Network, unique_names
 from sq_perception.evaluation.figures_of_merit import FiguresOfMerit, Summary, shortest_arc
 from sq_perception.evaluation.thesis_images import ImageChunk, ThesisImages
 from sq_perception.evaluation.thesis_tables import NOT_IN_THESIS, NOTHING, Result, Table
@@ -150,7 +150,7 @@ class TestImages:
 
 class TestContest:
     def test_chunks_do_not_change_the_result(self) -> None:
-        network, fit = Network.read(checkpoint.resolve()), Fit.of("classic")
+        network, fit = Network.read(checkpoint.resolve()), FittingMethod.of("classic")
         results = [contest.compare([(network, 7), (fit, 4)], ThesisImages(7), chunk) for chunk in (2, 7)]
         for small, large in zip(*results, strict=True):
             np.testing.assert_allclose(small.bodies.to_flat(), large.bodies.to_flat(), atol=1e-4)
@@ -174,7 +174,7 @@ class TestContest:
         images = ThesisImages(2)
         (chunk,) = images.chunks()
         chunk.depth[1] = np.nan
-        for contestant in (Network.read(checkpoint.resolve()), Fit.of("symmetry")):
+        for contestant in (Network.read(checkpoint.resolve()), FittingMethod.of("symmetry")):
             assert contestant.recover(chunk).recovered.tolist() == [True, False]
 
     @pytest.mark.parametrize("canonical", [False, True])
@@ -340,8 +340,7 @@ class TestCommand:
             ["--models", "--methods"],
             ["--output", str(tmp_path / "file")],
         ):
-            with pytest.raises(SystemExit, match="2"):
-                main.main(["evaluate", *wrong])
+            assert main.main(["evaluate", *wrong]) == main.USAGE
             assert "expected" in (said := capsys.readouterr().err) or "choose" in said or "--" in said
 
     def test_nothing_left_is_a_failure(self, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -71,6 +71,6 @@ def test_a_fit_takes_noise_that_grows(rng: np.random.Generator) -> None:
     body = Superquadric([0.08, 0.06, 0.05], [0.3, 0.6], [0.05, 0.0, 0.9], [0.3, 0.5, 0.1, 0.8])
     depth, index = raycast.render(body, camera)
     depth = np.where(index >= 0, depth + 0.002 * depth**2 * rng.standard_normal(depth.shape), np.nan)
-    fit = surface_fit.fit(depth, index >= 0, camera, options=surface_fit.Options(noise=DepthNoise(0.0, 0.002)))
+    fit = surface_fit.fit(depth, index >= 0, camera, options=surface_fit.FitOptions(noise=DepthNoise(0.0, 0.002)))
     assert fit.noise == pytest.approx(0.002 * 0.87**2, rel=0.1)
     np.testing.assert_allclose(np.sort(fit.superquadric.size), np.sort(body.size), rtol=0.06)

@@ -7,26 +7,29 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+import residual_statement as statement
 import torch
 
-from sq_perception.fitting import residual_statement as statement
 from sq_perception.fitting.levenberg_marquardt import State, minimize
 from sq_perception.fitting.normal_equations import STEP_LENGTH
-from sq_perception.fitting.residuals import (
-    CLASSIC,
+from sq_perception.fitting.rays import (
+    DEPTH,
+    DIRECTION_X,
+    DIRECTION_Y,
+    LAST,
+    ORIGIN_X,
+    ORIGIN_Y,
     RAY_COLUMNS,
-    RENDERED,
-    SAMPSON,
-    evaluate,
-    penetration,
-    surface_distance,
+    STIFFNESS,
+    WEIGHT,
 )
-from sq_perception.fitting.scene import Scene
+from sq_perception.fitting.residuals import CLASSIC, RENDERED, SAMPSON, evaluate, penetration, surface_distance
+from sq_perception.fitting.terms import Terms
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 
 NO_RAYS = np.empty((0, RAY_COLUMNS))
-PLAIN = Scene(huber=np.inf, outline_huber=np.inf)
+PLAIN = Terms(huber=np.inf, outline_huber=np.inf)
 SIGMA = 0.003
 
 
@@ -40,17 +43,18 @@ def random_body(rng: np.random.Generator, shape: tuple[float, float] | None = No
 def rays_to(points: np.ndarray, pinhole: bool) -> np.ndarray:
     rays = np.zeros((len(points), RAY_COLUMNS))
     if pinhole:
-        rays[:, 2:4] = points[:, :2] / points[:, 2:]
+        rays[:, [DIRECTION_X, DIRECTION_Y]] = points[:, :2] / points[:, 2:]
     else:
-        rays[:, 0:2] = points[:, :2]
-    rays[:, 4], rays[:, 5], rays[:, 6], rays[:, 7] = points[:, 2], 1 / SIGMA, 1.0, points[:, 2]
+        rays[:, [ORIGIN_X, ORIGIN_Y]] = points[:, :2]
+    rays[:, DEPTH] = rays[:, LAST] = points[:, 2]
+    rays[:, STIFFNESS], rays[:, WEIGHT] = 1 / SIGMA, 1.0
     return rays
 
 
 def torch_rays(rays: np.ndarray) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
     origin, direction = np.zeros((len(rays), 3)), np.ones((len(rays), 3))
-    origin[:, :2], direction[:, :2] = rays[:, 0:2], rays[:, 2:4]
-    return torch.tensor(origin), torch.tensor(direction), torch.tensor(rays[:, 4])
+    origin[:, :2], direction[:, :2] = rays[:, [ORIGIN_X, ORIGIN_Y]], rays[:, [DIRECTION_X, DIRECTION_Y]]
+    return torch.tensor(origin), torch.tensor(direction), torch.tensor(rays[:, DEPTH])
 
 
 def as_torch(body: Superquadric) -> Superquadric:
@@ -70,14 +74,14 @@ def assert_same(
     stage: int,
     rays: np.ndarray,
     free: np.ndarray,
-    scene: Scene,
+    terms: Terms,
     body: Superquadric,
     expected: tuple[float, np.ndarray],
     tolerance: float = 1e-5,
 ) -> None:
     sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
     state = State.of(body)
-    cost = evaluate(stage, rays, free, scene, state.parameters, state.rotation, sums)
+    cost = evaluate(stage, rays, free, terms, state.parameters, state.rotation, sums)
     value, matrix = expected
     assert cost == pytest.approx(value, rel=tolerance, abs=1e-12)
     lower = np.tril(np.ones((STEP_LENGTH, STEP_LENGTH), bool))
@@ -127,8 +131,8 @@ def test_rendered_depth_and_derivatives(
 ) -> None:
     body = random_body(rng, shape)
     rays = rays_to(visible_points(body, rng, pinhole), pinhole)
-    rays[:, 4] += rng.normal(0, 0.003, len(rays))
-    rays[:, 7] = rays[:, 4]
+    rays[:, DEPTH] += rng.normal(0, 0.003, len(rays))
+    rays[:, LAST] = rays[:, DEPTH]
     origin, direction, depth = torch_rays(rays)
     expected = expected_sums(
         body, lambda moved: statement.rendered(moved, origin, direction, depth, PLAIN.grazing) / SIGMA
@@ -142,16 +146,15 @@ def test_free_space_and_derivatives(pinhole: bool, rng: np.random.Generator) -> 
     body = random_body(rng)
     around = body.translation + rng.uniform(-0.12, 0.12, (400, 3))
     free = rays_to(around, pinhole)
-    free[:, 4] = np.where(rng.random(400) < 0.5, np.inf, around[:, 2])
-    free[:, 5] = 1.0
-    free[np.isinf(free[:, 4]), 4] = 1e300
+    free[:, DEPTH] = np.where(rng.random(400) < 0.5, 1e300, around[:, 2])
+    free[:, STIFFNESS] = 1.0
     origin, direction, limit = torch_rays(free)
-    scene = PLAIN._replace(outline_stiffness=1 / SIGMA, pinhole=float(pinhole))
+    terms = PLAIN._replace(outline_stiffness=1 / SIGMA, pinhole=float(pinhole))
     expected = expected_sums(body, lambda moved: torch.relu(statement.outline(moved, origin, direction, limit)) / SIGMA)
     assert expected[0] > 1
-    assert_same(SAMPSON, NO_RAYS, free, scene, body, expected)
+    assert_same(SAMPSON, NO_RAYS, free, terms, body, expected)
     state = State.of(body)
-    depth = penetration(free, scene, state.parameters, state.rotation)
+    depth = penetration(free, terms, state.parameters, state.rotation)
     assert depth @ depth == pytest.approx(expected[0] * SIGMA**2, rel=1e-5)
 
 
@@ -161,10 +164,10 @@ def test_pixels_of_the_object_that_miss_the_body_pull_its_outline(rng: np.random
     rim = np.stack([np.cos(angle), np.sin(angle)], 1)
     extent = np.asarray(body.support(np.concatenate([rim, np.zeros((200, 1))], 1)))
     rays = rays_to(np.concatenate([rim * extent[:, None] * 1.01, np.full((200, 1), 0.5)], 1), pinhole=False)
-    scene = PLAIN._replace(outline_stiffness=1 / SIGMA)
+    terms = PLAIN._replace(outline_stiffness=1 / SIGMA)
     sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
     state = State.of(body)
-    cost = evaluate(RENDERED, rays, NO_RAYS, scene, state.parameters, state.rotation, sums)
+    cost = evaluate(RENDERED, rays, NO_RAYS, terms, state.parameters, state.rotation, sums)
     assert cost > 0
     assert np.isfinite(cost)
     gradient = sums[STEP_LENGTH, :STEP_LENGTH]
@@ -177,22 +180,22 @@ def test_plane_rest_and_proportion(rng: np.random.Generator) -> None:
     normal /= np.linalg.norm(normal)
     plane = np.append(normal, -normal @ body.translation + 0.4 * body.size.min())
     target = torch.tensor(plane)
-    scene = PLAIN._replace(
+    terms = PLAIN._replace(
         normal_x=plane[0], normal_y=plane[1], normal_z=plane[2], offset=plane[3], plane_stiffness=200.0
     )
     expected = expected_sums(body, lambda moved: 200 * statement.lowest_height(moved, target)[None])
-    assert_same(SAMPSON, NO_RAYS, NO_RAYS, scene, body, expected)
+    assert_same(SAMPSON, NO_RAYS, NO_RAYS, terms, body, expected)
 
     lifted = plane + np.array([0, 0, 0, 3 * body.size.max()])
     height = float(statement.lowest_height(as_torch(body), torch.tensor(lifted))) * 40
     assert height > 0
-    gap = scene._replace(offset=lifted[3], gap_stiffness=40.0)
+    gap = terms._replace(offset=lifted[3], gap_stiffness=40.0)
     damped = 40 / np.sqrt(1 + height**2)
     _, matrix = expected_sums(body, lambda moved: damped * statement.lowest_height(moved, torch.tensor(lifted))[None])
     assert_same(SAMPSON, NO_RAYS, NO_RAYS, gap, body, (np.log1p(height**2), matrix))
 
     square = float(statement.leaning(as_torch(body), target).square().sum()) * 9
-    rest = scene._replace(plane_stiffness=0.0, rest_stiffness=3.0)
+    rest = terms._replace(plane_stiffness=0.0, rest_stiffness=3.0)
     _, matrix = expected_sums(body, lambda moved: 3 * statement.leaning(moved, target) / np.sqrt(1 + square))
     scaled = matrix.copy()
     assert_same(SAMPSON, NO_RAYS, NO_RAYS, rest, body, (np.log1p(square), scaled))
@@ -217,10 +220,10 @@ def test_plane_rest_and_proportion(rng: np.random.Generator) -> None:
 
 def test_a_body_above_the_plane_pays_nothing(rng: np.random.Generator) -> None:
     body = random_body(rng)
-    scene = PLAIN._replace(normal_y=-1.0, offset=1.0, plane_stiffness=1000.0)
+    terms = PLAIN._replace(normal_y=-1.0, offset=1.0, plane_stiffness=1000.0)
     state = State.of(body)
     sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
-    assert evaluate(SAMPSON, NO_RAYS, NO_RAYS, scene, state.parameters, state.rotation, sums) == 0
+    assert evaluate(SAMPSON, NO_RAYS, NO_RAYS, terms, state.parameters, state.rotation, sums) == 0
 
 
 def test_huber_loss_grows_linearly(rng: np.random.Generator) -> None:
@@ -230,8 +233,8 @@ def test_huber_loss_grows_linearly(rng: np.random.Generator) -> None:
     sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
     residual = 0.01 / SIGMA
     for huber, loss in ((10.0, residual**2), (2.0, 2 * 2.0 * residual - 4.0)):
-        scene = PLAIN._replace(huber=huber)
-        assert evaluate(SAMPSON, rays, NO_RAYS, scene, state.parameters, state.rotation, sums) == pytest.approx(loss)
+        terms = PLAIN._replace(huber=huber)
+        assert evaluate(SAMPSON, rays, NO_RAYS, terms, state.parameters, state.rotation, sums) == pytest.approx(loss)
     distance = surface_distance(rays, state.parameters, state.rotation)
     assert distance[0] == pytest.approx(0.01)
 

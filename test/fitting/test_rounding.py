@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sq_perception.fitting import surface_fit
-from sq_perception.fitting.residuals import RAY_COLUMNS
+from sq_perception.fitting.rays import DEPTH, RAY_COLUMNS
 from sq_perception.fitting.rounding import faces_camera
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast, unit_cube
@@ -15,9 +15,9 @@ from sq_perception.imaging import raycast, unit_cube
 def test_one_depth_in_common_makes_a_face(rng: np.random.Generator) -> None:
     step = 1 / 256
     rays = np.zeros((1000, RAY_COLUMNS))
-    rays[:, 4] = np.round(rng.uniform(0.2, 0.8, 1000) / step) * step
+    rays[:, DEPTH] = np.round(rng.uniform(0.2, 0.8, 1000) / step) * step
     assert not faces_camera(rays, step)
-    rays[:100, 4] = 128 * step
+    rays[:100, DEPTH] = 128 * step
     assert faces_camera(rays, step)
 
 

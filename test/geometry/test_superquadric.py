@@ -109,7 +109,7 @@ class TestClosedForms:
         """Ellipsoid, octahedron, box, cylinder and square prism."""
         assert local([0.2, 0.3, 0.5], shape).volume() == pytest.approx(expected * 0.03, rel=3e-3)
 
-    def test_volume_and_moments_are_integrals(self) -> None:
+    def test_the_volume_is_an_integral(self) -> None:
         bodies = random_bodies(8, 12)
         axis = (np.arange(80) + 0.5) / 40 - 1
         unit = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -117,8 +117,6 @@ class TestClosedForms:
             inside = body.gauge(body.to_parent(unit * body.size)) <= 1
             cell = np.prod(body.size) / 40**3
             assert body.volume() == pytest.approx(inside.sum() * cell, rel=0.01)
-            moments = ((unit[inside] * body.size) ** 2).sum(axis=0) * cell
-            np.testing.assert_allclose(body.second_moments(), moments, rtol=0.02)
 
     def test_support_is_the_farthest_surface_point(self) -> None:
         bodies = random_bodies(12, 13)
@@ -236,20 +234,6 @@ class TestKernels:
             assert first <= last
             assert ((g < 1 - 1e-9) <= ((t >= first) & (t <= last))).all()
         assert hits > 20
-
-    def test_ray_minimum_is_the_minimum(self) -> None:
-        rng = np.random.default_rng(30)
-        for body in random_bodies(100, 31, 0.1, 1.5):
-            origin, direction = rng.uniform(-0.5, 0.5, 3), rng.standard_normal(3)
-            low, high = np.sort(rng.uniform(-1, 1, 2))
-            g, t = kernels.ray_minimum(low, high, *origin, *direction, *body.size, *body.shape)
-            moved = Superquadric(body.size, body.shape, np.zeros(3), IDENTITY)
-            sampled = moved.gauge(origin + np.linspace(low, high, 2001)[:, None] * direction).min()
-            if sampled < 1 - 1e-6:
-                assert g == pytest.approx(sampled, rel=1e-3)
-                assert low - 1e-9 <= t <= high + 1e-9
-            else:
-                assert g > 1 - 1e-6
 
 
 class TestMisuse:

@@ -9,8 +9,8 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
+from frame_node_bench import Bench
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
-from test_nodes_wiring import Bench
 
 from sq_perception.imaging import compressed_depth
 

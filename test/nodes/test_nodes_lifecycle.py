@@ -28,14 +28,14 @@ from std_srvs.srv import Trigger
 
 from sq_msgs_py.depth_image import Intrinsics, depth_to_message, intrinsics_to_message
 from sq_msgs_py.superquadrics import from_message
-from sq_perception.fitting.fit import Status
+from sq_perception.fitting.fit import Fit, Status
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
 from sq_perception.nodes import managed_node
-from sq_perception.nodes.engine import Workshop
+from sq_perception.nodes.engine import RecovererFactory
 from sq_perception.nodes.frame_node import FrameNode
 from sq_perception.nodes.parameters import RecoverParameters
-from sq_perception.nodes.recover_node import _options
+from sq_perception.nodes.recover_node import options
 from sq_perception.recovery.recoverer import FrameRecovery, Recovery
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
@@ -65,7 +65,7 @@ class Recoverer:
             raise self.error
         size = 0.01 * float(self.model or 1)
         body = Superquadric(np.full(3, size), np.ones(2), np.array([0.0, 0.0, 0.5]), np.array([0, 0, 0, 1.0]))
-        one = Recovery(body, 0.9, 0.001, np.full(3, 0.001), Status.CONVERGED, "", 1, 100)
+        one = Recovery(Fit(body, 0.001, Status.CONVERGED, ""), 0.9, 1, 100)
         return FrameRecovery((one,), {"total": 1.0}, np.zeros(depth.shape, np.int32), None, "")
 
 
@@ -78,12 +78,12 @@ class Bench(SpunNodes):
         self.fault: Exception | None = None
         self.gate = threading.Event()
         self.gate.set()
-        workshop = Workshop(
+        factory = RecovererFactory(
             make=self._make,
-            options=_options,
-            ingredients=("model", "device", "method"),
+            options=options,
+            made_of=("model", "device", "method"),
             key=lambda parameters: (id(self), parameters.model, parameters.device),
-            judge=self._judge,
+            check=self._check,
             describe=lambda parameters: f"model {parameters.model}",
         )
         self.events: list[str] = []
@@ -104,14 +104,14 @@ class Bench(SpunNodes):
                 PointCloud2, f"{at}/recover_node/superquadrics", self.answers[space].append, 50
             )
         self.nodes = [
-            FrameNode("recover_node", RecoverParameters, workshop, namespace=space or None, context=self.context)
+            FrameNode("recover_node", RecoverParameters, factory, namespace=space or None, context=self.context)
             for space in namespaces
         ]
         self.node = self.nodes[0]
         self.spin(self.nodes, executor)
         self.stamps = 0
 
-    def _judge(self, parameters: Any, names: frozenset[str]) -> None:
+    def _check(self, parameters: Any, names: frozenset[str]) -> None:
         if "model" in names and not parameters.model.isdigit():
             raise ValueError(f"model: {parameters.model} is no model")
 
@@ -140,7 +140,7 @@ class Bench(SpunNodes):
             self.until(lambda node=node: node.is_active)
             self.until(lambda space=space: self.images[space].get_subscription_count() >= 1)
             self.until(lambda space=space: self.infos[space].get_subscription_count() >= 1)
-            self.until(lambda node=node: node._publisher.superquadrics.get_subscription_count() >= 1)
+            self.until(lambda node=node: node._outputs.superquadrics.get_subscription_count() >= 1)
         return self
 
     def publish(self, space: str = "", value: float = 0.5) -> Header:
@@ -324,7 +324,7 @@ class TestLifecycle:
         monkeypatch.setattr(managed_node, "_PAUSE", 0.1)
         bench = make_bench().active()
         withdrawn = []
-        monkeypatch.setattr(bench.node._publisher, "withdraw", lambda: withdrawn.append(bench.node.state))
+        monkeypatch.setattr(bench.node._outputs, "withdraw", lambda: withdrawn.append(bench.node.state))
         bench.node._fail("device lost")
         bench.until(lambda: len(bench.made) == 1 and bench.node.state == "unconfigured")
         bench.active()
@@ -358,7 +358,7 @@ class TestSwap:
         assert bench.node.set_parameters([Parameter("model", value="3")])[0].successful
         assert bench.answer() == 1.0, "the old one goes on until the new one is ready"
         bench.gate.set()
-        bench.until(lambda: bench.node._engine.words == "model 3")
+        bench.until(lambda: bench.node._engine.description == "model 3")
         assert bench.answer() == 3.0
         assert bench.made[-1].warm is not None
 
@@ -373,7 +373,7 @@ class TestSwap:
         assert bench.answer() == 1.0
         bench.fault = None
         assert bench.node.set_parameters([Parameter("model", value="4")])[0].successful
-        bench.until(lambda: bench.node._engine.words == "model 4")
+        bench.until(lambda: bench.node._engine.description == "model 4")
         assert bench.answer() == 4.0
         assert bench.node._engine.fault == ""
 
@@ -383,7 +383,7 @@ class TestSwap:
         for model in ("2", "3", "4", "5"):
             assert bench.node.set_parameters([Parameter("model", value=model)])[0].successful
         bench.gate.set()
-        bench.until(lambda: bench.node._engine.words == "model 5")
+        bench.until(lambda: bench.node._engine.description == "model 5")
         assert bench.answer() == 5.0
         assert len(bench.made) <= 3, "the first one, the one that was begun, and the last one"
 
@@ -394,7 +394,7 @@ class TestSwap:
         bench.until(lambda: bench.node.state == "configuring")
         assert bench.node.set_parameters([Parameter("model", value="6")])[0].successful
         bench.gate.set()
-        bench.until(lambda: bench.node._engine.words == "model 6")
+        bench.until(lambda: bench.node._engine.description == "model 6")
         assert bench.active().answer() == 6.0
 
     def test_what_does_not_concern_the_recoverer_swaps_nothing(self, make_bench):
@@ -443,7 +443,7 @@ class TestSeveralCameras:
     def test_a_swap_on_one_camera_leaves_the_other_alone(self, make_bench):
         bench = make_bench(namespaces=("front", "wrist")).active()
         assert bench.nodes[1].set_parameters([Parameter("model", value="7")])[0].successful
-        bench.until(lambda: bench.nodes[1]._engine.words == "model 7")
+        bench.until(lambda: bench.nodes[1]._engine.description == "model 7")
         assert (bench.answer("front"), bench.answer("wrist")) == (1.0, 7.0)
 
 

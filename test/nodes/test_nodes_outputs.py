@@ -18,19 +18,16 @@ from builtin_interfaces.msg import Time
 from geometry_msgs.msg import TransformStamped
 from std_msgs.msg import Header
 
-from sq_perception.fitting.fit import Status
+from sq_perception.fitting.fit import Fit, Status
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.calibration import Calibration
 from sq_perception.imaging.camera import Camera
-from sq_perception.nodes import results
-from sq_perception.nodes.camera_poses import CameraPoses, PoseError
-from sq_perception.nodes.frame import Frame
-from sq_perception.nodes.identity import Identity
-from sq_perception.nodes.inbox import Refused
-from sq_perception.nodes.outputs import Outputs
+from sq_perception.nodes.frame import Frame, Refused
+from sq_perception.nodes.outputs import OptionalOutputs, in_frame
 from sq_perception.nodes.parameters import FrameParameters, ParameterError
+from sq_perception.nodes.tracking import CameraPoses, PoseError, Tracking
 from sq_perception.recordings import publication
 from sq_perception.recordings.publication import Identified
 from sq_perception.recovery.recoverer import FrameRecovery, Recovery
@@ -45,7 +42,7 @@ ALL = FrameParameters(publish_tf=True, publish_detections=True, publish_collisio
 
 
 def one(body: Superquadric, label: int, status: Status = Status.CONVERGED) -> Recovery:
-    return Recovery(body, 0.9, 0.001, np.full(3, 0.002), status, "", label, 100, DEVIATIONS)
+    return Recovery(Fit(body, 0.001, status, "", covariance=DEVIATIONS), 0.9, label, 100)
 
 
 def frame(header: Header = HEADER, camera: Camera = CAMERA) -> Frame:
@@ -90,6 +87,7 @@ class Node:
         self.publishers: dict[str, Publisher] = {}
         self.all: list[Publisher] = []
         self.warnings: list[str] = []
+        self.said: list[str] = []
 
     def create_publisher(self, kind: type[Any], topic: str, queue: int) -> Publisher:
         assert topic not in self.publishers
@@ -101,7 +99,10 @@ class Node:
         assert self.publishers.pop(publisher.topic) is publisher
 
     def get_logger(self) -> Any:
-        return SimpleNamespace(warning=self.warnings.append)
+        def warning(text: str, **_: Any) -> None:
+            self.warnings.append(text)
+
+        return SimpleNamespace(warning=warning, info=self.said.append)
 
 
 @pytest.fixture
@@ -119,7 +120,7 @@ def objects(publisher: Publisher, which: int = -1) -> dict[str, bytes]:
 
 
 def test_nothing_is_created_before_it_is_asked_for(node):
-    outputs = Outputs(node)
+    outputs = OptionalOutputs(node)
     outputs.follow(FrameParameters())
     outputs.publish(found(1), FrameParameters())
     assert not node.all
@@ -137,7 +138,7 @@ def test_nothing_is_created_before_it_is_asked_for(node):
 
 def test_all_outputs_agree_on_names_poses_and_headers(node):
     parameters = replace(ALL, tf_prefix="thing")
-    outputs = Outputs(node)
+    outputs = OptionalOutputs(node)
     outputs.follow(parameters)
     outputs.publish(found(3, 4), parameters)
     (tree,), (seen,), (scene,) = (node.publishers[topic].sent for topic in (TF, DETECTIONS, SCENE))
@@ -154,7 +155,7 @@ def test_all_outputs_agree_on_names_poses_and_headers(node):
 
 
 def test_only_what_is_heard_is_made(node):
-    outputs = Outputs(node)
+    outputs = OptionalOutputs(node)
     outputs.follow(ALL)
     for publisher in node.all:
         publisher.listeners = 0
@@ -168,7 +169,7 @@ def test_only_what_is_heard_is_made(node):
 
 
 def test_gone_objects_are_removed_and_hidden_ones_stay(node):
-    outputs = Outputs(node)
+    outputs = OptionalOutputs(node)
     outputs.follow(ALL)
     scene = node.publishers[SCENE]
     add, remove = soft("moveit_msgs").CollisionObject.ADD, soft("moveit_msgs").CollisionObject.REMOVE
@@ -196,7 +197,7 @@ def test_gone_objects_are_removed_and_hidden_ones_stay(node):
 
 
 def test_switching_off_removes_and_ending_does_not(node):
-    outputs = Outputs(node)
+    outputs = OptionalOutputs(node)
     outputs.follow(ALL)
     scene = node.publishers[SCENE]
     outputs.publish(found(1, 2), ALL)
@@ -212,7 +213,7 @@ def test_switching_off_removes_and_ending_does_not(node):
     scene = node.publishers[SCENE]
     outputs.close()
     assert len(scene.sent) == 1
-    outputs = Outputs(node)
+    outputs = OptionalOutputs(node)
     outputs.follow(ALL)
     outputs.publish(found(1), ALL)
     outputs.withdraw()
@@ -222,7 +223,7 @@ def test_switching_off_removes_and_ending_does_not(node):
 
 def test_meshes_are_of_the_bodies_and_larger_than_they_are(node):
     parameters = replace(ALL, collision_shapes="mesh")
-    outputs = Outputs(node)
+    outputs = OptionalOutputs(node)
     outputs.follow(parameters)
     outputs.publish(found(3, 4), parameters)
     for thing, body in zip(node.publishers[SCENE].sent[0].world.collision_objects, (CAN, BOX), strict=True):
@@ -234,7 +235,7 @@ def test_meshes_are_of_the_bodies_and_larger_than_they_are(node):
 @pytest.mark.parametrize(("package", "topic"), [("tf2_msgs", TF), ("vision_msgs", DETECTIONS), ("moveit_msgs", SCENE)])
 def test_absent_packages_are_named_once_and_the_others_go_on(node, monkeypatch, package, topic):
     soft_messages.remove(monkeypatch, package)
-    outputs = Outputs(node)
+    outputs = OptionalOutputs(node)
     outputs.follow(ALL)
     for _ in range(3):
         outputs.publish(found(1), ALL)
@@ -249,7 +250,7 @@ def test_absent_packages_are_named_once_and_the_others_go_on(node, monkeypatch, 
 
 
 def test_images_without_frame_have_no_transforms_and_no_objects(node):
-    outputs = Outputs(node)
+    outputs = OptionalOutputs(node)
     outputs.follow(ALL)
     for _ in range(2):
         outputs.publish(found(1, header=Header()), ALL)
@@ -301,7 +302,7 @@ def tf2(monkeypatch: pytest.MonkeyPatch) -> Tf2:
 
 def test_findings_in_another_frame_are_the_bodies_seen_from_there(node, tf2):
     here = found(1, 2)
-    there = results.in_frame(here, CameraPoses(node), "map")
+    there = in_frame(here, CameraPoses(node), "map")
     turn, shift = tf2.frames["map"]
     assert (there.header.frame_id, there.header.stamp) == ("map", HEADER.stamp)
     assert here.header.frame_id == "camera"
@@ -311,12 +312,12 @@ def test_findings_in_another_frame_are_the_bodies_seen_from_there(node, tf2):
         assert quaternions.geodesic_angle(there.array.rotation[k].astype(float), expected.rotation) < 1e-5
         np.testing.assert_array_equal(there.array.size[k], here.array.size[k])
     np.testing.assert_array_equal(there.array.sigma_size, here.array.sigma_size)
-    assert results.in_frame(here, CameraPoses(node), "") is here
+    assert in_frame(here, CameraPoses(node), "") is here
 
 
 def test_markers_follow_the_frame(node, tf2):
     here = found(1, 2)
-    there = results.in_frame(here, CameraPoses(node), "map")
+    there = in_frame(here, CameraPoses(node), "map")
     turn, shift = tf2.frames["map"]
     one, other = (findings.markers() for findings in (here, there))
     assert {marker.header.frame_id for marker in other.markers} == {"map"}
@@ -344,7 +345,7 @@ def test_covariances_of_poses_are_about_the_axes_of_their_frame(node, tf2):
     own = np.diag(np.square([0.02, 0.03, 0.04]))
     turn = quaternions.to_matrix(BOX.rotation)
     np.testing.assert_allclose(here.covariances[0][3:, 3:], turn @ own @ turn.T, atol=1e-9)
-    there = results.in_frame(here, CameraPoses(node), "map").covariances[0]
+    there = in_frame(here, CameraPoses(node), "map").covariances[0]
     matrix = quaternions.to_matrix(tf2.frames["map"][0])
     np.testing.assert_allclose(there[:3, :3], matrix @ np.diag([1e-6, 4e-6, 9e-6]) @ matrix.T, atol=1e-12)
     np.testing.assert_allclose(there[3:, 3:], matrix @ turn @ own @ turn.T @ matrix.T, atol=1e-9)
@@ -365,14 +366,14 @@ def test_findings_of_a_cube_are_in_its_frame():
 def test_a_missing_transform_refuses_the_frame(node, tf2, monkeypatch):
     camera_poses = CameraPoses(node)
     with pytest.raises(Refused, match="target_frame: expected a transform from 'camera' to 'moon': moon does not"):
-        results.in_frame(found(1), camera_poses, "moon")
+        in_frame(found(1), camera_poses, "moon")
     late = Header(stamp=Time(sec=11), frame_id="camera")
     with pytest.raises(Refused, match="target_frame"):
-        results.in_frame(found(1, header=late), camera_poses, "map")
+        in_frame(found(1, header=late), camera_poses, "map")
     monkeypatch.setitem(sys.modules, "tf2_ros", None)
     with pytest.raises(Refused, match="tf2_ros cannot be imported"):
-        results.in_frame(found(1), CameraPoses(node), "map")
-    assert results.in_frame(found(1), CameraPoses(node), "camera").header.frame_id == "camera", "needs no tf2"
+        in_frame(found(1), CameraPoses(node), "map")
+    assert in_frame(found(1), CameraPoses(node), "camera").header.frame_id == "camera", "needs no tf2"
 
 
 # Poses of the camera
@@ -399,28 +400,32 @@ def test_all_frames_share_one_listener_and_none_is_there_before(node, tf2):
 
 
 def test_another_fixed_frame_is_another_world(node, tf2):
-    said: list[str] = []
-    identity = Identity(CameraPoses(node), lambda *_: None, said.append)
+    tracking = Tracking(node, CameraPoses(node))
 
-    def ids(fixed: str) -> tuple[int, ...]:
-        return identity.tracked(recovery(one(BOX, 1)), frame(), 0.0, fixed).ids
+    def identified(fixed: str) -> tuple[int, ...]:
+        parameters = FrameParameters(fixed_frame=fixed)
+        return tracking.identify(recovery(one(BOX, 1)), frame(), 0.0, parameters).ids
 
-    assert [ids(fixed) for fixed in ("", "", "map", "map", "base", "")] == [(1,), (1,), (2,), (2,), (3,), (4,)]
-    assert [text.split(":")[0] for text in said] == [
+    assert [identified(fixed) for fixed in ("", "", "map", "map", "base", "")] == [(1,), (1,), (2,), (2,), (3,), (4,)]
+    assert [text.split(":")[0] for text in node.said] == [
         *("fixed_frame is map from now on", "fixed_frame is base from now on", "fixed_frame is none from now on")
     ]
-    assert identity.tally.without_pose == 0
-    identity.tracked(recovery(one(BOX, 1)), frame(), 0.0, "moon")
-    assert identity.tally.without_pose == 1
+    assert tracking.tally.without_pose == 0
+    identified("moon")
+    assert tracking.tally.without_pose == 1
 
 
 def test_tracks_that_a_frame_does_not_show_are_hidden(node):
-    identity = Identity(CameraPoses(node), lambda *_: None, lambda _: None)
-    first = identity.tracked(recovery(one(BOX, 1), one(CAN, 2)), frame(), 10.0)
+    tracking = Tracking(node, CameraPoses(node))
+
+    def identified(parameters: FrameParameters, *bodies: Recovery) -> Identified:
+        return tracking.identify(recovery(*bodies), frame(), 10.0, parameters)
+
+    first = identified(FrameParameters(), one(BOX, 1), one(CAN, 2))
     assert (first.ids, first.hidden) == ((1, 2), ())
-    second = identity.tracked(recovery(one(CAN, 1)), frame(), 10.0)
+    second = identified(FrameParameters(), one(CAN, 1))
     assert (second.ids, second.hidden) == ((2,), (1,))
-    assert identity.untracked(recovery(one(CAN, 1)), frame()).hidden == ()
+    assert identified(FrameParameters(tracking=False), one(CAN, 1)).hidden == ()
 
 
 # Parameters

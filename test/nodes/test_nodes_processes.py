@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import signal
 import subprocess
-import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -33,6 +32,7 @@ from sq_msgs_py.superquadrics import SuperquadricArray, from_message
 from sq_perception.geometry.metrics import thesis_iou, volume_iou
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
+from sq_perception.nodes.children import command
 from sq_perception.simulation.scenes import Scene
 
 PATIENCE = 90.0
@@ -64,7 +64,7 @@ class Process:
         root = str(Path(__file__).resolve().parents[2])
         with log.open("wb") as sink:
             self.handle = subprocess.Popen(
-                [sys.executable, "-m", f"sq_perception.nodes.{node}", "--ros-args", *arguments],
+                command(node, ["--ros-args", *arguments]),
                 stdin=subprocess.DEVNULL,
                 stdout=sink,
                 stderr=subprocess.STDOUT,
@@ -426,16 +426,7 @@ def test_a_bad_parameter_ends_the_start_with_a_reason(start, node, parameter, wo
 
 def test_cameras_that_would_have_one_name_are_refused(tmp_path):
     done = subprocess.run(
-        [
-            sys.executable,
-            "-m",
-            "sq_perception.nodes.recover_cameras",
-            "front",
-            "wrist",
-            "--ros-args",
-            "-r",
-            "__ns:=/arm",
-        ],
+        command("recover_cameras", ["front", "wrist", "--ros-args", "-r", "__ns:=/arm"]),
         cwd=Path(__file__).resolve().parents[2],
         env={**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[2])},
         capture_output=True,

@@ -14,14 +14,14 @@ pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray
+from frame_node_bench import CAMERA, FRAME_ID, Bench
 from geometry_msgs.msg import TransformStamped
 from rclpy.parameter import Parameter
 from std_msgs.msg import Header
-from test_nodes_wiring import CAMERA, FRAME_ID, Bench
 from visualization_msgs.msg import Marker, MarkerArray
 
 from sq_msgs_py.depth_image import depth_to_message
-from sq_perception.fitting.fit import Status
+from sq_perception.fitting.fit import Fit, Status
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.nodes.parameters import FrameParameters, ParameterError
@@ -33,8 +33,7 @@ CAN = Superquadric([0.03, 0.03, 0.06], [0.2, 0.9], [-0.15, 0.02, 0.7], [0.5, 0.0
 
 
 def recovery(body: Superquadric, label: int, status: Status = Status.CONVERGED) -> Recovery:
-    sigma = np.sqrt(np.diag(DEVIATIONS)[:3])
-    return Recovery(body, 0.9, 0.001, sigma, status, "", label, 100, DEVIATIONS)
+    return Recovery(Fit(body, 0.001, status, "", covariance=DEVIATIONS), 0.9, label, 100)
 
 
 def grown(body: Superquadric, share: float) -> Superquadric:
@@ -77,7 +76,7 @@ def test_ids_and_forms_last_and_numbers_are_fused(make_bench):
     bench = make_bench()
     shown: list[MarkerArray] = []
     bench.peer.create_subscription(MarkerArray, "recover_node/markers", shown.append, 5)
-    bench.until(lambda: bench.node._publisher.markers.get_subscription_count())
+    bench.until(lambda: bench.node._outputs.markers.get_subscription_count())
     report = diagnostics(bench)
 
     bench.recoverer.bodies = (recovery(BOX, 1), recovery(CAN, 2))
@@ -213,7 +212,7 @@ def test_without_tf2_ids_remain(make_bench, monkeypatch, capfd):
         _, found = bench.answer(image(10 + k))
         assert found.id.tolist() == [1]
         np.testing.assert_allclose(found.size[0], (1 + share) * BOX.size, rtol=1e-6)
-    assert bench.node._publisher.tally.without_pose == 2
+    assert bench.node._tracking.tally.without_pose == 2
     assert "tf2_ros cannot be imported" in capfd.readouterr().err
 
 

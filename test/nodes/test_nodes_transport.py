@@ -22,10 +22,9 @@ from sq_perception.imaging.calibration import Calibration
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.distortion import Distortion
 from sq_perception.imaging.rectification import Rectification
-from sq_perception.nodes import transport
-from sq_perception.nodes.frame_source import FrameSource
+from sq_perception.nodes.frame import depth_of, image_topic, packed, size_of
 from sq_perception.nodes.parameters import ParameterError, SyntheticParameters
-from sq_perception.nodes.synthetic_publisher import SyntheticDepthNode
+from sq_perception.nodes.synthetic_depth_node import FrameSource, SyntheticDepthNode
 
 PATIENCE = 20.0
 LENS = Distortion("plumb_bob", (-0.2, 0.05, 0.001, -0.001, 0.0))
@@ -40,7 +39,7 @@ def distorted_camera(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("rules", "packed"),
+    ("rules", "expected"),
     [
         ([], "/depth/image/compressedDepth"),
         (["-r", "depth/image:=/camera/depth/image_rect_raw"], "/camera/depth/image_rect_raw/compressedDepth"),
@@ -48,37 +47,35 @@ def distorted_camera(tmp_path):
         (["-r", "__ns:=/robot"], "/robot/depth/image/compressedDepth"),
     ],
 )
-def test_topics_follow_the_image_s(rules, packed):
+def test_topics_follow_the_image_s(rules, expected):
     context = Context()
     context.init(args=["--ros-args", *rules])
     node = Node("listener", context=context)
     try:
-        assert transport.topic(node, "depth/image", "compressedDepth") == packed
-        assert transport.topic(node, "depth/image", "raw") == node.resolve_topic_name("depth/image")
+        assert image_topic(node, "depth/image", "compressedDepth") == expected
+        assert image_topic(node, "depth/image", "raw") == node.resolve_topic_name("depth/image")
     finally:
         node.destroy_node()
         context.try_shutdown()
-    assert transport.message_type("raw") is Image
-    assert transport.message_type("compressedDepth") is CompressedImage
 
 
 def test_packed_and_plain_are_read_alike(rng):
     depth = (rng.integers(300, 3000, (12, 16)) / 1000).astype(np.float32)
     depth[3, 4] = np.nan
     header = Header(frame_id="camera")
-    for message in (depth_to_message(depth, header, "16UC1"), transport.packed(depth, header, "16UC1")):
-        found, encoding = transport.depth_of(message)
+    for message in (depth_to_message(depth, header, "16UC1"), packed(depth, header, "16UC1")):
+        found, encoding = depth_of(message)
         np.testing.assert_array_equal(found, depth)
         assert found.dtype == np.float32
         assert encoding == "16UC1"
-        assert transport.size_of(message) == (16, 12)
+        assert size_of(message) == (16, 12)
         assert message.header == header
-    hostile = transport.packed(depth, header)
+    hostile = packed(depth, header)
     hostile.data = hostile.data[:40]
     with pytest.raises(ValueError, match="not readable"):
-        transport.depth_of(hostile)
+        depth_of(hostile)
     hostile.format = "jpeg"
-    for read in (transport.depth_of, transport.size_of):
+    for read in (depth_of, size_of):
         with pytest.raises(ValueError, match="format: expected"):
             read(hostile)
 
@@ -144,11 +141,11 @@ def test_a_distorting_synthetic_camera_sends_raw_images_packed_and_plain(hear, d
     parameters = {"camera_info_file": str(distorted_camera), "masks": "always", "rate": 5.0}
     heard = hear(**parameters, image_transport="compressedDepth", encoding="16UC1")
     topics = ("depth/image", "depth/image/compressedDepth", "depth/camera_info", "mask/image")
-    image, packed, info, mask = heard.together(*topics)
-    np.testing.assert_array_equal(transport.depth_of(packed)[0], depth_from_message(image))
+    image, small, info, mask = heard.together(*topics)
+    np.testing.assert_array_equal(depth_of(small)[0], depth_from_message(image))
     calibration = Calibration.of(info, "/depth/image")
     assert calibration.rectification == Rectification(Camera(320, 240, 262.0, 262.0, 159.5, 119.5), LENS)
-    assert transport.size_of(packed) == calibration.size == (320, 240)
+    assert size_of(small) == calibration.size == (320, 240)
     true = FrameSource(SyntheticParameters(**parameters)).next(0.0)
     found = calibration.rectified(depth_from_message(image))
     both = np.isfinite(found) & np.isfinite(true.depth)

@@ -2,134 +2,31 @@
 
 from __future__ import annotations
 
-import threading
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
-from builtin_interfaces.msg import Time
+from frame_node_bench import CAMERA, FRAME_ID, Bench, ball
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSProfile, QoSReliabilityPolicy
-from sensor_msgs.msg import CameraInfo, Image, PointCloud2
-from spun_nodes import PATIENCE, SpunNodes
+from sensor_msgs.msg import CameraInfo, Image
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import Marker, MarkerArray
 
 from sq_msgs_py.depth_image import (
-    Intrinsics,
     depth_from_message,
     depth_to_message,
     grey_to_message,
-    intrinsics_to_message,
     labels_to_message,
 )
-from sq_msgs_py.superquadrics import SuperquadricArray, from_message
 from sq_perception.fitting.fit import Status
-from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
-from sq_perception.nodes.engine import Workshop
-from sq_perception.nodes.frame_node import FrameNode
-from sq_perception.nodes.parameters import RecoverParameters
-from sq_perception.nodes.recover_node import _options
-from sq_perception.recovery.recoverer import FrameRecovery, Recovery
-
-CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
-FRAME_ID = "some_camera_optical_frame"
-
-
-def ball(label: int = 1, status: Status = Status.CONVERGED) -> Recovery:
-    body = Superquadric(np.full(3, 0.1), np.ones(2), np.array([0.01, 0.02, 0.5]), np.array([0, 0, 0, 1.0]))
-    return Recovery(body, 0.9, 0.001, np.full(3, np.nan), status, "", label, 100)
-
-
-class Recoverer:
-    """Notes what it is asked, and answers ``bodies``, or raises, once ``gate`` is open."""
-
-    def __init__(self) -> None:
-        self.asked: list[tuple[np.ndarray, Camera, np.ndarray | None, Any]] = []
-        self.bodies: tuple[Recovery, ...] = (ball(),)
-        self.error: Exception | None = None
-        self.gate = threading.Event()
-        self.gate.set()
-
-    def warm_up(self, camera: Camera) -> None:
-        self.warm = camera
-
-    def recover(self, depth: np.ndarray, camera: Camera, labels: np.ndarray | None, options: Any) -> FrameRecovery:
-        self.asked.append((depth, camera, labels, options))
-        assert self.gate.wait(PATIENCE)
-        if self.error is not None:
-            raise self.error
-        return FrameRecovery(self.bodies, {"total": 1.0}, np.zeros(depth.shape, np.int32), None, "")
-
-
-class Bench(SpunNodes):
-    """A frame node and a peer that publishes to it and listens, spun in the background."""
-
-    def __init__(self, *arguments: str) -> None:
-        super().__init__(*arguments)
-        self.recoverer = Recoverer()
-        workshop = Workshop(make=lambda _: self.recoverer, options=_options)
-        self.node = FrameNode("recover_node", RecoverParameters, workshop, context=self.context)
-        self.images = self.peer.create_publisher(Image, "depth/image", 5)
-        self.infos = self.peer.create_publisher(CameraInfo, "depth/camera_info", 5)
-        self.answers: list[PointCloud2] = []
-        self.peer.create_subscription(PointCloud2, "recover_node/superquadrics", self.answers.append, 10)
-        self.spin([self.node])
-        self.until(lambda: self.node.is_active)
-        if self.node._settings.current.image_transport == "raw":
-            self.until(lambda: self.images.get_subscription_count() == 1)
-        self.until(lambda: self.node._publisher.superquadrics.get_subscription_count() == 1)
-        self.stamps = 0
-
-    def close(self) -> None:
-        self.recoverer.gate.set()
-        assert self.node.close()
-        self.finish()
-
-    @property
-    def counts(self) -> Any:
-        return self.node._statistics.snapshot()
-
-    def header(self) -> Header:
-        self.stamps += 1
-        return Header(stamp=Time(sec=1000 + self.stamps, nanosec=7), frame_id=FRAME_ID)
-
-    def depth(self, camera: Camera = CAMERA, value: float = 0.5) -> Image:
-        return depth_to_message(np.full((camera.height, camera.width), value), self.header())
-
-    def send_info(self, camera: Camera = CAMERA) -> None:
-        """Publish a camera_info and wait until the node has it."""
-        known = Intrinsics(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-        self.put_info(intrinsics_to_message(known, self.header()))
-
-    def put_info(self, message: CameraInfo) -> None:
-        self.until(lambda: self.infos.get_subscription_count() == 1)
-        before = sum(1 for _ in self.node._inbox._infos)
-        assert before < self.node._inbox._infos.maxlen
-        self.infos.publish(message)
-        self.until(lambda: len(self.node._inbox._infos) > before)
-
-    def send(self, message: Image) -> Any:
-        """Publish an image and wait for its verdict: the counts after it."""
-        before = self.counts
-        self.images.publish(message)
-        self.until(lambda: self.counts.received > before.received and self.counts.in_work == 0)
-        return self.counts
-
-    def answer(self, message: Image) -> tuple[PointCloud2, SuperquadricArray]:
-        """Publish a good image; the published result."""
-        before = len(self.answers)
-        self.send(message)
-        self.until(lambda: len(self.answers) > before)
-        return self.answers[-1], from_message(self.answers[-1])
 
 
 @pytest.fixture
@@ -281,7 +178,7 @@ def test_frames_may_change_their_size(bench):
 
 def test_a_camera_info_that_comes_after_its_image_is_waited_for(make_bench):
     bench = make_bench()
-    bench.node._on_image(bench.depth())
+    bench.node._input._on_image(bench.depth())
     bench.send_info()
     bench.until(lambda: bench.counts.answered == 1)
     assert bench.counts.refused == 0
@@ -422,7 +319,7 @@ def test_triggers_leave_nothing_behind(bench):
 def test_masks_without_a_stamp_belong_to_no_image(bench):
     masks = bench.peer.create_publisher(Image, "mask/image", 5)
     bench.until(lambda: masks.get_subscription_count() == 1)
-    bench.node._inbox.put_mask(labels_to_message(np.ones((48, 64), np.int32), Header()))
+    bench.node._input.inbox.put_mask(labels_to_message(np.ones((48, 64), np.int32), Header()))
     image = bench.depth()
     image.header = Header(frame_id=FRAME_ID)
     bench.answer(image)
@@ -467,8 +364,8 @@ def test_pictures_are_made_while_somebody_listens_and_stale_markers_go(bench):
     bench.peer.create_subscription(Image, "recover_node/rendered_depth", rendered.append, 5)
     bench.until(
         lambda: (
-            bench.node._publisher.markers.get_subscription_count()
-            and bench.node._publisher.rendered_depth.get_subscription_count()
+            bench.node._outputs.markers.get_subscription_count()
+            and bench.node._outputs.rendered_depth.get_subscription_count()
         )
     )
     assert not shown
@@ -494,7 +391,7 @@ def test_orthographic_frames_need_no_camera_info_and_answer_in_the_cube_frame(ma
     assert bench.recoverer.warm == unit_cube.camera()
     rendered: list[Image] = []
     bench.peer.create_subscription(Image, "recover_node/rendered_depth", rendered.append, 5)
-    bench.until(lambda: bench.node._publisher.rendered_depth.get_subscription_count())
+    bench.until(lambda: bench.node._outputs.rendered_depth.get_subscription_count())
     for dtype in (np.uint8, np.uint16):
         grey = np.zeros((32, 32), dtype)
         grey[8:20, 8:20] = 0.75 * np.iinfo(dtype).max
@@ -519,7 +416,7 @@ def test_a_publisher_that_cannot_be_heard_is_named(make_bench):
     deaf = QoSProfile(depth=1, reliability=QoSReliabilityPolicy.BEST_EFFORT)
     bench.peer.create_publisher(Image, "depth/image", deaf)
     bench.until(lambda: bench.node.count_publishers("/depth/image") == 2)
-    words = bench.node._heard(bench.node._image_input)
+    words = bench.node._input.heard
     assert words.startswith("2 publishers: ")
     assert words.count("INCOMPATIBLE") == 1
     assert "best effort" in words
@@ -553,8 +450,8 @@ def test_diagnostics_count_and_warn(bench):
 
 
 def test_lost_messages_are_counted_and_the_remedy_is_named(bench, capfd):
-    bench.node._on_lost(SimpleNamespace(total_count=3, total_count_change=3))
-    bench.node._on_lost(SimpleNamespace(total_count=5, total_count_change=2))
+    bench.node._input._on_lost(SimpleNamespace(total_count=3, total_count_change=3))
+    bench.node._input._on_lost(SimpleNamespace(total_count=5, total_count_change=2))
     assert bench.counts.lost == 5
     said = capfd.readouterr().err
     assert said.count("FASTRTPS_DEFAULT_PROFILES_FILE") == 1

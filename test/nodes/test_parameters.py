@@ -171,15 +171,15 @@ def test_what_is_not_live_changes_while_it_is_not_locked(make_node):
     assert (live.current.projection, live.current.s) == ("orthographic", 3.0)
 
 
-def test_a_judge_may_refuse_and_a_listener_hears_what_was_set(make_node):
+def test_a_check_may_refuse_and_a_listener_hears_what_was_set(make_node):
     heard = []
 
-    def judge(candidate, names):
+    def check(candidate, names):
         if "model" in names and candidate.model == "bad":
             raise ValueError("model: no such file")
 
     node = make_node()
-    live = LiveParameters(node, RecoverParameters, judge=judge, changed=lambda new, names: heard.append((new, names)))
+    live = LiveParameters(node, RecoverParameters, check=check, changed=lambda new, names: heard.append((new, names)))
     refused = node.set_parameters_atomically([Parameter("model", value="bad"), Parameter("s", value=3.0)])
     assert (refused.successful, refused.reason) == (False, "model: no such file")
     assert (live.current, heard) == (RecoverParameters(), [])
@@ -198,11 +198,11 @@ def test_parameters_of_others_change_nothing(make_node):
 
 
 def test_a_file_that_cannot_be_looked_at_is_a_reason(make_node):
-    def judge(candidate, names):
+    def check(candidate, names):
         raise PermissionError(13, "Permission denied", candidate.model)
 
     node = make_node()
-    LiveParameters(node, RecoverParameters, judge=judge)
+    LiveParameters(node, RecoverParameters, check=check)
     refused = node.set_parameters([Parameter("model", value="secret.safetensors")])[0]
     assert not refused.successful
     assert "Permission denied" in refused.reason

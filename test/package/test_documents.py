@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import re
 import subprocess
@@ -44,6 +45,25 @@ def test_links_lead_somewhere_in_a_checkout(repository: Path) -> None:
     assert not broken
 
 
+def test_figures_and_the_house_are_what_was_measured(repository: Path) -> None:
+    """Blocks between markers equal what docs_build/blocks.py makes of results, floors and imports."""
+    path = repository / "docs_build" / "blocks.py"
+    spec = importlib.util.spec_from_file_location("blocks", path)
+    assert spec is not None
+    assert spec.loader is not None
+    blocks = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(blocks)
+    texts = {page: page.read_text(encoding="utf-8") for page in blocks.documents()}
+    stale = [page.name for page, text in texts.items() if blocks.renewed(text) != text]
+    assert not stale, f"run python docs_build/blocks.py: {stale}"
+    used = {name for text in texts.values() for name in re.findall(r"docs_build/blocks\.py: (\w+)", text)}
+    assert used == set(blocks.BLOCKS)
+    below: set[str] = set()
+    for rooms in blocks.floors():
+        below.update(rooms)
+        assert all(blocks.imported(room) <= below for room in rooms), rooms
+
+
 def test_the_workflow_pins_what_it_runs_and_may_only_read(repository: Path) -> None:
     text = (repository / ".github" / "workflows" / "ci.yml").read_text(encoding="utf-8")
     workflow = yaml.safe_load(text)
@@ -77,6 +97,7 @@ def site(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The built site; strict: what MkDocs warns of is an error."""
     pytest.importorskip("mkdocs", reason="mkdocs is missing: install the extra 'docs'")
     pytest.importorskip("material", reason="mkdocs-material is missing: install the extra 'docs'")
+    pytest.importorskip("mkdocstrings_handlers.python", reason="mkdocstrings is missing: install the extra 'docs'")
     folder = tmp_path_factory.mktemp("site")
     result = subprocess.run(
         [sys.executable, "-m", "mkdocs", "build", "--strict", "--site-dir", str(folder)],

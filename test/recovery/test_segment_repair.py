@@ -45,7 +45,7 @@ def seen(bodies, noise=NOISE, seed=0):
 def fit_of(depth):
     def fit(mask):
         fit.calls += 1
-        return surface_fit.fit(depth, mask, CAMERA, options=surface_fit.Options(plane=PLANE))
+        return surface_fit.fit(depth, mask, CAMERA, options=surface_fit.FitOptions(plane=PLANE))
 
     fit.calls = 0
     return fit

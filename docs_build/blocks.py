@@ -1,0 +1,238 @@
+"""The parts of the documents that say what can be measured or read from the source; nobody writes them by hand.
+
+    python docs_build/blocks.py     rewrites them in README.md and docs/
+
+A document holds such a part between two lines, ``<!-- made by docs_build/blocks.py: NAME -->`` and ``<!-- end -->``.
+Figures come from benchmarks/results/*.json, the house from ``FLOORS`` of test/package/test_imports.py, from what the
+rooms say of themselves and from their imports.  A test compares.
+"""
+
+from __future__ import annotations
+
+import ast
+import json
+import re
+from collections.abc import Callable, Iterator
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGE = ROOT / "sq_perception"
+_BLOCK = re.compile(r"(<!-- made by docs_build/blocks\.py: (\w+) -->\n).*?(<!-- end -->)", re.DOTALL)
+
+
+def documents() -> list[Path]:
+    """The pages that may hold blocks."""
+    return [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+
+
+def renewed(text: str) -> str:
+    """A page with its blocks as they should be; raises KeyError for a block of an unknown name."""
+    return _BLOCK.sub(lambda match: f"{match[1]}{BLOCKS[match[2]]().rstrip()}\n{match[3]}", text)
+
+
+def table(heads: list[str], rows: list[list[str]]) -> str:
+    lines = [heads, ["---"] * len(heads), *rows]
+    return "".join(f"| {' | '.join(line)} |\n" for line in lines)
+
+
+# Figures
+
+
+def results(name: str) -> Any:
+    return json.loads((ROOT / "benchmarks" / "results" / f"{name}.json").read_text(encoding="utf-8"))
+
+
+def accuracy() -> str:
+    """Images of the thesis' protocol: IoU from the evaluation, times of whole recoveries from the occlusion bench."""
+    summaries = {one["name"]: one["summary"] for one in results("evaluation")["contestants"]}
+    consensus = {one["name"]: one["summary"] for one in results("evaluation_consensus")["contestants"]}
+    times = {
+        name: row["milliseconds"]["median"] for name, row in results("occlusion")["rows"]["thesis, 0 % hidden"].items()
+    }
+    rows = [
+        ("`auto`: network + surface fit", summaries["auto"], "auto", ""),
+        ("`symmetry`: surface fit without the network", summaries["symmetry"], "symmetry", ""),
+        (
+            "`network` alone, weights `supervised`",
+            summaries["supervised"],
+            "network supervised",
+            "94.62 +- 3.18, 99.06 over 85, 2.88 ms on a GPU",
+        ),
+        ("the same, `consensus` of 8 positions", consensus["supervised x 8"], "network supervised x 8", ""),
+        ("`network` alone, weights `robust` (default)", summaries["robust"], "network robust", ""),
+        ("`classic`: Solina and Bajcsy", summaries["classic"], "classic", "84.51 +- 8.89, 690 ms"),
+    ]
+    return table(
+        ["method", "bodies", "IoU mean +- std", "min", "> 85 %", "ms", "the thesis reports"],
+        [
+            [
+                name,
+                str(of["bodies"]),
+                f"{100 * of['iou_mean']:.2f} +- {100 * of['iou_std']:.2f}",
+                f"{100 * of['iou_min']:.1f}",
+                f"{100 * of['over_85']:.1f}",
+                f"{times[timed]:.1f}",
+                thesis,
+            ]
+            for name, of, timed, thesis in rows
+        ],
+    )
+
+
+def household() -> str:
+    """Household things on a table through simulated sensors, at least half visible."""
+    found = results("real_scenes")
+    names = {
+        "given": "`auto`, masks given",
+        "own": "`auto`, own masks",
+        "classic": "`classic`, masks given",
+        "oriented box": "smallest box of the seen points, masks given",
+    }
+    rows = [(text, found[f"all, at least half visible: {name}"]) for name, text in names.items()]
+    return table(
+        ["method", "IoU with the true convex hull %", "error of full edges mm, median / mean", "within 2 sigma %"],
+        [
+            [
+                text,
+                f"{row['iou']['mean']:.1f}",
+                f"{row['edge_error']['median']:.1f} / {row['edge_error']['mean']:.1f}",
+                "" if row["within_2_sigma"] is None else f"{row['within_2_sigma']:.0f}",
+            ]
+            for text, row in rows
+        ],
+    )
+
+
+def kinds() -> str:
+    """The same by the kind of thing."""
+    found = results("real_scenes")
+    rows = [(name, found[f"{name}: given"], found[f"{name}: own"]) for name in ("box", "can", "bottle", "scan")]
+    return table(
+        ["things", "number", "IoU %, masks given / own", "error of edges mm, median", "within 2 sigma %, masks given"],
+        [
+            [
+                name,
+                f"{given['iou']['count']:.0f}",
+                f"{given['iou']['mean']:.1f} / {own['iou']['mean']:.1f}",
+                f"{given['edge_error']['median']:.1f} / {own['edge_error']['median']:.1f}",
+                f"{given['within_2_sigma']:.0f}",
+            ]
+            for name, given, own in rows
+        ],
+    )
+
+
+def frame_time() -> str:
+    """Whole frames of a simulated RealSense, VGA, own masks."""
+    rows = results("frame_time")["rows"]
+    shown = [(count, rows[f"realsense_d435, 640 x 480, {count}, own"]) for count in (1, 5, 20)]
+    return table(
+        ["bodies", "ms median / p95", "of which segmentation, fit"],
+        [
+            [
+                str(count),
+                f"{row['stages']['total']['median']:.0f} / {row['stages']['total']['p95']:.0f}",
+                f"{row['stages']['segmentation']['median']:.0f}, {row['stages']['fit']['median']:.0f}",
+            ]
+            for count, row in shown
+        ],
+    )
+
+
+def latency() -> str:
+    """From an image's stamp to its result in another process."""
+    names = {
+        "thesis 256 x 256": "256 x 256 orthographic",
+        "table 640 x 480, one object": "640 x 480 pinhole, table-top, own masks",
+    }
+    cases = results("node_latency")["cases"]
+    return table(
+        ["frame, one object", "ms median / p95 / max", "results / s", "trend over a minute"],
+        [
+            [
+                text,
+                " / ".join(f"{cases[name]['milliseconds'][part]:.1f}" for part in ("median", "p95", "max")),
+                f"{cases[name]['results_per_second']:.1f}",
+                f"{cases[name]['trend_ms']:+.1f} ms",
+            ]
+            for name, text in names.items()
+        ],
+    )
+
+
+# The house
+
+
+def floors() -> tuple[tuple[str, ...], ...]:
+    """``FLOORS`` of test/package/test_imports.py, from the ground up."""
+    tree = ast.parse((ROOT / "test" / "package" / "test_imports.py").read_text(encoding="utf-8"))
+    for node in tree.body:
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "FLOORS":
+            value: tuple[tuple[str, ...], ...] = ast.literal_eval(node.value)
+            return value
+    raise LookupError("test/package/test_imports.py has no FLOORS")
+
+
+def house() -> str:
+    """A drawing of the floors, the highest first; modules import from their own floor and from those below."""
+    rows = ["   ".join(rooms) for rooms in reversed(floors())]
+    inner = max(map(len, rows))
+    line = f"+{'-' * (inner + 2)}+"
+    return "\n".join(["```text", line, *(f"| {row.center(inner)} |\n{line}" for row in rows), "```"])
+
+
+def rooms() -> str:
+    """What each room holds, in its own words, and the rooms that it imports from."""
+    return table(
+        ["room", "holds", "imports from"],
+        [
+            [f"[`{room}/`](../sq_perception/{room}/__init__.py)", purpose(room), ", ".join(sorted(imported(room)))]
+            for floor in reversed(floors())
+            for room in floor
+        ],
+    )
+
+
+def purpose(room: str) -> str:
+    """The first paragraph of a room's docstring."""
+    docstring = ast.get_docstring(ast.parse((PACKAGE / room / "__init__.py").read_text(encoding="utf-8"))) or ""
+    return " ".join(docstring.partition("\n\n")[0].split())
+
+
+@cache
+def imported(room: str) -> frozenset[str]:
+    """Other rooms that modules of one import, wherever in them."""
+    return frozenset({there for path in (PACKAGE / room).rglob("*.py") for there in _rooms_of(path)}) - {room}
+
+
+def _rooms_of(path: Path) -> Iterator[str]:
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        names: list[str] = []
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            names = [f"{node.module}.{alias.name}" for alias in node.names]
+        for name in names:
+            package, _, rest = name.partition(".")
+            if package == "sq_perception" and (PACKAGE / rest.partition(".")[0]).is_dir():
+                yield rest.partition(".")[0]
+
+
+BLOCKS: dict[str, Callable[[], str]] = {
+    function.__name__: function for function in (accuracy, household, kinds, frame_time, latency, house, rooms)
+}
+
+
+def main() -> None:
+    """Rewrite every block."""
+    for page in documents():
+        text = page.read_text(encoding="utf-8")
+        if (new := renewed(text)) != text:
+            page.write_text(new, encoding="utf-8")
+            print(page.relative_to(ROOT))
+
+
+if __name__ == "__main__":
+    main()

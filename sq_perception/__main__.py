@@ -1,0 +1,6 @@
+"""``python -m sq_perception``: the command ``sq-perception``, also for torchrun."""
+
+from sq_perception.commands.main import main
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,158 @@
+"""``sq-perception evaluate``: tables 6.1 to 6.3 and 7.1 to 7.4 of the thesis, for every network and every fit."""
+
+from __future__ import annotations
+
+import argparse
+import shlex
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from sq_perception.commands.console import FAILURE, SUCCESS, complain, failed, parser
+from sq_perception.evaluation.protocol import BODIES, DEFAULT_SEED, FIT_BODIES, FITS
+
+if TYPE_CHECKING:
+    from sq_perception.evaluation.contest import Advance
+    from sq_perception.evaluation.contestants import Contestant
+    from sq_perception.recovery.recoverer import Method
+
+_HELP = """\
+Compare networks and fits on one test set of the thesis' protocol, and write its tables 6.1 to 6.3 and 7.1 to 7.4 with
+the thesis' figures beside ours, IoU histograms, angles of the rotations (figure 6.3), examples, and training curves.
+
+A network takes part alone, unrefined, from the 256 x 256 image on; the loss in its file's header says which row of the
+thesis it answers.  Fits: auto (network and surface fit), symmetry (surface fit alone), classic (Solina and Bajcsy).
+"""
+_EPILOG = """\
+writes into --output:
+  report.html    all tables and pictures in one file that needs no other and no network
+  report.md      the tables
+  results.json   every figure, the command, versions, processor, commit and seeds
+  *.png          the pictures
+
+A model file that cannot be read is reported and left out; the exit code is then 1.  The bodies are those of no
+training, and the first n are the same for every --bodies.  Expect 7 ms a body to draw the images, and 10 ms for each
+network and 15 ms for each fit; times of execution mean something on a quiet machine only.
+
+examples:
+  sq-perception evaluate
+  sq-perception evaluate --models runs/*/model.safetensors --bodies 2000 --fit-bodies 300 --output runs/losses
+  sq-perception evaluate --models new.safetensors --methods
+"""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Entry of ``sq-perception evaluate``; the exit code, which is that of a failure if a model could not be read."""
+    command = _parser()
+    options = command.parse_args(arguments)
+    for name in ("bodies", "fit_bodies"):
+        if getattr(options, name) < 1:
+            command.error(f"--{name.replace('_', '-')}: expected at least 1, got {getattr(options, name)}")
+    if options.seed < 0:
+        command.error(f"--seed: expected a number of at least 0, got {options.seed}")
+    methods: list[Method] = list(dict.fromkeys(FITS if options.methods is None else options.methods))
+    if options.models == [] and not methods:
+        command.error("nothing to evaluate: --models and --methods are both empty")
+    try:
+        options.output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        command.error(f"--output: {error}")
+    return _evaluate(options, methods, ["sq-perception", "evaluate", *arguments])
+
+
+def _evaluate(options: argparse.Namespace, methods: list[Method], words: list[str]) -> int:
+    import numba
+    import torch
+
+    from sq_perception.evaluation import report
+    from sq_perception.evaluation.contest import compare
+    from sq_perception.evaluation.thesis_images import ThesisImages
+    from sq_perception.files import provenance
+
+    torch.set_num_threads(1)  # the network's layers are so small that threads cost more than they save
+    contestants, failures = _contestants(options, methods)
+    for failure in failures:
+        complain(failure)
+    if not contestants:
+        return failed("nothing is left to evaluate")
+    images = ThesisImages(max(count for _, count in contestants), options.seed)
+    with _progress() as advance:
+        outcomes = compare(contestants, images, advance=advance)
+    facts = {
+        **provenance.facts(shlex.join(words)),
+        "threads": {"torch": torch.get_num_threads(), "numba": numba.get_num_threads()},
+        "seed": options.seed,
+        "spawn_key": "(6, block), blocks of 500 bodies",
+    }
+    written = report.write(options.output, outcomes, images, facts, failures)
+    print("\n\n".join(table.markdown() for table in report.overview(outcomes)))
+    print(f"written: {written}")
+    return FAILURE if failures else SUCCESS
+
+
+def _contestants(options: argparse.Namespace, methods: list[Method]) -> tuple[list[tuple[Contestant, int]], list[str]]:
+    """Who takes part, with the number of bodies, and what is wrong with those who cannot."""
+    from sq_perception.evaluation.contestants import FittingMethod, Network, unique_names
+    from sq_perception.learning.checkpoint import CheckpointError, shipped
+
+    contestants: list[tuple[Contestant, int]] = []
+    failures: list[str] = []
+    paths = list(shipped().values()) if options.models is None else options.models
+    for path, name in zip(paths, unique_names(paths), strict=True):
+        try:
+            contestants.append((Network.read(path, name), options.bodies))
+            if options.consensus:
+                contestants.append((Network.read(path, f"{name} x 8", consensus=True), options.bodies))
+        except CheckpointError as error:
+            failures.append(str(error))
+    for method in methods:
+        try:
+            contestants.append((FittingMethod.of(method), min(options.fit_bodies, options.bodies)))
+        except CheckpointError as error:
+            failures.append(f"{method}: {error}")
+    return contestants, failures
+
+
+def _parser() -> argparse.ArgumentParser:
+    command = parser("evaluate", _HELP, _EPILOG)
+    command.add_argument(
+        "--consensus", action="store_true", help="each network a second time, asked in 8 positions of each view"
+    )
+    command.add_argument(
+        "--models", type=Path, nargs="*", metavar="FILE", help="weights to compare (default: all that are shipped)"
+    )
+    command.add_argument(
+        "--methods", nargs="*", choices=FITS, metavar="FIT", help=f"fits to compare (default: {' '.join(FITS)})"
+    )
+    command.add_argument("--bodies", type=int, default=BODIES, metavar="N", help=f"bodies for networks ({BODIES})")
+    command.add_argument(
+        "--fit-bodies", type=int, default=FIT_BODIES, metavar="N", help=f"the first N of them for fits ({FIT_BODIES})"
+    )
+    command.add_argument("--seed", type=int, default=DEFAULT_SEED, help=f"of the test set ({DEFAULT_SEED})")
+    command.add_argument(
+        "--output", type=Path, default=Path("runs/evaluation"), metavar="DIR", help="folder (runs/evaluation)"
+    )
+    return command
+
+
+@contextmanager
+def _progress() -> Iterator[Advance | None]:
+    """A bar a contestant, on a terminal."""
+    if not sys.stderr.isatty():
+        yield None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bars:
+        tasks: dict[str, int] = {}
+
+        def advance(name: str, done: int, of: int) -> None:
+            if name not in tasks:
+                tasks[name] = bars.add_task(name, total=of)
+            bars.update(tasks[name], completed=done)  # type: ignore[arg-type]
+
+        yield advance

@@ -1,0 +1,44 @@
+"""``sq-perception render-search``: the grid search over s and tau of the thesis' figure 7.6."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from sq_perception.commands.console import SUCCESS, parser
+
+_HELP = "The best s and tau of the soft renderer: the grid search of the thesis' figure 7.6."
+_EPILOG = "example:\n  sq-perception render-search --picture render_search.png"
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Entry of ``sq-perception render-search``; the exit code."""
+    command = parser("render-search", _HELP, _EPILOG)
+    command.add_argument("--bodies", type=int, default=20, help="random bodies (default %(default)s)")
+    command.add_argument("--resolution", type=int, default=64, help="pixels and voxels a side (default %(default)s)")
+    command.add_argument("--steps", type=int, default=21, help="values of s and of tau (default %(default)s)")
+    command.add_argument("--seed", type=int, default=2020, help="default %(default)s")
+    command.add_argument("--picture", type=Path, metavar="FILE", help="draw the heat map there")
+    options = command.parse_args(arguments)
+    for name in ("bodies", "resolution", "steps"):
+        if getattr(options, name) < 2:
+            command.error(f"--{name}: expected at least 2, got {getattr(options, name)}")
+    if options.picture and not options.picture.resolve().parent.is_dir():
+        command.error(f"--picture: the folder of {options.picture} does not exist")
+
+    import numpy as np
+
+    from sq_perception.evaluation import plots, render_search
+    from sq_perception.imaging.soft_render import THESIS_SHARPNESS, THESIS_TAU
+    from sq_perception.simulation.scenes import thesis_bodies
+
+    bodies = thesis_bodies(options.bodies, np.random.default_rng(options.seed))
+    sharpness, taus = (np.geomspace(*limits, options.steps) for limits in (render_search.SHARPNESS, render_search.TAU))
+    found = render_search.search(bodies, sharpness, taus, options.resolution)
+    thesis = render_search.search(bodies, np.array([THESIS_SHARPNESS]), np.array([THESIS_TAU]), options.resolution)
+    s, tau, error = found.best
+    print(f"least MAE {error:.4f} at s = {s:.1f}, tau = {tau:.2f}")
+    print(f"at the thesis' s = 117.3, tau = 4.82: {thesis.best[2]:.4f} (the thesis reports 0.0056)")
+    if options.picture:
+        plots.save(render_search.figure(found), options.picture)
+    return SUCCESS

@@ -1,0 +1,66 @@
+"""``sq-perception train``: run a training, or go on with one."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import fields
+from pathlib import Path
+
+from sq_perception.commands.console import INTERRUPTED, SUCCESS, failed, parser
+from sq_perception.learning import training_config
+from sq_perception.learning.training_config import CHOICES, TrainingConfig
+
+_HELP = """\
+Train the network, with any loss of the thesis.  Options begin with the values of --config, or with the defaults.
+
+The output folder holds state.safetensors, from which the same command goes on where it stopped, log.jsonl,
+last.safetensors (the newest validated network) and model.safetensors (the best one so far).
+"""
+_EPILOG = """\
+examples:
+  sq-perception train --steps 20000 --output runs/compact
+  sq-perception train --config render --output runs/render
+  torchrun --nproc-per-node 2 -m sq_perception train --device cuda --output runs/two
+"""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Entry of ``sq-perception train``; the exit code."""
+    command = _parser()
+    options = vars(command.parse_args(arguments))
+    output, file = options.pop("output"), options.pop("config")
+    try:
+        config = TrainingConfig(**options) if file is None else training_config.read(file, **options)
+    except ValueError as error:
+        command.error(str(error))
+
+    from sq_perception.learning.checkpoint import CheckpointError
+    from sq_perception.learning.train import DivergedError, Stopped, train
+
+    try:
+        train(config, output)
+    except Stopped as stopped:
+        print(stopped, file=sys.stderr)
+        return INTERRUPTED
+    except (DivergedError, CheckpointError, ValueError) as error:
+        return failed(f"train: {error}")
+    return SUCCESS
+
+
+def _parser() -> argparse.ArgumentParser:
+    """``--output``, ``--config`` and one option for each field of the configuration."""
+    command = parser("train", _HELP, _EPILOG)
+    command.add_argument("--output", type=Path, default=Path("runs/compact"), help="folder of the run (runs/compact)")
+    shipped = ", ".join(training_config.shipped())
+    command.add_argument("--config", metavar="FILE", help=f"YAML file, or one of {shipped}")
+    for field in fields(TrainingConfig):
+        name = "--" + field.name.replace("_", "-")
+        default, text = argparse.SUPPRESS, f"default {field.default!r}"
+        if isinstance(field.default, bool):
+            command.add_argument(name, action=argparse.BooleanOptionalAction, default=default, help=text)
+        else:
+            choices = CHOICES.get(field.name)
+            command.add_argument(name, type=type(field.default), choices=choices, default=default, help=text)
+    return command

@@ -1,0 +1,50 @@
+"""``sq-perception warm-up``: compile every kernel once and keep it on disk, so that no first image has to wait.
+
+Compiled code is kept beside the modules, or in the user's cache where that folder cannot be written.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+
+from sq_perception.commands.console import SUCCESS, parser
+
+_HELP = "Compile every kernel once and keep it on disk (about two minutes), so that no first image has to wait."
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Entry of ``sq-perception warm-up``: run every step and say how long each took."""
+    parser("warm-up", _HELP).parse_args(arguments)
+    for name, action in steps():
+        began = time.perf_counter()
+        print(f"preparing {name} ...", end=" ", flush=True)
+        action()
+        print(f"{time.perf_counter() - began:.1f} s", flush=True)
+    return SUCCESS
+
+
+def steps() -> list[tuple[str, Callable[[], object]]]:
+    """Name and action of everything that compiles."""
+    import numpy as np
+
+    from sq_perception.fitting import solina_bajcsy, surface_fit
+    from sq_perception.geometry import metrics
+    from sq_perception.geometry.superquadric import Superquadric
+    from sq_perception.imaging import raycast
+    from sq_perception.imaging.camera import Camera
+    from sq_perception.segmentation import convex_parts
+    from sq_perception.simulation import view_rendering
+
+    batch = Superquadric.from_flat(np.array([[0.1, 0.2, 0.3, 0.5, 0.8, 0, 0, 1, 0, 0, 0, 1]]))
+    body = batch[0]
+    camera = Camera(32, 24, 30.0, 30.0, 16.0, 12.0)
+    points = body.sample_surface(50, np.random.default_rng(0))
+    return [
+        ("ray casting", lambda: raycast.render(body, camera)),
+        ("canonical views", lambda: view_rendering.render_views(batch, 16)),
+        ("overlap", lambda: metrics.volume_iou(batch, batch, 16)),
+        ("classic fit", lambda: solina_bajcsy.fit(points)),
+        ("surface fit", surface_fit.warm_up),
+        ("lines of sight", convex_parts.warm_up),
+    ]

@@ -1,0 +1,247 @@
+"""The exact course: for images that a superquadric explains down to the noise.
+
+1. Starts, cheap ones first: given bodies, central symmetry, boxes on the support plane.  From each, few steps on few
+   rays; the best go on with more rays.  More starts only while the best residual stays above the noise floor: the
+   rivals of the best body, then starts of every kind.  What no superquadric explains after that is left to
+   :mod:`sq_perception.fitting.tolerant`, which goes on from the bodies that were tried.
+2. The winner on all rays: free rays where the mask lost its edge are let go, object rays far off the surface are
+   dropped, the outline's precision is read from its misfit.
+3. The finalists that few rays do not tell apart are refined on all of them.
+4. Where something is left unexplained, or a half size is not certain to 1 %, the rivals of the result are tried.  Those
+   that explain the image almost as well stay as alternatives and add to the covariance.
+5. Half sizes along the view that the readings leave open are walked along (:mod:`sq_perception.fitting.rounding`).
+6. On a plane, the body is also tried as one of revolution (:mod:`sq_perception.fitting.revolution`).
+7. A half size that stays open is weighed against a prediction (:mod:`sq_perception.fitting.unseen`).
+
+The noise floor is a mean squared residual of 1, as residuals are in units of the noise.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from sq_perception.fitting import revolution, rounding, starts, tolerant, unseen
+from sq_perception.fitting.covariance import Alternative
+from sq_perception.fitting.levenberg_marquardt import State
+from sq_perception.fitting.observation import Observation
+from sq_perception.fitting.outline import sharpened, without_shrunk_edge
+from sq_perception.fitting.problem import (
+    BASIN_RAYS,
+    BASIN_STEPS,
+    ESCALATED_FINALISTS,
+    FINALISTS,
+    FIRST_STEPS,
+    RIVAL_SLACK,
+    Problem,
+    Solution,
+    by_cost,
+    coarse,
+    draw,
+    least,
+    refine,
+    select,
+    settle,
+    within_doubt,
+)
+from sq_perception.fitting.rays import Rays
+from sq_perception.fitting.residuals import surface_distance
+from sq_perception.fitting.rivals import SIGNIFICANT, alike, other_axes, other_depths
+
+_MORE_RAYS = 1500
+_FINAL_RAYS, _MOST_FINAL_RAYS = 3000, 6000
+_FINE_NOISE = 0.3
+"""Noise in pixel widths that the fewest rays of the last stage average out; more noise asks for more, by its square."""
+_OUTLIER = 5.0
+"""Object rays this many standard deviations off the surface of the winner are dropped: noise reaches there once in two
+million."""
+_MEDIAN_TO_SIGMA = 1.4826
+"""Of absolute values of a normal distribution."""
+_SETTLED, _UNSURE = 1.03, 0.01
+"""A last mean squared residual above the one, or a half size less certain than the other, as a share of it, make other
+valleys of the cost worth a look; chosen on benchmarks/single_body."""
+_MOST_VARIATIONS = 2
+_HOPELESS = 2.0
+"""A rival that costs so many times more than the body at hand after its first steps is given up."""
+
+
+def solve(problem: Problem, given: Sequence[State]) -> Solution:
+    """The best body from the given starts and, as far as needed, from automatic ones."""
+    tried = coarse(problem, given)
+    finalists = select(problem, tried) if given else []
+    if not given or _goes_on(problem, finalists):
+        found = starts.automatic(problem)
+        tried += found
+        finalists = select(problem, found, finalists)
+        if _goes_on(problem, finalists):
+            finalists = _with_rivals(problem, finalists)
+        if _goes_on(problem, finalists):
+            found = coarse(problem, starts.everything(problem.observation))
+            tried += found
+            finalists = select(problem, found, finalists, ESCALATED_FINALISTS)
+        if _goes_on(problem, finalists):
+            return tolerant.take_over(problem, finalists[0], tried)
+    return _decide(problem, finalists)
+
+
+def solve_cheaply(problem: Problem, given: Sequence[State], later: Callable[[], list[State]] | None) -> Solution | None:
+    """The same from the given starts and the first ones of symmetry only; None if they leave more than noise.
+
+    ``later`` returns further starts that cost time: it is called only if those before do not suffice.
+    """
+    finalists: list[State] = []
+    groups: list[Callable[[], Sequence[State]]] = [lambda: given, lambda: starts.symmetric(problem.observation)[0]]
+    for group in groups if later is None else [*groups, later]:
+        candidates = group()
+        if candidates:
+            finalists = select(problem, coarse(problem, candidates), finalists)
+        if problem.explained_by(finalists):
+            return _decide(problem, finalists)
+    return None
+
+
+def _goes_on(problem: Problem, finalists: list[State]) -> bool:
+    """Whether something is left to explain, and time to do so."""
+    return not problem.explained_by(finalists) and not problem.late
+
+
+def _decide(problem: Problem, finalists: list[State]) -> Solution:
+    """Steps 2 to 7: the finalists on the full budget of rays, the same terms for all of them."""
+    favourite, *others = finalists
+    if not problem.late:
+        problem, favourite = without_shrunk_edge(problem, favourite)
+    enough = _enough_rays(problem.observation)
+    rays = draw(problem, problem.options.pixels or enough, 0.3)
+    rays = rays._replace(hits=_without_outliers(problem.observation, rays.hits, favourite))
+    problem, favourite = sharpened(problem, favourite, rays.free, draw(problem, enough // 4, 0.3))
+
+    first, *others = _told_apart(problem, [favourite, *others])
+    best = refine(problem, first, rays)
+    for rival in others:
+        if problem.late:
+            break
+        best = least([best, refine(problem, rival, rays)])
+
+    solution = _varied(Solution(problem, best, rays))
+    if not problem.late:
+        solution = rounding.spread_along_view(solution)
+    # An exact body's symmetry is weighed on all its rays, before doubts about the model lessen their weight.
+    if not problem.late and problem.observation.camera.is_pinhole and problem.options.plane is not None:
+        solution = revolution.weighed(solution)
+    if not problem.late:
+        solution = unseen.weighed(solution)
+    return solution
+
+
+def _enough_rays(observation: Observation) -> int:
+    """Rays that bring the noise of the mean well below a pixel's width."""
+    ratio = observation.sigma / observation.footprint
+    return int(np.clip(_FINAL_RAYS * (ratio / _FINE_NOISE) ** 2, _FINAL_RAYS, _MOST_FINAL_RAYS))
+
+
+def _without_outliers(observation: Observation, hits: np.ndarray, state: State) -> np.ndarray:
+    """The rays whose points lie near the surface, as seen by the majority."""
+    distance = surface_distance(hits, state.parameters, state.rotation)
+    spread = max(observation.sigma, _MEDIAN_TO_SIGMA * float(np.median(distance)))
+    return hits[distance < _OUTLIER * spread]
+
+
+def _told_apart(problem: Problem, finalists: list[State]) -> list[State]:
+    """The finalists, best first, that are worth all rays: more rays do not tell them apart."""
+    if len(finalists) == 1:
+        return finalists
+    rays = draw(problem, _MORE_RAYS, 0.3)
+    settled = by_cost(settle(problem, state, rays) for state in finalists)
+    return _distinct(settled, settled[0].cost + RIVAL_SLACK)
+
+
+def _distinct(states: Sequence[State], most: float, known: Sequence[State] = ()) -> list[State]:
+    """Those cheaper than ``most`` that end in valleys of their own."""
+    chosen = list(known)
+    for state in states:
+        if state.cost < most and not any(alike(state, other) for other in chosen):
+            chosen.append(state)
+    return chosen[len(known) :]
+
+
+# Other valleys of the cost
+
+
+def _with_rivals(problem: Problem, finalists: list[State]) -> list[State]:
+    """The finalists, and what the rivals of the first one lead to."""
+    rays = draw(problem, BASIN_RAYS, 0.7)
+    best = settle(problem, finalists[0], rays)
+    rivals = other_depths(best, np.argsort(-np.abs(best.rotation[2]))) + other_axes(best)
+    return within_doubt([*finalists, *_promising(problem, rivals, rays, best.cost)])[:FINALISTS]
+
+
+def _varied(solution: Solution) -> Solution:
+    """Look beyond the valley that the search came down into: noise and poor sight hide that another one is deeper.
+
+    Rivals are the same body with a half size that the image hardly tells made smaller or larger, the seen face in
+    place, and, where something is left unexplained, the same box of axes with another z or turned by 45 degrees.
+    They go on with the rendered residual: Sampson's would make them grow, as g is convex and noise enters it.
+    """
+    found: list[State] = []
+    for _ in range(_MOST_VARIATIONS):
+        best = solution.state
+        unexplained = best.cost > _SETTLED * solution.rays.weight
+        unsure = solution.unsure()
+        if solution.problem.late or not (unexplained or unsure.max() > _UNSURE):
+            break
+        rivals = other_depths(best, np.argsort(-unsure))
+        if unexplained:
+            rivals += other_axes(best)
+        better, refined = _better(solution, rivals)
+        found += refined
+        if better is best:
+            break
+        found.append(best)
+        solution = replace(solution, state=better)
+    return replace(solution, alternatives=_alternatives(solution.state, found))
+
+
+def _better(solution: Solution, rivals: list[State]) -> tuple[State, list[State]]:
+    """The best of a body and its rivals, and those that were refined; few rays first, more for what holds on them."""
+    problem, best = solution.problem, solution.state
+    few = draw(problem, BASIN_RAYS, 0.2)
+    reference = settle(problem, best, few)
+    # On other rays the body may already find its way out of a shallow valley.
+    settled = [reference, *_promising(problem, rivals, few, reference.cost)]
+    chosen = _distinct(settled, reference.cost + RIVAL_SLACK, [best._replace(cost=reference.cost)])
+    if not chosen:
+        return best, []
+    more = draw(problem, _MORE_RAYS, 0.8)
+    reference = settle(problem, best, more)
+    found: list[State] = []
+    for rival in by_cost(chosen)[:FINALISTS]:
+        state = settle(problem, rival, more)
+        if state.cost > reference.cost + RIVAL_SLACK or problem.late:
+            continue
+        state = refine(problem, state, solution.rays)
+        found.append(state)
+        if state.cost < best.cost - SIGNIFICANT:
+            best = state
+    return best, found
+
+
+def _promising(problem: Problem, rivals: list[State], rays: Rays, cost: float) -> list[State]:
+    """Rivals on few rays, some steps at a time: those that stay far behind are given up."""
+    found: list[State] = []
+    for rival in rivals:
+        if problem.late:
+            break
+        state = settle(problem, rival, rays, FIRST_STEPS)
+        if state.cost < _HOPELESS * cost:
+            found.append(settle(problem, state, rays, BASIN_STEPS - FIRST_STEPS))
+    return found
+
+
+def _alternatives(best: State, found: list[State]) -> tuple[Alternative, ...]:
+    """The other valleys that explain the image almost as well, by their likelihood."""
+    others = [state for state in found if not alike(state, best)]
+    weights = np.array([math.exp(-0.5 * max(state.cost - best.cost, 0.0)) for state in others])
+    return tuple(Alternative(s, weight / (1 + weights.sum())) for s, weight in zip(others, weights, strict=True))

@@ -1,0 +1,269 @@
+"""One surface fit as data, and the steps that every course of it shares.
+
+    draw      rays of the object and of free space, for one stage
+    coarse    a few Levenberg-Marquardt steps from each start, with Sampson's residual on few rays: a wide basin
+    select    those that the noise does not tell apart, on more rays, then with the rendered residual
+    settle    some more steps of one body with the rendered residual, on rays at hand
+    refine    the same to convergence, on all rays
+
+All of them take a :class:`Problem` and return bodies (:class:`State`).  Costs are mean squared residuals in units of
+the noise times the rays' weight, so that a body that leaves nothing but noise costs about that weight.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sq_perception.fitting.covariance import Alternative, covariance_at
+from sq_perception.fitting.levenberg_marquardt import State, minimize
+from sq_perception.fitting.observation import Observation
+from sq_perception.fitting.options import FitOptions
+from sq_perception.fitting.rays import WEIGHT, Rays
+from sq_perception.fitting.residuals import RENDERED, SAMPSON
+from sq_perception.fitting.terms import Terms
+from sq_perception.geometry.superquadric import Superquadric
+
+# Rays and steps of the stages: chosen on benchmarks/single_body.
+COARSE_RAYS, COARSE_STEPS = 150, 8
+BASIN_RAYS, BASIN_STEPS = 300, 15
+FIRST_STEPS = 5
+"""Steps after which a rival that costs far more than the body at hand is given up."""
+REFINE_STEPS = 15
+FREE_SHARE = 0.25
+"""Free rays per object ray: an outline has fewer pixels than an area."""
+TOLERANCE, FINAL_TOLERANCE = 1e-3, 1e-4
+"""Share of the cost; a stage ends with a step that gains less."""
+FINAL_GATE = 1.4
+"""Mean squared residual up to which a body explains an image: 1, but for a sample of few rays and a search that is
+not finished.  Chosen on benchmarks/single_body."""
+DOUBT = 25.0
+"""Costs on the same rays that differ by D do so with a standard deviation of 2 sqrt(D) through noise: below this, 2.5
+of them, bodies go on together,"""
+RIVAL = 1.3
+"""and so do those within this factor of the best, as they have not converged yet."""
+FINALISTS, ESCALATED_FINALISTS = 3, 6
+"""Bodies that go on from a selection, and from one among starts of every kind; chosen on benchmarks/single_body."""
+RIVAL_SLACK = 4.0
+"""Cost that few rays may hide: one such standard deviation."""
+INDEPENDENT_RAYS = 50.0
+"""As how many independent rays an object counts whose model errs: errors of neighbouring pixels are alike.  Chosen on
+benchmarks/scanned_objects."""
+HIT_TOLERANCE = 3e-3
+"""Of g where a ray meets the body.  Rays remember where that was: this error vanishes as the search converges."""
+PLANE_SIGMA, GAP_SIGMA, REST_SIGMA = 0.001, 0.005, 0.05
+"""Metres below the plane and above it, and sine of the angle between the normal and an axis of the body: how well a
+plane fitted to a depth image is known, and a wide prior with long tails (:mod:`sq_perception.fitting.priors`)."""
+PROPORTION_SIGMA = 1.0
+"""Of a log size against the mean of the three: a factor e, a wide prior."""
+VOLUME_PRICE = 0.5
+"""Of log(a1 a2 a3): what the image does not tell, it does not make large.  Chosen on benchmarks/scanned_objects."""
+
+
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """One object to fit.
+
+    Attributes
+    ----------
+    observation
+        What the image says about it.
+    options
+        What the caller wants.
+    terms
+        Constants of the residuals and priors.
+    limits
+        Lower and upper limit (8,) of a1 a2 a3 e1 e2 t1 t2 t3.
+    deadline
+        ``time.perf_counter`` after which nothing new is tried.
+    independent
+        As how many independent rays the object counts where errors of neighbouring pixels are alike, however many are
+        drawn; None where every ray counts as one.
+    prior
+        A predicted body whose half sizes weigh in, by ``terms.expectation_stiffness``.
+    """
+
+    observation: Observation
+    options: FitOptions
+    terms: Terms
+    limits: tuple[np.ndarray, np.ndarray]
+    deadline: float
+    independent: float | None = None
+    prior: Superquadric | None = None
+
+    @classmethod
+    def of(cls, observation: Observation, options: FitOptions, began: float) -> Problem:
+        """The problem of a superquadric that leaves nothing but noise; ``began`` as by ``time.perf_counter``."""
+        limits = options.bounds.limits(observation.points)
+        return cls(observation, options, terms_of(observation, options), limits, began + options.time_budget)
+
+    @property
+    def late(self) -> bool:
+        """Whether the time is up."""
+        return time.perf_counter() > self.deadline
+
+    @property
+    def outline(self) -> float:
+        """Standard deviation of the outline where it is not known better, metres."""
+        return outline_sigma(self.observation)
+
+    def terms_at(self, state: State) -> Terms:
+        """The terms with the predicted half sizes along the axes that a body has now."""
+        if self.prior is None:
+            return self.terms
+        x, y, z = (float(extent) for extent in self.prior.support(state.rotation.T))
+        return self.terms._replace(expected_1=x, expected_2=y, expected_3=z)
+
+    def with_terms(self, **changed: float) -> Problem:
+        """The problem with some terms changed."""
+        return replace(self, terms=self.terms._replace(**changed))
+
+    def floor(self, count: int) -> float:
+        """Cost of a body that leaves nothing but noise on ``count`` drawn rays: their total weight."""
+        return float(min(count, len(self.observation.pixels))) if self.independent is None else self.independent
+
+    def explained_by(self, finalists: Sequence[State]) -> bool:
+        """Whether the first of some selected bodies leaves nothing but noise."""
+        return bool(finalists) and finalists[0].cost < FINAL_GATE * self.floor(BASIN_RAYS)
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """A body on its way through the last steps of a course; what the verdict reads in the end.
+
+    Attributes
+    ----------
+    problem
+        As it stands by now: observation, terms and prior of the last stage.
+    state, rays
+        The body, and the rays on which its cost is measured.
+    alternatives
+        Other bodies that explain the image almost as well.
+    notes
+        What the body rests on beyond the image, in words.
+    spread_factor
+        Of the covariance, where residuals err alike.
+    as_hull
+        Whether it resembles the convex hull of the object only.
+    """
+
+    problem: Problem
+    state: State
+    rays: Rays
+    alternatives: tuple[Alternative, ...] = ()
+    notes: tuple[str, ...] = ()
+    spread_factor: float = 1.0
+    as_hull: bool = False
+
+    def covariance(self) -> np.ndarray:
+        """(11, 11) of the valley of the cost that the body lies in."""
+        problem, state = self.problem, self.state
+        return covariance_at(state, self.rays, problem.terms_at(state), problem.outline) * self.spread_factor
+
+    def unsure(self) -> np.ndarray:
+        """Standard deviations (3,) of the half sizes, as shares of them."""
+        deviations = np.sqrt(np.diag(self.covariance())[:3])
+        return np.asarray(deviations / self.state.parameters[:3])
+
+
+def terms_of(observation: Observation, options: FitOptions) -> Terms:
+    """The terms of an observation; those of the plane where one is known."""
+    terms = Terms(
+        hit_tolerance=HIT_TOLERANCE,
+        pinhole=1.0 if observation.camera.is_pinhole else 0.0,
+        outline_stiffness=1 / outline_sigma(observation),
+        proportion_stiffness=1 / PROPORTION_SIGMA,
+    )
+    if options.plane is None:
+        return terms
+    x, y, z, offset = (float(value) for value in options.plane)
+    return terms._replace(
+        normal_x=x,
+        normal_y=y,
+        normal_z=z,
+        offset=offset,
+        plane_stiffness=1 / PLANE_SIGMA,
+        gap_stiffness=1 / GAP_SIGMA,
+        rest_stiffness=1 / REST_SIGMA,
+        volume_price=VOLUME_PRICE,
+    )
+
+
+def outline_sigma(observation: Observation) -> float:
+    """Standard deviation of an outline whose misfit was not measured yet, metres: the noise, or a whole pixel."""
+    return max(observation.sigma, observation.footprint)
+
+
+def draw(problem: Problem, count: int, offset: float) -> Rays:
+    """About ``count`` object rays, and the free rays that come with them; other offsets take other pixels."""
+    seen = problem.observation
+    hits, free = seen.object_rays(count, offset), seen.free_rays(int(FREE_SHARE * count), offset)
+    if problem.independent is not None:
+        hits[:, WEIGHT] = problem.independent / len(hits)
+        if len(free):
+            free[:, WEIGHT] = problem.independent / len(seen.pixels) * seen.free_pixels / len(free)
+    return Rays(hits, free)
+
+
+def coarse(problem: Problem, starts: Iterable[State]) -> list[State]:
+    """Where a few steps lead from each start, in their order; from the first one at least."""
+    rays = draw(problem, COARSE_RAYS, 0.5)
+    found: list[State] = []
+    for start in starts:
+        found.append(_minimized(problem, SAMPSON, start, rays, COARSE_STEPS, TOLERANCE))
+        if problem.late:
+            break
+    return found
+
+
+def select(
+    problem: Problem, candidates: Sequence[State], kept: Sequence[State] = (), most: int = FINALISTS
+) -> list[State]:
+    """The best of some candidates, refined, and of those kept before: at most FINALISTS, best first."""
+    rays = draw(problem, BASIN_RAYS, 0.7)
+    for stage in (SAMPSON, RENDERED):
+        candidates = [
+            _minimized(problem, stage, candidate, rays, BASIN_STEPS, TOLERANCE)
+            for candidate in within_doubt(candidates)[:most]
+        ]
+    return within_doubt([*kept, *candidates])[:FINALISTS]
+
+
+def within_doubt(candidates: Iterable[State]) -> list[State]:
+    """Candidates, best first, without those that the noise cannot have made worse than the best."""
+    ranked = by_cost(candidates)
+    least = ranked[0].cost
+    return [state for state in ranked if state.cost <= least + max(DOUBT, (RIVAL - 1) * abs(least))]
+
+
+def settle(problem: Problem, state: State, rays: Rays, steps: int = BASIN_STEPS) -> State:
+    """A body after some steps with the rendered residual."""
+    return _minimized(problem, RENDERED, state, rays, steps, TOLERANCE)
+
+
+def refine(problem: Problem, state: State, rays: Rays, steps: int = REFINE_STEPS) -> State:
+    """A body at the end of its valley."""
+    return _minimized(problem, RENDERED, state, rays, steps, FINAL_TOLERANCE)
+
+
+def refined_best(problem: Problem, settled: Sequence[State], rays: Rays, steps: int = REFINE_STEPS) -> State:
+    """The best on these rays of bodies ranked on few; the second one only has a chance if the ranking is close."""
+    close = [state for state in settled[:2] if state.cost < settled[0].cost + RIVAL_SLACK]
+    return least([refine(problem, state, rays, steps) for state in close])
+
+
+def by_cost(states: Iterable[State]) -> list[State]:
+    """Cheapest first."""
+    return sorted(states, key=lambda state: state.cost)
+
+
+def least(states: Iterable[State]) -> State:
+    """The cheapest."""
+    return min(states, key=lambda state: state.cost)
+
+
+def _minimized(problem: Problem, stage: int, state: State, rays: Rays, steps: int, tolerance: float) -> State:
+    return minimize(stage, *rays, problem.terms_at(state), state, problem.limits, steps, tolerance)

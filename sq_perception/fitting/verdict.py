@@ -1,0 +1,99 @@
+"""The verdict on a fit: residual, inliers, covariance, and words."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from sq_perception.fitting.covariance import carried_over, spread, undetermined
+from sq_perception.fitting.fit import Fit, Status
+from sq_perception.fitting.observation import Observation
+from sq_perception.fitting.problem import Solution
+from sq_perception.fitting.residuals import surface_distance
+from sq_perception.geometry.superquadric import Superquadric
+
+_INLIER = 3.0
+"""Noise levels: noise alone stays within for 99.7 % of the pixels."""
+_RAYS = 800
+"""Enough for a share to one or two percent."""
+_FAILED_SHARE = 0.25
+"""Of the smallest half size: a body that half of the points miss by more is none."""
+_REACHED = 0.9
+"""Of the points of a thing that was fitted as a hull: what the rest sticks out tells whether the body encloses it."""
+_TAIL = 0.01
+"""Of the points, at either end of an axis: outliers."""
+_AXES = "xyz"
+
+
+def verdict(solution: Solution, began: float) -> Fit:
+    """The result of a fit, with everything that can be said about its quality."""
+    observation, state = solution.problem.observation, solution.state
+    body = state.body
+    covariance = solution.covariance() + spread(state, solution.alternatives)
+    canonical = body.canonical_form()
+    covariance = carried_over(covariance, body, canonical)
+    everything = observation.object_rays(_RAYS)
+    distance = surface_distance(everything, state.parameters, state.rotation)
+    inlying = distance < _INLIER * observation.sigma
+    typical = float(np.median(distance))
+    kept = distance < max(_INLIER * observation.sigma, _INLIER * typical)
+    residual = float(np.sqrt(np.mean(distance[kept] ** 2))) if kept.any() else typical
+    if solution.as_hull:
+        # A hollow thing lies inside its hull: only what sticks out speaks against the body.
+        outside = body.gauge(observation.points) > 1
+        sticking_out = np.where(outside, np.abs(body.sampson_distance(observation.points)), 0.0)
+        typical = float(np.quantile(sticking_out, _REACHED))
+    status, message = _status(canonical, covariance, typical)
+    return Fit(
+        superquadric=canonical,
+        residual=residual,
+        status=status,
+        message="; ".join([message, *solution.notes]),
+        noise=observation.sigma,
+        inlier_share=float(inlying.mean()),
+        seen=seen_extents(canonical, observation.points),
+        covariance=covariance,
+        iterations=state.iterations,
+        milliseconds=(time.perf_counter() - began) * 1e3,
+        as_hull=solution.as_hull,
+    )
+
+
+def seen_extents(body: Superquadric, points: np.ndarray) -> np.ndarray:
+    """Share (3,) of each full size of a single body that points (n, 3) span along its axis, 0 to 1."""
+    local = (points - body.translation) @ body.rotation_matrix
+    low, high = np.quantile(local, [_TAIL, 1 - _TAIL], axis=0)
+    low, high = np.maximum(low, -body.size), np.minimum(high, body.size)
+    return np.clip((high - low) / (2 * body.size * (1 - 2 * _TAIL)), 0.0, 1.0)
+
+
+def failed(body: Superquadric, observation: Observation, reason: str, began: float) -> Fit:
+    """No fit, but a box around what was seen."""
+    points = observation.points
+    distance = np.abs(body.sampson_distance(points))
+    return Fit(
+        superquadric=body.canonical_form(),
+        residual=float(np.sqrt(np.mean(distance**2))),
+        status=Status.FAILED,
+        message=reason,
+        noise=observation.sigma,
+        inlier_share=0.0,
+        milliseconds=(time.perf_counter() - began) * 1e3,
+    )
+
+
+def _status(body: Superquadric, covariance: np.ndarray, typical: float) -> tuple[Status, str]:
+    if typical > _FAILED_SHARE * float(body.size.min()):
+        return Status.FAILED, (
+            f"no superquadric found: {1e3 * typical:.1f} mm and more between many of the points and the best one"
+        )
+    sigma, weak_axes = np.sqrt(np.diag(covariance)), undetermined(covariance, body.size)
+    weak = [
+        f"half size along {_AXES[k]} undetermined: {1e3 * body.size[k]:.0f} +- {1e3 * sigma[k]:.0f} mm"
+        for k in range(3)
+        if weak_axes[k]
+    ]
+    if weak:
+        return Status.WEAK, "; ".join(weak)
+    return Status.CONVERGED, "converged"

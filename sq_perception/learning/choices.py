@@ -1,0 +1,19 @@
+"""What a network and its training may be chosen from, by name; importable without torch, for the help of commands."""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+Backbone = Literal["compact", "resnet18"]
+"""The residual networks of :mod:`sq_perception.learning.backbone`."""
+Framing = Literal["cropped", "full"]
+"""What a view shows: one object that fills it, or the thesis' whole image."""
+Loss = Literal["occupancy", "occupancy_rotation", "parameters", "dual", "least_squares", "least_squares_free", "render"]
+"""The losses of :mod:`sq_perception.learning.objective`."""
+LOSSES: tuple[str, ...] = get_args(Loss)
+UNSUPERVISED = ("least_squares", "least_squares_free", "render")
+"""Losses that see the view alone, no label."""
+WITHOUT_SHARPNESS = ("parameters", "least_squares", "least_squares_free")
+"""Losses that have no sharpness s."""
+SIZE_RANGE = (0.04, 1.2)
+"""Half sizes that a network for cropped views can express, in sides of the view; the thesis' bodies reach 0.8."""

@@ -1,0 +1,97 @@
+"""The programs that `ros2 run sq_perception` knows: recover_node, fitter_node, recover_cameras, synthetic_depth_node.
+
+Each imports its node inside :func:`sq_perception.nodes.process.run`: torch, numba and rclpy take seconds to import, and
+a Ctrl-C meanwhile must end the process without a traceback.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING
+
+from sq_perception.nodes import process
+
+if TYPE_CHECKING:
+    from sq_perception.nodes.frame_node import FrameNode
+
+_CAMERAS = """\
+recover_cameras: one process with a recover_node for each of several cameras, which share one network.
+
+    ros2 run sq_perception recover_cameras front wrist --ros-args --params-file cameras.yaml
+
+makes /front/recover_node and /wrist/recover_node, which take /front/depth/image, /wrist/depth/image and so on.
+Parameters are those of recover_node, by node name or by wildcard:
+
+    /**:
+      ros__parameters:
+        max_objects: 5
+    /wrist/recover_node:
+      ros__parameters:
+        depth_max: 1.0
+
+Frames are computed one after the other, in the order in which they ask: a process per camera would hold the network
+once each and let them compete for the same cores."""
+_NAMESPACE = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
+
+
+def recover_node(arguments: Sequence[str] | None = None) -> int:
+    """Run recover_node; the exit code."""
+    return process.run("recover_node", lambda: [_frame_node("recover_node")], arguments)
+
+
+def fitter_node(arguments: Sequence[str] | None = None) -> int:
+    """Run fitter_node; the exit code."""
+    return process.run("fitter_node", lambda: [_frame_node("fitter_node")], arguments)
+
+
+def recover_cameras(arguments: Sequence[str] | None = None) -> int:
+    """Run a recover_node for each camera of the command line; the exit code."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    cut = given.index("--ros-args") if "--ros-args" in given else len(given)
+    parser = argparse.ArgumentParser(
+        prog="recover_cameras", description=_CAMERAS, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("cameras", nargs="+", metavar="CAMERA", type=_namespace, help="namespace of a camera")
+    cameras = parser.parse_args(given[:cut]).cameras
+    if len(set(cameras)) != len(cameras):
+        parser.error(f"expected different cameras, got {' '.join(cameras)}")
+
+    def create() -> Iterator[FrameNode]:
+        names: dict[str, str] = {}
+        for camera in cameras:
+            node = _frame_node("recover_node", camera)
+            yield node
+            other = names.setdefault(node.get_fully_qualified_name(), camera)
+            if other != camera:
+                raise ValueError(
+                    f"{other} and {camera} are both {node.get_fully_qualified_name()}: a namespace for the process "
+                    f"(__ns) replaces those of the cameras; say robot/{other} robot/{camera} instead"
+                )
+
+    return process.run("recover_cameras", create, given[cut:])
+
+
+def synthetic_depth_node(arguments: Sequence[str] | None = None) -> int:
+    """Run synthetic_depth_node; the exit code."""
+
+    def create() -> list[process.Stoppable]:
+        from sq_perception.nodes.synthetic_depth_node import SyntheticDepthNode
+
+        return [SyntheticDepthNode("synthetic_depth_node")]
+
+    return process.run("synthetic_depth_node", create, arguments)
+
+
+def _frame_node(name: str, namespace: str | None = None) -> FrameNode:
+    from sq_perception.nodes import recover_node as nodes
+
+    return nodes.create(namespace, name)
+
+
+def _namespace(text: str) -> str:
+    if not _NAMESPACE.fullmatch(text):
+        raise argparse.ArgumentTypeError(f"expected a ROS name such as front or arm/wrist, got {text!r}")
+    return text.strip("/")

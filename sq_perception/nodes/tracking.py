@@ -1,0 +1,182 @@
+"""Which track each body of a frame belongs to, in the camera's frame or a fixed one, and what is published of it.
+
+tf2_ros comes with a ROS installation and is not on PyPI: it is imported, and /tf listened to, only once a frame is
+asked for; all frames share that one buffer.
+
+A pose is (quaternion x y z w, translation), p_frame = R p_optical + t, metres.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+import numpy as np
+from rclpy.duration import Duration
+from rclpy.node import Node
+from rclpy.time import Time
+
+from sq_perception.nodes.frame import Frame
+from sq_perception.nodes.parameters import FrameParameters
+from sq_perception.nodes.statistics import THROTTLE
+from sq_perception.recordings import publication
+from sq_perception.recordings.publication import Identified
+from sq_perception.recovery.recoverer import FrameRecovery
+from sq_perception.tracking.session import Tally, TrackingSession
+
+Pose = tuple[np.ndarray, np.ndarray]
+_PATIENCE = Duration(seconds=0.1)
+"""How long to wait for the transform of a frame that is already here."""
+_LEAST_LENGTH = 1e-6
+"""Of a quaternion that can be normalised."""
+
+
+class PoseError(ValueError):
+    """The pose of a frame is not known; says why."""
+
+
+class CameraPoses:
+    """Looks up poses of optical frames; without tf2 every look-up fails with that reason."""
+
+    def __init__(self, node: Node) -> None:
+        self._node = node
+        self._buffer: Any = None
+        self._listener: Any = None
+        self._missing = ""
+
+    def listen(self) -> None:
+        """Begin to listen to /tf, if that was not done yet; a buffer knows only what it has heard."""
+        if self._buffer is not None or self._missing:
+            return
+        try:
+            tf2: Any = importlib.import_module("tf2_ros")
+        except ImportError as error:
+            self._missing = f"tf2_ros cannot be imported ({error})"
+            return
+        self._buffer = tf2.Buffer()
+        self._listener = tf2.TransformListener(self._buffer, self._node)
+
+    def at(self, header: Any, frame: str) -> Pose:
+        """The pose of a header's frame in ``frame`` at its stamp, the newest for a stamp of 0.
+
+        The transforms arrive in the node's executor: this waits for them, and must not be called in its thread.
+
+        Raises
+        ------
+        PoseError
+            If it is not known.
+        """
+        if header.frame_id == frame:
+            return np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3)
+        self.listen()
+        if self._buffer is None:
+            raise PoseError(self._missing)
+        if not header.frame_id:
+            raise PoseError("the image has no frame_id")
+        try:
+            found = self._buffer.lookup_transform(frame, header.frame_id, Time.from_msg(header.stamp), _PATIENCE)
+        except Exception as error:  # tf2's exceptions have no common base that is known without tf2
+            raise PoseError(str(error)) from error
+        turn, shift = found.transform.rotation, found.transform.translation
+        quaternion, translation = np.array([turn.x, turn.y, turn.z, turn.w]), np.array([shift.x, shift.y, shift.z])
+        length = np.linalg.norm(quaternion)
+        if not (np.isfinite(translation).all() and np.isfinite(length) and length > _LEAST_LENGTH):
+            raise PoseError(f"the transform from {header.frame_id} to {frame} is no rigid motion")
+        return quaternion / length, translation
+
+    def clear(self) -> None:
+        """Forget what was heard: after a jump back in time, transforms of the old time would shadow the new ones."""
+        if self._buffer is not None:
+            self._buffer.clear()
+
+    def close(self) -> None:
+        """Listen no more, until a frame is asked for again."""
+        if self._listener is not None:
+            self._listener.unregister()
+        self._buffer = self._listener = None
+
+
+class Tracking:
+    """Gives the bodies of a node's frames their ids; used by one thread, except for ``tally``.
+
+    Ids outlive a restart after a fault: a body keeps its name.
+
+    Parameters
+    ----------
+    node
+        Whose log hears of resets and of poses that are not known.
+    poses
+        Where the camera is; asked only while there is a fixed frame.
+    """
+
+    def __init__(self, node: Node, poses: CameraPoses) -> None:
+        self._node, self._poses = node, poses
+        self._session = TrackingSession()
+        self._frame_id = ""
+        self._fixed_frame: str | None = None
+        self._untracked_stamp = 0.0
+
+    @property
+    def tally(self) -> Tally:
+        """Counts of the tracking session."""
+        return self._session.tally
+
+    def identify(
+        self, recovery: FrameRecovery, frame: Frame, arrival: float, parameters: FrameParameters
+    ) -> Identified:
+        """Bodies and ids of their tracks; without ``tracking`` ids are labels, and what was tracked is forgotten.
+
+        Parameters
+        ----------
+        arrival
+            The time, seconds, of an image without stamp.
+
+        Raises
+        ------
+        ValueError
+            If the tracker cannot go on; it begins anew with the next frame.
+        """
+        if not parameters.tracking:
+            self._session.reset()
+            stamp = _seconds(frame.header)
+            if stamp < self._untracked_stamp:
+                self._poses.clear()  # a recording begins again
+            self._untracked_stamp = stamp
+            return publication.untracked(recovery)
+        fixed_frame = parameters.fixed_frame
+        if self._fixed_frame not in (None, fixed_frame):
+            self._forget(f"fixed_frame is {fixed_frame or 'none'} from now on")
+        self._fixed_frame = fixed_frame
+        if not fixed_frame and frame.header.frame_id != self._frame_id:
+            self._session.reset()  # another camera: its world is another one
+            self._frame_id = frame.header.frame_id
+        stamp, resets = _seconds(frame.header) or arrival, self._session.tally.resets
+        pose: Pose | None = None
+        is_known = True
+        if fixed_frame:
+            try:
+                pose = self._poses.at(frame.header, fixed_frame)
+            except PoseError as error:
+                is_known = False
+                self._node.get_logger().warning(
+                    f"no camera pose in fixed_frame, nothing is fused: {error}", throttle_duration_sec=THROTTLE
+                )
+        try:
+            tracks = self._session.follow(
+                recovery.recovered, stamp, pose, is_pose_known=is_known, camera=frame.camera, depth=frame.depth
+            )
+        except (ValueError, ArithmeticError) as error:
+            self._session.reset()
+            raise ValueError(f"tracking: {error}") from error
+        if self._session.tally.resets > resets:
+            self._node.get_logger().info(f"the stamps jumped back to {stamp:.3f} s: tracks are forgotten, ids go on")
+            self._poses.clear()
+        return publication.tracked(recovery, list(tracks), self._session.hidden)
+
+    def _forget(self, why: str) -> None:
+        self._session.reset()
+        self._node.get_logger().info(f"{why}: tracks are forgotten, ids go on")
+
+
+def _seconds(header: Any) -> float:
+    return float(header.stamp.sec) + 1e-9 * float(header.stamp.nanosec)

@@ -1,0 +1,112 @@
+"""One object of a frame: its body by the chosen method, and how well that agrees with its view."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+import torch
+
+from sq_perception.fitting import soft_render_fit, solina_bajcsy, surface_fit
+from sq_perception.fitting.fit import Fit, Status
+from sq_perception.fitting.options import MIN_PIXELS, FitOptions
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging import soft_render
+from sq_perception.imaging.camera import Camera
+from sq_perception.imaging.canonical_view import CanonicalView
+from sq_perception.recovery.options import RecoveryOptions
+from sq_perception.recovery.seen_object import SeenObject
+
+_SCORE_STRIDE = 3
+"""22 x 22 lines of sight of 64 voxels: few enough for torch not to spread them over threads, which would cost more."""
+_LEAST_BUDGET = 1e-6
+"""Seconds; an object whose turn comes too late is still fitted, from one start."""
+_HARD_IMAGE = (ValueError, ArithmeticError, np.linalg.LinAlgError)
+"""What numerical code may raise on degenerate data: reported with the object, never raised."""
+
+
+def fitted(one: SeenObject, depth: np.ndarray, camera: Camera, options: RecoveryOptions, deadline: float) -> Fit:
+    """The body of an object by the chosen method; FAILED with a reason instead of any exception on hard data."""
+    if one.pixels < MIN_PIXELS:
+        return _failed(one, f"{one.pixels} pixels with a depth are too few for a body")
+    try:
+        fit = _body(one, depth, camera, options, deadline)
+    except _HARD_IMAGE as error:
+        return _failed(one, f"{options.method}: {error}")
+    if not np.isfinite(fit.superquadric.to_flat()).all():
+        return _failed(one, f"{options.method}: the result is not finite")
+    return fit
+
+
+def _body(one: SeenObject, depth: np.ndarray, camera: Camera, options: RecoveryOptions, deadline: float) -> Fit:
+    if options.method == "classic":
+        return solina_bajcsy.fit(one.points)
+    if options.method == "network" or (options.method == "auto" and options.refine == "none"):
+        return _unfitted(_predicted(one), one, "prediction of the network, not refined")
+    if options.method == "auto" and options.refine == "soft_render":
+        return _soft_rendered(_predicted(one), one, options)
+    plane = one.plane if options.use_plane else None
+    fit = _surface_fit(one, depth, camera, plane, max(deadline - time.perf_counter(), _LEAST_BUDGET))
+    if options.refine == "soft_render" and fit.status != Status.FAILED:
+        return _soft_rendered(fit.superquadric, one, options)
+    return fit
+
+
+def _surface_fit(
+    one: SeenObject, depth: np.ndarray, camera: Camera, plane: np.ndarray | None, time_budget: float
+) -> Fit:
+    """From the cheapest starts of central symmetry; where those leave something, from the network's prediction too.
+
+    The network computes beside the fit.  What the image leaves open after all, such as the depth of a box seen
+    face-on, its prediction tells again.
+    """
+    if one.prediction is None:
+        return surface_fit.fit(depth, one.mask, camera, options=FitOptions(plane=plane, time_budget=time_budget))
+    predicted = one.prediction.body
+    options = FitOptions(plane=plane, time_budget=time_budget, expected=predicted)
+    return surface_fit.fit(depth, one.mask, camera, start=predicted, options=options)
+
+
+def _predicted(one: SeenObject) -> Superquadric:
+    if one.prediction is None:
+        raise ValueError("no prediction")
+    return one.prediction.body()
+
+
+def _soft_rendered(start: Superquadric, one: SeenObject, options: RecoveryOptions) -> Fit:
+    assert one.view is not None
+    body, before, after = soft_render_fit.refine(
+        one.view.image, one.view.to_canonical(start), options.sharpness, options.tau
+    )
+    refined = one.view.from_canonical(body).canonical_form()
+    return _unfitted(refined, one, f"soft-rendered residual {before:.4f} before, {after:.4f} after the refinement")
+
+
+def _unfitted(body: Superquadric, one: SeenObject, message: str) -> Fit:
+    """The answer of a method that is no least squares fit: distances measured, nothing known about uncertainty."""
+    distance = body.sampson_distance(one.points)
+    residual = float(np.sqrt(np.mean(distance**2)))
+    return Fit(body, residual, Status.CONVERGED, message)
+
+
+def _failed(one: SeenObject, reason: str) -> Fit:
+    points = one.points
+    low, high = points.min(axis=0), points.max(axis=0)
+    size = np.maximum(0.5 * (high - low), 1e-3 * max(float((high - low).max()), 1e-3))
+    body = Superquadric(size, np.ones(2), 0.5 * (low + high), np.array([0.0, 0.0, 0.0, 1.0]))
+    return Fit(body, np.nan, Status.FAILED, reason, inlier_share=0.0)
+
+
+def score(view: CanonicalView | None, fit: Fit, options: RecoveryOptions) -> float:
+    """Agreement of the soft-rendered body with the view, 0 to 1; 0 for a failed one."""
+    assert view is not None
+    if fit.status == Status.FAILED:
+        return 0.0
+    flat = np.array(view.to_canonical(fit.superquadric).to_flat())[None]
+    with torch.inference_mode():
+        image = torch.as_tensor(view.image)
+        axis = soft_render.cell_centres(image.shape[0], image)
+        single = Superquadric.from_flat(torch.as_tensor(flat, dtype=torch.float32))
+        rendered = soft_render.render_depth(single, axis, options.sharpness, options.tau, _SCORE_STRIDE)[0]
+        agreement = float(soft_render.agreement(image[::_SCORE_STRIDE, ::_SCORE_STRIDE], rendered).clip(0, 1))
+    return agreement if np.isfinite(agreement) else 0.0

@@ -1,0 +1,76 @@
+"""How to recover the objects of a frame: the options of :meth:`sq_perception.recovery.recoverer.Recoverer.recover`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+
+from sq_perception.imaging import soft_render
+from sq_perception.segmentation import segments
+
+Method = Literal["auto", "network", "symmetry", "classic"]
+Refine = Literal["surface", "soft_render", "none"]
+NEEDS_NETWORK = ("auto", "network")
+FITTED = ("auto", "symmetry")
+
+
+@dataclass(frozen=True)
+class RecoveryOptions:
+    """What may change from one frame to the next.
+
+    Attributes
+    ----------
+    method, refine
+        See :mod:`sq_perception.recovery.recoverer`.
+    sharpness, tau
+        s and tau of the soft renderer: of the score, and of the ``soft_render`` refinement.
+    depth_range
+        Nearest and farthest depth of an object, metres.
+    max_objects
+        The largest ones are recovered.
+    min_pixels
+        Smaller objects are ignored; None: 0.05 % of the image for own masks, any size for masks from outside.
+    use_plane
+        Let the fit know the support plane.
+    time_budget
+        Seconds per frame after which the surface fit tries no further start for any object, and the repair of segments
+        begins no further fit.  The objects with most pixels, large or near, come first.
+    repair
+        Join and split own segments where that describes the image in fewer words; masks from outside stay as they are.
+
+    Raises
+    ------
+    ValueError
+        For a value outside its range.
+    """
+
+    method: Method = "auto"
+    refine: Refine = "surface"
+    sharpness: float = soft_render.THESIS_SHARPNESS
+    tau: float = soft_render.THESIS_TAU
+    depth_range: tuple[float, float] = (0.0, np.inf)
+    max_objects: int = 20
+    min_pixels: int | None = None
+    use_plane: bool = True
+    time_budget: float = np.inf
+    repair: bool = True
+
+    def __post_init__(self) -> None:
+        for name, value, known in (("method", self.method, Method), ("refine", self.refine, Refine)):
+            if value not in get_args(known):
+                raise ValueError(f"{name}: expected one of {', '.join(get_args(known))}, got {value!r}")
+        for name, number in (("sharpness", self.sharpness), ("tau", self.tau)):
+            if not (np.isfinite(number) and number > 0):
+                raise ValueError(f"{name}: expected a positive number, got {number}")
+        if not self.time_budget > 0:
+            raise ValueError(f"time_budget: expected a positive number of seconds, got {self.time_budget}")
+        if self.min_pixels is not None and self.min_pixels < 1:
+            raise ValueError(f"min_pixels: expected at least 1, got {self.min_pixels}")
+        self.segmentation_options()
+
+    def segmentation_options(self) -> segments.SegmentationOptions:
+        return segments.SegmentationOptions(
+            depth_range=self.depth_range, max_objects=self.max_objects, min_pixels=self.min_pixels
+        )

@@ -1,0 +1,97 @@
+"""What a recovery answers: the objects of a frame and their bodies."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sq_perception.fitting.fit import Fit, Status
+from sq_perception.geometry.superquadric import Superquadric
+
+
+@dataclass(frozen=True, eq=False)
+class Recovery:
+    """One recovered object.
+
+    Attributes
+    ----------
+    fit : Fit
+        The body in the optical frame, how well it explains the image, and how sure it is.
+    score : float
+        Agreement of the soft-rendered body with the canonical view, 0 to 1 (:func:`soft_render.agreement`).
+    label : int
+        The object's value in the label image.
+    pixels : int
+        Measured pixels of the object.
+    """
+
+    fit: Fit
+    score: float
+    label: int
+    pixels: int
+
+    @property
+    def superquadric(self) -> Superquadric:
+        """A single body in the optical frame, in its canonical form."""
+        return self.fit.superquadric
+
+    @property
+    def residual(self) -> float:
+        """Root mean square distance of the object's points to the surface, metres; NaN where there is no body."""
+        return self.fit.residual
+
+    @property
+    def status(self) -> Status:
+        """The verdict."""
+        return self.fit.status
+
+    @property
+    def message(self) -> str:
+        """The reason for the verdict."""
+        return self.fit.message
+
+    @property
+    def covariance(self) -> np.ndarray:
+        """(11, 11), as in the fit; NaN for methods that do not compute it."""
+        return self.fit.covariance
+
+    @property
+    def sigma_size(self) -> np.ndarray:
+        """Standard deviations (3,) of the half sizes, metres; NaN for methods that do not compute them."""
+        return self.fit.sigma_size
+
+    @property
+    def seen(self) -> np.ndarray:
+        """Share (3,) of each size that was seen, as in the fit; the rest is inferred."""
+        return self.fit.seen
+
+
+@dataclass(frozen=True, eq=False)
+class FrameRecovery:
+    """All objects of one frame.
+
+    Attributes
+    ----------
+    bodies
+        One entry per object, the one with most pixels first, failed ones among them.
+    milliseconds
+        By stage: segmentation, network, fit, repair, score, total.
+    labels : int32 (height, width)
+        The masks that were used.
+    plane : (4,) or None
+        Support plane, height above it = n.p + d.
+    message
+        Why there are no objects; empty otherwise.
+    """
+
+    bodies: tuple[Recovery, ...]
+    milliseconds: dict[str, float]
+    labels: np.ndarray
+    plane: np.ndarray | None
+    message: str
+
+    @property
+    def recovered(self) -> tuple[Recovery, ...]:
+        """The bodies that did not fail."""
+        return tuple(body for body in self.bodies if body.status != Status.FAILED)

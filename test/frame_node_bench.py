@@ -1,0 +1,114 @@
+"""A frame node between real publishers and subscribers, around a recoverer that does what the test says."""
+
+from __future__ import annotations
+
+import threading
+from typing import Any
+
+import numpy as np
+from builtin_interfaces.msg import Time
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from spun_nodes import PATIENCE, SpunNodes
+from std_msgs.msg import Header
+
+from sq_msgs_py.depth_image import Intrinsics, depth_to_message, intrinsics_to_message
+from sq_msgs_py.superquadrics import SuperquadricArray, from_message
+from sq_perception.fitting.fit import Fit, Status
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging.camera import Camera
+from sq_perception.nodes.engine import RecovererFactory
+from sq_perception.nodes.frame_node import FrameNode
+from sq_perception.nodes.parameters import RecoverParameters
+from sq_perception.nodes.recover_node import options
+from sq_perception.recovery.recoverer import FrameRecovery, Recovery
+
+CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+FRAME_ID = "some_camera_optical_frame"
+
+
+def ball(label: int = 1, status: Status = Status.CONVERGED) -> Recovery:
+    body = Superquadric(np.full(3, 0.1), np.ones(2), np.array([0.01, 0.02, 0.5]), np.array([0, 0, 0, 1.0]))
+    return Recovery(Fit(body, 0.001, status, ""), 0.9, label, 100)
+
+
+class Recoverer:
+    """Notes what it is asked, and answers ``bodies``, or raises, once ``gate`` is open."""
+
+    def __init__(self) -> None:
+        self.asked: list[tuple[np.ndarray, Camera, np.ndarray | None, Any]] = []
+        self.bodies: tuple[Recovery, ...] = (ball(),)
+        self.error: Exception | None = None
+        self.gate = threading.Event()
+        self.gate.set()
+
+    def warm_up(self, camera: Camera) -> None:
+        self.warm = camera
+
+    def recover(self, depth: np.ndarray, camera: Camera, labels: np.ndarray | None, options: Any) -> FrameRecovery:
+        self.asked.append((depth, camera, labels, options))
+        assert self.gate.wait(PATIENCE)
+        if self.error is not None:
+            raise self.error
+        return FrameRecovery(self.bodies, {"total": 1.0}, np.zeros(depth.shape, np.int32), None, "")
+
+
+class Bench(SpunNodes):
+    """A frame node and a peer that publishes to it and listens, spun in the background."""
+
+    def __init__(self, *arguments: str) -> None:
+        super().__init__(*arguments)
+        self.recoverer = Recoverer()
+        factory = RecovererFactory(make=lambda _: self.recoverer, options=options)
+        self.node = FrameNode("recover_node", RecoverParameters, factory, context=self.context)
+        self.images = self.peer.create_publisher(Image, "depth/image", 5)
+        self.infos = self.peer.create_publisher(CameraInfo, "depth/camera_info", 5)
+        self.answers: list[PointCloud2] = []
+        self.peer.create_subscription(PointCloud2, "recover_node/superquadrics", self.answers.append, 10)
+        self.spin([self.node])
+        self.until(lambda: self.node.is_active)
+        if self.node._settings.current.image_transport == "raw":
+            self.until(lambda: self.images.get_subscription_count() == 1)
+        self.until(lambda: self.node._outputs.superquadrics.get_subscription_count() == 1)
+        self.stamps = 0
+
+    def close(self) -> None:
+        self.recoverer.gate.set()
+        assert self.node.close()
+        self.finish()
+
+    @property
+    def counts(self) -> Any:
+        return self.node._statistics.snapshot()
+
+    def header(self) -> Header:
+        self.stamps += 1
+        return Header(stamp=Time(sec=1000 + self.stamps, nanosec=7), frame_id=FRAME_ID)
+
+    def depth(self, camera: Camera = CAMERA, value: float = 0.5) -> Image:
+        return depth_to_message(np.full((camera.height, camera.width), value), self.header())
+
+    def send_info(self, camera: Camera = CAMERA) -> None:
+        """Publish a camera_info and wait until the node has it."""
+        known = Intrinsics(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+        self.put_info(intrinsics_to_message(known, self.header()))
+
+    def put_info(self, message: CameraInfo) -> None:
+        self.until(lambda: self.infos.get_subscription_count() == 1)
+        before = sum(1 for _ in self.node._input.inbox._infos)
+        assert before < self.node._input.inbox._infos.maxlen
+        self.infos.publish(message)
+        self.until(lambda: len(self.node._input.inbox._infos) > before)
+
+    def send(self, message: Image) -> Any:
+        """Publish an image and wait for its verdict: the counts after it."""
+        before = self.counts
+        self.images.publish(message)
+        self.until(lambda: self.counts.received > before.received and self.counts.in_work == 0)
+        return self.counts
+
+    def answer(self, message: Image) -> tuple[PointCloud2, SuperquadricArray]:
+        """Publish a good image; the published result."""
+        before = len(self.answers)
+        self.send(message)
+        self.until(lambda: len(self.answers) > before)
+        return self.answers[-1], from_message(self.answers[-1])

@@ -1,0 +1,66 @@
+"""The start of a node is not searched for garbage, neither while it lasts nor afterwards."""
+
+from __future__ import annotations
+
+import gc
+import weakref
+from collections.abc import Iterator
+
+import pytest
+
+from sq_perception.nodes import process
+
+
+class Ring:
+    """Refers to itself: only a collection can free it."""
+
+    def __init__(self) -> None:
+        self.itself = self
+
+
+@pytest.fixture(autouse=True)
+def thawed() -> Iterator[None]:
+    yield
+    gc.unfreeze()
+    gc.enable()
+
+
+def collections() -> int:
+    return sum(one["collections"] for one in gc.get_stats())
+
+
+def test_nothing_is_collected_within_and_new_garbage_is_afterwards():
+    assert gc.isenabled()
+    with process.garbage_postponed():
+        before = collections()
+        kept = [Ring() for _ in range(20_000)]
+        assert collections() == before
+        assert not gc.isenabled()
+    assert gc.isenabled()
+    assert gc.get_freeze_count() > len(kept)
+    seen = gc.get_objects()
+    assert not any(one is kept[0] for one in seen)
+    ghost = weakref.ref(Ring())
+    gc.collect()
+    assert ghost() is None
+
+
+def test_a_failure_and_a_process_without_collection_are_left_as_they_were():
+    with pytest.raises(ZeroDivisionError), process.garbage_postponed():
+        raise ZeroDivisionError
+    assert gc.isenabled()
+    gc.disable()
+    with process.garbage_postponed():
+        pass
+    assert not gc.isenabled()
+
+
+def test_what_is_kept_is_not_looked_at_until_it_is_released():
+    ring = Ring()
+    ghost = weakref.ref(ring)
+    process.keep_objects()
+    del ring
+    gc.collect()
+    assert ghost() is not None
+    process.release_objects()
+    assert ghost() is None
