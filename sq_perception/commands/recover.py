@@ -191,7 +191,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _region(text: str) -> tuple[int, int, int, int]:
-    left, top, width, height = (int(part) for part in text.split(","))
+    try:
+        left, top, width, height = (int(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected left,top,width,height in pixels, got {text!r}") from None
     return left, top, width, height
 
 
