@@ -58,6 +58,7 @@ class Input:
             patience=lambda: self._parameters().patience,
             dropped=lambda number: statistics.count("dropped", number),
         )
+        self._is_closed = False
         self._info: Subscription | None = None
         self._latched: Subscription | None = None
         self._mask: Subscription | None = None
@@ -71,14 +72,13 @@ class Input:
         self._mask = self._listen(Image, "mask/image", self.inbox.put_mask)
         kind = Image if self._transport == RAW else CompressedImage
         self._image = self._listen(kind, self.topic, self._on_image)
-        self.look_for_latched()
 
     def look_for_latched(self) -> None:
-        """Subscribe to a camera_info that was published once and is kept for those who come later, if there is one.
+        """Subscribe to a camera_info that was published once and is kept for late comers, if there is one; each second.
 
         Not from the start: a driver that keeps nothing would log an incompatible subscription.
         """
-        if self._info is None or self._latched is not None:
+        if self._info is None or self._latched is not None or self._is_closed:
             return
         offered = self._node.get_publishers_info_by_topic(self._info.topic_name)
         if any(one.qos_profile.durability == QoSDurabilityPolicy.TRANSIENT_LOCAL for one in offered):
@@ -107,6 +107,7 @@ class Input:
 
     def close(self) -> None:
         """Listen no more, and let the worker go; what waits is dropped."""
+        self._is_closed = True
         for one in (self._image, self._mask, self._latched, self._info):
             if one is not None:
                 self._node.destroy_subscription(one)

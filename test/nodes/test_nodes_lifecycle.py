@@ -127,7 +127,7 @@ class Bench(SpunNodes):
     def close(self) -> None:
         self.gate.set()
         for node in self.nodes:
-            assert node.close() or not node.is_configured
+            self.until(lambda node=node: node.close() or not node.is_configured)
         self.finish()
 
     def change(self, transition: int, label: str = "") -> bool:

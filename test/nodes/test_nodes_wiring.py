@@ -400,7 +400,7 @@ def test_markers_go_with_the_one_who_would_move_them(bench, end):
     elif end == "deactivated":
         bench.node._tasks.put(lambda: bench.node._change("deactivate"))
     else:
-        assert bench.node.close()
+        bench.until(bench.node.close)
     bench.until(lambda: len(shown) == 2)
     actions = {(marker.id, marker.ns, marker.action) for marker in shown[1].markers}
     kinds = ("superquadrics/surface", "superquadrics/outline")
