@@ -18,9 +18,8 @@ The way of an image, each room entered once:
     input.Input -> frame.decode -> engine.Engine.recover -> tracking.Tracking.identify -> outputs.Outputs.answer
 
 The executor's thread only stores messages; one worker thread takes the newest and does the work, so that services and
-parameters answer at once.  Stamp and frame of the input are copied to every output.  Results of orthographic frames are
-in the cube frame of :mod:`sq_perception.imaging.unit_cube`, those of others in the optical frame, or in
-``target_frame``.
+parameters answer at once.  Every output has the stamp of the input.  Results of orthographic frames are in the cube
+frame of :mod:`sq_perception.imaging.unit_cube`, others in the optical frame or ``target_frame``.
 
 A lifecycle node (:mod:`sq_perception.nodes.managed_node`): configuring loads the network and warms up, activating
 subscribes, deactivating ends the subscriptions after the frame at hand, cleaning up frees the network's memory.
@@ -258,7 +257,6 @@ class FrameNode(ManagedNode):
         return self._enabled or len(self._triggers) > 0
 
     def _recovered(self, source: Input, arrival: Arrival) -> _Result:
-        """The frame of a message and its bodies."""
         parameters = self._settings.current
         stages = {"wait": 1e3 * (monotonic() - arrival.time)}
         with timed(stages, "decode"):
@@ -369,7 +367,6 @@ class _Triggers:
         self._timer.cancel()
 
     def __len__(self) -> int:
-        """How many callers wait."""
         return len(self._waiting)
 
     async def next_outcome(self, timeout: float, why_none: Callable[[], str]) -> Outcome:
