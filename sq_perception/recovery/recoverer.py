@@ -85,6 +85,8 @@ class Recoverer:
         later call asks for one, it is loaded then.
     threads
         How many objects of a frame are worked on at the same time; None: as many as this process has cores.
+    weights_of
+        One whose loaded weights are taken, if it has any; the file is not read then.
 
     Raises
     ------
@@ -101,6 +103,8 @@ class Recoverer:
         method: Method = "auto",
         consensus: bool = False,
         threads: int | None = None,
+        *,
+        weights_of: Recoverer | None = None,
     ) -> None:
         if threads is not None and threads < 1:
             raise ValueError(f"threads: expected at least 1, got {threads}")
@@ -109,6 +113,7 @@ class Recoverer:
         self._path = model
         self._device = checked_device(device)
         self._consensus = consensus
+        self._single: inference.Predictor | None = weights_of._single if weights_of is not None else None
         self._network: inference.Predictor | None = None
         self._lock = threading.Lock()
         self._blas = ThreadpoolController()
@@ -116,6 +121,11 @@ class Recoverer:
         self._pool = ThreadPoolExecutor(self._threads, thread_name_prefix="fit")
         if method in NEEDS_NETWORK:
             self._load_network()
+
+    @property
+    def has_weights(self) -> bool:
+        """Whether the network has been loaded: its file is needed no more."""
+        return self._single is not None
 
     def warm_up(self, camera: Camera) -> None:
         """Compile or load every kernel and run the whole chain once on an image of the camera's size."""
@@ -226,8 +236,9 @@ class Recoverer:
     def _load_network(self) -> inference.Predictor:
         with self._lock:
             if self._network is None:
-                network = inference.prepare(checkpoint.load(self._path, self._device))
-                self._network = Consensus(network) if self._consensus else network
+                if self._single is None:
+                    self._single = inference.prepare(checkpoint.load(self._path, self._device))
+                self._network = Consensus(self._single) if self._consensus else self._single
             return self._network
 
 

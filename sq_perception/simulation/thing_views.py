@@ -333,7 +333,7 @@ def _edges(depth: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     inverse = (1 / depth).astype(np.float32)
     brush = np.ones((3, 3), np.uint8)
     highest = cv2.dilate(inverse, brush)
-    step = (highest - cv2.erode(inverse, brush) > 0.06 * highest).astype(np.uint8)
+    step: np.ndarray = (highest - cv2.erode(inverse, brush) > 0.06 * highest).astype(np.uint8)
     wider = int(rng.integers(0, 3))
     if wider:
         step = cv2.dilate(step, cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * wider + 1, 2 * wider + 1)))
