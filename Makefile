@@ -1,4 +1,5 @@
 # make demo    watch superquadrics being recovered from a synthetic camera; FRAME=file for a recorded frame
+# make quick   the tests of the core: no processes, no ROS, no browser; about a minute
 # make test    lint and the whole test suite, against the installed package
 # make lint    ruff and mypy alone
 # make bench   every benchmark, hours
@@ -28,7 +29,9 @@ SOURCES := setup.py setup.cfg pyproject.toml package.xml resource/sq_perception 
 	$(wildcard config/*) $(wildcard launch_scripts/*.py) $(wildcard sq_msgs_py/*.py) \
 	$(wildcard sq_perception/*.py) $(wildcard sq_perception/*/*.py) $(wildcard sq_perception/*/*/*.yaml) $(wildcard sq_perception/weights/*)
 
-.PHONY: demo test lint bench docs install clean
+CORE := geometry files imaging segmentation fitting tracking sq_msgs_py
+
+.PHONY: demo quick test lint bench docs install clean
 .DEFAULT_GOAL := install
 
 install: $(VENV)/.package
@@ -62,6 +65,9 @@ demo: $(VENV)/.package
 lint: $(VENV)/.package
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/mypy
+
+quick: $(VENV)/.package
+	$(VENV)/bin/pytest $(addprefix test/,$(CORE)) -m "not process"
 
 # The executable, not `python -m pytest`: that would put the source tree before the installed package.
 test: lint

@@ -67,13 +67,13 @@ WRAPPED: dict[str, Any] = {"break_long_words": False, "break_on_hyphens": False}
 # Tables
 
 
-HEADER = ["thing", "visible", "true edges, mm", "recovered, mm", "seen", "IoU", "score", "status"]
+HEADER = ["thing", "true edges, mm", "recovered, mm", "IoU", "status"]
 
 
 def table(found: Sequence[Found], frame: FrameRecovery) -> str:
     """A line for each thing, and for each body that belongs to none."""
     lines = [_line(one) for one in found]
-    lines += [["none", "", "", *_numbers(body), "", *_verdict(body)] for body in _surplus(found, frame)]
+    lines += [["none", "", _edges_of(body), "", _verdict(body)] for body in _surplus(found, frame)]
     return report.table(HEADER, lines)
 
 
@@ -83,24 +83,20 @@ def _surplus(found: Sequence[Found], frame: FrameRecovery) -> list[Recovery]:
 
 
 def _line(one: Found) -> list[str]:
-    true = " x ".join(f"{1e3 * edge:.0f}" for edge in one.stood.thing.edges[::-1])
-    start = [one.stood.name, f"{100 * one.visible:.0f} %", true]
+    start = [one.stood.name, " x ".join(f"{1e3 * edge:.0f}" for edge in one.stood.thing.edges[::-1])]
     if one.body is None:
-        return [*start, "nothing", "", "0 %", "", ""]
-    return [*start, *_numbers(one.body), f"{100 * one.iou:.0f} %", *_verdict(one.body)]
+        return [*start, "nothing", "0 %", ""]
+    return [*start, _edges_of(one.body), f"{100 * one.iou:.0f} %", _verdict(one.body)]
 
 
-def _numbers(body: Recovery) -> list[str]:
+def _edges_of(body: Recovery) -> str:
     order = np.argsort(-body.superquadric.size)
     edges, sigma = 2e3 * body.superquadric.size[order], 2e3 * body.sigma_size[order]
-    return [
-        " x ".join(f"{edge:.0f} ± {deviation:.0f}" for edge, deviation in zip(edges, sigma, strict=True)),
-        " / ".join(f"{100 * share:.0f}" for share in body.seen[order]) + " %",
-    ]
+    return " x ".join(f"{edge:.0f} ± {deviation:.0f}" for edge, deviation in zip(edges, sigma, strict=True))
 
 
-def _verdict(body: Recovery) -> list[str]:
-    return [f"{body.score:.2f}", Status(body.status).name.lower()]
+def _verdict(body: Recovery) -> str:
+    return Status(body.status).name.lower()
 
 
 def mean_iou(found: Sequence[Found]) -> float:
@@ -376,8 +372,7 @@ for figures over many scenes see [the surface fit](surface_fit.md), [segmentatio
 
 Left the depth image, near is light and black is nothing measured; in the middle masks and recovered outlines, hidden
 edges faint; right the recovered bodies, and the true things as thin lines. Edges are full lengths, ± one reported
-standard deviation. *Seen* is the share of each edge that the measured points span; the rest is inferred. IoU is that of
-volumes with the true convex hull.
+standard deviation. IoU is that of volumes with the true convex hull.
 """
 
 

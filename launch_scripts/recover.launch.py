@@ -20,13 +20,19 @@ ARGUMENTS = {
     "mask": ("mask/image", "topic of label images with the same stamps, if there are any"),
     "params_file": ("", "YAML file of parameters, like the one in share/sq_perception/config"),
     "namespace": ("", "of the nodes; relative topics are in it too"),
-    "autostart": ("true", "false: stay unconfigured until a lifecycle manager asks"),
+    "autostart": ("", "false: stay unconfigured until a lifecycle manager asks"),
+    "model": ("", "network weights: a .safetensors file or the name of shipped ones"),
+    "target_frame": ("", "tf2 frame that results are published in"),
+    "use_sim_time": ("", "true: time is that of /clock"),
+    "log_level": ("", "of the nodes: debug, info, warn, error or fatal"),
     "respawn": ("true", "start a node again that has ended by itself"),
     "fitter": ("false", "also start fitter_node, the classic method"),
     "rviz": ("false", "also start RViz2 with share/sq_perception/config/superquadrics.rviz"),
     "rviz_frame": ("camera_depth_optical_frame", "RViz2's fixed frame: the frame_id of the depth images"),
 }
 _YES = ("true", "1", "yes")
+_PARAMETERS = {"autostart": bool, "model": str, "target_frame": str, "use_sim_time": bool}
+"""Arguments that are parameters of the nodes: one that is not given is left to ``params_file``, or to the node."""
 _RESPAWN_DELAY = 2.0
 """Seconds: a model that is missing must not fill the log."""
 
@@ -42,6 +48,12 @@ def generate_launch_description() -> LaunchDescription:
 def _nodes(context: LaunchContext) -> list[Node]:
     given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
     executables = ["recover_node"] + ["fitter_node"] * (given["fitter"].lower() in _YES)
+    parameters: list[str | dict[str, bool | str]] = [given["params_file"]] if given["params_file"] else []
+    parameters += [
+        {name: given[name].lower() in _YES if kind is bool else given[name]}
+        for name, kind in _PARAMETERS.items()
+        if given[name]
+    ]
     nodes = [
         Node(
             package="sq_perception",
@@ -51,10 +63,8 @@ def _nodes(context: LaunchContext) -> list[Node]:
             output="screen",
             respawn=given["respawn"].lower() in _YES,
             respawn_delay=_RESPAWN_DELAY,
-            parameters=[
-                *([given["params_file"]] if given["params_file"] else []),
-                {"autostart": given["autostart"].lower() in _YES},
-            ],
+            parameters=parameters,
+            arguments=["--ros-args", "--log-level", given["log_level"]] if given["log_level"] else [],
             remappings=[
                 ("depth/image", given["depth"]),
                 ("depth/camera_info", given["camera_info"]),

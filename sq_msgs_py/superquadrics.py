@@ -15,9 +15,13 @@ residual        root mean square distance of the seen points to the surface, met
 sigma_a1..a3    standard deviations of the half sizes, metres; NaN where unknown
 id              of its track, kept from frame to frame (failed bodies: 2^31 + label); untracked, the label of its mask
 status          0 converged, 1 converged but the view leaves something open, 2 failed
+label           of the mask that the body was fitted to; 0 where there is none
+seen            frames that showed the body so far, this one included; 0 where nobody counted
+fused           1 where the numbers are those of a track, 0 where they are this frame's own
 
-All are float32 but id and status, which are uint32.  The header copies stamp and frame of the depth image.  Readers
-find fields by name: a later version may append fields, and raises VERSION when it changes the meaning of one.
+All are float32 but id and what follows it, which are uint32.  The header copies stamp and frame of the depth image.
+Readers find fields by name: a later version may append fields, and raises VERSION when it changes the meaning of one.
+The last three were appended after 0.2.0; in a cloud without them they are 0.
 
 The eight parameter vectors of one body (half turns about the axes, quarter turns about z with a1 and a2 exchanged) are
 equally right: compare bodies, never raw parameters.
@@ -49,8 +53,11 @@ FIELDS: tuple[tuple[str, int], ...] = tuple(
         *("x", "y", "z", "qx", "qy", "qz", "qw", "a1", "a2", "a3", "e1", "e2"),
         *("score", "residual", "sigma_a1", "sigma_a2", "sigma_a3"),
     )
-) + (("id", _UINT32), ("status", _UINT32))
+) + tuple((name, _UINT32) for name in ("id", "status", "label", "seen", "fused"))
 """Name and PointField datatype of every field, in the order of the message."""
+_APPENDED = ("label", "seen", "fused")
+"""Fields that a cloud may lack: 0 then."""
+_UNSIGNED = ("id", "status", *_APPENDED)
 
 _COLUMNS = {
     "size": ("a1", "a2", "a3"),
@@ -62,6 +69,7 @@ _COLUMNS = {
     "sigma_size": ("sigma_a1", "sigma_a2", "sigma_a3"),
     "id": ("id",),
     "status": ("status",),
+    **{name: (name,) for name in _APPENDED},
 }
 
 
@@ -82,12 +90,14 @@ class SuperquadricArray:
     score, residual : (n,) float32
     sigma_size : (n, 3) float32
     id, status : (n,) uint32
+    label, seen, fused : (n,) uint32
+        0 if not given.
 
     Raises
     ------
     ValueError
         If a column has another shape than the size column asks for, a half size, exponent, centre or quaternion is not
-        finite, or an id or status is no unsigned 32 bit integer.
+        finite, or one of the integers is no unsigned 32 bit integer.
     """
 
     size: np.ndarray
@@ -99,18 +109,22 @@ class SuperquadricArray:
     sigma_size: np.ndarray
     id: np.ndarray
     status: np.ndarray
+    label: np.ndarray | None = None
+    seen: np.ndarray | None = None
+    fused: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         count = len(np.atleast_1d(self.size))
         for column in fields(self):
             names = _COLUMNS[column.name]
-            values = np.asarray(getattr(self, column.name))
+            given = getattr(self, column.name)
+            values = np.zeros(count, np.uint32) if given is None else np.asarray(given)
             shape = (count,) if len(names) == 1 else (count, len(names))
             if values.size == 0 and count == 0:
                 values = values.reshape(shape)
             if values.shape != shape:
                 raise ValueError(f"{column.name}: expected shape {shape}, got {values.shape}")
-            if column.name in ("id", "status"):
+            if column.name in _UNSIGNED:
                 _check_unsigned(column.name, values)
                 values = values.astype(np.uint32)
             else:
@@ -132,9 +146,7 @@ class SuperquadricArray:
     def empty(cls) -> SuperquadricArray:
         """No superquadric at all."""
         return cls(
-            **{name: np.empty(0) for name in _COLUMNS if name not in ("id", "status")},
-            id=np.empty(0, np.uint32),
-            status=np.empty(0, np.uint32),
+            **{name: np.empty(0, np.uint32 if name in _UNSIGNED else np.float32) for name in _COLUMNS},
         )
 
 
@@ -180,6 +192,8 @@ def from_message(message: PointCloud2) -> SuperquadricArray:
     points = _points(message)
     columns: dict[str, np.ndarray] = {}
     for column, names in _COLUMNS.items():
+        if names[0] not in (points.dtype.names or ()):
+            continue  # a cloud of an earlier version
         values = np.stack([points[name] for name in names], axis=-1)
         columns[column] = values[:, 0] if len(names) == 1 else values
     try:
@@ -189,14 +203,16 @@ def from_message(message: PointCloud2) -> SuperquadricArray:
 
 
 def _points(message: PointCloud2) -> np.ndarray:
-    """The points (n,) of a cloud as a structured array of the fields of FIELDS."""
+    """The points (n,) of a cloud as a structured array of those of FIELDS that are there."""
     order = ">" if message.is_bigendian else "<"
     present = {field.name: field for field in message.fields}
-    missing = [name for name, _ in FIELDS if name not in present]
+    needed = [name for name, _ in FIELDS if name not in _APPENDED]
+    missing = [name for name in needed if name not in present]
     if missing:
-        raise MessageError(f"expected the fields {' '.join(name for name, _ in FIELDS)}; missing: {' '.join(missing)}")
+        raise MessageError(f"expected the fields {' '.join(needed)}; missing: {' '.join(missing)}")
+    names = [*needed, *(name for name in _APPENDED if name in present)]
     formats = []
-    for name, _ in FIELDS:
+    for name in names:
         field = present[name]
         if field.datatype not in _NUMPY_TYPES or field.count != 1:
             raise MessageError(f"field {name}: expected one number, got datatype {field.datatype} x {field.count}")
@@ -210,10 +226,10 @@ def _points(message: PointCloud2) -> np.ndarray:
         raise MessageError(f"row_step: expected at least {width * message.point_step} bytes, got {row_step}")
     if len(message.data) != height * row_step:
         raise MessageError(f"data: expected height x row_step = {height * row_step} bytes, got {len(message.data)}")
-    offsets = [present[name].offset for name, _ in FIELDS]
+    offsets = [present[name].offset for name in names]
     layout = np.dtype(
         {
-            "names": [name for name, _ in FIELDS],
+            "names": names,
             "formats": formats,
             "offsets": offsets,
             "itemsize": int(message.point_step),

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from sq_perception.evaluation.plots import recovery_figure
     from sq_perception.fitting.fit import Fit, Status
+    from sq_perception.fitting.options import FitOptions
     from sq_perception.fitting.surface_fit import fit
     from sq_perception.geometry.mesh import export as write_mesh
     from sq_perception.geometry.superquadric import Superquadric
@@ -26,6 +27,7 @@ __version__ = "0.2.0"
 __all__ = [
     "Camera",
     "Fit",
+    "FitOptions",
     "FrameRecovery",
     "RecordedFrame",
     "Recoverer",
@@ -44,6 +46,7 @@ __all__ = [
 _HOMES = {
     "Camera": "imaging.camera",
     "Fit": "fitting.fit",
+    "FitOptions": "fitting.options",
     "FrameRecovery": "recovery.recoverer",
     "RecordedFrame": "recordings.frame_file",
     "Recoverer": "recovery.recoverer",

@@ -2,23 +2,49 @@
 
 from __future__ import annotations
 
+import inspect
 import os
 import resource
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 REPOSITORY = Path(__file__).resolve().parent.parent
+_STARTING = {"subprocess", "browser", "running_nodes", "respawned_nodes", "hostile_messages"}
+"""Modules by which tests start processes."""
 
 
 def pytest_configure(config: pytest.Config) -> None:
     """Keep test nodes, and the processes they start, away from whatever else runs ROS on this machine."""
     os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark the tests that start processes, themselves, by their fixtures, or by a helper of this folder."""
+    for item in items:
+        if isinstance(item, pytest.Function):
+            names = [*inspect.unwrap(item.function).__code__.co_names, *item.fixturenames]
+            if _starts_processes(names, vars(item.module), set()):
+                item.add_marker(pytest.mark.process)
+
+
+def _starts_processes(names: Iterable[str], module: dict[str, Any], seen: set[str]) -> bool:
+    """Whether one of these names of a test module stands for, or uses, what starts processes."""
+    for name in set(names) & module.keys() - seen:
+        seen.add(name)
+        value = inspect.unwrap(module[name]) if callable(module[name]) else module[name]
+        if {getattr(value, "__name__", ""), getattr(value, "__module__", "")} & _STARTING:
+            return True
+        code = getattr(value, "__code__", None)
+        if code is not None and _starts_processes(code.co_names, module, seen):
+            return True
+    return False
 
 
 @pytest.fixture(scope="session")

@@ -3,7 +3,7 @@
 It runs in a network of its own (``unshare -rn``) in which every address is routed to the loopback device.  There each
 packet is seen, whichever library, thread or child process sends it: a look-up as a packet to port 53.
 
-As a program: ``python sealed_network.py RECORD COMMAND ...`` inside such a network writes the record as JSON.
+As a program inside such a network, ``sealed_network.py RECORD SECONDS AFTER COMMAND ...`` writes the record as JSON.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from __future__ import annotations
 import ipaddress
 import json
 import shutil
+import signal
 import socket
 import subprocess
 import sys
@@ -22,6 +23,8 @@ from pathlib import Path
 
 import pytest
 
+PATIENCE = 600
+"""Seconds: a loaded machine may have to compile."""
 _ALL_PROTOCOLS, _IPV4, _IPV6 = 0x0003, 0x0800, 0x86DD
 _NAMES, _DISCARD = 53, 9
 _TCP, _UDP = 6, 17
@@ -53,10 +56,12 @@ def require() -> None:
         pytest.skip(f"no network of one's own: {made.stderr.decode().strip()}")
 
 
-def run(command: Sequence[str], environment: Mapping[str, str], folder: Path, seconds: float) -> Sealed:
-    """Run a command to its end, or interrupt it after so many seconds as Ctrl-C does."""
+def run(
+    command: Sequence[str], environment: Mapping[str, str], folder: Path, seconds: float, after: str = ""
+) -> Sealed:
+    """Run a command to its end, or interrupt it, as Ctrl-C does, so many seconds after it has said ``after``."""
     record = folder / "record.json"
-    sealed = ["unshare", "-rn", sys.executable, __file__, str(record), str(seconds), *command]
+    sealed = ["unshare", "-rn", sys.executable, __file__, str(record), str(seconds), after, *command]
     done = subprocess.run(sealed, env=dict(environment), capture_output=True, text=True, cwd=folder, check=False)
     assert record.is_file(), done.stderr
     found = json.loads(record.read_text())
@@ -95,17 +100,32 @@ def _listen(found: list[str]) -> None:
     threading.Thread(target=record, daemon=True).start()
 
 
-def _main(record: str, seconds: str, *command: str) -> None:
+def _main(record: str, seconds: str, after: str, *command: str) -> None:
     for line in _SETUP:
         subprocess.run(line.split(), check="-6" not in line, capture_output=True)
     found: list[str] = []
     _listen(found)
-    process = subprocess.Popen(command)
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+    has_said = threading.Event()
+
+    def echo() -> None:
+        assert process.stdout is not None
+        for line in process.stdout:
+            print(line, end="")
+            if after in line:
+                has_said.set()
+        has_said.set()
+
+    reader = threading.Thread(target=echo)
+    reader.start()
+    if after:
+        has_said.wait(PATIENCE)
     try:
         code = process.wait(float(seconds))
     except subprocess.TimeoutExpired:
-        process.send_signal(2)
-        code = process.wait(60)
+        process.send_signal(signal.SIGINT)
+        code = process.wait(PATIENCE)
+    reader.join()
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as end:  # when this one has been seen, so have all before it
         end.sendto(b"", (_PROBE, _DISCARD))
     while (probe := f"{_PROBE} port {_DISCARD}") not in found:

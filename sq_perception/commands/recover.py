@@ -8,10 +8,12 @@ answers at once.
 from __future__ import annotations
 
 import argparse
+import logging
 import math
 import statistics
 import sys
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,7 +25,7 @@ if TYPE_CHECKING:
     from sq_perception.recordings.inputs import RecordedInput
     from sq_perception.recordings.result_bag import ResultBag
     from sq_perception.recordings.result_json import ResultLines
-    from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
+    from sq_perception.recovery.recoverer import Recoverer, Recovery, RecoveryOptions
 
 
 HELP = """\
@@ -32,9 +34,11 @@ Recover superquadrics from recorded depth images.
 A FRAME is
   .npz           depth (float, metres, NaN = no reading) and K (3 x 3); optional labels = instance masks, which are
                  then used instead of an own segmentation
-  .png, 16 bit   millimetres, 0 = no reading, with --camera-info
+  .png, 16 bit   millimetres (or see --depth-scale), 0 = no reading, with --camera-info or a camera file beside it
+  .npy           floats in metres, or uint16 as a PNG's; with a camera likewise
   .png, .bmp     with --projection orthographic: grey images of the unit cube, larger is nearer, 0 = background
-  a folder       all frames in it, in natural order; camera_info.yaml or camera.yaml in it is the camera of its PNGs
+  a folder       all frames in it, in natural order; camera_info.yaml, camera.yaml, intrinsics.json or
+                 camera_intrinsic.json in it is the camera of its images
   a rosbag2      a folder with metadata.yaml, or a .mcap or .db3 file: 16UC1 and 32FC1 images, raw or compressedDepth,
                  with the camera_info beside their topic; needs no ROS, but the extra 'bags'
 
@@ -126,8 +130,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--camera-info",
         metavar="FILE",
-        help="YAML with the intrinsics of 16 bit PNGs and bags; goes before what a folder or bag has",
+        help="the intrinsics of images and bags: YAML, JSON of librealsense or Open3D, or fx,fy,cx,cy; goes before "
+        "what a folder or bag has",
     )
+    parser.add_argument(
+        "--depth-scale",
+        type=float,
+        metavar="N",
+        help="units a metre of 16 bit files (default 1000; TUM RGB-D has 5000)",
+    )
+    parser.add_argument("--depth-min", type=float, default=0.0, metavar="M", help="metres; nearer readings are none")
+    parser.add_argument("--depth-max", type=float, default=math.inf, metavar="M", help="metres; farther ones likewise")
+    parser.add_argument("--roi", type=_region, metavar="X,Y,W,H", help="only this part of each image, in pixels")
+    parser.add_argument("--masks", metavar="DIR", help="label images, one a frame: its name and .png, 0 is background")
     parser.add_argument(
         "--distortion",
         choices=("auto", "apply", "ignore"),
@@ -164,7 +179,23 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="seconds per frame after which no further start is tried; the largest and nearest objects come first",
     )
+    parser.add_argument("--min-score", type=float, default=0.0, metavar="S", help="leave out bodies with a lower score")
+    parser.add_argument(
+        "--max-size", type=float, default=math.inf, metavar="M", help="leave out bodies whose longest side is longer"
+    )
+    parser.add_argument("-q", "--quiet", action="store_true", help="no table and no summary; what went wrong is said")
+    parser.add_argument(
+        "-v", "--verbose", action="store_true", help="also say the time of each stage, and what is logged"
+    )
     parser.add_argument("--max-objects", type=int, default=20, metavar="N", help="largest ones first (default 20)")
+
+
+def _region(text: str) -> tuple[int, int, int, int]:
+    try:
+        left, top, width, height = (int(part) for part in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"expected left,top,width,height in pixels, got {text!r}") from None
+    return left, top, width, height
 
 
 def run(options: argparse.Namespace) -> int:
@@ -175,13 +206,17 @@ def run(options: argparse.Namespace) -> int:
             return misused(f"--{name.replace('_', '-')}: expected at least 1, got {value}")
     if not options.time_budget > 0:
         return misused(f"--time-budget: expected a positive number of seconds, got {options.time_budget:g}")
+    if options.masks and not Path(options.masks).is_dir():
+        return misused(f"--masks: {options.masks}: expected a folder")
     if problem := recover_outputs.misuse(options):
         return misused(problem)
+    if options.verbose:
+        logging.basicConfig(level=logging.INFO, format="sq-perception: %(message)s")
 
     import torch
 
     from sq_perception.learning.checkpoint import CheckpointError
-    from sq_perception.recordings.frame_file import FrameError
+    from sq_perception.recordings.frame_file import FrameError, Reading
     from sq_perception.recordings.inputs import RecordedInput
     from sq_perception.recordings.result_json import Recovered, ResultLines
     from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
@@ -193,6 +228,16 @@ def run(options: argparse.Namespace) -> int:
         max_objects=options.max_objects,
         time_budget=options.time_budget,
     )
+    try:
+        reading = Reading(
+            options.depth_scale,
+            options.depth_min,
+            options.depth_max,
+            options.roi,
+            Path(options.masks) if options.masks else None,
+        )
+    except ValueError as error:
+        return misused(str(error))
     done = Recovered()
     try:
         recorded = RecordedInput(
@@ -203,7 +248,8 @@ def run(options: argparse.Namespace) -> int:
             options.every,
             options.limit,
             options.distortion,
-            is_done=done,
+            reading,
+            done,
         )
         if problem := recover_outputs.replaced_input(options, recorded.files):
             return misused(problem)
@@ -233,9 +279,10 @@ def run(options: argparse.Namespace) -> int:
     for problem in recover_outputs.finish(options, entries, bag, run.is_whole):
         complain(problem)
         code = code or FAILURE
-    if "-" not in (options.json, options.jsonl):
-        _print_table(run.results)
-    complain(run.summary())
+    if "-" not in (options.json, options.jsonl) and not options.quiet:
+        _print_table(run.results, options.verbose)
+    if not options.quiet:
+        complain(run.summary())
     return code
 
 
@@ -296,6 +343,13 @@ class _Run:
             parts.append(f"median {statistics.median(entry['ms'] for entry in self.results):.0f} ms")
         return ", ".join(parts)
 
+    def _is_wanted(self, body: Recovery) -> bool:
+        from sq_perception.fitting.fit import Status
+
+        longest = 2 * float(body.superquadric.size.max())
+        is_within = body.score >= self._options.min_score and longest <= self._options.max_size
+        return body.status == Status.FAILED or is_within
+
     def _frame(self, file: str, frame: RecordedFrame) -> None:
         from sq_perception.recordings.frame_entry import frame_entry
         from sq_perception.recordings.frame_file import FrameError
@@ -311,6 +365,7 @@ class _Run:
             recovery = self._recoverer.recover(frame.depth, frame.camera, labels, self._settings)
         except (ValueError, ArithmeticError) as error:  # a camera that no image can have come from
             raise FrameError(f"{file}: {frame.name}: {error}") from error
+        recovery = replace(recovery, bodies=tuple(body for body in recovery.bodies if self._is_wanted(body)))
         tracks = self._tracks.follow(file, frame, recovery) if self._tracks else [None] * len(recovery.bodies)
         entry = frame_entry(file, frame, recovery, tracks, has_masks=labels is not None)
         self.results.append(entry)
@@ -356,12 +411,14 @@ def _progress(recorded: RecordedInput) -> Iterator[tuple[str, Any]]:
             bar.advance(task)
 
 
-def _print_table(results: list[dict[str, Any]]) -> None:
+def _print_table(results: list[dict[str, Any]], verbose: bool) -> None:
     for entry in results:
         cube = entry["coordinates"] == "cube"
         stamp = entry["stamp"]
         taken = "" if stamp is None else f"  {stamp['sec']}.{stamp['nanosec']:09d}"
         print(f"{entry['file']}{taken}  {entry['ms']:.0f} ms  {entry['message']}".rstrip())
+        if verbose:
+            print("  " + ", ".join(f"{stage} {value:.0f} ms" for stage, value in entry["ms_by_stage"].items()))
         scale, unit, digits = (1.0, "", 4) if cube else (1e3, " mm", 1)
         for body in entry["superquadrics"]:
             label = "" if body["label"] is None else f"mask {body['label']}: "

@@ -26,6 +26,13 @@ _DECISIVE = (
     "method",
     "refine",
     "camera_info",
+    "depth_scale",
+    "depth_min",
+    "depth_max",
+    "roi",
+    "masks",
+    "min_score",
+    "max_size",
     "distortion",
     "topic",
     "model",
@@ -84,6 +91,7 @@ def place(name: str) -> str:
 def decisive(options: argparse.Namespace) -> dict[str, Any]:
     """Options that decide what is found in a frame, as JSON values; what was not given is None."""
     values = {name: getattr(options, name) for name in _DECISIVE}
+    values = {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
     return {name: None if value == math.inf else value for name, value in values.items()}
 
 

@@ -62,7 +62,7 @@ def compare(
             if len(mine) == 0:
                 continue
             answers, labels = contestant.recover(mine), contestant.labels(mine.truth)
-            bodies = contestant.judged(answers.bodies, labels)
+            bodies = contestant.with_given(answers.bodies, labels)
             figures = FiguresOfMerit.of(bodies, labels, answers.recovered, answers.milliseconds)
             part.append((figures, bodies.to_flat(), labels.to_flat()))
             if advance:

@@ -86,7 +86,7 @@ class Contestant(Protocol):
     def labels(self, truth: Superquadric) -> Superquadric:
         """The true bodies, each in the parameter vector with which rotations are to be compared."""
 
-    def judged(self, prediction: Superquadric, labels: Superquadric) -> Superquadric:
+    def with_given(self, prediction: Superquadric, labels: Superquadric) -> Superquadric:
         """What is compared with the labels: the prediction, with whatever was given to the contestant."""
 
 
@@ -165,8 +165,8 @@ class Network:
     def labels(self, truth: Superquadric) -> Superquadric:
         return truth.canonical_form() if self.training.get("canonical_labels", False) else truth
 
-    def judged(self, prediction: Superquadric, labels: Superquadric) -> Superquadric:
-        return Objective(self.loss).judged(prediction, labels) if self.loss else prediction
+    def with_given(self, prediction: Superquadric, labels: Superquadric) -> Superquadric:
+        return Objective(self.loss).with_given(prediction, labels) if self.loss else prediction
 
 
 @dataclass(frozen=True, eq=False)
@@ -212,7 +212,7 @@ class FittingMethod:
     def labels(self, truth: Superquadric) -> Superquadric:
         return truth.canonical_form()
 
-    def judged(self, prediction: Superquadric, labels: Superquadric) -> Superquadric:
+    def with_given(self, prediction: Superquadric, labels: Superquadric) -> Superquadric:
         return prediction
 
 

@@ -118,8 +118,8 @@ def walk(
         loss.backward()
         if not (torch.isfinite(loss) and raw.grad is not None and torch.isfinite(raw.grad).all()):
             break
-        judged = body if given is None else objective.judged(body, given)
-        flats.append(judged.to_flat()[0].detach().numpy())
+        compared = body if given is None else objective.with_given(body, given)
+        flats.append(compared.to_flat()[0].detach().numpy())
         losses.append(loss.item())
         sharpness.append(objective.sharpness_end)
         for group in optimiser.param_groups:

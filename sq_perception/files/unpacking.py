@@ -15,6 +15,7 @@ import zipfile
 import zlib
 from collections.abc import Iterable
 from pathlib import Path
+from typing import IO
 
 import cv2
 import numpy as np
@@ -50,6 +51,23 @@ def npz_arrays(path: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
         raise UnpackingError(f"not a readable NPZ archive: {error}") from error
 
 
+def npy_array(path: Path) -> np.ndarray:
+    """The array of an NPY file.
+
+    Raises
+    ------
+    UnpackingError
+        If it is no plain array, or larger than MOST_PIXELS numbers.
+    """
+    try:
+        with path.open("rb") as file:
+            return _numbers(file, path.stat().st_size)
+    except UnpackingError:
+        raise
+    except (OSError, ValueError, EOFError) as error:
+        raise UnpackingError(f"not a readable NPY file: {error}") from error
+
+
 def grey_image(path: Path) -> np.ndarray:
     """A grey PNG or BMP, uint8 or uint16 (height, width); three equal channels are grey too.
 
@@ -82,22 +100,25 @@ def grey_image(path: Path) -> np.ndarray:
 
 def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:
     with archive.open(info) as file:
-        version = np.lib.format.read_magic(file)
-        header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-        shape, is_fortran, dtype = header(file)
-        if dtype.hasobject:
-            raise UnpackingError(f"{info.filename}: expected numbers, got objects")
-        count = math.prod(shape)
-        if count > MOST_PIXELS or count * dtype.itemsize > 16 * MOST_PIXELS:
-            raise UnpackingError(f"{info.filename}: expected at most {MOST_PIXELS} numbers, got {count}")
-        size = count * dtype.itemsize
-        if info.file_size != file.tell() + size:
-            raise UnpackingError(
-                f"{info.filename}: expected {size} bytes of numbers, got {info.file_size - file.tell()}"
-            )
-        data = file.read(size)
+        return _numbers(file, info.file_size, f"{info.filename}: ")
+
+
+def _numbers(file: IO[bytes], file_size: int, where: str = "") -> np.ndarray:
+    """The array of an open NPY file of so many bytes."""
+    version = np.lib.format.read_magic(file)
+    header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+    shape, is_fortran, dtype = header(file)
+    if dtype.hasobject:
+        raise UnpackingError(f"{where}expected numbers, got objects")
+    count = math.prod(shape)
+    if count > MOST_PIXELS or count * dtype.itemsize > 16 * MOST_PIXELS:
+        raise UnpackingError(f"{where}expected at most {MOST_PIXELS} numbers, got {count}")
+    size = count * dtype.itemsize
+    if file_size != file.tell() + size:
+        raise UnpackingError(f"{where}expected {size} bytes of numbers, got {file_size - file.tell()}")
+    data = file.read(size)
     if len(data) != size:
-        raise UnpackingError(f"{info.filename}: expected {size} bytes of numbers, got {len(data)}")
+        raise UnpackingError(f"{where}expected {size} bytes of numbers, got {len(data)}")
     return np.frombuffer(data, dtype).reshape(shape, order="F" if is_fortran else "C").copy()
 
 

@@ -14,12 +14,16 @@ number, ``exp2`` one within -1022 and 1023.
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Callable
+from typing import Any, TypeVar
 
-import numba
 import numpy as np
 from numba import types
 from numba.extending import intrinsic
+
+from sq_perception.geometry import kernel_cache
+
+_F = TypeVar("_F", bound=Callable[..., Any])
 
 _EXPONENT_BITS = 52
 _MANTISSA = np.int64(0x000F_FFFF_FFFF_FFFF)
@@ -33,13 +37,16 @@ _E0, _E1, _E2, _E3, _E4, _E5, _E6, _E7, _E8, _E9, _E10, _E11, _E12 = (
     math.log(2) ** k / math.factorial(k) for k in range(13)
 )
 _OPTIONS: dict[str, Any] = {
-    "cache": True,
     "nogil": True,
     "forceinline": True,
     "error_model": "numpy",
     # Sums must keep their order here: the bias would swallow a term that is added to it first.
     "fastmath": {"contract"},
 }
+
+
+def _elementary(function: _F) -> _F:
+    return kernel_cache.compiled(function, _OPTIONS)
 
 
 def _bits_of(_typing: Any, number: Any) -> Any:
@@ -66,7 +73,7 @@ _bits: Any = intrinsic(_bits_of)
 _number: Any = intrinsic(_number_of)
 
 
-@numba.njit(**_OPTIONS)
+@_elementary
 def log2_from_1_to_2(m: float) -> float:
     """The logarithm to base 2 of 1 <= m <= 2."""
     s = (m - _ROOT) / (m + _ROOT)
@@ -77,7 +84,7 @@ def log2_from_1_to_2(m: float) -> float:
     return 0.5 + s * (even + ((_A4 + _A5 * q) + (_A6 + _A7 * q) * q2 + _A8 * q4) * q4)
 
 
-@numba.njit(**_OPTIONS)
+@_elementary
 def log2(x: float) -> float:
     """The logarithm to base 2 of a positive normal number."""
     bits = _bits(x)
@@ -85,7 +92,7 @@ def log2(x: float) -> float:
     return exponent + log2_from_1_to_2(_number((bits & _MANTISSA) | _BITS_OF_ONE))
 
 
-@numba.njit(**_OPTIONS)
+@_elementary
 def exp2_to_half(r: float) -> float:
     """2^r for |r| <= 1/2."""
     r2 = r * r
@@ -94,7 +101,7 @@ def exp2_to_half(r: float) -> float:
     return low + ((_E8 + _E9 * r) + (_E10 + _E11 * r) * r2 + _E12 * r4) * (r4 * r4)
 
 
-@numba.njit(**_OPTIONS)
+@_elementary
 def exp2(x: float) -> float:
     """2^x for -1022 <= x <= 1023."""
     n = np.floor(x + 0.5)

@@ -1,4 +1,4 @@
-"""A place for compiled kernels where numba finds none: a read-only installation and a user without a home.
+"""Compiling kernels and keeping them, also for a user without a home on a read-only installation.
 
 numba keeps machine code where ``NUMBA_CACHE_DIR`` says, beside the modules, or in the user's cache folder, and
 otherwise refuses to compile at all.  Service users and containers often have none of these.  For them there is a folder
@@ -11,10 +11,32 @@ import logging
 import os
 import stat
 import tempfile
+from collections.abc import Callable
 from functools import cache
 from pathlib import Path
+from typing import Any, TypeVar, cast
 
+import numba
+
+_F = TypeVar("_F", bound=Callable[..., Any])
 _log = logging.getLogger(__name__)
+
+
+def compiled(function: _F, options: dict[str, Any]) -> _F:
+    """numba's ``njit`` with these options, its machine code kept wherever there is a place."""
+    try:
+        return cast(_F, numba.njit(cache=True, **options)(function))
+    except RuntimeError:  # numba knows no place
+        folder = temporary_folder()
+    if folder is None:
+        return cast(_F, numba.njit(**options)(function))
+    settings: Any = numba.config
+    before = settings.CACHE_DIR
+    settings.CACHE_DIR = str(folder)  # read when a function is decorated; other packages keep theirs where they did
+    try:
+        return cast(_F, numba.njit(cache=True, **options)(function))
+    finally:
+        settings.CACHE_DIR = before
 
 
 @cache

@@ -14,9 +14,7 @@ import hashlib
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar, cast
-
-import numba
+from typing import Any, TypeVar
 
 from sq_perception.geometry import kernel_cache
 from sq_perception.geometry.elementary import exp2, exp2_to_half, log2, log2_from_1_to_2
@@ -45,24 +43,7 @@ def inline_kernel(function: _F) -> _F:
 def _compiled(function: _F, **more: bool) -> _F:
     function.__qualname__ += f"_{_FINGERPRINT}"
     options: dict[str, Any] = {"nogil": True, "fastmath": FAST, "error_model": "numpy", **more}
-    try:
-        return cast(_F, numba.njit(cache=True, **options)(function))
-    except RuntimeError:  # there is no place to keep it
-        return _compiled_elsewhere(function, options)
-
-
-def _compiled_elsewhere(function: _F, options: dict[str, Any]) -> _F:
-    """The same, kept in a folder of this user's own; not at all if there is none."""
-    folder = kernel_cache.temporary_folder()
-    if folder is None:
-        return cast(_F, numba.njit(**options)(function))
-    settings: Any = numba.config
-    before = settings.CACHE_DIR
-    settings.CACHE_DIR = str(folder)  # read when a function is decorated; other packages keep theirs where they did
-    try:
-        return cast(_F, numba.njit(cache=True, **options)(function))
-    finally:
-        settings.CACHE_DIR = before
+    return kernel_cache.compiled(function, options)
 
 
 def _fingerprint() -> str:

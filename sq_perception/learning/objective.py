@@ -110,6 +110,6 @@ class Objective:
             loss = torch.sqrt(loss + _ROOT_FLOOR) if self.root else loss
         return loss
 
-    def judged(self, prediction: Superquadric, truth: Superquadric) -> Superquadric:
+    def with_given(self, prediction: Superquadric, truth: Superquadric) -> Superquadric:
         """The bodies that a validation compares with the true ones: what is given counts as predicted."""
         return losses.turned_truth(prediction, truth) if self.name == "occupancy_rotation" else prediction

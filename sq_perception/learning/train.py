@@ -176,7 +176,7 @@ def validate(
     """
     flats = [model.predict(views[i : i + batch]).to_flat() for i in range(0, len(views), batch)]
     prediction = Superquadric.from_flat(np.concatenate(flats))
-    return volume_iou(objective.judged(prediction, truth) if objective else prediction, truth)
+    return volume_iou(objective.with_given(prediction, truth) if objective else prediction, truth)
 
 
 def _new_network(config: TrainingConfig, form: RegressorConfig | None) -> Regressor:

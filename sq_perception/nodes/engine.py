@@ -62,25 +62,31 @@ class RecovererFactory(Generic[P]):
     Attributes
     ----------
     make
-        A recoverer of parameters.
+        A recoverer of parameters, with the weights of another one if that is given.
     options
         What the parameters say to each frame.
     made_of
         Names of the parameters that the recoverer is made of.
-    key
-        Equal for parameters whose recoverers are the same; None where they are never shared.
+    read_by
+        Those of them whose setting reads the weights; the others keep what is loaded, whatever became of the file.
+    weights
+        Tells the weights that would be read now from others; None where recoverers are never shared.
+    answers
+        Names of the parameters that change what bodies come out, beside the weights.
     check
         Raises ValueError for parameters that :attr:`make` would refuse, as far as that can be told at once; it also
-        gets the names of those that change.
+        gets the names of those that change, and the recoverer at work.
     describe
         In a few words, for diagnostics.
     """
 
-    make: Callable[[P], Recoverer]
+    make: Callable[[P, Recoverer | None], Recoverer]
     options: Callable[[P], RecoveryOptions]
     made_of: tuple[str, ...] = ()
-    key: Callable[[P], Hashable] = lambda _: None
-    check: Callable[[P, frozenset[str]], None] = lambda _, __: None
+    read_by: tuple[str, ...] = ()
+    weights: Callable[[P], Hashable] = lambda _: None
+    answers: tuple[str, ...] = ()
+    check: Callable[[P, frozenset[str], Recoverer | None], None] = lambda *_: None
     describe: Callable[[P], str] = lambda _: ""
 
 
@@ -96,6 +102,7 @@ class _Superseded(Exception):  # noqa: N818 - no fault
 class _Built(Generic[P]):
     recoverer: Recoverer
     parameters: P
+    weights: Hashable
     key: Hashable
 
 
@@ -115,6 +122,8 @@ class Engine(Generic[P]):
         self._lock = threading.Lock()
         self._built: _Built[P] | None = None
         self._request = 0
+        self._is_to_read = False
+        """Whether weights that were asked for have not been read yet."""
         self.is_making = False
         """Whether another one is being made."""
         self.fault = ""
@@ -124,9 +133,9 @@ class Engine(Generic[P]):
         """Make the recoverer and warm it up; what the factory raises comes through."""
         with self._lock:
             self._request += 1
-        built = self._made(parameters, camera)
+        built = self._made(parameters, camera, None)
         with self._lock:
-            self._built, self.fault, self.is_making = built, "", False
+            self._built, self.fault, self.is_making, self._is_to_read = built, "", False, False
 
     def release(self) -> None:
         """Let go of the recoverer, and of one that is being made."""
@@ -142,6 +151,10 @@ class Engine(Generic[P]):
                 if _shared.get(built.key) is built.recoverer:
                     del _shared[built.key]
 
+    def check(self, parameters: P, changed: frozenset[str]) -> None:
+        """Raise ValueError for parameters that :meth:`follow` could not follow, as far as that can be told at once."""
+        self._factory.check(parameters, changed, None if self._built is None else self._built.recoverer)
+
     def follow(self, parameters: P, changed: frozenset[str], camera: Camera) -> None:
         """Swap the recoverer where a parameter that it is made of has been set, in the background.
 
@@ -153,12 +166,14 @@ class Engine(Generic[P]):
             self._request += 1
             request = self._request
             self.is_making = True
+            self._is_to_read = self._is_to_read or bool(changed.intersection(self._factory.read_by))
+            kept = None if self._is_to_read else self._built
         threading.Thread(
-            target=self._swap, args=(request, parameters, camera), name="recoverer in the making", daemon=True
+            target=self._swap, args=(request, parameters, camera, kept), name="recoverer in the making", daemon=True
         ).start()
 
-    def recover(self, frame: Frame, parameters: P) -> FrameRecovery:
-        """The bodies of a frame, by the parameters in force for the recoverer at work.
+    def recover(self, frame: Frame, parameters: P) -> tuple[FrameRecovery, Hashable]:
+        """The bodies of a frame by the parameters in force, and what tells their origin from another.
 
         Raises
         ------
@@ -170,7 +185,8 @@ class Engine(Generic[P]):
             raise RuntimeError("the recoverer has been released")
         made_of = {name: getattr(built.parameters, name) for name in self._factory.made_of}
         in_force: Any = replace(parameters, **made_of)  # type: ignore[type-var]
-        return built.recoverer.recover(frame.depth, frame.camera, frame.labels, self._factory.options(in_force))
+        recovery = built.recoverer.recover(frame.depth, frame.camera, frame.labels, self._factory.options(in_force))
+        return recovery, (built.weights, *(getattr(in_force, name) for name in self._factory.answers))
 
     @property
     def description(self) -> str:
@@ -180,11 +196,11 @@ class Engine(Generic[P]):
             return "none"
         return self._factory.describe(built.parameters) + (", another one is being made" if self.is_making else "")
 
-    def _swap(self, request: int, parameters: P, camera: Camera) -> None:
+    def _swap(self, request: int, parameters: P, camera: Camera, kept: _Built[P] | None) -> None:
         started = perf_counter()
         described = self._factory.describe(parameters)
         try:
-            built = self._made(parameters, camera, lambda: request == self._request)
+            built = self._made(parameters, camera, kept, lambda: request == self._request)
         except _Superseded:
             return
         except Exception as error:  # whatever it is: the old one goes on
@@ -198,29 +214,33 @@ class Engine(Generic[P]):
         with self._lock:
             if request != self._request:
                 return
-            self._built, self.fault, self.is_making = built, "", False
+            self._built, self.fault, self.is_making, self._is_to_read = built, "", False, False
         self._node.get_logger().info(f"changed to {described} within {perf_counter() - started:.1f} s")
 
-    def _made(self, parameters: P, camera: Camera, is_wanted: Callable[[], bool] = lambda: True) -> _Built[P]:
-        """A recoverer, warm; one that is there already if its key is the same.
+    def _made(
+        self, parameters: P, camera: Camera, kept: _Built[P] | None, is_wanted: Callable[[], bool] = lambda: True
+    ) -> _Built[P]:
+        """A recoverer, warm, with the weights of ``kept`` if given; one that is there already if its key is the same.
 
         Raises
         ------
         _Superseded
             If nobody wants it any more.
         """
-        key = self._factory.key(parameters)
+        weights = self._factory.weights(parameters) if kept is None else kept.weights
+        others = (name for name in self._factory.made_of if name != "model")  # the same file may have several names
+        key = None if weights is None else (weights, *(getattr(parameters, name) for name in others))
         with _making:
             if not is_wanted():
                 raise _Superseded
             known = None if key is None else _shared.get(key)
             if known is not None:
-                return _Built(known, parameters, key)
-            recoverer = self._factory.make(parameters)
+                return _Built(known, parameters, weights, key)
+            recoverer = self._factory.make(parameters, None if kept is None else kept.recoverer)
             if key is not None:
                 _shared[key] = recoverer
         with TURNS.turn():
             if not is_wanted():
                 raise _Superseded
             recoverer.warm_up(camera)
-        return _Built(recoverer, parameters, key)
+        return _Built(recoverer, parameters, weights, key)

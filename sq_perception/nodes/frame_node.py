@@ -18,9 +18,8 @@ The way of an image, each room entered once:
     input.Input -> frame.decode -> engine.Engine.recover -> tracking.Tracking.identify -> outputs.Outputs.answer
 
 The executor's thread only stores messages; one worker thread takes the newest and does the work, so that services and
-parameters answer at once.  Stamp and frame of the input are copied to every output.  Results of orthographic frames are
-in the cube frame of :mod:`sq_perception.imaging.unit_cube`, those of others in the optical frame, or in
-``target_frame``.
+parameters answer at once.  Every output has the stamp of the input.  Results of orthographic frames are in the cube
+frame of :mod:`sq_perception.imaging.unit_cube`, others in the optical frame or ``target_frame``.
 
 A lifecycle node (:mod:`sq_perception.nodes.managed_node`): configuring loads the network and warms up, activating
 subscribes, deactivating ends the subscriptions after the frame at hand, cleaning up frees the network's memory.
@@ -30,7 +29,7 @@ from __future__ import annotations
 
 import threading
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from dataclasses import dataclass, fields
 from time import monotonic, perf_counter
 from typing import Any
@@ -47,7 +46,8 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.nodes import fast_dds, process
 from sq_perception.nodes.engine import TURNS, Engine, RecovererFactory
 from sq_perception.nodes.frame import Frame
-from sq_perception.nodes.input import Arrival, Input
+from sq_perception.nodes.inbox import Arrival
+from sq_perception.nodes.input import Input
 from sq_perception.nodes.managed_node import ManagedNode
 from sq_perception.nodes.outputs import Outputs
 from sq_perception.nodes.parameters import LiveParameters
@@ -64,6 +64,16 @@ _DEFECTS = 10
 """Frames in a row that end in a defect of ours or of the device, after which the node starts anew."""
 _TICK = 0.05
 """Seconds between two looks at whether a caller of ~/trigger has waited long enough."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Result:
+    """A frame, its bodies, where they come from, and how long that took by stage."""
+
+    frame: Frame
+    recovery: FrameRecovery
+    origin: Hashable
+    milliseconds: dict[str, float]
 
 
 class FrameNode(ManagedNode):
@@ -99,7 +109,7 @@ class FrameNode(ManagedNode):
         super().__init__(name, namespace=namespace, context=context)
         self._engine: Engine[Any] = Engine(factory, self)
         self._settings: LiveParameters[Any] = LiveParameters(
-            self, kind, locked=self._why_locked, check=factory.check, changed=self._on_changed
+            self, kind, locked=self._why_locked, check=self._engine.check, changed=self._on_changed
         )
         self._statistics = Statistics()
         self._last_counts = self._statistics.snapshot()
@@ -109,6 +119,8 @@ class FrameNode(ManagedNode):
         self._input: Input | None = None
         self._worker: threading.Thread | None = None
         self._enabled = True
+        self._publishing = threading.Lock()
+        """Held while something is published, or it is decided that nothing is any more."""
         self._defects = 0
         self._triggers = _Triggers(self)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
@@ -149,18 +161,22 @@ class FrameNode(ManagedNode):
 
     def _deactivate(self) -> None:
         self._stop()
-        self._outputs.withdraw()
+        with self._publishing:
+            self._outputs.withdraw()
+            self._outputs.hide()
 
     def _cleanup(self) -> None:
         self._stop()
-        self._outputs.close()
+        with self._publishing:
+            self._outputs.close()
         self._poses.close()
         self._engine.release()
         process.release_objects()  # nothing of a network may hang on in a cycle of references
 
     def _stop(self) -> None:
         """End subscriptions and worker.  What planners were told of stays: a camera that fails takes no obstacles."""
-        one, self._input = self._input, None
+        with self._publishing:
+            one, self._input = self._input, None
         if one is not None:
             one.close()
         self._triggers.answer((False, "the node has been deactivated"))
@@ -209,12 +225,13 @@ class FrameNode(ManagedNode):
                     if not self._is_wanted:
                         self._statistics.count("dropped")
                         continue
-                    frame, recovery, stages = self._recovered(source, arrival)
-                if self._input is not source or not self._is_wanted:
-                    # Deactivated or disabled meanwhile: nothing is published any more, least of all a grasped body.
-                    self._statistics.count("dropped")
-                    continue
-                outcome = True, self._published(frame, recovery, arrival, stages)
+                    result = self._recovered(source, arrival)
+                with self._publishing:
+                    if self._input is not source or not self._is_wanted:
+                        # Deactivated or disabled meanwhile: nothing is published, least of all a grasped body.
+                        self._statistics.count("dropped")
+                        continue
+                    outcome = True, self._published(result, arrival)
                 self._defects = 0
             except ValueError as error:
                 outcome = False, str(error)
@@ -228,35 +245,42 @@ class FrameNode(ManagedNode):
             if not outcome[0]:
                 self._statistics.refuse(outcome[1])
                 self.get_logger().warning(f"refused a frame: {outcome[1]}", throttle_duration_sec=THROTTLE)
+            was_wanted = self._is_wanted
             self._triggers.answer(outcome, arrival.time)
+            if not was_wanted:
+                with self._publishing:
+                    self._outputs.hide()
 
     @property
     def _is_wanted(self) -> bool:
         """Whether frames are processed, or one is asked for."""
         return self._enabled or len(self._triggers) > 0
 
-    def _recovered(self, source: Input, arrival: Arrival) -> tuple[Frame, FrameRecovery, dict[str, float]]:
-        """The frame of a message, its bodies, and how long that took by stage, milliseconds."""
+    def _recovered(self, source: Input, arrival: Arrival) -> _Result:
         parameters = self._settings.current
         stages = {"wait": 1e3 * (monotonic() - arrival.time)}
         with timed(stages, "decode"):
             frame = source.frame(arrival, parameters)
-        recovery = self._engine.recover(frame, parameters)
-        return frame, recovery, stages | {f"recovery: {name}": took for name, took in recovery.milliseconds.items()}
+        recovery, origin = self._engine.recover(frame, parameters)
+        stages |= {f"recovery: {name}": took for name, took in recovery.milliseconds.items()}
+        return _Result(frame, recovery, origin, stages)
 
-    def _published(self, frame: Frame, recovery: FrameRecovery, arrival: Arrival, stages: dict[str, float]) -> str:
+    def _published(self, result: _Result, arrival: Arrival) -> str:
         """Name the bodies and publish them; the summary."""
         parameters = self._settings.current
+        frame, stages = result.frame, dict(result.milliseconds)
         with timed(stages, "tracking"):
-            found = self._tracking.identify(recovery, frame, arrival.time, parameters)
+            found = self._tracking.identify(result.recovery, frame, arrival.time, parameters, result.origin)
         with timed(stages, "publish"):
             findings = self._outputs.answer(found, frame, parameters)
-        age = 1e-9 * (self.get_clock().now().nanoseconds - _nanoseconds(frame.header.stamp))
+        stamp = frame.header.stamp  # not by rclpy's Time, which refuses stamps before 1970
+        age = 1e-9 * self.get_clock().now().nanoseconds - stamp.sec - 1e-9 * stamp.nanosec
         if abs(age) < _OLDEST:
             stages["stamp to result"] = 1e3 * age
-        self._statistics.answer(stages)
+        words = summary(found.recovery, found.ids)
+        self._statistics.answer(stages, words)
         self._statistics.note(self._outputs.accompany(found, findings, frame, parameters))
-        return summary(found.recovery, found.ids)
+        return words
 
     def _note_defect(self, words: str) -> None:
         """A defect of ours: it costs this frame and leaves its trace in the log, and the node goes on."""
@@ -270,6 +294,11 @@ class FrameNode(ManagedNode):
 
     def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self._enabled = bool(request.data)
+        if not self._is_wanted and self._publishing.acquire(blocking=False):  # otherwise the worker does it
+            try:
+                self._outputs.hide()
+            finally:
+                self._publishing.release()
         response.success = True
         response.message = "enabled" if self._enabled else "disabled: frames are dropped, ~/trigger still works"
         return response
@@ -295,6 +324,8 @@ class FrameNode(ManagedNode):
                 f"no depth image on {source.topic} for {source.silence:.0f} s: {source.heard}",
                 throttle_duration_sec=THROTTLE,
             )
+        if source is not None:
+            source.look_for_latched()
         now = self._statistics.snapshot()
         message = DiagnosticArray()
         message.header.stamp = self.get_clock().now().to_msg()
@@ -336,7 +367,6 @@ class _Triggers:
         self._timer.cancel()
 
     def __len__(self) -> int:
-        """How many callers wait."""
         return len(self._waiting)
 
     async def next_outcome(self, timeout: float, why_none: Callable[[], str]) -> Outcome:
@@ -368,8 +398,3 @@ class _Triggers:
                 self._timer.cancel()
         for one in late:
             one.outcome.set_result((False, one.why_none()))
-
-
-def _nanoseconds(stamp: Any) -> int:
-    """Of a header; rclpy's Time refuses stamps before 1970, which a message can hold."""
-    return int(stamp.sec) * 10**9 + int(stamp.nanosec)

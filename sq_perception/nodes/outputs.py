@@ -25,15 +25,20 @@ from __future__ import annotations
 import importlib
 from collections.abc import Collection
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
+from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
+from rclpy.qos import QoSPolicyKind
+from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import Image, PointCloud2
 from visualization_msgs.msg import MarkerArray
 
 from sq_msgs_py import collision_objects
 from sq_msgs_py.detections import detections
+from sq_msgs_py.markers import markers
 from sq_msgs_py.superquadrics import to_message
 from sq_msgs_py.transforms import name, transforms
 from sq_perception.nodes.frame import Frame, Refused
@@ -43,6 +48,10 @@ from sq_perception.nodes.tracking import CameraPoses, PoseError
 from sq_perception.recordings import publication
 from sq_perception.recordings.publication import Findings, Identified, MarkerStyle
 from sq_perception.recovery.recoverer import render_recovery
+
+_OVERRIDABLE = tuple(getattr(QoSPolicyKind, name) for name in ("HISTORY", "DEPTH", "RELIABILITY", "DURABILITY"))
+_ARRIVAL = Duration(seconds=0.5)
+"""How long the last markers may take to arrive before their publisher goes."""
 
 
 class Outputs:
@@ -60,7 +69,7 @@ class Outputs:
         self._node, self._poses = node, poses
         self._others = OptionalOutputs(node)
         self._publishers: tuple[Publisher, ...] = ()
-        self._shown_ids: list[int] = []
+        self._shown: Findings | None = None
 
     @property
     def absent(self) -> tuple[str, ...]:
@@ -69,19 +78,30 @@ class Outputs:
 
     def open(self, parameters: FrameParameters) -> None:
         """Create what is published."""
-        self.superquadrics = self._node.create_publisher(PointCloud2, "~/superquadrics", 10)
-        self.markers = self._node.create_publisher(MarkerArray, "~/markers", 1)
-        self.rendered_depth = self._node.create_publisher(Image, "~/rendered_depth", 1)
+        create = partial(
+            self._node.create_publisher, qos_overriding_options=QoSOverridingOptions(policy_kinds=_OVERRIDABLE)
+        )
+        self.superquadrics = create(PointCloud2, "~/superquadrics", 10)
+        self.markers = create(MarkerArray, "~/markers", 1)
+        self.rendered_depth = create(Image, "~/rendered_depth", 1)
         self._publishers = self.superquadrics, self.markers, self.rendered_depth
         self._others.follow(parameters)
 
     def close(self) -> None:
-        """Destroy the publishers; what planners were told of stays with them."""
+        """Destroy the publishers; what planners were told of stays with them, markers go."""
+        if self._publishers:
+            self.hide()
+            self.markers.wait_for_all_acked(_ARRIVAL)
         for publisher in self._publishers:
             self._node.destroy_publisher(publisher)
         self._publishers = ()
         self._others.close()
-        self._shown_ids = []
+
+    def hide(self) -> None:
+        """Delete the markers: nobody moves them from now on."""
+        if self._shown is not None and self._node.context.ok():
+            gone, self._shown = self._shown, None
+            self.markers.publish(markers([], [], gone.header, previous_ids=gone.shown_ids))
 
     def withdraw(self) -> None:
         """Take back what planners were told of: nobody looks after it from now on."""
@@ -96,7 +116,7 @@ class Outputs:
             If the transform to that frame is not known: nothing may be published in a wrong frame.
         """
         findings = publication.findings(found, frame.header, frame.is_cube)
-        findings = in_frame(findings, self._poses, parameters.target_frame)
+        findings = in_frame(findings, self._poses, parameters.target_frame, parameters.tf_tolerance)
         self.superquadrics.publish(to_message(findings.array, findings.header))
         return findings
 
@@ -110,8 +130,9 @@ class Outputs:
                 self._others.publish(findings, parameters, found.hidden)
             with timed(stages, "pictures"):
                 if self.markers.get_subscription_count():
-                    self.markers.publish(findings.markers(self._shown_ids, marker_style(parameters)))
-                    self._shown_ids = findings.shown_ids
+                    before = self._shown.shown_ids if self._shown is not None else ()
+                    self.markers.publish(findings.markers(before, marker_style(parameters)))
+                    self._shown = findings
                 if self.rendered_depth.get_subscription_count():
                     self.rendered_depth.publish(frame.encode(render_recovery(found.recovery, frame.camera)[0]))
         except Exception as error:
@@ -128,7 +149,7 @@ def marker_style(parameters: FrameParameters) -> MarkerStyle:
     return MarkerStyle(parameters.marker_colours, parameters.marker_alpha, parameters.marker_line_width)
 
 
-def in_frame(found: Findings, poses: CameraPoses, frame_id: str) -> Findings:
+def in_frame(found: Findings, poses: CameraPoses, frame_id: str, patience: float = 0.1) -> Findings:
     """Findings in another tf2 frame, by the transform at their stamp; as they are for an empty ``frame_id``.
 
     Raises
@@ -139,7 +160,7 @@ def in_frame(found: Findings, poses: CameraPoses, frame_id: str) -> Findings:
     if not frame_id:
         return found
     try:
-        rotation, translation = poses.at(found.header, frame_id)
+        rotation, translation = poses.at(found.header, frame_id, patience)
     except PoseError as error:
         raise Refused(
             f"target_frame: expected a transform from {found.header.frame_id!r} to {frame_id!r}: {error}"

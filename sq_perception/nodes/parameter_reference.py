@@ -52,9 +52,10 @@ value out of its range, of another type or that does not fit the others is refus
 swapped when it is warm; one that cannot be made leaves the old one at work, and `/diagnostics` says why. A model file
 is checked before the change is accepted. Setting the same file again reads it again.
 
-The quality of service of each subscription is a parameter too, at the start only:
-`qos_overrides.<topic>.subscription.reliability`, `.depth`, `.history`, with the topic as it is after remapping, such as
-`/camera/camera/depth/image_rect_raw`.
+The quality of service of each subscription, and of the cloud, markers and rendered depth, is a parameter too, at the
+start only: `qos_overrides.<topic>.subscription.reliability`, `.depth`, `.history`, or `.publisher.` and also
+`.durability`, with the topic as it is after remapping, such as `/camera/camera/depth/image_rect_raw`. So
+`qos_overrides./recover_node/superquadrics.publisher.durability: transient_local` keeps the last cloud for late comers.
 `use_sim_time` is that of every ROS 2 node.
 """
 

@@ -165,6 +165,13 @@ class FrameParameters:
         "refused. ~/rendered_depth stays the camera's. Empty: the frame of the image.",
         live=True,
     )
+    tf_tolerance: float = setting(
+        0.1,
+        "How long to wait for a transform (fixed_frame, target_frame) of an image that is already here.",
+        unit="s",
+        within=(0.0, 5.0),
+        live=True,
+    )
     publish_tf: bool = setting(
         False, "Publish a frame for each body on /tf: tf_prefix and its id, below the results' frame.", live=True
     )

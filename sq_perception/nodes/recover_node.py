@@ -39,7 +39,7 @@ def options(parameters: RecoverParameters) -> RecoveryOptions:
     )
 
 
-def _recoverer(parameters: RecoverParameters) -> Recoverer:
+def _recoverer(parameters: RecoverParameters, previous: Recoverer | None) -> Recoverer:
     # On a robot's busy cores the slowest of several threads sets the time; one image is too small to gain from them.
     torch.set_num_threads(1)
     return Recoverer(
@@ -48,28 +48,30 @@ def _recoverer(parameters: RecoverParameters) -> Recoverer:
         parameters.method,
         parameters.consensus,
         parameters.threads or None,
+        weights_of=previous,
     )
 
 
-def _key(parameters: RecoverParameters) -> Hashable:
-    """What a recoverer is made of: the very file too, as another one may take its name."""
+def _weights(parameters: RecoverParameters) -> Hashable:
+    """The very file: another one may take its name."""
     path = checkpoint.resolve(parameters.model or None)
     try:
         known = path.stat()
-        file: Hashable = (str(path.resolve()), known.st_ino, known.st_size, known.st_mtime_ns)
     except OSError:
-        file = str(path)
-    return file, parameters.device, parameters.consensus, parameters.threads, parameters.method
+        return str(path)
+    return str(path.resolve()), known.st_ino, known.st_size, known.st_mtime_ns
 
 
-def _check(parameters: RecoverParameters, names: frozenset[str]) -> None:
-    if "model" in names:
+def _check(parameters: RecoverParameters, names: frozenset[str], at_work: Recoverer | None) -> None:
+    if "device" in names:
+        checked_device(parameters.device)
+    is_loaded = at_work is not None and at_work.has_weights
+    is_wanted = parameters.method in _NEEDS_NETWORK and at_work is not None
+    if "model" in names or (is_wanted and ("device" in names or ("method" in names and not is_loaded))):
         try:
             checkpoint.check(parameters.model or None)
         except ValueError as error:
             raise ValueError(f"model: {error}") from error
-    if "device" in names:
-        checked_device(parameters.device)
 
 
 def _describe(parameters: RecoverParameters) -> str:
@@ -82,7 +84,9 @@ FACTORY: RecovererFactory[RecoverParameters] = RecovererFactory(
     make=_recoverer,
     options=options,
     made_of=("model", "device", "consensus", "threads", "method"),
-    key=_key,
+    read_by=("model", "device"),
+    weights=_weights,
+    answers=("method", "refine", "consensus"),
     check=_check,
     describe=_describe,
 )

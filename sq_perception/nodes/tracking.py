@@ -9,6 +9,7 @@ A pose is (quaternion x y z w, translation), p_frame = R p_optical + t, metres.
 from __future__ import annotations
 
 import importlib
+from collections.abc import Hashable
 from typing import Any
 
 import numpy as np
@@ -25,8 +26,6 @@ from sq_perception.recovery.recoverer import FrameRecovery
 from sq_perception.tracking.session import Tally, TrackingSession
 
 Pose = tuple[np.ndarray, np.ndarray]
-_PATIENCE = Duration(seconds=0.1)
-"""How long to wait for the transform of a frame that is already here."""
 _LEAST_LENGTH = 1e-6
 """Of a quaternion that can be normalised."""
 
@@ -56,10 +55,11 @@ class CameraPoses:
         self._buffer = tf2.Buffer()
         self._listener = tf2.TransformListener(self._buffer, self._node)
 
-    def at(self, header: Any, frame: str) -> Pose:
+    def at(self, header: Any, frame: str, patience: float = 0.1) -> Pose:
         """The pose of a header's frame in ``frame`` at its stamp, the newest for a stamp of 0.
 
-        The transforms arrive in the node's executor: this waits for them, and must not be called in its thread.
+        It is waited for, ``patience`` seconds at most; transforms arrive in the node's executor, in whose thread this
+        must not be called.
 
         Raises
         ------
@@ -74,7 +74,8 @@ class CameraPoses:
         if not header.frame_id:
             raise PoseError("the image has no frame_id")
         try:
-            found = self._buffer.lookup_transform(frame, header.frame_id, Time.from_msg(header.stamp), _PATIENCE)
+            stamp, wait = Time.from_msg(header.stamp), Duration(seconds=patience)
+            found = self._buffer.lookup_transform(frame, header.frame_id, stamp, wait)
         except Exception as error:  # tf2's exceptions have no common base that is known without tf2
             raise PoseError(str(error)) from error
         turn, shift = found.transform.rotation, found.transform.translation
@@ -114,6 +115,7 @@ class Tracking:
         self._session = TrackingSession()
         self._frame_id = ""
         self._fixed_frame: str | None = None
+        self._origin: Hashable = None
         self._untracked_stamp = 0.0
 
     @property
@@ -122,7 +124,12 @@ class Tracking:
         return self._session.tally
 
     def identify(
-        self, recovery: FrameRecovery, frame: Frame, arrival: float, parameters: FrameParameters
+        self,
+        recovery: FrameRecovery,
+        frame: Frame,
+        arrival: float,
+        parameters: FrameParameters,
+        origin: Hashable = None,
     ) -> Identified:
         """Bodies and ids of their tracks; without ``tracking`` ids are labels, and what was tracked is forgotten.
 
@@ -130,6 +137,9 @@ class Tracking:
         ----------
         arrival
             The time, seconds, of an image without stamp.
+        origin
+            Of the bodies, as :meth:`~sq_perception.nodes.engine.Engine.recover` tells it.  Numbers that another method
+            or model found, with deviations of another kind, are not fused with these: a change ends the tracks.
 
         Raises
         ------
@@ -143,6 +153,9 @@ class Tracking:
                 self._poses.clear()  # a recording begins again
             self._untracked_stamp = stamp
             return publication.untracked(recovery)
+        if self._origin not in (None, origin):
+            self._forget("bodies come from another method, refine, consensus or model from now on")
+        self._origin = origin
         fixed_frame = parameters.fixed_frame
         if self._fixed_frame not in (None, fixed_frame):
             self._forget(f"fixed_frame is {fixed_frame or 'none'} from now on")
@@ -155,7 +168,7 @@ class Tracking:
         is_known = True
         if fixed_frame:
             try:
-                pose = self._poses.at(frame.header, fixed_frame)
+                pose = self._poses.at(frame.header, fixed_frame, parameters.tf_tolerance)
             except PoseError as error:
                 is_known = False
                 self._node.get_logger().warning(

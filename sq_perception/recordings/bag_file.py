@@ -29,12 +29,14 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+import numpy as np
+
 from sq_msgs_py import depth_image
 from sq_perception.files import plain_yaml
 from sq_perception.imaging import compressed_depth, unit_cube
 from sq_perception.imaging.calibration import Calibration, Treatment
 from sq_perception.imaging.camera import Projection
-from sq_perception.recordings.frame_file import FrameError, RecordedFrame, Stamp
+from sq_perception.recordings.frame_file import FrameError, Reading, RecordedFrame, Stamp
 
 SUFFIXES = (".mcap", ".db3")
 LARGEST = 2**29
@@ -77,13 +79,16 @@ class RecordedBag:
     topic
         Of the images; needed where several show depth.
     camera_info
-        Anything with the fields of sensor_msgs/CameraInfo; goes before those in the bag.
+        Anything with the fields of sensor_msgs/CameraInfo, or a function of an image's width and height that gives it;
+        goes before those in the bag.
     projection
         "orthographic" looks for grey images of the unit cube.
     every, limit
         Every n-th image only, and at most so many.
     distortion
         "auto", "apply" or "ignore", see :mod:`sq_perception.imaging.calibration`.
+    reading
+        What is taken of each image; masks are files called as the frames are.
     is_done
         Asked with the stamp of each image that counts; where it says yes, the image is neither decoded nor given.
 
@@ -102,6 +107,7 @@ class RecordedBag:
         every: int = 1,
         limit: int | None = None,
         distortion: Treatment = "auto",
+        reading: Reading | None = None,
         is_done: Callable[[Stamp], bool] = lambda stamp: False,
     ) -> None:
         if every < 1 or (limit is not None and limit < 1):
@@ -112,7 +118,7 @@ class RecordedBag:
         self._distortion: Treatment = distortion
         self._orthographic = projection == "orthographic"
         self._every, self._limit = every, limit
-        self._is_done = is_done
+        self._reading, self._is_done = reading or Reading(), is_done
         self._reader, self._types = _open(self._path)
         try:
             self.topic = self._chosen(topic)
@@ -268,35 +274,42 @@ class RecordedBag:
     def _decoded(self, message: _Message, info: _Message | None) -> RecordedFrame:
         warning = ""
         encoding = str(getattr(message.content, "encoding", ""))
+        name, labels = f"{self._name}_{message.stamp}", None
         if self._orthographic:
             grey = depth_image.grey_from_message(message.content)
             depth, camera = unit_cube.depth_from_grey(grey), unit_cube.camera(grey.shape[1], grey.shape[0])
         else:
-            calibration = self._calibration(info)
             if message.is_packed:
                 depth = compressed_depth.decode(message.content.format, message.content.data)
                 encoding = compressed_depth.encoding(message.content.format) or ""
             else:
                 depth = depth_image.depth_from_message(message.content)
+            calibration = self._calibration(info, depth)
+            labels = self._reading.labels(name, depth)
+            labels = None if labels is None else calibration.rectified_labels(labels)
             depth, camera = calibration.rectified(depth), calibration.camera
             warning = f"{self._path}: {self.topic}: {calibration.note}" if calibration.note else ""
-        return RecordedFrame(
-            depth,
-            camera,
-            labels=None,
-            name=f"{self._name}_{message.stamp}",
-            is_cube=self._orthographic,
-            stamp=message.stamp,
-            topic=self.topic,
-            frame_id=message.content.header.frame_id,
-            warning=warning,
-            encoding=encoding,
-            received=message.received,
+        return self._reading.of(
+            RecordedFrame(
+                depth,
+                camera,
+                labels,
+                name,
+                is_cube=self._orthographic,
+                stamp=message.stamp,
+                topic=self.topic,
+                frame_id=message.content.header.frame_id,
+                warning=warning,
+                encoding=encoding,
+                received=message.received,
+            )
         )
 
-    def _calibration(self, info: _Message | None) -> Calibration:
+    def _calibration(self, info: _Message | None, depth: np.ndarray) -> Calibration:
         if self._camera_info is not None:
-            return Calibration.of(self._camera_info, self.topic, self._distortion)
+            given = self._camera_info
+            known = given(depth.shape[1], depth.shape[0]) if callable(given) else given
+            return Calibration.of(known, self.topic, self._distortion)
         if info is None:
             raise ValueError(f"no camera_info on {self._info_topic}: name the camera with --camera-info")
         return Calibration.of(info.content, self.topic, self._distortion)

@@ -3,11 +3,14 @@
 | file | needs | depth |
 | --- | --- | --- |
 | ``.npz`` | ``depth`` float (h, w), ``K`` (3, 3) | metres, NaN = nothing |
-| 16 bit ``.png`` | a camera_info YAML | millimetres, 0 = nothing; rectified where it is raw |
+| ``.npy`` of floats | a camera_info | metres, NaN or 0 = nothing; rectified where it is raw |
+| 16 bit ``.png``, ``.npy`` | a camera_info | millimetres or as ``Reading.scale`` says, 0 = nothing; likewise |
 | 8 or 16 bit ``.png``, ``.bmp``, orthographic | nothing | grey values of the cube, 0 = nothing |
 | ``.npz``, orthographic | ``depth`` | depth in the cube, 1 - z; NaN = nothing |
 
-A file whose name is a time, such as 1305031102.160407.png, has that stamp in seconds.
+A file whose name is a time, such as 1305031102.160407.png, has that stamp in seconds.  Names of exactly this form are
+those of the TUM RGB-D benchmark, whose PNGs have 5000 units a metre: they are read so, with a warning, unless the scale
+is given.  A camera_info is a YAML, or one of the forms of :mod:`sq_perception.recordings.intrinsics`.
 
 The cube is the thesis' unit cube, :mod:`sq_perception.imaging.unit_cube`.  An NPZ may bring ``labels`` (h, w), a
 support ``plane`` (4,), and the text "orthographic" as ``projection``, which goes before what the caller says.  Nothing
@@ -20,6 +23,7 @@ Whole folders and rosbags are read by :mod:`sq_perception.recordings.inputs`, fr
 
 from __future__ import annotations
 
+import math
 import re
 import reprlib
 from dataclasses import dataclass, replace
@@ -29,13 +33,18 @@ from typing import Any, NamedTuple, get_args
 import numpy as np
 
 from sq_perception.files import plain_yaml
-from sq_perception.files.unpacking import UnpackingError, grey_image, npz_arrays
+from sq_perception.files.unpacking import UnpackingError, grey_image, npy_array, npz_arrays
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.calibration import Calibration, Treatment
 from sq_perception.imaging.camera import Camera, Projection
+from sq_perception.recordings import intrinsics
 
-SUFFIXES = (".npz", ".png", ".bmp")
-_MILLIMETRES = np.float32(1000.0)
+SUFFIXES = (".npz", ".npy", ".png", ".bmp")
+MILLIMETRES = 1000.0
+"""Units a metre."""
+TUM_SCALE = 5000.0
+"""Of the TUM RGB-D benchmark, https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats"""
+_TUM_NAME = re.compile(r"\d{10}\.\d{6}")
 _IMAGES = (".png", ".bmp")
 _SKEW = 1e-6
 """Of fx; no depth camera in use has any."""
@@ -100,6 +109,81 @@ class RecordedFrame:
 
 
 @dataclass(frozen=True)
+class Reading:
+    """What is taken of an image, whatever it comes from.
+
+    Attributes
+    ----------
+    scale : float or None
+        Units a metre of 16 bit files; None: millimetres, or what the file's name says.
+    nearest, farthest : float
+        Readings beyond, metres, are none.
+    region : (4,) of int or None
+        Left column, top row, width and height of the part to look at, pixels of the rectified image.
+    masks : Path or None
+        A folder with a label image for each frame, of its name and ``.png``: 0 is background.
+
+    Raises
+    ------
+    ValueError
+        For a scale or depth that is not positive, limits that leave nothing, or an empty region.
+    """
+
+    scale: float | None = None
+    nearest: float = 0.0
+    farthest: float = math.inf
+    region: tuple[int, int, int, int] | None = None
+    masks: Path | None = None
+
+    def __post_init__(self) -> None:
+        if self.scale is not None and not 0 < self.scale < math.inf:
+            raise ValueError(f"scale: expected a positive number of units a metre, got {self.scale:g}")
+        if not 0 <= self.nearest < self.farthest:
+            raise ValueError(f"depths: expected 0 <= nearest < farthest, got {self.nearest:g} and {self.farthest:g}")
+        if self.region is not None and (min(self.region[:2]) < 0 or min(self.region[2:]) < 1):
+            raise ValueError(f"region: expected left, top >= 0 and width, height >= 1, got {self.region}")
+
+    def labels(self, name: str, like: np.ndarray) -> np.ndarray | None:
+        """The label image (height, width) of a frame, int32; None without a folder of them.
+
+        Raises
+        ------
+        FrameError
+            If it is missing, unreadable, or not of the size of the image ``like``.
+        """
+        if self.masks is None:
+            return None
+        path = self.masks / f"{name}.png"
+        if not path.is_file():
+            raise FrameError(f"{path}: no such mask")
+        try:
+            labels = grey_image(path)
+        except UnpackingError as error:
+            raise FrameError(f"{path}: {error}") from error
+        if labels.shape != like.shape:
+            raise FrameError(f"{path}: expected labels of the depth's shape {like.shape}, got {labels.shape}")
+        return labels.astype(np.int32)
+
+    def of(self, frame: RecordedFrame) -> RecordedFrame:
+        """The frame within the limits; raises FrameError if the region is not within the image."""
+        if self == Reading():
+            return frame
+        with np.errstate(invalid="ignore"):
+            is_far = (frame.depth < self.nearest) | (frame.depth > self.farthest)
+        depth = np.where(is_far, np.float32(np.nan), frame.depth) if is_far.any() else frame.depth
+        if self.region is None:
+            return replace(frame, depth=depth)
+        left, top, width, height = self.region
+        camera = frame.camera
+        if left + width > camera.width or top + height > camera.height:
+            raise FrameError(f"{frame.name}: region: expected one within {camera.width} x {camera.height} pixels")
+        part = np.s_[top : top + height, left : left + width]
+        camera = replace(camera, width=width, height=height, cx=camera.cx - left, cy=camera.cy - top)
+        labels = None if frame.labels is None else frame.labels[part]
+        return replace(frame, depth=np.ascontiguousarray(depth[part]), camera=camera, labels=labels)
+
+
+@dataclass(frozen=True)
 class Region:
     """The fields of a sensor_msgs/RegionOfInterest that count."""
 
@@ -129,6 +213,7 @@ def read(
     camera_info: str | Path | None = None,
     projection: Projection = "pinhole",
     distortion: Treatment = "auto",
+    reading: Reading | None = None,
 ) -> RecordedFrame:
     """Read one frame.
 
@@ -137,12 +222,15 @@ def read(
     path
         See the table above.
     camera_info
-        YAML with the intrinsics of a PNG, as camera_calibration writes it or as a camera_info message prints.
+        Intrinsics of an image: YAML as camera_calibration writes it or as a camera_info message prints, or another
+        form of :mod:`sq_perception.recordings.intrinsics`.
     projection
         "pinhole" or "orthographic".
     distortion
         Of a PNG: "auto", "apply" or "ignore", see :mod:`sq_perception.imaging.calibration`; auto looks at the
         names of the file and its folder.
+    reading
+        What is taken of the image; all of it by default.
 
     Raises
     ------
@@ -158,36 +246,62 @@ def read(
     path = Path(path)
     if not path.is_file():
         raise FrameError(f"{path}: no such file")
-    return replace(_read(path, camera_info, projection, distortion), stamp=stamp_of(path))
+    reading = reading or Reading()
+    return reading.of(replace(_read(path, camera_info, projection, distortion, reading), stamp=stamp_of(path)))
 
 
-def _read(path: Path, camera_info: str | Path | None, projection: Projection, distortion: Treatment) -> RecordedFrame:
+def _read(
+    path: Path, camera_info: str | Path | None, projection: Projection, distortion: Treatment, reading: Reading
+) -> RecordedFrame:
     suffix = path.suffix.lower()
     if suffix == ".npz":
-        return _read_npz(path, projection)
-    if suffix not in _IMAGES:
-        raise FrameError(f"{path}: expected a name that ends in .npz, .png or .bmp")
+        frame = _read_npz(path, projection)
+        labels = reading.labels(path.stem, frame.depth)
+        return frame if labels is None else replace(frame, labels=labels)
+    if suffix not in SUFFIXES:
+        raise FrameError(f"{path}: expected a name that ends in {', '.join(SUFFIXES)}")
     try:
-        image = grey_image(path)
+        image = npy_array(path) if suffix == ".npy" else grey_image(path)
     except UnpackingError as error:
         raise FrameError(f"{path}: {error}") from error
+    if image.ndim != 2 or not image.size:
+        raise FrameError(f"{path}: expected an image (height, width), got {image.shape}")
     if projection == "orthographic":
-        return _from_grey(path, image)
-    if image.dtype != np.uint16:
+        if image.dtype not in (np.uint8, np.uint16):
+            raise FrameError(f"{path}: expected 8 or 16 bit, got {image.dtype}")
+        return replace(_from_grey(path, image), labels=reading.labels(path.stem, image))
+    is_metric = image.dtype.kind == "f"
+    if not is_metric and image.dtype != np.uint16:
         raise FrameError(
-            f"{path}: a pinhole depth image has 16 bit (millimetres), this one has 8; "
+            f"{path}: a pinhole depth image has 16 bit (millimetres) or floats (metres), this one {image.dtype}; "
             "for grey images of the thesis' kind choose the orthographic projection"
         )
     if camera_info is None:
-        raise FrameError(f"{path}: a 16 bit image needs a camera_info file with the camera's intrinsics")
-    calibration = calibrated(camera_info, read_camera_info(camera_info), path.with_suffix("").as_posix(), distortion)
-    depth = np.where(image > 0, image / _MILLIMETRES, np.float32(np.nan))
+        raise FrameError(f"{path}: a depth image needs a camera_info file with the camera's intrinsics")
+    info = camera_info_of(camera_info, image.shape[1], image.shape[0])
+    calibration = calibrated(camera_info, info, path.with_suffix("").as_posix(), distortion)
+    scale, warnings = 1.0 if is_metric else MILLIMETRES, [f"{camera_info}: {calibration.note}"] * bool(calibration.note)
+    if not is_metric and reading.scale is not None:
+        scale = reading.scale
+    elif not is_metric and suffix in _IMAGES and _TUM_NAME.fullmatch(path.stem):
+        scale = TUM_SCALE
+        warnings.append(
+            f"{path.parent}: names as in the TUM RGB-D benchmark, so {TUM_SCALE:g} units are a metre; "
+            f"depth scale = {MILLIMETRES:g} takes them for millimetres"
+        )
+    with np.errstate(invalid="ignore", over="ignore"):
+        depth = np.where(np.isfinite(image) & (image > 0), image / np.float32(scale), np.nan).astype(np.float32)
     try:
         depth = calibration.rectified(depth)
+        labels = reading.labels(path.stem, image)
+        labels = None if labels is None else calibration.rectified_labels(labels)
+    except FrameError:
+        raise
     except ValueError as error:
         raise FrameError(f"{path}: {error}") from error
-    warning = f"{camera_info}: {calibration.note}" if calibration.note else ""
-    return RecordedFrame(depth, calibration.camera, None, path.name, is_cube=False, warning=warning, encoding="16UC1")
+    encoding = "16UC1" if scale == MILLIMETRES else "32FC1"
+    warning = "; ".join(warnings)
+    return RecordedFrame(depth, calibration.camera, labels, path.name, False, warning=warning, encoding=encoding)
 
 
 def stamp_of(path: Path) -> Stamp | None:
@@ -204,6 +318,16 @@ def calibrated(where: str | Path, info: Any, name: str, distortion: Treatment) -
         raise FrameError(f"{where}: {error}") from error
 
 
+def camera_info_of(source: str | Path, width: int, height: int) -> CameraInfo:
+    """What a YAML, JSON or four numbers say of images of this size; raises FrameError as :func:`read_camera_info`."""
+    numbers = None if Path(source).exists() else intrinsics.four_numbers(str(source))
+    if numbers is None:
+        return read_camera_info(source)
+    fx, fy, cx, cy = numbers
+    none = (0.0,) * 12
+    return CameraInfo(width, height, "plumb_bob", (), (fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0), none, 0, 0, Region())
+
+
 def read_calibration(path: str | Path, name: str = "", distortion: Treatment = "auto") -> Calibration:
     """The calibration that a YAML file tells of; ``name`` is that of the images.
 
@@ -216,7 +340,7 @@ def read_calibration(path: str | Path, name: str = "", distortion: Treatment = "
 
 
 def read_camera_info(path: str | Path) -> CameraInfo:
-    """A YAML file in the layout of camera_calibration, or of a printed camera_info message.
+    """A YAML file in the layout of camera_calibration, or of a printed camera_info message; or JSON, see the module.
 
     A file that does not name its distortion model means plumb_bob; what else it does not name is zero.
 
@@ -226,8 +350,11 @@ def read_camera_info(path: str | Path) -> CameraInfo:
     """
     path = Path(path)
     try:
-        documents = [entry for entry in plain_yaml.read_all(path) if entry is not None]
-    except plain_yaml.YamlError as error:
+        if path.suffix.lower() == ".json":
+            documents: list[Any] = [intrinsics.read_json(path)]
+        else:
+            documents = [entry for entry in plain_yaml.read_all(path) if entry is not None]
+    except (plain_yaml.YamlError, intrinsics.IntrinsicsError) as error:
         raise FrameError(f"{path}: cannot read the camera_info: {error}") from error
     if not documents or not isinstance(documents[0], dict):
         raise FrameError(f"{path}: expected a camera_info as a YAML mapping")
@@ -238,6 +365,8 @@ def read_camera_info(path: str | Path) -> CameraInfo:
     projection = _matrix(path, info, ("projection_matrix", "p", "P"), 12)
     if matrix is None and projection is None:
         raise FrameError(f"{path}: expected a camera_matrix (or k) of 9 numbers, or a projection_matrix (or p) of 12")
+    if matrix is not None and _is_transposed(matrix):
+        raise FrameError(f"{path}: camera matrix: expected 0 0 1 in its last row; it seems to be transposed")
     if matrix is not None and abs(matrix[1]) > _SKEW * abs(matrix[0]):
         raise FrameError(f"{path}: camera matrix: expected no skew, got {matrix[1]:g}")
     region = info.get("roi", {})
@@ -274,6 +403,8 @@ def _read_npz(path: Path, projection: Projection) -> RecordedFrame:
         return RecordedFrame(depth, _cube_camera(path, width, height), labels, path.name, is_cube=True)
     if "K" not in fields:
         raise FrameError(f"{path}: expected a field 'K', the 3 x 3 camera matrix")
+    if fields["K"].shape == (3, 3) and _is_transposed(fields["K"].ravel()):
+        raise FrameError(f"{path}: K: expected 0 0 1 in its last row; it seems to be transposed")
     try:
         camera = Camera.from_matrix(fields["K"], width, height)
     except (ValueError, TypeError) as error:
@@ -282,6 +413,11 @@ def _read_npz(path: Path, projection: Projection) -> RecordedFrame:
         depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.nan).astype(np.float32)
     plane = _plane(path, fields.get("plane"))
     return RecordedFrame(depth, camera, labels, path.name, is_cube=False, plane=plane, encoding="32FC1")
+
+
+def _is_transposed(matrix: np.ndarray) -> bool:
+    """Whether the centre (cx, cy) stands in the last row of a flat camera matrix, not in its last column."""
+    return bool((matrix[6:8] != 0).any() and not (matrix[[2, 5]] != 0).any())
 
 
 def _labels(path: Path, labels: np.ndarray | None, depth: np.ndarray) -> np.ndarray | None:

@@ -1,8 +1,9 @@
 """All frames that a user names: files, folders of files, and bags, one frame after the other.
 
-A folder gives its frames and bags in natural order (frame_2 before frame_10); the camera of its PNGs is
-``camera_info.yaml`` or ``camera.yaml`` in it.  What cannot be read comes as the error that says why, in its place, and
-the rest follows.
+A folder gives its frames and bags in natural order (frame_2 before frame_10), NPYs only where it has nothing else, as
+matrices of calibrations are such files too.  The camera of its images, and of an image that is named by itself, is
+``camera_info.yaml``, ``camera.yaml``, ``intrinsics.json`` or ``camera_intrinsic.json`` beside it.  What cannot be read
+comes as the error that says why, in its place, and the rest follows.
 """
 
 from __future__ import annotations
@@ -15,11 +16,20 @@ from sq_perception.imaging.calibration import Treatment
 from sq_perception.imaging.camera import Projection
 from sq_perception.recordings import bag_file, frame_file
 from sq_perception.recordings.bag_file import RecordedBag
-from sq_perception.recordings.frame_file import CameraInfo, FrameError, RecordedFrame, Stamp
+from sq_perception.recordings.frame_file import FrameError, Reading, RecordedFrame, Stamp
 
-CAMERA_FILES = ("camera_info.yaml", "camera_info.yml", "camera.yaml", "camera.yml")
+CAMERA_FILES = (
+    "camera_info.yaml",
+    "camera_info.yml",
+    "camera.yaml",
+    "camera.yml",
+    "intrinsics.json",
+    "camera_intrinsic.json",  # Open3D's
+)
 SUFFIXES = frame_file.SUFFIXES + bag_file.SUFFIXES
 
+_ANY_SIZE = (640, 480)
+"""Pixels, of images that nothing is known of yet."""
 _DIGITS = re.compile(r"(\d+)")
 
 
@@ -31,7 +41,7 @@ class RecordedInput:
     names
         As the user gave them.
     camera_info
-        YAML with the intrinsics of PNGs and bags; goes before what a folder or bag brings.
+        Intrinsics of images and bags, as :func:`frame_file.read` takes them; goes before what a folder or bag brings.
     projection
         "pinhole" or "orthographic".
     topic
@@ -40,6 +50,8 @@ class RecordedInput:
         Of each folder and bag: every n-th frame only, and at most so many.
     distortion
         Of PNGs and bags: "auto", "apply" or "ignore", see :mod:`sq_perception.imaging.calibration`.
+    reading
+        What is taken of each image; all of it by default.
     is_done
         Asked with file, topic and stamp of each frame that counts; where it says yes, the frame is neither read nor
         given.
@@ -59,15 +71,16 @@ class RecordedInput:
         every: int = 1,
         limit: int | None = None,
         distortion: Treatment = "auto",
+        reading: Reading | None = None,
         is_done: Callable[[str, str, Stamp | None], bool] = lambda file, topic, stamp: False,
     ) -> None:
         self._camera_info = camera_info
-        self._info: CameraInfo | None = None
         self._distortion: Treatment = distortion
+        self._reading = reading
         if camera_info is not None:
-            self._info = frame_file.read_camera_info(camera_info)
+            info = frame_file.camera_info_of(camera_info, *_ANY_SIZE)
             # Auto depends on what the images are called.
-            frame_file.calibrated(camera_info, self._info, "", "ignore" if distortion == "auto" else distortion)
+            frame_file.calibrated(camera_info, info, "", "ignore" if distortion == "auto" else distortion)
         self._projection: Projection = projection
         self._topic, self._every, self._limit = topic, every, limit
         self._is_done = is_done
@@ -80,7 +93,7 @@ class RecordedInput:
     @property
     def files(self) -> list[Path]:
         """Files and bags that are read."""
-        given = [] if self._camera_info is None else [Path(self._camera_info)]
+        given = [] if self._camera_info is None or not Path(self._camera_info).exists() else [Path(self._camera_info)]
         return given + [path for path, rest in self._sources if not isinstance(rest, FrameError)]
 
     def __iter__(self) -> Iterator[tuple[str, RecordedFrame | FrameError]]:
@@ -96,7 +109,7 @@ class RecordedInput:
 
     def _add(self, path: Path) -> None:
         if not path.is_dir() or bag_file.is_bag(path):
-            self._sources.append((path, self._camera_info))
+            self._sources.append((path, self._camera_info or _camera_file(path.parent)))
             return
         try:
             found = in_folder(path)[:: self._every][: self._limit]
@@ -111,22 +124,25 @@ class RecordedInput:
 
     def _file(self, path: Path, camera_info: str | Path | None) -> RecordedFrame | FrameError:
         try:
-            return frame_file.read(path, camera_info, self._projection, self._distortion)
+            return frame_file.read(path, camera_info, self._projection, self._distortion, self._reading)
         except FrameError as error:
             return error
         except (OSError, MemoryError) as error:
             return FrameError(f"{path}: {error}")
 
     def _bag(self, path: Path) -> Iterator[tuple[str, RecordedFrame | FrameError]]:
+        source = self._camera_info
+        info = None if source is None else lambda width, height: frame_file.camera_info_of(source, width, height)
         try:
             bag = RecordedBag(
                 path,
                 self._topic,
-                self._info,
+                info,
                 self._projection,
                 self._every,
                 self._limit,
                 self._distortion,
+                self._reading,
                 lambda stamp: self._is_done(str(path), bag.topic, stamp),
             )
         except FrameError as error:
@@ -144,7 +160,8 @@ def in_folder(folder: Path) -> list[Path]:
     def is_frame(path: Path) -> bool:
         return path.suffix.lower() in frame_file.SUFFIXES and path.is_file()
 
-    return sorted((one for one in folder.iterdir() if is_frame(one) or bag_file.is_bag(one)), key=_natural)
+    found = sorted((one for one in folder.iterdir() if is_frame(one) or bag_file.is_bag(one)), key=_natural)
+    return [one for one in found if one.suffix.lower() != ".npy"] or found
 
 
 def _natural(path: Path) -> tuple[list[str | int], str]:

@@ -43,11 +43,25 @@ Mesh = tuple[np.ndarray, np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class Identified:
-    """The objects of a frame as they are published, the id of each, and ids of tracks that the frame does not show."""
+    """The objects of a frame as they are published.
+
+    Attributes
+    ----------
+    ids
+        Of each object.
+    hidden
+        Ids of tracks that the frame does not show.
+    seen
+        Frames that showed each object so far; empty where nobody counted.
+    fused
+        Whether the numbers of each object are those of its track; empty for none.
+    """
 
     recovery: FrameRecovery
     ids: tuple[int, ...]
     hidden: tuple[int, ...] = ()
+    seen: tuple[int, ...] = ()
+    fused: tuple[bool, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -90,17 +104,21 @@ def untracked(recovery: FrameRecovery) -> Identified:
 def tracked(recovery: FrameRecovery, tracks: Sequence[Followed], hidden: tuple[int, ...] = ()) -> Identified:
     """Bodies and ids of their tracks, of which there is one for each body that did not fail, in their order."""
     found = iter(tracks)
-    bodies, ids = [], []
+    bodies, ids, seen, fused = [], [], [], []
     for one in recovery.bodies:
         if one.status == Status.FAILED:
             bodies.append(one)
             ids.append(FIRST_FAILED_ID + one.label)
+            seen.append(0)
+            fused.append(False)
             continue
         track = next(found)
         fit = replace(one.fit, superquadric=track.superquadric, covariance=track.covariance)
         bodies.append(replace(one, fit=fit))
         ids.append(track.id)
-    return Identified(replace(recovery, bodies=tuple(bodies)), tuple(ids), hidden)
+        seen.append(track.seen)
+        fused.append(track.is_fused)
+    return Identified(replace(recovery, bodies=tuple(bodies)), tuple(ids), hidden, tuple(seen), tuple(fused))
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +190,7 @@ class Findings:
 def findings(found: Identified, header: Any, is_cube: bool) -> Findings:
     """What a frame showed, in the frame of its image, whose header it is."""
     recovery = found.recovery
-    array = superquadric_array(recovery, found.ids, is_cube)
+    array = superquadric_array(found, is_cube)
     covariances = np.full((len(array), 6, 6), np.nan)
     for k, one in enumerate(recovery.bodies):
         covariances[k] = one.covariance[_CENTRE_AND_TURN, _CENTRE_AND_TURN]
@@ -182,8 +200,9 @@ def findings(found: Identified, header: Any, is_cube: bool) -> Findings:
     return Findings(array, change @ covariances @ np.swapaxes(change, 1, 2), header)
 
 
-def superquadric_array(recovery: FrameRecovery, ids: Sequence[int], is_cube: bool) -> SuperquadricArray:
+def superquadric_array(found: Identified, is_cube: bool) -> SuperquadricArray:
     """Every object of a frame, failed ones included; in the cube frame if ``is_cube``, else in the optical frame."""
+    recovery = found.recovery
     if not recovery.bodies:
         return SuperquadricArray.empty()
     bodies = Superquadric.stack([one.superquadric for one in recovery.bodies])
@@ -197,8 +216,11 @@ def superquadric_array(recovery: FrameRecovery, ids: Sequence[int], is_cube: boo
         score=np.array([one.score for one in recovery.bodies]),
         residual=np.array([one.residual for one in recovery.bodies]),
         sigma_size=np.stack([one.sigma_size for one in recovery.bodies]),
-        id=np.array(ids, dtype=np.uint32),
+        id=np.array(found.ids, dtype=np.uint32),
         status=np.array([one.status for one in recovery.bodies], dtype=np.uint32),
+        label=np.array([one.label for one in recovery.bodies], dtype=np.uint32),
+        seen=np.array(found.seen, dtype=np.uint32) if found.seen else None,
+        fused=np.array(found.fused, dtype=np.uint32) if found.fused else None,
     )
 
 

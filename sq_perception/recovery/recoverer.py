@@ -86,6 +86,8 @@ class Recoverer:
         later call asks for one, it is loaded then.
     threads
         How many objects of a frame are worked on at the same time; None: as many as this process has cores.
+    weights_of
+        One whose loaded weights are taken, if it has any; the file is not read then.
 
     Raises
     ------
@@ -102,6 +104,8 @@ class Recoverer:
         method: Method = "auto",
         consensus: bool = False,
         threads: int | None = None,
+        *,
+        weights_of: Recoverer | None = None,
     ) -> None:
         if threads is not None and threads < 1:
             raise ValueError(f"threads: expected at least 1, got {threads}")
@@ -110,13 +114,18 @@ class Recoverer:
         self._path = model
         self._device = checked_device(device)
         self._consensus = consensus
-        self._networks: dict[bool, Network] = {}
+        self._loaded: dict[bool, Network] = {} if weights_of is None else weights_of._loaded
         self._lock = threading.Lock()
         self._blas = ThreadpoolController()
         self._beside = ThreadPoolExecutor(1, thread_name_prefix="network")
         self._pool = ThreadPoolExecutor(self._threads, thread_name_prefix="fit")
         if method in NEEDS_NETWORK:
             self._load_network(True)
+
+    @property
+    def has_weights(self) -> bool:
+        """Whether the network has been loaded: its file is needed no more."""
+        return bool(self._loaded)
 
     def warm_up(self, camera: Camera) -> None:
         """Compile or load every kernel and run the whole chain once on an image of the camera's size."""
@@ -230,17 +239,16 @@ class Recoverer:
     def _load_network(self, pinhole: bool) -> Network:
         """The network for a kind of camera; the same one for both if a file of weights was named."""
         with self._lock:
-            if pinhole not in self._networks:
-                network = self._loaded(pinhole)
+            if pinhole not in self._loaded:
                 kinds = (pinhole,) if self._path is None else (True, False)
-                self._networks.update(dict.fromkeys(kinds, network))
-            return self._networks[pinhole]
+                self._loaded.update(dict.fromkeys(kinds, self._read_network(pinhole)))
+            network = self._loaded[pinhole]
+        return Consensus(network) if self._consensus and not isinstance(network, inference.ThingPredictor) else network
 
-    def _loaded(self, pinhole: bool) -> Network:
+    def _read_network(self, pinhole: bool) -> Network:
         if (self._path is None and pinhole) or checkpoint.tells_hulls(self._path):
             return inference.ThingPredictor(checkpoint.load_things(self._path, self._device))
-        network = inference.prepare(checkpoint.load(self._path, self._device))
-        return Consensus(network) if self._consensus else network
+        return inference.prepare(checkpoint.load(self._path, self._device))
 
 
 def render_recovery(frame: FrameRecovery, camera: Camera) -> tuple[np.ndarray, np.ndarray]:

@@ -43,7 +43,7 @@ class Scripted:
     def labels(self, truth: Superquadric) -> Superquadric:
         return truth
 
-    def judged(self, prediction: Superquadric, labels: Superquadric) -> Superquadric:
+    def with_given(self, prediction: Superquadric, labels: Superquadric) -> Superquadric:
         return prediction
 
 
@@ -184,9 +184,9 @@ class TestContest:
         path = small_network(tmp_path / "a.safetensors", loss="occupancy_rotation", canonical_labels=canonical)
         network = Network.read(path)
         labels = network.labels(LABELS)
-        judged = network.judged(Superquadric.from_flat(LABELS.to_flat()[::-1]), labels)
-        np.testing.assert_array_equal(judged.size, labels.size)
-        np.testing.assert_allclose(judged.rotation, LABELS.rotation[::-1], atol=1e-12)
+        compared = network.with_given(Superquadric.from_flat(LABELS.to_flat()[::-1]), labels)
+        np.testing.assert_array_equal(compared.size, labels.size)
+        np.testing.assert_allclose(compared.rotation, LABELS.rotation[::-1], atol=1e-12)
         assert (labels.size[:, 0] >= labels.size[:, 1]).all() == canonical
 
     def test_names_are_unique(self, tmp_path: Path) -> None:

@@ -89,11 +89,21 @@ def test_recover_is_wired_to_the_camera(repository: Path, launch: dict[str, type
     }
     both = nodes_of(path, launch, fitter="true", params_file="mine.yaml")
     assert [node.named["executable"] for node in both] == ["recover_node", "fitter_node"]
-    assert both[0].named["parameters"] == ["mine.yaml", {"autostart": True}]
+    assert both[0].named["parameters"] == ["mine.yaml"], "an argument that is not given overrides nothing"
     assert both[0].named["respawn"]
     (managed,) = nodes_of(path, launch, namespace="wrist", autostart="false", respawn="false")
     assert (managed.named["namespace"], managed.named["respawn"]) == ("wrist", False)
     assert managed.named["parameters"] == [{"autostart": False}]
+    assert managed.named["arguments"] == []
+    given = {"model": "supervised", "target_frame": "map", "use_sim_time": "true", "log_level": "debug"}
+    (node,) = nodes_of(path, launch, params_file="mine.yaml", **given)
+    assert node.named["parameters"] == [
+        "mine.yaml",
+        {"model": "supervised"},
+        {"target_frame": "map"},
+        {"use_sim_time": True},
+    ]
+    assert node.named["arguments"] == ["--ros-args", "--log-level", "debug"]
 
 
 @pytest.mark.parametrize(("scene", "projection"), [("table", "pinhole"), ("thesis", "orthographic")])

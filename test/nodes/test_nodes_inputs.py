@@ -61,7 +61,7 @@ def test_raw_images_of_a_lens_are_rectified_and_rendered_as_they_were_sent(make_
     bench.put_info(info)
     rendered: list[Image] = []
     bench.peer.create_subscription(Image, "recover_node/rendered_depth", rendered.append, 5)
-    bench.until(lambda: bench.node._publisher.rendered_depth.get_subscription_count())
+    bench.until(lambda: bench.node._outputs.rendered_depth.get_subscription_count())
     bench.answer(bench.depth())
     depth, camera, _, _ = bench.recoverer.asked[-1]
     assert depth.shape == (camera.height, camera.width)

@@ -82,7 +82,9 @@ class Bench(SpunNodes):
             make=self._make,
             options=options,
             made_of=("model", "device", "method"),
-            key=lambda parameters: (id(self), parameters.model, parameters.device),
+            read_by=("model", "device"),
+            weights=lambda parameters: (id(self), parameters.model),
+            answers=("method", "refine"),
             check=self._check,
             describe=lambda parameters: f"model {parameters.model}",
         )
@@ -111,11 +113,11 @@ class Bench(SpunNodes):
         self.spin(self.nodes, executor)
         self.stamps = 0
 
-    def _check(self, parameters: Any, names: frozenset[str]) -> None:
+    def _check(self, parameters: Any, names: frozenset[str], at_work: Recoverer | None) -> None:
         if "model" in names and not parameters.model.isdigit():
             raise ValueError(f"model: {parameters.model} is no model")
 
-    def _make(self, parameters: Any) -> Recoverer:
+    def _make(self, parameters: Any, previous: Recoverer | None) -> Recoverer:
         assert self.gate.wait(PATIENCE)
         if self.fault is not None:
             raise self.fault
@@ -125,7 +127,7 @@ class Bench(SpunNodes):
     def close(self) -> None:
         self.gate.set()
         for node in self.nodes:
-            assert node.close() or not node.is_configured
+            self.until(lambda node=node: node.close() or not node.is_configured)
         self.finish()
 
     def change(self, transition: int, label: str = "") -> bool:

@@ -12,8 +12,8 @@ pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
 from frame_node_bench import CAMERA, FRAME_ID, Bench, ball
 from rclpy.parameter import Parameter
-from rclpy.qos import QoSProfile, QoSReliabilityPolicy
-from sensor_msgs.msg import CameraInfo, Image
+from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import Marker, MarkerArray
@@ -27,6 +27,7 @@ from sq_msgs_py.depth_image import (
 from sq_perception.fitting.fit import Status
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
+from sq_perception.nodes import fast_dds
 
 
 @pytest.fixture
@@ -386,6 +387,27 @@ def test_pictures_are_made_while_somebody_listens_and_stale_markers_go(bench):
     assert actions == {(5, Marker.ADD), (1, Marker.DELETE)}
 
 
+@pytest.mark.parametrize("end", ["disabled", "deactivated", "ended"])
+def test_markers_go_with_the_one_who_would_move_them(bench, end):
+    shown: list[MarkerArray] = []
+    bench.peer.create_subscription(MarkerArray, "recover_node/markers", shown.append, 5)
+    bench.until(lambda: bench.node._outputs.markers.get_subscription_count())
+    bench.recoverer.bodies = (ball(1), ball(5))
+    bench.answer(bench.depth())
+    bench.until(lambda: len(shown) == 1)
+    if end == "disabled":
+        assert bench.call(SetBool, "/recover_node/enable", SetBool.Request(data=False)).success
+    elif end == "deactivated":
+        bench.node._tasks.put(lambda: bench.node._change("deactivate"))
+    else:
+        bench.until(bench.node.close)
+    bench.until(lambda: len(shown) == 2)
+    actions = {(marker.id, marker.ns, marker.action) for marker in shown[1].markers}
+    kinds = ("superquadrics/surface", "superquadrics/outline")
+    names = {marker.id: marker.id for marker in shown[0].markers}
+    assert actions == {(number, kind, Marker.DELETE) for number in names for kind in kinds}
+
+
 def test_orthographic_frames_need_no_camera_info_and_answer_in_the_cube_frame(make_bench):
     bench = make_bench("-p", "projection:=orthographic")
     assert bench.recoverer.warm == unit_cube.camera()
@@ -422,6 +444,16 @@ def test_a_publisher_that_cannot_be_heard_is_named(make_bench):
     assert "best effort" in words
 
 
+def test_a_latched_cloud_reaches_those_who_come_later(make_bench):
+    bench = make_bench("-p", "qos_overrides./recover_node/superquadrics.publisher.durability:=transient_local")
+    bench.send_info()
+    bench.answer(bench.depth())
+    late: list[PointCloud2] = []
+    kept = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
+    bench.peer.create_subscription(PointCloud2, "recover_node/superquadrics", late.append, kept)
+    bench.until(lambda: late)
+
+
 def test_diagnostics_count_and_warn(bench):
     from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 
@@ -450,11 +482,32 @@ def test_diagnostics_count_and_warn(bench):
 
 
 def test_lost_messages_are_counted_and_the_remedy_is_named(bench, capfd):
-    bench.node._input._on_lost(SimpleNamespace(total_count=3, total_count_change=3))
-    bench.node._input._on_lost(SimpleNamespace(total_count=5, total_count_change=2))
-    assert bench.counts.lost == 5
+    image = bench.node._input._image
+    bench.node._input._on_lost(image, SimpleNamespace(total_count=3, total_count_change=3))
+    bench.node._input._on_lost(image, SimpleNamespace(total_count=5, total_count_change=2))
+    bench.node._input._on_lost(bench.node._input._info, SimpleNamespace(total_count=1, total_count_change=1))
+    assert bench.counts.lost == {"/depth/image": 5, "/depth/camera_info": 1}
     said = capfd.readouterr().err
-    assert said.count("FASTRTPS_DEFAULT_PROFILES_FILE") == 1
+    assert said.count(f"FASTRTPS_DEFAULT_PROFILES_FILE={fast_dds.profile_path()}") == 1
+    assert "3 messages of /depth/image lost" in said
+
+
+def test_the_remedy_for_lost_messages_fits_the_subscription(make_bench, capfd):
+    bench = make_bench("-p", "qos_overrides./depth/image.subscription.reliability:=reliable")
+    bench.node._input._on_lost(bench.node._input._image, SimpleNamespace(total_count=3, total_count_change=3))
+    said = capfd.readouterr().err
+    assert "Raise the depth of the PUBLISHER" in said
+    assert "FASTRTPS" not in said
+
+
+def test_a_camera_info_that_was_published_once_before_is_received(make_bench):
+    bench = make_bench()
+    once = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
+    bench.peer.destroy_publisher(bench.infos)
+    latched = bench.peer.create_publisher(CameraInfo, "depth/camera_info", once)
+    latched.publish(bench.info())
+    bench.until(lambda: len(bench.node._input.inbox._infos) == 1)
+    assert len(bench.answer(bench.depth())[1]) == 1
 
 
 def test_silence_is_reported(make_bench):

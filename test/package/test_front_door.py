@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import pkgutil
 import re
 import subprocess
 import sys
@@ -47,7 +48,11 @@ def test_nothing_else_is_offered() -> None:
 
 def test_every_name_is_in_the_reference(repository: Path) -> None:
     page = (repository / "docs" / "api.md").read_text(encoding="utf-8")
-    assert set(offered_to_type_checkers().values()) <= set(re.findall(r"^::: (\S+)$", page, re.MULTILINE))
+    shown = set(re.findall(r"^::: (\S+)$", page, re.MULTILINE))
+    assert set(offered_to_type_checkers().values()) <= shown
+    pytest.importorskip("sensor_msgs", reason="message packages missing: install the extra 'ros' or source ROS 2")
+    for name in shown:
+        pkgutil.resolve_name(name)
 
 
 def test_names_are_loaded_when_they_are_used() -> None:
@@ -62,7 +67,7 @@ def test_names_are_loaded_when_they_are_used() -> None:
         "from sq_perception import *\n"
         "assert Recoverer.__module__ == 'sq_perception.recovery.recoverer'\n"
     )
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=600)
 
 
 def snippets(page: Path) -> list[str]:
@@ -90,7 +95,7 @@ def test_the_reader_of_the_readme_runs(repository: Path) -> None:
     pytest.importorskip("rclpy", reason="needs the extra 'ros'")
     script = snippets(repository / "README.md")[1]
     code = f"import rclpy; rclpy.spin = lambda node: print(node.get_name())\n{script}\nprint(read.__name__)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=True)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600, check=True)
     assert done.stdout.split() == ["reader", "read"]
 
 

@@ -171,7 +171,7 @@ def loaded_after(statement: str) -> set[str]:
     """Names of the modules that a fresh interpreter holds after a statement; it must not print anything itself."""
     places = [str(package.parent) for package in PACKAGES]
     code = f"import sys; sys.path[:1] = {places!r}; {statement}; print(*sorted(sys.modules))"
-    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=120)
+    result = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=600)
     assert result.stdout.count("\n") == 1, result.stdout
     return set(result.stdout.split())
 

@@ -207,7 +207,7 @@ def test_bad_images_are_named(tmp_path, info):
     with pytest.raises(FrameError, match="no such file"):
         read(tmp_path)
     (tmp_path / "depth.txt").write_text("1 2 3")
-    with pytest.raises(FrameError, match=r"\.npz, \.png or \.bmp"):
+    with pytest.raises(FrameError, match=r"\.npz, \.npy, \.png, \.bmp"):
         read(tmp_path / "depth.txt")
     with pytest.raises(ValueError, match="projection"):
         read(tmp_path / "eight.png", projection="fisheye")

@@ -21,7 +21,8 @@ from sq_msgs_py.markers import PALETTE, markers
 from sq_msgs_py.superquadrics import FIELDS, MessageError, SuperquadricArray
 
 HEADER = Header(stamp=Time(sec=7, nanosec=8), frame_id="optical")
-COLUMNS = ("size", "shape", "translation", "rotation", "score", "residual", "sigma_size", "id", "status")
+APPENDED = ("label", "seen", "fused")
+COLUMNS = ("size", "shape", "translation", "rotation", "score", "residual", "sigma_size", "id", "status", *APPENDED)
 LAYOUT_1 = "x y z qx qy qz qw a1 a2 a3 e1 e2 score residual sigma_a1 sigma_a2 sigma_a3 id status"
 
 
@@ -36,15 +37,20 @@ def some(count: int, rng: np.random.Generator) -> SuperquadricArray:
         sigma_size=rng.random((count, 3)) * 1e-3,
         id=rng.integers(0, 2**32, count),
         status=rng.integers(0, 3, count),
+        label=rng.integers(0, 2**16, count),
+        seen=rng.integers(0, 1000, count),
+        fused=rng.integers(0, 2, count),
     )
 
 
 def test_the_published_layout_does_not_change() -> None:
-    """Other programs read these names and types: whoever changes them raises VERSION and this test."""
+    """Other programs read these names and types: whoever changes them raises VERSION and this test; more may follow."""
     assert superquadrics.VERSION == 1
-    assert " ".join(name for name, _ in FIELDS) == LAYOUT_1
+    names = [name for name, _ in FIELDS]
+    assert " ".join(names[:19]) == LAYOUT_1
+    assert tuple(names[19:]) == APPENDED
     types = dict(FIELDS)
-    assert {types.pop("id"), types.pop("status")} == {PointField.UINT32}
+    assert {types.pop(name) for name in ("id", "status", *APPENDED)} == {PointField.UINT32}
     assert set(types.values()) == {PointField.FLOAT32}
 
 
@@ -59,19 +65,40 @@ def test_one_body_reads_by_hand() -> None:
         sigma_size=np.array([[7.0, 8.0, 9.0]]),
         id=np.array([4_000_000_000]),
         status=np.array([1]),
+        label=np.array([12]),
+        seen=np.array([3]),
+        fused=np.array([1]),
     )
     message = superquadrics.to_message(body, HEADER)
     assert (message.header, message.height, message.width, message.point_step, message.row_step) == (
         HEADER,
         1,
         1,
-        76,
-        76,
+        88,
+        88,
     )
-    numbers = struct.unpack("<17f2I", message.data.tobytes())
-    assert numbers == (4, 5, 6, 0, 0, 0, 1, 1, 2, 3, 0.25, 0.5, 0.75, 0.125, 7, 8, 9, 4_000_000_000, 1)
-    assert [field.offset for field in message.fields] == list(range(0, 76, 4))
+    numbers = struct.unpack("<17f5I", message.data.tobytes())
+    assert numbers == (4, 5, 6, 0, 0, 0, 1, 1, 2, 3, 0.25, 0.5, 0.75, 0.125, 7, 8, 9, 4_000_000_000, 1, 12, 3, 1)
+    assert [field.offset for field in message.fields] == list(range(0, 88, 4))
     assert message.is_dense
+
+
+def test_a_cloud_of_release_0_2_0_is_read(rng: np.random.Generator) -> None:
+    """As its writer laid it out: 76 bytes a point, no field behind the status."""
+    before = some(3, rng)
+    columns = (before.translation, before.rotation, before.size, before.shape, before.score, before.residual)
+    flat = np.column_stack([*columns, before.sigma_size])
+    points = [struct.pack("<17f2I", *flat[k], before.id[k], before.status[k]) for k in range(3)]
+    message = PointCloud2(header=HEADER, height=1, width=3, point_step=76, row_step=228)
+    for k, name in enumerate(LAYOUT_1.split()):
+        kind = PointField.UINT32 if name in ("id", "status") else PointField.FLOAT32
+        message.fields.append(PointField(name=name, offset=4 * k, datatype=kind, count=1))
+    message.data = array.array("B", b"".join(points))
+    after = superquadrics.from_message(message)
+    for column in COLUMNS[:-3]:
+        np.testing.assert_array_equal(getattr(after, column), getattr(before, column))
+    for column in APPENDED:
+        np.testing.assert_array_equal(getattr(after, column), np.zeros(3, np.uint32))
 
 
 @pytest.mark.parametrize("count", [0, 1, 10])
@@ -98,17 +125,18 @@ def test_readers_go_by_name_offset_type_and_byte_order(rng: np.random.Generator)
     names = [name for name, _ in FIELDS][::-1]
     layout = np.dtype({
         "names": ["extra", *names],
-        "formats": [">f4"] + [">u4" if name in ("id", "status") else ">f8" for name in names],
+        "formats": [">f4"] + [">u4" if name in ("id", "status", *APPENDED) else ">f8" for name in names],
         "offsets": [0] + [4 + 9 * k for k in range(len(names))],
-        "itemsize": 180,
+        "itemsize": 210,
     })  # fmt: skip
     points = np.zeros(4, layout)
     flat = np.column_stack([bodies.translation, bodies.rotation, bodies.size, bodies.shape, bodies.score,
                             bodies.residual, bodies.sigma_size])  # fmt: skip
-    for k, (name, _) in enumerate(FIELDS[:-2]):
+    for k, (name, _) in enumerate(FIELDS[:17]):
         points[name] = flat[:, k]
-    points["id"], points["status"] = bodies.id, bodies.status
-    message = PointCloud2(header=HEADER, height=2, width=2, is_bigendian=True, point_step=180, row_step=365)
+    for name in ("id", "status", *APPENDED):
+        points[name] = getattr(bodies, name)
+    message = PointCloud2(header=HEADER, height=2, width=2, is_bigendian=True, point_step=210, row_step=425)
     for name in layout.names:
         kind = {"f4": PointField.FLOAT32, "f8": PointField.FLOAT64, "u4": PointField.UINT32}[layout[name].str[1:]]
         message.fields.append(PointField(name=name, offset=layout.fields[name][1], datatype=kind, count=1))
@@ -129,7 +157,7 @@ def broken(change: str, rng: np.random.Generator) -> PointCloud2:
     elif change == "unknown type":
         message.fields[3].datatype = 77
     elif change == "outside":
-        message.fields[5].offset = 74
+        message.fields[5].offset = 86
     elif change == "cut":
         message.data = message.data[:-1]
     elif change == "short row":
@@ -146,9 +174,9 @@ def broken(change: str, rng: np.random.Generator) -> PointCloud2:
         ("no field", "missing: x y z"),
         ("two in one", "field qx: expected one number"),
         ("unknown type", "field qx: expected one number, got datatype 77"),
-        ("outside", "field qz: offset 74 lies outside a point of 76 bytes"),
-        ("cut", "228 bytes, got 227"),
-        ("short row", "at least 228 bytes, got 100"),
+        ("outside", "field qz: offset 86 lies outside a point of 88 bytes"),
+        ("cut", "264 bytes, got 263"),
+        ("short row", "at least 264 bytes, got 100"),
         ("nan", "translation: expected finite"),
     ],
 )

@@ -316,14 +316,14 @@ def test_options_are_checked(options):
 
 
 def test_twenty_bodies_take_milliseconds(rng):
-    """5 ms on an idle core; the bound leaves room for a busy one."""
+    """5 ms of processor time on an AMD EPYC; the bound leaves room for slower ones."""
     truths, tracker = spread_bodies(20, rng), Tracker()
     spent = []
     for k in range(15):
         seen = [draw(t, noise(), rng) for t in truths]
-        began = time.perf_counter()
+        began = time.thread_time()
         tracker.update(seen, 0.1 * k)
-        spent.append(time.perf_counter() - began)
+        spent.append(time.thread_time() - began)
     assert min(spent) < 0.015
 
 

@@ -1,0 +1,102 @@
+"""What recover_node makes its recoverer of, and what becomes of that when the model's file is gone or another one."""
+
+from __future__ import annotations
+
+import shutil
+import threading
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs the extra 'ros'")
+
+from std_msgs.msg import Header
+
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging import raycast
+from sq_perception.imaging.calibration import Calibration
+from sq_perception.imaging.camera import Camera
+from sq_perception.learning import checkpoint
+from sq_perception.nodes.engine import Engine
+from sq_perception.nodes.frame import Frame
+from sq_perception.nodes.parameters import FitterParameters, RecoverParameters
+from sq_perception.nodes.recover_node import FACTORY, options
+
+CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+BODY = Superquadric([0.08, 0.06, 0.1], [0.4, 0.7], [0.0, 0.02, 0.6], [0.3, 0.2, 0.1, 0.9])
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> Path:
+    return Path(shutil.copy(checkpoint.resolve(None), tmp_path / "model.safetensors"))
+
+
+@pytest.fixture
+def engine() -> Engine[RecoverParameters]:
+    said = SimpleNamespace(info=lambda *_: None, error=lambda *_: None)
+    node: Any = SimpleNamespace(get_logger=lambda: said)
+    return Engine(FACTORY, node)
+
+
+def frame() -> Frame:
+    depth, _ = raycast.render(BODY, CAMERA)
+    image = np.where(np.isfinite(depth), depth, np.nan).astype(np.float32)
+    return Frame(Header(), "32FC1", image, Calibration(CAMERA, (64, 48)), np.isfinite(image).astype(np.int32))
+
+
+def set_to(engine: Engine[RecoverParameters], before: RecoverParameters, **values: Any) -> RecoverParameters:
+    """As ``ros2 param set`` does, and wait for the swap."""
+    after = replace(before, **values)
+    engine.check(after, frozenset(values))
+    engine.follow(after, frozenset(values), CAMERA)
+    for thread in threading.enumerate():
+        if thread.name == "recoverer in the making":
+            thread.join(60)
+    return after
+
+
+def test_what_is_loaded_stays_when_the_file_is_gone(engine, model):
+    parameters = RecoverParameters(model=str(model), threads=1, method="network")
+    engine.build(parameters, CAMERA)
+    before, origin = engine.recover(frame(), parameters)
+    model.unlink()
+    parameters = set_to(engine, parameters, threads=2)
+    after, same = engine.recover(frame(), parameters)
+    assert (engine.fault, same) == ("", origin), "other threads are no other weights: tracks go on"
+    np.testing.assert_array_equal(after.bodies[0].superquadric.size, before.bodies[0].superquadric.size)
+    parameters = set_to(engine, parameters, consensus=True)
+    after, other = engine.recover(frame(), parameters)
+    assert engine.fault == ""
+    assert other != origin
+    assert (after.bodies[0].superquadric.size != before.bodies[0].superquadric.size).any()
+    parameters = set_to(engine, parameters, method="auto")
+    assert (engine.fault, engine.description) == ("", f"method auto, {model} on cpu")
+    with pytest.raises(ValueError, match=r"model: .*model.safetensors"):
+        set_to(engine, parameters, model=str(model))
+
+
+def test_a_method_that_needs_a_network_whose_file_is_gone_is_refused(engine, model):
+    parameters = RecoverParameters(model=str(model), threads=1, method="symmetry")
+    engine.build(parameters, CAMERA)
+    model.unlink()
+    with pytest.raises(ValueError, match=r"model: .*model.safetensors"):
+        set_to(engine, parameters, method="network")
+    assert engine.description == "method symmetry, no network"
+
+
+@pytest.mark.parametrize(("name", "value"), [("threads", 2), ("method", "auto"), ("consensus", True)])
+def test_only_a_set_of_the_model_reads_its_file_again(engine, model, name, value):
+    parameters = RecoverParameters(model=str(model), threads=1, method="network")
+    engine.build(parameters, CAMERA)
+    model.write_bytes(b"another one")
+    set_to(engine, parameters, **{name: value})
+    assert engine.fault == ""
+
+
+def test_fitter_node_asks_for_the_classic_method_and_nothing_else():
+    one, other = options(FitterParameters()), options(RecoverParameters())
+    assert one == replace(other, method="classic")

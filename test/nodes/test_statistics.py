@@ -1,0 +1,98 @@
+"""What /diagnostics says is of the last seconds, and names what a look at the robot needs."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+pytest.importorskip("rclpy", reason="needs the extra 'ros'")
+
+from diagnostic_msgs.msg import DiagnosticStatus
+
+from sq_perception.nodes.statistics import SECONDS, Condition, Snapshot, Statistics, status
+
+
+class Clock:
+    """Seconds that pass when the test says so."""
+
+    def __init__(self) -> None:
+        self.now = 1000.0
+
+    def __call__(self) -> float:
+        return self.now
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock()
+
+
+@pytest.fixture
+def statistics(clock: Clock) -> Statistics:
+    return Statistics(clock)
+
+
+def said(statistics: Statistics, before: Snapshot | None = None) -> tuple[DiagnosticStatus, dict[str, str]]:
+    one = status("/recover_node", statistics.snapshot(), before or Snapshot(), Condition())
+    return one, {pair.key: pair.value for pair in one.values}
+
+
+def frames(statistics: Statistics, clock: Clock, count: int, every: float, took: float) -> None:
+    for _ in range(count):
+        statistics.count("received")
+        clock.now += every
+        statistics.answer({"stamp to result": took}, "1 body")
+
+
+def test_latencies_of_long_ago_are_forgotten(statistics, clock):
+    """78 ms from 25 minutes ago must not stand for a node that needs 6 s a frame now."""
+    frames(statistics, clock, 300, 0.1, 78.0)
+    one, values = said(statistics)
+    assert (one.level, values["stamp to result: median [ms]"]) == (DiagnosticStatus.OK, "78.00")
+    assert float(values["rate [Hz]"]) == pytest.approx(10.0, abs=0.2)
+    frames(statistics, clock, 5, 6.0, 6000.0)
+    one, values = said(statistics)
+    assert values["stamp to result: median [ms]"] == "6000.00"
+    assert 0.1 <= float(values["rate [Hz]"]) <= 0.2
+    clock.now += 2 * SECONDS
+    _, values = said(statistics)
+    assert "stamp to result: median [ms]" not in values
+    assert (values["rate [Hz]"], values["answered"]) == ("0.00", "305")
+
+
+def test_frames_that_come_and_are_not_answered_are_a_warning(statistics, clock):
+    frames(statistics, clock, 10, 0.1, 50.0)
+    for _ in range(int(2 * SECONDS)):
+        clock.now += 1.0
+        statistics.count("received")
+        statistics.count("dropped")
+    one, _ = said(statistics)
+    assert one.level == DiagnosticStatus.WARN
+    assert re.fullmatch(r"1\d frames came within (9|10) s, none was answered", one.message)
+    statistics.answer({}, "")
+    assert said(statistics)[0].level == DiagnosticStatus.OK
+
+
+def test_the_first_frame_of_a_start_is_no_warning(statistics, clock):
+    statistics.count("received")
+    clock.now += 1.0
+    assert said(statistics)[0].level == DiagnosticStatus.OK
+
+
+def test_the_last_error_has_a_time_and_no_bodies_a_reason(statistics):
+    statistics.refuse("encoding: expected 16UC1")
+    statistics.answer({}, "no bodies in 5 ms: nothing is nearer than depth_max")
+    _, values = said(statistics)
+    assert re.fullmatch(r"\d{4}-\d\d-\d\dT\d\d:\d\d:\d\dZ encoding: expected 16UC1", values["last error"])
+    assert values["last answer"] == "no bodies in 5 ms: nothing is nearer than depth_max"
+
+
+def test_lost_messages_are_counted_by_topic(statistics):
+    statistics.lose("/depth/image", 3)
+    before = statistics.snapshot()
+    statistics.lose("/depth/camera_info", 2)
+    statistics.lose("/depth/image", 1)
+    one, values = said(statistics, before)
+    assert one.message == "messages lost before they arrived: 1 of /depth/image, 2 of /depth/camera_info"
+    assert (values["lost"], values["lost of /depth/image"], values["lost of /depth/camera_info"]) == ("6", "4", "2")

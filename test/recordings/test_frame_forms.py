@@ -1,0 +1,179 @@
+"""Depth images and intrinsics as other tools write them, and what is taken of an image."""
+
+from __future__ import annotations
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from sq_perception.imaging.camera import Camera
+from sq_perception.recordings.frame_file import FrameError, Reading, read
+from sq_perception.recordings.inputs import RecordedInput
+
+NUMBERS = "60,61,31.5,23.5"
+CAMERA = Camera(64, 48, 60.0, 61.0, 31.5, 23.5)
+
+
+def save(path, value=1000, dtype=np.uint16):
+    image = np.full((48, 64), value, dtype)
+    image[0, 0] = 0
+    np.save(path, image) if path.suffix == ".npy" else cv2.imwrite(str(path), image)
+    return path
+
+
+def as_json(path, content):
+    path.write_text(json.dumps(content))
+    return path
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        {"width": 64, "height": 48, "fx": 60, "fy": 61, "ppx": 31.5, "ppy": 23.5, "model": "Brown Conrady",
+         "coeffs": [0, 0, 0, 0, 0]},
+        {"width": 64, "height": 48, "fx": 60, "fy": 61, "ppx": 31.5, "ppy": 23.5, "model": "distortion.none"},
+        {"width": 64, "height": 48, "intrinsic_matrix": [60, 0, 0, 0, 61, 0, 31.5, 23.5, 1]},
+        {"width": 64, "height": 48, "k": [60, 0, 31.5, 0, 61, 23.5, 0, 0, 1]},
+    ],
+    ids=["librealsense", "librealsense, no distortion", "Open3D", "camera_info"],
+)  # fmt: skip
+def test_json_is_the_same_camera(tmp_path, content):
+    frame = read(save(tmp_path / "a.png"), as_json(tmp_path / "camera.json", content))
+    assert frame.camera == CAMERA
+
+
+def test_a_transposed_matrix_is_named(tmp_path):
+    matrix = np.array([[60, 0, 31.5], [0, 61, 23.5], [0, 0, 1]])
+    np.savez(tmp_path / "a.npz", depth=np.ones((48, 64), np.float32), K=matrix.T)
+    with pytest.raises(FrameError, match="transposed"):
+        read(tmp_path / "a.npz")
+
+
+def test_four_numbers_are_the_same_camera(tmp_path):
+    assert read(save(tmp_path / "a.png"), NUMBERS).camera == CAMERA
+    ((_, frame),) = RecordedInput([str(tmp_path / "a.png")], NUMBERS)
+    assert frame.camera == CAMERA
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        ([1], "a JSON object"),
+        ({"ppx": 1, "ppy": 2}, "expected width"),
+        ({"width": 64, "height": 48, "fx": 1, "fy": 1, "ppx": 1, "ppy": 1, "model": "F-Theta"}, "F-Theta"),
+        ({"width": 64, "height": 48, "intrinsic_matrix": [1, 2]}, "9 numbers"),
+        ({"width": 64, "height": 48, "intrinsic_matrix": [60, 0, 31.5, 0, 61, 23.5, 0, 0, 1]}, "transposed"),
+        ({"intrinsic_matrix": [60, 0, 0, 0, 61, 0, 31.5, 23.5, 1]}, "width"),
+        ({}, "width"),
+    ],
+)
+def test_other_json_says_what_was_expected(tmp_path, content, said):
+    with pytest.raises(FrameError, match=said):
+        read(save(tmp_path / "a.png"), as_json(tmp_path / "camera.json", content))
+
+
+def test_deep_json_is_no_camera(tmp_path):
+    path = tmp_path / "camera.json"
+    path.write_text("[" * 100_000)
+    with pytest.raises(FrameError, match="not JSON"):
+        read(save(tmp_path / "a.png"), path)
+
+
+@pytest.mark.parametrize(("value", "dtype"), [(0.8, np.float32), (0.8, np.float64), (800, np.uint16)])
+def test_npy_has_the_units_of_its_type(tmp_path, value, dtype):
+    frame = read(save(tmp_path / "a.npy", value, dtype), NUMBERS)
+    assert frame.depth.dtype == np.float32
+    assert frame.depth[1, 1] == pytest.approx(0.8)
+    assert np.isnan(frame.depth[0, 0])
+
+
+@pytest.mark.parametrize("array", [np.zeros((2, 3, 4), np.uint16), np.zeros((0, 4)), np.zeros((4, 4), np.int64)])
+def test_an_npy_of_another_form_is_refused(tmp_path, array):
+    np.save(tmp_path / "a.npy", array)
+    with pytest.raises(FrameError, match=r"expected an image|has 16 bit"):
+        read(tmp_path / "a.npy", NUMBERS)
+
+
+def test_a_hostile_npy_is_refused(tmp_path):
+    path = tmp_path / "a.npy"
+    np.save(path, np.array([{}], dtype=object), allow_pickle=True)
+    with pytest.raises(FrameError, match="objects"):
+        read(path, NUMBERS)
+    whole = save(path).read_bytes()
+    path.write_bytes(whole[:-1])
+    with pytest.raises(FrameError, match="bytes of numbers"):
+        read(path, NUMBERS)
+
+
+def test_scale_is_what_is_said_or_what_the_name_says(tmp_path):
+    tum, other = save(tmp_path / "1305031102.160407.png"), save(tmp_path / "7.5.png")
+    frame = read(tum, NUMBERS)
+    assert frame.depth[1, 1] == pytest.approx(0.2)
+    assert "5000 units are a metre" in frame.warning
+    assert frame.encoding == "32FC1", "millimetres would round it"
+    for path, scale, depth in ((tum, 1000.0, 1.0), (other, None, 1.0), (other, 5000.0, 0.2)):
+        frame = read(path, NUMBERS, reading=Reading(scale=scale))
+        assert frame.depth[1, 1] == pytest.approx(depth)
+        assert not frame.warning
+
+
+def test_what_is_taken_of_an_image(tmp_path):
+    path = tmp_path / "a.npz"
+    depth = np.tile(np.linspace(0.5, 1.5, 64, dtype=np.float32), (48, 1))
+    labels = np.arange(48 * 64, dtype=np.int32).reshape(48, 64)
+    np.savez(path, depth=depth, labels=labels, K=[[60, 0, 31.5], [0, 61, 23.5], [0, 0, 1]])
+    whole, frame = read(path), read(path, reading=Reading(nearest=0.7, farthest=1.2, region=(10, 5, 50, 40)))
+    part = np.s_[5:45, 10:60]
+    is_within = (depth[part] >= 0.7) & (depth[part] <= 1.2)
+    np.testing.assert_array_equal(np.isfinite(frame.depth), is_within)
+    np.testing.assert_array_equal(frame.labels, labels[part])
+    points = whole.camera.unproject(np.array([20.0]), np.array([15.0]), np.array([1.0]))
+    np.testing.assert_allclose(frame.camera.unproject(np.array([10.0]), np.array([10.0]), np.array([1.0])), points)
+    with pytest.raises(FrameError, match="within 64 x 48"):
+        read(path, reading=Reading(region=(10, 5, 55, 40)))
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"scale": 0.0}, {"scale": np.inf}, {"nearest": 2.0, "farthest": 1.0}, {"nearest": -1.0},
+     {"region": (0, 0, 0, 4)}, {"region": (-1, 0, 4, 4)}],
+)  # fmt: skip
+def test_limits_that_leave_nothing_are_refused(wrong):
+    with pytest.raises(ValueError, match="expected"):
+        Reading(**wrong)
+
+
+def test_masks_are_found_by_name(tmp_path):
+    folder = tmp_path / "masks"
+    folder.mkdir()
+    reading = Reading(masks=folder)
+    path = save(tmp_path / "a.png")
+    with pytest.raises(FrameError, match="no such mask"):
+        read(path, NUMBERS, reading=reading)
+    labels = np.zeros((48, 64), np.uint8)
+    labels[10:20, 10:20] = 7
+    cv2.imwrite(str(folder / "a.png"), labels)
+    np.testing.assert_array_equal(read(path, NUMBERS, reading=reading).labels, labels)
+    cv2.imwrite(str(folder / "a.png"), labels[:-1])
+    with pytest.raises(FrameError, match="shape"):
+        read(path, NUMBERS, reading=reading)
+
+
+def test_an_image_finds_the_camera_beside_it(tmp_path):
+    path = save(tmp_path / "a.png")
+    as_json(
+        tmp_path / "camera_intrinsic.json",
+        {"width": 64, "height": 48, "intrinsic_matrix": [60, 0, 0, 0, 61, 0, 31.5, 23.5, 1]},
+    )
+    ((_, frame),) = RecordedInput([str(path)])
+    assert frame.camera == CAMERA
+
+
+def test_matrices_beside_frames_are_no_frames(tmp_path):
+    save(tmp_path / "a.png")
+    save(tmp_path / "K.npy")
+    assert [file for file, _ in RecordedInput([str(tmp_path)], NUMBERS)] == [str(tmp_path / "a.png")]
+    (tmp_path / "a.png").unlink()
+    assert [file for file, _ in RecordedInput([str(tmp_path)], NUMBERS)] == [str(tmp_path / "K.npy")]
