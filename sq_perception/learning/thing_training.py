@@ -20,7 +20,7 @@ import copy
 import json
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -54,13 +54,13 @@ class ThingTraining:
 
     minutes: float = 120.0
     """Training time, that of all parts of a stopped run together."""
-    batch: int = 128
-    rate: float = 1e-3
+    batch: int = 64
+    rate: float = 8e-4
     weight_decay: float = 1e-4
     seed: int = 0
     threads: int = 0
     """Of torch; 0 leaves its own choice."""
-    held: int = 4
+    held: int = 2
     """Shards that are kept for validation."""
     validation: int = 200
     """Steps between two validations."""
@@ -68,10 +68,10 @@ class ThingTraining:
     """Weights to begin with, as names of torch parameters: a safetensors file of this network or of a Regressor."""
 
 
-def write_views(folder: Path, shards: int, views: int, seed: int, said: Callable[[str], None]) -> None:
+def write_views(folder: Path, shards: Iterable[int], views: int, seed: int, said: Callable[[str], None]) -> None:
     """Write shards of freshly drawn views that are not there yet; shard k follows from (seed, k) alone."""
     folder.mkdir(parents=True, exist_ok=True)
-    for k in range(shards):
+    for k in shards:
         path = folder / f"{k:05d}.safetensors"
         if path.exists():
             continue
@@ -115,7 +115,7 @@ def train(config: ThingTraining, views: Path, output: Path, form: ThingConfig | 
     output.mkdir(parents=True, exist_ok=True)
     network = ThingNetwork(form)
     if config.start:
-        begin_with(network, Path(config.start))
+        begin_with(network, checkpoint.resolve(config.start))
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = torch.optim.AdamW(network.parameters(), lr=config.rate, weight_decay=config.weight_decay)
     state = TrainingState(network, copy.deepcopy(network), optimizer, Cosine(config.rate, _WARM_UP, 1))

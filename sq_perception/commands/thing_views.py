@@ -1,0 +1,38 @@
+"""``sq-perception thing-views``: views of simulated household things, to train the network of things on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from sq_perception.commands.console import SUCCESS, failed, parser
+
+_HELP = """\
+Draw canonical views of simulated household things into a folder, shard by shard.
+
+Shard k follows from the seed and k alone; those that are there already stay.  Several processes may fill one folder
+with other --first; a training reads what it finds.
+"""
+_EPILOG = "example:\n  sq-perception thing-views sets/things --shards 200 && sq-perception train-things sets/things"
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Entry of ``sq-perception thing-views``; the exit code."""
+    command = parser("thing-views", _HELP, _EPILOG)
+    command.add_argument("folder", type=Path, help="of the shards")
+    command.add_argument("--shards", type=int, default=100, help="how many there shall be (100)")
+    command.add_argument("--first", type=int, default=0, help="number of the first one (0)")
+    command.add_argument("--views", type=int, default=512, help="views a shard (512)")
+    command.add_argument("--seed", type=int, default=0, help="default 0")
+    given = command.parse_args(arguments)
+    for name, least in (("shards", 1), ("first", 0), ("views", 1), ("seed", 0)):
+        if getattr(given, name) < least:
+            command.error(f"--{name}: expected {least} or more, got {getattr(given, name)}")
+
+    from sq_perception.learning.thing_training import write_views
+
+    try:
+        write_views(given.folder, range(given.first, given.first + given.shards), given.views, given.seed, print)
+    except OSError as error:
+        return failed(f"thing-views: {given.folder}: {error}")
+    return SUCCESS

@@ -1,0 +1,58 @@
+"""``sq-perception train-things``: train the network that tells the unseen side of things."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from sq_perception.commands.console import FAILURE, SUCCESS, failed, parser
+
+_HELP = """\
+Train the network that tells the unseen side of things, on views that `thing-views` wrote (or still writes).
+
+The same command goes on with a run that was stopped.  The output folder holds the state, a log, and the newest network,
+things.safetensors, which `recover --model` takes.
+"""
+_EPILOG = """\
+example:
+  sq-perception train-things sets/things --output runs/things --minutes 120 --start robust
+"""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Entry of ``sq-perception train-things``; the exit code."""
+    command = parser("train-things", _HELP, _EPILOG)
+    command.add_argument("views", type=Path, metavar="FOLDER", help="of the shards of views")
+    command.add_argument("--output", "-o", type=Path, default=Path("runs/things"), help="folder (runs/things)")
+    command.add_argument("--minutes", type=float, default=120.0, help="training time in all, over which the rate falls")
+    command.add_argument("--batch", type=int, default=64, help="views a step (64)")
+    command.add_argument("--rate", type=float, default=8e-4, help="largest learning rate (0.0008)")
+    command.add_argument("--threads", type=int, default=0, help="of torch; 0: its own choice")
+    command.add_argument("--held", type=int, default=2, help="shards that are kept for validation (2)")
+    command.add_argument("--seed", type=int, default=0, help="default 0")
+    command.add_argument("--start", default="", metavar="MODEL", help="weights to begin with: a file, or shipped ones")
+    given = command.parse_args(arguments)
+    for name in ("minutes", "batch", "rate", "held"):
+        if not getattr(given, name) > 0:
+            command.error(f"--{name}: expected a positive number, got {getattr(given, name)}")
+
+    from sq_perception.learning.checkpoint import CheckpointError
+    from sq_perception.learning.thing_training import ThingTraining, train
+
+    config = ThingTraining(
+        given.minutes,
+        given.batch,
+        given.rate,
+        seed=given.seed,
+        threads=given.threads,
+        held=given.held,
+        start=given.start,
+    )
+    try:
+        train(config, given.views, given.output)
+    except (CheckpointError, ValueError, ArithmeticError, OSError) as error:
+        return failed(f"train-things: {error}")
+    except KeyboardInterrupt:
+        failed("train-things: stopped; the same command goes on from the last validation")
+        return FAILURE
+    return SUCCESS

@@ -1,0 +1,122 @@
+"""A predicted support function in the fit: its derivatives, and the unseen side that it tells."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from sq_perception.fitting import surface_fit
+from sq_perception.fitting.hull_prior import MODEL_SHARE, HullPrior
+from sq_perception.fitting.levenberg_marquardt import State, move
+from sq_perception.fitting.normal_equations import STEP_LENGTH
+from sq_perception.fitting.priors import prior_cost
+from sq_perception.fitting.surface_fit import FitOptions
+from sq_perception.fitting.terms import Terms
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.geometry.support_directions import DIRECTIONS
+from sq_perception.imaging import raycast
+from sq_perception.imaging.camera import Camera
+
+CAMERA = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)
+BODY = Superquadric([0.03, 0.04, 0.06], [0.3, 0.6], [0.01, -0.02, 0.5], [0.3, 0.2, -0.1, 0.9])
+
+
+def told(body: Superquadric, sigma: float, freedom: float = 10.0) -> HullPrior:
+    """The support function of a body, each direction with the same deviation in metres."""
+    support = DIRECTIONS @ body.translation + body.support(DIRECTIONS)
+    return HullPrior(DIRECTIONS, support, sigma**2 * np.eye(len(DIRECTIONS)), freedom, 0.1)
+
+
+def terms_of(prior: HullPrior) -> Terms:
+    return Terms(
+        hull_directions=np.array(prior.directions),
+        hull_support=prior.support,
+        hull_root=prior.root(),
+        hull_freedom=prior.freedom,
+    )
+
+
+def test_the_root_whitens_what_was_predicted_and_what_no_superquadric_reaches(rng: np.random.Generator) -> None:
+    spread = rng.normal(size=(42, 42))
+    prior = HullPrior(DIRECTIONS, np.zeros(42), 1e-5 * spread @ spread.T, 10.0, 0.2)
+    whole = prior.covariance + (MODEL_SHARE * 0.2) ** 2 * np.eye(42)
+    assert prior.root() @ whole @ prior.root().T == pytest.approx(np.eye(42), abs=1e-8)
+
+
+def test_the_true_body_costs_nothing_and_others_by_the_t_distribution() -> None:
+    prior, sums = told(BODY, 0.004), np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
+    state = State.of(BODY)
+    assert prior_cost(terms_of(prior), state.parameters, state.rotation, sums) == pytest.approx(0.0, abs=1e-12)
+    moved = state.parameters.copy()
+    moved[5] += 0.01
+    error = prior.root() @ (DIRECTIONS[:, 0] * 0.01)
+    expected = (10 + 42) * math.log1p(float(error @ error) / 10)
+    assert prior_cost(terms_of(prior), moved, state.rotation, sums) == pytest.approx(expected)
+
+
+def test_the_gradient_is_that_of_the_cost() -> None:
+    terms = terms_of(told(BODY, 0.004))
+    state = State.of(Superquadric([0.035, 0.03, 0.05], [0.5, 0.4], [0.0, -0.01, 0.51], [0.2, 0.3, -0.1, 0.9]))
+    sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
+    prior_cost(terms, state.parameters, state.rotation, sums)
+    wide = (np.full(8, -10.0), np.full(8, 10.0))
+    spare = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
+    for k in range(STEP_LENGTH):
+        costs = []
+        for sign in (1, -1):
+            step = np.zeros(STEP_LENGTH)
+            step[k] = sign * 1e-6
+            parameters, rotation = np.empty(8), np.empty((3, 3))
+            move(state.parameters, state.rotation, step, *wide, parameters, rotation)
+            costs.append(prior_cost(terms, parameters, rotation, spare))
+        slope = (costs[0] - costs[1]) / 2e-6
+        # The scale of the t distribution is held: J^T r is half of the gradient.
+        assert 2 * sums[STEP_LENGTH, k] == pytest.approx(slope, rel=1e-4, abs=1e-4)
+
+
+@pytest.fixture(scope="module")
+def box_from_the_front() -> tuple[np.ndarray, np.ndarray, Superquadric, np.ndarray]:
+    """A box that shows its front and a little of its top; its depth, 60 mm, is for the prediction to tell."""
+    tilt = math.radians(12.0)
+    normal = np.array([0.0, -math.cos(tilt), -math.sin(tilt)])
+    axes = np.stack([[1.0, 0.0, 0.0], np.cross(normal, [1.0, 0.0, 0.0]), normal], axis=1)
+    from sq_perception.geometry import rotation as quaternions
+
+    body = Superquadric([0.04, 0.03, 0.06], [0.1, 0.1], [0.0, 0.02, 0.55], quaternions.from_matrix(axes))
+    plane = np.append(normal, -normal @ (body.translation - 0.06 * normal))
+    shown, _ = raycast.render(body, CAMERA)
+    mask = np.isfinite(shown)
+    noise = np.random.default_rng(5).normal(0, 0.002, shown.shape)
+    # Round corners and a bulge, as no superquadric has them.
+    bulge = 0.004 * np.cos(np.linspace(-1.5, 1.5, shown.shape[1]))[None]
+    depth = np.where(mask, shown + noise - bulge, 1.5).astype(np.float32)
+    return depth, mask, body, plane
+
+
+@pytest.mark.parametrize("deep", [0.02, 0.03, 0.05])
+def test_a_prediction_tells_the_depth_behind_a_front(
+    box_from_the_front: tuple[np.ndarray, np.ndarray, Superquadric, np.ndarray], deep: float
+) -> None:
+    depth, mask, body, plane = box_from_the_front
+    front = body.translation[2] - 0.03
+    told_body = Superquadric([0.04, deep, 0.06], body.shape, [*body.translation[:2], front + deep], body.rotation)
+    options = FitOptions(plane=plane, model_error=0.0025, hull=told(told_body, 0.004))
+    found = surface_fit.fit(depth, mask, CAMERA, options=options)
+    reach = found.superquadric.support(np.array([[0.0, 0.0, 1.0]]))[0]
+    assert reach == pytest.approx(float(told_body.support(np.array([[0.0, 0.0, 1.0]]))[0]), abs=0.007)
+    height = found.superquadric.support(plane[None, :3])[0]
+    assert height == pytest.approx(0.06, abs=0.005)
+
+
+def test_a_vague_prediction_leaves_the_size_open(
+    box_from_the_front: tuple[np.ndarray, np.ndarray, Superquadric, np.ndarray],
+) -> None:
+    """What is predicted less surely comes out less surely: the deviation is that of the posterior."""
+    depth, mask, body, plane = box_from_the_front
+    widest = []
+    for sigma in (0.003, 0.03):
+        options = FitOptions(plane=plane, model_error=0.0025, hull=told(body, sigma))
+        widest.append(surface_fit.fit(depth, mask, CAMERA, options=options).sigma_size.max())
+    assert widest[1] > 1.5 * widest[0]

@@ -1,0 +1,145 @@
+"""The network of things: its likelihood in closed form, mirrors, what it begins with, and a short training."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.numpy import save_file
+from scipy.stats import multivariate_t
+
+from sq_perception.commands import main
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.geometry.support_directions import DIRECTIONS, mirrored
+from sq_perception.imaging.canonical_view import NEAREST
+from sq_perception.learning import checkpoint, thing_network, thing_training
+from sq_perception.learning.inference import ThingPredictor
+from sq_perception.learning.thing_network import FREEDOM, HullPrediction, ThingConfig, ThingNetwork
+
+SMALL = ThingConfig(widths=(8, 16, 16, 16), blocks=1, hidden=16, factors=2)
+J = len(DIRECTIONS)
+
+
+def bodies(count: int, rng: np.random.Generator) -> Superquadric:
+    turn = rng.standard_normal((count, 4))
+    return Superquadric(
+        rng.uniform(0.1, 0.4, (count, 3)),
+        rng.uniform(0.1, 1.0, (count, 2)),
+        rng.uniform(0.3, 0.7, (count, 3)),
+        turn / np.linalg.norm(turn, axis=1, keepdims=True),
+    )
+
+
+def shards(folder: Path, count: int, rng: np.random.Generator) -> None:
+    """Shards of 24 random views whose numbers have the right form."""
+    folder.mkdir()
+    for k in range(count):
+        arrays = {
+            "images": rng.random((24, 64, 64)).astype(np.float16),
+            "planes": rng.standard_normal((24, 4)).astype(np.float32),
+            "support": rng.uniform(0.2, 0.8, (24, J)).astype(np.float32),
+            "kinds": rng.integers(3, size=24),
+        }
+        save_file(arrays, str(folder / f"{k:05d}.safetensors"))
+
+
+def test_directions_are_42_and_closed_under_mirrors() -> None:
+    assert DIRECTIONS.shape == (42, 3)
+    assert np.linalg.norm(DIRECTIONS, axis=1) == pytest.approx(np.ones(42))
+    for axis in range(3):
+        turned = DIRECTIONS * np.where(np.arange(3) == axis, -1, 1)
+        assert DIRECTIONS[mirrored(axis)] == pytest.approx(turned)
+    # No two of them are nearer than the edge of a twice divided icosahedron allows.
+    assert np.max(DIRECTIONS @ DIRECTIONS.T - 2 * np.eye(42)) == pytest.approx(0.8506508, abs=1e-6)
+
+
+def test_the_likelihood_is_that_of_a_multivariate_t(rng: np.random.Generator) -> None:
+    mu, log_sigma = rng.normal(size=J), rng.uniform(-3, -1, J)
+    factors, truth = 0.1 * rng.normal(size=(J, 3)), rng.normal(size=(5, J))
+    said = HullPrediction(
+        Superquadric.from_flat(torch.ones(5, 12)),
+        torch.tensor(np.tile(mu, (5, 1))),
+        torch.tensor(np.tile(log_sigma, (5, 1))),
+        torch.tensor(np.tile(factors, (5, 1, 1))),
+    )
+    shape = np.diag(np.exp(2 * log_sigma)) + factors @ factors.T
+    expected = -multivariate_t(mu, shape, df=FREEDOM).logpdf(truth)
+    found = said.negative_log_likelihood(torch.tensor(truth)).numpy()
+    assert said.covariance()[0].numpy() == pytest.approx(shape)
+    # A constant is left out.
+    assert found - found[0] == pytest.approx(expected - expected[0], rel=1e-6, abs=1e-6)
+
+
+def test_the_support_of_a_body_touches_its_farthest_points(rng: np.random.Generator) -> None:
+    body = bodies(3, rng)
+    reach = thing_network.support_of(Superquadric.from_flat(torch.tensor(body.to_flat())))
+    for k in range(3):
+        points = body[k].sample_surface(4000, rng) - np.array([0.5, 0.5, NEAREST])
+        sampled = (points @ DIRECTIONS.T).max(axis=0)
+        assert (sampled <= reach[k].numpy() + 1e-9).all()
+        assert sampled == pytest.approx(reach[k].numpy(), abs=0.02)
+
+
+def test_a_predictor_answers_a_mirrored_view_with_the_mirrored_hull(rng: np.random.Generator) -> None:
+    torch.manual_seed(3)
+    predictor = ThingPredictor(ThingNetwork(SMALL))
+    views, planes = rng.random((2, 64, 64)).astype(np.float32), rng.standard_normal((2, 4))
+    straight = predictor.predict(views, planes)
+    turned = predictor.predict(np.ascontiguousarray(views[:, :, ::-1]), thing_network.mirrored_planes(planes))
+    back = mirrored(0)
+    assert turned.support[:, back] == pytest.approx(straight.support, abs=1e-5)
+    assert turned.covariance[:, back][:, :, back] == pytest.approx(straight.covariance, abs=1e-5)
+    assert (np.linalg.eigvalsh(straight.covariance) > 0).all()
+
+
+def test_planes_mirror_with_their_points(rng: np.random.Generator) -> None:
+    plane, points = rng.standard_normal(4), rng.random((10, 3))
+    there = thing_network.mirrored_planes(plane[None])[0]
+    moved = points * [-1, 1, 1] + [1, 0, 0]
+    assert moved @ there[:3] + there[3] == pytest.approx(points @ plane[:3] + plane[3])
+
+
+def test_it_begins_with_the_weights_of_a_regressor() -> None:
+    """The second channel and the plane are not listened to at first: the features are those of the shipped network."""
+    network, given = ThingNetwork(), checkpoint.load("robust")
+    thing_training.begin_with(network, checkpoint.resolve("robust"))
+    network.eval()
+    views = torch.rand(2, 64, 64)
+    with torch.inference_mode():
+        body = network(views, torch.randn(2, 4)).body
+        expected = given(views[:, None])
+    assert torch.allclose(body.to_flat(), expected.to_flat(), atol=2e-2)
+
+
+def test_weights_of_another_kind_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "things.safetensors"
+    checkpoint.save(path, ThingNetwork(SMALL))
+    assert checkpoint.load_things(path).config == SMALL
+    assert checkpoint.tells_hulls(path)
+    assert not checkpoint.tells_hulls("robust")
+    with pytest.raises(checkpoint.CheckpointError, match="expected a header"):
+        checkpoint.load(path)
+    with pytest.raises(checkpoint.CheckpointError, match="expected a header"):
+        checkpoint.load_things("robust")
+
+
+def test_a_run_that_was_stopped_goes_on(tmp_path: Path, rng: np.random.Generator) -> None:
+    shards(tmp_path / "views", 3, rng)
+    config = thing_training.ThingTraining(minutes=0.02, batch=8, held=1, validation=1, threads=1)
+    thing_training.train(config, tmp_path / "views", tmp_path / "run", SMALL)
+    first = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
+    longer = thing_training.ThingTraining(minutes=0.04, batch=8, held=1, validation=1, threads=1)
+    thing_training.train(longer, tmp_path / "views", tmp_path / "run", SMALL)
+    log = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
+    assert [row["step"] for row in log] == sorted(row["step"] for row in log)
+    assert log[len(first)]["step"] > first[-1]["step"]
+    assert log[-1]["seconds"] > first[-1]["seconds"]
+    assert checkpoint.load_things(tmp_path / "run" / "things.safetensors").config == SMALL
+
+
+def test_a_folder_without_views_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main.main(["train-things", str(tmp_path), "--output", str(tmp_path / "run")]) == 1
+    assert "expected more than 2 shards of views, found 0" in capsys.readouterr().err
