@@ -145,6 +145,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="seconds per frame after which no further start is tried; the largest and nearest objects come first",
     )
     parser.add_argument("--max-objects", type=int, default=20, metavar="N", help="largest ones first (default 20)")
+    parser.add_argument(
+        "--max-size", type=float, default=0.6, metavar="M", help="largest edge of an object in metres (default 0.6)"
+    )
+    parser.add_argument(
+        "--workspace",
+        type=float,
+        nargs=6,
+        metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
+        help="box of the optical frame, in metres, that the middle of what is seen of an object lies in",
+    )
 
 
 def run(options: argparse.Namespace) -> int:
@@ -175,12 +185,17 @@ def run(options: argparse.Namespace) -> int:
     from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
 
     torch.set_num_threads(1)  # the network's layers are so small that threads cost more than they save
-    settings = RecoveryOptions(
-        method=options.method,
-        refine=options.refine,
-        max_objects=options.max_objects,
-        time_budget=options.time_budget,
-    )
+    try:
+        settings = RecoveryOptions(
+            method=options.method,
+            refine=options.refine,
+            max_objects=options.max_objects,
+            time_budget=options.time_budget,
+            max_size=options.max_size,
+            workspace=None if options.workspace is None else tuple(options.workspace),
+        )
+    except ValueError as error:
+        return misused(str(error))
     try:
         recorded = RecordedInput(
             options.frames,

@@ -87,6 +87,11 @@ class RecoveryOptions:
         The largest ones are recovered.
     min_pixels
         Smaller objects are ignored; None: 0.05 % of the image for own masks, any size for masks from outside.
+    max_size
+        Largest full edge of an object, metres: walls, furniture and tables are larger.  Masks from outside may be, too.
+    workspace
+        The middle of what is seen of an object lies in this box of the optical frame, metres: least x, y, z and
+        greatest x, y, z; None: anywhere.
     use_plane
         Let the fit know the support plane.
     time_budget
@@ -108,6 +113,8 @@ class RecoveryOptions:
     depth_range: tuple[float, float] = (0.0, np.inf)
     max_objects: int = 20
     min_pixels: int | None = None
+    max_size: float = 0.6
+    workspace: tuple[float, float, float, float, float, float] | None = None
     use_plane: bool = True
     time_budget: float = np.inf
     repair: bool = True
@@ -127,7 +134,11 @@ class RecoveryOptions:
 
     def segmentation_options(self) -> segments.SegmentationOptions:
         return segments.SegmentationOptions(
-            depth_range=self.depth_range, max_objects=self.max_objects, min_pixels=self.min_pixels
+            depth_range=self.depth_range,
+            max_objects=self.max_objects,
+            min_pixels=self.min_pixels,
+            max_size=self.max_size,
+            workspace=self.workspace,
         )
 
 
