@@ -180,14 +180,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="seconds per frame after which no further start is tried; the largest and nearest objects come first",
     )
     parser.add_argument("--min-score", type=float, default=0.0, metavar="S", help="leave out bodies with a lower score")
-    parser.add_argument(
-        "--max-size", type=float, default=math.inf, metavar="M", help="leave out bodies whose longest side is longer"
-    )
     parser.add_argument("-q", "--quiet", action="store_true", help="no table and no summary; what went wrong is said")
     parser.add_argument(
         "-v", "--verbose", action="store_true", help="also say the time of each stage, and what is logged"
     )
     parser.add_argument("--max-objects", type=int, default=20, metavar="N", help="largest ones first (default 20)")
+    parser.add_argument(
+        "--max-size", type=float, default=0.6, metavar="M", help="largest edge of an object in metres (default 0.6)"
+    )
+    parser.add_argument(
+        "--workspace",
+        type=float,
+        nargs=6,
+        metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
+        help="box of the optical frame, in metres, that the middle of what is seen of an object lies in",
+    )
 
 
 def _region(text: str) -> tuple[int, int, int, int]:
@@ -222,12 +229,17 @@ def run(options: argparse.Namespace) -> int:
     from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
 
     torch.set_num_threads(1)  # the network's layers are so small that threads cost more than they save
-    settings = RecoveryOptions(
-        method=options.method,
-        refine=options.refine,
-        max_objects=options.max_objects,
-        time_budget=options.time_budget,
-    )
+    try:
+        settings = RecoveryOptions(
+            method=options.method,
+            refine=options.refine,
+            max_objects=options.max_objects,
+            time_budget=options.time_budget,
+            max_size=options.max_size,
+            workspace=None if options.workspace is None else tuple(options.workspace),
+        )
+    except ValueError as error:
+        return misused(str(error))
     try:
         reading = Reading(
             options.depth_scale,
@@ -346,9 +358,7 @@ class _Run:
     def _is_wanted(self, body: Recovery) -> bool:
         from sq_perception.fitting.fit import Status
 
-        longest = 2 * float(body.superquadric.size.max())
-        is_within = body.score >= self._options.min_score and longest <= self._options.max_size
-        return body.status == Status.FAILED or is_within
+        return body.status == Status.FAILED or body.score >= self._options.min_score
 
     def _frame(self, file: str, frame: RecordedFrame) -> None:
         from sq_perception.recordings.frame_entry import frame_entry

@@ -37,6 +37,11 @@ class RecoveryOptions:
     time_budget
         Seconds per frame after which the surface fit tries no further start for any object, and the repair of segments
         begins no further fit.  The objects with most pixels, large or near, come first.
+    max_size
+        Largest full edge of an object, metres: walls, furniture and tables are larger.  Masks from outside may be, too.
+    workspace
+        The middle of what is seen of an object lies in this box of the optical frame, metres: least x, y, z and
+        greatest x, y, z; None: anywhere.
     repair
         Join and split own segments where that describes the image in fewer words; masks from outside stay as they are.
 
@@ -55,6 +60,8 @@ class RecoveryOptions:
     min_pixels: int | None = None
     use_plane: bool = True
     time_budget: float = np.inf
+    max_size: float = 0.6
+    workspace: tuple[float, float, float, float, float, float] | None = None
     repair: bool = True
 
     def __post_init__(self) -> None:
@@ -72,5 +79,9 @@ class RecoveryOptions:
 
     def segmentation_options(self) -> segments.SegmentationOptions:
         return segments.SegmentationOptions(
-            depth_range=self.depth_range, max_objects=self.max_objects, min_pixels=self.min_pixels
+            depth_range=self.depth_range,
+            max_objects=self.max_objects,
+            min_pixels=self.min_pixels,
+            max_size=self.max_size,
+            workspace=self.workspace,
         )

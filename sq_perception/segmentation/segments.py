@@ -20,7 +20,6 @@ Metres and pixels.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import cv2
@@ -28,19 +27,21 @@ import numpy as np
 
 from sq_perception.imaging import depth_steps
 from sq_perception.imaging.camera import Camera
-from sq_perception.segmentation import convex_parts, patch_grouping, support_plane, surface_patches
+from sq_perception.segmentation import (
+    convex_parts,
+    patch_grouping,
+    standing,
+    support_plane,
+    support_surface,
+    surface_patches,
+)
 from sq_perception.segmentation.convex_parts import SightOptions
 from sq_perception.segmentation.patch_grouping import GroupingOptions
-from sq_perception.segmentation.support_plane import Plane, noise_growth
+from sq_perception.segmentation.support_surface import SupportSurface
 from sq_perception.segmentation.surface_patches import FoldOptions
 
 _FOOT_PIXELS = 3
 _LEAST_SIGMA = 5e-4
-_BUMP, _ON_WALL = 6.0, 3.5
-"""An object rises so many deviations of the plane's own points above it; what lies within so many of another plane is a
-part of that,"""
-_FACE_SHARE = 0.5
-"""unless it makes up this share of its points: then the plane is a face of the object."""
 _UNKNOWN_SIGMA = 1.5e-3
 _VESSEL = 0.15
 """A segment with more hollow surface than this share may be a vessel."""
@@ -62,6 +63,11 @@ class SegmentationOptions:
         An object reaches at least this far above the plane, metres.
     depth_step
         Neighbouring pixels whose depths differ by more than this share of the depth belong to different objects.
+    max_size
+        Largest edge of an object, metres; what is larger is furniture.  Not asked of labels from outside.
+    workspace
+        The middle of what is seen of an object lies in this box of the optical frame, metres: least x, y, z and
+        greatest x, y, z.  None: anywhere.
     plane_tolerance
         Half thickness of a plane while it is searched, metres at a depth of one metre.
     min_plane_share
@@ -76,6 +82,8 @@ class SegmentationOptions:
     max_objects: int = 20
     min_pixels: int | None = None
     min_height: float = 0.012
+    max_size: float = 0.6
+    workspace: standing.Box | None = None
     depth_step: float = 0.015
     plane_tolerance: float = 0.008
     min_plane_share: float = 0.1
@@ -90,7 +98,13 @@ class SegmentationOptions:
             raise ValueError(f"depth_range: expected 0 <= nearest < farthest, got {self.depth_range}")
         if self.max_objects < 1:
             raise ValueError(f"max_objects: expected at least 1, got {self.max_objects}")
-        for name in ("min_height", "depth_step", "plane_tolerance"):
+        if self.workspace is not None:
+            box = tuple(self.workspace)
+            if len(box) != 6 or not all(low < high for low, high in zip(box[:3], box[3:], strict=True)):
+                raise ValueError(
+                    f"workspace: expected least x, y, z and greater x, y, z in metres, got {self.workspace}"
+                )
+        for name in ("min_height", "max_size", "depth_step", "plane_tolerance"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}")
 
@@ -151,15 +165,19 @@ def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | No
     if np.count_nonzero(valid) < least:
         return Segmentation(np.zeros(depth.shape, np.int32), None, ())
     planes = support_plane.planes(depth, valid, camera, _search(options))
-    support = support_plane.support(planes, depth, valid, camera, options.depth_step)
-    if support is None:
-        known = np.where(valid, depth, np.float32(0))
-        labels, ids = _ordered(_bodies(known, valid, camera, _UNKNOWN_SIGMA, options), least, options.max_objects)
+    plane = support_plane.support(planes, depth, valid, camera, options.depth_step)
+    known = np.where(valid, depth, np.float32(0))
+    limits = _limits(options)
+    if plane is None:
+        labels = _bodies(known, valid, camera, _UNKNOWN_SIGMA, options)
+        labels, ids = _ordered(labels, least, options.max_objects, standing.alone(known, camera, limits))
         return _marked(labels, None, ids, depth, valid, camera, _UNKNOWN_SIGMA, options)
-    labels = _above(depth, valid, camera, support, options)
-    walls = [plane for plane in planes if plane is not support]
-    labels, ids = _ordered(labels, least, options.max_objects, _object_test(depth, camera, support, walls, options))
-    return _marked(labels, support.equation, ids, depth, valid, camera, support.sigma, options)
+    support = support_surface.measured(plane, known, valid, camera, options.plane_tolerance)
+    labels = _above(known, valid, camera, support, options)
+    walls = [other for other in planes if other is not plane]
+    test = standing.standing(known, valid, camera, support, walls, limits)
+    labels, ids = _ordered(labels, least, options.max_objects, test)
+    return _marked(labels, plane.equation, ids, depth, valid, camera, support.sigma, options)
 
 
 def from_labels(
@@ -196,7 +214,10 @@ def from_labels(
     values, counts = np.unique(labels[valid], return_counts=True)
     order = np.argsort(-counts, kind="stable")
     least = options.min_pixels or 1
-    ids = tuple(int(values[k]) for k in order if values[k] > 0 and counts[k] >= least)[: options.max_objects]
+    ids = tuple(int(values[k]) for k in order if values[k] > 0 and counts[k] >= least)
+    if options.workspace is not None:
+        ids = tuple(k for k in ids if standing.within(options.workspace, _points(labels == k, depth, valid, camera)))
+    ids = ids[: options.max_objects]
     plane = None
     if ids and camera.is_pinhole:
         plane = support_plane.around(labels, ids, depth, valid, camera, _search(options))
@@ -247,6 +268,17 @@ def _search(options: SegmentationOptions) -> support_plane.Search:
     return support_plane.Search(options.plane_tolerance, options.min_plane_share, options.seed)
 
 
+def _points(mask: np.ndarray, depth: np.ndarray, valid: np.ndarray, camera: Camera) -> np.ndarray:
+    rows, columns = np.nonzero(mask & valid)
+    return camera.unproject(columns, rows, depth[rows, columns])
+
+
+def _limits(options: SegmentationOptions) -> standing.Limits:
+    return standing.Limits(
+        options.min_height, options.max_size, options.workspace, options.plane_tolerance, options.depth_step
+    )
+
+
 def _checked(depth: np.ndarray, camera: Camera, limits: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
     depth = np.asarray(depth)
     if depth.ndim != 2 or depth.dtype.kind != "f":
@@ -269,18 +301,18 @@ def _least_pixels(options: SegmentationOptions, depth: np.ndarray) -> int:
 
 
 def _above(
-    depth: np.ndarray, valid: np.ndarray, camera: Camera, plane: Plane, options: SegmentationOptions
+    known: np.ndarray, valid: np.ndarray, camera: Camera, support: SupportSurface, options: SegmentationOptions
 ) -> np.ndarray:
-    """Bodies (labels from 1, unordered) of what is above the plane."""
-    labels = np.zeros(depth.shape, np.int32)
-    known = np.where(valid, depth, np.float32(0))
-    relative = plane.image_height(known, camera) / noise_growth(known)
+    """Bodies (labels from 1, unordered) of what is above the support."""
+    labels = np.zeros(known.shape, np.int32)
+    relative = support.image_relative(known, camera)
     relative *= valid
     # Half of the tolerance band is a compromise: bent depth of real cameras stays below, thin objects stay above.
-    clear = cv2.blur(relative, (3, 3)) > max(0.5 * options.plane_tolerance, 4 * plane.sigma)
+    clear = cv2.blur(relative, (3, 3)) > max(0.5 * options.plane_tolerance, 4 * support.sigma)
     # The mean beside a tall body is that of its height: the pixel itself decides there.
-    standing = relative > max(0.25 * options.plane_tolerance, 2 * plane.sigma)
-    clear &= standing
+    above = relative > max(0.25 * options.plane_tolerance, 2 * support.sigma)
+    above &= ~support_surface.risen(relative, known, valid, camera, options.plane_tolerance, options.depth_step)
+    clear &= above
     left, top, width, height = cv2.boundingRect(clear.view(np.uint8))
     if width == 0:
         return labels
@@ -288,8 +320,8 @@ def _above(
     window = slice(top, top + height + 2 * _FOOT_PIXELS), slice(left, left + width + 2 * _FOOT_PIXELS)
     known = known[window]
     seen = camera.cropped(left, top, known.shape[1], known.shape[0])
-    inside = _bodies(known, clear[window], seen, plane.sigma, options)
-    foot = standing[window] & (inside == 0)
+    inside = _bodies(known, clear[window], seen, support.sigma, options)
+    foot = above[window] & (inside == 0)
     labels[window] = depth_steps.grown(inside, foot, known, _FOOT_PIXELS, options.depth_step)
     return labels
 
@@ -337,42 +369,8 @@ def _refined(
     return labels
 
 
-_ObjectTest = Callable[[np.ndarray, np.ndarray], bool]
-
-
-def _object_test(
-    depth: np.ndarray, camera: Camera, support: Plane, walls: list[Plane], options: SegmentationOptions
-) -> _ObjectTest:
-    """Whether a component, given by its pixels, is an object on the table and not the room behind it."""
-    last_row, last_column = camera.height - 1, camera.width - 1
-    measured = np.count_nonzero(np.isfinite(depth) & (depth > 0))
-
-    def is_object(rows: np.ndarray, columns: np.ndarray) -> bool:
-        step = max(1, rows.size // 2000)
-        points = camera.unproject(columns[::step], rows[::step], depth[rows[::step], columns[::step]])
-        heights = support.height(points)
-        growth = noise_growth(points[:, 2])
-        if np.quantile(heights, 0.95) < options.min_height:
-            return False
-        # Noise that is alike over a window makes bumps; walls fall apart into pieces where things hide parts of them.
-        if np.quantile(heights / growth, 0.95) < _BUMP * support.sigma:
-            return False
-        for wall in walls:
-            on_it = rows.size < _FACE_SHARE * wall.share * measured
-            if on_it and np.quantile(np.abs(wall.height(points)) / growth, 0.95) < _ON_WALL * wall.sigma:
-                return False
-        at_border = rows.min() == 0 or columns.min() == 0 or rows.max() == last_row or columns.max() == last_column
-        if not at_border:
-            return True
-        reach = options.plane_tolerance * growth
-        on_wall = [np.mean(np.abs(wall.height(points)) < 2 * reach) for wall in walls]
-        return not any(share > 0.5 for share in on_wall)
-
-    return is_object
-
-
 def _ordered(
-    labels: np.ndarray, least: int, most: int, accept: _ObjectTest | None = None
+    labels: np.ndarray, least: int, most: int, accept: standing.ObjectTest | None = None
 ) -> tuple[np.ndarray, tuple[int, ...]]:
     """Components with at least ``least`` pixels, renumbered from 1 by falling size, at most ``most`` of them."""
     left, top, width, height = cv2.boundingRect((labels > 0).view(np.uint8))

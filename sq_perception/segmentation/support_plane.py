@@ -33,6 +33,9 @@ _COARSE_PIXELS = 120
 _FACE_TOLERANCE = 0.008
 _BENT_SHARE = 0.08
 _ISLAND_SHARE = 0.25
+_CARRIED_SHARE, _WELL_WITHIN = 0.03, 0.1
+"""A plane carries things if so many times its own points stand on it, farther from its border than this share of its
+width."""
 _LEVEL, _STOREY, _TABLE_SHARE = 0.99, 0.3, 0.4
 """Cosine between the normals of level planes, metres from a floor to the table above it, and the share that it shows of
 what the floor does.  Of lower steps the larger level is the support, and things are found on both."""
@@ -127,7 +130,7 @@ def support(
     floor below it things stand on the table, though the picture may show more of the floor.
     """
     surfaces = _on_one_surface(depth, valid, camera, depth_step)
-    chosen = [plane for plane in candidates if not _is_face(plane, surfaces)]
+    chosen = [plane for plane in candidates if not _is_face(plane, surfaces) or _carries(plane, surfaces)]
     if not chosen:
         return None
     best = max(chosen, key=_vote)
@@ -226,6 +229,34 @@ def _is_face(plane: Plane, surfaces: list[_Surface]) -> bool:
             on = inside
             below, alone = int(np.count_nonzero(height < -2)), is_island
     return alone or below > _BENT_SHARE * on
+
+
+def _carries(plane: Plane, surfaces: list[_Surface]) -> bool:
+    """Whether things stand on a plane: points above it whose feet, straight below them, lie well within what was seen
+    of it.  Edges of tables are round and floors run on below them, but nothing stands on the faces of a lone body; what
+    that stands on lies beside each of its faces.
+    """
+    axes = _across(plane.equation[:3])
+    points = np.concatenate([points for points, _ in surfaces]) if surfaces else np.zeros((0, 3))
+    height = plane.height(points)
+    tolerance = _FACE_TOLERANCE * noise_growth(points[:, 2])
+    on = points[np.abs(height) < tolerance] @ axes
+    feet = points[(height > 2 * tolerance) & (height < _STOREY)] @ axes
+    if len(on) < 3 or len(feet) == 0:
+        return False
+    hull = cv2.convexHull(on.astype(np.float32))
+    # Only well within it: a wall that a table stands at, or the table before a box, ends at its border.
+    low, high = on.min(axis=0), on.max(axis=0)
+    margin = _WELL_WITHIN * float((high - low).min())
+    inside = sum(
+        cv2.pointPolygonTest(hull, (float(a), float(b)), True) > margin for a, b in feet[:: 1 + len(feet) // 500]
+    )
+    return inside * (1 + len(feet) // 500) > _CARRIED_SHARE * len(on)
+
+
+def _across(normal: np.ndarray) -> np.ndarray:
+    """Two axes (3, 2) at right angles to a normal."""
+    return np.linalg.svd(normal[None])[2][1:].T
 
 
 def _on_one_surface(depth: np.ndarray, valid: np.ndarray, camera: Camera, depth_step: float) -> list[_Surface]:

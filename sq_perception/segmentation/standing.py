@@ -1,0 +1,195 @@
+"""Which segments are things that stand on the support, and not the room around it.
+
+    foot of a point p = p - h(p) n,    h(p) = n.p + d
+
+A thing has the support under it: where its foot is, and a little below, the camera sees the support, or the thing
+itself or another one before the support, but nothing that lies below it.  Chairs and walls behind a table have their
+feet beyond its edge, where the camera looks past it; their surface runs on below the table's height.  Walls that reach
+down to the support are planes of their own, and larger than things.
+
+Metres, optical frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from sq_perception.imaging.camera import Camera
+from sq_perception.segmentation.support_plane import Plane, noise_growth
+from sq_perception.segmentation.support_surface import SupportSurface
+
+ObjectTest = Callable[[np.ndarray, np.ndarray], bool]
+"""Of the rows and columns of a segment's pixels."""
+Box = tuple[float, float, float, float, float, float]
+
+_SAMPLES = 2000
+_BUMP, _ON_WALL = 6.0, 3.5
+"""A thing rises so many deviations of the support's own points above it; what lies within so many of another plane is a
+part of that,"""
+_FACE_SHARE = 0.5
+"""unless it makes up this share of its points: then the plane is a face of the thing."""
+_OUTLIERS = 0.01
+"""Share of the points at either end that do not count for the extent: sensors smear edges."""
+_EDGE_SAMPLES = 400
+_TURNS = np.deg2rad(np.arange(0, 180, 10))
+_UNDER, _BELOW = 3.0, 2.0
+"""Tolerances below the support at which is looked for it, and from which on something seen lies below it."""
+_TOLD = 1 / 3
+"""Share of the feet that must be told to have the support, or something before it, under them."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a thing may be.
+
+    Attributes
+    ----------
+    min_height
+        It reaches at least this far above the support, metres.
+    max_size
+        Largest edge of a box around what is seen of it, metres.
+    workspace
+        The middle of what is seen of it lies in this box of the optical frame: least x, y, z and greatest x, y, z.
+    tolerance
+        Half thickness of a plane, metres at a depth of one metre.
+    step
+        Share of the depth by which neighbouring pixels of one surface differ at most.
+    """
+
+    min_height: float
+    max_size: float
+    workspace: Box | None
+    tolerance: float
+    step: float
+
+    def hold(self, points: np.ndarray, up: np.ndarray | None = None) -> bool:
+        """Whether points (n, 3) are no larger than a thing and in the workspace; ``up`` is the support's normal."""
+        if self.workspace is not None and not within(self.workspace, points):
+            return False
+        return largest_edge(points, up) <= self.max_size
+
+
+def within(box: Box, points: np.ndarray) -> bool:
+    """Whether the middle of points (n, 3) lies in a box of the optical frame."""
+    middle = np.median(points, axis=0)
+    return bool((middle >= box[:3]).all() and (middle <= box[3:]).all())
+
+
+def largest_edge(points: np.ndarray, up: np.ndarray | None = None) -> float:
+    """Largest edge of the box around points (n, 3) whose largest edge is least, metres: upright, or of principal axes.
+
+    A hundredth of the points at either end may stick out.
+    """
+    points = points[:: 1 + len(points) // _EDGE_SAMPLES]
+    if up is None:
+        axes = np.linalg.eigh(np.cov(points.T))[1] if len(points) > 3 else np.eye(3)
+        return float(_extents(points @ axes).max())
+    first, second = np.linalg.svd(up[None])[2][1:]
+    flat = points @ np.stack([first, second], axis=1) @ np.stack([np.cos(_TURNS), np.sin(_TURNS)])
+    edges = _extents(flat)
+    # A quarter turn apart, the two edges of one rectangle.
+    rectangles = np.maximum(edges, np.roll(edges, len(edges) // 2))
+    return float(max(rectangles.min(), _extents(points @ up[:, None])[0]))
+
+
+def _extents(values: np.ndarray) -> np.ndarray:
+    """Of each column, without what sticks out."""
+    low, high = np.quantile(values, (_OUTLIERS, 1 - _OUTLIERS), axis=0)
+    return np.asarray(high - low)
+
+
+def alone(depth: np.ndarray, camera: Camera, limits: Limits) -> ObjectTest:
+    """The test of a segment in an image without a support: no larger than a thing, and not wherever the image ends.
+
+    A surface that runs out of the image on opposite sides fills it.
+    """
+    last_row, last_column = camera.height - 1, camera.width - 1
+
+    def is_thing(rows: np.ndarray, columns: np.ndarray) -> bool:
+        if (rows.min() == 0 and rows.max() == last_row) or (columns.min() == 0 and columns.max() == last_column):
+            return False
+        step = max(1, rows.size // _SAMPLES)
+        r, c = rows[::step], columns[::step]
+        return limits.hold(camera.unproject(c, r, depth[r, c]))
+
+    return is_thing
+
+
+def standing(
+    depth: np.ndarray, valid: np.ndarray, camera: Camera, support: SupportSurface, walls: list[Plane], limits: Limits
+) -> ObjectTest:
+    """The test of whether a segment is a thing that stands on the support.
+
+    Parameters
+    ----------
+    depth, valid : (height, width)
+        Metres, and where they are a measurement.
+    camera
+        A pinhole camera.
+    support
+        What things stand on.
+    walls
+        Other planes of the image.
+    """
+    last_row, last_column = camera.height - 1, camera.width - 1
+    measured = np.count_nonzero(valid)
+    plane = support.plane
+
+    def is_thing(rows: np.ndarray, columns: np.ndarray) -> bool:
+        step = max(1, rows.size // _SAMPLES)
+        r, c = rows[::step], columns[::step]
+        points = camera.unproject(c, r, depth[r, c])
+        growth = noise_growth(points[:, 2])
+        relative = support.relative(points)
+        if (
+            np.quantile(relative * growth, 0.95) < limits.min_height
+            or np.quantile(relative, 0.95) < _BUMP * support.sigma
+        ):
+            return False
+        for wall in walls:
+            on_it = rows.size < _FACE_SHARE * wall.share * measured
+            if on_it and np.quantile(np.abs(wall.height(points)) / growth, 0.95) < _ON_WALL * wall.sigma:
+                return False
+        if rows.min() == 0 or columns.min() == 0 or rows.max() == last_row or columns.max() == last_column:
+            reach = 2 * limits.tolerance * growth
+            if any(np.mean(np.abs(wall.height(points)) < reach) > 0.5 for wall in walls):
+                return False
+        if not limits.hold(points, plane.equation[:3]):
+            return False
+        return _stands(points, depth, valid, camera, support, limits.tolerance)
+
+    return is_thing
+
+
+def _stands(
+    points: np.ndarray, depth: np.ndarray, valid: np.ndarray, camera: Camera, support: SupportSurface, tolerance: float
+) -> bool:
+    """Whether the support is under points (n, 3), as far as the camera tells; what the image cuts off tells nothing."""
+    normal = support.plane.equation[:3]
+    under = support.plane.height(points) + _UNDER * tolerance * noise_growth(points[:, 2])
+    feet = points - under[:, None] * normal
+    feet = feet[feet[:, 2] > 0]
+    at = np.rint(camera.project(feet))
+    inside = (at >= 0).all(axis=1) & (at[:, 0] < camera.width) & (at[:, 1] < camera.height)
+    columns, rows = at[inside].astype(int).T
+    told = valid[rows, columns]
+    columns, rows = columns[told], rows[told]
+    seen = support.relative(camera.unproject(columns, rows, depth[rows, columns]))
+    past = np.count_nonzero(seen < -_BELOW * tolerance)
+    held = len(seen) - past
+    return past <= held and held + np.count_nonzero(~inside) >= _TOLD * len(feet)
+
+
+def _roughness(rows: np.ndarray, columns: np.ndarray, depth: np.ndarray, valid: np.ndarray) -> float:
+    """Noise of the depth, metres at one metre, as second differences along the rows tell it; 0 where none can."""
+    inner = (columns > 0) & (columns < depth.shape[1] - 1)
+    r, c = rows[inner], columns[inner]
+    whole = valid[r, c - 1] & valid[r, c + 1]
+    r, c = r[whole], c[whole]
+    if r.size == 0:
+        return 0.0
+    bent = np.abs(depth[r, c - 1] - 2 * depth[r, c] + depth[r, c + 1]) / noise_growth(depth[r, c])
+    return float(1.4826 * np.median(bent) / np.sqrt(6))

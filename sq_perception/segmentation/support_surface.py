@@ -1,0 +1,194 @@
+"""The support as a sensor shows it: a plane that its calibration bends and that stray light raises.
+
+Equation
+--------
+With the height h of a point above the plane and the growth g(z) of the noise, a table is where
+
+    | h / g - b(x, y) | < tolerance,    b = b_0 + b_1 x + b_2 y + b_3 x^2 + b_4 x y + b_5 y^2,
+
+x = (u - cx)/fx and y = (v - cy)/fy.  b is fitted to a band about itself again and again, so that it grows from the part
+of a table that lies in one plane over all of it.  It is bounded by what the calibration of a depth camera may be off, a
+share of the depth.
+
+Beside tall things a table seems to rise, as light reaches a time-of-flight camera by way of them and windows of a
+stereo camera hold some of both.  Such a rise is a ramp; the side of a thing is steep or a step.  Support is therefore
+also what is reached from it without a step, on a slope below a bound, up to some tolerances high.
+
+Metres and pixels.  Reference: P. J. Besl, R. C. Jain, Segmentation through variable-order surface fitting, IEEE PAMI 10
+(1988).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from sq_perception.imaging.camera import Camera
+from sq_perception.segmentation.support_plane import Plane, noise_growth
+
+_COARSE_PIXELS = 120
+_ROUNDS = 6
+_TERMS = 6
+_DISTORTION = 0.02
+"""Makers of depth cameras promise an error of at most 2 % of the depth."""
+_GAIN = 1.05
+"""A support is bent if that brings so many times the samples within half of the tolerance."""
+_RAMP = float(np.sin(np.deg2rad(30)))
+"""Slope against the support up to which it rises; sides of things are steeper where they meet it."""
+_HIGHEST = 5.0
+"""Tolerances that such a rise is high at most."""
+_RAMP_LENGTH = 0.08
+"""Metres over which it goes on at most."""
+
+
+@dataclass(frozen=True, eq=False)
+class SupportSurface:
+    """A plane, and how the sensor bends it.
+
+    Attributes
+    ----------
+    plane
+        With the noise about it.
+    bend : (6,)
+        Of the height at one metre, by 1, x, y, x^2, x y and y^2.
+    limit
+        Of the bend, metres at one metre.
+    sigma
+        Of the heights above the bent surface at a depth of one metre, metres.
+    """
+
+    plane: Plane
+    bend: np.ndarray
+    limit: float
+    sigma: float
+
+    def relative(self, points: np.ndarray) -> np.ndarray:
+        """Height (...) of points (..., 3) above the bent surface, as at one metre of depth."""
+        x, y = points[..., 0] / points[..., 2], points[..., 1] / points[..., 2]
+        bend = np.clip(_terms(x, y) @ self.bend, -self.limit, self.limit)
+        return self.plane.height(points) / noise_growth(points[..., 2]) - bend
+
+    def image_relative(self, depth: np.ndarray, camera: Camera) -> np.ndarray:
+        """The same, float32 (height, width), for every pixel of a pinhole camera's depth image."""
+        b = self.bend.astype(np.float32)
+        x = ((np.arange(camera.width) - camera.cx) / camera.fx).astype(np.float32)
+        y = ((np.arange(camera.height) - camera.cy) / camera.fy).astype(np.float32)
+        bend = (b[0] + b[1] * x + b[3] * x * x)[None, :] + (b[2] * y + b[5] * y * y)[:, None]
+        bend += (b[4] * y)[:, None] * x[None, :]
+        np.clip(bend, -self.limit, self.limit, out=bend)
+        relative = self.plane.image_height(depth, camera) / noise_growth(depth)
+        relative -= bend
+        return relative
+
+
+def measured(plane: Plane, depth: np.ndarray, valid: np.ndarray, camera: Camera, tolerance: float) -> SupportSurface:
+    """The surface that a plane was seen as.
+
+    Parameters
+    ----------
+    plane
+        Found in this image.
+    depth, valid : (height, width)
+        Metres, and where they are a measurement.
+    camera
+        A pinhole camera.
+    tolerance
+        Half thickness of a plane, metres at a depth of one metre.
+    """
+    k = _stride(depth.shape)
+    rows, columns = np.nonzero(valid[::k, ::k])
+    points = camera.unproject(k * columns, k * rows, depth[::k, ::k][rows, columns])
+    growth = noise_growth(points[:, 2])
+    height = plane.height(points) / growth
+    flat = SupportSurface(plane, np.zeros(_TERMS), 0.0, plane.sigma)
+    terms = _terms(points[:, 0] / points[:, 2], points[:, 1] / points[:, 2])
+    on = np.abs(height) < tolerance
+    if not on.any():
+        return flat
+    limit = _DISTORTION * float(np.median(points[on, 2] / growth[on]))
+    bend, off = flat.bend, height
+    for _ in range(_ROUNDS):
+        if np.count_nonzero(on) < 10 * _TERMS:
+            return flat
+        some = terms[on]
+        bend = np.linalg.lstsq(some.T @ some, some.T @ height[on], rcond=None)[0]
+        off = height - np.clip(terms @ bend, -limit, limit)
+        grown = np.abs(off) < tolerance
+        if np.array_equal(grown, on):
+            break
+        on = grown
+    gained = np.count_nonzero(np.abs(off) < 0.5 * tolerance)
+    if gained < _GAIN * np.count_nonzero(np.abs(height) < 0.5 * tolerance):
+        return flat
+    return SupportSurface(plane, bend, limit, float(1.4826 * np.median(np.abs(off[on]))))
+
+
+def risen(
+    relative: np.ndarray, depth: np.ndarray, valid: np.ndarray, camera: Camera, tolerance: float, step: float
+) -> np.ndarray:
+    """Where the support was seen raised, bool (height, width): reached from it on a ramp.
+
+    Parameters
+    ----------
+    relative
+        Heights (height, width) above the support, metres at a depth of one metre.
+    depth, valid, camera, tolerance
+        As in :func:`measured`.
+    step
+        Share of the depth by which neighbouring pixels of one surface differ at most.
+    """
+    k = _stride(depth.shape)
+    size = (-(-depth.shape[1] // k), -(-depth.shape[0] // k))
+    share = cv2.resize(valid.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    known = share > 0.5
+    weight = 1 / np.maximum(share, np.float32(0.5))
+    height = cv2.resize(np.where(valid, relative, np.float32(0)), size, interpolation=cv2.INTER_AREA) * weight
+    z = cv2.resize(np.where(valid, depth, np.float32(0)), size, interpolation=cv2.INTER_AREA) * weight
+    width = z * np.float32(k / np.sqrt(camera.fx * camera.fy))
+    reached = known & (height < 0.5 * tolerance)
+    if not reached.any():
+        return np.zeros(depth.shape, bool)
+    passable = known & (height < _HIGHEST * tolerance) & _shallow(height * noise_growth(z), z, known, width)
+    joined = [
+        (here, there, np.abs(z[here] - z[there]) < k * step * z[here])
+        for here, there in (
+            ((slice(1, None), slice(None)), (slice(None, -1), slice(None))),
+            ((slice(None), slice(1, None)), (slice(None), slice(None, -1))),
+        )
+    ]
+    for _ in range(int(np.ceil(_RAMP_LENGTH / max(float(np.median(width[reached])), 1e-4)))):
+        before = np.count_nonzero(reached)
+        for here, there, near in joined:
+            reached[here] |= reached[there] & near & passable[here]
+            reached[there] |= reached[here] & near & passable[there]
+        if np.count_nonzero(reached) == before:
+            break
+    full = cv2.resize(reached.view(np.uint8), (size[0] * k, size[1] * k), interpolation=cv2.INTER_NEAREST)
+    return full[: depth.shape[0], : depth.shape[1]] > 0
+
+
+def _shallow(height: np.ndarray, z: np.ndarray, known: np.ndarray, width: np.ndarray) -> np.ndarray:
+    """Samples whose surface is turned from the support by less than a ramp, told by chords along rows and columns.
+
+    With the chords' rises h_u, h_v and their inner products G, the squared sine of the slope is h^T G^-1 h.
+    """
+    ok = np.zeros(height.shape, bool)
+    here = slice(1, -1)
+    rise_u, rise_v = height[here, 2:] - height[here, :-2], height[2:, here] - height[:-2, here]
+    away_u, away_v = z[here, 2:] - z[here, :-2], z[2:, here] - z[:-2, here]
+    side = (2 * width[here, here]) ** 2
+    uu, vv, uv = side + away_u**2, side + away_v**2, away_u * away_v
+    sine = (vv * rise_u**2 - 2 * uv * rise_u * rise_v + uu * rise_v**2) / np.maximum(uu * vv - uv**2, 1e-12)
+    ends = known[here, 2:] & known[here, :-2] & known[2:, here] & known[:-2, here]
+    ok[here, here] = ends & (sine < _RAMP**2)
+    return ok
+
+
+def _terms(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
+
+
+def _stride(shape: tuple[int, ...]) -> int:
+    return max(1, min(shape[:2]) // _COARSE_PIXELS)

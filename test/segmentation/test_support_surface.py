@@ -1,0 +1,206 @@
+"""Surfaces are no objects: bent tables, tables without a border, room corners, what stands beyond the edge."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sq_perception.geometry import rotation
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging import raycast
+from sq_perception.imaging.camera import Camera
+from sq_perception.segmentation import standing, support_plane, support_surface
+from sq_perception.segmentation.segments import SegmentationOptions, from_labels, segment
+
+CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)
+STRAIGHT = np.array([0.0, 0.0, 0.0, 1.0])
+TOLERANCE = SegmentationOptions().plane_tolerance
+
+
+def plane_image(normal, distance, camera=CAMERA):
+    """Depth of the plane n.p + distance = 0, infinite where no line of sight meets it."""
+    v, u = np.indices((camera.height, camera.width))
+    _, direction = camera.rays(u, v)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = -distance / (direction @ np.asarray(normal, float))
+    return np.where(depth > 0, depth, np.inf)
+
+
+def slanted(degrees):
+    """The normal of a table that the camera looks at from so many degrees above its horizon."""
+    angle = np.deg2rad(degrees)
+    return np.array([0.0, -np.cos(angle), -np.sin(angle)])
+
+
+def with_bodies(depth, bodies, camera=CAMERA):
+    rendered, index = raycast.render(Superquadric.stack(bodies), camera)
+    seen = (index >= 0) & (rendered < depth)
+    return np.where(seen, rendered, depth), np.where(seen, index + 1, 0)
+
+
+def noisy(depth, sigma=1e-3, seed=0):
+    rng = np.random.default_rng(seed)
+    with np.errstate(invalid="ignore"):
+        depth = depth + sigma * depth**2 * rng.standard_normal(depth.shape)
+    return np.where(np.isfinite(depth), depth, np.nan).astype(np.float32)
+
+
+def bulging(away, bulge, camera=CAMERA):
+    """A wall-like table seen from straight above, nearer in the middle by ``bulge``: a paraboloid about the middle."""
+    v, u = np.indices((camera.height, camera.width))
+    radius = np.hypot(u - camera.cx, v - camera.cy) / np.hypot(camera.cx, camera.cy)
+    return away - bulge * (1 - radius**2)
+
+
+def cube_on(depth, u, v, half, camera=CAMERA):
+    """A box with its base at the depth of that pixel, upright before a camera that looks straight down."""
+    base = camera.unproject(np.array(u), np.array(v), np.array(depth[v, u]))
+    return Superquadric(np.full(3, half), np.full(2, 0.1), base - [0, 0, half], STRAIGHT)
+
+
+def overlap(mask, labels):
+    found = [labels == k for k in range(1, labels.max() + 1)]
+    return max((np.sum(mask & one) / np.sum(mask | one) for one in found), default=0)
+
+
+@pytest.mark.parametrize("away", [0.3, 0.45, 0.6])
+def test_a_bulging_table_is_no_object(away):
+    """A centimetre, as structured light shows it close by."""
+    assert segment(noisy(bulging(away, 0.01)), CAMERA).ids == ()
+
+
+@pytest.mark.parametrize("away", [0.45, 0.6])
+def test_a_box_on_a_bulging_table_is_found_with_its_outline(away):
+    table = bulging(away, 0.01)
+    depth, truth = with_bodies(table, [cube_on(table, 110, 120, 0.03)])
+    found = segment(noisy(depth), CAMERA)
+    assert len(found.ids) == 1
+    assert overlap(truth == 1, found.labels) > 0.9
+
+
+def test_the_bend_is_measured_and_a_flat_table_has_none():
+    """Of the paraboloid, the curvature in x follows from its definition: h = bulge (1 - r^2) + const."""
+    away, bulge = 0.6, 0.012
+    depth = noisy(bulging(away, bulge), 5e-4)
+    plane = support_plane.planes(depth, np.isfinite(depth), CAMERA, support_plane.Search(TOLERANCE, 0.1, 0))[0]
+    surface = support_surface.measured(plane, depth, np.isfinite(depth), CAMERA, TOLERANCE)
+    expected = -bulge * CAMERA.fx**2 / (CAMERA.cx**2 + CAMERA.cy**2) / away**2
+    assert surface.bend[[3, 5]] == pytest.approx([expected, expected], rel=0.15)
+    assert surface.sigma == pytest.approx(5e-4, rel=0.25)
+    flat = noisy(np.full((240, 320), away), 5e-4)
+    surface = support_surface.measured(plane_of(flat), flat, np.isfinite(flat), CAMERA, TOLERANCE)
+    assert not surface.bend.any()
+
+
+def plane_of(depth):
+    return support_plane.planes(depth, np.isfinite(depth), CAMERA, support_plane.Search(TOLERANCE, 0.1, 0))[0]
+
+
+def test_a_ramp_is_support_and_the_side_of_a_thing_is_not():
+    """A table that seems to rise by 15 degrees over 10 cm, as beside tall things, and a box of 3 cm."""
+    normal = slanted(90)
+    table = plane_image(normal, 0.8)
+    _, u = np.indices(table.shape)
+    x = (u - CAMERA.cx) / CAMERA.fx * 0.8
+    rise = np.clip(np.tan(np.deg2rad(15)) * (x - 0.1), 0, 0.027)
+    depth, truth = with_bodies(table - rise, [cube_on(table, 90, 120, 0.015)])
+    found = segment(noisy(depth), CAMERA)
+    assert len(found.ids) == 1
+    assert overlap(truth == 1, found.labels) > 0.8
+
+
+def test_a_table_whose_border_is_round_carries_what_stands_on_it():
+    """Its front edge bends down and runs on as an apron, a floor lies below: it is the support all the same."""
+    normal = slanted(35)
+    table = plane_image(normal, 0.45)
+    v, _ = np.indices(table.shape)
+    depth = np.where(v > 185, table[185, 0], table)
+    middle = CAMERA.unproject(np.array(150), np.array(130), np.array(table[130, 150]))
+    body = Superquadric(np.array([0.05, 0.04, 0.05]), np.full(2, 0.2), middle + 0.05 * normal, frame_of(normal))
+    depth, truth = with_bodies(depth, [body])
+    found = segment(noisy(depth), CAMERA)
+    assert found.plane is not None
+    assert np.degrees(np.arccos(np.clip(found.plane[:3] @ normal, -1, 1))) < 2
+    assert overlap(truth == 1, found.labels) > 0.85
+
+
+def room_corner():
+    """A floor and two walls at right angles, 1.5 m away, the camera 1 m above the floor and tilted down."""
+    tilt = np.deg2rad(25)
+    down = np.array([0.0, np.cos(tilt), np.sin(tilt)])
+    ahead = np.array([0.0, -np.sin(tilt), np.cos(tilt)])
+    left = (ahead + np.array([1.0, 0, 0])) / np.sqrt(2)
+    right = (ahead - np.array([1.0, 0, 0])) / np.sqrt(2)
+    walls = [plane_image(-down, 1.0), plane_image(-left, 1.6), plane_image(-right, 1.6)]
+    return np.min(walls, axis=0)
+
+
+def test_a_room_corner_holds_no_objects():
+    assert segment(noisy(room_corner(), 2e-3), CAMERA).ids == ()
+
+
+def test_what_stands_behind_the_table_is_not_on_it():
+    """A board half a metre behind the table's far edge, seen above it and running on below its height."""
+    normal = slanted(30)
+    table = plane_image(normal, 0.5)
+    depth = np.where(table < 1.2, table, np.inf)
+    up = normal
+    ahead = np.array([0.0, -normal[2], normal[1]])
+    ahead *= np.sign(ahead[2])
+    behind = 1.6 * ahead - 0.5 * up
+    body = Superquadric(np.array([0.12, 0.02, 0.25]), np.full(2, 0.1), behind, frame_of(normal))
+    near = -0.5 * up + 0.85 * ahead + 0.05 * up
+    thing = Superquadric(np.array([0.05, 0.05, 0.05]), np.full(2, 0.1), near, frame_of(normal))
+    depth, truth = with_bodies(depth, [body, thing])
+    assert np.count_nonzero(truth == 1) > 200
+    found = segment(noisy(depth), CAMERA)
+    assert len(found.ids) == 1
+    assert overlap(truth == 2, found.labels) > 0.85
+
+
+def frame_of(normal):
+    return rotation.from_matrix(np.stack([[1, 0, 0], np.cross(normal, [1, 0, 0]), normal], axis=1))
+
+
+def two_boxes():
+    table = np.full((240, 320), 1.0)
+    small = cube_on(table, 90, 120, 0.04)
+    tall = Superquadric(np.array([0.2, 0.06, 0.05]), np.full(2, 0.1), np.array([0.2, 0.0, 0.95]), STRAIGHT)
+    return with_bodies(table, [small, tall])
+
+
+def test_an_object_is_no_larger_than_max_size():
+    depth, truth = two_boxes()
+    depth = noisy(depth)
+    assert len(segment(depth, CAMERA).ids) == 2
+    found = segment(depth, CAMERA, SegmentationOptions(max_size=0.3))
+    assert len(found.ids) == 1
+    assert overlap(truth == 1, found.labels) > 0.9
+
+
+def test_a_workspace_holds_the_middle_of_what_is_seen():
+    depth, truth = two_boxes()
+    depth = noisy(depth)
+    right = SegmentationOptions(workspace=(0.0, -1.0, 0.0, 1.0, 1.0, 2.0))
+    found = segment(depth, CAMERA, right)
+    assert len(found.ids) == 1
+    assert overlap(truth == 2, found.labels) > 0.9
+    assert from_labels(truth.astype(np.int32), depth, CAMERA, right).ids == (2,)
+
+
+@pytest.mark.parametrize("box", [(0, 0, 0, 1, 1), (0, 0, 0, 1, 0, 1), (0, 0, 0, 1, 1, np.nan)])
+def test_a_workspace_has_an_inside(box):
+    with pytest.raises(ValueError, match="workspace: expected least x, y, z"):
+        SegmentationOptions(workspace=box)
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.3, 0.7])
+def test_the_largest_edge_is_that_of_the_box_and_not_its_diagonal(turn):
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-0.5, 0.5, (20_000, 3)) * [0.4, 0.3, 0.1]
+    c, s = np.cos(turn), np.sin(turn)
+    points = points @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
+    up = np.array([0.0, 0.0, 1.0])
+    assert standing.largest_edge(points, up) == pytest.approx(0.4, rel=0.08)
+    wild = np.concatenate([points, [[5.0, 5.0, 5.0]]])
+    assert standing.largest_edge(wild, up) == pytest.approx(0.4, rel=0.08)
