@@ -64,6 +64,8 @@ _SETTLED, _UNSURE = 1.03, 0.01
 """A last mean squared residual above the one, or a half size less certain than the other, as a share of it, make other
 valleys of the cost worth a look; chosen on benchmarks/single_body."""
 _MOST_VARIATIONS = 2
+_HANDED_OVER = 8
+"""Of the bodies that were tried, so many begin in the tolerant course."""
 _HOPELESS = 2.0
 """A rival that costs so many times more than the body at hand after its first steps is given up."""
 
@@ -83,7 +85,7 @@ def solve(problem: Problem, given: Sequence[State]) -> Solution:
             tried += found
             finalists = select(problem, found, finalists, ESCALATED_FINALISTS)
         if _goes_on(problem, finalists):
-            return tolerant.take_over(problem, finalists[0], [*given, finalists[0]])
+            return tolerant.take_over(problem, finalists[0], [*given, *by_cost(tried)[:_HANDED_OVER]])
     return _decide(problem, finalists)
 
 

@@ -6,7 +6,7 @@ One maximum a posteriori fit.  The cost, minus twice the log of the posterior, i
     free    FREE w rho(r)   pixels beside it that saw farther: the body keeps out of that space
     plane, rest             it does not reach below its support, and mostly lies on a face
     hull                    (nu + J) log(1 + |W (h - b)|^2 / nu): its support function beside the predicted one
-    volume                  a weak price on it, only where nothing is predicted
+    volume, proportion      weak, and only where nothing is predicted (:mod:`sq_perception.fitting.unseen` then too)
 
 (:mod:`sq_perception.fitting.residuals`, :mod:`sq_perception.fitting.priors`, :mod:`sq_perception.fitting.hull_prior`).
 Errors of neighbouring pixels are alike where the model errs: the object counts as INDEPENDENT_RAYS rays, however many
@@ -27,7 +27,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sq_perception.fitting import box_start, revolution
+from sq_perception.fitting import box_start, revolution, unseen
 from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.problem import (
     INDEPENDENT_RAYS,
@@ -59,8 +59,9 @@ _INNER_CAUCHY = 1.0
 """Noise levels behind the surface of a hull, beyond which a point hardly counts."""
 _SPREAD = 2.5**2
 """Factor of the covariance for things that are no superquadrics, whose errors are alike."""
-_HUBER = 1.0
-"""Noise levels; what strays farther from a superquadric is another part of the thing: a neck, a handle."""
+_HUBER, _HUBER_OF_PREDICTED = 2.0, 1.0
+"""Noise levels; what strays farther from a superquadric is another part of the thing: a neck, a handle.  Where a
+prediction tells how far the hull reaches, such parts need not."""
 
 
 def solve(problem: Problem, given: Sequence[State]) -> Solution:
@@ -75,6 +76,8 @@ def solve(problem: Problem, given: Sequence[State]) -> Solution:
         as_hull = replace(problem.with_terms(inner_cauchy=_INNER_CAUCHY), observation=observation.of_hull())
         notes = ("like the convex hull of the object",)
         solution = replace(_best(as_hull, [solution.state, *starts]), notes=notes, as_hull=True)
+    if len(problem.terms.hull_directions) == 0 and not problem.late:
+        solution = unseen.weighed(solution)
     return solution if problem.late else revolution.weighed(solution)
 
 
@@ -96,9 +99,12 @@ def take_over(problem: Problem, best: State, given: Sequence[State]) -> Solution
 
 def _with_priors(problem: Problem) -> Problem:
     hull = problem.options.hull() if callable(problem.options.hull) else problem.options.hull
-    terms = problem.terms._replace(huber=_HUBER, proportion_stiffness=0.0, volume_price=0.0 if hull else VOLUME_PRICE)
+    terms = problem.terms._replace(huber=_HUBER, volume_price=VOLUME_PRICE)
     if hull is not None:
         terms = terms._replace(
+            huber=_HUBER_OF_PREDICTED,
+            proportion_stiffness=0.0,
+            volume_price=0.0,
             hull_directions=np.ascontiguousarray(hull.directions),
             hull_support=np.ascontiguousarray(hull.support),
             hull_root=hull.root(),

@@ -56,9 +56,9 @@ def test_a_bottle_that_no_superquadric_explains_is_as_deep_as_it_is_wide() -> No
     neck = Superquadric([0.015, 0.015, 0.11], [0.1, 1.0], foot.translation + 0.05 * NORMAL, foot.rotation)
     fit = fitted(Superquadric.stack([foot, neck]))
     assert "revolution" in fit.message
-    assert fit.as_hull
     first, second, _ = fit.superquadric.size
     assert first == pytest.approx(second, rel=0.02)
+    assert first == pytest.approx(0.04, rel=0.2)
     assert fit.superquadric.shape[1] > 0.95
 
 

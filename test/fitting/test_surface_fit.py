@@ -208,18 +208,22 @@ def test_bodies_on_a_table_do_not_sink_into_it(seed: int) -> None:
 
 
 def test_a_box_seen_face_on_is_weak_and_says_what_is_missing() -> None:
+    """Whatever the noise.  Which depth it then gives is chance: of eight, at least half are within three deviations."""
     truth = Superquadric([0.06, 0.05, 0.04], [0.1, 0.1], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0, 1.0])
     camera = Camera(160, 120, 800.0, 800.0, 79.5, 59.5, "orthographic")
     flat, _ = raycast.render(truth, camera)
-    noisy = flat + np.random.default_rng(0).normal(0, 4e-3, flat.shape)
-    depth = np.where(np.isfinite(flat), noisy, np.nan).astype(np.float32)
-    fit = surface_fit.fit(depth, np.isfinite(depth), camera)
-    assert fit.status == Status.WEAK
-    assert "half size along" in fit.message
-    assert "undetermined" in fit.message
-    hidden = int(np.argmax(fit.sigma_size))
-    assert abs(fit.superquadric.rotation_matrix[2, hidden]) > 0.9
-    assert abs(fit.superquadric.size[hidden] - 0.04) < 3 * fit.sigma_size[hidden]
+    within = 0
+    for seed in range(8):
+        noisy = flat + np.random.default_rng(seed).normal(0, 4e-3, flat.shape)
+        depth = np.where(np.isfinite(flat), noisy, np.nan).astype(np.float32)
+        fit = surface_fit.fit(depth, np.isfinite(depth), camera)
+        assert fit.status == Status.WEAK
+        assert "half size along" in fit.message
+        assert "undetermined" in fit.message
+        hidden = int(np.argmax(fit.sigma_size))
+        assert abs(fit.superquadric.rotation_matrix[2, hidden]) > 0.9
+        within += abs(fit.superquadric.size[hidden] - 0.04) < 3 * fit.sigma_size[hidden]
+    assert within >= 4
 
 
 def test_reported_deviations_cover_the_errors() -> None:

@@ -1,0 +1,186 @@
+"""Recorded frames of things whose true size, and pose where there is one, are known.
+
+    python benchmarks/known_frames.py FRAMES HULLS [--name known_frames]
+
+FRAMES holds NPZ files with ``depth``, ``K``, ``labels`` and, for each of ``ids``: ``kind``, ``dims`` (full edges,
+metres, NaN unknown), ``mesh`` (name, or empty) and ``T_cam_mesh`` (4 x 4, NaN unknown); HULLS holds <mesh>.hull.ply.
+None of it belongs to the repository.
+
+| method | masks | what |
+| --- | --- | --- |
+| auto, given | true | `Recoverer().recover(depth, camera, labels)` |
+| network, given | true | the prediction of the network of things, not refined |
+| auto, own | its own | the body whose mask has the largest IoU with the true one, if that is at least 0.25 |
+| classic | true | Solina and Bajcsy's fit to the points |
+| smallest box | true | the smallest box around the measured points |
+
+IoU is with the convex hull of the mesh in its pose, 0 for a thing without a body; errors are those of the sorted full
+edges, their mean over the three; ``2 sigma`` the share of half sizes within two reported deviations.  ``fair`` are
+boxes, cans and bottles, which superquadrics can be like.  Times are of single threads.  Millimetres, milliseconds.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+
+if __name__ == "__main__":  # as a script only: a process that imports this has threads already
+    for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
+        os.environ.setdefault(variable, "1")
+
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import report
+import trimesh
+from hull_oracle import Columns
+from scene_verdict import _oriented_box
+
+from sq_perception.fitting.fit import Status
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging.camera import Camera
+from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, RecoveryOptions
+
+FAIR = ("box", "rounded_box", "cylinder", "bottle")
+MATCH = 0.25
+METHODS = ("auto, given", "network, given", "auto, own", "classic", "smallest box")
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What one method made of one thing; NaN where the truth, or the method's word, is missing."""
+
+    kind: str
+    method: str
+    iou: float
+    error: float
+    covered: float
+    milliseconds: float
+
+
+@cache
+def columns(path: Path) -> Columns:
+    return Columns.of(np.asarray(trimesh.load_mesh(path, process=False).vertices))
+
+
+def answer(
+    frame: Any, number: int, hulls: Path, method: str, body: Superquadric | None, sigma: np.ndarray, ms: float
+) -> Answer:
+    """One body beside the truth; ``sigma`` (3,) of its half sizes, metres."""
+    dims, mesh, pose = np.sort(frame["dims"][number]), str(frame["mesh"][number]), frame["T_cam_mesh"][number]
+    iou = error = covered = np.nan
+    if mesh and np.isfinite(pose).all():
+        iou = 0.0
+        if body is not None:
+            turned = trimesh.transformations.quaternion_from_matrix(np.linalg.inv(pose))
+            inverse = np.linalg.inv(pose)
+            there = body.transformed(np.roll(turned, -1), inverse[:3, 3])
+            iou = columns(hulls / f"{mesh}.hull.ply").iou(there)
+    if body is not None and np.isfinite(dims).all():
+        order = np.argsort(body.size)
+        error = float(np.abs(2 * body.size[order] - dims).mean())
+        if np.isfinite(sigma).all():
+            covered = float((np.abs(body.size[order] - dims / 2) < 2 * sigma[order]).mean())
+    return Answer(str(frame["kind"][number]), method, iou, error, covered, ms)
+
+
+def answers(frame: Any, hulls: Path, recoverer: Recoverer) -> list[Answer]:
+    """Every method on every labelled thing of one frame."""
+    depth, k = frame["depth"], frame["K"]
+    camera = Camera(depth.shape[1], depth.shape[0], k[0, 0], k[1, 1], k[0, 2], k[1, 2])
+    labels = frame["labels"].astype(np.int32)
+    found: list[Answer] = []
+    for method, name in (("auto", METHODS[0]), ("network", METHODS[1]), ("classic", METHODS[3])):
+        result = recoverer.recover(depth, camera, labels, RecoveryOptions(method=method))  # type: ignore[arg-type]
+        share = result.milliseconds["total"] / max(len(result.bodies), 1)
+        by_label = {one.label: one for one in result.bodies if one.status != Status.FAILED}
+        for number, label in enumerate(frame["ids"]):
+            one = by_label.get(int(label))
+            body, sigma = (None, np.full(3, np.nan)) if one is None else (one.superquadric, one.sigma_size)
+            found.append(answer(frame, number, hulls, name, body, sigma, share))
+    found += _own(frame, hulls, recoverer.recover(depth, camera))
+    for number, label in enumerate(frame["ids"]):
+        rows, cols = np.nonzero((labels == label) & np.isfinite(depth) & (depth > 0))
+        points = camera.unproject(cols, rows, depth[rows, cols])
+        found.append(answer(frame, number, hulls, METHODS[4], _oriented_box(points), np.full(3, np.nan), np.nan))
+    return found
+
+
+def _own(frame: Any, hulls: Path, result: FrameRecovery) -> list[Answer]:
+    found = []
+    share = result.milliseconds["total"] / max(len(result.bodies), 1)
+    for number, label in enumerate(frame["ids"]):
+        true = frame["labels"] == label
+        best, overlap = None, MATCH
+        for one in result.recovered:
+            mine = result.labels == one.label
+            iou = np.count_nonzero(mine & true) / max(np.count_nonzero(mine | true), 1)
+            if iou >= overlap:
+                best, overlap = one, iou
+        body, sigma = (None, np.full(3, np.nan)) if best is None else (best.superquadric, best.sigma_size)
+        found.append(answer(frame, number, hulls, METHODS[2], body, sigma, share))
+    return found
+
+
+def summary(group: list[Answer]) -> dict[str, Any]:
+    """Means and medians; None where nothing is known."""
+
+    def figure(values: list[float], function: Any) -> float | None:
+        known = np.array(values)[np.isfinite(values)]
+        return float(function(known)) if len(known) else None
+
+    return {
+        "things": len(group),
+        "iou": figure([one.iou for one in group], np.mean),
+        "error_median": figure([one.error for one in group], np.median),
+        "error_mean": figure([one.error for one in group], np.mean),
+        "two_sigma": figure([one.covered for one in group], np.mean),
+        "milliseconds": figure([one.milliseconds for one in group], np.median),
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("frames", type=Path, help="folder of NPZ files")
+    parser.add_argument("hulls", type=Path, help="folder of <mesh>.hull.ply")
+    parser.add_argument("--name", default="known_frames", help="name of the result files")
+    options = parser.parse_args()
+    paths = sorted(options.frames.glob("*.npz"))
+    if not paths:
+        parser.error(f"{options.frames}: no NPZ files")
+    recoverer = Recoverer(threads=1)
+    everything: list[Answer] = []
+    for path in paths:
+        with np.load(path) as file:
+            everything += answers({name: file[name] for name in file.files}, options.hulls, recoverer)
+    kinds = sorted({one.kind for one in everything})
+    groups = {"fair": FAIR, **{kind: (kind,) for kind in kinds}}
+    result: dict[str, Any] = {}
+    rows = []
+    for title, members in groups.items():
+        for method in METHODS:
+            one = result.setdefault(title, {})[method] = summary(
+                [a for a in everything if a.method == method and a.kind in members]
+            )
+            rows.append([title, method, str(one["things"]), *_cells(one)])
+    header = ["things", "method", "number", "IoU %", "edge error mm, median / mean", "2 sigma %", "ms a body"]
+    report.write(options.name, {"frames": len(paths), "groups": result}, report.table(header, rows))
+
+
+def _cells(one: dict[str, Any]) -> list[str]:
+    def cell(value: float | None, factor: float, digits: int) -> str:
+        return "-" if value is None else f"{factor * value:.{digits}f}"
+
+    return [
+        cell(one["iou"], 100, 1),
+        f"{cell(one['error_median'], 1e3, 1)} / {cell(one['error_mean'], 1e3, 1)}",
+        cell(one["two_sigma"], 100, 0),
+        cell(one["milliseconds"], 1, 0),
+    ]
+
+
+if __name__ == "__main__":
+    main()
