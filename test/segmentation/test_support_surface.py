@@ -1,4 +1,4 @@
-"""Surfaces are no objects: tables that sensors bend, tables without a border, room corners, what stands beyond the edge."""
+"""Surfaces are no objects: tables that sensors bend, tables without a border, room corners, what stands beyond."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_a_box_on_a_bulging_table_is_found_with_its_outline(away):
 
 
 def test_the_bend_is_measured_and_a_flat_table_has_none():
-    """Of the paraboloid, the curvature in x follows from its definition: h = bulge (1 - r^2) + const, in units of z^2."""
+    """Of the paraboloid, the curvature in x follows from its definition: h = bulge (1 - r^2), in units of z^2."""
     away, bulge = 0.6, 0.012
     depth = noisy(bulging(away, bulge), 5e-4)
     plane = support_plane.planes(depth, np.isfinite(depth), CAMERA, support_plane.Search(TOLERANCE, 0.1, 0))[0]
@@ -100,7 +100,7 @@ def test_a_ramp_is_support_and_the_side_of_a_thing_is_not():
     """A table that seems to rise by 15 degrees over 10 cm, as beside tall things, and a box of 3 cm."""
     normal = slanted(90)
     table = plane_image(normal, 0.8)
-    v, u = np.indices(table.shape)
+    _, u = np.indices(table.shape)
     x = (u - CAMERA.cx) / CAMERA.fx * 0.8
     rise = np.clip(np.tan(np.deg2rad(15)) * (x - 0.1), 0, 0.027)
     depth, truth = with_bodies(table - rise, [cube_on(table, 90, 120, 0.015)])
