@@ -33,7 +33,7 @@ _COARSE_PIXELS = 120
 _FACE_TOLERANCE = 0.008
 _BENT_SHARE = 0.08
 _ISLAND_SHARE = 0.25
-_CARRIED_SHARE, _WELL_WITHIN, _FACING_DOWN = 0.03, 4.0, 0.3
+_CARRIED_SHARE, _WELL_WITHIN, _FACING_DOWN = 0.01, 4.0, 0.3
 """A plane carries things if so many times its own points stand on it, so many tolerances within its border, and if its
 normal points no farther down in the image than this."""
 _LEVEL, _STOREY, _TABLE_SHARE = 0.99, 0.3, 0.4
