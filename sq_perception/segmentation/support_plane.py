@@ -237,7 +237,9 @@ def _carries(plane: Plane, surfaces: list[_Surface]) -> bool:
     that stands on lies beside each of its faces.
     """
     axes = _across(plane.equation[:3])
-    points = np.concatenate([points for points, _ in surfaces]) if surfaces else np.zeros((0, 3))
+    # A plane through a lone round body has a part of that above it, well within its border.
+    spread = [points for points, is_island in surfaces if not is_island]
+    points = np.concatenate(spread) if spread else np.zeros((0, 3))
     height = plane.height(points)
     tolerance = _FACE_TOLERANCE * noise_growth(points[:, 2])
     on = points[np.abs(height) < tolerance] @ axes
