@@ -175,7 +175,9 @@ def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | No
     support = support_surface.measured(plane, known, valid, camera, options.plane_tolerance)
     labels = _above(known, valid, camera, support, options)
     walls = [other for other in planes if other is not plane]
-    test = standing.standing(known, valid, camera, support, walls, limits)
+    # What is out of range holds things up and hides them all the same.
+    told = np.isfinite(depth) & (depth > 0)
+    test = standing.standing(np.where(told, depth, np.float32(0)), told, camera, support, walls, limits)
     labels, ids = _ordered(labels, least, options.max_objects, test)
     return _marked(labels, plane.equation, ids, depth, valid, camera, support.sigma, options)
 

@@ -33,9 +33,9 @@ _COARSE_PIXELS = 120
 _FACE_TOLERANCE = 0.008
 _BENT_SHARE = 0.08
 _ISLAND_SHARE = 0.25
-_CARRIED_SHARE, _WELL_WITHIN = 0.03, 0.1
-"""A plane carries things if so many times its own points stand on it, farther from its border than this share of its
-width."""
+_CARRIED_SHARE, _WELL_WITHIN, _FACING_DOWN = 0.01, 4.0, 0.3
+"""A plane carries things if so many times its own points stand on it, so many tolerances within its border, and if its
+normal points no farther down in the image than this."""
 _LEVEL, _STOREY, _TABLE_SHARE = 0.99, 0.3, 0.4
 """Cosine between the normals of level planes, metres from a floor to the table above it, and the share that it shows of
 what the floor does.  Of lower steps the larger level is the support, and things are found on both."""
@@ -237,17 +237,18 @@ def _carries(plane: Plane, surfaces: list[_Surface]) -> bool:
     that stands on lies beside each of its faces.
     """
     axes = _across(plane.equation[:3])
-    points = np.concatenate([points for points, _ in surfaces]) if surfaces else np.zeros((0, 3))
+    # A plane through a lone round body has a part of that above it, well within its border.
+    spread = [points for points, is_island in surfaces if not is_island]
+    points = np.concatenate(spread) if spread else np.zeros((0, 3))
     height = plane.height(points)
     tolerance = _FACE_TOLERANCE * noise_growth(points[:, 2])
     on = points[np.abs(height) < tolerance] @ axes
     feet = points[(height > 2 * tolerance) & (height < _STOREY)] @ axes
-    if len(on) < 3 or len(feet) == 0:
+    if len(on) < 3 or len(feet) == 0 or plane.equation[1] > _FACING_DOWN:
         return False
     hull = cv2.convexHull(on.astype(np.float32))
     # Only well within it: a wall that a table stands at, or the table before a box, ends at its border.
-    low, high = on.min(axis=0), on.max(axis=0)
-    margin = _WELL_WITHIN * float((high - low).min())
+    margin = _WELL_WITHIN * float(np.median(tolerance))
     inside = sum(
         cv2.pointPolygonTest(hull, (float(a), float(b)), True) > margin for a, b in feet[:: 1 + len(feet) // 500]
     )

@@ -25,6 +25,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from sq_perception.imaging import depth_steps
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation.support_plane import Plane, noise_growth
 
@@ -39,6 +40,8 @@ _RAMP = float(np.sin(np.deg2rad(30)))
 """Slope against the support up to which it rises; sides of things are steeper where they meet it."""
 _HIGHEST = 5.0
 """Tolerances that such a rise is high at most."""
+_WIDE = 0.1
+"""Share of its largest part that a part of the support has at least."""
 _RAMP_LENGTH = 0.08
 """Metres over which it goes on at most."""
 
@@ -147,7 +150,11 @@ def risen(
     height = cv2.resize(np.where(valid, relative, np.float32(0)), size, interpolation=cv2.INTER_AREA) * weight
     z = cv2.resize(np.where(valid, depth, np.float32(0)), size, interpolation=cv2.INTER_AREA) * weight
     width = z * np.float32(k / np.sqrt(camera.fx * camera.fy))
-    reached = known & (height < 0.5 * tolerance)
+    # Only from where it is wide: the bottom of a bowl is as low.
+    flat = depth_steps.components(known & (height < 0.5 * tolerance))
+    counts = np.bincount(flat.ravel())
+    counts[0] = 0
+    reached = (counts > _WIDE * counts.max())[flat] & (flat > 0)
     if not reached.any():
         return np.zeros(depth.shape, bool)
     passable = known & (height < _HIGHEST * tolerance) & _shallow(height * noise_growth(z), z, known, width)

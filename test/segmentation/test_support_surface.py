@@ -1,4 +1,4 @@
-"""Surfaces are no objects: bent tables, tables without a border, room corners, what stands beyond the edge."""
+"""Surfaces are no objects: tables that sensors bend, tables without a border, room corners, what stands beyond."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def test_a_box_on_a_bulging_table_is_found_with_its_outline(away):
 
 
 def test_the_bend_is_measured_and_a_flat_table_has_none():
-    """Of the paraboloid, the curvature in x follows from its definition: h = bulge (1 - r^2) + const."""
+    """Of the paraboloid, the curvature in x follows from its definition: h = bulge (1 - r^2), in units of z^2."""
     away, bulge = 0.6, 0.012
     depth = noisy(bulging(away, bulge), 5e-4)
     plane = support_plane.planes(depth, np.isfinite(depth), CAMERA, support_plane.Search(TOLERANCE, 0.1, 0))[0]
