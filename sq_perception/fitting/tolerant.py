@@ -51,10 +51,10 @@ _FIRST_STEPS, _MORE_STEPS, _LAST_STEPS = 5, 12, 40
 _LEFT_OVER_RAYS = 3000
 _MEDIAN_TO_SIGMA = 1.4826
 """Of absolute values of a normal distribution."""
-_HOLLOW = 3.0**2
-"""Mean squared residual, in noise levels, of the body of a solid thing at the most.  A thing that is hollow or notched,
-such as a bowl or a pair of pliers, is fitted as its hull instead: points may lie behind the surface of the body that
-encloses it, and the space within its outline's hull may be empty."""
+_HOLLOW = 3.0
+"""Noise levels that the points of a solid thing typically stray at the most.  A thing that is hollow or notched, such as
+a bowl or a pair of pliers, is fitted as its hull instead: points may lie behind the surface of the body that encloses
+it, and the space within its outline's hull may be empty."""
 _INNER_CAUCHY = 1.0
 """Noise levels behind the surface of a hull, beyond which a point hardly counts."""
 _SPREAD = 2.5**2
@@ -71,8 +71,9 @@ def solve(problem: Problem, given: Sequence[State]) -> Solution:
     boxes = box_start.principal(observation.points) if plane is None else box_start.on_plane(observation.points, plane)
     starts = [*given, *boxes]
     solution = _best(problem, starts)
-    hollow = solution.state.cost > _HOLLOW * INDEPENDENT_RAYS
-    if hollow and not problem.late:
+    huber = problem.terms.huber
+    typical_of_hollow = huber * (2 * _HOLLOW - huber) * INDEPENDENT_RAYS
+    if solution.state.cost > typical_of_hollow and not problem.late:
         as_hull = replace(problem.with_terms(inner_cauchy=_INNER_CAUCHY), observation=observation.of_hull())
         notes = ("like the convex hull of the object",)
         solution = replace(_best(as_hull, [solution.state, *starts]), notes=notes, as_hull=True)

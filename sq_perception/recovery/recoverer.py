@@ -75,7 +75,8 @@ class Recoverer:
     Parameters
     ----------
     model
-        Weights file; None: the ones that ship with the package.
+        Weights file; None: the ones that ship with the package, ``things`` for what ``auto`` fits to images of pinhole
+        cameras, as it tells hulls with their uncertainty, and ``robust``, which tells bodies, for all else.
     device
         Of the network: "cpu", "cuda" ...
     consensus
@@ -120,7 +121,7 @@ class Recoverer:
         self._beside = ThreadPoolExecutor(1, thread_name_prefix="network")
         self._pool = ThreadPoolExecutor(self._threads, thread_name_prefix="fit")
         if method in NEEDS_NETWORK:
-            self._load_network(True)
+            self._load_network(method == "auto")
 
     @property
     def has_weights(self) -> bool:
@@ -177,7 +178,10 @@ class Recoverer:
     ) -> FrameRecovery:
         started = time.perf_counter()
         milliseconds = dict.fromkeys(("segmentation", "network", "fit", "repair", "score", "total"), 0.0)
-        network = self._load_network(camera.is_pinhole) if options.method in NEEDS_NETWORK else None
+        network = None
+        if options.method in NEEDS_NETWORK:
+            is_fitted = options.method == "auto" and options.refine == "surface"
+            network = self._load_network(camera.is_pinhole and is_fitted)
 
         with _timed(milliseconds, "segmentation"):
             depth = _plausible(np.asarray(depth), camera)
@@ -236,17 +240,17 @@ class Recoverer:
             return [function(one) for one in items]
         return list(self._pool.map(function, items))
 
-    def _load_network(self, pinhole: bool) -> Network:
-        """The network for a kind of camera; the same one for both if a file of weights was named."""
+    def _load_network(self, of_things: bool) -> Network:
+        """The network that tells hulls, or the one that tells bodies; if a file of weights was named, that one."""
         with self._lock:
-            if pinhole not in self._loaded:
-                kinds = (pinhole,) if self._path is None else (True, False)
-                self._loaded.update(dict.fromkeys(kinds, self._read_network(pinhole)))
-            network = self._loaded[pinhole]
+            if of_things not in self._loaded:
+                kinds = (of_things,) if self._path is None else (True, False)
+                self._loaded.update(dict.fromkeys(kinds, self._read_network(of_things)))
+            network = self._loaded[of_things]
         return Consensus(network) if self._consensus and not isinstance(network, inference.ThingPredictor) else network
 
-    def _read_network(self, pinhole: bool) -> Network:
-        if (self._path is None and pinhole) or checkpoint.tells_hulls(self._path):
+    def _read_network(self, of_things: bool) -> Network:
+        if (self._path is None and of_things) or checkpoint.tells_hulls(self._path):
             return inference.ThingPredictor(checkpoint.load_things(self._path, self._device))
         return inference.prepare(checkpoint.load(self._path, self._device))
 

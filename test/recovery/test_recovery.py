@@ -186,7 +186,7 @@ def test_methods_do_what_they_say(weights):
     np.testing.assert_array_equal(network.superquadric.to_flat(), unrefined.superquadric.to_flat())
     assert np.isnan(network.sigma_size).all()
     view = canonical_view.from_mask(depth, labels == 1, CAMERA)
-    predicted = view.from_canonical(recoverer._load_network(True).predict(view.image[None])[0])
+    predicted = view.from_canonical(recoverer._load_network(False).predict(view.image[None])[0])
     assert iou(network.superquadric, predicted) > 0.99
     assert iou(run(method="auto").superquadric, truth[0]) > 0.9, "whatever the network says"
     assert iou(run(method="symmetry").superquadric, truth[0]) > 0.9
