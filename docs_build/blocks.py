@@ -220,8 +220,24 @@ def _rooms_of(path: Path) -> Iterator[str]:
                 yield rest.partition(".")[0]
 
 
+def known() -> str:
+    """Recorded frames of known sizes: the fair kinds by method, then what the fit makes of each kind."""
+    groups = results("known_frames")["groups"]
+
+    def row(title: str, method: str, one: dict[str, Any]) -> list[str]:
+        sigma = "-" if one["two_sigma"] is None else f"{100 * one['two_sigma']:.0f}"
+        errors = f"{1e3 * one['error_median']:.1f} / {1e3 * one['error_mean']:.1f}"
+        iou = "-" if one["iou"] is None else f"{100 * one['iou']:.1f}"
+        return [title, method, str(one["things"]), iou, errors, sigma]
+
+    rows = [row("boxes, cans, bottles", method, one) for method, one in groups["fair"].items()]
+    for kind in ("box", "cylinder", "bottle", "vessel", "other"):
+        rows += [row(kind, method, groups[kind][method]) for method in ("auto, given", "auto, own")]
+    return table(["things", "method, masks", "number", "IoU %", "error of edges mm, median / mean", "2 sigma %"], rows)
+
+
 BLOCKS: dict[str, Callable[[], str]] = {
-    function.__name__: function for function in (accuracy, household, kinds, frame_time, latency, house, rooms)
+    function.__name__: function for function in (accuracy, household, kinds, known, frame_time, latency, house, rooms)
 }
 
 

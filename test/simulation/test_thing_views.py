@@ -16,7 +16,7 @@ from sq_perception.imaging.raycast import render
 from sq_perception.simulation import thing_views
 from sq_perception.simulation.household import KINDS, draw_thing
 from sq_perception.simulation.thing_rendering import render_things
-from sq_perception.simulation.thing_views import Setting, draw_setting, draw_thing_views, plane_in_view, support_in_view
+from sq_perception.simulation.thing_views import Setting, draw_setting, draw_thing_views, support_in_view
 
 NOTHING = Superquadric.stack([])
 
@@ -163,7 +163,7 @@ def test_planes_move_into_the_view_with_their_points() -> None:
     points = foot + rng.uniform(-0.1, 0.1, (20, 2)) @ across
     matrix = quaternions.to_matrix(view.rotation)
     moved = (points - view.anchor) @ matrix.T / view.extent + [0.5, 0.5, NEAREST]
-    plane = plane_in_view(setting.table, view)
+    plane = view.plane_to_canonical(setting.table)
     np.testing.assert_allclose(moved @ plane[:3] + plane[3], 0, atol=1e-9)
     height = 0.03
     raised = (points + height * setting.table[:3] - view.anchor) @ matrix.T / view.extent + [0.5, 0.5, NEAREST]
