@@ -53,8 +53,8 @@ _MEDIAN_TO_SIGMA = 1.4826
 """Of absolute values of a normal distribution."""
 _HOLLOW = 3.0
 """Noise levels that the points of a solid thing typically stray at the most.  A thing that is hollow or notched, such
-as a bowl or a pair of pliers, is fitted as its hull instead: points may lie behind the surface of the body that encloses
-it, and the space within its outline's hull may be empty."""
+as a bowl or a pair of pliers, is fitted as its hull instead: points may lie behind the surface of the body that
+encloses it, and the space within its outline's hull may be empty."""
 _INNER_CAUCHY = 1.0
 """Noise levels behind the surface of a hull, beyond which a point hardly counts."""
 _SPREAD = 2.5**2
