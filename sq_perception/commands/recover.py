@@ -276,6 +276,7 @@ def run(options: argparse.Namespace) -> int:
             lines = ResultLines(recover_outputs.place(options.jsonl), recover_outputs.decisive(options))
             if lines.done and (options.track or options.mcap):
                 name = "--track" if options.track else "--mcap"
+                lines.close()
                 return misused(f"--jsonl: {options.jsonl} has {len(lines.done)} frames already, and {name} needs all")
             done.add(lines.done)
         bag = recover_outputs.bag(options)
@@ -286,7 +287,11 @@ def run(options: argparse.Namespace) -> int:
         return FAILURE
 
     run = _Run(options, recoverer, settings, lines, bag)
-    code = run.over(recorded)
+    try:
+        code = run.over(recorded)
+    finally:
+        if lines is not None:
+            lines.close()
     entries = [*(lines.done if lines else []), *run.results]
     for problem in recover_outputs.finish(options, entries, bag, run.is_whole):
         complain(problem)

@@ -17,8 +17,9 @@ _INLIER = 3.0
 """Noise levels: noise alone stays within for 99.7 % of the pixels."""
 _RAYS = 800
 """Enough for a share to one or two percent."""
-_FAILED_SHARE = 0.25
-"""Of the smallest half size: a body that half of the points miss by more is none."""
+_FAILED_SHARE, _FAILED_LEVELS = 0.25, 3.0
+"""Of the smallest half size, and in levels of noise and model error: a body that half of the points miss by more than
+both is none.  Of a plate or a pen, a quarter of the thickness is less than what any thing strays."""
 _REACHED = 0.9
 """Of the points of a thing that was fitted as a hull: what the rest sticks out tells whether the body encloses it."""
 _TAIL = 0.01
@@ -44,7 +45,7 @@ def verdict(solution: Solution, began: float) -> Fit:
         outside = body.gauge(observation.points) > 1
         sticking_out = np.where(outside, np.abs(body.sampson_distance(observation.points)), 0.0)
         typical = float(np.quantile(sticking_out, _REACHED))
-    status, message = _status(canonical, covariance, typical)
+    status, message = _status(canonical, covariance, typical, _FAILED_LEVELS * observation.sigma)
     return Fit(
         superquadric=canonical,
         residual=residual,
@@ -83,8 +84,8 @@ def failed(body: Superquadric, observation: Observation, reason: str, began: flo
     )
 
 
-def _status(body: Superquadric, covariance: np.ndarray, typical: float) -> tuple[Status, str]:
-    if typical > _FAILED_SHARE * float(body.size.min()):
+def _status(body: Superquadric, covariance: np.ndarray, typical: float, strays: float) -> tuple[Status, str]:
+    if typical > max(_FAILED_SHARE * float(body.size.min()), strays):
         return Status.FAILED, (
             f"no superquadric found: {1e3 * typical:.1f} mm and more between many of the points and the best one"
         )
