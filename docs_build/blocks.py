@@ -236,8 +236,32 @@ def known() -> str:
     return table(["things", "method, masks", "number", "IoU %", "error of edges mm, median / mean", "2 sigma %"], rows)
 
 
+def recorded() -> str:
+    """The fair kinds of the recorded frames, by method."""
+    heads = [
+        "method, masks",
+        "IoU with the true convex hull %",
+        "error of full edges mm, median / mean",
+        "within 2 sigma %",
+    ]
+    rows = []
+    for method, one in results("known_frames")["groups"]["fair"].items():
+        sigma = "" if one["two_sigma"] is None else f"{100 * one['two_sigma']:.0f}"
+        errors = f"{1e3 * one['error_median']:.1f} / {1e3 * one['error_mean']:.1f}"
+        rows.append(
+            [
+                f"`{method.split(',')[0]}`{method.partition(',')[2] and ','}{method.partition(',')[2]}",
+                f"{100 * one['iou']:.1f}",
+                errors,
+                sigma,
+            ]
+        )
+    return table(heads, rows)
+
+
 BLOCKS: dict[str, Callable[[], str]] = {
-    function.__name__: function for function in (accuracy, household, kinds, known, frame_time, latency, house, rooms)
+    function.__name__: function
+    for function in (accuracy, household, kinds, known, recorded, frame_time, latency, house, rooms)
 }
 
 

@@ -124,6 +124,13 @@ class FrameParameters:
         100.0, "Farther readings are left out; 100 keeps all.", unit="m", within=(0.001, 100.0), live=True
     )
     max_objects: int = setting(20, "At most so many bodies per frame, the largest ones.", within=(1, 100), live=True)
+    max_size: float = setting(
+        0.6,
+        "Largest full edge of an object found by the node's own segmentation: walls, furniture and tables are larger.",
+        unit="m",
+        within=(0.01, 100.0),
+        live=True,
+    )
     time_budget: float = setting(
         0.0,
         "Seconds per frame after which no further start is tried; the largest and nearest objects come first. 0: none.",

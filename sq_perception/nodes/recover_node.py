@@ -34,6 +34,7 @@ def options(parameters: RecoverParameters) -> RecoveryOptions:
         tau=parameters.tau,
         depth_range=parameters.depth_range,
         max_objects=parameters.max_objects,
+        max_size=parameters.max_size,
         time_budget=parameters.seconds,
         repair=parameters.repair,
     )
