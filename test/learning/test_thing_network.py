@@ -18,6 +18,7 @@ from sq_perception.imaging.canonical_view import NEAREST
 from sq_perception.learning import checkpoint, thing_network, thing_training
 from sq_perception.learning.inference import ThingPredictor
 from sq_perception.learning.thing_network import FREEDOM, HullPrediction, ThingConfig, ThingNetwork
+from sq_perception.simulation.thing_views import draw_thing_views
 
 SMALL = ThingConfig(widths=(8, 16, 16, 16), blocks=1, hidden=16, factors=2)
 J = len(DIRECTIONS)
@@ -143,3 +144,19 @@ def test_a_run_that_was_stopped_goes_on(tmp_path: Path, rng: np.random.Generator
 def test_a_folder_without_views_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main.main(["train-things", str(tmp_path), "--output", str(tmp_path / "run")]) == 1
     assert "expected more than 2 shards of views, found 0" in capsys.readouterr().err
+
+
+def test_the_shipped_network_says_how_well_it_knows() -> None:
+    """On views that no training saw: the error of the support function, and its deviation in units of the said one."""
+    held = draw_thing_views(240, np.random.default_rng([77, 1]))
+    found = thing_training.validate(checkpoint.load_things(), held)
+    assert found["error"] < 0.09
+    assert 0.8 < found["ratio"] < 1.25
+
+
+def test_the_shipped_network_says_where_it_comes_from() -> None:
+    header = checkpoint.read_header("things")
+    assert "train-things" in json.loads(header["made"])["command"]
+    assert json.loads(header["training"])["views"] > 0
+    assert json.loads(header["validation"])["error"] > 0
+    assert checkpoint.resolve("things").stat().st_size < 8_000_000
