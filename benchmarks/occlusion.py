@@ -72,7 +72,7 @@ def cell(figures: dict[str, np.ndarray]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--bodies", type=int, default=500)
-    shipped = list(checkpoint.shipped().values())
+    shipped = list(checkpoint.shipped_regressors().values())
     parser.add_argument("--models", type=Path, nargs="*", default=shipped, help="default: all shipped weights")
     options = parser.parse_args()
     torch.set_num_threads(1)

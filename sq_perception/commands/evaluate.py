@@ -95,11 +95,11 @@ def _evaluate(options: argparse.Namespace, methods: list[Method], words: list[st
 def _contestants(options: argparse.Namespace, methods: list[Method]) -> tuple[list[tuple[Contestant, int]], list[str]]:
     """Who takes part, with the number of bodies, and what is wrong with those who cannot."""
     from sq_perception.evaluation.contestants import FittingMethod, Network, unique_names
-    from sq_perception.learning.checkpoint import CheckpointError, shipped
+    from sq_perception.learning.checkpoint import CheckpointError, shipped_regressors
 
     contestants: list[tuple[Contestant, int]] = []
     failures: list[str] = []
-    paths = list(shipped().values()) if options.models is None else options.models
+    paths = list(shipped_regressors().values()) if options.models is None else options.models
     for path, name in zip(paths, unique_names(paths), strict=True):
         try:
             contestants.append((Network.read(path, name), options.bodies))

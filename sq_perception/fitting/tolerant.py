@@ -3,14 +3,14 @@
 One maximum a posteriori fit.  The cost, minus twice the log of the posterior, is the sum of
 
     object  w rho(r)        what the object's pixels measured; sigma is the noise and the model error in squares
-    free    FREE w rho(r)   pixels beside it that saw farther: the body keeps out of that space
+    free    w rho(r)        pixels beside it that saw farther: the body keeps out; times FREE beside a hull
     plane, rest             it does not reach below its support, and mostly lies on a face
     hull                    (nu + J) log(1 + |W (h - b)|^2 / nu): its support function beside the predicted one
     volume, proportion      weak, and only where nothing is predicted (:mod:`sq_perception.fitting.unseen` then too)
 
 (:mod:`sq_perception.fitting.residuals`, :mod:`sq_perception.fitting.priors`, :mod:`sq_perception.fitting.hull_prior`).
 Errors of neighbouring pixels are alike where the model errs: the object counts as INDEPENDENT_RAYS rays, however many
-are drawn.  Free rays weigh less still, as an outline errs as a whole.
+are drawn.  Free rays weigh less still beside a predicted hull, as an outline errs as a whole.
 
 1. Starts: the given bodies (the prediction), and boxes on the plane, or along the points' axes without one.
 2. A few steps from each on few rays; more from the best; to the end, on all rays, from the best one or two.
@@ -100,10 +100,11 @@ def take_over(problem: Problem, best: State, given: Sequence[State]) -> Solution
 
 def _with_priors(problem: Problem) -> Problem:
     hull = problem.options.hull() if callable(problem.options.hull) else problem.options.hull
-    terms = problem.terms._replace(huber=_HUBER, volume_price=VOLUME_PRICE)
+    terms = problem.terms._replace(huber=_HUBER, inner_cauchy=_INNER_CAUCHY, volume_price=VOLUME_PRICE)
     if hull is not None:
         terms = terms._replace(
             huber=_HUBER_OF_PREDICTED,
+            inner_cauchy=0.0,
             proportion_stiffness=0.0,
             volume_price=0.0,
             hull_directions=np.ascontiguousarray(hull.directions),
@@ -116,7 +117,8 @@ def _with_priors(problem: Problem) -> Problem:
 
 def _drawn(problem: Problem, count: int, offset: float) -> Rays:
     rays = draw(problem, count, offset)
-    rays.free[:, WEIGHT] *= FREE
+    if len(problem.terms.hull_directions) > 0:
+        rays.free[:, WEIGHT] *= FREE
     return rays
 
 

@@ -55,6 +55,11 @@ def shipped() -> dict[str, Path]:
     return {path.stem: path for path in sorted(folder.glob("*.safetensors"))}
 
 
+def shipped_regressors() -> dict[str, Path]:
+    """Those among them that tell a body, and no hull."""
+    return {name: path for name, path in shipped().items() if not tells_hulls(path)}
+
+
 def resolve(model: Path | str | None = None) -> Path:
     """The file that is meant by a path, by the name of shipped weights, or by None: those for real cameras."""
     if model is None:
@@ -132,12 +137,13 @@ def tells_hulls(path: Path | str | None = None) -> bool:
 
 
 def check(path: Path | str | None = None) -> None:
-    """Raise CheckpointError where a look at the header is enough to tell that :func:`load` would.
+    """Raise CheckpointError where a look at the header tells that :func:`load` or :func:`load_things` would.
 
     Reads a megabyte at most, whatever the file.
     """
     path = resolve(path)
-    _described(path, read_header(path), FORMAT)
+    header = read_header(path)
+    _described(path, header, THING_FORMAT if header.get("format") == THING_FORMAT else FORMAT)
 
 
 def _bytes(path: Path, header_only: bool = False) -> tuple[bytes, int]:

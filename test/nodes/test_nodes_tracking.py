@@ -163,7 +163,7 @@ def test_a_tracker_that_cannot_go_on_costs_one_frame(make_bench):
     bench.recoverer.bodies = (recovery(BOX, 1),)
     bench.answer(image(10.0))
     broken = recovery(BOX, 1)
-    object.__setattr__(broken, "covariance", np.eye(3))
+    object.__setattr__(broken.fit, "covariance", np.eye(3))
     bench.recoverer.bodies = (broken,)
     assert "tracking: covariance" in bench.send(image(10.1)).last_error
     bench.recoverer.bodies = (recovery(BOX, 1),)
