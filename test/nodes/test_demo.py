@@ -227,7 +227,7 @@ def test_a_node_that_dies_is_named_and_ends_the_demonstration(tmp_path: Path) ->
     process = demo("--seconds", "60", env=env, cwd=tmp_path)
 
     def victims() -> list[int]:
-        return [pid for pid, command in marked(mark).items() if "executables.fitter_node" in command]
+        return [pid for pid, command in marked(mark).items() if "e.fitter_node(" in command]
 
     wait_for(victims)
     os.kill(victims()[0], signal.SIGKILL)
