@@ -99,8 +99,11 @@ class Browser:
         assert "exceptionDetails" not in found, found["exceptionDetails"]
         return found["result"].get("value")
 
-    def until(self, condition: Callable[[], Any], seconds: float = 20.0) -> Any:
-        """The first true value of a condition."""
+    def until(self, condition: Callable[[], Any], seconds: float = 90.0) -> Any:
+        """The first true value of a condition.
+
+        A killed node's subscriptions stay until DDS takes it for lost, 20 s, and a node may start slowly beside others.
+        """
         deadline = time.monotonic() + seconds
         while not (value := condition()):
             assert time.monotonic() < deadline, f"waited in vain; the page says: {self.text()[:2000]}"
