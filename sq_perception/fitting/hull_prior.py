@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 
 MODEL_SHARE = 0.01
-"""Root mean square difference between a household thing's support function and that of the nearest superquadric, as a
-share of the thing's extent; measured on simulation/household.py."""
+"""Difference between a thing's support function and that of the nearest superquadric, as a share of the thing's extent:
+an estimate, not measured."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -70,7 +70,7 @@ class ThingPredictor:
     """The network of things, made ready to predict.
 
     It is asked about each view and its mirror image, whose answer is mirrored back: the mean of two support functions
-    errs less than one (by 5 to 8 % on recorded things); the mean of their covariances does not promise more.  The
+    errs less than one (by 3 to 6 % on recorded things); the mean of their covariances does not promise more.  The
     body is that of the view itself.
     """
 

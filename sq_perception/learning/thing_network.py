@@ -45,7 +45,7 @@ from sq_perception.learning.regressor import RegressorConfig
 MIDDLE = (0.5, 0.5, NEAREST)
 """c: what h is measured from."""
 FREEDOM = 10.0
-"""nu of the t distribution: one view in twenty errs by a half more than it says."""
+"""nu of the t distribution: tails a little longer than normal; chosen beforehand, no other value was tried."""
 _HALF_WAY = 0.5
 """Depth at which a pixel without a surface is given its height above the plane."""
 _LEAST_LOG, _MOST_LOG = -5.0, 0.5
