@@ -64,39 +64,12 @@ TRACKED_WINDOW = (70.0, 550.0, 40.0, 440.0)
 WRAPPED: dict[str, Any] = {"break_long_words": False, "break_on_hyphens": False}
 
 
-# Tables
-
-
-HEADER = ["thing", "true edges, mm", "recovered, mm", "IoU", "status"]
-
-
-def table(found: Sequence[Found], frame: FrameRecovery) -> str:
-    """A line for each thing, and for each body that belongs to none."""
-    lines = [_line(one) for one in found]
-    lines += [["none", "", _edges_of(body), "", _verdict(body)] for body in _surplus(found, frame)]
-    return report.table(HEADER, lines)
+# Figures of a scene
 
 
 def _surplus(found: Sequence[Found], frame: FrameRecovery) -> list[Recovery]:
     taken = {one.body.label for one in found if one.body is not None}
     return [body for body in frame.recovered if body.label not in taken]
-
-
-def _line(one: Found) -> list[str]:
-    start = [one.stood.name, " x ".join(f"{1e3 * edge:.0f}" for edge in one.stood.thing.edges[::-1])]
-    if one.body is None:
-        return [*start, "nothing", "0 %", ""]
-    return [*start, _edges_of(one.body), f"{100 * one.iou:.0f} %", _verdict(one.body)]
-
-
-def _edges_of(body: Recovery) -> str:
-    order = np.argsort(-body.superquadric.size)
-    edges, sigma = 2e3 * body.superquadric.size[order], 2e3 * body.sigma_size[order]
-    return " x ".join(f"{edge:.0f} ± {deviation:.0f}" for edge, deviation in zip(edges, sigma, strict=True))
-
-
-def _verdict(body: Recovery) -> str:
-    return Status(body.status).name.lower()
 
 
 def mean_iou(found: Sequence[Found]) -> float:
@@ -124,14 +97,14 @@ def of_scene(
     azimuth: float = 35.0,
     **where: float,
 ) -> Callable[[Path], Entry]:
-    """A picture of three panels with its table."""
+    """A picture of three panels."""
 
     def draw(path: Path) -> Entry:
         view = viewed(things, sensor, **where)
         frame = recoverer().recover(view.depth, view.camera)
         found = matched(view, frame)
         write_picture(scene_figure(view, frame, azimuth), path)
-        return Entry(title, text(found, frame), table(found, frame))
+        return Entry(title, text(found, frame))
 
     return draw
 
@@ -364,11 +337,9 @@ ENTRIES: dict[str, Callable[[Path], Entry]] = {
 }
 
 INTRODUCTION = """
-Synthetic scenes with known truth, seen by simulated [sensors](sensors.md), and what
-`Recoverer().recover(depth, camera)` makes of them: own masks, default options. Pictures, tables and numbers are those
-of one run of `python benchmarks/gallery.py` ({facts}). The scenes were composed to show something;
-for figures over many scenes see [the surface fit](surface_fit.md), [segmentation](segmentation.md) and
-[tracking](tracking.md).
+Synthetic scenes with known truth through simulated [sensors](sensors.md), and what `Recoverer().recover(depth, camera)`
+makes of them: own masks, default options. Pictures and numbers are those of one run of `python benchmarks/gallery.py`
+({facts}). Single scenes prove nothing: figures over many are in the [README](../README.md#accuracy-and-speed).
 
 Left the depth image, near is light and black is nothing measured; in the middle masks and recovered outlines, hidden
 edges faint; right the recovered bodies, and the true things as thin lines. Edges are full lengths, ± one reported
