@@ -3,8 +3,8 @@
     python docs_build/blocks.py     rewrites them in README.md and docs/
 
 A document holds such a part between two lines, ``<!-- made by docs_build/blocks.py: NAME -->`` and ``<!-- end -->``.
-Figures come from benchmarks/results/*.json, the house from ``FLOORS`` of test/package/test_imports.py, from what the
-rooms say of themselves and from their imports.  A test compares.
+Figures come from benchmarks/results/*.json and from the header of the weights, the packages from ``FLOORS`` of
+test/package/test_imports.py and from what they say of themselves.  A test compares.
 """
 
 from __future__ import annotations
@@ -106,9 +106,16 @@ def household() -> str:
 
 
 def kinds() -> str:
-    """The same by the kind of thing."""
-    found = results("real_scenes")
-    rows = [(name, found[f"{name}: given"], found[f"{name}: own"]) for name in ("box", "can", "bottle", "scan")]
+    """The same by the kind of thing and by how much of it is visible; in the end the harder things."""
+    scenes, harder = results("real_scenes"), results("household_things")
+    names = {
+        **{name: name for name in ("box", "can", "bottle", "scan")},
+        "50 to 90 % visible": "visible: 50 to 90 %",
+        "under 50 % visible": "visible: under 50 %",
+    }
+    rows = [(title, scenes[f"{name}: given"], scenes[f"{name}: own"]) for title, name in names.items()]
+    every = "all, at least half visible"
+    rows.append(("harder things", harder[f"{every}: given"], harder[f"{every}: own"]))
     return table(
         ["things", "number", "IoU %, masks given / own", "error of edges mm, median", "within 2 sigma %, masks given"],
         [
@@ -120,6 +127,30 @@ def kinds() -> str:
                 f"{given['within_2_sigma']:.0f}",
             ]
             for name, given, own in rows
+        ],
+    )
+
+
+def prediction() -> str:
+    """Errors of the network of things, from the header of its weights."""
+    path = PACKAGE / "weights" / "things.safetensors"
+    with path.open("rb") as file:
+        header = json.loads(file.read(int.from_bytes(file.read(8), "little")))
+    validation = json.loads(header["__metadata__"]["validation"])
+    kinds = {name: values for name, values in validation.items() if isinstance(values, list)}
+    return table(
+        ["kind", "all", *kinds],
+        [
+            [
+                "error of h, % of the view",
+                f"{100 * validation['error']:.1f}",
+                *(f"{100 * error:.1f}" for error, _ in kinds.values()),
+            ],
+            [
+                "error over sigma",
+                f"{validation['ratio']:.2f}",
+                *(f"{ratio:.2f}" for _, ratio in kinds.values()),
+            ],
         ],
     )
 
@@ -162,7 +193,24 @@ def latency() -> str:
     )
 
 
-# The house
+def tracks() -> str:
+    """Errors of sizes of tracked bodies by frame, per cent."""
+    frames = ("1", "10", "30", "300")
+    return table(
+        ["camera, masks", *(f"after {frame}" for frame in frames), "common to all views", "within 2 sigma %"],
+        [
+            [
+                name,
+                *(f"{100 * row['error'][frame]:.2f}" for frame in frames),
+                f"{100 * row['bias']:.2f}",
+                f"{100 * row['within_2_sigma']:.0f}",
+            ]
+            for name, row in results("tracking")["rows"].items()
+        ],
+    )
+
+
+# The packages
 
 
 def floors() -> tuple[tuple[str, ...], ...]:
@@ -175,7 +223,7 @@ def floors() -> tuple[tuple[str, ...], ...]:
     raise LookupError("test/package/test_imports.py has no FLOORS")
 
 
-def house() -> str:
+def layers() -> str:
     """A drawing of the floors, the highest first; modules import from their own floor and from those below."""
     rows = ["   ".join(rooms) for rooms in reversed(floors())]
     inner = max(map(len, rows))
@@ -183,27 +231,27 @@ def house() -> str:
     return "\n".join(["```text", line, *(f"| {row.center(inner)} |\n{line}" for row in rows), "```"])
 
 
-def rooms() -> str:
-    """What each room holds, in its own words, and the rooms that it imports from."""
+def packages() -> str:
+    """What each subpackage holds, in its own words."""
     return table(
-        ["room", "holds", "imports from"],
+        ["package", "holds"],
         [
-            [f"[`{room}/`](../sq_perception/{room}/__init__.py)", purpose(room), ", ".join(sorted(imported(room)))]
+            [f"[`{name}/`](../sq_perception/{name}/__init__.py)", purpose(name)]
             for floor in reversed(floors())
-            for room in floor
+            for name in floor
         ],
     )
 
 
 def purpose(room: str) -> str:
-    """The first paragraph of a room's docstring."""
+    """The first paragraph of a package's docstring."""
     docstring = ast.get_docstring(ast.parse((PACKAGE / room / "__init__.py").read_text(encoding="utf-8"))) or ""
     return " ".join(docstring.partition("\n\n")[0].split())
 
 
 @cache
 def imported(room: str) -> frozenset[str]:
-    """Other rooms that modules of one import, wherever in them."""
+    """Other packages that modules of one import, wherever in them."""
     return frozenset({there for path in (PACKAGE / room).rglob("*.py") for there in _rooms_of(path)}) - {room}
 
 
@@ -261,7 +309,19 @@ def recorded() -> str:
 
 BLOCKS: dict[str, Callable[[], str]] = {
     function.__name__: function
-    for function in (accuracy, household, kinds, known, recorded, frame_time, latency, house, rooms)
+    for function in (
+        accuracy,
+        household,
+        kinds,
+        prediction,
+        known,
+        recorded,
+        frame_time,
+        latency,
+        tracks,
+        layers,
+        packages,
+    )
 }
 
 
