@@ -82,11 +82,10 @@ def mean_iou(found: Sequence[Found]) -> float:
 
 @dataclass(frozen=True)
 class Entry:
-    """A part of the page: what stands above the picture, in its place, and below."""
+    """A part of the page: what stands above the picture, and below it."""
 
     title: str
     text: str
-    below: str = ""
 
 
 def of_scene(
@@ -253,19 +252,6 @@ def tracked(path: Path) -> Entry:
     course = figure.add_subplot(grid[1])
     _draw_course(course, error[:, chosen, axis], sigma[:, chosen, axis], single[:, chosen, axis])
     write_picture(figure, path)
-    header = ["after frame", "mean error of edges, mm", "mean reported deviation, mm", "within 2 deviations"]
-    rows = []
-    for k in TRACKED:
-        known = np.isfinite(error[k - 1]) & np.isfinite(sigma[k - 1])
-        within = np.abs(error[k - 1][known]) <= 2 * sigma[k - 1][known]
-        rows.append(
-            [
-                str(k),
-                f"{np.abs(error[k - 1][known]).mean():.1f}",
-                f"{sigma[k - 1][known].mean():.1f}",
-                f"{100 * within.mean():.0f} % of {known.sum()}",
-            ]
-        )
     births = session.tally.births
     steps = ", ".join(f"{error[k - 1, chosen, axis]:+.1f} ± {sigma[k - 1, chosen, axis]:.1f}" for k in TRACKED)
     return Entry(
@@ -274,7 +260,6 @@ def tracked(path: Path) -> Entry:
         f"masks; ids given: {births}. Right, the edge of which the first frame knows least: its error is {steps} mm "
         f"after frames {', '.join(map(str, TRACKED))} (line: fused; dots: each frame by itself). What all views "
         f"share, such as edges widened by stereo, is not taken out by any number of frames.",
-        report.table(header, rows),
     )
 
 
@@ -361,10 +346,9 @@ def main() -> None:
     for name in options.only or ENTRIES:
         path = pictures / f"{name}.png"
         entry = ENTRIES[name](path)
-        below = f"\n{entry.below}\n" if entry.below else ""
         text = textwrap.fill(entry.text, 120, **WRAPPED)
-        parts.append(f"## {entry.title}\n\n![{entry.title}](gallery/{path.name})\n\n{text}\n{below}")
-        print(f"{path.name}: {path.stat().st_size / 1e3:.0f} kB\n{entry.text}\n{entry.below}\n", flush=True)
+        parts.append(f"## {entry.title}\n\n![{entry.title}](gallery/{path.name})\n\n{text}\n")
+        print(f"{path.name}: {path.stat().st_size / 1e3:.0f} kB\n{entry.text}\n", flush=True)
     if not options.only:
         (options.docs / "gallery.md").write_text("\n".join(parts), encoding="utf-8")
 
