@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import threading
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 from builtin_interfaces.msg import Time
@@ -16,10 +19,8 @@ from sq_msgs_py.superquadrics import SuperquadricArray, from_message
 from sq_perception.fitting.fit import Fit, Status
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
-from sq_perception.nodes.engine import RecovererFactory
+from sq_perception.nodes import engine
 from sq_perception.nodes.frame_node import FrameNode
-from sq_perception.nodes.parameters import RecoverParameters
-from sq_perception.nodes.recover_node import options
 from sq_perception.recovery.recoverer import FrameRecovery, Recovery
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
@@ -33,6 +34,8 @@ def ball(label: int = 1, status: Status = Status.CONVERGED) -> Recovery:
 
 class Recoverer:
     """Notes what it is asked, and answers ``bodies``, or raises, once ``gate`` is open."""
+
+    has_weights = True
 
     def __init__(self) -> None:
         self.asked: list[tuple[np.ndarray, Camera, np.ndarray | None, Any]] = []
@@ -58,8 +61,10 @@ class Bench(SpunNodes):
     def __init__(self, *arguments: str) -> None:
         super().__init__(*arguments)
         self.recoverer = Recoverer()
-        factory = RecovererFactory(make=lambda *_: self.recoverer, options=options, answers=("method", "refine"))
-        self.node = FrameNode("recover_node", RecoverParameters, factory, context=self.context)
+        weights = SimpleNamespace(resolve=lambda _: Path(f"weights of {id(self)}"), check=lambda _: None)
+        self.stand_ins = patch.multiple(engine, Recoverer=lambda *_, **__: self.recoverer, checkpoint=weights)
+        self.stand_ins.start()
+        self.node = FrameNode("recover_node", context=self.context)
         self.images = self.peer.create_publisher(Image, "depth/image", 5)
         self.infos = self.peer.create_publisher(CameraInfo, "depth/camera_info", 5)
         self.answers: list[PointCloud2] = []
@@ -75,6 +80,7 @@ class Bench(SpunNodes):
         self.recoverer.gate.set()
         self.until(self.node.close)  # a starved machine collects garbage for longer than a node waits for it
         self.finish()
+        self.stand_ins.stop()
 
     @property
     def counts(self) -> Any:

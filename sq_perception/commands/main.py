@@ -21,7 +21,7 @@ COMMANDS = {
     "recover": ("sq_perception.commands.recover", "depth images in, superquadrics out"),
     "render": ("sq_perception.commands.render", "draw a superquadric as a depth image"),
     "demo": ("sq_perception.nodes.demo", "live demonstration with real ROS 2 nodes (extra 'ros')"),
-    "view": ("sq_perception.nodes.view", "a page in the browser: depth, bodies, parameters (extras 'ros', 'view')"),
+    "view": ("sq_perception.commands.view", "a page in the browser: depth, bodies, parameters (extras 'ros', 'view')"),
     "train": ("sq_perception.commands.train", "train a network"),
     "thing-views": ("sq_perception.commands.thing_views", "draw views of household things to train on"),
     "train-things": ("sq_perception.commands.train_things", "train the network that tells the unseen side of things"),

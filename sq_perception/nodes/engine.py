@@ -18,15 +18,23 @@ from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from time import perf_counter
-from typing import Any, Generic, TypeVar
 
+import torch
 from rclpy.node import Node
 
 from sq_perception.imaging.camera import Camera
+from sq_perception.learning import checkpoint
 from sq_perception.nodes.frame import Frame
-from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, RecoveryOptions
+from sq_perception.nodes.parameters import RecoverParameters
+from sq_perception.recovery.options import NEEDS_NETWORK, RecoveryOptions
+from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, checked_device
 
-P = TypeVar("P")
+_MADE_OF = ("device", "consensus", "threads", "method", "model")
+"""Parameters that a recoverer is made of."""
+_READ_BY = frozenset(("model", "device"))
+"""Those whose setting reads the weights; the others keep what is loaded, whatever became of the file."""
+_ANSWERS = ("method", "refine", "consensus")
+"""Parameters that change what bodies come out, beside the weights."""
 
 
 class Turns:
@@ -53,43 +61,6 @@ class Turns:
 
 TURNS = Turns()
 """Those of this process."""
-
-
-@dataclass(frozen=True)
-class RecovererFactory(Generic[P]):
-    """How a kind of node makes its recoverer, and tells it what the parameters say.
-
-    Attributes
-    ----------
-    make
-        A recoverer of parameters, with the weights of another one if that is given.
-    options
-        What the parameters say to each frame.
-    made_of
-        Names of the parameters that the recoverer is made of.
-    read_by
-        Those of them whose setting reads the weights; the others keep what is loaded, whatever became of the file.
-    weights
-        Tells the weights that would be read now from others; None where recoverers are never shared.
-    answers
-        Names of the parameters that change what bodies come out, beside the weights.
-    check
-        Raises ValueError for parameters that :attr:`make` would refuse, as far as that can be told at once; it also
-        gets the names of those that change, and the recoverer at work.
-    describe
-        In a few words, for diagnostics.
-    """
-
-    make: Callable[[P, Recoverer | None], Recoverer]
-    options: Callable[[P], RecoveryOptions]
-    made_of: tuple[str, ...] = ()
-    read_by: tuple[str, ...] = ()
-    weights: Callable[[P], Hashable] = lambda _: None
-    answers: tuple[str, ...] = ()
-    check: Callable[[P, frozenset[str], Recoverer | None], None] = lambda *_: None
-    describe: Callable[[P], str] = lambda _: ""
-
-
 _shared: weakref.WeakValueDictionary[Hashable, Recoverer] = weakref.WeakValueDictionary()
 _making = threading.Lock()
 
@@ -99,28 +70,21 @@ class _Superseded(Exception):  # noqa: N818 - no fault
 
 
 @dataclass(frozen=True)
-class _Built(Generic[P]):
+class _Built:
     recoverer: Recoverer
-    parameters: P
+    parameters: RecoverParameters
     weights: Hashable
     key: Hashable
+    """Equal for recoverers that nodes may share."""
 
 
-class Engine(Generic[P]):
-    """The recoverer at work; see the module.
+class Engine:
+    """The recoverer at work; see the module.  The node's log hears of swaps."""
 
-    Parameters
-    ----------
-    factory
-        What makes it.
-    node
-        Whose log hears of swaps.
-    """
-
-    def __init__(self, factory: RecovererFactory[P], node: Node) -> None:
-        self._factory, self._node = factory, node
+    def __init__(self, node: Node) -> None:
+        self._node = node
         self._lock = threading.Lock()
-        self._built: _Built[P] | None = None
+        self._built: _Built | None = None
         self._request = 0
         self._is_to_read = False
         """Whether weights that were asked for have not been read yet."""
@@ -129,118 +93,160 @@ class Engine(Generic[P]):
         self.fault = ""
         """Why the last swap came to nothing; empty once one has succeeded."""
 
-    def build(self, parameters: P, camera: Camera) -> None:
-        """Make the recoverer and warm it up; what the factory raises comes through."""
-        with self._lock:
-            self._request += 1
-        built = self._made(parameters, camera, None)
-        with self._lock:
-            self._built, self.fault, self.is_making, self._is_to_read = built, "", False, False
+    def build(self, parameters: RecoverParameters, camera: Camera) -> None:
+        """Make the recoverer and warm it up.
+
+        Raises
+        ------
+        CheckpointError, ValueError
+            If the model or the device cannot be used.
+        """
+        self._replace(None)
+        self._replace(_made(parameters, camera, None, lambda: True))
 
     def release(self) -> None:
         """Let go of the recoverer, and of one that is being made."""
-        with self._lock:
-            self._request += 1
-            self._built, self.fault, self.is_making = None, "", False
+        self._replace(None)
 
     def discard(self) -> None:
         """Let nobody else share the recoverer from now on: it has failed again and again."""
-        built = self._built
-        if built is not None:
-            with _making:
-                if _shared.get(built.key) is built.recoverer:
-                    del _shared[built.key]
+        with _making:
+            if self._built is not None and _shared.get(self._built.key) is self._built.recoverer:
+                del _shared[self._built.key]
 
-    def check(self, parameters: P, changed: frozenset[str]) -> None:
+    def check(self, parameters: RecoverParameters, changed: frozenset[str]) -> None:
         """Raise ValueError for parameters that :meth:`follow` could not follow, as far as that can be told at once."""
-        self._factory.check(parameters, changed, None if self._built is None else self._built.recoverer)
+        if "device" in changed:
+            checked_device(parameters.device)
+        reads = not changed.isdisjoint(_READ_BY)
+        if self._built is not None and "method" in changed:
+            reads = reads or not self._built.recoverer.has_weights
+        if "model" in changed or (reads and self._built is not None and parameters.method in NEEDS_NETWORK):
+            try:
+                checkpoint.check(parameters.model or None)
+            except ValueError as error:
+                raise ValueError(f"model: {error}") from error
 
-    def follow(self, parameters: P, changed: frozenset[str], camera: Camera) -> None:
+    def follow(self, parameters: RecoverParameters, changed: frozenset[str], camera: Camera) -> None:
         """Swap the recoverer where a parameter that it is made of has been set, in the background.
 
         A set that leaves the value as it is counts too: it is how a model file that was replaced is read again.
         """
-        if not changed.intersection(self._factory.made_of) or self._built is None:
+        if not changed.intersection(_MADE_OF) or self._built is None:
             return
         with self._lock:
             self._request += 1
-            request = self._request
             self.is_making = True
-            self._is_to_read = self._is_to_read or bool(changed.intersection(self._factory.read_by))
-            kept = None if self._is_to_read else self._built
-        threading.Thread(
-            target=self._swap, args=(request, parameters, camera, kept), name="recoverer in the making", daemon=True
-        ).start()
+            self._is_to_read = self._is_to_read or not changed.isdisjoint(_READ_BY)
+            work = self._request, parameters, camera, None if self._is_to_read else self._built
+        threading.Thread(target=self._swap, args=work, name="recoverer in the making", daemon=True).start()
 
-    def recover(self, frame: Frame, parameters: P) -> tuple[FrameRecovery, Hashable]:
+    def recover(self, frame: Frame, parameters: RecoverParameters) -> tuple[FrameRecovery, Hashable]:
         """The bodies of a frame by the parameters in force, and what tells their origin from another.
 
         Raises
         ------
         RuntimeError
-            If there is none.
+            If there is no recoverer.
         """
         built = self._built
         if built is None:
             raise RuntimeError("the recoverer has been released")
-        made_of = {name: getattr(built.parameters, name) for name in self._factory.made_of}
-        in_force: Any = replace(parameters, **made_of)  # type: ignore[type-var]
-        recovery = built.recoverer.recover(frame.depth, frame.camera, frame.labels, self._factory.options(in_force))
-        return recovery, (built.weights, *(getattr(in_force, name) for name in self._factory.answers))
+        in_force = replace(parameters, **{name: getattr(built.parameters, name) for name in _MADE_OF})
+        recovery = built.recoverer.recover(frame.depth, frame.camera, frame.labels, options(in_force))
+        return recovery, (built.weights, *(getattr(in_force, name) for name in _ANSWERS))
 
     @property
     def description(self) -> str:
         """What is at work, for diagnostics."""
-        built = self._built
-        if built is None:
+        if (built := self._built) is None:
             return "none"
-        return self._factory.describe(built.parameters) + (", another one is being made" if self.is_making else "")
+        return _described(built.parameters) + (", another one is being made" if self.is_making else "")
 
-    def _swap(self, request: int, parameters: P, camera: Camera, kept: _Built[P] | None) -> None:
-        started = perf_counter()
-        described = self._factory.describe(parameters)
+    def _replace(self, built: _Built | None, request: int | None = None, fault: str = "") -> bool:
+        """End all requests, or one of them; False if it is the last one no more, and nothing has changed then."""
+        with self._lock:
+            if request not in (None, self._request):
+                return False
+            self._request += 1
+            self.is_making, self.fault = False, fault
+            if not fault:
+                self._built, self._is_to_read = built, False
+            return True
+
+    def _swap(self, request: int, parameters: RecoverParameters, camera: Camera, kept: _Built | None) -> None:
+        started, log = perf_counter(), self._node.get_logger()
         try:
-            built = self._made(parameters, camera, kept, lambda: request == self._request)
+            built = _made(parameters, camera, kept, lambda: request == self._request)
+            if self._replace(built, request):
+                log.info(f"changed to {_described(parameters)} within {perf_counter() - started:.1f} s")
         except _Superseded:
             return
         except Exception as error:  # whatever it is: the old one goes on
-            with self._lock:
-                if request != self._request:
-                    return
-                self.is_making = False
-                self.fault = f"cannot change to {described}: {' '.join(str(error).split())}"
-            self._node.get_logger().error(f"{self.fault}; what was there before goes on")
-            return
-        with self._lock:
-            if request != self._request:
-                return
-            self._built, self.fault, self.is_making, self._is_to_read = built, "", False, False
-        self._node.get_logger().info(f"changed to {described} within {perf_counter() - started:.1f} s")
+            fault = f"cannot change to {_described(parameters)}: {' '.join(str(error).split())}"
+            if self._replace(None, request, fault):
+                log.error(f"{fault}; what was there before goes on")
 
-    def _made(
-        self, parameters: P, camera: Camera, kept: _Built[P] | None, is_wanted: Callable[[], bool] = lambda: True
-    ) -> _Built[P]:
-        """A recoverer, warm, with the weights of ``kept`` if given; one that is there already if its key is the same.
 
-        Raises
-        ------
-        _Superseded
-            If nobody wants it any more.
-        """
-        weights = self._factory.weights(parameters) if kept is None else kept.weights
-        others = (name for name in self._factory.made_of if name != "model")  # the same file may have several names
-        key = None if weights is None else (weights, *(getattr(parameters, name) for name in others))
-        with _making:
-            if not is_wanted():
-                raise _Superseded
-            known = None if key is None else _shared.get(key)
-            if known is not None:
-                return _Built(known, parameters, weights, key)
-            recoverer = self._factory.make(parameters, None if kept is None else kept.recoverer)
-            if key is not None:
-                _shared[key] = recoverer
-        with TURNS.turn():
-            if not is_wanted():
-                raise _Superseded
-            recoverer.warm_up(camera)
-        return _Built(recoverer, parameters, weights, key)
+def options(parameters: RecoverParameters) -> RecoveryOptions:
+    """What the parameters say to each frame."""
+    return RecoveryOptions(
+        method=parameters.method,
+        refine=parameters.refine,
+        sharpness=parameters.s,
+        tau=parameters.tau,
+        depth_range=parameters.depth_range,
+        max_objects=parameters.max_objects,
+        max_size=parameters.max_size,
+        time_budget=parameters.seconds,
+        repair=parameters.repair,
+    )
+
+
+def _made(parameters: RecoverParameters, camera: Camera, kept: _Built | None, is_wanted: Callable[[], bool]) -> _Built:
+    """A recoverer, warm, with the weights of ``kept`` if given; one that is there already if it is as good.
+
+    Raises
+    ------
+    _Superseded
+        If nobody wants it any more.
+    """
+    weights = _file(parameters.model) if kept is None else kept.weights
+    # Without the model: the same file may have several names.
+    key = (weights, *(getattr(parameters, name) for name in _MADE_OF if name != "model"))
+    # On a robot's busy cores the slowest of several threads sets the time; one image is too small to gain from them.
+    torch.set_num_threads(1)
+    with _making:
+        if not is_wanted():
+            raise _Superseded
+        if (known := _shared.get(key)) is not None:
+            return _Built(known, parameters, weights, key)
+        recoverer = _shared[key] = Recoverer(
+            parameters.model or None,
+            parameters.device,
+            parameters.method,
+            parameters.consensus,
+            parameters.threads or None,
+            weights_of=None if kept is None else kept.recoverer,
+        )
+    with TURNS.turn():
+        if not is_wanted():
+            raise _Superseded
+        recoverer.warm_up(camera)
+    return _Built(recoverer, parameters, weights, key)
+
+
+def _file(model: str) -> Hashable:
+    """The very file of the weights: another one may take its name."""
+    path = checkpoint.resolve(model or None)
+    try:
+        known = path.stat()
+    except OSError:
+        return str(path)
+    return str(path.resolve()), known.st_ino, known.st_size, known.st_mtime_ns
+
+
+def _described(parameters: RecoverParameters) -> str:
+    if parameters.method not in NEEDS_NETWORK:
+        return f"method {parameters.method}, no network"
+    return f"method {parameters.method}, {parameters.model or 'default weights'} on {parameters.device}"

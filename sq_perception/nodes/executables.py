@@ -86,9 +86,11 @@ def synthetic_depth_node(arguments: Sequence[str] | None = None) -> int:
 
 
 def _frame_node(name: str, namespace: str | None = None) -> FrameNode:
-    from sq_perception.nodes import recover_node as nodes
+    from sq_perception.nodes.frame_node import FrameNode
+    from sq_perception.nodes.parameters import FitterParameters, RecoverParameters
 
-    return nodes.create(namespace, name)
+    kinds = {"recover_node": RecoverParameters, "fitter_node": FitterParameters}
+    return FrameNode(name, kinds[name], namespace=namespace)
 
 
 def _namespace(text: str) -> str:

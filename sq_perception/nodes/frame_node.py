@@ -44,13 +44,13 @@ from std_srvs.srv import SetBool, Trigger
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.nodes import fast_dds, process
-from sq_perception.nodes.engine import TURNS, Engine, RecovererFactory
+from sq_perception.nodes.engine import TURNS, Engine
 from sq_perception.nodes.frame import Frame
 from sq_perception.nodes.inbox import Arrival
 from sq_perception.nodes.input import Input
 from sq_perception.nodes.managed_node import ManagedNode
 from sq_perception.nodes.outputs import Outputs
-from sq_perception.nodes.parameters import LiveParameters
+from sq_perception.nodes.parameters import LiveParameters, RecoverParameters
 from sq_perception.nodes.statistics import THROTTLE, Condition, Statistics, status, summary, timed
 from sq_perception.nodes.tracking import CameraPoses, Tracking
 from sq_perception.recovery.recoverer import FrameRecovery
@@ -85,8 +85,6 @@ class FrameNode(ManagedNode):
         Of the node.
     kind
         The dataclass of its parameters.
-    factory
-        What makes the recoverer that does the work, and tells it what the parameters say.
     context
         rclpy's default if not given.
 
@@ -100,15 +98,14 @@ class FrameNode(ManagedNode):
     def __init__(
         self,
         name: str,
-        kind: type[Any],
-        factory: RecovererFactory[Any],
+        kind: type[RecoverParameters] = RecoverParameters,
         *,
         namespace: str | None = None,
         context: Any = None,
     ) -> None:
         super().__init__(name, namespace=namespace, context=context)
-        self._engine: Engine[Any] = Engine(factory, self)
-        self._settings: LiveParameters[Any] = LiveParameters(
+        self._engine = Engine(self)
+        self._settings: LiveParameters[RecoverParameters] = LiveParameters(
             self, kind, locked=self._why_locked, check=self._engine.check, changed=self._on_changed
         )
         self._statistics = Statistics()

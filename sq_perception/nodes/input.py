@@ -17,7 +17,7 @@ from sq_perception.imaging.calibration import Calibration
 from sq_perception.nodes import fast_dds
 from sq_perception.nodes.frame import Frame, Refused, decode, image_topic
 from sq_perception.nodes.inbox import Arrival, Inbox, NoCameraInfo
-from sq_perception.nodes.parameters import RAW, FrameParameters
+from sq_perception.nodes.parameters import RAW, RecoverParameters
 from sq_perception.nodes.statistics import THROTTLE, Statistics, publishers
 
 
@@ -41,7 +41,7 @@ class Input:
     def __init__(
         self,
         node: Node,
-        parameters: Callable[[], FrameParameters],
+        parameters: Callable[[], RecoverParameters],
         is_wanted: Callable[[], bool],
         statistics: Statistics,
     ) -> None:
@@ -113,7 +113,7 @@ class Input:
                 self._node.destroy_subscription(one)
         self._statistics.count("dropped", self.inbox.close())
 
-    def frame(self, arrival: Arrival, parameters: FrameParameters) -> Frame:
+    def frame(self, arrival: Arrival, parameters: RecoverParameters) -> Frame:
         """The frame of an image with what belongs to it.
 
         Raises

@@ -42,7 +42,7 @@ from sq_msgs_py.markers import markers
 from sq_msgs_py.superquadrics import to_message
 from sq_msgs_py.transforms import name, transforms
 from sq_perception.nodes.frame import Frame, Refused
-from sq_perception.nodes.parameters import FrameParameters
+from sq_perception.nodes.parameters import RecoverParameters
 from sq_perception.nodes.statistics import THROTTLE, timed
 from sq_perception.nodes.tracking import CameraPoses, PoseError
 from sq_perception.recordings import publication
@@ -76,7 +76,7 @@ class Outputs:
         """Packages that outputs are asked for and that are not there."""
         return self._others.absent
 
-    def open(self, parameters: FrameParameters) -> None:
+    def open(self, parameters: RecoverParameters) -> None:
         """Create what is published."""
         create = partial(
             self._node.create_publisher, qos_overriding_options=QoSOverridingOptions(policy_kinds=_OVERRIDABLE)
@@ -107,7 +107,7 @@ class Outputs:
         """Take back what planners were told of: nobody looks after it from now on."""
         self._others.withdraw()
 
-    def answer(self, found: Identified, frame: Frame, parameters: FrameParameters) -> Findings:
+    def answer(self, found: Identified, frame: Frame, parameters: RecoverParameters) -> Findings:
         """Publish the point cloud, in ``target_frame`` if there is one; what was found as every output shows it.
 
         Raises
@@ -121,7 +121,7 @@ class Outputs:
         return findings
 
     def accompany(
-        self, found: Identified, findings: Findings, frame: Frame, parameters: FrameParameters
+        self, found: Identified, findings: Findings, frame: Frame, parameters: RecoverParameters
     ) -> dict[str, float]:
         """Publish what goes with the answer; milliseconds by stage.  Whatever goes wrong here is told, and no more."""
         stages: dict[str, float] = {}
@@ -144,7 +144,7 @@ class Outputs:
         return stages
 
 
-def marker_style(parameters: FrameParameters) -> MarkerStyle:
+def marker_style(parameters: RecoverParameters) -> MarkerStyle:
     """How markers look."""
     return MarkerStyle(parameters.marker_colours, parameters.marker_alpha, parameters.marker_line_width)
 
@@ -199,7 +199,7 @@ class OptionalOutputs:
         """Packages that are asked for and missing; may be read from another thread."""
         return tuple(self._absent.values())
 
-    def follow(self, parameters: FrameParameters) -> None:
+    def follow(self, parameters: RecoverParameters) -> None:
         """Create the publishers that are asked for, and destroy the others."""
         for parameter, kind in _KINDS.items():
             if getattr(parameters, parameter):
@@ -213,7 +213,7 @@ class OptionalOutputs:
             elif parameter in self._publishers:
                 self._node.destroy_publisher(self._publishers.pop(parameter)[1])
 
-    def publish(self, found: Findings, parameters: FrameParameters, hidden: Collection[int] = ()) -> None:
+    def publish(self, found: Findings, parameters: RecoverParameters, hidden: Collection[int] = ()) -> None:
         """Publish what a frame showed, where it is asked for and somebody listens.
 
         Parameters
@@ -267,13 +267,15 @@ class OptionalOutputs:
     def _is_heard(self, parameter: str) -> bool:
         return parameter in self._publishers and bool(self._publishers[parameter][1].get_subscription_count())
 
-    def _publish_transforms(self, found: Findings, parameters: FrameParameters) -> None:
+    def _publish_transforms(self, found: Findings, parameters: RecoverParameters) -> None:
         message_type, publisher = self._publishers["publish_tf"]
         frames = transforms(found.array, found.header, prefix=parameters.tf_prefix)
         if frames:
             publisher.publish(message_type(transforms=frames))
 
-    def _publish_collision_objects(self, found: Findings, parameters: FrameParameters, hidden: Collection[int]) -> None:
+    def _publish_collision_objects(
+        self, found: Findings, parameters: RecoverParameters, hidden: Collection[int]
+    ) -> None:
         meshes = found.meshes if parameters.collision_shapes == "mesh" else None
         objects = collision_objects.collision_objects(
             found.array, found.header, meshes=meshes, prefix=parameters.tf_prefix

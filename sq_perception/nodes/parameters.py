@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import Field, asdict, dataclass, field, fields, replace
+from dataclasses import Field, dataclass, field, fields, replace
 from typing import Any, Generic, Literal, TypeVar, get_args
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
@@ -23,10 +23,9 @@ from rclpy.parameter import Parameter
 
 from sq_perception.imaging import compressed_depth
 from sq_perception.imaging.calibration import Treatment
+from sq_perception.recovery.options import Method, Refine
 from sq_perception.simulation.sensor_noise import PRESETS
 
-Method = Literal["auto", "network", "symmetry", "classic"]
-Refine = Literal["surface", "soft_render", "none"]
 Projection = Literal["pinhole", "orthographic"]
 RAW = "raw"
 TRANSPORTS = (RAW, compressed_depth.TRANSPORT)
@@ -53,15 +52,9 @@ def setting(
     return field(default=default, metadata=about)
 
 
-def replaced(name: str, kind: type[Any], default: Any) -> Any:
-    """The field of another dataclass with another default."""
-    (one,) = (one for one in fields(kind) if one.name == name)
-    return field(default=default, metadata=one.metadata)
-
-
 @dataclass(frozen=True)
-class FrameParameters:
-    """What every node that takes depth images and publishes bodies has."""
+class RecoverParameters:
+    """recover_node, and each node of recover_cameras."""
 
     autostart: bool = setting(
         True,
@@ -205,39 +198,6 @@ class FrameParameters:
         live=True,
     )
 
-    @property
-    def seconds(self) -> float:
-        """``time_budget``, infinity where there is none."""
-        return self.time_budget if self.time_budget > 0 else math.inf
-
-    @property
-    def depth_range(self) -> tuple[float, float]:
-        """Nearest and farthest depth in metres, infinity where ``depth_max`` is at its upper end."""
-        return self.depth_min, math.inf if self.depth_max >= 100.0 else self.depth_max
-
-    def __post_init__(self) -> None:
-        if not self.depth_min < self.depth_max:
-            raise ParameterError(
-                f"depth_min, depth_max: expected depth_min < depth_max, got {self.depth_min:g} and {self.depth_max:g}"
-            )
-        if self.image_transport != RAW and self.projection == "orthographic":
-            raise ParameterError(
-                f"image_transport: expected {RAW} for projection = orthographic, got {self.image_transport}"
-            )
-        if self.fixed_frame and self.projection == "orthographic":
-            raise ParameterError(f"fixed_frame: expected none for projection = orthographic, got {self.fixed_frame}")
-        if self.target_frame and self.projection == "orthographic":
-            raise ParameterError(f"target_frame: expected none for projection = orthographic, got {self.target_frame}")
-        for name in ("fixed_frame", "target_frame", "tf_prefix"):
-            frame = getattr(self, name)
-            if frame.startswith("/"):
-                raise ParameterError(f"{name}: expected no / at the beginning, as tf2 allows none, got {frame}")
-
-
-@dataclass(frozen=True)
-class RecoverParameters(FrameParameters):
-    """recover_node: learned start, refined."""
-
     model: str = setting(
         "",
         "Network weights: a .safetensors file or the name of shipped ones; empty: the default. Set while the node "
@@ -272,12 +232,40 @@ class RecoverParameters(FrameParameters):
         live=True,
     )
 
+    @property
+    def seconds(self) -> float:
+        """``time_budget``, infinity where there is none."""
+        return self.time_budget if self.time_budget > 0 else math.inf
+
+    @property
+    def depth_range(self) -> tuple[float, float]:
+        """Nearest and farthest depth in metres, infinity where ``depth_max`` is at its upper end."""
+        return self.depth_min, math.inf if self.depth_max >= 100.0 else self.depth_max
+
+    def __post_init__(self) -> None:
+        if not self.depth_min < self.depth_max:
+            raise ParameterError(
+                f"depth_min, depth_max: expected depth_min < depth_max, got {self.depth_min:g} and {self.depth_max:g}"
+            )
+        if self.image_transport != RAW and self.projection == "orthographic":
+            raise ParameterError(
+                f"image_transport: expected {RAW} for projection = orthographic, got {self.image_transport}"
+            )
+        if self.fixed_frame and self.projection == "orthographic":
+            raise ParameterError(f"fixed_frame: expected none for projection = orthographic, got {self.fixed_frame}")
+        if self.target_frame and self.projection == "orthographic":
+            raise ParameterError(f"target_frame: expected none for projection = orthographic, got {self.target_frame}")
+        for name in ("fixed_frame", "target_frame", "tf_prefix"):
+            frame = getattr(self, name)
+            if frame.startswith("/"):
+                raise ParameterError(f"{name}: expected no / at the beginning, as tf2 allows none, got {frame}")
+
 
 @dataclass(frozen=True)
 class FitterParameters(RecoverParameters):
     """fitter_node: recover_node with another method."""
 
-    method: Method = replaced("method", RecoverParameters, "classic")  # noqa: RUF009 - a field
+    method: Method = field(default="classic", metadata=RecoverParameters.__dataclass_fields__["method"].metadata)
 
 
 @dataclass(frozen=True)
@@ -356,7 +344,13 @@ class SyntheticParameters:
             raise ParameterError(f"noise: expected 0 for sensor = {self.sensor}, which has its own, got {self.noise:g}")
 
 
-P = TypeVar("P", bound="FrameParameters | SyntheticParameters")
+KINDS: dict[str, type[RecoverParameters] | type[SyntheticParameters]] = {
+    "recover_node": RecoverParameters,
+    "fitter_node": FitterParameters,
+    "synthetic_depth_node": SyntheticParameters,
+}
+"""The parameters of each node."""
+P = TypeVar("P", bound="RecoverParameters | SyntheticParameters")
 
 
 class LiveParameters(Generic[P]):
@@ -479,11 +473,6 @@ def describe(one: Field[Any], is_fixed: bool = True) -> ParameterDescriptor:
         else:
             descriptor.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high))]
     return descriptor
-
-
-def as_ros(values: FrameParameters | SyntheticParameters) -> dict[str, Any]:
-    """Name and value of every parameter, as a YAML file for ROS holds them."""
-    return asdict(values)
 
 
 def _unit(about: Any, form: str = " {}") -> str:

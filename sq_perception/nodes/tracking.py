@@ -18,7 +18,7 @@ from rclpy.node import Node
 from rclpy.time import Time
 
 from sq_perception.nodes.frame import Frame
-from sq_perception.nodes.parameters import FrameParameters
+from sq_perception.nodes.parameters import RecoverParameters
 from sq_perception.nodes.statistics import THROTTLE
 from sq_perception.recordings import publication
 from sq_perception.recordings.publication import Identified
@@ -128,7 +128,7 @@ class Tracking:
         recovery: FrameRecovery,
         frame: Frame,
         arrival: float,
-        parameters: FrameParameters,
+        parameters: RecoverParameters,
         origin: Hashable = None,
     ) -> Identified:
         """Bodies and ids of their tracks; without ``tracking`` ids are labels, and what was tracked is forgotten.

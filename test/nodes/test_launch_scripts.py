@@ -1,23 +1,16 @@
-"""Launch files, run against a stand-in for the launch package (not on PyPI), and the plain scripts as processes."""
+"""Launch files, run against a stand-in for the launch package (not on PyPI)."""
 
 from __future__ import annotations
 
 import importlib.util
-import os
-import signal
-import subprocess
 import sys
-import time
 import types
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-import sq_perception
 from sq_perception.nodes import fast_dds
-
-ROOT = str(Path(sq_perception.__file__).parent.parent)
 
 
 class Recorded:
@@ -140,36 +133,3 @@ def test_rviz_is_fixed_to_the_frame_of_the_synthetic_camera(
 ) -> None:
     nodes = nodes_of(repository / "launch_scripts" / "synthetic.launch.py", launch, scene=scene, rviz="true")
     assert rviz_of(nodes).named["arguments"][-1] == frame
-
-
-@pytest.mark.parametrize("name", ["recover.py", "synthetic.py"])
-def test_plain_scripts_explain_themselves(name: str, repository: Path) -> None:
-    result = run(repository, name, "--help").communicate(timeout=60)
-    assert "usage" in result[0]
-
-
-def run(repository: Path, name: str, *arguments: str) -> subprocess.Popen[str]:
-    path = os.pathsep.join([ROOT, os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
-    return subprocess.Popen(
-        [sys.executable, str(repository / "launch_scripts" / name), *arguments],
-        env={**os.environ, "PYTHONPATH": path},
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
-
-
-def test_a_plain_script_runs_its_node_until_ctrl_c(repository: Path, tmp_path: Path) -> None:
-    pytest.importorskip("rclpy", reason="rclpy missing: install the extra 'ros' or source ROS 2")
-    process = run(repository, "recover.py", "--depth", "/camera/depth")
-    assert process.stdout is not None
-    deadline, said = time.monotonic() + 90, ""
-    while "listening to /camera/depth" not in said:
-        assert time.monotonic() < deadline, said
-        line = process.stdout.readline()
-        assert line, said
-        said += line
-    process.send_signal(signal.SIGINT)
-    rest, _ = process.communicate(timeout=30)
-    assert process.returncode == 0, said + rest
-    assert "Traceback" not in said + rest

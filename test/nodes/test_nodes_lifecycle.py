@@ -7,7 +7,10 @@ import threading
 import time
 import weakref
 from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pytest
@@ -31,11 +34,8 @@ from sq_msgs_py.superquadrics import from_message
 from sq_perception.fitting.fit import Fit, Status
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
-from sq_perception.nodes import managed_node
-from sq_perception.nodes.engine import RecovererFactory
+from sq_perception.nodes import engine, managed_node
 from sq_perception.nodes.frame_node import FrameNode
-from sq_perception.nodes.parameters import RecoverParameters
-from sq_perception.nodes.recover_node import options
 from sq_perception.recovery.recoverer import FrameRecovery, Recovery
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
@@ -43,6 +43,8 @@ CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
 
 class Recoverer:
     """Answers one ball of the size that its model's name says, in centimetres."""
+
+    has_weights = True
 
     def __init__(self, model: str) -> None:
         self.model = model
@@ -78,16 +80,9 @@ class Bench(SpunNodes):
         self.fault: Exception | None = None
         self.gate = threading.Event()
         self.gate.set()
-        factory = RecovererFactory(
-            make=self._make,
-            options=options,
-            made_of=("model", "device", "method"),
-            read_by=("model", "device"),
-            weights=lambda parameters: (id(self), parameters.model),
-            answers=("method", "refine"),
-            check=self._check,
-            describe=lambda parameters: f"model {parameters.model}",
-        )
+        weights = SimpleNamespace(resolve=lambda model: Path(f"{id(self)} {model}"), check=self._check)
+        self.stand_ins = patch.multiple(engine, Recoverer=self._make, checkpoint=weights)
+        self.stand_ins.start()
         self.events: list[str] = []
         self.reports: list[DiagnosticStatus] = []
         self.peer.create_subscription(
@@ -105,23 +100,20 @@ class Bench(SpunNodes):
             self.peer.create_subscription(
                 PointCloud2, f"{at}/recover_node/superquadrics", self.answers[space].append, 50
             )
-        self.nodes = [
-            FrameNode("recover_node", RecoverParameters, factory, namespace=space or None, context=self.context)
-            for space in namespaces
-        ]
+        self.nodes = [FrameNode("recover_node", namespace=space or None, context=self.context) for space in namespaces]
         self.node = self.nodes[0]
         self.spin(self.nodes, executor)
         self.stamps = 0
 
-    def _check(self, parameters: Any, names: frozenset[str], at_work: Recoverer | None) -> None:
-        if "model" in names and not parameters.model.isdigit():
-            raise ValueError(f"model: {parameters.model} is no model")
+    def _check(self, model: str) -> None:
+        if not model.isdigit():
+            raise ValueError(f"{model} is no model")
 
-    def _make(self, parameters: Any, previous: Recoverer | None) -> Recoverer:
+    def _make(self, model: str | None, *_: Any, **__: Any) -> Recoverer:
         assert self.gate.wait(PATIENCE)
         if self.fault is not None:
             raise self.fault
-        self.made.append(Recoverer(parameters.model))
+        self.made.append(Recoverer(model or ""))
         return self.made[-1]
 
     def close(self) -> None:
@@ -129,6 +121,7 @@ class Bench(SpunNodes):
         for node in self.nodes:
             self.until(lambda node=node: node.close() or not node.is_configured)
         self.finish()
+        self.stand_ins.stop()
 
     def change(self, transition: int, label: str = "") -> bool:
         request = ChangeState.Request(transition=Transition(id=transition, label=label))
@@ -360,7 +353,7 @@ class TestSwap:
         assert bench.node.set_parameters([Parameter("model", value="3")])[0].successful
         assert bench.answer() == 1.0, "the old one goes on until the new one is ready"
         bench.gate.set()
-        bench.until(lambda: bench.node._engine.description == "model 3")
+        bench.until(lambda: bench.node._engine.description == "method auto, 3 on cpu")
         assert bench.answer() == 3.0
         assert bench.made[-1].warm is not None
 
@@ -370,12 +363,12 @@ class TestSwap:
         assert (refused.successful, refused.reason) == (False, "model: bad is no model")
         bench.fault = MemoryError("no room for weights")
         assert bench.node.set_parameters([Parameter("model", value="4")])[0].successful
-        reason = "cannot change to model 4: no room for weights"
+        reason = "cannot change to method auto, 4 on cpu: no room for weights"
         bench.report(lambda one: one.level == DiagnosticStatus.WARN and one.message == reason)
         assert bench.answer() == 1.0
         bench.fault = None
         assert bench.node.set_parameters([Parameter("model", value="4")])[0].successful
-        bench.until(lambda: bench.node._engine.description == "model 4")
+        bench.until(lambda: bench.node._engine.description == "method auto, 4 on cpu")
         assert bench.answer() == 4.0
         assert bench.node._engine.fault == ""
 
@@ -385,7 +378,7 @@ class TestSwap:
         for model in ("2", "3", "4", "5"):
             assert bench.node.set_parameters([Parameter("model", value=model)])[0].successful
         bench.gate.set()
-        bench.until(lambda: bench.node._engine.description == "model 5")
+        bench.until(lambda: bench.node._engine.description == "method auto, 5 on cpu")
         assert bench.answer() == 5.0
         assert len(bench.made) <= 3, "the first one, the one that was begun, and the last one"
 
@@ -396,7 +389,7 @@ class TestSwap:
         bench.until(lambda: bench.node.state == "configuring")
         assert bench.node.set_parameters([Parameter("model", value="6")])[0].successful
         bench.gate.set()
-        bench.until(lambda: bench.node._engine.description == "model 6")
+        bench.until(lambda: bench.node._engine.description == "method auto, 6 on cpu")
         assert bench.active().answer() == 6.0
 
     def test_what_does_not_concern_the_recoverer_swaps_nothing(self, make_bench):
@@ -445,7 +438,7 @@ class TestSeveralCameras:
     def test_a_swap_on_one_camera_leaves_the_other_alone(self, make_bench):
         bench = make_bench(namespaces=("front", "wrist")).active()
         assert bench.nodes[1].set_parameters([Parameter("model", value="7")])[0].successful
-        bench.until(lambda: bench.nodes[1]._engine.description == "model 7")
+        bench.until(lambda: bench.nodes[1]._engine.description == "method auto, 7 on cpu")
         assert (bench.answer("front"), bench.answer("wrist")) == (1.0, 7.0)
 
 

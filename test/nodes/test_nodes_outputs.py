@@ -26,7 +26,7 @@ from sq_perception.imaging.calibration import Calibration
 from sq_perception.imaging.camera import Camera
 from sq_perception.nodes.frame import Frame, Refused
 from sq_perception.nodes.outputs import OptionalOutputs, in_frame
-from sq_perception.nodes.parameters import FrameParameters, ParameterError
+from sq_perception.nodes.parameters import ParameterError, RecoverParameters
 from sq_perception.nodes.tracking import CameraPoses, PoseError, Tracking
 from sq_perception.recordings import publication
 from sq_perception.recordings.publication import Identified
@@ -38,7 +38,7 @@ DEVIATIONS = np.diag(np.square([0.002] * 3 + [0.03] * 2 + [0.001, 0.002, 0.003] 
 BOX = Superquadric([0.05, 0.04, 0.03], [0.3, 0.6], [0.01, 0.02, 0.6], [0.1, 0.2, 0.3, 0.9])
 CAN = Superquadric([0.03, 0.03, 0.06], [0.1, 1.0], [-0.15, 0.02, 0.7], [0.5, 0.0, 0.1, 0.8])
 TF, DETECTIONS, SCENE = "/tf", "~/detections", "~/planning_scene"
-ALL = FrameParameters(publish_tf=True, publish_detections=True, publish_collision_objects=True)
+ALL = RecoverParameters(publish_tf=True, publish_detections=True, publish_collision_objects=True)
 
 
 def one(body: Superquadric, label: int, status: Status = Status.CONVERGED) -> Recovery:
@@ -121,8 +121,8 @@ def objects(publisher: Publisher, which: int = -1) -> dict[str, bytes]:
 
 def test_nothing_is_created_before_it_is_asked_for(node):
     outputs = OptionalOutputs(node)
-    outputs.follow(FrameParameters())
-    outputs.publish(found(1), FrameParameters())
+    outputs.follow(RecoverParameters())
+    outputs.publish(found(1), RecoverParameters())
     assert not node.all
     assert outputs.absent == ()
     outputs.publish(found(1), replace(ALL, publish_tf=False))
@@ -245,7 +245,7 @@ def test_absent_packages_are_named_once_and_the_others_go_on(node, monkeypatch, 
     assert f"ros-$ROS_DISTRO-{package.replace('_', '-')}" in warning
     assert set(node.publishers) == {TF, DETECTIONS, SCENE} - {topic}
     assert all(len(publisher.sent) == 3 for publisher in node.all)
-    outputs.publish(found(1), FrameParameters())
+    outputs.publish(found(1), RecoverParameters())
     assert outputs.absent == (), "nobody asks for it any more"
 
 
@@ -403,7 +403,7 @@ def test_another_fixed_frame_is_another_world(node, tf2):
     tracking = Tracking(node, CameraPoses(node))
 
     def identified(fixed: str) -> tuple[int, ...]:
-        parameters = FrameParameters(fixed_frame=fixed)
+        parameters = RecoverParameters(fixed_frame=fixed)
         return tracking.identify(recovery(one(BOX, 1)), frame(), 0.0, parameters).ids
 
     assert [identified(fixed) for fixed in ("", "", "map", "map", "base", "")] == [(1,), (1,), (2,), (2,), (3,), (4,)]
@@ -418,14 +418,14 @@ def test_another_fixed_frame_is_another_world(node, tf2):
 def test_tracks_that_a_frame_does_not_show_are_hidden(node):
     tracking = Tracking(node, CameraPoses(node))
 
-    def identified(parameters: FrameParameters, *bodies: Recovery) -> Identified:
+    def identified(parameters: RecoverParameters, *bodies: Recovery) -> Identified:
         return tracking.identify(recovery(*bodies), frame(), 10.0, parameters)
 
-    first = identified(FrameParameters(), one(BOX, 1), one(CAN, 2))
+    first = identified(RecoverParameters(), one(BOX, 1), one(CAN, 2))
     assert (first.ids, first.hidden) == ((1, 2), ())
-    second = identified(FrameParameters(), one(CAN, 1))
+    second = identified(RecoverParameters(), one(CAN, 1))
     assert (second.ids, second.hidden) == ((2,), (1,))
-    assert identified(FrameParameters(tracking=False), one(CAN, 1)).hidden == ()
+    assert identified(RecoverParameters(tracking=False), one(CAN, 1)).hidden == ()
 
 
 # Parameters
@@ -442,4 +442,4 @@ def test_tracks_that_a_frame_does_not_show_are_hidden(node):
 )
 def test_frames_that_tf2_would_not_take_are_refused(values):
     with pytest.raises(ParameterError, match=f"{next(iter(values))}: expected no"):
-        FrameParameters(**values)
+        RecoverParameters(**values)

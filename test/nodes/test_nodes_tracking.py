@@ -24,7 +24,7 @@ from sq_msgs_py.depth_image import depth_to_message
 from sq_perception.fitting.fit import Fit, Status
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.nodes.parameters import FrameParameters, ParameterError
+from sq_perception.nodes.parameters import ParameterError, RecoverParameters
 from sq_perception.recovery.recoverer import Recovery
 
 DEVIATIONS = np.diag(np.square([0.002] * 3 + [0.03] * 2 + [0.001] * 3 + [0.02] * 3))
@@ -237,6 +237,6 @@ def test_without_tf2_ids_remain(make_bench, monkeypatch, capfd):
 
 def test_a_cube_has_no_fixed_frame_and_no_budget_is_endless():
     with pytest.raises(ParameterError, match="fixed_frame"):
-        FrameParameters(projection="orthographic", fixed_frame="map")
-    assert FrameParameters().seconds == np.inf
-    assert FrameParameters(time_budget=0.05).seconds == 0.05
+        RecoverParameters(projection="orthographic", fixed_frame="map")
+    assert RecoverParameters().seconds == np.inf
+    assert RecoverParameters(time_budget=0.05).seconds == 0.05

@@ -83,8 +83,6 @@ def test_share_is_complete(install: Path) -> None:
         "package.xml",
         "launch/recover.launch.py",
         "launch/synthetic.launch.py",
-        "launch/recover.py",
-        "launch/synthetic.py",
         "config/fast_dds.xml",
         "config/superquadrics.rviz",
     ):

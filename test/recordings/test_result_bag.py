@@ -435,7 +435,7 @@ def test_the_file_holds_what_the_node_publishes(tmp_path, scene):
     from sq_perception.imaging.calibration import Calibration
     from sq_perception.nodes.frame import Frame
     from sq_perception.nodes.outputs import marker_style
-    from sq_perception.nodes.parameters import FrameParameters
+    from sq_perception.nodes.parameters import RecoverParameters
     from sq_perception.recordings import publication
     from sq_perception.recovery.recoverer import render_recovery
 
@@ -446,7 +446,7 @@ def test_the_file_holds_what_the_node_publishes(tmp_path, scene):
     shown = publication.findings(publication.Identified(recovery, ids), live.header, is_cube=False)
     expected = {
         SUPERQUADRICS: superquadrics.to_message(shown.array, live.header),
-        MARKERS: shown.markers(style=marker_style(FrameParameters())),
+        MARKERS: shown.markers(style=marker_style(RecoverParameters())),
         RENDERED: live.encode(render_recovery(recovery, frame.camera)[0]),
         "/a/image": live.encode(frame.depth),
     }

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 import trimesh
 
+from sq_perception.commands import view
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
-from sq_perception.nodes import view
 from sq_perception.viewing import controls, scene, tables
 from sq_perception.viewing.controls import Control, Description
 from sq_perception.viewing.scene import Bodies

@@ -1,36 +1,23 @@
 """The reference of every parameter, made from what the nodes declare: a page for people and YAML files for launches.
 
-    python -m sq_perception.nodes.parameter_reference       # in a source tree: docs/parameters.md and config/*.yaml
+    python docs_build/parameter_reference.py       # docs/parameters.md and config/*.yaml
 
 One truth: the dataclasses of :mod:`sq_perception.nodes.parameters`.  A test holds the files to them.
 """
 
 from __future__ import annotations
 
-import argparse
 import json
-import sys
 import textwrap
 from collections.abc import Sequence
 from dataclasses import Field, fields
 from pathlib import Path
 from typing import Any
 
-from sq_perception.nodes.parameters import (
-    FitterParameters,
-    FrameParameters,
-    RecoverParameters,
-    SyntheticParameters,
-    as_ros,
-)
+from sq_perception.nodes.parameters import KINDS, FitterParameters, RecoverParameters, SyntheticParameters
 
-KINDS: dict[str, type[Any]] = {
-    "recover_node": RecoverParameters,
-    "fitter_node": FitterParameters,
-    "synthetic_depth_node": SyntheticParameters,
-}
 PAGE = Path("docs/parameters.md")
-COMMAND = "python -m sq_perception.nodes.parameter_reference"
+COMMAND = "python docs_build/parameter_reference.py"
 
 _HEAD = f"""\
 # Parameters
@@ -62,24 +49,21 @@ start only: `qos_overrides.<topic>.subscription.reliability`, `.depth`, `.histor
 
 def page() -> str:
     """The page, Markdown."""
-    shared = {one.name for one in fields(FrameParameters)}
-    own = [one for one in fields(RecoverParameters) if one.name not in shared]
     other = f"fitter_node is recover_node with `method: {FitterParameters.method}`.\n"
-    parts = [_HEAD, "## recover_node, recover_cameras, fitter_node\n", _table([*fields(FrameParameters)], "configure")]
-    parts += ["## What computes in them\n", other, _table(own, "configure")]
-    parts += ["## synthetic_depth_node\n", _table(list(fields(SyntheticParameters)), "start")]
+    parts = [_HEAD, "## recover_node, recover_cameras, fitter_node\n", other]
+    parts += [_table(fields(RecoverParameters), "configure")]
+    parts += ["## synthetic_depth_node\n", _table(fields(SyntheticParameters), "start")]
     return "\n".join(parts)
 
 
 def yaml_text(name: str) -> str:
     """A parameter file of a node with every default, each below its description."""
     kind = KINDS[name]
-    values = as_ros(kind())
     lines = [
         f"# Parameters of {name} with their defaults: start it with --ros-args --params-file <this file>.",
         f"# Those marked live also change while the node runs: ros2 param set /{name} <name> <value>.",
     ]
-    if issubclass(kind, FrameParameters):
+    if issubclass(kind, RecoverParameters):
         lines += [
             "# Inputs are best effort, keep last 1; qos_overrides./depth/image.subscription.reliability: reliable, for",
             "# instance, changes that (also .history and .depth; the topic's name is the one after remapping).",
@@ -92,22 +76,16 @@ def yaml_text(name: str) -> str:
         remark = "; ".join(filter(None, remarks))
         text = one.metadata["description"] + (f" [{remark}]" if remark else "")
         lines += textwrap.wrap(text, 120, initial_indent="    # ", subsequent_indent="    # ", break_on_hyphens=False)
-        lines.append(f"    {one.name}: {json.dumps(values[one.name])}")
+        lines.append(f"    {one.name}: {json.dumps(one.default)}")
     return "\n".join(lines) + "\n"
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    """Write the page and the files; the exit code."""
-    parser = argparse.ArgumentParser(description="Write docs/parameters.md and config/*.yaml of a source tree.")
-    parser.add_argument("root", nargs="?", type=Path, default=Path("."), help="of the source tree")
-    root = parser.parse_args(arguments).root
-    if not (root / PAGE.parent).is_dir() or not (root / "config").is_dir():
-        print(f"{root}: expected a source tree with docs/ and config/", file=sys.stderr)
-        return 2
+def main() -> None:
+    """Write the page and the files."""
+    root = Path(__file__).resolve().parent.parent
     (root / PAGE).write_text(page(), encoding="utf-8")
     for name in KINDS:
         (root / "config" / f"{name}.yaml").write_text(yaml_text(name), encoding="utf-8")
-    return 0
 
 
 def _table(rows: Sequence[Field[Any]], otherwise: str) -> str:
@@ -144,4 +122,4 @@ def _range(one: Field[Any]) -> str:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

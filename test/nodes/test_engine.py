@@ -21,10 +21,9 @@ from sq_perception.imaging import raycast
 from sq_perception.imaging.calibration import Calibration
 from sq_perception.imaging.camera import Camera
 from sq_perception.learning import checkpoint
-from sq_perception.nodes.engine import Engine
+from sq_perception.nodes.engine import Engine, options
 from sq_perception.nodes.frame import Frame
 from sq_perception.nodes.parameters import FitterParameters, RecoverParameters
-from sq_perception.nodes.recover_node import FACTORY, options
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
 BODY = Superquadric([0.08, 0.06, 0.1], [0.4, 0.7], [0.0, 0.02, 0.6], [0.3, 0.2, 0.1, 0.9])
@@ -36,10 +35,10 @@ def model(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def engine() -> Engine[RecoverParameters]:
+def engine() -> Engine:
     said = SimpleNamespace(info=lambda *_: None, error=lambda *_: None)
     node: Any = SimpleNamespace(get_logger=lambda: said)
-    return Engine(FACTORY, node)
+    return Engine(node)
 
 
 def frame() -> Frame:
@@ -48,7 +47,7 @@ def frame() -> Frame:
     return Frame(Header(), "32FC1", image, Calibration(CAMERA, (64, 48)), np.isfinite(image).astype(np.int32))
 
 
-def set_to(engine: Engine[RecoverParameters], before: RecoverParameters, **values: Any) -> RecoverParameters:
+def set_to(engine: Engine, before: RecoverParameters, **values: Any) -> RecoverParameters:
     """As ``ros2 param set`` does, and wait for the swap."""
     after = replace(before, **values)
     engine.check(after, frozenset(values))
