@@ -20,7 +20,7 @@ from sq_perception.commands.console import FAILURE, INTERRUPTED, SUCCESS, USAGE,
 COMMANDS = {
     "recover": ("sq_perception.commands.recover", "depth images in, superquadrics out"),
     "render": ("sq_perception.commands.render", "draw a superquadric as a depth image"),
-    "demo": ("sq_perception.nodes.demo", "live demonstration with real ROS 2 nodes (extra 'ros')"),
+    "demo": ("sq_perception.commands.demo", "live demonstration with real ROS 2 nodes (extra 'ros')"),
     "view": ("sq_perception.commands.view", "a page in the browser: depth, bodies, parameters (extras 'ros', 'view')"),
     "train": ("sq_perception.commands.train", "train a network"),
     "thing-views": ("sq_perception.commands.thing_views", "draw views of household things to train on"),
@@ -32,7 +32,7 @@ COMMANDS = {
     "export": ("sq_perception.commands.export", "write a network as ONNX"),
     "warm-up": ("sq_perception.commands.warm_up", "compile everything once, so that no first image waits"),
 }
-"""Name, module and summary.  The two that are ROS nodes themselves live with the nodes."""
+"""Name, module and summary."""
 
 _EPILOG = """\
 examples:

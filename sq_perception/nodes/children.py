@@ -15,18 +15,19 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
-from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from types import FrameType, TracebackType
+from types import FrameType
 
 NODES = ("recover_node", "recover_cameras", "fitter_node", "synthetic_depth_node")
 """Of :mod:`sq_perception.nodes.executables`."""
 
-_KEPT_LINES = 40
+_TAIL = 2**14
+"""Bytes of a node's output that are looked at."""
 _ROOT = str(Path(__file__).resolve().parent.parent.parent)
 _CODE = "import sys; sys.path[:1] = [{root!r}]; from sq_perception.nodes import executables as e; sys.exit(e.{node}())"
 
@@ -34,24 +35,17 @@ _CODE = "import sys; sys.path[:1] = [{root!r}]; from sq_perception.nodes import 
 class Child:
     """One running node."""
 
-    def __init__(
-        self, node: str, arguments: Sequence[str], environment: Mapping[str, str], *, echo: bool = False
-    ) -> None:
+    def __init__(self, node: str, arguments: Sequence[str], environment: Mapping[str, str]) -> None:
         self.name = node
-        self._echo = echo
-        self._lines: deque[str] = deque(maxlen=_KEPT_LINES)
+        self._said = tempfile.TemporaryFile()  # noqa: SIM115 - as long as the child
         self._process = subprocess.Popen(
             command(node, arguments),
             env={**environment, "PYTHONUNBUFFERED": "1"},
             stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
+            stdout=self._said,
             stderr=subprocess.STDOUT,
-            text=True,
-            errors="replace",
             start_new_session=True,
         )
-        self._reader = threading.Thread(target=self._read, name=f"output of {node}", daemon=True)
-        self._reader.start()
 
     @property
     def pid(self) -> int:
@@ -65,9 +59,9 @@ class Child:
 
     def last_lines(self, count: int = 15) -> list[str]:
         """What it said last, standard output and error together."""
-        if self.exit_code is not None:
-            self._reader.join(timeout=1.0)
-        return list(self._lines)[-count:]
+        number = self._said.fileno()
+        tail = os.pread(number, _TAIL, max(0, os.fstat(number).st_size - _TAIL))
+        return tail.decode(errors="replace").splitlines()[-count:]
 
     def interrupt(self) -> None:
         """Ask it to stop, as Ctrl-C does."""
@@ -75,11 +69,9 @@ class Child:
 
     def wait(self, seconds: float) -> bool:
         """Whether it has ended within some seconds."""
-        try:
+        with suppress(subprocess.TimeoutExpired):
             self._process.wait(timeout=max(seconds, 0.0))
-        except subprocess.TimeoutExpired:
-            return False
-        return True
+        return self.exit_code is not None
 
     def kill(self) -> None:
         """End it and all that it started."""
@@ -87,28 +79,17 @@ class Child:
         self._process.wait()
 
     def _signal(self, number: int) -> None:
-        if self.exit_code is not None:
-            return
-        try:
-            os.killpg(self.pid, number)
-        except ProcessLookupError:
-            return
-
-    def _read(self) -> None:
-        assert self._process.stdout is not None
-        for line in self._process.stdout:
-            self._lines.append(line.rstrip())
-            if self._echo:
-                print(f"[{self.name}] {line}", end="", flush=True)
+        if self.exit_code is None:
+            with suppress(ProcessLookupError):
+                os.killpg(self.pid, number)
 
 
 class Children:
     """Nodes that live as long as a ``with`` block."""
 
-    def __init__(self, environment: Mapping[str, str], *, patience: float = 8.0, echo: bool = False) -> None:
+    def __init__(self, environment: Mapping[str, str], *, patience: float = 8.0) -> None:
         self._environment = dict(environment)
         self._patience = patience
-        self._echo = echo
         self._running: list[Child] = []
         self.killed: list[str] = []
         """Names of those that did not stop when asked to."""
@@ -116,14 +97,12 @@ class Children:
     def __enter__(self) -> Children:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.stop()
 
     def start(self, node: str, arguments: Sequence[str] = ()) -> Child:
         """Start one node."""
-        child = Child(node, arguments, self._environment, echo=self._echo)
+        child = Child(node, arguments, self._environment)
         self._running.append(child)
         return child
 
@@ -131,25 +110,10 @@ class Children:
         """The first one that has ended by itself, if any."""
         return next((child for child in self._running if child.exit_code is not None), None)
 
-    def words(self) -> str:
-        """What the nodes said last, for a report."""
-        return "\n".join(f"[{child.name}] {line}" for child in self._running for line in child.last_lines(8))
-
-    def until_stopped(self) -> int:
-        """Wait for Ctrl-C or SIGTERM (0), or for a node that ends by itself (its exit code)."""
-        with interruptible():
-            try:
-                while (ended := self.dead()) is None:
-                    time.sleep(0.2)
-            except KeyboardInterrupt:
-                return 0
-        return ended.exit_code or 0
-
     def stop(self) -> None:
         """Interrupt all, wait, and kill those that do not listen.  A second Ctrl-C must not leave one behind."""
-        previous = {}
-        if threading.current_thread() is threading.main_thread():
-            previous = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGTERM)}
+        numbers = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
+        previous = {number: signal.signal(number, signal.SIG_IGN) for number in numbers}
         try:
             for child in self._running:
                 child.interrupt()
@@ -195,7 +159,5 @@ def interruptible() -> Iterator[None]:
 
 def parameter_arguments(parameters: Mapping[str, object]) -> list[str]:
     """Command line arguments that set ROS parameters; JSON is the YAML that ROS expects there."""
-    arguments = ["--ros-args"]
-    for name, value in parameters.items():
-        arguments += ["-p", f"{name}:={json.dumps(value)}"]
-    return arguments
+    settings = [("-p", f"{name}:={json.dumps(value)}") for name, value in parameters.items()]
+    return ["--ros-args", *(word for setting in settings for word in setting)]

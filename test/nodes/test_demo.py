@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import signal
@@ -14,18 +15,18 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from rich.console import Console
 
 pytest.importorskip("rclpy", reason="rclpy missing: install the extra 'ros' or source ROS 2")
 
 import sq_perception
-from sq_msgs_py.superquadrics import SuperquadricArray
 from sq_perception.evaluation.comparison import alike, pair
 from sq_perception.evaluation.demo_figure import demo_figure
-from sq_perception.fitting.fit import Status
+from sq_perception.evaluation.demo_table import demo_table
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast, unit_cube
 from sq_perception.imaging.camera import Camera
-from sq_perception.nodes import demo_table, fast_dds
+from sq_perception.nodes import fast_dds
 from sq_perception.nodes.children import Children, parameter_arguments
 
 ROOT = str(Path(sq_perception.__file__).parent.parent)
@@ -38,21 +39,6 @@ def boxes(*centres: float) -> Superquadric:
     size = np.array([[0.03, 0.04, 0.05 + 0.01 * k] for k in range(count)]).reshape(count, 3)
     translation = np.array([[x, 0.0, 1.0] for x in centres]).reshape(count, 3)
     return Superquadric(size, np.full((count, 2), 0.3), translation, np.tile(IDENTITY, (count, 1)))
-
-
-def found(bodies: Superquadric, status: int = Status.CONVERGED) -> SuperquadricArray:
-    count = len(bodies)
-    return SuperquadricArray(
-        bodies.size,
-        bodies.shape,
-        bodies.translation,
-        bodies.rotation,
-        np.ones(count),
-        np.full(count, 0.0012),
-        np.zeros((count, 3)),
-        np.arange(1, count + 1),
-        np.full(count, status, dtype=int),
-    )
 
 
 # Pairs
@@ -91,39 +77,38 @@ def test_of_the_eight_forms_the_one_like_the_truth_is_shown(rng: np.random.Gener
 # Table
 
 
-def test_the_lines_say_sizes_overlap_and_delay() -> None:
+def shown(truth: Superquadric | None, one: Superquadric, other: Superquadric, **latencies) -> list[str]:
+    """The rows of the table as a terminal of 200 columns has them, and the line below it; blanks are single ones."""
+    console = Console(width=200, file=io.StringIO())
+    methods = {"recover_node": one, "fitter_node": other}
+    results = {name: (bodies, np.full(len(bodies), 0.0012)) for name, bodies in methods.items()}
+    console.print(demo_table(truth, results, "mm", "image 7", latencies))
+    text = console.file.getvalue().translate(str.maketrans("│┃┏┓┡┩└┘├┤━─╇┴┳┼", " " * 16))
+    lines = [" ".join(line.split()) for line in text.splitlines()]
+    assert lines[0] == "image 7"
+    return [line for line in lines if line and (line[0].isdigit() or "mm" in line or "stamp" in line)]
+
+
+def test_the_table_says_sizes_overlap_and_delay() -> None:
     truth = boxes(0.0, 0.3)
-    comparison = demo_table.compare(found(truth), {"recover_node": found(truth), "fitter_node": found(truth[:1])}, "mm")
-    text = demo_table.lines(comparison, "image 7", {"recover_node": [10.0, 20.0, 90.0], "fitter_node": []})
-    assert text.splitlines() == [
-        "image 7",
-        "  1  truth 30 40 50 mm e 0.30 0.30 | CNN + fit 30 40 50 mm e 0.30 0.30 100.0 % "
-        "| classic fit 30 40 50 mm e 0.30 0.30 100.0 %",
-        "  2  truth 30 40 60 mm e 0.30 0.30 | CNN + fit 30 40 60 mm e 0.30 0.30 100.0 % | classic fit not found",
-        "  stamp to result, median: CNN + fit 20 ms, classic fit -",
+    rows = shown(truth, truth, truth[:1], recover_node=[10.0, 20.0, 90.0], fitter_node=[])
+    assert rows == [
+        "1 30 40 50 mm 0.30 0.30 30 40 50 mm 0.30 0.30 100.0 % 30 40 50 mm 0.30 0.30 100.0 %",
+        "2 30 40 60 mm 0.30 0.30 30 40 60 mm 0.30 0.30 100.0 % not found",
+        "stamp to result, median: CNN + fit 20 ms, classic fit -",
     ]
-    assert comparison.overlaps == {"recover_node": [1.0, 1.0], "fitter_node": [1.0, 0.0]}
-
-
-def test_a_failed_body_counts_as_not_found() -> None:
-    truth = boxes(0.0)
-    results = {"recover_node": found(truth, Status.FAILED), "fitter_node": found(boxes())}
-    comparison = demo_table.compare(found(truth), results, "mm")
-    assert [cell.size for cell in comparison.rows[0].methods] == ["not found", "not found"]
 
 
 def test_without_truth_the_residual_stands_in() -> None:
-    results = {"recover_node": found(boxes(0.0)), "fitter_node": found(boxes(0.0, 3.0))}
-    comparison = demo_table.compare(None, results, "mm")
-    assert not comparison.has_truth
-    assert [cell.quality for cell in comparison.rows[0].methods] == ["1.2 mm", "1.2 mm"]
-    assert len(comparison.rows) == 2
-    assert "truth" not in demo_table.lines(comparison, "", {})
+    rows = shown(None, boxes(0.0), boxes(0.0, 3.0))
+    assert rows[:2] == [
+        "1 30 40 50 mm 0.30 0.30 1.2 mm 30 40 50 mm 0.30 0.30 1.2 mm",
+        "30 40 60 mm 0.30 0.30",
+    ]
 
 
 def test_an_image_without_any_body_has_an_empty_table() -> None:
-    empty = SuperquadricArray.empty()
-    assert demo_table.compare(empty, {"recover_node": empty, "fitter_node": empty}, "mm").rows == ()
+    assert shown(boxes(), boxes(), boxes()) == ["stamp to result, median: CNN + fit -, classic fit -"]
 
 
 @pytest.mark.parametrize("count", [0, 2])
@@ -185,7 +170,8 @@ def test_the_demonstration_shows_draws_and_leaves_nothing_running(tmp_path: Path
     said, _ = process.communicate(timeout=180)
     assert process.returncode == 0, said
     assert "Traceback" not in said
-    rows = re.findall(r"truth [\d ]+ mm e .*CNN \+ fit (?:[\d ]+ mm e [\d. ]+ ([\d.]+) %|not found) \| classic", said)
+    number, row = r"[\d ]+ mm +│ [\d. ]+ ", r"│ +\d │ +"
+    rows = re.findall(row + number + "│ +(?:" + number + r"│ +([\d.]+) %|not found)", said)
     assert rows, said
     assert np.median([float(overlap or 0) for overlap in rows]) > 80, said
     assert "demo.png" in said
@@ -204,7 +190,7 @@ def test_a_recorded_grey_image_is_recognised_and_recovered(tmp_path: Path) -> No
     process = demo("--frame", "body.bmp", "--seconds", "1", env=env, cwd=tmp_path)
     said, _ = process.communicate(timeout=180)
     assert process.returncode == 0, said
-    sizes = re.search(r"CNN \+ fit ([\d.]+) ([\d.]+) ([\d.]+) e", said)
+    sizes = re.search(r"│ +1 │ +([\d.]+) ([\d.]+) ([\d.]+) ", said)
     assert sizes is not None, said
     assert sorted(map(float, sizes.groups())) == pytest.approx([0.15, 0.2, 0.25], abs=0.01)
     assert (tmp_path / "demo.png").is_file()

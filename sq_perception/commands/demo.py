@@ -13,40 +13,27 @@ import argparse
 import os
 import sys
 import time
-from collections import OrderedDict
 from collections.abc import Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-import rclpy
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
-from rclpy.qos import QoSProfile, QoSReliabilityPolicy
-from rclpy.signals import SignalHandlerOptions
 from rich.console import Console, Group
 from rich.live import Live
 from rich.text import Text
-from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
-from sq_msgs_py.depth_image import GREY_ENCODINGS
-from sq_msgs_py.superquadrics import SuperquadricArray, from_message
 from sq_perception.evaluation.comparison import pair
+from sq_perception.evaluation.demo_table import TITLES, delays, demo_table
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
-from sq_perception.imaging.calibration import Calibration
 from sq_perception.imaging.camera import Projection
-from sq_perception.nodes import demo_table, fast_dds
+from sq_perception.nodes import fast_dds
 from sq_perception.nodes.children import Children, interruptible, parameter_arguments
-from sq_perception.nodes.frame import Frame, decode
+from sq_perception.nodes.watch import CAMERA, Shot, Watch
 from sq_perception.recordings.frame_file import FrameError, read
 
-RESULTS = ("recover_node", "fitter_node")
-TRUTH = "synthetic_depth_node"
 DEFAULT_SECONDS = 20.0
 _RATE = 10.0
 _START_PATIENCE = 120.0
@@ -54,9 +41,6 @@ _START_PATIENCE = 120.0
 _TABLE_PERIOD = 0.25
 _LINE_PERIOD = 2.0
 _SHOWN_LATENCIES = 50
-_REMEMBERED = 40
-"""Images that wait for what belongs to them."""
-
 _HINTS = """\
 What next
   {picture}    the last image: depth, recovered outlines, both methods in space
@@ -64,102 +48,6 @@ What next
   sq-perception recover FRAME --json out.json    the same from files, without ROS
   ros2 run sq_perception recover_node    on your camera; README.md has the topics and parameters
   make demo FRAME=recording.npz    this with a frame of yours"""
-
-
-@dataclass(eq=False)
-class Shot:
-    """All that belongs to one stamp.
-
-    Attributes
-    ----------
-    image, truth
-        None while they have not come.
-    results
-        Superquadrics by the node that found them.
-    latency
-        From the image's stamp to the arrival of the result here, milliseconds, by node.
-    """
-
-    stamp: int
-    image: Image | None = None
-    truth: SuperquadricArray | None = None
-    results: dict[str, SuperquadricArray] = field(default_factory=dict)
-    latency: dict[str, float] = field(default_factory=dict)
-
-
-class Watch(Node):
-    """Collects, image by image, what the demonstration shows: depth, truth and both results."""
-
-    def __init__(self, context: Any = None) -> None:
-        super().__init__("demo", context=context)
-        self._shots: OrderedDict[int, Shot] = OrderedDict()
-        self._info: CameraInfo | None = None
-        self._truth_comes = False
-        self.images = 0
-        """How many images came."""
-        self.latest: Shot | None = None
-        """The newest image with everything that belongs to it."""
-        self.latencies: dict[str, list[float]] = {name: [] for name in RESULTS}
-        fast = QoSProfile(depth=5, reliability=QoSReliabilityPolicy.BEST_EFFORT)
-        self.create_subscription(CameraInfo, "depth/camera_info", self._on_info, fast)
-        self.create_subscription(Image, "depth/image", self._on_image, fast)
-        self.create_subscription(PointCloud2, f"{TRUTH}/truth", self._on_truth, fast)
-        for name in RESULTS:
-            self.create_subscription(PointCloud2, f"{name}/superquadrics", partial(self._on_result, name), 10)
-
-    def frame(self, shot: Shot) -> Frame:
-        """The decoded depth image of a complete shot.
-
-        Raises
-        ------
-        ValueError
-            If the image or its camera_info cannot be used.
-        """
-        assert shot.image is not None
-        if shot.image.encoding in GREY_ENCODINGS:
-            return decode(shot.image, None)
-        return decode(shot.image, self._calibration)
-
-    def _calibration(self) -> Calibration:
-        if self._info is None:
-            raise ValueError("no camera_info came with the depth image")
-        return Calibration.of(self._info, self.resolve_topic_name("depth/image"))
-
-    def _on_info(self, message: CameraInfo) -> None:
-        self._info = message
-
-    def _on_image(self, message: Image) -> None:
-        self.images += 1
-        shot = self._shot(message)
-        shot.image = message
-        self._check(shot)
-
-    def _on_truth(self, message: PointCloud2) -> None:
-        shot = self._shot(message)
-        shot.truth = from_message(message)
-        self._truth_comes = self._truth_comes or len(shot.truth) > 0
-        self._check(shot)
-
-    def _on_result(self, name: str, message: PointCloud2) -> None:
-        shot = self._shot(message)
-        shot.results[name] = from_message(message)
-        shot.latency[name] = 1e-6 * (time.time_ns() - shot.stamp)
-        self.latencies[name].append(shot.latency[name])
-        self._check(shot)
-
-    def _shot(self, message: Any) -> Shot:
-        stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
-        shot = self._shots.setdefault(stamp, Shot(stamp))
-        while len(self._shots) > _REMEMBERED:
-            self._shots.popitem(last=False)
-        return shot
-
-    def _check(self, shot: Shot) -> None:
-        """Make a shot the latest once nothing is missing any more."""
-        if shot.image is None or set(shot.results) != set(RESULTS) or (self._truth_comes and shot.truth is None):
-            return
-        if self.latest is None or shot.stamp > self.latest.stamp:
-            self.latest = shot
 
 
 class DemoError(RuntimeError):
@@ -208,18 +96,12 @@ def run(camera: dict[str, Any], seconds: float, folder: Path) -> int:
     os.environ.update(_own_domain())
     console = Console()
     with Children(fast_dds.environment()) as children:
-        for name in RESULTS:
+        for name in TITLES:
             children.start(name, parameter_arguments({"projection": camera["projection"]}))
-        children.start(TRUTH, parameter_arguments(camera))
-        rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-        try:
-            watch = Watch()
-            executor = SingleThreadedExecutor()
-            executor.add_node(watch)
-            _wait_for_results(watch, executor, children, console)
-            _show(watch, executor, children, console, seconds, camera["projection"])
-        finally:
-            rclpy.try_shutdown()
+        children.start(CAMERA, parameter_arguments(camera))
+        with Watch(tuple(TITLES)) as watch:
+            _wait_for_results(watch, children, console)
+            _show(watch, children, console, seconds, camera["projection"])
     if children.killed:
         console.print(f"had to kill: {', '.join(children.killed)}", highlight=False)
     _summary(watch, console, folder)
@@ -273,49 +155,40 @@ def _own_domain() -> dict[str, str]:
     return {**{name: value for name, value in wanted.items() if not os.environ.get(name)}, **fast_dds.additions()}
 
 
-def _wait_for_results(watch: Watch, executor: SingleThreadedExecutor, children: Children, console: Console) -> None:
+def _wait_for_results(watch: Watch, children: Children, console: Console) -> None:
     deadline = time.monotonic() + _START_PATIENCE
     with console.status("starting three nodes (the first time, they compile) ..."):
         while watch.latest is None:
-            executor.spin_once(timeout_sec=0.1)
+            watch.listen(0.1)
             _check(children)
             if time.monotonic() > deadline:
+                came = ", ".join(f"{name} {len(times)}" for name, times in watch.latencies.items())
                 raise DemoError(
-                    f"no complete result within {_START_PATIENCE:g} s; {watch.images} images came, results: "
-                    + ", ".join(f"{name} {len(watch.latencies[name])}" for name in RESULTS)
-                    + "\n"
-                    + children.words()
+                    f"no complete result within {_START_PATIENCE:g} s; {watch.images} images came, results: {came}"
                 )
 
 
-def _show(
-    watch: Watch,
-    executor: SingleThreadedExecutor,
-    children: Children,
-    console: Console,
-    seconds: float,
-    projection: str,
-) -> None:
+def _show(watch: Watch, children: Children, console: Console, seconds: float, projection: str) -> None:
     unit = "mm" if projection == "pinhole" else ""
-    started = time.monotonic()
-    period = _TABLE_PERIOD if console.is_terminal else _LINE_PERIOD
-    due, shown = started, -1
+    started = due = time.monotonic()
+    period, shown = _TABLE_PERIOD if console.is_terminal else _LINE_PERIOD, -1
     with Live(console=console, auto_refresh=False) if console.is_terminal else nullcontext() as screen:
         while (passed := time.monotonic() - started) < seconds:
-            executor.spin_once(timeout_sec=0.05)
+            watch.listen(0.05)
             _check(children)
             shot = watch.latest
             if shot is None or time.monotonic() < due or shot.stamp == shown:
                 continue
             due, shown = time.monotonic() + period, shot.stamp
-            comparison = demo_table.compare(shot.truth, shot.results, unit)
-            latencies = {name: times[-_SHOWN_LATENCIES:] for name, times in watch.latencies.items()}
             heading = f"image {watch.images}, {passed:.0f} of {seconds:.0f} s, half sizes" + f" in {unit}" * bool(unit)
+            latest = {name: times[-_SHOWN_LATENCIES:] for name, times in watch.latencies.items()}
+            results = {name: (shot.results[name].bodies, shot.results[name].residual) for name in TITLES}
+            table = demo_table(shot.truth, results, unit, heading, latest)
             if screen is None:
-                console.out(demo_table.lines(comparison, heading, latencies), highlight=False)
+                console.print(table)
             else:
                 note = Text("Ctrl-C ends the demonstration", style="dim")
-                screen.update(Group(demo_table.live(comparison, heading, latencies), note), refresh=True)
+                screen.update(Group(table, note), refresh=True)
 
 
 def _check(children: Children) -> None:
@@ -331,8 +204,8 @@ def _summary(watch: Watch, console: Console, folder: Path) -> None:
     shot = watch.latest
     assert shot is not None
     picture, mesh = draw(watch, shot, folder)
-    counts = ", ".join(f"{title} {len(watch.latencies[name])}" for name, title in demo_table.TITLES.items())
-    console.out(f"{watch.images} images seen, answered: {counts}; {demo_table.delays(watch.latencies)}")
+    counts = ", ".join(f"{title} {len(watch.latencies[name])}" for name, title in TITLES.items())
+    console.out(f"{watch.images} images seen, answered: {counts}; {delays(watch.latencies)}")
     console.out(_HINTS.format(picture=picture, mesh=mesh or "(no body, no mesh)"), highlight=False)
 
 
@@ -352,20 +225,18 @@ def draw(watch: Watch, shot: Shot, folder: Path) -> tuple[Path, Path | None]:
     def optical(found: Superquadric) -> Superquadric:
         return unit_cube.optical_from_cube(found) if frame.is_cube else found
 
-    truth = Superquadric.stack([])
-    if shot.truth is not None and len(shot.truth):
-        truth = optical(demo_table.bodies(shot.truth))
+    truth = Superquadric.stack([]) if shot.truth is None else optical(shot.truth)
     methods = []
     model = truth
-    for name, title in demo_table.TITLES.items():
-        found = optical(demo_table.bodies(shot.results[name]))
+    for name, title in TITLES.items():
+        found = optical(shot.results[name].bodies)
         if not len(model):
             model = found
         pairs = pair(model, found)
         ordered = [found[one.recovered] for one in pairs if one.recovered is not None]
         overlaps = [one.iou or 0.0 for one in pairs[: len(truth)]]
         remark = f"mean IoU {100 * np.mean(overlaps):.1f} %, " if overlaps else ""
-        methods.append((title, ordered, f"{remark}{shot.latency[name]:.0f} ms after the stamp"))
+        methods.append((title, ordered, f"{remark}{shot.results[name].latency:.0f} ms after the stamp"))
     plane = None if frame.is_cube else segment(frame.depth, frame.camera).plane
     heading = "Superquadrics recovered from one depth image"
     picture = save(
