@@ -34,7 +34,7 @@ from dataclasses import dataclass, fields
 from time import monotonic, perf_counter
 from typing import Any
 
-from diagnostic_msgs.msg import DiagnosticArray
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
@@ -51,7 +51,7 @@ from sq_perception.nodes.input import Input
 from sq_perception.nodes.managed_node import ManagedNode
 from sq_perception.nodes.outputs import Outputs
 from sq_perception.nodes.parameters import LiveParameters, RecoverParameters
-from sq_perception.nodes.statistics import THROTTLE, Condition, Statistics, status, summary, timed
+from sq_perception.nodes.statistics import THROTTLE, Standing, Statistics, summary, timed
 from sq_perception.nodes.tracking import CameraPoses, Tracking
 from sq_perception.recovery.recoverer import FrameRecovery
 
@@ -109,7 +109,6 @@ class FrameNode(ManagedNode):
             self, kind, locked=self._why_locked, check=self._engine.check, changed=self._on_changed
         )
         self._statistics = Statistics()
-        self._last_counts = self._statistics.snapshot()
         self._poses = CameraPoses(self)
         self._tracking = Tracking(self, self._poses)
         self._outputs = Outputs(self, self._poses)
@@ -323,21 +322,29 @@ class FrameNode(ManagedNode):
             )
         if source is not None:
             source.look_for_latched()
-        now = self._statistics.snapshot()
+        more = {"state": self.state, "enabled": str(self._enabled).lower(), "engine": self._engine.description}
+        if self._outputs.absent:
+            more["missing packages"] = " ".join(self._outputs.absent)
+        if self.is_active and parameters.tracking:
+            tally = self._tracking.tally
+            more |= {"tracks": str(tally.tracks), "track ids given": str(tally.births)}
+            more |= {"track resets": str(tally.resets), "frames without camera pose": str(tally.without_pose)}
         message = DiagnosticArray()
         message.header.stamp = self.get_clock().now().to_msg()
-        condition = Condition(
-            state=self.state,
-            fault=self.fault or self._engine.fault,
-            silent=silent,
-            enabled=self._enabled,
-            engine=self._engine.description,
-            absent=self._outputs.absent,
-            tally=self._tracking.tally if self.is_active and parameters.tracking else None,
-        )
-        message.status.append(status(self.get_fully_qualified_name(), now, self._last_counts, condition))
-        self._last_counts = now
+        message.status.append(self._statistics.status(self.get_fully_qualified_name(), self._standing(silent), more))
         self._diagnostics.publish(message)
+
+    def _standing(self, silent: bool) -> Standing | None:
+        """What diagnostics say of the node before they look at its frames."""
+        fault = self.fault or self._engine.fault
+        if not self.is_active:
+            level = DiagnosticStatus.ERROR if fault else DiagnosticStatus.OK
+            return level, f"{self.state}: {fault}" if fault else self.state
+        if fault:
+            return DiagnosticStatus.WARN, fault
+        if not self._enabled:
+            return DiagnosticStatus.OK, "disabled"
+        return (DiagnosticStatus.WARN, "no depth images arrive") if silent else None
 
 
 Outcome = tuple[bool, str]

@@ -8,7 +8,14 @@ from typing import Any
 
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
-from rclpy.qos import QoSDurabilityPolicy, QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
+from rclpy.qos import (
+    QoSCompatibility,
+    QoSDurabilityPolicy,
+    QoSHistoryPolicy,
+    QoSProfile,
+    QoSReliabilityPolicy,
+    qos_check_compatible,
+)
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
@@ -18,7 +25,7 @@ from sq_perception.nodes import fast_dds
 from sq_perception.nodes.frame import Frame, Refused, decode, image_topic
 from sq_perception.nodes.inbox import Arrival, Inbox, NoCameraInfo
 from sq_perception.nodes.parameters import RAW, RecoverParameters
-from sq_perception.nodes.statistics import THROTTLE, Statistics, publishers
+from sq_perception.nodes.statistics import THROTTLE, Statistics
 
 
 class Input:
@@ -188,7 +195,17 @@ class Input:
         self._node.get_logger().warning(said, throttle_duration_sec=THROTTLE)
 
     def _publishers_of(self, subscription: Subscription | None) -> str:
+        """Who publishes a topic, with which quality of service, and whether the subscription can hear it."""
         if subscription is None:
             return "nothing is subscribed to"
-        offered = self._node.get_publishers_info_by_topic(subscription.topic_name)
-        return publishers(offered, subscription.qos_profile)
+        parts = []
+        for one in self._node.get_publishers_info_by_topic(subscription.topic_name):
+            profile = one.qos_profile
+            verdict, why = qos_check_compatible(profile, subscription.qos_profile)
+            said = ", ".join(
+                policy.name.lower().replace("_", " ") for policy in (profile.reliability, profile.durability)
+            )
+            note = f"; INCOMPATIBLE: {why.strip().rstrip(';')}" if verdict == QoSCompatibility.ERROR else ""
+            parts.append(f"{one.node_namespace.rstrip('/')}/{one.node_name} ({one.topic_type}, {said}{note})")
+        count = len(parts)
+        return f"{count} publisher{'s' * (count > 1)}: {', '.join(parts)}" if parts else "nobody publishes it"

@@ -7,17 +7,18 @@ thread takes it with :meth:`RemoteNode.show`.
 
 from __future__ import annotations
 
-import importlib
 import threading
 from collections.abc import Callable
+from functools import partial
 from time import monotonic
 from typing import Any
 
+from lifecycle_msgs.msg import Transition
+from lifecycle_msgs.srv import ChangeState, GetState
 from rcl_interfaces.msg import ParameterDescriptor, ParameterEvent
-from rcl_interfaces.srv import DescribeParameters, GetParameters, ListParameters, SetParameters
-from rclpy.client import Client
 from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
+from rclpy.parameter_client import AsyncParameterClient
 from rclpy.task import Future
 
 from sq_perception.viewing.controls import Control, Description, arranged
@@ -25,12 +26,13 @@ from sq_perception.viewing.page import Page
 
 _PATIENCE = 3.0
 """Seconds until a call is given up."""
+_TRANSITION_PATIENCE = 60.0
+"""Configuring loads a network and compiles."""
 _LOOK_PERIOD = 0.5
 """Seconds between two looks at whether the node is there, and at its lifecycle state."""
 _SETTLED = 0.4
 """Seconds after the last of many parameter events until they are read: a node that starts sends one for each."""
-_TRANSITIONS = {"configure": 1, "cleanup": 2, "activate": 3, "deactivate": 4}
-"""lifecycle_msgs/Transition."""
+_TRANSITIONS = ("configure", "cleanup", "activate", "deactivate")
 
 
 class RemoteNode:
@@ -48,18 +50,11 @@ class RemoteNode:
         self.name = name
         self.is_there = False
         self.lifecycle = ""
-        self._node = node
-        self._list = node.create_client(ListParameters, f"{name}/list_parameters")
-        self._describe = node.create_client(DescribeParameters, f"{name}/describe_parameters")
-        self._get = node.create_client(GetParameters, f"{name}/get_parameters")
-        self._set = node.create_client(SetParameters, f"{name}/set_parameters")
-        self._lifecycle_services: Any = None
-        self._state: Client | None = None
-        self._transit: Client | None = None
-        self._create_lifecycle_clients()
-        self._calls: list[tuple[float, Client, Future, Callable[[], None]]] = []
-        self._descriptors: list[ParameterDescriptor] = []
-        self._floats: set[str] = set()
+        self._parameters = AsyncParameterClient(node, name)
+        self._state = node.create_client(GetState, f"{name}/get_state")
+        self._transit = node.create_client(ChangeState, f"{name}/change_state")
+        self._calls: list[tuple[float, Future]] = []
+        self._known: set[str] = set()
         self._look_due = 0.0
         self._load_due: float | None = None
         self._lock = threading.Lock()
@@ -72,13 +67,10 @@ class RemoteNode:
     def tick(self) -> None:
         """Look after the node; called often."""
         now = monotonic()
-        for deadline, client, future, give_up in list(self._calls):
-            if future.done():
-                self._calls.remove((deadline, client, future, give_up))
-            elif now > deadline:
-                self._calls.remove((deadline, client, future, give_up))
-                client.remove_pending_request(future)
-                give_up()
+        late = [future for deadline, future in self._calls if now > deadline]
+        self._calls = [(deadline, future) for deadline, future in self._calls if now <= deadline and not future.done()]
+        for future in late:
+            future.cancel()  # nothing happens to one that is done
         if now >= self._look_due:
             self._look_due = now + _LOOK_PERIOD
             self._look()
@@ -88,8 +80,7 @@ class RemoteNode:
 
     def on_event(self, event: ParameterEvent) -> None:
         """Follow a message of /parameter_events of this node."""
-        known = {one.name for one in self._descriptors}
-        if any(one.name not in known for one in event.new_parameters) or event.deleted_parameters:
+        if any(one.name not in self._known for one in event.new_parameters) or event.deleted_parameters:
             self._load_due = monotonic() + _SETTLED
         values = [*event.new_parameters, *event.changed_parameters]
         with self._lock:
@@ -100,118 +91,93 @@ class RemoteNode:
         if not self.is_there:
             self._say(f"{name}: {self.name} is not there", False)
             return
-        request = SetParameters.Request(parameters=[Parameter(name, value=value).to_parameter_msg()])
 
-        def answered(response: SetParameters.Response) -> None:
+        def answered(response: Any) -> None:
             result = response.results[0]
             # Not every reason of rclpy's own says which parameter it is about.
             reason = result.reason if name in result.reason else f"{name}: {result.reason or 'refused'}"
             self._say(f"{name} is now {_shown(value)}" if result.successful else reason, result.successful)
-            self._read([name])
+            self._call(self._parameters.get_parameters([name]), read)
 
-        self._call(self._set, request, answered, lambda: self._unanswered(name))
+        def read(response: Any) -> None:
+            with self._lock:  # what the node holds, whatever was asked for
+                self._new_values[name] = parameter_value_to_python(response.values[0])
+
+        call = self._parameters.set_parameters([Parameter(name, value=value)])
+        silence = f"{name}: no answer from {self.name} within {_PATIENCE:g} s"
+        self._call(call, answered, partial(self._say, silence, False))
 
     def transit(self, label: str) -> None:
         """Ask for a lifecycle transition."""
-        if self._transit is None or label not in _TRANSITIONS:
+        if label not in _TRANSITIONS or not self._transit.service_is_ready():
             return
-        request = self._lifecycle_services.ChangeState.Request()
-        request.transition.id = _TRANSITIONS[label]
 
-        def answered(response: Any) -> None:
+        def answered(response: ChangeState.Response) -> None:
             self._say(f"{label}: {'done' if response.success else 'the node could not'}", response.success)
             self._look_due = 0.0
 
-        # Configuring loads a network and compiles.
-        self._call(self._transit, request, answered, lambda: self._say(f"{label}: no answer", False), 60.0)
+        request = ChangeState.Request(transition=Transition(id=getattr(Transition, f"TRANSITION_{label.upper()}")))
+        give_up = partial(self._say, f"{label}: no answer", False)
+        self._call(self._transit.call_async(request), answered, give_up, _TRANSITION_PATIENCE)
 
     def _look(self) -> None:
-        was_there, self.is_there = self.is_there, self._get.service_is_ready() and self._list.service_is_ready()
+        was_there, self.is_there = self.is_there, self._parameters.services_are_ready()
         if self.is_there and not was_there:
             self._load_due = monotonic()
         if not self.is_there:
             self.lifecycle = ""
-        elif self._state is not None and self._state.service_is_ready() and not self._is_asked(self._state):
+        elif self._state.service_is_ready():
 
-            def answered(response: Any) -> None:
+            def answered(response: GetState.Response) -> None:
                 self.lifecycle = str(response.current_state.label)
 
-            self._call(self._state, self._lifecycle_services.GetState.Request(), answered)
+            self._call(self._state.call_async(GetState.Request()), answered)
 
     def _load(self) -> None:
-        """Names, then descriptors, then values, then controls."""
+        """Names, then descriptors, then values, then controls; all over again where an answer stays away."""
 
-        def listed(response: ListParameters.Response) -> None:
+        def listed(response: Any) -> None:
             names = list(response.result.names)
-            self._call(self._describe, DescribeParameters.Request(names=names), described, self._load_again)
+            self._call(self._parameters.describe_parameters(names), described, self._load_again)
 
-        def described(response: DescribeParameters.Response) -> None:
+        def described(response: Any) -> None:
             descriptors = list(response.descriptors)
             names = [one.name for one in descriptors]
 
-            def got(values: GetParameters.Response) -> None:
-                self._descriptors = descriptors
-                read = [parameter_value_to_python(one) for one in values.values]
+            def got(response: Any) -> None:
+                self._known = set(names)
+                read = [parameter_value_to_python(one) for one in response.values]
                 about = [_description(one, value) for one, value in zip(descriptors, read, strict=True)]
                 with self._lock:
                     self._new_controls = arranged(about)
                     self._new_values.clear()
 
-            self._call(self._get, GetParameters.Request(names=names), got, self._load_again)
+            self._call(self._parameters.get_parameters(names), got, self._load_again)
 
-        self._call(self._list, ListParameters.Request(), listed, self._load_again)
+        self._call(self._parameters.list_parameters(), listed, self._load_again)
 
     def _load_again(self) -> None:
         self._load_due = monotonic() + _LOOK_PERIOD
 
-    def _read(self, names: list[str]) -> None:
-        """Show what the node holds, whatever was asked for."""
-
-        def got(response: GetParameters.Response) -> None:
-            with self._lock:
-                for name, value in zip(names, response.values, strict=False):
-                    self._new_values[name] = parameter_value_to_python(value)
-
-        self._call(self._get, GetParameters.Request(names=names), got)
-
-    def _unanswered(self, name: str) -> None:
-        self._say(f"{name}: no answer from {self.name} within {_PATIENCE:g} s", False)
-
     def _call(
         self,
-        client: Client,
-        request: Any,
+        future: Future,
         answered: Callable[[Any], None],
         give_up: Callable[[], None] = lambda: None,
         patience: float = _PATIENCE,
     ) -> None:
-        future = client.call_async(request)
-
         def done(finished: Future) -> None:
             if finished.cancelled() or finished.exception() is not None or finished.result() is None:
                 give_up()
-                return
-            answered(finished.result())
+            else:
+                answered(finished.result())
 
         future.add_done_callback(done)
-        self._calls.append((monotonic() + patience, client, future, give_up))
-
-    def _is_asked(self, client: Client) -> bool:
-        return any(one is client and not future.done() for _, one, future, _ in self._calls)
+        self._calls.append((monotonic() + patience, future))
 
     def _say(self, words: str, good: bool) -> None:
         with self._lock:
             self._new_answer = words, good
-
-    def _create_lifecycle_clients(self) -> None:
-        """Where the messages are installed: they come with every ROS, not with the wheels' smallest choice."""
-        try:
-            self._lifecycle_services = importlib.import_module("lifecycle_msgs.srv")
-        except ImportError:
-            return
-        services = self._lifecycle_services
-        self._state = self._node.create_client(services.GetState, f"{self.name}/get_state")
-        self._transit = self._node.create_client(services.ChangeState, f"{self.name}/change_state")
 
     # In the drawing thread
 
@@ -230,23 +196,18 @@ class RemoteNode:
 
 
 def _description(about: ParameterDescriptor, value: Any) -> Description:
-    low = high = None
-    step, is_float = 0.0, False
-    if about.floating_point_range:
-        one = about.floating_point_range[0]
-        low, high, step, is_float = float(one.from_value), float(one.to_value), float(one.step), True
-    elif about.integer_range:
-        one = about.integer_range[0]
-        low, high, step = int(one.from_value), int(one.to_value), float(one.step)
+    ranges = [*about.floating_point_range, *about.integer_range]
+    is_float = bool(about.floating_point_range)
+    kind = float if is_float else int
     return Description(
         name=about.name,
         value=value,
         text=about.description,
         constraints=about.additional_constraints,
         read_only=about.read_only,
-        low=low,
-        high=high,
-        step=step,
+        low=kind(ranges[0].from_value) if ranges else None,
+        high=kind(ranges[0].to_value) if ranges else None,
+        step=float(ranges[0].step) if ranges else 0.0,
         is_float_range=is_float,
     )
 

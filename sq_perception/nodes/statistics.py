@@ -1,4 +1,4 @@
-"""Counts and latencies of a node, and what it says about them: diagnostics, summaries, publishers of its topics.
+"""Counts and latencies of a node, and what it says about them: diagnostics, summaries.
 
 Every received frame ends as exactly one of answered, dropped (a newer one came first, or the node is disabled) and
 refused (bad input); the rest is in work.  Counts are since the start, rates and latencies of the last seconds.
@@ -7,31 +7,30 @@ refused (bad input); the rest is in work.  Counts are since the start, rates and
 from __future__ import annotations
 
 import threading
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import datetime, timezone
 from time import monotonic, perf_counter
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
-from rclpy.qos import QoSCompatibility, QoSProfile, qos_check_compatible
-from rclpy.topic_endpoint_info import TopicEndpointInfo
 
 from sq_perception.fitting.fit import Status
 from sq_perception.recovery.recoverer import FrameRecovery
-from sq_perception.tracking.session import Tally
 
 THROTTLE = 5.0
 """Seconds between two messages of the same place in the log."""
 
 SECONDS = 10.0
 """What rates and latencies are taken over."""
-_MOST = 3000
-"""Durations that are kept of a stage: more than any camera sends in that time."""
+_MOST = 5000
+"""Events that are kept: more than any camera causes in that time."""
 _SLOW = 3.0
 """Seconds after which a frame without a verdict tells of more than a start."""
+Standing = tuple[bytes, str]
+"""Level and message of a DiagnosticStatus."""
 
 
 @contextmanager
@@ -44,42 +43,28 @@ def timed(milliseconds: dict[str, float], stage: str) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Snapshot:
-    """The state of affairs at one moment.
+    """Frames since the start, and what the last :data:`SECONDS` were like.
 
     Attributes
     ----------
-    received, answered, dropped, refused
-        Frames since the start.
-    lost
-        Messages since the start that were never received, by topic.
     recent
-        Frames received, answered, dropped and refused in the last :data:`SECONDS`.
+        Frames received, answered, dropped and refused in that time.
     starved
-        Seconds since the first of the recent frames came, if none was answered since then; else 0.
+        Seconds since the first of them came, if none was answered since then; else 0.
     rate
-        Answers per second over the last :data:`SECONDS`.
+        Answers per second.
     latency
         (median, 95th percentile) in milliseconds by stage, of the same answers.
-    last_error
-        What was wrong with the last refused frame; empty if none was.
-    last_error_time
-        When that was, UTC, to the second.
-    last_answer
-        The summary of the last answered frame: also why there are no bodies.
     """
 
-    received: int = 0
-    answered: int = 0
-    dropped: int = 0
-    refused: int = 0
-    lost: Mapping[str, int] = field(default_factory=dict)
-    recent: Mapping[str, int] = field(default_factory=dict)
-    starved: float = 0.0
-    rate: float = 0.0
-    latency: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    last_error: str = ""
-    last_error_time: str = ""
-    last_answer: str = ""
+    received: int
+    answered: int
+    dropped: int
+    refused: int
+    recent: Mapping[str, int]
+    starved: float
+    rate: float
+    latency: Mapping[str, tuple[float, float]]
 
     @property
     def in_work(self) -> int:
@@ -93,11 +78,13 @@ class Statistics:
     def __init__(self, clock: Callable[[], float] = monotonic) -> None:
         self._clock, self._started = clock, clock()
         self._lock = threading.Lock()
-        self._counts = dict.fromkeys(("received", "answered", "dropped", "refused"), 0)
-        self._recent: dict[str, deque[float]] = {what: deque() for what in self._counts}
-        self._stages: dict[str, deque[tuple[float, float]]] = {}
-        self._lost: dict[str, int] = {}
-        self._last_error = self._last_error_time = self._last_answer = ""
+        self._counts: Counter[str] = Counter()
+        self._recent: deque[tuple[float, str]] = deque(maxlen=_MOST)
+        self._stages: deque[tuple[float, Mapping[str, float]]] = deque(maxlen=_MOST)
+        self._lost: Counter[str] = Counter()
+        self._said: tuple[int, Counter[str]] = 0, Counter()
+        """Refused and lost when the last status was made."""
+        self._last_error = self._last_answer = ""
 
     def count(self, what: str, number: int = 1) -> None:
         """Add to received or dropped."""
@@ -107,159 +94,94 @@ class Statistics:
     def lose(self, topic: str, number: int) -> None:
         """Count messages of a topic that were never received."""
         with self._lock:
-            self._lost[topic] = self._lost.get(topic, 0) + number
+            self._lost[topic] += number
 
     def refuse(self, reason: str) -> None:
         """Count a refused frame."""
         with self._lock:
             self._add("refused", 1)
-            self._last_error = reason
-            self._last_error_time = datetime.now(timezone.utc).strftime("%Y-%m-%dT%H:%M:%SZ")
+            self._last_error = f"{datetime.now(timezone.utc):%Y-%m-%dT%H:%M:%SZ} {reason}"
 
     def answer(self, milliseconds: Mapping[str, float], summary: str = "") -> None:
-        """Count an answered frame with the duration of its stages."""
+        """Count an answered frame with the duration of its stages; the summary also says why there are no bodies."""
         with self._lock:
             self._add("answered", 1)
             self._last_answer = summary
-            self._keep(milliseconds)
+        self.note(milliseconds)
 
     def note(self, milliseconds: Mapping[str, float]) -> None:
         """Keep the duration of stages that follow the answer."""
         with self._lock:
-            self._keep(milliseconds)
+            self._stages.append((self._clock(), milliseconds))
 
     def snapshot(self) -> Snapshot:
         """The state of affairs now."""
         with self._lock:
             now = self._clock()
-            for times in self._recent.values():
-                _forget(times, now)
-            for durations in self._stages.values():
-                while durations and now - durations[0][0] > SECONDS:
-                    durations.popleft()
-            counts, lost, recent = dict(self._counts), dict(self._lost), {k: len(v) for k, v in self._recent.items()}
-            starved = now - self._recent["received"][0] if recent["received"] and not recent["answered"] else 0.0
-            stages = {stage: np.array([took for _, took in kept]) for stage, kept in self._stages.items() if kept}
-            last = self._last_error, self._last_error_time, self._last_answer
-        latency = {name: (float(np.median(x)), float(np.percentile(x, 95))) for name, x in stages.items()}
-        seconds = min(SECONDS, max(now - self._started, 1.0))
+            since = now - SECONDS
+            recent = [(time, what) for time, what in self._recent if time >= since]
+            kept = [took for time, took in self._stages if time >= since]
+            counts = [self._counts[what] for what in ("received", "answered", "dropped", "refused")]
+        number = Counter(what for _, what in recent)
+        first = next((time for time, what in recent if what == "received"), now)
+        stages: dict[str, list[float]] = {}
+        for stage, took in (pair for one in kept for pair in one.items()):
+            stages.setdefault(stage, []).append(took)
         return Snapshot(
-            **counts,
-            lost=lost,
-            recent=recent,
-            starved=starved,
-            rate=recent["answered"] / seconds,
-            latency=latency,
-            last_error=last[0],
-            last_error_time=last[1],
-            last_answer=last[2],
+            *counts,
+            recent=number,
+            starved=0.0 if number["answered"] else now - first,
+            rate=number["answered"] / min(SECONDS, max(now - self._started, 1.0)),
+            latency={name: (float(np.median(took)), float(np.percentile(took, 95))) for name, took in stages.items()},
         )
 
+    def status(self, name: str, standing: Standing | None, more: Mapping[str, str]) -> DiagnosticStatus:
+        """The diagnostics of a node.
+
+        Parameters
+        ----------
+        standing
+            Level and message where there is more to say than of the frames; else WARN where they come and none is
+            answered, or were refused or lost since the last status.
+        more
+            What there is to know beside the frames.
+        """
+        now = self.snapshot()
+        with self._lock:
+            lost, last_error, last_answer = Counter(self._lost), self._last_error, self._last_answer
+        (refused, known), self._said = self._said, (now.refused, lost)
+        level, message = DiagnosticStatus.WARN, ""
+        if standing is not None:
+            level, message = standing
+        elif now.refused > refused:
+            message = f"refused a frame: {last_error.partition(' ')[2]}"
+        elif now.starved > _SLOW:
+            message = f"{now.recent['received']} frames came within {now.starved:.0f} s, none was answered"
+        elif new := lost - known:
+            parts = ", ".join(f"{number} of {topic}" for topic, number in new.items())
+            message = f"messages lost before they arrived: {parts}"
+        else:
+            level, message = DiagnosticStatus.OK, f"{now.rate:.1f} Hz"
+        values = {
+            "rate [Hz]": f"{now.rate:.2f}",
+            **{what: str(getattr(now, what)) for what in ("received", "answered", "dropped", "refused")},
+            "in work": str(now.in_work),
+            "lost": str(lost.total()),
+            **{f"lost of {topic}": str(number) for topic, number in lost.items()},
+            "last error": last_error,
+            "last answer": last_answer,
+            **more,
+        }
+        for stage, (median, high) in now.latency.items():
+            values[f"{stage}: median [ms]"] = f"{median:.2f}"
+            values[f"{stage}: p95 [ms]"] = f"{high:.2f}"
+        pairs = [KeyValue(key=key, value=value) for key, value in values.items()]
+        about = f"{name.lstrip('/')}: frames"
+        return DiagnosticStatus(level=level, name=about, message=message, hardware_id=name, values=pairs)
+
     def _add(self, what: str, number: int) -> None:
-        now = self._clock()
         self._counts[what] += number
-        self._recent[what].extend([now] * number)
-        _forget(self._recent[what], now)
-
-    def _keep(self, milliseconds: Mapping[str, float]) -> None:
-        now = self._clock()
-        for stage, duration in milliseconds.items():
-            kept = self._stages.setdefault(stage, deque(maxlen=_MOST))
-            kept.append((now, duration))
-
-
-def _forget(times: deque[float], now: float) -> None:
-    while times and now - times[0] > SECONDS:
-        times.popleft()
-
-
-@dataclass(frozen=True)
-class Condition:
-    """What a node is like, beside its counts.
-
-    Attributes
-    ----------
-    state
-        Of its lifecycle.
-    fault
-        Why a transition or a change of the model came to nothing; empty if all went well.
-    silent
-        Whether images are expected and stay away.
-    enabled
-        Whether images are processed.
-    engine
-        What computes, in a few words.
-    absent
-        Packages that outputs are asked for and that are not there.
-    tally
-        Of the tracking session; None where nothing is tracked.
-    """
-
-    state: str = "active"
-    fault: str = ""
-    silent: bool = False
-    enabled: bool = True
-    engine: str = ""
-    absent: tuple[str, ...] = ()
-    tally: Tally | None = None
-
-
-def status(name: str, now: Snapshot, before: Snapshot, condition: Condition) -> DiagnosticStatus:
-    """The diagnostics of a node.
-
-    ERROR where it cannot work, WARN where frames stay away or come and none is answered, get lost or were refused since
-    the last report, or a change came to nothing.
-    """
-    lost = {topic: number - before.lost.get(topic, 0) for topic, number in now.lost.items()}
-    lost = {topic: number for topic, number in lost.items() if number}
-    level, message = DiagnosticStatus.OK, f"{now.rate:.1f} Hz"
-    if condition.state != "active":
-        level = DiagnosticStatus.ERROR if condition.fault else DiagnosticStatus.OK
-        message = condition.state + (f": {condition.fault}" if condition.fault else "")
-    elif condition.fault:
-        level, message = DiagnosticStatus.WARN, condition.fault
-    elif not condition.enabled:
-        message = "disabled"
-    elif condition.silent:
-        level, message = DiagnosticStatus.WARN, "no depth images arrive"
-    elif now.refused > before.refused:
-        level, message = DiagnosticStatus.WARN, f"refused a frame: {now.last_error}"
-    elif now.starved > _SLOW:
-        came = f"{now.recent['received']} frames came within {now.starved:.0f} s, none was answered"
-        level, message = DiagnosticStatus.WARN, came
-    elif lost:
-        parts = ", ".join(f"{number} of {topic}" for topic, number in lost.items())
-        level, message = DiagnosticStatus.WARN, f"messages lost before they arrived: {parts}"
-    values = {
-        "rate [Hz]": f"{now.rate:.2f}",
-        "received": str(now.received),
-        "answered": str(now.answered),
-        "dropped": str(now.dropped),
-        "refused": str(now.refused),
-        "in work": str(now.in_work),
-        "lost": str(sum(now.lost.values())),
-        **{f"lost of {topic}": str(number) for topic, number in now.lost.items()},
-        "state": condition.state,
-        "enabled": str(condition.enabled).lower(),
-        "engine": condition.engine,
-        "last error": f"{now.last_error_time} {now.last_error}" if now.last_error else "",
-        "last answer": now.last_answer,
-    }
-    if condition.absent:
-        values["missing packages"] = " ".join(condition.absent)
-    tally = condition.tally
-    if tally is not None:
-        values["tracks"] = str(tally.tracks)
-        values["track ids given"] = str(tally.births)
-        values["track resets"] = str(tally.resets)
-        values["frames without camera pose"] = str(tally.without_pose)
-    for stage, (median, high) in now.latency.items():
-        values[f"{stage}: median [ms]"] = f"{median:.2f}"
-        values[f"{stage}: p95 [ms]"] = f"{high:.2f}"
-    pairs = [KeyValue(key=key, value=value) for key, value in values.items()]
-    return DiagnosticStatus(
-        level=level, name=f"{name.lstrip('/')}: frames", message=message, hardware_id=name, values=pairs
-    )
+        self._recent.extend([(self._clock(), what)] * number)
 
 
 def summary(recovery: FrameRecovery, ids: Sequence[int]) -> str:
@@ -279,23 +201,3 @@ def summary(recovery: FrameRecovery, ids: Sequence[int]) -> str:
         )
     count = len(recovery.bodies)
     return f"{count} {'body' if count == 1 else 'bodies'} {took}; " + "; ".join(parts)
-
-
-def publishers(offered: Sequence[TopicEndpointInfo], wanted: QoSProfile) -> str:
-    """Who publishes a topic, with which quality of service, and whether a subscription can hear it."""
-    if not offered:
-        return "nobody publishes it"
-    parts = []
-    for one in offered:
-        profile = one.qos_profile
-        verdict, why = qos_check_compatible(profile, wanted)
-        said = f"{_name(profile.reliability)}, {_name(profile.durability)}"
-        namespace = one.node_namespace.rstrip("/")
-        note = f"; INCOMPATIBLE: {why.strip().rstrip(';')}" if verdict == QoSCompatibility.ERROR else ""
-        parts.append(f"{namespace}/{one.node_name} ({one.topic_type}, {said}{note})")
-    count = len(parts)
-    return f"{count} publisher{'s' if count > 1 else ''}: " + ", ".join(parts)
-
-
-def _name(policy: object) -> str:
-    return str(getattr(policy, "name", policy)).lower().replace("_", " ")

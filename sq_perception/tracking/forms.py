@@ -26,11 +26,15 @@ import numpy as np
 
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.tracking import state
-from sq_perception.tracking.state import LENGTH, SHAPE, SIZE, TURN
+from sq_perception.tracking.state import LENGTH, SHAPE, SIZE, SIZE_AND_SHAPE, TURN
 
 _SHORTLIST = 4
 """Forms compared with their whole covariances; the others are farther off already by their variances."""
 _SIZE_PER_SHAPE = 0.1
+_SAME_NAME = np.pi / 4
+"""Radians: nearer to an axis than to any other one."""
+_SELDOM_TURNED = 2 * np.log(100)
+"""Of d^2 + log det S: of the bodies that a frame shows, a hand has turned fewer than one in a hundred so far."""
 
 
 def _turns() -> np.ndarray:
@@ -83,6 +87,15 @@ def candidates(observed: np.ndarray) -> np.ndarray:
     )
 
 
+def _added(observed: np.ndarray) -> np.ndarray:
+    """Variances (..., 11) that an exchange of z adds to observations (..., 12)."""
+    unlike = np.abs(observed[..., 3] - observed[..., 4])
+    added = np.zeros((*unlike.shape, LENGTH))
+    added[..., SIZE] = (_SIZE_PER_SHAPE * unlike[..., None]) ** 2
+    added[..., SHAPE] = unlike[..., None] ** 2
+    return added
+
+
 def nearest(
     track: np.ndarray, track_covariance: np.ndarray, observed: np.ndarray, covariance: np.ndarray, exchange: float
 ) -> Match:
@@ -99,16 +112,13 @@ def nearest(
     count = len(track)
     forms = candidates(observed)
     errors = state.difference(track[:, None], forms)
-    unlike = np.abs(observed[:, 3] - observed[:, 4])
-    added = np.zeros((count, LENGTH))
-    added[:, SIZE] = (_SIZE_PER_SHAPE * unlike[:, None]) ** 2
-    added[:, SHAPE] = unlike[:, None] ** 2
+    added = _added(observed)
 
     own = np.einsum("nii->ni", covariance)
     variances = np.einsum("kij,nj->nki", _CHANGES**2, own) + np.einsum("nii->ni", track_covariance)[:, None]
     variances[:, EXACT:] += added[:, None]
     rough = (errors**2 / variances + np.log(variances)).sum(axis=-1)
-    rough[:, EXACT:][unlike > exchange] = np.inf
+    rough[:, EXACT:][np.abs(observed[:, 3] - observed[:, 4]) > exchange] = np.inf
 
     some = np.argpartition(rough, _SHORTLIST - 1, axis=1)[:, :_SHORTLIST]
     row = np.arange(count)[:, None]
@@ -121,3 +131,30 @@ def nearest(
     best = np.argmin(cost, axis=1)
     one = np.arange(count)
     return Match(forms[one, some[one, best]], changed[one, best], cost[one, best])
+
+
+def named(
+    track: np.ndarray, track_covariance: np.ndarray, observed: np.ndarray, covariance: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """An observation (12,) that its track does not follow, and its covariance, with the axes named as the track's.
+
+    An exact form with axes within 45 degrees of those of the same names is taken as it is.  Otherwise either the fit
+    has taken another axis as z, or somebody has turned the body.  Sizes and exponents tell which: those of the exchange
+    that keeps the names against those of the exact forms, whatever their turn.  Where they tell nothing, as for a cube,
+    the names are kept.
+    """
+    exact = nearest(track[None], track_covariance[None], observed[None], covariance[None], exchange=0.0)
+    if np.linalg.norm(state.difference(track, exact.state[0])[TURN]) <= _SAME_NAME:
+        return exact.state[0], exact.covariance[0]
+    forms = candidates(observed)
+    errors = state.difference(track, forms)
+    changed = _CHANGES @ covariance @ _CHANGES.swapaxes(-1, -2)
+    changed[EXACT:, range(LENGTH), range(LENGTH)] += _added(observed)
+    total = (changed + track_covariance)[:, SIZE_AND_SHAPE, SIZE_AND_SHAPE]
+    cost = state.mahalanobis(total, errors[:, SIZE_AND_SHAPE]) + np.linalg.slogdet(total)[1]
+    keeps = np.linalg.norm(errors[:, TURN], axis=-1) <= _SAME_NAME
+    keeps[:EXACT] = False
+    best = int(np.argmin(np.where(keeps, cost, np.inf)))
+    if not keeps[best] or cost[best] > cost[:EXACT].min() + _SELDOM_TURNED:
+        return exact.state[0], exact.covariance[0]
+    return forms[best], changed[best]

@@ -9,8 +9,9 @@ What a consumer gets of each body is in the optical frame of its frame and in th
 | wanted and not known | any | its own; the pose of the frame before is taken to find the ids |
 
 So a body that is moved by a hand is never published where it was, and nothing is published that the frame does not
-show.  A single observation of other sizes in the same place is taken for an error and left out.  Observations are in
-the exact forms only (:mod:`sq_perception.tracking.forms`): their bodies are not changed.
+show.  A single observation of other sizes in the same place is taken for an error and left out.  Observations keep
+their bodies, and have their axes named as the track's; where the fit has taken another axis as z, that changes the
+exponents (:func:`sq_perception.tracking.forms.named`).
 
 Ids count from 1 and are never used again, not after a reset either.  A body that failed has no track; its id is
 FIRST_FAILED_ID + its label, which no track reaches.
@@ -180,16 +181,15 @@ class TrackingSession:
 
 
 def _in_form_of(body: Superquadric, covariance: np.ndarray, one: Observed) -> tuple[Superquadric, np.ndarray]:
-    """What was observed in its form nearest to a body with this covariance, and the covariance of the observation."""
+    """What was observed with the axes named as those of a body with this covariance, and its own covariance."""
     own = np.asarray(one.covariance, dtype=float)
     known = np.isfinite(own).all()
     size = one.superquadric.size
-    match = forms.nearest(
-        body.to_flat()[None],
-        state.to_log(covariance, body.size)[None],
-        one.superquadric.to_flat()[None],
-        state.to_log(own if known else 0 * np.eye(LENGTH), size)[None],
-        exchange=0.0,
+    found, changed = forms.named(
+        body.to_flat(),
+        state.to_log(covariance, body.size),
+        one.superquadric.to_flat(),
+        state.to_log(own if known else 0 * np.eye(LENGTH), size),
     )
-    found = Superquadric.from_flat(match.state[0])
-    return found, state.from_log(match.covariance[0], found.size) if known else own
+    named = Superquadric.from_flat(found)
+    return named, state.from_log(changed, named.size) if known else own

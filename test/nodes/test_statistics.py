@@ -10,7 +10,7 @@ pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
 from diagnostic_msgs.msg import DiagnosticStatus
 
-from sq_perception.nodes.statistics import SECONDS, Condition, Snapshot, Statistics, status
+from sq_perception.nodes.statistics import SECONDS, Statistics
 
 
 class Clock:
@@ -33,8 +33,8 @@ def statistics(clock: Clock) -> Statistics:
     return Statistics(clock)
 
 
-def said(statistics: Statistics, before: Snapshot | None = None) -> tuple[DiagnosticStatus, dict[str, str]]:
-    one = status("/recover_node", statistics.snapshot(), before or Snapshot(), Condition())
+def said(statistics: Statistics) -> tuple[DiagnosticStatus, dict[str, str]]:
+    one = statistics.status("/recover_node", None, {})
     return one, {pair.key: pair.value for pair in one.values}
 
 
@@ -90,9 +90,9 @@ def test_the_last_error_has_a_time_and_no_bodies_a_reason(statistics):
 
 def test_lost_messages_are_counted_by_topic(statistics):
     statistics.lose("/depth/image", 3)
-    before = statistics.snapshot()
+    said(statistics)
     statistics.lose("/depth/camera_info", 2)
     statistics.lose("/depth/image", 1)
-    one, values = said(statistics, before)
+    one, values = said(statistics)
     assert one.message == "messages lost before they arrived: 1 of /depth/image, 2 of /depth/camera_info"
     assert (values["lost"], values["lost of /depth/image"], values["lost of /depth/camera_info"]) == ("6", "4", "2")

@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tracked_bodies import Seen, angle_between, body, draw, from_camera, looking_at, noise, spread_bodies
+from tracked_bodies import Seen, angle_between, body, draw, exchanged, from_camera, looking_at, noise, spread_bodies
 
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.tracking import session, state
+from sq_perception.tracking import forms, session, state
 from sq_perception.tracking.session import Tally, TrackingSession
 from sq_perception.tracking.tracker import Tracker, TrackerOptions
 
@@ -82,6 +82,49 @@ def test_without_a_pose_there_are_ids_and_forms_but_no_fusion(rng):
             assert angle_between(found.superquadric, last) < 0.3
         last = found.superquadric
     assert one.tally == Tally(tracks=1, births=1, resets=0, without_pose=15)
+
+
+EXCHANGES = range(forms.EXACT, len(forms.TURNS))
+
+
+@pytest.mark.parametrize("turn", EXCHANGES)
+@pytest.mark.parametrize("size", [(0.05, 0.04, 0.03), (0.04, 0.04, 0.04)])
+def test_a_frame_without_pose_names_the_axes_as_the_track_does(turn, size, rng):
+    """A fit that takes another axis as z: a grasp on the frame of tf must not turn by 90 degrees."""
+    truth, one = body(size, (0.25, 0.35)), TrackingSession()
+    for k in range(6):
+        (last,) = one.follow([draw(truth, noise(), rng)], 0.1 * k)
+    seen = exchanged(draw(truth, noise(), rng, form=0), turn)
+    (found,) = one.follow([seen], 0.6, is_pose_known=False)
+    assert not found.is_fused
+    assert angle_between(found.superquadric, last.superquadric) < 0.3
+    np.testing.assert_allclose(np.sort(found.superquadric.size), np.sort(seen.superquadric.size))
+    np.testing.assert_allclose(found.superquadric.size, last.superquadric.size, rtol=0.2)
+    assert np.isfinite(found.sigma_size).all()
+
+
+@pytest.mark.parametrize("turn", EXCHANGES)
+def test_a_body_that_is_found_elsewhere_keeps_the_names_of_its_axes(turn, rng):
+    truth, one = body((0.05, 0.04, 0.03), (0.15, 0.6)), TrackingSession()
+    for k in range(6):
+        (last,) = one.follow([draw(truth, noise(), rng)], 0.1 * k)
+    there = Superquadric(truth.size, truth.shape, truth.translation + [0.03, 0, 0], truth.rotation)
+    (found,) = one.follow([exchanged(draw(there, noise(), rng, form=0), turn)], 0.6)
+    assert not found.is_fused
+    assert angle_between(found.superquadric, last.superquadric) < 0.3
+
+
+@pytest.mark.parametrize("height", [0.03, 0.06])
+def test_a_can_that_is_tipped_over_stays_a_can(height, rng):
+    """Sizes and exponents are those of the track about another axis: it has been turned, and is shown as it is."""
+    truth, one = body((0.03, 0.03, height), (0.1, 1.0), turn=(0.0, 0.0, 0.0)), TrackingSession()
+    for k in range(6):
+        one.follow([draw(truth, noise(), rng)], 0.1 * k)
+    tipped = body(truth.size, truth.shape, turn=(np.pi / 2, 0.0, 0.0))
+    seen = draw(tipped, noise(), rng)
+    (found,) = one.follow([seen], 0.6, is_pose_known=False)
+    points = seen.superquadric.translation + rng.uniform(-0.06, 0.06, (50, 3))
+    np.testing.assert_allclose(found.superquadric.gauge(points), seen.superquadric.gauge(points), rtol=1e-9)
 
 
 def test_time_that_goes_back_resets_and_ids_go_on(rng):
