@@ -12,16 +12,21 @@ a1 a2 a3        HALF sizes along the body's x y z, metres
 e1 e2           exponents: e1 along z, e2 in the xy plane; 0.1 is a box, 1 an ellipsoid, 2 an octahedron
 score           0 to 1: agreement of the soft-rendered body with the image
 residual        root mean square distance of the seen points to the surface, metres
-sigma_a1..a3    standard deviations of the half sizes, metres; NaN where unknown
+sigma_a1..a3    standard deviations of the half sizes, metres
 id              of its track, kept from frame to frame (failed bodies: 2^31 + label); untracked, the label of its mask
 status          0 converged, 1 converged but the view leaves something open, 2 failed
 label           of the mask that the body was fitted to; 0 where there is none
 seen            frames that showed the body so far, this one included; 0 where nobody counted
 fused           1 where the numbers are those of a track, 0 where they are this frame's own
+reason          why the status is 1, and what else there is to know of the fit: the bits of :class:`Reason`
+sigma_e1 sigma_e2    standard deviations of the exponents
+sigma_c1..c3    standard deviations of the centre along the body's axes x y z, metres
+sigma_r1..r3    standard deviations of the rotation about the body's axes x y z, radians
 
-All are float32 but id and what follows it, which are uint32.  The header copies stamp and frame of the depth image.
-Readers find fields by name: a later version may append fields, and raises VERSION when it changes the meaning of one.
-The last three were appended after 0.2.0; in a cloud without them they are 0.
+All are float32 but id, status, label, seen, fused and reason, which are uint32.  Deviations are NaN where unknown.  The
+header copies stamp and frame of the depth image.  Readers find fields by name: a later version may append fields, and
+raises VERSION when it changes the meaning of one.  What follows status was appended after 0.2.0; in a cloud without it
+integers are 0 and deviations NaN.
 
 The eight parameter vectors of one body (half turns about the axes, quarter turns about z with a1 and a2 exchanged) are
 equally right: compare bodies, never raw parameters.
@@ -30,6 +35,7 @@ equally right: compare bodies, never raw parameters.
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from enum import IntFlag
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -43,6 +49,19 @@ if TYPE_CHECKING:
 VERSION = 1
 CONVERGED, WEAK, FAILED = 0, 1, 2
 
+
+class Reason(IntFlag):
+    """Why a body is WEAK, and what else there is to know of its fit, by the axes that the message gives the body."""
+
+    OPEN_X = 1
+    """The frame leaves the half size along the body's x open; the track of other views may know it."""
+    OPEN_Y = 2
+    OPEN_Z = 4
+    HULL = 8
+    """No superquadric came near, so that the body was fitted like the convex hull of the object."""
+
+
+
 _NUMPY_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """By the datatypes of sensor_msgs/PointField."""
 _UINT32, _FLOAT32 = 6, 7
@@ -53,11 +72,10 @@ FIELDS: tuple[tuple[str, int], ...] = tuple(
         *("x", "y", "z", "qx", "qy", "qz", "qw", "a1", "a2", "a3", "e1", "e2"),
         *("score", "residual", "sigma_a1", "sigma_a2", "sigma_a3"),
     )
-) + tuple((name, _UINT32) for name in ("id", "status", "label", "seen", "fused"))
+) + tuple((name, _UINT32) for name in ("id", "status", "label", "seen", "fused", "reason"))
+FIELDS += tuple((f"sigma_{name}", _FLOAT32) for name in ("e1", "e2", "c1", "c2", "c3", "r1", "r2", "r3"))
 """Name and PointField datatype of every field, in the order of the message."""
-_APPENDED = ("label", "seen", "fused")
-"""Fields that a cloud may lack: 0 then."""
-_UNSIGNED = ("id", "status", *_APPENDED)
+_UNSIGNED = tuple(name for name, kind in FIELDS if kind == _UINT32)
 
 _COLUMNS = {
     "size": ("a1", "a2", "a3"),
@@ -69,8 +87,13 @@ _COLUMNS = {
     "sigma_size": ("sigma_a1", "sigma_a2", "sigma_a3"),
     "id": ("id",),
     "status": ("status",),
-    **{name: (name,) for name in _APPENDED},
+    **{name: (name,) for name in ("label", "seen", "fused", "reason")},
+    "sigma_shape": ("sigma_e1", "sigma_e2"),
+    "sigma_centre": ("sigma_c1", "sigma_c2", "sigma_c3"),
+    "sigma_turn": ("sigma_r1", "sigma_r2", "sigma_r3"),
 }
+_NEEDED = tuple(name for name, _ in FIELDS[: [name for name, _ in FIELDS].index("label")])
+"""Fields that every cloud has."""
 
 
 class MessageError(ValueError):
@@ -90,8 +113,11 @@ class SuperquadricArray:
     score, residual : (n,) float32
     sigma_size : (n, 3) float32
     id, status : (n,) uint32
-    label, seen, fused : (n,) uint32
+    label, seen, fused, reason : (n,) uint32
         0 if not given.
+    sigma_shape : (n, 2) float32
+    sigma_centre, sigma_turn : (n, 3) float32
+        NaN if not given.
 
     Raises
     ------
@@ -112,14 +138,20 @@ class SuperquadricArray:
     label: np.ndarray | None = None
     seen: np.ndarray | None = None
     fused: np.ndarray | None = None
+    reason: np.ndarray | None = None
+    sigma_shape: np.ndarray | None = None
+    sigma_centre: np.ndarray | None = None
+    sigma_turn: np.ndarray | None = None
 
     def __post_init__(self) -> None:
         count = len(np.atleast_1d(self.size))
         for column in fields(self):
             names = _COLUMNS[column.name]
             given = getattr(self, column.name)
-            values = np.zeros(count, np.uint32) if given is None else np.asarray(given)
             shape = (count,) if len(names) == 1 else (count, len(names))
+            if given is None:
+                given = np.zeros(shape, np.uint32) if column.name in _UNSIGNED else np.full(shape, np.nan)
+            values = np.asarray(given)
             if values.size == 0 and count == 0:
                 values = values.reshape(shape)
             if values.shape != shape:
@@ -171,11 +203,7 @@ def to_message(superquadrics: SuperquadricArray, header: Any, types: MessageType
         point_step=layout.itemsize,
         row_step=layout.itemsize * len(points),
         data=byte_array(points),
-        is_dense=bool(
-            np.isfinite(superquadrics.sigma_size).all()
-            and np.isfinite(superquadrics.score).all()
-            and np.isfinite(superquadrics.residual).all()
-        ),
+        is_dense=all(bool(np.isfinite(getattr(superquadrics, column)).all()) for column in _COLUMNS),
     )
     return message
 
@@ -192,7 +220,7 @@ def from_message(message: PointCloud2) -> SuperquadricArray:
     points = _points(message)
     columns: dict[str, np.ndarray] = {}
     for column, names in _COLUMNS.items():
-        if names[0] not in (points.dtype.names or ()):
+        if not set(names) <= set(points.dtype.names or ()):
             continue  # a cloud of an earlier version
         values = np.stack([points[name] for name in names], axis=-1)
         columns[column] = values[:, 0] if len(names) == 1 else values
@@ -206,11 +234,10 @@ def _points(message: PointCloud2) -> np.ndarray:
     """The points (n,) of a cloud as a structured array of those of FIELDS that are there."""
     order = ">" if message.is_bigendian else "<"
     present = {field.name: field for field in message.fields}
-    needed = [name for name, _ in FIELDS if name not in _APPENDED]
-    missing = [name for name in needed if name not in present]
+    missing = [name for name in _NEEDED if name not in present]
     if missing:
-        raise MessageError(f"expected the fields {' '.join(needed)}; missing: {' '.join(missing)}")
-    names = [*needed, *(name for name in _APPENDED if name in present)]
+        raise MessageError(f"expected the fields {' '.join(_NEEDED)}; missing: {' '.join(missing)}")
+    names = [name for name, _ in FIELDS if name in present]
     formats = []
     for name in names:
         field = present[name]

@@ -101,7 +101,7 @@ class RemoteNode:
 
         def read(response: Any) -> None:
             with self._lock:  # what the node holds, whatever was asked for
-                self._new_values[name] = parameter_value_to_python(response.values[0])
+                self._new_values.update((name, parameter_value_to_python(one)) for one in response.values)
 
         call = self._parameters.set_parameters([Parameter(name, value=value)])
         silence = f"{name}: no answer from {self.name} within {_PATIENCE:g} s"

@@ -55,6 +55,10 @@ class Snapshot:
         Answers per second.
     latency
         (median, 95th percentile) in milliseconds by stage, of the same answers.
+    lost
+        Messages since the start that were never received, by topic.
+    last_error, last_answer
+        Why the last refused frame was refused, and when, and the summary of the last answered one.
     """
 
     received: int
@@ -65,6 +69,9 @@ class Snapshot:
     starved: float
     rate: float
     latency: Mapping[str, tuple[float, float]]
+    lost: Mapping[str, int]
+    last_error: str
+    last_answer: str
 
     @property
     def in_work(self) -> int:
@@ -121,18 +128,25 @@ class Statistics:
             since = now - SECONDS
             recent = [(time, what) for time, what in self._recent if time >= since]
             kept = [took for time, took in self._stages if time >= since]
-            counts = [self._counts[what] for what in ("received", "answered", "dropped", "refused")]
+            counts, lost = Counter(self._counts), Counter(self._lost)
+            last_error, last_answer = self._last_error, self._last_answer
         number = Counter(what for _, what in recent)
         first = next((time for time, what in recent if what == "received"), now)
         stages: dict[str, list[float]] = {}
         for stage, took in (pair for one in kept for pair in one.items()):
             stages.setdefault(stage, []).append(took)
         return Snapshot(
-            *counts,
+            received=counts["received"],
+            answered=counts["answered"],
+            dropped=counts["dropped"],
+            refused=counts["refused"],
             recent=number,
             starved=0.0 if number["answered"] else now - first,
             rate=number["answered"] / min(SECONDS, max(now - self._started, 1.0)),
             latency={name: (float(np.median(took)), float(np.percentile(took, 95))) for name, took in stages.items()},
+            lost=lost,
+            last_error=last_error,
+            last_answer=last_answer,
         )
 
     def status(self, name: str, standing: Standing | None, more: Mapping[str, str]) -> DiagnosticStatus:
@@ -147,14 +161,13 @@ class Statistics:
             What there is to know beside the frames.
         """
         now = self.snapshot()
-        with self._lock:
-            lost, last_error, last_answer = Counter(self._lost), self._last_error, self._last_answer
+        lost = Counter(now.lost)
         (refused, known), self._said = self._said, (now.refused, lost)
         level, message = DiagnosticStatus.WARN, ""
         if standing is not None:
             level, message = standing
         elif now.refused > refused:
-            message = f"refused a frame: {last_error.partition(' ')[2]}"
+            message = f"refused a frame: {now.last_error.partition(' ')[2]}"
         elif now.starved > _SLOW:
             message = f"{now.recent['received']} frames came within {now.starved:.0f} s, none was answered"
         elif new := lost - known:
@@ -168,8 +181,8 @@ class Statistics:
             "in work": str(now.in_work),
             "lost": str(lost.total()),
             **{f"lost of {topic}": str(number) for topic, number in lost.items()},
-            "last error": last_error,
-            "last answer": last_answer,
+            "last error": now.last_error,
+            "last answer": now.last_answer,
             **more,
         }
         for stage, (median, high) in now.latency.items():

@@ -20,8 +20,9 @@ from sq_msgs_py import poses
 from sq_msgs_py.depth_image import depth_to_message, grey_to_message
 from sq_msgs_py.markers import markers
 from sq_msgs_py.message_types import MessageTypes, installed
-from sq_msgs_py.superquadrics import CONVERGED, SuperquadricArray
-from sq_perception.fitting.fit import Status
+from sq_msgs_py.superquadrics import CONVERGED, Reason, SuperquadricArray
+from sq_perception.fitting.covariance import undetermined
+from sq_perception.fitting.fit import Fit, Status
 from sq_perception.geometry.mesh import MARKER_RESOLUTION, outline, triangles
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
@@ -32,8 +33,8 @@ CAMERA_FRAME, CUBE_FRAME = "camera_depth_optical_frame", "unit_cube"
 """Frame ids of images that bring none."""
 
 _GREY_TYPES: dict[str, type[np.unsignedinteger]] = {"mono8": np.uint8, "mono16": np.uint16}
-_CENTRE_AND_TURN = slice(5, 11)
-"""Of a body's covariance: its centre in the optical frame and its rotation vector in its own."""
+_SHAPE, _CENTRE, _TURN, _CENTRE_AND_TURN = slice(3, 5), slice(5, 8), slice(8, 11), slice(5, 11)
+"""Of a body's covariance: its exponents, its centre in the optical frame and its rotation vector in its own."""
 _WORST, _BEST = np.array([0.80, 0.20, 0.15]), np.array([0.20, 0.65, 0.30])
 
 
@@ -55,6 +56,8 @@ class Identified:
         Frames that showed each object so far; empty where nobody counted.
     fused
         Whether the numbers of each object are those of its track; empty for none.
+    reasons
+        :class:`~sq_msgs_py.superquadrics.Reason` of each object, by the frame's fit and the axes that are published.
     """
 
     recovery: FrameRecovery
@@ -62,6 +65,7 @@ class Identified:
     hidden: tuple[int, ...] = ()
     seen: tuple[int, ...] = ()
     fused: tuple[bool, ...] = ()
+    reasons: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -98,19 +102,21 @@ DEFAULT_STYLE = MarkerStyle()
 
 def untracked(recovery: FrameRecovery) -> Identified:
     """Ids are labels."""
-    return Identified(recovery, tuple(one.label for one in recovery.bodies))
+    reasons = tuple(_reason(one.fit, one.superquadric) for one in recovery.bodies)
+    return Identified(recovery, tuple(one.label for one in recovery.bodies), reasons=reasons)
 
 
 def tracked(recovery: FrameRecovery, tracks: Sequence[Followed], hidden: tuple[int, ...] = ()) -> Identified:
     """Bodies and ids of their tracks, of which there is one for each body that did not fail, in their order."""
     found = iter(tracks)
-    bodies, ids, seen, fused = [], [], [], []
+    bodies, ids, seen, fused, reasons = [], [], [], [], []
     for one in recovery.bodies:
         if one.status == Status.FAILED:
             bodies.append(one)
             ids.append(FIRST_FAILED_ID + one.label)
             seen.append(0)
             fused.append(False)
+            reasons.append(0)
             continue
         track = next(found)
         fit = replace(one.fit, superquadric=track.superquadric, covariance=track.covariance)
@@ -118,7 +124,20 @@ def tracked(recovery: FrameRecovery, tracks: Sequence[Followed], hidden: tuple[i
         ids.append(track.id)
         seen.append(track.seen)
         fused.append(track.is_fused)
-    return Identified(replace(recovery, bodies=tuple(bodies)), tuple(ids), hidden, tuple(seen), tuple(fused))
+        reasons.append(_reason(one.fit, track.superquadric))
+    shown = replace(recovery, bodies=tuple(bodies))
+    return Identified(shown, tuple(ids), hidden, tuple(seen), tuple(fused), tuple(reasons))
+
+
+def _reason(fit: Fit, shown: Superquadric) -> int:
+    """The reason that a fit gives for its status, by the axes of the body that is shown in its place."""
+    reason = Reason.HULL if fit.as_hull else Reason(0)
+    if fit.status == Status.WEAK:
+        partner = np.abs(shown.rotation_matrix.T @ fit.superquadric.rotation_matrix).argmax(axis=1)
+        is_open = undetermined(fit.covariance, fit.superquadric.size)[partner]
+        for one in np.array([Reason.OPEN_X, Reason.OPEN_Y, Reason.OPEN_Z])[is_open]:
+            reason |= one
+    return int(reason)
 
 
 @dataclass(frozen=True, eq=False)
@@ -208,6 +227,10 @@ def superquadric_array(found: Identified, is_cube: bool) -> SuperquadricArray:
     bodies = Superquadric.stack([one.superquadric for one in recovery.bodies])
     if is_cube:
         bodies = unit_cube.cube_from_optical(bodies)
+    covariances = np.stack([one.covariance for one in recovery.bodies])
+    turns = np.stack([one.superquadric.rotation_matrix for one in recovery.bodies])
+    centres = np.swapaxes(turns, 1, 2) @ covariances[:, _CENTRE, _CENTRE] @ turns
+    deviations = np.sqrt(np.einsum("nii->ni", covariances))
     return SuperquadricArray(
         size=bodies.size,
         shape=bodies.shape,
@@ -221,6 +244,10 @@ def superquadric_array(found: Identified, is_cube: bool) -> SuperquadricArray:
         label=np.array([one.label for one in recovery.bodies], dtype=np.uint32),
         seen=np.array(found.seen, dtype=np.uint32) if found.seen else None,
         fused=np.array(found.fused, dtype=np.uint32) if found.fused else None,
+        reason=np.array(found.reasons, dtype=np.uint32) if found.reasons else None,
+        sigma_shape=deviations[:, _SHAPE],
+        sigma_centre=np.sqrt(np.einsum("nii->ni", centres)),
+        sigma_turn=deviations[:, _TURN],
     )
 
 
@@ -235,6 +262,9 @@ def truth_array(bodies: Superquadric) -> SuperquadricArray:
         score=np.ones(count),
         residual=np.zeros(count),
         sigma_size=np.zeros((count, 3)),
+        sigma_shape=np.zeros((count, 2)),
+        sigma_centre=np.zeros((count, 3)),
+        sigma_turn=np.zeros((count, 3)),
         id=np.arange(1, count + 1, dtype=np.uint32),
         status=np.full(count, CONVERGED, dtype=np.uint32),
     )

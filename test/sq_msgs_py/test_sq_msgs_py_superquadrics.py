@@ -18,11 +18,14 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from sq_msgs_py import superquadrics
 from sq_msgs_py.markers import PALETTE, markers
-from sq_msgs_py.superquadrics import FIELDS, MessageError, SuperquadricArray
+from sq_msgs_py.superquadrics import FIELDS, MessageError, Reason, SuperquadricArray
 
 HEADER = Header(stamp=Time(sec=7, nanosec=8), frame_id="optical")
-APPENDED = ("label", "seen", "fused")
-COLUMNS = ("size", "shape", "translation", "rotation", "score", "residual", "sigma_size", "id", "status", *APPENDED)
+BEFORE = ("size", "shape", "translation", "rotation", "score", "residual", "sigma_size", "id", "status")
+COUNTS = ("label", "seen", "fused", "reason")
+DEVIATIONS = ("sigma_shape", "sigma_centre", "sigma_turn")
+COLUMNS = (*BEFORE, *COUNTS, *DEVIATIONS)
+LAYOUT_MORE = "label seen fused reason sigma_e1 sigma_e2 sigma_c1 sigma_c2 sigma_c3 sigma_r1 sigma_r2 sigma_r3"
 LAYOUT_1 = "x y z qx qy qz qw a1 a2 a3 e1 e2 score residual sigma_a1 sigma_a2 sigma_a3 id status"
 
 
@@ -40,6 +43,10 @@ def some(count: int, rng: np.random.Generator) -> SuperquadricArray:
         label=rng.integers(0, 2**16, count),
         seen=rng.integers(0, 1000, count),
         fused=rng.integers(0, 2, count),
+        reason=rng.integers(0, 16, count),
+        sigma_shape=rng.random((count, 2)),
+        sigma_centre=rng.random((count, 3)) * 1e-3,
+        sigma_turn=rng.random((count, 3)),
     )
 
 
@@ -48,9 +55,9 @@ def test_the_published_layout_does_not_change() -> None:
     assert superquadrics.VERSION == 1
     names = [name for name, _ in FIELDS]
     assert " ".join(names[:19]) == LAYOUT_1
-    assert tuple(names[19:]) == APPENDED
+    assert " ".join(names[19:]) == LAYOUT_MORE
     types = dict(FIELDS)
-    assert {types.pop(name) for name in ("id", "status", *APPENDED)} == {PointField.UINT32}
+    assert {types.pop(name) for name in ("id", "status", *COUNTS)} == {PointField.UINT32}
     assert set(types.values()) == {PointField.FLOAT32}
 
 
@@ -68,18 +75,23 @@ def test_one_body_reads_by_hand() -> None:
         label=np.array([12]),
         seen=np.array([3]),
         fused=np.array([1]),
+        reason=np.array([Reason.OPEN_Z | Reason.HULL]),
+        sigma_shape=np.array([[0.25, 0.5]]),
+        sigma_centre=np.array([[1.5, 2.5, 3.5]]),
+        sigma_turn=np.array([[0.5, 0.25, 0.125]]),
     )
     message = superquadrics.to_message(body, HEADER)
     assert (message.header, message.height, message.width, message.point_step, message.row_step) == (
         HEADER,
         1,
         1,
-        88,
-        88,
+        124,
+        124,
     )
-    numbers = struct.unpack("<17f5I", message.data.tobytes())
-    assert numbers == (4, 5, 6, 0, 0, 0, 1, 1, 2, 3, 0.25, 0.5, 0.75, 0.125, 7, 8, 9, 4_000_000_000, 1, 12, 3, 1)
-    assert [field.offset for field in message.fields] == list(range(0, 88, 4))
+    numbers = struct.unpack("<17f6I8f", message.data.tobytes())
+    before = (4, 5, 6, 0, 0, 0, 1, 1, 2, 3, 0.25, 0.5, 0.75, 0.125, 7, 8, 9, 4_000_000_000, 1)
+    assert numbers == (*before, 12, 3, 1, 4 + 8, 0.25, 0.5, 1.5, 2.5, 3.5, 0.5, 0.25, 0.125)
+    assert [field.offset for field in message.fields] == list(range(0, 124, 4))
     assert message.is_dense
 
 
@@ -95,10 +107,13 @@ def test_a_cloud_of_release_0_2_0_is_read(rng: np.random.Generator) -> None:
         message.fields.append(PointField(name=name, offset=4 * k, datatype=kind, count=1))
     message.data = array.array("B", b"".join(points))
     after = superquadrics.from_message(message)
-    for column in COLUMNS[:-3]:
+    for column in BEFORE:
         np.testing.assert_array_equal(getattr(after, column), getattr(before, column))
-    for column in APPENDED:
+    for column in COUNTS:
         np.testing.assert_array_equal(getattr(after, column), np.zeros(3, np.uint32))
+    for column in DEVIATIONS:
+        assert getattr(after, column).shape == getattr(before, column).shape
+        assert np.isnan(getattr(after, column)).all()
 
 
 @pytest.mark.parametrize("count", [0, 1, 10])
@@ -125,18 +140,21 @@ def test_readers_go_by_name_offset_type_and_byte_order(rng: np.random.Generator)
     names = [name for name, _ in FIELDS][::-1]
     layout = np.dtype({
         "names": ["extra", *names],
-        "formats": [">f4"] + [">u4" if name in ("id", "status", *APPENDED) else ">f8" for name in names],
+        "formats": [">f4"] + [">u4" if name in ("id", "status", *COUNTS) else ">f8" for name in names],
         "offsets": [0] + [4 + 9 * k for k in range(len(names))],
-        "itemsize": 210,
+        "itemsize": 300,
     })  # fmt: skip
     points = np.zeros(4, layout)
     flat = np.column_stack([bodies.translation, bodies.rotation, bodies.size, bodies.shape, bodies.score,
                             bodies.residual, bodies.sigma_size])  # fmt: skip
     for k, (name, _) in enumerate(FIELDS[:17]):
         points[name] = flat[:, k]
-    for name in ("id", "status", *APPENDED):
+    for name in ("id", "status", *COUNTS):
         points[name] = getattr(bodies, name)
-    message = PointCloud2(header=HEADER, height=2, width=2, is_bigendian=True, point_step=210, row_step=425)
+    more = np.column_stack([getattr(bodies, name) for name in DEVIATIONS])
+    for k, (name, _) in enumerate(FIELDS[-8:]):
+        points[name] = more[:, k]
+    message = PointCloud2(header=HEADER, height=2, width=2, is_bigendian=True, point_step=300, row_step=605)
     for name in layout.names:
         kind = {"f4": PointField.FLOAT32, "f8": PointField.FLOAT64, "u4": PointField.UINT32}[layout[name].str[1:]]
         message.fields.append(PointField(name=name, offset=layout.fields[name][1], datatype=kind, count=1))
@@ -157,7 +175,7 @@ def broken(change: str, rng: np.random.Generator) -> PointCloud2:
     elif change == "unknown type":
         message.fields[3].datatype = 77
     elif change == "outside":
-        message.fields[5].offset = 86
+        message.fields[5].offset = 122
     elif change == "cut":
         message.data = message.data[:-1]
     elif change == "short row":
@@ -174,9 +192,9 @@ def broken(change: str, rng: np.random.Generator) -> PointCloud2:
         ("no field", "missing: x y z"),
         ("two in one", "field qx: expected one number"),
         ("unknown type", "field qx: expected one number, got datatype 77"),
-        ("outside", "field qz: offset 86 lies outside a point of 88 bytes"),
-        ("cut", "264 bytes, got 263"),
-        ("short row", "at least 264 bytes, got 100"),
+        ("outside", "field qz: offset 122 lies outside a point of 124 bytes"),
+        ("cut", "372 bytes, got 371"),
+        ("short row", "at least 372 bytes, got 100"),
         ("nan", "translation: expected finite"),
     ],
 )

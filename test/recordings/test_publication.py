@@ -1,0 +1,75 @@
+"""What the cloud says of a body beside its parameters: how sure each of them is, and why a body is weak."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sq_msgs_py import poses
+from sq_msgs_py.superquadrics import FAILED, WEAK, Reason
+from sq_perception.fitting.fit import Fit, Status
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.recordings import publication
+from sq_perception.recovery.recoverer import FrameRecovery, Recovery
+from sq_perception.tracking.session import Followed
+
+BODY = Superquadric([0.05, 0.04, 0.03], [0.3, 0.6], [0.01, 0.02, 0.6], [0.1, 0.2, 0.3, 0.9])
+SIGMA = np.array([0.001, 0.02, 0.001, 0.03, 0.05, 0.001, 0.002, 0.003, 0.02, 0.03, 0.04])
+
+
+def recovery(status: Status, sigma: np.ndarray = SIGMA, body: Superquadric = BODY, as_hull: bool = False):
+    fit = Fit(body, 0.001, status, "", covariance=np.diag(np.square(sigma)), as_hull=as_hull)
+    return FrameRecovery((Recovery(fit, 0.9, 7, 100),), {}, np.zeros((48, 64), np.int32), None, "")
+
+
+def array(found: publication.Identified):
+    return publication.superquadric_array(found, is_cube=False)
+
+
+def test_a_weak_body_names_the_axis_that_is_open():
+    """0.02 of 0.04 m along y; a body that converged or failed gives no reason."""
+    (reason,) = array(publication.untracked(recovery(Status.WEAK))).reason
+    assert Reason(int(reason)) == Reason.OPEN_Y
+    (reason,) = array(publication.untracked(recovery(Status.WEAK, as_hull=True))).reason
+    assert Reason(int(reason)) == Reason.OPEN_Y | Reason.HULL
+    for status in (Status.CONVERGED, Status.FAILED):
+        assert array(publication.untracked(recovery(status))).reason == [0]
+
+
+def test_the_axis_is_named_as_the_published_body_names_it():
+    """The track knows the open size from other views and has x and y exchanged: the frame's reason is about its x."""
+    forms = BODY.equivalent_forms()
+    exchanged = next(form for form in forms if form.size[0] == BODY.size[1])
+    track = Followed(3, 9, True, exchanged, np.diag(np.square(SIGMA)) / 100)
+    shown = array(publication.tracked(recovery(Status.WEAK), [track]))
+    assert (shown.status, shown.reason) == ([WEAK], [Reason.OPEN_X])
+    np.testing.assert_allclose(shown.sigma_size[0], SIGMA[:3] / 10, rtol=1e-6)
+    failed = array(publication.tracked(recovery(Status.FAILED), []))
+    assert (failed.status, failed.reason) == ([FAILED], [0])
+
+
+def test_deviations_are_along_and_about_the_axes_of_the_body():
+    """x of the body is y of the camera: what is unsure along y of the camera is so along x of the body."""
+    turned = Superquadric(BODY.size, BODY.shape, BODY.translation, [0, 0, np.sqrt(0.5), np.sqrt(0.5)])
+    found = publication.untracked(recovery(Status.CONVERGED, body=turned))
+    shown = array(found)
+    np.testing.assert_allclose(shown.sigma_shape, [[0.03, 0.05]], rtol=1e-6)
+    np.testing.assert_allclose(shown.sigma_centre, [[0.002, 0.001, 0.003]], rtol=1e-6)
+    np.testing.assert_allclose(shown.sigma_turn, [[0.02, 0.03, 0.04]], rtol=1e-6)
+    moved = poses.moved(shown, np.array([0.3, 0.1, 0.2, 0.9]), np.array([1.0, 2.0, 3.0]))
+    for column in ("sigma_size", "sigma_shape", "sigma_centre", "sigma_turn", "reason"):
+        np.testing.assert_array_equal(getattr(moved, column), getattr(shown, column))
+
+
+def test_what_a_method_does_not_know_is_not_claimed():
+    shown = array(publication.untracked(recovery(Status.CONVERGED, np.full(11, np.nan))))
+    for column in ("sigma_size", "sigma_shape", "sigma_centre", "sigma_turn"):
+        assert np.isnan(getattr(shown, column)).all(), column
+
+
+@pytest.mark.parametrize("count", [0, 3])
+def test_the_truth_is_sure_of_everything(count):
+    bodies = Superquadric.stack([BODY] * count)
+    truth = publication.truth_array(bodies)
+    for column in ("sigma_size", "sigma_shape", "sigma_centre", "sigma_turn"):
+        assert not getattr(truth, column).any()
