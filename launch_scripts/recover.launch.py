@@ -1,7 +1,11 @@
 """recover_node, and fitter_node if asked for, on the topics of a depth camera; RViz2 if asked for.
 
+With ``cameras`` one process for several cameras, which share a network: topics are then in the namespace of each.
+
 ros2 launch sq_perception recover.launch.py depth:=/camera/camera/depth/image_rect_raw \
     camera_info:=/camera/camera/depth/camera_info rviz:=true
+ros2 launch sq_perception recover.launch.py cameras:="front wrist" depth:=camera/depth/image_rect_raw \
+    camera_info:=camera/depth/camera_info
 """
 
 from __future__ import annotations
@@ -19,6 +23,7 @@ ARGUMENTS = {
     "camera_info": ("depth/camera_info", "topic of their camera_info"),
     "mask": ("mask/image", "topic of label images with the same stamps, if there are any"),
     "params_file": ("", "YAML file of parameters, like the one in share/sq_perception/config"),
+    "cameras": ("", "namespaces of several cameras: recover_cameras instead of recover_node"),
     "namespace": ("", "of the nodes; relative topics are in it too"),
     "autostart": ("", "false: stay unconfigured until a lifecycle manager asks"),
     "model": ("", "network weights: a .safetensors file or the name of shipped ones"),
@@ -47,7 +52,9 @@ def generate_launch_description() -> LaunchDescription:
 
 def _nodes(context: LaunchContext) -> list[Node]:
     given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
-    executables = ["recover_node"] + ["fitter_node"] * (given["fitter"].lower() in _YES)
+    cameras = given["cameras"].split()
+    executables = ["recover_cameras" if cameras else "recover_node"]
+    executables += ["fitter_node"] * (given["fitter"].lower() in _YES)
     parameters: list[str | dict[str, bool | str]] = [given["params_file"]] if given["params_file"] else []
     parameters += [
         {name: given[name].lower() in _YES if kind is bool else given[name]}
@@ -58,13 +65,16 @@ def _nodes(context: LaunchContext) -> list[Node]:
         Node(
             package="sq_perception",
             executable=executable,
-            name=executable,
-            namespace=given["namespace"],
+            # Those of recover_cameras have names of their own: one for the process would be one for all of them.
+            **({} if executable == "recover_cameras" else {"name": executable, "namespace": given["namespace"]}),
             output="screen",
             respawn=given["respawn"].lower() in _YES,
             respawn_delay=_RESPAWN_DELAY,
             parameters=parameters,
-            arguments=["--ros-args", "--log-level", given["log_level"]] if given["log_level"] else [],
+            arguments=[
+                *([_within(given["namespace"], one).strip("/") for one in cameras] * (executable == "recover_cameras")),
+                *(["--ros-args", "--log-level", given["log_level"]] if given["log_level"] else []),
+            ],
             remappings=[
                 ("depth/image", given["depth"]),
                 ("depth/camera_info", given["camera_info"]),

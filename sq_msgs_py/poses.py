@@ -1,4 +1,4 @@
-"""Poses of superquadrics as geometry_msgs/Pose, and whole arrays moved from one frame into another.
+"""Poses of superquadrics and of planes as geometry_msgs, and whole arrays moved from one frame into another.
 
 A rigid motion is (rotation, translation): quaternion x y z w of any length but 0, metres; p_new = R p + t.  It is what
 tf2's ``lookup_transform(new_frame, header.frame_id, ...)`` answers.  Half sizes, exponents and their deviations belong
@@ -18,9 +18,11 @@ import numpy as np
 from sq_msgs_py.superquadrics import SuperquadricArray
 
 if TYPE_CHECKING:
-    from geometry_msgs.msg import Pose
+    from geometry_msgs.msg import Pose, PoseStamped
 
 _LEAST_LENGTH = 1e-6
+_ACROSS = 0.9
+"""Of the x part of a plane's normal: nearer to the x axis than 26 degrees."""
 
 
 def pose_messages(superquadrics: SuperquadricArray) -> list[Pose]:
@@ -66,6 +68,45 @@ def moved(superquadrics: SuperquadricArray, rotation: np.ndarray, translation: n
     )
 
 
+def plane_message(plane: np.ndarray, header: Any) -> PoseStamped:
+    """A plane n.p + d = 0 (4,) as a pose: z is n, the origin is the point next to that of the header's frame.
+
+    The x axis is that of the header's frame laid into the plane, or its y axis where the plane is across x.
+    """
+    from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
+
+    normal, offset = np.asarray(plane[:3], dtype=float), float(plane[3])
+    length = np.linalg.norm(normal)
+    normal, offset = normal / length, offset / length
+    axis = np.eye(3)[0 if abs(normal[0]) < _ACROSS else 1]
+    along = np.cross(np.cross(normal, axis), normal)
+    along /= np.linalg.norm(along)
+    x, y, z, w = _quaternion(np.column_stack([along, np.cross(normal, along), normal])).tolist()
+    centre = (-offset * normal).tolist()
+    pose = Pose(position=Point(x=centre[0], y=centre[1], z=centre[2]), orientation=Quaternion(x=x, y=y, z=z, w=w))
+    return PoseStamped(header=header, pose=pose)
+
+
+def plane_of(message: PoseStamped) -> np.ndarray:
+    """The plane (4,), n of length 1, n.p + d = 0, of a pose: the inverse of :func:`plane_message`.
+
+    Raises
+    ------
+    ValueError
+        If the quaternion names no rotation.
+    """
+    turn, centre = message.pose.orientation, message.pose.position
+    normal = matrices(unit_quaternions(np.array([turn.x, turn.y, turn.z, turn.w])))[:, 2]
+    return np.append(normal, -normal @ [centre.x, centre.y, centre.z])
+
+
+def moved_plane(plane: np.ndarray, rotation: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    """A plane n.p + d = 0 (4,) in another frame; ValueError as :func:`moved`."""
+    turn, shift = _motion(rotation, translation)
+    normal = matrices(turn) @ plane[:3]
+    return np.append(normal, plane[3] - normal @ shift)
+
+
 def moved_covariances(covariances: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     """Covariances (n, 6, 6) of poses in a frame that is turned by a quaternion (4,), p_new = R p."""
     change = np.kron(np.eye(2), matrices(unit_quaternions(rotation)))
@@ -103,6 +144,20 @@ def matrices(quaternions: np.ndarray) -> np.ndarray:
         [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
     ]
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def _quaternion(matrix: np.ndarray) -> np.ndarray:
+    """Unit quaternion (4,) of a rotation matrix (3, 3): the eigenvector that Bar-Itzhack's matrix has for 3."""
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = matrix
+    symmetric = np.array(
+        [
+            [xx - yy - zz, xy + yx, xz + zx, zy - yz],
+            [xy + yx, yy - xx - zz, yz + zy, xz - zx],
+            [xz + zx, yz + zy, zz - xx - yy, yx - xy],
+            [zy - yz, xz - zx, yx - xy, xx + yy + zz],
+        ]
+    )
+    return np.asarray(np.linalg.eigh(symmetric)[1][:, -1])
 
 
 def _motion(rotation: np.ndarray, translation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

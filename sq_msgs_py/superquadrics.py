@@ -171,7 +171,10 @@ class SuperquadricArray:
     @property
     def recovered(self) -> SuperquadricArray:
         """Those that did not fail, in their order."""
-        kept = self.status != FAILED
+        return self.where(self.status != FAILED)
+
+    def where(self, kept: np.ndarray) -> SuperquadricArray:
+        """Those of a mask (n,), in their order."""
         return replace(self, **{column.name: getattr(self, column.name)[kept] for column in fields(self)})
 
     @classmethod

@@ -40,6 +40,7 @@ class Recoverer:
     def __init__(self) -> None:
         self.asked: list[tuple[np.ndarray, Camera, np.ndarray | None, Any]] = []
         self.bodies: tuple[Recovery, ...] = (ball(),)
+        self.plane: np.ndarray | None = None
         self.error: Exception | None = None
         self.gate = threading.Event()
         self.gate.set()
@@ -52,7 +53,7 @@ class Recoverer:
         assert self.gate.wait(PATIENCE)
         if self.error is not None:
             raise self.error
-        return FrameRecovery(self.bodies, {"total": 1.0}, np.zeros(depth.shape, np.int32), None, "")
+        return FrameRecovery(self.bodies, {"total": 1.0}, np.zeros(depth.shape, np.int32), self.plane, "")
 
 
 class Bench(SpunNodes):

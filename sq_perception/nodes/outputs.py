@@ -14,10 +14,11 @@ missing is named once in the log and stays in ``absent``.  Messages are made onl
 /tf is published as tf2_ros.TransformBroadcaster does it, with the same queue of 100; a publisher of our own needs
 tf2_msgs alone, knows whether anybody listens, and can be taken down again.
 
-An object of the planning scene is removed when its id is gone, that is neither in a frame nor that of a track which the
-frame does not show: what a robot's arm hides is still there.  Switching the output off removes all objects that were
-added.  A node that ends removes nothing: a planner must not lose its obstacles because a camera fails; and what
-planners were told of outlives a restart after a fault, so that an object that is gone is still removed.
+An object of the planning scene is sent again when it has changed, and all of them when another planner listens, as a
+planner copies its world for each message.  One is removed when its id is gone, that is neither in a frame nor that of a
+track which the frame does not show: what a robot's arm hides is still there.  Switching the output off removes all
+objects that were added.  A node that ends removes nothing: a planner must not lose its obstacles because a camera
+fails; and what planners were told of outlives a restart after a fault, so that an object that is gone is still removed.
 """
 
 from __future__ import annotations
@@ -28,10 +29,12 @@ from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
+import numpy as np
+from geometry_msgs.msg import PoseStamped
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSPolicyKind
+from rclpy.qos import QoSDurabilityPolicy, QoSPolicyKind, QoSProfile
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import Image, PointCloud2
 from visualization_msgs.msg import MarkerArray
@@ -39,7 +42,8 @@ from visualization_msgs.msg import MarkerArray
 from sq_msgs_py import collision_objects
 from sq_msgs_py.detections import detections
 from sq_msgs_py.markers import markers
-from sq_msgs_py.superquadrics import to_message
+from sq_msgs_py.poses import plane_message, unit_quaternions
+from sq_msgs_py.superquadrics import SuperquadricArray, to_message
 from sq_msgs_py.transforms import name, transforms
 from sq_perception.nodes.frame import Frame, Refused
 from sq_perception.nodes.parameters import RecoverParameters
@@ -50,6 +54,10 @@ from sq_perception.recordings.publication import Findings, Identified, MarkerSty
 from sq_perception.recovery.recoverer import render_recovery
 
 _OVERRIDABLE = tuple(getattr(QoSPolicyKind, name) for name in ("HISTORY", "DEPTH", "RELIABILITY", "DURABILITY"))
+_LATCHED = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
+"""Late comers get the last one: a table that is hidden by an arm is still there."""
+_STEP = 0.002
+"""Metres: planners, whose paddings are larger, are not told of a body of which no point has moved farther."""
 _ARRIVAL = Duration(seconds=0.5)
 """How long the last markers may take to arrive before their publisher goes."""
 
@@ -84,7 +92,8 @@ class Outputs:
         self.superquadrics = create(PointCloud2, "~/superquadrics", 10)
         self.markers = create(MarkerArray, "~/markers", 1)
         self.rendered_depth = create(Image, "~/rendered_depth", 1)
-        self._publishers = self.superquadrics, self.markers, self.rendered_depth
+        self.support_plane = create(PoseStamped, "~/support_plane", _LATCHED)
+        self._publishers = self.superquadrics, self.markers, self.rendered_depth, self.support_plane
         self._others.follow(parameters)
 
     def close(self) -> None:
@@ -118,6 +127,8 @@ class Outputs:
         findings = publication.findings(found, frame.header, frame.is_cube)
         findings = in_frame(findings, self._poses, parameters.target_frame, parameters.tf_tolerance)
         self.superquadrics.publish(to_message(findings.array, findings.header))
+        if findings.plane is not None:
+            self.support_plane.publish(plane_message(findings.plane, findings.header))
         return findings
 
     def accompany(
@@ -190,7 +201,10 @@ class OptionalOutputs:
         self._node = node
         self._publishers: dict[str, tuple[type[Any], Publisher]] = {}
         self._absent: dict[str, str] = {}
-        self._added: set[str] = set()
+        self._told: dict[str, SuperquadricArray | None] = {}
+        """What planners were told of, by name; None for what has to be told again."""
+        self._told_as = "", ""
+        self._listeners = 0
         self._last_header: Any = None
         self._said_no_frame = False
 
@@ -208,7 +222,7 @@ class OptionalOutputs:
                 continue
             if parameter in self._absent:
                 self._absent = {other: package for other, package in self._absent.items() if other != parameter}
-            if parameter == "publish_collision_objects" and self._added:
+            if parameter == "publish_collision_objects" and self._told:
                 self.withdraw()  # the publisher lasts until the next call, so that its last message arrives
             elif parameter in self._publishers:
                 self._node.destroy_publisher(self._publishers.pop(parameter)[1])
@@ -240,10 +254,10 @@ class OptionalOutputs:
 
     def withdraw(self) -> None:
         """Remove every object that was added to the planning scene."""
-        if not self._added:
+        if not self._told:
             return
-        self._publish_scene(collision_objects.removals(self._added, self._last_header))
-        self._added = set()
+        self._publish_scene(collision_objects.removals(self._told, self._last_header))
+        self._told = {}
 
     def close(self) -> None:
         """Destroy the publishers; what is in the planning scene stays there, and is remembered."""
@@ -276,16 +290,37 @@ class OptionalOutputs:
     def _publish_collision_objects(
         self, found: Findings, parameters: RecoverParameters, hidden: Collection[int]
     ) -> None:
-        meshes = found.meshes if parameters.collision_shapes == "mesh" else None
+        listeners = self._publishers["publish_collision_objects"][1].get_subscription_count()
+        told_as = found.header.frame_id, parameters.collision_shapes
+        if listeners > self._listeners or told_as != self._told_as:
+            self._told = dict.fromkeys(self._told)
+        self._listeners, self._told_as, self._last_header = listeners, told_as, found.header
+        shown = found.array.recovered
+        names = [name(number, parameters.tf_prefix) for number in shown.id]
+        new = np.array([_has_changed(self._told.get(one), shown, k) for k, one in enumerate(names)], dtype=bool)
+        meshes = [found.meshes[k] for k in np.flatnonzero(new)] if parameters.collision_shapes == "mesh" else None
         objects = collision_objects.collision_objects(
-            found.array, found.header, meshes=meshes, prefix=parameters.tf_prefix
+            shown.where(new), found.header, meshes=meshes, prefix=parameters.tf_prefix
         )
-        there = {one.id for one in objects}
-        kept = self._added & {name(number, parameters.tf_prefix) for number in hidden}
-        objects += collision_objects.removals(self._added - there - kept, found.header)
-        self._added, self._last_header = there | kept, found.header
+        kept = {*names, *(name(number, parameters.tf_prefix) for number in hidden)}
+        objects += collision_objects.removals(self._told.keys() - kept, found.header)
+        self._told = {one: state for one, state in self._told.items() if one in kept}
+        self._told.update({names[k]: shown.where(np.arange(len(shown)) == k) for k in np.flatnonzero(new)})
         if objects:
             self._publish_scene(objects)
 
     def _publish_scene(self, objects: list[Any]) -> None:
         self._publishers["publish_collision_objects"][1].publish(collision_objects.planning_scene(objects))
+
+
+def _has_changed(told: SuperquadricArray | None, shown: SuperquadricArray, k: int) -> bool:
+    """Whether a point of a body may have moved by more than a step since planners were told of it."""
+    if told is None:
+        return True
+    largest = float(told.size.max())
+    turn = 2 * np.arccos(
+        min(1.0, abs(float(np.vdot(unit_quaternions(told.rotation[0]), unit_quaternions(shown.rotation[k])))))
+    )
+    moves = np.linalg.norm(told.translation[0] - shown.translation[k]), np.abs(told.size[0] - shown.size[k]).max()
+    rounds = largest * np.abs(told.shape[0] - shown.shape[k]).max()
+    return bool(sum(moves) + rounds + largest * turn > _STEP)

@@ -152,11 +152,14 @@ class Findings:
         Of their poses, as in :mod:`sq_msgs_py.poses`; NaN where unknown.
     header
         std_msgs/Header: the stamp of the image, and the frame that all this is in.
+    plane : (4,) or None
+        The support plane, height above it = n.p + d.
     """
 
     array: SuperquadricArray
     covariances: np.ndarray
     header: Any
+    plane: np.ndarray | None = None
 
     @property
     def shown_ids(self) -> list[int]:
@@ -177,6 +180,7 @@ class Findings:
             array=poses.moved(self.array, rotation, translation),
             covariances=poses.moved_covariances(self.covariances, rotation),
             header=poses.header_in(self.header, frame_id),
+            plane=None if self.plane is None else poses.moved_plane(self.plane, rotation, translation),
         )
 
     def markers(
@@ -216,7 +220,7 @@ def findings(found: Identified, header: Any, is_cube: bool) -> Findings:
     change = np.zeros((len(array), 6, 6))
     change[:, :3, :3] = np.diag([1.0, -1.0, -1.0]) if is_cube else np.eye(3)
     change[:, 3:, 3:] = poses.matrices(poses.unit_quaternions(array.rotation))
-    return Findings(array, change @ covariances @ np.swapaxes(change, 1, 2), header)
+    return Findings(array, change @ covariances @ np.swapaxes(change, 1, 2), header, recovery.plane)
 
 
 def superquadric_array(found: Identified, is_cube: bool) -> SuperquadricArray:

@@ -99,6 +99,21 @@ def test_recover_is_wired_to_the_camera(repository: Path, launch: dict[str, type
     assert node.named["arguments"] == ["--ros-args", "--log-level", "debug"]
 
 
+def test_several_cameras_are_one_process_with_names_of_their_own(repository: Path, launch: dict[str, type]) -> None:
+    path = repository / "launch_scripts" / "recover.launch.py"
+    given = {"cameras": "front arm/wrist", "depth": "camera/depth", "params_file": "mine.yaml", "log_level": "warn"}
+    (process,) = nodes_of(path, launch, namespace="robot", **given)
+    assert process.named["executable"] == "recover_cameras"
+    assert process.named["arguments"] == ["robot/front", "robot/arm/wrist", "--ros-args", "--log-level", "warn"]
+    assert not {"name", "namespace"} & set(process.named), "they would replace those of all cameras"
+    assert dict(process.named["remappings"])["depth/image"] == "camera/depth"
+    assert process.named["parameters"] == ["mine.yaml"]
+    two = nodes_of(path, launch, cameras="front", fitter="true")
+    assert [(one.named["executable"], one.named["arguments"]) for one in two] == [
+        *(("recover_cameras", ["front"]), ("fitter_node", [])),
+    ]
+
+
 @pytest.mark.parametrize(("scene", "projection"), [("table", "pinhole"), ("thesis", "orthographic")])
 def test_the_synthetic_camera_and_its_readers_agree(
     scene: str, projection: str, repository: Path, launch: dict[str, type]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +12,7 @@ import pytest
 pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
 from frame_node_bench import CAMERA, FRAME_ID, Bench, ball
+from geometry_msgs.msg import PoseStamped
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
@@ -24,6 +26,7 @@ from sq_msgs_py.depth_image import (
     grey_to_message,
     labels_to_message,
 )
+from sq_msgs_py.poses import plane_of
 from sq_perception.fitting.fit import Status
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
@@ -517,3 +520,17 @@ def test_silence_is_reported(make_bench):
     reports: list[DiagnosticArray] = []
     bench.peer.create_subscription(DiagnosticArray, "/diagnostics", reports.append, 5)
     bench.until(lambda: reports and reports[-1].status[0].message == "no depth images arrive")
+
+
+def test_the_support_plane_reaches_those_who_come_late(bench):
+    """A frame without plane, as behind an arm, takes nothing back."""
+    bench.recoverer.plane = np.array([0.0, -0.8, -0.6, 0.5])
+    header = bench.answer(bench.depth())[0].header
+    bench.recoverer.plane = None
+    bench.answer(bench.depth())
+    heard: list[Any] = []
+    latched = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
+    bench.peer.create_subscription(PoseStamped, "recover_node/support_plane", heard.append, latched)
+    bench.until(lambda: heard)
+    assert heard[0].header == header
+    np.testing.assert_allclose(plane_of(heard[0]), [0.0, -0.8, -0.6, 0.5], atol=1e-12)

@@ -229,3 +229,19 @@ def test_without_the_package_only_the_call_fails(monkeypatch, package, make):
     soft_messages.remove(monkeypatch, package)
     with pytest.raises(ImportError):
         make(three(), HEADER)
+
+
+@pytest.mark.parametrize("normal", [[0, 0, 1], [1, 0, 0], [-1, 0, 0], [0, -1, 0], [0.1, -0.8, -0.59]])
+def test_a_plane_is_a_pose_on_it_with_z_along_its_normal(normal: list[float]) -> None:
+    """And moves with its frame: heights of points stay what they are."""
+    plane = np.append(np.array(normal) / np.linalg.norm(normal), 0.7)
+    message = poses.plane_message(3 * plane, HEADER)
+    assert message.header == HEADER
+    np.testing.assert_allclose(poses.plane_of(message), plane, atol=1e-12)
+    centre = message.pose.position
+    np.testing.assert_allclose([centre.x, centre.y, centre.z], -0.7 * plane[:3], atol=1e-12)
+    turn, shift = np.array([0.1, 0.5, -0.3, 0.8]), np.array([1.0, 2.0, 3.0])
+    points = np.array([[0.3, 0.1, 0.9], [-0.2, 0.4, 1.5]])
+    there = points @ poses.matrices(poses.unit_quaternions(turn)).T + shift
+    moved = poses.moved_plane(plane, turn, shift)
+    np.testing.assert_allclose(there @ moved[:3] + moved[3], points @ plane[:3] + plane[3], atol=1e-12)
