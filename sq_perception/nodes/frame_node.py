@@ -9,6 +9,7 @@
 | `~/superquadrics` | sensor_msgs/PointCloud2 | out: one point per body, see sq_msgs_py.superquadrics |
 | `~/markers` | visualization_msgs/MarkerArray | out, while somebody listens |
 | `~/rendered_depth` | sensor_msgs/Image | out, while somebody listens; in the encoding of the input |
+| `~/support_plane` | geometry_msgs/PoseStamped | out, latched: what the objects stand on, z is its normal |
 | `/diagnostics` | diagnostic_msgs/DiagnosticArray | out, once per second, in every state |
 | `~/enable` | std_srvs/SetBool | drop all frames, or process them again |
 | `~/trigger` | std_srvs/Trigger | process the next frame, also while disabled, and answer with a summary |
