@@ -249,7 +249,9 @@ class OptionalOutputs:
         if parameters.publish_detections and self._is_heard("publish_detections"):
             message = detections(found.array, found.header, covariances=found.covariances, prefix=parameters.tf_prefix)
             self._publishers["publish_detections"][1].publish(message)
-        if parameters.publish_collision_objects and has_frame and self._is_heard("publish_collision_objects"):
+        if not self._is_heard("publish_collision_objects"):
+            self._listeners = 0
+        elif parameters.publish_collision_objects and has_frame:
             self._publish_collision_objects(found, parameters, hidden)
 
     def withdraw(self) -> None:

@@ -228,6 +228,10 @@ def test_planners_are_told_of_changes_alone_and_a_new_planner_of_everything(node
     scene.listeners = 2
     assert [show(BOX, CAN), show(BOX, CAN)] == [2, 0]
     assert show(BOX, CAN, collision_shapes="mesh") == 2
+    scene.listeners = 0
+    show(BOX, CAN, collision_shapes="mesh")
+    scene.listeners = 1
+    assert show(BOX, CAN, collision_shapes="mesh") == 2, "a planner that has started again knows nothing"
 
 
 def test_switching_off_removes_and_ending_does_not(node):
