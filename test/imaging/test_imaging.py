@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from sq_perception.geometry import Superquadric, rotation
-from sq_perception.imaging import canonical_view, raycast, soft_render, unit_cube
+from sq_perception.imaging import canonical_view, raycast, soft_agreement, soft_render, unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.simulation import view_rendering
 from sq_perception.simulation.scenes import thesis_bodies
@@ -262,6 +262,19 @@ class TestSoftRender:
         assert soft_render.agreement(image, image).tolist() == [1, 1, 1]
         assert (soft_render.agreement(image, torch.zeros_like(image)) == 0).all()
         assert (soft_render.agreement(image, image * 0.5) - 0.5).abs().max() < 1e-6
+
+    @pytest.mark.parametrize(("s", "tau"), [(soft_render.THESIS_SHARPNESS, soft_render.THESIS_TAU), (8.0, 0.5)])
+    def test_the_compiled_agreement_is_that_of_the_soft_image(self, s: float, tau: float) -> None:
+        """Bodies against images of others, as of themselves; sharp and soft, thick and thin to the light."""
+        bodies = thesis_bodies(4, np.random.default_rng(10))
+        tensors = Superquadric.from_flat(torch.tensor(bodies.to_flat()))
+        rendered = soft_render.render_depth(tensors, soft_render.cell_centres(64), s, tau)
+        images = (0.7 * rendered + 0.3 * rendered.roll(1, dims=0)).float()
+        expected = soft_render.agreement(images[:, ::3, ::3].double(), rendered[:, ::3, ::3])
+        for body, image, value in zip(bodies, images.numpy(), expected.tolist(), strict=True):
+            parameters = np.concatenate([body.size, body.shape, body.translation])
+            got = soft_agreement.agreement(image, 3, parameters, body.rotation_matrix, s, tau)
+            assert got == pytest.approx(value, abs=1e-9)
 
     @pytest.mark.parametrize(("s", "tau"), [(0.0, 1.0), (1.0, -1.0)])
     def test_refuses_nonsense(self, s: float, tau: float) -> None:

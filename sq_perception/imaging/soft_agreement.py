@@ -1,0 +1,65 @@
+"""How far a soft-rendered body agrees with a view: the score of a recovery, compiled.
+
+:func:`agreement` is :func:`sq_perception.imaging.soft_render.agreement` of a view and
+:func:`~sq_perception.imaging.soft_render.render_depth`, for one body and without derivatives; equations there, a test
+proves both equal.  A line of sight is walked from where it comes near the body until nothing more passes: voxels whose
+occupancy is below e^-NEGLIGIBLE, and what lies behind as much of the body, change no digit that is kept.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from sq_perception.geometry.kernels import box_interval, gauge, kernel
+
+_NEGLIGIBLE = 30.0
+
+
+@kernel
+def agreement(
+    image: np.ndarray,
+    stride: int,
+    parameters: np.ndarray,
+    rotation: np.ndarray,
+    sharpness: float,
+    tau: float,
+) -> float:
+    """Intersection over union of what the view and the body show, at every ``stride``-th row and column.
+
+    ``image`` (n, n) is that of a canonical view; the body is ``parameters`` a1 a2 a3 e1 e2 t1 t2 t3 and ``rotation``
+    (3, 3), object to canonical frame.
+    """
+    n = image.shape[0]
+    a1, a2, a3, e1, e2, t1, t2, t3 = parameters
+    reach = math.sqrt(1.0 + _NEGLIGIBLE / sharpness)
+    ez1, ez2, ez3 = rotation[2]
+    difference, union = 0.0, 0.0
+    for i in range(0, n, stride):
+        y = 1.0 - (i + 0.5) / n - t2
+        for j in range(0, n, stride):
+            x = (j + 0.5) / n - t1
+            # The line of sight at z = 0, in the object's frame; z grows along it.
+            ox = rotation[0, 0] * x + rotation[1, 0] * y - ez1 * t3
+            oy = rotation[0, 1] * x + rotation[1, 1] * y - ez2 * t3
+            oz = rotation[0, 2] * x + rotation[1, 2] * y - ez3 * t3
+            lowest, highest = box_interval(ox, oy, oz, ez1, ez2, ez3, reach * a1, reach * a2, reach * a3)
+            # Voxel k = 0 .. n - 1 from the viewer has its centre at z = 1 - (k + 1/2) / n.
+            first = int(math.ceil(max((1.0 - highest) * n - 0.5, 0.0))) if lowest <= highest else n
+            last = int(math.floor(min((1.0 - lowest) * n - 0.5, n - 1.0))) if lowest <= highest else -1
+            first = min(first, n)
+            passed, left = float(first), 1.0
+            depth, k = 0.0, first
+            while k <= last and depth < _NEGLIGIBLE:
+                z = 1.0 - (k + 0.5) / n
+                g = gauge(ox + z * ez1, oy + z * ez2, oz + z * ez3, a1, a2, a3, e1, e2)
+                depth += tau / (1.0 + math.exp(min(sharpness * (g * g - 1.0), 2.0 * _NEGLIGIBLE)))
+                left = math.exp(-depth)
+                passed += left
+                k += 1
+            rendered = 1.0 - (passed + (n - k) * left) / n
+            seen = float(image[i, j])
+            difference += abs(seen - rendered)
+            union += max(seen, rendered)
+    return 1.0 - difference / union if union > 0.0 else 1.0
