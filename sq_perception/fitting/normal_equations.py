@@ -40,13 +40,19 @@ def cauchy_loss(residual: float, scale: float, weight: float) -> tuple[float, fl
 
 @kernel
 def add_block(block: np.ndarray, filled: int, sums: np.ndarray) -> None:
-    """Add the outer products of the first ``filled`` columns of the block."""
-    for k in range(STEP_LENGTH + 1):
-        for j in range(k + 1):
-            total = 0.0
+    """Add the outer products of the first ``filled`` columns of the block, two by two rows at a time."""
+    for k in range(0, STEP_LENGTH + 1, 2):
+        for j in range(0, k + 2, 2):
+            total, right, below, across = 0.0, 0.0, 0.0, 0.0
             for i in range(filled):
                 total += block[k, i] * block[j, i]
+                right += block[k, i] * block[j + 1, i]
+                below += block[k + 1, i] * block[j, i]
+                across += block[k + 1, i] * block[j + 1, i]
             sums[k, j] += total
+            sums[k, j + 1] += right
+            sums[k + 1, j] += below
+            sums[k + 1, j + 1] += across
 
 
 @kernel

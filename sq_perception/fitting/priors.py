@@ -21,9 +21,9 @@ import math
 
 import numpy as np
 
-from sq_perception.fitting.normal_equations import STEP_LENGTH, add_row
+from sq_perception.fitting.normal_equations import STEP_LENGTH, add_block, add_row
 from sq_perception.fitting.terms import Terms
-from sq_perception.geometry.kernels import kernel, p_norm
+from sq_perception.geometry.kernels import inline_kernel, kernel, p_norm
 
 Derivatives = tuple[float, float, float, float, float, float]
 """h and its derivatives by x, y, z, e1 and e2."""
@@ -50,7 +50,7 @@ def prior_cost(terms: Terms, parameters: np.ndarray, rotation: np.ndarray, sums:
     return cost
 
 
-@kernel
+@inline_kernel
 def support_derivatives(
     nx: float, ny: float, nz: float, a1: float, a2: float, a3: float, e1: float, e2: float
 ) -> Derivatives:
@@ -119,31 +119,39 @@ def _support_cost(terms: Terms, parameters: np.ndarray, rotation: np.ndarray, su
 
 @kernel
 def _hull_cost(terms: Terms, parameters: np.ndarray, rotation: np.ndarray, sums: np.ndarray) -> float:
-    a1, a2, a3, e1, e2, t1, t2, t3 = parameters
     count = terms.hull_directions.shape[0]
-    rows = np.empty((count, STEP_LENGTH + 1))
-    n = np.zeros(3)
+    rows = np.empty((STEP_LENGTH + 1, count))
     for j in range(count):
-        d0, d1, d2 = terms.hull_directions[j]
-        for k in range(3):
-            n[k] = rotation[0, k] * d0 + rotation[1, k] * d1 + rotation[2, k] * d2
-        h, hx, hy, hz, h1, h2 = support_derivatives(n[0], n[1], n[2], a1, a2, a3, e1, e2)
-        rows[j, 0], rows[j, 1], rows[j, 2] = hx * n[0], hy * n[1], hz * n[2]
-        rows[j, 3], rows[j, 4] = h1, h2
-        rows[j, 5], rows[j, 6], rows[j, 7] = d0, d1, d2
-        rows[j, 8] = hy * n[2] - hz * n[1]
-        rows[j, 9] = hz * n[0] - hx * n[2]
-        rows[j, 10] = hx * n[1] - hy * n[0]
-        rows[j, STEP_LENGTH] = d0 * t1 + d1 * t2 + d2 * t3 + h - terms.hull_support[j]
-    whitened = terms.hull_root @ rows
+        rows[5, j], rows[6, j], rows[7, j] = terms.hull_directions[j]
+        rows[STEP_LENGTH, j] = -terms.hull_support[j]
+    _hull_rows(count, parameters, rotation, rows)
+    whitened = rows @ terms.hull_root.T
     square = 0.0
     for j in range(count):
-        square += whitened[j, STEP_LENGTH] * whitened[j, STEP_LENGTH]
+        square += whitened[STEP_LENGTH, j] * whitened[STEP_LENGTH, j]
     freedom = terms.hull_freedom
     whitened *= math.sqrt((freedom + count) / (freedom + square))
-    for j in range(count):
-        add_row(whitened[j], sums)
+    add_block(whitened, count, sums)
     return (freedom + count) * math.log1p(square / freedom)
+
+
+@kernel
+def _hull_rows(count: int, parameters: np.ndarray, rotation: np.ndarray, rows: np.ndarray) -> None:
+    """Derivatives and residuals, of directions in rows 5 to 7 and minus their b in the last: one array, vector code."""
+    a1, a2, a3, e1, e2, t1, t2, t3 = parameters
+    m11, m12, m13 = rotation[0]
+    m21, m22, m23 = rotation[1]
+    m31, m32, m33 = rotation[2]
+    for j in range(count):
+        d0, d1, d2 = rows[5, j], rows[6, j], rows[7, j]
+        n0 = m11 * d0 + m21 * d1 + m31 * d2
+        n1 = m12 * d0 + m22 * d1 + m32 * d2
+        n2 = m13 * d0 + m23 * d1 + m33 * d2
+        h, hx, hy, hz, h1, h2 = support_derivatives(n0, n1, n2, a1, a2, a3, e1, e2)
+        rows[0, j], rows[1, j], rows[2, j] = hx * n0, hy * n1, hz * n2
+        rows[3, j], rows[4, j] = h1, h2
+        rows[8, j], rows[9, j], rows[10, j] = hy * n2 - hz * n1, hz * n0 - hx * n2, hx * n1 - hy * n0
+        rows[STEP_LENGTH, j] += d0 * t1 + d1 * t2 + d2 * t3 + h
 
 
 @kernel

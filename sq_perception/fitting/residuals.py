@@ -57,6 +57,8 @@ _HIT_STEPS = 12
 """Of Newton's method on a convex function; it converges quadratically, most rays need 2."""
 _LOWEST_STEPS, _LOWEST_TOLERANCE = 20, 1e-9
 """Most steps to the smallest gauge on a ray, and how near to a lower bound it ends."""
+_ANY, _COVERED_TOLERANCE = 1e300, 1e-6
+"""The same for a ray that should meet the body but misses it: how far it passes always matters."""
 _NEAREST = 1e-3
 """A free ray starts this far in front of a pinhole camera, metres."""
 _FAR_OUTSIDE = 2.0
@@ -82,6 +84,7 @@ def evaluate(
     sums[:] = 0.0
     block = np.empty((STEP_LENGTH + 1, LANES))
     lanes = np.empty((_ROWS, LANES))
+    again = np.empty((_ROWS, LANES))
     missed = np.empty(LANES, np.bool_)
     cost = 0.0
     for begin in range(0, rays.shape[0], LANES):
@@ -89,7 +92,7 @@ def evaluate(
         part = rays[begin : begin + filled]
         _place(part, stage == RENDERED, parameters, rotation, lanes)
         if stage == RENDERED:
-            _meet(filled, terms.hit_tolerance, parameters, lanes, missed)
+            _meet(filled, terms.hit_tolerance, parameters, lanes, missed, again)
             cost += _rendered_rows(part, terms, lanes, missed, block)
         else:
             _gauge(filled, parameters, lanes)
@@ -149,13 +152,15 @@ def _gauge(filled: int, parameters: np.ndarray, lanes: np.ndarray) -> None:
 
 
 @kernel
-def _meet(filled: int, tolerance: float, parameters: np.ndarray, lanes: np.ndarray, missed: np.ndarray) -> None:
+def _meet(
+    filled: int, tolerance: float, parameters: np.ndarray, lanes: np.ndarray, missed: np.ndarray, again: np.ndarray
+) -> None:
     """Where the rays meet the surface: shift along the ray and the gauge there; ``missed`` where they do not.
 
     Newton's method along the ray.  From a point on the near side of the body it cannot fail, as g is convex along the
     ray; from the far side, from far outside, and where it passes the smallest g, it starts again at the bounding box.
     The last point lies within the tolerance of the surface; the caller takes the last step in first order.  For a miss
-    it is the point of the smallest g, or q if even the bounding box is missed.
+    it is the point of the smallest g, or q if even the bounding box is missed.  ``again`` (ROWS, LANES) is scratch.
     """
     _gauge(filled, parameters, lanes)
     for i in range(filled):
@@ -172,46 +177,55 @@ def _meet(filled: int, tolerance: float, parameters: np.ndarray, lanes: np.ndarr
         _gauge(filled, parameters, lanes)
         for i in range(filled):
             missed[i] = missed[i] or lanes[_SLOPE, i] >= 0.0
+    count = 0
     for i in range(filled):
         if missed[i]:
-            missed[i] = not _meet_from_box(i, tolerance, parameters, lanes)
+            for row in range(_QX, _SHIFT):
+                again[row, count] = lanes[row, i]
+            count += 1
+    if count == 0:
+        return
+    _meet_from_box(count, tolerance, parameters, again)
+    count = 0
+    for i in range(filled):
+        if missed[i]:
+            for row in range(_SHIFT, _SLOPE + 1):
+                lanes[row, i] = again[row, count]
+            missed[i] = again[_WEIGHT, count] == 0.0
+            count += 1
 
 
 @kernel
-def _meet_from_box(i: int, tolerance: float, parameters: np.ndarray, lanes: np.ndarray) -> bool:
-    """The same for one ray, from where it enters the bounding box; whether it meets the surface."""
-    a1, a2, a3, e1, e2 = parameters[0], parameters[1], parameters[2], parameters[3], parameters[4]
-    qx, qy, qz, ex, ey, ez = lanes[_QX, i], lanes[_QY, i], lanes[_QZ, i], lanes[_EX, i], lanes[_EY, i], lanes[_EZ, i]
-    shift, t_out = box_interval(qx, qy, qz, ex, ey, ez, a1, a2, a3)
-    inside = shift <= t_out
-    if not inside:
-        shift = 0.0
-    hit = False
-    before = shift
+def _meet_from_box(filled: int, tolerance: float, parameters: np.ndarray, lanes: np.ndarray) -> None:
+    """The same from where the rays enter the bounding box; WEIGHT says whether one meets the surface, 1 or 0."""
+    for i in range(filled):
+        qx, qy, qz, ex, ey, ez = lanes[_QX, i], lanes[_QY, i], lanes[_QZ, i], lanes[_EX, i], lanes[_EY, i], lanes[_EZ, i]
+        t_in, t_out = box_interval(qx, qy, qz, ex, ey, ez, parameters[0], parameters[1], parameters[2])
+        inside = t_in <= t_out
+        lanes[_WEIGHT, i] = 1.0 if inside else 0.0
+        lanes[_SHIFT, i] = lanes[_LOW, i] = t_in if inside else 0.0
+    _gauge(filled, parameters, lanes)
     for _ in range(_HIT_STEPS):
-        g, gx, gy, gz, _, _ = gauge_derivatives(qx + shift * ex, qy + shift * ey, qz + shift * ez, a1, a2, a3, e1, e2)
-        slope = gx * ex + gy * ey + gz * ez
-        hit = inside and (abs(g - 1.0) < tolerance or slope < 0.0)
-        if not hit or abs(g - 1.0) < tolerance:
+        moving = 0
+        for i in range(filled):
+            moves = lanes[_WEIGHT, i] > 0.0 and lanes[_SLOPE, i] < 0.0 and abs(lanes[_G, i] - 1.0) >= tolerance
+            lanes[_LOW, i] = lanes[_SHIFT, i] if moves else lanes[_LOW, i]
+            lanes[_SHIFT, i] += (1.0 - lanes[_G, i]) / lanes[_SLOPE, i] if moves else 0.0
+            moving += moves
+        if moving == 0:
             break
-        before = shift
-        shift += (1.0 - g) / slope
-    if inside and not hit:
-        low, high = before, shift
-        for _ in range(_HIT_STEPS):
-            shift = 0.5 * (low + high)
-            g, gx, gy, gz, _, _ = gauge_derivatives(
-                qx + shift * ex, qy + shift * ey, qz + shift * ez, a1, a2, a3, e1, e2
-            )
-            if gx * ex + gy * ey + gz * ez > 0.0:
-                high = shift
-            else:
-                low = shift
-    g, gx, gy, gz, g1, g2 = gauge_derivatives(qx + shift * ex, qy + shift * ey, qz + shift * ez, a1, a2, a3, e1, e2)
-    lanes[_SHIFT, i] = shift
-    lanes[_G, i], lanes[_GX, i], lanes[_GY, i], lanes[_GZ, i], lanes[_G1, i], lanes[_G2, i] = g, gx, gy, gz, g1, g2
-    lanes[_SLOPE, i] = gx * ex + gy * ey + gz * ez
-    return hit
+        _gauge(filled, parameters, lanes)
+    # Newton's method passes the smallest g of a ray that misses: it lies between the last two points.
+    passed = 0
+    for i in range(filled):
+        open_bracket = lanes[_WEIGHT, i] > 0.0 and lanes[_SLOPE, i] >= 0.0 and abs(lanes[_G, i] - 1.0) >= tolerance
+        lanes[_HIGH, i] = lanes[_SHIFT, i]
+        lanes[_LOW, i] = lanes[_LOW, i] if open_bracket else lanes[_SHIFT, i]
+        lanes[_WEIGHT, i] = 0.0 if open_bracket else lanes[_WEIGHT, i]
+        passed += open_bracket
+    if passed > 0:
+        above = np.empty(LANES, np.bool_)
+        _lowest(filled, _ANY, _COVERED_TOLERANCE, parameters, lanes, above)
 
 
 @kernel
@@ -314,11 +328,13 @@ def _enter(
 
 
 @kernel
-def _lowest(filled: int, parameters: np.ndarray, lanes: np.ndarray, missed: np.ndarray) -> None:
+def _lowest(
+    filled: int, matters: float, tolerance: float, parameters: np.ndarray, lanes: np.ndarray, missed: np.ndarray
+) -> None:
     """The smallest gauge on each ray between LOW and HIGH, as far as it matters: shift and gauge there.
 
     Convexity brackets the minimum between two tangents; their intersection is a lower bound, and the search of a ray
-    ends once that is above 1 (``missed``) or within a tolerance of the best point.  The next point is the minimum of
+    ends once that is above ``matters`` (``missed``) or within the tolerance of the best point.  The next point is the minimum of
     the cubic through both ends, exact for smooth g, or the intersection, exact for edges, by turns.
     """
     for i in range(filled):
@@ -346,9 +362,9 @@ def _lowest(filled: int, parameters: np.ndarray, lanes: np.ndarray, missed: np.n
             tangents = (g_low - g_high + s_high * width) / (s_high - s_low)
             bound = g_low + s_low * tangents
             open_bracket = width > 0.0
-            missed[i] = missed[i] or (open_bracket and bound > 1.0)
+            missed[i] = missed[i] or (open_bracket and bound > matters)
             best = min(g_low, g_high)
-            goes_on = open_bracket and not missed[i] and best - bound > _LOWEST_TOLERANCE
+            goes_on = open_bracket and not missed[i] and best - bound > tolerance
             bend = 3.0 * (g_low - g_high) / width + s_low + s_high
             root = math.sqrt(max(bend * bend - s_low * s_high, 0.0))
             cubic = width - width * (s_high + root - bend) / (s_high - s_low + 2.0 * root)
@@ -385,7 +401,7 @@ def _free_rows(
     sums: np.ndarray,
 ) -> float:
     """The residuals of free rays that cross the bounding box: their cost, added to the normal equations."""
-    _lowest(filled, parameters, lanes, missed)
+    _lowest(filled, 1.0, _LOWEST_TOLERANCE, parameters, lanes, missed)
     cost = 0.0
     for i in range(filled):
         gx, gy, gz = lanes[_GX, i], lanes[_GY, i], lanes[_GZ, i]
@@ -430,7 +446,7 @@ def penetration(free: np.ndarray, terms: Terms, parameters: np.ndarray, rotation
             owner[filled] = n
             filled += _enter(free[n], terms, parameters, rotation, filled, lanes)
         if filled == LANES or (n == free.shape[0] and filled > 0):
-            _lowest(filled, parameters, lanes, missed)
+            _lowest(filled, 1.0, _LOWEST_TOLERANCE, parameters, lanes, missed)
             for i in range(filled):
                 gx, gy, gz = lanes[_GX, i], lanes[_GY, i], lanes[_GZ, i]
                 inside = (1.0 - lanes[_G, i]) / math.sqrt(gx * gx + gy * gy + gz * gz + _TINY)
