@@ -47,9 +47,9 @@ def on_plane(points: np.ndarray, plane: np.ndarray) -> list[State]:
 
 def standing_axes(points: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """Columns (3, 3): the sides of the smallest rectangle around the footprint of the points, and the unit normal."""
-    first = np.cross(normal, [0.0, 0.0, 1.0] if abs(normal[2]) < 0.9 else [1.0, 0.0, 0.0])
+    first = quaternions.cross(normal, np.array([0.0, 0.0, 1.0] if abs(normal[2]) < 0.9 else [1.0, 0.0, 0.0]))
     first /= np.linalg.norm(first)
-    second = np.cross(normal, first)
+    second = quaternions.cross(normal, first)
     flat = np.stack([points @ first, points @ second], axis=1)
     (_, _), (_, _), angle = cv2.minAreaRect(flat.astype(np.float32))
     c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
@@ -67,8 +67,7 @@ def _axes_of(points: np.ndarray) -> np.ndarray:
 def _box_states(
     points: np.ndarray, axes: np.ndarray, away: np.ndarray | None, ground: np.ndarray | None = None
 ) -> list[State]:
-    local = points @ axes
-    low, high = np.quantile(local, [_OUTLIER_SHARE, 1 - _OUTLIER_SHARE], axis=0)
+    low, high = np.quantile(axes.T @ points.T, [_OUTLIER_SHARE, 1 - _OUTLIER_SHARE], axis=1)
     if ground is not None:
         low[2] = min(float(ground @ axes[:, 2]), high[2] - 1e-4)
     boxes = [(low, high)]

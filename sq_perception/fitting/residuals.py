@@ -199,7 +199,8 @@ def _meet(
 def _meet_from_box(filled: int, tolerance: float, parameters: np.ndarray, lanes: np.ndarray) -> None:
     """The same from where the rays enter the bounding box; WEIGHT says whether one meets the surface, 1 or 0."""
     for i in range(filled):
-        qx, qy, qz, ex, ey, ez = lanes[_QX, i], lanes[_QY, i], lanes[_QZ, i], lanes[_EX, i], lanes[_EY, i], lanes[_EZ, i]
+        qx, qy, qz = lanes[_QX, i], lanes[_QY, i], lanes[_QZ, i]
+        ex, ey, ez = lanes[_EX, i], lanes[_EY, i], lanes[_EZ, i]
         t_in, t_out = box_interval(qx, qy, qz, ex, ey, ez, parameters[0], parameters[1], parameters[2])
         inside = t_in <= t_out
         lanes[_WEIGHT, i] = 1.0 if inside else 0.0
@@ -334,8 +335,8 @@ def _lowest(
     """The smallest gauge on each ray between LOW and HIGH, as far as it matters: shift and gauge there.
 
     Convexity brackets the minimum between two tangents; their intersection is a lower bound, and the search of a ray
-    ends once that is above ``matters`` (``missed``) or within the tolerance of the best point.  The next point is the minimum of
-    the cubic through both ends, exact for smooth g, or the intersection, exact for edges, by turns.
+    ends once that is above ``matters`` (``missed``) or within the tolerance of the best point.  The next point is the
+    minimum of the cubic through both ends, exact for smooth g, or the intersection, exact for edges, by turns.
     """
     for i in range(filled):
         missed[i] = False

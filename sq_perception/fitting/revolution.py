@@ -18,6 +18,7 @@ Metres, optical frame; costs are those of :mod:`sq_perception.fitting.residuals`
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -37,6 +38,7 @@ from sq_perception.fitting.problem import (
 )
 from sq_perception.fitting.rivals import resized
 from sq_perception.fitting.symmetry_start import three_orders
+from sq_perception.geometry import rotation as quaternions
 
 SPARED, SPARED_OF_PREDICTED = 3, 1
 """Parameters that a body of revolution has less; and where a prediction of the hull weighs the half size and the turn
@@ -118,46 +120,35 @@ def on_plane(points: np.ndarray, plane: np.ndarray) -> list[State]:
     """
     axes = standing_axes(points, plane[:3])
     normal = axes[:, 2]
-    heights = points @ normal + plane[3]
-    high = max(float(np.quantile(heights, 1 - _OUTLIER_SHARE)), 1e-4)
     middle = points.mean(axis=0)
     ahead = middle - (middle @ normal) * normal
     ahead /= max(float(np.linalg.norm(ahead)), 1e-9)
-    found = [_round(points, normal, np.cross(normal, ahead), ahead, (0.0, high), plane, None)]
+    side = quaternions.cross(normal, ahead)
+    directions = np.stack([normal, side, ahead, axes[:, 0], axes[:, 1]])
+    spans = np.quantile(directions @ points.T, [_OUTLIER_SHARE, 1 - _OUTLIER_SHARE], axis=1).T
+    ground = -float(plane[3])
+    high = max(float(spans[0, 1]) - ground, 1e-4)
+    found = [_round(normal, (ground, ground + high), side, spans[1], ahead, spans[2, 0])]
     for k in (0, 1):
-        along, across = axes[:, k], axes[:, 1 - k]
-        across = across * (1.0 if across @ ahead >= 0 else -1.0)
-        found.append(_round(points, along, normal, across, None, plane, 0.5 * high))
+        along, across, nearest = axes[:, k], axes[:, 1 - k], spans[4 - k, 0]
+        if across @ ahead < 0:
+            across, nearest = -across, -spans[4 - k, 1]
+        found.append(_round(along, spans[3 + k], normal, (ground, ground + high), across, nearest))
     return found
 
 
 def _round(
-    points: np.ndarray,
     axis: np.ndarray,
+    along: Sequence[float] | np.ndarray,
     side: np.ndarray,
+    across: Sequence[float] | np.ndarray,
     away: np.ndarray,
-    span: tuple[float, float] | None,
-    plane: np.ndarray,
-    radius: float | None,
+    nearest: float,
 ) -> State:
-    """A round body about ``axis``: its section spans ``side``, and goes ``away`` from its nearest points.
-
-    ``span`` is what it covers along the axis, above the plane; None: what its points cover.  ``radius`` None: half of
-    what they cover along the side; otherwise the body lies on the plane, along which ``side`` is the normal.
-    """
-    tail = [_OUTLIER_SHARE, 1 - _OUTLIER_SHARE]
-    low, high = np.quantile(points @ side, tail)
-    first, last = np.quantile(points @ axis, tail)
-    if span is not None:
-        first, last = span[0] - plane[3], span[1] - plane[3]
-    across = 0.5 * (low + high)
-    if radius is None:
-        radius = 0.5 * (high - low)
-    else:
-        across = radius - plane[3]
-    radius = max(float(radius), 1e-4)
-    half = max(float(0.5 * (last - first)), 1e-4)
-    centre = 0.5 * (first + last) * axis + across * side + (float(np.quantile(points @ away, tail[0])) + radius) * away
-    rotation = np.ascontiguousarray(np.stack([side, np.cross(axis, side), axis], axis=1))
+    """A round body about ``axis``: what it spans along that and ``side``, and where it begins going ``away``."""
+    radius = max(float(0.5 * (across[1] - across[0])), 1e-4)
+    half = max(float(0.5 * (along[1] - along[0])), 1e-4)
+    centre = 0.5 * (along[0] + along[1]) * axis + 0.5 * (across[0] + across[1]) * side + (nearest + radius) * away
+    rotation = np.ascontiguousarray(np.stack([side, quaternions.cross(axis, side), axis], axis=1))
     parameters = np.concatenate([[radius, radius, half, _START_EXPONENT, 1.0], centre])
     return State(parameters, rotation, math.inf, 0)

@@ -141,16 +141,16 @@ def support(
         return None
     points = one.points
     heights = points @ found.plane[:3] + found.plane[3]
-    behind = float(np.median(heights)) <= 0
-    if not behind and np.quantile(heights, _LOWEST) < _HOVERING:
+    low, median = np.quantile(heights, [_LOWEST, 0.5])
+    behind = median <= 0
+    if not behind and low < _HOVERING:
         return found.plane
     other = segments.support_under(found, one.label, depth, camera, options)
     if other is not None:
         lowest, middle = np.quantile(points @ other[:3] + other[3], [_LOWEST, 0.5])
         if abs(lowest) < _HOVERING < middle + _HOVERING:
             return other
-    far_above = float(np.quantile(heights, _LOWEST)) > _HIGHEST_STACK
-    return None if behind or far_above else found.plane
+    return None if behind or low > _HIGHEST_STACK else found.plane
 
 
 def viewed(
