@@ -1,0 +1,144 @@
+"""Parallel grippers as boxes, and where their tool centre point is.
+
+The frame of a grasp is that of the tool centre point, TCP, midway between the pads:
+
+    z   the way of the approach, out of the palm
+    y   the way of the fingers: they close along y, towards each other
+    x   along the width of a finger
+
+The fingers are boxes |x| <= finger_width / 2, opening / 2 <= |y| <= opening / 2 + finger_thickness, -palm <= z <= tip; the
+hand is a box behind them, z <= -palm, and so long that it holds the way of the approach as well.  Metres, newtons.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from types import MappingProxyType
+
+import numpy as np
+
+_QUARTER_TURN = (0.0, 0.0, float(np.sqrt(0.5)), float(np.sqrt(0.5)))
+_REACH = 0.1
+"""The approach is straight for so many metres."""
+
+
+@dataclass(frozen=True)
+class Gripper:
+    """One parallel gripper.
+
+    Attributes
+    ----------
+    opening
+        Between the pads, at most.
+    finger_width, finger_thickness
+        Along x and along y.
+    tip, palm
+        From the TCP to the fingers' ends and back to the palm.
+    hand : (3,)
+        Full sizes of the box behind the palm.
+    force
+        Of one finger when it holds.
+    link
+        The link of the gripper's model that the pose of the TCP is given in.
+    link_from_tcp : (3,), (4,)
+        Position and quaternion x y z w of the TCP in that link: p_link = R p_tcp + t.
+
+    Raises
+    ------
+    ValueError
+        For a length or force that is not positive and finite.
+    """
+
+    name: str
+    opening: float
+    finger_width: float
+    finger_thickness: float
+    tip: float
+    palm: float
+    hand: tuple[float, float, float]
+    force: float
+    link: str
+    link_from_tcp: tuple[tuple[float, float, float], tuple[float, float, float, float]]
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if field.name not in ("name", "link", "link_from_tcp"):
+                numbers = np.asarray(value, dtype=float)
+                if not (np.isfinite(numbers) & (numbers > 0)).all():
+                    raise ValueError(f"{field.name}: expected positive numbers, got {value}")
+
+    def boxes(self, opening: float) -> np.ndarray:
+        """Centre and half sizes (3, 6) of both fingers and the hand in the TCP's frame, at an opening."""
+        middle, long = 0.5 * (self.tip - self.palm), 0.5 * (self.tip + self.palm)
+        aside = 0.5 * (opening + self.finger_thickness)
+        x, y, z = self.hand
+        z += _REACH
+        finger = [0.5 * self.finger_width, 0.5 * self.finger_thickness, long]
+        return np.array(
+            [
+                [0, aside, middle, *finger],
+                [0, -aside, middle, *finger],
+                [0, 0, -self.palm - 0.5 * z, 0.5 * x, 0.5 * y, 0.5 * z],
+            ]
+        )
+
+
+PANDA = Gripper(
+    name="panda",
+    opening=0.080,
+    finger_width=0.0175,
+    finger_thickness=0.0152,
+    tip=0.0095,
+    palm=0.0374,
+    hand=(0.063, 0.204, 0.066),
+    force=70.0,
+    link="panda_hand",
+    link_from_tcp=((0.0, 0.0, 0.1034), (0.0, 0.0, 0.0, 1.0)),
+)
+"""Franka Hand.  Opening 80 mm, 70 N without end: its data sheet.  Boxes of pads and hand, TCP: franka_description."""
+
+ROBOTIQ_2F_85 = Gripper(
+    name="robotiq_2f_85",
+    opening=0.085,
+    finger_width=0.022,
+    finger_thickness=0.014,
+    tip=0.018,
+    palm=0.050,
+    hand=(0.075, 0.150, 0.095),
+    force=100.0,
+    link="robotiq_85_base_link",
+    link_from_tcp=((0.0, 0.0, 0.145), _QUARTER_TURN),
+)
+"""Robotiq 2F-85.  Stroke 85 mm, 20 to 235 N, pads of 22 x 37.5 mm: its manual.  Thickness, palm and hand enclose the
+linkage at any opening, to half a centimetre; the TCP is for parallel pads at mid stroke and moves by 14 mm over it."""
+
+ROBOTIQ_2F_140 = Gripper(
+    name="robotiq_2f_140",
+    opening=0.140,
+    finger_width=0.027,
+    finger_thickness=0.018,
+    tip=0.025,
+    palm=0.095,
+    hand=(0.075, 0.200, 0.110),
+    force=100.0,
+    link="robotiq_140_base_link",
+    link_from_tcp=((0.0, 0.0, 0.205), (0.0, 0.0, 0.0, 1.0)),
+)
+"""Robotiq 2F-140.  Stroke 140 mm, 10 to 125 N: its manual; the rest as for the 2F-85, to a centimetre."""
+
+GRIPPERS: Mapping[str, Gripper] = MappingProxyType({one.name: one for one in (PANDA, ROBOTIQ_2F_85, ROBOTIQ_2F_140)})
+
+
+def gripper(name: str) -> Gripper:
+    """The preset of this name.
+
+    Raises
+    ------
+    ValueError
+        If there is none.
+    """
+    if name not in GRIPPERS:
+        raise ValueError(f"gripper: expected one of {', '.join(GRIPPERS)}, got {name!r}")
+    return GRIPPERS[name]

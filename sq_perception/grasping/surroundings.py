@@ -1,0 +1,100 @@
+"""What is around the bodies: the table, what else was measured, and where nobody has looked."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sq_perception.imaging.camera import Camera
+
+_BEHIND = 0.015
+"""A place so many metres behind what a pixel measured was not seen."""
+_SPACING = 0.005
+"""Metres between the points that are kept."""
+_MOST = 6000
+_ABOVE = 0.008
+"""Metres; lower points are the table's."""
+
+
+@dataclass(frozen=True, eq=False)
+class Surroundings:
+    """All that a gripper has to mind beside the bodies, in their frame.
+
+    Attributes
+    ----------
+    plane : (4,), optional
+        What the bodies stand on: the height above it is n.p + d, n up and of length 1.
+    points : (j, 3)
+        Measured points of things; the table's are not among them.
+    depth, camera
+        A depth image in metres, NaN where nothing was measured, and its pinhole camera, if the frame is the optical one:
+        what lies behind what it shows has not been seen.
+
+    Raises
+    ------
+    ValueError
+        For arrays of another form, a plane that is none, or an image without its camera.
+    """
+
+    plane: np.ndarray | None = None
+    points: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
+    depth: np.ndarray | None = None
+    camera: Camera | None = None
+
+    def __post_init__(self) -> None:
+        if self.plane is not None:
+            plane = np.asarray(self.plane, dtype=float)
+            if plane.shape != (4,) or not np.isfinite(plane).all() or abs(np.linalg.norm(plane[:3]) - 1) > 1e-3:
+                raise ValueError(f"plane: expected a unit normal and a distance (4,), got {self.plane}")
+            object.__setattr__(self, "plane", plane)
+        points = np.asarray(self.points, dtype=float)
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise ValueError(f"points: expected shape (j, 3), got {points.shape}")
+        points = np.ascontiguousarray(points[np.isfinite(points).all(axis=1)])
+        object.__setattr__(self, "points", points)
+        if (self.depth is None) != (self.camera is None):
+            raise ValueError("depth, camera: expected both or neither")
+        if self.camera is not None and self.depth is not None:
+            self.camera.check_image(self.depth)
+
+    @classmethod
+    def of_image(cls, depth: np.ndarray, camera: Camera, plane: np.ndarray | None) -> Surroundings:
+        """What a depth image shows: its plane, all points above it, thinned out, and what it hides.
+
+        Parameters
+        ----------
+        depth : float (height, width)
+            Metres, not positive or not finite where nothing was measured.
+        camera
+            A pinhole camera.
+        plane : (4,), optional
+        """
+        z = np.where(np.isfinite(depth) & (depth > 0), depth, np.nan)
+        rows, columns = np.nonzero(np.isfinite(z))
+        points = camera.unproject(columns, rows, z[rows, columns].astype(float))
+        if plane is not None:
+            points = points[points @ plane[:3] + plane[3] > _ABOVE]
+        _, kept = np.unique(np.floor(points / _SPACING) @ [1.0, 1e4, 1e8], return_index=True)
+        kept = kept[:: max(1, len(kept) // _MOST)]
+        return cls(plane, points[kept], z, camera)
+
+    def down(self, places: np.ndarray) -> np.ndarray:
+        """Unit vectors (k, 3) downwards at places (k, 3): onto the plane, without one away from the frame's origin."""
+        if self.plane is not None:
+            return np.broadcast_to(-self.plane[:3], places.shape)
+        length = np.linalg.norm(places, axis=1, keepdims=True)
+        return np.where(length > 1e-6, places / np.maximum(length, 1e-6), [0.0, 0.0, 1.0])
+
+    def unseen(self, frames: np.ndarray, boxes: np.ndarray) -> np.ndarray:
+        """Share (k,) of some boxes (k, m, 6) at frames (k, 3, 4) that lies behind what the image shows."""
+        if self.depth is None or self.camera is None:
+            return np.zeros(len(frames))
+        corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (0, 1)])
+        local = boxes[:, :, None, :3] + corners * boxes[:, :, None, 3:]
+        places = local.reshape(len(frames), -1, 3) @ frames[:, :, :3].transpose(0, 2, 1) + frames[:, None, :, 3]
+        pixels = np.round(self.camera.project(np.where(places[..., 2:] > 1e-3, places, [0.0, 0.0, 1e-3]))).astype(int)
+        inside = ((pixels >= 0) & (pixels < [self.camera.width, self.camera.height])).all(axis=-1)
+        pixels = np.where(inside[..., None], pixels, 0)
+        shown = self.depth[pixels[..., 1], pixels[..., 0]]
+        return np.asarray((inside & (places[..., 2] > shown + _BEHIND)).mean(axis=1))
