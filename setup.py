@@ -15,6 +15,7 @@ ROOMS = (
     "segmentation",
     "simulation",
     "fitting",
+    "grasping",
     "learning",
     "tracking",
     "recovery",
@@ -45,6 +46,9 @@ view = [
 ]
 train = [
     "tensorboard>=2.14",  # curves of a running training
+]
+picking = [
+    "mujoco==3.3.7",  # the physics of benchmarks/picking.py; another release, another physics
 ]
 docs = [
     "mkdocs>=1.6,<2",  # docs/ as a site; its hooks may change with 2
@@ -103,11 +107,13 @@ setup(
         "bags": bags,
         "train": train,
         "view": view,
+        "picking": picking,
         "docs": docs,
         "test": [
             *bags,
             *train,
             *view,
+            *picking,
             *docs,
             "pytest>=7,<8.4",  # later ones break the launch_testing plugins of a ROS installation
             "hypothesis>=6",

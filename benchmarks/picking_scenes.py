@@ -1,10 +1,10 @@
-"""Scenes of the picking benchmark: five household things that the gripper can take, upright or dropped, and their images.
+"""Scenes of the picking benchmark: five household things that the gripper can take, upright or dropped.
 
-    packed   upright within 24 x 24 cm, at least 5 mm apart
+    packed   upright within 24 x 24 cm, at least 5 mm apart; drawn again if one falls over
     pile     dropped one after the other into a box of 24 x 24 cm, which is then taken away
 
-Things are those of :mod:`sq_perception.simulation.household`, all kinds but vessels, whose walls are no convex parts.  A
-thing that no grasp of the gripper could take is drawn again: packed, one that is wider than 70 mm in every level
+Things are those of :mod:`sq_perception.simulation.household`, all kinds but vessels, whose walls are no convex parts.
+A thing that no grasp of the gripper could take is drawn again: packed, one that is wider than 70 mm in every level
 direction or not 4 to 25 cm high; in a pile, one whose box has a middle edge above 70 mm, a longest above 20 cm or a
 shortest below 15 mm.
 
@@ -39,11 +39,12 @@ EYE = np.array([0.0, 0.0, 0.75])
 _BEARINGS = np.linspace(0, 2 * np.pi, 36, endpoint=False)
 _LEVEL = np.stack([np.cos(_BEARINGS), np.sin(_BEARINGS), 0 * _BEARINGS], axis=1)
 _FRICTION = (0.5, 1.0)
+_UPRIGHT = np.deg2rad(10.0)
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Things as they lie: their positions (5, 3) and rotations (5, 4) in the world, and the sensor that looks at them."""
+    """Things as they lie: their positions (5, 3) and rotations (5, 4) in the world, and the sensor."""
 
     kind: str
     seed: int
@@ -155,7 +156,10 @@ def _settled(things: list[Thing], positions: list[np.ndarray], rotations: list[n
     for k in range(len(things)):
         world.put(k, positions[k], rotations[k])
     world.settle(1.5)
-    return _resting(world)
+    found = _resting(world)
+    if found is not None and (quaternions.to_matrix(found[2])[:, 2, 2] < np.cos(_UPRIGHT)).any():
+        return None
+    return found
 
 
 def _resting(world: World) -> Poses | None:

@@ -1,12 +1,12 @@
 """A table with things and a free-flying parallel gripper, in MuJoCo: what the picking benchmark is decided by.
 
-The world's frame has x to the right, y away from the camera, z up; the table is z = 0.  The gripper is made of the boxes
-of :class:`sq_perception.grasping.gripper.Gripper`: the hand follows a target by a stiff spring, the fingers are position
-controlled and push with at most the gripper's force.  Things are unions of convex parts (the parts' own triangle
-meshes), of one density, each with its own friction against everything.
+The world's frame has x to the right, y away from the camera, z up; the table is z = 0.  The gripper is made of the
+boxes of :class:`sq_perception.grasping.gripper.Gripper`: the hand follows a target by a stiff spring, the fingers are
+position controlled and push with at most the gripper's force.  Things are unions of convex parts (the parts' own
+triangle meshes), of one density, each with its own friction against everything.
 
-One pick: the open gripper is placed 10 cm before the grasp and comes along its axis, closes, lifts by 10 cm, shakes once
-along x and once along y, and holds, or not.  It stops where it is pushed back by more than a real arm allows.
+One pick: the open gripper is placed 10 cm before the grasp and comes along its axis, closes, lifts by 10 cm, shakes
+once along x and once along y, and holds, or not.  It stops where it is pushed back by more than a real arm allows.
 
 Metres, seconds, kilograms, newtons.
 """
@@ -267,13 +267,14 @@ def _xml(things: Sequence[Thing], gripper: Gripper, walls: float | None) -> str:
                 'solref="0.004 1" solimp="0.95 0.99 0.0005"/>'
             )
         bodies.append(f'<body name="thing{k}"><freejoint/>{"".join(geoms)}</body>')
-    left, right, hand = gripper.boxes(0.0)
+    left, right, _ = gripper.boxes(0.0)
     x, y, z = gripper.hand
     back = -gripper.palm - 0.5 * z
     pad = 'friction="0.5" condim="6"'
     fingers = "".join(
         f'<body name="{name}"><joint name="{name}" type="slide" axis="0 {side} 0" range="0 {0.5 * gripper.opening}" '
-        f'limited="true" damping="5" armature="{_ARMATURE}"/><geom type="box" pos="{_row(box[:3])}" size="{_row(box[3:])}" {pad} '
+        f'limited="true" damping="5" armature="{_ARMATURE}"/>'
+        f'<geom type="box" pos="{_row(box[:3])}" size="{_row(box[3:])}" {pad} '
         f'mass="{_FINGER_MASS}"/></body>'
         for name, side, box in (("left", 1, left), ("right", -1, right))
     )

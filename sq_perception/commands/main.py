@@ -19,6 +19,7 @@ from sq_perception.commands.console import FAILURE, INTERRUPTED, SUCCESS, USAGE,
 
 COMMANDS = {
     "recover": ("sq_perception.commands.recover", "depth images in, superquadrics out"),
+    "grasp": ("sq_perception.commands.grasp", "depth images in, grasps of a parallel gripper out"),
     "render": ("sq_perception.commands.render", "draw a superquadric as a depth image"),
     "demo": ("sq_perception.commands.demo", "live demonstration with real ROS 2 nodes (extra 'ros')"),
     "view": ("sq_perception.commands.view", "a page in the browser: depth, bodies, parameters (extras 'ros', 'view')"),

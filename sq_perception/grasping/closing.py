@@ -77,6 +77,20 @@ def reaches(
     return reach, np.sqrt(np.maximum(variance, 0.0))
 
 
+def middle_angles(bodies: Superquadric, owner: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """Angle (k,) between directions (k, 3) and the normals where the lines through the centre along them leave a body.
+
+    The gradient of the gauge is the same all along such a line.
+    """
+    turn = bodies.rotation_matrix[owner]
+    size, shape = bodies.size[owner], bodies.shape[owner]
+    m = (directions[:, None] @ turn)[:, 0]
+    q = np.abs(m) / size
+    value, slopes = nested_norm_and_slopes(q[:, 0], q[:, 1], q[:, 2], shape[:, 0], shape[:, 1])
+    steepness = np.linalg.norm(np.stack(slopes, axis=1) / size, axis=1)
+    return np.asarray(np.arccos(np.clip(value / steepness, -1.0, 1.0)))
+
+
 def chords(
     bodies: Superquadric, owner: np.ndarray, offset: np.ndarray, direction: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:

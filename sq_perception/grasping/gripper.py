@@ -6,8 +6,8 @@ The frame of a grasp is that of the tool centre point, TCP, midway between the p
     y   the way of the fingers: they close along y, towards each other
     x   along the width of a finger
 
-The fingers are boxes |x| <= finger_width / 2, opening / 2 <= |y| <= opening / 2 + finger_thickness, -palm <= z <= tip; the
-hand is a box behind them, z <= -palm, and so long that it holds the way of the approach as well.  Metres, newtons.
+The fingers are boxes |x| <= finger_width / 2, opening / 2 <= |y| <= opening / 2 + finger_thickness, -palm <= z <= tip;
+the hand is a box behind them, z <= -palm, and so long that it holds the way of the approach as well.  Metres, newtons.
 """
 
 from __future__ import annotations
@@ -69,12 +69,15 @@ class Gripper:
                 if not (np.isfinite(numbers) & (numbers > 0)).all():
                     raise ValueError(f"{field.name}: expected positive numbers, got {value}")
 
-    def boxes(self, opening: float) -> np.ndarray:
-        """Centre and half sizes (3, 6) of both fingers and the hand in the TCP's frame, at an opening."""
+    def boxes(self, opening: float, reach: float = _REACH) -> np.ndarray:
+        """Centre and half sizes (3, 6) of both fingers and the hand in the TCP's frame, at an opening.
+
+        The hand is longer by ``reach``, by which it sweeps the way that it comes.
+        """
         middle, long = 0.5 * (self.tip - self.palm), 0.5 * (self.tip + self.palm)
         aside = 0.5 * (opening + self.finger_thickness)
         x, y, z = self.hand
-        z += _REACH
+        z += reach
         finger = [0.5 * self.finger_width, 0.5 * self.finger_thickness, long]
         return np.array(
             [
@@ -83,6 +86,17 @@ class Gripper:
                 [0, 0, -self.palm - 0.5 * z, 0.5 * x, 0.5 * y, 0.5 * z],
             ]
         )
+
+    def boxes_at(self, openings: np.ndarray) -> np.ndarray:
+        """:meth:`boxes` (k, 3, 6) at many openings (k,)."""
+        closed = self.boxes(0.0)
+        return np.asarray(closed + openings[:, None, None] * (self.boxes(1.0) - closed))
+
+    def wires(self, opening: float) -> list[np.ndarray]:
+        """Lines (j, 3) in the TCP's frame that draw the gripper: the fork of its fingers, and its wrist."""
+        fork = np.array([[0, 0.5, self.tip], [0, 0.5, -self.palm], [0, -0.5, -self.palm], [0, -0.5, self.tip]])
+        wrist = np.array([[0.0, 0.0, -self.palm], [0.0, 0.0, -self.palm - self.hand[2]]])
+        return [fork * [1.0, opening, 1.0], wrist]
 
 
 PANDA = Gripper(

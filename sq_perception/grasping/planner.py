@@ -10,7 +10,7 @@ Every margin m_k is what may be lost before the grasp fails, sigma_k how sure it
 | engagement | fingers' ends beyond the body's near end | of the near end |
 | palm | the body's near end before the palm | of the near end |
 | friction | atan(mu) less the angle between pads and surface | of the surface's turn |
-| weight | what friction of both pads holds against gravity, as a force and as a torque about the closing line | of the mass |
+| weight | friction of both pads against gravity, as a force and as a torque about the closing line | of the mass |
 | table, bodies, points | the gripper's least distance | of the obstacle |
 | unseen | share of the fingers in space that nobody has seen | a share of it is taken |
 
@@ -44,8 +44,8 @@ PER_BODY = 8
 """Grasps a body that are told at most."""
 _GRAVITY, _LIFT = 9.81, 2.0
 """m/s^2; of the lift beside gravity."""
-_CLEARANCE = 0.005
-"""Metres on either side of the body, above the table and before the palm."""
+_CLEARANCE, _ABOVE_TABLE = 0.005, 0.004
+"""Metres on either side of the body and before the palm; above the table."""
 _ENGAGED = 0.012
 """Metres of finger beyond the near end that a shallow grasp has."""
 _LEAST_ENGAGED = 0.004
@@ -54,14 +54,16 @@ _PAD_RADIUS = 0.006
 _SQUARE = np.deg2rad(8.0)
 """How sure normals are."""
 _TABLE_SIGMA, _POINT_SIGMA, _BODY_SIGMA = 0.002, 0.002, 0.004
+_POINT_INSIDE = 0.004
+"""Metres that a point counts for which is inside the gripper: of its depth there the point says nothing."""
 _HIDDEN = 0.15
 """Probability that space which nobody has seen beside a body is taken."""
 _SWINGS = np.deg2rad([0.0, 25.0, -25.0, 50.0, -50.0, 80.0, -80.0])
 """Of the approach about the closing line, away from the steepest one."""
-_SLIDES = np.array([0.0, 0.5, -0.5])
+_SLIDES = np.array([0.0, 0.4, -0.4, 0.8, -0.8])
 """Along the third axis, shares of the way to where the finger's width is no more wholly on the body."""
-_CHECKED = 40
-"""Grasps a body whose surroundings are looked at, those first that hold best."""
+_CHECKED, _CHECKED_CLOSELY = 60, 20
+"""Grasps a body whose distance to the other bodies is looked at, and of the best of these that to measured points."""
 _LEAST = 0.05
 """Grasps less probable than that are not told."""
 _MARGINS = ("opening", "engagement", "palm", "friction", "weight", "table", "other bodies", "measured points", "unseen")
@@ -100,6 +102,10 @@ class Grasp:
         """The unit vector (3,) along which the gripper comes."""
         return np.asarray(quaternions.to_matrix(self.rotation))[:, 2]
 
+    def placed(self, points: np.ndarray) -> np.ndarray:
+        """Points (j, 3) of the TCP's frame in the frame of the bodies."""
+        return points @ np.asarray(quaternions.to_matrix(self.rotation)).T + self.position
+
 
 @dataclass(frozen=True, eq=False)
 class GraspPlan:
@@ -132,9 +138,7 @@ class _Trials:
     logs: np.ndarray
 
     def at(self, which: np.ndarray) -> _Trials:
-        return _Trials(
-            self.owner[which], self.frames[which], self.opening[which], self.width[which], self.logs[which]
-        )
+        return _Trials(self.owner[which], self.frames[which], self.opening[which], self.width[which], self.logs[which])
 
     def first(self, count: int) -> _Trials:
         """The most probable ones of each body, each body's in order."""
@@ -194,13 +198,13 @@ def grasps(
     trials = _trials(bodies, spread, closings, gripper, around, friction)
     reasons[np.unique(closings.owner)] = "no way for the fingers to come with the table and the palm in their way"
     for k in np.unique(trials.owner):
-        reasons[k] = f"nothing holds: {_weakest(trials.logs[trials.owner == k].max(axis=0))}"
+        reasons[k] = f"nothing holds: {_best_weakest(trials, k)}"
     trials = trials.at(trials.logs.sum(axis=1) > np.log(_LEAST)).first(_CHECKED)
     if not len(trials.owner):
         return GraspPlan((), tuple(reasons))
     trials = _among_others(bodies, spread, trials, gripper, around)
     for k in np.unique(trials.owner):
-        reasons[k] = f"in the way: {_weakest(trials.logs[trials.owner == k].max(axis=0))}"
+        reasons[k] = f"in the way: {_best_weakest(trials, k)}"
     trials = trials.at(trials.logs.sum(axis=1) > np.log(_LEAST)).first(PER_BODY)
     reasons[np.unique(trials.owner)] = ""
     return GraspPlan(tuple(_told(trials)), tuple(reasons))
@@ -212,11 +216,8 @@ def _closings(bodies: Superquadric, spread: np.ndarray, gripper: Gripper, fricti
     local = np.tile(closing.DIRECTIONS, (len(bodies), 1))
     along = (local[:, None] @ bodies.rotation_matrix[owner].transpose(0, 2, 1))[:, 0]
     reach, sigma = closing.reaches(bodies, spread, owner, along)
-    narrow = 2 * reach < gripper.opening
-    owner, along, reach, sigma = owner[narrow], along[narrow], reach[narrow], sigma[narrow]
-    _, angle = closing.chords(bodies, owner, np.zeros_like(along), along)
-    square = angle < np.arctan(friction)
-    return _Closings(owner[square], along[square], reach[square], sigma[square])
+    fits = (2 * reach < gripper.opening) & (closing.middle_angles(bodies, owner, along) < np.arctan(friction))
+    return _Closings(owner[fits], along[fits], reach[fits], sigma[fits])
 
 
 def _trials(
@@ -247,15 +248,14 @@ def _trials(
     # At every depth: where the palm or the table stops the gripper or the middle is reached, shallow, and between.
     spare = np.minimum(0.5 * gripper.opening - half, _CLEARANCE + 2 * side)
     opening = 2 * (half + spare)
-    boxes = np.stack([gripper.boxes(one) for one in (0.0, 1.0)])
-    boxes = boxes[0] + opening[:, None, None] * (boxes[1] - boxes[0])
+    boxes = gripper.boxes_at(opening)
     deepest = np.minimum(gripper.palm - _CLEARANCE - near, 0.0)
     centre = bodies.translation[owner]
     if around.plane is not None:
         frames = np.concatenate([np.stack([x, y, z], axis=2), centre[:, :, None]], axis=2)
         height = clearance.heights_above(around.plane, frames, boxes)
         sink = -(z @ around.plane[:3])
-        low = np.where(sink > 1e-3, (height - _CLEARANCE) / np.maximum(sink, 1e-3), np.inf)
+        low = np.where(sink > 1e-3, (height - _ABOVE_TABLE) / np.maximum(sink, 1e-3), np.inf)
         deepest = np.minimum(deepest, low)
     shallow = np.minimum(_ENGAGED - near - gripper.tip, deepest)
     reachable = deepest > _LEAST_ENGAGED - near - gripper.tip
@@ -273,7 +273,9 @@ def _trials(
     owner, half, side, opening = owner[at], half[at], side[at], opening[at]
     near, near_sigma = near[at], near_sigma[at]
     offset = u[:, None] * z[at] + v[:, None] * x[at]
-    ends, angle = closing.chords(bodies, owner, offset, y[at])
+    # A pad touches where it overlaps the body, which may lie wholly beyond the TCP.
+    touch = 0.5 * (np.maximum(u - gripper.tip, -near) + np.minimum(u + gripper.tip, near))
+    ends, angle = closing.chords(bodies, owner, offset + (touch - u)[:, None] * z[at], y[at])
     aside = np.nan_to_num(0.5 * (ends[:, 0] - ends[:, 1]))
     position = bodies.translation[owner] + offset + aside[:, None] * y[at]
     frames = np.concatenate([np.stack([x[at], y[at], z[at]], axis=2), position[:, :, None]], axis=2)
@@ -301,17 +303,18 @@ def _among_others(
     bodies: Superquadric, spread: np.ndarray, trials: _Trials, gripper: Gripper, around: Surroundings
 ) -> _Trials:
     """The same with the margins that the surroundings decide."""
-    boxes = np.stack([gripper.boxes(one) for one in (0.0, 1.0)])
-    boxes = boxes[0] + trials.opening[:, None, None] * (boxes[1] - boxes[0])
+    boxes = gripper.boxes_at(trials.opening)
     flat, turns = np.ascontiguousarray(bodies.to_flat(), dtype=float), np.ascontiguousarray(bodies.rotation_matrix)
     gap, other = clearance.gaps_to_bodies(trials.frames, boxes, trials.owner, flat, turns)
     vague = np.sqrt(np.diagonal(spread, axis1=1, axis2=2)[:, :6].mean(axis=1))
-    logs = trials.logs.copy()
-    logs[:, 6] = np.where(other >= 0, _log(gap, np.hypot(_BODY_SIGMA, vague[other])), 0.0)
+    trials.logs[:, 6] = np.where(other >= 0, _log(gap, np.hypot(_BODY_SIGMA, vague[other])), 0.0)
+    trials = trials.first(_CHECKED_CLOSELY)
+    boxes = gripper.boxes_at(trials.opening)
     if len(around.points):
-        logs[:, 7] = _log(clearance.gaps_to_points(trials.frames, boxes, around.points), _POINT_SIGMA)
-    logs[:, 8] = np.log1p(-_HIDDEN * around.unseen(trials.frames, boxes[:, :2]))
-    return _Trials(trials.owner, trials.frames, trials.opening, trials.width, logs)
+        gap = clearance.gaps_to_points(trials.frames, boxes, around.points)
+        trials.logs[:, 7] = _log(np.where(gap > 0, gap, -_POINT_INSIDE), _POINT_SIGMA)
+    trials.logs[:, 8] = np.log1p(-_HIDDEN * around.unseen(trials.frames, boxes[:, :2]))
+    return trials
 
 
 def _log(margin: np.ndarray, sigma: np.ndarray | float) -> np.ndarray:
@@ -321,6 +324,12 @@ def _log(margin: np.ndarray, sigma: np.ndarray | float) -> np.ndarray:
 
 def _weakest(logs: np.ndarray) -> str:
     return _MARGINS[int(np.argmin(logs))]
+
+
+def _best_weakest(trials: _Trials, body: int) -> str:
+    """What the most probable grasp of a body suffers from most."""
+    mine = trials.logs[trials.owner == body]
+    return _weakest(mine[np.argmax(mine.sum(axis=1))])
 
 
 def _told(trials: _Trials) -> Iterator[Grasp]:

@@ -28,8 +28,8 @@ class Surroundings:
     points : (j, 3)
         Measured points of things; the table's are not among them.
     depth, camera
-        A depth image in metres, NaN where nothing was measured, and its pinhole camera, if the frame is the optical one:
-        what lies behind what it shows has not been seen.
+        A depth image in metres, NaN where nothing was measured, and its pinhole camera, if the frame is the optical
+        one: what lies behind what it shows has not been seen.
 
     Raises
     ------
@@ -94,7 +94,8 @@ class Surroundings:
         local = boxes[:, :, None, :3] + corners * boxes[:, :, None, 3:]
         places = local.reshape(len(frames), -1, 3) @ frames[:, :, :3].transpose(0, 2, 1) + frames[:, None, :, 3]
         pixels = np.round(self.camera.project(np.where(places[..., 2:] > 1e-3, places, [0.0, 0.0, 1e-3]))).astype(int)
-        inside = ((pixels >= 0) & (pixels < [self.camera.width, self.camera.height])).all(axis=-1)
+        inside = np.all((pixels >= 0) & (pixels < [self.camera.width, self.camera.height]), axis=-1)
         pixels = np.where(inside[..., None], pixels, 0)
         shown = self.depth[pixels[..., 1], pixels[..., 0]]
-        return np.asarray((inside & (places[..., 2] > shown + _BEHIND)).mean(axis=1))
+        hidden = np.logical_and(inside, places[..., 2] > shown + _BEHIND)
+        return np.asarray(np.mean(hidden, axis=1))

@@ -22,7 +22,7 @@ FLOORS = (
     ("geometry", "files"),
     ("imaging", "tracking"),
     ("segmentation", "simulation"),
-    ("learning", "fitting"),
+    ("learning", "fitting", "grasping"),
     ("recovery", "viewing"),
     ("recordings",),
     ("evaluation",),

@@ -1,0 +1,209 @@
+"""``sq-perception grasp``: recorded frames in; grasps of what is on the table out, as JSON, pictures and meshes.
+
+Heavy imports happen inside, so that ``--help`` answers at once.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sq_perception.commands.console import FAILURE, SUCCESS, complain, misused, parser
+from sq_perception.files import output_file
+
+if TYPE_CHECKING:
+    from sq_perception.grasping.gripper import Gripper
+    from sq_perception.grasping.planner import GraspPlan
+    from sq_perception.recordings.frame_file import RecordedFrame
+    from sq_perception.recovery.recoverer import Recoverer, Recovery
+
+HELP = """\
+Plan grasps of a parallel gripper on the objects of recorded depth images.
+
+A FRAME is what 'sq-perception recover' reads: an .npz with depth and K, a PNG with a camera beside it, a folder, a bag.
+"""
+EPILOG = """\
+output:
+  {"format": "sq_perception.grasps", "version": 1, "options": {...},
+   "frames": [{"file": ..., "bodies": [{"label": ..., "reason": ..., "grasps": [{"position": [x, y, z],
+   "rotation": [x, y, z, w], "opening": ..., "width": ..., "score": ..., "weakest": ...}, ...]}, ...]}, ...]}
+  Position and rotation are those of the gripper's tool centre point, metres in the optical frame: z the approach, y the
+  way of the fingers.  "score" is the probability that the grasp holds, the best first; "weakest" what takes most from
+  it.  A body without a grasp has the reason.
+
+examples:
+  sq-perception grasp table.npz --json grasps.json --pictures pictures/
+  sq-perception grasp depth_1.png --camera-info camera.yaml --gripper robotiq_2f_85 --meshes meshes/
+"""
+FORMAT, VERSION = "sq_perception.grasps", 1
+_SHARP = 0.02
+"""Exponents of a gripper's boxes in a mesh."""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Entry of ``sq-perception grasp``; the exit code."""
+    command = parser("grasp", HELP, EPILOG)
+    command.add_argument("frames", nargs="+", metavar="FRAME", help="recorded depth images, folders or bags of them")
+    command.add_argument("--gripper", default="panda", help="panda, robotiq_2f_85 or robotiq_2f_140 (default panda)")
+    command.add_argument("--friction", type=float, help="between pads and things (default 0.5)")
+    command.add_argument("--camera-info", metavar="FILE", help="the intrinsics of images, as for recover")
+    command.add_argument("--json", metavar="OUT", help="write the grasps there; - is the standard output")
+    command.add_argument("--pictures", metavar="DIR", help="draw a picture per frame into this folder")
+    command.add_argument("--meshes", metavar="DIR", help="write bodies and best grasps of each frame as a GLB there")
+    return run(command.parse_args(arguments))
+
+
+def run(options: argparse.Namespace) -> int:
+    """Run the command; returns the exit code."""
+    from sq_perception.grasping import planner
+    from sq_perception.grasping.gripper import gripper
+
+    try:
+        hand = gripper(options.gripper)
+        if options.json not in (None, "-"):
+            output_file.check(options.json)
+        for folder in (options.pictures, options.meshes):
+            if folder:
+                output_file.check_folder(folder)
+    except (ValueError, OSError) as error:
+        return misused(str(error))
+    friction = planner.FRICTION if options.friction is None else options.friction
+    if not (np.isfinite(friction) and friction > 0):
+        return misused(f"--friction: expected a positive number, got {friction}")
+
+    from sq_perception.learning.checkpoint import CheckpointError
+    from sq_perception.recordings.frame_file import FrameError
+    from sq_perception.recordings.inputs import RecordedInput
+    from sq_perception.recovery.recoverer import Recoverer
+
+    entries, code = [], SUCCESS
+    try:
+        recorded, recoverer = RecordedInput(options.frames, options.camera_info), Recoverer()
+    except (FrameError, CheckpointError) as error:
+        complain(str(error))
+        return FAILURE
+    for file, frame in recorded:
+        if isinstance(frame, FrameError):
+            complain(str(frame))
+            code = FAILURE
+        elif frame.is_cube:
+            complain(f"{file}: a view of the unit cube has no metres to grasp in")
+            code = FAILURE
+        else:
+            entries.append(_frame(file, frame, recoverer, hand, friction, options))
+    text = json.dumps(
+        {
+            "format": FORMAT,
+            "version": VERSION,
+            "options": {"gripper": hand.name, "friction": friction},
+            "frames": entries,
+        },
+        indent=1,
+        allow_nan=False,
+    )
+    if options.json == "-":
+        sys.stdout.write(f"{text}\n")
+    elif options.json and entries:
+        output_file.write(options.json, f"{text}\n".encode())
+    if options.json != "-":
+        _print_table(entries)
+    return code
+
+
+def _frame(
+    file: str, frame: RecordedFrame, recoverer: Recoverer, hand: Gripper, friction: float, options: argparse.Namespace
+) -> dict[str, Any]:
+    from sq_perception.geometry.superquadric import Superquadric
+    from sq_perception.grasping.planner import grasps
+    from sq_perception.grasping.surroundings import Surroundings
+
+    recovery = recoverer.recover(frame.depth, frame.camera, frame.labels)
+    found = recovery.recovered
+    bodies = Superquadric.stack([one.superquadric for one in found])
+    covariance = np.array([one.covariance for one in found]).reshape(-1, 11, 11)
+    around = Surroundings.of_image(frame.depth, frame.camera, recovery.plane)
+    plan = grasps(bodies, hand, covariance, around, friction)
+    stem = Path(frame.name).stem
+    if options.pictures:
+        _draw(Path(options.pictures) / f"{stem}.png", frame, found, plan, hand)
+    if options.meshes and found:
+        _write_mesh(Path(options.meshes) / f"{stem}.glb", found, plan, hand)
+    return {
+        "file": file,
+        "bodies": [
+            {
+                "label": int(one.label),
+                "reason": plan.reasons[k],
+                "grasps": [
+                    {
+                        "position": grasp.position.tolist(),
+                        "rotation": grasp.rotation.tolist(),
+                        "opening": grasp.opening,
+                        "width": grasp.width,
+                        "score": grasp.score,
+                        "weakest": grasp.weakest,
+                    }
+                    for grasp in plan.of(k)
+                ],
+            }
+            for k, one in enumerate(found)
+        ],
+    }
+
+
+def _draw(path: Path, frame: RecordedFrame, found: Sequence[Recovery], plan: GraspPlan, hand: Gripper) -> None:
+    """Outlines of the bodies, and of each body's best grasp the gripper."""
+    from sq_perception.evaluation import plots
+
+    figure = plots.new_figure(9.6, 9.6 * frame.camera.height / frame.camera.width)
+    ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    plots.draw_depth(ax, frame.depth)
+    plots.draw_outlines(ax, [one.superquadric for one in found], frame.camera, edges=False, width=1.4)
+    for k in range(len(found)):
+        for grasp in plan.of(k)[:1]:
+            for line in hand.wires(grasp.opening):
+                pixels = frame.camera.project(grasp.placed(line))
+                ax.plot(*pixels.T, color="white", lw=5.0, solid_capstyle="round")
+                ax.plot(*pixels.T, color=plots.colour(k), lw=2.6, solid_capstyle="round")
+            ax.text(pixels[-1, 0], pixels[-1, 1], f" {grasp.score:.2f}", color=plots.INK, fontsize=11, weight="bold")
+    ax.set_xlim(-0.5, frame.camera.width - 0.5)
+    ax.set_ylim(frame.camera.height - 0.5, -0.5)
+    with output_file.writing(path) as partial:
+        plots.save(figure, partial)
+
+
+def _write_mesh(path: Path, found: Sequence[Recovery], plan: GraspPlan, hand: Gripper) -> None:
+    """Bodies and, as sharp superquadrics, the boxes of each body's best gripper."""
+    from sq_perception.geometry import mesh
+    from sq_perception.geometry.superquadric import Superquadric
+
+    solids = [one.superquadric for one in found]
+    names = [f"body_{k}" for k in range(len(found))]
+    owner = list(range(len(found)))
+    for k in range(len(found)):
+        for grasp in plan.of(k)[:1]:
+            boxes = hand.boxes(grasp.opening, reach=0.0)
+            for name, one in zip(("left", "right", "hand"), boxes, strict=True):
+                solids.append(Superquadric(one[3:], np.full(2, _SHARP), grasp.placed(one[None, :3])[0], grasp.rotation))
+                names.append(f"grasp_{k}_{name}")
+                owner.append(k)
+    with output_file.writing(path) as partial:
+        mesh.export(solids, partial, names=names, colours=mesh.COLOURS[np.array(owner) % len(mesh.COLOURS)])
+
+
+def _print_table(entries: Sequence[dict[str, Any]]) -> None:
+    for entry in entries:
+        print(entry["file"])
+        for body in entry["bodies"]:
+            text = body["reason"]
+            if body["grasps"]:
+                best = body["grasps"][0]
+                at = " ".join(f"{value:.3f}" for value in best["position"])
+                text = f"{best['score']:.2f}  at {at} m, {1e3 * best['opening']:.0f} mm open"
+            print(f"  {body['label']:4d}  {text}")

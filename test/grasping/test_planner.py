@@ -1,0 +1,216 @@
+"""Grasps whose best is known in closed form; what makes one impossible; and a plan's invariances."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sq_perception.geometry import rotation as quaternions
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.grasping import closing
+from sq_perception.grasping.gripper import GRIPPERS, PANDA, Gripper, gripper
+from sq_perception.grasping.planner import grasps
+from sq_perception.grasping.surroundings import Surroundings
+from sq_perception.imaging.camera import Camera
+
+TABLE = np.array([0.0, 0.0, 1.0, 0.0])
+ON_TABLE = Surroundings(plane=TABLE)
+UPRIGHT = [0.0, 0.0, 0.0, 1.0]
+SPHERE = ([0.03, 0.03, 0.03], [1.0, 1.0])
+CAN = ([0.033, 0.033, 0.06], [0.1, 1.0])
+BOX = ([0.05, 0.02, 0.06], [0.1, 0.1])
+
+
+def standing(size, shape, x=0.0, y=0.0):
+    return Superquadric(size, shape, [x, y, size[2]], UPRIGHT)
+
+
+def sure(count, sigma=0.001):
+    """Covariances of bodies that are known to ``sigma`` metres and 0.01 radians."""
+    one = np.diag([sigma**2] * 3 + [1e-4] * 2 + [sigma**2] * 3 + [1e-4] * 3)
+    return np.repeat(one[None], count, axis=0)
+
+
+def plan(*bodies, hand=PANDA, around=ON_TABLE, covariance=None, **more):
+    covariance = sure(len(bodies)) if covariance is None else covariance
+    return grasps(Superquadric.stack(list(bodies)), hand, covariance, around, **more)
+
+
+def closing_line(grasp):
+    return quaternions.to_matrix(grasp.rotation)[:, 1]
+
+
+@pytest.mark.parametrize(("size", "shape"), [SPHERE, CAN, BOX])
+def test_reach_and_chord_agree_with_the_body(size, shape):
+    body = Superquadric.stack([Superquadric(size, shape, [0.1, 0.2, 0.3], [0.3, -0.2, 0.5, 0.7])])
+    directions = np.random.default_rng(1).standard_normal((40, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    owner = np.zeros(40, dtype=int)
+    reach, _ = closing.reaches(body, closing.known(body, sure(1)), owner, directions)
+    np.testing.assert_allclose(reach, body[0].support(directions), rtol=1e-9)
+    offset = 0.2 * np.array(size).min() * directions[::-1]
+    ends, angle = closing.chords(body, owner, offset, directions)
+    for side, sign in ((0, 1), (1, -1)):
+        points = body[0].translation + offset + sign * ends[:, side, None] * directions
+        np.testing.assert_allclose(body[0].gauge(points), 1.0, atol=2e-2)
+    assert np.isfinite(angle).all()
+
+
+def test_the_sigma_of_a_reach_is_that_of_disturbed_bodies():
+    rng = np.random.default_rng(2)
+    body = Superquadric.stack([Superquadric([0.05, 0.03, 0.02], [0.4, 0.8], [0.1, 0.0, 0.5], [0.1, 0.4, 0.2, 0.8])])
+    spread = np.diag(np.array([2, 1, 3, 0, 0, 2, 2, 4, 30, 20, 10]) ** 2 * 1e-6)[None]
+    directions = quaternions.to_matrix(body.rotation)[0].T @ np.eye(3)
+    _, sigma = closing.reaches(body, closing.known(body, spread), np.zeros(3, dtype=int), directions)
+    step = rng.standard_normal((20000, 11)) * np.sqrt(np.diag(spread[0]))
+    turn = quaternions.multiply(body.rotation, quaternions.from_rotation_vector(step[:, 8:]))
+    many = Superquadric(body.size + step[:, :3], body.shape, body.translation + step[:, 5:8], turn)
+    reach = many.support(directions) + many.translation @ directions.T
+    np.testing.assert_allclose(sigma, reach.std(axis=0), rtol=0.05)
+
+
+def test_a_sphere_is_taken_through_its_middle():
+    best = plan(standing(*SPHERE)).grasps[0]
+    np.testing.assert_allclose(best.position, [0, 0, 0.03], atol=1e-3)
+    assert best.width == pytest.approx(0.06)
+    assert best.width < best.opening <= PANDA.opening
+    assert best.score > 0.95
+
+
+def test_a_can_is_taken_across_its_axis_from_every_side():
+    found = plan(standing(*CAN)).grasps
+    assert all(abs(closing_line(grasp)[2]) < 0.3 for grasp in found)
+    assert found[0].width == pytest.approx(0.066, rel=1e-3)
+    np.testing.assert_allclose(found[0].position[:2], 0, atol=1e-3)
+
+
+def test_a_box_is_taken_across_its_narrow_sides_and_along_them():
+    found = plan(standing(*BOX)).grasps
+    for grasp in found:
+        np.testing.assert_allclose(np.abs(closing_line(grasp)), [0, 1, 0], atol=0.3)
+        assert grasp.width == pytest.approx(0.04, abs=0.012)
+    assert np.ptp([grasp.position[0] for grasp in found]) > 0.02
+
+
+def test_the_gripper_stands_off_the_body_and_the_table():
+    for body in (standing(*SPHERE), standing(*CAN), standing(*BOX)):
+        for grasp in plan(body).grasps:
+            corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+            for box in PANDA.boxes(grasp.opening):
+                inside = grasp.placed(box[:3] + np.random.default_rng(0).uniform(-1, 1, (500, 3)) * box[3:])
+                assert body.gauge(inside).min() > 1.0
+                assert grasp.placed(box[:3] + corners * box[3:])[:, 2].min() > 0.0
+
+
+def test_what_is_wider_than_the_opening_is_never_tried():
+    found = plan(standing([0.041] * 3, [0.1, 0.1]), standing(*SPHERE, x=0.3))
+    assert not found.of(0)
+    assert "wider than the opening of 80 mm" in found.reasons[0]
+    assert found.of(1)
+    assert found.reasons[1] == ""
+
+
+def test_an_uncertain_width_is_given_room_and_believed_less():
+    known = plan(standing(*BOX)).grasps[0]
+    vague = plan(standing(*BOX), covariance=sure(1, sigma=0.012)).grasps[0]
+    assert vague.opening > known.opening
+    assert vague.score < known.score
+
+
+def test_a_body_of_unknown_depth_is_taken_by_its_known_sides():
+    doubtful = sure(1)
+    doubtful[0, 0, 0] = 0.02**2  # along x; y is as narrow
+    found = plan(standing([0.025, 0.025, 0.05], [0.1, 0.1]), covariance=doubtful).grasps
+    assert all(abs(closing_line(grasp)[1]) > 0.9 for grasp in found)
+
+
+def test_the_score_falls_with_the_friction():
+    scores = [plan(standing(*CAN), friction=mu).grasps[0].score for mu in (0.2, 0.4, 0.8)]
+    assert scores == sorted(scores)
+
+
+def test_a_long_heavy_body_is_taken_near_its_middle():
+    found = plan(Superquadric([0.14, 0.03, 0.03], [0.1, 0.1], [0.0, 0.0, 0.03], UPRIGHT))
+    assert abs(found.grasps[0].position[0]) < 0.03
+
+
+def test_fingers_do_not_go_between_bodies_that_touch():
+    side = [0.02, 0.02, 0.05], [0.1, 0.1]
+    found = plan(standing(*side, x=0.0), standing(*side, x=0.042))
+    assert found.grasps
+    for grasp in found.grasps:
+        assert abs(closing_line(grasp)[1]) > 0.9
+
+
+def test_measured_points_of_no_body_are_kept_clear_of():
+    wall = np.stack(np.meshgrid(np.linspace(-0.1, 0.1, 41), [0.03], np.linspace(0, 0.3, 61)), axis=-1).reshape(-1, 3)
+    body = standing([0.03, 0.02, 0.05], [0.1, 0.1])
+    assert any(abs(closing_line(grasp)[1]) > 0.9 for grasp in plan(body).grasps)
+    found = plan(body, around=Surroundings(TABLE, wall))
+    assert all(abs(closing_line(grasp)[1]) < 0.3 for grasp in found.grasps)
+
+
+def test_space_that_nobody_saw_makes_a_grasp_less_sure():
+    camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+    body = Superquadric(*SPHERE, [0.0, 0.0, 0.6], UPRIGHT)
+    free = plan(body, around=Surroundings()).grasps[0].score
+    seen = np.full((48, 64), 1.0)
+    assert plan(body, around=Surroundings(depth=seen, camera=camera)).grasps[0].score == pytest.approx(free)
+    hidden = np.full((48, 64), 0.5)
+    assert plan(body, around=Surroundings(depth=hidden, camera=camera)).grasps[0].score < 0.95 * free
+
+
+def test_a_plan_moves_with_the_scene():
+    turn, shift = np.array([0.2, -0.4, 0.1, 0.88]), np.array([0.3, -0.1, 0.7])
+    turn /= np.linalg.norm(turn)
+    normal = quaternions.to_matrix(turn)[:, 2]
+    bodies = [standing(*CAN), standing(*BOX, x=0.15)]
+    here = plan(*bodies)
+    there = plan(
+        *(body.transformed(turn, shift) for body in bodies),
+        around=Surroundings(plane=np.append(normal, -normal @ shift)),
+        covariance=np.stack([np.diag([1e-6] * 3 + [1e-4] * 2 + [1e-6] * 3 + [1e-4] * 3)] * 2),
+    )
+    for k in range(2):  # equal ones may come in another order
+        assert there.of(k)[0].score == pytest.approx(here.of(k)[0].score, abs=2e-3)
+
+
+def test_hostile_input_gets_an_answer_with_a_reason():
+    rng = np.random.default_rng(3)
+    places = np.concatenate([rng.uniform(-1, 1, (200, 2)), np.full((200, 1), 0.05)], axis=1)
+    many = Superquadric(
+        rng.uniform(0.01, 0.2, (200, 3)), rng.uniform(0.1, 1, (200, 2)), places, rng.standard_normal((200, 4))
+    )
+    for around in (None, ON_TABLE):
+        found = grasps(many, PANDA, np.full((200, 11, 11), np.nan), around)
+        assert len(found.reasons) == 200
+        assert all(bool(found.of(k)) == (found.reasons[k] == "") for k in range(200))
+    tiny = Gripper("tiny", 0.002, 0.001, 0.001, 0.001, 0.01, (0.01, 0.01, 0.01), 5.0, "hand", PANDA.link_from_tcp)
+    assert all("wider" in reason for reason in plan(standing(*CAN), standing(*BOX, x=0.2), hand=tiny).reasons)
+    assert plan(covariance=np.zeros((0, 11, 11))).grasps == ()
+    flat = plan(standing([0.1, 0.1, 0.002], [0.1, 0.1]))
+    assert flat.grasps == ()
+    assert flat.reasons[0]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "what"),
+    [
+        ({"covariance": np.zeros((2, 11, 11))}, "covariance"),
+        ({"friction": 0.0}, "friction"),
+        ({"friction": np.nan}, "friction"),
+    ],
+)
+def test_misuse_is_told(wrong, what):
+    with pytest.raises(ValueError, match=what):
+        plan(standing(*CAN), **wrong)
+    with pytest.raises(ValueError, match="plane"):
+        Surroundings(plane=np.ones(4))
+    with pytest.raises(ValueError, match="gripper"):
+        gripper("claw")
+
+
+@pytest.mark.parametrize("hand", GRIPPERS.values(), ids=lambda hand: hand.name)
+def test_every_gripper_takes_a_can(hand):
+    assert plan(standing(*CAN), hand=hand).grasps[0].score > 0.9
+    assert np.linalg.norm(hand.link_from_tcp[1]) == pytest.approx(1.0)
