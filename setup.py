@@ -6,7 +6,7 @@ from glob import glob
 from setuptools import setup
 
 NAME = "sq_perception"
-NODES = ("recover_node", "recover_cameras", "fitter_node", "synthetic_depth_node")
+NODES = ("recover_node", "recover_cameras", "fitter_node", "grasp_node", "synthetic_depth_node")
 
 ROOMS = (
     "geometry",
@@ -139,6 +139,7 @@ setup(
             "recover_node = sq_perception.nodes.executables:recover_node",
             "recover_cameras = sq_perception.nodes.executables:recover_cameras",
             "fitter_node = sq_perception.nodes.executables:fitter_node",
+            "grasp_node = sq_perception.nodes.executables:grasp_node",
             "synthetic_depth_node = sq_perception.nodes.executables:synthetic_depth_node",
         ],
     },

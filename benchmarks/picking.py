@@ -51,6 +51,8 @@ import trimesh
 from picking_scenes import EYE, KINDS, LOOK, TABLE_CAMERA, THINGS, Scene
 from picking_world import Thing, World
 
+from sq_perception.evaluation import plots
+from sq_perception.evaluation.grasp_figure import draw_grasps
 from sq_perception.fitting import solina_bajcsy
 from sq_perception.geometry import mesh
 from sq_perception.geometry import rotation as quaternions
@@ -63,6 +65,8 @@ from sq_perception.recovery.recoverer import FrameRecovery, Recoverer
 MOST_ROUNDS = 12
 ASKED = {"packed": (93, 92), "pile": (80, 70)}
 BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
+_SHOWN = (150, 490), (335, 65)
+"""Columns and rows of a picture."""
 _FIRST_SEED = 5000
 """Chosen before the first run."""
 
@@ -289,6 +293,26 @@ def table(found: dict[str, Any]) -> str:
     return report.table(heads, rows)
 
 
+def picture(path: Path, seed: int, recoverer: Recoverer) -> None:
+    """A scene of each kind before the first pick, with the best grasp of each body."""
+    figure = plots.new_figure(13.0, 5.1)
+    for column, kind in enumerate(KINDS):
+        scene = picking_scenes.scene(kind, seed)
+        world = scene.world()
+        depth = picking_scenes.observed(world, scene.sensor, np.random.default_rng([seed, 1]))
+        found = recoverer.recover(depth, TABLE_CAMERA)
+        bodies = [one.superquadric for one in found.recovered]
+        covariance = np.array([one.covariance for one in found.recovered])
+        around = Surroundings.of_image(depth, TABLE_CAMERA, found.plane)
+        plan = grasps(Superquadric.stack(bodies), PANDA, covariance, around)
+        ax = figure.add_axes((0.5 * column + 0.003, 0.0, 0.494, 1.0))
+        draw_grasps(ax, depth, TABLE_CAMERA, bodies, plan, PANDA)
+        ax.set_xlim(*_SHOWN[0])
+        ax.set_ylim(*_SHOWN[1])
+        ax.text(0.02, 0.04, f"{kind}, {scene.sensor}", transform=ax.transAxes, color=plots.INK, weight="bold")
+    plots.save(figure, path, dots_per_inch=90)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", type=int, default=20, help="of each kind")
@@ -296,8 +320,12 @@ def main() -> None:
     parser.add_argument("--contestants", default=",".join(CONTESTANTS))
     parser.add_argument("--first", type=int, default=_FIRST_SEED)
     parser.add_argument("--each", type=Path, help="result lines; those that are there are not computed again")
+    parser.add_argument("--picture", type=Path, help="draw the first scene of each kind there, and do no more")
     parser.add_argument("--name", default="picking", help="of the results; empty: none are written")
     arguments = parser.parse_args()
+    if arguments.picture:
+        picture(arguments.picture, arguments.first, Recoverer())
+        return
     lines: list[dict[str, Any]] = []
     if arguments.each and arguments.each.exists():
         lines = [json.loads(line) for line in arguments.each.read_text().splitlines()]

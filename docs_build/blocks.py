@@ -317,6 +317,27 @@ def recorded() -> str:
     return table(heads, rows) + measured("known_frames")
 
 
+def picking() -> str:
+    """Grasps in physics: how often one holds, how much is cleared, and what went wrong."""
+    names = {
+        "ours": "recovered bodies, with their covariance",
+        "ours without sigma": "the same, 10 % of the size as sigma",
+        "true bodies": "true bodies",
+        "classic": "`classic` fit",
+        "box": "smallest box of the seen points",
+        "centroid": "straight down on the points' middle, no planner",
+    }
+    asked = {"packed": "93 / 92", "pile": "80 / 70"}
+    causes = ("collision", "missed", "slipped")
+    rows = []
+    for name, one in results("picking")["rows"].items():
+        kind, _, who = name.partition(": ")
+        rates = [f"{one[rate][0]:.0f} ({one[rate][1]:.0f} to {one[rate][2]:.0f})" for rate in ("gsr", "dr")]
+        numbers = [str(one["causes"][cause]) for cause in causes]
+        rows.append([kind, names[who], str(one["scenes"]), *rates, asked[kind] if who == "ours" else "", *numbers])
+    return table(["scenes", "planned on", "number", "GSR %", "DR %", "asked", *causes], rows) + measured("picking")
+
+
 BLOCKS: dict[str, Callable[[], str]] = {
     function.__name__: function
     for function in (
@@ -328,6 +349,7 @@ BLOCKS: dict[str, Callable[[], str]] = {
         recorded,
         frame_time,
         latency,
+        picking,
         tracks,
         layers,
         packages,

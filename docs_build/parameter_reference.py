@@ -14,7 +14,13 @@ from dataclasses import Field, fields
 from pathlib import Path
 from typing import Any
 
-from sq_perception.nodes.parameters import KINDS, FitterParameters, RecoverParameters, SyntheticParameters
+from sq_perception.nodes.parameters import (
+    KINDS,
+    FitterParameters,
+    GraspParameters,
+    RecoverParameters,
+    SyntheticParameters,
+)
 
 PAGE = Path("docs/parameters.md")
 COMMAND = "python docs_build/parameter_reference.py"
@@ -52,6 +58,7 @@ def page() -> str:
     other = f"fitter_node is recover_node with `method: {FitterParameters.method}`.\n"
     parts = [_HEAD, "## recover_node, recover_cameras, fitter_node\n", other]
     parts += [_table(fields(RecoverParameters), "configure")]
+    parts += ["## grasp_node\n", _table(fields(GraspParameters), "start")]
     parts += ["## synthetic_depth_node\n", _table(fields(SyntheticParameters), "start")]
     return "\n".join(parts)
 

@@ -34,6 +34,7 @@ equally right: compare bodies, never raw parameters.
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from enum import IntFlag
 from typing import TYPE_CHECKING, Any
@@ -61,21 +62,20 @@ class Reason(IntFlag):
     """No superquadric came near, so that the body was fitted like the convex hull of the object."""
 
 
-
 _NUMPY_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """By the datatypes of sensor_msgs/PointField."""
-_UINT32, _FLOAT32 = 6, 7
+UINT32, FLOAT32 = 6, 7
 
 FIELDS: tuple[tuple[str, int], ...] = tuple(
-    (name, _FLOAT32)
+    (name, FLOAT32)
     for name in (
         *("x", "y", "z", "qx", "qy", "qz", "qw", "a1", "a2", "a3", "e1", "e2"),
         *("score", "residual", "sigma_a1", "sigma_a2", "sigma_a3"),
     )
-) + tuple((name, _UINT32) for name in ("id", "status", "label", "seen", "fused", "reason"))
-FIELDS += tuple((f"sigma_{name}", _FLOAT32) for name in ("e1", "e2", "c1", "c2", "c3", "r1", "r2", "r3"))
+) + tuple((name, UINT32) for name in ("id", "status", "label", "seen", "fused", "reason"))
+FIELDS += tuple((f"sigma_{name}", FLOAT32) for name in ("e1", "e2", "c1", "c2", "c3", "r1", "r2", "r3"))
 """Name and PointField datatype of every field, in the order of the message."""
-_UNSIGNED = tuple(name for name, kind in FIELDS if kind == _UINT32)
+_UNSIGNED = tuple(name for name, kind in FIELDS if kind == UINT32)
 
 _COLUMNS = {
     "size": ("a1", "a2", "a3"),
@@ -187,12 +187,24 @@ class SuperquadricArray:
 
 def to_message(superquadrics: SuperquadricArray, header: Any, types: MessageTypes = installed) -> PointCloud2:
     """The message of n superquadrics (n may be 0) with the given std_msgs/Header, of the classes in ``types``."""
-    layout = np.dtype([(name, "<" + _NUMPY_TYPES[datatype]) for name, datatype in FIELDS])
-    points = np.zeros(len(superquadrics), layout)
+    columns: dict[str, np.ndarray] = {}
     for column, names in _COLUMNS.items():
         values = getattr(superquadrics, column).reshape(len(superquadrics), len(names))
-        for k, name in enumerate(names):
-            points[name] = values[:, k]
+        columns.update({name: values[:, k] for k, name in enumerate(names)})
+    return cloud(columns, FIELDS, header, types)
+
+
+def cloud(
+    columns: Mapping[str, np.ndarray],
+    described: Sequence[tuple[str, int]],
+    header: Any,
+    types: MessageTypes = installed,
+) -> PointCloud2:
+    """A PointCloud2 with one point a row of some columns (n,), whose fields have these names and datatypes."""
+    layout = np.dtype([(name, "<" + _NUMPY_TYPES[datatype]) for name, datatype in described])
+    points = np.zeros(len(columns[described[0][0]]), layout)
+    for name, _ in described:
+        points[name] = columns[name]
     field = types("sensor_msgs/msg/PointField")
     message: PointCloud2 = types("sensor_msgs/msg/PointCloud2")(
         header=header,
@@ -200,13 +212,13 @@ def to_message(superquadrics: SuperquadricArray, header: Any, types: MessageType
         width=len(points),
         fields=[
             field(name=name, offset=int(layout.fields[name][1]), datatype=datatype, count=1)  # type: ignore[index]
-            for name, datatype in FIELDS
+            for name, datatype in described
         ],
         is_bigendian=False,
         point_step=layout.itemsize,
         row_step=layout.itemsize * len(points),
         data=byte_array(points),
-        is_dense=all(bool(np.isfinite(getattr(superquadrics, column)).all()) for column in _COLUMNS),
+        is_dense=all(bool(np.isfinite(columns[name]).all()) for name, _ in described),
     )
     return message
 
@@ -220,7 +232,7 @@ def from_message(message: PointCloud2) -> SuperquadricArray:
         If a field is missing, has an unknown datatype, a count other than one or an offset outside the point, or if the
         data is not as long as width, height and steps say.
     """
-    points = _points(message)
+    points = cloud_points(message, FIELDS, _NEEDED)
     columns: dict[str, np.ndarray] = {}
     for column, names in _COLUMNS.items():
         if not set(names) <= set(points.dtype.names or ()):
@@ -233,14 +245,20 @@ def from_message(message: PointCloud2) -> SuperquadricArray:
         raise MessageError(str(error)) from error
 
 
-def _points(message: PointCloud2) -> np.ndarray:
-    """The points (n,) of a cloud as a structured array of those of FIELDS that are there."""
+def cloud_points(message: PointCloud2, described: Sequence[tuple[str, int]], needed: Sequence[str]) -> np.ndarray:
+    """The points (n,) of a cloud as a structured array of those of the described fields that are there.
+
+    Raises
+    ------
+    MessageError
+        As :func:`from_message`, for fields that are needed.
+    """
     order = ">" if message.is_bigendian else "<"
     present = {field.name: field for field in message.fields}
-    missing = [name for name in _NEEDED if name not in present]
+    missing = [name for name in needed if name not in present]
     if missing:
-        raise MessageError(f"expected the fields {' '.join(_NEEDED)}; missing: {' '.join(missing)}")
-    names = [name for name, _ in FIELDS if name in present]
+        raise MessageError(f"expected the fields {' '.join(needed)}; missing: {' '.join(missing)}")
+    names = [name for name, _ in described if name in present]
     formats = []
     for name in names:
         field = present[name]

@@ -158,22 +158,12 @@ def _frame(
 
 
 def _draw(path: Path, frame: RecordedFrame, found: Sequence[Recovery], plan: GraspPlan, hand: Gripper) -> None:
-    """Outlines of the bodies, and of each body's best grasp the gripper."""
     from sq_perception.evaluation import plots
+    from sq_perception.evaluation.grasp_figure import draw_grasps
 
     figure = plots.new_figure(9.6, 9.6 * frame.camera.height / frame.camera.width)
     ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    plots.draw_depth(ax, frame.depth)
-    plots.draw_outlines(ax, [one.superquadric for one in found], frame.camera, edges=False, width=1.4)
-    for k in range(len(found)):
-        for grasp in plan.of(k)[:1]:
-            for line in hand.wires(grasp.opening):
-                pixels = frame.camera.project(grasp.placed(line))
-                ax.plot(*pixels.T, color="white", lw=5.0, solid_capstyle="round")
-                ax.plot(*pixels.T, color=plots.colour(k), lw=2.6, solid_capstyle="round")
-            ax.text(pixels[-1, 0], pixels[-1, 1], f" {grasp.score:.2f}", color=plots.INK, fontsize=11, weight="bold")
-    ax.set_xlim(-0.5, frame.camera.width - 0.5)
-    ax.set_ylim(frame.camera.height - 0.5, -0.5)
+    draw_grasps(ax, frame.depth, frame.camera, [one.superquadric for one in found], plan, hand)
     with output_file.writing(path) as partial:
         plots.save(figure, partial)
 

@@ -19,6 +19,8 @@ from types import MappingProxyType
 import numpy as np
 
 _QUARTER_TURN = (0.0, 0.0, float(np.sqrt(0.5)), float(np.sqrt(0.5)))
+_QUADS = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
+_BOX_FACES = np.array([corners for a, b, c, d in _QUADS for corners in ((a, b, c), (a, c, d))])
 _REACH = 0.1
 """The approach is straight for so many metres."""
 
@@ -91,6 +93,15 @@ class Gripper:
         """:meth:`boxes` (k, 3, 6) at many openings (k,)."""
         closed = self.boxes(0.0)
         return np.asarray(closed + openings[:, None, None] * (self.boxes(1.0) - closed))
+
+    def mesh(self, opening: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Vertices (24, 3), faces (36, 3) and edges (36, 2, 3) of fingers and hand in the TCP's frame."""
+        signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
+        vertices = np.concatenate([box[:3] + signs * box[3:] for box in self.boxes(opening, reach=0.0)])
+        faces = np.concatenate([_BOX_FACES + 8 * k for k in range(3)])
+        pairs = [(i, j) for i in range(8) for j in range(i) if np.abs(signs[i] - signs[j]).sum() == 2]
+        edges = np.concatenate([np.array(pairs) + 8 * k for k in range(3)])
+        return vertices, faces, vertices[edges]
 
     def wires(self, opening: float) -> list[np.ndarray]:
         """Lines (j, 3) in the TCP's frame that draw the gripper: the fork of its fingers, and its wrist."""

@@ -33,7 +33,7 @@ from scipy.special import ndtr
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.grasping import clearance, closing
-from sq_perception.grasping.gripper import Gripper
+from sq_perception.grasping.gripper import PANDA, Gripper
 from sq_perception.grasping.surroundings import Surroundings
 
 FRICTION = 0.5
@@ -208,6 +208,13 @@ def grasps(
     trials = trials.at(trials.logs.sum(axis=1) > np.log(_LEAST)).first(PER_BODY)
     reasons[np.unique(trials.owner)] = ""
     return GraspPlan(tuple(_told(trials)), tuple(reasons))
+
+
+def warm_up() -> None:
+    """Compile or load every kernel."""
+    two = np.array([[0.0, 0.0, 0.5], [0.1, 0.0, 0.5]])
+    bodies = Superquadric(np.full((2, 3), 0.02), np.ones((2, 2)), two, np.tile([0.0, 0.0, 0.0, 1.0], (2, 1)))
+    grasps(bodies, PANDA, around=Surroundings(points=two + 0.3))
 
 
 def _closings(bodies: Superquadric, spread: np.ndarray, gripper: Gripper, friction: float) -> _Closings:

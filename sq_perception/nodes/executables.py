@@ -1,4 +1,5 @@
-"""The programs that `ros2 run sq_perception` knows: recover_node, fitter_node, recover_cameras, synthetic_depth_node.
+"""The programs that `ros2 run sq_perception` knows: recover_node, fitter_node, recover_cameras, grasp_node,
+synthetic_depth_node.
 
 Each imports its node inside :func:`sq_perception.nodes.process.run`: torch, numba and rclpy take seconds to import, and
 a Ctrl-C meanwhile must end the process without a traceback.
@@ -72,6 +73,17 @@ def recover_cameras(arguments: Sequence[str] | None = None) -> int:
                 )
 
     return process.run("recover_cameras", create, given[cut:])
+
+
+def grasp_node(arguments: Sequence[str] | None = None) -> int:
+    """Run grasp_node; the exit code."""
+
+    def create() -> list[process.Stoppable]:
+        from sq_perception.nodes.grasp_node import GraspNode
+
+        return [GraspNode("grasp_node")]
+
+    return process.run("grasp_node", create, arguments)
 
 
 def synthetic_depth_node(arguments: Sequence[str] | None = None) -> int:

@@ -21,6 +21,8 @@ from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValu
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from sq_perception.grasping.gripper import GRIPPERS
+from sq_perception.grasping.planner import FRICTION
 from sq_perception.imaging import compressed_depth
 from sq_perception.imaging.calibration import Treatment
 from sq_perception.recovery.options import Method, Refine
@@ -344,13 +346,29 @@ class SyntheticParameters:
             raise ParameterError(f"noise: expected 0 for sensor = {self.sensor}, which has its own, got {self.noise:g}")
 
 
-KINDS: dict[str, type[RecoverParameters] | type[SyntheticParameters]] = {
+@dataclass(frozen=True)
+class GraspParameters:
+    """grasp_node."""
+
+    autostart: bool = setting(True, "Configure and activate at the start, as recover_node does.")
+    gripper: str = setting("panda", "The gripper that grasps are for.", choices=tuple(GRIPPERS), live=True)
+    friction: float = setting(
+        FRICTION, "Coefficient of friction between pads and things.", within=(0.05, 2.0), live=True
+    )
+    min_score: float = setting(
+        0.3, "Grasps that hold with less probability are not published.", within=(0.0, 1.0), live=True
+    )
+    only_id: int = setting(-1, "Plan for the body of this id alone; -1: for all.", within=(-1, 2**31 - 1), live=True)
+
+
+KINDS: dict[str, type[RecoverParameters] | type[SyntheticParameters] | type[GraspParameters]] = {
     "recover_node": RecoverParameters,
     "fitter_node": FitterParameters,
+    "grasp_node": GraspParameters,
     "synthetic_depth_node": SyntheticParameters,
 }
 """The parameters of each node."""
-P = TypeVar("P", bound="RecoverParameters | SyntheticParameters")
+P = TypeVar("P", bound="RecoverParameters | SyntheticParameters | GraspParameters")
 
 
 class LiveParameters(Generic[P]):

@@ -14,7 +14,7 @@ pytest.importorskip("colcon_core", reason="colcon is missing: install the extra 
 catkin_package = pytest.importorskip("catkin_pkg.package", reason="catkin_pkg is missing: install the extra 'test'")
 
 PACKAGE = "sq_perception"
-EXECUTABLES = ("recover_node", "recover_cameras", "fitter_node", "synthetic_depth_node", "sq-perception")
+EXECUTABLES = ("recover_node", "recover_cameras", "fitter_node", "grasp_node", "synthetic_depth_node", "sq-perception")
 
 
 @pytest.fixture(scope="module")

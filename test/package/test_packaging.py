@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-NODES = ("recover_node", "recover_cameras", "fitter_node", "synthetic_depth_node")
+NODES = ("recover_node", "recover_cameras", "fitter_node", "grasp_node", "synthetic_depth_node")
 PACKAGE = "sq_perception"
 
 
@@ -109,7 +109,7 @@ def test_the_found_executable_starts_the_node(prefix: Path, node: str, tmp_path:
     path = ros2_run_lookup(PACKAGE, node, str(prefix))
     (site,) = prefix.glob("lib/python3*/site-packages")
     python_path = os.pathsep.join([str(site), os.environ.get("PYTHONPATH", "")]).rstrip(os.pathsep)
-    bad = "rate:=-1.0" if node == "synthetic_depth_node" else "max_objects:=0"
+    bad = {"synthetic_depth_node": "rate:=-1.0", "grasp_node": "friction:=-1.0"}.get(node, "max_objects:=0")
     cameras = ["front", "wrist"] if node == "recover_cameras" else []
     result = subprocess.run(
         [path, *cameras, "--ros-args", "-p", bad],

@@ -1,0 +1,116 @@
+"""Grasps in a sensor_msgs/PointCloud2: one point a grasp, one named field a number, the most probable first.
+
+Fields
+------
+x y z           tool centre point, midway between the pads, metres, in the frame of the header
+qx qy qz qw     unit quaternion, gripper to header frame: z the way of the approach, y the way of the fingers
+opening         between the pads before they close, metres
+width           of the body between them, metres
+score           0 to 1: the probability that it holds
+id              of the body, as in the cloud of the superquadrics (uint32; the others are float32)
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from sq_msgs_py.message_types import MessageTypes, installed
+from sq_msgs_py.superquadrics import FLOAT32, UINT32, MessageError, cloud, cloud_points
+
+if TYPE_CHECKING:
+    from geometry_msgs.msg import PoseArray
+    from sensor_msgs.msg import PointCloud2
+
+FIELDS: tuple[tuple[str, int], ...] = (
+    *((name, FLOAT32) for name in ("x", "y", "z", "qx", "qy", "qz", "qw", "opening", "width", "score")),
+    ("id", UINT32),
+)
+"""Name and PointField datatype of every field, in the order of the message."""
+_COLUMNS = {
+    "position": ("x", "y", "z"),
+    "rotation": ("qx", "qy", "qz", "qw"),
+    "opening": ("opening",),
+    "width": ("width",),
+    "score": ("score",),
+    "id": ("id",),
+}
+
+
+@dataclass(frozen=True, eq=False)
+class GraspArray:
+    """n grasps, column by column; see the module for units and conventions.
+
+    Attributes
+    ----------
+    position : (n, 3) float32
+    rotation : (n, 4) float32
+    opening, width, score : (n,) float32
+    id : (n,) uint32
+
+    Raises
+    ------
+    ValueError
+        If a column has another shape, or position or rotation is not finite.
+    """
+
+    position: np.ndarray
+    rotation: np.ndarray
+    opening: np.ndarray
+    width: np.ndarray
+    score: np.ndarray
+    id: np.ndarray
+
+    def __post_init__(self) -> None:
+        count = len(self.position)
+        for column, names in _COLUMNS.items():
+            values = np.asarray(getattr(self, column))
+            shape = (count,) if len(names) == 1 else (count, len(names))
+            values = values.reshape(shape) if values.size == 0 == count else values
+            if values.shape != shape:
+                raise ValueError(f"{column}: expected shape {shape}, got {values.shape}")
+            if column in ("position", "rotation") and not np.isfinite(values).all():
+                raise ValueError(f"{column}: expected finite numbers, got {values.tolist()}")
+            object.__setattr__(self, column, values.astype(np.uint32 if column == "id" else np.float32))
+
+    def __len__(self) -> int:
+        return len(self.position)
+
+
+def to_message(grasps: GraspArray, header: Any, types: MessageTypes = installed) -> PointCloud2:
+    """The message of n grasps (n may be 0) with the given std_msgs/Header, of the classes in ``types``."""
+    columns: dict[str, np.ndarray] = {}
+    for column, names in _COLUMNS.items():
+        values = getattr(grasps, column).reshape(len(grasps), len(names))
+        columns.update({name: values[:, k] for k, name in enumerate(names)})
+    return cloud(columns, FIELDS, header, types)
+
+
+def from_message(message: PointCloud2) -> GraspArray:
+    """The grasps of a message; fields are found by name, unknown ones are left aside.
+
+    Raises
+    ------
+    MessageError
+        As for superquadrics.
+    """
+    points = cloud_points(message, FIELDS, [name for name, _ in FIELDS])
+    columns = {column: np.stack([points[name] for name in names], axis=-1) for column, names in _COLUMNS.items()}
+    try:
+        return GraspArray(**{k: v[:, 0] if len(_COLUMNS[k]) == 1 else v for k, v in columns.items()})
+    except ValueError as error:
+        raise MessageError(str(error)) from error
+
+
+def poses(grasps: GraspArray, header: Any, types: MessageTypes = installed) -> PoseArray:
+    """The poses alone as a geometry_msgs/PoseArray, in the same order."""
+    pose, point = types("geometry_msgs/msg/Pose"), types("geometry_msgs/msg/Point")
+    quaternion = types("geometry_msgs/msg/Quaternion")
+    found = [
+        pose(position=point(x=x, y=y, z=z), orientation=quaternion(x=qx, y=qy, z=qz, w=qw))
+        for (x, y, z), (qx, qy, qz, qw) in zip(grasps.position.tolist(), grasps.rotation.tolist(), strict=True)
+    ]
+    array: PoseArray = types("geometry_msgs/msg/PoseArray")(header=header, poses=found)
+    return array

@@ -1,0 +1,167 @@
+"""grasp_node: superquadrics in, grasps of a parallel gripper out.
+
+| name | type | |
+| --- | --- | --- |
+| `superquadrics` | sensor_msgs/PointCloud2 | in: the cloud of recover_node; remap it to `/recover_node/superquadrics` |
+| `support_plane` | geometry_msgs/PoseStamped | in: what the bodies stand on, of recover_node too |
+| `~/grasps` | geometry_msgs/PoseArray | out: tool centre points, the most probable grasp first |
+| `~/grasp_details` | sensor_msgs/PointCloud2 | out: the same in their order: opening, width, score, the body's id |
+| `~/markers` | visualization_msgs/MarkerArray | out: the gripper at the best grasp of each body |
+| `~/plan` | std_srvs/Trigger | the last cloud again, with the parameters as they are; says what came of it |
+
+All have the header of the cloud.  The last plane in its frame counts; without one, grippers come from the side of the
+frame's origin, that of the camera.  What no message holds, measured points and unseen space, is not looked at; the
+command ``sq-perception grasp`` does.  Correlations of a body's numbers are not in the cloud either.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from geometry_msgs.msg import PoseArray, PoseStamped
+from rclpy.publisher import Publisher
+from rclpy.qos import QoSDurabilityPolicy, QoSProfile
+from sensor_msgs.msg import PointCloud2
+from std_srvs.srv import Trigger
+from visualization_msgs.msg import MarkerArray
+
+from sq_msgs_py import grasps as messages
+from sq_msgs_py.markers import markers
+from sq_msgs_py.poses import plane_of
+from sq_msgs_py.superquadrics import SuperquadricArray, from_message
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.grasping.gripper import Gripper, gripper
+from sq_perception.grasping.planner import GraspPlan, grasps, warm_up
+from sq_perception.grasping.surroundings import Surroundings
+from sq_perception.nodes.managed_node import ManagedNode
+from sq_perception.nodes.parameters import GraspParameters, LiveParameters
+from sq_perception.nodes.statistics import THROTTLE
+
+_LATCHED = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
+
+
+class GraspNode(ManagedNode):
+    """See the module."""
+
+    def __init__(self, name: str, *, namespace: str | None = None, context: Any = None) -> None:
+        super().__init__(name, namespace=namespace, context=context)
+        self._settings = LiveParameters(self, GraspParameters)
+        self._last: PointCloud2 | None = None
+        self._plane: PoseStamped | None = None
+        self._shown: tuple[int, ...] = ()
+        self._publishers: list[Publisher] = []
+        self._subscriptions: list[Any] = []
+        self._service = self.create_service(Trigger, "~/plan", self._on_plan)
+        if self._settings.current.autostart:
+            self.start()
+
+    def _configure(self) -> None:
+        """Compile or load the kernels, so that no first cloud waits."""
+        warm_up()
+
+    def _activate(self) -> None:
+        kinds: tuple[tuple[type[Any], str], ...] = (
+            (PoseArray, "~/grasps"),
+            (PointCloud2, "~/grasp_details"),
+            (MarkerArray, "~/markers"),
+        )
+        self._publishers = [self.create_publisher(kind, topic, 10) for kind, topic in kinds]
+        self._subscriptions = [
+            self.create_subscription(PoseStamped, "support_plane", self._on_plane, _LATCHED),
+            self.create_subscription(PointCloud2, "superquadrics", self._on_cloud, 1),
+        ]
+
+    def _deactivate(self) -> None:
+        for subscription in self._subscriptions:
+            self.destroy_subscription(subscription)
+        self._subscriptions = []
+        for publisher in self._publishers:
+            self.destroy_publisher(publisher)
+        self._publishers, self._shown = [], ()
+
+    def _cleanup(self) -> None:
+        self._deactivate()
+        self._last = self._plane = None
+
+    def _comes_back(self) -> bool:
+        return self._settings.current.autostart
+
+    def _on_plane(self, message: PoseStamped) -> None:
+        self._plane = message
+
+    def _on_cloud(self, message: PointCloud2) -> None:
+        self._last = message
+        self._answered(message)
+
+    def _on_plan(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        if not self.is_active or self._last is None:
+            response.message = "no superquadrics have come yet" if self.is_active else f"the node is {self.state}"
+            return response
+        response.success, response.message = self._answered(self._last)
+        return response
+
+    def _answered(self, message: PointCloud2) -> tuple[bool, str]:
+        """Plan and publish; whether there is a grasp, and why not.  No message ends the node."""
+        try:
+            bodies = from_message(message).recovered
+            plane = None
+            if self._plane is not None and self._plane.header.frame_id == message.header.frame_id:
+                plane = plane_of(self._plane)
+            plan = planned(bodies, self._settings.current, plane)
+            self._publish(message.header, bodies, plan, gripper(self._settings.current.gripper))
+        except Exception as error:
+            reason = f"refused superquadrics: {type(error).__name__}: {error}"
+            self.get_logger().warning(reason, throttle_duration_sec=THROTTLE)
+            return False, reason
+        reasons = [f"{number}: {why}" for number, why in zip(bodies.id, plan.reasons, strict=True) if why]
+        return bool(plan.grasps), "; ".join([f"{len(plan.grasps)} grasps of {len(bodies)} bodies", *reasons])
+
+    def _publish(self, header: Any, bodies: SuperquadricArray, plan: GraspPlan, hand: Gripper) -> None:
+        found = messages.GraspArray(
+            np.array([grasp.position for grasp in plan.grasps]).reshape(-1, 3),
+            np.array([grasp.rotation for grasp in plan.grasps]).reshape(-1, 4),
+            np.array([grasp.opening for grasp in plan.grasps]),
+            np.array([grasp.width for grasp in plan.grasps]),
+            np.array([grasp.score for grasp in plan.grasps]),
+            np.array([bodies.id[grasp.body] for grasp in plan.grasps], dtype=np.uint32),
+        )
+        poses, details, shown = self._publishers
+        poses.publish(messages.poses(found, header))
+        details.publish(messages.to_message(found, header))
+        best = {int(bodies.id[grasp.body]): grasp for grasp in reversed(plan.grasps)}
+        meshes = []
+        for grasp in best.values():
+            vertices, faces, edges = hand.mesh(grasp.opening)
+            meshes.append((grasp.placed(vertices), faces, grasp.placed(edges)))
+        shown.publish(markers(meshes, list(best), header, namespace="grasps", previous_ids=self._shown))
+        self._shown = tuple(best)
+
+
+def planned(bodies: SuperquadricArray, parameters: GraspParameters, plane: np.ndarray | None = None) -> GraspPlan:
+    """The plan that the parameters ask for; bodies that they leave out are minded, and have no grasp."""
+    columns = (bodies.size, bodies.shape, bodies.translation, bodies.rotation)
+    batch = Superquadric(*(column.astype(float) for column in columns))
+    hand = gripper(parameters.gripper)
+    plan = grasps(batch, hand, covariances(bodies, batch), Surroundings(plane), parameters.friction)
+    wanted = [parameters.only_id in (-1, int(number)) for number in bodies.id]
+    kept = tuple(one for one in plan.grasps if one.score >= parameters.min_score and wanted[one.body])
+    have = {one.body for one in kept}
+    reasons = tuple(
+        "" if k in have or not wanted[k] else why or f"less probable than {parameters.min_score:g}"
+        for k, why in enumerate(plan.reasons)
+    )
+    return GraspPlan(kept, reasons)
+
+
+def covariances(bodies: SuperquadricArray, batch: Superquadric) -> np.ndarray:
+    """(n, 11, 11) from the deviations of sizes, centre and turn; NaN where those are unknown."""
+    found = np.zeros((len(bodies), 11, 11))
+    size, centre, turn = (
+        np.asarray(sigma, dtype=float) ** 2 for sigma in (bodies.sigma_size, bodies.sigma_centre, bodies.sigma_turn)
+    )
+    found[:, :3, :3] = size[:, :, None] * np.eye(3)
+    axes = batch.rotation_matrix
+    found[:, 5:8, 5:8] = (axes * centre[:, None]) @ axes.transpose(0, 2, 1)
+    found[:, 8:, 8:] = turn[:, :, None] * np.eye(3)
+    return found

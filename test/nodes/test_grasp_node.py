@@ -1,0 +1,127 @@
+"""grasp_node between a real publisher and subscribers: order, headers, parameters, and messages that are none."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs the extra 'ros'")
+
+from geometry_msgs.msg import PoseArray, PoseStamped
+from rclpy.parameter import Parameter
+from rclpy.qos import QoSDurabilityPolicy, QoSProfile
+from sensor_msgs.msg import PointCloud2
+from spun_nodes import SpunNodes
+from std_msgs.msg import Header
+from std_srvs.srv import Trigger
+from visualization_msgs.msg import Marker, MarkerArray
+
+from sq_msgs_py import grasps as messages
+from sq_msgs_py.poses import plane_message
+from sq_msgs_py.superquadrics import SuperquadricArray, to_message
+from sq_perception.grasping.planner import warm_up
+from sq_perception.nodes.grasp_node import GraspNode
+
+BOX, CAN, WALL = 4, 7, 9
+HEADER = Header(frame_id="base_link")
+
+
+def bodies():
+    size = np.array([[0.05, 0.02, 0.06], [0.033, 0.033, 0.06], [0.1, 0.1, 0.1]])
+    count = len(size)
+    return SuperquadricArray(
+        size=size,
+        shape=np.array([[0.1, 0.1], [0.1, 1.0], [0.1, 0.1]]),
+        translation=np.array([[0.4, 0.0, 0.06], [0.6, 0.0, 0.06], [0.0, 0.5, 0.1]]),
+        rotation=np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)),
+        score=np.ones(count),
+        residual=np.zeros(count),
+        sigma_size=np.full((count, 3), 0.001),
+        sigma_centre=np.full((count, 3), 0.001),
+        sigma_turn=np.full((count, 3), 0.01),
+        id=np.array([BOX, CAN, WALL]),
+        status=np.zeros(count, dtype=int),
+    )
+
+
+class Bench(SpunNodes):
+    def __init__(self):
+        super().__init__()
+        self.node = GraspNode("grasp_node", context=self.context)
+        self.heard = {}
+        for kind, topic in ((PoseArray, "grasps"), (PointCloud2, "grasp_details"), (MarkerArray, "markers")):
+            self.peer.create_subscription(
+                kind, f"/grasp_node/{topic}", lambda message, topic=topic: self.heard.update({topic: message}), 10
+            )
+        self.cloud = self.peer.create_publisher(PointCloud2, "/superquadrics", 10)
+        latched = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
+        self.plane = self.peer.create_publisher(PoseStamped, "/support_plane", latched)
+        self.plane.publish(plane_message(np.array([0.0, 0.0, 1.0, 0.0]), HEADER))
+        self.spin([self.node])
+        self.until(lambda: self.node.is_active and self.cloud.get_subscription_count())
+        self.until(lambda: self.node._plane is not None)
+        self.until(lambda: all(one.get_subscription_count() for one in self.node._publishers))
+
+    def answer(self, message):
+        self.heard.clear()
+        self.cloud.publish(message)
+        self.until(lambda: len(self.heard) == 3)
+        return self.heard
+
+    def finish(self):
+        self.node.close()
+        super().finish()
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compiled():
+    """Kernels that have to be compiled first would take longer than the bench is patient."""
+    warm_up()
+
+
+@pytest.fixture
+def bench():
+    one = Bench()
+    yield one
+    one.finish()
+
+
+def test_grasps_come_best_first_with_the_header_of_the_bodies(bench):
+    message = to_message(bodies(), HEADER)
+    heard = bench.answer(message)
+    details = messages.from_message(heard["grasp_details"])
+    assert {one.header.frame_id for one in (heard["grasps"], heard["grasp_details"])} == {"base_link"}
+    assert set(details.id) == {BOX, CAN}
+    assert (np.diff(details.score) <= 0).all()
+    assert len(heard["grasps"].poses) == len(details)
+    first = heard["grasps"].poses[0].position
+    np.testing.assert_allclose([first.x, first.y, first.z], details.position[0], atol=1e-6)
+    assert {marker.id for marker in heard["markers"].markers} == {BOX, CAN}
+    tips = details.position[:, 2] - 0.0095  # the plane is z = 0
+    assert (tips > 0).all()
+
+
+def test_one_body_may_be_asked_for_and_the_reason_of_none_is_told(bench):
+    bench.answer(to_message(bodies(), HEADER))
+    bench.node.set_parameters([Parameter("only_id", value=WALL)])
+    answer = bench.call(Trigger, "/grasp_node/plan", Trigger.Request())
+    assert not answer.success
+    assert f"{WALL}: wider than the opening" in answer.message
+    bench.until(lambda: not bench.heard["grasps"].poses)
+    assert {marker.action for marker in bench.heard["markers"].markers} == {Marker.DELETE}
+
+
+def test_a_cloud_of_something_else_is_refused_and_the_next_one_answered(bench):
+    bench.cloud.publish(PointCloud2(width=3, height=1))
+    assert len(bench.answer(to_message(bodies(), Header()))["grasps"].poses) > 0
+    assert len(bench.answer(to_message(SuperquadricArray.empty(), Header()))["grasps"].poses) == 0
+
+
+def test_grasps_survive_the_way_through_a_message():
+    rng = np.random.default_rng(0)
+    given = messages.GraspArray(
+        rng.random((5, 3)), rng.random((5, 4)), rng.random(5), rng.random(5), rng.random(5), np.arange(5)
+    )
+    back = messages.from_message(messages.to_message(given, Header()))
+    for name in ("position", "rotation", "opening", "width", "score", "id"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(given, name))
