@@ -156,3 +156,27 @@ def test_package_xml_names_every_ros_package_that_is_imported(repository: Path) 
     assert ros - optional <= declared
     assert not declared & optional
     assert all(one in text for one in optional)
+
+
+def test_the_messages_install_alone_with_numpy_only(source_copy: Path, tmp_path: Path) -> None:
+    """For a consumer of the cloud: no torch, no compiler; a cloud is read without ROS too."""
+    pip("wheel", "--no-deps", "--no-build-isolation", "--no-index", "-w", tmp_path, source_copy / "sq_msgs_py")
+    (wheel,) = tmp_path.glob("sq_msgs_py-*.whl")
+    with zipfile.ZipFile(wheel) as archive:
+        names = {name for name in archive.namelist() if ".dist-info/" not in name}
+        (metadata,) = (archive.read(name).decode() for name in archive.namelist() if name.endswith("/METADATA"))
+        archive.extractall(tmp_path / "alone")
+    modules = {f"sq_msgs_py/{path.name}" for path in (source_copy / "sq_msgs_py").glob("*.py")}
+    assert names == {*modules, "sq_msgs_py/py.typed"}
+    assert re.findall("^Requires-Dist: (.*)$", metadata, re.MULTILINE) == ["numpy>=1.26"]
+    code = (
+        "import sys; from types import SimpleNamespace as made; from sq_msgs_py.superquadrics import *; "
+        "types = lambda name: lambda **fields: made(**fields); "
+        "assert len(from_message(to_message(SuperquadricArray.empty(), None, types))) == 0; "
+        "import sq_msgs_py; print(sq_msgs_py.__file__); "
+        "assert not {'rclpy', 'sensor_msgs', 'torch', 'sq_perception'} & set(sys.modules)"
+    )
+    environment = {**os.environ, "PYTHONPATH": str(tmp_path / "alone")}
+    said = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True)
+    assert (said.returncode, said.stderr) == (0, "")
+    assert str(tmp_path) in said.stdout
