@@ -107,12 +107,16 @@ def _table(rows: Sequence[Field[Any]], otherwise: str) -> str:
 
 
 def _kind(one: Field[Any]) -> str:
-    return {float: "double or integer", int: "integer", bool: "bool", str: "string"}[type(one.default)]
+    return {float: "double or integer", int: "integer", bool: "bool", str: "string", tuple: "6 doubles"}[
+        type(one.default)
+    ]
 
 
 def _value(value: Any) -> str:
     if isinstance(value, bool):
         return str(value).lower()
+    if isinstance(value, tuple):
+        return f"`{list(value)}`"
     return f"`{value}`" if value != "" else "empty"
 
 

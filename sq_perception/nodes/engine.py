@@ -28,6 +28,7 @@ from sq_perception.nodes.frame import Frame
 from sq_perception.nodes.parameters import RecoverParameters
 from sq_perception.recovery.options import NEEDS_NETWORK, RecoveryOptions
 from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, checked_device
+from sq_perception.segmentation.standing import Pose
 
 _MADE_OF = ("device", "consensus", "threads", "method", "model")
 """Parameters that a recoverer is made of."""
@@ -141,8 +142,15 @@ class Engine:
             work = self._request, parameters, camera, None if self._is_to_read else self._built
         threading.Thread(target=self._swap, args=work, name="recoverer in the making", daemon=True).start()
 
-    def recover(self, frame: Frame, parameters: RecoverParameters) -> tuple[FrameRecovery, Hashable]:
+    def recover(
+        self, frame: Frame, parameters: RecoverParameters, pose: Pose | None = None
+    ) -> tuple[FrameRecovery, Hashable]:
         """The bodies of a frame by the parameters in force, and what tells their origin from another.
+
+        Parameters
+        ----------
+        pose
+            Of the frame in ``target_frame``; None where there is none.
 
         Raises
         ------
@@ -153,7 +161,7 @@ class Engine:
         if built is None:
             raise RuntimeError("the recoverer has been released")
         in_force = replace(parameters, **{name: getattr(built.parameters, name) for name in _MADE_OF})
-        recovery = built.recoverer.recover(frame.depth, frame.camera, frame.labels, options(in_force))
+        recovery = built.recoverer.recover(frame.depth, frame.camera, frame.labels, options(in_force, pose))
         return recovery, (built.weights, *(getattr(in_force, name) for name in _ANSWERS))
 
     @property
@@ -188,8 +196,8 @@ class Engine:
                 log.error(f"{fault}; what was there before goes on")
 
 
-def options(parameters: RecoverParameters) -> RecoveryOptions:
-    """What the parameters say to each frame."""
+def options(parameters: RecoverParameters, pose: Pose | None = None) -> RecoveryOptions:
+    """What the parameters say to each frame, whose pose in ``target_frame`` is given."""
     return RecoveryOptions(
         method=parameters.method,
         refine=parameters.refine,
@@ -198,6 +206,8 @@ def options(parameters: RecoverParameters) -> RecoveryOptions:
         depth_range=parameters.depth_range,
         max_objects=parameters.max_objects,
         max_size=parameters.max_size,
+        workspace=parameters.box,
+        workspace_pose=pose,
         time_budget=parameters.seconds,
         repair=parameters.repair,
     )

@@ -50,7 +50,7 @@ from sq_perception.nodes.frame import Frame
 from sq_perception.nodes.inbox import Arrival
 from sq_perception.nodes.input import Input
 from sq_perception.nodes.managed_node import ManagedNode
-from sq_perception.nodes.outputs import Outputs
+from sq_perception.nodes.outputs import Outputs, pose_in
 from sq_perception.nodes.parameters import LiveParameters, RecoverParameters
 from sq_perception.nodes.statistics import THROTTLE, Standing, Statistics, summary, timed
 from sq_perception.nodes.tracking import CameraPoses, Tracking
@@ -258,7 +258,12 @@ class FrameNode(ManagedNode):
         stages = {"wait": 1e3 * (monotonic() - arrival.time)}
         with timed(stages, "decode"):
             frame = source.frame(arrival, parameters)
-        recovery, origin = self._engine.recover(frame, parameters)
+        pose = None
+        if parameters.target_frame and parameters.box is not None:
+            known = pose_in(self._poses, frame.header, parameters.target_frame, parameters.tf_tolerance)
+            turn, shift = (tuple(part.tolist()) for part in known)
+            pose = turn, shift
+        recovery, origin = self._engine.recover(frame, parameters, pose)
         stages |= {f"recovery: {name}": took for name, took in recovery.milliseconds.items()}
         return _Result(frame, recovery, origin, stages)
 

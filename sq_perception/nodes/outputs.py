@@ -48,7 +48,7 @@ from sq_msgs_py.transforms import name, transforms
 from sq_perception.nodes.frame import Frame, Refused
 from sq_perception.nodes.parameters import RecoverParameters
 from sq_perception.nodes.statistics import THROTTLE, timed
-from sq_perception.nodes.tracking import CameraPoses, PoseError
+from sq_perception.nodes.tracking import CameraPoses, Pose, PoseError
 from sq_perception.recordings import publication
 from sq_perception.recordings.publication import Findings, Identified, MarkerStyle
 from sq_perception.recovery.recoverer import render_recovery
@@ -160,23 +160,25 @@ def marker_style(parameters: RecoverParameters) -> MarkerStyle:
     return MarkerStyle(parameters.marker_colours, parameters.marker_alpha, parameters.marker_line_width)
 
 
-def in_frame(found: Findings, poses: CameraPoses, frame_id: str, patience: float = 0.1) -> Findings:
-    """Findings in another tf2 frame, by the transform at their stamp; as they are for an empty ``frame_id``.
+def pose_in(poses: CameraPoses, header: Any, frame_id: str, patience: float) -> Pose:
+    """The pose of a header's frame in another tf2 frame, at its stamp.
 
     Raises
     ------
     Refused
-        If the transform is not known.
+        If it is not known.
     """
-    if not frame_id:
-        return found
     try:
-        rotation, translation = poses.at(found.header, frame_id, patience)
+        return poses.at(header, frame_id, patience)
     except PoseError as error:
         raise Refused(
-            f"target_frame: expected a transform from {found.header.frame_id!r} to {frame_id!r}: {error}"
+            f"target_frame: expected a transform from {header.frame_id!r} to {frame_id!r}: {error}"
         ) from error
-    return found.moved(frame_id, rotation, translation)
+
+
+def in_frame(found: Findings, poses: CameraPoses, frame_id: str, patience: float = 0.1) -> Findings:
+    """Findings in another tf2 frame; as they are for an empty ``frame_id``.  Raises Refused as :func:`pose_in`."""
+    return found.moved(frame_id, *pose_in(poses, found.header, frame_id, patience)) if frame_id else found
 
 
 @dataclass(frozen=True)

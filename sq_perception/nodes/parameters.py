@@ -12,9 +12,10 @@ accepts both.  The range is checked here for both, as the range of a descriptor 
 from __future__ import annotations
 
 import math
+from array import array
 from collections.abc import Callable
 from dataclasses import Field, dataclass, field, fields, replace
-from typing import Any, Generic, Literal, TypeVar, get_args
+from typing import Any, Generic, Literal, TypeVar, cast, get_args
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
 from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
@@ -26,6 +27,7 @@ from sq_perception.grasping.planner import FRICTION
 from sq_perception.imaging import compressed_depth
 from sq_perception.imaging.calibration import Treatment
 from sq_perception.recovery.options import Method, Refine
+from sq_perception.segmentation.standing import Box
 from sq_perception.simulation.sensor_noise import PRESETS
 
 Projection = Literal["pinhole", "orthographic"]
@@ -124,6 +126,13 @@ class RecoverParameters:
         "Largest full edge of an object found by the node's own segmentation: walls, furniture and tables are larger.",
         unit="m",
         within=(0.01, 100.0),
+        live=True,
+    )
+    workspace: tuple[float, ...] = setting(
+        (-100.0, -100.0, -100.0, 100.0, 100.0, 100.0),
+        "Box that the middle of what is seen of an object lies in: least x, y, z, then greatest x, y, z, in "
+        "target_frame, or in the image's frame where there is none. The default keeps all.",
+        unit="m",
         live=True,
     )
     time_budget: float = setting(
@@ -244,7 +253,17 @@ class RecoverParameters:
         """Nearest and farthest depth in metres, infinity where ``depth_max`` is at its upper end."""
         return self.depth_min, math.inf if self.depth_max >= 100.0 else self.depth_max
 
+    @property
+    def box(self) -> Box | None:
+        """``workspace``; None for the default, which keeps all."""
+        return None if self.workspace == RecoverParameters.workspace else cast(Box, self.workspace)
+
     def __post_init__(self) -> None:
+        low, high = self.workspace[:3], self.workspace[3:]
+        if len(self.workspace) != 6 or not all(a < b for a, b in zip(low, high, strict=True)):
+            raise ParameterError(
+                f"workspace: expected least x, y, z and greater x, y, z in metres, got {list(self.workspace)}"
+            )
         if not self.depth_min < self.depth_max:
             raise ParameterError(
                 f"depth_min, depth_max: expected depth_min < depth_max, got {self.depth_min:g} and {self.depth_max:g}"
@@ -458,6 +477,8 @@ def checked(one: Field[Any], value: Any) -> Any:
     about = one.metadata
     if kind is float and isinstance(value, int) and not isinstance(value, bool):
         value = float(value)
+    if kind is tuple and isinstance(value, (list, tuple, array)):
+        value = tuple(map(float, value))
     if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
         raise ParameterError(f"{one.name}: expected a value like {one.default!r}, got {value!r}")
     if about["choices"] and value not in about["choices"]:
@@ -480,7 +501,7 @@ def describe(one: Field[Any], is_fixed: bool = True) -> ParameterDescriptor:
         description=about["description"] + _unit(about, " [{}]"),
         read_only=is_fixed and not about["live"],
     )
-    descriptor.dynamic_typing = kind is float
+    descriptor.dynamic_typing = kind in (float, tuple)
     if about["choices"]:
         descriptor.additional_constraints = "one of: " + ", ".join(about["choices"])
     elif about["within"] is not None:

@@ -8,7 +8,7 @@ from typing import Literal, get_args
 import numpy as np
 
 from sq_perception.imaging import soft_render
-from sq_perception.segmentation import segments
+from sq_perception.segmentation import segments, standing
 
 Method = Literal["auto", "network", "symmetry", "classic"]
 Refine = Literal["surface", "soft_render", "none"]
@@ -40,8 +40,10 @@ class RecoveryOptions:
     max_size
         Largest full edge of an object, metres: walls, furniture and tables are larger.  Masks from outside may be, too.
     workspace
-        The middle of what is seen of an object lies in this box of the optical frame, metres: least x, y, z and
-        greatest x, y, z; None: anywhere.
+        The middle of what is seen of an object lies in this box, metres: least x, y, z and greatest x, y, z; None:
+        anywhere.
+    workspace_pose
+        Quaternion x y z w and translation of the optical frame in the frame of the box; None: they are the same.
     repair
         Join and split own segments where that describes the image in fewer words; masks from outside stay as they are.
 
@@ -61,7 +63,8 @@ class RecoveryOptions:
     use_plane: bool = True
     time_budget: float = np.inf
     max_size: float = 0.6
-    workspace: tuple[float, float, float, float, float, float] | None = None
+    workspace: standing.Box | None = None
+    workspace_pose: standing.Pose | None = None
     repair: bool = True
 
     def __post_init__(self) -> None:
@@ -84,4 +87,5 @@ class RecoveryOptions:
             min_pixels=self.min_pixels,
             max_size=self.max_size,
             workspace=self.workspace,
+            workspace_pose=self.workspace_pose,
         )

@@ -66,8 +66,10 @@ class SegmentationOptions:
     max_size
         Largest edge of an object, metres; what is larger is furniture.  Not asked of labels from outside.
     workspace
-        The middle of what is seen of an object lies in this box of the optical frame, metres: least x, y, z and
-        greatest x, y, z.  None: anywhere.
+        The middle of what is seen of an object lies in this box, metres: least x, y, z and greatest x, y, z.  None:
+        anywhere.
+    workspace_pose
+        Quaternion x y z w and translation of the optical frame in the frame of the box; None: they are the same.
     plane_tolerance
         Half thickness of a plane while it is searched, metres at a depth of one metre.
     min_plane_share
@@ -84,6 +86,7 @@ class SegmentationOptions:
     min_height: float = 0.012
     max_size: float = 0.6
     workspace: standing.Box | None = None
+    workspace_pose: standing.Pose | None = None
     depth_step: float = 0.015
     plane_tolerance: float = 0.008
     min_plane_share: float = 0.1
@@ -218,7 +221,8 @@ def from_labels(
     least = options.min_pixels or 1
     ids = tuple(int(values[k]) for k in order if values[k] > 0 and counts[k] >= least)
     if options.workspace is not None:
-        ids = tuple(k for k in ids if standing.within(options.workspace, _points(labels == k, depth, valid, camera)))
+        box, pose = options.workspace, options.workspace_pose
+        ids = tuple(k for k in ids if standing.within(box, _points(labels == k, depth, valid, camera), pose))
     ids = ids[: options.max_objects]
     plane = None
     if ids and camera.is_pinhole:
@@ -277,7 +281,12 @@ def _points(mask: np.ndarray, depth: np.ndarray, valid: np.ndarray, camera: Came
 
 def _limits(options: SegmentationOptions) -> standing.Limits:
     return standing.Limits(
-        options.min_height, options.max_size, options.workspace, options.plane_tolerance, options.depth_step
+        options.min_height,
+        options.max_size,
+        options.workspace,
+        options.workspace_pose,
+        options.plane_tolerance,
+        options.depth_step,
     )
 
 

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from sq_perception.geometry import rotation
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation.support_plane import Plane, noise_growth
 from sq_perception.segmentation.support_surface import SupportSurface
@@ -24,6 +25,8 @@ from sq_perception.segmentation.support_surface import SupportSurface
 ObjectTest = Callable[[np.ndarray, np.ndarray], bool]
 """Of the rows and columns of a segment's pixels."""
 Box = tuple[float, float, float, float, float, float]
+Pose = tuple[tuple[float, float, float, float], tuple[float, float, float]]
+"""Quaternion x y z w and translation."""
 
 _SAMPLES = 2000
 _BUMP, _ON_WALL = 6.0, 3.5
@@ -52,7 +55,9 @@ class Limits:
     max_size
         Largest edge of a box around what is seen of it, metres.
     workspace
-        The middle of what is seen of it lies in this box of the optical frame: least x, y, z and greatest x, y, z.
+        The middle of what is seen of it lies in this box: least x, y, z and greatest x, y, z.
+    workspace_pose
+        Of the optical frame in the frame of the box; None: they are the same.
     tolerance
         Half thickness of a plane, metres at a depth of one metre.
     step
@@ -62,18 +67,21 @@ class Limits:
     min_height: float
     max_size: float
     workspace: Box | None
+    workspace_pose: Pose | None
     tolerance: float
     step: float
 
     def hold(self, points: np.ndarray, up: np.ndarray | None = None) -> bool:
         """Whether points (n, 3) are no larger than a thing and in the workspace; ``up`` is the support's normal."""
-        if self.workspace is not None and not within(self.workspace, points):
+        if self.workspace is not None and not within(self.workspace, points, self.workspace_pose):
             return False
         return largest_edge(points, up) <= self.max_size
 
 
-def within(box: Box, points: np.ndarray) -> bool:
-    """Whether the middle of points (n, 3) lies in a box of the optical frame."""
+def within(box: Box, points: np.ndarray, pose: Pose | None = None) -> bool:
+    """Whether the middle of points (n, 3) lies in a box; ``pose`` is that of their frame in the frame of the box."""
+    if pose is not None:
+        points = points @ rotation.to_matrix(np.array(pose[0])).T + np.array(pose[1])
     middle = np.median(points, axis=0)
     return bool((middle >= box[:3]).all() and (middle <= box[3:]).all())
 

@@ -534,3 +534,20 @@ def test_the_support_plane_reaches_those_who_come_late(bench):
     bench.until(lambda: heard)
     assert heard[0].header == header
     np.testing.assert_allclose(plane_of(heard[0]), [0.0, -0.8, -0.6, 0.5], atol=1e-12)
+
+
+@pytest.mark.parametrize(("target", "pose"), [("", None), (FRAME_ID, ((0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0)))])
+def test_the_workspace_is_a_box_of_the_target_frame(make_bench, target, pose):
+    box = [-0.5, -0.5, 0.0, 0.5, 0.5, 1.5]
+    bench = make_bench("-p", f"workspace:={box}", "-p", f"target_frame:='{target}'")
+    bench.send_info()
+    bench.answer(bench.depth())
+    options = bench.recoverer.asked[-1][3]
+    assert (options.workspace, options.workspace_pose) == (tuple(box), pose)
+
+
+def test_without_its_transform_a_workspace_refuses_the_frame(make_bench):
+    bench = make_bench("-p", "workspace:=[-1.0, -1.0, 0.0, 1.0, 1.0, 2.0]", "-p", "target_frame:=moon")
+    bench.send_info()
+    assert "target_frame: expected a transform from" in bench.send(bench.depth()).last_error
+    assert bench.recoverer.asked == [], "nothing is computed for a frame that cannot be published"

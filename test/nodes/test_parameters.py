@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import json
 from collections.abc import Iterator
 from dataclasses import asdict, fields
 from typing import Any
@@ -58,7 +59,7 @@ def make_node(context: Context) -> Iterator[Any]:
 def test_the_shipped_file_holds_every_parameter_with_its_default(name, repository):
     with open(repository / "config" / f"{name}.yaml", encoding="utf-8") as file:
         content = yaml.safe_load(file)
-    assert content == {"/**": {"ros__parameters": asdict(KINDS[name]())}}
+    assert content == {"/**": {"ros__parameters": json.loads(json.dumps(asdict(KINDS[name]())))}}
 
 
 def test_the_reference_is_what_the_generator_writes(repository, monkeypatch):
@@ -201,3 +202,18 @@ def test_a_file_that_cannot_be_looked_at_is_a_reason(make_node):
     refused = node.set_parameters([Parameter("model", value="secret.safetensors")])[0]
     assert not refused.successful
     assert "Permission denied" in refused.reason
+
+
+@pytest.mark.parametrize("given", [[0, -1, 0, 1, 1, 2], [0.0, -1.0, 0.0, 1.0, 1.0, 2.0]])
+def test_a_workspace_is_six_numbers_integers_or_not(make_node, given):
+    assert LiveParameters(make_node(), RecoverParameters).current.box is None
+    assert LiveParameters(make_node(workspace=given), RecoverParameters).current.box == (0, -1, 0, 1, 1, 2)
+    node = make_node()
+    live = LiveParameters(node, RecoverParameters)
+    assert node.set_parameters([Parameter("workspace", value=given)])[0].successful
+    assert live.current.box == (0.0, -1.0, 0.0, 1.0, 1.0, 2.0)
+    for wrong in ([0.0, 1.0], [0.0, 0.0, 0.0, 1.0, 1.0, -1.0], [float("nan")] * 6, "all"):
+        result = node.set_parameters([Parameter("workspace", value=wrong)])[0]
+        assert not result.successful
+        assert "workspace: expected" in result.reason
+    assert live.current.box == (0.0, -1.0, 0.0, 1.0, 1.0, 2.0)

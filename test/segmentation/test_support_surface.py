@@ -178,10 +178,18 @@ def test_an_object_is_no_larger_than_max_size():
     assert overlap(truth == 1, found.labels) > 0.9
 
 
-def test_a_workspace_holds_the_middle_of_what_is_seen():
+@pytest.mark.parametrize(
+    ("box", "pose"),
+    [
+        ((0.0, -1.0, 0.0, 1.0, 1.0, 2.0), None),
+        ((-1.0, -1.0, 5.0, 0.0, 1.0, 7.0), ((0.0, 0.0, 1.0, 0.0), (0.0, 0.0, 5.0))),
+    ],
+    ids=["of the camera", "of a frame that is turned about z and lies behind"],
+)
+def test_a_workspace_holds_the_middle_of_what_is_seen(box, pose):
     depth, truth = two_boxes()
     depth = noisy(depth)
-    right = SegmentationOptions(workspace=(0.0, -1.0, 0.0, 1.0, 1.0, 2.0))
+    right = SegmentationOptions(workspace=box, workspace_pose=pose)
     found = segment(depth, CAMERA, right)
     assert len(found.ids) == 1
     assert overlap(truth == 2, found.labels) > 0.9
