@@ -52,12 +52,18 @@ def to_matrix(quaternion: Array) -> Array:
     xp = array_namespace(quaternion)
     q = normalize(quaternion)
     x, y, z, w = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
-    rows = [
-        xp.stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], axis=-1),
-        xp.stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], axis=-1),
-        xp.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], axis=-1),
+    entries = [
+        1 - 2 * (y * y + z * z),
+        2 * (x * y - z * w),
+        2 * (x * z + y * w),
+        2 * (x * y + z * w),
+        1 - 2 * (x * x + z * z),
+        2 * (y * z - x * w),
+        2 * (x * z - y * w),
+        2 * (y * z + x * w),
+        1 - 2 * (x * x + y * y),
     ]
-    return xp.stack(rows, axis=-2)
+    return xp.reshape(xp.stack(entries, axis=-1), (*q.shape[:-1], 3, 3))
 
 
 def from_matrix(matrix: Array) -> Array:
@@ -68,26 +74,13 @@ def from_matrix(matrix: Array) -> Array:
     """
     xp = array_namespace(matrix)
     m = [[matrix[..., i, j] for j in range(3)] for i in range(3)]
-    squares = xp.stack(
-        [
-            1 + m[0][0] - m[1][1] - m[2][2],
-            1 - m[0][0] + m[1][1] - m[2][2],
-            1 - m[0][0] - m[1][1] + m[2][2],
-            1 + m[0][0] + m[1][1] + m[2][2],
-        ],
-        axis=-1,
-    )
+    xx, yy = 1 + m[0][0] - m[1][1] - m[2][2], 1 - m[0][0] + m[1][1] - m[2][2]
+    zz, ww = 1 - m[0][0] - m[1][1] + m[2][2], 1 + m[0][0] + m[1][1] + m[2][2]
     xy, xz, yz = m[0][1] + m[1][0], m[0][2] + m[2][0], m[1][2] + m[2][1]
     xw, yw, zw = m[2][1] - m[1][2], m[0][2] - m[2][0], m[1][0] - m[0][1]
-    rows = xp.stack(
-        [
-            xp.stack([squares[..., 0], xy, xz, xw], axis=-1),
-            xp.stack([xy, squares[..., 1], yz, yw], axis=-1),
-            xp.stack([xz, yz, squares[..., 2], zw], axis=-1),
-            xp.stack([xw, yw, zw, squares[..., 3]], axis=-1),
-        ],
-        axis=-2,
-    )
+    products = xp.stack([xx, xy, xz, xw, xy, yy, yz, yw, xz, yz, zz, zw, xw, yw, zw, ww], axis=-1)
+    rows = xp.reshape(products, (*matrix.shape[:-2], 4, 4))
+    squares = xp.stack([xx, yy, zz, ww], axis=-1)
     best = xp.argmax(squares, axis=-1)
     row = xp.zeros_like(rows[..., 0, :])
     for i in range(4):
