@@ -2,6 +2,7 @@
 # make quick   the tests of the core: no processes, no ROS, no browser; about a minute
 # make test    lint and the whole test suite, against the installed package
 # make lint    ruff and mypy alone
+# make speed   what a frame costs against a fixed loop and the classic fit, beside the figures last recorded
 # make bench   every benchmark, hours
 # make docs    the pages of docs/ as a site: site/index.html
 # make clean   remove everything that these commands made
@@ -31,7 +32,7 @@ SOURCES := setup.py setup.cfg pyproject.toml package.xml resource/sq_perception 
 
 CORE := geometry files imaging segmentation fitting tracking sq_msgs_py
 
-.PHONY: demo quick test lint bench docs install clean
+.PHONY: demo quick test lint speed bench docs install clean
 .DEFAULT_GOAL := install
 
 install: $(VENV)/.package
@@ -72,6 +73,9 @@ quick: $(VENV)/.package
 # The executable, not `python -m pytest`: that would put the source tree before the installed package.
 test: lint
 	$(VENV)/bin/pytest test
+
+speed: $(VENV)/.package
+	$(VENV)/bin/python benchmarks/speed.py --repeats 3
 
 bench: $(VENV)/.package
 	for script in benchmarks/*.py; do $(VENV)/bin/python "$$script" || exit 1; done

@@ -276,6 +276,29 @@ def _rooms_of(path: Path) -> Iterator[str]:
                 yield rest.partition(".")[0]
 
 
+def speed() -> str:
+    """What a frame costs, before and now."""
+    found = results("speed")
+
+    def shares(part: dict[str, float]) -> str:
+        return " / ".join(f"{100 * share:.0f}" for share in part.values())
+
+    heads = ["frame", "loops before", "now", "times the classic fits before", "now"]
+    heads += [
+        "segmentation / network / fit / repair / score %",
+        "compiled / libraries / interpreter %",
+        "IoU % before",
+        "now",
+    ]
+    rows = []
+    for name, row in found["rows"].items():
+        then = found["before"].get(name, row)
+        pairs = [f"{one[key]:.1f}" for key in ("loops", "classic") for one in (then, row)]
+        iou = [f"{100 * one['iou']:.1f}" for one in (then, row)]
+        rows.append([name, *pairs, shares(row["stages"]), shares(row["kinds"]), *iou])
+    return table(heads, rows) + measured("speed")
+
+
 def known() -> str:
     """Recorded frames of known sizes: what the fit makes of each kind."""
     groups = results("known_frames")["groups"]
@@ -348,6 +371,7 @@ BLOCKS: dict[str, Callable[[], str]] = {
         known,
         recorded,
         frame_time,
+        speed,
         latency,
         picking,
         tracks,

@@ -1,0 +1,203 @@
+"""What a frame costs, in units that hold on a busy machine: processor time over that of a fixed loop and a classic fit.
+
+    python benchmarks/speed.py [--repeats 5] [--record]
+
+Frames: the first of frame_time's VGA scenes of 1, 5 and 20 bodies through the first of its sensors, own masks and given
+ones, and one 256 x 256 image of the thesis' protocol.  One thread for everything.  Every repetition measures the loop,
+the classic fits of all objects (Solina and Bajcsy's, 1000 points each) and the frame after each other, so that what
+slows the processor slows all three; ratios are medians.  Processor time leaves out what others take, not
+that their work empties the caches.
+
+    loops     processor time of the frame / that of ``arithmetic``
+    classic   the same / that of the classic fits of its objects
+    stages    shares of the frame, the network's under ``fit`` where it computes beside the fit
+    compiled  share in kernels, in libraries (NumPy, OpenCV, torch), in the interpreter, as the profiler sees it: it
+              slows the interpreter alone
+    IoU       of volumes, mean over the true bodies at least half visible
+
+Printed beside the ratios in ``results/speed.json``, those last recorded: at a release, or where something was made
+faster; ``--record`` replaces them and keeps what they replace.  Under two minutes on an idle core.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+
+if __name__ == "__main__":  # as a script only: a process that imports this has threads already
+    for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
+        os.environ.setdefault(variable, "1")
+
+import cProfile
+import pstats
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+from unittest import mock
+
+import frame_time
+import numpy as np
+import report
+import single_body
+import torch
+from synthetic_tabletop import STAGES, scored
+
+from sq_perception.fitting import solina_bajcsy
+from sq_perception.geometry import metrics
+from sq_perception.imaging.camera import Camera
+from sq_perception.recovery import recoverer
+from sq_perception.recovery.options import Method, RecoveryOptions
+from sq_perception.recovery.recovery import FrameRecovery
+
+STEPS, LENGTH = 300, 2000
+"""Of the loop: as much interpreter as NumPy, some milliseconds."""
+KINDS = ("compiled", "libraries", "interpreter")
+
+
+@dataclass(frozen=True)
+class Work:
+    """One row: a frame, how it is recovered, and how good the answer is."""
+
+    name: str
+    depth: np.ndarray
+    camera: Camera
+    labels: np.ndarray | None
+    masks: np.ndarray
+    method: Method
+    seen: frame_time.Frame | None
+    truth: Any
+
+    def iou(self, found: FrameRecovery) -> float:
+        if self.seen is not None:
+            return float(np.mean(scored(self.seen, found).ious))
+        return float(metrics.volume_iou(found.bodies[0].superquadric, self.truth)) if found.bodies else 0.0
+
+
+def works() -> list[Work]:
+    """The rows, in their order."""
+    body = single_body.cube_bodies(1, np.random.default_rng(single_body.SEED))[0]
+    image = single_body.orthographic(body)
+    methods: tuple[Method, ...] = ("symmetry", "auto", "network")
+    ones = image.mask.astype(np.int32)
+    rows = [Work(f"thesis, {m}", image.depth, image.camera, None, ones, m, None, body) for m in methods]
+    camera = frame_time.camera(*frame_time.IMAGES[0])
+    for count in frame_time.GOALS:
+        frame = frame_time.frame(count, 0, camera, frame_time.SENSORS[0])
+        for name, labels in (("own", None), ("given", frame.labels)):
+            row = Work(f"VGA, {count}, {name}", frame.depth, camera, labels, frame.labels, "auto", frame, None)
+            rows.append(row)
+    return rows
+
+
+def arithmetic() -> float:
+    """The loop that everything is measured in."""
+    values, total = np.linspace(0.1, 1.0, LENGTH), 0.0
+    for step in range(STEPS):
+        values = np.sqrt(values * values + 1e-9 * step)
+        total += sum(number * 0.5 for number in (1.0, 2.0, 3.0, float(values[0])))
+    return total
+
+
+def classic(work: Work) -> None:
+    """The classic fit of every object."""
+    for label in range(1, int(work.masks.max()) + 1):
+        rows, columns = np.nonzero((work.masks == label) & np.isfinite(work.depth))
+        chosen = np.linspace(0, len(rows) - 1, min(len(rows), 1000)).astype(int)
+        rows, columns = rows[chosen], columns[chosen]
+        solina_bajcsy.fit(work.camera.unproject(columns, rows, work.depth[rows, columns]))
+
+
+@contextmanager
+def by_processor(milliseconds: dict[str, float], stage: str) -> Iterator[None]:
+    """The recoverer's stages by processor time."""
+    began = time.process_time()
+    yield
+    milliseconds[stage] = 1e3 * (time.process_time() - began)
+
+
+def measured(chain: recoverer.Recoverer, work: Work, repeats: int) -> dict[str, Any]:
+    """A row's ratios."""
+    options = RecoveryOptions(method=work.method)
+
+    def frame() -> FrameRecovery:
+        return chain.recover(work.depth, work.camera, work.labels, options)
+
+    found, times, stages = frame(), [], []
+    for _ in range(repeats):
+        moments = [time.process_time()]
+        arithmetic()
+        moments.append(time.process_time())
+        classic(work)
+        moments.append(time.process_time())
+        found = frame()
+        moments.append(time.process_time())
+        times.append(np.diff(moments))
+        stages.append([found.milliseconds[stage] for stage in STAGES if stage != "total"])
+    loop, old, new = np.array(times).T
+    spent = np.median(stages, axis=0)
+    return {
+        "loops": float(np.median(new / loop)),
+        "classic": float(np.median(new / old)),
+        "ms": 1e3 * float(np.min(new)),
+        "stages": dict(zip((s for s in STAGES if s != "total"), (spent / spent.sum()).tolist(), strict=True)),
+        "kinds": kinds(frame),
+        "iou": work.iou(found),
+    }
+
+
+def kinds(frame: Any) -> dict[str, float]:
+    """Shares of compiled code, libraries and interpreter in one frame."""
+    profile = cProfile.Profile(time.thread_time)
+    profile.runcall(frame)
+    spent = dict.fromkeys(KINDS, 0.0)
+    kernels = {
+        (code.co_filename, code.co_firstlineno)
+        for name, module in list(sys.modules.items())
+        if name.startswith("sq_perception.")
+        for each in vars(module).values()
+        if hasattr(each, "py_func") and (code := each.py_func.__code__)
+    }
+    statistics: dict[tuple[str, int, str], tuple[int, int, float, float, Any]] = pstats.Stats(profile).stats  # type: ignore[attr-defined]
+    for (file, line, _), (_, _, own, _, _) in statistics.items():
+        kind = "compiled" if (file, line) in kernels else "libraries" if file == "~" else "interpreter"
+        spent[kind] += own
+    return {kind: seconds / sum(spent.values()) for kind, seconds in spent.items()}
+
+
+HEADER = ["frame", "loops", "recorded", "classic fits", "recorded", "of which " + " / ".join(STAGES[:-1]) + " %"]
+HEADER += [" / ".join(KINDS) + " %", "IoU %"]
+
+
+def line(name: str, row: dict[str, Any], before: dict[str, Any]) -> list[str]:
+    """A row of the table."""
+    then = [f"{before[name][key]:.1f}" if name in before else "-" for key in ("loops", "classic")]
+    shares = [" / ".join(f"{100 * share:.0f}" for share in row[part].values()) for part in ("stages", "kinds")]
+    return [name, f"{row['loops']:.1f}", then[0], f"{row['classic']:.1f}", then[1], *shares, f"{100 * row['iou']:.1f}"]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--record", action="store_true", help="keep the figures")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    before = report.previous("speed", "rows")
+    rows: dict[str, dict[str, Any]] = {}
+    chain = recoverer.Recoverer(threads=1)
+    with mock.patch.object(recoverer, "_timed", by_processor):
+        for work in works():
+            chain.warm_up(work.camera)
+            rows[work.name] = measured(chain, work, options.repeats)
+            print(" | ".join(line(work.name, rows[work.name], before)), flush=True)
+    text = report.table(HEADER, [line(name, row, before) for name, row in rows.items()])
+    if options.record:
+        report.write("speed", {"rows": rows, "before": before}, text)
+    else:
+        print(text)
+
+
+if __name__ == "__main__":
+    main()
