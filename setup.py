@@ -2,6 +2,7 @@
 
 import sys
 from glob import glob
+from pathlib import Path
 
 from setuptools import setup
 
@@ -60,7 +61,8 @@ setup(
     name=NAME,
     version="0.2.0",
     description="Superquadrics from depth images: a network, exact fits and ROS 2 nodes",
-    long_description="Depth images in, superquadrics with pose, shape, score and uncertainty out; see README.md.",
+    long_description=Path(__file__).with_name("README.md").read_text(encoding="utf-8"),
+    long_description_content_type="text/markdown",
     author="sq_perception maintainers",
     author_email="sq-perception@example.org",
     license="Apache-2.0",
@@ -76,6 +78,7 @@ setup(
     package_data={
         "sq_perception.config": ["*.rviz", "*.xml", "*.yaml"],
         "sq_perception.learning": ["configurations/*.yaml"],
+        "sq_perception.recordings": ["*.json"],
         "sq_perception.weights": ["*.safetensors", "*.json", "*.md"],
         "sq_perception": ["py.typed"],
         "sq_msgs_py": ["py.typed"],
@@ -117,6 +120,7 @@ setup(
             *docs,
             "pytest>=7,<8.4",  # later ones break the launch_testing plugins of a ROS installation
             "hypothesis>=6",
+            "jsonschema>=4.18",  # what recover writes against its schema
             "mcap-ros2-support>=0.5",  # reads bags independently of the code that wrote them
             "ruff>=0.6",
             "mypy>=1.11",
@@ -144,7 +148,12 @@ setup(
         ],
     },
     classifiers=[
-        "Programming Language :: Python :: 3",
+        "Development Status :: 4 - Beta",
+        "Intended Audience :: Science/Research",
+        "License :: OSI Approved :: Apache Software License",
+        "Operating System :: POSIX :: Linux",
+        *(f"Programming Language :: Python :: 3.{minor}" for minor in (10, 11, 12, 13)),
+        "Topic :: Scientific/Engineering :: Image Processing",
         "Topic :: Scientific/Engineering :: Image Recognition",
     ],
 )

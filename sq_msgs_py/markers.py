@@ -26,15 +26,17 @@ Mesh = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 PALETTE = np.array(
     [
-        [0.20, 0.47, 0.80],
-        [0.93, 0.55, 0.18],
-        [0.27, 0.66, 0.44],
-        [0.78, 0.31, 0.40],
-        [0.55, 0.43, 0.75],
-        [0.36, 0.70, 0.75],
+        [0.02, 0.58, 0.97],
+        [0.96, 0.75, 0.05],
+        [0.02, 0.68, 0.46],
+        [0.53, 0.19, 0.61],
+        [0.77, 0.17, 0.07],
+        [0.35, 0.77, 0.97],
+        [0.69, 0.88, 0.48],
+        [0.55, 0.10, 0.15],
     ]
 )
-"""Colours that bodies take in turn, by id."""
+"""Colours that bodies take in turn, by id: those of sq_perception.geometry.mesh, where their choice is explained."""
 
 
 def markers(

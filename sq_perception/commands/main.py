@@ -31,6 +31,7 @@ COMMANDS = {
     "render-search": ("sq_perception.commands.render_search", "find the best s and tau of the soft renderer"),
     "gradient-search": ("sq_perception.commands.gradient_search", "watch a body walk down a loss, step by step"),
     "export": ("sq_perception.commands.export", "write a network as ONNX"),
+    "doctor": ("sq_perception.commands.doctor", "versions, extras, kernels, cores, and what is missing"),
     "warm-up": ("sq_perception.commands.warm_up", "compile everything once, so that no first image waits"),
 }
 """Name, module and summary."""
@@ -43,6 +44,9 @@ examples:
   sq-perception train --help
   sq-perception evaluate --help
 """
+
+_VIEW_RECORDING = "sq_perception.commands.view_recording"
+"""Of ``view FRAME ...``, which needs no ROS."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -79,8 +83,9 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run(name: str, arguments: list[str]) -> int:
+    is_recording = name == "view" and arguments and not arguments[0].startswith("-")
     try:
-        module = importlib.import_module(COMMANDS[name][0])
+        module = importlib.import_module(_VIEW_RECORDING if is_recording else COMMANDS[name][0])
     except ModuleNotFoundError as error:
         if name != "demo":
             raise

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from sq_perception.recordings.inputs import RecordedInput
     from sq_perception.recordings.result_bag import ResultBag
     from sq_perception.recordings.result_json import ResultLines
+    from sq_perception.recordings.still_page import StillPage
     from sq_perception.recovery.recoverer import Recoverer, Recovery, RecoveryOptions
 
 
@@ -34,13 +35,14 @@ Recover superquadrics from recorded depth images.
 A FRAME is
   .npz           depth (float, metres, NaN = no reading) and K (3 x 3); optional labels = instance masks, which are
                  then used instead of an own segmentation
-  .png, 16 bit   millimetres (or see --depth-scale), 0 = no reading, with --camera-info or a camera file beside it
-  .npy           floats in metres, or uint16 as a PNG's; with a camera likewise
+  an image       PNG or TIFF of 16 bit (millimetres), TIFF, EXR or NPY of floats (metres), or see --depth-scale;
+                 0 = no reading; with --camera-info or a camera file beside it
+  .pcd, .ply     a point cloud in the optical frame; a PCD that is an image of a pinhole camera is taken as one
   .png, .bmp     with --projection orthographic: grey images of the unit cube, larger is nearer, 0 = background
-  a folder       all frames in it, in natural order; camera_info.yaml, camera.yaml, intrinsics.json or
-                 camera_intrinsic.json in it is the camera of its images
+  a folder       all frames in it, in natural order, or those of its subfolders where it has none; camera_info.yaml,
+                 camera.yaml, intrinsics.json or camera_intrinsic.json in it is the camera of its images
   a rosbag2      a folder with metadata.yaml, or a .mcap or .db3 file: 16UC1 and 32FC1 images, raw or compressedDepth,
-                 with the camera_info beside their topic; needs no ROS, but the extra 'bags'
+                 with the camera_info beside their topic, and masks on mask/image; needs no ROS, but the extra 'bags'
 
 What cannot be read is reported and skipped; the exit code is then 1.
 """
@@ -53,30 +55,25 @@ methods:
 
 examples:
   sq-perception recover table.npz --json out.json --pictures pictures/
-  sq-perception recover depth_*.png --camera-info camera.yaml --json out.json
+  sq-perception recover depth_*.png --camera-info 525,525,319.5,239.5 --csv out.csv --html out.html
   sq-perception recover recording/ --topic /camera/depth/image_rect_raw --every 10 --meshes meshes/
   sq-perception recover thousand_frames/ --jsonl out.jsonl             # again after Ctrl-C: goes on
-  sq-perception recover recording/ --track --json tracks.json
   sq-perception recover recording/ --track --mcap results.mcap
   sq-perception recover views/*.bmp --projection orthographic --method network --json -
-  sq-perception recover table.npz --ignore-masks --refine soft_render
+
+a line a body:
+  0 converged 480 x 196 x 214 mm (+-5 +-11 +-7) at 0.12 0.03 0.84 m
+  Its place in "superquadrics" and in the meshes, its status, FULL edges with their standard deviations, its centre.
+  What weak and failed mean, and what to do with them: docs/how_sure.md.
 
 files:
   What is there stays until something better can take its place: a result that was interrupted, or of no frame at all,
   does not replace a file but is put beside it as NAME.partial.SUFFIX.  Devices, FIFOs and links are written through.
   --jsonl FILE grows by a line a frame; the same command with the same file skips the frames that are in it.
-
-output:
-  {"format": ..., "version": ..., "options": {...},
-   "frames": [{"file": ..., "ms": ..., "superquadrics": [{"size": [a1, a2, a3], "shape": [e1, e2],
-   "translation": [x, y, z], "rotation": [x, y, z, w], "score": ..., "residual": ..., "sigma_size": [...],
-   "seen": [...], "status": "converged" | "weak" | "failed", "message": ..., "label": ..., "pixels": ...,
-   "track": ...}, ...], "stamp": {"sec": ..., "nanosec": ...}, "topic": ..., "frame_id": ...}, ...]}
-  Half sizes and positions are metres in the optical frame (x right, y down, z forward); for orthographic frames the
-  unit cube (x right, y up, z to the viewer).  What is unknown is null: topic and frame_id of anything but a bag,
-  and stamp, unless a file's name is its time (1305031102.160407.png).  "seen" is the share of each size that the
-  measured points span; the rest is inferred.  A failed object is listed with its reason; its numbers only say where it
-  is.  "label" is the mask's value, null without masks; "pixels" counts the measured ones.
+  JSON has HALF sizes in metres; sq_perception/recordings/result.schema.json describes every field of it.  CSV has a row
+  a body, with the same numbers.  Positions are in the optical frame (x right, y down, z forward); those of orthographic
+  frames in the unit cube (x right, y up, z to the viewer).  A file whose name is a time (1305031102.160407.png) has
+  that stamp.
 
 distortion:
   Where a camera_info has distortion coefficients that are not zero, --distortion auto takes images for rectified if the
@@ -85,10 +82,8 @@ distortion:
   shows what the raw image shows.  models: plumb_bob, rational_polynomial, equidistant.
 
 tracking:
-  --track follows bodies over the frames of each bag and folder, for a camera that stands still.  "track" is then
-  {"id": ..., "seen": ..., "fused": true | false, "size": ..., "shape": ..., "translation": ..., "rotation": ...,
-  "sigma_size": ...}: the same body keeps its id and the names of its axes; fused numbers are those of all frames so
-  far, others the frame's own.  It is null without --track and for failed objects.
+  --track follows bodies over the frames of each bag and folder, for a camera that stands still: the same body keeps its
+  id and the names of its axes, and "track" has the numbers of all frames so far.
 
 bags:
   --mcap writes what recover_node would have published, and what it would have read, with stamps, frame ids and times of
@@ -98,7 +93,7 @@ bags:
 meshes:
   One file a frame with all its bodies, in metres, coloured as in the pictures; a frame without a body gets none.  PLY
   has the coordinates of the JSON.  GLB turns the optical frame half about x, as its y axis points up, and names each
-  body by its position in "superquadrics": body_0, body_1, ...
+  body by its place in "superquadrics": body_0, body_1, ...
 """
 
 
@@ -118,6 +113,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="OUT",
         help="add a line there for each frame when it is done, and skip those it has; see below",
     )
+    parser.add_argument("--csv", metavar="OUT", help="write the bodies there as a table; - is the standard output")
+    parser.add_argument("--html", metavar="OUT", help="write one page with points, bodies and numbers, for any browser")
     parser.add_argument("--projection", choices=("pinhole", "orthographic"), default="pinhole")
     methods = ("auto", "network", "symmetry", "classic")
     parser.add_argument("--method", choices=methods, default="auto", help="see below")
@@ -137,7 +134,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--depth-scale",
         type=float,
         metavar="N",
-        help="units a metre of 16 bit files (default 1000; TUM RGB-D has 5000)",
+        help="units a metre (default 1000 of whole numbers, TUM RGB-D has 5000; 1 of floats)",
     )
     parser.add_argument("--depth-min", type=float, default=0.0, metavar="M", help="metres; nearer readings are none")
     parser.add_argument("--depth-max", type=float, default=math.inf, metavar="M", help="metres; farther ones likewise")
@@ -222,6 +219,7 @@ def run(options: argparse.Namespace) -> int:
 
     import torch
 
+    from sq_perception.commands.recover_lines import lines as lines_of
     from sq_perception.learning.checkpoint import CheckpointError
     from sq_perception.recordings.frame_file import FrameError, Reading
     from sq_perception.recordings.inputs import RecordedInput
@@ -270,34 +268,36 @@ def run(options: argparse.Namespace) -> int:
         complain(str(error))
         return FAILURE
 
-    lines, bag = None, None
+    lines, bag, page = None, None, None
     try:
         if options.jsonl:
             lines = ResultLines(recover_outputs.place(options.jsonl), recover_outputs.decisive(options))
-            if lines.done and (options.track or options.mcap):
-                name = "--track" if options.track else "--mcap"
+            if lines.done and (options.track or options.mcap or options.html):
+                name = "--track" if options.track else "--mcap" if options.mcap else "--html"
                 lines.close()
                 return misused(f"--jsonl: {options.jsonl} has {len(lines.done)} frames already, and {name} needs all")
             done.add(lines.done)
         bag = recover_outputs.bag(options)
+        page = recover_outputs.page(options)
     except ValueError as error:
         return misused(str(error))
     except (OSError, ImportError) as error:
         complain(str(error))
         return FAILURE
 
-    run = _Run(options, recoverer, settings, lines, bag)
+    run = _Run(options, recoverer, settings, lines, bag, page)
     try:
         code = run.over(recorded)
     finally:
         if lines is not None:
             lines.close()
     entries = [*(lines.done if lines else []), *run.results]
-    for problem in recover_outputs.finish(options, entries, bag, run.is_whole):
+    for problem in recover_outputs.finish(options, entries, {"mcap": bag, "html": page}, run.is_whole):
         complain(problem)
         code = code or FAILURE
-    if "-" not in (options.json, options.jsonl) and not options.quiet:
-        _print_table(run.results, options.verbose)
+    if "-" not in (options.json, options.jsonl, options.csv) and not options.quiet:
+        for line in lines_of(run.results, options.verbose):
+            print(line)
     if not options.quiet:
         complain(run.summary())
     return code
@@ -313,6 +313,7 @@ class _Run:
         settings: RecoveryOptions,
         lines: ResultLines | None,
         bag: ResultBag | None,
+        page: StillPage | None,
     ) -> None:
         from sq_perception.recordings.tracks import RecordedTracks
 
@@ -321,7 +322,7 @@ class _Run:
         self.is_whole = False
         """Whether all frames were tried."""
         self._options, self._recoverer, self._settings = options, recoverer, settings
-        self._lines, self._bag = lines, bag
+        self._lines, self._bag, self._page = lines, bag, page
         self._tracks = RecordedTracks(lambda text: complain(f"warning: {text}")) if options.track else None
         self._warm: set[Any] = set()
         self._stems = {Path(one["file"]).stem for one in lines.done if not one.get("topic")} if lines else set()
@@ -377,7 +378,9 @@ class _Run:
             if frame.camera not in self._warm:
                 self._recoverer.warm_up(frame.camera)
                 self._warm.add(frame.camera)
-            recovery = self._recoverer.recover(frame.depth, frame.camera, labels, self._settings)
+            recovery = self._recoverer.recover(
+                frame.depth, frame.camera, labels, replace(self._settings, free_space=frame.has_free_space)
+            )
         except (ValueError, ArithmeticError) as error:  # a camera that no image can have come from
             raise FrameError(f"{file}: {frame.name}: {error}") from error
         recovery = replace(recovery, bodies=tuple(body for body in recovery.bodies if self._is_wanted(body)))
@@ -392,6 +395,8 @@ class _Run:
             recover_outputs.write_mesh(path, frame, recovery)
         if self._bag is not None:
             self._bag.add(frame, recovery, tracks if self._tracks else None)
+        if self._page is not None:
+            self._page.add(frame, recovery)
         if self._lines is not None:  # last: what has a line has all its files
             self._lines.add(entry)
 
@@ -424,24 +429,3 @@ def _progress(recorded: RecordedInput) -> Iterator[tuple[str, Any]]:
             bar.update(task, total=recorded.total, visible=recorded.total > 1)
             yield pair
             bar.advance(task)
-
-
-def _print_table(results: list[dict[str, Any]], verbose: bool) -> None:
-    for entry in results:
-        cube = entry["coordinates"] == "cube"
-        stamp = entry["stamp"]
-        taken = "" if stamp is None else f"  {stamp['sec']}.{stamp['nanosec']:09d}"
-        print(f"{entry['file']}{taken}  {entry['ms']:.0f} ms  {entry['message']}".rstrip())
-        if verbose:
-            print("  " + ", ".join(f"{stage} {value:.0f} ms" for stage, value in entry["ms_by_stage"].items()))
-        scale, unit, digits = (1.0, "", 4) if cube else (1e3, " mm", 1)
-        for body in entry["superquadrics"]:
-            label = "" if body["label"] is None else f"mask {body['label']}: "
-            label += "" if body["track"] is None else f"id {body['track']['id']}: "
-            if body["status"] == "failed":
-                print(f"  {label}failed: {body['message']}")
-                continue
-            size = " x ".join(f"{scale * value:.{digits}f}" for value in body["size"])
-            shape = " ".join(f"{value:.2f}" for value in body["shape"])
-            note = f"  ({body['message']})" if body["status"] == "weak" else ""
-            print(f"  {label}half sizes {size}{unit}, exponents {shape}, score {body['score']:.3f}{note}")

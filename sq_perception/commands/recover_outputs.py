@@ -17,10 +17,13 @@ from sq_perception.files import output_file
 if TYPE_CHECKING:
     from sq_perception.recordings.frame_file import RecordedFrame
     from sq_perception.recordings.result_bag import ResultBag
+    from sq_perception.recordings.still_page import StillPage
     from sq_perception.recovery.recoverer import FrameRecovery
 
 STANDARD_OUTPUT = "-"
-_FILES, _FOLDERS = ("json", "jsonl", "mcap"), ("pictures", "meshes")
+_FILES, _FOLDERS = ("json", "jsonl", "csv", "mcap", "html"), ("pictures", "meshes")
+_BINARY = ("mcap", "html")
+"""Never on the standard output."""
 _DECISIVE = (
     "projection",
     "method",
@@ -47,11 +50,11 @@ _DECISIVE = (
 
 def misuse(options: argparse.Namespace) -> str:
     """What is wrong with the names of the outputs; empty if nothing.  Folders that are missing are made."""
-    if options.json == options.jsonl == STANDARD_OUTPUT:
-        return "--json, --jsonl: only one of them can be the standard output"
+    if [options.json, options.jsonl, options.csv].count(STANDARD_OUTPUT) > 1:
+        return "--json, --jsonl, --csv: only one of them can be the standard output"
     for name in _FILES:
         path = getattr(options, name)
-        if not path or (path == STANDARD_OUTPUT and name != "mcap"):
+        if not path or (path == STANDARD_OUTPUT and name not in _BINARY):
             continue
         if not Path(path).resolve().parent.is_dir():
             return f"--{name}: {path}: its folder does not exist"
@@ -118,36 +121,53 @@ def bag(options: argparse.Namespace) -> ResultBag | None:
         raise ImportError(f"--mcap: {error}") from error
 
 
+def page(options: argparse.Namespace) -> StillPage | None:
+    """The page that was asked for, open; raises OSError if it cannot be written."""
+    if not options.html:
+        return None
+    from sq_perception.recordings.still_page import StillPage
+
+    return StillPage(options.html)
+
+
 def finish(
-    options: argparse.Namespace, entries: Sequence[Mapping[str, Any]], bag: ResultBag | None, whole: bool
+    options: argparse.Namespace,
+    entries: Sequence[Mapping[str, Any]],
+    growing: Mapping[str, ResultBag | StillPage | None],
+    whole: bool,
 ) -> Iterator[str]:
-    """Close the bag and write the document; what could not be done, or went elsewhere, one sentence after the other.
+    """Close what grew and write the documents; what could not be done, or went elsewhere, one sentence each.
 
     ``whole`` says whether all frames were tried.
     """
-    try:
-        if bag is not None and (found := bag.close(whole)) is not None and found != Path(options.mcap):
-            yield f"--mcap: unfinished, so {options.mcap} stays as it is: see {found}"
-    except OSError as error:
-        yield f"--mcap: {error}"
-    if not options.json:
-        return
-    from sq_perception.recordings.result_json import document
+    for name, output in growing.items():
+        try:
+            if output is not None and (found := output.close(whole)) is not None:
+                yield from _elsewhere(name, Path(getattr(options, name)), found)
+        except OSError as error:
+            yield f"--{name}: {error}"
+    from sq_perception.recordings import result_json
 
-    text = document(decisive(options), entries)
-    if options.json == STANDARD_OUTPUT:
-        sys.stdout.write(text)
-        return
-    path = Path(options.json)
-    try:
-        if not entries and path.is_file() and path.stat().st_size:
-            yield f"--json: no frame was read, so {path} stays as it is"
-            return
-        found = output_file.write(path, text.encode(), whole)
-        if found != path:
-            yield f"--json: unfinished, so {path} stays as it is: see {found}"
-    except OSError as error:
-        yield f"--json: {error}"
+    for name, text in (
+        ("json", lambda: result_json.document(decisive(options), entries)),
+        ("csv", lambda: result_json.table(entries)),
+    ):
+        if getattr(options, name) == STANDARD_OUTPUT:
+            sys.stdout.write(text())
+        elif getattr(options, name):
+            path = Path(getattr(options, name))
+            try:
+                if not entries and path.is_file() and path.stat().st_size:
+                    yield f"--{name}: no frame was read, so {path} stays as it is"
+                else:
+                    yield from _elsewhere(name, path, output_file.write(path, text().encode(), whole))
+            except OSError as error:
+                yield f"--{name}: {error}"
+
+
+def _elsewhere(name: str, path: Path, found: Path) -> Iterator[str]:
+    if found != path:
+        yield f"--{name}: unfinished, so {path} stays as it is: see {found}"
 
 
 def draw(path: Path, frame: RecordedFrame, recovery: FrameRecovery) -> None:

@@ -106,7 +106,8 @@ def _parser() -> argparse.ArgumentParser:
         prog="sq-perception view",
         description="A page in the browser: depth as points, superquadrics with their uncertainty, rates, latencies, "
         "and parameters to change while the nodes run. Everything comes from this machine, nothing from the internet.",
-        epilog="examples:\n  sq-perception view\n"
+        epilog="recordings, without ROS:\n  sq-perception view FRAME ...    # sq-perception view FRAME --help\n\n"
+        "examples:\n  sq-perception view\n"
         "  sq-perception view --depth /camera/camera/depth/image_rect_raw --node /recover_node --node /fitter_node\n"
         "  sq-perception view --ros-args -r depth/image:=/camera/depth/image_raw\n"
         "  ssh -L 8080:localhost:8080 robot    # on the machine with the screen; then http://localhost:8080",

@@ -25,18 +25,20 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Polygon, Rectangle
 from scipy.spatial import ConvexHull
 
+from sq_perception.fitting.covariance import undetermined
 from sq_perception.fitting.fit import Status
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.mesh import COLOURS, mesh, outline
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
-from sq_perception.recovery.recoverer import FrameRecovery
+from sq_perception.recovery import wording
+from sq_perception.recovery.recovery import FrameRecovery, Recovery
 
 INK = "#22303c"
 WIRE = "#d1006c"
 NOTHING = "#1b2129"
-_FAINT = "#8a97a3"
+FAINT = "#8a97a3"
 _DEPTH_MAP = LinearSegmentedColormap.from_list("depth", ["#f4f6f7", "#c3ced6", "#8b9dab", "#566a7b", "#36475a"])
 _CONTOUR_PIXELS = 1280
 _MOST_POINTS = 1500
@@ -218,67 +220,72 @@ def picture_axes(elevation: float, azimuth: float, plane: np.ndarray | None = No
 def recovery_figure(
     depth: np.ndarray, camera: Camera, recovery: FrameRecovery, title: str = "", unit: str = "m"
 ) -> Figure:
-    """The whole story of one frame: input and masks, outlines on the depth picture, two 3D views, numbers."""
+    """The whole story of one frame: input and masks, outlines on the depth picture, two 3D views, numbers.
+
+    A body has the same number, its place in ``recovery.bodies``, wherever it is drawn.
+    """
     shown = [(k, body) for k, body in enumerate(recovery.bodies) if body.status != Status.FAILED]
     bodies = [body.superquadric for _, body in shown]
     shades = [colour(k) for k, _ in shown]
     figure = new_figure(14.4, 10.4)
     edges = {"left": 0.02, "right": 0.985, "top": 0.925, "bottom": 0.03}
-    rows = figure.add_gridspec(2, 1, height_ratios=(1.25, 1), hspace=0.12, **edges)
+    rows = figure.add_gridspec(2, 1, height_ratios=(1.25, 1), hspace=0.16, **edges)
     top = rows[0].subgridspec(1, 2, wspace=0.04)
-    bottom = rows[1].subgridspec(1, 3, wspace=0.02, width_ratios=(1, 1, 0.95))
+    bottom = rows[1].subgridspec(1, 3, wspace=0.02, width_ratios=(1, 1, 1.05))
     figure.text(0.02, 0.968, title or "Recovered superquadrics", fontsize=15, weight="bold", color=INK)
 
-    window = _window(recovery, bodies, camera)
-    limits = _limits(depth, window)
+    pixels = np.argwhere(np.isin(recovery.labels, [body.label for body in recovery.bodies]))[:, ::-1].astype(float)
+    window = window_of(bodies, camera, pixels)
+    limits = span_within(depth, window)
     left = figure.add_subplot(top[0])
     draw_depth(left, depth, limits)
+    _depth_bar(left, limits, unit)
     draw_masks(left, recovery.labels, [body.label for body in recovery.bodies])
-    _heading(left, "Depth and masks", f"{camera.width} x {camera.height}, {limits[0]:.2f} to {limits[1]:.2f} {unit}")
+    heading_of(left, "Depth and masks", f"{camera.width} x {camera.height}")
     right = figure.add_subplot(top[1])
     draw_depth(right, depth, limits)
     draw_outlines(right, bodies, camera, shades)
     right.set_xlim(window[0], window[1])
     right.set_ylim(window[3], window[2])
-    _heading(right, "Recovered outlines", "faint: hidden edges")
+    for k, body in shown:
+        _draw_open_axes(right, body, camera)
+        _number(right, camera.project(body.superquadric.translation), k)
+    heading_of(right, "Recovered outlines", "faint: hidden edges; axes: what the view leaves open")
 
     clouds = [_cloud(depth, recovery.labels == body.label, camera) for _, body in shown]
     for k, (elevation, azimuth, name) in enumerate(((24, 28, "From the camera's side"), (12, 90, "From the right"))):
         ax = figure.add_subplot(bottom[k])
         draw_bodies_3d(ax, bodies, clouds, recovery.plane, shades, elevation=elevation, azimuth=azimuth, unit=unit)
-        _heading(ax, name, "")
+        heading_of(ax, name, "")
     draw_numbers(figure.add_subplot(bottom[2]), recovery, unit)
     return figure
 
 
 def draw_numbers(ax: Axes, recovery: FrameRecovery, unit: str = "m", most: int = 8) -> None:
-    """The bodies' half sizes, exponents, score and verdict as text."""
+    """The bodies' full edges with their deviations, exponents, score and verdict as text."""
     ax.set_axis_off()
     ax.set_xlim(0, 1)
     ax.set_ylim(0, 1)
     total = recovery.milliseconds.get("total", float("nan"))
-    ax.text(0, 0.95, "Half sizes, exponents, score", fontsize=10.5, color=INK)
-    ax.text(1, 0.95, f"{total:.0f} ms", fontsize=9.5, color=_FAINT, ha="right")
+    ax.text(0, 0.95, "Full edges, exponents, score", fontsize=10.5, color=INK)
+    ax.text(1, 0.95, f"{total:.0f} ms", fontsize=9.5, color=FAINT, ha="right")
     if not recovery.bodies:
-        ax.text(0, 0.86, recovery.message or "no object", fontsize=9.5, color=_FAINT)
-    scale, digits, name = (1e3, 0, "mm") if unit == "m" else (1.0, 3, "")
+        ax.text(0, 0.86, recovery.message or "no object", fontsize=9.5, color=FAINT)
     for k, body in enumerate(recovery.bodies[:most]):
         y = 0.85 - 0.108 * k
-        ax.add_patch(_swatch(0.0, y - 0.012, colour(k)))
+        ax.add_patch(Rectangle((0.0, y - 0.032), 0.035, 0.064, color=colour(k), lw=0))
+        _number(ax, (0.0175, y), k)
         if body.status == Status.FAILED:
-            ax.text(0.06, y, f"failed: {body.message}"[:58], fontsize=9, color=_FAINT, va="center")
+            ax.text(0.06, y, f"failed: {body.message}"[:70], fontsize=9, color=FAINT, va="center")
             continue
-        sizes = " x ".join(f"{scale * value:.{digits}f}" for value in body.superquadric.size)
         e1, e2 = body.superquadric.shape
-        ax.text(0.06, y + 0.018, f"{sizes} {name}", fontsize=10, color=INK, va="center")
-        numbers = f"e {e1:.2f} {e2:.2f}   {body.score:.2f}"
-        ax.text(1, y + 0.018, numbers, fontsize=9.5, color=INK, ha="right", va="center")
-        verdict = f"residual {scale * body.residual:.{digits + 1}f} {name}"
-        if body.status == Status.WEAK:
-            verdict = body.message
-        ax.text(0.06, y - 0.032, verdict[:62], fontsize=8, color=_FAINT, va="center")
+        said = wording.edges(body.superquadric.size, body.sigma_size, unit != "m")
+        ax.text(0.06, y + 0.018, said, fontsize=9, color=INK, va="center")
+        ax.text(1, y + 0.018, f"e {e1:.2f} {e2:.2f}  {body.score:.2f}", fontsize=9, color=INK, ha="right", va="center")
+        verdict = f"{body.status.name.lower()}: {body.message}" if body.status == Status.WEAK else body.message
+        ax.text(0.06, y - 0.032, verdict[:76], fontsize=8, color=FAINT, va="center")
     if len(recovery.bodies) > most:
-        ax.text(0, 0.0, f"and {len(recovery.bodies) - most} more", fontsize=9, color=_FAINT)
+        ax.text(0, 0.0, f"and {len(recovery.bodies) - most} more", fontsize=9, color=FAINT)
 
 
 def new_figure(width: float, height: float) -> Figure:
@@ -295,13 +302,42 @@ def save(figure: Figure, path: str | Path, dots_per_inch: int = 110) -> Path:
     return path
 
 
-def _heading(ax: Axes, text: str, detail: str) -> None:
+def heading_of(ax: Axes, text: str, detail: str) -> None:
+    """The title of a picture, and a remark at its right."""
     ax.set_title(text, loc="left", fontsize=11, color=INK, pad=5)
-    ax.set_title(detail, loc="right", fontsize=9, color=_FAINT, pad=5)
+    ax.set_title(detail, loc="right", fontsize=9, color=FAINT, pad=5)
 
 
-def _swatch(x: float, y: float, shade: np.ndarray) -> Rectangle:
-    return Rectangle((x, y - 0.02), 0.035, 0.064, color=shade, lw=0)
+def _depth_bar(ax: Axes, limits: tuple[float, float], unit: str) -> None:
+    """The scale of the depth picture, under it."""
+    bar = ax.inset_axes((0.0, -0.055, 1.0, 0.025))
+    bar.imshow(np.linspace(0.0, 1.0, 256)[None], cmap=_DEPTH_MAP, aspect="auto", extent=(*limits, 0.0, 1.0))
+    bar.set_yticks([])
+    bar.set_xticks(limits, [f"{limit:.2f} {unit}" for limit in limits])
+    bar.tick_params(length=0, labelsize=8.5, labelcolor=FAINT, pad=2)
+    near, far = bar.get_xticklabels()
+    near.set_horizontalalignment("left")
+    far.set_horizontalalignment("right")
+    bar.spines[:].set_visible(False)
+
+
+def _number(ax: Axes, at: Sequence[float] | np.ndarray, k: int) -> None:
+    """The number of the k-th body, dark on a light disc."""
+    disc = {"boxstyle": "circle,pad=0.2", "facecolor": "white", "edgecolor": colour(k), "linewidth": 1.5}
+    ax.text(at[0], at[1], str(k), fontsize=8.5, color=INK, ha="center", va="center", bbox=disc, zorder=6, clip_on=True)
+
+
+def _draw_open_axes(ax: Axes, body: Recovery, camera: Camera) -> None:
+    """The axes of a body whose half sizes its message calls undetermined, with their letters."""
+    if body.status != Status.WEAK or not np.isfinite(body.sigma_size).all():
+        return
+    shape = body.superquadric
+    for k in np.flatnonzero(undetermined(body.covariance, shape.size)):
+        reach = shape.size[k] * shape.rotation_matrix[:, k]
+        ends = camera.project(shape.translation + np.array([-1.0, 1.0])[:, None] * reach)
+        if np.isfinite(ends).all():
+            ax.plot(*ends.T, color=WIRE, lw=1.4, solid_capstyle="round", zorder=5)
+            ax.text(ends[1, 0], ends[1, 1], "xyz"[k], fontsize=9, color=WIRE, weight="bold", zorder=6, clip_on=True)
 
 
 def _faces_camera(body: Superquadric, points: np.ndarray, camera: Camera) -> np.ndarray:
@@ -316,27 +352,23 @@ def _cloud(depth: np.ndarray, mask: np.ndarray, camera: Camera) -> np.ndarray:
     return camera.unproject(columns, rows, depth[rows, columns])
 
 
-def _window(
-    recovery: FrameRecovery, bodies: Sequence[Superquadric], camera: Camera
+def window_of(
+    bodies: Sequence[Superquadric], camera: Camera, pixels: np.ndarray | None = None
 ) -> tuple[float, float, float, float]:
-    """Left, right, top, bottom of the image's part with the objects, in the image's aspect ratio."""
-    full = (-0.5, camera.width - 0.5, -0.5, camera.height - 0.5)
-    ids = [body.label for body in recovery.bodies]
-    rows, columns = np.nonzero(np.isin(recovery.labels, ids)) if ids else (np.array([]), np.array([]))
-    if rows.size == 0:
-        return full
-    spots = [np.stack([columns, rows], axis=1).astype(float)]
-    spots += [loop for body in bodies for loop in silhouettes(body, camera)]
-    low, high = np.vstack(spots).min(axis=0), np.vstack(spots).max(axis=0)
-    middle = 0.5 * (low + high)
-    aspect = camera.width / camera.height
-    half_height = 0.5 * 1.25 * max((high - low)[1], (high - low)[0] / aspect, 0.2 * camera.height)
-    half = np.minimum(half_height * np.array([aspect, 1.0]), 0.5 * np.array([camera.width, camera.height]))
-    middle = np.clip(middle, half - 0.5, np.array([camera.width, camera.height]) - 0.5 - half)
+    """Left, right, top, bottom of the part of the image with bodies and pixels (n, 2), in the image's proportions."""
+    size = np.array([camera.width, camera.height], dtype=float)
+    spots = [loop for body in bodies for loop in silhouettes(body, camera)]
+    spots += [] if pixels is None or not len(pixels) else [pixels]
+    half, middle = size / 2, size / 2 - 0.5
+    if spots:
+        low, high = np.vstack(spots).min(axis=0), np.vstack(spots).max(axis=0)
+        half = min(max(1.25 * np.max((high - low) / size), 0.25), 1.0) * size / 2
+        middle = np.clip((low + high) / 2, half - 0.5, size - half - 0.5)
     return middle[0] - half[0], middle[0] + half[0], middle[1] - half[1], middle[1] + half[1]
 
 
-def _limits(depth: np.ndarray, window: tuple[float, float, float, float]) -> tuple[float, float]:
+def span_within(depth: np.ndarray, window: tuple[float, float, float, float]) -> tuple[float, float]:
+    """Nearest and farthest depth of the scale: those of the window, a few stray readings left out."""
     left, right, top, bottom = (max(0, round(value)) for value in window)
     part = depth[top : bottom + 1, left : right + 1]
     seen = part[np.isfinite(part)]

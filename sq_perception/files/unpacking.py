@@ -3,14 +3,16 @@
 A file of a megabyte can claim, or unpack to, any number of gigabytes.  So the size that it claims is read first, must
 be bounded, and for arrays must be what the file really holds; only then is memory taken.
 
-References: https://numpy.org/doc/stable/reference/generated/numpy.lib.format.html (an NPZ is a ZIP of such arrays);
-PNG's IHDR chunk, https://www.w3.org/TR/png-3/#11IHDR; BMP's information header, the size from byte 18 on.
+Pillow reads the size in an image's header without unpacking it.
+
+Reference: https://numpy.org/doc/stable/reference/generated/numpy.lib.format.html (an NPZ is a ZIP of such arrays).
 """
 
 from __future__ import annotations
 
+import io
 import math
-import struct
+import warnings
 import zipfile
 import zlib
 from collections.abc import Iterable
@@ -24,9 +26,6 @@ MOST_PIXELS = 2**25
 """Of an image, or numbers of an array: no depth camera has more."""
 MOST_BYTES = 2**28
 """Of a packed file."""
-_PNG, _BMP = b"\x89PNG\r\n\x1a\n", b"BM"
-_PNG_SIZE, _BMP_SIZE = struct.Struct(">II"), struct.Struct("<ii")
-_PNG_AT, _BMP_AT = 16, 18
 
 
 class UnpackingError(ValueError):
@@ -69,17 +68,17 @@ def npy_array(path: Path) -> np.ndarray:
 
 
 def grey_image(path: Path) -> np.ndarray:
-    """A grey PNG or BMP, uint8 or uint16 (height, width); three equal channels are grey too.
+    """A grey PNG, BMP or TIFF, uint8, uint16 or float32 (height, width); three equal channels are grey too.
 
     Raises
     ------
     UnpackingError
-        If it cannot be read, is no grey image of 8 or 16 bit, or has more than MOST_PIXELS pixels.
+        If it cannot be read, is no grey image of 8 or 16 bit or floats, or has more than MOST_PIXELS pixels.
     """
     if path.stat().st_size > MOST_BYTES:
         raise UnpackingError(f"expected at most {MOST_BYTES} bytes, got {path.stat().st_size}")
     encoded = np.fromfile(path, dtype=np.uint8)
-    width, height = _image_size(encoded[:64].tobytes())
+    width, height = _image_size(encoded)
     if not (width >= 1 and height >= 1 and width * height <= MOST_PIXELS):
         raise UnpackingError(f"not a readable image: expected 1 to {MOST_PIXELS} pixels, got {width} x {height}")
     try:
@@ -90,11 +89,15 @@ def grey_image(path: Path) -> np.ndarray:
         raise UnpackingError("not a readable image")
     if image.ndim == 3:
         colours = image[..., :3]
-        if not (colours == colours[..., :1]).all():
-            raise UnpackingError("expected a grey image, got a colour image")
+        if not np.array_equal(
+            colours, np.broadcast_to(colours[..., :1], colours.shape), equal_nan=colours.dtype.kind == "f"
+        ):
+            raise UnpackingError(
+                "expected a grey image, got a colour image: is it the camera's picture, or depth drawn in colours?"
+            )
         image = np.ascontiguousarray(colours[..., 0])
-    if image.dtype not in (np.uint8, np.uint16):
-        raise UnpackingError(f"expected 8 or 16 bit, got {image.dtype}")
+    if image.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
+        raise UnpackingError(f"expected 8 or 16 bit or floats, got {image.dtype}")
     return image
 
 
@@ -122,12 +125,14 @@ def _numbers(file: IO[bytes], file_size: int, where: str = "") -> np.ndarray:
     return np.frombuffer(data, dtype).reshape(shape, order="F" if is_fortran else "C").copy()
 
 
-def _image_size(head: bytes) -> tuple[int, int]:
-    if head.startswith(_PNG) and len(head) >= _PNG_AT + _PNG_SIZE.size:
-        width, height = _PNG_SIZE.unpack_from(head, _PNG_AT)
-    elif head.startswith(_BMP) and len(head) >= _BMP_AT + _BMP_SIZE.size:
-        width, height = _BMP_SIZE.unpack_from(head, _BMP_AT)
-        height = abs(height)  # negative where rows are listed from the top
-    else:
-        raise UnpackingError("not a readable image: expected a PNG or BMP")
-    return int(width), int(height)
+def _image_size(encoded: np.ndarray) -> tuple[int, int]:
+    from PIL import Image
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of large and damaged ones: what it says is looked at here
+            with Image.open(io.BytesIO(encoded.tobytes()), formats=("PNG", "BMP", "TIFF")) as image:
+                return image.size
+    except Exception as error:  # whatever damaged headers lead to
+        kinds = "PNG, BMP or TIFF"
+        raise UnpackingError(f"not a readable image: expected {kinds} of at most {MOST_PIXELS} pixels") from error

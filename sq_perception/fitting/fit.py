@@ -10,6 +10,9 @@ import numpy as np
 
 from sq_perception.geometry.superquadric import Superquadric
 
+CUT_SHORT = "cut short by the time budget"
+"""In the message of a body whose fit had to end before it was done."""
+
 
 class Status(IntEnum):
     """How far a recovery can be trusted; the numbers travel in messages and never change."""

@@ -116,7 +116,8 @@ def fit(
     distance = np.abs(body.sampson_distance(points))
     residual = float(np.sqrt(np.mean(distance**2)))
     if not reason and float(np.median(distance)) > _FAILED_SHARE * float(body.size.min()):
-        reason = f"no superquadric found: half of the points lie more than {1e3 * np.median(distance):.1f} mm off"
+        off = float(np.median(distance) / body.size.min())
+        reason = f"no superquadric found: half of the points lie more than {off:.0%} of its smallest half size off"
     return Fit(
         superquadric=body,
         residual=residual,

@@ -7,7 +7,7 @@ import time
 import numpy as np
 
 from sq_perception.fitting.covariance import carried_over, spread, undetermined
-from sq_perception.fitting.fit import Fit, Status
+from sq_perception.fitting.fit import CUT_SHORT, Fit, Status
 from sq_perception.fitting.observation import Observation
 from sq_perception.fitting.problem import Solution
 from sq_perception.fitting.residuals import surface_distance
@@ -46,11 +46,12 @@ def verdict(solution: Solution, began: float) -> Fit:
         sticking_out = np.where(outside, np.abs(body.sampson_distance(observation.points)), 0.0)
         typical = float(np.quantile(sticking_out, _REACHED))
     status, message = _status(canonical, covariance, typical, _FAILED_LEVELS * observation.sigma)
+    cut = (CUT_SHORT,) if solution.problem.late else ()
     return Fit(
         superquadric=canonical,
         residual=residual,
         status=status,
-        message="; ".join([message, *solution.notes]),
+        message="; ".join([message, *solution.notes, *cut]),
         noise=observation.sigma,
         inlier_share=float(inlying.mean()),
         seen=seen_extents(canonical, observation.points),
@@ -85,16 +86,12 @@ def failed(body: Superquadric, observation: Observation, reason: str, began: flo
 
 
 def _status(body: Superquadric, covariance: np.ndarray, typical: float, strays: float) -> tuple[Status, str]:
-    if typical > max(_FAILED_SHARE * float(body.size.min()), strays):
-        return Status.FAILED, (
-            f"no superquadric found: {1e3 * typical:.1f} mm and more between many of the points and the best one"
-        )
-    sigma, weak_axes = np.sqrt(np.diag(covariance)), undetermined(covariance, body.size)
-    weak = [
-        f"half size along {_AXES[k]} undetermined: {1e3 * body.size[k]:.0f} +- {1e3 * sigma[k]:.0f} mm"
-        for k in range(3)
-        if weak_axes[k]
-    ]
+    """The verdict and its reason, without lengths: only the reader of the image knows their unit."""
+    smallest = float(body.size.min())
+    if typical > max(_FAILED_SHARE * smallest, strays):
+        off = f"{typical / smallest:.0%} of its smallest half size"
+        return Status.FAILED, f"no superquadric found: many of the points lie {off} and more off the best one"
+    weak = [_AXES[k] for k in np.flatnonzero(undetermined(covariance, body.size))]
     if weak:
-        return Status.WEAK, "; ".join(weak)
+        return Status.WEAK, f"half size along {' and '.join(weak)} undetermined"
     return Status.CONVERGED, "converged"

@@ -29,6 +29,11 @@ from sq_perception.learning.regressor import Regressor, RegressorConfig
 
 INPUT, OUTPUT = "views", "parameters"
 PARAMETERS = ("a1", "a2", "a3", "e1", "e2", "t1", "t2", "t3", "qx", "qy", "qz", "qw")
+INPUT_WORDS = (
+    "views, each of one object: z of its surface in the unit cube (x right, y up, z to the viewer), 0 for background, "
+    "-0.5 where it may go on unseen"
+)
+OUTPUT_WORDS = "bodies in the frames of their views: half sizes, exponents, centre, unit quaternion"
 OPSET, IR_VERSION = 18, 8
 """Of ONNX 1.13 (2022): runtimes of any age read it."""
 
@@ -75,8 +80,8 @@ def build(model: Regressor, notes: Mapping[str, str] | None = None) -> Any:
         helper.make_graph(
             graph.nodes,
             "sq_perception",
-            [helper.make_tensor_value_info(INPUT, kind, ["batch", 1, pixels, pixels])],
-            [helper.make_tensor_value_info(OUTPUT, kind, ["batch", len(PARAMETERS)])],
+            [helper.make_tensor_value_info(INPUT, kind, ["batch", 1, pixels, pixels], INPUT_WORDS)],
+            [helper.make_tensor_value_info(OUTPUT, kind, ["batch", len(PARAMETERS)], OUTPUT_WORDS)],
             graph.initializers,
         ),
         producer_name="sq_perception",

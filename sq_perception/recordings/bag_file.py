@@ -9,6 +9,9 @@ by type and encoding:
 | sensor_msgs/CompressedImage | 16UC1, 32FC1 of the compressedDepth transport, PNG or RVL | likewise |
 | sensor_msgs/Image, orthographic | mono8, mono16 | grey values of the unit cube |
 
+Label images on the one topic that is called ``mask/image``, with or without a name before it, are the masks of the
+images with their stamps; they may have been recorded later.
+
 The camera is that of the sibling topic ``camera_info``, as image_transport pairs them: the message with the image's
 stamp; failing that, the last one before the image; failing that, the bag's first, however late.  The name of their
 topic decides whether images are raw and have to be rectified (:mod:`sq_perception.imaging.calibration`).
@@ -22,7 +25,7 @@ Reference: rosbags, https://ternaris.gitlab.io/rosbags; MCAP, https://mcap.dev/s
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Generator, Iterator
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
@@ -36,7 +39,7 @@ from sq_perception.files import plain_yaml
 from sq_perception.imaging import compressed_depth, unit_cube
 from sq_perception.imaging.calibration import Calibration, Treatment
 from sq_perception.imaging.camera import Projection
-from sq_perception.recordings.frame_file import FrameError, Reading, RecordedFrame, Stamp
+from sq_perception.recordings.frame_file import MILLIMETRES, FrameError, Reading, RecordedFrame, Stamp
 
 SUFFIXES = (".mcap", ".db3")
 LARGEST = 2**29
@@ -44,6 +47,7 @@ LARGEST = 2**29
 
 _IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 _CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+_MASKS = "/mask/image"
 _PEEKED = 10
 """Messages of a topic after which it shows no depth: the first ones may be damaged."""
 _ZSTD = b"\x28\xb5\x2f\xfd"
@@ -126,6 +130,8 @@ class RecordedBag:
             self.close()
             raise
         self._info_topic = camera_info_topic(self.topic)
+        self._masks = self._recorded_masks()
+        self._mask = next(self._masks, None)
 
     def __enter__(self) -> RecordedBag:
         return self
@@ -136,6 +142,8 @@ class RecordedBag:
     def close(self) -> None:
         """Close the files."""
         self._reader.close()
+        if hasattr(self, "_masks"):
+            self._masks.close()
 
     def __len__(self) -> int:
         """Images that will be read, as the bag counts them; a damaged bag may count wrong."""
@@ -191,7 +199,7 @@ class RecordedBag:
                 raise FrameError(f"{self._path}: no images on {wanted}; topics with images: {listed}")
             return wanted
         known = depth_image.GREY_ENCODINGS if self._orthographic else depth_image.DEPTH_ENCODINGS
-        found = [topic for topic in images if encodings[topic] in known]
+        found = [topic for topic in images if encodings[topic] in known and not topic.endswith(_MASKS)]
         packed = f"/{compressed_depth.TRANSPORT}"
         found = [one for one in found if not (one.endswith(packed) and one.removesuffix(packed) in found)]
         if not found and damage is not None:
@@ -262,6 +270,32 @@ class RecordedBag:
 
     # frames
 
+    def _recorded_masks(self) -> Generator[_Message, None, None]:
+        """The messages of the mask topic, in a reading of their own, as they come at any distance from their images."""
+        topics = {
+            one.topic for one in self._reader.connections if one.msgtype == _IMAGE and one.topic.endswith(_MASKS)
+        } - {self.topic}
+        if len(topics) != 1:
+            return
+        with RecordedBag(self._path, topics.pop()) as masks:
+            for message in masks._messages(masks._connections((_IMAGE,), masks.topic)):
+                if not isinstance(message, FrameError):
+                    yield message
+
+    def _labels(self, stamp: Stamp, name: str, image: np.ndarray) -> np.ndarray | None:
+        """The masks of an image: from files if there is a folder of them, else from the bag."""
+        labels = self._reading.labels(name, image)
+        if labels is not None:
+            return labels
+        while self._mask is not None and self._mask.stamp < stamp:
+            self._mask = next(self._masks, None)
+        if self._mask is None or self._mask.stamp != stamp:
+            return None
+        labels = depth_image.labels_from_message(self._mask.content)
+        if labels.shape != image.shape:
+            raise ValueError(f"mask: expected labels of the depth's shape {image.shape}, got {labels.shape}")
+        return labels
+
     def _frame(self, message: _Message, info: _Message | None) -> Iterator[RecordedFrame | FrameError]:
         """The frame of an image, unless it is done."""
         if self._is_done(message.stamp):
@@ -278,14 +312,17 @@ class RecordedBag:
         if self._orthographic:
             grey = depth_image.grey_from_message(message.content)
             depth, camera = unit_cube.depth_from_grey(grey), unit_cube.camera(grey.shape[1], grey.shape[0])
+            labels = self._labels(message.stamp, name, depth)
         else:
             if message.is_packed:
                 depth = compressed_depth.decode(message.content.format, message.content.data)
                 encoding = compressed_depth.encoding(message.content.format) or ""
             else:
                 depth = depth_image.depth_from_message(message.content)
+            if self._reading.scale is not None:
+                depth = depth * np.float32((MILLIMETRES if encoding.startswith("16UC1") else 1.0) / self._reading.scale)
             calibration = self._calibration(info, depth)
-            labels = self._reading.labels(name, depth)
+            labels = self._labels(message.stamp, name, depth)
             labels = None if labels is None else calibration.rectified_labels(labels)
             depth, camera = calibration.rectified(depth), calibration.camera
             warning = f"{self._path}: {self.topic}: {calibration.note}" if calibration.note else ""

@@ -1,6 +1,6 @@
 """One recorded frame and what was recovered from it, as an element of ``frames`` in the JSON of ``recover``.
 
-Coordinates are metres in the optical frame, or those of the unit cube.  ``sq-perception recover --help`` explains every
+Coordinates are metres in the optical frame, or those of the unit cube.  ``result.schema.json`` explains every
 name.
 """
 
@@ -49,6 +49,12 @@ def frame_entry(
         "ms": _number(recovery.milliseconds["total"]),
         "superquadrics": bodies,
         "coordinates": "cube" if frame.is_cube else "optical",
+        "camera": {
+            "projection": frame.camera.projection,
+            "width": frame.camera.width,
+            "height": frame.camera.height,
+            "K": _numbers(frame.camera.matrix.ravel()),
+        },
         "message": recovery.message,
         "ms_by_stage": {stage: _number(value) for stage, value in recovery.milliseconds.items()},
         "plane": None if recovery.plane is None else _numbers(recovery.plane),

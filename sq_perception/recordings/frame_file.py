@@ -3,14 +3,16 @@
 | file | needs | depth |
 | --- | --- | --- |
 | ``.npz`` | ``depth`` float (h, w), ``K`` (3, 3) | metres, NaN = nothing |
-| ``.npy`` of floats | a camera_info | metres, NaN or 0 = nothing; rectified where it is raw |
-| 16 bit ``.png``, ``.npy`` | a camera_info | millimetres or as ``Reading.scale`` says, 0 = nothing; likewise |
+| ``.npy``, ``.tif`` of floats | a camera_info | metres, NaN or 0 = nothing; rectified where it is raw |
+| 16 bit ``.png``, ``.tif``, ``.npy`` | a camera_info | millimetres, 0 = nothing; likewise |
+| ``.pcd``, ``.ply`` | nothing | points in metres, see :mod:`sq_perception.recordings.cloud_file` |
 | 8 or 16 bit ``.png``, ``.bmp``, orthographic | nothing | grey values of the cube, 0 = nothing |
 | ``.npz``, orthographic | ``depth`` | depth in the cube, 1 - z; NaN = nothing |
 
 A file whose name is a time, such as 1305031102.160407.png, has that stamp in seconds.  Names of exactly this form are
 those of the TUM RGB-D benchmark, whose PNGs have 5000 units a metre: they are read so, with a warning, unless the scale
-is given.  A camera_info is a YAML, or one of the forms of :mod:`sq_perception.recordings.intrinsics`.
+is given.  ``Reading.scale`` goes before all of these units.  A camera_info is a YAML, or one of the forms of
+:mod:`sq_perception.recordings.intrinsics`.
 
 The cube is the thesis' unit cube, :mod:`sq_perception.imaging.unit_cube`.  An NPZ may bring ``labels`` (h, w), a
 support ``plane`` (4,), and the text "orthographic" as ``projection``, which goes before what the caller says.  Nothing
@@ -37,17 +39,18 @@ from sq_perception.files.unpacking import UnpackingError, grey_image, npy_array,
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.calibration import Calibration, Treatment
 from sq_perception.imaging.camera import Camera, Projection
-from sq_perception.recordings import intrinsics
+from sq_perception.recordings import cloud_file, intrinsics
 
-SUFFIXES = (".npz", ".npy", ".png", ".bmp")
+SUFFIXES = (".npz", ".npy", ".png", ".bmp", ".tif", ".tiff", *cloud_file.SUFFIXES)
 MILLIMETRES = 1000.0
 """Units a metre."""
 TUM_SCALE = 5000.0
 """Of the TUM RGB-D benchmark, https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats"""
 _TUM_NAME = re.compile(r"\d{10}\.\d{6}")
-_IMAGES = (".png", ".bmp")
 _SKEW = 1e-6
 """Of fx; no depth camera in use has any."""
+_NEAREST, _FARTHEST = 0.01, 100.0
+"""Metres; no depth camera sees half of its image nearer or farther."""
 _TIME = re.compile(r"(\d{1,18})\.(\d{1,9})")
 
 
@@ -92,6 +95,8 @@ class RecordedFrame:
         Of the depth where it came from, as messages name it (16UC1, 32FC1, mono8, mono16); empty where it has none.
     received : int or None
         When a bag received it, nanoseconds.
+    has_free_space : bool
+        Whether a pixel beside an object tells that there is nothing before what it measured.
     """
 
     depth: np.ndarray
@@ -106,6 +111,7 @@ class RecordedFrame:
     warning: str = ""
     encoding: str = ""
     received: int | None = None
+    has_free_space: bool = True
 
 
 @dataclass(frozen=True)
@@ -115,7 +121,7 @@ class Reading:
     Attributes
     ----------
     scale : float or None
-        Units a metre of 16 bit files; None: millimetres, or what the file's name says.
+        Units a metre; None: 1000 for whole numbers, or what the file's name says, and 1 for floats.
     nearest, farthest : float
         Readings beyond, metres, are none.
     region : (4,) of int or None
@@ -165,7 +171,14 @@ class Reading:
         return labels.astype(np.int32)
 
     def of(self, frame: RecordedFrame) -> RecordedFrame:
-        """The frame within the limits; raises FrameError if the region is not within the image."""
+        """The frame within the limits, with a warning where it seems to be another kind of image.
+
+        Raises
+        ------
+        FrameError
+            If the region is not within the image.
+        """
+        frame = replace(frame, warning="; ".join(filter(None, (frame.warning, _likely_mistake(frame)))))
         if self == Reading():
             return frame
         with np.errstate(invalid="ignore"):
@@ -255,9 +268,11 @@ def _read(
 ) -> RecordedFrame:
     suffix = path.suffix.lower()
     if suffix == ".npz":
-        frame = _read_npz(path, projection)
+        frame = _read_npz(path, projection, reading.scale)
         labels = reading.labels(path.stem, frame.depth)
         return frame if labels is None else replace(frame, labels=labels)
+    if suffix in cloud_file.SUFFIXES:
+        return _read_cloud(path, reading)
     if suffix not in SUFFIXES:
         raise FrameError(f"{path}: expected a name that ends in {', '.join(SUFFIXES)}")
     try:
@@ -281,9 +296,9 @@ def _read(
     info = camera_info_of(camera_info, image.shape[1], image.shape[0])
     calibration = calibrated(camera_info, info, path.with_suffix("").as_posix(), distortion)
     scale, warnings = 1.0 if is_metric else MILLIMETRES, [f"{camera_info}: {calibration.note}"] * bool(calibration.note)
-    if not is_metric and reading.scale is not None:
+    if reading.scale is not None:
         scale = reading.scale
-    elif not is_metric and suffix in _IMAGES and _TUM_NAME.fullmatch(path.stem):
+    elif suffix == ".png" and _TUM_NAME.fullmatch(path.stem):
         scale = TUM_SCALE
         warnings.append(
             f"{path.parent}: names as in the TUM RGB-D benchmark, so {TUM_SCALE:g} units are a metre; "
@@ -299,7 +314,7 @@ def _read(
         raise
     except ValueError as error:
         raise FrameError(f"{path}: {error}") from error
-    encoding = "16UC1" if scale == MILLIMETRES else "32FC1"
+    encoding = "16UC1" if scale == MILLIMETRES and not is_metric else "32FC1"
     warning = "; ".join(warnings)
     return RecordedFrame(depth, calibration.camera, labels, path.name, False, warning=warning, encoding=encoding)
 
@@ -386,7 +401,35 @@ def read_camera_info(path: str | Path) -> CameraInfo:
     )
 
 
-def _read_npz(path: Path, projection: Projection) -> RecordedFrame:
+def _read_cloud(path: Path, reading: Reading) -> RecordedFrame:
+    try:
+        depth, camera, is_image = cloud_file.as_image(cloud_file.read_points(path) / (reading.scale or 1.0))
+    except UnpackingError as error:
+        raise FrameError(f"{path}: {error}") from error
+    labels = reading.labels(path.stem, depth) if is_image else None
+    warning = "" if is_image else cloud_file.UNORGANISED
+    return RecordedFrame(
+        depth, camera, labels, path.name, False, warning=warning, encoding="32FC1", has_free_space=is_image
+    )
+
+
+def _likely_mistake(frame: RecordedFrame) -> str:
+    """What an image that no depth camera takes seems to be; empty for others."""
+    shown = frame.depth[::4, ::4]
+    shown = shown[np.isfinite(shown)]
+    if not shown.size:
+        return ""
+    if frame.is_cube:
+        is_within = shown.min() > -1.0 and shown.max() < 2.0
+        return "" if is_within else "depths far outside of the unit cube: a metric image is not orthographic"
+    if np.median(shown) > _FARTHEST:
+        return f"half of the image is farther than {_FARTHEST:g} m: for millimetres the depth scale is 1000"
+    if np.median(shown) < _NEAREST:
+        return f"half of the image is nearer than {_NEAREST:g} m: for metres the depth scale is 1"
+    return ""
+
+
+def _read_npz(path: Path, projection: Projection, scale: float | None) -> RecordedFrame:
     try:
         fields = npz_arrays(path, ("depth", "K", "labels", "plane", "projection"))
     except UnpackingError as error:
@@ -398,9 +441,12 @@ def _read_npz(path: Path, projection: Projection) -> RecordedFrame:
         raise FrameError(f"{path}: depth: expected floats (height, width) in metres, got {depth.dtype} {depth.shape}")
     labels = _labels(path, fields.get("labels"), depth)
     height, width = depth.shape
-    if projection == "orthographic" or str(fields.get("projection", "")) == "orthographic":
+    is_cube = str(fields.get("projection", "")) == "orthographic"
+    if projection == "orthographic" or is_cube:
         depth = np.where(np.isfinite(depth), depth, np.nan).astype(np.float32)
-        return RecordedFrame(depth, _cube_camera(path, width, height), labels, path.name, is_cube=True)
+        has_camera = "K" in fields and not is_cube
+        warning = "orthographic was asked for, and a file has the matrix K of a pinhole camera" if has_camera else ""
+        return RecordedFrame(depth, _cube_camera(path, width, height), labels, path.name, is_cube=True, warning=warning)
     if "K" not in fields:
         raise FrameError(f"{path}: expected a field 'K', the 3 x 3 camera matrix")
     if fields["K"].shape == (3, 3) and _is_transposed(fields["K"].ravel()):
@@ -410,7 +456,7 @@ def _read_npz(path: Path, projection: Projection) -> RecordedFrame:
     except (ValueError, TypeError) as error:
         raise FrameError(f"{path}: K: {error}") from error
     with np.errstate(invalid="ignore"):
-        depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.nan).astype(np.float32)
+        depth = np.where(np.isfinite(depth) & (depth > 0), depth / (scale or 1.0), np.nan).astype(np.float32)
     plane = _plane(path, fields.get("plane"))
     return RecordedFrame(depth, camera, labels, path.name, is_cube=False, plane=plane, encoding="32FC1")
 

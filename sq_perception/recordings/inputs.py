@@ -1,13 +1,15 @@
 """All frames that a user names: files, folders of files, and bags, one frame after the other.
 
 A folder gives its frames and bags in natural order (frame_2 before frame_10), NPYs only where it has nothing else, as
-matrices of calibrations are such files too.  The camera of its images, and of an image that is named by itself, is
-``camera_info.yaml``, ``camera.yaml``, ``intrinsics.json`` or ``camera_intrinsic.json`` beside it.  What cannot be read
-comes as the error that says why, in its place, and the rest follows.
+matrices of calibrations are such files too; one without any gives those of its subfolders.  The camera of its images,
+and of an image that is named by itself, is ``camera_info.yaml``, ``camera.yaml``, ``intrinsics.json`` or
+``camera_intrinsic.json`` beside it, or in the folder that was named.  What cannot be read comes as the error that says
+why, in its place, and the rest follows.
 """
 
 from __future__ import annotations
 
+import logging
 import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -28,6 +30,7 @@ CAMERA_FILES = (
 )
 SUFFIXES = frame_file.SUFFIXES + bag_file.SUFFIXES
 
+_log = logging.getLogger(__name__)
 _ANY_SIZE = (640, 480)
 """Pixels, of images that nothing is known of yet."""
 _DIGITS = re.compile(r"(\d+)")
@@ -112,15 +115,20 @@ class RecordedInput:
             self._sources.append((path, self._camera_info or _camera_file(path.parent)))
             return
         try:
-            found = in_folder(path)[:: self._every][: self._limit]
+            found = self._in_folders(path, None)
         except OSError as error:
             self._sources.append((path, FrameError(f"{path}: {error}")))
             return
-        if found:
-            camera_info = self._camera_info or _camera_file(path)
-            self._sources += [(one, camera_info) for one in found]
-        else:
-            self._sources.append((path, FrameError(f"{path}: no frames in it ({', '.join(SUFFIXES)})")))
+        self._sources += found or [(path, FrameError(f"{path}: no frames in it ({', '.join(SUFFIXES)})"))]
+
+    def _in_folders(self, folder: Path, above: str | Path | None) -> list[tuple[Path, str | Path | None]]:
+        """The frames of a folder, or of those in it, with their camera, which may be that of the folder ``above``."""
+        camera_info = self._camera_info or _camera_file(folder) or above
+        if found := in_folder(folder):
+            _log.info("%s: %d frames, camera %s", folder, len(found), camera_info or "as the files say")
+            return [(one, camera_info) for one in found[:: self._every][: self._limit]]
+        folders = [one for one in folder.iterdir() if one.is_dir() and not one.is_symlink()]
+        return [pair for one in sorted(folders, key=_natural) for pair in self._in_folders(one, camera_info)]
 
     def _file(self, path: Path, camera_info: str | Path | None) -> RecordedFrame | FrameError:
         try:

@@ -1,6 +1,6 @@
-"""Results of recorded frames as JSON: one document when all is done, or a line a frame as it goes, to be resumed.
+"""Results of recorded frames: JSON and CSV when all is done, or a line of JSON a frame as it goes, to be resumed.
 
-A document is ``{"format": ..., "version": ..., "options": {...}, "frames": [...]}``.  A file of JSON lines has the same
+``result.schema.json`` beside this file describes the document, and every field in it.  A file of JSON lines has its
 head without ``frames`` in its first line, and in each line that follows an element of ``frames``
 (:mod:`sq_perception.recordings.frame_entry`).  Such a file grows; a line that an end of the program cut short is taken
 away when it is opened again, and nothing is added to what other options have found.
@@ -8,7 +8,9 @@ away when it is opened again, and nothing is added to what other options have fo
 
 from __future__ import annotations
 
+import csv
 import errno
+import io
 import json
 import os
 from collections import Counter
@@ -17,10 +19,13 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+from sq_perception import __version__
 from sq_perception.files import output_file
 from sq_perception.recordings.frame_file import Stamp
 
 FORMAT, VERSION = "sq_perception.recovery", 1
+UNITS = {"optical": "m", "cube": "1"}
+"""Of lengths, by a frame's coordinates."""
 LARGEST = 2**30
 """Bytes of a file of lines that is resumed: some 10^5 frames."""
 
@@ -31,12 +36,38 @@ class ResumeError(ValueError):
 
 def head(options: Mapping[str, Any]) -> dict[str, Any]:
     """What both forms begin with; ``options`` are those that decide what is found."""
-    return {"format": FORMAT, "version": VERSION, "options": dict(options)}
+    program = f"sq_perception {__version__}"
+    return {"format": FORMAT, "version": VERSION, "program": program, "units": UNITS, "options": dict(options)}
 
 
 def document(options: Mapping[str, Any], frames: Sequence[Mapping[str, Any]]) -> str:
     """The whole document."""
     return json.dumps({**head(options), "frames": frames}, indent=1, allow_nan=False) + "\n"
+
+
+def table(frames: Sequence[Mapping[str, Any]]) -> str:
+    """The bodies as CSV, a row each under a line of names; numbers as in the document, empty where unknown."""
+    axes = ("1", "2", "3")
+    columns = {
+        "size": [f"a{k}" for k in axes],
+        "sigma_size": [f"sigma_a{k}" for k in axes],
+        "shape": ["e1", "e2"],
+        "translation": ["x", "y", "z"],
+        "rotation": ["qx", "qy", "qz", "qw"],
+        "seen": [f"seen_a{k}" for k in axes],
+    }
+    single = ("score", "residual", "pixels", "label", "message")
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    names = [name for group in columns.values() for name in group]
+    writer.writerow(["file", "stamp", "body", "status", "id", "coordinates", *names, *single])
+    for frame in frames:
+        stamp = "" if frame["stamp"] is None else str(Stamp(**frame["stamp"]))
+        for number, body in enumerate(frame["superquadrics"]):
+            track = body["track"] and body["track"]["id"]
+            values = [value for group in columns for value in body[group]] + [body[name] for name in single]
+            writer.writerow([frame["file"], stamp, number, body["status"], track, frame["coordinates"], *values])
+    return text.getvalue()
 
 
 class ResultLines:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 
 import numpy as np
 
 from sq_perception.fitting import soft_render_fit, solina_bajcsy, surface_fit
 from sq_perception.fitting.fit import Fit, Status
-from sq_perception.fitting.options import MIN_PIXELS, FitOptions
+from sq_perception.fitting.options import MIN_PIXELS, MODEL_ERROR_ON_PLANE, FitOptions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import soft_agreement
 from sq_perception.imaging.camera import Camera
@@ -44,25 +45,29 @@ def _body(one: SeenObject, depth: np.ndarray, camera: Camera, options: RecoveryO
         return _unfitted(_predicted(one), one, "prediction of the network, not refined")
     if options.method == "auto" and options.refine == "soft_render":
         return _soft_rendered(_predicted(one), one, options)
-    plane = one.plane if options.use_plane else None
-    fit = _surface_fit(one, depth, camera, plane, max(deadline - time.perf_counter(), _LEAST_BUDGET))
+    known = FitOptions(
+        plane=one.plane if options.use_plane else None,
+        time_budget=max(deadline - time.perf_counter(), _LEAST_BUDGET),
+    )
+    if not options.free_space:
+        depth = np.where(one.mask, depth, np.float32(np.nan))
+        known = replace(known, nan_is_empty=False, model_error=MODEL_ERROR_ON_PLANE)
+    fit = _surface_fit(one, depth, camera, known)
     if options.refine == "soft_render" and fit.status != Status.FAILED:
         return _soft_rendered(fit.superquadric, one, options)
     return fit
 
 
-def _surface_fit(
-    one: SeenObject, depth: np.ndarray, camera: Camera, plane: np.ndarray | None, time_budget: float
-) -> Fit:
+def _surface_fit(one: SeenObject, depth: np.ndarray, camera: Camera, known: FitOptions) -> Fit:
     """From the cheapest starts of central symmetry; where those leave something, from the network's prediction too.
 
     The network computes beside the fit.  What the image leaves open after all, such as the depth of a box seen
     face-on, its prediction tells again.
     """
     if one.prediction is None:
-        return surface_fit.fit(depth, one.mask, camera, options=FitOptions(plane=plane, time_budget=time_budget))
+        return surface_fit.fit(depth, one.mask, camera, options=known)
     predicted = one.prediction.body
-    options = FitOptions(plane=plane, time_budget=time_budget, expected=predicted, hull=one.prediction.hull)
+    options = replace(known, expected=predicted, hull=one.prediction.hull)
     return surface_fit.fit(depth, one.mask, camera, start=predicted, options=options)
 
 

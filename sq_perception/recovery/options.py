@@ -44,6 +44,9 @@ class RecoveryOptions:
         anywhere.
     workspace_pose
         Quaternion x y z w and translation of the optical frame in the frame of the box; None: they are the same.
+    free_space
+        Whether a pixel beside an object tells that there is nothing before what it measured; not so where the image was
+        made of a cloud.  Without it things are fitted by the tolerant course.
     repair
         Join and split own segments where that describes the image in fewer words; masks from outside stay as they are.
 
@@ -65,6 +68,7 @@ class RecoveryOptions:
     max_size: float = 0.6
     workspace: standing.Box | None = None
     workspace_pose: standing.Pose | None = None
+    free_space: bool = True
     repair: bool = True
 
     def __post_init__(self) -> None:

@@ -102,6 +102,8 @@ class Page:
         Fully qualified names.
     most_points
         Of the cloud.
+    parameters
+        Whether the nodes have any, so that there is a place for them.
 
     Raises
     ------
@@ -109,7 +111,9 @@ class Page:
         If it cannot be served.
     """
 
-    def __init__(self, bound: socket.socket, nodes: Sequence[str], most_points: int = 40000) -> None:
+    def __init__(
+        self, bound: socket.socket, nodes: Sequence[str], most_points: int = 40000, *, parameters: bool = True
+    ) -> None:
         self._most_points = most_points
         self._requests: queue.SimpleQueue[Request] = queue.SimpleQueue()
         self._span: tuple[float, float] | None = None
@@ -122,7 +126,7 @@ class Page:
         self._drawn: dict[tuple[str, int], _Drawn] = {}
         self._server = server.serve(bound)
         self._nodes = {name: _NodePart(name) for name in nodes}
-        self._furnish()
+        self._furnish(parameters)
 
     @property
     def watched(self) -> bool:
@@ -248,7 +252,7 @@ class Page:
 
     # Furniture
 
-    def _furnish(self) -> None:
+    def _furnish(self, parameters: bool) -> None:
         gui, world = self._server.gui, self._server.scene
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, brand_color=(64, 130, 200))
         gui.set_panel_label(TITLE)
@@ -262,7 +266,7 @@ class Page:
 
         self._source = gui.add_html("")
         for part in self._nodes.values():
-            part.status = gui.add_html(tables.node_status(NodeState(part.name)))
+            part.status = gui.add_html(tables.node_status(NodeState(part.name)) if parameters else "")
         tabs = gui.add_tab_group()
         for part in self._nodes.values():
             short = part.name.rsplit("/", 1)[-1]
@@ -271,6 +275,8 @@ class Page:
                 titles = (short, f"{short}: parameters")
             with tabs.add_tab(titles[0]):
                 part.table = gui.add_html("")
+            if not parameters:
+                continue
             part.tab = tabs.add_tab(titles[1])
             with part.tab:
                 part.answer = gui.add_html("")

@@ -12,6 +12,8 @@ import yaml
 
 from sq_perception.commands import main
 from sq_perception.commands.recover import complain
+from sq_perception.commands.recover_lines import lines
+from sq_perception.fitting.fit import CUT_SHORT
 from sq_perception.geometry.mesh import COLOURS
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
@@ -147,6 +149,77 @@ def test_meshes_are_the_bodies(tmp_path, kind):
         np.testing.assert_allclose(part.bounds.mean(axis=0), turn @ body.translation, atol=2e-3)
         colour = np.round(255 * COLOURS[k % len(COLOURS)])
         np.testing.assert_array_equal(np.asarray(part.visual.vertex_colors)[0, :3], colour)
+
+
+def test_the_schema_describes_what_is_written(tmp_path, repository):
+    """Document and lines, a frame with masks and tracks and one of the cube; and every field is described."""
+    jsonschema = pytest.importorskip("jsonschema")
+    schema = json.loads((repository / "sq_perception" / "recordings" / "result.schema.json").read_text())
+    jsonschema.Draft202012Validator.check_schema(schema)
+    save_npz(tmp_path / "1.5.npz")
+    np.savez(tmp_path / "2.5.npz", depth=np.full((8, 8), np.nan), projection="orthographic")
+    lines = tmp_path / "out.jsonl"
+    names = tmp_path / "1.5.npz", tmp_path / "2.5.npz"
+    first, second = recover(tmp_path, *names, "--track", "--jsonl", lines)
+    jsonschema.validate(json.loads((tmp_path / "out.json").read_text()), schema)
+    head, *frames = map(json.loads, lines.read_text().splitlines())
+    jsonschema.validate({**head, "frames": frames}, schema)
+    assert first["camera"]["K"] == CAMERA.matrix.ravel().tolist()
+    assert (first["coordinates"], second["coordinates"]) == ("optical", "cube")
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate({**head, "frames": [{**first, "ms": "soon"}]}, schema)
+
+
+def body_entry(status="converged", message="converged", **changed):
+    entry = {
+        "size": [0.24, 0.098, 0.107], "sigma_size": [0.0025, 0.0055, 0.0035], "shape": [0.1, 1.0],
+        "translation": [0.12, 0.03, 0.84], "score": 0.9, "seen": [1.0, 0.9, None], "pixels": 500, "label": None,
+        "track": None, "status": status, "message": message,
+    }  # fmt: skip
+    return {**entry, **changed}
+
+
+def test_a_line_a_body_and_a_reason_once():
+    bodies = [
+        body_entry(),
+        body_entry("weak", "half size along y undetermined; hollow", sigma_size=[0.001, None, 0.04]),
+        body_entry("weak", "half size along x and z undetermined", label=3, track={"id": 7}),
+        body_entry("failed", "5 pixels with a depth are too few for a body"),
+        body_entry(message=f"converged; {CUT_SHORT}", sigma_size=[None] * 3),
+    ]  # fmt: skip
+    frame = {"file": "a.npz", "stamp": None, "ms": 12.3, "message": "", "ms_by_stage": {"fit": 3.0}}
+    frames = [{**frame, "coordinates": "optical", "superquadrics": bodies},
+              {**frame, "coordinates": "cube", "superquadrics": bodies[:1]}]  # fmt: skip
+    assert list(lines(frames, verbose=False)) == [
+        "a.npz  12 ms",
+        "  0 converged 480 x 196 x 214 mm (+-5 +-11 +-7) at 0.12 0.03 0.84 m",
+        "  1 weak 480 x 196 x 214 mm (+-2 +-? +-80) at 0.12 0.03 0.84 m",
+        "  2 weak 480 x 196 x 214 mm (+-5 +-11 +-7) at 0.12 0.03 0.84 m  mask 3  id 7",
+        "  3 failed at 0.12 0.03 0.84 m",
+        "  4 converged (cut short by the time budget) 480 x 196 x 214 mm at 0.12 0.03 0.84 m",
+        "a.npz  12 ms",
+        "  0 converged 0.480 x 0.196 x 0.214 of the cube (+-0.005 +-0.011 +-0.007) at 0.12 0.03 0.84",
+        "2 weak: half size undetermined",
+        "1 failed: 5 pixels with a depth are too few for a body",
+        "what to do with them: docs/how_sure.md; -v says more of each body",
+    ]
+    details = list(lines(frames[:1], verbose=True))
+    assert "    exponents 0.10 1.00, score 0.900, seen 100% 90% ?, pixels 500: converged" in details
+    assert sum("undetermined" in line for line in details) == 2
+
+
+def test_csv_and_a_page_are_written_beside_each_other(tmp_path, capsys):
+    frame, table, page = save_npz(tmp_path / "a.npz"), tmp_path / "out.csv", tmp_path / "out.html"
+    assert run(frame, "--csv", table, "--html", page) == 0
+    assert len(table.read_text().splitlines()) == 3
+    assert "frames.push" in page.read_text()
+    capsys.readouterr()
+    assert run(frame, "--csv", "-") == 0
+    assert capsys.readouterr().out == table.read_text()
+    assert run(frame, "--csv", "-", "--json", "-") == 2
+    assert run(tmp_path / "none.npz", "--csv", table, "--html", page) == 1
+    assert len(table.read_text().splitlines()) == 3
+    assert "frames.push" in page.read_text()
 
 
 def test_an_interruption_leaves_whole_files(tmp_path, monkeypatch, capsys):

@@ -103,10 +103,14 @@ def test_an_archive_that_unpacks_to_far_more_than_it_weighs_is_refused(tmp_path,
 
 def test_grey_images_are_read(tmp_path):
     rng = np.random.default_rng(1)
-    for name, dtype in (("a.png", np.uint8), ("b.png", np.uint16), ("c.bmp", np.uint8)):
+    for name, dtype in (("a.png", np.uint8), ("b.png", np.uint16), ("c.bmp", np.uint8), ("c.tif", np.uint16)):
         grey = rng.integers(0, np.iinfo(dtype).max, (6, 9)).astype(dtype)
         assert cv2.imwrite(str(tmp_path / name), grey)
         np.testing.assert_array_equal(grey_image(tmp_path / name), grey)
+    far = rng.random((6, 9), dtype=np.float32)
+    far[2, 3] = np.nan
+    assert cv2.imwrite(str(tmp_path / "e.tiff"), far)
+    np.testing.assert_array_equal(grey_image(tmp_path / "e.tiff"), far)
     (tmp_path / "d.png").write_bytes(png(3, 2, b"\x00\x01\x02\x03\x00\x04\x05\x06"))
     np.testing.assert_array_equal(grey_image(tmp_path / "d.png"), [[1, 2, 3], [4, 5, 6]])
 
@@ -114,15 +118,16 @@ def test_grey_images_are_read(tmp_path):
 @pytest.mark.parametrize(
     ("data", "words"),
     [
-        (png(20_000, 20_000, bytes(2000)), "1 to 33554432 pixels, got 20000 x 20000"),
+        (png(9_000, 9_000, bytes(2000)), "1 to 33554432 pixels, got 9000 x 9000"),
+        (png(20_000, 20_000, bytes(2000)), "33554432 pixels"),
         (png(2**31 - 1, 2**31 - 1, b""), "pixels"),
         (png(0, 5, b""), "pixels"),
         (b"BM" + bytes(16) + struct.pack("<ii", 50_000, -50_000) + bytes(32), "pixels"),
-        (b"\x89PNG\r\n\x1a\n", "PNG or BMP"),
-        (b"GIF89a", "PNG or BMP"),
-        (b"", "PNG or BMP"),
+        (b"\x89PNG\r\n\x1a\n", "PNG, BMP or TIFF"),
+        (b"GIF89a", "PNG, BMP or TIFF"),
+        (b"", "PNG, BMP or TIFF"),
     ],
-    ids=["large", "overflow", "none", "bmp", "cut", "other", "nothing"],
+    ids=["large", "larger", "overflow", "none", "bmp", "cut", "other", "nothing"],
 )
 def test_images_that_would_fill_the_memory_are_refused(tmp_path, data, words):
     (tmp_path / "some.png").write_bytes(data)

@@ -82,3 +82,34 @@ def test_misuse_is_refused(tmp_path):
         export([], tmp_path / "none.glb")
     with pytest.raises(ValueError, match="names: expected 2 different ones"):
         export([body(), body()], tmp_path / "two.glb", names=["a", "a"])
+
+
+def test_any_two_colours_differ_to_every_eye():
+    """CIE 1976 differences as normal, deuteranopic and protanopic eyes see them (Machado et al. 2009, severity 1)."""
+    eyes = {
+        "normal": np.eye(3),
+        "deuteranopic": [
+            [0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.01182, 0.04294, 0.968881],
+        ],
+        "protanopic": [
+            [0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998],
+        ],
+    }  # fmt: skip
+    linear = np.where(COLOURS <= 0.04045, COLOURS / 12.92, ((COLOURS + 0.055) / 1.055) ** 2.4)
+    to_xyz = np.array(
+        [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.072175], [0.0193339, 0.119192, 0.9503041]]
+    )
+    for name, eye in eyes.items():
+        share = np.clip(linear @ np.transpose(eye), 0, 1) @ to_xyz.T / to_xyz.sum(axis=1)
+        x, y, z = np.where(share > (6 / 29) ** 3, np.cbrt(share), share / (3 * (6 / 29) ** 2) + 4 / 29).T
+        lab = np.stack([116 * y - 16, 500 * (x - y), 200 * (y - z)], axis=1)
+        different = np.linalg.norm(lab[:, None] - lab, axis=-1) + 100 * np.eye(len(lab))
+        assert different.min() > 25, name
+
+
+def test_markers_have_the_colours_of_meshes():
+    """sq_msgs_py stands alone, so that it has a table of its own."""
+    pytest.importorskip("visualization_msgs", reason="needs the extra 'ros'")
+    from sq_msgs_py.markers import PALETTE
+
+    np.testing.assert_array_equal(PALETTE, COLOURS)

@@ -8,6 +8,7 @@ import re
 import stat
 import subprocess
 import sys
+import tarfile
 import zipfile
 from pathlib import Path
 
@@ -180,3 +181,20 @@ def test_the_messages_install_alone_with_numpy_only(source_copy: Path, tmp_path:
     said = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True)
     assert (said.returncode, said.stderr) == (0, "")
     assert str(tmp_path) in said.stdout
+
+
+def test_the_source_archive_is_whole(source_copy: Path, tmp_path: Path) -> None:
+    """What is in the tree is in the archive, so that it builds, tests and explains itself alone."""
+    made = [sys.executable, "setup.py", "-q", "sdist", "--dist-dir", tmp_path]
+    subprocess.run(made, cwd=source_copy, check=True, capture_output=True, timeout=300)
+    with tarfile.open(next(tmp_path.glob("*.tar.gz"))) as archive:
+        carried = {name.partition("/")[2] for name in archive.getnames()}
+        about = archive.extractfile(next(name for name in archive.getnames() if name.endswith("/PKG-INFO")))
+        assert about is not None
+        assert "Description-Content-Type: text/markdown" in about.read().decode()
+    there = {
+        path.relative_to(source_copy).as_posix()
+        for path in source_copy.rglob("*")
+        if path.is_file() and not any(part == "build" or part.endswith(".egg-info") for part in path.parts)
+    }
+    assert there - carried == set()

@@ -177,3 +177,67 @@ def test_matrices_beside_frames_are_no_frames(tmp_path):
     assert [file for file, _ in RecordedInput([str(tmp_path)], NUMBERS)] == [str(tmp_path / "a.png")]
     (tmp_path / "a.png").unlink()
     assert [file for file, _ in RecordedInput([str(tmp_path)], NUMBERS)] == [str(tmp_path / "K.npy")]
+
+
+@pytest.mark.parametrize(("value", "dtype"), [(0.8, np.float32), (800, np.uint16)])
+def test_tiff_has_the_units_of_its_type(tmp_path, value, dtype):
+    frame = read(save(tmp_path / "a.tiff", value, dtype), NUMBERS)
+    assert frame.depth[1, 1] == pytest.approx(0.8)
+    assert np.isnan(frame.depth[0, 0])
+    (tmp_path / "b.tif").write_bytes((tmp_path / "a.tiff").read_bytes()[:100])
+    with pytest.raises(FrameError, match="not a readable image"):
+        read(tmp_path / "b.tif", NUMBERS)
+
+
+def npz(path, depth, **fields):
+    np.savez(path, depth=np.full((48, 64), depth, np.float32), **fields)
+    return path
+
+
+MATRIX = [[60, 0, 31.5], [0, 60, 23.5], [0, 0, 1]]
+
+
+@pytest.mark.parametrize(
+    ("depth", "fields", "projection", "said"),
+    [
+        (800.0, {"K": MATRIX}, "pinhole", "for millimetres the depth scale is 1000"),
+        (0.0008, {"K": MATRIX}, "pinhole", "for metres the depth scale is 1"),
+        (0.8, {"K": MATRIX}, "orthographic", "has the matrix K of a pinhole camera"),
+        (2.5, {}, "orthographic", "a metric image is not orthographic"),
+    ],
+)
+def test_the_likely_mistake_is_named(tmp_path, depth, fields, projection, said):
+    path = npz(tmp_path / "a.npz", depth, **fields)
+    assert said in read(path, projection=projection).warning
+    assert not read(npz(path, 0.8, K=MATRIX)).warning
+    assert not read(npz(path, 0.8), projection="orthographic").warning
+
+
+@pytest.mark.parametrize("name", ["a.npz", "a.npy", "a.tiff"])
+def test_a_scale_holds_for_floats_too(tmp_path, name):
+    path = tmp_path / name
+    npz(path, 800.0, K=MATRIX) if path.suffix == ".npz" else save(path, 800.0, np.float32)
+    frame = read(path, NUMBERS, reading=Reading(scale=1000.0))
+    assert frame.depth[1, 1] == pytest.approx(0.8)
+    assert not frame.warning
+
+
+def test_a_colour_picture_is_named(tmp_path):
+    image = np.zeros((48, 64, 3), np.uint16)
+    image[..., 2] = 900
+    cv2.imwrite(str(tmp_path / "a.png"), image)
+    with pytest.raises(FrameError, match="the camera's picture, or depth drawn in colours"):
+        read(tmp_path / "a.png", NUMBERS)
+
+
+def test_a_folder_without_frames_gives_those_of_its_subfolders(tmp_path):
+    """In natural order, with the camera beside them or above; a folder with frames keeps to them."""
+    for name in ("take10/b.png", "take2/depth/a.png", "take2/depth/deeper/x.png"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        save(tmp_path / name)
+    for folder, focal in ((tmp_path, 60), (tmp_path / "take10", 70)):
+        as_json(folder / "camera_intrinsic.json",
+                {"width": 64, "height": 48, "intrinsic_matrix": [focal, 0, 0, 0, focal, 0, 31.5, 23.5, 1]})  # fmt: skip
+    found = list(RecordedInput([str(tmp_path)]))
+    assert [file for file, _ in found] == [str(tmp_path / name) for name in ("take2/depth/a.png", "take10/b.png")]
+    assert [frame.camera.fx for _, frame in found] == [60, 70]

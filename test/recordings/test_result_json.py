@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import csv
+import io
 import json
 
 import pytest
 
+from sq_perception import __version__
 from sq_perception.recordings.frame_file import Stamp
-from sq_perception.recordings.result_json import Recovered, ResultLines, ResumeError
+from sq_perception.recordings.result_json import Recovered, ResultLines, ResumeError, table
 
 OPTIONS = {"method": "auto", "model": None}
 
@@ -29,7 +32,8 @@ def path(tmp_path):
 
 def test_a_head_and_a_line_a_frame(path):
     head, *frames = map(json.loads, path.read_text().splitlines())
-    assert head == {"format": "sq_perception.recovery", "version": 1, "options": OPTIONS}
+    about = {"program": f"sq_perception {__version__}", "units": {"optical": "m", "cube": "1"}, "options": OPTIONS}
+    assert head == {"format": "sq_perception.recovery", "version": 1, **about}
     assert frames == [entry(0), entry(1)]
 
 
@@ -98,6 +102,25 @@ def test_a_full_disk_leaves_whole_lines(path, file_size_limit):
     lines.add(entry(2))
     lines.close()
     assert json.loads(path.read_text().splitlines()[-1]) == entry(2)
+
+
+def test_a_row_a_body_with_the_numbers_of_the_document():
+    body = {
+        "size": [0.1, 0.2, 0.3], "sigma_size": [0.01, None, 0.03], "shape": [0.5, 1.0], "translation": [1.0, 2.0, 3.0],
+        "rotation": [0.0, 0.0, 0.0, 1.0], "seen": [1.0, 0.5, None], "score": 0.9, "residual": 0.001, "pixels": 99,
+        "label": None, "message": "converged; a, b", "status": "converged", "track": {"id": 7},
+    }  # fmt: skip
+    stamp = {"sec": 3, "nanosec": 40}
+    frame = {
+        "file": "a.npz",
+        "stamp": stamp,
+        "coordinates": "optical",
+        "superquadrics": [body, {**body, "track": None}],
+    }
+    first, second = csv.DictReader(io.StringIO(table([frame, {**frame, "superquadrics": []}])))
+    assert (first["stamp"], first["body"], first["id"], first["a2"]) == ("3.000000040", "0", "7", "0.2")
+    assert (first["sigma_a2"], first["seen_a3"], first["qw"], first["message"]) == ("", "", "1.0", "converged; a, b")
+    assert (second["body"], second["id"], second["e2"], second["label"]) == ("1", "", "1.0", "")
 
 
 def test_equal_frames_count_one_by_one():

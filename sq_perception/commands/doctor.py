@@ -1,0 +1,85 @@
+"""``sq-perception doctor``: versions, extras, kernels, weights and cores, and what to do about what is missing."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import platform
+import re
+from collections.abc import Iterator, Sequence
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from sq_perception import __version__
+from sq_perception.commands.console import FAILURE, SUCCESS, parser
+
+_HELP = "Say what is installed, what is missing, and how to get it; the exit code is 1 where the core cannot work."
+_PACKAGE = Path(__file__).parents[1]
+_EXTRAS = {
+    "bags": ("rosbags", "mcap"),
+    "view": ("viser",),
+    "train": ("tensorboard",),
+    "ros": ("rclpy", "sensor_msgs", "visualization_msgs"),
+}
+"""What tells that an extra is there."""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Entry of ``sq-perception doctor``; the exit code."""
+    parser("doctor", _HELP).parse_args(arguments)
+    faults = 0
+    for what, words, is_fault in findings():
+        print(f"{what:12} {words}")
+        faults += is_fault
+    return FAILURE if faults else SUCCESS
+
+
+def findings() -> Iterator[tuple[str, str, bool]]:
+    """What was looked at, what was found, and whether nothing works without it."""
+    from sq_perception.files import provenance
+
+    yield "program", f"sq_perception {__version__}, Python {platform.python_version()}, {_PACKAGE}", False
+    yield (
+        "cores",
+        f"{len(os.sched_getaffinity(0))} of {os.cpu_count()} for this process: {provenance.processor()}",
+        False,
+    )
+    for requirement in _requirements():
+        name = re.split(r"[^\w.-]", requirement, maxsplit=1)[0]
+        if "extra ==" not in requirement:
+            try:
+                yield name, metadata.version(name), False
+            except metadata.PackageNotFoundError:
+                yield name, f"missing: pip install '{requirement}'", True
+    for extra, modules in _EXTRAS.items():
+        missing = [name for name in modules if importlib.util.find_spec(name) is None]
+        remedy = f"missing {', '.join(missing)}: pip install 'sq_perception[{extra}]'"
+        yield f"[{extra}]", remedy if missing else "there", False
+    if distro := os.environ.get("ROS_DISTRO"):
+        yield "ROS", f"{distro}, sourced", False
+    yield "weights", *_weights()
+    yield "kernels", _kernels(), False
+
+
+def _requirements() -> list[str]:
+    try:
+        return metadata.requires("sq-perception") or []
+    except metadata.PackageNotFoundError:  # run from the sources
+        return []
+
+
+def _weights() -> tuple[str, bool]:
+    found = sorted((_PACKAGE / "weights").glob("*.safetensors"))
+    return (", ".join(path.stem for path in found) or "missing: install the package again", not found)
+
+
+def _kernels() -> str:
+    try:
+        from sq_perception.geometry import kernels
+    except ImportError as error:
+        return f"cannot be loaded: {error}"
+    gauge: Any = kernels.gauge
+    folder = Path(gauge.stats.cache_path)
+    kept = any(folder.glob(f"kernels.{gauge.py_func.__qualname__}-*.nbi"))
+    return f"compiled, in {folder}" if kept else f"not compiled yet: sq-perception warm-up; they go to {folder}"

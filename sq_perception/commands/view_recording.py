@@ -1,0 +1,152 @@
+"""``sq-perception view FRAME``: the page of ``view`` for recorded frames, which are recovered here; needs no ROS."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import queue
+from collections.abc import Iterator, Sequence
+from typing import TYPE_CHECKING, NoReturn
+
+from sq_perception.commands.console import FAILURE, SUCCESS, complain, failed, parser
+
+if TYPE_CHECKING:
+    from sq_perception.recordings.frame_file import RecordedFrame
+    from sq_perception.recovery.recovery import FrameRecovery
+    from sq_perception.viewing.page import Page
+    from sq_perception.viewing.scene import Bodies
+
+_HELP = """\
+A page in the browser for recorded frames: depth as points, superquadrics with their uncertainty, numbers.  FRAME is
+what `sq-perception recover` takes: an image, an NPZ, a cloud, a folder or a bag.  Everything comes from this machine.
+"""
+_SOURCE = "/recording"
+_PREVIOUS, _NEXT = "previous", "next"
+_KEPT = 20
+"""Frames that one can go back to."""
+_REDRAWN = 0.5
+"""Seconds between two drawings, so that the boxes of the page take effect."""
+
+
+def main(arguments: Sequence[str]) -> int:
+    """Entry of ``sq-perception view FRAME``; the exit code."""
+    command = parser("view", _HELP)
+    command.add_argument("frames", nargs="+", metavar="FRAME", help="recorded depth images, folders or bags of them")
+    command.add_argument("--projection", choices=("pinhole", "orthographic"), default="pinhole")
+    command.add_argument("--camera-info", metavar="FILE", help="the intrinsics of images and bags, or fx,fy,cx,cy")
+    command.add_argument("--topic", metavar="NAME", help="depth images of a bag, where it has several such topics")
+    command.add_argument("--every", type=int, default=1, metavar="N", help="only every Nth frame of a bag or folder")
+    methods = ("auto", "network", "symmetry", "classic")
+    command.add_argument("--method", choices=methods, default="auto", help="as `sq-perception recover` has them")
+    command.add_argument("--ignore-masks", action="store_true", help="segment, even where a frame brings labels")
+    command.add_argument("--host", default="127.0.0.1", metavar="ADDRESS", help="address to serve on (%(default)s)")
+    command.add_argument("--port", type=int, help="port to serve on, 0 for any free one (8080, or the next free one)")
+    options = command.parse_args(arguments)
+    if options.every < 1:
+        command.error(f"--every: expected at least 1, got {options.every}")
+    try:
+        from sq_perception.viewing import server
+        from sq_perception.viewing.page import Page
+    except ImportError as error:
+        return failed(f"view needs the module {error.name!r}: pip install 'sq_perception[view]'")
+    from sq_perception.recordings.frame_file import FrameError
+
+    try:
+        frames = _recovered(options)
+        first = next(frames, None)
+        if first is None:
+            return FAILURE
+        bound = server.listening_socket(options.host, options.port)
+    except (FrameError, server.ServerError) as error:
+        return failed(str(error))
+    page = Page(bound, [_SOURCE], parameters=False)
+    try:
+        print(f"http://{options.host}:{bound.getsockname()[1]}; Ctrl-C ends", flush=True)
+        _turn_over(page, first, frames)
+    except KeyboardInterrupt:
+        return SUCCESS
+    finally:
+        page.close()
+        bound.close()
+
+
+def _recovered(options: argparse.Namespace) -> Iterator[tuple[RecordedFrame, FrameRecovery]]:
+    """The frames that can be read, one by one as they are asked for."""
+    from sq_perception.recordings.frame_file import FrameError
+    from sq_perception.recordings.inputs import RecordedInput
+    from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
+
+    recorded = RecordedInput(
+        options.frames, options.camera_info, options.projection, topic=options.topic, every=options.every
+    )
+    recoverer = Recoverer(method=options.method)
+    for _, frame in recorded:
+        if isinstance(frame, FrameError):
+            complain(str(frame))
+            continue
+        if frame.warning:
+            complain(f"warning: {frame.name}: {frame.warning}")
+        labels = None if options.ignore_masks else frame.labels
+        settings = RecoveryOptions(method=options.method, free_space=frame.has_free_space)
+        yield frame, recoverer.recover(frame.depth, frame.camera, labels, settings)
+
+
+def _turn_over(
+    page: Page,
+    first: tuple[RecordedFrame, FrameRecovery],
+    frames: Iterator[tuple[RecordedFrame, FrameRecovery]],
+) -> NoReturn:
+    """Show frames as the buttons of the page say; never returns."""
+    wishes: queue.SimpleQueue[str] = queue.SimpleQueue()
+    buttons = page.server.gui.add_button_group("Frame", (_PREVIOUS, _NEXT))
+    buttons.on_click(lambda _: wishes.put(buttons.value))
+    shown, at = [first], 0
+    while True:
+        _show(page, *shown[at])
+        try:
+            wish = wishes.get(timeout=_REDRAWN)
+        except queue.Empty:
+            continue
+        if wish == _PREVIOUS:
+            at = max(at - 1, 0)
+        elif at + 1 < len(shown):
+            at += 1
+        elif (new := next(frames, None)) is not None:
+            shown = [*shown, new][-_KEPT:]
+            at = len(shown) - 1
+
+
+def _show(page: Page, frame: RecordedFrame, recovery: FrameRecovery) -> None:
+    from sq_perception.viewing import tables
+    from sq_perception.viewing.tables import NodeState
+
+    if not page.watched:
+        return
+    camera = frame.camera
+    words = f"{frame.name}: {camera.width} x {camera.height}, {recovery.milliseconds['total']:.0f} ms"
+    page.show_source(tables.answer(f"{words}; {recovery.message or frame.warning}".rstrip("; "), not frame.warning))
+    page.show_depth(frame.depth, camera)
+    stamp = 0.0 if frame.stamp is None else frame.stamp.sec + 1e-9 * frame.stamp.nanosec
+    page.show_bodies(_SOURCE, bodies_of(recovery), stamp, NodeState(_SOURCE, age=0.0))
+
+
+def bodies_of(recovery: FrameRecovery) -> Bodies:
+    """What the page draws of a frame; ids are places in ``recovery.bodies``."""
+    import numpy as np
+
+    from sq_perception.fitting.fit import Status
+    from sq_perception.geometry.mesh import COLOURS
+    from sq_perception.geometry.superquadric import Superquadric
+    from sq_perception.viewing.scene import Bodies
+
+    found = [k for k, body in enumerate(recovery.bodies) if body.status != Status.FAILED]
+    bodies = [recovery.bodies[k] for k in found]
+    return Bodies(
+        superquadrics=Superquadric.stack([body.superquadric for body in bodies]),
+        sigma_size=np.array([body.sigma_size for body in bodies]).reshape(-1, 3),
+        score=np.array([body.score if math.isfinite(body.score) else 0.0 for body in bodies]),
+        ids=found,
+        is_weak=[body.status == Status.WEAK for body in bodies],
+        colours=COLOURS[np.array(found, dtype=int) % len(COLOURS)].reshape(-1, 3),
+        failed=[k for k in range(len(recovery.bodies)) if k not in found],
+    )

@@ -1,0 +1,135 @@
+"""Point clouds of PCD and PLY files as depth images: metres of the optical frame, seen from its origin.
+
+An ORGANISED cloud (a PCD of several rows) of a pinhole camera IS a depth image: z, and the camera from the points
+themselves, as u = fx x / z + cx.  Any other cloud is looked at from the origin: each pixel takes its nearest point.
+Nothing is then known of the space beside an object (``RecordedFrame.has_free_space``), as points of several views, or
+thinned ones, leave gaps through which one sees what is behind.
+
+References: PCD, https://pointclouds.org/documentation/tutorials/pcd_file_format.html; trimesh reads PLY.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sq_perception.files.unpacking import MOST_BYTES, MOST_PIXELS, UnpackingError
+from sq_perception.imaging.camera import Camera
+
+SUFFIXES = (".pcd", ".ply")
+UNORGANISED = (
+    "a cloud that is no image, seen from its origin: nothing is known of the space beside an object, so that the side "
+    "that is not seen is less sure; a depth image or an organised cloud tells more"
+)
+_NUMBERS = {"F": "f", "I": "i", "U": "u"}
+_PIXEL_ERROR = 0.1
+"""Of 99 % of the points of an organised cloud, between their place in it and in the image of its camera."""
+_LEAST_POINTS = 100
+_POINTS_A_PIXEL = 2.0
+"""Of a cloud that is no image, so that few pixels of a surface stay empty."""
+_LARGEST_SIDE = 1024
+_NEIGHBOURS = 2000
+"""Points whose nearest neighbour tells how dense the cloud is."""
+
+
+def read_points(path: Path) -> np.ndarray:
+    """Points (height, width, 3), one row where they are not organised; NaN for none.
+
+    Raises
+    ------
+    UnpackingError
+        If the file is no readable cloud.
+    """
+    if path.stat().st_size > MOST_BYTES:
+        raise UnpackingError(f"expected at most {MOST_BYTES} bytes, got {path.stat().st_size}")
+    try:
+        points = _pcd(path.read_bytes()) if path.suffix.lower() == ".pcd" else _ply(path)
+    except UnpackingError:
+        raise
+    except Exception as error:  # whatever damaged files lead to
+        raise UnpackingError(f"not a readable cloud: {type(error).__name__}: {error}") from error
+    return points.astype(float)
+
+
+def as_image(points: np.ndarray) -> tuple[np.ndarray, Camera, bool]:
+    """Depth (height, width), its camera, and whether the points were an image before.
+
+    Raises
+    ------
+    UnpackingError
+        If they do not lie before a camera in the origin that looks along z.
+    """
+    with np.errstate(invalid="ignore"):
+        there = np.isfinite(points).all(axis=2) & (points[..., 2] != 0)
+        before = there & (points[..., 2] > 0)
+    if np.count_nonzero(before) < max(_LEAST_POINTS, 0.5 * np.count_nonzero(there)):
+        raise UnpackingError(
+            f"expected {_LEAST_POINTS} points or more, most of them before the camera: z forward, y down"
+        )
+    v, u = np.nonzero(before)
+    x, y, z = points[before].T
+    tangents = np.stack([x / z, y / z], axis=1)
+    if points.shape[0] > 1:
+        fx, cx = np.polyfit(tangents[:, 0], u, 1)
+        fy, cy = np.polyfit(tangents[:, 1], v, 1)
+        off = np.abs(tangents * [fx, fy] + [cx, cy] - np.stack([u, v], axis=1))
+        if np.quantile(off, 0.99) < _PIXEL_ERROR:
+            depth = np.where(before, points[..., 2], np.nan).astype(np.float32)
+            return depth, Camera(points.shape[1], points.shape[0], float(fx), float(fy), float(cx), float(cy)), True
+    return (*_seen(tangents, z), False)
+
+
+def _seen(tangents: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, Camera]:
+    """The nearest depth in each pixel of a camera that is as fine as the points."""
+    from scipy.spatial import cKDTree
+
+    some = tangents[:: max(1, len(tangents) // _NEIGHBOURS)]
+    spacing = float(np.median(cKDTree(tangents).query(some, k=2)[0][:, 1]))
+    low, high = tangents.min(axis=0), tangents.max(axis=0)
+    finest = float((high - low).max()) / (_LARGEST_SIDE - 2)
+    pixel = max(spacing * np.sqrt(_POINTS_A_PIXEL), finest, 1e-9)
+    width, height = (int(side) + 2 for side in np.ceil((high - low) / pixel))
+    column, row = np.rint((tangents - low) / pixel).astype(int).T
+    depth = np.full((height, width), np.inf, np.float32)
+    np.minimum.at(depth, (row, column), z.astype(np.float32))
+    camera = Camera(width, height, 1 / pixel, 1 / pixel, float(-low[0] / pixel), float(-low[1] / pixel))
+    return np.where(np.isfinite(depth), depth, np.float32(np.nan)), camera
+
+
+def _ply(path: Path) -> np.ndarray:
+    import trimesh
+
+    found: Any = trimesh.load(path, file_type="ply", process=False)
+    points: np.ndarray = np.array(found.vertices, dtype=np.float64)
+    return points[None]
+
+
+def _pcd(data: bytes) -> np.ndarray:
+    head: dict[str, list[str]] = {}
+    at = 0
+    while "DATA" not in head:
+        end = data.index(b"\n", at)
+        name, *values = data[at:end].decode("ascii").split() or [""]
+        head[name], at = values, end + 1
+    width, height = int(head["WIDTH"][0]), int(head["HEIGHT"][0])
+    count = width * height
+    if not (0 < count <= MOST_PIXELS and width > 0):
+        raise UnpackingError(f"expected 1 to {MOST_PIXELS} points, got {width} x {height}")
+    counts = [int(one) for one in head.get("COUNT", ["1"] * len(head["FIELDS"]))]
+    kinds = [_NUMBERS[kind] + size for kind, size in zip(head["TYPE"], head["SIZE"], strict=True)]
+    where = [head["FIELDS"].index(axis) for axis in "xyz"]
+    if head["DATA"] == ["ascii"]:
+        columns = np.cumsum([0, *counts])
+        table = np.array(data[at:].split(), dtype=float).reshape(count, columns[-1])
+        points = table[:, [columns[k] for k in where]]
+    elif head["DATA"] == ["binary"]:
+        layout = np.dtype(
+            [(f"{k}", f"<{kind}", (number,)) for k, (kind, number) in enumerate(zip(kinds, counts, strict=True))]
+        )
+        table = np.frombuffer(data, layout, count, at)
+        points = np.stack([table[f"{k}"][:, 0] for k in where], axis=1)
+    else:
+        raise UnpackingError(f"DATA: expected ascii or binary, got {' '.join(head['DATA'])}: save it uncompressed")
+    return points.reshape(height, width, 3)

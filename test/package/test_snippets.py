@@ -1,0 +1,109 @@
+"""The Python of the documents runs, on things of the kind that its comments name."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging import raycast
+from sq_perception.imaging.camera import Camera
+
+CAMERA = Camera(80, 60, 100.0, 100.0, 39.5, 29.5)
+BODY = Superquadric([0.05, 0.04, 0.06], [0.2, 0.9], [0.0, 0.0, 0.5], [0.7, 0.1, 0.1, 0.7])
+
+
+def names() -> dict[str, Any]:
+    depth, index = raycast.render(BODY, CAMERA)
+    depth = np.where(np.isfinite(depth), depth, 0.8).astype(np.float32)
+    return {
+        "depth": depth,
+        "mask": index >= 0,
+        "camera": CAMERA,
+        "last_body": BODY,
+        "table": np.array([0.0, 0.0, -1.0, 0.8]),
+        "true_depth": depth,
+        "rng": np.random.default_rng(1),
+        "z": np.array([0.5]),
+        "cosine": np.array([0.7]),
+    }
+
+
+def run(repository: Path, page: str, given: dict[str, Any]) -> dict[str, Any]:
+    text = (repository / "docs" / page).read_text(encoding="utf-8")
+    (snippet,) = re.findall(r"^```python\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
+    exec(compile(snippet, page, "exec"), given)  # noqa: S102
+    return given
+
+
+def test_the_surface_fit(repository: Path) -> None:
+    found = run(repository, "surface_fit.md", names())["found"]
+    np.testing.assert_allclose(found.superquadric.translation, BODY.translation, atol=0.01)
+
+
+def test_sensors(repository: Path) -> None:
+    given = names()
+    before = given["true_depth"]
+    measured = run(repository, "sensors.md", given)["depth"]
+    assert measured.shape == before.shape
+    assert np.nanmedian(np.abs(measured - before)) < 0.01
+
+
+def test_tracking(repository: Path) -> None:
+    from sq_perception.recovery.recoverer import Recoverer
+
+    depth = names()["depth"]
+    frames = [(0.1 * k, depth, np.eye(4)) for k in range(2)]
+    given = run(
+        repository, "tracking.md", {"frames": frames, "recoverer": Recoverer(method="symmetry"), "camera": CAMERA}
+    )
+    assert given["track"].observation == 0
+
+
+def test_outputs(repository: Path) -> None:
+    pytest.importorskip("shape_msgs", reason="needs the extra 'ros'")
+    from std_msgs.msg import Header
+
+    from sq_msgs_py.superquadrics import to_message
+    from sq_perception.recordings.publication import truth_array
+
+    message = to_message(truth_array(Superquadric.stack([BODY])), Header())
+    given = run(repository, "outputs.md", {"message": message, "quaternion": [0, 0, 0, 1.0], "shift": [0, 0, 1.0]})
+    np.testing.assert_allclose(given["there"].translation, [[0, 0, 1.5]], atol=1e-6)
+
+
+def test_bags(repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
+    pytest.importorskip("mcap", reason="needs the extra 'bags'")
+    from sq_perception.recordings.frame_file import RecordedFrame
+    from sq_perception.recordings.result_bag import ResultBag
+    from sq_perception.recovery.recoverer import Recoverer
+
+    given = names()
+    monkeypatch.chdir(tmp_path)
+    frame = RecordedFrame(given["depth"], CAMERA, None, "a", False)
+    recovery = Recoverer(method="symmetry").recover(frame.depth, CAMERA, given["mask"].astype(np.int32))
+    with ResultBag("results.mcap") as bag:
+        bag.add(frame, recovery, None)
+    run(repository, "bags.md", given)
+    assert re.search(r"s  body 1: \[.*\] mm", capsys.readouterr().out)
+
+
+def test_the_exported_network(repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The same body as asked in this package, and the graph says itself what it takes."""
+    onnx = pytest.importorskip("onnx")
+    pytest.importorskip("onnxruntime")
+    from sq_perception.commands import main
+    from sq_perception.recovery.recoverer import Recoverer
+
+    monkeypatch.chdir(tmp_path)
+    assert main.main(["export", "--output", "net.onnx"]) == 0
+    graph = onnx.load("net.onnx").graph
+    assert "z to the viewer" in graph.input[0].doc_string
+    assert "quaternion" in graph.output[0].doc_string
+    given = run(repository, "models.md", names())
+    (own,) = Recoverer(method="network").recover(given["depth"], CAMERA, given["mask"].astype(np.int32)).bodies
+    assert np.linalg.norm(given["body"].translation - own.superquadric.translation) < 0.01

@@ -1,0 +1,127 @@
+"""Clouds: an organised one is the image that it came from, any other one is seen again, and nothing hostile is read."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging import raycast
+from sq_perception.imaging.camera import Camera
+from sq_perception.recordings.cloud_file import UNORGANISED
+from sq_perception.recordings.frame_file import FrameError, Reading, read
+from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
+
+CAMERA = Camera(160, 120, 210.0, 200.0, 80.5, 58.25)
+BODY = Superquadric([0.06, 0.04, 0.05], [0.2, 0.2], [0.01, 0.02, 0.7], [0.4, 0.2, 0.1, 0.8])
+
+
+def points():
+    depth, _ = raycast.render(BODY, CAMERA)
+    depth = np.where(np.isfinite(depth), depth, 1.2)
+    depth[:10, :10] = np.nan
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    return depth, CAMERA.unproject(u, v, depth)
+
+
+def pcd(path, cloud, kind="binary"):
+    """As PCL writes it, with a padding and a colour behind the coordinates."""
+    height, width, _ = cloud.shape
+    head = f"""# .PCD v0.7 - Point Cloud Data file format
+VERSION 0.7
+FIELDS x y z _ rgb
+SIZE 4 4 4 1 4
+TYPE F F F U F
+COUNT 1 1 1 4 1
+WIDTH {width}
+HEIGHT {height}
+VIEWPOINT 0 0 0 1 0 0 0
+POINTS {width * height}
+DATA {kind}
+"""
+    flat = cloud.reshape(-1, 3).astype("<f4")
+    if kind == "ascii":
+        body = "\n".join(f"{x} {y} {z} 0 0 0 0 0.5" for x, y, z in flat).encode()
+    else:
+        rows = np.zeros(len(flat), np.dtype([("p", "<f4", 3), ("_", "u1", 4), ("rgb", "<f4")]))
+        rows["p"] = flat
+        body = rows.tobytes()
+    path.write_bytes(head.encode() + body)
+    return path
+
+
+@pytest.mark.parametrize("kind", ["ascii", "binary"])
+def test_an_organised_cloud_is_its_depth_image(tmp_path, kind):
+    depth, cloud = points()
+    frame = read(pcd(tmp_path / "a.pcd", cloud, kind))
+    np.testing.assert_allclose(frame.depth, depth, rtol=1e-6)
+    for name in ("fx", "fy", "cx", "cy"):
+        assert getattr(frame.camera, name) == pytest.approx(getattr(CAMERA, name), abs=1e-2)
+    assert frame.has_free_space
+    assert not frame.warning
+    assert (
+        read(pcd(tmp_path / "a.pcd", 1e3 * cloud), reading=Reading(scale=1000.0)).depth[50, 50] == frame.depth[50, 50]
+    )
+
+
+def test_a_cloud_in_any_order_is_seen_again(tmp_path):
+    """A PLY of shuffled points: its pixels hold points of the cloud, most of them, and the body keeps its seen size."""
+    _, cloud = points()
+    flat = cloud[np.isfinite(cloud).all(axis=2)]
+    np.random.default_rng(0).shuffle(flat)
+    trimesh.PointCloud(flat).export(tmp_path / "a.ply")
+    frame = read(tmp_path / "a.ply")
+    assert frame.warning == UNORGANISED
+    assert not frame.has_free_space
+    rows, columns = np.nonzero(np.isfinite(frame.depth))
+    assert np.isfinite(frame.depth).mean() > 0.8
+    seen = frame.camera.unproject(columns, rows, frame.depth[rows, columns])
+    width = np.median(seen[:, 2]) / frame.camera.fx
+    distance = np.abs(flat[:, None] - seen[None, ::97]).sum(axis=2).min(axis=0)
+    assert np.quantile(distance, 0.9) < 2 * width
+    mask = (frame.depth < 1.0).astype(np.int32)
+    options = RecoveryOptions(method="symmetry", free_space=frame.has_free_space)
+    (found,) = Recoverer(method="symmetry").recover(frame.depth, frame.camera, mask, options).bodies
+    error = np.abs(np.sort(found.superquadric.size) - np.sort(BODY.size))
+    assert (error < np.maximum(0.006, 3 * np.sort(found.sigma_size))).all()
+
+
+def test_no_free_space_means_that_what_is_beside_says_nothing():
+    """The same body before a near wall and a far one: without free space both give the same fit."""
+    depth, index = raycast.render(BODY, CAMERA)
+    mask = (index >= 0).astype(np.int32)
+    recoverer = Recoverer(method="symmetry")
+    sizes = []
+    for behind in (0.9, 3.0):
+        image = np.where(np.isfinite(depth), depth, behind).astype(np.float32)
+        options = RecoveryOptions(method="symmetry", free_space=False, use_plane=False)
+        sizes.append(recoverer.recover(image, CAMERA, mask, options).bodies[0].superquadric.size)
+    np.testing.assert_array_equal(*sizes)
+
+
+@pytest.mark.parametrize(
+    ("content", "said"),
+    [
+        (b"", "not a readable cloud"),
+        (b"DATA binary\n", "not a readable cloud"),
+        (b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 100000\nHEIGHT 100000\nDATA binary\n", "points, got"),
+        (b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 10\nHEIGHT 1\nDATA binary\n1234", "not a readable cloud"),
+        (b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 10\nHEIGHT 1\nDATA binary_compressed\n", "uncompressed"),
+        (b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 1\nHEIGHT 1\nDATA ascii\n1 2 3\n", "or more"),
+    ],
+)
+def test_what_is_no_cloud_is_refused(tmp_path, content, said):
+    path = tmp_path / "a.pcd"
+    path.write_bytes(content)
+    with pytest.raises(FrameError, match=said):
+        read(path)
+    (tmp_path / "a.ply").write_bytes(content)
+    with pytest.raises(FrameError, match="not a readable cloud"):
+        read(tmp_path / "a.ply")
+
+
+def test_a_cloud_behind_the_camera_is_named(tmp_path):
+    _, cloud = points()
+    with pytest.raises(FrameError, match="z forward"):
+        read(pcd(tmp_path / "a.pcd", -cloud))
