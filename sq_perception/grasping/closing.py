@@ -27,7 +27,7 @@ MODEL_ERROR = 0.0025
 UNKNOWN = 0.1
 """Of a half size: its standard deviation where a body comes without one."""
 _STEP = np.pi / 12
-_NEWTON_STEPS = 5
+_NEWTON_STEPS = 3
 _KEPT = [0, 1, 2, 5, 6, 7, 8, 9, 10]
 """Rows of the covariance without the exponents."""
 
@@ -106,10 +106,12 @@ def chords(
     turn = bodies.rotation_matrix[owner]
     size, shape = bodies.size[owner], bodies.shape[owner]
     at, way = (offset[:, None] @ turn)[:, 0] / size, (direction[:, None] @ turn)[:, 0] / size
-    # The way in units of the half sizes: g along the line is convex, and Newton's steps from outside stay outside.
-    start = 2 * np.sqrt(3) / np.linalg.norm(way, axis=1)
+    # In units of the half sizes, from where the line leaves the box around the body: g is convex along it, and Newton's
+    # steps from outside stay outside.
     sides = np.stack([np.ones(len(at)), -np.ones(len(at))], axis=1)
-    run = start[:, None] * sides
+    with np.errstate(divide="ignore"):
+        wall = (1 - sides[:, :, None] * (at * np.sign(way))[:, None]) / np.abs(way)[:, None]
+    run = np.maximum(wall.min(axis=2), 0.0) * sides
     e1, e2 = shape[:, None, 0], shape[:, None, 1]
     for _ in range(_NEWTON_STEPS + 1):
         p = at[:, None] + run[..., None] * way[:, None]

@@ -1,0 +1,62 @@
+"""sq-perception grasp: what is in its JSON, its pictures and meshes, and wrong usage."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+import trimesh
+
+from sq_perception.commands import main
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging.camera import Camera
+from sq_perception.simulation.thing_rendering import render_things
+from sq_perception.simulation.thing_views import looking_down
+
+CAMERA = Camera(160, 120, 200.0, 200.0, 79.5, 59.5)
+EYE = np.array([0.0, 0.0, 0.6])
+
+
+@pytest.fixture
+def frame(tmp_path):
+    """A can of 6 x 10 cm on a table, 45 degrees from above."""
+    look = looking_down(np.pi / 4, 0.0)
+    can = Superquadric([[0.03, 0.03, 0.05]], [[0.1, 1.0]], [[0.0, 0.0, 0.05]], [[0.0, 0.0, 0.0, 1.0]])
+    can = can.transformed(look, EYE)
+    up = can.rotation_matrix[0][:, 2]
+    plane = np.append(up, -up @ EYE)
+    depth, thing = render_things(can, np.zeros(1), Superquadric.stack([]), np.zeros(0), CAMERA, plane)
+    path = tmp_path / "can.npz"
+    depth = np.where(np.isfinite(depth), depth, np.nan).astype(np.float32)
+    np.savez(path, depth=depth, K=CAMERA.matrix, labels=(thing + 1).astype(np.int32))
+    return path
+
+
+def test_a_can_is_grasped_across_and_everything_is_written(frame, tmp_path, capsys):
+    out = tmp_path / "out.json"
+    command = ["grasp", str(frame), "--json", str(out), "--pictures", str(tmp_path), "--meshes", str(tmp_path)]
+    assert main.main(command) == 0
+    document = json.loads(out.read_text())
+    assert document["options"] == {"gripper": "panda", "friction": 0.5}
+    (body,) = document["frames"][0]["bodies"]
+    best = body["grasps"][0]
+    assert body["reason"] == ""
+    assert best["width"] == pytest.approx(0.06, abs=0.006)
+    assert best["score"] > 0.7
+    assert np.linalg.norm(np.array(best["position"]) - EYE) < 0.12
+    assert (tmp_path / "can.png").stat().st_size > 1000
+    names = set(trimesh.load_scene(tmp_path / "can.glb").geometry)
+    assert names == {"body_0", "grasp_0_left", "grasp_0_right", "grasp_0_hand"}
+    assert "mm open" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("wrong", [["--gripper", "claw"], ["--friction", "0"], ["--json", "nowhere/out.json"]])
+def test_wrong_usage_is_told(frame, wrong, capsys):
+    assert main.main(["grasp", str(frame), *wrong]) == 2
+    assert "sq-perception: " in capsys.readouterr().err
+
+
+def test_a_frame_that_is_none_is_reported(tmp_path, capsys):
+    assert main.main(["grasp", str(tmp_path / "none.npz"), "--json", "-"]) == 1
+    assert "none.npz" in capsys.readouterr().err
