@@ -234,10 +234,17 @@ def _tin(rng: np.random.Generator) -> Thing:
     height = 2 * radius * _log_uniform(rng, 0.35, 2.6)
     e1 = 0.03 + 0.2 * rng.random() ** 2
     rows = [_part((radius, radius, height / 2), (e1, 1.0))]
+    end, top = radius, height / 2
     if rng.random() < 0.35:  # the narrower end of a drink can, or a raised lid
         end, rim = rng.uniform(0.8, 0.98) * radius, rng.uniform(0.002, 0.01)
-        rows.append(_part((end, end, rim), (0.15, 1.0), (0, 0, height / 2)))
-    return _thing("can", "tin", rows, _ROUND_RESTS)
+        rows.append(_part((end, end, rim), (0.15, 1.0), (0, 0, top)))
+        top += rim
+    cut = []
+    if rng.random() < 0.6:  # seamed ends, which lie a countersink of 3 to 7 mm below their rims
+        for inner, z in ((end, top), (radius, -height / 2)):
+            inner -= rng.uniform(0.0015, 0.0035)
+            cut.append(_part((inner, inner, rng.uniform(0.003, 0.007)), (0.1, 1.0), (0, 0, z)))
+    return _thing("can", "tin", rows, _ROUND_RESTS, cut)
 
 
 def _spray_can(rng: np.random.Generator) -> Thing:
