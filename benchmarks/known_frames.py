@@ -1,6 +1,6 @@
 """Recorded frames of things whose true size, and pose where there is one, are known.
 
-    python benchmarks/known_frames.py FRAMES HULLS [--name known_frames]
+    python benchmarks/known_frames.py FRAMES HULLS [--bodies METHOD=FILE ...] [--name known_frames]
 
 FRAMES holds NPZ files with ``depth``, ``K``, ``labels`` and, for each of ``ids``: ``kind``, ``dims`` (full edges,
 metres, NaN unknown), ``mesh`` (name, or empty) and ``T_cam_mesh`` (4 x 4, NaN unknown); HULLS holds <mesh>.hull.ply.
@@ -13,10 +13,14 @@ None of it belongs to the repository.
 | auto, own | its own | the body whose mask has the largest IoU with the true one, if that is at least 0.25 |
 | classic | true | Solina and Bajcsy's fit to the points |
 | smallest box | true | the smallest box around the measured points |
+| METHOD | true | bodies of another program, if its file has one for the frame and label |
 
 IoU is with the convex hull of the mesh in its pose, 0 for a thing without a body; errors are those of the sorted full
 edges, their mean over the three; ``2 sigma`` the share of half sizes within two reported deviations.  ``fair`` are
 boxes, cans and bottles, which superquadrics can be like.  Times are of single threads.  Millimetres, milliseconds.
+
+The FILE of another METHOD is a JSON list of objects with ``frame`` (the NPZ's stem), ``label``, ``size``, ``shape``,
+``translation``, ``rotation`` (x y z w) and ``milliseconds``; what it lacks was missed.
 """
 
 from __future__ import annotations
@@ -28,6 +32,7 @@ if __name__ == "__main__":  # as a script only: a process that imports this has 
     for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
 
+import json
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -47,6 +52,9 @@ from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, RecoveryO
 FAIR = ("box", "rounded_box", "cylinder", "bottle")
 MATCH = 0.25
 METHODS = ("auto, given", "network, given", "auto, own", "classic", "smallest box")
+
+Others = dict[str, dict[tuple[str, int], dict[str, Any]]]
+"""Bodies of other programs, by method, by frame and label."""
 
 
 @dataclass(frozen=True)
@@ -87,26 +95,42 @@ def answer(
     return Answer(str(frame["kind"][number]), method, iou, error, covered, ms)
 
 
-def answers(frame: Any, hulls: Path, recoverer: Recoverer) -> list[Answer]:
+def answers(name: str, frame: Any, hulls: Path, recoverer: Recoverer, others: Others) -> list[Answer]:
     """Every method on every labelled thing of one frame."""
     depth, k = frame["depth"], frame["K"]
     camera = Camera(depth.shape[1], depth.shape[0], k[0, 0], k[1, 1], k[0, 2], k[1, 2])
     labels = frame["labels"].astype(np.int32)
     found: list[Answer] = []
-    for method, name in (("auto", METHODS[0]), ("network", METHODS[1]), ("classic", METHODS[3])):
+    for method, title in (("auto", METHODS[0]), ("network", METHODS[1]), ("classic", METHODS[3])):
         result = recoverer.recover(depth, camera, labels, RecoveryOptions(method=method))  # type: ignore[arg-type]
         share = result.milliseconds["total"] / max(len(result.bodies), 1)
         by_label = {one.label: one for one in result.bodies if one.status != Status.FAILED}
         for number, label in enumerate(frame["ids"]):
             one = by_label.get(int(label))
             body, sigma = (None, np.full(3, np.nan)) if one is None else (one.superquadric, one.sigma_size)
-            found.append(answer(frame, number, hulls, name, body, sigma, share))
+            found.append(answer(frame, number, hulls, title, body, sigma, share))
     found += _own(frame, hulls, recoverer.recover(depth, camera))
     for number, label in enumerate(frame["ids"]):
         rows, cols = np.nonzero((labels == label) & np.isfinite(depth) & (depth > 0))
         points = camera.unproject(cols, rows, depth[rows, cols])
         found.append(answer(frame, number, hulls, METHODS[4], _oriented_box(points), np.full(3, np.nan), np.nan))
+        for title, bodies in others.items():
+            given = bodies.get((name, int(label)))
+            body = None if given is None else _body(given)
+            milliseconds = np.nan if given is None else given["milliseconds"]
+            found.append(answer(frame, number, hulls, title, body, np.full(3, np.nan), milliseconds))
     return found
+
+
+def _body(given: dict[str, Any]) -> Superquadric:
+    return Superquadric(*(np.array(given[name]) for name in ("size", "shape", "translation", "rotation")))
+
+
+def _bodies_of(argument: str) -> tuple[str, dict[tuple[str, int], dict[str, Any]]]:
+    """METHOD=FILE, read."""
+    method, _, path = argument.partition("=")
+    rows = json.loads(Path(path).read_text(encoding="utf-8"))
+    return method, {(row["frame"], int(row["label"])): row for row in rows}
 
 
 def _own(frame: Any, hulls: Path, result: FrameRecovery) -> list[Answer]:
@@ -146,22 +170,24 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("frames", type=Path, help="folder of NPZ files")
     parser.add_argument("hulls", type=Path, help="folder of <mesh>.hull.ply")
+    parser.add_argument("--bodies", type=_bodies_of, action="append", default=[], help="METHOD=FILE of another program")
     parser.add_argument("--name", default="known_frames", help="name of the result files")
     options = parser.parse_args()
     paths = sorted(options.frames.glob("*.npz"))
     if not paths:
         parser.error(f"{options.frames}: no NPZ files")
-    recoverer = Recoverer(threads=1)
+    recoverer, others = Recoverer(threads=1), dict(options.bodies)
     everything: list[Answer] = []
     for path in paths:
         with np.load(path) as file:
-            everything += answers({name: file[name] for name in file.files}, options.hulls, recoverer)
+            frame = {name: file[name] for name in file.files}
+        everything += answers(path.stem, frame, options.hulls, recoverer, others)
     kinds = sorted({one.kind for one in everything})
     groups = {"fair": FAIR, **{kind: (kind,) for kind in kinds}}
     result: dict[str, Any] = {}
     rows = []
     for title, members in groups.items():
-        for method in METHODS:
+        for method in (*METHODS, *others):
             one = result.setdefault(title, {})[method] = summary(
                 [a for a in everything if a.method == method and a.kind in members]
             )
