@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-MODEL_SHARE = 0.01
-"""Difference between a thing's support function and that of the nearest superquadric, as a share of the thing's extent:
-an estimate, not measured."""
+MODEL_SHARE = 0.02
+"""Difference between a thing's support function and that of the nearest superquadric, as a share of the thing's extent.
+Chosen on benchmarks/household_things, where 0.01 and 0.03 cost 0.2 % of IoU."""
 
 
 @dataclass(frozen=True, eq=False)
