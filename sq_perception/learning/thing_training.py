@@ -263,4 +263,6 @@ def _keep(output: Path, state: TrainingState[ThingNetwork], record: dict[str, An
         file.write(json.dumps(record) + "\n")
     state.save(output / "state.safetensors")
     made = provenance.facts("sq-perception train-things")
-    checkpoint.save(output / "things.safetensors", state.average, {"training": asdict(config), "made": made})
+    validation = {name: value for name, value in record.items() if name in ("step", "error", "body", "ratio", *KINDS)}
+    facts = {"training": asdict(config), "made": made, "validation": validation}
+    checkpoint.save(output / "things.safetensors", state.average, facts)
