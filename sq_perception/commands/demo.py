@@ -41,6 +41,8 @@ _START_PATIENCE = 120.0
 _TABLE_PERIOD = 0.25
 _LINE_PERIOD = 2.0
 _SHOWN_LATENCIES = 50
+_FILE_WIDTH = 120
+"""Columns: the table, unbroken."""
 _HINTS = """\
 What next
   {picture}    the last image: depth, recovered outlines, both methods in space
@@ -94,7 +96,7 @@ def run(camera: dict[str, Any], seconds: float, folder: Path) -> int:
         If a node ends, or no result comes.
     """
     os.environ.update(_own_domain())
-    console = Console()
+    console = Console(width=None if sys.stdout.isatty() else _FILE_WIDTH)
     with Children(fast_dds.environment()) as children:
         for name in TITLES:
             children.start(name, parameter_arguments({"projection": camera["projection"]}))
