@@ -6,7 +6,8 @@ and holds the current values; a worker that takes ``current`` once per frame see
 effect with the next frame.
 
 ``ros2 param set /node s 3`` sends an INTEGER, so every number that is a float here is declared with dynamic typing and
-accepts both.  The range is checked here for both, as the range of a descriptor holds for doubles alone.
+accepts both; it is kept as a double, as readers expect one.  The range is checked here for both, as the range of a
+descriptor holds for doubles alone.
 """
 
 from __future__ import annotations
@@ -423,6 +424,7 @@ class LiveParameters(Generic[P]):
         self._locked, self._check, self._changed = locked, check, changed
         values = {name: self._declare(node, one) for name, one in self._fields.items()}
         self._current: P = kind(**values)
+        node.add_pre_set_parameters_callback(self._as_doubles)
         node.add_on_set_parameters_callback(self._on_set)
         node.add_post_set_parameters_callback(self._accept)
 
@@ -438,12 +440,30 @@ class LiveParameters(Generic[P]):
             raise ParameterError(f"{one.name}: expected a value like {one.default!r}, {error}") from error
         except InvalidParameterValueException as error:
             raise ParameterError(str(error)) from error
-        return checked(one, node.get_parameter(one.name).value)
+        given = node.get_parameter(one.name)
+        (kept,) = self._as_doubles([given])
+        if kept is not given:
+            node.set_parameters([kept])
+        return checked(one, kept.value)
+
+    def _as_doubles(self, changes: list[Parameter]) -> list[Parameter]:
+        """Integers as doubles where the parameter is one, or a list of them; everything else as it is."""
+        found = []
+        for change in changes:
+            kind = type(self._fields[change.name].default) if change.name in self._fields else None
+            if kind is float and change.type_ == Parameter.Type.INTEGER:
+                change = Parameter(change.name, value=float(change.value))
+            elif kind is tuple and change.type_ == Parameter.Type.INTEGER_ARRAY:
+                change = Parameter(change.name, value=[float(one) for one in change.value])
+            found.append(change)
+        return found
 
     def _on_set(self, changes: list[Parameter]) -> SetParametersResult:
         try:
             candidate, names = self._merged(changes)
-            frozen = sorted(name for name in names if not self._fields[name].metadata["live"])
+            # A value that stays as it is may always be set: `ros2 param load` sets all of a file.
+            other = (name for name in names if getattr(candidate, name) != getattr(self._current, name))
+            frozen = sorted(name for name in other if not self._fields[name].metadata["live"])
             reason = self._locked() if frozen and self._locked is not None else ""
             if reason:
                 raise ParameterError(f"{', '.join(frozen)}: {reason}")
