@@ -79,7 +79,7 @@ def _render(options: argparse.Namespace) -> int:
     from sq_perception.geometry.superquadric import Superquadric
     from sq_perception.imaging import raycast, unit_cube
     from sq_perception.imaging.camera import Camera
-    from sq_perception.recordings.frame_file import read_calibration
+    from sq_perception.recordings.camera_file import read_calibration
 
     try:
         body = Superquadric.from_flat(np.array([getattr(options, name) for name in PARAMETERS]))

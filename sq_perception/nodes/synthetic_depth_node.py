@@ -45,7 +45,7 @@ from sq_perception.imaging.calibration import Calibration
 from sq_perception.imaging.camera import Camera
 from sq_perception.nodes.frame import image_topic, packed
 from sq_perception.nodes.parameters import IDEAL, RAW, LiveParameters, ParameterError, SyntheticParameters
-from sq_perception.recordings import frame_file
+from sq_perception.recordings import camera_file, frame_file
 from sq_perception.recordings.frame_file import FrameError
 from sq_perception.recordings.publication import CAMERA_FRAME, CUBE_FRAME, truth_array
 from sq_perception.simulation.scenes import table_scene, thesis_scene
@@ -99,7 +99,7 @@ class FrameSource:
         self._files = _recordings(Path(parameters.path)) if parameters.scene == "replay" else []
         self._calibration = None
         if parameters.camera_info_file:
-            self._calibration = frame_file.read_calibration(parameters.camera_info_file)
+            self._calibration = camera_file.read_calibration(parameters.camera_info_file)
         self._noise = np.random.default_rng([parameters.seed, _NOISE])
         self._count = len(self._files) or parameters.scenes
         self._position, self._left = 0, parameters.hold

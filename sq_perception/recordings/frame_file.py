@@ -12,7 +12,7 @@
 A file whose name is a time, such as 1305031102.160407.png, has that stamp in seconds.  Names of exactly this form are
 those of the TUM RGB-D benchmark, whose PNGs have 5000 units a metre: they are read so, with a warning, unless the scale
 is given.  ``Reading.scale`` goes before all of these units.  A camera_info is a YAML, or one of the forms of
-:mod:`sq_perception.recordings.intrinsics`.
+:mod:`sq_perception.recordings.camera_file`.
 
 The cube is the thesis' unit cube, :mod:`sq_perception.imaging.unit_cube`.  An NPZ may bring ``labels`` (h, w), a
 support ``plane`` (4,), and the text "orthographic" as ``projection``, which goes before what the caller says.  Nothing
@@ -27,19 +27,18 @@ from __future__ import annotations
 
 import math
 import re
-import reprlib
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple, get_args
+from typing import NamedTuple, get_args
 
 import numpy as np
 
-from sq_perception.files import plain_yaml
 from sq_perception.files.unpacking import UnpackingError, grey_image, npy_array, npz_arrays
 from sq_perception.imaging import unit_cube
-from sq_perception.imaging.calibration import Calibration, Treatment
+from sq_perception.imaging.calibration import Treatment
 from sq_perception.imaging.camera import Camera, Projection
-from sq_perception.recordings import cloud_file, intrinsics
+from sq_perception.recordings import cloud_file
+from sq_perception.recordings.camera_file import FrameError, calibrated, camera_info_of, is_transposed
 
 SUFFIXES = (".npz", ".npy", ".png", ".bmp", ".tif", ".tiff", *cloud_file.SUFFIXES)
 MILLIMETRES = 1000.0
@@ -47,15 +46,9 @@ MILLIMETRES = 1000.0
 TUM_SCALE = 5000.0
 """Of the TUM RGB-D benchmark, https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats"""
 _TUM_NAME = re.compile(r"\d{10}\.\d{6}")
-_SKEW = 1e-6
-"""Of fx; no depth camera in use has any."""
 _NEAREST, _FARTHEST = 0.01, 100.0
 """Metres; no depth camera sees half of its image nearer or farther."""
 _TIME = re.compile(r"(\d{1,18})\.(\d{1,9})")
-
-
-class FrameError(ValueError):
-    """A file that is missing, damaged, or does not hold what it should; the message says what was expected."""
 
 
 class Stamp(NamedTuple):
@@ -196,31 +189,6 @@ class Reading:
         return replace(frame, depth=np.ascontiguousarray(depth[part]), camera=camera, labels=labels)
 
 
-@dataclass(frozen=True)
-class Region:
-    """The fields of a sensor_msgs/RegionOfInterest that count."""
-
-    x_offset: int = 0
-    y_offset: int = 0
-    width: int = 0
-    height: int = 0
-
-
-@dataclass(frozen=True)
-class CameraInfo:
-    """The fields of a sensor_msgs/CameraInfo, from a file; matrices are flat."""
-
-    width: int
-    height: int
-    distortion_model: str
-    d: tuple[float, ...]
-    k: tuple[float, ...]
-    p: tuple[float, ...]
-    binning_x: int
-    binning_y: int
-    roi: Region
-
-
 def read(
     path: str | Path,
     camera_info: str | Path | None = None,
@@ -236,7 +204,7 @@ def read(
         See the table above.
     camera_info
         Intrinsics of an image: YAML as camera_calibration writes it or as a camera_info message prints, or another
-        form of :mod:`sq_perception.recordings.intrinsics`.
+        form of :mod:`sq_perception.recordings.camera_file`.
     projection
         "pinhole" or "orthographic".
     distortion
@@ -325,82 +293,6 @@ def stamp_of(path: Path) -> Stamp | None:
     return Stamp(int(parts[1]), int(parts[2].ljust(9, "0"))) if parts else None
 
 
-def calibrated(where: str | Path, info: Any, name: str, distortion: Treatment) -> Calibration:
-    """:meth:`Calibration.of <sq_perception.imaging.calibration.Calibration.of>` whose fault is a FrameError."""
-    try:
-        return Calibration.of(info, name, distortion)
-    except ValueError as error:
-        raise FrameError(f"{where}: {error}") from error
-
-
-def camera_info_of(source: str | Path, width: int, height: int) -> CameraInfo:
-    """What a YAML, JSON or four numbers say of images of this size; raises FrameError as :func:`read_camera_info`."""
-    numbers = None if Path(source).exists() else intrinsics.four_numbers(str(source))
-    if numbers is None:
-        return read_camera_info(source)
-    fx, fy, cx, cy = numbers
-    none = (0.0,) * 12
-    return CameraInfo(width, height, "plumb_bob", (), (fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0), none, 0, 0, Region())
-
-
-def read_calibration(path: str | Path, name: str = "", distortion: Treatment = "auto") -> Calibration:
-    """The calibration that a YAML file tells of; ``name`` is that of the images.
-
-    Raises
-    ------
-    FrameError
-        As :func:`read_camera_info`, or if the camera is not calibrated or its distortion not known.
-    """
-    return calibrated(path, read_camera_info(path), name, distortion)
-
-
-def read_camera_info(path: str | Path) -> CameraInfo:
-    """A YAML file in the layout of camera_calibration, or of a printed camera_info message; or JSON, see the module.
-
-    A file that does not name its distortion model means plumb_bob; what else it does not name is zero.
-
-    Raises
-    ------
-    FrameError
-    """
-    path = Path(path)
-    try:
-        if path.suffix.lower() == ".json":
-            documents: list[Any] = [intrinsics.read_json(path)]
-        else:
-            documents = [entry for entry in plain_yaml.read_all(path) if entry is not None]
-    except (plain_yaml.YamlError, intrinsics.IntrinsicsError) as error:
-        raise FrameError(f"{path}: cannot read the camera_info: {error}") from error
-    if not documents or not isinstance(documents[0], dict):
-        raise FrameError(f"{path}: expected a camera_info as a YAML mapping")
-    info = documents[0]
-    width, height = (_size(path, info, names) for names in (("image_width", "width"), ("image_height", "height")))
-    matrix = _matrix(path, info, ("camera_matrix", "k", "K"), 9)
-    distortion = _matrix(path, info, ("distortion_coefficients", "d", "D"), None)
-    projection = _matrix(path, info, ("projection_matrix", "p", "P"), 12)
-    if matrix is None and projection is None:
-        raise FrameError(f"{path}: expected a camera_matrix (or k) of 9 numbers, or a projection_matrix (or p) of 12")
-    if matrix is not None and _is_transposed(matrix):
-        raise FrameError(f"{path}: camera matrix: expected 0 0 1 in its last row; it seems to be transposed")
-    if matrix is not None and abs(matrix[1]) > _SKEW * abs(matrix[0]):
-        raise FrameError(f"{path}: camera matrix: expected no skew, got {matrix[1]:g}")
-    region = info.get("roi", {})
-    if not isinstance(region, dict):
-        raise FrameError(f"{path}: roi: expected a mapping, got {reprlib.repr(region)}")
-    offsets = (_count(path, region, name) for name in ("x_offset", "y_offset", "width", "height"))
-    return CameraInfo(
-        width,
-        height,
-        str(info.get("distortion_model", info.get("camera_model", "plumb_bob"))),
-        () if distortion is None else tuple(distortion.tolist()),
-        (0.0,) * 9 if matrix is None else tuple(matrix.tolist()),
-        (0.0,) * 12 if projection is None else tuple(projection.tolist()),
-        _count(path, info, "binning_x"),
-        _count(path, info, "binning_y"),
-        Region(*offsets),
-    )
-
-
 def _read_cloud(path: Path, reading: Reading) -> RecordedFrame:
     try:
         depth, camera, is_image = cloud_file.as_image(cloud_file.read_points(path) / (reading.scale or 1.0))
@@ -449,7 +341,7 @@ def _read_npz(path: Path, projection: Projection, scale: float | None) -> Record
         return RecordedFrame(depth, _cube_camera(path, width, height), labels, path.name, is_cube=True, warning=warning)
     if "K" not in fields:
         raise FrameError(f"{path}: expected a field 'K', the 3 x 3 camera matrix")
-    if fields["K"].shape == (3, 3) and _is_transposed(fields["K"].ravel()):
+    if fields["K"].shape == (3, 3) and is_transposed(fields["K"].ravel()):
         raise FrameError(f"{path}: K: expected 0 0 1 in its last row; it seems to be transposed")
     try:
         camera = Camera.from_matrix(fields["K"], width, height)
@@ -459,11 +351,6 @@ def _read_npz(path: Path, projection: Projection, scale: float | None) -> Record
         depth = np.where(np.isfinite(depth) & (depth > 0), depth / (scale or 1.0), np.nan).astype(np.float32)
     plane = _plane(path, fields.get("plane"))
     return RecordedFrame(depth, camera, labels, path.name, is_cube=False, plane=plane, encoding="32FC1")
-
-
-def _is_transposed(matrix: np.ndarray) -> bool:
-    """Whether the centre (cx, cy) stands in the last row of a flat camera matrix, not in its last column."""
-    return bool((matrix[6:8] != 0).any() and not (matrix[[2, 5]] != 0).any())
 
 
 def _labels(path: Path, labels: np.ndarray | None, depth: np.ndarray) -> np.ndarray | None:
@@ -496,37 +383,3 @@ def _cube_camera(path: Path, width: int, height: int) -> Camera:
         return unit_cube.camera(width, height)
     except ValueError as error:
         raise FrameError(f"{path}: {error}") from error
-
-
-def _size(path: Path, info: dict[Any, Any], names: tuple[str, ...]) -> int:
-    for name in names:
-        if name in info:
-            value = _count(path, info, name)
-            if value < 1:
-                raise FrameError(f"{path}: {name}: expected a positive integer, got {value!r}")
-            return value
-    raise FrameError(f"{path}: expected {names[0]} (or {names[1]})")
-
-
-def _count(path: Path, info: dict[Any, Any], name: str) -> int:
-    value = info.get(name, 0)
-    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-        raise FrameError(f"{path}: {name}: expected a positive integer or 0, got {value!r}")
-    return value
-
-
-def _matrix(path: Path, info: dict[Any, Any], names: tuple[str, ...], length: int | None) -> np.ndarray | None:
-    for name in names:
-        if name not in info:
-            continue
-        entry = info[name]
-        values = entry.get("data") if isinstance(entry, dict) else entry
-        try:
-            numbers = np.array(values, dtype=float).ravel()
-        except (TypeError, ValueError) as error:
-            raise FrameError(f"{path}: {name}: expected numbers, got {reprlib.repr(values)}") from error
-        if not np.isfinite(numbers).all() or (length is not None and numbers.size != length):
-            wanted = "finite numbers" if length is None else f"{length} finite numbers"
-            raise FrameError(f"{path}: {name}: expected {wanted}, got {reprlib.repr(values)}")
-        return numbers
-    return None

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from sq_perception.imaging.calibration import Treatment
 from sq_perception.imaging.camera import Projection
-from sq_perception.recordings import bag_file, frame_file
+from sq_perception.recordings import bag_file, camera_file, frame_file
 from sq_perception.recordings.bag_file import RecordedBag
 from sq_perception.recordings.frame_file import FrameError, Reading, RecordedFrame, Stamp
 
@@ -81,9 +81,9 @@ class RecordedInput:
         self._distortion: Treatment = distortion
         self._reading = reading
         if camera_info is not None:
-            info = frame_file.camera_info_of(camera_info, *_ANY_SIZE)
+            info = camera_file.camera_info_of(camera_info, *_ANY_SIZE)
             # Auto depends on what the images are called.
-            frame_file.calibrated(camera_info, info, "", "ignore" if distortion == "auto" else distortion)
+            camera_file.calibrated(camera_info, info, "", "ignore" if distortion == "auto" else distortion)
         self._projection: Projection = projection
         self._topic, self._every, self._limit = topic, every, limit
         self._is_done = is_done
@@ -140,7 +140,7 @@ class RecordedInput:
 
     def _bag(self, path: Path) -> Iterator[tuple[str, RecordedFrame | FrameError]]:
         source = self._camera_info
-        info = None if source is None else lambda width, height: frame_file.camera_info_of(source, width, height)
+        info = None if source is None else lambda width, height: camera_file.camera_info_of(source, width, height)
         try:
             bag = RecordedBag(
                 path,

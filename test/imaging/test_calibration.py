@@ -19,7 +19,7 @@ from sq_perception.imaging.calibration import Calibration, is_rectified_name
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.distortion import Distortion
 from sq_perception.imaging.rectification import Rectification
-from sq_perception.recordings.frame_file import CameraInfo, Region
+from sq_perception.recordings.camera_file import CameraInfo, Region
 
 K = (500.0, 0.0, 321.0, 0.0, 502.0, 243.0, 0.0, 0.0, 1.0)
 P = (450.0, 0.0, 315.0, 0.0, 0.0, 451.0, 238.0, 0.0, 0.0, 0.0, 1.0, 0.0)

@@ -166,7 +166,7 @@ def test_the_messages_install_alone_with_numpy_only(source_copy: Path, tmp_path:
     with zipfile.ZipFile(wheel) as archive:
         names = {name for name in archive.namelist() if ".dist-info/" not in name}
         (metadata,) = (archive.read(name).decode() for name in archive.namelist() if name.endswith("/METADATA"))
-        archive.extractall(tmp_path / "alone")
+        archive.extractall(tmp_path / "alone")  # noqa: S202
     modules = {f"sq_msgs_py/{path.name}" for path in (source_copy / "sq_msgs_py").glob("*.py")}
     assert names == {*modules, "sq_msgs_py/py.typed"}
     assert re.findall("^Requires-Dist: (.*)$", metadata, re.MULTILINE) == ["numpy>=1.26"]

@@ -12,7 +12,8 @@ from sq_perception.imaging import raycast, unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.distortion import Distortion
 from sq_perception.imaging.rectification import Rectification
-from sq_perception.recordings.frame_file import FrameError, Region, read, read_calibration, read_camera_info
+from sq_perception.recordings.camera_file import FrameError, Region, read_calibration, read_camera_info
+from sq_perception.recordings.frame_file import read
 
 K = np.array([[60.0, 0, 31.5], [0, 61.0, 23.5], [0, 0, 1]])
 

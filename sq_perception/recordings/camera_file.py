@@ -1,0 +1,234 @@
+"""The camera of recorded images: a camera_info YAML, or intrinsics as other tools write them.
+
+| form | from |
+| --- | --- |
+| YAML | camera_calibration, or a printed camera_info message |
+| ``525,525,319.5,239.5`` | papers and data sets: fx, fy, cx, cy in pixels, of an image without distortion |
+| JSON with ``ppx``, ``ppy`` | librealsense (``rs-enumerate-devices``, ``rs2_intrinsics``) |
+| JSON with ``intrinsic_matrix`` | Open3D: nine numbers, COLUMN by column |
+
+A pixel's centre has integer coordinates, in all of them.
+"""
+
+from __future__ import annotations
+
+import json
+import reprlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sq_perception.files import plain_yaml
+from sq_perception.imaging.calibration import Calibration, Treatment
+
+LARGEST = 2**20
+"""Bytes of a file."""
+_SKEW = 1e-6
+"""Of fx; no depth camera in use has any."""
+_NO_DISTORTION = ("none", "")
+_BROWN_CONRADY = ("brown conrady", "inverse brown conrady", "modified brown conrady")
+"""Names of librealsense.  Of depth images the coefficients are zero; others are taken for plumb_bob's."""
+
+
+class FrameError(ValueError):
+    """A file that is missing, damaged, or does not hold what it should; the message says what was expected."""
+
+
+@dataclass(frozen=True)
+class Region:
+    """The fields of a sensor_msgs/RegionOfInterest that count."""
+
+    x_offset: int = 0
+    y_offset: int = 0
+    width: int = 0
+    height: int = 0
+
+
+@dataclass(frozen=True)
+class CameraInfo:
+    """The fields of a sensor_msgs/CameraInfo, from a file; matrices are flat."""
+
+    width: int
+    height: int
+    distortion_model: str
+    d: tuple[float, ...]
+    k: tuple[float, ...]
+    p: tuple[float, ...]
+    binning_x: int
+    binning_y: int
+    roi: Region
+
+
+def calibrated(where: str | Path, info: Any, name: str, distortion: Treatment) -> Calibration:
+    """:meth:`Calibration.of <sq_perception.imaging.calibration.Calibration.of>` whose fault is a FrameError."""
+    try:
+        return Calibration.of(info, name, distortion)
+    except ValueError as error:
+        raise FrameError(f"{where}: {error}") from error
+
+
+def camera_info_of(source: str | Path, width: int, height: int) -> CameraInfo:
+    """What a YAML, JSON or four numbers say of images of this size; raises FrameError as :func:`read_camera_info`."""
+    numbers = None if Path(source).exists() else four_numbers(str(source))
+    if numbers is None:
+        return read_camera_info(source)
+    fx, fy, cx, cy = numbers
+    none = (0.0,) * 12
+    return CameraInfo(width, height, "plumb_bob", (), (fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0), none, 0, 0, Region())
+
+
+def read_calibration(path: str | Path, name: str = "", distortion: Treatment = "auto") -> Calibration:
+    """The calibration that a YAML file tells of; ``name`` is that of the images.
+
+    Raises
+    ------
+    FrameError
+        As :func:`read_camera_info`, or if the camera is not calibrated or its distortion not known.
+    """
+    return calibrated(path, read_camera_info(path), name, distortion)
+
+
+def read_camera_info(path: str | Path) -> CameraInfo:
+    """A YAML file in the layout of camera_calibration, or of a printed camera_info message; or JSON, see the module.
+
+    A file that does not name its distortion model means plumb_bob; what else it does not name is zero.
+
+    Raises
+    ------
+    FrameError
+    """
+    path = Path(path)
+    try:
+        if path.suffix.lower() == ".json":
+            documents: list[Any] = [read_json(path)]
+        else:
+            documents = [entry for entry in plain_yaml.read_all(path) if entry is not None]
+    except (plain_yaml.YamlError, FrameError) as error:
+        raise FrameError(f"{path}: cannot read the camera_info: {error}") from error
+    if not documents or not isinstance(documents[0], dict):
+        raise FrameError(f"{path}: expected a camera_info as a YAML mapping")
+    info = documents[0]
+    width, height = (_size(path, info, names) for names in (("image_width", "width"), ("image_height", "height")))
+    matrix = _matrix(path, info, ("camera_matrix", "k", "K"), 9)
+    distortion = _matrix(path, info, ("distortion_coefficients", "d", "D"), None)
+    projection = _matrix(path, info, ("projection_matrix", "p", "P"), 12)
+    if matrix is None and projection is None:
+        raise FrameError(f"{path}: expected a camera_matrix (or k) of 9 numbers, or a projection_matrix (or p) of 12")
+    if matrix is not None and is_transposed(matrix):
+        raise FrameError(f"{path}: camera matrix: expected 0 0 1 in its last row; it seems to be transposed")
+    if matrix is not None and abs(matrix[1]) > _SKEW * abs(matrix[0]):
+        raise FrameError(f"{path}: camera matrix: expected no skew, got {matrix[1]:g}")
+    region = info.get("roi", {})
+    if not isinstance(region, dict):
+        raise FrameError(f"{path}: roi: expected a mapping, got {reprlib.repr(region)}")
+    offsets = (_count(path, region, name) for name in ("x_offset", "y_offset", "width", "height"))
+    return CameraInfo(
+        width,
+        height,
+        str(info.get("distortion_model", info.get("camera_model", "plumb_bob"))),
+        () if distortion is None else tuple(distortion.tolist()),
+        (0.0,) * 9 if matrix is None else tuple(matrix.tolist()),
+        (0.0,) * 12 if projection is None else tuple(projection.tolist()),
+        _count(path, info, "binning_x"),
+        _count(path, info, "binning_y"),
+        Region(*offsets),
+    )
+
+
+def is_transposed(matrix: np.ndarray) -> bool:
+    """Whether the centre (cx, cy) stands in the last row of a flat camera matrix, not in its last column."""
+    return bool((matrix[6:8] != 0).any() and not (matrix[[2, 5]] != 0).any())
+
+
+def four_numbers(text: str) -> tuple[float, float, float, float] | None:
+    """fx, fy, cx, cy of a text such as ``525,525,319.5,239.5``; None if it is another text, such as a path."""
+    parts = text.split(",")
+    try:
+        numbers = [float(part) for part in parts]
+    except ValueError:
+        return None
+    return (numbers[0], numbers[1], numbers[2], numbers[3]) if len(numbers) == 4 else None
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """The mapping of a file.
+
+    Raises
+    ------
+    FrameError
+        If it is missing, too large, no JSON, or of another form.
+    """
+    try:
+        with path.open("rb") as file:
+            data = file.read(LARGEST + 1)
+        found = json.loads(data)
+    except (OSError, ValueError, RecursionError) as error:
+        raise FrameError(f"not JSON: {error}") from error
+    if len(data) > LARGEST:
+        raise FrameError(f"expected at most {LARGEST} bytes")
+    if not isinstance(found, dict):
+        raise FrameError("expected a JSON object with intrinsics")
+    if "ppx" in found and "ppy" in found:
+        return _of_librealsense(found)
+    if "intrinsic_matrix" in found:
+        return _of_open3d(found)
+    return found
+
+
+def _of_librealsense(found: dict[str, Any]) -> dict[str, Any]:
+    missing = [name for name in ("width", "height", "fx", "fy") if name not in found]
+    if missing:
+        raise FrameError(f"expected {', '.join(missing)} beside ppx and ppy")
+    model = str(found.get("model", "")).lower().replace("_", " ").removeprefix("distortion.")
+    if model not in _NO_DISTORTION + _BROWN_CONRADY:
+        raise FrameError(f"model: expected Brown Conrady or none, got {found['model']!r}")
+    return {
+        "width": found["width"],
+        "height": found["height"],
+        "k": [found["fx"], 0, found["ppx"], 0, found["fy"], found["ppy"], 0, 0, 1],
+        "d": found.get("coeffs", []) if model in _BROWN_CONRADY else [],
+    }
+
+
+def _of_open3d(found: dict[str, Any]) -> dict[str, Any]:
+    columns = found["intrinsic_matrix"]
+    if not isinstance(columns, list) or len(columns) != 9:
+        raise FrameError("intrinsic_matrix: expected 9 numbers, column by column")
+    rows = [columns[3 * column + row] for row in range(3) for column in range(3)]
+    return {"width": found.get("width"), "height": found.get("height"), "k": rows}
+
+
+def _size(path: Path, info: dict[Any, Any], names: tuple[str, ...]) -> int:
+    for name in names:
+        if name in info:
+            value = _count(path, info, name)
+            if value < 1:
+                raise FrameError(f"{path}: {name}: expected a positive integer, got {value!r}")
+            return value
+    raise FrameError(f"{path}: expected {names[0]} (or {names[1]})")
+
+
+def _count(path: Path, info: dict[Any, Any], name: str) -> int:
+    value = info.get(name, 0)
+    if isinstance(value, bool) or not isinstance(value, int) or value < 0:
+        raise FrameError(f"{path}: {name}: expected a positive integer or 0, got {value!r}")
+    return value
+
+
+def _matrix(path: Path, info: dict[Any, Any], names: tuple[str, ...], length: int | None) -> np.ndarray | None:
+    for name in names:
+        if name not in info:
+            continue
+        entry = info[name]
+        values = entry.get("data") if isinstance(entry, dict) else entry
+        try:
+            numbers = np.array(values, dtype=float).ravel()
+        except (TypeError, ValueError) as error:
+            raise FrameError(f"{path}: {name}: expected numbers, got {reprlib.repr(values)}") from error
+        if not np.isfinite(numbers).all() or (length is not None and numbers.size != length):
+            wanted = "finite numbers" if length is None else f"{length} finite numbers"
+            raise FrameError(f"{path}: {name}: expected {wanted}, got {reprlib.repr(values)}")
+        return numbers
+    return None
