@@ -59,7 +59,7 @@ class SightOptions:
     convex
         Share of crossed pairs that the parts of a segment have on average, at most, and each of them at most twice.
     apart
-        Share of crossed pairs, on average, between parts of a segment.
+        Share of crossed pairs, on average, between parts of a segment: more than half, as between bodies that touch.
     one_body
         Segments with a smaller share of crossed pairs between them are one body.
     hollow
@@ -77,7 +77,7 @@ class SightOptions:
     least_gap: float = 0.005
     suspicious: float = 0.12
     convex: float = 0.12
-    apart: float = 0.45
+    apart: float = 0.55
     one_body: float = 0.3
     hollow: float = 0.7
     hollow_vessel: float = 0.1

@@ -2,7 +2,8 @@
 
 Steps
 -----
-1. The support plane (:mod:`sq_perception.segmentation.support_plane`) and what is clearly above it.
+1. The support plane (:mod:`sq_perception.segmentation.support_plane`) and what is clearly above it; walls and other
+   planes larger than a thing go first.
 2. Smooth patches of surface, cut at depth steps and folds (:mod:`sq_perception.segmentation.surface_patches`).
 3. Patches that belong to one body: convex edges join, concave edges and steps part, with exceptions for vessels and
    for bodies that go on behind others (:mod:`sq_perception.segmentation.patch_grouping`).
@@ -37,10 +38,13 @@ from sq_perception.segmentation import (
 )
 from sq_perception.segmentation.convex_parts import SightOptions
 from sq_perception.segmentation.patch_grouping import GroupingOptions
+from sq_perception.segmentation.support_plane import Plane
 from sq_perception.segmentation.support_surface import SupportSurface
 from sq_perception.segmentation.surface_patches import FoldOptions
 
 _FOOT_PIXELS = 3
+_AROUND = 40
+"""Pixels around all that is above the support in which its noise is measured; two of the longest chords at VGA."""
 _LEAST_SIGMA = 5e-4
 _UNKNOWN_SIGMA = 1.5e-3
 _VESSEL = 0.15
@@ -124,10 +128,6 @@ class Segmentation:
         n and d of the support plane, height above it = n.p + d; None where there is none.
     ids : tuple of int
         Labels in the image, the one with most pixels first.
-    truncated : tuple of int
-        Those of ``ids`` that reach the border of what the camera measures, so that a part of them may be missing.
-    too_far : tuple of int
-        Those of ``ids`` at whose distance the noise or the pixels are too coarse to part touching bodies.
     sigma
         Noise of the depth at one metre as measured on the plane, or a guess where there is none, metres.
     """
@@ -135,8 +135,6 @@ class Segmentation:
     labels: np.ndarray
     plane: np.ndarray | None
     ids: tuple[int, ...]
-    truncated: tuple[int, ...] = ()
-    too_far: tuple[int, ...] = ()
     sigma: float = _UNKNOWN_SIGMA
 
 
@@ -174,15 +172,15 @@ def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | No
     if plane is None:
         labels = _bodies(known, valid, camera, _UNKNOWN_SIGMA, options)
         labels, ids = _ordered(labels, least, options.max_objects, standing.alone(known, camera, limits))
-        return _marked(labels, None, ids, depth, valid, camera, _UNKNOWN_SIGMA, options)
+        return Segmentation(labels, None, ids)
     support = support_surface.measured(plane, known, valid, camera, options.plane_tolerance)
-    labels = _above(known, valid, camera, support, options)
     walls = [other for other in planes if other is not plane]
+    labels = _above(known, valid, camera, support, walls, options)
     # What is out of range holds things up and hides them all the same.
     told = np.isfinite(depth) & (depth > 0)
     test = standing.standing(np.where(told, depth, np.float32(0)), told, camera, support, walls, limits)
     labels, ids = _ordered(labels, least, options.max_objects, test)
-    return _marked(labels, plane.equation, ids, depth, valid, camera, support.sigma, options)
+    return Segmentation(labels, plane.equation, ids, max(support.sigma, _LEAST_SIGMA))
 
 
 def from_labels(
@@ -227,7 +225,7 @@ def from_labels(
     plane = None
     if ids and camera.is_pinhole:
         plane = support_plane.around(labels, ids, depth, valid, camera, _search(options))
-    return _marked(labels, plane, ids, depth, valid, camera, _UNKNOWN_SIGMA, options)
+    return Segmentation(labels, plane, ids)
 
 
 def support_under(
@@ -243,31 +241,6 @@ def support_under(
     if not camera.is_pinhole or not ((found.labels == label) & valid).any():
         return None
     return support_plane.around(found.labels, (label,), depth, valid, camera, _search(options))
-
-
-def _marked(
-    labels: np.ndarray,
-    plane: np.ndarray | None,
-    ids: tuple[int, ...],
-    depth: np.ndarray,
-    valid: np.ndarray,
-    camera: Camera,
-    sigma: float,
-    options: SegmentationOptions,
-) -> Segmentation:
-    """The result, with the bodies cut by the border and those too far away."""
-    left, top, width, height = cv2.boundingRect(valid.view(np.uint8))
-    part = labels[top : top + height, left : left + width]
-    border = np.concatenate([part[:1].ravel(), part[-1:].ravel(), part[:, :1].ravel(), part[:, -1:].ravel()])
-    truncated = tuple(k for k in ids if k in set(border.tolist()))
-    far = []
-    if camera.is_pinhole and ids:
-        some = (slice(None, None, 2), slice(None, None, 2))
-        for k in ids:
-            z = depth[some][(labels[some] == k) & valid[some]]
-            if z.size and not options.folds.resolved_at(float(np.median(z)), sigma, camera):
-                far.append(k)
-    return Segmentation(labels, plane, ids, truncated, tuple(far), max(sigma, _LEAST_SIGMA))
 
 
 def _search(options: SegmentationOptions) -> support_plane.Search:
@@ -312,7 +285,12 @@ def _least_pixels(options: SegmentationOptions, depth: np.ndarray) -> int:
 
 
 def _above(
-    known: np.ndarray, valid: np.ndarray, camera: Camera, support: SupportSurface, options: SegmentationOptions
+    known: np.ndarray,
+    valid: np.ndarray,
+    camera: Camera,
+    support: SupportSurface,
+    walls: list[Plane],
+    options: SegmentationOptions,
 ) -> np.ndarray:
     """Bodies (labels from 1, unordered) of what is above the support."""
     labels = np.zeros(known.shape, np.int32)
@@ -324,25 +302,32 @@ def _above(
     above = relative > max(0.25 * options.plane_tolerance, 2 * support.sigma)
     above &= ~support_surface.risen(relative, known, valid, camera, options.plane_tolerance, options.depth_step)
     clear &= above
+    clear &= ~standing.furniture(known, clear, camera, walls, _limits(options))
     left, top, width, height = cv2.boundingRect(clear.view(np.uint8))
     if width == 0:
         return labels
-    top, left = max(top - _FOOT_PIXELS, 0), max(left - _FOOT_PIXELS, 0)
-    window = slice(top, top + height + 2 * _FOOT_PIXELS), slice(left, left + width + 2 * _FOOT_PIXELS)
+    top, left = max(top - _AROUND, 0), max(left - _AROUND, 0)
+    window = slice(top, top + height + 2 * _AROUND), slice(left, left + width + 2 * _AROUND)
+    flat = (valid & (np.abs(relative) < options.plane_tolerance))[window]
     known = known[window]
     seen = camera.cropped(left, top, known.shape[1], known.shape[0])
-    inside = _bodies(known, clear[window], seen, support.sigma, options)
+    inside = _bodies(known, clear[window], seen, support.sigma, options, flat)
     foot = above[window] & (inside == 0)
     labels[window] = depth_steps.grown(inside, foot, known, _FOOT_PIXELS, options.depth_step)
     return labels
 
 
 def _bodies(
-    depth: np.ndarray, wanted: np.ndarray, camera: Camera, sigma: float, options: SegmentationOptions
+    depth: np.ndarray,
+    wanted: np.ndarray,
+    camera: Camera,
+    sigma: float,
+    options: SegmentationOptions,
+    flat: np.ndarray | None = None,
 ) -> np.ndarray:
     """Bodies (labels from 1, unordered) of the wanted pixels, taken apart at steps and concave edges."""
     sigma = max(sigma, _LEAST_SIGMA)
-    patches = surface_patches.find(depth, wanted, camera, sigma, options.depth_step, options.folds)
+    patches = surface_patches.find(depth, wanted, camera, sigma, options.depth_step, flat, options.folds)
     if patches is None:
         return depth_steps.separated(depth, wanted, options.depth_step)
     body = patch_grouping.bodies(patches, camera, options.grouping)

@@ -46,6 +46,10 @@ _RAMP_LENGTH = 0.08
 """Metres over which it goes on at most."""
 
 
+_LEVELS = (0.5, 1.0, 2.0, 3.0, 4.0)
+"""Tolerances above the support at which is looked for low things: from what counts as above it to the highest ramp."""
+
+
 @dataclass(frozen=True, eq=False)
 class SupportSurface:
     """A plane, and how the sensor bends it.
@@ -172,8 +176,26 @@ def risen(
             reached[there] |= reached[here] & near & passable[there]
         if np.count_nonzero(reached) == before:
             break
+    reached &= ~_low_things(height, known, reached, tolerance)
     full = cv2.resize(reached.view(np.uint8), (size[0] * k, size[1] * k), interpolation=cv2.INTER_NEAREST)
     return full[: depth.shape[0], : depth.shape[1]] > 0
+
+
+def _low_things(height: np.ndarray, known: np.ndarray, reached: np.ndarray, tolerance: float) -> np.ndarray:
+    """Samples of what is no ramp although it was reached, as it does not lead up to anything.
+
+    A ramp belongs to the tall thing beside which it rises.  Where the samples above some level hold together and what
+    is highest of them was reached, they are a thing of their own, such as a book or a bag, whose sides the windows of a
+    sensor smooth into ramps.
+    """
+    own = np.zeros(height.shape, bool)
+    for level in _LEVELS:
+        parts = depth_steps.components(known & (height > level * tolerance))
+        rows, columns = np.nonzero(parts)
+        tops = np.zeros((2, int(parts.max()) + 1), np.float32)
+        np.maximum.at(tops, (reached[rows, columns].astype(int), parts[rows, columns]), height[rows, columns])
+        own |= (tops[1] > tops[0] - 0.5 * tolerance)[parts] & (parts > 0)
+    return own
 
 
 def _shallow(height: np.ndarray, z: np.ndarray, known: np.ndarray, width: np.ndarray) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
@@ -97,16 +98,41 @@ def plane_of(depth):
 
 
 def test_a_ramp_is_support_and_the_side_of_a_thing_is_not():
-    """A table that seems to rise by 15 degrees over 10 cm, as beside tall things, and a box of 3 cm."""
+    """A table that seems to rise by 15 degrees over 10 cm beside a tall thing, and a box of 3 cm."""
     normal = slanted(90)
     table = plane_image(normal, 0.8)
     _, u = np.indices(table.shape)
     x = (u - CAMERA.cx) / CAMERA.fx * 0.8
     rise = np.clip(np.tan(np.deg2rad(15)) * (x - 0.1), 0, 0.027)
-    depth, truth = with_bodies(table - rise, [cube_on(table, 90, 120, 0.015)])
+    depth, truth = with_bodies(table - rise, [cube_on(table, 90, 120, 0.015), cube_on(table, 255, 120, 0.1)])
     found = segment(noisy(depth), CAMERA)
-    assert len(found.ids) == 1
+    assert len(found.ids) == 2
     assert overlap(truth == 1, found.labels) > 0.8
+    assert overlap(truth == 2, found.labels) > 0.8
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_low_thing_whose_sides_the_sensor_smooths_is_no_ramp(seed):
+    """A board 2 cm high, its sides smeared over 4 cm: slopes of about 27 degrees that lead up to nothing else."""
+    table = plane_image(slanted(90), 0.8)
+    v, u = np.indices(table.shape)
+    board = (np.abs(u - 150) < 35) & (np.abs(v - 120) < 25)
+    depth = cv2.blur((table - 0.02 * board).astype(np.float32), (13, 13))
+    found = segment(noisy(depth, 1e-3, seed), CAMERA)
+    assert len(found.ids) == 1
+    assert overlap(board, found.labels) > 0.7
+
+
+def test_walls_are_furniture_and_faces_of_things_are_not():
+    """The same plane holds a wall and, apart from it, the front of a box as a thing may be."""
+    wall = support_plane.Plane(np.array([0.0, 0.0, -1.0, 2.0]), 0.5, 1e-3)
+    limits = standing.Limits(0.012, 0.6, None, None, TOLERANCE, 0.015)
+    depth = np.zeros((240, 320), np.float32)
+    depth[:, :150] = 2.0  # 1.1 m wide, 1.8 m high
+    depth[100:160, 220:280] = 2.0  # 0.44 m
+    large = standing.furniture(noisy(depth), depth > 0, CAMERA, [wall], limits)
+    assert large[:, :140].mean() > 0.99
+    assert not large[:, 160:].any()
 
 
 def test_a_table_whose_border_is_round_carries_what_stands_on_it():

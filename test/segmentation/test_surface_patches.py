@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 
@@ -23,7 +24,7 @@ def plane_depth(normal, distance):
 
 def patches(depth, wanted=None, sigma=1e-4, **options):
     depth = np.where(np.isfinite(depth), depth, 0).astype(np.float32)
-    return find(depth, depth > 0 if wanted is None else wanted, CAMERA, sigma, STEP, FoldOptions(**options))
+    return find(depth, depth > 0 if wanted is None else wanted, CAMERA, sigma, STEP, None, FoldOptions(**options))
 
 
 def turned(angle):
@@ -84,12 +85,24 @@ def test_no_patch_reaches_over_a_depth_step():
         assert np.ptp(found.depth[found.labels == label]) == 0
 
 
-def test_more_noise_needs_longer_chords_until_too_far():
-    options = FoldOptions()
-    assert options.radius_at(0.7, 1e-4) == options.radius
-    assert options.radius_at(3.0, 2e-3) > 2 * options.radius
-    assert options.resolved_at(0.7, 1e-3, CAMERA)
-    assert not options.resolved_at(6.0, 2e-3, CAMERA)
+@pytest.mark.parametrize("seed", range(3))
+def test_noise_that_is_alike_over_windows_makes_no_folds(seed):
+    """As that of stereo cameras: 5 mm in windows of 11 x 9 pixels, on a plane seen beside the same plane.
+
+    Taken for independent noise of that size it folds the plane into many patches.
+    """
+    rng = np.random.default_rng(seed)
+    noise = cv2.boxFilter(rng.standard_normal((240, 320)), -1, (11, 9), borderType=cv2.BORDER_REFLECT)
+    depth = 1.0 + 0.005 * noise / noise.std()
+    wanted = np.zeros(depth.shape, bool)
+    wanted[:, 160:] = True
+    measured = find(depth.astype(np.float32), wanted, CAMERA, 0.005, STEP, ~wanted)
+    assumed = find(depth.astype(np.float32), wanted, CAMERA, 0.005, STEP)
+    assert measured.count < 6
+    assert assumed.count > 10 * measured.count
+
+
+def test_bodies_too_far_for_a_chord_have_no_patches():
     assert patches(np.full((240, 320), 50.0)) is None
 
 
