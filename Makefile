@@ -32,7 +32,7 @@ SOURCES := setup.py setup.cfg pyproject.toml package.xml resource/sq_perception 
 
 CORE := geometry files imaging segmentation fitting tracking sq_msgs_py
 
-.PHONY: demo quick test lint speed bench docs install clean
+.PHONY: demo quick test test-computing test-processes lint speed bench docs install clean
 .DEFAULT_GOAL := install
 
 install: $(VENV)/.package
@@ -70,9 +70,13 @@ lint: $(VENV)/.package
 quick: $(VENV)/.package
 	$(VENV)/bin/pytest $(addprefix test/,$(CORE)) -m "not process"
 
-# The executable, not `python -m pytest`: that would put the source tree before the installed package.
+# Both halves at once: tests that start processes mostly wait for them.
 test: lint
-	$(VENV)/bin/pytest test
+	$(MAKE) --no-print-directory --jobs 2 --output-sync=target test-computing test-processes
+
+# The executable, not `python -m pytest`: that would put the source tree before the installed package.
+test-computing test-processes: $(VENV)/.package
+	$(VENV)/bin/pytest test -m "$(if $(filter %-processes,$@),,not )process"
 
 speed: $(VENV)/.package
 	$(VENV)/bin/python benchmarks/speed.py --repeats 3

@@ -52,14 +52,15 @@ def previous(name: str, key: str) -> dict[str, Any]:
     return dict(json.loads(path.read_text())[key]) if path.exists() else {}
 
 
-def write(name: str, result: dict[str, Any], table: str) -> None:
-    """Write ``results/name.json`` and ``results/name.md``, and print the table."""
+def write(name: str, result: dict[str, Any], table: str, shown: bool = True) -> None:
+    """Write ``results/name.json`` and ``results/name.md``, and print the table if it shall be shown."""
     RESULTS.mkdir(exist_ok=True)
     facts = environment()
     (RESULTS / f"{name}.json").write_text(json.dumps({"environment": facts, **result}, indent=1) + "\n")
     head = f"`{facts['command']}`, {facts['processor']}, {facts['date']}, commit {facts['commit']}"
     (RESULTS / f"{name}.md").write_text(f"{head}\n\n{table}\n")
-    print(table)
+    if shown:
+        print(table)
 
 
 def table(header: list[str], rows: list[list[str]]) -> str:

@@ -11,19 +11,30 @@ from sq_perception.fitting import covariance as fit_covariance
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
-from sq_perception.tracking import forms, state
-from sq_perception.tracking.options import TrackerOptions
+from sq_perception.tracking import forms, judgement, state, tracker
 
-EXACT = TrackerOptions(
-    least_log_size=0, least_shape=0, least_centre=0, least_turn=0, drift_centre=0, drift_turn=0, gate=1 - 1e-9
-)
-"""Nothing but the covariances given."""
 CAMERA = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)
+NOTHING = np.full((CAMERA.height, CAMERA.width), np.nan)
+"""A depth image in which nothing was measured."""
 
 
 class Seen(NamedTuple):
     superquadric: Superquadric
     covariance: np.ndarray
+
+
+def nothing_but_the_covariances(patch, common, lasting):
+    """A tracker for which the covariances that it is given are all there is, with these shares in common."""
+    nought = np.zeros_like(tracker.LEAST)
+    for module, name, value in (
+        (tracker, "LEAST", nought),
+        (tracker, "DRIFT", nought),
+        (tracker, "COMMON_SHARE", common),
+        (tracker, "LASTING_SHARE", lasting),
+        (judgement, "GATE", 1 - 1e-9),
+    ):
+        patch.setattr(module, name, value)
+    return tracker.Tracker()
 
 
 def body(size=(0.05, 0.04, 0.03), shape=(0.3, 0.5), centre=(0, 0, 0.8), turn=(0.1, 0.2, 0.3)):

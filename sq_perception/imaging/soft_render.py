@@ -6,9 +6,9 @@ Occupancy (6.6) on a grid of points, voxel k = 1..n of a line of sight counted f
 
     V = sigma(s (1 - F^e1))
 
-silhouette (7.8) and depth projection (7.9, 7.10) along the line of sight:
+depth projection (7.9, 7.10) along the line of sight:
 
-    P(V) = 1 - exp(-tau sum_k V_k),        A_k = exp(-tau sum_{l <= k} V_l),        T(V) = 1 - 1/n sum_k A_k
+    A_k = exp(-tau sum_{l <= k} V_l),        T(V) = 1 - 1/n sum_k A_k
 
 A_k stays 1 until a voxel is hit and then drops to 0, so the sum counts the empty voxels before the surface: T is the
 image of the unit cube (:mod:`sq_perception.imaging.unit_cube`), z of the nearest surface, near 0 where there is none.
@@ -59,12 +59,6 @@ def occupancy_grid(bodies: Superquadric, axis: torch.Tensor, sharpness: float, s
     y, x, z = torch.meshgrid(rows, columns, voxels, indexing="ij")
     points = torch.stack([x, y, z], dim=-1).reshape(-1, 3)
     return bodies.occupancy(points, sharpness).reshape(-1, *x.shape)
-
-
-def silhouette(occupancy: torch.Tensor, tau: float) -> torch.Tensor:
-    """P(V) of occupancy grids (..., voxels), shape (...), in [0, 1) (equation 7.8)."""
-    _check_positive("tau", tau)
-    return 1 - torch.exp(-tau * occupancy.sum(dim=-1))
 
 
 def depth_projection(occupancy: torch.Tensor, tau: float) -> torch.Tensor:

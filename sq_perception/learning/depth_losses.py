@@ -28,7 +28,7 @@ from __future__ import annotations
 import torch
 
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.imaging import sight_lines, soft_render
+from sq_perception.imaging import sight_lines
 
 
 def least_squares_loss(prediction: Superquadric, lines: torch.Tensor, depth: torch.Tensor) -> torch.Tensor:
@@ -66,10 +66,3 @@ def render_loss(
     """L_DR of each body, (n,), in the limit of fine voxels; ``density`` is D = n tau."""
     soft = sight_lines.soft_depth(prediction, lines, sharpness, density, cells)
     return (depth - soft).abs().mean(dim=-1)
-
-
-def voxel_render_loss(
-    prediction: Superquadric, view: torch.Tensor, axis: torch.Tensor, sharpness: float, tau: float
-) -> torch.Tensor:
-    """L_DR of each body, (n,), as the thesis defines it: views (n, p, p), grids of p^3 voxels on ``axis`` (p,)."""
-    return (view - soft_render.render_depth(prediction, axis, sharpness, tau)).abs().mean(dim=(-2, -1))

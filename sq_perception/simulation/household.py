@@ -108,11 +108,6 @@ class Thing:
         reach = self.support(SIX_WAYS)
         return -reach[3:], reach[:3]
 
-    @property
-    def height(self) -> float:
-        """Of the standing thing, metres."""
-        return float(self.box[1][2] - self.box[0][2])
-
     def pose(self, rng: np.random.Generator, leaning: float = 0.06) -> tuple[str, np.ndarray]:
         """A way to rest, turned about the vertical by any angle: its name and the quaternion (4,) to a frame with z up.
 

@@ -7,11 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy.optimize import nnls
 
 from sq_perception.imaging.camera import Camera
-
-_LAW_TOLERANCE = 0.25
 
 
 @dataclass(frozen=True)
@@ -62,30 +59,6 @@ class SensorNoise(ABC):
     def dropout(self, z: Any, cosine: Any = 1.0) -> np.ndarray:
         """Share of the readings of a surface that are missing; arguments as of :meth:`sigma`."""
         return np.zeros(np.broadcast_shapes(np.shape(z), np.shape(cosine)))
-
-    def quadratic_law(self, near: float, far: float, cosine: float = 1.0) -> tuple[float, float]:
-        """``constant`` and ``quadratic`` of sigma(z)^2 = constant^2 + (quadratic z^2)^2 between two depths.
-
-        ``fitting.depth_noise.DepthNoise(*law)`` is what the fit is told of this sensor.  Least squares of relative
-        variances.
-
-        Raises
-        ------
-        ValueError
-            If depths are not 0 < near < far, or the law is wrong by more than 25 % of sigma somewhere between.
-        """
-        if not 0 < near < far < np.inf:
-            raise ValueError(f"near, far: expected 0 < near < far, got {near} and {far}")
-        z = np.linspace(near, far, 64)
-        sigma = self.sigma(z, cosine)
-        if not sigma.any():
-            return 0.0, 0.0
-        parts, _ = nnls(np.stack([np.ones_like(z), z**4], axis=1) / sigma[:, None] ** 2, np.ones_like(z))
-        parts[parts * [1.0, far**4] < 1e-8 * sigma.max() ** 2] = 0.0
-        wrong = np.abs(np.sqrt(parts[0] + parts[1] * z**4) / sigma - 1).max()
-        if wrong > _LAW_TOLERANCE:
-            raise ValueError(f"{self}: no constant and quadratic noise from {near} to {far} m, off by {wrong:.0%}")
-        return float(np.sqrt(parts[0])), float(np.sqrt(parts[1]))
 
     @abstractmethod
     def _measured(self, depth: np.ndarray, camera: Camera, rng: np.random.Generator) -> np.ndarray: ...

@@ -29,7 +29,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
-from sq_perception.tracking import forms, state
+from sq_perception.tracking import forms, judgement, state
 from sq_perception.tracking.state import CENTRE, LENGTH, SIZE_AND_SHAPE
 
 _DEEP = 0.5
@@ -61,24 +61,22 @@ def in_place(
     track_covariance: np.ndarray,
     observed: np.ndarray,
     covariance: np.ndarray,
-    exchange: float,
-    gate: float,
 ) -> Pairs:
     """Pairs of n tracks (n, 12), oldest first, and m observations (m, 12), most important first, that overlap.
 
-    ``gate`` is a probability.  Covariances are (n, 11, 11) and (m, 11, 11); what observations have in addition to
-    theirs, such as a least error, is part of the tracks'.
+    Covariances are (n, 11, 11) and (m, 11, 11); what observations have in addition to theirs, such as a least error,
+    is part of the tracks'.
     """
     if not len(track) or not len(observed):
         return Pairs.none()
     between, apart = _apart(track, observed)
     centres = track_covariance[:, None, CENTRE, CENTRE] + covariance[None, :, CENTRE, CENTRE]
-    agree = state.mahalanobis(centres, between) < state.chi2_limit(gate, 3)
+    agree = state.mahalanobis(centres, between) < state.chi2_limit(judgement.GATE, 3)
     deep = apart < _DEEP
     i, j = np.nonzero(deep | ((apart < 1) & agree))
     if not len(i):
         return Pairs.none()
-    match = forms.nearest(track[i], track_covariance[i], observed[j], covariance[j], exchange)
+    match = forms.nearest(track[i], track_covariance[i], observed[j], covariance[j], forms.EXCHANGE)
     total = track_covariance[i] + match.covariance
     error = state.difference(track[i], match.state)
     cost = _student(total, error)
@@ -103,8 +101,6 @@ def elsewhere(
     reach: np.ndarray,
     observed: np.ndarray,
     covariance: np.ndarray,
-    exchange: float,
-    gate: float,
 ) -> Pairs:
     """Pairs that agree in sizes and exponents, with centres within ``reach`` (n,) metres."""
     if not len(track) or not len(observed):
@@ -114,10 +110,10 @@ def elsewhere(
     if not len(i):
         return Pairs.none()
     free = _unplaced(track_covariance[i], distance[i, j])
-    match = forms.nearest(track[i], free, observed[j], covariance[j], exchange)
+    match = forms.nearest(track[i], free, observed[j], covariance[j], forms.EXCHANGE)
     total = (track_covariance[i] + match.covariance)[:, SIZE_AND_SHAPE, SIZE_AND_SHAPE]
     error = state.difference(track[i], match.state)[:, SIZE_AND_SHAPE]
-    alike = state.mahalanobis(total, error) < state.chi2_limit(gate, 5)
+    alike = state.mahalanobis(total, error) < state.chi2_limit(judgement.GATE, 5)
     pairs = Pairs(i[alike], j[alike], match.state[alike], match.covariance[alike])
     if not alike.any():
         return Pairs.none()

@@ -28,6 +28,9 @@ from sq_perception.geometry import rotation as quaternions
 from sq_perception.tracking import state
 from sq_perception.tracking.state import LENGTH, SHAPE, SIZE, SIZE_AND_SHAPE, TURN
 
+EXCHANGE = 0.3
+"""Largest |e1 - e2| for which z may change places with x or y.  Chosen: the exponents of fitted boxes differ by less, a
+cylinder's by more."""
 _SHORTLIST = 4
 """Forms compared with their whole covariances; the others are farther off already by their variances."""
 _SIZE_PER_SHAPE = 0.1

@@ -43,6 +43,10 @@ from sq_perception.geometry import rotation as quaternions
 from sq_perception.tracking import state
 from sq_perception.tracking.state import LENGTH, TURN
 
+VIEW_ANGLE = 0.25
+"""Radians: views closer than this share their systematic error.  Chosen: outlines change little within 14 degrees."""
+VIEWS = 16
+"""Directions that are remembered for each body: two thirds of a circle at ``VIEW_ANGLE``.  Each costs time."""
 _TOLD = 0.2
 """Radians: a turn about an axis whose standard deviation is larger is not told by an observation."""
 
@@ -69,10 +73,10 @@ class Views:
     used: np.ndarray
 
     @classmethod
-    def none(cls, kept: int) -> Views:
-        """No view yet, room for some."""
-        square = np.zeros((kept, LENGTH, LENGTH))
-        return cls(np.zeros((kept, 3)), square, square.copy(), np.full(kept, -1))
+    def none(cls) -> Views:
+        """No view yet."""
+        square = np.zeros((VIEWS, LENGTH, LENGTH))
+        return cls(np.zeros((VIEWS, 3)), square, square.copy(), np.full(VIEWS, -1))
 
     @classmethod
     def stack(cls, several: list[Views]) -> Views:
@@ -98,7 +102,6 @@ def fused(
     common: np.ndarray,
     shared: np.ndarray,
     direction: np.ndarray,
-    angle: float,
     turning: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, Views]:
     """n tracks after one observation each.
@@ -119,8 +122,6 @@ def fused(
         L.
     direction : (n, 3)
         Unit vector from the body to the camera, world frame.
-    angle
-        Views closer than this, radians, share their systematic error.
     turning : (n,) bool
         Bodies that have turned themselves.  What rotates a resting body's estimate is a correction, and what it was
         seen from stays where it is in the world; a turned body shows another side.
@@ -137,7 +138,7 @@ def fused(
     row = np.arange(count)
     likeness = np.einsum("nmi,ni->nm", views.direction, local)
     place = np.argmax(likeness, axis=1)
-    fresh = likeness[row, place] < np.cos(angle)
+    fresh = likeness[row, place] < np.cos(VIEW_ANGLE)
     place = np.where(fresh, np.argmin(views.used, axis=1), place)
     views.direction[row[fresh], place[fresh]] = local[fresh]
     views.bias[row[fresh], place[fresh]] = common[fresh]

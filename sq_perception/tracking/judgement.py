@@ -1,6 +1,6 @@
 """Whether an observation agrees with its track, and in what it does not.
 
-With the error e = z - x^, its covariance S and the gate's probability p, an observation agrees if
+With the error e = z - x^, its covariance S and the probability p (``GATE``), an observation agrees if
 
     e^T S^-1 e < chi2_11(p)
 
@@ -17,6 +17,8 @@ import numpy as np
 from sq_perception.tracking import state
 from sq_perception.tracking.state import CENTRE, LENGTH, SIZE_AND_SHAPE, TURN
 
+GATE = 0.999
+"""Probability that an observation of the tracked body is taken for one.  Chosen: one good one in 1000 is doubted."""
 STILL_SHARE = 0.05
 """Displacements below this share of the mean half size, and turns below so many radians, are no motion."""
 
@@ -35,9 +37,9 @@ class Judgement(NamedTuple):
     excess: np.ndarray
 
 
-def judged(size: np.ndarray, total: np.ndarray, error: np.ndarray, gate: float) -> Judgement:
+def judged(size: np.ndarray, total: np.ndarray, error: np.ndarray) -> Judgement:
     """Judge errors (n, 11) with covariances (n, 11, 11) of bodies with half sizes (n, 3)."""
-    limit, limit_five, limit_three = state.chi2_limit(gate, np.array([LENGTH, 5, 3]))
+    limit, limit_five, limit_three = state.chi2_limit(GATE, np.array([LENGTH, 5, 3]))
 
     def outside(part: slice, bound: float) -> np.ndarray:
         return state.mahalanobis(total[:, part, part], error[:, part]) > bound

@@ -30,7 +30,6 @@ from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
 from sq_perception.tracking import forms, state
-from sq_perception.tracking.options import TrackerOptions
 from sq_perception.tracking.state import LENGTH, Observed
 from sq_perception.tracking.tracker import Tracker
 
@@ -90,16 +89,10 @@ class Tally:
 
 
 class TrackingSession:
-    """Follows the bodies of one camera's frames.
+    """Follows the bodies of one camera's frames."""
 
-    Parameters
-    ----------
-    options : TrackerOptions, optional
-        ``publish_after`` is taken as 1: every body of a frame has a track.
-    """
-
-    def __init__(self, options: TrackerOptions | None = None) -> None:
-        self._tracker = Tracker(replace(options or TrackerOptions(), publish_after=1))
+    def __init__(self) -> None:
+        self._tracker = Tracker()
         self._stamp = -np.inf
         self._pose: tuple[np.ndarray, np.ndarray] = state.as_pose(None)
         self._tally = Tally()

@@ -1,9 +1,8 @@
 """Whether a body should have been seen where it is thought to be.
 
 26 points of the surface, in the directions of a cube's faces, edges and corners, speak for a body; those on the far
-side are left out.  A point is hidden if it falls outside of the image or behind something nearer.  With a depth image
-a point is evidence of absence only where the image measured something farther: where nothing was measured, or where
-something lies at the body's place, nobody can say that it has gone.
+side are left out.  A point is evidence of absence only where the image measured something farther: beyond the image,
+where nothing was measured, or where something lies in front or at the body's place, nobody can say that it has gone.
 
 Optical frame, metres.
 """
@@ -20,34 +19,25 @@ _TOLERANCE = 0.25
 """Of the smallest half size: a depth that differs by less is the body's own."""
 
 
-def open_share(
-    bodies: Superquadric, camera: Camera, depth: np.ndarray | None = None, others: Superquadric | None = None
-) -> np.ndarray:
-    """Share (n,) of the near side that the camera sees, or, with a depth image, sees through.
+def open_share(bodies: Superquadric, camera: Camera, depth: np.ndarray) -> np.ndarray:
+    """Share (n,) of the near side that the camera sees through.
 
     Parameters
     ----------
     bodies : Superquadric
         A batch (n,).
     camera : Camera
-    depth : float (height, width), optional
+    depth : float (height, width)
         What was measured; NaN, inf or (pinhole) 0 and less: nothing.
-    others : Superquadric, optional
-        A batch (m,) of bodies that may stand in front; used only without a depth image.
     """
     points, near = _near_side(bodies, camera)
     pixels = camera.project(points)
     inside = near & (pixels >= 0).all(axis=-1) & (pixels <= [camera.width - 1, camera.height - 1]).all(axis=-1)
-    if depth is not None:
-        column, row = np.where(inside[..., None], np.rint(np.nan_to_num(pixels)), 0).astype(int).transpose(2, 0, 1)
-        measured = np.asarray(depth, dtype=float)[row, column]
-        valid = np.isfinite(measured) & ((measured > 0) | (not camera.is_pinhole))
-        tolerance = _TOLERANCE * bodies.size.min(axis=-1)[:, None]
-        clear = inside & valid & (np.where(valid, measured, 0) > points[..., 2] + tolerance)
-    else:
-        clear = inside
-        if others is not None and len(others):
-            clear = inside & ~_behind(points, others, camera)
+    column, row = np.where(inside[..., None], np.rint(np.nan_to_num(pixels)), 0).astype(int).transpose(2, 0, 1)
+    measured = np.asarray(depth, dtype=float)[row, column]
+    valid = np.isfinite(measured) & ((measured > 0) | (not camera.is_pinhole))
+    tolerance = _TOLERANCE * bodies.size.min(axis=-1)[:, None]
+    clear = inside & valid & (np.where(valid, measured, 0) > points[..., 2] + tolerance)
     return clear.sum(axis=1) / np.maximum(near.sum(axis=1), 1)
 
 
@@ -59,18 +49,3 @@ def _near_side(bodies: Superquadric, camera: Camera) -> tuple[np.ndarray, np.nda
     normals = bodies.gauge_gradient(points)
     sight = points if camera.is_pinhole else np.array([0.0, 0.0, 1.0])
     return points, (normals * sight).sum(axis=-1) < 0
-
-
-def _behind(points: np.ndarray, others: Superquadric, camera: Camera) -> np.ndarray:
-    """Which points (n, p) are hidden by one of m bodies, each taken at its sight line's nearest point to its centre.
-
-    Nearest in units of the half sizes: exact for ellipsoids, close for the rest.
-    """
-    target = points.reshape(-1, 3)
-    origin = np.zeros_like(target) if camera.is_pinhole else target * [1.0, 1.0, 0.0]
-    start = others.to_object(origin[None]) / others.size[:, None]
-    end = others.to_object(target[None]) / others.size[:, None]
-    way = end - start
-    share = np.clip(-(start * way).sum(-1) / np.maximum((way**2).sum(-1), 1e-12), 0, 1)
-    crossing = origin + share[..., None] * (target - origin)
-    return (others.gauge(crossing) < 1).any(axis=0).reshape(points.shape[:-1])

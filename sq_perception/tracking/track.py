@@ -37,12 +37,8 @@ class Track:
         Of a1 a2 a3 e1 e2 t1 t2 t3 (world frame) and the rotation vector in the object frame, metres and radians.
     velocity : (3,)
         Metres per second in the world frame; zero for bodies at rest.
-    age
-        Seconds between the first and the last observation.
     seen
         Number of observations.
-    last_stamp
-        Stamp of the last observation, seconds.
     state : TrackState
     observation
         Index of this frame's observation; None if there is none.
@@ -57,9 +53,7 @@ class Track:
     sigma_size: np.ndarray
     covariance: np.ndarray
     velocity: np.ndarray
-    age: float
     seen: int
-    last_stamp: float
     state: TrackState
     observation: int | None
     follows: bool

@@ -20,6 +20,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
@@ -30,12 +31,34 @@ from sq_perception.tracking import association, fusion, judgement, sight, state
 from sq_perception.tracking.association import Pairs
 from sq_perception.tracking.fusion import Views
 from sq_perception.tracking.judgement import STILL_SHARE
-from sq_perception.tracking.options import TrackerOptions
 from sq_perception.tracking.state import CENTRE, LENGTH, POSE, TURN, Observed
 from sq_perception.tracking.track import Track, TrackState
 
-__all__ = ["Track", "TrackState", "Tracker", "TrackerOptions"]
+__all__ = ["Track", "TrackState", "Tracker"]
 
+COMMON_SHARE, LASTING_SHARE = 0.25, 0.25
+"""rho and gamma, the shares of an observation's covariance that all views from one direction, and all views, have in
+common.  Chosen; benchmarks/tracking.py finds half of a view's error to be the same over all frames."""
+LEAST = state.diagonal(0.01, 0.02, 0.001, 0.01)
+"""F, the least common error of a view.  Chosen: 1 % in size, a millimetre, half a degree."""
+UNKNOWN = 0.15, 0.2, 0.15, 0.2
+"""Deviations (log sizes, exponents, centre as a share of the mean half size, turn) of observations without covariance.
+Chosen: errors of the classic fit and of the network alone on household things are of this order."""
+DRIFT = state.diagonal(0.0, 0.0, 0.001, 0.01)
+"""Random walk of a body at rest in a second: a millimetre, and 0.6 degrees.  Chosen."""
+PATIENCE = 2
+"""After so many disagreeing observations in a row the track gives way: the second may not be chance any more."""
+FASTEST = 1.0
+"""Metres per second: how far a body may have been moved between two frames.  A hand that sets things down."""
+CONFIRM_AFTER = 3
+"""Observations until a track is confirmed: one more than ``PATIENCE``.  Chosen."""
+MISSES = 5
+"""A confirmed track dies in the so-manieth frame in a row that should have shown it; a tentative one in the second.
+Chosen: a sixth of a second of a camera at 30 Hz."""
+FORGET_POSE_AFTER, FORGET_AFTER = 5.0, 30.0
+"""Seconds without observation until a body may be anywhere within reach, and until it is given up.  Chosen."""
+MOST = 100
+"""Tracks that are kept; beyond them those die first that were not observed for longest.  Bounds the time of a frame."""
 _EXPECTED_SHARE = 0.5
 _RESTART = 3.0
 """A restarted pose is unsure by this many times the displacement."""
@@ -57,7 +80,6 @@ class _Body:
     lasting: np.ndarray
     """M: of the error that all views have in common; ``covariance`` is without it."""
     views: Views
-    born: float
     last: float
     agreed: float
     """Stamp of the last observation that the centre follows."""
@@ -78,15 +100,9 @@ class _Body:
 
 
 class Tracker:
-    """Follows bodies; one call of :meth:`update` for each frame.
+    """Follows bodies; one call of :meth:`update` for each frame."""
 
-    Parameters
-    ----------
-    options : TrackerOptions, optional
-    """
-
-    def __init__(self, options: TrackerOptions | None = None) -> None:
-        self._options = options or TrackerOptions()
+    def __init__(self) -> None:
         self._bodies: list[_Body] = []
         self._stamp: float | None = None
         self._next_id = 1
@@ -108,7 +124,6 @@ class Tracker:
         *,
         camera: Camera | None = None,
         depth: np.ndarray | None = None,
-        expected_visible: Callable[[Track], bool] | None = None,
     ) -> tuple[Track, ...]:
         """The tracks after another frame, oldest first.
 
@@ -122,12 +137,9 @@ class Tracker:
         camera_pose
             Camera in the world: 4 x 4, or (quaternion x y z w, translation).  None: the camera is the world.
         camera : Camera, optional
-            With it, bodies outside of the image or behind other ones do not count as missed.
         depth : float (height, width), optional
             The frame's depth image, metres, NaN invalid.  With it, and the camera, only bodies that the image sees
-            through count as missed.
-        expected_visible
-            Asked instead, for each track without observation: should it have been seen?
+            through count as missed; without it all that were not observed.
 
         Raises
         ------
@@ -150,7 +162,7 @@ class Tracker:
         self._predict(stamp)
         self._stamp = stamp
 
-        expected = _Expectation(camera, rotation, position, depth, expected_visible, observed)
+        expected = partial(_expected, camera=camera, depth=depth, rotation=rotation, position=position)
         pairs, missing = self._pairs(observed, covariance, stamp, expected)
         to_camera = _towards(observed[:, 5:8], rotation, position, orthographic)
         self._fuse(pairs, to_camera, stamp)
@@ -159,7 +171,7 @@ class Tracker:
             if j not in taken:
                 self._begin(j, observed[j], covariance[j], to_camera[j], stamp)
         self._miss(missing, stamp)
-        return tuple(_published(one, self._options) for one in self._bodies if one.seen >= self._options.publish_after)
+        return tuple(_published(one) for one in self._bodies)
 
     def _in_world(
         self, recoveries: Sequence[Observed], rotation: np.ndarray, position: np.ndarray
@@ -176,22 +188,18 @@ class Tracker:
         covariance = state.to_log(np.array([one.covariance for one in recoveries], dtype=float), flat[:, 0:3])
         unknown = ~np.isfinite(covariance).all(axis=(1, 2))
         if unknown.any():
-            o = self._options
+            log_size, shape, centre, turn = UNKNOWN
             for k in np.flatnonzero(unknown):
-                centre = o.unknown_centre * float(flat[k, 0:3].mean())
-                covariance[k] = state.diagonal(o.unknown_log_size, o.unknown_shape, centre, o.unknown_turn)
+                covariance[k] = state.diagonal(log_size, shape, centre * float(flat[k, 0:3].mean()), turn)
         matrix = quaternions.to_matrix(rotation)
         flat[:, 5:8] = flat[:, 5:8] @ matrix.T + position
         flat[:, 8:12] = quaternions.multiply(rotation, flat[:, 8:12])
         return flat, state.turned(covariance, matrix)
 
     def _predict(self, stamp: float) -> None:
-        o = self._options
         elapsed = 0.0 if self._stamp is None else stamp - self._stamp
         for one in self._bodies:
-            variance = np.zeros(LENGTH)
-            variance[CENTRE] = o.drift_centre**2 * elapsed
-            variance[TURN] = o.drift_turn**2 * elapsed
+            variance = np.diag(DRIFT) * elapsed
             if stamp - one.last > _COASTING:
                 one.velocity = np.zeros(3)
             if one.is_moving:
@@ -200,57 +208,57 @@ class Tracker:
                 one.state[5:8] += step
                 variance[CENTRE] += _MOTION_SHARE**2 * (step @ step)
                 variance[TURN] += _MOVING_TURN**2 * min(elapsed, 1.0)
-            if stamp - one.last > o.forget_pose_after:
+            if stamp - one.last > FORGET_POSE_AFTER:
                 variance[POSE] += _UNPLACED**2
             one.covariance = one.covariance + np.diag(variance)
             one.observation, one.follows = None, False
 
     def _pairs(
-        self, observed: np.ndarray, covariance: np.ndarray, stamp: float, expectation: _Expectation
+        self,
+        observed: np.ndarray,
+        covariance: np.ndarray,
+        stamp: float,
+        expected: Callable[[list[_Body]], list[bool]],
     ) -> tuple[Pairs, set[int]]:
         """In place first, then what was moved; and the ids of tracks that should have been in place and were not."""
-        o = self._options
         if not self._bodies:
             return Pairs.none(), set()
         states, covariances = self._stacked(self._bodies)
-        covariances = covariances + o.least()
-        here = association.in_place(states, covariances, observed, covariance, o.exchange, o.gate)
+        covariances = covariances + LEAST
+        here = association.in_place(states, covariances, observed, covariance)
         left = np.setdiff1d(np.arange(len(states)), here.track)
         new = np.setdiff1d(np.arange(len(observed)), here.observed)
-        open_place = expectation.of([self._bodies[k] for k in left], o)
+        open_place = expected([self._bodies[k] for k in left])
         missing = {self._bodies[k].id for k, visible in zip(left, open_place, strict=True) if visible}
         # What is hidden has rather stayed where it was than become one more body of its kind far away.
         free = np.array([visible or self._bodies[k].is_moving for k, visible in zip(left, open_place, strict=True)])
-        reach = o.fastest * np.array([stamp - self._bodies[k].last for k in left])
+        reach = FASTEST * np.array([stamp - self._bodies[k].last for k in left])
         reach = np.where(free, reach, np.minimum(reach, 2 * states[left, 0:3].max(axis=1)))
-        there = association.elsewhere(
-            states[left], covariances[left], reach, observed[new], covariance[new], o.exchange, o.gate
-        )
+        there = association.elsewhere(states[left], covariances[left], reach, observed[new], covariance[new])
         there = there._replace(track=left[there.track], observed=new[there.observed])
         for k in here.track:
             self._bodies[k].jumps = 0
         for k in there.track:
             # Its sizes and exponents were found elsewhere: nothing more has to be waited for.
             self._bodies[k].jumps += 1
-            self._bodies[k].disagreed = max(self._bodies[k].disagreed, o.patience)
+            self._bodies[k].disagreed = max(self._bodies[k].disagreed, PATIENCE)
         return here + there, missing
 
     def _fuse(self, pairs: Pairs, to_camera: np.ndarray, stamp: float) -> None:
         if not len(pairs.track):
             return
-        o = self._options
         some = [self._bodies[k] for k in pairs.track]
         states, covariances = self._stacked(some)
-        common = o.common_share * pairs.covariance + o.least()
-        white = (1 - o.common_share - o.lasting_share) * pairs.covariance
-        whole = pairs.covariance + o.least()
+        common = COMMON_SHARE * pairs.covariance + LEAST
+        white = (1 - COMMON_SHARE - LASTING_SHARE) * pairs.covariance
+        whole = pairs.covariance + LEAST
         total, error = covariances + whole, state.difference(states, pairs.state)
-        verdict = judgement.judged(states[:, 0:3], total, error, o.gate)
+        verdict = judgement.judged(states[:, 0:3], total, error)
         turning = np.zeros(len(some), dtype=bool)
         for k, one in enumerate(some):
             agrees, slid, turned = verdict.agrees[k], verdict.slid[k], verdict.turned[k]
             one.disagreed = 0 if agrees else one.disagreed + 1
-            impatient = one.disagreed > 0 and (one.is_moving or one.disagreed >= o.patience)
+            impatient = one.disagreed > 0 and (one.is_moving or one.disagreed >= PATIENCE)
             if not one.is_moving and one.jumps == 0:
                 # What moves strays to the same side again; errors larger than they are said to be do so seldom.
                 slid = slid and judgement.same_side(one.strayed[CENTRE], error[k, CENTRE])
@@ -265,7 +273,7 @@ class Tracker:
             else:
                 # One stray observation is doubted itself; of several in a row, both sides are.
                 white[k] += (verdict.excess[k] - 1) * whole[k]
-                if one.disagreed >= o.patience:
+                if one.disagreed >= PATIENCE:
                     covariances[k] *= verdict.excess[k]
             self._follow(one, error[k, CENTRE], slid and impatient, stamp, total[k, CENTRE, CENTRE])
             if agrees or impatient:
@@ -279,17 +287,16 @@ class Tracker:
             pairs.state,
             white,
             common,
-            fusion.root(o.lasting_share * pairs.covariance),
+            fusion.root(LASTING_SHARE * pairs.covariance),
             to_camera[pairs.observed],
-            o.view_angle,
             turning,
         )
-        strays = judgement.judged(after[:, 0:3], whole, state.difference(after, pairs.state), o.gate)
+        strays = judgement.judged(after[:, 0:3], whole, state.difference(after, pairs.state))
         for k, one in enumerate(some):
             one.state, one.covariance, one.lasting, one.views = after[k], covariances[k], lasting[k], views[k]
             one.seen, one.missed, one.last = one.seen + 1, 0, stamp
             one.observation = int(pairs.observed[k])
-            insists = one.disagreed >= o.patience and not strays.fits[k]
+            insists = one.disagreed >= PATIENCE and not strays.fits[k]
             one.follows = not (strays.slid[k] or strays.turned[k] or insists)
 
     def _follow(self, one: _Body, error: np.ndarray, slid: bool, stamp: float, covariance: np.ndarray) -> None:
@@ -304,36 +311,34 @@ class Tracker:
             one.velocity = velocity if np.linalg.norm(velocity) * elapsed > still else np.zeros(3)
         elif slid and one.jumps != 1:
             velocity = error / elapsed
-            one.velocity = velocity * min(1.0, self._options.fastest / float(np.linalg.norm(velocity)))
+            one.velocity = velocity * min(1.0, FASTEST / float(np.linalg.norm(velocity)))
 
     def _begin(self, index: int, observed: np.ndarray, covariance: np.ndarray, view: np.ndarray, stamp: float) -> None:
-        o = self._options
-        whole, views = (1 - o.lasting_share) * covariance + o.least(), Views.none(o.views)
-        lasting = fusion.root(o.lasting_share * covariance)
+        whole, views = (1 - LASTING_SHARE) * covariance + LEAST, Views.none()
+        lasting = fusion.root(LASTING_SHARE * covariance)
         views.direction[0] = quaternions.to_matrix(observed[8:12]).T @ view
-        views.bias[0] = views.correlation[0] = o.common_share * covariance + o.least()
+        views.bias[0] = views.correlation[0] = COMMON_SHARE * covariance + LEAST
         views.used[0] = 0
-        born = _Body(self._next_id, observed, whole, lasting, views, stamp, stamp, stamp)
+        born = _Body(self._next_id, observed, whole, lasting, views, stamp, stamp)
         born.observation, born.follows = index, True
         self._next_id += 1
         self._bodies.append(born)
 
     def _miss(self, missing: set[int], stamp: float) -> None:
         """Count misses of what should have been seen, and bury the dead."""
-        o = self._options
         dead = set()
         ousted = self._ousted()
         for one in self._bodies:
             if one.observation is not None:
                 continue
             one.missed = one.missed + 1 if one.id in missing | ousted else 0
-            patience = o.misses if one.seen >= o.confirm_after else min(1 if one.id in ousted else 2, o.misses)
-            if one.missed >= patience or stamp - one.last > o.forget_after:
+            patience = MISSES if one.seen >= CONFIRM_AFTER else 1 if one.id in ousted else 2
+            if one.missed >= patience or stamp - one.last > FORGET_AFTER:
                 dead.add(one.id)
         left = [one for one in self._bodies if one.id not in dead]
-        if len(left) > o.most:
+        if len(left) > MOST:
             unseen = sorted((one for one in left if one.observation is None), key=lambda one: one.last)
-            dead |= {one.id for one in unseen[: len(left) - o.most]}
+            dead |= {one.id for one in unseen[: len(left) - MOST]}
         self._bodies = [one for one in self._bodies if one.id not in dead]
 
     def _ousted(self) -> set[int]:
@@ -350,44 +355,28 @@ class Tracker:
         return np.array([one.state for one in some]), np.array([one.covariance for one in some])
 
 
-@dataclass(frozen=True, eq=False)
-class _Expectation:
+def _expected(
+    unseen: list[_Body], camera: Camera | None, depth: np.ndarray | None, rotation: np.ndarray, position: np.ndarray
+) -> list[bool]:
     """Whether tracks without observation should have been seen, by what is known of the frame."""
-
-    camera: Camera | None
-    rotation: np.ndarray
-    position: np.ndarray
-    depth: np.ndarray | None
-    asked: Callable[[Track], bool] | None
-    observed: np.ndarray
-
-    def of(self, unseen: list[_Body], options: TrackerOptions) -> list[bool]:
-        if not unseen:
-            return []
-        if self.asked is not None:
-            return [bool(self.asked(_published(one, options))) for one in unseen]
-        if self.camera is None:
-            return [True] * len(unseen)
-        back = quaternions.conjugate(self.rotation)
-        home = -quaternions.to_matrix(back) @ self.position
-        places = state.bodies(np.array([one.state for one in unseen])).transformed(back, home)
-        others = state.bodies(self.observed).transformed(back, home)
-        share = sight.open_share(places, self.camera, self.depth, others)
-        return [bool(visible) for visible in share >= _EXPECTED_SHARE]
+    if camera is None or depth is None or not unseen:
+        return [True] * len(unseen)
+    back = quaternions.conjugate(rotation)
+    home = -quaternions.to_matrix(back) @ position
+    places = state.bodies(np.array([one.state for one in unseen])).transformed(back, home)
+    return [bool(visible) for visible in sight.open_share(places, camera, depth) >= _EXPECTED_SHARE]
 
 
-def _published(one: _Body, options: TrackerOptions) -> Track:
+def _published(one: _Body) -> Track:
     covariance = state.from_log(one.covariance + one.lasting @ one.lasting.T, one.state[0:3])
-    known = TrackState.CONFIRMED if one.seen >= options.confirm_after else TrackState.TENTATIVE
+    known = TrackState.CONFIRMED if one.seen >= CONFIRM_AFTER else TrackState.TENTATIVE
     return Track(
         id=one.id,
         superquadric=Superquadric.from_flat(one.state.copy()),
         sigma_size=np.sqrt(np.diag(covariance)[0:3]),
         covariance=covariance,
         velocity=one.velocity.copy(),
-        age=one.last - one.born,
         seen=one.seen,
-        last_stamp=one.last,
         state=known if one.observation is not None else TrackState.LOST,
         observation=one.observation,
         follows=one.follows,

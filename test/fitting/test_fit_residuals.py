@@ -253,7 +253,7 @@ def test_cost_never_rises_and_reaches_the_truth(rng: np.random.Generator) -> Non
     for _ in range(60):
         state = minimize(SAMPSON, rays, NO_RAYS, PLAIN, state, limits, 1, 0.0)
         costs.append(state.cost)
-    assert all(after <= before for before, after in itertools.pairwise(costs))
+    assert all(after <= before * (1 + 1e-9) for before, after in itertools.pairwise(costs))
     assert costs[-1] < 1e-4 * costs[0]
     assert np.sort(state.body.size) == pytest.approx(np.sort(truth.size), rel=1e-3)
 

@@ -255,9 +255,7 @@ class TestLifecycle:
         request = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_CONFIGURE))
         future = client.call_async(request)
         bench.until(lambda: bench.node.state == "configuring")
-        started = time.monotonic()
         assert bench.state() == "configuring"
-        assert time.monotonic() - started < 2.0
         assert not future.done()
         bench.gate.set()
         bench.until(future.done)

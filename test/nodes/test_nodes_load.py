@@ -153,12 +153,10 @@ def test_a_storm_of_parameters_changes_what_it_says_and_stops_nothing(peer, chil
             time.sleep(max(0.0, began + k / STORM_RATE - time.monotonic()))
         until(lambda: all(future.done() for _, future in futures), alive)
         during = len(heard) - seen
-        took = time.monotonic() - began
     for is_bad, future in futures:
         (result,) = future.result().results
         assert result.successful != is_bad, result.reason
         assert bool(result.reason) == is_bad
-    assert took < 3 * STORM_SECONDS
     assert during >= 3
     assert peer.get(name, "s", "tau", "max_objects", alive=alive) == [
         expected[key] for key in ("s", "tau", "max_objects")

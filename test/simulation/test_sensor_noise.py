@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import time
 
 import numpy as np
 import pytest
 from scipy.stats import norm
 
-from sq_perception.fitting.depth_noise import DepthNoise
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.inverse_depth import InverseDepth
@@ -106,16 +104,6 @@ def test_noise_of_triangulation_is_shared_within_the_window(rng):
         assert found == pytest.approx(max(0, 1 - lag / columns), abs=0.06)
     found = np.mean(error[2:] * error[:-2]) / np.mean(error**2)
     assert found == pytest.approx(1 - 2 / rows, abs=0.06)
-
-
-@pytest.mark.parametrize("name", NAMES)
-def test_the_fit_can_be_told_the_noise(name):
-    model = PRESETS[name]
-    noise = DepthNoise(*model.quadratic_law(0.6, 2.5))
-    for z in np.linspace(0.6, 2.5, 7):
-        assert noise.at(z) == pytest.approx(float(model.sigma(z)), rel=0.25)
-    assert D435.quadratic_law(0.5, 3.0) == pytest.approx((0.0, 0.08 / (424 * 0.05)), abs=1e-9)
-    assert Ideal(0.002).quadratic_law(0.5, 3.0) == pytest.approx((0.002, 0.0))
 
 
 # Edges
@@ -285,19 +273,6 @@ def test_the_ideal_sensor_adds_its_deviation_and_nothing_else(rng):
     np.testing.assert_array_equal(Ideal().measured(below, unit_cube.camera(9), rng), below)
 
 
-def test_a_frame_takes_little_time(rng):
-    scene = table_scene(np.random.default_rng(3), 4)
-    true, _ = scene.render()
-    for name in NAMES:
-        times = []
-        for _ in range(5):
-            start = time.process_time()
-            PRESETS[name].measured(true, scene.camera, rng)
-            times.append(time.process_time() - start)
-        # 18 ms on one core of an EPYC; slower and shared machines shall pass.
-        assert min(times) < 0.15
-
-
 def test_misuse_is_named(rng):
     for model in (KINECT, AZURE, D435, Ideal(0.001)):
         with pytest.raises(ValueError, match="does not fit a camera of 320 x 240"):
@@ -314,8 +289,6 @@ def test_misuse_is_named(rng):
         for cosine in (0.0, 1.1, np.nan):
             with pytest.raises(ValueError, match="cosine: expected"):
                 model.sigma(1.0, cosine)
-        with pytest.raises(ValueError, match="near, far"):
-            model.quadratic_law(2.0, 1.0)
     for model in PRESETS.values():
         for bad in (0.0, -1.0, -np.inf):
             with pytest.raises(ValueError, match="expected positive metres"):

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from tracked_bodies import (
-    EXACT,
     Seen,
     angle_between,
     assert_chi_square,
@@ -20,13 +17,14 @@ from tracked_bodies import (
     looking_at,
     nees,
     noise,
+    nothing_but_the_covariances,
     spread_bodies,
 )
 
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.tracking import forms, state
-from sq_perception.tracking.tracker import Tracker, TrackerOptions
+from sq_perception.tracking.tracker import Tracker
 
 # Forms
 
@@ -87,10 +85,10 @@ def test_z_changes_places_only_where_the_exponents_are_alike(rng):
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5])
-def test_nees_of_independent_views(share, rng):
+def test_nees_of_independent_views(share, rng, monkeypatch):
     """20 bodies, each frame from another side: the errors are as large as the covariances say."""
     truths = spread_bodies(20, rng)
-    tracker = Tracker(TrackerOptions(**{**vars(EXACT), "common_share": share, "lasting_share": 0}))
+    tracker = nothing_but_the_covariances(monkeypatch, share, 0.0)
     covariances = [correlated(rng) for _ in truths]
     directions = [(-0.1, 0.1, -1), (1, 0.2, 0.1), (0.1, 1, 0), (0.2, 0, 1), (-1, 0, 0.2), (0, -1, 0.1)]
     for k, direction in enumerate(directions):
@@ -107,10 +105,10 @@ def test_nees_of_independent_views(share, rng):
     np.testing.assert_allclose(np.cbrt(shrunk), 1 / np.sqrt(len(directions)), rtol=0.1)
 
 
-def test_nees_of_one_view_with_a_common_error(rng):
+def test_nees_of_one_view_with_a_common_error(rng, monkeypatch):
     """A still camera repeats its error; 50 frames from two sides are as good as they are said to be."""
     truths = spread_bodies(20, rng)
-    tracker = Tracker(TrackerOptions(**{**vars(EXACT), "common_share": 0.5, "lasting_share": 0}))
+    tracker = nothing_but_the_covariances(monkeypatch, 0.5, 0.0)
     covariance = correlated(rng)
     middle = truths.translation.mean(axis=0)
     for view, direction in enumerate([(0, 0, -1.0), (1.0, 0, 0)]):
@@ -136,9 +134,9 @@ def test_identical_frames_leave_the_common_error_and_another_view_does_not(rng):
     assert (other.sigma_size < 0.95 * track.sigma_size).all()
 
 
-def test_no_number_of_views_lessens_what_all_have_in_common(rng):
+def test_no_number_of_views_lessens_what_all_have_in_common(rng, monkeypatch):
     """An error of the same size on all of 30 sides: the deviation falls to its share and tells the truth."""
-    truths, tracker = spread_bodies(20, rng), Tracker(replace(EXACT, common_share=0.25, lasting_share=0.25))
+    truths, tracker = spread_bodies(20, rng), nothing_but_the_covariances(monkeypatch, 0.25, 0.25)
     covariance = noise()
     middle = truths.translation.mean(axis=0)
     lasting = rng.multivariate_normal(np.zeros(11), 0.25 * covariance, 20)

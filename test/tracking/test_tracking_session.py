@@ -9,7 +9,7 @@ from tracked_bodies import Seen, angle_between, body, draw, exchanged, from_came
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.tracking import forms, session, state
 from sq_perception.tracking.session import Tally, TrackingSession
-from sq_perception.tracking.tracker import Tracker, TrackerOptions
+from sq_perception.tracking.tracker import Tracker
 
 
 def test_numbers_are_those_of_the_tracks_in_the_optical_frame(rng):
@@ -141,7 +141,7 @@ def test_time_that_goes_back_resets_and_ids_go_on(rng):
 
 
 def test_every_body_of_a_frame_has_a_track_and_nothing_else_comes_out(rng):
-    one = TrackingSession(TrackerOptions(publish_after=3))
+    one = TrackingSession()
     near, far = body(), body(centre=(0.3, 0, 0.8))
     assert [f.id for f in one.follow([draw(near, noise(), rng), draw(far, noise(), rng)], 0.0)] == [1, 2]
     assert [f.id for f in one.follow([draw(far, noise(), rng)], 0.1)] == [2]
