@@ -20,9 +20,11 @@ _STARTING = {"subprocess", "browser", "running_nodes", "respawned_nodes", "hosti
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Keep test nodes, and the processes they start, away from whatever else runs ROS on this machine."""
+    """Keep test nodes, and the processes they start, away from whatever else runs on this machine."""
     os.environ["ROS_DOMAIN_ID"] = str(1 + os.getpid() % 100)
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
+    # OpenMP's idle threads spin by default: beside other work, numba's and torch's keep each other from the cores.
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
