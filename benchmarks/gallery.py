@@ -2,7 +2,7 @@
 
     python benchmarks/gallery.py [--only can bottles] [--docs docs]
 
-Every scene is household things (:mod:`household`) at given places on a table, through a simulated sensor; the moving
+Every scene is household things (:mod:`mesh_things`) at given places on a table, through a simulated sensor; the moving
 camera is that of :mod:`tracking`.  Left, what the sensor saw; in the middle, the program's own masks with the outlines
 of the recovered bodies; right, these bodies from another place, with the true things as thin lines.  All numbers of the
 page are measured here, so that text and pictures agree; ``--only`` draws some pictures and leaves the page as it is.
@@ -27,8 +27,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import household
 import mesh_scene
+import mesh_things
 import numpy as np
 import report
 import tracking
@@ -300,7 +300,7 @@ ENTRIES: dict[str, Callable[[Path], Entry]] = {
         (
             Stood("bottle 1", bottle(1), (-0.13, 0.02)),
             Stood("bottle 2", bottle(4), (0.0, 0.08)),
-            Stood("bottle 3", bottle(9), (0.1, -0.06), 35, household.ON_X),
+            Stood("bottle 3", bottle(9), (0.1, -0.06), 35, mesh_things.ON_X),
         ),
         _bottles,
         down=32.0,

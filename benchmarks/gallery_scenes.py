@@ -10,11 +10,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-import household
 import mesh_scene
+import mesh_things
 import numpy as np
 import tabletop
-from household import Thing
+from mesh_things import Thing
 
 from sq_perception.imaging.camera import Camera
 from sq_perception.simulation import sensor_noise
@@ -31,7 +31,7 @@ class Stood:
     thing: Thing
     place: tuple[float, float]
     heading: float = 0.0
-    turn: np.ndarray = field(default_factory=lambda: household.UPRIGHT)
+    turn: np.ndarray = field(default_factory=lambda: mesh_things.UPRIGHT)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,15 +105,15 @@ def viewed(things: Sequence[Stood], sensor: str, down: float = 40.0, distance: f
 
 def carton(width: float, depth: float, height: float) -> Thing:
     """A box with these edges along x, y and z, millimetres, rounded by 2 mm; none need be the shortest."""
-    return household.rounded_box(np.array([width, depth, height]) / 1e3, 0.002)
+    return mesh_things.rounded_box(np.array([width, depth, height]) / 1e3, 0.002)
 
 
 def can(diameter: float, height: float) -> Thing:
-    return household.cylinder(diameter / 1e3, height / 1e3, 0.002)
+    return mesh_things.cylinder(diameter / 1e3, height / 1e3, 0.002)
 
 
 def bottle(number: int) -> Thing:
-    return household.bottle(np.random.default_rng(number))
+    return mesh_things.bottle(np.random.default_rng(number))
 
 
 def kitchen() -> tuple[Stood, ...]:
@@ -124,5 +124,5 @@ def kitchen() -> tuple[Stood, ...]:
         Stood("small box", carton(85, 60, 45), (0.0, -0.05), 35),
         Stood("tall can", can(66, 160), (0.115, 0.09)),
         Stood("carton", carton(70, 95, 120), (0.2, 0.2), -20),
-        Stood("lying can", can(66, 115), (-0.22, -0.06), 60, household.ON_X),
+        Stood("lying can", can(66, 115), (-0.22, -0.06), 60, mesh_things.ON_X),
     )

@@ -3,7 +3,7 @@
     python benchmarks/household_things.py [--scenes 1000] [--first 0] [--jobs 1] [--sensor stereo]
                                           [--each FILE] [--name household_things]
 
-Scenes are those of :mod:`sq_perception.simulation.things_on_table`: unions of superquadrics (cartons, cans, round and
+Scenes are those of :mod:`things_on_table`: unions of superquadrics (cartons, cans, round and
 oval bottles, open vessels, fruit, tools, toys, bags) that stand, lie, lean on each other and are stacked; scene k from
 the seed (``SEED``, k) alone.  Sensors alternate (:data:`tabletop.SENSORS`).  Methods and measures are those of
 :mod:`scene_verdict`, rows those of :mod:`real_scenes`.  Counted are things at least half visible, apart from the rows
@@ -27,7 +27,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import household
+import mesh_things
 import numpy as np
 import real_scenes
 import report
@@ -37,11 +37,11 @@ import trimesh
 from real_scenes import HEADER, WORST, WORST_HEADER
 from scene_verdict import METHODS, Judged, SceneVerdict
 from scipy.spatial import ConvexHull
+from things_on_table import PlacedThing, hull_points, things_on_table
 
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.simulation import sensor_noise
 from sq_perception.simulation.household import KINDS
-from sq_perception.simulation.things_on_table import PlacedThing, hull_points, things_on_table
 
 SEED = 7801
 HALF = 0.5
@@ -68,7 +68,7 @@ def _known(placed: PlacedThing) -> tabletop.Placed:
     points = hull_points(thing.parts)
     hull = points[ConvexHull(points).vertices]
     edges = np.sort(thing.box[1] - thing.box[0])
-    known = household.Thing(thing.kind, thing.name, trimesh.convex.convex_hull(hull), hull, edges, ())
+    known = mesh_things.Thing(thing.kind, thing.name, trimesh.convex.convex_hull(hull), hull, edges, ())
     matrix = quaternions.to_matrix(placed.rotation)
     return tabletop.Placed(known, placed.rest, matrix, placed.translation, placed.label, placed.pixels, placed.alone)
 

@@ -33,8 +33,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import household
 import mesh_scene
+import mesh_things
 import numpy as np
 import report
 import scene_verdict
@@ -90,9 +90,10 @@ def main() -> None:
     parser.add_argument("--name", default="real_scenes", help="name of the result files")
     options = parser.parse_args()
     words = [word.strip() for word in options.kinds.split(";") if word.strip()]
-    if not set(words) <= set(household.KINDS):
-        parser.error(f"--kinds: expected some of {', '.join(household.KINDS)}")
-    kinds = {word: max(household.KINDS[word], min(filter(None, household.KINDS.values()))) for word in words} or None
+    if not set(words) <= set(mesh_things.KINDS):
+        parser.error(f"--kinds: expected some of {', '.join(mesh_things.KINDS)}")
+    least = min(filter(None, mesh_things.KINDS.values()))
+    kinds = {word: max(mesh_things.KINDS[word], least) for word in words} or None
     scans = report.shared_data("ycb_meshes")
     if options.picture is not None or options.pictures:
         import scene_pictures
@@ -146,7 +147,7 @@ def tables(verdicts: list[SceneVerdict]) -> tuple[dict[str, Any], str]:
     counted = [one for one in everything if one.kind != APART]
     half = [one for one in counted if one.visible_share >= HALF]
     groups: dict[str, list[Judged]] = {"**all, at least half visible**": half}
-    for kind in household.KINDS:
+    for kind in mesh_things.KINDS:
         for rest in ("", "upright", "lying"):
             chosen = [one for one in everything if one.kind == kind and one.visible_share >= HALF]
             chosen = [one for one in chosen if not rest or one.rest == rest]

@@ -1,7 +1,7 @@
 """Seeded scenes of household things on a table, as a depth sensor sees them.
 
 A pinhole camera of 640 x 480 pixels, 60 degrees wide, looks down on the table at 25 to 65 degrees from 0.5 to 1.2 m.
-The table is a rectangle; beside it one sees the floor, 0.75 m lower.  1 to 8 things (:mod:`household`) lie on it in
+The table is a rectangle; beside it one sees the floor, 0.75 m lower.  1 to 8 things (:mod:`mesh_things`) lie on it in
 stable poses, wholly inside the image, farther than the sensor's shortest distance, their outlines on the table at least
 ``GAP`` apart: no two penetrate, but many stand close by each other or before each other.
 
@@ -18,10 +18,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import household
 import mesh_scene
+import mesh_things
 import numpy as np
-from household import Thing
+from mesh_things import Thing
 from scipy.spatial import ConvexHull
 
 from sq_perception.imaging.camera import Camera
@@ -136,7 +136,7 @@ def scene(
     seed
         The same one, with the same other arguments, gives the same scene and the same noise.
     kinds
-        Weights of the kinds of things; those of :mod:`household` by default.
+        Weights of the kinds of things; those of :mod:`mesh_things` by default.
     scans
         The folder of scanned objects; without it there are none of them.
     sensor
@@ -150,16 +150,16 @@ def scene(
     sensor = sensor or list(SENSORS)[seed % len(SENSORS)]
     if sensor not in SENSORS:
         raise ValueError(f"sensor: expected one of {', '.join(SENSORS)}, got {sensor!r}")
-    kinds = household.KINDS if kinds is None else kinds
-    if not set(kinds) <= set(household.KINDS):
-        raise ValueError(f"kinds: expected some of {', '.join(household.KINDS)}, got {', '.join(kinds)}")
+    kinds = mesh_things.KINDS if kinds is None else kinds
+    if not set(kinds) <= set(mesh_things.KINDS):
+        raise ValueError(f"kinds: expected some of {', '.join(mesh_things.KINDS)}, got {', '.join(kinds)}")
     rng = np.random.default_rng([_STREAM, seed])
     model = sensor_noise.preset(SENSORS[sensor])
     nearest = max(NEAREST, getattr(model, "near", 0.0) + 0.01)
-    scanned = household.scans(scans)
+    scanned = mesh_things.scans(scans)
     count = int(rng.integers(1, MOST + 1))
     while True:
-        things = [household.draw(rng, kinds, scanned) for _ in range(count)]
+        things = [mesh_things.draw(rng, kinds, scanned) for _ in range(count)]
         for _ in range(_TRIES):
             stand = _stand(rng, nearest)
             poses = _arranged(things, stand, rng)

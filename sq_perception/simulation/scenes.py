@@ -14,10 +14,6 @@ A body touches the plane where its support function h says: its centre t has the
 one of its three axes, turned about n by any angle.  The shortest axis always holds; another one is taken only for
 bodies with flat faces (e1 and e2 below 0.5), since an egg does not stand on its tip.
 
-A crowd is closer together: most bodies are pushed along the table against another one until they touch, so that they
-lean on each other and hide each other.  Convex bodies A and B overlap where a point of one's surface lies inside the
-other; the push ends where no sampled point does any more.
-
 Metres; depth is the z coordinate, NaN where nothing is seen.
 """
 
@@ -39,7 +35,6 @@ THESIS_CENTRE = (88 / 255, 168 / 255)
 
 TABLE_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 MAX_TABLE_BODIES = 10
-MAX_CROWD_BODIES = 12
 
 _TABLE_SIZE = (0.02, 0.07)
 _TABLE_SHAPE = (0.1, 1.0)
@@ -50,14 +45,6 @@ _PLACE_RADIUS = 0.3
 _GAP = 0.015
 _FLAT_BELOW = 0.5
 _ATTEMPTS = 2000
-_VIEWS = 10
-_CROWD_DISTANCE = (0.5, 1.2)
-_CROWD_PITCH = tuple(np.deg2rad([30.0, 65.0]))
-_CROWD_RADIUS = 0.25
-_PUSHED = 0.7
-"""Share of the bodies of a crowd that touch another one."""
-_CONTACT = 2e-4
-_SURFACE_SAMPLES = 1500
 _FARTHEST = 4.0
 
 
@@ -115,86 +102,21 @@ def table_scene(rng: np.random.Generator, count: int = 3, camera: Camera = TABLE
         raise ValueError(f"count: expected 1 to {MAX_TABLE_BODIES} bodies, got {count}")
     if not camera.is_pinhole:
         raise ValueError("camera: expected a pinhole camera, got an orthographic one")
-    plane = _table(rng, _DISTANCE, _PITCH)
+    plane = table_plane(rng, _DISTANCE, _PITCH)
     bodies: list[Superquadric] = []
     reach: list[float] = []
     for _ in range(_ATTEMPTS):
-        body, radius = _resting_body(rng, plane)
+        body, radius = resting_body(rng, plane)
         apart = all(
             np.linalg.norm(body.translation - other.translation) > radius + other_radius + _GAP
             for other, other_radius in zip(bodies, reach, strict=True)
         )
-        if apart and _inside_image(body, camera):
+        if apart and inside_image(body, camera):
             bodies.append(body)
             reach.append(radius)
         if len(bodies) == count:
             return Scene(Superquadric.stack(bodies), camera, plane)
     raise ValueError(f"no room for {count} bodies in an image of {camera.width} x {camera.height} pixels")
-
-
-def crowded_scene(rng: np.random.Generator, count: int = 6, camera: Camera = TABLE_CAMERA) -> Scene:
-    """``count`` random bodies on a table seen from 0.5 to 1.2 m, most touching another one, wholly inside the image.
-
-    Raises
-    ------
-    ValueError
-        If ``count`` is not 1 to 12, the camera is no pinhole, or the bodies find no room in its image.
-    """
-    if not 1 <= count <= MAX_CROWD_BODIES:
-        raise ValueError(f"count: expected 1 to {MAX_CROWD_BODIES} bodies, got {count}")
-    if not camera.is_pinhole:
-        raise ValueError("camera: expected a pinhole camera, got an orthographic one")
-    for _ in range(_VIEWS):
-        plane = _table(rng, _CROWD_DISTANCE, _CROWD_PITCH)
-        bodies: list[_Placed] = []
-        for _ in range(_ATTEMPTS // _VIEWS):
-            drawn = _resting_body(rng, plane, _CROWD_RADIUS)[0]
-            if not _inside_image(drawn, camera):
-                continue
-            body = _Placed.of(drawn, rng)
-            if bodies and rng.random() < _PUSHED:
-                body = _pushed(body, bodies[rng.integers(len(bodies))], plane[:3])
-            if not any(map(body.overlaps, bodies)) and _inside_image(body.body, camera):
-                bodies.append(body)
-            if len(bodies) == count:
-                return Scene(Superquadric.stack([placed.body for placed in bodies]), camera, plane)
-    raise ValueError(f"no room for {count} bodies in an image of {camera.width} x {camera.height} pixels")
-
-
-@dataclass(frozen=True)
-class _Placed:
-    """A body with points (n, 3) of its surface."""
-
-    body: Superquadric
-    surface: np.ndarray
-
-    @classmethod
-    def of(cls, body: Superquadric, rng: np.random.Generator) -> _Placed:
-        return cls(body, body.sample_surface(_SURFACE_SAMPLES, rng, oversampling=2))
-
-    def moved(self, by: np.ndarray) -> _Placed:
-        body = Superquadric(self.body.size, self.body.shape, self.body.translation + by, self.body.rotation)
-        return _Placed(body, self.surface + by)
-
-    def overlaps(self, other: _Placed) -> bool:
-        if np.linalg.norm(self.body.translation - other.body.translation) > np.linalg.norm(
-            self.body.size
-        ) + np.linalg.norm(other.body.size):
-            return False
-        return bool((self.body.gauge(other.surface) < 1).any() or (other.body.gauge(self.surface) < 1).any())
-
-
-def _pushed(body: _Placed, other: _Placed, normal: np.ndarray) -> _Placed:
-    """The body moved along the table, straight towards the other one or away from it, until they just touch."""
-    way = body.body.translation - other.body.translation
-    way = way - (way @ normal) * normal
-    length = float(np.linalg.norm(way))
-    way = way / length if length > 0 else np.cross(normal, [0.0, 0.0, 1.0])
-    near, far = -length, float(np.linalg.norm(body.body.size) + np.linalg.norm(other.body.size))
-    while far - near > _CONTACT:
-        middle = 0.5 * (near + far)
-        near, far = (middle, far) if body.moved(middle * way).overlaps(other) else (near, middle)
-    return body.moved(far * way)
 
 
 def plane_depth(plane: np.ndarray, camera: Camera) -> np.ndarray:
@@ -207,14 +129,14 @@ def plane_depth(plane: np.ndarray, camera: Camera) -> np.ndarray:
     return np.where((slope < 0) & (depth > 0) & (depth < _FARTHEST), depth, np.inf)
 
 
-def _table(rng: np.random.Generator, distance: tuple[float, float], pitch: tuple[float, float]) -> np.ndarray:
+def table_plane(rng: np.random.Generator, distance: tuple[float, float], pitch: tuple[float, float]) -> np.ndarray:
     """The plane (4,) of a table that the camera looks down on, at a distance along its axis."""
     far, down, roll = rng.uniform(*distance), rng.uniform(*pitch), rng.uniform(-_ROLL, _ROLL)
     normal = -np.array([np.cos(down) * np.sin(roll), np.cos(down) * np.cos(roll), np.sin(down)])
     return np.append(normal, far * np.sin(down))
 
 
-def _resting_body(
+def resting_body(
     rng: np.random.Generator, plane: np.ndarray, reach: float = _PLACE_RADIUS
 ) -> tuple[Superquadric, float]:
     """A random body that touches the plane within ``reach`` of where the camera looks.
@@ -238,7 +160,7 @@ def _resting_body(
     return Superquadric(size, shape, centre, rotation), float(np.linalg.norm(size))
 
 
-def _inside_image(body: Superquadric, camera: Camera) -> bool:
+def inside_image(body: Superquadric, camera: Camera) -> bool:
     lower, upper = body.bounding_box()
     if lower[2] <= 0:
         return False

@@ -33,10 +33,13 @@ from sq_perception.tracking import forms, judgement, state
 from sq_perception.tracking.state import CENTRE, LENGTH, SIZE_AND_SHAPE
 
 _DEEP = 0.5
+"""D over both supports, where 1 is touching: no two things can be nearer than half of that.  Chosen."""
 _FREEDOM = 5.0
+"""nu of the Student density: long tails, as deviations are often too small.  Chosen."""
 _ALONE = 1e4
-"""d^2."""
+"""d^2 of a pair that costs as much as what is left alone: beyond any error.  Chosen."""
 _TWIN = 30.0
+"""What another pair than elder and first costs more: as much as d = 5.  Chosen."""
 
 
 class Pairs(NamedTuple):

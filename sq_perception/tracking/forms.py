@@ -34,6 +34,7 @@ cylinder's by more."""
 _SHORTLIST = 4
 """Forms compared with their whole covariances; the others are farther off already by their variances."""
 _SIZE_PER_SHAPE = 0.1
+"""Deviation of the log sizes after an exchange, for each |e1 - e2|; see the module.  Chosen."""
 _SAME_NAME = np.pi / 4
 """Radians: nearer to an axis than to any other one."""
 _SELDOM_TURNED = 2 * np.log(100)

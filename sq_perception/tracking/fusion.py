@@ -48,7 +48,8 @@ VIEW_ANGLE = 0.25
 VIEWS = 16
 """Directions that are remembered for each body: two thirds of a circle at ``VIEW_ANGLE``.  Each costs time."""
 _TOLD = 0.2
-"""Radians: a turn about an axis whose standard deviation is larger is not told by an observation."""
+"""Radians: a turn about an axis whose standard deviation is larger is not told by an observation.  Chosen,
+below ``VIEW_ANGLE``: it could pass for another side."""
 
 
 @dataclass

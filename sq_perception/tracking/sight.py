@@ -16,7 +16,8 @@ from sq_perception.imaging.camera import Camera
 
 _DIRECTIONS = np.array([d for d in np.ndindex(3, 3, 3) if d != (1, 1, 1)], dtype=float) - 1
 _TOLERANCE = 0.25
-"""Of the smallest half size: a depth that differs by less is the body's own."""
+"""Of the smallest half size: a depth that differs by less is the body's own.  Chosen: above noise and misfit, below
+a thing that stands behind."""
 
 
 def open_share(bodies: Superquadric, camera: Camera, depth: np.ndarray) -> np.ndarray:

@@ -28,6 +28,7 @@ SIZE, SHAPE, CENTRE, TURN = slice(0, 3), slice(3, 5), slice(5, 8), slice(8, 11)
 SIZE_AND_SHAPE, POSE = slice(0, 5), slice(5, 11)
 """Parts of the error."""
 _SHAPE_LIMITS = (0.01, 2.0)
+"""Exponents: down to where the gauge was tried, up to where bodies are convex (:mod:`geometry.superquadric`)."""
 
 
 class Observed(Protocol):

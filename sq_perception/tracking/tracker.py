@@ -60,14 +60,17 @@ FORGET_POSE_AFTER, FORGET_AFTER = 5.0, 30.0
 MOST = 100
 """Tracks that are kept; beyond them those die first that were not observed for longest.  Bounds the time of a frame."""
 _EXPECTED_SHARE = 0.5
+"""Of the near side that is seen through: the greater part."""
 _RESTART = 3.0
-"""A restarted pose is unsure by this many times the displacement."""
+"""A restarted pose is unsure by this many times the displacement.  Chosen."""
 _MOTION_SHARE = 0.5
-"""Standard deviation of a predicted motion, as a share of it."""
+"""Standard deviation of a predicted motion, as a share of it: hands speed up and stop.  Chosen."""
 _MOVING_TURN = 0.3
+"""Radians in a second that a moving body may turn, standard deviation.  Chosen."""
 _COASTING = 1.0
-"""Seconds: so long an unseen body is taken to go on as it was seen to move."""
+"""Seconds: so long an unseen body is taken to go on as it was seen to move.  Chosen."""
 _UNPLACED = 1.0
+"""Metres and radians: deviation of a pose that is forgotten, farther than things are carried."""
 
 
 @dataclass(eq=False)

@@ -23,7 +23,7 @@ def modules(repository: Path) -> Iterator[dict[str, ModuleType]]:
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(repository / "benchmarks"))
         yield {
-            name: importlib.import_module(name) for name in ("household", "tabletop", "scene_verdict", "real_scenes")
+            name: importlib.import_module(name) for name in ("mesh_things", "tabletop", "scene_verdict", "real_scenes")
         }
 
 
@@ -33,8 +33,8 @@ def tabletop(modules: dict[str, ModuleType]) -> ModuleType:
 
 
 @pytest.fixture(scope="module")
-def household(modules: dict[str, ModuleType]) -> ModuleType:
-    return modules["household"]
+def mesh_things(modules: dict[str, ModuleType]) -> ModuleType:
+    return modules["mesh_things"]
 
 
 @pytest.fixture(scope="module")
@@ -104,9 +104,9 @@ def test_a_mask_shows_the_mesh_and_the_sensor_nearly_does(scenes: list[Any]) -> 
 
 
 @pytest.mark.parametrize("kind", ["box", "can", "bottle", "vessel"])
-def test_edges_are_those_of_the_hull(household: ModuleType, kind: str, rng: np.random.Generator) -> None:
+def test_edges_are_those_of_the_hull(mesh_things: ModuleType, kind: str, rng: np.random.Generator) -> None:
     for _ in range(5):
-        thing = household.MAKERS[kind](rng)
+        thing = mesh_things.MAKERS[kind](rng)
         np.testing.assert_allclose(np.sort(np.ptp(thing.hull, axis=0)), thing.edges, rtol=2e-3)
         assert thing.mesh.is_watertight
         assert sum(rest.likely for rest in thing.rests) == pytest.approx(1)
@@ -117,7 +117,7 @@ def test_edges_are_those_of_the_hull(household: ModuleType, kind: str, rng: np.r
 
 def test_a_box_is_itself(modules: dict[str, ModuleType], scenes: list[Any]) -> None:
     edges = np.array([0.04, 0.09, 0.15])
-    thing = modules["household"].rounded_box(edges, 0.0005)
+    thing = modules["mesh_things"].rounded_box(edges, 0.0005)
     scene = scenes[1]
     turn, place = scene.table, scene.table @ np.array([0, 0, 0.075]) + scene.placed[0].translation
     placed = modules["tabletop"].Placed(thing, "upright", turn, place, 1, 1000, 1000)

@@ -8,7 +8,7 @@ import pytest
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
-from sq_perception.simulation.scenes import Scene, crowded_scene, plane_depth, table_scene, thesis_scene
+from sq_perception.simulation.scenes import Scene, plane_depth, table_scene, thesis_scene
 
 
 @pytest.mark.parametrize("seed", range(20))
@@ -37,30 +37,6 @@ def test_bodies_rest_on_the_table_and_do_not_meet(seed, count):
         assert height.min() < 2e-3
         for other in list(scene.bodies)[:k]:
             assert (other.gauge(surface) > 1).all()
-
-
-@pytest.mark.parametrize("seed", range(8))
-def test_a_crowd_rests_touches_and_does_not_overlap(seed):
-    rng = np.random.default_rng(seed)
-    scene = crowded_scene(rng, 5)
-    normal, offset = scene.plane[:3], scene.plane[3]
-    surfaces = [body.sample_surface(4000, np.random.default_rng(1)) for body in scene.bodies]
-    gaps = []
-    for k, body in enumerate(scene.bodies):
-        height = surfaces[k] @ normal + offset
-        assert height.min() > -1e-9
-        assert height.min() < 2e-3
-        others = [body.gauge(surface) for j, surface in enumerate(surfaces) if j != k]
-        assert min(gauge.min() for gauge in others) > 0.97
-        gaps.append(min(gauge.min() for gauge in others))
-    assert min(gaps) < 1.05  # at least one pair touches
-
-
-def test_crowds_are_refused_where_there_is_no_room():
-    with pytest.raises(ValueError, match="1 to 12"):
-        crowded_scene(np.random.default_rng(0), 13)
-    with pytest.raises(ValueError, match="no room"):
-        crowded_scene(np.random.default_rng(0), 3, Camera(64, 48, 2000.0, 2000.0, 31.5, 23.5))
 
 
 @pytest.mark.parametrize("seed", range(6))
