@@ -187,8 +187,13 @@ def test_importing_the_package_loads_next_to_nothing() -> None:
     assert not loaded_after("import sq_perception") & {"torch", "numba", "scipy", "cv2", "matplotlib", "rclpy"}
 
 
-def test_recovery_neither_trains_nor_draws_and_knows_no_ros() -> None:
-    modules = loaded_after("import sq_perception.recovery.recoverer")
+def test_recovery_neither_trains_nor_draws_reads_no_weights_and_knows_no_ros() -> None:
+    statement = (
+        "opened = []; sys.addaudithook(lambda event, args: opened.append(str(args[0])) if event == 'open' else None); "
+        "import sq_perception.recovery.recoverer; "
+        "assert opened and not any(name.endswith('.safetensors') for name in opened)"
+    )
+    modules = loaded_after(statement)
     assert "torch" in modules
     forbidden = {"sq_perception.learning.train", "sq_perception.learning.dataset", "rclpy", "sensor_msgs", "sq_msgs_py"}
     assert not modules & (forbidden | {"matplotlib", "trimesh"})
@@ -199,12 +204,3 @@ def test_a_node_that_starts_again_waits_for_nothing_that_it_does_not_need() -> N
     modules = loaded_after("import sq_perception.nodes.frame_node")
     assert "torch" in modules
     assert not modules & {"scipy.stats", "trimesh", "matplotlib", "rich", "onnx", "onnxruntime"}
-
-
-def test_importing_recovery_reads_no_weights() -> None:
-    statement = (
-        "opened = []; sys.addaudithook(lambda event, args: opened.append(str(args[0])) if event == 'open' else None); "
-        "import sq_perception.recovery.recoverer; "
-        "assert opened and not any(name.endswith('.safetensors') for name in opened)"
-    )
-    assert "sq_perception.recovery.recoverer" in loaded_after(statement)
