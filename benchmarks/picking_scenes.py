@@ -18,6 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from picking_world import Thing, World
+from things_on_table import TABLE_CAMERA
 
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
@@ -26,7 +27,6 @@ from sq_perception.grasping.gripper import PANDA
 from sq_perception.simulation import household, sensor_noise
 from sq_perception.simulation.thing_rendering import render_things
 from sq_perception.simulation.thing_views import looking_down
-from sq_perception.simulation.things_on_table import TABLE_CAMERA
 
 KINDS = ("packed", "pile")
 THINGS = 5

@@ -18,10 +18,10 @@ sys.exit(f"{changed} set by the import" if changed else 0)
 """
 
 
-READ = ["frame_time", "real_scenes", "scanned_objects", "segmentation", "single_body", "speed", "tracking"]
+READ = ["constants", "frame_time", "real_scenes", "scanned_objects", "segmentation", "single_body", "speed", "tracking"]
 
 
-@pytest.mark.parametrize("name", [*READ, "unseen_sizes"])
+@pytest.mark.parametrize("name", READ)
 def test_an_import_leaves_the_number_of_threads_alone(name: str, repository: Path) -> None:
     # Numba refuses to compile once its threads run and NUMBA_NUM_THREADS names another number.
     done = subprocess.run(
