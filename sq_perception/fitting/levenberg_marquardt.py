@@ -26,12 +26,10 @@ _LONGEST_LOG_SIZE, _LONGEST_SHAPE, _LONGEST_TURN = 0.5, 0.3, 0.5
 """Of one step: beyond, residuals are no longer linear.  A shift is limited to the largest half size."""
 _FIRST_DAMPING = 1e-3
 """Times the diagonal: tau of Madsen et al. for starts that are believed to be good."""
-_WORSE, _BETTER = 20.0, 0.12
+_WORSE, _BETTER = 7.0, 0.12
 """Factors of the damping after a step that was refused and one that was taken."""
-_LEAST_REFUSED = 0.05
-"""Damping after a refused step, at least: with less, the next step is almost the same."""
-_ATTEMPTS = 3
-"""Steps refused in a row before the search ends."""
+_ATTEMPTS = 6
+"""Steps refused in a row, damping growing 10^5 fold, before the search ends."""
 
 
 class State(NamedTuple):
@@ -115,7 +113,7 @@ def _minimize(
                 if next_cost < cost:
                     accepted = True
                     break
-            damping = max(damping * _WORSE, _LEAST_REFUSED)
+            damping = max(damping * _WORSE, 1e-6)
         if not accepted:
             break
         gain = cost - next_cost
