@@ -7,12 +7,11 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
-
-import numpy as np
 
 from sq_perception.commands.console import FAILURE, SUCCESS, complain, misused, parser
 from sq_perception.files import output_file
@@ -74,7 +73,7 @@ def run(options: argparse.Namespace) -> int:
     except (ValueError, OSError) as error:
         return misused(str(error))
     friction = planner.FRICTION if options.friction is None else options.friction
-    if not (np.isfinite(friction) and friction > 0):
+    if not 0 < friction < math.inf:
         return misused(f"--friction: expected a positive number, got {friction}")
 
     from sq_perception.learning.checkpoint import CheckpointError
@@ -119,6 +118,8 @@ def run(options: argparse.Namespace) -> int:
 def _frame(
     file: str, frame: RecordedFrame, recoverer: Recoverer, hand: Gripper, friction: float, options: argparse.Namespace
 ) -> dict[str, Any]:
+    import numpy as np
+
     from sq_perception.geometry.superquadric import Superquadric
     from sq_perception.grasping.planner import grasps
     from sq_perception.grasping.surroundings import Surroundings
@@ -170,6 +171,8 @@ def _draw(path: Path, frame: RecordedFrame, found: Sequence[Recovery], plan: Gra
 
 def _write_mesh(path: Path, found: Sequence[Recovery], plan: GraspPlan, hand: Gripper) -> None:
     """Bodies and, as sharp superquadrics, the boxes of each body's best gripper."""
+    import numpy as np
+
     from sq_perception.geometry import mesh
     from sq_perception.geometry.superquadric import Superquadric
 

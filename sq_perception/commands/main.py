@@ -15,7 +15,7 @@ import sys
 from collections.abc import Sequence
 
 from sq_perception import __version__
-from sq_perception.commands.console import FAILURE, INTERRUPTED, SUCCESS, USAGE, complain, failed
+from sq_perception.commands.console import FAILURE, INTERRUPTED, SUCCESS, USAGE, complain
 
 COMMANDS = {
     "recover": ("sq_perception.commands.recover", "depth images in, superquadrics out"),
@@ -84,15 +84,7 @@ def _parser() -> argparse.ArgumentParser:
 
 def _run(name: str, arguments: list[str]) -> int:
     is_recording = name == "view" and arguments and not arguments[0].startswith("-")
-    try:
-        module = importlib.import_module(_VIEW_RECORDING if is_recording else COMMANDS[name][0])
-    except ModuleNotFoundError as error:
-        if name != "demo":
-            raise
-        return failed(
-            f"the demonstration needs ROS 2 in Python, and the module {error.name!r} is missing: "
-            "pip install 'sq_perception[ros]', or source a ROS 2 Jazzy installation"
-        )
+    module = importlib.import_module(_VIEW_RECORDING if is_recording else COMMANDS[name][0])
     code: int = module.main(arguments)
     return code
 
