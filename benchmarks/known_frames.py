@@ -9,7 +9,7 @@ None of it belongs to the repository.
 | method | masks | what |
 | --- | --- | --- |
 | auto, given | true | `Recoverer().recover(depth, camera, labels)` |
-| network, given | true | the prediction of the network of things, not refined |
+| network, given | true | the prediction of the weights `robust`, not refined |
 | auto, own | its own | the body whose mask has the largest IoU with the true one, if that is at least 0.25 |
 | classic | true | Solina and Bajcsy's fit to the points |
 | smallest box | true | the smallest box around the measured points |
