@@ -12,7 +12,7 @@ import logging
 import math
 import statistics
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from sq_perception.recordings.result_bag import ResultBag
     from sq_perception.recordings.result_json import ResultLines
     from sq_perception.recordings.still_page import StillPage
-    from sq_perception.recovery.recoverer import Recoverer, Recovery, RecoveryOptions
+    from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, Recovery, RecoveryOptions
 
 
 HELP = """\
@@ -57,7 +57,7 @@ examples:
   sq-perception recover table.npz --json out.json --pictures pictures/
   sq-perception recover depth_*.png --camera-info 525,525,319.5,239.5 --csv out.csv --html out.html
   sq-perception recover recording/ --topic /camera/depth/image_rect_raw --every 10 --meshes meshes/
-  sq-perception recover thousand_frames/ --jsonl out.jsonl             # again after Ctrl-C: goes on
+  sq-perception recover thousand_frames/ --jobs 8 --jsonl out.jsonl    # again after Ctrl-C: goes on
   sq-perception recover recording/ --track --mcap results.mcap
   sq-perception recover views/*.bmp --projection orthographic --method network --json -
 
@@ -176,6 +176,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="S",
         help="seconds per frame after which no further start is tried; the largest and nearest objects come first",
     )
+    parser.add_argument(
+        "--jobs",
+        type=int,
+        default=1,
+        metavar="N",
+        help="recover N frames at a time, in processes of one thread each: for many frames (default 1: one frame at a "
+        "time, its objects in threads)",
+    )
     parser.add_argument("--min-score", type=float, default=0.0, metavar="S", help="leave out bodies with a lower score")
     parser.add_argument("-q", "--quiet", action="store_true", help="no table and no summary; what went wrong is said")
     parser.add_argument(
@@ -204,7 +212,7 @@ def _region(text: str) -> tuple[int, int, int, int]:
 
 def run(options: argparse.Namespace) -> int:
     """Run the command; returns the exit code."""
-    for name in ("max_objects", "every", "limit"):
+    for name in ("max_objects", "every", "limit", "jobs"):
         value = getattr(options, name)
         if value is not None and value < 1:
             return misused(f"--{name.replace('_', '-')}: expected at least 1, got {value}")
@@ -333,11 +341,11 @@ class _Run:
         from sq_perception.recordings.frame_file import FrameError
 
         try:
-            for file, frame in _progress(recorded):
+            for (file, frame), answer in self._answered(_progress(recorded)):
                 try:
                     if isinstance(frame, FrameError):
                         raise frame
-                    self._frame(file, frame)
+                    self._frame(file, frame, answer)
                 except FrameError as error:
                     complain(str(error))
                     self.unreadable += 1
@@ -366,26 +374,51 @@ class _Run:
 
         return body.status == Status.FAILED or body.score >= self._options.min_score
 
-    def _frame(self, file: str, frame: RecordedFrame) -> None:
+    def _answered(self, pairs: Iterable[tuple[str, Any]]) -> Iterator[tuple[tuple[str, Any], Any]]:
+        """The frames with what was recovered of each, or the error that it raised; None for what is no frame."""
+        from sq_perception.recordings.frame_file import RecordedFrame
+        from sq_perception.recovery import workers
+
+        def work(frame: RecordedFrame) -> workers.Work:
+            labels = None if self._options.ignore_masks else frame.labels
+            settings = replace(self._settings, free_space=frame.has_free_space)
+            return workers.Work(frame.depth, frame.camera, labels, settings)
+
+        if self._options.jobs > 1:
+            setup = workers.Setup(self._options.model, self._settings, self._options.consensus)
+            asked = ((pair, work(pair[1]) if isinstance(pair[1], RecordedFrame) else None) for pair in pairs)
+            yield from workers.recovered(asked, setup, self._options.jobs)
+            return
+        for pair in pairs:
+            answer: Any = None
+            if isinstance(frame := pair[1], RecordedFrame):
+                try:
+                    if frame.camera not in self._warm:
+                        self._recoverer.warm_up(frame.camera)
+                        self._warm.add(frame.camera)
+                    one = work(frame)
+                    answer = self._recoverer.recover(one.depth, one.camera, one.labels, one.options)
+                except (ValueError, ArithmeticError) as error:
+                    answer = error
+            yield pair, answer
+
+    def _frame(self, file: str, frame: RecordedFrame, answer: FrameRecovery | Exception) -> None:
         from sq_perception.recordings.frame_entry import frame_entry
         from sq_perception.recordings.frame_file import FrameError
+        from sq_perception.recovery.workers import WorkerLostError
 
         if frame.warning and frame.warning not in self._warnings:
             complain(f"warning: {frame.warning}")
             self._warnings.add(frame.warning)
-        labels = None if self._options.ignore_masks else frame.labels
-        try:
-            if frame.camera not in self._warm:
-                self._recoverer.warm_up(frame.camera)
-                self._warm.add(frame.camera)
-            recovery = self._recoverer.recover(
-                frame.depth, frame.camera, labels, replace(self._settings, free_space=frame.has_free_space)
-            )
-        except (ValueError, ArithmeticError) as error:  # a camera that no image can have come from
-            raise FrameError(f"{file}: {frame.name}: {error}") from error
-        recovery = replace(recovery, bodies=tuple(body for body in recovery.bodies if self._is_wanted(body)))
+        if isinstance(answer, (ValueError, ArithmeticError, WorkerLostError)):  # such as a camera of no image
+            raise FrameError(f"{file}: {frame.name}: {answer}") from answer
+        if isinstance(answer, Exception):
+            raise answer
+        recovery = replace(answer, bodies=tuple(body for body in answer.bodies if self._is_wanted(body)))
         tracks = self._tracks.follow(file, frame, recovery) if self._tracks else [None] * len(recovery.bodies)
-        entry = frame_entry(file, frame, recovery, tracks, has_masks=labels is not None)
+        entry = frame_entry(
+            file, frame, recovery, tracks, has_masks=not self._options.ignore_masks and frame.labels is not None
+        )
         self.results.append(entry)
         stem = _free_stem(frame.name if frame.topic else Path(frame.name).stem, self._stems)
         if self._options.pictures:
