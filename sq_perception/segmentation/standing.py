@@ -34,8 +34,9 @@ _SAMPLES = 2000
 _COARSE_PIXELS, _FEWEST = 120, 30
 """Samples along the shorter side of the image that surfaces are searched on, and least samples of one."""
 _BUMP, _ON_WALL = 6.0, 3.5
-"""A thing rises so many deviations of the support's own points above it; what lies within so many of another plane is a
-part of that.  Of normal noise 0.05 % lies beyond 3.5; a bump of correlated noise seldom reaches 6."""
+"""A thing rises so many deviations of the support's own points above it, and is that far off any other plane; pixels
+within so many of another plane are a part of that.  Of normal noise 0.05 % lies beyond 3.5; a bump of correlated noise
+seldom reaches 6."""
 _FACE_SHARE = 0.5
 """What makes up this share of a plane's points is no part of it: the plane is a face of the thing."""
 _OUTLIERS = 0.01
@@ -189,7 +190,7 @@ def standing(
         for wall in walls:
             off = np.abs(wall.height(points)) / growth
             on_it = rows.size < _FACE_SHARE * wall.share * measured
-            if on_it and _top(off) < _ON_WALL * wall.sigma:
+            if on_it and _top(off) < _BUMP * wall.sigma:
                 return False
             if at_border and np.mean(off < 2 * limits.tolerance) > 0.5:
                 return False
