@@ -21,8 +21,7 @@ _FAILED_SHARE, _FAILED_LEVELS = 0.25, 3.0
 """Of the smallest half size, and in levels of noise and model error: a body that half of the points miss by more than
 both is none.  Of a plate or a pen, a quarter of the thickness is less than what any thing strays."""
 _REACHED = 0.9
-"""Of the points of a thing that was fitted as a hull without a prediction: what the rest sticks out tells whether the
-body encloses it.  A predicted hull does not follow the points that far: half of them there, as of any body."""
+"""Of the points of a thing that was fitted as a hull: what the rest sticks out tells whether the body encloses it."""
 _TAIL = 0.01
 """Of the points, at either end of an axis: outliers."""
 _AXES = "xyz"
@@ -41,12 +40,11 @@ def verdict(solution: Solution, began: float) -> Fit:
     typical = float(np.median(distance))
     kept = distance < max(_INLIER * observation.sigma, _INLIER * typical)
     residual = float(np.sqrt(np.mean(distance[kept] ** 2))) if kept.any() else typical
-    is_predicted = len(solution.problem.terms.hull_directions) > 0
-    if solution.as_hull or is_predicted:
-        # A thing lies inside its hull: where that was fitted, only what sticks out speaks against the body.
+    if solution.as_hull:
+        # A hollow thing lies inside its hull: only what sticks out speaks against the body.
         outside = body.gauge(observation.points) > 1
         sticking_out = np.where(outside, np.abs(body.sampson_distance(observation.points)), 0.0)
-        typical = float(np.quantile(sticking_out, 0.5 if is_predicted else _REACHED))
+        typical = float(np.quantile(sticking_out, _REACHED))
     status, message = _status(canonical, covariance, typical, _FAILED_LEVELS * observation.sigma)
     cut = (CUT_SHORT,) if solution.problem.late else ()
     return Fit(

@@ -103,8 +103,8 @@ class ResNet18(nn.Module):
         Parameters
         ----------
         state
-            A plain state dict: ``safetensors.torch.load_file(path)``, or ``torch.load(path, weights_only=True)``.  The
-            classifier ``fc.*`` is not taken; all else must fit by name and shape.
+            A plain state dict, as ``safetensors.torch.load_file(path)`` reads it.  The classifier ``fc.*`` is not
+            taken; all else must fit by name and shape.
 
         Raises
         ------

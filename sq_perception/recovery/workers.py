@@ -31,6 +31,7 @@ if TYPE_CHECKING:
 AHEAD = 3
 """Frames under way for each process: the one it works on, one that waits for it, one whose answer waits."""
 TRIES = 3
+"""Deaths of its process after which a frame is given up: one may be an operator's, or another frame's memory."""
 
 _Key = TypeVar("_Key")
 _Answer: TypeAlias = "Future[FrameRecovery | None]"
@@ -38,7 +39,7 @@ _Answer: TypeAlias = "Future[FrameRecovery | None]"
 
 @dataclass(frozen=True, eq=False)
 class Work:
-    """What :meth:`Recoverer.recover` is called with."""
+    """What :meth:`Recoverer.recover` is called with: shapes and units are given there."""
 
     depth: np.ndarray
     camera: Camera
