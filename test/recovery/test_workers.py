@@ -44,9 +44,9 @@ def test_two_processes_answer_as_one_and_in_order() -> None:
     assert answers[3][1] is None
     for (_, work), (_, answer) in zip(frames, [one for one in answers if one[1] is not None], strict=True):
         expected = alone.recover(work.depth, work.camera, work.labels, work.options)
-        np.testing.assert_array_equal(
-            answer.bodies[0].superquadric.to_flat(), expected.bodies[0].superquadric.to_flat()
-        )
+        mine, theirs = answer.bodies[0].superquadric, expected.bodies[0].superquadric
+        # Kernels just compiled and those read from the cache may differ in the last bit.
+        np.testing.assert_allclose(mine.to_flat(), theirs.to_flat(), rtol=1e-6, atol=1e-9)
 
 
 def test_what_a_frame_raises_is_its_answer() -> None:
