@@ -112,7 +112,7 @@ def _can(found: list[Found], frame: FrameRecovery) -> str:
     (one,) = found
     return (
         f"A can of {_edges(one)} mm. The camera never sees its back: that comes from the silhouette and the curvature "
-        f"of the front, the foot from the table. IoU with the true can {100 * one.iou:.0f} %."
+        f"of the front, the foot from the table. IoU {100 * one.iou:.0f} %."
     )
 
 
@@ -120,17 +120,16 @@ def _kitchen(found: list[Found], frame: FrameRecovery) -> str:
     hidden = min(found, key=lambda one: one.visible)
     return (
         f"Six things that stand before each other, the {hidden.stood.name} {100 * hidden.visible:.0f} % visible. "
-        f"{_count(found, frame)} Mean IoU with the true hulls {mean_iou(found):.0f} %. Stereo matches windows, which "
-        f"widens what is near by some pixels: edges are off by {_bias(found):+.1f} mm in the mean."
+        f"{_count(found, frame)} Mean IoU {mean_iou(found):.0f} %. Stereo matches windows, which widens what is near "
+        f"by some pixels: edges are off by {_bias(found):+.1f} mm in the mean."
     )
 
 
 def _kitchen_light(found: list[Found], frame: FrameRecovery) -> str:
     light, stereo = (1e3 * float(sensor_noise.preset(name).sigma(0.85)) for name in ("kinect_v1", "realsense_d435"))
     return (
-        f"The same table through structured light, with a noise of {light:.1f} mm at 0.85 m where stereo has "
-        f"{stereo:.1f}. {_count(found, frame)} Mean IoU {mean_iou(found):.0f} %, edges off by {_bias(found):+.1f} mm "
-        f"in the mean."
+        f"Noise of {light:.1f} mm at 0.85 m where stereo has {stereo:.1f}. {_count(found, frame)} Mean IoU "
+        f"{mean_iou(found):.0f} %, edges off by {_bias(found):+.1f} mm in the mean."
     )
 
 
@@ -144,9 +143,9 @@ def _touching(found: list[Found], frame: FrameRecovery) -> str:
 def _bottles(found: list[Found], frame: FrameRecovery) -> str:
     worst = min(found, key=lambda one: one.iou)
     return (
-        f"Here we lose. A bottle is no superquadric: no exponents make a shoulder and a neck. One body leaves out the "
-        f"neck, or bottle and neck become two. {_count(found, frame)} Mean IoU {mean_iou(found):.0f} %, the worst "
-        f"{100 * worst.iou:.0f} % ({worst.stood.name})."
+        f"No superquadric has a shoulder and a neck: one body leaves out the neck, or bottle and neck become two. "
+        f"{_count(found, frame)} Mean IoU {mean_iou(found):.0f} %, the worst {100 * worst.iou:.0f} % "
+        f"({worst.stood.name})."
     )
 
 
@@ -162,9 +161,8 @@ def _hidden(found: list[Found], frame: FrameRecovery) -> str:
         for k, name in enumerate(("longest", "middle", "shortest"))
     ]
     return (
-        f"A box of which another one hides {100 * (1 - one.visible):.0f} %. `Recovery.seen` says how much of each edge "
-        f"was measured, the rest is inferred; `sigma_size` says how surely: {'; '.join(parts)}. Status "
-        f"`{Status(one.body.status).name}`, message: {one.body.message}."
+        f"A box of which another one hides {100 * (1 - one.visible):.0f} %: {'; '.join(parts)} (`seen`, `sigma_size`). "
+        f"Status `{Status(one.body.status).name}`, message: {one.body.message}."
     )
 
 
@@ -256,10 +254,9 @@ def tracked(path: Path) -> Entry:
     steps = ", ".join(f"{error[k - 1, chosen, axis]:+.1f} ± {sigma[k - 1, chosen, axis]:.1f}" for k in TRACKED)
     return Entry(
         "Thirty frames of a moving camera",
-        f"{count} bodies, a stereo camera that goes {tracking.ARC:.0f} degrees about the table, its pose known, own "
-        f"masks; ids given: {births}. Right, the edge of which the first frame knows least: its error is {steps} mm "
-        f"after frames {', '.join(map(str, TRACKED))} (line: fused; dots: each frame by itself). What all views "
-        f"share, such as edges widened by stereo, is not taken out by any number of frames.",
+        f"{count} bodies, a stereo camera that goes {tracking.ARC:.0f} degrees about the table, its pose known; ids "
+        f"given: {births}. Right, the edge of which the first frame knows least: its error is {steps} mm after frames "
+        f"{', '.join(map(str, TRACKED))} (line: fused; dots: each frame by itself).",
     )
 
 
@@ -322,9 +319,9 @@ ENTRIES: dict[str, Callable[[Path], Entry]] = {
 }
 
 INTRODUCTION = """
-Synthetic scenes with known truth through simulated [sensors](sensors.md), and what `Recoverer().recover(depth, camera)`
-makes of them: own masks, default options. Pictures and numbers are those of one run of `python benchmarks/gallery.py`
-({facts}). Single scenes prove nothing: figures over many are in the [README](../README.md#accuracy-and-speed).
+Synthetic scenes through simulated [sensors](sensors.md), recovered with own masks and default options: one run of
+`python benchmarks/gallery.py` ({facts}). Single scenes prove nothing; [figures over
+many](../README.md#accuracy-and-speed).
 
 Left the depth image, near is light and black is nothing measured; in the middle masks and recovered outlines, hidden
 edges faint; right the recovered bodies, and the true things as thin lines. Edges are full lengths, ± one reported

@@ -28,28 +28,29 @@ COMMAND = "python docs_build/parameter_reference.py"
 _HEAD = f"""\
 # Parameters
 
-Made by `{COMMAND}` from what the nodes declare; `ros2 param describe /recover_node s` tells the same.
+Made by `{COMMAND}` from what the nodes declare; `ros2 param describe` says the same.
 
 ```sh
-ros2 param set /recover_node s 100             # while it runs; an integer is as good as 100.0
+ros2 param set /recover_node s 100             # while it runs
 ros2 run sq_perception recover_node --ros-args -p s:=100 -p model:=supervised
 ros2 run sq_perception recover_node --ros-args --params-file recover_node.yaml     # like the ones in config/
 ```
 
-**Changes**: "live" parameters take effect with the next frame. Those that say "configure" are read when the node is
-configured; they are refused with the reason while it is up, and may be set while it is unconfigured
-(`ros2 lifecycle set /recover_node deactivate`, then `cleanup`). Those that say "start" are given at the start only. A
-value out of its range, of another type or that does not fit the others is refused with a reason and changes nothing.
+The default shows the type; where it has a point, integers are accepted too. A value of another type, out of its range,
+or that does not fit the others is refused with a reason and changes nothing.
 
-`model`, `device`, `method`, `consensus` and `threads` change what computes: the new one is made beside the work and
-swapped when it is warm; one that cannot be made leaves the old one at work, and `/diagnostics` says why. A model file
-is checked before the change is accepted. Setting the same file again reads it again.
+Parameters are **live**, so that a change takes effect with the next frame, unless their meaning begins with
+*configure*: these can be set while the node is unconfigured (`ros2 lifecycle set /recover_node deactivate`, then
+`cleanup`), or with *start*: these are given at the start only.
+
+`model`, `device`, `method`, `consensus` and `threads` change what computes. The new one is made in the background while
+frames go on with the old one, and takes its place when it is warm; if it cannot be made the old one stays, and
+`/diagnostics` says why. A model file that is missing, cut short or of another kind is refused at once; after the change
+the file is not needed. Another `method`, `refine`, `consensus` or model ends the tracks.
 
 The quality of service of each subscription, and of the cloud, markers and rendered depth, is a parameter too, at the
 start only: `qos_overrides.<topic>.subscription.reliability`, `.depth`, `.history`, or `.publisher.` and also
-`.durability`, with the topic as it is after remapping, such as `/camera/camera/depth/image_rect_raw`. So
-`qos_overrides./recover_node/superquadrics.publisher.durability: transient_local` keeps the last cloud for late comers.
-`use_sim_time` is that of every ROS 2 node.
+`.durability`, with the topic as it is after remapping, such as `/camera/camera/depth/image_rect_raw`.
 """
 
 
@@ -96,20 +97,13 @@ def main() -> None:
 
 
 def _table(rows: Sequence[Field[Any]], otherwise: str) -> str:
-    lines = ["| name | type | default | range | change | meaning |", "| --- | --- | --- | --- | --- | --- |"]
+    lines = ["| name | default; range | meaning |", "| --- | --- | --- |"]
     for one in rows:
         about = one.metadata
-        when = "live" if about["live"] else "start" if one.name == "autostart" else otherwise
-        lines.append(
-            f"| `{one.name}` | {_kind(one)} | {_value(one.default)} | {_range(one)} | {when} | {about['description']} |"
-        )
+        when = "" if about["live"] else "*start*: " if one.name == "autostart" else f"*{otherwise}*: "
+        values = "; ".join(filter(None, (_value(one.default), _range(one))))
+        lines.append(f"| `{one.name}` | {values} | {when}{about['description']} |")
     return "\n".join(lines) + "\n"
-
-
-def _kind(one: Field[Any]) -> str:
-    return {float: "double or integer", int: "integer", bool: "bool", str: "string", tuple: "6 doubles"}[
-        type(one.default)
-    ]
 
 
 def _value(value: Any) -> str:
@@ -124,7 +118,7 @@ def _range(one: Field[Any]) -> str:
     about = one.metadata
     unit = f" {about['unit']}" if about["unit"] else ""
     if about["choices"]:
-        return ", ".join(f"`{choice}`" for choice in about["choices"])
+        return "or " + ", ".join(f"`{choice}`" for choice in about["choices"] if choice != one.default)
     if about["within"] is not None:
         low, high = about["within"]
         whole = isinstance(one.default, int)

@@ -35,7 +35,7 @@ class Fit:
     residual
         Root mean square distance of the inlying object points to the surface, metres.
     status, message
-        The verdict and the reason for it in words.
+        How far the body can be trusted, and why.
     noise
         Standard deviation of the depth noise, estimated or given, metres.
     inlier_share

@@ -63,13 +63,11 @@ class RecoverParameters:
 
     autostart: bool = setting(
         True,
-        "Configure and activate at the start. Without, the node stays unconfigured until somebody asks: ros2 lifecycle "
-        "set, or a lifecycle manager.",
+        "Configure and activate at the start; false: wait for ros2 lifecycle set or a lifecycle manager.",
     )
     free_shared_memory: bool = setting(
         False,
-        "Delete the shared memory that Fast DDS has left behind for killed processes of this user, 17 MB each. That of "
-        "living processes stays.",
+        "Delete the shared memory that Fast DDS has left behind for killed processes of this user, 17 MB each.",
     )
     projection: Projection = setting(  # noqa: RUF009 - a field
         "pinhole",
@@ -80,14 +78,13 @@ class RecoverParameters:
     use_masks: str = setting(
         "auto",
         "Label images on mask/image with the stamp of the depth image: auto uses them where they come and segments "
-        "where none does, always refuses frames without, never does not look at them.",
+        "where none does, always refuses frames without, never ignores them.",
         choices=("auto", "always", "never"),
         live=True,
     )
     patience: float = setting(
         0.25,
-        "How long an image waits for its camera_info or mask before it is processed, or refused, without. Masks of a "
-        "slow segmentation need more.",
+        "How long an image waits for its camera_info or mask before it is processed, or refused, without.",
         unit="s",
         within=(0.0, 10.0),
         live=True,
@@ -100,9 +97,8 @@ class RecoverParameters:
     )
     distortion: Treatment = setting(  # noqa: RUF009 - a field
         "auto",
-        "What a camera_info with distortion coefficients means: apply takes images for raw and rectifies them, ignore "
-        "takes them for rectified, auto takes them for raw unless the last two parts of their topic have the word rect "
-        "or rectified in them.",
+        "What a camera_info with distortion coefficients means: apply rectifies the images, ignore takes them for "
+        "rectified, auto rectifies unless one of the last two parts of their topic has the word rect or rectified.",
         choices=get_args(Treatment),
     )
     s: float = setting(
@@ -124,15 +120,15 @@ class RecoverParameters:
     max_objects: int = setting(20, "At most so many bodies per frame, the largest ones.", within=(1, 100), live=True)
     max_size: float = setting(
         0.6,
-        "Largest full edge of an object found by the node's own segmentation: walls, furniture and tables are larger.",
+        "Largest full edge of an object found by the node's own segmentation.",
         unit="m",
         within=(0.01, 100.0),
         live=True,
     )
     workspace: tuple[float, ...] = setting(
         (-100.0, -100.0, -100.0, 100.0, 100.0, 100.0),
-        "Box that the middle of what is seen of an object lies in: least x, y, z, then greatest x, y, z, in "
-        "target_frame, or in the image's frame where there is none. The default keeps all.",
+        "Objects outside are left out, by the middle of what is seen of them: least x, y, z, then greatest x, y, z, in "
+        "target_frame, or in the image's frame where there is none.",
         unit="m",
         live=True,
     )
@@ -146,13 +142,13 @@ class RecoverParameters:
     tracking: bool = setting(
         True,
         "Follow bodies from frame to frame: ids are those of tracks, axes keep their names, and numbers are fused over "
-        "the frames. Without, ids are mask labels and each frame stands for itself.",
+        "the frames; false: ids are mask labels and each frame stands for itself.",
         live=True,
     )
     fixed_frame: str = setting(
         "",
         "tf2 frame that the bodies rest in, for a camera that moves; its pose at the image's stamp is looked up. "
-        "Empty: the camera stands still. A change forgets the tracks; ids go on.",
+        "Empty: the camera stands still. A change ends the tracks.",
         live=True,
     )
     marker_colours: str = setting(
@@ -212,8 +208,8 @@ class RecoverParameters:
 
     model: str = setting(
         "",
-        "Network weights: a .safetensors file or the name of shipped ones; empty: the default. Set while the node "
-        "runs, they are loaded beside the work and swapped; setting the same file again reads it again.",
+        "Network weights: a .safetensors file or the name of shipped ones; empty: the default. Setting the same file "
+        "again reads it again.",
         live=True,
     )
     device: str = setting("cpu", "Where the network runs: cpu, cuda or cuda:N.", live=True)

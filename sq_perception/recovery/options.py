@@ -48,7 +48,7 @@ class RecoveryOptions:
         Whether a pixel beside an object tells that there is nothing before what it measured; not so where the image was
         made of a cloud.  Without it things are fitted by the tolerant course.
     repair
-        Join and split own segments where that describes the image in fewer words; masks from outside stay as they are.
+        Join and split own segments where that describes the image more briefly; masks from outside stay as they are.
 
     Raises
     ------

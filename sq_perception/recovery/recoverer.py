@@ -76,7 +76,7 @@ class Recoverer:
     ----------
     model
         Weights file; None: the ones that ship with the package, ``things`` for what ``auto`` fits to images of pinhole
-        cameras, as it tells hulls with their uncertainty, and ``robust``, which tells bodies, for all else.
+        cameras, as it predicts hulls with their uncertainty, and ``robust``, which predicts bodies, for all else.
     device
         Of the network: "cpu", "cuda" ...
     consensus

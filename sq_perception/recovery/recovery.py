@@ -43,12 +43,12 @@ class Recovery:
 
     @property
     def status(self) -> Status:
-        """The verdict."""
+        """How far the body can be trusted."""
         return self.fit.status
 
     @property
     def message(self) -> str:
-        """The reason for the verdict."""
+        """The reason for the status."""
         return self.fit.message
 
     @property
