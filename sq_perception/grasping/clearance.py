@@ -17,10 +17,12 @@ import math
 
 import numpy as np
 
-from sq_perception.geometry.kernels import kernel, support
+from sq_perception.geometry.kernels import inline_kernel, kernel, support
 
-FAR = 0.05
-"""Gaps are cut off there: nothing depends on larger ones."""
+FAR, NEAR = 0.05, 0.02
+"""Gaps to bodies and distances to points are cut off there: nothing depends on larger ones."""
+_CELL = 0.03
+"""Metres: points are passed over by such cubes."""
 _STRAY = 3
 """Nearest points that a gap is not told by: flying pixels."""
 
@@ -44,90 +46,146 @@ def gaps_to_bodies(
     """
     least = np.full(len(frames), FAR)
     which = np.full(len(frames), -1)
+    centre, axes, reach = np.empty(3), np.empty((3, 3)), np.empty(3)
     for k in range(len(frames)):
+        frame = frames[k]
         for body in range(len(flat)):
             if body == owner[k]:
                 continue
+            size = flat[body, :3]
+            radius = math.sqrt(size[0] ** 2 + size[1] ** 2 + size[2] ** 2)
+            _into(frame, flat[body, 5:8], centre)
+            turned = False
             for box in range(boxes.shape[1]):
-                gap = _gap(frames[k], boxes[k, box], flat[body], turns[body])
+                if _distance(centre, boxes[k, box]) >= radius + least[k]:
+                    continue
+                if not turned:  # the body's axes in the gripper's frame, and its reach along the gripper's
+                    turned = True
+                    for i in range(3):
+                        for j in range(3):
+                            axes[i, j] = 0.0
+                            for m in range(3):
+                                axes[i, j] += frame[m, i] * turns[body, m, j]
+                    for i in range(3):
+                        reach[i] = _reach(axes[i], flat[body])
+                gap = _gap(boxes[k, box], centre, axes, reach, flat[body], least[k])
                 if gap < least[k]:
                     least[k], which[k] = gap, body
     return least, which
 
 
 @kernel
-def _gap(frame: np.ndarray, box: np.ndarray, body: np.ndarray, turn: np.ndarray) -> float:
-    """The gap of one box to one body, cut off at FAR."""
-    # The body's centre in the box's frame, and the way to it from the box's nearest point.
-    centre, way = np.empty(3), np.empty(3)
-    for i in range(3):
-        centre[i] = -box[i]
-        for j in range(3):
-            centre[i] += frame[j, i] * (body[5 + j] - frame[j, 3])
-        way[i] = centre[i] - min(max(centre[i], -box[3 + i]), box[3 + i])
-    distance = math.sqrt(way[0] ** 2 + way[1] ** 2 + way[2] ** 2)
-    if distance > math.sqrt(body[0] ** 2 + body[1] ** 2 + body[2] ** 2) + FAR:
-        return FAR
+def _gap(
+    box: np.ndarray, centre: np.ndarray, axes: np.ndarray, reach: np.ndarray, body: np.ndarray, enough: float
+) -> float:
+    """The gap of a box to a body whose centre and axes are given in the box's frame; any that is ``enough`` will do."""
     best = -1.0
-    for trial in range(7):
-        n = np.zeros(3)
-        if trial == 0:
-            if distance < 1e-9:
-                continue
-            for i in range(3):
-                n[i] = way[i] / distance
-        elif trial < 4:
-            n[trial - 1] = 1.0
-        else:
-            for i in range(3):
-                for j in range(3):
-                    n[i] += frame[j, i] * turn[j, trial - 4]
-        along = n[0] * centre[0] + n[1] * centre[1] + n[2] * centre[2]
-        reach = abs(n[0]) * box[3] + abs(n[1]) * box[4] + abs(n[2]) * box[5]
-        m = np.zeros(3)
+    for i in range(3):
+        best = max(best, abs(centre[i] - box[i]) - box[3 + i] - reach[i])
+    for j in range(3):
+        along, half = 0.0, 0.0
         for i in range(3):
-            for j in range(3):
-                for k in range(3):
-                    m[i] += turn[k, i] * frame[k, j] * n[j]
-        gap = abs(along) - reach - support(m[0], m[1], m[2], body[0], body[1], body[2], body[3], body[4])
-        best = max(best, gap)
-        if best >= FAR:
-            break
-    return min(best, FAR)
+            along += axes[i, j] * (centre[i] - box[i])
+            half += abs(axes[i, j]) * box[3 + i]
+        best = max(best, abs(along) - half - body[j])
+    distance = _distance(centre, box)
+    if best >= enough or distance < 1e-9:
+        return best
+    way = np.empty(3)
+    along, half = 0.0, 0.0
+    for i in range(3):
+        away = centre[i] - box[i]
+        way[i] = (away - min(max(away, -box[3 + i]), box[3 + i])) / distance
+        along += way[i] * away
+        half += abs(way[i]) * box[3 + i]
+    local = np.empty(3)
+    for j in range(3):
+        local[j] = way[0] * axes[0, j] + way[1] * axes[1, j] + way[2] * axes[2, j]
+    return max(best, along - half - _reach(local, body))
+
+
+@inline_kernel
+def _reach(m: np.ndarray, body: np.ndarray) -> float:
+    """The support function of a body (12,) along m (3,) in its own frame."""
+    return support(m[0], m[1], m[2], body[0], body[1], body[2], body[3], body[4])
+
+
+@inline_kernel
+def _distance(place: np.ndarray, box: np.ndarray) -> float:
+    """Of a place (3,) to a box (6,) in the same frame."""
+    square = 0.0
+    for i in range(3):
+        square += max(abs(place[i] - box[i]) - box[3 + i], 0.0) ** 2
+    return math.sqrt(square)
+
+
+def gaps_to_points(frames: np.ndarray, boxes: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Distance (k,) of each gripper to the points (j, 3), but for the few nearest; 0 where they are inside."""
+    cell = np.floor(points / _CELL)
+    key = cell @ [1.0, 1e4, 1e8]
+    order = np.argsort(key)
+    starts = np.flatnonzero(np.diff(key[order], prepend=np.nan, append=np.nan) != 0)
+    return _gaps_to_cells(frames, boxes, points[order], (cell[order[starts[:-1]]] + 0.5) * _CELL, starts)
 
 
 @kernel
-def gaps_to_points(frames: np.ndarray, boxes: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Distance (k,) of each gripper to the points (j, 3), but for the few nearest; 0 where they are inside."""
-    found = np.full(len(frames), FAR)
+def _gaps_to_cells(
+    frames: np.ndarray, boxes: np.ndarray, points: np.ndarray, middles: np.ndarray, starts: np.ndarray
+) -> np.ndarray:
+    """The same of points in cells, those of cell c from ``starts[c]`` on: cells out of reach are passed over."""
+    found = np.full(len(frames), NEAR)
+    reach = NEAR + 0.5 * math.sqrt(3.0) * _CELL
+    at = np.empty(3)
     for k in range(len(frames)):
-        nearest = np.full(_STRAY + 1, FAR * FAR)
-        frame = frames[k]
-        for p in range(len(points)):
-            dx, dy, dz = points[p, 0] - frame[0, 3], points[p, 1] - frame[1, 3], points[p, 2] - frame[2, 3]
-            x = frame[0, 0] * dx + frame[1, 0] * dy + frame[2, 0] * dz
-            y = frame[0, 1] * dx + frame[1, 1] * dy + frame[2, 1] * dz
-            z = frame[0, 2] * dx + frame[1, 2] * dy + frame[2, 2] * dz
-            square = FAR * FAR
-            for box in range(boxes.shape[1]):
-                b = boxes[k, box]
-                u = max(abs(x - b[0]) - b[3], 0.0)
-                v = max(abs(y - b[1]) - b[4], 0.0)
-                w = max(abs(z - b[2]) - b[5], 0.0)
-                square = min(square, u * u + v * v + w * w)
-            slot = _STRAY
-            if square < nearest[slot]:
-                while slot > 0 and nearest[slot - 1] > square:
-                    nearest[slot] = nearest[slot - 1]
-                    slot -= 1
-                nearest[slot] = square
-        found[k] = math.sqrt(nearest[_STRAY])
+        nearest = np.full(_STRAY + 1, NEAR)
+        for c in range(len(middles)):
+            _into(frames[k], middles[c], at)
+            if _least_distance(at, boxes[k]) > reach:
+                continue
+            for p in range(starts[c], starts[c + 1]):
+                _into(frames[k], points[p], at)
+                distance = _least_distance(at, boxes[k])
+                slot = _STRAY
+                if distance < nearest[slot]:
+                    while slot > 0 and nearest[slot - 1] > distance:
+                        nearest[slot] = nearest[slot - 1]
+                        slot -= 1
+                    nearest[slot] = distance
+        found[k] = nearest[_STRAY]
     return found
 
 
+@inline_kernel
+def _into(frame: np.ndarray, place: np.ndarray, at: np.ndarray) -> None:
+    """Write a place (3,) in a gripper's frame (3, 4) to ``at``."""
+    for i in range(3):
+        at[i] = 0.0
+        for j in range(3):
+            at[i] += frame[j, i] * (place[j] - frame[j, 3])
+
+
+@inline_kernel
+def _least_distance(place: np.ndarray, boxes: np.ndarray) -> float:
+    """Of a place (3,) to the nearest of some boxes (m, 6) in the same frame."""
+    least = np.inf
+    for box in range(len(boxes)):
+        least = min(least, _distance(place, boxes[box]))
+    return least
+
+
+@kernel
 def heights_above(plane: np.ndarray, frames: np.ndarray, boxes: np.ndarray) -> np.ndarray:
     """Height (k,) of the lowest corner of each gripper's boxes above a plane n.p + d = 0."""
-    normal = frames[:, :, :3].transpose(0, 2, 1) @ plane[:3]
-    origin = frames[:, :, 3] @ plane[:3] + plane[3]
-    below = (boxes[..., :3] @ normal[..., None])[..., 0] - (boxes[..., 3:] @ np.abs(normal)[..., None])[..., 0]
-    return np.asarray((origin[:, None] + below).min(axis=1))
+    height = np.full(len(frames), np.inf)
+    up = np.empty(3)
+    for k in range(len(frames)):
+        origin = plane[3]
+        for i in range(3):
+            origin += plane[i] * frames[k, i, 3]
+            up[i] = plane[0] * frames[k, 0, i] + plane[1] * frames[k, 1, i] + plane[2] * frames[k, 2, i]
+        for box in range(boxes.shape[1]):
+            low = origin
+            for i in range(3):
+                low += up[i] * boxes[k, box, i] - abs(up[i]) * boxes[k, box, 3 + i]
+            height[k] = min(height[k], low)
+    return height

@@ -18,8 +18,12 @@ Metres, in the frame of the bodies.
 
 from __future__ import annotations
 
+import math
+from itertools import pairwise
+
 import numpy as np
 
+from sq_perception.geometry.kernels import gauge_derivatives, kernel, p_norm
 from sq_perception.geometry.superquadric import Superquadric, nested_norm_and_slopes
 
 MODEL_ERROR = 0.0025
@@ -27,7 +31,9 @@ MODEL_ERROR = 0.0025
 UNKNOWN = 0.1
 """Of a half size: its standard deviation where a body comes without one."""
 _STEP = np.pi / 12
-_NEWTON_STEPS = 3
+_NEWTON_STEPS = 4
+_GRAZING = 1e-12
+"""Slopes of the gauge, per metre, that are no way out of a body."""
 _KEPT = [0, 1, 2, 5, 6, 7, 8, 9, 10]
 """Rows of the covariance without the exponents."""
 
@@ -65,16 +71,37 @@ def reaches(
     bodies: Superquadric, covariance: np.ndarray, owner: np.ndarray, directions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """h(n) (k,) and the standard deviation (k,) of n.t + h(n), of body ``owner`` (k,) along ``directions`` (k, 3)."""
-    turn = bodies.rotation_matrix[owner]
-    m = (directions[:, None] @ turn)[:, 0]
-    size, shape = bodies.size[owner], bodies.shape[owner]
-    q = size * np.abs(m)
-    reach, slopes = nested_norm_and_slopes(q[:, 0], q[:, 1], q[:, 2], 2 - shape[:, 0], 2 - shape[:, 1])
-    slope = np.stack(slopes, axis=1)
-    farthest = slope * size * np.sign(m)
-    gradient = np.concatenate([slope * np.abs(m), directions, np.cross(farthest, m)], axis=1)
-    variance = np.einsum("ki,ki->k", (gradient[:, None] @ covariance[owner])[:, 0], gradient)
-    return reach, np.sqrt(np.maximum(variance, 0.0))
+    flat, turns = np.ascontiguousarray(bodies.to_flat(), dtype=float), np.ascontiguousarray(bodies.rotation_matrix)
+    return _reaches(flat, turns, covariance, owner, directions)
+
+
+@kernel
+def _reaches(
+    flat: np.ndarray, turns: np.ndarray, covariance: np.ndarray, owner: np.ndarray, directions: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    reach, sigma = np.empty(len(owner)), np.empty(len(owner))
+    m, q, farthest, gradient = np.empty(3), np.empty(3), np.empty(3), np.empty(9)
+    for k in range(len(owner)):
+        body, n = flat[owner[k]], directions[k]
+        for i in range(3):
+            m[i] = n[0] * turns[owner[k], 0, i] + n[1] * turns[owner[k], 1, i] + n[2] * turns[owner[k], 2, i]
+            q[i] = body[i] * abs(m[i])
+        h, h_x, h_y, _ = p_norm(q[0], q[1], max(2.0 - body[4], 1e-3))
+        reach[k], by_h, by_z, _ = p_norm(h, q[2], max(2.0 - body[3], 1e-3))
+        gradient[0], gradient[1], gradient[2] = by_h * h_x, by_h * h_y, by_z
+        for i in range(3):
+            farthest[i] = gradient[i] * body[i] * np.sign(m[i])
+            gradient[i] *= abs(m[i])
+            gradient[3 + i] = n[i]
+        gradient[6] = farthest[1] * m[2] - farthest[2] * m[1]
+        gradient[7] = farthest[2] * m[0] - farthest[0] * m[2]
+        gradient[8] = farthest[0] * m[1] - farthest[1] * m[0]
+        variance = 0.0
+        for i in range(9):
+            for j in range(9):
+                variance += gradient[i] * covariance[owner[k], i, j] * gradient[j]
+        sigma[k] = math.sqrt(max(variance, 0.0))
+    return reach, sigma
 
 
 def middle_angles(bodies: Superquadric, owner: np.ndarray, directions: np.ndarray) -> np.ndarray:
@@ -103,25 +130,46 @@ def chords(
     angle : (k,)
         The larger one between direction and the normals at both ends, radians; NaN likewise.
     """
-    turn = bodies.rotation_matrix[owner]
-    size, shape = bodies.size[owner], bodies.shape[owner]
-    at, way = (offset[:, None] @ turn)[:, 0] / size, (direction[:, None] @ turn)[:, 0] / size
-    # In units of the half sizes, from where the line leaves the box around the body: g is convex along it, and Newton's
-    # steps from outside stay outside.
-    sides = np.stack([np.ones(len(at)), -np.ones(len(at))], axis=1)
-    with np.errstate(divide="ignore"):
-        wall = (1 - sides[:, :, None] * (at * np.sign(way))[:, None]) / np.abs(way)[:, None]
-    run = np.maximum(wall.min(axis=2), 0.0) * sides
-    e1, e2 = shape[:, None, 0], shape[:, None, 1]
-    for _ in range(_NEWTON_STEPS + 1):
-        p = at[:, None] + run[..., None] * way[:, None]
-        q = np.abs(p)
-        value, slopes = nested_norm_and_slopes(q[..., 0], q[..., 1], q[..., 2], e1, e2)
-        gradient = np.stack(slopes, axis=-1) * np.sign(p)
-        slope = (gradient * way[:, None]).sum(axis=-1)
-        outwards = slope * sides > 1e-12
-        run = np.where(outwards, run - (value - 1) / np.where(outwards, slope, 1.0), np.nan)
-    normal = gradient / size[:, None]
-    cosine = slope * sides / np.linalg.norm(normal, axis=-1)
-    angle = np.arccos(np.clip(cosine, -1.0, 1.0)).max(axis=1)
-    return run * sides, np.where(np.isfinite(run).all(axis=1), angle, np.nan)
+    flat, turns = np.ascontiguousarray(bodies.to_flat(), dtype=float), np.ascontiguousarray(bodies.rotation_matrix)
+    ends, cosine = np.empty((2, len(owner))), np.empty((2, len(owner)))
+    starts = np.flatnonzero(np.diff(owner, prepend=-1, append=-1))
+    for first, last in pairwise(starts):
+        body = owner[first]
+        at, way = (np.ascontiguousarray((one[first:last] @ turns[body]).T) for one in (offset, direction))
+        for end in range(2):
+            _leave(flat[body], at, way if end == 0 else -way, ends[end, first:last], cosine[end, first:last])
+    angle = np.arccos(np.clip(cosine, -1.0, 1.0)).max(axis=0)
+    return ends.T, np.where(np.isfinite(ends).all(axis=0), angle, np.nan)
+
+
+@kernel
+def _leave(body: np.ndarray, at: np.ndarray, way: np.ndarray, run: np.ndarray, cosine: np.ndarray) -> None:
+    """Where lines from at (3, k) along way (3, k), in a body's own frame, leave it, and the cosine to the normal there.
+
+    They start where they leave the box around the body: g is convex along them, and Newton's steps from outside stay
+    outside.  A step is one loop over all lines that has no branch and few arrays, so that it becomes vector code.
+    """
+    a1, a2, a3, e1, e2 = body[:5]
+    x, y, z = at[0], at[1], at[2]
+    u, v, w = way[0], way[1], way[2]
+    for k in range(len(run)):
+        run[k] = np.inf
+        for i in range(3):
+            if way[i, k] != 0.0:
+                run[k] = min(run[k], (body[i] - at[i, k] * np.sign(way[i, k])) / abs(way[i, k]))
+        run[k] = max(run[k], 0.0)
+    for _ in range(_NEWTON_STEPS):
+        for k in range(len(run)):
+            t = run[k]
+            value, g_x, g_y, g_z, _, _ = gauge_derivatives(
+                x[k] + t * u[k], y[k] + t * v[k], z[k] + t * w[k], a1, a2, a3, e1, e2
+            )
+            slope = g_x * u[k] + g_y * v[k] + g_z * w[k]
+            run[k] = t - (value - 1.0) / (slope if slope > _GRAZING else np.nan)
+    for k in range(len(run)):
+        t = run[k]
+        _, g_x, g_y, g_z, _, _ = gauge_derivatives(
+            x[k] + t * u[k], y[k] + t * v[k], z[k] + t * w[k], a1, a2, a3, e1, e2
+        )
+        slope = g_x * u[k] + g_y * v[k] + g_z * w[k]
+        cosine[k] = slope / math.sqrt(g_x * g_x + g_y * g_y + g_z * g_z)

@@ -140,6 +140,11 @@ class _Trials:
     def at(self, which: np.ndarray) -> _Trials:
         return _Trials(self.owner[which], self.frames[which], self.opening[which], self.width[which], self.logs[which])
 
+    @property
+    def weakest(self) -> np.ndarray:
+        """Which margin takes most from each."""
+        return np.asarray(np.argmin(self.logs, axis=1))
+
     def first(self, count: int) -> _Trials:
         """The most probable ones of each body, each body's in order."""
         order = np.lexsort((-self.logs.sum(axis=1), self.owner))
@@ -197,17 +202,22 @@ def grasps(
     closings = _closings(bodies, spread, gripper, friction)
     trials = _trials(bodies, spread, closings, gripper, around, friction)
     reasons[np.unique(closings.owner)] = "no way for the fingers to come with the table and the palm in their way"
-    for k in np.unique(trials.owner):
-        reasons[k] = f"nothing holds: {_best_weakest(trials, k)}"
-    trials = trials.at(trials.logs.sum(axis=1) > np.log(_LEAST)).first(_CHECKED)
+    trials = _probable(trials, _CHECKED, reasons, "nothing holds")
     if not len(trials.owner):
         return GraspPlan((), tuple(reasons))
     trials = _among_others(bodies, spread, trials, gripper, around)
-    for k in np.unique(trials.owner):
-        reasons[k] = f"in the way: {_best_weakest(trials, k)}"
-    trials = trials.at(trials.logs.sum(axis=1) > np.log(_LEAST)).first(PER_BODY)
-    reasons[np.unique(trials.owner)] = ""
-    return GraspPlan(tuple(_told(trials)), tuple(reasons))
+    trials = _probable(trials, PER_BODY, reasons, "in the way")
+    reasons[trials.owner] = ""
+    return GraspPlan(tuple(_as_grasps(trials)), tuple(reasons))
+
+
+def _probable(trials: _Trials, count: int, reasons: np.ndarray, why: str) -> _Trials:
+    """The ``count`` best of each body that has any; what the best of the others suffer from is their reason."""
+    found = trials.at(trials.logs.sum(axis=1) > np.log(_LEAST)).first(count)
+    without = trials.at(~np.isin(trials.owner, found.owner)).first(1)
+    for k, weakest in zip(without.owner, without.weakest, strict=True):
+        reasons[k] = f"{why}: {_MARGINS[weakest]}"
+    return found
 
 
 def warm_up() -> None:
@@ -258,6 +268,7 @@ def _trials(
     boxes = gripper.boxes_at(opening)
     deepest = np.minimum(gripper.palm - _CLEARANCE - near, 0.0)
     centre = bodies.translation[owner]
+    height = np.full(len(owner), np.inf)
     if around.plane is not None:
         frames = np.concatenate([np.stack([x, y, z], axis=2), centre[:, :, None]], axis=2)
         height = clearance.heights_above(around.plane, frames, boxes)
@@ -300,9 +311,8 @@ def _trials(
     logs[:, 2] = _log(gripper.palm - near - u, deep)
     logs[:, 3] = np.where(np.isfinite(angle), _log(np.arctan(friction) - np.nan_to_num(angle), _SQUARE), -np.inf)
     logs[:, 4] = _log(1 / np.maximum(load, 1e-9) - 1, 0.5)
-    if around.plane is not None:
-        boxes = boxes[at]
-        logs[:, 5] = _log(clearance.heights_above(around.plane, frames, boxes), _TABLE_SIGMA)
+    if around.plane is not None:  # moved without a turn, so that the lowest corner is the same
+        logs[:, 5] = _log(height[at] + (offset + aside[:, None] * y[at]) @ around.plane[:3], _TABLE_SIGMA)
     return _Trials(owner, frames, opening, 2 * half, logs)
 
 
@@ -329,19 +339,12 @@ def _log(margin: np.ndarray, sigma: np.ndarray | float) -> np.ndarray:
     return np.asarray(np.log(np.maximum(ndtr(margin / sigma), 1e-12)))
 
 
-def _weakest(logs: np.ndarray) -> str:
-    return _MARGINS[int(np.argmin(logs))]
-
-
-def _best_weakest(trials: _Trials, body: int) -> str:
-    """What the most probable grasp of a body suffers from most."""
-    mine = trials.logs[trials.owner == body]
-    return _weakest(mine[np.argmax(mine.sum(axis=1))])
-
-
-def _told(trials: _Trials) -> Iterator[Grasp]:
-    order = np.argsort(-trials.logs.sum(axis=1), kind="stable")
+def _as_grasps(trials: _Trials) -> Iterator[Grasp]:
+    """All of them, the most probable first."""
+    total = trials.logs.sum(axis=1)
+    order = np.argsort(-total, kind="stable")
     turns = quaternions.from_matrix(trials.frames[:, :, :3])
+    scores, weakest = np.exp(total), trials.weakest
     for k in order:
         yield Grasp(
             int(trials.owner[k]),
@@ -349,6 +352,6 @@ def _told(trials: _Trials) -> Iterator[Grasp]:
             turns[k],
             float(trials.opening[k]),
             float(trials.width[k]),
-            float(np.exp(trials.logs[k].sum())),
-            _weakest(trials.logs[k]),
+            float(scores[k]),
+            _MARGINS[weakest[k]],
         )
