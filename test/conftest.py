@@ -28,7 +28,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark the tests that start processes, themselves, by their fixtures, or by a helper of this folder."""
+    """Mark the tests that start processes, themselves, by their fixtures, or by a helper."""
     for item in items:
         if isinstance(item, pytest.Function):
             names = [*inspect.unwrap(item.function).__code__.co_names, *item.fixturenames]

@@ -16,8 +16,8 @@ that, at the stamp.
 
 The file is written as ``<name>.partial`` and takes its name when it is whole (:mod:`sq_perception.files.output_file`).
 It is closed properly with what there is where the run is interrupted or the disk is full, and then leaves an older file
-alone; if there is no room for the index either, the partial file stays, up to its last whole chunk, from which ``mcap
-recover`` makes a file.  Frames are held in memory until they fill a chunk, whatever the length of the recording.
+alone; where even that fails the partial file stays, from which ``mcap recover`` makes a file.  Frames are held in
+memory until they fill a chunk, whatever the length of the recording.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, NoReturn, get_args
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -94,7 +94,7 @@ class ResultBag:
         self._shown_ids: list[int] = []
         self._last = Stamp(0, 0)
         self._output = OutputFile(self._path, f"{self._path.name}.partial")
-        self._raw = self._output.partial.open("wb", buffering=0)
+        self._raw = self._output.partial.open("wb")
         try:
             self._file = McapFile(self._raw, "sq_perception")
         except BaseException:
@@ -106,11 +106,6 @@ class ResultBag:
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self.close(whole=error is None)
-
-    @property
-    def frames(self) -> int:
-        """Frames in the file, once it is closed."""
-        return self._file.groups
 
     def add(self, frame: RecordedFrame, recovery: FrameRecovery, tracks: Sequence[Followed | None] | None) -> None:
         """Write a frame and what was recovered from it.
@@ -144,7 +139,10 @@ class ResultBag:
         try:
             self._file.add(group, min(max(received, 0), LATEST))
         except OSError as error:
-            self._close_after(error)
+            place = self._end(whole=False)
+            written = self._file.groups
+            kept = f"the first {written} of {self._frames} frames are kept" if written else "nothing is kept"
+            raise OSError(error.errno, f"{_said(error)}; {kept}", str(place or self._path)) from error
 
     def close(self, whole: bool = True) -> Path | None:
         """Finish the file and give it its name; returns where it is, None without a frame.
@@ -160,13 +158,7 @@ class ResultBag:
         OSError
             As :meth:`add`.
         """
-        if self._raw.closed:
-            return None
-        try:
-            self._file.flush()
-        except OSError as error:
-            self._close_after(error)
-        return self._end(whole)
+        return None if self._raw.closed else self._end(whole)
 
     # frames
 
@@ -216,16 +208,6 @@ class ResultBag:
 
     # the end
 
-    def _close_after(self, error: OSError) -> NoReturn:
-        """Close the file with as many frames as it can hold, and say so."""
-        with suppress(OSError):
-            while self._file.waiting:
-                self._file.flush(1)
-        place = self._end(whole=False)
-        written = self._file.groups
-        kept = f"the first {written} of {self._frames} frames are kept" if written else "nothing is kept"
-        raise OSError(error.errno, f"{_said(error)}; {kept}", str(place or self._path)) from error
-
     def _end(self, whole: bool) -> Path | None:
         """Close the file and name it; no file where there is no frame."""
         if not self._file.groups:
@@ -235,9 +217,8 @@ class ResultBag:
             self._file.finish()
             self._raw.close()
         except OSError as error:
-            with suppress(OSError):
-                self._file.cut()
-            self._raw.close()
+            with suppress(OSError):  # what was left in its buffer has no more room
+                self._raw.close()
             text = f"{_said(error)}; kept without an index, from which 'mcap recover' makes a file"
             raise OSError(error.errno, text, str(self._output.keep())) from error
         return self._output.commit(whole)
