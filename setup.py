@@ -40,7 +40,7 @@ if "bdist_wheel" in sys.argv:
 
 bags = [
     "rosbags>=0.11.9,<0.12",  # rosbag2 without ROS; its tables of decompressors are no promise beyond
-    "mcap>=1.2,<2",  # the records of MCAP files, by the authors of the format
+    "mcap>=1.2,<2",  # writes MCAP files, by the authors of the format
 ]
 view = [
     "viser>=1.1.1,<1.2",  # the page of `sq-perception view`, all of it local; its server is guarded by a way of calling

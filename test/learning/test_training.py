@@ -22,8 +22,7 @@ from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.learning import checkpoint, train, training_config, training_log
 from sq_perception.learning.dataset import full_frames
-from sq_perception.learning.fixed_set import Settings
-from sq_perception.learning.fixed_set_writer import generate
+from sq_perception.learning.fixed_set import Settings, generate
 from sq_perception.learning.regressor import Regressor, RegressorConfig
 from sq_perception.learning.schedule import Cosine, Plateau
 from sq_perception.learning.training_config import TrainingConfig
@@ -264,7 +263,7 @@ class TestThesisSetting:
             recoverer.recover(depth, Camera(64, 48, 50, 50, 32, 24), labels)
 
     def test_from_a_fixed_set(self, tmp_path: Path) -> None:
-        generate(tmp_path / "set", Settings("full", 64, 8, train=24, test=0, shard=10))
+        generate(tmp_path / "set", Settings("full", 64, train=24, test=0, seed=1))
         train.train(replace(self.RUN, data=str(tmp_path / "set")), tmp_path / "run", self.FORM)
         assert training_log.read(tmp_path / "run")[-1]["step"] == 3
         other = replace(RUN, data=str(tmp_path / "set"))

@@ -1,6 +1,6 @@
 """The promise of SECURITY.md: no program of this package calls anybody, or leaves a file behind that was not asked for.
 
-Real processes, with a HOME that is empty and a network in which every packet is seen (``test/helpers/sealed_network.py``).
+Real processes, with a HOME that is empty and a network in which every packet is seen (``sealed_network.py``).
 """
 
 from __future__ import annotations

@@ -116,8 +116,7 @@ def as_many_as_fit(mcap, channel, rng):
     for k in range(20):
         try:
             mcap.add([(channel, rng.bytes(GROUP))], k)
-        except OSError as error:
-            assert error.strerror == "File too large"
+        except OSError:
             return k
     return 20
 
@@ -141,9 +140,10 @@ def test_an_interrupt_finds_no_half_group(file, rng, monkeypatch):
     mcap, added = filled(file, 1, rng)
     more = [rng.bytes(3000), rng.bytes(3000)]
     begun.clear()
-    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
+    with monkeypatch.context() as patched:
         patched.setattr("concurrent.futures.Future.result", interrupted)
-        mcap.add([(1, more[0]), (2, more[1])], 200)
+        with pytest.raises(KeyboardInterrupt):
+            mcap.add([(1, more[0]), (2, more[1])], 200)
     mcap.finish()
     assert read(file)[1] == expected([*added, (200, more)])
     assert mcap.groups == 2
