@@ -40,9 +40,8 @@ from sq_perception.fitting.rivals import resized
 from sq_perception.fitting.symmetry_start import three_orders
 from sq_perception.geometry import rotation as quaternions
 
-SPARED, SPARED_OF_PREDICTED = 3, 1
-"""Parameters that a body of revolution has less; and where a prediction of the hull weighs the half size and the turn
-of a free body already, which leaves the exponent."""
+SPARED = 3
+"""Parameters that a body of revolution has less."""
 ODDS = 3.0
 """Of the things whose unseen side is in question, so many more are round than any other one oval shape."""
 HOPELESS = 15.0
@@ -72,11 +71,10 @@ def weighed(solution: Solution) -> Solution:
     few = draw(problem, BASIN_RAYS, 0.7)
     settled = by_cost(settle(round_, state, few) for state in promising)
     reference = settle(problem, free, few, FIRST_STEPS)
-    spared = SPARED if len(problem.terms.hull_directions) == 0 else SPARED_OF_PREDICTED
-    if gain(reference.cost, settled[0].cost, few.weight, spared) < -HOPELESS:
+    if gain(reference.cost, settled[0].cost, few.weight) < -HOPELESS:
         return solution
     best = refined_best(round_, settled, rays)
-    better = gain(free.cost, best.cost, rays.weight, spared)
+    better = gain(free.cost, best.cost, rays.weight)
     weight = math.exp(-0.5 * abs(better))
     other = Alternative(free if better > 0 else best, weight / (1 + weight))
     solution = replace(solution, alternatives=(*solution.alternatives, other))
@@ -86,9 +84,9 @@ def weighed(solution: Solution) -> Solution:
     return replace(solution, problem=round_, state=best, notes=notes)
 
 
-def gain(free_cost: float, round_cost: float, weight: float, spared: int = SPARED) -> float:
+def gain(free_cost: float, round_cost: float, weight: float) -> float:
     """How much better a body of revolution describes rays of a total weight than a free body; see the module."""
-    simpler = spared * math.log(max(weight, 1.0)) + 2 * math.log(ODDS)
+    simpler = SPARED * math.log(max(weight, 1.0)) + 2 * math.log(ODDS)
     return _deviance(free_cost, weight) - _deviance(round_cost, weight) + simpler
 
 

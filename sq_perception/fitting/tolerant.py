@@ -20,8 +20,9 @@ model's error is not known beforehand, and the likelihood that is largest over i
 1. Starts: the given bodies (the prediction), and boxes on the plane, or along the points' axes without one.
 2. A few steps from each on few rays; more from the best, which tells c.
 3. To the end, on all rays, from the best one or two.
-4. Without a prediction: what is hollow or notched, once more as its convex hull.
-5. The same as a body of revolution, chosen by evidence (:mod:`sq_perception.fitting.revolution`).
+4. Without a prediction: what is hollow or notched, once more as its convex hull; and all the same as a body of
+   revolution, chosen by evidence (:mod:`sq_perception.fitting.revolution`).  Beside a predicted hull it is not asked:
+   on benchmarks/household_things it cost tools 12 % of IoU, and gained no other kind 1 %.
 
 Metres, radians, optical frame.
 """
@@ -80,10 +81,11 @@ def solve(problem: Problem, given: Sequence[State]) -> Solution:
     solution = _best(problem, starts)
     if _is_predicted(problem):
         if _mean_loss(problem, solution.state) > _typical_of_hollow(problem):
-            solution = replace(solution, notes=_AS_HULL, as_hull=True)
-    elif not problem.late:
-        solution = unseen.weighed(_hollow_as_hull(solution, starts))
-    return solution if problem.late else revolution.weighed(solution)
+            return replace(solution, notes=_AS_HULL, as_hull=True)
+        return solution
+    if problem.late:
+        return solution
+    return revolution.weighed(unseen.weighed(_hollow_as_hull(solution, starts)))
 
 
 def _best(problem: Problem, starts: Sequence[State]) -> Solution:
