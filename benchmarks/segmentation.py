@@ -1,6 +1,6 @@
 """Instances found in recorded depth images against human masks, without learning and without colour.
 
-    python benchmarks/segmentation.py [--frames N] [--repeats 5] [--constants] [--name segmentation]
+    python benchmarks/segmentation.py [--frames N] [--repeats 5] [--name segmentation]
 
 Data: ../shared/data/mosd_learn (Kinect v1, tables) and those of ../shared/data/frames that have masks (see its README);
 skipped where they are missing.  Only pixels with a depth count, as nothing else can be found in a depth image.
@@ -13,7 +13,6 @@ skipped where they are missing.  Only pixels with a depth count, as nothing else
 
 The frames of ``frames`` have masks of chosen things only: a segment on what nobody labelled costs precision there, so
 that they stand apart and only their IoU means something.  Every third frame was held out while constants were chosen.
-``--constants`` varies each of them by 30 % to either side.
 
 Goals: IoU 0.85; F1 0.90 for boxes, stacks and round things, 0.80 for occluded; 15 ms of processor time,
 one pinned thread.
@@ -30,7 +29,7 @@ if __name__ == "__main__":  # as a script only: a process that imports this has 
 
 import sys
 import time
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +47,6 @@ NAMES = {"boxes": "boxes", "stacked_boxes": "stacked boxes", "cylindric": "round
 OTHER = "other frames"
 HELD_OUT = 3
 """Every third frame, from the first, was not looked at while constants were chosen."""
-VARIED = (0.7, 1.3)
 _MATCH = 0.5
 _PIECE = 0.1
 
@@ -217,43 +215,10 @@ def summary(known: list[Instances], scores: list[Score]) -> tuple[dict[str, Any]
     return result, text
 
 
-def varied(name: str, factor: float) -> SegmentationOptions:
-    """The usual options with one constant changed; ``folds.radius`` and the like reach into the parts."""
-    options = SegmentationOptions()
-    part, _, field = name.rpartition(".")
-    inner = getattr(options, part) if part else options
-    value = factor * getattr(inner, field)
-    if field == "steepest":  # what is left to the right angle is what varies
-        value = np.pi / 2 - factor * (np.pi / 2 - inner.steepest)
-    changed = replace(inner, **{field: value})
-    return replace(options, **{part: changed}) if part else changed
-
-
-def constants(known: list[Instances]) -> tuple[dict[str, Any], str]:
-    """F1 and IoU of the frames with categories, each constant changed by itself."""
-    table = [each for each in known if each.category != OTHER]
-    usual = SegmentationOptions()
-    names = ["depth_step", "plane_tolerance", "min_height"]
-    names += [f"{part}.{each.name}" for part in ("folds", "grouping", "sight") for each in fields(getattr(usual, part))]
-    result, rows = {}, []
-    for name in names:
-        part, _, field = name.rpartition(".")
-        inner = getattr(usual, part) if part else usual
-        row = [name, f"{getattr(inner, field):.4g}"]
-        for factor in VARIED:
-            group = figures([scored(each, 1, varied(name, factor)) for each in table])
-            result[f"{name} x {factor}"] = {"f1": group["f1"], "iou_of_all": group["iou_of_all"]}
-            row += [f"{group['f1']:.3f}", f"{group['iou_of_all']:.3f}"]
-        rows.append(row)
-    header = ["constant", "value"] + [f"{name} x {factor}" for factor in VARIED for name in ("F1", "IoU of all")]
-    return result, "Each constant changed by itself\n\n" + report.table(header, rows)
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--frames", type=int, default=1000, help="frames of each folder, at most")
     parser.add_argument("--repeats", type=int, default=5, help="the time is the shortest of so many")
-    parser.add_argument("--constants", action="store_true", help="vary the constants as well")
     parser.add_argument("--name", default="segmentation", help="name of the result files")
     options = parser.parse_args()
     folders = [folder for folder in map(report.shared_data, ("mosd_learn", "frames")) if folder is not None]
@@ -264,9 +229,6 @@ def main() -> None:
     cv2.setNumThreads(1)
     known = frames(folders, options.frames)
     result, text = summary(known, [scored(each, options.repeats) for each in known])
-    if options.constants:
-        result["constants"], more = constants(known)
-        text += "\n\n" + more
     report.write(options.name, {"options": vars(options), **result}, text)
 
 

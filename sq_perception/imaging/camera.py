@@ -84,8 +84,14 @@ class Camera:
 
     def unproject(self, u: np.ndarray, v: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """Points (..., 3) in the optical frame of pixels (...) at the given depths (...)."""
-        origin, direction = self.rays(u, v)
-        return origin + np.asarray(depth, dtype=float)[..., None] * direction
+        z = np.asarray(depth, dtype=float)
+        if not self.is_pinhole:
+            origin, direction = self.rays(u, v)
+            return origin + z[..., None] * direction
+        x, y = z * ((np.asarray(u) - self.cx) / self.fx), z * ((np.asarray(v) - self.cy) / self.fy)
+        points = np.empty((*np.broadcast_shapes(x.shape, y.shape), 3))
+        points[..., 0], points[..., 1], points[..., 2] = x, y, z
+        return points
 
     def points(self, depth: np.ndarray) -> np.ndarray:
         """The organised cloud (height, width, 3) of a depth image; NaN where the depth is."""

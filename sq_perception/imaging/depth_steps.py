@@ -12,8 +12,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from sq_perception.geometry.kernels import kernel
+
 CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
-_NEIGHBOURS = ((0, 1), (0, -1), (1, 0), (-1, 0))
 
 
 def edges(filled: np.ndarray, wanted: np.ndarray, step: float) -> np.ndarray:
@@ -38,20 +39,35 @@ def separated(depth: np.ndarray, wanted: np.ndarray, step: float) -> np.ndarray:
 
 def grown(labels: np.ndarray, free: np.ndarray, depth: np.ndarray, rounds: int, step: float) -> np.ndarray:
     """Let labels grow into free pixels, by a pixel per round and not across a depth step."""
-    labels = labels.astype(np.int32)
-    rows, columns = np.nonzero(free)
+    grown = np.array(labels, dtype=np.int32, order="C")
+    _grow(grown, np.flatnonzero(free), np.ascontiguousarray(depth, dtype=np.float32), rounds, np.float32(step))
+    return grown
+
+
+@kernel
+def _grow(labels: np.ndarray, free: np.ndarray, depth: np.ndarray, rounds: int, step: float) -> None:
+    """The same, in place; a pixel takes the label of the neighbour to the right, to the left, below or above."""
+    height, width = labels.shape
+    chosen = np.empty(free.size, np.int32)
+    left = free.size
     for _ in range(rounds):
-        if rows.size == 0:
-            break
-        chosen = np.zeros(rows.size, np.int32)
-        here = depth[rows, columns]
-        for down, right in _NEIGHBOURS:
-            r = np.clip(rows + down, 0, labels.shape[0] - 1)
-            c = np.clip(columns + right, 0, labels.shape[1] - 1)
-            neighbour = labels[r, c]
-            fits = (chosen == 0) & (neighbour > 0) & (np.abs(depth[r, c] - here) <= step * here)
-            chosen = np.where(fits, neighbour, chosen)
-        labels[rows, columns] = chosen
-        left = chosen == 0
-        rows, columns = rows[left], columns[left]
-    return labels
+        for k in range(left):
+            v, u = free[k] // width, free[k] % width
+            limit = step * depth[v, u]
+            chosen[k] = 0
+            for side in range(4):
+                v2, u2 = v + (side == 2) - (side == 3), u + (side == 0) - (side == 1)
+                inside = 0 <= v2 < height and 0 <= u2 < width
+                if inside and labels[v2, u2] > 0 and abs(depth[v2, u2] - depth[v, u]) <= limit:
+                    chosen[k] = labels[v2, u2]
+                    break
+        kept = 0
+        for k in range(left):
+            if chosen[k] > 0:
+                labels[free[k] // width, free[k] % width] = chosen[k]
+            else:
+                free[kept] = free[k]
+                kept += 1
+        if kept == left:
+            return
+        left = kept

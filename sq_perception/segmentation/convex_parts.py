@@ -30,76 +30,59 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.cluster.hierarchy import fcluster, linkage
 
 from sq_perception.geometry.kernels import inline_kernel, kernel
+from sq_perception.imaging import regions
 from sq_perception.imaging.camera import Camera
 
 _STEPS = 8
-_FEW, _MANY, _MOST_SEGMENTS = 30, 160, 25
-_FEWEST_PIXELS = 30
+_FEW, _MANY = 30, 160
 _LEAST_SAMPLES = 4
 _LEAST_SHARE = 0.04
 _METRIC = 0.3
 _HOME = 0.1
-_NEVER = 9.0
+_NOISE_MARGIN, _LEAST_GAP = 3.0, 0.005
+"""A line is crossed where what was seen lies behind it by so many standard deviations of the noise, and metres."""
+_ONE_BODY = 0.3
+"""Segments with a smaller share of crossed pairs between them are one body."""
+_HOLLOW, _HOLLOW_VESSEL = 0.7, 0.1
+"""A part whose surface lies behind its own lines, on average by that many standard deviations of the noise, is the
+inside of a vessel; the same for segments that look hollow by other signs."""
+_LEAST_AREA = 8e-4
+"""Of a part, square metres across the line of sight."""
+_NEAR = 0.03
+"""Neighbouring segments are no farther apart, metres, beyond the distance of their samples."""
 
 
 @dataclass(frozen=True)
 class SightOptions:
-    """When segments are taken apart and put together.
+    """When a segment is taken apart.
 
     Attributes
     ----------
-    noise_margin, least_gap
-        A line is crossed where what was seen lies behind it by so many standard deviations of the noise, and by so many
-        metres.
     suspicious
         Share of crossed pairs from which on a segment may be several bodies.
     convex
         Share of crossed pairs that the parts of a segment have on average, at most, and each of them at most twice.
     apart
         Share of crossed pairs, on average, between parts of a segment: more than half, as between bodies that touch.
-    one_body
-        Segments with a smaller share of crossed pairs between them are one body.
-    hollow
-        A part whose surface lies behind its own lines, on average by that many standard deviations of the noise, is the
-        inside of a vessel.
-    hollow_vessel
-        The same for segments that look hollow by other signs.
-    least_area
-        Of a part, square metres across the line of sight.
-    near
-        Neighbouring segments are no farther apart, metres, beyond the distance of their samples.
     """
 
-    noise_margin: float = 3.0
-    least_gap: float = 0.005
     suspicious: float = 0.12
     convex: float = 0.12
     apart: float = 0.55
-    one_body: float = 0.3
-    hollow: float = 0.7
-    hollow_vessel: float = 0.1
-    least_area: float = 8e-4
-    near: float = 0.03
 
     def __post_init__(self) -> None:
-        for name in ("noise_margin", "least_gap", "hollow", "hollow_vessel", "least_area", "near"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}")
-        for name in ("suspicious", "convex", "apart", "one_body"):
+        for name in ("suspicious", "convex", "apart"):
             if not 0 < getattr(self, name) < 1:
                 raise ValueError(f"{name}: expected a share between 0 and 1, got {getattr(self, name)}")
 
 
+_USUAL = SightOptions()
+
+
 def corrected(
-    labels: np.ndarray,
-    depth: np.ndarray,
-    camera: Camera,
-    sigma: float,
-    vessels: np.ndarray | None = None,
-    options: SightOptions | None = None,
+    labels: np.ndarray, depth: np.ndarray, camera: Camera, sigma: float, vessels: np.ndarray | None = None
 ) -> np.ndarray:
     """Segments taken apart where they are several convex bodies, and joined where they are one.
 
@@ -121,74 +104,70 @@ def corrected(
     labels : int32 (height, width)
         From 1, in no order; of the same pixels.
     """
-    options = options or SightOptions()
-    depth, labels = _plain(depth), np.ascontiguousarray(labels)
-    segments = _segments(labels)
-    if not segments:
-        return labels
-    result, count = labels.copy(), int(labels.max())
-    parts: list[_Part] = []
-    for label, pixels in segments:
-        part = _Part.of(pixels, depth, camera, label)
+    image = _Image(_plain(depth), np.ascontiguousarray(labels), camera, sigma)
+    result, parts = image.labels.copy(), []
+    extents = regions.extents(image.labels)
+    count = len(extents) - 1
+    for label in _by_size(extents):
+        part = image.sampled(label, extents[label], _FEW)
         if part is None:
             continue
-        crossed, _ = part.lines(depth, labels, sigma, options)
-        if crossed.mean() < options.suspicious:
-            parts.append(part)
-            continue
-        hollow = options.hollow_vessel if vessels is not None and vessels[label] else options.hollow
-        pieces = _pieces(label, pixels, labels, depth, camera, sigma, hollow, options)
+        hollow = _HOLLOW_VESSEL if vessels is not None and vessels[label] else _HOLLOW
+        pieces = image.pieces(part, extents[label], hollow, _USUAL)
         if not pieces:
             parts.append(part)
-        for number, piece_pixels in enumerate(pieces):
+        for number, pixels in enumerate(pieces):
             if number > 0:
                 count += 1
-                result[piece_pixels[:, 0], piece_pixels[:, 1]] = count
-            piece = _Part.of(piece_pixels, depth, camera, count if number > 0 else label)
+            name = count if number > 0 else label
+            result[pixels] = name
+            piece = image.of_pixels(name, *pixels, _FEW)
             if piece is not None:
                 parts.append(piece)
-    number_of = _joined(parts, depth, sigma, options, count)
+    number_of = np.arange(count + 1)
+    if len(parts) > 1:
+        names = np.array([part.label for part in parts])
+        group = _linked(
+            image.crossed_between(parts, _NEAR), np.array([len(part.z) for part in parts], float), _ONE_BODY
+        )
+        first = np.unique(group, return_index=True)[1]
+        number_of[names] = names[first[group]]
     return number_of[result]
 
 
 def parts(
-    mask: np.ndarray, depth: np.ndarray, camera: Camera, sigma: float, options: SightOptions | None = None
+    mask: np.ndarray, depth: np.ndarray, camera: Camera, sigma: float, options: SightOptions = _USUAL
 ) -> list[np.ndarray]:
     """Masks (height, width) of the convex parts of a mask; none where it is one, or has no such parts.
 
     ``depth``, ``camera`` and ``sigma`` as in :func:`corrected`.
     """
-    options = options or SightOptions()
-    depth, labels = _plain(depth), mask.astype(np.int32)
-    pixels = np.stack(np.nonzero(mask & (depth > 0)), axis=-1)
-    whole = _Part.of(pixels, depth, camera, 1)
-    if whole is None or whole.lines(depth, labels, sigma, options)[0].mean() < options.suspicious:
-        return []
+    depth = _plain(depth)
+    image = _Image(depth, (mask & (depth > 0)).astype(np.int32), camera, sigma)
+    extents = regions.extents(image.labels)
+    whole = image.sampled(1, extents[1], _FEW) if len(extents) > 1 else None
     found = []
-    for piece in _pieces(1, pixels, labels, depth, camera, sigma, options.hollow, options):
+    for pixels in [] if whole is None else image.pieces(whole, extents[1], _HOLLOW, options):
         found.append(np.zeros(mask.shape, bool))
-        found[-1][piece[:, 0], piece[:, 1]] = True
+        found[-1][pixels] = True
     return found
 
 
-def free_pairs(
-    labels: np.ndarray, depth: np.ndarray, camera: Camera, sigma: float, options: SightOptions | None = None
-) -> list[tuple[int, int]]:
+def free_pairs(labels: np.ndarray, depth: np.ndarray, camera: Camera, sigma: float) -> list[tuple[int, int]]:
     """Pairs of labels, the smaller first, between which few lines are crossed, wherever they are in the image.
 
     Parameters as in :func:`corrected`.  As an object casts lines over the table, which is seen to be farther, such
     segments touch, or something nearer hides all that is between them.
     """
-    options = options or SightOptions()
     depth = _plain(depth)
-    known = [_Part.of(pixels, depth, camera, label) for label, pixels in _segments(np.where(depth > 0, labels, 0))]
-    found = [part for part in known if part is not None]
-    return [
-        (min(a.label, b.label), max(a.label, b.label))
-        for k, a in enumerate(found)
-        for b in found[:k]
-        if a.crossed_towards(b, depth, sigma, options) < options.one_body
-    ]
+    image = _Image(depth, np.where(depth > 0, labels, 0).astype(np.int32), camera, sigma)
+    extents = regions.extents(image.labels)
+    found = [part for label in _by_size(extents) if (part := image.sampled(label, extents[label], _FEW)) is not None]
+    if len(found) < 2:
+        return []
+    crossed = image.crossed_between(found, np.inf)
+    pairs = [(found[i].label, found[j].label) for i in range(len(found)) for j in range(i) if crossed[i, j] < _ONE_BODY]
+    return [(min(pair), max(pair)) for pair in pairs]
 
 
 def warm_up() -> None:
@@ -205,134 +184,103 @@ def _plain(depth: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(depth, dtype=np.float32)
 
 
+def _by_size(extents: np.ndarray) -> list[int]:
+    """Labels that have pixels, the largest first."""
+    order = np.argsort(-extents[:, 0], kind="stable")
+    return [int(label) for label in order if extents[label, 0] > 0 and label > 0]
+
+
 @dataclass(frozen=True, eq=False)
 class _Part:
-    """A segment's samples: pixels (n, 2) as row and column, points (n, 3), and their distance in metres."""
+    """A segment's samples: pixels (n, 2) as row and column, depths (n,), and their distance in metres."""
 
     label: int
     pixels: np.ndarray
-    points: np.ndarray
+    z: np.ndarray
     spacing: float
 
-    @classmethod
-    def of(cls, pixels: np.ndarray, depth: np.ndarray, camera: Camera, label: int, count: int = _FEW) -> _Part | None:
-        """Some ``count`` samples on a grid; None where they are too few to say anything."""
-        stride = max(1, int(np.sqrt(len(pixels) / count)))
-        z = depth[pixels[:, 0], pixels[:, 1]]
-        chosen = pixels[(pixels % stride == stride // 2).all(1) & (z > 0)]
-        if len(chosen) < _LEAST_SAMPLES:
+
+@dataclass(frozen=True, eq=False)
+class _Image:
+    """What lines of sight are drawn in."""
+
+    depth: np.ndarray
+    labels: np.ndarray
+    camera: Camera
+    sigma: float
+
+    @property
+    def focal(self) -> float:
+        return math.sqrt(self.camera.fx * self.camera.fy)
+
+    @property
+    def limits(self) -> tuple[float, float]:
+        return _NOISE_MARGIN * self.sigma, _LEAST_GAP
+
+    def sampled(self, label: int, extent: np.ndarray, count: int) -> _Part | None:
+        """Some ``count`` samples of a segment on a grid; None where they are too few to say anything."""
+        pixels, top, bottom, left, right = extent
+        stride = max(1, int(np.sqrt(pixels / count)))
+        top, left = (first + (stride // 2 - first) % stride for first in (int(top), int(left)))
+        window = slice(top, int(bottom), stride), slice(left, int(right), stride)
+        rows, columns = np.nonzero((self.labels[window] == label) & (self.depth[window] > 0))
+        return self._part(label, top + stride * rows, left + stride * columns, stride)
+
+    def of_pixels(self, label: int, rows: np.ndarray, columns: np.ndarray, count: int) -> _Part | None:
+        """The same of pixels that have a depth."""
+        stride = max(1, int(np.sqrt(len(rows) / count)))
+        chosen = (rows % stride == stride // 2) & (columns % stride == stride // 2)
+        return self._part(label, rows[chosen], columns[chosen], stride)
+
+    def _part(self, label: int, rows: np.ndarray, columns: np.ndarray, stride: int) -> _Part | None:
+        if len(rows) < _LEAST_SAMPLES:
             return None
-        z = depth[chosen[:, 0], chosen[:, 1]].astype(float)
-        spacing = stride * float(np.median(z)) / float(np.sqrt(camera.fx * camera.fy))
-        return cls(label, chosen, camera.unproject(chosen[:, 1], chosen[:, 0], z), spacing)
+        z = self.depth[rows, columns].astype(float)
+        return _Part(label, np.stack([rows, columns], axis=-1), z, stride * float(np.median(z)) / self.focal)
 
-    def lines(
-        self, depth: np.ndarray, labels: np.ndarray, sigma: float, options: SightOptions
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Of each pair of samples (n, n): 1 where its line is crossed, and the mean gap behind it, metres."""
-        return _within(self.pixels, self.points[:, 2], depth, labels, *_limits(sigma, options))
+    def crossed_between(self, parts: list[_Part], near: float) -> np.ndarray:
+        """Of each pair of parts (n, n) the share of crossed lines between their samples; inf if they are not near."""
+        pixels, z = np.concatenate([part.pixels for part in parts]), np.concatenate([part.z for part in parts])
+        ends = np.cumsum([0] + [len(part.z) for part in parts])
+        points = self.camera.unproject(pixels[:, 1], pixels[:, 0], z)
+        reach = near / 2 + 0.7 * np.array([part.spacing for part in parts])
+        return _between(pixels, points, ends, reach, self.depth, *self.limits)
 
-    def crossed_towards(self, other: _Part, depth: np.ndarray, sigma: float, options: SightOptions) -> float:
-        """Share of crossed lines to the samples of another one."""
-        return float(
-            _between(self.pixels, self.points[:, 2], other.pixels, other.points[:, 2], depth, *_limits(sigma, options))
+    def pieces(
+        self, part: _Part, extent: np.ndarray, hollow: float, options: SightOptions
+    ) -> list[tuple[np.ndarray, np.ndarray]]:
+        """Rows and columns of each convex part of a segment; nothing where it has no such parts."""
+        crossed = _within(part.pixels, self._points(part), self.depth, self.labels, *self.limits)[0]
+        if crossed.mean() < options.suspicious:
+            return []
+        whole = self.sampled(part.label, extent, _MANY)
+        if whole is None:
+            return []
+        crossed, gap, far = _within(whole.pixels, self._points(whole), self.depth, self.labels, *self.limits)
+        n = len(whole.z)
+        group = _linked(crossed + _METRIC * far / max(far.max(), 1e-9), np.ones(n), options.apart)
+        size = np.bincount(group)
+        large = size >= max(_LEAST_SAMPLES, _LEAST_SHARE * n, _LEAST_AREA / whole.spacing**2)
+        if np.count_nonzero(large) < 2:
+            return []
+        # What is too small for a part joins the one that it is nearest to.
+        keep = np.flatnonzero(large[group])
+        group = np.unique(group[keep[np.argmin(far[:, keep], axis=1)]], return_inverse=True)[1]
+        member = (group == np.arange(group.max() + 1)[:, None]).astype(float)
+        pairs = member.sum(1) ** 2
+        within, behind = (np.einsum("ki,ij,kj->k", member, each, member, optimize=True) for each in (crossed, gap))
+        if within.sum() > options.convex * pairs.sum() or (within > 2 * options.convex * pairs).any():
+            return []
+        if (behind > hollow * self.sigma * np.median(whole.z) ** 2 * pairs).any():
+            return []
+        rows, columns = regions.pixels(self.labels, part.label, extent)
+        chosen = _assigned(
+            rows, columns, whole.pixels, whole.z, group, len(pairs), self.depth, self.focal, whole.spacing, *self.limits
         )
+        return [(rows[chosen == k], columns[chosen == k]) for k in range(len(pairs)) if (chosen == k).any()]
 
-
-def _limits(sigma: float, options: SightOptions) -> tuple[float, float]:
-    return options.noise_margin * sigma, options.least_gap
-
-
-def _segments(labels: np.ndarray) -> list[tuple[int, np.ndarray]]:
-    """The largest segments with their pixels (n, 2)."""
-    flat = np.flatnonzero(labels)
-    numbers = labels.ravel()[flat]
-    order = np.argsort(numbers.astype(np.uint16) if numbers.size and numbers.max() < 2**16 else numbers, kind="stable")
-    counts = np.bincount(numbers, minlength=1)
-    ends = np.cumsum(counts)
-    largest = np.argsort(-counts, kind="stable")[:_MOST_SEGMENTS]
-    found = []
-    for label in largest[counts[largest] >= _FEWEST_PIXELS]:
-        rows, columns = np.divmod(flat[order[ends[label] - counts[label] : ends[label]]], labels.shape[1])
-        found.append((int(label), np.stack([rows, columns], axis=-1)))
-    return found
-
-
-def _pieces(
-    label: int,
-    pixels: np.ndarray,
-    labels: np.ndarray,
-    depth: np.ndarray,
-    camera: Camera,
-    sigma: float,
-    hollow: float,
-    options: SightOptions,
-) -> list[np.ndarray]:
-    """Pixels (n, 2) of each convex part of a segment; nothing where it has no such parts."""
-    whole = _Part.of(pixels, depth, camera, label, _MANY)
-    if whole is None:
-        return []
-    crossed, gap = whole.lines(depth, labels, sigma, options)
-    far = np.linalg.norm(whole.points[:, None] - whole.points[None], axis=-1)
-    upper = np.triu_indices(len(far), 1)
-    tree = linkage((crossed + _METRIC * far / max(far.max(), 1e-9))[upper], "average")
-    part = fcluster(tree, options.apart, "distance") - 1
-    large = np.bincount(part) >= max(_LEAST_SAMPLES, _LEAST_SHARE * len(part), options.least_area / whole.spacing**2)
-    if np.count_nonzero(large) < 2:
-        return []
-    # What is too small for a part joins the one that it is nearest to.
-    keep = np.flatnonzero(large[part])
-    part = part[keep[np.argmin(far[:, keep], axis=1)]]
-    part = np.unique(part, return_inverse=True)[1]
-    same = part[:, None] == part[None]
-    within = np.array([crossed[np.ix_(part == k, part == k)].mean() for k in range(part.max() + 1)])
-    if crossed[same].mean() > options.convex or within.max() > 2 * options.convex:
-        return []
-    behind = np.array([gap[np.ix_(part == k, part == k)].mean() for k in range(part.max() + 1)])
-    level = sigma * float(np.median(whole.points[:, 2])) ** 2
-    if (behind > hollow * level).any():
-        return []
-    focal = float(np.sqrt(camera.fx * camera.fy))
-    limits = _limits(sigma, options)
-    chosen = _assigned(
-        pixels, whole.pixels, whole.points[:, 2], part, int(part.max()) + 1, depth, focal, whole.spacing, *limits
-    )
-    pieces = [pixels[chosen == k] for k in range(part.max() + 1)]
-    return [piece for piece in pieces if len(piece) >= _FEWEST_PIXELS]
-
-
-def _joined(parts: list[_Part], depth: np.ndarray, sigma: float, options: SightOptions, count: int) -> np.ndarray:
-    """New label (count + 1,) of each label."""
-    number = np.arange(count + 1)
-    n = len(parts)
-    if n < 2:
-        return number
-    crossed = np.full((n, n), _NEVER)
-    size = np.array([len(part.pixels) for part in parts], float)
-    middle = np.array([part.points.mean(0) for part in parts])
-    reach = np.array([np.linalg.norm(part.points - m, axis=1).max() for part, m in zip(parts, middle, strict=True)])
-    for i in range(n):
-        for j in range(i):
-            a, b = parts[i], parts[j]
-            allowed = options.near + 0.7 * (a.spacing + b.spacing)
-            if np.linalg.norm(middle[i] - middle[j]) > reach[i] + reach[j] + allowed:
-                continue
-            square = ((a.points[:, None] - b.points[None]) ** 2).sum(-1).min()
-            if square > allowed**2:
-                continue
-            crossed[i, j] = crossed[j, i] = a.crossed_towards(b, depth, sigma, options)
-    while True:
-        i, j = divmod(int(np.argmin(crossed)), n)
-        if crossed[i, j] >= options.one_body:
-            return number
-        number[number == parts[j].label] = parts[i].label
-        # Shares between the joined one and others, weighted by samples; where one of both is no neighbour, the other's.
-        a, b = crossed[i], crossed[j]
-        mixed = (size[i] * a + size[j] * b) / (size[i] + size[j])
-        mixed = np.where(a >= _NEVER, b, np.where(b >= _NEVER, a, mixed))
-        crossed[i], crossed[:, i] = mixed, mixed
-        crossed[j], crossed[:, j], crossed[i, i] = _NEVER, _NEVER, _NEVER
-        size[i] += size[j]
+    def _points(self, part: _Part) -> np.ndarray:
+        return self.camera.unproject(part.pixels[:, 1], part.pixels[:, 0], part.z)
 
 
 @inline_kernel
@@ -352,29 +300,42 @@ def _crossed(
 @kernel
 def _between(
     pixels: np.ndarray,
-    z: np.ndarray,
-    others: np.ndarray,
-    z_others: np.ndarray,
+    points: np.ndarray,
+    ends: np.ndarray,
+    reach: np.ndarray,
     depth: np.ndarray,
     noise: float,
     least: float,
-) -> float:
-    """Share of crossed lines between the samples (n, 2) of two segments."""
-    count = 0
-    for i in range(pixels.shape[0]):
-        for j in range(others.shape[0]):
-            if _crossed(pixels[i, 0], pixels[i, 1], z[i], others[j, 0], others[j, 1], z_others[j], depth, noise, least):
-                count += 1
-    return count / (pixels.shape[0] * others.shape[0])
+) -> np.ndarray:
+    """Share (n, n) of crossed lines between the samples of segments, the rows between two ``ends``; inf where the
+    nearest samples are farther apart than the sum of their reaches."""
+    n = len(ends) - 1
+    share = np.full((n, n), np.inf)
+    for a in range(n):
+        for b in range(a):
+            nearest, count = np.inf, 0
+            for i in range(ends[a], ends[a + 1]):
+                for j in range(ends[b], ends[b + 1]):
+                    x, y, z = points[i, 0] - points[j, 0], points[i, 1] - points[j, 1], points[i, 2] - points[j, 2]
+                    nearest = min(nearest, x * x + y * y + z * z)
+            if nearest > (reach[a] + reach[b]) ** 2:
+                continue
+            for i in range(ends[a], ends[a + 1]):
+                for j in range(ends[b], ends[b + 1]):
+                    p, q = pixels[i], pixels[j]
+                    count += _crossed(p[0], p[1], points[i, 2], q[0], q[1], points[j, 2], depth, noise, least)
+            share[a, b] = share[b, a] = count / ((ends[a + 1] - ends[a]) * (ends[b + 1] - ends[b]))
+    return share
 
 
 @kernel
 def _within(
-    pixels: np.ndarray, z: np.ndarray, depth: np.ndarray, labels: np.ndarray, noise: float, least: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Of each pair of samples (n, n): 1 where the line is crossed, and the mean gap behind it over its own segment."""
+    pixels: np.ndarray, points: np.ndarray, depth: np.ndarray, labels: np.ndarray, noise: float, least: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of each pair of samples (n, n): 1 where the line is crossed, the mean gap behind it over its own segment, and the
+    distance, metres."""
     n = pixels.shape[0]
-    crossed, gaps = np.zeros((n, n), np.float32), np.zeros((n, n), np.float32)
+    crossed, gaps, far = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n))
     for i in range(n):
         own = labels[pixels[i, 0], pixels[i, 1]]
         for j in range(i):
@@ -384,7 +345,7 @@ def _within(
                 v = int((1 - t) * pixels[i, 0] + t * pixels[j, 0] + 0.5)
                 u = int((1 - t) * pixels[i, 1] + t * pixels[j, 1] + 0.5)
                 seen = np.float64(depth[v, u])
-                line = 1.0 / ((1 - t) / z[i] + t / z[j])
+                line = 1.0 / ((1 - t) / points[i, 2] + t / points[j, 2])
                 gap = seen - line
                 if gap > max(noise * line * line, least):
                     over = 1.0
@@ -394,12 +355,64 @@ def _within(
             crossed[i, j] = crossed[j, i] = over
             if count > 0:
                 gaps[i, j] = gaps[j, i] = total / count
-    return crossed, gaps
+            x, y, z = points[i, 0] - points[j, 0], points[i, 1] - points[j, 1], points[i, 2] - points[j, 2]
+            far[i, j] = far[j, i] = math.sqrt(x * x + y * y + z * z)
+    return crossed, gaps, far
+
+
+@kernel
+def _linked(distance: np.ndarray, size: np.ndarray, limit: float) -> np.ndarray:
+    """Groups (n,) from 0 by average linkage: the two nearest of (n, n) are joined until none are nearer than a limit.
+
+    Distances to the joined group are averages by size; inf is no distance, and the other one's holds.
+    """
+    n = len(size)
+    far, weight = distance.copy(), size.copy()
+    parent = np.arange(n)
+    nearest, least = np.zeros(n, np.int64), np.full(n, np.inf)
+    for i in range(n):
+        far[i, i] = np.inf
+        nearest[i] = np.argmin(far[i])
+        least[i] = far[i, nearest[i]]
+    while True:
+        i = int(np.argmin(least))
+        j = int(nearest[i])
+        if not least[i] < limit:
+            break
+        for k in range(n):
+            if np.isinf(far[i, k]):
+                far[i, k] = far[k, i] = far[j, k]
+            elif not np.isinf(far[j, k]):
+                far[i, k] = far[k, i] = (weight[i] * far[i, k] + weight[j] * far[j, k]) / (weight[i] + weight[j])
+            far[j, k] = far[k, j] = np.inf
+        far[i, i] = np.inf
+        weight[i] += weight[j]
+        parent[j], least[j] = i, np.inf
+        for k in range(n):
+            if k == i or (parent[k] == k and (nearest[k] == i or nearest[k] == j)):
+                nearest[k] = np.argmin(far[k])
+                least[k] = far[k, nearest[k]]
+            elif far[i, k] < least[k]:
+                nearest[k], least[k] = i, far[i, k]
+    group, count = np.empty(n, np.int64), 0
+    for k in range(n):
+        root = k
+        while parent[root] != root:
+            root = parent[root]
+        parent[k] = root
+    number = np.full(n, -1)
+    for k in range(n):
+        if number[parent[k]] < 0:
+            number[parent[k]] = count
+            count += 1
+        group[k] = number[parent[k]]
+    return group
 
 
 @kernel
 def _assigned(
-    pixels: np.ndarray,
+    rows: np.ndarray,
+    columns: np.ndarray,
     samples: np.ndarray,
     z: np.ndarray,
     part: np.ndarray,
@@ -410,13 +423,13 @@ def _assigned(
     noise: float,
     least: float,
 ) -> np.ndarray:
-    """The part (n,) of each pixel (n, 2): that of the nearest sample, or, of those almost as near, of the one to whose
+    """The part (n,) of each pixel: that of the nearest sample, or, of those almost as near, of the one to whose
     samples most lines are free."""
-    chosen = np.zeros(pixels.shape[0], np.int64)
+    chosen = np.zeros(rows.size, np.int64)
     nearest = np.empty(parts)
     over, count = np.empty(parts), np.empty(parts)
-    for i in range(pixels.shape[0]):
-        v, u = pixels[i, 0], pixels[i, 1]
+    for i in range(rows.size):
+        v, u = rows[i], columns[i]
         here = np.float64(depth[v, u])
         nearest[:] = np.inf
         for j in range(samples.shape[0]):

@@ -22,14 +22,23 @@ additive edge contraction).
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import cv2
 import numpy as np
 
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation.surface_patches import Patches
 
+_HOLLOW_RADIUS = 0.1
+"""A patch is hollow if the curvatures of its two directions sum up to more than one by this, metres."""
+_HOLLOW_DEPTH = 0.3
+"""A step down into a hollow is not deeper, metres."""
+_PLANE_ANGLE, _PLANE_DISTANCE = float(np.deg2rad(12)), 0.02
+"""Two patches lie in one plane if their normals, and each centre from the other's plane, are no farther apart, radians
+and metres."""
+_LEAST_AREA = 1.6e-3
+"""A body that shows less, square metres across the line of sight, and is attached to another, is a part of that."""
+_ATTACHED = 0.03
+"""Surfaces no farther apart than this along the line of sight are attached, metres."""
 _FLAT = 0.3
 _CLEARLY = 1.0
 _UNKNOWN = 0.1
@@ -37,59 +46,25 @@ _SIGHT_SAMPLES = 24
 _SEEN_THROUGH = 0.1
 
 
-@dataclass(frozen=True)
-class GroupingOptions:
-    """What makes one body of several patches.
-
-    Attributes
-    ----------
-    hollow_radius
-        A patch is hollow if the curvatures of its two directions sum up to more than one by this, metres.
-    hollow_depth
-        A step down into a hollow is not deeper, metres.
-    plane_angle, plane_distance
-        Two patches lie in one plane if their normals, and each centre from the other's plane, are no farther apart,
-        radians and metres.
-    least_area
-        A body that shows less, square metres across the line of sight, and is attached to another, is a part of that.
-    attached
-        Surfaces no farther apart than this along the line of sight are attached, metres.
-    """
-
-    hollow_radius: float = 0.1
-    hollow_depth: float = 0.3
-    plane_angle: float = float(np.deg2rad(12))
-    plane_distance: float = 0.02
-    least_area: float = 1.6e-3
-    attached: float = 0.03
-
-    def __post_init__(self) -> None:
-        for name in ("hollow_radius", "hollow_depth", "plane_angle", "plane_distance", "least_area", "attached"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}")
-
-
-def bodies(patches: Patches, camera: Camera, options: GroupingOptions | None = None) -> np.ndarray:
+def bodies(patches: Patches, camera: Camera) -> np.ndarray:
     """Body (count + 1,) of each patch, from 1; 0 for 0."""
-    options = options or GroupingOptions()
     n = patches.count + 1
-    weights, dents, over, joint = _borders(patches, options)
-    hollow = patches.curvature > 1 / options.hollow_radius
+    weights, dents, over, joint = _borders(patches)
+    hollow = patches.curvature > 1 / _HOLLOW_RADIUS
     gain = 2 * over * hollow[:, None]
     weights += gain + gain.T + 2 * dents * (hollow[:, None] & hollow[None, :])
     areas = np.bincount(patches.labels.ravel(), minlength=n) * _sample_area(patches, camera)
     body = _contracted(weights)
     member = (body[None, :] == np.arange(int(body.max()) + 1)[:, None]).astype(float)
-    weights += _continued(patches, body, camera, options)
+    weights += _continued(patches, body, camera)
     body = _contracted(member @ weights @ member.T)[body]
-    return _without_fragments(body, areas, joint, options.least_area)
+    return _without_fragments(body, areas, joint, _LEAST_AREA)
 
 
-def hollow_share(patches: Patches, body: np.ndarray, options: GroupingOptions | None = None) -> np.ndarray:
+def hollow_share(patches: Patches, body: np.ndarray) -> np.ndarray:
     """Share (bodies + 1,) of each body's samples that lie on hollow patches; ``body`` is what :func:`bodies` found."""
-    options = options or GroupingOptions()
     samples = np.bincount(patches.labels.ravel(), minlength=patches.count + 1).astype(float)
-    hollow = np.bincount(body, samples * (patches.curvature > 1 / options.hollow_radius))
+    hollow = np.bincount(body, samples * (patches.curvature > 1 / _HOLLOW_RADIUS))
     return hollow / np.maximum(np.bincount(body, samples), 1)
 
 
@@ -99,7 +74,7 @@ def _sample_area(patches: Patches, camera: Camera) -> float:
     return (z * patches.stride) ** 2 / (camera.fx * camera.fy)
 
 
-def _borders(patches: Patches, options: GroupingOptions) -> tuple[np.ndarray, ...]:
+def _borders(patches: Patches) -> tuple[np.ndarray, ...]:
     """Of each pair of patches (n, n): sum of the scores, what concave edges took from it, samples at which the first
     lies a step behind, and samples of attached border.
 
@@ -128,9 +103,9 @@ def _borders(patches: Patches, options: GroupingOptions) -> tuple[np.ndarray, ..
         score = np.where(step, -np.minimum(beyond, 1), np.where(far, 0.0, score))
         weights += np.bincount(a * n + b, score, n * n)
         dents += np.bincount(a * n + b, np.where(step, 0.0, np.maximum(-score, 0)), n * n)
-        joint += np.bincount((a * n + b)[np.abs(za - zb) < options.attached], minlength=n * n)
+        joint += np.bincount((a * n + b)[np.abs(za - zb) < _ATTACHED], minlength=n * n)
         behind = np.where(za > zb, a * n + b, b * n + a)
-        over += np.bincount(behind[step & (np.abs(za - zb) < options.hollow_depth)], minlength=n * n)
+        over += np.bincount(behind[step & (np.abs(za - zb) < _HOLLOW_DEPTH)], minlength=n * n)
     scores, bent, behind_of, attached = (each.reshape(n, n) for each in (weights, dents, over, joint))
     return scores + scores.T, bent + bent.T, behind_of, attached + attached.T
 
@@ -147,7 +122,7 @@ def _bridged(patches: Patches) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return patches.labels.ravel()[source[nearest]], patches.depth.ravel()[source[nearest]], gap
 
 
-def _continued(patches: Patches, body: np.ndarray, camera: Camera, options: GroupingOptions) -> np.ndarray:
+def _continued(patches: Patches, body: np.ndarray, camera: Camera) -> np.ndarray:
     """Scores (n, n) of patches in one plane between which only nearer things, or nothing at all, were measured."""
     n = patches.count + 1
     rows, columns = np.nonzero(patches.labels)
@@ -161,9 +136,7 @@ def _continued(patches: Patches, body: np.ndarray, camera: Camera, options: Grou
         normals = patches.planes / length[:, None]
         z = 1 / np.einsum("ij,ij->i", rays, patches.planes)
         distance = np.abs(1 - z[None, :] * (patches.planes @ rays.T)) / length[:, None]
-        one = (normals @ normals.T > np.cos(options.plane_angle)) & (
-            np.maximum(distance, distance.T) < options.plane_distance
-        )
+        one = (normals @ normals.T > np.cos(_PLANE_ANGLE)) & (np.maximum(distance, distance.T) < _PLANE_DISTANCE)
     a, b = np.nonzero(np.triu(one & (body[:, None] != body[None, :]), 1))
     weights = np.zeros((n, n))
     if a.size == 0:

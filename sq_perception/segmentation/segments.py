@@ -21,12 +21,13 @@ Metres and pixels.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-from sq_perception.imaging import depth_steps
+from sq_perception.geometry.kernels import kernel
+from sq_perception.imaging import depth_steps, regions
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation import (
     convex_parts,
@@ -36,11 +37,8 @@ from sq_perception.segmentation import (
     support_surface,
     surface_patches,
 )
-from sq_perception.segmentation.convex_parts import SightOptions
-from sq_perception.segmentation.patch_grouping import GroupingOptions
 from sq_perception.segmentation.support_plane import Plane
 from sq_perception.segmentation.support_surface import SupportSurface
-from sq_perception.segmentation.surface_patches import FoldOptions
 
 _FOOT_PIXELS = 3
 _AROUND = 40
@@ -78,8 +76,6 @@ class SegmentationOptions:
         Half thickness of a plane while it is searched, metres at a depth of one metre.
     min_plane_share
         Share of the valid pixels that a support plane has at least.
-    folds, grouping, sight
-        What parts touching bodies, what holds one body together, and what corrects both.
     seed
         Of the random sample; the same image gives the same result.
     """
@@ -95,9 +91,6 @@ class SegmentationOptions:
     plane_tolerance: float = 0.008
     min_plane_share: float = 0.1
     seed: int = 0
-    folds: FoldOptions = field(default_factory=FoldOptions)
-    grouping: GroupingOptions = field(default_factory=GroupingOptions)
-    sight: SightOptions = field(default_factory=SightOptions)
 
     def __post_init__(self) -> None:
         near, far = self.depth_range
@@ -177,8 +170,8 @@ def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | No
     walls = [other for other in planes if other is not plane]
     labels = _above(known, valid, camera, support, walls, options)
     # What is out of range holds things up and hides them all the same.
-    told = np.isfinite(depth) & (depth > 0)
-    test = standing.standing(np.where(told, depth, np.float32(0)), told, camera, support, walls, limits)
+    everything, measured = _checked(depth, camera, (0.0, np.inf))
+    test = standing.standing(everything, measured, camera, support, walls, limits)
     labels, ids = _ordered(labels, least, options.max_objects, test)
     return Segmentation(labels, plane.equation, ids, max(support.sigma, _LEAST_SIGMA))
 
@@ -269,9 +262,12 @@ def _checked(depth: np.ndarray, camera: Camera, limits: tuple[float, float]) -> 
         raise ValueError(f"depth: expected a float image (height, width), got {depth.dtype} {depth.shape}")
     camera.check_image(depth)
     depth = depth.astype(np.float32, copy=False)
-    valid = np.isfinite(depth) & (depth >= limits[0]) & (depth <= limits[1])
+    near, far = limits
+    valid = np.isfinite(depth) if np.isinf(far) else depth <= far
     if camera.is_pinhole:
         valid &= depth > 0
+    if near > 0 or not camera.is_pinhole:
+        valid &= depth >= near
     return depth, valid
 
 
@@ -295,7 +291,6 @@ def _above(
     """Bodies (labels from 1, unordered) of what is above the support."""
     labels = np.zeros(known.shape, np.int32)
     relative = support.image_relative(known, camera)
-    relative *= valid
     # Half of the tolerance band is a compromise: bent depth of real cameras stays below, thin objects stay above.
     clear = cv2.blur(relative, (3, 3)) > max(0.5 * options.plane_tolerance, 4 * support.sigma)
     # The mean beside a tall body is that of its height: the pixel itself decides there.
@@ -327,13 +322,13 @@ def _bodies(
 ) -> np.ndarray:
     """Bodies (labels from 1, unordered) of the wanted pixels, taken apart at steps and concave edges."""
     sigma = max(sigma, _LEAST_SIGMA)
-    patches = surface_patches.find(depth, wanted, camera, sigma, options.depth_step, flat, options.folds)
+    patches = surface_patches.find(depth, wanted, camera, sigma, options.depth_step, flat)
     if patches is None:
         return depth_steps.separated(depth, wanted, options.depth_step)
-    body = patch_grouping.bodies(patches, camera, options.grouping)
-    vessels = patch_grouping.hollow_share(patches, body, options.grouping) > _VESSEL
+    body = patch_grouping.bodies(patches, camera)
+    vessels = patch_grouping.hollow_share(patches, body) > _VESSEL
     labels = _refined(body[patches.labels].astype(np.int32), patches, depth, wanted, options.depth_step)
-    labels = convex_parts.corrected(labels, depth, camera, sigma, vessels, options.sight)
+    labels = convex_parts.corrected(labels, depth, camera, sigma, vessels)
     # What is too small for a patch stays what the steps made of it.
     rest = cv2.morphologyEx((wanted & (labels == 0)).view(np.uint8), cv2.MORPH_OPEN, depth_steps.CROSS)
     rest = depth_steps.components(rest)
@@ -344,24 +339,39 @@ def _refined(
     body: np.ndarray, patches: surface_patches.Patches, depth: np.ndarray, wanted: np.ndarray, step: float
 ) -> np.ndarray:
     """Labels (height, width) from those of the samples; beside a step, of the one whose depth is most alike."""
-    k = patches.stride
-    labels = np.repeat(np.repeat(body, k, axis=0), k, axis=1)[: depth.shape[0], : depth.shape[1]]
-    near = np.repeat(np.repeat(patches.stepped | (body == 0), k, axis=0), k, axis=1)
-    near = near[: depth.shape[0], : depth.shape[1]] & wanted
-    labels = np.where(wanted, labels, 0)
-    rows, columns = np.nonzero(near)
-    here = depth[rows, columns]
-    known = np.where(body > 0, patches.depth, np.float32(np.inf))
-    known, body = np.pad(known, (1, 2), constant_values=np.inf), np.pad(body, (1, 2))
-    best, chosen = step * here, np.zeros(rows.size, np.int32)
-    r, c = (rows + k // 2) // k + 1, (columns + k // 2) // k + 1
-    for down in (-1, 0, 1):
-        for right in (-1, 0, 1):
-            off = np.abs(known[r + down, c + right] - here)
-            closer = off < best
-            best = np.where(closer, off, best)
-            chosen = np.where(closer, body[r + down, c + right], chosen)
-    labels[rows, columns] = chosen
+    unsure = patches.stepped | (body == 0)
+    known = np.pad(np.where(body > 0, patches.depth, np.float32(np.inf)), 1, constant_values=np.inf)
+    return np.asarray(_fine(body, unsure, known, depth, wanted, patches.stride, np.float32(step)))
+
+
+@kernel
+def _fine(
+    body: np.ndarray,
+    unsure: np.ndarray,
+    known: np.ndarray,
+    depth: np.ndarray,
+    wanted: np.ndarray,
+    stride: int,
+    step: float,
+) -> np.ndarray:
+    """The same; ``known`` are the depths of labelled samples in a frame of one sample, inf for others."""
+    labels = np.zeros(depth.shape, np.int32)
+    rows, columns = body.shape
+    for v in range(depth.shape[0]):
+        for u in range(depth.shape[1]):
+            if not wanted[v, u]:
+                continue
+            if not unsure[v // stride, u // stride]:
+                labels[v, u] = body[v // stride, u // stride]
+                continue
+            r, c = (v + stride // 2) // stride, (u + stride // 2) // stride
+            least = step * depth[v, u]
+            for i in range(max(r - 1, 0), min(r + 2, rows)):
+                for j in range(max(c - 1, 0), min(c + 2, columns)):
+                    off = abs(known[i + 1, j + 1] - depth[v, u])
+                    if off < least:
+                        least = off
+                        labels[v, u] = body[i, j]
     return labels
 
 
@@ -369,25 +379,12 @@ def _ordered(
     labels: np.ndarray, least: int, most: int, accept: standing.ObjectTest | None = None
 ) -> tuple[np.ndarray, tuple[int, ...]]:
     """Components with at least ``least`` pixels, renumbered from 1 by falling size, at most ``most`` of them."""
-    left, top, width, height = cv2.boundingRect((labels > 0).view(np.uint8))
-    window = slice(top, top + height), slice(left, left + width)
-    part = np.ascontiguousarray(labels[window])
-    counts = np.bincount(part.ravel(), minlength=1)
-    counts[0] = 0
-    order = [int(k) for k in np.argsort(-counts, kind="stable") if counts[k] >= least]
-    pixels = np.flatnonzero(part)
-    short = np.uint16 if len(counts) < 2**16 else np.int32  # 16 bit integers are sorted by radix, ten times as fast
-    pixels = pixels[np.argsort(part.ravel()[pixels].astype(short), kind="stable")]
-    ends = np.cumsum(counts)
-    number = np.zeros(len(counts), np.int32)
-    kept = 0
-    for label in order:
-        if kept == most:
+    extents = regions.extents(labels)
+    number, kept = np.zeros(len(extents), np.int32), 0
+    for label in np.argsort(-extents[:, 0], kind="stable"):
+        if kept == most or extents[label, 0] < least:
             break
-        rows, columns = np.divmod(pixels[ends[label] - counts[label] : ends[label]], max(width, 1))
-        if accept is None or accept(rows + top, columns + left):
+        if accept is None or accept(*regions.pixels(labels, label, extents[label])):
             kept += 1
             number[label] = kept
-    result = np.zeros(labels.shape, np.int32)
-    result[window] = number[part]
-    return result, tuple(range(1, kept + 1))
+    return number[labels], tuple(range(1, kept + 1))

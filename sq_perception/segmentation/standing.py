@@ -21,6 +21,7 @@ import numpy as np
 from sq_perception.geometry import rotation
 from sq_perception.imaging import depth_steps
 from sq_perception.imaging.camera import Camera
+from sq_perception.segmentation import support_plane
 from sq_perception.segmentation.support_plane import Plane, noise_growth
 from sq_perception.segmentation.support_surface import SupportSurface
 
@@ -30,7 +31,7 @@ Box = tuple[float, float, float, float, float, float]
 Pose = tuple[tuple[float, float, float, float], tuple[float, float, float]]
 """Quaternion x y z w and translation."""
 
-_SAMPLES = 2000
+_SAMPLES = 400
 _COARSE_PIXELS, _FEWEST = 120, 30
 """Samples along the shorter side of the image that surfaces are searched on, and least samples of one."""
 _BUMP, _ON_WALL = 6.0, 3.5
@@ -41,8 +42,9 @@ _FACE_SHARE = 0.5
 """What makes up this share of a plane's points is no part of it: the plane is a face of the thing."""
 _OUTLIERS = 0.01
 """Share of the points at either end that do not count for the extent: sensors smear edges."""
-_EDGE_SAMPLES = 400
-_TURNS = np.deg2rad(np.arange(0, 180, 10))
+
+_TURNS = np.stack([np.cos(np.deg2rad(np.arange(0, 180, 10))), np.sin(np.deg2rad(np.arange(0, 180, 10)))])
+"""Directions (2, 18) in which edges are measured."""
 _UNDER, _BELOW = 3.0, 2.0
 """Tolerances below the support at which is looked for it, and from which on something seen lies below it."""
 _TOLD = 1 / 3
@@ -96,16 +98,14 @@ def largest_edge(points: np.ndarray, up: np.ndarray | None = None) -> float:
 
     A hundredth of the points at either end may stick out.
     """
-    points = points[:: 1 + len(points) // _EDGE_SAMPLES]
+    points = points[:: 1 + len(points) // _SAMPLES]
     if up is None:
         axes = np.linalg.eigh(np.cov(points.T))[1] if len(points) > 3 else np.eye(3)
         return float(_extents(points @ axes).max())
-    first, second = np.linalg.svd(up[None])[2][1:]
-    flat = points @ np.stack([first, second], axis=1) @ np.stack([np.cos(_TURNS), np.sin(_TURNS)])
-    edges = _extents(flat)
+    edges = _extents(points @ np.concatenate([support_plane.across(up) @ _TURNS, up[:, None]], axis=1))
     # A quarter turn apart, the two edges of one rectangle.
-    rectangles = np.maximum(edges, np.roll(edges, len(edges) // 2))
-    return float(max(rectangles.min(), _extents(points @ up[:, None])[0]))
+    half = _TURNS.shape[1] // 2
+    return float(max(np.maximum(edges[:half], edges[half:-1]).min(), edges[-1]))
 
 
 def _extents(values: np.ndarray) -> np.ndarray:

@@ -40,6 +40,9 @@ _LEVEL, _STOREY, _TABLE_SHARE = 0.99, 0.3, 0.4
 """Cosine between the normals of level planes, metres from a floor to the table above it, and the share that it shows of
 what the floor does.  Of lower steps the larger level is the support, and things are found on both."""
 
+LEAST_GROWTH = 0.1
+"""Of the noise: nearer than 0.3 m it falls no further, as a sensor's own quantisation and calibration remain."""
+
 _Surface = tuple[np.ndarray, bool]
 
 
@@ -84,20 +87,10 @@ class Plane:
         """Height (...) of points (..., 3) above the plane, metres."""
         return points @ self.equation[:3] + self.equation[3]
 
-    def image_height(self, depth: np.ndarray, camera: Camera) -> np.ndarray:
-        """Height float32 (height, width) of every pixel of a pinhole camera's depth image."""
-        n_x, n_y, n_z, d = self.equation
-        across = (n_x * (np.arange(camera.width) - camera.cx) / camera.fx + n_z).astype(np.float32)
-        down = (n_y * (np.arange(camera.height) - camera.cy) / camera.fy).astype(np.float32)
-        height = across[None, :] + down[:, None]
-        height *= depth
-        height += np.float32(d)
-        return height
-
 
 def noise_growth(z: np.ndarray) -> np.ndarray:
-    """Growth of the depth noise, 1 at one metre; not below what near objects' own quantisation needs."""
-    return np.maximum(z * z, 0.1)
+    """Growth of the depth noise, 1 at one metre."""
+    return np.maximum(z * z, LEAST_GROWTH)
 
 
 def planes(depth: np.ndarray, valid: np.ndarray, camera: Camera, search: Search) -> list[Plane]:
@@ -236,7 +229,7 @@ def _carries(plane: Plane, surfaces: list[_Surface]) -> bool:
     of it.  Edges of tables are round and floors run on below them, but nothing stands on the faces of a lone body; what
     that stands on lies beside each of its faces.
     """
-    axes = _across(plane.equation[:3])
+    axes = across(plane.equation[:3])
     # A plane through a lone round body has a part of that above it, well within its border.
     spread = [points for points, is_island in surfaces if not is_island]
     points = np.concatenate(spread) if spread else np.zeros((0, 3))
@@ -255,9 +248,12 @@ def _carries(plane: Plane, surfaces: list[_Surface]) -> bool:
     return inside * (1 + len(feet) // 500) > _CARRIED_SHARE * len(on)
 
 
-def _across(normal: np.ndarray) -> np.ndarray:
+def across(normal: np.ndarray) -> np.ndarray:
     """Two axes (3, 2) at right angles to a normal."""
-    return np.linalg.svd(normal[None])[2][1:].T
+    x, y, z = normal
+    first = np.array([z, 0.0, -x] if abs(z) > 0.5 else [-y, x, 0.0])
+    first /= np.linalg.norm(first)
+    return np.stack([first, np.cross(normal, first)], axis=1)
 
 
 def _on_one_surface(depth: np.ndarray, valid: np.ndarray, camera: Camera, depth_step: float) -> list[_Surface]:

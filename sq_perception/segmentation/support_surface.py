@@ -25,9 +25,10 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from sq_perception.geometry.kernels import inline_kernel, kernel
 from sq_perception.imaging import depth_steps
 from sq_perception.imaging.camera import Camera
-from sq_perception.segmentation.support_plane import Plane, noise_growth
+from sq_perception.segmentation.support_plane import LEAST_GROWTH, Plane, noise_growth
 
 _COARSE_PIXELS = 120
 _ROUNDS = 6
@@ -72,22 +73,14 @@ class SupportSurface:
     sigma: float
 
     def relative(self, points: np.ndarray) -> np.ndarray:
-        """Height (...) of points (..., 3) above the bent surface, as at one metre of depth."""
-        x, y = points[..., 0] / points[..., 2], points[..., 1] / points[..., 2]
-        bend = np.clip(_terms(x, y) @ self.bend, -self.limit, self.limit)
-        return self.plane.height(points) / noise_growth(points[..., 2]) - bend
+        """Height (n,) of points (n, 3) above the bent surface, as at one metre of depth."""
+        return np.asarray(_relative(points, self.plane.equation, self.bend, self.limit))
 
     def image_relative(self, depth: np.ndarray, camera: Camera) -> np.ndarray:
-        """The same, float32 (height, width), for every pixel of a pinhole camera's depth image."""
-        b = self.bend.astype(np.float32)
-        x = ((np.arange(camera.width) - camera.cx) / camera.fx).astype(np.float32)
-        y = ((np.arange(camera.height) - camera.cy) / camera.fy).astype(np.float32)
-        bend = (b[0] + b[1] * x + b[3] * x * x)[None, :] + (b[2] * y + b[5] * y * y)[:, None]
-        bend += (b[4] * y)[:, None] * x[None, :]
-        np.clip(bend, -self.limit, self.limit, out=bend)
-        relative = self.plane.image_height(depth, camera) / noise_growth(depth)
-        relative -= bend
-        return relative
+        """The same, float32 (height, width), for every pixel of a pinhole camera's depth image, 0 for depth 0."""
+        x = (np.arange(camera.width) - camera.cx) / camera.fx
+        y = (np.arange(camera.height) - camera.cy) / camera.fy
+        return np.asarray(_image_relative(depth, x, y, self.plane.equation, self.bend, self.limit))
 
 
 def measured(plane: Plane, depth: np.ndarray, valid: np.ndarray, camera: Camera, tolerance: float) -> SupportSurface:
@@ -141,7 +134,9 @@ def risen(
     ----------
     relative
         Heights (height, width) above the support, metres at a depth of one metre.
-    depth, valid, camera, tolerance
+    depth, valid : (height, width)
+        Metres, and where they are a measurement; both images are 0 elsewhere.
+    camera, tolerance
         As in :func:`measured`.
     step
         Share of the depth by which neighbouring pixels of one surface differ at most.
@@ -151,8 +146,8 @@ def risen(
     share = cv2.resize(valid.astype(np.float32), size, interpolation=cv2.INTER_AREA)
     known = share > 0.5
     weight = 1 / np.maximum(share, np.float32(0.5))
-    height = cv2.resize(np.where(valid, relative, np.float32(0)), size, interpolation=cv2.INTER_AREA) * weight
-    z = cv2.resize(np.where(valid, depth, np.float32(0)), size, interpolation=cv2.INTER_AREA) * weight
+    height = cv2.resize(relative, size, interpolation=cv2.INTER_AREA) * weight
+    z = cv2.resize(depth, size, interpolation=cv2.INTER_AREA) * weight
     width = z * np.float32(k / np.sqrt(camera.fx * camera.fy))
     # Only from where it is wide: the bottom of a bowl is as low.
     flat = depth_steps.components(known & (height < 0.5 * tolerance))
@@ -213,6 +208,36 @@ def _shallow(height: np.ndarray, z: np.ndarray, known: np.ndarray, width: np.nda
     ends = known[here, 2:] & known[here, :-2] & known[2:, here] & known[:-2, here]
     ok[here, here] = ends & (sine < _RAMP**2)
     return ok
+
+
+@inline_kernel
+def _bent(x: float, y: float, bend: np.ndarray, limit: float) -> float:
+    off = bend[0] + x * (bend[1] + bend[3] * x + bend[4] * y) + y * (bend[2] + bend[5] * y)
+    return min(max(off, -limit), limit)
+
+
+@kernel
+def _relative(points: np.ndarray, plane: np.ndarray, bend: np.ndarray, limit: float) -> np.ndarray:
+    height = np.empty(len(points))
+    for k in range(len(points)):
+        x, y, z = points[k, 0], points[k, 1], points[k, 2]
+        above = x * plane[0] + y * plane[1] + z * plane[2] + plane[3]
+        height[k] = above / max(z * z, LEAST_GROWTH) - _bent(x / z, y / z, bend, limit)
+    return height
+
+
+@kernel
+def _image_relative(
+    depth: np.ndarray, x: np.ndarray, y: np.ndarray, plane: np.ndarray, bend: np.ndarray, limit: float
+) -> np.ndarray:
+    height = np.zeros(depth.shape, np.float32)
+    for v in range(depth.shape[0]):
+        for u in range(depth.shape[1]):
+            z = np.float64(depth[v, u])
+            above = z * (plane[0] * x[u] + plane[1] * y[v] + plane[2]) + plane[3]
+            if z > 0:
+                height[v, u] = above / max(z * z, LEAST_GROWTH) - _bent(x[u], y[v], bend, limit)
+    return height
 
 
 def _terms(x: np.ndarray, y: np.ndarray) -> np.ndarray:

@@ -28,16 +28,31 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from sq_perception.geometry.kernels import kernel
 from sq_perception.imaging import depth_steps
 from sq_perception.imaging.camera import Camera
 
+_RADIUS = 0.01
+"""Half length of the chord, metres; up to twice as long where noise would hide the fold."""
+_FOLD = float(np.tan(np.deg2rad(33) / 2))
+"""A fold turns the normal by 33 degrees at least."""
+_STEEPEST = float(np.deg2rad(80))
+"""A surface turned farther from the line of sight shows steps, radians."""
+_NOISE_MARGIN = 1.5
+"""A fold is that many standard deviations of the noise; few, since the whole border of two patches is added up before
+they are parted.  Of 411 things of :mod:`~sq_perception.simulation.things_on_table` through four sensors 1.5 joined 61
+and cut 48, 2 joined 74 and cut 46."""
+_BENT_MARGIN = 0.5
+"""So is a curved patch off its plane, on average; less, as hundreds of samples tell it."""
+_LEAST_AREA = 1e-4
+"""Of a patch, square metres across the line of sight."""
 _RADIUS_SAMPLES = 4
 _MOST_SAMPLES = 50_000
 _LEAST_RADIUS = 2.0
 _CHORD_NOISE = float(np.sqrt(1.5))
 _DIRECTIONS = ((0, 1), (1, 0), (1, 1), (1, -1))
-_SHAPE_SAMPLES = 300
 _SHAPE_TERMS = 6
+"""Of a quadratic surface; twice as many samples tell its shape."""
 _FEWEST_CHORDS = 100
 _FULL = 0.9
 _MOST_PATCHES = 150
@@ -45,44 +60,6 @@ _CONCAVE_BAND = 0.3
 _SANE = (1e-3, 1e3)
 _FAR_RADII = 2.0
 """Chords are at most so many times longer where there is noise: 2 found 86.1 % of the same things, 3 84.7 %."""
-
-
-@dataclass(frozen=True)
-class FoldOptions:
-    """What counts as a fold.
-
-    Attributes
-    ----------
-    radius
-        Half length of the chord, metres; up to twice as long where noise would hide the fold.
-    angle
-        The normal turns at least by this, radians.
-    steepest
-        A surface turned farther from the line of sight shows steps, radians.
-    noise_margin
-        A fold is that many standard deviations of the noise; few, since the whole border of two patches is added up
-        before they are parted.  Of 411 things of :mod:`~sq_perception.simulation.things_on_table` through four sensors
-        1.5 joined 61 and cut 48, 2 joined 74 and cut 46.
-    bent_margin
-        So is a curved patch off its plane, on average; less, as hundreds of samples tell it.
-    least_area
-        Of a patch, square metres across the line of sight.
-    """
-
-    radius: float = 0.01
-    angle: float = float(np.deg2rad(33))
-    steepest: float = float(np.deg2rad(80))
-    noise_margin: float = 1.5
-    bent_margin: float = 0.5
-    least_area: float = 1e-4
-
-    def __post_init__(self) -> None:
-        for name in ("radius", "noise_margin", "bent_margin", "least_area"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}")
-        for name in ("angle", "steepest"):
-            if not 0 < getattr(self, name) < np.pi / 2:
-                raise ValueError(f"{name}: expected radians between 0 and pi / 2, got {getattr(self, name)}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +106,6 @@ def find(
     sigma: float,
     depth_step: float,
     flat: np.ndarray | None = None,
-    options: FoldOptions | None = None,
 ) -> Patches | None:
     """Patches of the wanted pixels of a pinhole camera.
 
@@ -150,7 +126,6 @@ def find(
     Patches or None
         None where nothing as large as a patch is wanted, or bodies are too far to show the chord in two pixels.
     """
-    options = options or FoldOptions()
     filled = np.where(wanted, depth, np.float32(0))
     some = filled[::4, ::4]
     some = some[some > 0]
@@ -159,30 +134,31 @@ def find(
     focal = float(np.sqrt(camera.fx * camera.fy))
     middle = float(np.median(some))
     longest = min(depth.shape) / 8
-    pixels = min(options.radius * focal / middle, longest)
+    pixels = min(_RADIUS * focal / middle, longest)
     if pixels < _LEAST_RADIUS:
         return None
     chord = _Chord.of(pixels, int(np.count_nonzero(wanted)))
-    noise = _chord_noise(depth, flat, chord, sigma)
+    every_inverse = 1 / np.clip(depth, *_SANE)
+    noise = _chord_noise(every_inverse, flat, chord, sigma)
     # The noise of a triangulating camera is alike over windows: longer chords see less of it as an angle.
-    hidden = options.noise_margin * noise * middle * focal / pixels / np.tan(options.angle / 2)
+    hidden = _NOISE_MARGIN * noise * middle * focal / pixels / _FOLD
     if hidden > 1:
         pixels = max(pixels, min(pixels * min(hidden, _FAR_RADII), longest))
         chord = _Chord.of(pixels, int(np.count_nonzero(wanted)))
-        noise = _chord_noise(depth, flat, chord, sigma)
-    half, stride, rho = chord.half, chord.stride, chord.rho
-    inverse, known = _inverse_depth(filled, wanted, half, stride)
+        noise = _chord_noise(every_inverse, flat, chord, sigma)
+    stride, rho = chord.stride, chord.rho
+    inverse, known = _mean(every_inverse, wanted, chord)
     coarse = filled[::stride, ::stride]
-    step = max(depth_step, float(np.tan(options.steepest)) * stride / focal)
+    step = max(depth_step, float(np.tan(_STEEPEST)) * stride / focal)
     stepped = _steps(filled, wanted, depth_step, stride)
     known &= coarse > 0
     fold = _fold(inverse, known & ~stepped, rho, stride / focal)
     angular = noise * focal / (rho * stride) * coarse
-    limit = np.maximum(np.tan(options.angle / 2), options.noise_margin * angular)
+    limit = np.maximum(_FOLD, _NOISE_MARGIN * angular)
     with np.errstate(invalid="ignore"):
         fold /= limit
         smooth = known & ~stepped & (np.abs(fold) < 1)
-    least = max(6, round(options.least_area * (focal / middle / stride) ** 2))
+    least = max(6, round(_LEAST_AREA * (focal / middle / stride) ** 2))
     seeds = _large(cv2.morphologyEx(smooth.astype(np.uint8), cv2.MORPH_OPEN, depth_steps.CROSS), least)
     free = (coarse > 0) & (seeds == 0)
     # Concave bands come last, so that two patches meet in the middle of theirs, even if the other edge of a narrow
@@ -197,7 +173,7 @@ def find(
     count += int(left.max())
     if count == 0:
         return None
-    curvature, planes = _shapes(seeds, count, inverse, camera, stride, options.bent_margin * sigma)
+    curvature, planes = _shapes(seeds, count, inverse, camera, stride, _BENT_MARGIN * sigma)
     return Patches(labels, count, depth[::stride, ::stride], stepped, fold, curvature, planes, stride, step)
 
 
@@ -218,14 +194,14 @@ class _Chord:
         return cls(max(1, round(pixels / _RADIUS_SAMPLES)), stride, max(2, round(pixels / stride)))
 
 
-def _chord_noise(depth: np.ndarray, flat: np.ndarray | None, chord: _Chord, sigma: float) -> float:
+def _chord_noise(every_inverse: np.ndarray, flat: np.ndarray | None, chord: _Chord, sigma: float) -> float:
     """Standard deviation of (w(p - rho) + w(p + rho)) / 2 - w(p) on a plane, 1 / metres.
 
     It is measured where there is one, since noise that is alike over a window of pixels is no smaller in the mean of
     a square; else it is that of independent noise.
     """
     if flat is not None:
-        inverse, known = _inverse_depth(np.where(flat, depth, np.float32(0)), flat, chord.half, chord.stride)
+        inverse, known = _mean(every_inverse, flat, chord)
         reach, rest = chord.rho, 2 * chord.rho
         both = []
         for w, ok in ((inverse, known), (inverse.T, known.T)):
@@ -238,12 +214,11 @@ def _chord_noise(depth: np.ndarray, flat: np.ndarray | None, chord: _Chord, sigm
     return _CHORD_NOISE * sigma / (2 * chord.half + 1)
 
 
-def _inverse_depth(filled: np.ndarray, wanted: np.ndarray, half: int, stride: int) -> tuple[np.ndarray, np.ndarray]:
-    """1/z on the grid, averaged over the wanted pixels of a square, and where nearly all of it is wanted."""
+def _mean(image: np.ndarray, wanted: np.ndarray, chord: _Chord) -> tuple[np.ndarray, np.ndarray]:
+    """An image on the grid, averaged over the wanted pixels of a square, and where nearly all of it is wanted."""
     mask = wanted.astype(np.float32)
-    inverse = np.where(wanted, 1 / np.clip(filled, *_SANE), 0).astype(np.float32)
-    side = (2 * half + 1, 2 * half + 1)
-    total = cv2.blur(inverse, side, borderType=cv2.BORDER_CONSTANT)[::stride, ::stride]
+    side, stride = (2 * chord.half + 1, 2 * chord.half + 1), chord.stride
+    total = cv2.blur(image * mask, side, borderType=cv2.BORDER_CONSTANT)[::stride, ::stride]
     share = cv2.blur(mask, side, borderType=cv2.BORDER_CONSTANT)[::stride, ::stride]
     known = share > _FULL
     return np.where(known, total / np.maximum(share, np.float32(1e-6)), np.float32(0)), known
@@ -303,27 +278,59 @@ def _shapes(
     With x = (u - cx)/fx and y = (v - cy)/fy, the second derivative of w in x or y is the curvature of a surface seen
     frontally, 1 / metres, positive where it is hollow.  What may be noise counts as 0.
     """
+    samples = np.bincount(seeds.ravel(), minlength=count + 1)
+    scale = np.array([stride / camera.fx, stride / camera.fy])
+    middle = np.array([camera.cx, camera.cy]) / stride
+    centre, gram = _grams(seeds, inverse, scale, middle, count)
     curvature, planes = np.zeros(count + 1), np.full((count + 1, 3), np.nan)
-    rows, columns = np.nonzero(seeds)
-    numbers = seeds[rows, columns].astype(np.uint16)
-    order = np.argsort(numbers, kind="stable")
-    rows, columns = rows[order], columns[order]
-    ends = np.cumsum(np.bincount(numbers, minlength=count + 1))
-    w = inverse[rows, columns].astype(float)
-    x, y = (columns * stride - camera.cx) / camera.fx, (rows * stride - camera.cy) / camera.fy
-    for label in range(1, count + 1):
-        part = slice(ends[label - 1], ends[label], max(1, (ends[label] - ends[label - 1]) // _SHAPE_SAMPLES))
-        if ends[label] - ends[label - 1] < _SHAPE_TERMS + 4:
-            continue
-        x0, y0 = x[part].mean(), y[part].mean()
-        p, q = x[part] - x0, y[part] - y0
-        design = np.stack([p, q, np.ones_like(p), p * p, p * q, q * q, w[part]])
-        gram = design @ design.T
-        a, b, c = np.linalg.lstsq(gram[:3, :3], gram[:3, 6], rcond=None)[0]
-        planes[label] = a, b, c - a * x0 - b * y0
-        bent = np.linalg.lstsq(gram[:6, :6], gram[:6, 6], rcond=None)[0]
-        # What the curvature explains, w - w_plane, may be noise if it is small beside that of single pixels.
-        explained = bent @ gram[:6, 6] - np.array([a, b, c]) @ gram[:3, 6]
-        if explained > p.size * least_bend**2:
-            curvature[label] = 2 * (bent[3] + bent[5])
+    told = np.flatnonzero(samples[1:] >= 2 * _SHAPE_TERMS) + 1
+    gram, centre = gram[told], centre[told]
+    flat = _solved(gram, 3)
+    planes[told] = flat
+    planes[told, 2] -= np.einsum("ij,ij->i", flat[:, :2], centre)
+    bent = _solved(gram, _SHAPE_TERMS)
+    # What the curvature explains, w - w_plane, may be noise if it is small beside that of single pixels.
+    explained = np.einsum("ij,ij->i", bent, gram[:, :6, 6]) - np.einsum("ij,ij->i", flat, gram[:, :3, 6])
+    curvature[told] = np.where(explained > samples[told] * least_bend**2, 2 * (bent[:, 3] + bent[:, 5]), 0)
     return curvature, planes
+
+
+def _solved(gram: np.ndarray, terms: int) -> np.ndarray:
+    """Least squares (n, terms) by the first terms, of normal equations (n, 7, 7) whose last column is the right side.
+
+    Terms that the samples do not tell apart are shared out, as by the pseudoinverse.
+    """
+    scale = 1 / np.sqrt(np.maximum(np.einsum("ijj->ij", gram[:, :terms, :terms]), 1e-300))
+    normal = gram[:, :terms, :terms] * scale[:, :, None] * scale[:, None, :]
+    inverse = np.linalg.pinv(normal, rcond=1e-12, hermitian=True)
+    return scale * np.einsum("ijk,ik->ij", inverse, scale * gram[:, :terms, 6])
+
+
+@kernel
+def _grams(
+    seeds: np.ndarray, inverse: np.ndarray, scale: np.ndarray, middle: np.ndarray, count: int
+) -> tuple[np.ndarray, np.ndarray]:
+    """Of each patch the middle (count + 1, 2), and the sums of the products (count + 1, 7, 7) of p, q, 1, p p, p q, q q
+    and w, p and q counted from there."""
+    rows, columns = seeds.shape
+    centre, number = np.zeros((count + 1, 2)), np.zeros(count + 1)
+    for r in range(rows):
+        for c in range(columns):
+            label = seeds[r, c]
+            if label > 0:
+                number[label] += 1
+                centre[label, 0] += scale[0] * (c - middle[0])
+                centre[label, 1] += scale[1] * (r - middle[1])
+    for label in range(count + 1):
+        centre[label] /= max(number[label], 1.0)
+    gram = np.zeros((count + 1, 7, 7))
+    for r in range(rows):
+        for c in range(columns):
+            label = seeds[r, c]
+            if label > 0:
+                p, q = scale[0] * (c - middle[0]) - centre[label, 0], scale[1] * (r - middle[1]) - centre[label, 1]
+                term = (p, q, 1.0, p * p, p * q, q * q, np.float64(inverse[r, c]))
+                for i in range(7):
+                    for j in range(7):
+                        gram[label, i, j] += term[i] * term[j]
+    return centre, gram

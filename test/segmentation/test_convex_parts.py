@@ -113,8 +113,6 @@ def test_nothing_to_say_changes_nothing(depth):
 
 
 def test_options_are_checked():
-    with pytest.raises(ValueError, match="least_gap"):
-        SightOptions(least_gap=0.0)
     with pytest.raises(ValueError, match="apart"):
         SightOptions(apart=1.5)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sq_perception.imaging.camera import Camera
-from sq_perception.segmentation.patch_grouping import GroupingOptions, bodies
+from sq_perception.segmentation.patch_grouping import bodies
 from sq_perception.segmentation.surface_patches import Patches
 
 CAMERA = Camera(60, 40, 50.0, 50.0, 29.5, 19.5)
@@ -100,10 +100,3 @@ def test_attached_fragments_join_and_free_ones_stay():
     fold = np.full((40, 60), 1.5)
     body = bodies(patches(labels, fold=fold), CAMERA)
     assert body[2] == body[1] != body[3]
-    kept = bodies(patches(labels, fold=fold), CAMERA, GroupingOptions(least_area=1e-4))
-    assert len(set(kept[1:].tolist())) == 3
-
-
-def test_misuse_is_refused():
-    with pytest.raises(ValueError, match="least_area"):
-        GroupingOptions(least_area=0.0)

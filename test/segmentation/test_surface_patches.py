@@ -10,7 +10,8 @@ from sq_perception.geometry import rotation
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
-from sq_perception.segmentation.surface_patches import FoldOptions, find
+from sq_perception.segmentation import surface_patches
+from sq_perception.segmentation.surface_patches import find
 
 CAMERA = Camera(320, 240, 525.0, 525.0, 159.5, 119.5)
 STEP = 0.015
@@ -22,9 +23,9 @@ def plane_depth(normal, distance):
     return distance / (CAMERA.rays(u, v)[1] @ np.asarray(normal, float))
 
 
-def patches(depth, wanted=None, sigma=1e-4, **options):
+def patches(depth, wanted=None, sigma=1e-4):
     depth = np.where(np.isfinite(depth), depth, 0).astype(np.float32)
-    return find(depth, depth > 0 if wanted is None else wanted, CAMERA, sigma, STEP, None, FoldOptions(**options))
+    return find(depth, depth > 0 if wanted is None else wanted, CAMERA, sigma, STEP)
 
 
 def turned(angle):
@@ -49,7 +50,7 @@ def test_an_edge_folds_by_the_tangent_of_half_its_angle(half, sign):
     found = patches(np.minimum(left, right) if sign > 0 else np.maximum(left, right))
     assert found.count == 2
     middle = found.fold.shape[1] // 2
-    s = found.fold[20:-20, middle - 1 : middle + 2] * np.tan(FoldOptions().angle / 2)
+    s = found.fold[20:-20, middle - 1 : middle + 2] * surface_patches._FOLD
     # The mean over a square blunts the edge by up to a quarter of the chord's radius.
     assert 0.7 * np.tan(half) < np.nanmax(sign * s) < 1.05 * np.tan(half)
 
@@ -108,9 +109,3 @@ def test_bodies_too_far_for_a_chord_have_no_patches():
 
 def test_nothing_wanted():
     assert patches(np.full((240, 320), np.nan)) is None
-
-
-@pytest.mark.parametrize("wrong", [{"radius": 0.0}, {"angle": 2.0}, {"steepest": 0.0}, {"least_area": -1.0}])
-def test_misuse_is_refused(wrong):
-    with pytest.raises(ValueError, match=next(iter(wrong))):
-        FoldOptions(**wrong)

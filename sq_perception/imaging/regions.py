@@ -1,0 +1,42 @@
+"""Regions of a label image: int32 (height, width), 0 for nothing, labels from 1."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sq_perception.geometry.kernels import kernel
+
+
+def extents(labels: np.ndarray) -> np.ndarray:
+    """Of each label (count + 1, 5): how many pixels it has, its first row, the one after its last, and its columns
+    alike.  All 0 for a label without pixels and for 0."""
+    labels = np.ascontiguousarray(labels, dtype=np.int32)
+    return np.asarray(_extents(labels, int(labels.max(initial=0))))
+
+
+def pixels(labels: np.ndarray, label: int, extent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns of a label's pixels, by its extent."""
+    _, top, bottom, left, right = extent.tolist()
+    rows, columns = np.nonzero(labels[top:bottom, left:right] == label)
+    return rows + top, columns + left
+
+
+@kernel
+def _extents(labels: np.ndarray, count: int) -> np.ndarray:
+    height, width = labels.shape
+    found = np.zeros((count + 1, 5), np.int64)
+    for v in range(height):
+        u = 0
+        while u < width:
+            label, first = labels[v, u], u
+            while u < width and labels[v, u] == label:
+                u += 1
+            if label > 0:
+                one = found[label]
+                if one[0] == 0:
+                    one[1], one[3] = v, first
+                one[0] += u - first
+                one[2] = v + 1
+                one[3] = min(one[3], first)
+                one[4] = max(one[4], u)
+    return found
