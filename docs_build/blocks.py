@@ -281,12 +281,12 @@ def speed() -> str:
     found = results("speed")
 
     def shares(part: dict[str, float]) -> str:
-        return " / ".join(f"{100 * share:.0f}" for share in part.values())
+        return "/".join(f"{100 * share:.0f}" for share in part.values())
 
     heads = ["frame", "loops before", "now", "times the classic fits before", "now"]
     heads += [
-        "segmentation / network / fit / repair / score %",
-        "compiled / libraries / interpreter %",
+        "segmentation/network/fit/repair/score %",
+        "compiled/libraries/interpreter %",
         "IoU % before",
         "now",
     ]
@@ -303,18 +303,22 @@ def known() -> str:
     """Recorded frames of known sizes: what the fit makes of each kind."""
     groups = results("known_frames")["groups"]
 
-    def row(title: str, method: str, one: dict[str, Any]) -> list[str]:
-        sigma = "-" if one["two_sigma"] is None else f"{100 * one['two_sigma']:.0f}"
-        errors = f"{1e3 * one['error_median']:.1f} / {1e3 * one['error_mean']:.1f}"
-        iou = "-" if one["iou"] is None else f"{100 * one['iou']:.1f}"
-        return [title, method, str(one["things"]), iou, errors, sigma]
+    def both(kind: str, key: str, scale: float, digits: int = 1) -> str:
+        pair = (groups[kind][f"auto, {masks}"][key] for masks in ("given", "own"))
+        return " / ".join("-" if one is None else f"{scale * one:.{digits}f}" for one in pair)
 
-    rows = []
-    for kind in ("box", "cylinder", "bottle", "vessel", "other"):
-        rows += [row(kind, method, groups[kind][method]) for method in ("auto, given", "auto, own")]
-    return table(
-        ["things", "method, masks", "number", "IoU %", "error of edges mm, median / mean", "2 sigma %"], rows
-    ) + measured("known_frames")
+    rows = [
+        [
+            kind,
+            str(groups[kind]["auto, given"]["things"]),
+            both(kind, "iou", 100),
+            both(kind, "error_median", 1e3),
+            both(kind, "two_sigma", 100, 0),
+        ]
+        for kind in ("box", "cylinder", "bottle", "vessel", "other")
+    ]
+    heads = ["things", "number", "IoU %, masks given / own", "error of edges mm, median", "within 2 sigma %"]
+    return table(heads, rows) + measured("known_frames")
 
 
 def recorded() -> str:
@@ -341,7 +345,7 @@ def recorded() -> str:
 
 
 def picking() -> str:
-    """Grasps in physics: how often one holds, how much is cleared, and what went wrong."""
+    """Grasps in physics: how often one holds, and how much is cleared."""
     names = {
         "ours": "recovered bodies, with their covariance",
         "ours without sigma": "the same, 10 % of the size as sigma",
@@ -350,15 +354,19 @@ def picking() -> str:
         "box": "smallest box of the seen points",
         "centroid": "straight down on the points' middle, no planner",
     }
-    asked = {"packed": "93 / 92", "pile": "80 / 70"}
-    causes = ("collision", "missed", "slipped")
+    found = results("picking")["rows"]
     rows = []
-    for name, one in results("picking")["rows"].items():
-        kind, _, who = name.partition(": ")
-        rates = [f"{one[rate][0]:.0f} ({one[rate][1]:.0f} to {one[rate][2]:.0f})" for rate in ("gsr", "dr")]
-        numbers = [str(one["causes"][cause]) for cause in causes]
-        rows.append([kind, names[who], str(one["scenes"]), *rates, asked[kind] if who == "ours" else "", *numbers])
-    return table(["scenes", "planned on", "number", "GSR %", "DR %", "asked", *causes], rows) + measured("picking")
+    for who, text in names.items():
+        kinds = [found.get(f"{kind}: {who}") for kind in ("packed", "pile")]
+        scenes = " / ".join(str(one["scenes"]) if one else "-" for one in kinds)
+        rows.append([text, scenes, *(_rate(one[rate]) if one else "-" for one in kinds for rate in ("gsr", "dr"))])
+    heads = ["planned on", "scenes, packed / pile", "packed: GSR %", "DR %", "pile: GSR %", "DR %"]
+    return table(heads, rows) + measured("picking")
+
+
+def _rate(one: list[float]) -> str:
+    """A rate in per cent with its interval."""
+    return "{:.0f} ({:.0f}-{:.0f})".format(*one)
 
 
 BLOCKS: dict[str, Callable[[], str]] = {

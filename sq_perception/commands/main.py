@@ -25,7 +25,10 @@ COMMANDS = {
     "view": ("sq_perception.commands.view", "a page in the browser: depth, bodies, parameters (extras 'ros', 'view')"),
     "train": ("sq_perception.commands.train", "train a network"),
     "thing-views": ("sq_perception.commands.thing_views", "draw views of household things to train on"),
-    "train-things": ("sq_perception.commands.train_things", "train the network that tells the unseen side of things"),
+    "train-things": (
+        "sq_perception.commands.train_things",
+        "train the network that predicts the unseen side of things",
+    ),
     "dataset": ("sq_perception.commands.dataset", "write a fixed set of training and test images"),
     "evaluate": ("sq_perception.commands.evaluate", "the thesis' tables and plots, for networks and fits"),
     "render-search": ("sq_perception.commands.render_search", "find the best s and tau of the soft renderer"),

@@ -1,4 +1,4 @@
-"""``sq-perception train-things``: train the network that tells the unseen side of things."""
+"""``sq-perception train-things``: train the network that predicts the unseen side of things."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from sq_perception.commands.console import FAILURE, SUCCESS, failed, parser
 
 _HELP = """\
-Train the network that tells the unseen side of things, on views that `thing-views` wrote (or still writes).
+Train the network that predicts the unseen side of things, on views that `thing-views` wrote (or still writes).
 
 The same command goes on with a run that was stopped.  The output folder holds the state, a log, and the newest network,
 things.safetensors, which `recover --model` takes.
