@@ -34,7 +34,7 @@ import report
 import tracking
 from gallery_figures import (
     FAINT,
-    Found,
+    MatchedThing,
     empty_figure,
     matched,
     panel_title,
@@ -67,12 +67,12 @@ WRAPPED: dict[str, Any] = {"break_long_words": False, "break_on_hyphens": False}
 # Figures of a scene
 
 
-def _surplus(found: Sequence[Found], frame: FrameRecovery) -> list[Recovery]:
+def _surplus(found: Sequence[MatchedThing], frame: FrameRecovery) -> list[Recovery]:
     taken = {one.body.label for one in found if one.body is not None}
     return [body for body in frame.recovered if body.label not in taken]
 
 
-def mean_iou(found: Sequence[Found]) -> float:
+def mean_iou(found: Sequence[MatchedThing]) -> float:
     """Per cent."""
     return 100 * float(np.mean([one.iou for one in found]))
 
@@ -91,7 +91,7 @@ class Entry:
 def of_scene(
     title: str,
     things: Sequence[Stood],
-    text: Callable[[list[Found], FrameRecovery], str],
+    text: Callable[[list[MatchedThing], FrameRecovery], str],
     sensor: str = "realsense_d435",
     azimuth: float = 35.0,
     **where: float,
@@ -108,7 +108,7 @@ def of_scene(
     return draw
 
 
-def _can(found: list[Found], frame: FrameRecovery) -> str:
+def _can(found: list[MatchedThing], frame: FrameRecovery) -> str:
     (one,) = found
     return (
         f"A can of {_edges(one)} mm. The camera never sees its back: that comes from the silhouette and the curvature "
@@ -116,7 +116,7 @@ def _can(found: list[Found], frame: FrameRecovery) -> str:
     )
 
 
-def _kitchen(found: list[Found], frame: FrameRecovery) -> str:
+def _kitchen(found: list[MatchedThing], frame: FrameRecovery) -> str:
     hidden = min(found, key=lambda one: one.visible)
     return (
         f"Six things that stand before each other, the {hidden.stood.name} {100 * hidden.visible:.0f} % visible. "
@@ -125,7 +125,7 @@ def _kitchen(found: list[Found], frame: FrameRecovery) -> str:
     )
 
 
-def _kitchen_light(found: list[Found], frame: FrameRecovery) -> str:
+def _kitchen_light(found: list[MatchedThing], frame: FrameRecovery) -> str:
     light, stereo = (1e3 * float(sensor_noise.preset(name).sigma(0.85)) for name in ("kinect_v1", "realsense_d435"))
     return (
         f"Noise of {light:.1f} mm at 0.85 m where stereo has {stereo:.1f}. {_count(found, frame)} Mean IoU "
@@ -133,14 +133,14 @@ def _kitchen_light(found: list[Found], frame: FrameRecovery) -> str:
     )
 
 
-def _touching(found: list[Found], frame: FrameRecovery) -> str:
+def _touching(found: list[MatchedThing], frame: FrameRecovery) -> str:
     return (
         f"Three boxes and a can, each touching another. {_count(found, frame)} What parts them are folds in the depth, "
         f"and lines of sight that pass through the empty space between them. Mean IoU {mean_iou(found):.0f} %."
     )
 
 
-def _bottles(found: list[Found], frame: FrameRecovery) -> str:
+def _bottles(found: list[MatchedThing], frame: FrameRecovery) -> str:
     worst = min(found, key=lambda one: one.iou)
     return (
         f"No superquadric has a shoulder and a neck: one body leaves out the neck, or bottle and neck become two. "
@@ -149,7 +149,7 @@ def _bottles(found: list[Found], frame: FrameRecovery) -> str:
     )
 
 
-def _hidden(found: list[Found], frame: FrameRecovery) -> str:
+def _hidden(found: list[MatchedThing], frame: FrameRecovery) -> str:
     one = next(each for each in found if each.stood.name == "hidden box")
     if one.body is None:
         return "A box behind another one. Nothing was recovered of the hidden one."
@@ -166,11 +166,11 @@ def _hidden(found: list[Found], frame: FrameRecovery) -> str:
     )
 
 
-def _edges(one: Found) -> str:
+def _edges(one: MatchedThing) -> str:
     return " x ".join(f"{1e3 * edge:.0f}" for edge in one.stood.thing.edges)
 
 
-def _count(found: list[Found], frame: FrameRecovery) -> str:
+def _count(found: list[MatchedThing], frame: FrameRecovery) -> str:
     missed = [one.stood.name for one in found if one.body is None]
     matched_bodies = sum(one.body is not None for one in found)
     extra = len(frame.recovered) - matched_bodies
@@ -179,7 +179,7 @@ def _count(found: list[Found], frame: FrameRecovery) -> str:
     return text + (f", and there are {extra} bodies too many{_where(found, frame)}." if extra else ", none too many.")
 
 
-def _where(found: list[Found], frame: FrameRecovery) -> str:
+def _where(found: list[MatchedThing], frame: FrameRecovery) -> str:
     """What the surplus bodies are pieces of."""
     names = set()
     for body in _surplus(found, frame):
@@ -188,7 +188,7 @@ def _where(found: list[Found], frame: FrameRecovery) -> str:
     return f", pieces of {' and '.join(sorted(names))}" if names else ""
 
 
-def _bias(found: list[Found]) -> float:
+def _bias(found: list[MatchedThing]) -> float:
     """Recovered minus true edges, mean, millimetres."""
     errors = [
         2e3 * np.sort(one.body.superquadric.size) - 1e3 * one.stood.thing.edges for one in found if one.body is not None

@@ -49,7 +49,7 @@ _SEGMENTS = 64
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class MatchedThing:
     """A thing and its body; None where nothing was recovered of it.  ``labels`` is the frame's true label image."""
 
     stood: Stood
@@ -64,7 +64,7 @@ def recoverer() -> Recoverer:
     return Recoverer()
 
 
-def matched(view: View, frame: FrameRecovery) -> list[Found]:
+def matched(view: View, frame: FrameRecovery) -> list[MatchedThing]:
     """Each thing with its body."""
     iou = np.zeros((len(view.things), len(frame.recovered)))
     for k in range(len(view.things)):
@@ -73,7 +73,7 @@ def matched(view: View, frame: FrameRecovery) -> list[Found]:
     rows, chosen = linear_sum_assignment(-iou)
     pairs = {k: j for k, j in zip(rows, chosen, strict=True) if iou[k, j] > 0}
     return [
-        Found(
+        MatchedThing(
             stood,
             view.labels,
             float(view.visible[k]),

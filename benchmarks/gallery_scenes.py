@@ -14,7 +14,7 @@ import mesh_scene
 import mesh_things
 import numpy as np
 import tabletop
-from mesh_things import Thing
+from mesh_things import MeshThing
 
 from sq_perception.imaging.camera import Camera
 from sq_perception.simulation import sensor_noise
@@ -28,7 +28,7 @@ class Stood:
     """A thing on a table: its middle there (to the right, away from the camera), metres, and its heading, degrees."""
 
     name: str
-    thing: Thing
+    thing: MeshThing
     place: tuple[float, float]
     heading: float = 0.0
     turn: np.ndarray = field(default_factory=lambda: mesh_things.UPRIGHT)
@@ -103,16 +103,16 @@ def viewed(things: Sequence[Stood], sensor: str, down: float = 40.0, distance: f
     return View(camera, sensor, measured, labels, plane, tuple(things), tuple(poses), visible)
 
 
-def carton(width: float, depth: float, height: float) -> Thing:
+def carton(width: float, depth: float, height: float) -> MeshThing:
     """A box with these edges along x, y and z, millimetres, rounded by 2 mm; none need be the shortest."""
     return mesh_things.rounded_box(np.array([width, depth, height]) / 1e3, 0.002)
 
 
-def can(diameter: float, height: float) -> Thing:
+def can(diameter: float, height: float) -> MeshThing:
     return mesh_things.cylinder(diameter / 1e3, height / 1e3, 0.002)
 
 
-def bottle(number: int) -> Thing:
+def bottle(number: int) -> MeshThing:
     return mesh_things.bottle(np.random.default_rng(number))
 
 

@@ -15,27 +15,21 @@ the half sizes of each kind within two reported deviations.
 
 from __future__ import annotations
 
-import argparse
 import os
 
 if __name__ == "__main__":  # as a script only: a process that imports this has threads already
     for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
 
-import json
 from functools import partial
-from pathlib import Path
-from typing import Any
 
 import mesh_things
 import numpy as np
 import real_scenes
-import report
 import scene_verdict
 import tabletop
 import trimesh
-from real_scenes import HEADER, WORST, WORST_HEADER
-from scene_verdict import METHODS, Judged, SceneVerdict
+from scene_verdict import Judged, SceneVerdict
 from scipy.spatial import ConvexHull
 from things_on_table import PlacedThing, hull_points, things_on_table
 
@@ -44,9 +38,7 @@ from sq_perception.simulation import sensor_noise
 from sq_perception.simulation.household import KINDS
 
 SEED = 7801
-HALF = 0.5
 GOALS = {"given": "88", "own": "85"}
-SHARES = {"all visible (90 % and more)": (0.9, np.inf), "50 to 90 %": (0.5, 0.9), "under 50 %": (0.0, 0.5)}
 NAMES = ("round bottle", "oval bottle")
 WAYS = ("standing", "lying", "leaning", "stacked")
 
@@ -68,7 +60,7 @@ def _known(placed: PlacedThing) -> tabletop.Placed:
     points = hull_points(thing.parts)
     hull = points[ConvexHull(points).vertices]
     edges = np.sort(thing.box[1] - thing.box[0])
-    known = mesh_things.Thing(thing.kind, thing.name, trimesh.convex.convex_hull(hull), hull, edges, ())
+    known = mesh_things.MeshThing(thing.kind, thing.name, trimesh.convex.convex_hull(hull), hull, edges, ())
     matrix = quaternions.to_matrix(placed.rotation)
     return tabletop.Placed(known, placed.rest, matrix, placed.translation, placed.label, placed.pixels, placed.alone)
 
@@ -80,54 +72,17 @@ def verdict(seed: int, sensor: str | None) -> SceneVerdict:
 
 def groups(everything: list[Judged]) -> dict[str, list[Judged]]:
     """The rows of the table: by kind, bottles apart, by the way a thing came to rest, by sensor, by visible share."""
-    half = [one for one in everything if one.visible_share >= HALF]
-    rows: dict[str, list[Judged]] = {"**all, at least half visible**": half}
+    half = [one for one in everything if one.visible_share >= real_scenes.HALF]
+    rows: dict[str, list[Judged]] = {real_scenes.ALL: half}
     rows |= {kind: [one for one in half if one.kind == kind] for kind in KINDS}
     rows |= {name: [one for one in half if one.name == name] for name in NAMES}
     rows |= {way: [one for one in half if one.rest.startswith(way)] for way in WAYS}
-    rows |= {sensor: [one for one in half if one.sensor == sensor] for sensor in tabletop.SENSORS}
-    for name, (low, high) in SHARES.items():
-        rows[f"visible: {name}"] = [one for one in everything if low <= one.visible_share < high]
-    return {name: chosen for name, chosen in rows.items() if chosen}
-
-
-def tables(verdicts: list[SceneVerdict]) -> tuple[dict[str, Any], str]:
-    """All figures, as numbers and as Markdown."""
-    everything = [one for each in verdicts for one in each.judged]
-    result, rows = {}, []
-    for name, chosen in groups(everything).items():
-        whole = name.startswith("**")
-        for method in METHODS if whole else ("given", "own"):
-            figures = real_scenes.summary(chosen, method)
-            result[f"{name.strip('*')}: {method}"] = figures
-            rows.append(real_scenes.line(name, method, figures, GOALS.get(method, "-") if whole else ""))
-    chain_result, chain_text = real_scenes.chain(verdicts)
-    text = [report.table(HEADER, rows), "Whole chain and times\n\n" + chain_text]
-    half = [one for one in everything if one.visible_share >= HALF]
-    for method in ("given", "own"):
-        order = sorted(half, key=lambda one: one.answers[method].iou)[:WORST]
-        worst = [real_scenes.worst_line(one, method) for one in order]
-        text.append(f"The worst with masks {method}\n\n{report.table(WORST_HEADER, worst)}")
-    return {**chain_result, **result}, "\n\n".join(text)
+    return rows | real_scenes.by_sensor_and_share(half, everything)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("--scenes", type=int, default=1000, help="number of scenes")
-    parser.add_argument("--first", type=int, default=0, help="seed of the first scene")
-    parser.add_argument("--sensor", choices=list(tabletop.SENSORS), help="one for all scenes; they alternate otherwise")
-    parser.add_argument("--jobs", type=int, default=1, help="processes, each of one thread")
-    parser.add_argument("--each", type=Path, help="write every thing's figures and bodies to this file, JSON")
-    parser.add_argument("--name", default="household_things", help="name of the result files")
-    options = parser.parse_args()
-    seeds = range(options.first, options.first + options.scenes)
-    verdicts = list(real_scenes.judged(partial(verdict, sensor=options.sensor), seeds, options.jobs))
-    if options.each is not None:
-        everything = [real_scenes.thing_facts(one) for each in verdicts for one in each.judged]
-        options.each.write_text(json.dumps(everything, indent=1) + "\n")
-    result, text = tables(verdicts)
-    facts = {name: str(value) if isinstance(value, Path) else value for name, value in vars(options).items()}
-    report.write(options.name, {"seed": SEED, "options": facts, **result}, text)
+    options = real_scenes.arguments(__doc__, "household_things").parse_args()
+    real_scenes.run(partial(verdict, sensor=options.sensor), options, groups, GOALS, seed=SEED)
 
 
 if __name__ == "__main__":

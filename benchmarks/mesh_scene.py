@@ -36,7 +36,7 @@ QUANTUM = 0.001
 
 
 @dataclass(frozen=True)
-class View:
+class MeshView:
     """One object in one image.
 
     Attributes
@@ -135,7 +135,7 @@ def resting(hull: trimesh.Trimesh) -> Poser:
     return pose
 
 
-def view(mesh: trimesh.Trimesh, pose: Poser, rng: np.random.Generator) -> View:
+def view(mesh: trimesh.Trimesh, pose: Poser, rng: np.random.Generator) -> MeshView:
     """One image of the mesh through the sensor; poses that the image cuts are drawn again."""
     while True:
         turn, translation, plane = pose(rng)
@@ -147,7 +147,7 @@ def view(mesh: trimesh.Trimesh, pose: Poser, rng: np.random.Generator) -> View:
     mask = np.isfinite(depth)
     if plane is not None:
         depth = np.where(mask, depth, plane_depth(plane, CAMERA))
-    return View(measured(depth, rng), mask, CAMERA, plane, turn, translation)
+    return MeshView(measured(depth, rng), mask, CAMERA, plane, turn, translation)
 
 
 def measured(depth: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -34,7 +34,7 @@ ROUNDING_STEPS = 5
 
 
 @dataclass(frozen=True, eq=False)
-class Rest:
+class MeshRest:
     """A way to lie on a table: the rotation (3, 3) from the thing's frame to one with z up, and its probability."""
 
     name: str
@@ -43,7 +43,7 @@ class Rest:
 
 
 @dataclass(frozen=True, eq=False)
-class Thing:
+class MeshThing:
     """One household object.
 
     Attributes
@@ -63,7 +63,7 @@ class Thing:
     mesh: trimesh.Trimesh
     hull: np.ndarray
     edges: np.ndarray
-    rests: tuple[Rest, ...]
+    rests: tuple[MeshRest, ...]
 
     @cached_property
     def columns(self) -> Columns:
@@ -76,7 +76,7 @@ ON_X = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
 ON_Y = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 
 
-def box(rng: np.random.Generator) -> Thing:
+def box(rng: np.random.Generator) -> MeshThing:
     """A carton."""
     longest = np.exp(rng.uniform(np.log(0.06), np.log(0.30)))
     middle = longest * rng.uniform(0.45, 1.0)
@@ -85,21 +85,21 @@ def box(rng: np.random.Generator) -> Thing:
     return rounded_box(edges, rng.uniform(0.0005, 0.004))
 
 
-def rounded_box(edges: np.ndarray, radius: float) -> Thing:
+def rounded_box(edges: np.ndarray, radius: float) -> MeshThing:
     """The carton with these full edges (3,), ascending, along x, y and z, whose edges are rounded."""
     ball = trimesh.creation.icosphere(subdivisions=2, radius=radius).vertices
     corners = np.array(list(product((-0.5, 0.5), repeat=3))) * (np.asarray(edges) - 2 * radius)
     surface = trimesh.convex.convex_hull((corners[:, None] + ball).reshape(-1, 3))
-    rests = Rest("standing", UPRIGHT, 0.3), Rest("flat", ON_X, 0.4), Rest("on its side", ON_Y, 0.3)
-    return Thing("box", "box", surface, surface.vertices, np.sort(edges), rests)
+    rests = MeshRest("standing", UPRIGHT, 0.3), MeshRest("flat", ON_X, 0.4), MeshRest("on its side", ON_Y, 0.3)
+    return MeshThing("box", "box", surface, surface.vertices, np.sort(edges), rests)
 
 
-def can(rng: np.random.Generator) -> Thing:
+def can(rng: np.random.Generator) -> MeshThing:
     """A cylinder."""
     return cylinder(rng.uniform(0.05, 0.11), rng.uniform(0.04, 0.20), rng.uniform(0.001, 0.003))
 
 
-def cylinder(diameter: float, height: float, rim: float) -> Thing:
+def cylinder(diameter: float, height: float, rim: float) -> MeshThing:
     """The cylinder with rounded rims that stands on the origin."""
     angle = np.linspace(0, np.pi / 2, ROUNDING_STEPS)
     r = diameter / 2 - rim + rim * np.sin(angle)
@@ -108,7 +108,7 @@ def cylinder(diameter: float, height: float, rim: float) -> Thing:
     return _revolved("can", "can", profile, lying=0.25)
 
 
-def bottle(rng: np.random.Generator) -> Thing:
+def bottle(rng: np.random.Generator) -> MeshThing:
     """Body, a smooth shoulder, neck."""
     radius, height, neck = rng.uniform(0.06, 0.09) / 2, rng.uniform(0.15, 0.28), rng.uniform(0.011, 0.02)
     low = height * rng.uniform(0.5, 0.68)
@@ -122,7 +122,7 @@ def bottle(rng: np.random.Generator) -> Thing:
     return _revolved("bottle", "bottle", np.array(profile), lying=0.2)
 
 
-def vessel(rng: np.random.Generator) -> Thing:
+def vessel(rng: np.random.Generator) -> MeshThing:
     """A bowl that widens upwards, or a straight cup without a handle."""
     wall = 0.004
     if rng.random() < 0.5:
@@ -140,32 +140,37 @@ def vessel(rng: np.random.Generator) -> Thing:
     return _revolved("vessel", name, profile, lying=0.0)
 
 
-def scans(folder: Path | None) -> tuple[Thing, ...]:
+def scans(folder: Path | None) -> tuple[MeshThing, ...]:
     """The YCB objects of a folder; none without one."""
     return () if folder is None else _scans(folder)
 
 
 @cache
-def _scans(folder: Path) -> tuple[Thing, ...]:
+def _scans(folder: Path) -> tuple[MeshThing, ...]:
     found = []
     for path in sorted(path for path in folder.glob("*.ply") if ".hull" not in path.name):
         mesh = trimesh.load_mesh(path, process=False)
         hull = trimesh.load_mesh(path.with_suffix(".hull.ply"), process=False)
         poses, likely = hull.compute_stable_poses()
         rests = tuple(
-            Rest(f"rest {k}", pose[:3, :3], share)
+            MeshRest(f"rest {k}", pose[:3, :3], share)
             for k, (pose, share) in enumerate(zip(poses, likely / likely.sum(), strict=True))
         )
         edges = np.sort(trimesh.bounds.oriented_bounds(hull)[1])
         name = path.stem.split("_", 1)[-1].replace("_", " ")
-        found.append(Thing("scan", name, mesh, np.asarray(hull.vertices), edges, rests))
+        found.append(MeshThing("scan", name, mesh, np.asarray(hull.vertices), edges, rests))
     return tuple(found)
 
 
-MAKERS: dict[str, Callable[[np.random.Generator], Thing]] = {"box": box, "can": can, "bottle": bottle, "vessel": vessel}
+MAKERS: dict[str, Callable[[np.random.Generator], MeshThing]] = {
+    "box": box,
+    "can": can,
+    "bottle": bottle,
+    "vessel": vessel,
+}
 
 
-def draw(rng: np.random.Generator, kinds: dict[str, float], scanned: tuple[Thing, ...]) -> Thing:
+def draw(rng: np.random.Generator, kinds: dict[str, float], scanned: tuple[MeshThing, ...]) -> MeshThing:
     """A random thing of one of the kinds, by their weights."""
     names = [name for name, weight in kinds.items() if weight > 0 and (name != "scan" or scanned)]
     weights = np.array([kinds[name] for name in names])
@@ -173,10 +178,10 @@ def draw(rng: np.random.Generator, kinds: dict[str, float], scanned: tuple[Thing
     return scanned[rng.integers(len(scanned))] if kind == "scan" else MAKERS[kind](rng)
 
 
-def _revolved(kind: str, name: str, profile: np.ndarray, lying: float) -> Thing:
+def _revolved(kind: str, name: str, profile: np.ndarray, lying: float) -> MeshThing:
     """A body of revolution with the profile (n, 2) = (radius, height) from the base along its outside."""
     surface = trimesh.creation.revolve(profile, sections=SECTIONS)
     hull = np.asarray(surface.vertices)[ConvexHull(surface.vertices).vertices]
-    rests = (Rest("upright", UPRIGHT, 1 - lying), Rest("lying", ON_X, lying))
+    rests = (MeshRest("upright", UPRIGHT, 1 - lying), MeshRest("lying", ON_X, lying))
     diameter, height = 2 * profile[:, 0].max(), np.ptp(profile[:, 1])
-    return Thing(kind, name, surface, hull, np.sort([diameter, diameter, height]), rests)
+    return MeshThing(kind, name, surface, hull, np.sort([diameter, diameter, height]), rests)

@@ -117,7 +117,7 @@ def carton(folder: Path) -> tuple[dict[str, Any], str]:
 
 
 @dataclass(frozen=True)
-class Thing:
+class MeasuredObject:
     """One object on a table, and how its two bodies lie to what was measured, millimetres."""
 
     name: str
@@ -140,7 +140,7 @@ def below_table(body: Superquadric, plane: np.ndarray) -> float:
     return float(1e3 * max(0.0, -lowest))
 
 
-def things(folder: Path, frames: int) -> list[Thing]:
+def things(folder: Path, frames: int) -> list[MeasuredObject]:
     """Every labelled object of the first frames of each category."""
     seen: dict[str, int] = {}
     found = []
@@ -159,7 +159,7 @@ def things(folder: Path, frames: int) -> list[Thing]:
             result = both(frame.depth, mask, frame.camera, surface_fit.FitOptions(plane=plane))
             ours, classic = result.fit.superquadric, result.classic.superquadric
             found.append(
-                Thing(
+                MeasuredObject(
                     f"{path.stem} {label}",
                     category,
                     result,
@@ -172,7 +172,7 @@ def things(folder: Path, frames: int) -> list[Thing]:
     return found
 
 
-def table_line(title: str, chosen: list[Thing]) -> tuple[dict[str, Any], list[str]]:
+def table_line(title: str, chosen: list[MeasuredObject]) -> tuple[dict[str, Any], list[str]]:
     """Figures of some objects."""
     figures: dict[str, Any] = {
         name: report.spread(np.array([getattr(each, name) for each in chosen]))

@@ -1,7 +1,7 @@
 """Household things on a table through a depth sensor: how close the recovered bodies come to the true hulls.
 
     python benchmarks/real_scenes.py [--scenes 1000] [--first 0] [--jobs 1] [--kinds "box; can"] [--sensor stereo]
-                                     [--pictures 0] [--each FILE] [--name real_scenes]
+                                     [--each FILE] [--name real_scenes]
 
 Scenes are those of :mod:`tabletop`, methods and measures those of :mod:`scene_verdict`.  Counted are things at least
 half visible; things with under 200 pixels are left out and numbered, vessels (--kinds) are apart from all others.
@@ -11,8 +11,7 @@ of three: median 5 mm, mean 9 mm.  Whole chain, own masks: median distance from 
 nearest body at most 3 mm, at least 95 % of them within 10 mm, no body below the table by more than 10 mm.
 
 ``2 sigma`` is the share of half sizes within two reported deviations of half the hull's extent along the same axis.
-Millimetres; times are of one thread each, milliseconds.  --pictures N saves the first N scenes, --picture SEED one, to
---folder (runs/real_scenes).
+Millimetres; times are of one thread each, milliseconds.
 """
 
 from __future__ import annotations
@@ -41,6 +40,9 @@ import scene_verdict
 import tabletop
 from scene_verdict import EXPLAINED, METHODS, Judged, SceneVerdict
 
+Groups = Callable[[list[Judged]], dict[str, list[Judged]]]
+"""Makes the rows of a table of all things; the first one, ALL, is what goals are for."""
+ALL = "**all, at least half visible**"
 HALF = 0.5
 APART = "vessel"
 """Counted by themselves."""
@@ -77,17 +79,8 @@ WORST_HEADER = [
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
-    parser.add_argument("--scenes", type=int, default=1000, help="number of scenes")
-    parser.add_argument("--first", type=int, default=0, help="seed of the first scene")
+    parser = arguments(__doc__, "real_scenes")
     parser.add_argument("--kinds", default="", help="of things, separated by semicolons")
-    parser.add_argument("--sensor", choices=list(tabletop.SENSORS), help="one for all scenes; they alternate otherwise")
-    parser.add_argument("--jobs", type=int, default=1, help="processes, each of one thread")
-    parser.add_argument("--pictures", type=int, default=0, help="save pictures of the first scenes")
-    parser.add_argument("--picture", type=int, help="save a picture of the scene of this seed, and do nothing else")
-    parser.add_argument("--folder", type=Path, default=Path("runs/real_scenes"), help="for pictures")
-    parser.add_argument("--each", type=Path, help="write every thing's figures and bodies to this file, JSON")
-    parser.add_argument("--name", default="real_scenes", help="name of the result files")
     options = parser.parse_args()
     words = [word.strip() for word in options.kinds.split(";") if word.strip()]
     if not set(words) <= set(mesh_things.KINDS):
@@ -95,23 +88,36 @@ def main() -> None:
     least = min(filter(None, mesh_things.KINDS.values()))
     kinds = {word: max(mesh_things.KINDS[word], least) for word in words} or None
     scans = report.shared_data("ycb_meshes")
-    if options.picture is not None or options.pictures:
-        import scene_pictures
+    run(partial(scene_verdict.verdict, kinds=kinds, scans=scans, sensor=options.sensor), options, groups, GOALS)
 
-        seeds = range(options.first, options.first + options.pictures)
-        for seed in [options.picture] if options.picture is not None else seeds:
-            scene = tabletop.scene(seed, kinds, scans, options.sensor)
-            print(scene_pictures.save_picture(scene, options.folder), flush=True)
-        if options.picture is not None:
-            return
-    judge = partial(scene_verdict.verdict, kinds=kinds, scans=scans, sensor=options.sensor)
+
+def arguments(text: str | None, name: str) -> argparse.ArgumentParser:
+    """Options of a benchmark of scenes that describes itself so."""
+    parser = argparse.ArgumentParser(description=(text or "").split("\n\n")[0])
+    parser.add_argument("--scenes", type=int, default=1000, help="number of scenes")
+    parser.add_argument("--first", type=int, default=0, help="seed of the first scene")
+    parser.add_argument("--sensor", choices=list(tabletop.SENSORS), help="one for all scenes; they alternate otherwise")
+    parser.add_argument("--jobs", type=int, default=1, help="processes, each of one thread")
+    parser.add_argument("--each", type=Path, help="write every thing's figures and bodies to this file, JSON")
+    parser.add_argument("--name", default=name, help="name of the result files")
+    return parser
+
+
+def run(
+    judge: Callable[[int], SceneVerdict],
+    options: argparse.Namespace,
+    groups: Groups,
+    goals: dict[str, str],
+    **facts: Any,
+) -> None:
+    """Judge the scenes that were asked for, and write the results."""
     verdicts = list(judged(judge, range(options.first, options.first + options.scenes), options.jobs))
     if options.each is not None:
         everything = [thing_facts(one) for each in verdicts for one in each.judged]
         options.each.write_text(json.dumps(everything, indent=1) + "\n")
-    result, text = tables(verdicts)
-    facts = {name: str(value) if isinstance(value, Path) else value for name, value in vars(options).items()}
-    report.write(options.name, {"options": facts, **result}, text)
+    result, text = tables(verdicts, groups, goals)
+    words = {name: str(value) if isinstance(value, Path) else value for name, value in vars(options).items()}
+    report.write(options.name, {**facts, "options": words, **result}, text)
 
 
 def judged(judge: Callable[[int], SceneVerdict], seeds: range, jobs: int) -> Iterator[SceneVerdict]:
@@ -141,35 +147,40 @@ def _told(each: SceneVerdict, began: float) -> SceneVerdict:
     return each
 
 
-def tables(verdicts: list[SceneVerdict]) -> tuple[dict[str, Any], str]:
-    """All figures, as numbers and as Markdown."""
-    everything = [one for each in verdicts for one in each.judged]
+def groups(everything: list[Judged]) -> dict[str, list[Judged]]:
+    """The rows of the table, all first."""
     counted = [one for one in everything if one.kind != APART]
     half = [one for one in counted if one.visible_share >= HALF]
-    groups: dict[str, list[Judged]] = {"**all, at least half visible**": half}
+    rows: dict[str, list[Judged]] = {ALL: half}
     for kind in mesh_things.KINDS:
-        for rest in ("", "upright", "lying"):
-            chosen = [one for one in everything if one.kind == kind and one.visible_share >= HALF]
-            chosen = [one for one in chosen if not rest or one.rest == rest]
-            groups[f"{kind}, {rest}" if rest else kind] = chosen
-    for sensor in tabletop.SENSORS:
-        groups[sensor] = [one for one in half if one.sensor == sensor]
+        chosen = [one for one in everything if one.kind == kind and one.visible_share >= HALF]
+        rows[kind] = chosen
+        rows |= {f"{kind}, {rest}": [one for one in chosen if one.rest == rest] for rest in ("upright", "lying")}
+    return rows | by_sensor_and_share(half, counted)
+
+
+def by_sensor_and_share(half: list[Judged], counted: list[Judged]) -> dict[str, list[Judged]]:
+    """Rows of things at least half visible by sensor, and of all by their visible share."""
+    rows = {sensor: [one for one in half if one.sensor == sensor] for sensor in tabletop.SENSORS}
     for name, (low, high) in SHARES.items():
-        groups[f"visible: {name}"] = [one for one in counted if low <= one.visible_share < high]
+        rows[f"visible: {name}"] = [one for one in counted if low <= one.visible_share < high]
+    return rows
+
+
+def tables(verdicts: list[SceneVerdict], groups: Groups, goals: dict[str, str]) -> tuple[dict[str, Any], str]:
+    """All figures, as numbers and as Markdown."""
+    found = groups([one for each in verdicts for one in each.judged])
     result: dict[str, Any] = {}
     rows = []
-    for name, chosen in groups.items():
-        if not chosen:
-            continue
-        whole = name.startswith("**")
-        for method in METHODS if whole else ("given", "own"):
-            figures = summary(chosen, method)
-            result[f"{name.strip('*')}: {method}"] = figures
-            rows.append(line(name, method, figures, GOALS.get(method, "-") if whole else ""))
+    for name, chosen in found.items():
+        for method in METHODS if name == ALL else ("given", "own"):
+            if chosen:
+                result[f"{name.strip('*')}: {method}"] = figures = summary(chosen, method)
+                rows.append(line(name, method, figures, goals.get(method, "-") if name == ALL else ""))
     chain_result, chain_text = chain(verdicts)
     text = [report.table(HEADER, rows), "Whole chain and times\n\n" + chain_text]
     for method in ("given", "own"):
-        order = sorted(half, key=lambda one: one.answers[method].iou)[:WORST]
+        order = sorted(found[ALL], key=lambda one: one.answers[method].iou)[:WORST]
         worst = [worst_line(one, method) for one in order]
         result[f"worst: {method}"] = [dict(zip(WORST_HEADER, row, strict=True)) for row in worst]
         text.append(f"The worst with masks {method}\n\n{report.table(WORST_HEADER, worst)}")

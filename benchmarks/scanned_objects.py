@@ -49,7 +49,7 @@ WORST = 12
 
 
 @dataclass(frozen=True)
-class Setting:
+class Placement:
     """How the objects are placed, with seeds of their own, what is known of empty pixels, and the share asked for."""
 
     poser: Callable[[trimesh.Trimesh], mesh_scene.Poser]
@@ -59,9 +59,9 @@ class Setting:
 
 
 SETTINGS = {
-    "floating": Setting(mesh_scene.floating, SEED, "0.90"),
-    "floating, NaN unknown": Setting(mesh_scene.floating, SEED, "-", nan_is_empty=False),
-    "on plane": Setting(mesh_scene.resting, SEED + 1, "0.93"),
+    "floating": Placement(mesh_scene.floating, SEED, "0.90"),
+    "floating, NaN unknown": Placement(mesh_scene.floating, SEED, "-", nan_is_empty=False),
+    "on plane": Placement(mesh_scene.resting, SEED + 1, "0.93"),
 }
 CLASSIC_GOAL = "half"
 
@@ -78,7 +78,7 @@ class Scan:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class FittedScan:
     """Both fits of one image; the body in the frame of the mesh."""
 
     scan: Scan
@@ -109,27 +109,27 @@ def scans(folder: Path, wanted: str) -> list[Scan]:
     return found
 
 
-def image(scan: Scan, setting: Setting, pose: int, poser: mesh_scene.Poser) -> mesh_scene.View:
+def image(scan: Scan, setting: Placement, pose: int, poser: mesh_scene.Poser) -> mesh_scene.MeshView:
     """The image of one pose; the same however many are asked for."""
     return mesh_scene.view(scan.mesh, poser, np.random.default_rng([setting.seed, scan.number, pose]))
 
 
-def in_mesh_frame(body: Superquadric, view: mesh_scene.View) -> Superquadric:
+def in_mesh_frame(body: Superquadric, view: mesh_scene.MeshView) -> Superquadric:
     """A body of the optical frame where the hull is."""
     return body.transformed(quaternions.from_matrix(view.rotation.T), -view.rotation.T @ view.translation)
 
 
-def outcome(scan: Scan, setting: Setting, pose: int, view: mesh_scene.View) -> Outcome:
+def outcome(scan: Scan, setting: Placement, pose: int, view: mesh_scene.MeshView) -> FittedScan:
     """Fit one image with both methods."""
     options = surface_fit.FitOptions(plane=view.plane, nan_is_empty=setting.nan_is_empty)
     found = both(view.depth, view.mask, view.camera, options)
     body = in_mesh_frame(found.fit.superquadric, view)
     classic = in_mesh_frame(found.classic.superquadric, view)
     extent = np.ptp(scan.hull.vertices @ body.rotation_matrix, axis=0) / 2
-    return Outcome(scan, pose, found, body, scan.columns.iou(body), scan.columns.iou(classic), extent)
+    return FittedScan(scan, pose, found, body, scan.columns.iou(body), scan.columns.iou(classic), extent)
 
 
-def summary(outcomes: list[Outcome], best: dict[str, float]) -> dict[str, Any]:
+def summary(outcomes: list[FittedScan], best: dict[str, float]) -> dict[str, Any]:
     """The figures of some images; ``best`` is the oracle's IoU of each object."""
     limit = np.array([best[each.scan.name] for each in outcomes])
     iou = np.array([each.iou for each in outcomes])
@@ -196,7 +196,7 @@ WORST_HEADER = [
 ]
 
 
-def worst_line(setting: str, each: Outcome, best: dict[str, float]) -> list[str]:
+def worst_line(setting: str, each: FittedScan, best: dict[str, float]) -> list[str]:
     sizes = [" ".join(f"{1e3 * x:.0f}" for x in values) for values in (each.body.size, each.extent)]
     return [
         setting,
@@ -227,7 +227,7 @@ def main() -> None:
     result: dict[str, Any] = {"oracle": {name: body.to_flat().tolist() for name, body in bodies.items()}}
     tables, worst = [], []
     for setting, how in SETTINGS.items():
-        found: list[Outcome] = []
+        found: list[FittedScan] = []
         rows = []
         for scan in objects:
             poser = how.poser(scan.hull)

@@ -21,7 +21,7 @@ from pathlib import Path
 import mesh_scene
 import mesh_things
 import numpy as np
-from mesh_things import Thing
+from mesh_things import MeshThing
 from scipy.spatial import ConvexHull
 
 from sq_perception.imaging.camera import Camera
@@ -60,7 +60,7 @@ class Placed:
         How many pixels show it, and would if it were alone.
     """
 
-    thing: Thing
+    thing: MeshThing
     rest: str
     rotation: np.ndarray
     translation: np.ndarray
@@ -193,7 +193,7 @@ def _stand(rng: np.random.Generator, nearest: float) -> _Stand:
     return _Stand(tilt @ level, origin, rng.uniform(-0.5, 0.5), sides, nearest)
 
 
-def _arranged(things: list[Thing], stand: _Stand, rng: np.random.Generator) -> list[tuple[str, np.ndarray]] | None:
+def _arranged(things: list[MeshThing], stand: _Stand, rng: np.random.Generator) -> list[tuple[str, np.ndarray]] | None:
     """A rest and a pose (4, 4) on the table for each thing; None where they find no room."""
     poses: list[tuple[str, np.ndarray]] = []
     outlines: list[np.ndarray] = []
@@ -214,7 +214,7 @@ def _arranged(things: list[Thing], stand: _Stand, rng: np.random.Generator) -> l
     return poses
 
 
-def _lying(thing: Thing, spread: float, rng: np.random.Generator) -> tuple[str, np.ndarray]:
+def _lying(thing: MeshThing, spread: float, rng: np.random.Generator) -> tuple[str, np.ndarray]:
     """One of the rests of a thing, turned about the vertical, its middle at most ``spread`` from the origin."""
     rest = thing.rests[rng.choice(len(thing.rests), p=[each.likely for each in thing.rests])]
     yaw, bearing, radius = rng.uniform(0, 2 * np.pi), rng.uniform(0, 2 * np.pi), spread * np.sqrt(rng.random())
@@ -242,7 +242,7 @@ def _seen(
     sensor: str,
     model: sensor_noise.SensorNoise,
     stand: _Stand,
-    things: list[Thing],
+    things: list[MeshThing],
     poses: list[tuple[str, np.ndarray]],
     rng: np.random.Generator,
 ) -> Tabletop:

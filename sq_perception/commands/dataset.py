@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from sq_perception.commands.console import FAILURE, SUCCESS, complain, failed, parser
+from sq_perception.commands.console import FAILURE, SUCCESS, complain, failed, parser, progress
 
 _HELP = "Make a fixed set of images on disk, go on with an interrupted one, or verify one."
 _EPILOG = """\
@@ -47,7 +45,9 @@ def main(arguments: Sequence[str]) -> int:
     try:
         if given.verify:
             settings, _ = read_manifest(folder)
-        with _progress("verifying" if given.verify else "drawing", settings.train + settings.test) as advance:
+        with progress() as bar:
+            task = bar.add_task("verifying" if given.verify else "drawing", total=settings.train + settings.test)
+            advance = partial(bar.advance, task)
             if given.verify:
                 faults = verify(folder, advance)
             else:
@@ -63,14 +63,3 @@ def main(arguments: Sequence[str]) -> int:
     size = sum(path.stat().st_size for path in folder.glob("*.safetensors"))
     print(f"{folder}: {settings.train} + {settings.test} images, {size / 1e6:.1f} MB, all checksums right")
     return SUCCESS
-
-
-@contextmanager
-def _progress(what: str, total: int) -> Iterator[Callable[[int], None]]:
-    """A bar, on a terminal."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), disable=not sys.stderr.isatty()) as bar:
-        yield partial(bar.advance, bar.add_task(what, total=total))

@@ -4,17 +4,14 @@ from __future__ import annotations
 
 import argparse
 import shlex
-import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sq_perception.commands.console import FAILURE, SUCCESS, complain, failed, parser
+from sq_perception.commands.console import FAILURE, SUCCESS, complain, failed, parser, progress
 from sq_perception.evaluation.protocol import BODIES, DEFAULT_SEED, FIT_BODIES, FITS
 
 if TYPE_CHECKING:
-    from sq_perception.evaluation.contest import Advance
     from sq_perception.evaluation.contestants import Contestant
     from sq_perception.recovery.recoverer import Method
 
@@ -66,7 +63,7 @@ def _evaluate(options: argparse.Namespace, methods: list[Method], words: list[st
     import numba
     import torch
 
-    from sq_perception.evaluation import report
+    from sq_perception.evaluation import thesis_report
     from sq_perception.evaluation.contest import compare
     from sq_perception.evaluation.thesis_images import ThesisImages
     from sq_perception.files import provenance
@@ -78,16 +75,17 @@ def _evaluate(options: argparse.Namespace, methods: list[Method], words: list[st
     if not contestants:
         return failed("nothing is left to evaluate")
     images = ThesisImages(max(count for _, count in contestants), options.seed)
-    with _progress() as advance:
-        outcomes = compare(contestants, images, advance=advance)
+    with progress() as bar:
+        tasks = {contestant.name: bar.add_task(contestant.name, total=count) for contestant, count in contestants}
+        outcomes = compare(contestants, images, advance=lambda name, done: bar.update(tasks[name], completed=done))
     facts = {
         **provenance.facts(shlex.join(words)),
         "threads": {"torch": torch.get_num_threads(), "numba": numba.get_num_threads()},
         "seed": options.seed,
         "spawn_key": "(6, block), blocks of 500 bodies",
     }
-    written = report.write(options.output, outcomes, images, facts, failures)
-    print("\n\n".join(table.markdown() for table in report.overview(outcomes)))
+    written = thesis_report.write(options.output, outcomes, images, facts, failures)
+    print("\n\n".join(table.markdown() for table in thesis_report.overview(outcomes)))
     print(f"written: {written}")
     return FAILURE if failures else SUCCESS
 
@@ -135,24 +133,3 @@ def _parser() -> argparse.ArgumentParser:
         "--output", type=Path, default=Path("runs/evaluation"), metavar="DIR", help="folder (runs/evaluation)"
     )
     return command
-
-
-@contextmanager
-def _progress() -> Iterator[Advance | None]:
-    """A bar a contestant, on a terminal."""
-    if not sys.stderr.isatty():
-        yield None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bars:
-        tasks: dict[str, int] = {}
-
-        def advance(name: str, done: int, of: int) -> None:
-            if name not in tasks:
-                tasks[name] = bars.add_task(name, total=of)
-            bars.update(tasks[name], completed=done)  # type: ignore[arg-type]
-
-        yield advance

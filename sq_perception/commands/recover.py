@@ -11,14 +11,13 @@ import argparse
 import logging
 import math
 import statistics
-import sys
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sq_perception.commands import recover_outputs
-from sq_perception.commands.console import FAILURE, INTERRUPTED, SUCCESS, complain, misused, parser
+from sq_perception.commands.console import FAILURE, INTERRUPTED, SUCCESS, complain, failed, misused, parser, progress
 
 if TYPE_CHECKING:
     from sq_perception.recordings.frame_file import RecordedFrame
@@ -235,6 +234,8 @@ def run(options: argparse.Namespace) -> int:
     from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
 
     torch.set_num_threads(1)  # the network's layers are so small that threads cost more than they save
+    done = Recovered()
+    lines, bag, page = None, None, None
     try:
         settings = RecoveryOptions(
             method=options.method,
@@ -244,20 +245,8 @@ def run(options: argparse.Namespace) -> int:
             max_size=options.max_size,
             workspace=None if options.workspace is None else tuple(options.workspace),
         )
-    except ValueError as error:
-        return misused(str(error))
-    try:
-        reading = Reading(
-            options.depth_scale,
-            options.depth_min,
-            options.depth_max,
-            options.roi,
-            Path(options.masks) if options.masks else None,
-        )
-    except ValueError as error:
-        return misused(str(error))
-    done = Recovered()
-    try:
+        masks = Path(options.masks) if options.masks else None
+        reading = Reading(options.depth_scale, options.depth_min, options.depth_max, options.roi, masks)
         recorded = RecordedInput(
             options.frames,
             options.camera_info,
@@ -272,12 +261,6 @@ def run(options: argparse.Namespace) -> int:
         if problem := recover_outputs.replaced_input(options, recorded.files):
             return misused(problem)
         recoverer = Recoverer(options.model, method=options.method, consensus=options.consensus)
-    except (FrameError, CheckpointError) as error:
-        complain(str(error))
-        return FAILURE
-
-    lines, bag, page = None, None, None
-    try:
         if options.jsonl:
             lines = ResultLines(recover_outputs.place(options.jsonl), recover_outputs.decisive(options))
             if lines.done and (options.track or options.mcap or options.html):
@@ -287,11 +270,10 @@ def run(options: argparse.Namespace) -> int:
             done.add(lines.done)
         bag = recover_outputs.bag(options)
         page = recover_outputs.page(options)
+    except (FrameError, CheckpointError, OSError, ImportError) as error:
+        return failed(str(error))
     except ValueError as error:
         return misused(str(error))
-    except (OSError, ImportError) as error:
-        complain(str(error))
-        return FAILURE
 
     run = _Run(options, recoverer, settings, lines, bag, page)
     try:
@@ -449,15 +431,8 @@ def _free_stem(stem: str, taken: set[str]) -> str:
 
 def _progress(recorded: RecordedInput) -> Iterator[tuple[str, Any]]:
     """The frames, with a bar on a terminal where there are several."""
-    if not sys.stderr.isatty():
-        yield from recorded
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (TextColumn("recovering"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("", total=recorded.total, visible=recorded.total > 1)
+    with progress() as bar:
+        task = bar.add_task("recovering", total=recorded.total, visible=recorded.total > 1)
         for pair in recorded:
             bar.update(task, total=recorded.total, visible=recorded.total > 1)
             yield pair

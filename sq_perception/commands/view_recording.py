@@ -13,8 +13,8 @@ from sq_perception.commands.console import FAILURE, SUCCESS, complain, failed, p
 if TYPE_CHECKING:
     from sq_perception.recordings.frame_file import RecordedFrame
     from sq_perception.recovery.recovery import FrameRecovery
+    from sq_perception.viewing.drawings import Bodies
     from sq_perception.viewing.page import Page
-    from sq_perception.viewing.scene import Bodies
 
 _HELP = """\
 A page in the browser for recorded frames: depth as points, superquadrics with their uncertainty, numbers.  FRAME is
@@ -137,7 +137,7 @@ def bodies_of(recovery: FrameRecovery) -> Bodies:
     from sq_perception.fitting.fit import Status
     from sq_perception.geometry.mesh import COLOURS
     from sq_perception.geometry.superquadric import Superquadric
-    from sq_perception.viewing.scene import Bodies
+    from sq_perception.viewing.drawings import Bodies
 
     found = [k for k, body in enumerate(recovery.bodies) if body.status != Status.FAILED]
     bodies = [recovery.bodies[k] for k in found]

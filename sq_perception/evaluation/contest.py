@@ -12,8 +12,8 @@ from sq_perception.evaluation.figures_of_merit import FiguresOfMerit
 from sq_perception.evaluation.thesis_images import CHUNK, ThesisImages
 from sq_perception.geometry.superquadric import Superquadric
 
-Advance = Callable[[str, int, int], None]
-"""Called with a contestant's name, the bodies done and all of its bodies."""
+Advance = Callable[[str, int], None]
+"""Called with a contestant's name and the number of bodies done."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +66,7 @@ def compare(
             figures = FiguresOfMerit.of(bodies, labels, answers.recovered, answers.milliseconds)
             part.append((figures, bodies.to_flat(), labels.to_flat()))
             if advance:
-                advance(contestant.name, mine.first + len(mine), count)
+                advance(contestant.name, mine.first + len(mine))
     outcomes = []
     for (contestant, _), part in zip(contestants, parts, strict=True):
         figures, flats, labels_flat = zip(*part, strict=True)

@@ -17,7 +17,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -58,41 +58,17 @@ class Answers:
     milliseconds: np.ndarray
 
 
-class Contestant(Protocol):
-    """Anything that recovers one body from an image of the test set.
+@dataclass(frozen=True, eq=False)
+class Network:
+    """A network alone.
 
     Attributes
     ----------
-    name
+    name : str
         Short, unique within a comparison; also names files.
-    description
-        One line for the reader.
-    loss
-        What it was trained by; empty for fits, and where a file does not say it.
+    training, metrics : dict
+        The notes of its file's header.
     """
-
-    @property
-    def name(self) -> str: ...
-
-    @property
-    def description(self) -> str: ...
-
-    @property
-    def loss(self) -> str: ...
-
-    def recover(self, images: ImageChunk) -> Answers:
-        """One body an image; the truth in the chunk is not looked at."""
-
-    def labels(self, truth: Superquadric) -> Superquadric:
-        """The true bodies, each in the parameter vector with which rotations are to be compared."""
-
-    def with_given(self, prediction: Superquadric, labels: Superquadric) -> Superquadric:
-        """What is compared with the labels: the prediction, with whatever was given to the contestant."""
-
-
-@dataclass(frozen=True, eq=False)
-class Network:
-    """A network alone.  ``training`` and ``metrics`` are the notes of its file's header."""
 
     name: str
     path: Path
@@ -128,11 +104,13 @@ class Network:
 
     @property
     def loss(self) -> str:
+        """What it was trained by; empty where its file does not say it."""
         # Headers without a loss are of the time when there was one only.
         return str(self.training.get("loss", "occupancy")) if self.training else ""
 
     @property
     def description(self) -> str:
+        """One line for the reader."""
         parts = [f"network alone, loss {self.loss or 'not in the file'}"]
         parts.append(f"views of {self.model.config.pixels} x {self.model.config.pixels}")
         if "step" in self.metrics:
@@ -146,6 +124,7 @@ class Network:
         return ", ".join(parts)
 
     def recover(self, images: ImageChunk) -> Answers:
+        """One body an image; the truth in the chunk is not looked at."""
         views = images.views(self.model.config)
         there = [k for k, view in enumerate(views) if view is not None]
         flat, recovered = np.tile(_NOBODY, (len(views), 1)), np.zeros(len(views), bool)
@@ -163,18 +142,21 @@ class Network:
         return Answers(Superquadric.from_flat(flat), recovered, milliseconds)
 
     def labels(self, truth: Superquadric) -> Superquadric:
+        """The true bodies, each in the parameter vector with which rotations are to be compared."""
         return truth.canonical_form() if self.training.get("canonical_labels", False) else truth
 
     def with_given(self, prediction: Superquadric, labels: Superquadric) -> Superquadric:
+        """What is compared with the labels: the prediction, with whatever was given to the contestant."""
         return Objective(self.loss).with_given(prediction, labels) if self.loss else prediction
 
 
 @dataclass(frozen=True, eq=False)
 class FittingMethod:
-    """A method of the recovery with a fit: auto, symmetry or classic."""
+    """A method of the recovery with a fit: auto, symmetry or classic.  As :class:`Network`; nothing is given to it."""
 
     name: str
     recoverer: Recoverer
+    loss: str = ""
 
     @classmethod
     def of(cls, method: Method) -> FittingMethod:
@@ -182,10 +164,6 @@ class FittingMethod:
         if method not in FITS:
             raise ValueError(f"method: expected one of {', '.join(FITS)}, got {method!r}")
         return cls(method, Recoverer(method=method))
-
-    @property
-    def loss(self) -> str:
-        return ""
 
     @property
     def description(self) -> str:
@@ -214,6 +192,9 @@ class FittingMethod:
 
     def with_given(self, prediction: Superquadric, labels: Superquadric) -> Superquadric:
         return prediction
+
+
+Contestant = Network | FittingMethod
 
 
 def default_name(path: Path) -> str:

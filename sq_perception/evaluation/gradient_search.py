@@ -24,14 +24,13 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from sq_perception.evaluation.walk_options import WalkOptions
-from sq_perception.fitting import solina_bajcsy
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.metrics import volume_iou
 from sq_perception.geometry.superquadric import FLAT_LENGTH, Superquadric
 from sq_perception.imaging import canonical_view, raycast, unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.canonical_view import CanonicalView
+from sq_perception.learning.choices import WITHOUT_SHARPNESS
 from sq_perception.learning.objective import Objective
 from sq_perception.learning.regressor import RegressorConfig
 from sq_perception.segmentation import segments
@@ -41,6 +40,45 @@ _DISTURBANCE = {"size": 0.25, "shape": 0.2, "translation": 0.06, "rotation": 0.3
 """Standard deviations: of log sizes, exponents, the centre in sides of the view, and of each angle in radians."""
 _SHAPE_ROOM = 0.05
 _REST = 1e-7
+_POINTS = 1024
+"""Comparison points, or about so many lines of sight."""
+
+
+@dataclass(frozen=True)
+class WalkOptions:
+    """How to walk.
+
+    Attributes
+    ----------
+    loss
+        By its name in :mod:`sq_perception.learning.objective`.
+    learning_rate
+        Of Adam, at the first step.
+    sharpness
+        s at the first and at the last step, geometric in between; None is the s with which trainings end, throughout.
+
+    Raises
+    ------
+    ValueError
+        For an unknown loss, a loss without s that is given one, or numbers that are not positive.
+    """
+
+    loss: str = "occupancy"
+    steps: int = 200
+    learning_rate: float = 0.05
+    sharpness: tuple[float, float] | None = None
+
+    def __post_init__(self) -> None:
+        Objective(self.loss)
+        if self.sharpness is not None and self.loss in WITHOUT_SHARPNESS:
+            raise ValueError(f"s: the loss {self.loss} has none")
+        for name, values in (
+            ("steps", (self.steps,)),
+            ("learning_rate", (self.learning_rate,)),
+            ("s", self.sharpness or ()),
+        ):
+            if not all(math.isfinite(value) and value > 0 for value in values):
+                raise ValueError(f"{name}: expected positive numbers, got {' '.join(f'{value:g}' for value in values)}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,7 +150,7 @@ def walk(
     for step in range(options.steps + 1):
         objective = _objective(options, step, len(view))
         body = ranges.decode(raw)
-        generator = torch.Generator().manual_seed(options.seed)
+        generator = torch.Generator().manual_seed(0)
         loss = objective.loss(body, image, given, 1.0, generator)[0]
         optimiser.zero_grad()
         loss.backward()
@@ -139,8 +177,8 @@ def _objective(options: WalkOptions, step: int, pixels: int) -> Objective:
     """The loss of one step, before a view of so many pixels a side."""
     start, end = options.sharpness or (Objective(options.loss).sharpness(1.0),) * 2
     s = start * (end / start) ** (step / options.steps)
-    stride = max(1, round(pixels / math.sqrt(options.points)))
-    return Objective(options.loss, options.points, sharpness_start=s, sharpness_end=s, stride=stride)
+    stride = max(1, round(pixels / math.sqrt(_POINTS)))
+    return Objective(options.loss, _POINTS, sharpness_start=s, sharpness_end=s, stride=stride)
 
 
 # What is walked before, and from where
@@ -195,32 +233,17 @@ class Subject:
         return unit_cube.cube_from_optical(self.view.from_canonical(bodies))
 
 
-def disturbed(body: Superquadric, rng: np.random.Generator) -> Superquadric:
-    """Another single body nearby: sizes by about a quarter, exponents by 0.2, angles by 17 degrees an axis."""
+def disturbed(body: Superquadric, ranges: RegressorConfig, rng: np.random.Generator) -> Superquadric:
+    """Another single body nearby: sizes by about a quarter, exponents by 0.2, angles by 17 degrees an axis.
+
+    It is within the ranges, its exponents clear of their limits: on them the parametrisation is all but level.
+    """
     noise = {name: sigma * rng.standard_normal(getattr(body, name).shape) for name, sigma in _DISTURBANCE.items()}
-    turn = quaternions.from_rotation_vector(noise["rotation"][:3])
-    shape = np.clip(body.shape + noise["shape"], 0.1, 1.0)
-    rotation = quaternions.multiply(body.rotation, turn)
-    return Superquadric(body.size * np.exp(noise["size"]), shape, body.translation + noise["translation"], rotation)
-
-
-def moments(view: np.ndarray) -> Superquadric:
-    """The classic start of Solina and Bajcsy: the ellipsoid along the principal axes of what is seen in a view."""
-    rows, columns = np.nonzero(view > 0)
-    if rows.size == 0:
-        raise ValueError("the view shows nothing")
-    pixels = len(view)
-    points = np.stack([(columns + 0.5) / pixels, 1 - (rows + 0.5) / pixels, view[rows, columns]], axis=-1)
-    return solina_bajcsy.moment_start(points.astype(float)).body
-
-
-def clamped(body: Superquadric, ranges: RegressorConfig) -> Superquadric:
-    """The body within the ranges, its exponents clear of their limits: on them the parametrisation is all but level."""
     low, high = ranges.shape_range
     room = _SHAPE_ROOM * (high - low)
     return Superquadric(
-        np.clip(body.size, *ranges.size_range),
-        np.clip(body.shape, low + room, high - room),
-        np.clip(body.translation, *ranges.translation_range),
-        body.rotation,
+        np.clip(body.size * np.exp(noise["size"]), *ranges.size_range),
+        np.clip(np.clip(body.shape + noise["shape"], 0.1, 1.0), low + room, high - room),
+        np.clip(body.translation + noise["translation"], *ranges.translation_range),
+        quaternions.multiply(body.rotation, quaternions.from_rotation_vector(noise["rotation"][:3])),
     )

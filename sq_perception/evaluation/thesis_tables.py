@@ -56,7 +56,7 @@ class Table:
 
 
 @dataclass(frozen=True)
-class Result:
+class TableEntry:
     """What a table needs to know of a contestant; ``loss`` is empty for fits."""
 
     name: str
@@ -69,13 +69,13 @@ class _Row:
     """A row of the thesis: its label, who answers it, and the thesis' cells."""
 
     label: str
-    answered_by: Callable[[Result], bool]
+    answered_by: Callable[[TableEntry], bool]
     iou: str = ""
     time: str = ""
     errors: tuple[str, str, str] = ("", "", "")
 
 
-def _trained_by(loss: str) -> Callable[[Result], bool]:
+def _trained_by(loss: str) -> Callable[[TableEntry], bool]:
     return lambda result: result.loss == loss
 
 
@@ -121,7 +121,7 @@ _DISTRIBUTIONS: Mapping[str, tuple[str, str, str]] = {
 }
 
 
-def thesis_tables(results: Sequence[Result]) -> list[Table]:
+def thesis_tables(results: Sequence[TableEntry]) -> list[Table]:
     """All tables of chapters 6 and 7, in order."""
     own = "Rows that the thesis does not have stand last."
     time = (
@@ -143,7 +143,7 @@ def thesis_tables(results: Sequence[Result]) -> list[Table]:
     ]  # fmt: skip
 
 
-def overview(results: Sequence[Result]) -> list[Table]:
+def overview(results: Sequence[TableEntry]) -> list[Table]:
     """Every contestant: how well the bodies overlap, and what is wrong about them, with the time it took."""
     accuracy, errors = [], []
     for result in results:
@@ -206,14 +206,14 @@ def spread(mean: float, deviation: float) -> str:
 def _table(
     title: str,
     rows: Sequence[_Row],
-    results: Sequence[Result],
-    columns: Callable[[_Row, Result | None], dict[str, str]],
+    results: Sequence[TableEntry],
+    columns: Callable[[_Row, TableEntry | None], dict[str, str]],
     note: str = "",
 ) -> Table:
     lines = []
     header: tuple[str, ...] = ()
     for row in rows:
-        answers: list[Result | None] = [result for result in results if row.answered_by(result)]
+        answers: list[TableEntry | None] = [result for result in results if row.answered_by(result)]
         for result in answers or [None]:
             cells = {"Method": row.label, "Contestant": result.name if result else NOTHING, **columns(row, result)}
             header = tuple(cells)
@@ -221,12 +221,12 @@ def _table(
     return Table(title, header, tuple(lines), note)
 
 
-def _iou(row: _Row, result: Result | None) -> dict[str, str]:
+def _iou(row: _Row, result: TableEntry | None) -> dict[str, str]:
     s = result.summary if result else None
     return {"IoU": spread(s.iou_mean, s.iou_std) if s else NOTHING, "IoU, thesis": row.iou or NOT_IN_THESIS}
 
 
-def _iou_and_time(row: _Row, result: Result | None) -> dict[str, str]:
+def _iou_and_time(row: _Row, result: TableEntry | None) -> dict[str, str]:
     s = result.summary if result else None
     time = NOTHING
     if s:
@@ -239,7 +239,7 @@ def _iou_and_time(row: _Row, result: Result | None) -> dict[str, str]:
     }
 
 
-def _errors(row: _Row, result: Result | None) -> dict[str, str]:
+def _errors(row: _Row, result: TableEntry | None) -> dict[str, str]:
     s = result.summary if result else None
     ours = (signed(s.delta_a), signed(s.delta_e), _triple(s.delta_t)) if s else (NOTHING,) * 3
     cells = {}
@@ -248,7 +248,7 @@ def _errors(row: _Row, result: Result | None) -> dict[str, str]:
     return cells
 
 
-def _distribution(row: _Row, result: Result | None) -> dict[str, str]:
+def _distribution(row: _Row, result: TableEntry | None) -> dict[str, str]:
     s = result.summary if result else None
     ours = [percent(value) for value in (s.iou_min, s.iou_max, s.over_85)] if s else [NOTHING] * 3
     cells = {}

@@ -17,7 +17,6 @@ from PIL import Image
 
 from sq_perception.evaluation import plots
 from sq_perception.evaluation.gradient_search import Subject, Walk
-from sq_perception.geometry.superquadric import Superquadric
 
 _BODY = plots.colour(0)
 _MILLISECONDS, _LAST_MILLISECONDS = 110, 2200
@@ -39,9 +38,9 @@ def walk_figure(subject: Subject, found: Walk, step: int, title: str = "") -> Fi
     for body in truth:
         for loop in plots.silhouettes(body, subject.camera):
             image.plot(*np.vstack([loop, loop[:1]]).T, color=plots.WIRE, lw=1.4, ls=(0, (4, 2.5)))
-    middle, half = _window(subject, [*extremes, *truth])
-    image.set_xlim(middle[0] - half, middle[0] + half)
-    image.set_ylim(middle[1] + half, middle[1] - half)
+    left, right, top, bottom = plots.window_of([*extremes, *truth], subject.camera)
+    image.set_xlim(left, right)
+    image.set_ylim(bottom, top)
     image.patch.set_facecolor(plots.NOTHING)
 
     space = figure.add_axes((0.325, 0.03, 0.305, 0.854))
@@ -57,18 +56,6 @@ def walk_figure(subject: Subject, found: Walk, step: int, title: str = "") -> Fi
     )
     _draw_curves(figure.add_axes((0.69, 0.14, 0.245, 0.68)), found, step)
     return figure
-
-
-def _window(subject: Subject, bodies: Sequence[Superquadric]) -> tuple[np.ndarray, float]:
-    """Middle (2,) and half width of the square, in pixels, that holds bodies of the optical frame and is no larger than
-    the image."""
-    corners = np.stack([np.stack(body.bounding_box()) for body in bodies])
-    pixels = subject.camera.project(corners).reshape(-1, 2)
-    size = np.array([subject.camera.width, subject.camera.height], dtype=float)
-    half = min(0.56 * float(np.ptp(pixels, axis=0).max()), 0.5 * float(size.max()))
-    middle = 0.5 * (pixels.min(axis=0) + pixels.max(axis=0))
-    low, high = np.minimum(half, size / 2) - 0.5, size - 0.5 - np.minimum(half, size / 2)
-    return np.clip(middle, low, high), half
 
 
 def _draw_curves(ax: Axes, found: Walk, step: int) -> None:
@@ -102,11 +89,6 @@ def _draw_curves(ax: Axes, found: Walk, step: int) -> None:
     right.tick_params(axis="y", colors=shade)
     right.spines["top"].set_visible(False)
     right.set_title(f"IoU {100 * found.iou[step]:.1f} %", loc="right", fontsize=11, color=shade)
-
-
-def chosen_steps(found: Walk, count: int) -> list[int]:
-    """At most ``count`` steps to be drawn, evenly, the first and the last among them."""
-    return [int(step) for step in np.unique(np.round(np.linspace(0, len(found) - 1, max(count, 2))))]
 
 
 def picture(figure: Figure) -> Image.Image:

@@ -45,8 +45,8 @@ from sq_perception.nodes.remote_node import RemoteNode
 from sq_perception.nodes.statistics import THROTTLE
 from sq_perception.nodes.tracking import CameraPoses, PoseError
 from sq_perception.viewing import tables
+from sq_perception.viewing.drawings import Bodies
 from sq_perception.viewing.page import Change, Page, Transition
-from sq_perception.viewing.scene import Bodies
 from sq_perception.viewing.tables import NodeState
 
 _IMAGES = 8

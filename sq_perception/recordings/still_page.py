@@ -25,7 +25,7 @@ from sq_perception.recordings.frame_entry import in_result_frame
 from sq_perception.recordings.frame_file import RecordedFrame
 from sq_perception.recovery import wording
 from sq_perception.recovery.recovery import FrameRecovery, Recovery
-from sq_perception.viewing import scene
+from sq_perception.viewing import drawings
 
 _MOST_POINTS = 30000
 _HALF_TURN_ABOUT_X = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -94,8 +94,8 @@ def _as_script(value: object) -> str:
 
 def _scene(frame: RecordedFrame, recovery: FrameRecovery) -> trimesh.Scene:
     """Points and bodies, with a camera behind the one that took the image."""
-    span = scene.depth_span(frame.depth) or (0.0, 1.0)
-    cloud = scene.cloud(frame.depth, frame.camera, span, _MOST_POINTS, is_muted=True)
+    span = drawings.depth_span(frame.depth) or (0.0, 1.0)
+    cloud = drawings.cloud(frame.depth, frame.camera, span, _MOST_POINTS, is_muted=True)
     whole = trimesh.Scene()
     middle = np.array([0.0, 0.0, span[0]])
     if len(cloud.points):

@@ -11,19 +11,19 @@ from __future__ import annotations
 import contextlib
 import queue
 import socket
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
 from time import monotonic
 from typing import Any
 
 import numpy as np
 import viser
 
-from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
-from sq_perception.viewing import scene, server, tables
+from sq_perception.viewing import drawings, server, tables
 from sq_perception.viewing.controls import GROUPS, Control
-from sq_perception.viewing.scene import Bodies, Cloud
+from sq_perception.viewing.drawings import Bodies, Cloud
 from sq_perception.viewing.tables import NodeState
 
 TITLE = "sq_perception: superquadrics from depth"
@@ -32,16 +32,26 @@ _UP = (0.0, -1.0, 0.0)
 _VIEW_ANGLE = np.deg2rad(42.0)
 _BACKGROUND = np.full((2, 2, 3), (22, 24, 28), np.uint8)
 _BODY_ALPHA, _FADED_ALPHA, _SHELL_ALPHA = 0.85, 0.2, 0.2
-_FRUSTUM = (150, 160, 175)
-_CAMERA = "camera"
+_FRUSTUM, _BARS = (150, 160, 175), (245, 245, 245)
+_START, _CAMERA = "behind", "camera"
 _PLACES = {
-    "behind": (1.0, np.array([0.28, -0.38, -1.25])),
+    _START: (1.0, np.array([0.28, -0.38, -1.25])),
     _CAMERA: (1.0, np.zeros(3)),
     "above": (0.6, np.array([0.0, -1.7, -0.03])),
     "side": (0.55, np.array([1.6, -0.4, -0.2])),
 }
 """Where to look from: at what share of the way to the middle of the scene, and from where, in units of that way."""
 _MUTED = "muted"
+_SHOWN = {
+    "Points": "The measured depth",
+    "Bodies": None,
+    "Ids": None,
+    "Shells": f"The body with half sizes {drawings.SHELL_SIGMAS:g} standard deviations larger",
+    "Error bars": f"± {drawings.SHELL_SIGMAS:g} standard deviations of each half size",
+    "Camera": "What the camera sees, and its optical frame",
+    "Depth image": None,
+}
+"""Check boxes of what is drawn, with their hints."""
 _FIRST_DISTANCE = 1.0
 """What the start view looks at, metres, until an image tells."""
 _NEAR_SHARE = 0.4
@@ -66,21 +76,6 @@ class Transition:
 
 
 Request = Change | Transition
-
-
-@dataclass(eq=False)
-class _Drawn:
-    """The nodes of the scene that belong to one body."""
-
-    surface: Any
-    label: Any
-    shell: Any = None
-    bars: Any = None
-
-    def remove(self) -> None:
-        for handle in (self.surface, self.label, self.shell, self.bars):
-            if handle is not None:
-                handle.remove()
 
 
 @dataclass(eq=False)
@@ -120,10 +115,9 @@ class Page:
         self._target: np.ndarray | None = None
         self._aimed_at_bodies = False
         self._camera: Camera | None = None
-        self._cloud: Any = None
-        self._frustum: Any = None
-        self._faces = scene.mesh_faces()
-        self._drawn: dict[tuple[str, int], _Drawn] = {}
+        self._faces = drawings.mesh_faces()
+        self._handles: dict[tuple[str, str], Any] = {}
+        """What is drawn, by the node that it is of, empty for the camera, and its path."""
         self._server = server.serve(bound)
         self._nodes = {name: _NodePart(name) for name in nodes}
         self._furnish(parameters)
@@ -162,16 +156,16 @@ class Page:
 
     def show_depth(self, depth: np.ndarray, camera: Camera) -> None:
         """Draw a depth image (height, width), metres, NaN where nothing was measured: cloud, picture, view volume."""
-        span = scene.depth_span(depth)
+        span = drawings.depth_span(depth)
         if span is not None:
-            self._span = scene.steady_span(self._span, span)
+            self._span = drawings.steady_span(self._span, span)
         shown = self._span or (0.0, 1.0)
-        points = scene.cloud(depth, camera, shown, self._most_points, is_muted=self._point_colours.value == _MUTED)
+        points = drawings.cloud(depth, camera, shown, self._most_points, is_muted=self._point_colours.value == _MUTED)
         with self._server.atomic():
             self._draw_cloud(points)
             self._draw_view_volume(camera, shown)
-        if self._picture_wanted.value:
-            self._picture.image = scene.picture(depth, shown)
+        if self._wanted["Depth image"].value:
+            self._picture.image = drawings.picture(depth, shown)
         self._legend.content = tables.legend(shown, "m" if camera.is_pinhole else "")
         if span is not None and self._target is None:
             self._aim(np.median(points.points, axis=0))
@@ -187,13 +181,13 @@ class Page:
             self._aim(bodies.superquadrics.translation.mean(axis=0))
         is_wanted = part.wanted is None or part.wanted.value
         drawn = bodies if bodies is not None and not state.remark and is_wanted else None
-        wanted = {} if drawn is None else {int(number): k for k, number in enumerate(drawn.ids)}
         with self._server.atomic():
-            for key in [key for key in self._drawn if key[0] == node and key[1] not in wanted]:
-                self._drawn.pop(key).remove()
-            if drawn is not None:
-                for number, k in wanted.items():
-                    self._draw_body(node, number, drawn, k, state.is_silent)
+            kept: set[str] = set()
+            for k in range(len(drawn) if drawn is not None else 0):
+                assert drawn is not None
+                kept |= self._draw_body(node, drawn, k, state.is_silent)
+            for key in [key for key in self._handles if key[0] == node and key[1] not in kept]:
+                self._handles.pop(key).remove()
         is_cube = self._camera is not None and not self._camera.is_pinhole
         part.table.content = tables.bodies_table(node, bodies, stamp, state, is_cube=is_cube)
 
@@ -291,35 +285,21 @@ class Page:
     def _furnish_view(self) -> None:
         gui = self._server.gui
         places = gui.add_button_group("Look from", tuple(_PLACES), hint="Camera: as the depth camera sees it")
-        self._points_wanted = gui.add_checkbox("Points", True, hint="The measured depth")
         self._point_colours = gui.add_dropdown("Point colours", (_MUTED, "depth"), initial_value=_MUTED)
-        self._bodies_wanted = gui.add_checkbox("Bodies", True)
-        self._labels_wanted = gui.add_checkbox("Ids", True)
-        self._shells_wanted = gui.add_checkbox(
-            "Shells", True, hint=f"The body with half sizes {scene.SHELL_SIGMAS:g} standard deviations larger"
-        )
-        self._bars_wanted = gui.add_checkbox(
-            "Error bars", True, hint=f"± {scene.SHELL_SIGMAS:g} standard deviations of each half size"
-        )
+        self._wanted = {name: gui.add_checkbox(name, True, hint=hint) for name, hint in _SHOWN.items()}
         if len(self._nodes) > 1:
             for part in self._nodes.values():
                 part.wanted = gui.add_checkbox(part.name, True, hint="The bodies of this node")
-        self._volume_wanted = gui.add_checkbox("Camera", True, hint="What the camera sees, and its optical frame")
-        self._picture_wanted = gui.add_checkbox("Depth image", True)
 
         @places.on_click
         def _(event: viser.GuiEvent) -> None:
-            if event.client is None:
-                return
-            if places.value == _CAMERA:
-                self._look_through(event.client.camera)
-            else:
-                self._look(event.client.camera, *self._from(_PLACES[places.value]))
+            if event.client is not None and (places.value != _CAMERA or self._camera is not None):
+                self._look(event.client.camera, places.value)
 
-        @self._picture_wanted.on_update
+        @self._wanted["Depth image"].on_update
         def _(_: viser.GuiEvent) -> None:
-            self._picture.visible = self._picture_wanted.value
-            self._legend.visible = self._picture_wanted.value
+            self._picture.visible = self._wanted["Depth image"].value
+            self._legend.visible = self._wanted["Depth image"].value
 
     def _add_button(self, part: _NodePart, label: str) -> Any:
         button = self._server.gui.add_button(label.capitalize(), visible=False)
@@ -356,96 +336,57 @@ class Page:
 
     # Drawing
 
-    def _draw_cloud(self, points: Cloud) -> None:
-        if self._cloud is None:
-            self._cloud = self._server.scene.add_point_cloud(
-                "/depth",
-                points.points,
-                points.colours,
-                point_size=points.point_size,
-                point_shape="circle",
-                point_shading="flat",
-                precision="float32",
-            )
+    def _put(self, node: str, path: str, add: Callable[..., Any], **state: Any) -> str:
+        """Draw something, or give what is drawn there another state; returns the path."""
+        handle = self._handles.get((node, path))
+        if handle is None:
+            self._handles[node, path] = add(path, **state)
         else:
-            self._cloud.points, self._cloud.colors = points.points, points.colours
-            self._cloud.point_size = round(points.point_size, 5)
-        self._cloud.visible = self._points_wanted.value
+            for name, value in state.items():
+                setattr(handle, name, value)
+        return path
+
+    def _draw_cloud(self, points: Cloud) -> None:
+        look = {"point_shape": "circle", "point_shading": "flat", "precision": "float32"}
+        add = partial(self._server.scene.add_point_cloud, **look)  # type: ignore[arg-type]
+        state = {"points": points.points, "colors": points.colours, "point_size": round(points.point_size, 5)}
+        self._put("", "/depth", add, **state, visible=self._wanted["Points"].value)
 
     def _draw_view_volume(self, camera: Camera, span: tuple[float, float]) -> None:
+        length = max(_NEAR_SHARE * span[0] if camera.is_pinhole else 1.0, 1e-3)
+        state: dict[str, Any] = {"visible": self._wanted["Camera"].value}
         if camera != self._camera:
-            self._camera = camera
-            length = _NEAR_SHARE * span[0] if camera.is_pinhole else 1.0
-            lines = scene.view_volume(camera, max(length, 1e-3))
-            self._frustum = self._server.scene.add_line_segments(
-                "/camera", lines, _FRUSTUM, thickness=1.5, thickness_units="screen"
-            )
-        if self._frustum is not None:
-            self._frustum.visible = self._volume_wanted.value
+            self._camera, state["points"] = camera, drawings.view_volume(camera, length)
+        self._put("", "/camera", partial(self._add_lines, _FRUSTUM, 1.5), **state)
 
-    def _draw_body(self, node: str, number: int, bodies: Bodies, k: int, is_silent: bool) -> None:
-        body = bodies.superquadrics[k]
-        red, green, blue = (round(255 * float(channel)) for channel in bodies.colours[k])
-        colour = red, green, blue
+    def _add_lines(self, colour: tuple[int, int, int], width: float, path: str, **state: Any) -> Any:
+        look: dict[str, Any] = {"colors": colour, "thickness": width, "thickness_units": "screen"}
+        return self._server.scene.add_line_segments(path, **look, **state)
+
+    def _draw_body(self, node: str, bodies: Bodies, k: int, is_silent: bool) -> set[str]:
+        """Surface, label, shell and error bars of a body, as far as they are wanted and known; their paths."""
+        body, sigma, number = bodies.superquadrics[k], bodies.sigma_size[k], int(bodies.ids[k])
+        colour: Any = tuple(round(255 * float(channel)) for channel in bodies.colours[k])
         x, y, z, w = body.rotation
-        pose: dict[str, Any] = {"position": body.translation, "wxyz": np.array([w, x, y, z])}
-        vertices = scene.mesh_vertices(body)
-        around = scene.shell(body, bodies.sigma_size[k])
-        bars = scene.error_bars(body, bodies.sigma_size[k])
+        pose = {"position": body.translation, "wxyz": np.array([w, x, y, z])}
         world, path = self._server.scene, f"/bodies{node}/{number}"
-        drawn = self._drawn.get((node, number))
-        if drawn is None:
-            surface = world.add_mesh_simple(
-                f"{path}/surface", vertices, self._faces, color=colour, opacity=_BODY_ALPHA, **pose
-            )
-            label = world.add_label(
-                f"{path}/id",
-                self._title(node, number),
-                position=scene.label_position(body),
-                anchor="bottom-center",
-                font_screen_scale=1.4,
-            )
-            drawn = self._drawn[node, number] = _Drawn(surface, label)
-        else:
-            drawn.surface.vertices = vertices
-            drawn.surface.position, drawn.surface.wxyz = pose["position"], pose["wxyz"]
-            drawn.label.position = scene.label_position(body)
-        drawn.surface.opacity = _FADED_ALPHA if is_silent else _BODY_ALPHA
-        drawn.surface.visible = self._bodies_wanted.value
-        drawn.label.visible = self._labels_wanted.value
-        drawn.shell = self._draw_shell(drawn.shell, f"{path}/shell", around, colour, pose)
-        drawn.bars = self._draw_bars(drawn.bars, f"{path}/bars", bars, pose)
-
-    def _title(self, node: str, number: int) -> str:
-        """What a label says; the same id of two nodes is not the same body."""
-        return str(number) if len(self._nodes) == 1 else f"{node.rsplit('/', 1)[-1]} {number}"
-
-    def _draw_shell(
-        self, drawn: Any, path: str, around: Superquadric | None, colour: tuple[int, int, int], pose: dict[str, Any]
-    ) -> Any:
-        if around is None or not self._shells_wanted.value:
-            if drawn is not None:
-                drawn.remove()
-            return None
-        vertices = scene.mesh_vertices(around)
-        if drawn is None:
-            return self._server.scene.add_mesh_simple(
-                path, vertices, self._faces, color=colour, opacity=_SHELL_ALPHA, side="front", **pose
-            )
-        drawn.vertices, drawn.position, drawn.wxyz = vertices, pose["position"], pose["wxyz"]
-        return drawn
-
-    def _draw_bars(self, drawn: Any, path: str, bars: np.ndarray, pose: dict[str, Any]) -> Any:
-        if not len(bars) or not self._bars_wanted.value:
-            if drawn is not None:
-                drawn.remove()
-            return None
-        if drawn is None:
-            return self._server.scene.add_line_segments(
-                path, bars, (245, 245, 245), thickness=2.5, thickness_units="screen", **pose
-            )
-        drawn.points, drawn.position, drawn.wxyz = bars, pose["position"], pose["wxyz"]
-        return drawn
+        surface = partial(world.add_mesh_simple, faces=self._faces, color=colour)
+        # The same id of two nodes is not the same body.
+        title = str(number) if len(self._nodes) == 1 else f"{node.rsplit('/', 1)[-1]} {number}"
+        label = partial(world.add_label, text=title, anchor="bottom-center", font_screen_scale=1.4)
+        look = {"opacity": _FADED_ALPHA if is_silent else _BODY_ALPHA, "visible": self._wanted["Bodies"].value}
+        where = {"position": drawings.label_position(body), "visible": self._wanted["Ids"].value}
+        paths = {
+            self._put(node, f"{path}/surface", surface, vertices=drawings.mesh_vertices(body), **look, **pose),
+            self._put(node, f"{path}/id", label, **where),
+        }
+        around, bars = drawings.shell(body, sigma), drawings.error_bars(body, sigma)
+        if around is not None and self._wanted["Shells"].value:
+            add = partial(surface, opacity=_SHELL_ALPHA, side="front")
+            paths.add(self._put(node, f"{path}/shell", add, vertices=drawings.mesh_vertices(around), **pose))
+        if len(bars) and self._wanted["Error bars"].value:
+            paths.add(self._put(node, f"{path}/bars", partial(self._add_lines, _BARS, 2.5), points=bars, **pose))
+        return paths
 
     # Views
 
@@ -454,54 +395,47 @@ class Page:
         self._target = np.asarray(target, dtype=float)
         self._set_start_view()
         for client in self._server.get_clients().values():
-            self._look(client.camera, *self._overview())
+            self._look(client.camera, _START)
 
-    def _overview(self) -> tuple[np.ndarray, np.ndarray]:
-        """Position and target: from behind the camera, a little above and to the right of its axis."""
-        return self._from(_PLACES["behind"])
-
-    def _from(self, place: tuple[float, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """Position and target, from an entry of _PLACES."""
-        share, offset = place
+    def _from(self, place: str) -> tuple[np.ndarray, np.ndarray]:
+        """Position and target of a name in _PLACES."""
+        share, offset = _PLACES[place]
         middle = np.array([0.0, 0.0, _FIRST_DISTANCE]) if self._target is None else self._target
         return share * middle + float(np.linalg.norm(middle)) * offset, share * middle
 
     def _set_start_view(self) -> None:
         start = self._server.initial_camera
-        start.position, start.look_at = self._overview()
+        start.position, start.look_at = self._from(_START)
         start.up, start.fov = _UP, float(_VIEW_ANGLE)
 
-    def _look(self, camera: Any, position: np.ndarray, target: np.ndarray, angle: float = float(_VIEW_ANGLE)) -> None:
-        camera.up_direction, camera.fov = _UP, angle
-        camera.position, camera.look_at = position, target
-
-    def _look_through(self, camera: Any) -> None:
-        seen = self._camera
-        if seen is None:
-            return
-        if seen.is_pinhole:
-            angle = 2 * np.arctan(0.5 * seen.height / seen.fy)
-            self._look(camera, np.zeros(3), np.array([0.0, 0.0, _FIRST_DISTANCE]), float(angle))
-        else:
-            self._look(camera, np.array([0.5, 0.5, -1.0]), np.array([0.5, 0.5, 1.0]))
+    def _look(self, view: Any, place: str) -> None:
+        """Let a view look from a place, or as the depth camera does."""
+        (position, target), angle, camera = self._from(place), _VIEW_ANGLE, self._camera
+        if place == _CAMERA and camera is not None and camera.is_pinhole:
+            angle = 2 * np.arctan(0.5 * camera.height / camera.fy)
+            position, target = np.zeros(3), np.array([0.0, 0.0, _FIRST_DISTANCE])
+        elif place == _CAMERA:
+            position, target = np.array([0.5, 0.5, -1.0]), np.array([0.5, 0.5, 1.0])
+        view.up_direction, view.fov = _UP, float(angle)
+        view.position, view.look_at = position, target
 
 
+@dataclass(eq=False)
 class _NodePart:
     """What belongs to one node on the page."""
 
-    def __init__(self, name: str) -> None:
-        self.name = name
-        self.status: Any = None
-        self.table: Any = None
-        self.tab: Any = None
-        self.answer: Any = None
-        self.wanted: Any = None
-        self.buttons: dict[str, Any] = {}
-        self.folders: list[Any] = []
-        self.controls: dict[str, Control] = {}
-        self.handles: dict[str, Any] = {}
-        self.known: dict[str, Any] = {}
-        self.pending: dict[str, _Pending] = {}
+    name: str
+    status: Any = None
+    table: Any = None
+    tab: Any = None
+    answer: Any = None
+    wanted: Any = None
+    buttons: dict[str, Any] = field(default_factory=dict)
+    folders: list[Any] = field(default_factory=list)
+    controls: dict[str, Control] = field(default_factory=dict)
+    handles: dict[str, Any] = field(default_factory=dict)
+    known: dict[str, Any] = field(default_factory=dict)
+    pending: dict[str, _Pending] = field(default_factory=dict)
 
 
 _TRANSITIONS: dict[str, tuple[str, ...]] = {

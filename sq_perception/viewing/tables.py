@@ -11,7 +11,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from sq_perception.viewing.scene import Bodies, colour_scale
+from sq_perception.viewing.drawings import Bodies, colour_scale
 
 SILENT_SECONDS = 3.0
 """A node without results for so long is called silent."""

@@ -13,11 +13,11 @@ import pytest
 import torch
 
 from sq_perception.commands import main
-from sq_perception.evaluation import contest, evaluation_pictures, report, thesis_tables
+from sq_perception.evaluation import contest, evaluation_pictures, thesis_tables
 from sq_perception.evaluation.contestants import Answers, FittingMethod, Network, unique_names
 from sq_perception.evaluation.figures_of_merit import FiguresOfMerit, Summary, shortest_arc
 from sq_perception.evaluation.thesis_images import ImageChunk, ThesisImages
-from sq_perception.evaluation.thesis_tables import NOT_IN_THESIS, NOTHING, Result, Table
+from sq_perception.evaluation.thesis_tables import NOT_IN_THESIS, NOTHING, Table, TableEntry
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
@@ -212,10 +212,10 @@ class TestTables:
 
     def test_losses_answer_the_rows_of_the_thesis(self) -> None:
         results = [
-            Result("shipped", "occupancy", summary(iou_mean=0.9)),
-            Result("free", "least_squares_free", summary(iou_mean=0.8)),
-            Result("classic", "", summary(iou_mean=0.7)),
-            Result("auto", "", summary(iou_mean=0.99)),
+            TableEntry("shipped", "occupancy", summary(iou_mean=0.9)),
+            TableEntry("free", "least_squares_free", summary(iou_mean=0.8)),
+            TableEntry("classic", "", summary(iou_mean=0.7)),
+            TableEntry("auto", "", summary(iou_mean=0.99)),
         ]
         tables = {table.title.split(":")[0]: table for table in thesis_tables.thesis_tables(results)}
         rows = {row[0]: row for row in tables["Table 7.4"].rows}
@@ -228,7 +228,7 @@ class TestTables:
         assert [len(table.rows) for table in thesis_tables.overview(results)] == [4, 4]
 
     def test_two_networks_of_one_loss_are_two_rows(self) -> None:
-        results = [Result(name, "render", summary()) for name in ("first", "second")]
+        results = [TableEntry(name, "render", summary()) for name in ("first", "second")]
         (table,) = (one for one in thesis_tables.thesis_tables(results) if one.title.startswith("Table 7.2"))
         assert [row[1] for row in table.rows if row[0].endswith("L_DR")] == ["first", "second"]
 
@@ -258,15 +258,6 @@ def test_examples_are_chosen_by_rank() -> None:
     assert [len(group) for group in groups.values()] == [3, 3, 3]
     assert outcome.figures.iou[groups["median"][1]] == pytest.approx(np.median(outcome.figures.iou), abs=0.02)
     assert outcome.figures.iou[groups["worst"][-1]] == outcome.figures.iou.min()
-
-
-def test_a_training_log_may_be_absent_or_damaged(tmp_path: Path) -> None:
-    model = tmp_path / "model.safetensors"
-    assert report.training_log(model) == []
-    good = {"step": 10, "loss": 0.5, "iou": 0.4, "note": "x"}
-    lines = [json.dumps(good), "[1]", '{"step": "a"}', '{"step": 1, "loss": NaN, "iou": 0}', '{"step": 20, "lo']
-    (tmp_path / "log.jsonl").write_text("\n".join(lines))
-    assert report.training_log(model) == [{"step": 10.0, "loss": 0.5, "iou": 0.4}]
 
 
 class References(HTMLParser):

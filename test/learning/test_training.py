@@ -198,6 +198,9 @@ class TestLog:
             log.close()
         assert training_log.read(tmp_path) == [{"step": 5, "loss": 1.0}, {"step": 10, "loss": 1.0}]
         assert training_log.read(tmp_path / "nowhere") == []
+        with (tmp_path / "log.jsonl").open("a") as file:
+            file.write('{"step": 15, "lo')
+        assert len(training_log.read(tmp_path)) == 2
 
     def test_tensorboard_gets_the_same_numbers(self, tmp_path: Path) -> None:
         events = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator", reason="no tensorboard")

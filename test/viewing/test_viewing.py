@@ -14,9 +14,9 @@ from sq_perception.commands import view
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
-from sq_perception.viewing import controls, scene, tables
+from sq_perception.viewing import controls, drawings, tables
 from sq_perception.viewing.controls import Control, Description
-from sq_perception.viewing.scene import Bodies
+from sq_perception.viewing.drawings import Bodies
 from sq_perception.viewing.tables import NodeState
 
 CAMERA = Camera(64, 48, 60.0, 61.0, 31.0, 24.5)
@@ -40,7 +40,7 @@ def bodies(sigma: float = 0.001, weak: bool = False) -> Bodies:
 def test_the_cloud_is_the_image_thinned(most: int, rng: np.random.Generator) -> None:
     depth = rng.uniform(0.5, 2.0, (48, 64)).astype(np.float32)
     depth[rng.random((48, 64)) < 0.3] = np.nan
-    points = scene.cloud(depth, CAMERA, (0.5, 2.0), most)
+    points = drawings.cloud(depth, CAMERA, (0.5, 2.0), most)
     assert len(points.points) <= most
     assert points.points.dtype == np.float32
     assert points.colours.shape == points.points.shape
@@ -54,14 +54,14 @@ def test_the_cloud_is_the_image_thinned(most: int, rng: np.random.Generator) -> 
 
 def test_an_image_without_a_reading_has_no_points() -> None:
     depth = np.full((48, 64), np.nan, np.float32)
-    assert scene.depth_span(depth) is None
-    assert scene.cloud(depth, CAMERA, (0.0, 1.0), 100).points.shape == (0, 3)
-    assert scene.cloud(depth, CAMERA, (0.0, 1.0), 100, is_muted=True).colours.shape == (0, 3)
-    assert scene.picture(depth, (0.0, 1.0)).shape == (288, 384, 3)
+    assert drawings.depth_span(depth) is None
+    assert drawings.cloud(depth, CAMERA, (0.0, 1.0), 100).points.shape == (0, 3)
+    assert drawings.cloud(depth, CAMERA, (0.0, 1.0), 100, is_muted=True).colours.shape == (0, 3)
+    assert drawings.picture(depth, (0.0, 1.0)).shape == (288, 384, 3)
 
 
 def test_colours_go_with_depth_and_holes_are_dark() -> None:
-    colours = scene.coloured(np.array([[0.5, 1.0, np.nan, 0.1, 9.0]], np.float32), (0.5, 1.0))[0].astype(int)
+    colours = drawings.coloured(np.array([[0.5, 1.0, np.nan, 0.1, 9.0]], np.float32), (0.5, 1.0))[0].astype(int)
     assert colours[0][0] > colours[0][2] + 50, "near is red"
     assert colours[1][2] > colours[1][0] + 50, "far is blue"
     assert colours[2].max() < 50
@@ -69,15 +69,15 @@ def test_colours_go_with_depth_and_holes_are_dark() -> None:
 
 
 def test_the_span_is_steady() -> None:
-    assert scene.steady_span(None, (0.5, 1.0)) == (0.5, 1.0)
-    assert scene.steady_span((0.5, 1.0), (0.51, 1.02)) == (0.5, 1.0)
-    assert scene.steady_span((0.5, 1.0), (0.5, 1.2)) == (0.5, 1.2)
+    assert drawings.steady_span(None, (0.5, 1.0)) == (0.5, 1.0)
+    assert drawings.steady_span((0.5, 1.0), (0.51, 1.02)) == (0.5, 1.0)
+    assert drawings.steady_span((0.5, 1.0), (0.5, 1.2)) == (0.5, 1.2)
 
 
 @pytest.mark.parametrize("shape", [(0.1, 0.1), (1.0, 1.0), (0.1, 1.0), (1.9, 0.5)])
 def test_a_mesh_is_closed_outwards_and_on_the_surface(shape: tuple[float, float]) -> None:
     one = body(shape=shape)
-    vertices, faces = scene.mesh_vertices(one).astype(float), scene.mesh_faces()
+    vertices, faces = drawings.mesh_vertices(one).astype(float), drawings.mesh_faces()
     assert faces.max() == len(vertices) - 1
     mesh = trimesh.Trimesh(vertices, faces, process=False)
     assert mesh.is_watertight
@@ -90,15 +90,15 @@ def test_a_mesh_is_closed_outwards_and_on_the_surface(shape: tuple[float, float]
 
 def test_a_shell_is_two_deviations_larger_but_never_huge() -> None:
     one = body()
-    around = scene.shell(one, np.array([0.01, np.nan, 5.0]))
+    around = drawings.shell(one, np.array([0.01, np.nan, 5.0]))
     assert around is not None
     np.testing.assert_allclose(around.size, [0.12, 0.07, 0.15])
-    assert scene.shell(one, np.full(3, np.nan)) is None
-    assert scene.shell(one, np.zeros(3)) is None
+    assert drawings.shell(one, np.full(3, np.nan)) is None
+    assert drawings.shell(one, np.zeros(3)) is None
 
 
 def test_error_bars_straddle_the_surface() -> None:
-    bars = scene.error_bars(body(), np.array([0.01, np.nan, 5.0]))
+    bars = drawings.error_bars(body(), np.array([0.01, np.nan, 5.0]))
     assert bars.shape == (4, 2, 3)
     np.testing.assert_allclose(bars[1], [[0.08, 0, 0], [0.12, 0, 0]], atol=1e-7)
     np.testing.assert_allclose(bars[2], [[0, 0, 0], [0, 0, -0.15]], atol=1e-7)
@@ -106,15 +106,15 @@ def test_error_bars_straddle_the_surface() -> None:
 
 def test_a_label_stands_above_its_body() -> None:
     one = body()
-    place = scene.label_position(one)
-    vertices = one.to_parent(scene.mesh_vertices(one).astype(float))
+    place = drawings.label_position(one)
+    vertices = one.to_parent(drawings.mesh_vertices(one).astype(float))
     assert place[1] < vertices[:, 1].min()
     assert place[1] > vertices[:, 1].min() - 0.02
 
 
 @pytest.mark.parametrize("camera", [CAMERA, unit_cube.camera(32)], ids=["pinhole", "orthographic"])
 def test_the_view_volume_ends_at_the_corners_of_the_image(camera: Camera) -> None:
-    lines = scene.view_volume(camera, 0.5)
+    lines = drawings.view_volume(camera, 0.5)
     assert lines.shape == ((8 if camera.is_pinhole else 12), 2, 3)
     pixels = camera.project(lines[:4, 1])
     np.testing.assert_allclose(pixels.min(axis=0), [-0.5, -0.5], atol=1e-4)
@@ -123,9 +123,9 @@ def test_the_view_volume_ends_at_the_corners_of_the_image(camera: Camera) -> Non
 
 def test_misuse_is_refused() -> None:
     with pytest.raises(ValueError, match="number of points"):
-        scene.cloud(np.ones((48, 64), np.float32), CAMERA, (0, 1), 0)
+        drawings.cloud(np.ones((48, 64), np.float32), CAMERA, (0, 1), 0)
     with pytest.raises(ValueError, match="does not fit"):
-        scene.cloud(np.ones((4, 6), np.float32), CAMERA, (0, 1), 9)
+        drawings.cloud(np.ones((4, 6), np.float32), CAMERA, (0, 1), 9)
     with pytest.raises(ValueError, match="ids: expected one for each of 1"):
         Bodies(Superquadric.stack([body()]), np.ones((1, 3)), np.ones(1), [], [False], np.ones((1, 3)))
 
@@ -306,6 +306,37 @@ def test_a_port_that_is_taken_is_an_error_in_words(taken: int) -> None:
         listening_socket("203.0.113.1", 0)
     with listening_socket("127.0.0.1", 0) as free:
         assert free.getsockname()[1] > 0
+
+
+def test_the_page_draws_what_is_there_and_takes_away_what_is_not() -> None:
+    """Without a browser: what viser is told to show of two nodes, frame by frame."""
+    pytest.importorskip("viser", reason="needs the extra 'view'")
+    from sq_perception.viewing.page import Page
+    from sq_perception.viewing.server import listening_socket
+
+    with listening_socket("127.0.0.1", 0) as bound:
+        page = Page(bound, ["/a", "/a/b"])
+        try:
+            for camera, lines in ((CAMERA, 8), (unit_cube.camera(64, 48), 12)):
+                page.show_depth(np.full((48, 64), 0.8, np.float32), camera)
+                assert page._handles["", "/camera"].points.shape == (lines, 2, 3)
+            page.show_bodies("/a/b", bodies(), 0.0, NodeState("/a/b", age=99.0))
+            for found, parts in (
+                (bodies(), {"surface", "id", "shell", "bars"}),
+                (bodies(np.nan), {"surface", "id"}),
+                (None, set()),
+                (bodies(), {"surface", "id", "shell", "bars"}),
+            ):
+                page.show_bodies("/a", found, 0.0, NodeState("/a", age=0.0))
+                assert {path for node, path in page._handles if node == "/a"} == {f"/bodies/a/7/{x}" for x in parts}
+            fresh, silent = (page._handles[node, f"/bodies{node}/7/surface"].opacity for node in ("/a", "/a/b"))
+            assert silent < fresh
+            assert page._handles["/a/b", "/bodies/a/b/7/id"].text == "b 7"
+            page._wanted["Shells"].value = False
+            page.show_bodies("/a", bodies(), 0.0, NodeState("/a", age=0.0))
+            assert ("/a", "/bodies/a/7/shell") not in page._handles
+        finally:
+            page.close()
 
 
 # The command

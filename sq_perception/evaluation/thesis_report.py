@@ -22,10 +22,10 @@ from sq_perception.evaluation import plots, thesis_tables
 from sq_perception.evaluation.contest import Outcome
 from sq_perception.evaluation.contestants import Network
 from sq_perception.evaluation.thesis_images import ThesisImages
-from sq_perception.evaluation.thesis_tables import Result, Table
+from sq_perception.evaluation.thesis_tables import Table, TableEntry
+from sq_perception.learning import training_log
 
 FORMAT, VERSION = "sq_perception.evaluation", 1
-_MOST_RECORDS = 100_000
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; color: #22303c; background: #fff; max-width: 76rem; margin: 2.5rem auto;
        padding: 0 1.5rem; }
@@ -114,26 +114,8 @@ def overview(outcomes: Sequence[Outcome]) -> list[Table]:
     return thesis_tables.overview(_results(outcomes))
 
 
-def training_log(model: Path) -> list[dict[str, float]]:
-    """The records of the log.jsonl beside a model file, those that have a step, a loss and an IoU; often none."""
-    path = model.parent / "log.jsonl"
-    records = []
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()[:_MOST_RECORDS]
-    except (OSError, UnicodeDecodeError):
-        return []
-    for line in lines:
-        try:
-            record = json.loads(line)
-        except json.JSONDecodeError:
-            continue  # the last line of a run that was killed
-        if isinstance(record, dict) and all(_is_number(record.get(key)) for key in ("step", "loss", "iou")):
-            records.append({key: float(value) for key, value in record.items() if _is_number(value)})
-    return records
-
-
-def _results(outcomes: Sequence[Outcome]) -> list[Result]:
-    return [Result(one.contestant.name, one.contestant.loss, one.figures.summary()) for one in outcomes]
+def _results(outcomes: Sequence[Outcome]) -> list[TableEntry]:
+    return [TableEntry(one.contestant.name, one.contestant.loss, one.figures.summary()) for one in outcomes]
 
 
 def _own_pictures(outcome: Outcome, images: ThesisImages, folder: Path) -> list[_Picture]:
@@ -143,7 +125,7 @@ def _own_pictures(outcome: Outcome, images: ThesisImages, folder: Path) -> list[
         ("examples", pictures.examples(outcome, images)),
     ]
     if isinstance(outcome.contestant, Network):
-        records = training_log(outcome.contestant.path)
+        records = [one for one in training_log.read(outcome.contestant.path.parent) if "iou" in one]
         if len(records) > 1:
             drawn.append(("training", pictures.training_curves(records)))
     return [_saved(figure, folder, f"{name}_{kind}", kind) for kind, figure in drawn]
@@ -178,10 +160,6 @@ def _finite(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, (int, float)) and not isinstance(value, bool) and math.isfinite(value)
 
 
 def _facts_line(facts: dict[str, Any]) -> str:
