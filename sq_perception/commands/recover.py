@@ -82,7 +82,8 @@ distortion:
 
 tracking:
   --track follows bodies over the frames of each bag and folder, for a camera that stands still: the same body keeps its
-  id and the names of its axes, and "track" has the numbers of all frames so far.
+  id and the names of its axes, and "track" has the numbers of all frames so far.  What reads the same as in the frame
+  before, but for noise, is not recovered again; with --jobs each frame is recovered for itself.
 
 bags:
   --mcap writes what recover_node would have published, and what it would have read, with stamps, frame ids and times of
@@ -371,6 +372,7 @@ class _Run:
             asked = ((pair, work(pair[1]) if isinstance(pair[1], RecordedFrame) else None) for pair in pairs)
             yield from workers.recovered(asked, setup, self._options.jobs)
             return
+        previous: FrameRecovery | None = None
         for pair in pairs:
             answer: Any = None
             if isinstance(frame := pair[1], RecordedFrame):
@@ -379,7 +381,8 @@ class _Run:
                         self._recoverer.warm_up(frame.camera)
                         self._warm.add(frame.camera)
                     one = work(frame)
-                    answer = self._recoverer.recover(one.depth, one.camera, one.labels, one.options)
+                    answer = self._recoverer.recover(one.depth, one.camera, one.labels, one.options, previous)
+                    previous = answer if self._tracks else None
                 except (ValueError, ArithmeticError) as error:
                     answer = error
             yield pair, answer

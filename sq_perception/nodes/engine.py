@@ -18,6 +18,7 @@ from collections.abc import Callable, Hashable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from time import perf_counter
+from typing import TypeAlias
 
 import torch
 from rclpy.node import Node
@@ -36,6 +37,10 @@ _READ_BY = frozenset(("model", "device"))
 """Those whose setting reads the weights; the others keep what is loaded, whatever became of the file."""
 _ANSWERS = ("method", "refine", "consensus")
 """Parameters that change what bodies come out, beside the weights."""
+
+
+Answer: TypeAlias = tuple[FrameRecovery, Hashable]
+"""The bodies of a frame, and what tells their origin from another."""
 
 
 class Turns:
@@ -143,14 +148,17 @@ class Engine:
         threading.Thread(target=self._swap, args=work, name="recoverer in the making", daemon=True).start()
 
     def recover(
-        self, frame: Frame, parameters: RecoverParameters, pose: Pose | None = None
-    ) -> tuple[FrameRecovery, Hashable]:
+        self, frame: Frame, parameters: RecoverParameters, pose: Pose | None = None, previous: Answer | None = None
+    ) -> Answer:
         """The bodies of a frame by the parameters in force, and what tells their origin from another.
 
         Parameters
         ----------
         pose
             Of the frame in ``target_frame``; None where there is none.
+        previous
+            Of the same camera's frame before this one: what did not change since then, if its origin is the same, is
+            taken from it.
 
         Raises
         ------
@@ -161,8 +169,10 @@ class Engine:
         if built is None:
             raise RuntimeError("the recoverer has been released")
         in_force = replace(parameters, **{name: getattr(built.parameters, name) for name in _MADE_OF})
-        recovery = built.recoverer.recover(frame.depth, frame.camera, frame.labels, options(in_force, pose))
-        return recovery, (built.weights, *(getattr(in_force, name) for name in _ANSWERS))
+        origin = (built.weights, *(getattr(in_force, name) for name in _ANSWERS))
+        known = previous[0] if previous is not None and previous[1] == origin else None
+        recovery = built.recoverer.recover(frame.depth, frame.camera, frame.labels, options(in_force, pose), known)
+        return recovery, origin
 
     @property
     def description(self) -> str:

@@ -45,7 +45,7 @@ from std_srvs.srv import SetBool, Trigger
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.nodes import fast_dds, process
-from sq_perception.nodes.engine import TURNS, Engine
+from sq_perception.nodes.engine import TURNS, Answer, Engine
 from sq_perception.nodes.frame import Frame
 from sq_perception.nodes.inbox import Arrival
 from sq_perception.nodes.input import Input
@@ -113,6 +113,8 @@ class FrameNode(ManagedNode):
         self._poses = CameraPoses(self)
         self._tracking = Tracking(self, self._poses)
         self._outputs = Outputs(self, self._poses)
+        self._before: dict[str, Answer] = {}
+        """What the last frame came to, by its frame_id."""
         self._input: Input | None = None
         self._worker: threading.Thread | None = None
         self._enabled = True
@@ -168,6 +170,7 @@ class FrameNode(ManagedNode):
             self._outputs.close()
         self._poses.close()
         self._engine.release()
+        self._before = {}
         process.release_objects()  # nothing of a network may hang on in a cycle of references
 
     def _stop(self) -> None:
@@ -263,7 +266,9 @@ class FrameNode(ManagedNode):
             known = pose_in(self._poses, frame.header, parameters.target_frame, parameters.tf_tolerance)
             turn, shift = (tuple(part.tolist()) for part in known)
             pose = turn, shift
-        recovery, origin = self._engine.recover(frame, parameters, pose)
+        before = self._before.get(frame.header.frame_id) if parameters.tracking else None
+        recovery, origin = answer = self._engine.recover(frame, parameters, pose, before)
+        self._before = {frame.header.frame_id: answer}
         stages |= {f"recovery: {name}": took for name, took in recovery.milliseconds.items()}
         return _Result(frame, recovery, origin, stages)
 

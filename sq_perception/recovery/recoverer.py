@@ -45,7 +45,8 @@ from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
 from sq_perception.learning import checkpoint, inference
 from sq_perception.learning.consensus import Consensus
-from sq_perception.recovery import methods, seen_object, segment_repair
+from sq_perception.recovery import continuity, methods, seen_object, segment_repair
+from sq_perception.recovery.continuity import Reference
 from sq_perception.recovery.options import FITTED, NEEDS_NETWORK, Method, RecoveryOptions, Refine
 from sq_perception.recovery.recovery import FrameRecovery, Recovery
 from sq_perception.recovery.seen_object import Prediction, SeenObject
@@ -149,6 +150,7 @@ class Recoverer:
         camera: Camera,
         labels: np.ndarray | None = None,
         options: RecoveryOptions | None = None,
+        previous: FrameRecovery | None = None,
     ) -> FrameRecovery:
         """Recover every object of a depth image.
 
@@ -161,6 +163,9 @@ class Recoverer:
             Instance masks, 0 for background; without them the image is segmented.
         options
             Defaults with the method given to the constructor.
+        previous
+            What the same camera's frame before this one came to, by the same network: bodies whose readings are the
+            same but for noise are taken from it (:mod:`sq_perception.recovery.continuity`).
 
         Raises
         ------
@@ -171,10 +176,15 @@ class Recoverer:
         """
         # Threads of a BLAS spin after products as small as these, on the cores that fits of other objects want.
         with self._blas.limit(limits=1, user_api="blas"):
-            return self._recover(depth, camera, labels, options or self._options)
+            return self._recover(depth, camera, labels, options or self._options, previous)
 
     def _recover(
-        self, depth: np.ndarray, camera: Camera, labels: np.ndarray | None, options: RecoveryOptions
+        self,
+        depth: np.ndarray,
+        camera: Camera,
+        labels: np.ndarray | None,
+        options: RecoveryOptions,
+        previous: FrameRecovery | None,
     ) -> FrameRecovery:
         started = time.perf_counter()
         milliseconds = dict.fromkeys(("segmentation", "network", "fit", "repair", "score", "total"), 0.0)
@@ -185,33 +195,56 @@ class Recoverer:
 
         with _timed(milliseconds, "segmentation"):
             depth = _plausible(np.asarray(depth), camera)
+            camera.check_image(depth)
+            kept = continuity.NOTHING
+            if previous is not None:
+                kept = continuity.repeated(previous, _cleaned(depth, camera), camera, options)
+                if kept.whole and (labels is None or np.array_equal(labels, previous.labels)):
+                    milliseconds["segmentation"] = milliseconds["total"] = 1e3 * (time.perf_counter() - started)
+                    bodies = tuple(replace(one, repeats=one.repeats + 1) for one in previous.bodies)
+                    return replace(previous, bodies=bodies, milliseconds=milliseconds)
             if labels is None:
                 found = segments.segment(depth, camera, options.segmentation_options())
             else:
                 found = segments.from_labels(labels, depth, camera, options.segmentation_options())
             depth = _cleaned(depth, camera)
             objects = seen_object.objects(depth, found, camera, options.depth_range)
+            same = {} if previous is None else continuity.matched(kept, previous.labels, objects)
 
         with _timed(milliseconds, "network"):
-            objects = self._mapped(lambda one: _viewed(one, depth, camera, found, options, network), objects)
+            fresh = [one for one in objects if one.label not in same]
+            fresh = self._mapped(lambda one: _viewed(one, depth, camera, found, options, network), fresh)
             if network is not None:
-                objects = self._predicted(objects, network, options)
+                fresh = self._predicted(fresh, network, options)
 
         with _timed(milliseconds, "fit"):
             deadline = started + options.time_budget
-            fits = self._mapped(lambda one: methods.fitted(one, depth, camera, options, deadline), objects)
+            fits = self._mapped(lambda one: methods.fitted(one, depth, camera, options, deadline), fresh)
+            fit_of = {one.label: fit for one, fit in zip(fresh, fits, strict=True)}
+            known = {one.label: one for one in fresh}
+            objects = [known.get(one.label, one) for one in objects]
+            fits = [same[one.label].fit if one.label in same else fit_of[one.label] for one in objects]
         with _timed(milliseconds, "repair"):
             if labels is None and options.repair and options.method in FITTED and options.refine == "surface":
                 found, objects, fits = _repaired(found, objects, fits, depth, camera, options, deadline)
         with _timed(milliseconds, "score"):
             pairs = list(zip(objects, fits, strict=True))
-            scores = self._mapped(lambda pair: methods.score(pair[0].view, pair[1], options), pairs)
-        bodies = tuple(
-            Recovery(fit, score, one.label, one.pixels) for (one, fit), score in zip(pairs, scores, strict=True)
-        )
+
+            def recovery(pair: tuple[SeenObject, Fit]) -> Recovery:
+                one, fit = pair
+                if one.label in same and same[one.label].fit is fit:
+                    return same[one.label]
+                return Recovery(fit, methods.score(one.view, fit, options), one.label, one.pixels)
+
+            bodies = tuple(self._mapped(recovery, pairs))
+        reference = Reference.of(depth, camera, found.sigma, options)
+        if previous is not None and previous.reference is not None and same:
+            reference = reference.keeping(
+                previous.reference, found.labels, [one.label for one in bodies if one.repeats]
+            )
         milliseconds["total"] = 1e3 * (time.perf_counter() - started)
         message = "" if bodies else _why_empty(depth, found)
-        return FrameRecovery(bodies, milliseconds, found.labels, found.plane, message)
+        return FrameRecovery(bodies, milliseconds, found.labels, found.plane, message, reference)
 
     def _predicted(self, objects: Sequence[SeenObject], network: Network, options: RecoveryOptions) -> list[SeenObject]:
         """The objects with their predictions, which may still be computed beside a fit that begins without them."""

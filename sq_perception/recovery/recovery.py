@@ -8,6 +8,7 @@ import numpy as np
 
 from sq_perception.fitting.fit import Fit, Status
 from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.recovery.continuity import Reference
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,12 +25,16 @@ class Recovery:
         The object's value in the label image.
     pixels : int
         Measured pixels of the object.
+    repeats : int
+        Frames before this one whose readings the body was recovered from, as these are the same but for noise
+        (:mod:`sq_perception.recovery.continuity`): an answer given before, with the same error.  0: from this frame.
     """
 
     fit: Fit
     score: float
     label: int
     pixels: int
+    repeats: int = 0
 
     @property
     def superquadric(self) -> Superquadric:
@@ -83,6 +88,8 @@ class FrameRecovery:
         Support plane, height above it = n.p + d.
     message
         Why there are no objects; empty otherwise.
+    reference
+        What the next frame of the same camera is compared with.
     """
 
     bodies: tuple[Recovery, ...]
@@ -90,6 +97,7 @@ class FrameRecovery:
     labels: np.ndarray
     plane: np.ndarray | None
     message: str
+    reference: Reference | None = None
 
     @property
     def recovered(self) -> tuple[Recovery, ...]:

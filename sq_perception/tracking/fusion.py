@@ -24,6 +24,9 @@ carried along,
 and K does not know of it: a gain that did would subtract one view from another to cancel what they are supposed to
 share.
 
+An answer that repeats an earlier one, of readings that are the same but for noise, has the same v again and says no
+more than that the body is where it was: it is not fused, K = 0.
+
 Equal views are averaged with equal weights and P falls to B, not to zero; views from elsewhere count as new.  With rho
 = gamma = 0 and F = 0 it is the Kalman filter of a constant.
 

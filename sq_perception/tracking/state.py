@@ -35,7 +35,8 @@ class Observed(Protocol):
     """What the tracker reads of a body of one frame, as :class:`~sq_perception.recovery.recoverer.Recovery` is.
 
     ``superquadric`` is a single body in the optical frame.  ``covariance`` is (11, 11), of a1 a2 a3 e1 e2 t1 t2 t3 and
-    the rotation vector in the object frame, metres and radians; NaN where unknown.
+    the rotation vector in the object frame, metres and radians; NaN where unknown.  ``repeats`` is above 0 for an
+    answer that was given before, of readings that are the same but for noise: its error is the same, too.
     """
 
     @property
@@ -43,6 +44,9 @@ class Observed(Protocol):
 
     @property
     def covariance(self) -> np.ndarray: ...
+
+    @property
+    def repeats(self) -> int: ...
 
 
 def difference(state: np.ndarray, other: np.ndarray) -> np.ndarray:

@@ -8,7 +8,8 @@ world frame.  A frame is dealt with in this order:
    (:mod:`~sq_perception.tracking.forms`).
 3. An observation that agrees with its track is fused (:mod:`~sq_perception.tracking.fusion`).  One that does not agree
    counts little; where several in a row disagree in the pose alone, the body has moved: its pose starts again, its
-   sizes and exponents are kept.  Where they disagree otherwise, the track is doubted too and learns anew.
+   sizes and exponents are kept.  Where they disagree otherwise, the track is doubted too and learns anew.  An answer
+   that repeats an earlier one says of a body at rest that it is there, and no more.
 4. Observations without a track start one; ids are never used again.
 5. A track without observation is kept while it is hidden (:mod:`~sq_perception.tracking.sight`), and dies after a
    number of frames in which it should have been seen, or in which another body was seen in its place.
@@ -168,8 +169,8 @@ class Tracker:
         expected = partial(_expected, camera=camera, depth=depth, rotation=rotation, position=position)
         pairs, missing = self._pairs(observed, covariance, stamp, expected)
         to_camera = _towards(observed[:, 5:8], rotation, position, orthographic)
-        self._fuse(pairs, to_camera, stamp)
         taken = set(pairs.observed.tolist())
+        self._fuse(self._without_repeats(pairs, recoveries, stamp), to_camera, stamp)
         for j in range(len(observed)):
             if j not in taken:
                 self._begin(j, observed[j], covariance[j], to_camera[j], stamp)
@@ -214,7 +215,7 @@ class Tracker:
             if stamp - one.last > FORGET_POSE_AFTER:
                 variance[POSE] += _UNPLACED**2
             one.covariance = one.covariance + np.diag(variance)
-            one.observation, one.follows = None, False
+            one.observation = None
 
     def _pairs(
         self,
@@ -246,6 +247,19 @@ class Tracker:
             self._bodies[k].jumps += 1
             self._bodies[k].disagreed = max(self._bodies[k].disagreed, PATIENCE)
         return here + there, missing
+
+    def _without_repeats(self, pairs: Pairs, recoveries: Sequence[Observed], stamp: float) -> Pairs:
+        """The pairs that are to be fused.  A moving body's pose is not what was fused before, even in an old answer."""
+        new = np.ones(len(pairs.track), dtype=bool)
+        for k, (track, index) in enumerate(zip(pairs.track, pairs.observed, strict=True)):
+            one = self._bodies[track]
+            if recoveries[index].repeats == 0 or one.is_moving:
+                continue
+            new[k] = False
+            one.seen, one.missed, one.last, one.observation = one.seen + 1, 0, stamp, int(index)
+            if one.follows:
+                one.agreed = stamp
+        return Pairs(*(part[new] for part in pairs))
 
     def _fuse(self, pairs: Pairs, to_camera: np.ndarray, stamp: float) -> None:
         if not len(pairs.track):
@@ -382,7 +396,7 @@ def _published(one: _Body) -> Track:
         seen=one.seen,
         state=known if one.observation is not None else TrackState.LOST,
         observation=one.observation,
-        follows=one.follows,
+        follows=one.follows and one.observation is not None,
     )
 
 

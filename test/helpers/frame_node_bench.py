@@ -48,7 +48,9 @@ class Recoverer:
     def warm_up(self, camera: Camera) -> None:
         self.warm = camera
 
-    def recover(self, depth: np.ndarray, camera: Camera, labels: np.ndarray | None, options: Any) -> FrameRecovery:
+    def recover(
+        self, depth: np.ndarray, camera: Camera, labels: np.ndarray | None, options: Any, previous: Any = None
+    ) -> FrameRecovery:
         self.asked.append((depth, camera, labels, options))
         assert self.gate.wait(PATIENCE)
         if self.error is not None:

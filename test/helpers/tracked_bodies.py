@@ -21,6 +21,7 @@ NOTHING = np.full((CAMERA.height, CAMERA.width), np.nan)
 class Seen(NamedTuple):
     superquadric: Superquadric
     covariance: np.ndarray
+    repeats: int = 0
 
 
 def nothing_but_the_covariances(patch, common, lasting):

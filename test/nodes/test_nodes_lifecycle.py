@@ -57,7 +57,7 @@ class Recoverer:
     def warm_up(self, camera: Camera) -> None:
         self.warm = camera
 
-    def recover(self, depth: np.ndarray, camera: Camera, labels: Any, options: Any) -> FrameRecovery:
+    def recover(self, depth: np.ndarray, camera: Camera, labels: Any, options: Any, previous: Any) -> FrameRecovery:
         self.asked += 1
         self.at_work += 1
         self.most_at_work = max(self.most_at_work, self.at_work)

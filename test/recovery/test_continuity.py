@@ -1,0 +1,200 @@
+"""Frames that repeat others: what stands still is not recovered again, and what changed is noticed at once."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.stats import chi2
+
+from sq_perception.fitting.fit import Status
+from sq_perception.geometry import rotation as quaternions
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging import raycast
+from sq_perception.imaging.camera import Camera
+from sq_perception.recovery import continuity
+from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
+from sq_perception.tracking import state
+from sq_perception.tracking.tracker import Tracker
+
+CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)
+PITCH, DISTANCE, SIGMA = np.deg2rad(50), 0.8, 0.001
+NORMAL = -np.array([0.0, np.cos(PITCH), np.sin(PITCH)])
+AWAY = np.array([0.0, -np.sin(PITCH), np.cos(PITCH)])
+TABLE = np.stack([[1.0, 0, 0], AWAY, NORMAL], axis=1)
+"""Optical from table frame."""
+PLACES = ((-0.16, 0.0), (0.0, 0.0), (0.16, 0.02))
+
+
+def standing(x, y, size=(0.04, 0.035, 0.05), shape=(0.3, 0.4), yaw=0.5):
+    c, s = np.cos(yaw), np.sin(yaw)
+    turn = quaternions.from_matrix(TABLE @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]]))
+    return Superquadric(np.array(size), np.array(shape), TABLE @ [x, y, size[2]] + [0, 0, DISTANCE], turn)
+
+
+STILL = tuple(standing(*place) for place in PLACES)
+
+
+def image(bodies, seed, camera=CAMERA):
+    """Things on the table with the noise of a sensor."""
+    depth, _ = raycast.render(Superquadric.stack(list(bodies)), camera)
+    rows, columns = np.mgrid[: camera.height, : camera.width]
+    rays = np.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones(rows.shape)], axis=-1)
+    with np.errstate(divide="ignore"):
+        table = -DISTANCE * np.sin(PITCH) / (rays @ NORMAL)
+    z = np.minimum(depth, np.where(table > 0, table, np.inf))
+    z = z + np.random.default_rng(seed).normal(0, SIGMA, z.shape) * np.where(np.isfinite(z), z, 0) ** 2
+    return np.where(z < 3, z, np.nan).astype(np.float32)
+
+
+def changed(k, body):
+    return (*STILL[:k], body, *STILL[k + 1 :])
+
+
+@pytest.fixture(scope="module")
+def recoverer():
+    return Recoverer(method="symmetry")
+
+
+@pytest.fixture(scope="module")
+def first(recoverer):
+    return recoverer.recover(image(STILL, 0), CAMERA)
+
+
+def place_of(frame, body):
+    """Which entry of the frame is nearest to a body."""
+    return int(np.argmin([np.linalg.norm(one.superquadric.translation - body.translation) for one in frame.bodies]))
+
+
+def test_what_stands_still_is_the_frame_alone_within_its_sigma(recoverer, first):
+    assert [one.repeats for one in first.bodies] == [0] * len(STILL)
+    frame = first
+    for seed in range(1, 5):
+        depth = image(STILL, seed)
+        frame = recoverer.recover(depth, CAMERA, previous=frame)
+        assert [one.repeats for one in frame.bodies] == [seed] * len(STILL)
+        assert frame.milliseconds["fit"] == 0
+        alone = recoverer.recover(depth, CAMERA)
+        for body in frame.bodies:
+            other = alone.bodies[place_of(alone, body.superquadric)]
+            for part in (state.SIZE, state.CENTRE):
+                off = (other.superquadric.to_flat() - body.superquadric.to_flat())[:8][part]
+                total = (body.covariance + other.covariance)[part, part]
+                assert state.mahalanobis(total, off) < chi2.ppf(1 - 1e-5, 3)
+
+
+@pytest.mark.parametrize("k", range(3))
+@pytest.mark.parametrize(
+    "become",
+    [
+        lambda x, y: standing(x + 0.004, y),
+        lambda x, y: standing(x, y - 0.004),
+        lambda x, y: standing(x, y, yaw=0.65),
+        lambda x, y: standing(x, y, shape=(1.0, 1.0)),
+        lambda x, y: standing(x, y, shape=(0.1, 1.0)),
+        lambda x, y: standing(x, y, size=(0.04, 0.035, 0.046)),
+    ],
+    ids=["slid", "drawn nearer", "turned", "swapped for a ball", "swapped for a can", "swapped for a lower one"],
+)
+def test_a_change_is_noticed_at_once_and_the_others_stand(recoverer, first, k, become):
+    after = become(*PLACES[k])
+    frame = recoverer.recover(image(changed(k, after), 7), CAMERA, previous=first)
+    assert len(frame.bodies) == len(STILL)
+    changed_one = place_of(frame, after)
+    for j, one in enumerate(frame.bodies):
+        assert one.repeats == (j != changed_one)
+    # And it is known as by the frame alone.
+    alone = recoverer.recover(image(changed(k, after), 7), CAMERA)
+    np.testing.assert_allclose(
+        frame.bodies[changed_one].superquadric.to_flat(),
+        alone.bodies[place_of(alone, after)].superquadric.to_flat(),
+        atol=1e-9,
+    )
+
+
+def test_what_is_put_down_or_taken_away_is_noticed_at_once(recoverer, first):
+    more = (*STILL, standing(0.08, 0.16, size=(0.02, 0.02, 0.025)))
+    frame = recoverer.recover(image(more, 8), CAMERA, previous=first)
+    assert sorted(one.repeats for one in frame.bodies) == [0, 1, 1, 1]
+    frame = recoverer.recover(image(STILL[:2], 9), CAMERA, previous=frame)
+    assert [one.repeats for one in frame.bodies] == [2, 2]
+
+
+def test_slow_motion_adds_up_until_it_is_noticed(recoverer, first):
+    frame, x = first, PLACES[1][0]
+    for step in range(1, 16):
+        x += 0.0005
+        body = standing(x, PLACES[1][1])
+        frame = recoverer.recover(image(changed(1, body), 20 + step), CAMERA, previous=frame)
+        found = frame.bodies[place_of(frame, body)]
+        if found.repeats == 0:
+            break
+    assert 0 < step * 0.5 < 4
+    assert np.linalg.norm(found.superquadric.translation - body.translation) < 0.003
+
+
+def test_a_camera_that_moved_repeats_nothing(recoverer, first):
+    def moved(shift, turn=(0, 0, 0)):
+        turn = quaternions.from_rotation_vector(np.array(turn))
+        return [one.transformed(turn, np.array(shift)) for one in STILL]
+
+    for bodies in (moved((0.01, 0, 0)), moved((0, 0, 0), (0, 0, 0.03))):
+        # The table is not seen to move by these: the bodies have to tell.
+        assert not any(one.repeats for one in recoverer.recover(image(bodies, 3), CAMERA, previous=first).bodies)
+    nearer = image(STILL, 4) - np.float32(0.004)
+    assert continuity.repeated(first, nearer, CAMERA, first.reference.options) is continuity.NOTHING
+
+
+def test_other_options_cameras_and_segments_repeat_nothing(recoverer, first):
+    depth = image(STILL, 5)
+    options = RecoveryOptions(method="symmetry")
+    assert continuity.repeated(first, depth, CAMERA, options).whole
+    other = replace(options, max_size=0.5)
+    assert not continuity.repeated(first, depth, CAMERA, other).bodies
+    assert not continuity.repeated(first, depth, replace(CAMERA, cx=150.0), options).bodies
+    small = Camera(60, 40, 50.0, 50.0, 29.5, 19.5)
+    assert not recoverer.recover(np.full((40, 60), 1, np.float32), small, previous=first).bodies
+    halves = np.where(first.labels == 1, np.where(np.arange(CAMERA.width) % 2, 7, 8), first.labels)
+    frame = recoverer.recover(depth, CAMERA, halves, previous=first)
+    assert {one.label: one.repeats for one in frame.bodies} == {2: 1, 3: 1, 7: 0, 8: 0}
+
+
+def test_given_masks_that_stay_repeat_too(recoverer):
+    _, index = raycast.render(Superquadric.stack(list(STILL)), CAMERA)
+    labels = (index + 1).astype(np.int32)
+    before = recoverer.recover(image(STILL, 10), CAMERA, labels)
+    after = recoverer.recover(image(STILL, 11), CAMERA, labels, previous=before)
+    assert [one.repeats for one in after.bodies] == [1, 1, 1]
+
+
+@pytest.mark.parametrize("status", [Status.CONVERGED, Status.WEAK])
+def test_each_body_has_its_turn_one_at_a_time_and_a_weak_one_sooner(first, status):
+    limit = {Status.CONVERGED: 30, Status.WEAK: 10}[status]
+    options = first.reference.options
+    bodies = [
+        replace(one, fit=replace(one.fit, status=status), repeats=limit + k) for k, one in enumerate(first.bodies)
+    ]
+    kept = continuity.repeated(replace(first, bodies=tuple(bodies)), image(STILL, 1), CAMERA, options)
+    assert set(kept.bodies) == {one.label for one in bodies[:-1]}
+    assert not kept.whole
+    young = tuple(replace(one, repeats=limit - 1) for one in bodies)
+    assert continuity.repeated(replace(first, bodies=young), image(STILL, 1), CAMERA, options).whole
+
+
+def test_a_tracker_counts_the_error_of_a_repeated_answer_once(recoverer, first):
+    tracker, frame = Tracker(), first
+    before = tracker.update(first.recovered, 0.0)
+    for seed in range(1, 6):
+        frame = recoverer.recover(image(STILL, seed), CAMERA, previous=frame)
+        tracks = tracker.update(frame.recovered, seed / 30)
+    for old, new in zip(before, tracks, strict=True):
+        np.testing.assert_array_equal(new.superquadric.to_flat(), old.superquadric.to_flat())
+        assert (new.sigma_size >= old.sigma_size).all()
+        assert new.follows
+        assert new.seen == 6
+    # The same answers as new ones: six looks would be surer, and are not.
+    fooled = Tracker()
+    for k in range(6):
+        surer = fooled.update(first.recovered, k / 30)
+    assert all((a.sigma_size < b.sigma_size).all() for a, b in zip(surer, tracks, strict=True))
