@@ -1,18 +1,14 @@
 """Exact depth images of superquadrics: rays against the gauge, Newton from the bounding box inwards.
 
-Depth is the z coordinate in the optical frame (metres), +inf where a pixel sees no body.  :func:`render` is the
-compiled renderer for scenes, :func:`render_batch` the torch statement of the same for many single bodies.
+Depth is the z coordinate in the optical frame (metres), +inf where a pixel sees no body.
 """
 
 from __future__ import annotations
 
-from typing import Any
-
 import numba
 import numpy as np
-import torch
 
-from sq_perception.geometry.kernels import RAY_TOLERANCE, box_interval, kernel, parallel_kernel, ray_entry, support
+from sq_perception.geometry.kernels import box_interval, kernel, parallel_kernel, ray_entry, support
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
 
@@ -118,54 +114,3 @@ def _render_bodies(
                 if hit and t < depth[v, u] and (t > 0.0 or not pinhole):
                     depth[v, u] = t
                     index[v, u] = k
-
-
-def render_batch(bodies: Superquadric, camera: Camera, steps: int = 40) -> torch.Tensor:
-    """Depth (n, height, width) of each body of a torch batch (n,) alone; +inf where its rays miss.
-
-    The same Newton iteration as :func:`render`, all rays of all bodies at once, on the bodies' device and in their
-    precision.  Values carry no gradient: for a differentiable image see :mod:`sq_perception.imaging.soft_render`.
-    """
-    with torch.no_grad():
-        device, dtype = bodies.size.device, bodies.size.dtype
-        v, u = np.indices((camera.height, camera.width))
-        origin, direction = (torch.as_tensor(x.reshape(-1, 3), device=device, dtype=dtype) for x in camera.rays(u, v))
-        o = bodies.to_object(origin.expand(len(bodies), -1, -1))
-        d = direction @ bodies.rotation_matrix
-        a = bodies.size[:, None, :]
-        tiny = torch.finfo(dtype).tiny
-        flat = d.abs() < tiny
-        d_safe = torch.where(flat, torch.full_like(d, tiny), d)
-        first, second = (-a - o) / d_safe, (a - o) / d_safe
-        t_in = torch.minimum(first, second).amax(-1)
-        t_out = torch.maximum(first, second).amin(-1)
-        alive = (t_in <= t_out) & ~(flat & (o.abs() > a)).any(-1)
-        t = torch.where(alive, t_in, torch.zeros_like(t_in))
-        hit = torch.zeros_like(alive)
-        tolerance = max(RAY_TOLERANCE, 32 * torch.finfo(dtype).eps)
-        for _ in range(steps):
-            g, slope = _gauge_along(bodies, o + t[..., None] * d, d)
-            hit |= alive & (g <= 1 + tolerance)
-            alive &= ~hit & (slope < 0)
-            if not bool(alive.any()):
-                break
-            step = torch.where(alive, (1 - g) / torch.where(alive, slope, -torch.ones_like(slope)), torch.zeros_like(g))
-            t = t + step
-            hit |= alive & (step <= tolerance * (t_out - t_in)) & (t <= t_out)
-            alive &= ~hit & (t <= t_out)
-        if camera.is_pinhole:
-            hit &= t > 0
-        depth = torch.where(hit, t, torch.full_like(t, torch.inf))
-    return depth.reshape(len(bodies), camera.height, camera.width)
-
-
-def _gauge_along(bodies: Superquadric, points: torch.Tensor, direction: torch.Tensor) -> tuple[Any, Any]:
-    """g at object-frame points (n, N, 3) and its derivative along object-frame directions."""
-    local = Superquadric(
-        bodies.size,
-        bodies.shape,
-        torch.zeros_like(bodies.translation),
-        torch.tensor([0.0, 0, 0, 1], device=points.device, dtype=points.dtype).expand(len(bodies), 4),
-    )
-    gradient = local.gauge_gradient(points)
-    return local.gauge(points), (gradient * direction).sum(-1)

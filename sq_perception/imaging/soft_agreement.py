@@ -1,9 +1,12 @@
 """How far a soft-rendered body agrees with a view: the score of a recovery, compiled.
 
-:func:`agreement` is :func:`sq_perception.imaging.soft_render.agreement` of a view and
-:func:`~sq_perception.imaging.soft_render.render_depth`, for one body and without derivatives; equations there, a test
-proves both equal.  A line of sight is walked from where it comes near the body until nothing more passes: voxels whose
-occupancy is below e^-NEGLIGIBLE, and what lies behind as much of the body, change no digit that is kept.
+    1 - sum |X - T| / sum max(X, T),
+
+X the view and T the body's image of :func:`sq_perception.imaging.soft_render.render_depth` (a test proves it): the
+intersection over union of the two solids between each surface and the back of the cube, hence one number for a wrong
+silhouette and a wrong depth alike.  A line of sight is walked from where it comes near the body until nothing more
+passes: voxels whose occupancy is below e^-NEGLIGIBLE, and what lies behind as much of the body, change no digit that is
+kept.
 """
 
 from __future__ import annotations

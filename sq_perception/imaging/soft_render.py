@@ -27,16 +27,9 @@ THESIS_SHARPNESS = 117.3
 THESIS_TAU = 4.82
 
 
-def cell_centres(resolution: int, like: torch.Tensor | None = None) -> torch.Tensor:
-    """Centres (resolution,) of equal cells of [0, 1], as the pixels of a canonical view."""
-    axis = (torch.arange(resolution, dtype=torch.float64) + 0.5) / resolution
-    return axis if like is None else axis.to(like)
-
-
-def grid_points(resolution: int, like: torch.Tensor | None = None) -> torch.Tensor:
+def grid_points(resolution: int) -> torch.Tensor:
     """Points (resolution,) of [0, 1], ends included: an axis of the thesis' grid and of its images."""
-    axis = torch.linspace(0, 1, resolution, dtype=torch.float64)
-    return axis if like is None else axis.to(like)
+    return torch.linspace(0, 1, resolution, dtype=torch.float64)
 
 
 def occupancy_grid(bodies: Superquadric, axis: torch.Tensor, sharpness: float, stride: int = 1) -> torch.Tensor:
@@ -72,17 +65,6 @@ def render_depth(
 ) -> torch.Tensor:
     """Soft images (n, rows, columns) of each body alone: :func:`depth_projection` of :func:`occupancy_grid`."""
     return depth_projection(occupancy_grid(bodies, axis, sharpness, stride), tau)
-
-
-def agreement(image: torch.Tensor, rendered: torch.Tensor) -> torch.Tensor:
-    """How far two images (..., rows, columns) of the cube are the same, in [0, 1].
-
-    1 - sum |X - T| / sum max(X, T): the intersection over union of the two solids between each surface and the back of
-    the cube, hence one number for a wrong silhouette and a wrong depth alike.
-    """
-    difference = (image - rendered).abs().sum(dim=(-2, -1))
-    union = torch.maximum(image, rendered).sum(dim=(-2, -1))
-    return 1 - difference / torch.where(union > 0, union, torch.ones_like(union))
 
 
 def _check_positive(name: str, value: float) -> None:

@@ -20,7 +20,7 @@ class Recovery:
     fit : Fit
         The body in the optical frame, how well it explains the image, and how sure it is.
     score : float
-        Agreement of the soft-rendered body with the canonical view, 0 to 1 (:func:`soft_render.agreement`).
+        Agreement of the soft-rendered body with the canonical view, 0 to 1 (:mod:`soft_agreement`).
     label : int
         The object's value in the label image.
     pixels : int

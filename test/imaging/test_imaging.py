@@ -101,17 +101,6 @@ class TestRaycast:
         hit = sure & np.isfinite(expected)
         np.testing.assert_allclose(depth[hit], expected[hit], atol=1e-8)
 
-    def test_batched_torch_equals_compiled(self) -> None:
-        small = Camera(80, 60, 65.0, 65.0, 40.0, 30.0)
-        for camera in (small, unit_cube.camera(64)):
-            bodies = tabletop_bodies(12, 3)
-            batch = raycast.render_batch(Superquadric.from_flat(torch.tensor(bodies.to_flat())), camera).numpy()
-            for body, image in zip(bodies, batch, strict=True):
-                expected, _ = raycast.render(body, camera)
-                both = np.isfinite(expected) & np.isfinite(image)
-                assert (np.isfinite(expected) != np.isfinite(image)).sum() <= 2
-                np.testing.assert_allclose(image[both], expected[both], atol=1e-6)
-
     def test_body_behind_the_camera_is_not_seen(self) -> None:
         body = Superquadric(np.full(3, 0.1), np.ones(2), np.array([0, 0, -1.0]), np.array([0, 0, 0, 1.0]))
         depth, index = raycast.render(body, VGA)
@@ -229,6 +218,11 @@ class TestCanonicalView:
             canonical_view.from_mask(np.full((48, 64), np.nan), np.ones((48, 64), bool), Camera(64, 48, 50, 50, 32, 24))
 
 
+def cell_centres(resolution: int) -> torch.Tensor:
+    """Centres of equal cells of [0, 1], as the pixels of a canonical view."""
+    return (torch.arange(resolution, dtype=torch.float64) + 0.5) / resolution
+
+
 class TestSoftRender:
     def test_projection_of_a_hand_made_column(self) -> None:
         """Two empty voxels, then solid: A = 1, 1, e^-tau, e^-2tau; T counts what lies before the surface."""
@@ -250,26 +244,21 @@ class TestSoftRender:
 
     def test_gradcheck(self) -> None:
         bodies = thesis_bodies(2, np.random.default_rng(9))
-        axis = soft_render.cell_centres(6)
+        axis = cell_centres(6)
         flat = torch.tensor(bodies.to_flat(), requires_grad=True)
         assert torch.autograd.gradcheck(
             lambda f: soft_render.render_depth(Superquadric.from_flat(f), axis, 8.0, 1.5), flat
         )
-
-    def test_agreement_is_one_only_for_the_same_image(self) -> None:
-        image = torch.rand(3, 8, 8)
-        assert soft_render.agreement(image, image).tolist() == [1, 1, 1]
-        assert (soft_render.agreement(image, torch.zeros_like(image)) == 0).all()
-        assert (soft_render.agreement(image, image * 0.5) - 0.5).abs().max() < 1e-6
 
     @pytest.mark.parametrize(("s", "tau"), [(soft_render.THESIS_SHARPNESS, soft_render.THESIS_TAU), (8.0, 0.5)])
     def test_the_compiled_agreement_is_that_of_the_soft_image(self, s: float, tau: float) -> None:
         """Bodies against images of others, as of themselves; sharp and soft, thick and thin to the light."""
         bodies = thesis_bodies(4, np.random.default_rng(10))
         tensors = Superquadric.from_flat(torch.tensor(bodies.to_flat()))
-        rendered = soft_render.render_depth(tensors, soft_render.cell_centres(64), s, tau)
+        rendered = soft_render.render_depth(tensors, cell_centres(64), s, tau)
         images = (0.7 * rendered + 0.3 * rendered.roll(1, dims=0)).float()
-        expected = soft_render.agreement(images[:, ::3, ::3].double(), rendered[:, ::3, ::3])
+        seen, shown = images[:, ::3, ::3].double(), rendered[:, ::3, ::3]
+        expected = 1 - (seen - shown).abs().sum(dim=(1, 2)) / torch.maximum(seen, shown).sum(dim=(1, 2))
         for body, image, value in zip(bodies, images.numpy(), expected.tolist(), strict=True):
             parameters = np.concatenate([body.size, body.shape, body.translation])
             got = soft_agreement.agreement(image, 3, parameters, body.rotation_matrix, s, tau)
@@ -279,4 +268,4 @@ class TestSoftRender:
     def test_refuses_nonsense(self, s: float, tau: float) -> None:
         bodies = Superquadric.from_flat(torch.tensor(thesis_bodies(1, np.random.default_rng(0)).to_flat()))
         with pytest.raises(ValueError, match="positive"):
-            soft_render.render_depth(bodies, soft_render.cell_centres(4), s, tau)
+            soft_render.render_depth(bodies, cell_centres(4), s, tau)
