@@ -1,6 +1,7 @@
 """Things taken from a table, in physics: how often a grasp holds and how much of the table is cleared.
 
     python benchmarks/picking.py [--scenes 20] [--kinds packed,pile] [--contestants ours,...] [--each FILE]
+        [--contact-graspnet COMMAND]
 
 The protocol of VGN and GIGA: scenes of :mod:`picking_scenes`, five things each; every round one image, one recovery
 with our own masks, one grasp, the most probable one, in the physics of :mod:`picking_world`; until the table is empty,
@@ -12,15 +13,30 @@ no grasp is found, or two have failed in a row.
 | --- | --- | --- |
 | ours | the recovery | its covariance |
 | ours without sigma | the same | 10 % of the size each |
+| ours at any score | the same as ours, but the grasp tried is the one whose score is nearest to a random number | |
 | true bodies | the superquadric nearest to the true hull, at the true place | none |
 | classic | Solina and Bajcsy's fit to our masks' points | 10 % |
 | box | the smallest box of our masks' points | 10 % |
 | centroid | no planner: straight down on the points' middle, across their narrowest direction | |
+| cgn in masks | Contact-GraspNet, its most confident grasp with the contact in one of our masks | |
+| cgn | the same anywhere on the table | |
 
-Ours has its own masks, mended by its fits; classic, box and centroid have the segmentation's.  All but the last go
-through the same planner with the same surroundings.  Intervals are Wilson's, 95 %; picks of one scene are not
-independent, so that they are somewhat too narrow.  ``--each`` is a file of lines, one a scene and contestant: the same
-command goes on where it was interrupted.
+Ours has its own masks, mended by its fits; classic, box and centroid have the segmentation's.  All but centroid and
+cgn go through the same planner with the same surroundings.  Contact-GraspNet is a process of its own, started by the
+command that ``--contact-graspnet`` gives (:mod:`contact_graspnet` says how); without it both are left out.  "At any
+score" is for the calibration of scores and goes on whatever fails.
+
+| failure | |
+| --- | --- |
+| collision | with the table or another thing on the way |
+| wrong size | with the thing itself: the fingers do not pass it |
+| missed | nothing between the pads once they closed |
+| slipped | held, but not any more after lift and shake |
+| unreachable | things for which there was no grasp when the scene ended |
+
+Intervals are Wilson's, 95 %; picks of one scene are not independent, so that they are somewhat too narrow.  Those of
+differences are from 2000 draws of scenes.  ``--each`` is a file of lines, one a scene and contestant: the same command
+goes on where it was interrupted.
 
 Published for orientation only, other things and another simulator: GIGA (HR) 87.9 / 86.0 packed, 69.8 / 51.1 pile; VGN
 74.5 / 79.2, 60.7 / 44.0; GPD 35.4 / 30.7, 17.7 / 9.2 (GSR / DR).  Physics: mujoco, the extra ``picking``.
@@ -30,6 +46,9 @@ from __future__ import annotations
 
 import argparse
 import os
+import shlex
+import subprocess
+import tempfile
 
 if __name__ == "__main__":  # as a script only: a process that imports this has threads already
     for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
@@ -37,7 +56,7 @@ if __name__ == "__main__":  # as a script only: a process that imports this has 
 
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from functools import lru_cache
 from itertools import pairwise
@@ -48,16 +67,14 @@ import numpy as np
 import picking_scenes
 import report
 import trimesh
-from picking_scenes import EYE, KINDS, LOOK, TABLE_CAMERA, THINGS, Scene
-from picking_world import Thing, World
+from picking_scenes import EYE, GRIPPER, KINDS, LOOK, TABLE_CAMERA, THINGS, Scene
+from picking_world import Pick, Thing, World
 
-from sq_perception.evaluation import plots
-from sq_perception.evaluation.grasp_figure import draw_grasps
 from sq_perception.fitting import solina_bajcsy
 from sq_perception.geometry import mesh
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.grasping.gripper import PANDA
+from sq_perception.grasping import planner
 from sq_perception.grasping.planner import Grasp, grasps
 from sq_perception.grasping.surroundings import Surroundings
 from sq_perception.recovery.recoverer import FrameRecovery, Recoverer
@@ -65,10 +82,40 @@ from sq_perception.recovery.recoverer import FrameRecovery, Recoverer
 MOST_ROUNDS = 12
 ASKED = {"packed": (93, 92), "pile": (80, 70)}
 BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
-_SHOWN = (150, 490), (335, 65)
-"""Columns and rows of a picture."""
+_MANY = 60
+"""Grasps of a body among which one of any score is sought."""
+_DRAWS = 2000
 _FIRST_SEED = 5000
 """Chosen before the first run."""
+
+
+class ContactGraspNet:
+    """The process of :mod:`contact_graspnet`, started by a command."""
+
+    def __init__(self, command: str) -> None:
+        self._process = subprocess.Popen(
+            shlex.split(command), stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+        )
+        self._folder = tempfile.TemporaryDirectory()
+        self._frame = Path(self._folder.name) / "frame.npz"
+        self._optical_from_world = np.eye(4)
+        self._optical_from_world[:3, :3], self._optical_from_world[:3, 3] = quaternions.to_matrix(LOOK), EYE
+
+    def found(self, depth: np.ndarray) -> list[tuple[Grasp, int, int]]:
+        """Grasps, the most confident first, and row and column of the contact of each."""
+        world_from_optical = np.linalg.inv(self._optical_from_world)
+        np.savez(self._frame, depth=depth, K=TABLE_CAMERA.matrix, world_from_optical=world_from_optical)
+        assert self._process.stdin is not None
+        assert self._process.stdout is not None
+        self._process.stdin.write(f"{self._frame}\n")
+        self._process.stdin.flush()
+        answer = self._process.stdout.readline()
+        if not answer:
+            raise RuntimeError("the command of --contact-graspnet ended: run it by itself to see why")
+        return [
+            (Grasp(-1, np.array(place), np.array(turn), opening, np.nan, score, ""), row, column)
+            for place, turn, opening, score, row, column in json.loads(answer)
+        ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +125,8 @@ class Seen:
     depth: np.ndarray
     recovery: FrameRecovery
     world: World
+    peer: ContactGraspNet | None = None
+    chance: float = 0.0
 
     def points(self, label: int) -> np.ndarray:
         """Measured points (n, 3) of one mask."""
@@ -86,7 +135,7 @@ class Seen:
 
     def planned(self, bodies: list[Superquadric], covariance: np.ndarray | None = None) -> tuple[Grasp, ...]:
         around = Surroundings.of_image(self.depth, TABLE_CAMERA, self.recovery.plane)
-        return grasps(Superquadric.stack(bodies), PANDA, covariance, around).grasps
+        return grasps(Superquadric.stack(bodies), GRIPPER, covariance, around).grasps
 
 
 def ours(seen: Seen) -> tuple[Grasp, ...]:
@@ -148,64 +197,107 @@ def centroid(seen: Seen) -> tuple[Grasp, ...]:
         y = np.cross(down, np.cross(y, down))
         y /= np.linalg.norm(y)
         top = float(np.quantile(heights, 0.98))
-        height = max(top - 0.03, PANDA.tip + 0.005)
+        height = max(top - 0.03, GRIPPER.tip + 0.005)
         position = middle + (height - float(np.median(heights))) * plane[:3]
         frame = np.stack([np.cross(y, down), y, down], axis=1)
-        found.append(Grasp(k, position, quaternions.from_matrix(frame), PANDA.opening, np.nan, top, ""))
+        found.append(Grasp(k, position, quaternions.from_matrix(frame), GRIPPER.opening, np.nan, top, ""))
     return tuple(sorted(found, key=lambda grasp: -grasp.score))
+
+
+def at_any_score(seen: Seen) -> tuple[Grasp, ...]:
+    """The one whose score is nearest to a random number first."""
+    usual, planner.PER_BODY = planner.PER_BODY, _MANY
+    try:
+        found = ours(seen)
+    finally:
+        planner.PER_BODY = usual
+    return tuple(sorted(found, key=lambda grasp: abs(grasp.score - seen.chance)))
+
+
+def cgn(seen: Seen) -> tuple[Grasp, ...]:
+    assert seen.peer
+    return tuple(grasp for grasp, _, _ in seen.peer.found(seen.depth))
+
+
+def cgn_in_masks(seen: Seen) -> tuple[Grasp, ...]:
+    assert seen.peer
+    labels = seen.recovery.labels
+    return tuple(grasp for grasp, row, column in seen.peer.found(seen.depth) if labels[row, column] > 0)
 
 
 CONTESTANTS: dict[str, Callable[[Seen], tuple[Grasp, ...]]] = {
     "ours": ours,
     "ours without sigma": without_sigma,
+    "ours at any score": at_any_score,
     "true bodies": true_bodies,
     "classic": classic,
     "box": box,
     "centroid": centroid,
+    "cgn in masks": cgn_in_masks,
+    "cgn": cgn,
 }
+ON_RECOVERED = ("ours", "ours without sigma", "ours at any score", "classic")
+PEERS = ("cgn in masks", "cgn")
 
 
-_OURS = ("ours", "ours without sigma")
+def method_of(contestant: str) -> str:
+    """The recovery that a contestant gets."""
+    return "auto" if contestant.startswith("ours") or contestant == "cgn in masks" else "classic"
 
 
-def cleared(scene: Scene, contestant: str, recoverer: Recoverer) -> dict[str, Any]:
-    """One scene by one contestant, round by round."""
-    world = scene.world()
-    rng = np.random.default_rng([scene.seed, 1])
-    picks: list[dict[str, Any]] = []
-    failed, end = 0, "rounds"
+@dataclass(frozen=True, eq=False)
+class Round:
+    """What was seen, which grasp was tried at which thing, and what came of it."""
+
+    seen: Seen
+    grasp: Grasp
+    aim: int
+    milliseconds: float
+    pick: Pick
+
+
+def rounds(
+    scene: Scene, contestant: str, recoverer: Recoverer, peer: ContactGraspNet | None = None, world: World | None = None
+) -> Iterator[Round]:
+    """Image, grasp, pick, until the table is empty or no grasp is found."""
+    world = world or scene.world()
+    rng, chance = np.random.default_rng([scene.seed, 1]), np.random.default_rng([scene.seed, 3])
     for _ in range(MOST_ROUNDS):
         if not world.left:
-            end = "empty"
-            break
+            return
         depth = picking_scenes.observed(world, scene.sensor, rng)
-        seen = Seen(depth, recoverer.recover(depth, TABLE_CAMERA), world)
+        seen = Seen(depth, recoverer.recover(depth, TABLE_CAMERA), world, peer, chance.uniform())
         started = time.process_time()
         found = CONTESTANTS[contestant](seen)
         milliseconds = 1e3 * (time.process_time() - started)
         if not found:
-            end = "no grasp"
-            break
-        best = found[0]
-        position, rotation = picking_scenes.to_world(best.position, best.rotation)
+            return
+        position, rotation = scene.carried_out(found[0].position, found[0].rotation)
         aim = _aimed_at(world, position)
-        pick = world.pick(position, rotation, best.opening)
+        yield Round(seen, found[0], aim, milliseconds, world.pick(position, rotation, found[0].opening))
+
+
+def cleared(scene: Scene, contestant: str, recoverer: Recoverer, peer: ContactGraspNet | None) -> dict[str, Any]:
+    """One scene by one contestant, round by round."""
+    world = scene.world()
+    picks: list[dict[str, Any]] = []
+    failed, end = 0, ""
+    for one in rounds(scene, contestant, recoverer, peer, world):
         picks.append(
             {
-                **asdict(pick),
-                "score": best.score,
-                "weakest": best.weakest,
-                "aim": aim,
-                "position": np.round(position, 4).tolist(),
-                "rotation": np.round(rotation, 4).tolist(),
-                "opening": round(best.opening, 4),
-                "ms": round(milliseconds, 1),
+                **asdict(one.pick),
+                "score": one.grasp.score,
+                "weakest": one.grasp.weakest,
+                "aim": one.aim,
+                "ms": round(one.milliseconds, 1),
             }
         )
-        failed = 0 if pick.held >= 0 else failed + 1
-        if failed == 2:
+        failed = 0 if one.pick.held >= 0 else failed + 1
+        if failed == 2 and contestant != "ours at any score":
             end = "two failures"
             break
+    if not end:
+        end = "empty" if not world.left else "no grasp" if len(picks) < MOST_ROUNDS else "rounds"
     return {
         "kind": scene.kind,
         "seed": scene.seed,
@@ -224,6 +316,16 @@ def _aimed_at(world: World, position: np.ndarray) -> int:
         at, turn = world.pose(k)
         gauge[k] = float(world.things[k].parts.transformed(turn, at).gauge(position[None])[:, 0].min())
     return min(gauge, key=gauge.__getitem__)
+
+
+FAILURES = ("collision", "wrong size", "missed", "slipped")
+
+
+def failure(pick: dict[str, Any]) -> str:
+    """Why a pick failed, empty if it did not; see the module."""
+    if pick["held"] >= 0:
+        return ""
+    return "wrong size" if pick["how"] == "collision" and pick["touched"] == str(pick["aim"]) else str(pick["how"])
 
 
 def wilson(good: int, count: int) -> tuple[float, float, float]:
@@ -254,8 +356,10 @@ def summary(lines: list[dict[str, Any]]) -> dict[str, Any]:
                 bins.append(
                     [count, float(scores[inside].mean()), float(np.mean(np.array(held)[inside]))] if count else [0]
                 )
-            causes = {how: sum(pick["how"] == how for pick in picks) for how in ("collision", "missed", "slipped")}
-            causes |= {end: sum(run["end"] == end for run in runs) for end in ("no grasp", "two failures", "rounds")}
+            failed = [failure(pick) for pick in picks]
+            causes = {cause: failed.count(cause) for cause in FAILURES}
+            causes["unreachable"] = sum(len(run["left"]) for run in runs if run["end"] == "no grasp")
+            causes["two failures"] = sum(run["end"] == "two failures" for run in runs)
             found[f"{kind}: {name}"] = {
                 "scenes": len(runs),
                 "tried": len(picks),
@@ -285,32 +389,36 @@ def table(found: dict[str, Any]) -> str:
                 str(asked[0]),
                 rate(one["dr"]),
                 str(asked[1]),
-                *(str(causes[cause]) for cause in ("collision", "missed", "slipped", "no grasp", "two failures")),
+                *(str(count) for count in causes.values()),
             ]
         )
     heads = ["scenes: contestant", "scenes", "tried", "GSR %", "asked", "DR %", "asked"]
-    heads += ["collision", "missed", "slipped", "ended without a grasp", "ended by two failures"]
+    heads += [*FAILURES, "unreachable", "ended by two failures"]
     return report.table(heads, rows)
 
 
-def picture(path: Path, seed: int, recoverer: Recoverer) -> None:
-    """A scene of each kind before the first pick, with the best grasp of each body."""
-    figure = plots.new_figure(13.0, 5.1)
-    for column, kind in enumerate(KINDS):
-        scene = picking_scenes.scene(kind, seed)
-        world = scene.world()
-        depth = picking_scenes.observed(world, scene.sensor, np.random.default_rng([seed, 1]))
-        found = recoverer.recover(depth, TABLE_CAMERA)
-        bodies = [one.superquadric for one in found.recovered]
-        covariance = np.array([one.covariance for one in found.recovered])
-        around = Surroundings.of_image(depth, TABLE_CAMERA, found.plane)
-        plan = grasps(Superquadric.stack(bodies), PANDA, covariance, around)
-        ax = figure.add_axes((0.5 * column + 0.003, 0.0, 0.494, 1.0))
-        draw_grasps(ax, depth, TABLE_CAMERA, bodies, plan, PANDA)
-        ax.set_xlim(*_SHOWN[0])
-        ax.set_ylim(*_SHOWN[1])
-        ax.text(0.02, 0.04, f"{kind}, {scene.sensor}", transform=ax.transAxes, color=plots.INK, weight="bold")
-    plots.save(figure, path, dots_per_inch=90)
+def gain(lines: list[dict[str, Any]], kind: str, name: str, other: str) -> dict[str, list[float]]:
+    """By how many percent GSR and DR of one contestant are above another's on the same scenes, and 95 % intervals."""
+    runs = {
+        who: {run["seed"]: run for run in lines if run["kind"] == kind and run["contestant"] == who}
+        for who in (name, other)
+    }
+    seeds = sorted(set(runs[name]) & set(runs[other]))
+    if not seeds:
+        return {}
+    counts = np.array(
+        [[(runs[who][seed]["taken"], len(runs[who][seed]["picks"])) for seed in seeds] for who in (name, other)]
+    )
+    draws = np.random.default_rng(0).integers(len(seeds), size=(_DRAWS, len(seeds)))
+    found = {}
+    for rate in ("gsr", "dr"):
+        values = []
+        for chosen in (np.arange(len(seeds))[None], draws):
+            taken, tried = counts[:, chosen].sum(axis=2).transpose(2, 0, 1)
+            share = taken / np.maximum(tried, 1) if rate == "gsr" else taken / (THINGS * len(seeds))
+            values.append(100 * (share[0] - share[1]))
+        found[rate] = [float(values[0][0]), *np.percentile(values[1], [2.5, 97.5]).tolist()]
+    return {"scenes": [len(seeds)], **found}
 
 
 def main() -> None:
@@ -320,33 +428,42 @@ def main() -> None:
     parser.add_argument("--contestants", default=",".join(CONTESTANTS))
     parser.add_argument("--first", type=int, default=_FIRST_SEED)
     parser.add_argument("--each", type=Path, help="result lines; those that are there are not computed again")
-    parser.add_argument("--picture", type=Path, help="draw the first scene of each kind there, and do no more")
+    parser.add_argument("--contact-graspnet", metavar="COMMAND", help="that starts contact_graspnet.py")
     parser.add_argument("--name", default="picking", help="of the results; empty: none are written")
     arguments = parser.parse_args()
-    if arguments.picture:
-        picture(arguments.picture, arguments.first, Recoverer())
-        return
+    contestants = arguments.contestants.split(",")
+    peer = None
+    if arguments.contact_graspnet:
+        peer = ContactGraspNet(arguments.contact_graspnet)
+    elif set(contestants) & set(PEERS):
+        contestants = [name for name in contestants if name not in PEERS]
+        print("no --contact-graspnet: cgn is left out")
     lines: list[dict[str, Any]] = []
     if arguments.each and arguments.each.exists():
         lines = [json.loads(line) for line in arguments.each.read_text().splitlines()]
     have = {(line["kind"], line["seed"], line["contestant"]) for line in lines}
-    recoverers = {name: Recoverer(method="auto" if name in _OURS else "classic") for name in CONTESTANTS}
+    recoverers = {name: Recoverer(method=method_of(name)) for name in CONTESTANTS}
     for seed in range(arguments.first, arguments.first + arguments.scenes):
         for kind in arguments.kinds.split(","):
-            missing = [name for name in arguments.contestants.split(",") if (kind, seed, name) not in have]
+            missing = [name for name in contestants if (kind, seed, name) not in have]
             if not missing:
                 continue
             scene = picking_scenes.scene(kind, seed)
             for name in missing:
-                line = cleared(scene, name, recoverers[name])
+                line = cleared(scene, name, recoverers[name], peer)
                 lines.append(line)
                 if arguments.each:
                     with arguments.each.open("a") as file:
                         file.write(json.dumps(line) + "\n")
                 print(kind, seed, name, line["taken"], [pick["how"] for pick in line["picks"]], line["end"], flush=True)
     found = summary(lines)
+    gains = {
+        f"{kind}: ours over {other}": gain(lines, kind, "ours", other)
+        for kind in KINDS
+        for other in ("ours without sigma", "classic", "cgn in masks")
+    }
     if arguments.name:
-        report.write(arguments.name, {"rows": found}, table(found))
+        report.write(arguments.name, {"rows": found, "gains": gains}, table(found))
     else:
         print(table(found))
 

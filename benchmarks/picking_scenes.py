@@ -1,25 +1,28 @@
-"""Scenes of the picking benchmark: five household things that the gripper can take, upright or dropped.
+"""Scenes of the picking benchmark: five household things that some parallel gripper could take, upright or dropped.
 
     packed   upright within 24 x 24 cm, at least 5 mm apart; drawn again if one falls over
     pile     dropped one after the other into a box of 24 x 24 cm, which is then taken away
 
-Things are those of :mod:`sq_perception.simulation.household`, all kinds but vessels, whose walls are no convex parts.
-A thing that no grasp of the gripper could take is drawn again: packed, one that is wider than 70 mm in every level
-direction or not 4 to 25 cm high; in a pile, one whose box has a middle edge above 70 mm, a longest above 20 cm or a
-shortest below 15 mm.
+Things are those of :mod:`sq_perception.simulation.household`, all kinds, drawn with seeds of their own: the networks
+were trained with others of the same generator.  Vessels have walls and are open.  A thing is drawn again if nothing of
+it can be taken as it stands or, in a pile, as it lies lowest: if in every level direction it is wider than 74 mm, and
+so is what of it is within 3 cm of its top (a neck, a cap), and it has no open rim; if it is lower than 25 mm; or longer
+than 25 cm.  Which of these a gripper can reach where they come to lie is not looked at.
 
 One fixed camera, 45 degrees above the table at 0.75 m; odd seeds see through a Kinect v1, even ones through a D435.
-The world's frame is that of :mod:`picking_world`.
+What is planned in its frame is carried out as far off as a camera is calibrated to an arm: 2 mm and 0.3 degrees, drawn
+once a scene.  The fingers push with 30 N, which a carton bears.  The world's frame is that of :mod:`picking_world`.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from picking_world import Thing, World
+from picking_world import NO_CAVITY, Thing, World
 from things_on_table import TABLE_CAMERA
 
+from sq_perception.geometry import mesh
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.union import flat_support, moved
@@ -30,7 +33,10 @@ from sq_perception.simulation.thing_views import looking_down
 
 KINDS = ("packed", "pile")
 THINGS = 5
-WIDEST, TALLEST, LOWEST, THINNEST, LONGEST = 0.07, 0.25, 0.04, 0.015, 0.20
+GRIPPER = replace(PANDA, force=30.0)
+WIDEST, LOWEST, LONGEST, CAP = 0.074, 0.025, 0.25, 0.03
+RIM = (0.02, 0.015)
+"""Radius and depth of a cavity that a finger goes into."""
 HALF = 0.12
 GAP = 0.005
 LOOK = looking_down(np.pi / 4, 0.0)
@@ -40,6 +46,8 @@ _BEARINGS = np.linspace(0, 2 * np.pi, 36, endpoint=False)
 _LEVEL = np.stack([np.cos(_BEARINGS), np.sin(_BEARINGS), 0 * _BEARINGS], axis=1)
 _FRICTION = (0.5, 1.0)
 _UPRIGHT = np.deg2rad(10.0)
+_CALIBRATION = 0.002, float(np.deg2rad(0.3))
+_RESTS = (household.UPRIGHT, household.ON_X, household.ON_Y)
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,10 +66,18 @@ class Scene:
 
     def world(self) -> World:
         """A new world with the things in it."""
-        world = World(self.things, PANDA)
+        world = World(self.things, GRIPPER)
         for k in range(len(self.things)):
             world.put(k, self.positions[k], self.rotations[k])
         return world
+
+    def carried_out(self, position: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Where the gripper is when it is sent to a pose of the optical frame: a pose in the world."""
+        rng = np.random.default_rng([self.seed, 2])
+        shift, turn = (sigma * rng.standard_normal(3) for sigma in _CALIBRATION)
+        position, rotation = to_world(position, rotation)
+        off = quaternions.from_rotation_vector(turn)
+        return quaternions.to_matrix(off) @ position + shift, quaternions.multiply(off, rotation)
 
 
 def scene(kind: str, seed: int) -> Scene:
@@ -75,21 +91,22 @@ def scene(kind: str, seed: int) -> Scene:
 
 def observed(world: World, sensor: str, rng: np.random.Generator) -> np.ndarray:
     """What the sensor measures of a world, the gripper out of sight."""
-    parts, owner = bodies_seen(world)
+    parts, owner = seen(world, [thing.parts for thing in world.things])
+    cavities, cavity_owner = seen(world, [thing.cavity for thing in world.things])
     table = quaternions.to_matrix(LOOK)[:, 2]
-    none = Superquadric.stack([])
     plane = np.append(table, -table @ EYE)
-    depth, _ = render_things(parts, owner, none, np.empty(0, dtype=int), TABLE_CAMERA, plane)
+    depth, _ = render_things(parts, owner, cavities, cavity_owner, TABLE_CAMERA, plane)
     return sensor_noise.preset(sensor).measured(depth, TABLE_CAMERA, rng)
 
 
-def bodies_seen(world: World) -> tuple[Superquadric, np.ndarray]:
-    """Parts (k,) in the optical frame of all things that are left, and whose they are."""
+def seen(world: World, bodies: list[Superquadric]) -> tuple[Superquadric, np.ndarray]:
+    """Bodies (k,) in the optical frame of all things that are left, and whose they are."""
     rows, owner = [np.empty((0, 12))], []
     for k in world.left:
-        position, rotation = world.pose(k)
-        rows.append(moved(moved(world.things[k].parts.to_flat(), rotation, position), LOOK, EYE))
-        owner += [k] * len(world.things[k].parts)
+        if len(bodies[k]):
+            position, rotation = world.pose(k)
+            rows.append(moved(moved(bodies[k].to_flat(), rotation, position), LOOK, EYE))
+            owner += [k] * len(bodies[k])
     return Superquadric.from_flat(np.concatenate(rows)), np.array(owner, dtype=int)
 
 
@@ -100,18 +117,32 @@ def to_world(position: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np
 
 
 def _thing(rng: np.random.Generator, packed: bool) -> Thing:
-    kinds = [kind for kind in household.KINDS if kind != "vessel"]
     while True:
-        drawn = household.draw_thing(rng, kinds)
-        low, high = drawn.box
-        edges = np.sort(high - low)
-        width = drawn.support(_LEVEL) + drawn.support(-_LEVEL)
-        if packed:
-            fits = width.min() < WIDEST and LOWEST < drawn.height < TALLEST
-        else:
-            fits = edges[0] > THINNEST and edges[1] < WIDEST and edges[2] < LONGEST
-        if fits:
-            return Thing(drawn.parts, rng.uniform(*_FRICTION), drawn.name)
+        drawn = household.draw_thing(rng)
+        cavity = drawn.cavities[:1] if drawn.kind == "vessel" else NO_CAVITY
+        thing = Thing(drawn.parts, rng.uniform(*_FRICTION), drawn.name, cavity)
+        turn = household.UPRIGHT
+        if not packed:
+            turn = min(_RESTS, key=lambda turn: np.ptp(_points(thing, turn)[:, 2]))
+        if can_be_taken(thing, turn):
+            return thing
+
+
+def can_be_taken(thing: Thing, turn: np.ndarray) -> bool:
+    """Whether some part of a thing that rests like that could be between the fingers; see the module."""
+    points = _points(thing, turn)
+    if np.ptp(points, axis=0).max() > LONGEST or np.ptp(points[:, 2]) < LOWEST:
+        return False
+    if len(thing.cavity) and turn is household.UPRIGHT and (thing.cavity.size[0, [0, 2]] > RIM).all():
+        return True
+    cap = points[points[:, 2] > points[:, 2].max() - CAP]
+    return bool(min(np.ptp(one @ _LEVEL.T, axis=0).min() for one in (points, cap)) < WIDEST)
+
+
+def _points(thing: Thing, turn: np.ndarray) -> np.ndarray:
+    """Points all over the parts of a thing, turned."""
+    points = np.concatenate([mesh.triangles(part, 16)[0] for part in thing.parts])
+    return points @ quaternions.to_matrix(turn).T
 
 
 Poses = tuple[tuple[Thing, ...], np.ndarray, np.ndarray]
@@ -141,7 +172,7 @@ def _packed(rng: np.random.Generator) -> Poses | None:
 
 def _pile(rng: np.random.Generator) -> Poses | None:
     things = [_thing(rng, packed=False) for _ in range(THINGS)]
-    world = World(things, PANDA, walls=HALF)
+    world = World(things, GRIPPER, walls=HALF)
     for k in range(THINGS):
         at = np.array([*rng.uniform(-0.3 * HALF, 0.3 * HALF, 2), 0.3])
         world.put(k, at, quaternions.random(1, rng)[0])
@@ -152,7 +183,7 @@ def _pile(rng: np.random.Generator) -> Poses | None:
 
 
 def _settled(things: list[Thing], positions: list[np.ndarray], rotations: list[np.ndarray]) -> Poses | None:
-    world = World(things, PANDA)
+    world = World(things, GRIPPER)
     for k in range(len(things)):
         world.put(k, positions[k], rotations[k])
     world.settle(1.5)

@@ -1,9 +1,10 @@
 """A table with things and a free-flying parallel gripper, in MuJoCo: what the picking benchmark is decided by.
 
 The world's frame has x to the right, y away from the camera, z up; the table is z = 0.  The gripper is made of the
-boxes of :class:`sq_perception.grasping.gripper.Gripper`: the hand follows a target by a stiff spring, the fingers are
-position controlled and push with at most the gripper's force.  Things are unions of convex parts (the parts' own
-triangle meshes), of one density, each with its own friction against everything.
+boxes of :class:`sq_perception.grasping.gripper.Gripper`: the hand follows a target by a stiff spring, the fingers move
+as one, position controlled, and push with at most the gripper's force.  Things are unions of convex parts (the parts'
+own triangle meshes) or, with a cavity, of the convex pieces of their walls, of one density, each with its own friction
+against everything.
 
 One pick: the open gripper is placed 10 cm before the grasp and comes along its axis, closes, lifts by 10 cm, shakes
 once along x and once along y, and holds, or not.  It stops where it is pushed back by more than a real arm allows.
@@ -13,8 +14,9 @@ Metres, seconds, kilograms, newtons.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from xml.sax.saxutils import quoteattr
 
 import mujoco
@@ -26,6 +28,7 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.grasping.gripper import Gripper
 from sq_perception.grasping.planner import DENSITY
 
+NO_CAVITY = Superquadric.stack([])
 STEP = 0.002
 APPROACH, LIFT = 0.10, 0.10
 SHAKE, SHAKES = 0.03, 2.0
@@ -44,17 +47,75 @@ _ARMATURE = 0.2
 """Of a finger's drive, so that a finger does not arrive as a hammer."""
 _SPEED = 0.05
 """m/s of a finger: its data sheet."""
-_ROLLING, _TORSION = 2e-4, 5e-3
-"""Metres: of rolling and of turning on the spot."""
+_ROLLING, _PAD_ARM = 2e-4, 6e-3
+"""Metres: of rolling; mean arm of a pad's friction against turning on the spot."""
+_SECTORS, _SLICES, _THINNEST = 24, 6, 1e-3
+"""Pieces that a wall is made of, around and upwards; metres of it at least."""
 
 
 @dataclass(frozen=True, eq=False)
 class Thing:
-    """What lies on the table: convex parts (k,) in its own frame, and its friction."""
+    """What lies on the table: convex parts (k,) in its own frame, a cavity (0 or 1,) about its z axis, its friction."""
 
     parts: Superquadric
     friction: float
     name: str = "thing"
+    cavity: Superquadric = NO_CAVITY
+
+    def solids(self) -> list[np.ndarray]:
+        """Vertices (n, 3) of convex pieces that make it up."""
+        around = [len(self.cavity) > 0 and _on_axis(part, self.cavity[0]) for part in self.parts]
+        found = [mesh.triangles(self.parts[k], _RESOLUTION)[0] for k in range(len(around)) if not around[k]]
+        if any(around):
+            found += walls([self.parts[k] for k in range(len(around)) if around[k]], self.cavity[0])
+        return found
+
+
+def _on_axis(part: Superquadric, cavity: Superquadric) -> bool:
+    """Whether a part stands on the upright axis of a cavity; a handle does not."""
+    aside = np.concatenate([part.translation[:2] - cavity.translation[:2], part.rotation[:3]])
+    return bool(np.abs(aside).max() < 1e-6)
+
+
+def walls(stack: Sequence[Superquadric], cavity: Superquadric) -> list[np.ndarray]:
+    """Convex pieces of bodies about an upright axis less a cavity about it: sectors of a wall, discs of a floor."""
+    angles = np.linspace(0, 2 * np.pi, _SECTORS + 1)
+    base = min(part.translation[2] - part.size[2] for part in stack)
+    top = max(part.translation[2] + part.size[2] for part in stack)
+    z = np.linspace(base + 1e-4, top - 1e-4, 200)
+    thick = np.max([_radii(part, z, angles[:1]) for part in stack], axis=0) - _radii(cavity, z, angles[:1])
+    top = z[np.flatnonzero(thick[:, 0] > _THINNEST)[-1]]
+    floor = max(cavity.translation[2] - cavity.size[2], base + 2e-3)
+    found = []
+    for low, high, count in ((z[0], floor, 3), (floor, top, _SLICES)):
+        for levels in pairwise(np.linspace(low, high, count + 1)):
+            outer = np.max([_radii(part, np.array(levels), angles) for part in stack], axis=0)
+            inner = _radii(cavity, np.array(levels), angles) if low == floor else 0 * outer
+            inner = np.clip(inner, 0.0, outer - _THINNEST)
+            if inner.max() <= 0:
+                found.append(_ring(outer, angles, levels))
+                continue
+            for k in range(_SECTORS):
+                sector = slice(k, k + 2)
+                pieces = [_ring(r[:, sector], angles[sector], levels) for r in (outer, inner)]
+                found.append(np.concatenate(pieces))
+    return [piece + [*cavity.translation[:2], 0.0] for piece in found]
+
+
+def _radii(body: Superquadric, z: np.ndarray, angles: np.ndarray) -> np.ndarray:
+    """Distances (j, k) from its upright axis to a body at heights (j,) along angles (k,); 0 beyond its ends."""
+    a, b, c = body.size
+    e1, e2 = body.shape
+    high = np.minimum(np.abs(z - body.translation[2]) / c, 1.0)
+    share = (1 - high ** (2 / e1)) ** (e1 / 2)
+    across = ((np.abs(np.cos(angles)) / a) ** (2 / e2) + (np.abs(np.sin(angles)) / b) ** (2 / e2)) ** (-e2 / 2)
+    return np.asarray(share[:, None] * across)
+
+
+def _ring(radii: np.ndarray, angles: np.ndarray, levels: Sequence[float]) -> np.ndarray:
+    """Points (2 k, 3) at two levels with radii (2, k) along angles (k,)."""
+    z = np.repeat(np.array(levels)[:, None], len(angles), axis=1)
+    return np.stack([radii * np.cos(angles), radii * np.sin(angles), z], axis=-1).reshape(-1, 3)
 
 
 @dataclass(frozen=True)
@@ -78,7 +139,9 @@ class Pick:
 
 
 class World:
-    """Things on a table; :meth:`pick` changes it."""
+    """Things on a table; :meth:`pick` changes it.  ``watch`` is called after every step of the physics."""
+
+    watch: Callable[[World], None] | None = None
 
     def __init__(self, things: Sequence[Thing], gripper: Gripper, walls: float | None = None) -> None:
         self.things, self.gripper = tuple(things), gripper
@@ -122,7 +185,7 @@ class World:
         """Let things move with the gripper out of the way, until they rest or this time is over."""
         self._hide()
         for k in range(int(seconds / STEP)):
-            mujoco.mj_step(self.model, self.data)
+            self._step()
             if k > 50 and k % 10 == 0 and np.abs(self.data.qvel[8:]).max() < _REST:
                 break
 
@@ -131,6 +194,12 @@ class World:
         for wall in self._walls:
             self.model.geom_contype[wall] = self.model.geom_conaffinity[wall] = 0
             self.model.geom_rgba[wall, 3] = 0
+
+    def gripper_pose(self) -> tuple[np.ndarray, np.ndarray, float]:
+        """Position (3,) and rotation (4,) x y z w of the TCP, and the opening."""
+        at = self.model.jnt_qposadr[self.model.body("hand").jntadr[0]]
+        pose = self.data.qpos[at : at + 9].copy()
+        return pose[:3], np.roll(pose[3:7], -1), float(pose[7] + pose[8])
 
     # Picking
 
@@ -161,7 +230,7 @@ class World:
         for way in np.eye(3)[:2]:
             for t in np.arange(0, 1 / SHAKES, STEP):
                 self._aim(position + [0.0, 0.0, LIFT] + SHAKE * np.sin(2 * np.pi * SHAKES * t) * way, rotation)
-                mujoco.mj_step(self.model, self.data)
+                self._step()
         held = self._between()
         return Pick(held, "held") if held >= 0 else Pick(-1, "slipped")
 
@@ -185,7 +254,7 @@ class World:
         steps = int(seconds / STEP)
         for k in range(steps + 100):
             self._aim(start + min((k + 1) / steps, 1.0) * (position - start), rotation)
-            mujoco.mj_step(self.model, self.data)
+            self._step()
             most = max(most, self._push())
             if most[0] > stop:
                 break
@@ -219,7 +288,7 @@ class World:
         from_here = float(self.data.ctrl[0])
         for k in range(int(from_here / _SPEED / STEP)):
             self._open(2 * (from_here - k * STEP * _SPEED))
-            mujoco.mj_step(self.model, self.data)
+            self._step()
         self._open(0.0)
         self._run(0.2)
 
@@ -232,7 +301,7 @@ class World:
         self.data.qpos[at + 7 : at + 9] = 0.5 * opening
         first = self.model.body("hand").dofadr[0]
         self.data.qvel[first : first + 8] = 0
-        mujoco.mj_step(self.model, self.data)
+        self._step()
 
     def _hide(self) -> None:
         self._place(np.array([0.0, 0.0, 3.0]), np.array([0.0, 0.0, 0.0, 1.0]), self.gripper.opening)
@@ -248,18 +317,22 @@ class World:
     def _address(self, thing: int) -> int:
         return int(self.model.jnt_qposadr[self.model.body(self._bodies[thing]).jntadr[0]])
 
+    def _step(self) -> None:
+        mujoco.mj_step(self.model, self.data)
+        if self.watch is not None:
+            self.watch(self)
+
     def _run(self, seconds: float) -> None:
         for _ in range(int(seconds / STEP)):
-            mujoco.mj_step(self.model, self.data)
+            self._step()
 
 
 def _xml(things: Sequence[Thing], gripper: Gripper, walls: float | None) -> str:
     assets, bodies = [], []
     for k, thing in enumerate(things):
-        friction = f"{thing.friction:.4f} {_TORSION} {_ROLLING}"
+        friction = f"{thing.friction:.4f} {_PAD_ARM * thing.friction:.5f} {_ROLLING}"
         geoms = []
-        for p, part in enumerate(thing.parts):
-            vertices, _ = mesh.triangles(part, _RESOLUTION)
+        for p, vertices in enumerate(thing.solids()):
             numbers = " ".join(f"{value:.6f}" for value in vertices.ravel())
             assets.append(f'<mesh name="m{k}_{p}" vertex="{numbers}" inertia="convex"/>')
             geoms.append(
@@ -296,14 +369,17 @@ def _xml(things: Sequence[Thing], gripper: Gripper, walls: float | None) -> str:
   <size memory="64M"/>
   <asset>{"".join(assets)}</asset>
   <worldbody>
-    <geom name="table" type="plane" size="0 0 1" friction="0.6 {_TORSION} {_ROLLING}" condim="6"/>{fence}
+    <geom name="table" type="plane" size="0 0 1" friction="0.6 {0.6 * _PAD_ARM} {_ROLLING}" condim="6"/>{fence}
     <body name="target" mocap="true" pos="0 0 3"/>
     <body name="hand" pos="0 0 3" gravcomp="1"><freejoint/>
       <geom type="box" pos="0 0 {back}" size="{0.5 * x} {0.5 * y} {0.5 * z}" mass="{_HAND_MASS}" {pad}/>{fingers}
     </body>
     {"".join(bodies)}
   </worldbody>
-  <equality><weld body1="target" body2="hand" solref="0.01 1" solimp="0.95 0.99 0.001"/></equality>
+  <equality>
+    <weld body1="target" body2="hand" solref="0.01 1" solimp="0.95 0.99 0.001"/>
+    <joint joint1="left" joint2="right" solref="0.004 1" solimp="0.95 0.99 0.0005"/>
+  </equality>
   <contact><exclude body1="hand" body2="left"/><exclude body1="hand" body2="right"/></contact>
   <actuator>{held}</actuator>
 </mujoco>"""

@@ -20,16 +20,22 @@ TABLE = Surroundings(plane=np.array([0.0, 0.0, 1.0, 0.0]))
 
 
 @pytest.fixture(scope="module")
-def world_of(repository):
+def picking(repository):
+    """The world and the benchmark."""
     sys.path.insert(0, str(repository / "benchmarks"))
     try:
-        from picking_world import Thing, World
+        import picking
+        import picking_world
     finally:
         sys.path.pop(0)
+    return picking_world, picking
 
+
+@pytest.fixture(scope="module")
+def world_of(picking):
     def made(friction=0.5, half=HALF):
         body = Superquadric(half, [0.1, 0.1], np.zeros(3), [0.0, 0.0, 0.0, 1.0])
-        world = World([Thing(Superquadric.stack([body]), friction)], PANDA)
+        world = picking[0].World([picking[0].Thing(Superquadric.stack([body]), friction)], PANDA)
         world.put(0, np.array([0.0, 0.0, half[2]]), np.array([0.0, 0.0, 0.0, 1.0]))
         world.settle(0.3)
         return world
@@ -63,3 +69,57 @@ def test_friction_is_what_holds(world_of):
     at = np.array([0.0, 0.0, 0.075])
     assert world_of(friction=0.002).pick(at, DOWN, 0.075).held < 0
     assert world_of(friction=1.0).pick(at, DOWN, 0.075).held == 0
+
+
+def test_doubling_the_friction_never_lowers_the_rate(world_of):
+    """Grasps across the body, turned about the approach and off its middle, that do not touch it on the way."""
+    rng = np.random.default_rng(0)
+    tries = []
+    for _ in range(3):
+        turn = quaternions.from_rotation_vector(np.array([0.0, 0.0, rng.uniform(-0.2, 0.2)]))
+        at = np.array([rng.uniform(-0.02, 0.02), rng.uniform(-0.004, 0.004), rng.uniform(0.07, 0.1)])
+        tries.append((at, quaternions.multiply(turn, DOWN)))
+    rates = []
+    for friction in (0.02, 0.04, 0.5, 1.0):
+        rates.append(sum(world_of(friction=friction).pick(*one, 0.08).held == 0 for one in tries))
+    assert rates == sorted(rates)
+    assert rates[-1] == 3
+
+
+def test_a_vessel_has_walls_that_are_taken_at_the_rim(world_of, picking):
+    """A cup of 9 cm, wider than the gripper opens: one finger goes into it."""
+    world_module, _ = picking
+    cup = Superquadric.stack([Superquadric([0.045, 0.045, 0.04], [0.1, 1.0], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])])
+    hollow = Superquadric([[0.042, 0.042, 0.074]], [[0.1, 1.0]], [[0.0, 0.0, 0.04]], [[0.0, 0.0, 0.0, 1.0]])
+    thing = world_module.Thing(cup, 0.6, "cup", hollow)
+    solids = thing.solids()
+    inside = np.concatenate(solids)
+    inside = inside[inside[:, 2] > 0.0]
+    assert np.hypot(*inside[:, :2].T).min() > 0.04
+    assert np.ptp(inside[:, :2], axis=0) == pytest.approx([0.09, 0.09], abs=2e-3)
+    world = world_module.World([thing], PANDA)
+    world.put(0, np.array([0.0, 0.0, 0.04]), np.array([0.0, 0.0, 0.0, 1.0]))
+    world.settle(0.3)
+    assert world.pick(np.array([0.0, 0.0435, 0.07]), DOWN, 0.05).held == 0
+
+
+def test_failures_are_told_apart(picking):
+    failure = picking[1].failure
+    assert failure({"held": 2, "how": "held", "touched": "", "aim": 2}) == ""
+    assert failure({"held": -1, "how": "collision", "touched": "2", "aim": 2}) == "wrong size"
+    assert failure({"held": -1, "how": "collision", "touched": "1", "aim": 2}) == "collision"
+    assert failure({"held": -1, "how": "collision", "touched": "table", "aim": 2}) == "collision"
+    assert failure({"held": -1, "how": "missed", "touched": "", "aim": 2}) == "missed"
+
+
+def test_a_gain_is_that_of_the_same_scenes(picking):
+    def line(who, seed, taken):
+        picks = [{"held": 0}] * taken + [{"held": -1}] * (5 - taken)
+        return {"kind": "pile", "contestant": who, "seed": seed, "taken": taken, "picks": picks}
+
+    lines = [line("ours", seed, 4) for seed in range(6)] + [line("box", seed, 3) for seed in range(2, 9)]
+    found = picking[1].gain(lines, "pile", "ours", "box")
+    assert found["scenes"] == [4]
+    np.testing.assert_allclose(found["gsr"], 20.0)
+    np.testing.assert_allclose(found["dr"], 20.0)
+    assert picking[1].gain(lines, "packed", "ours", "box") == {}
