@@ -27,10 +27,10 @@ os.environ.setdefault("ROS_DOMAIN_ID", "80")
 os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
 sys.path.append(str(Path(__file__).resolve().parent.parent / "test"))
 
-from respawned_nodes import CAMERA, MEMBERS, NODE, VIEWER, Kill, Robot
+from respawned_nodes import CAMERA, MEMBERS, NODE, VIEWER, Kill, Robot, orphans
 from running_nodes import Peer
 
-from sq_perception.nodes.fast_dds import orphans, remove_orphans
+from sq_perception.nodes.fast_dds import remove_orphans
 
 ASKED = 5.0
 """Seconds to the first result after a restart."""

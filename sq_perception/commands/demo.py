@@ -1,4 +1,4 @@
-"""``sq-perception demo``: the demonstration of :mod:`sq_perception.nodes.demonstration`, with its options."""
+"""``sq-perception demo``: the options of :mod:`sq_perception.commands.demonstration`."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def main(arguments: Sequence[str]) -> int:
     if not options.seconds > 0:
         command.error(f"--seconds: expected a number above 0, got {options.seconds:g}")
     try:
-        from sq_perception.nodes import demonstration
+        from sq_perception.commands import demonstration
     except ModuleNotFoundError as error:
         return failed(
             f"the demonstration needs ROS 2 in Python, and the module {error.name!r} is missing: "

@@ -161,6 +161,11 @@ def is_distorted(coefficients: Sequence[float]) -> bool:
     return not all(abs(value) <= _NEGLIGIBLE for value in coefficients)
 
 
+def intrinsics(camera: Camera) -> Intrinsics:
+    """What a camera_info says of a camera's images."""
+    return Intrinsics(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
+
+
 def _camera(known: Intrinsics) -> Camera:
     return Camera(known.width, known.height, known.fx, known.fy, known.cx, known.cy)
 

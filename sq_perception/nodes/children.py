@@ -18,14 +18,12 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from pathlib import Path
-from types import FrameType
 
-NODES = ("recover_node", "recover_cameras", "fitter_node", "synthetic_depth_node")
-"""Of :mod:`sq_perception.nodes.executables`."""
-
+_PATIENCE = 8.0
+"""Seconds for all children together to end after an interrupt: a lifecycle node waits 4 s for its transition."""
 _TAIL = 2**14
 """Bytes of a node's output that are looked at."""
 _ROOT = str(Path(__file__).resolve().parent.parent.parent)
@@ -33,24 +31,21 @@ _CODE = "import sys; sys.path[:1] = [{root!r}]; from sq_perception.nodes import 
 
 
 class Child:
-    """One running node."""
+    """One running node of :mod:`sq_perception.nodes.executables`; the environment is this process's if not given."""
 
-    def __init__(self, node: str, arguments: Sequence[str], environment: Mapping[str, str]) -> None:
+    def __init__(self, node: str, arguments: Sequence[str], environment: Mapping[str, str] | None = None) -> None:
         self.name = node
         self._said = tempfile.TemporaryFile()  # noqa: SIM115 - as long as the child
         self._process = subprocess.Popen(
             command(node, arguments),
-            env={**environment, "PYTHONUNBUFFERED": "1"},
+            env={**(os.environ if environment is None else environment), "PYTHONUNBUFFERED": "1"},
             stdin=subprocess.DEVNULL,
             stdout=self._said,
             stderr=subprocess.STDOUT,
             start_new_session=True,
         )
-
-    @property
-    def pid(self) -> int:
+        self.pid = self._process.pid
         """Its process id, and that of its group."""
-        return self._process.pid
 
     @property
     def exit_code(self) -> int | None:
@@ -67,7 +62,7 @@ class Child:
         """Ask it to stop, as Ctrl-C does."""
         self._signal(signal.SIGINT)
 
-    def wait(self, seconds: float) -> bool:
+    def ends_within(self, seconds: float) -> bool:
         """Whether it has ended within some seconds."""
         with suppress(subprocess.TimeoutExpired):
             self._process.wait(timeout=max(seconds, 0.0))
@@ -87,9 +82,8 @@ class Child:
 class Children:
     """Nodes that live as long as a ``with`` block."""
 
-    def __init__(self, environment: Mapping[str, str], *, patience: float = 8.0) -> None:
-        self._environment = dict(environment)
-        self._patience = patience
+    def __init__(self, environment: Mapping[str, str] | None = None) -> None:
+        self._environment = environment
         self._running: list[Child] = []
         self.killed: list[str] = []
         """Names of those that did not stop when asked to."""
@@ -117,9 +111,9 @@ class Children:
         try:
             for child in self._running:
                 child.interrupt()
-            deadline = time.monotonic() + self._patience
+            deadline = time.monotonic() + _PATIENCE
             for child in self._running:
-                if not child.wait(deadline - time.monotonic()):
+                if not child.ends_within(deadline - time.monotonic()):
                     child.kill()
                     self.killed.append(child.name)
             self._running.clear()
@@ -129,32 +123,8 @@ class Children:
 
 
 def command(node: str, arguments: Sequence[str] = ()) -> list[str]:
-    """The command line that runs a node by this interpreter, from this package.
-
-    Raises
-    ------
-    ValueError
-        If there is no node of that name.
-    """
-    if node not in NODES:
-        raise ValueError(f"node: expected one of {', '.join(NODES)}, got {node!r}")
+    """The command line that runs a node by this interpreter, from this package."""
     return [sys.executable, "-c", _CODE.format(root=_ROOT, node=node), *arguments]
-
-
-@contextmanager
-def interruptible() -> Iterator[None]:
-    """Within the block, SIGTERM and SIGHUP raise KeyboardInterrupt as Ctrl-C does; call it in the main thread."""
-
-    def interrupt(number: int, frame: FrameType | None) -> None:
-        raise KeyboardInterrupt
-
-    numbers = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-    previous = {number: signal.signal(number, interrupt) for number in numbers}
-    try:
-        yield
-    finally:
-        for number, handler in previous.items():
-            signal.signal(number, handler)
 
 
 def parameter_arguments(parameters: Mapping[str, object]) -> list[str]:

@@ -101,8 +101,8 @@ def _frame_node(name: str, namespace: str | None = None) -> FrameNode:
     from sq_perception.nodes.frame_node import FrameNode
     from sq_perception.nodes.parameters import FitterParameters, RecoverParameters
 
-    kinds = {"recover_node": RecoverParameters, "fitter_node": FitterParameters}
-    return FrameNode(name, kinds[name], namespace=namespace)
+    kind = FitterParameters if name == "fitter_node" else RecoverParameters
+    return FrameNode(name, kind, namespace=namespace)
 
 
 def _namespace(text: str) -> str:

@@ -17,7 +17,6 @@ import fcntl
 import os
 import re
 import time
-from collections.abc import Mapping
 from pathlib import Path
 
 VARIABLE = "FASTRTPS_DEFAULT_PROFILES_FILE"
@@ -43,66 +42,33 @@ def profile_path() -> Path:
     raise FileNotFoundError(f"{_FILE} is missing beside {package}: install the package again")
 
 
-def additions(base: Mapping[str, str] | None = None) -> dict[str, str]:
-    """What ``base`` (os.environ by default) lacks: the variable of the shipped profile, or nothing if it names one."""
-    present = os.environ if base is None else base
-    return {} if present.get(VARIABLE) else {VARIABLE: str(profile_path())}
+def additions() -> dict[str, str]:
+    """What the environment lacks: the variable of the shipped profile, or nothing if it names one."""
+    return {} if os.environ.get(VARIABLE) else {VARIABLE: str(profile_path())}
 
 
-def environment(base: Mapping[str, str] | None = None) -> dict[str, str]:
-    """A copy of the environment ``base`` (os.environ by default) with the profile in it."""
-    return {**(os.environ if base is None else base), **additions(base)}
-
-
-def orphans(folder: Path = FOLDER) -> tuple[str, ...]:
-    """Names of the segments whose owner is dead, of any age and user."""
-    return tuple(segment.name for lock, segment in _pairs(folder) if segment.exists() and not _owned(lock))
-
-
-def remove_orphans(folder: Path = FOLDER, least_age: float = LEAST_AGE) -> tuple[str, ...]:
-    """Delete this user's segments of dead owners that are older than ``least_age`` seconds; their names.
+def remove_orphans(folder: Path = FOLDER) -> tuple[str, ...]:
+    """Delete this user's segments of dead owners that are older than :data:`LEAST_AGE`; their names.
 
     What cannot be read or removed stays, and nothing is raised for it.  Ports (``fastrtps_port<number>``) stay too:
     they are few, small, and taken over by the next process with the same number.
     """
-    return tuple(segment.name for lock, segment in _pairs(folder) if _removed(lock, segment, least_age))
-
-
-def _pairs(folder: Path) -> list[tuple[Path, Path]]:
     try:
         names = sorted(os.listdir(folder))
     except OSError:
-        return []
-    found = ((name, _LOCK.fullmatch(name)) for name in names)
-    return [(folder / name, folder / match[1]) for name, match in found if match is not None]
+        return ()
+    found = (match for match in map(_LOCK.fullmatch, names) if match is not None)
+    return tuple(match[1] for match in found if _removed(folder / match[0], folder / match[1]))
 
 
-def _opened(lock: Path) -> int:
-    return os.open(lock, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
-
-
-def _owned(lock: Path) -> bool:
+def _removed(lock: Path, segment: Path) -> bool:
     try:
-        descriptor = _opened(lock)
-    except OSError:
-        return True
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except OSError:
-        return True
-    finally:
-        os.close(descriptor)
-    return False
-
-
-def _removed(lock: Path, segment: Path, least_age: float) -> bool:
-    try:
-        descriptor = _opened(lock)
+        descriptor = os.open(lock, os.O_RDONLY | os.O_CLOEXEC | os.O_NOFOLLOW)
     except OSError:
         return False
     try:
         about = os.fstat(descriptor)
-        if about.st_uid != os.geteuid() or time.time() - about.st_mtime < least_age:
+        if about.st_uid != os.geteuid() or time.time() - about.st_mtime < LEAST_AGE:
             return False
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         # Held until both names are gone: whoever asks meanwhile takes the owner for alive and leaves them alone.

@@ -70,16 +70,14 @@ class Frame:
         """Whether results belong in the cube frame."""
         return not self.camera.is_pinhole
 
-    def with_mask(self, message: Image | None) -> Frame:
-        """The frame with the label image of its objects; None leaves it without.
+    def with_mask(self, message: Image) -> Frame:
+        """The frame with the label image of its objects.
 
         Raises
         ------
         Refused, ImageError
             If the mask has another size than the depth image, or is no label image.
         """
-        if message is None:
-            return self
         labels = labels_from_message(message)
         (rows, columns), (width, height) = labels.shape, self.calibration.size
         if (columns, rows) != (width, height):
@@ -140,6 +138,11 @@ def image_topic(node: Node, name: str, transport: str) -> str:
     if transport == RAW or resolved.endswith(f"/{transport}"):
         return resolved
     return f"{resolved}/{transport}"
+
+
+def stamp_of(message: Any) -> int:
+    """Nanoseconds of a message's header.  Not by rclpy's Time, which refuses stamps before 1970."""
+    return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
 
 
 def size_of(message: Image | CompressedImage) -> tuple[int, int]:

@@ -46,9 +46,8 @@ from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.nodes import fast_dds, process
 from sq_perception.nodes.engine import TURNS, Answer, Engine
-from sq_perception.nodes.frame import Frame
-from sq_perception.nodes.inbox import Arrival
-from sq_perception.nodes.input import Input
+from sq_perception.nodes.frame import Frame, stamp_of
+from sq_perception.nodes.input import Arrival, Input
 from sq_perception.nodes.managed_node import ManagedNode
 from sq_perception.nodes.outputs import Outputs, pose_in
 from sq_perception.nodes.parameters import LiveParameters, RecoverParameters
@@ -69,9 +68,10 @@ _TICK = 0.05
 
 @dataclass(frozen=True, eq=False)
 class _Result:
-    """A frame, its bodies, where they come from, and how long that took by stage."""
+    """A frame, when it arrived, its bodies, where they come from, and how long that took by stage."""
 
     frame: Frame
+    time: float
     recovery: FrameRecovery
     origin: Hashable
     milliseconds: dict[str, float]
@@ -153,15 +153,15 @@ class FrameNode(ManagedNode):
     def _activate(self) -> None:
         self._defects = 0
         self._input = one = Input(self, lambda: self._settings.current, lambda: self._is_wanted, self._statistics)
+        one.open()
         self._worker = threading.Thread(target=self._work, args=(one,), name="worker", daemon=True)
         self._worker.start()
-        one.open()
         self.get_logger().info(f"ready, listening to {one.topic}")
 
     def _deactivate(self) -> None:
         self._stop()
         with self._publishing:
-            self._outputs.withdraw()
+            self._outputs.optional.withdraw()
             self._outputs.hide()
 
     def _cleanup(self) -> None:
@@ -174,7 +174,7 @@ class FrameNode(ManagedNode):
         process.release_objects()  # nothing of a network may hang on in a cycle of references
 
     def _stop(self) -> None:
-        """End subscriptions and worker.  What planners were told of stays: a camera that fails takes no obstacles."""
+        """End subscriptions and worker.  What planners know stays: a camera that fails takes no obstacles."""
         with self._publishing:
             one, self._input = self._input, None
         if one is not None:
@@ -213,26 +213,19 @@ class FrameNode(ManagedNode):
     # The worker
 
     def _work(self, source: Input) -> None:
-        while source.inbox.wait():
+        while source.wait():
             arrival: Arrival | None = None
-            outcome: Outcome
+            outcome: Outcome | None = None
             try:
                 with TURNS.turn():
                     # Taken when the turn has come: while others were computing, a newer one may have arrived.
-                    arrival = source.inbox.take()
-                    if arrival is None:
-                        continue
-                    if not self._is_wanted:
-                        self._statistics.count("dropped")
-                        continue
-                    result = self._recovered(source, arrival)
+                    arrival = source.take()
+                    result = self._recovered(source, arrival) if arrival is not None and self._is_wanted else None
                 with self._publishing:
-                    if self._input is not source or not self._is_wanted:
-                        # Deactivated or disabled meanwhile: nothing is published, least of all a grasped body.
-                        self._statistics.count("dropped")
-                        continue
-                    outcome = True, self._published(result, arrival)
-                self._defects = 0
+                    # Deactivated or disabled meanwhile: nothing is published, least of all a grasped body.
+                    if result is not None and self._input is source and self._is_wanted:
+                        outcome = True, self._published(result)
+                        self._defects = 0
             except ValueError as error:
                 outcome = False, str(error)
             except Exception as error:
@@ -241,6 +234,9 @@ class FrameNode(ManagedNode):
                 outcome = False, f"{type(error).__name__}: {error}"
                 self._note_defect(outcome[1])
             if arrival is None:
+                continue
+            if outcome is None:
+                self._statistics.count("dropped")
                 continue
             if not outcome[0]:
                 self._statistics.refuse(outcome[1])
@@ -270,32 +266,31 @@ class FrameNode(ManagedNode):
         recovery, origin = answer = self._engine.recover(frame, parameters, pose, before)
         self._before = {frame.header.frame_id: answer}
         stages |= {f"recovery: {name}": took for name, took in recovery.milliseconds.items()}
-        return _Result(frame, recovery, origin, stages)
+        return _Result(frame, arrival.time, recovery, origin, stages)
 
-    def _published(self, result: _Result, arrival: Arrival) -> str:
+    def _published(self, result: _Result) -> str:
         """Name the bodies and publish them; the summary."""
         parameters = self._settings.current
         frame, stages = result.frame, dict(result.milliseconds)
         with timed(stages, "tracking"):
-            found = self._tracking.identify(result.recovery, frame, arrival.time, parameters, result.origin)
+            found = self._tracking.identify(result.recovery, frame, result.time, parameters, result.origin)
         with timed(stages, "publish"):
             findings = self._outputs.answer(found, frame, parameters)
-        stamp = frame.header.stamp  # not by rclpy's Time, which refuses stamps before 1970
-        age = 1e-9 * self.get_clock().now().nanoseconds - stamp.sec - 1e-9 * stamp.nanosec
+        age = 1e-9 * (self.get_clock().now().nanoseconds - stamp_of(frame))
         if abs(age) < _OLDEST:
             stages["stamp to result"] = 1e3 * age
-        words = summary(found.recovery, found.ids)
-        self._statistics.answer(stages, words)
+        text = summary(found.recovery, found.ids)
+        self._statistics.answer(stages, text)
         self._statistics.note(self._outputs.accompany(found, findings, frame, parameters))
-        return words
+        return text
 
-    def _note_defect(self, words: str) -> None:
+    def _note_defect(self, text: str) -> None:
         """A defect of ours: it costs this frame and leaves its trace in the log, and the node goes on."""
         self.get_logger().error(traceback.format_exc(), throttle_duration_sec=THROTTLE)
         self._defects += 1
         if self._defects == _DEFECTS:
             self._engine.discard()
-            self._fail(f"{_DEFECTS} frames in a row failed, the last one by {words}")
+            self._fail(f"{_DEFECTS} frames in a row failed, the last one by {text}")
 
     # Services and diagnostics, in the executor's thread
 
@@ -334,8 +329,8 @@ class FrameNode(ManagedNode):
         if source is not None:
             source.look_for_latched()
         more = {"state": self.state, "enabled": str(self._enabled).lower(), "engine": self._engine.description}
-        if self._outputs.absent:
-            more["missing packages"] = " ".join(self._outputs.absent)
+        if absent := self._outputs.optional.absent:
+            more["missing packages"] = " ".join(absent)
         if self.is_active and parameters.tracking:
             tally = self._tracking.tally
             more |= {"tracks": str(tally.tracks), "track ids given": str(tally.births)}

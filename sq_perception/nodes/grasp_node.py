@@ -37,6 +37,7 @@ from sq_perception.grasping.surroundings import Surroundings
 from sq_perception.nodes.managed_node import ManagedNode
 from sq_perception.nodes.parameters import GraspParameters, LiveParameters
 from sq_perception.nodes.statistics import THROTTLE
+from sq_perception.recordings.publication import superquadrics
 
 _LATCHED = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 
@@ -140,8 +141,7 @@ class GraspNode(ManagedNode):
 
 def planned(bodies: SuperquadricArray, parameters: GraspParameters, plane: np.ndarray | None = None) -> GraspPlan:
     """The plan that the parameters ask for; bodies that they leave out are minded, and have no grasp."""
-    columns = (bodies.size, bodies.shape, bodies.translation, bodies.rotation)
-    batch = Superquadric(*(column.astype(float) for column in columns))
+    batch = superquadrics(bodies)
     hand = gripper(parameters.gripper)
     plan = grasps(batch, hand, covariances(bodies, batch), Surroundings(plane), parameters.friction)
     wanted = [parameters.only_id in (-1, int(number)) for number in bodies.id]

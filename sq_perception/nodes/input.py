@@ -1,8 +1,20 @@
-"""The input of a frame node: its subscriptions, and the frames that are made of their messages."""
+"""The input of a frame node: what it hears, what waits for the worker, and the frames that are made of it.
+
+Callbacks of the executor store, one worker thread takes; the newest complete depth image wins.  It is complete with the
+camera_info of its own stamp, or else the latest one of its size, and, where masks are expected, with the mask of its
+own stamp.  What is missing may come a moment later: the image waits for it for ``patience`` seconds, beside newer
+images.  As soon as an image is complete, or its patience is at an end, it takes the place of every older one.
+
+So a frame is never computed without its mask only because the network that makes the mask is slower than the camera,
+and nobody who has the turn to compute waits for a message.
+"""
 
 from __future__ import annotations
 
+import threading
+from collections import OrderedDict, deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from time import monotonic
 from typing import Any
 
@@ -20,16 +32,48 @@ from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
+from sq_msgs_py.depth_image import size_mismatch
 from sq_perception.imaging.calibration import Calibration
 from sq_perception.nodes import fast_dds
-from sq_perception.nodes.frame import Frame, Refused, decode, image_topic
-from sq_perception.nodes.inbox import Arrival, Inbox, NoCameraInfo
+from sq_perception.nodes.frame import Frame, Refused, decode, image_topic, size_of, stamp_of
 from sq_perception.nodes.parameters import RAW, RecoverParameters
 from sq_perception.nodes.statistics import THROTTLE, Statistics
 
+_INFOS = 16
+_MASKS = 8
+_WAITING = 64
+"""Images that wait for their companions at the same time; older ones are dropped."""
+
+
+@dataclass(frozen=True)
+class Arrival:
+    """A depth image, when it came, in seconds of the monotonic clock, and its mask if one came."""
+
+    message: Image | CompressedImage
+    time: float
+    mask: Image | None = None
+
+
+@dataclass(frozen=True)
+class _Waiting:
+    message: Image | CompressedImage
+    size: tuple[int, int] | None
+    """None for what is no image, which is to be refused at once."""
+    time: float
+    deadline: float
+    needs_mask: bool
+
+
+@dataclass(frozen=True)
+class _Info:
+    stamp: int
+    size: tuple[int, int]
+    calibration: Calibration | None
+    fault: str
+
 
 class Input:
-    """The subscriptions of an active node, whose messages go into an inbox, and the frames that are made of them.
+    """The subscriptions of an active node, and what came.
 
     Inputs are best effort, keep last 1: a slow subscriber with a queue answers old images.
 
@@ -53,32 +97,31 @@ class Input:
         statistics: Statistics,
     ) -> None:
         self._node, self._parameters, self._is_wanted, self._statistics = node, parameters, is_wanted, statistics
-        self._note = ""
-        self._last_image = monotonic()
-        self._is_pinhole = parameters().projection == "pinhole"
         self._transport = parameters().image_transport
+        self._has_infos = parameters().projection == "pinhole"
         self.topic = image_topic(node, "depth/image", self._transport)
         """Of the depth images."""
-        self.inbox = Inbox(
-            self._calibrated if self._is_pinhole else None,
-            needs_mask=self._expects_mask,
-            patience=lambda: self._parameters().patience,
-            dropped=lambda number: statistics.count("dropped", number),
-        )
-        self._is_closed = False
+        self._note = ""
+        self._last_image = monotonic()
         self._info: Subscription | None = None
         self._latched: Subscription | None = None
         self._mask: Subscription | None = None
         self._image: Subscription | None = None
+        self._changed = threading.Condition()
+        """Guards what follows."""
+        self._waiting: deque[_Waiting] = deque()
+        self._ready: Arrival | None = None
+        self._infos: deque[_Info] = deque(maxlen=_INFOS)
+        self._masks: OrderedDict[int, Image] = OrderedDict()
+        self._is_closed = False
 
     def open(self) -> None:
         """Subscribe."""
         # Subscriptions are served in this order: what an image needs is there before the image.
-        if self._is_pinhole:
-            self._info = self._listen(CameraInfo, "depth/camera_info", self.inbox.put_info)
-        self._mask = self._listen(Image, "mask/image", self.inbox.put_mask)
-        kind = Image if self._transport == RAW else CompressedImage
-        self._image = self._listen(kind, self.topic, self._on_image)
+        if self._has_infos:
+            self._info = self._listen(CameraInfo, "depth/camera_info", self._on_info)
+        self._mask = self._listen(Image, "mask/image", self._on_mask)
+        self._image = self._listen(Image if self._transport == RAW else CompressedImage, self.topic, self._on_image)
 
     def look_for_latched(self) -> None:
         """Subscribe to a camera_info that was published once and is kept for late comers, if there is one; each second.
@@ -92,12 +135,8 @@ class Input:
             self._latched = self._node.create_subscription(
                 CameraInfo,
                 self._info.topic_name,
-                self.inbox.put_info,
-                QoSProfile(
-                    depth=1,
-                    reliability=QoSReliabilityPolicy.RELIABLE,
-                    durability=QoSDurabilityPolicy.TRANSIENT_LOCAL,
-                ),
+                self._on_info,
+                QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL),
                 # Others on the topic may keep nothing; the plain subscription hears them.
                 event_callbacks=SubscriptionEventCallbacks(incompatible_qos=lambda _: None),
             )
@@ -114,11 +153,37 @@ class Input:
 
     def close(self) -> None:
         """Listen no more, and let the worker go; what waits is dropped."""
-        self._is_closed = True
+        with self._changed:
+            self._is_closed = True
+            left = len(self._waiting) + (self._ready is not None)
+            self._waiting.clear()
+            self._ready = None
+            self._changed.notify_all()
+        self._statistics.count("dropped", left)
         for one in (self._image, self._mask, self._latched, self._info):
             if one is not None:
                 self._node.destroy_subscription(one)
-        self._statistics.count("dropped", self.inbox.close())
+
+    # For the worker
+
+    def wait(self) -> bool:
+        """Wait until an image can be taken; False once the input is closed."""
+        with self._changed:
+            while not self._is_closed:
+                now = monotonic()
+                self._promote(now)
+                if self._ready is not None:
+                    return True
+                deadline = min((one.deadline for one in self._waiting), default=None)
+                self._changed.wait(None if deadline is None else max(deadline - now, 0.0))
+            return False
+
+    def take(self) -> Arrival | None:
+        """The image that :meth:`wait` waited for, or a newer one; None if there is none."""
+        with self._changed:
+            self._promote(monotonic())
+            arrival, self._ready = self._ready, None
+            return arrival
 
     def frame(self, arrival: Arrival, parameters: RecoverParameters) -> Frame:
         """The frame of an image with what belongs to it.
@@ -128,42 +193,111 @@ class Input:
         ValueError
             For anything that keeps it from being processed.
         """
-        message = arrival.message
-        if parameters.projection == "orthographic":
-            frame = decode(message, None)
-        else:
-            try:
-                frame = decode(message, lambda: self.inbox.calibration_of(message))
-            except NoCameraInfo as error:
-                topic = self._info.topic_name if self._info is not None else "depth/camera_info"
-                raise Refused(f"{error}, on {topic}: {self._publishers_of(self._info)}") from error
-        if parameters.use_masks == "always" and arrival.mask is None:
+        message, use = arrival.message, parameters.use_masks
+        frame = decode(message, (lambda: self._calibration_of(message)) if self._has_infos else None)
+        if use == "always" and arrival.mask is None:
             where = f" on {self._mask.topic_name}" if self._mask is not None else ""
             raise Refused(f"mask: expected one with the stamp of the image (use_masks is always), none came{where}")
-        return frame.with_mask(arrival.mask if parameters.use_masks != "never" else None)
+        return frame if arrival.mask is None or use == "never" else frame.with_mask(arrival.mask)
+
+    def _calibration_of(self, image: Image | CompressedImage) -> Calibration:
+        size = size_of(image)
+        with self._changed:
+            info = self._info_for(size, stamp_of(image))
+            last = self._infos[-1] if self._infos else None
+        if info is not None and info.calibration is not None:
+            return info.calibration
+        if info is not None:
+            fault = info.fault
+        elif last is not None:
+            why = last.fault or size_mismatch(size, last.size)
+            fault = f"{_wanted(size)}, the last one is for {last.size[0]} x {last.size[1]} ({why})"
+        else:
+            fault = f"{_wanted(size)}, none came"
+        topic = self._info.topic_name if self._info is not None else "depth/camera_info"
+        raise Refused(f"{fault}, on {topic}: {self._publishers_of(self._info)}")
 
     # Callbacks, in the executor's thread: quick, and nothing in them can fail on a message's content
 
     def _on_image(self, message: Image | CompressedImage) -> None:
-        self._last_image = monotonic()
+        now = self._last_image = monotonic()
         self._statistics.count("received")
-        if self._is_wanted():
-            self.inbox.put_image(message)
-        else:
+        if not self._is_wanted():
             self._statistics.count("dropped")
+            return
+        parameters = self._parameters()
+        try:
+            size = size_of(message)
+        except ValueError:
+            size = None
+        waiting = _Waiting(message, size, now, now + parameters.patience, self._expects_mask(parameters.use_masks))
+        with self._changed:
+            if self._is_closed:
+                self._statistics.count("dropped")
+                return
+            self._waiting.append(waiting)
+            self._promote(now)
 
-    def _calibrated(self, info: CameraInfo) -> Calibration:
-        calibration = Calibration.of(info, self.topic, self._parameters().distortion)
-        if calibration.note != self._note:
-            self._note = calibration.note
-            said = f"{self.topic}: {calibration.note or 'no distortion'}"
-            self._node.get_logger().info(said, throttle_duration_sec=THROTTLE)
-        return calibration
+    def _on_info(self, message: CameraInfo) -> None:
+        """Keep a camera_info; a useless one is kept as the reason for refusing frames of its size."""
+        size, calibration, fault = (int(message.width), int(message.height)), None, ""
+        try:
+            calibration = Calibration.of(message, self.topic, self._parameters().distortion)
+            size = calibration.size
+            if calibration.note != self._note:
+                self._note = calibration.note
+                said = f"{self.topic}: {calibration.note or 'no distortion'}"
+                self._node.get_logger().info(said, throttle_duration_sec=THROTTLE)
+        except ValueError as error:
+            fault = str(error)
+        with self._changed:
+            self._infos.append(_Info(stamp_of(message), size, calibration, fault))
+            self._promote(monotonic())
 
-    def _expects_mask(self) -> bool:
+    def _on_mask(self, message: Image) -> None:
+        """Keep a label image for the depth image of the same stamp; one without a stamp belongs to none."""
+        if stamp_of(message) == 0:
+            return
+        with self._changed:
+            self._masks[stamp_of(message)] = message
+            while len(self._masks) > _MASKS:
+                self._masks.popitem(last=False)
+            self._promote(monotonic())
+
+    # What waits, with the lock held
+
+    def _promote(self, now: float) -> None:
+        """Make the newest image ready that is complete or has waited long enough; it takes the place of older ones."""
+        ready = [k for k, one in enumerate(self._waiting) if one.deadline <= now or self._is_complete(one)]
+        gone = ready[-1] + 1 if ready else max(len(self._waiting) - _WAITING, 0)
+        dropped = gone
+        if ready:
+            one = self._waiting[ready[-1]]
+            dropped += (self._ready is not None) - 1
+            self._ready = Arrival(one.message, one.time, self._masks.pop(stamp_of(one.message), None))
+        for _ in range(gone):
+            self._waiting.popleft()
+        if dropped:
+            self._statistics.count("dropped", dropped)
+        self._changed.notify_all()
+
+    def _is_complete(self, one: _Waiting) -> bool:
+        if one.size is None:
+            return True
+        stamp = stamp_of(one.message)
+        has_info = not self._has_infos or self._info_for(one.size, stamp) is not None
+        return has_info and (not one.needs_mask or stamp in self._masks)
+
+    def _info_for(self, size: tuple[int, int], stamp: int) -> _Info | None:
+        fitting = [info for info in self._infos if info.size == size]
+        best = [info for info in fitting if info.stamp == stamp] or fitting
+        return best[-1] if best else None
+
+    # Subscriptions
+
+    def _expects_mask(self, use: str) -> bool:
         if self._mask is None:
             return False
-        use = self._parameters().use_masks
         return use == "always" or (use == "auto" and bool(self._node.count_publishers(self._mask.topic_name)))
 
     def _listen(self, kind: type[Any], topic: str, callback: Callable[[Any], None]) -> Subscription:
@@ -209,3 +343,7 @@ class Input:
             parts.append(f"{one.node_namespace.rstrip('/')}/{one.node_name} ({one.topic_type}, {said}{note})")
         count = len(parts)
         return f"{count} publisher{'s' * (count > 1)}: {', '.join(parts)}" if parts else "nobody publishes it"
+
+
+def _wanted(size: tuple[int, int]) -> str:
+    return f"camera_info: expected one for {size[0]} x {size[1]} pixels"

@@ -18,7 +18,7 @@ An object of the planning scene is sent again when it has changed, and all of th
 planner copies its world for each message.  One is removed when its id is gone, that is neither in a frame nor that of a
 track which the frame does not show: what a robot's arm hides is still there.  Switching the output off removes all
 objects that were added.  A node that ends removes nothing: a planner must not lose its obstacles because a camera
-fails; and what planners were told of outlives a restart after a fault, so that an object that is gone is still removed.
+fails; and what planners know outlives a restart after a fault, so that an object that is gone is still removed.
 """
 
 from __future__ import annotations
@@ -57,13 +57,13 @@ _OVERRIDABLE = tuple(getattr(QoSPolicyKind, name) for name in ("HISTORY", "DEPTH
 _LATCHED = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 """Late comers get the last one: a table that is hidden by an arm is still there."""
 _STEP = 0.002
-"""Metres: planners, whose paddings are larger, are not told of a body of which no point has moved farther."""
+"""Metres: a body of which no point has moved farther is not sent again to planners, whose paddings are larger."""
 _ARRIVAL = Duration(seconds=0.5)
 """How long the last markers may take to arrive before their publisher goes."""
 
 
 class Outputs:
-    """Publishes frames; used by one thread at a time, except for ``absent``.
+    """Publishes frames; used by one thread at a time.
 
     Parameters
     ----------
@@ -75,14 +75,9 @@ class Outputs:
 
     def __init__(self, node: Node, poses: CameraPoses) -> None:
         self._node, self._poses = node, poses
-        self._others = OptionalOutputs(node)
+        self.optional = OptionalOutputs(node)
         self._publishers: tuple[Publisher, ...] = ()
         self._shown: Findings | None = None
-
-    @property
-    def absent(self) -> tuple[str, ...]:
-        """Packages that outputs are asked for and that are not there."""
-        return self._others.absent
 
     def open(self, parameters: RecoverParameters) -> None:
         """Create what is published."""
@@ -94,27 +89,23 @@ class Outputs:
         self.rendered_depth = create(Image, "~/rendered_depth", 1)
         self.support_plane = create(PoseStamped, "~/support_plane", _LATCHED)
         self._publishers = self.superquadrics, self.markers, self.rendered_depth, self.support_plane
-        self._others.follow(parameters)
+        self.optional.follow(parameters)
 
     def close(self) -> None:
-        """Destroy the publishers; what planners were told of stays with them, markers go."""
+        """Destroy the publishers; what planners know stays with them, markers go."""
         if self._publishers:
             self.hide()
             self.markers.wait_for_all_acked(_ARRIVAL)
         for publisher in self._publishers:
             self._node.destroy_publisher(publisher)
         self._publishers = ()
-        self._others.close()
+        self.optional.close()
 
     def hide(self) -> None:
         """Delete the markers: nobody moves them from now on."""
         if self._shown is not None and self._node.context.ok():
             gone, self._shown = self._shown, None
             self.markers.publish(markers([], [], gone.header, previous_ids=gone.shown_ids))
-
-    def withdraw(self) -> None:
-        """Take back what planners were told of: nobody looks after it from now on."""
-        self._others.withdraw()
 
     def answer(self, found: Identified, frame: Frame, parameters: RecoverParameters) -> Findings:
         """Publish the point cloud, in ``target_frame`` if there is one; what was found as every output shows it.
@@ -134,11 +125,11 @@ class Outputs:
     def accompany(
         self, found: Identified, findings: Findings, frame: Frame, parameters: RecoverParameters
     ) -> dict[str, float]:
-        """Publish what goes with the answer; milliseconds by stage.  Whatever goes wrong here is told, and no more."""
+        """Publish what goes with the answer; milliseconds by stage.  What goes wrong here is logged, and no more."""
         stages: dict[str, float] = {}
         try:
             with timed(stages, "outputs"):
-                self._others.publish(findings, parameters, found.hidden)
+                self.optional.publish(findings, parameters, found.hidden)
             with timed(stages, "pictures"):
                 if self.markers.get_subscription_count():
                     before = self._shown.shown_ids if self._shown is not None else ()
@@ -203,9 +194,9 @@ class OptionalOutputs:
         self._node = node
         self._publishers: dict[str, tuple[type[Any], Publisher]] = {}
         self._absent: dict[str, str] = {}
-        self._told: dict[str, SuperquadricArray | None] = {}
-        """What planners were told of, by name; None for what has to be told again."""
-        self._told_as = "", ""
+        self._known: dict[str, SuperquadricArray | None] = {}
+        """Bodies as planners know them, by name; None for those that have to be sent again."""
+        self._known_as = "", ""
         self._listeners = 0
         self._last_header: Any = None
         self._said_no_frame = False
@@ -224,7 +215,7 @@ class OptionalOutputs:
                 continue
             if parameter in self._absent:
                 self._absent = {other: package for other, package in self._absent.items() if other != parameter}
-            if parameter == "publish_collision_objects" and self._told:
+            if parameter == "publish_collision_objects" and self._known:
                 self.withdraw()  # the publisher lasts until the next call, so that its last message arrives
             elif parameter in self._publishers:
                 self._node.destroy_publisher(self._publishers.pop(parameter)[1])
@@ -257,11 +248,11 @@ class OptionalOutputs:
             self._publish_collision_objects(found, parameters, hidden)
 
     def withdraw(self) -> None:
-        """Remove every object that was added to the planning scene."""
-        if not self._told:
+        """Remove every object that was added to the planning scene: nobody looks after it from now on."""
+        if not self._known:
             return
-        self._publish_scene(collision_objects.removals(self._told, self._last_header))
-        self._told = {}
+        self._publish_scene(collision_objects.removals(self._known, self._last_header))
+        self._known = {}
 
     def close(self) -> None:
         """Destroy the publishers; what is in the planning scene stays there, and is remembered."""
@@ -295,21 +286,21 @@ class OptionalOutputs:
         self, found: Findings, parameters: RecoverParameters, hidden: Collection[int]
     ) -> None:
         listeners = self._publishers["publish_collision_objects"][1].get_subscription_count()
-        told_as = found.header.frame_id, parameters.collision_shapes
-        if listeners > self._listeners or told_as != self._told_as:
-            self._told = dict.fromkeys(self._told)
-        self._listeners, self._told_as, self._last_header = listeners, told_as, found.header
+        known_as = found.header.frame_id, parameters.collision_shapes
+        if listeners > self._listeners or known_as != self._known_as:
+            self._known = dict.fromkeys(self._known)
+        self._listeners, self._known_as, self._last_header = listeners, known_as, found.header
         shown = found.array.recovered
         names = [name(number, parameters.tf_prefix) for number in shown.id]
-        new = np.array([_has_changed(self._told.get(one), shown, k) for k, one in enumerate(names)], dtype=bool)
+        new = np.array([_has_changed(self._known.get(one), shown, k) for k, one in enumerate(names)], dtype=bool)
         meshes = [found.meshes[k] for k in np.flatnonzero(new)] if parameters.collision_shapes == "mesh" else None
         objects = collision_objects.collision_objects(
             shown.where(new), found.header, meshes=meshes, prefix=parameters.tf_prefix
         )
         kept = {*names, *(name(number, parameters.tf_prefix) for number in hidden)}
-        objects += collision_objects.removals(self._told.keys() - kept, found.header)
-        self._told = {one: state for one, state in self._told.items() if one in kept}
-        self._told.update({names[k]: shown.where(np.arange(len(shown)) == k) for k in np.flatnonzero(new)})
+        objects += collision_objects.removals(self._known.keys() - kept, found.header)
+        self._known = {one: state for one, state in self._known.items() if one in kept}
+        self._known.update({names[k]: shown.where(np.arange(len(shown)) == k) for k in np.flatnonzero(new)})
         if objects:
             self._publish_scene(objects)
 
@@ -317,14 +308,14 @@ class OptionalOutputs:
         self._publishers["publish_collision_objects"][1].publish(collision_objects.planning_scene(objects))
 
 
-def _has_changed(told: SuperquadricArray | None, shown: SuperquadricArray, k: int) -> bool:
-    """Whether a point of a body may have moved by more than a step since planners were told of it."""
-    if told is None:
+def _has_changed(known: SuperquadricArray | None, shown: SuperquadricArray, k: int) -> bool:
+    """Whether a point of a body may have moved by more than a step since planners were sent it."""
+    if known is None:
         return True
-    largest = float(told.size.max())
+    largest = float(known.size.max())
     turn = 2 * np.arccos(
-        min(1.0, abs(float(np.vdot(unit_quaternions(told.rotation[0]), unit_quaternions(shown.rotation[k])))))
+        min(1.0, abs(float(np.vdot(unit_quaternions(known.rotation[0]), unit_quaternions(shown.rotation[k])))))
     )
-    moves = np.linalg.norm(told.translation[0] - shown.translation[k]), np.abs(told.size[0] - shown.size[k]).max()
-    rounds = largest * np.abs(told.shape[0] - shown.shape[k]).max()
+    moves = np.linalg.norm(known.translation[0] - shown.translation[k]), np.abs(known.size[0] - shown.size[k]).max()
+    rounds = largest * np.abs(known.shape[0] - shown.shape[k]).max()
     return bool(sum(moves) + rounds + largest * turn > _STEP)

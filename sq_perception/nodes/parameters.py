@@ -23,20 +23,19 @@ from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValu
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
+from sq_msgs_py.depth_image import DEPTH_ENCODINGS, GREY_ENCODINGS
 from sq_perception.grasping.gripper import GRIPPERS
 from sq_perception.grasping.planner import FRICTION
 from sq_perception.imaging import compressed_depth
 from sq_perception.imaging.calibration import Treatment
+from sq_perception.imaging.camera import Projection
 from sq_perception.recovery.options import Method, Refine
 from sq_perception.segmentation.standing import Box
-from sq_perception.simulation.sensor_noise import PRESETS
+from sq_perception.simulation.sensor_noise import IDEAL, PRESETS
 
-Projection = Literal["pinhole", "orthographic"]
 RAW = "raw"
 TRANSPORTS = (RAW, compressed_depth.TRANSPORT)
 """As image_transport names them."""
-IDEAL = "ideal"
-"""The sensor with Gaussian noise and nothing else."""
 
 
 class ParameterError(ValueError):
@@ -69,7 +68,7 @@ class RecoverParameters:
         False,
         "Delete the shared memory that Fast DDS has left behind for killed processes of this user, 17 MB each.",
     )
-    projection: Projection = setting(  # noqa: RUF009 - a field
+    projection: Projection = setting(
         "pinhole",
         "Camera model: pinhole takes 16UC1 and 32FC1 with camera_info; orthographic takes mono8 and mono16 images of "
         "the unit cube and needs no camera_info.",
@@ -95,7 +94,7 @@ class RecoverParameters:
         "depth/image/compressedDepth.",
         choices=TRANSPORTS,
     )
-    distortion: Treatment = setting(  # noqa: RUF009 - a field
+    distortion: Treatment = setting(
         "auto",
         "What a camera_info with distortion coefficients means: apply rectifies the images, ignore takes them for "
         "rectified, auto rectifies unless one of the last two parts of their topic has the word rect or rectified.",
@@ -222,13 +221,13 @@ class RecoverParameters:
         within=(0, 256),
         live=True,
     )
-    method: Method = setting(  # noqa: RUF009 - a field
+    method: Method = setting(
         "auto",
         "Where the fit starts: network, symmetry, or auto (the best of them); classic is Solina and Bajcsy's method.",
         choices=get_args(Method),
         live=True,
     )
-    refine: Refine = setting(  # noqa: RUF009 - a field
+    refine: Refine = setting(
         "surface",
         "Refinement: surface fits the measured depth, soft_render the soft-rendered image, none keeps the start.",
         choices=get_args(Refine),
@@ -265,14 +264,12 @@ class RecoverParameters:
             raise ParameterError(
                 f"depth_min, depth_max: expected depth_min < depth_max, got {self.depth_min:g} and {self.depth_max:g}"
             )
-        if self.image_transport != RAW and self.projection == "orthographic":
-            raise ParameterError(
-                f"image_transport: expected {RAW} for projection = orthographic, got {self.image_transport}"
-            )
-        if self.fixed_frame and self.projection == "orthographic":
-            raise ParameterError(f"fixed_frame: expected none for projection = orthographic, got {self.fixed_frame}")
-        if self.target_frame and self.projection == "orthographic":
-            raise ParameterError(f"target_frame: expected none for projection = orthographic, got {self.target_frame}")
+        for name, expected in (("image_transport", RAW), ("fixed_frame", ""), ("target_frame", "")):
+            given = getattr(self, name)
+            if self.projection == "orthographic" and given != expected:
+                raise ParameterError(
+                    f"{name}: expected {expected or 'none'} for projection = orthographic, got {given}"
+                )
         for name in ("fixed_frame", "target_frame", "tf_prefix"):
             frame = getattr(self, name)
             if frame.startswith("/"):
@@ -290,7 +287,7 @@ class FitterParameters(RecoverParameters):
 class SyntheticParameters:
     """synthetic_depth_node."""
 
-    scene: str = setting(
+    scene: Literal["thesis", "table", "replay"] = setting(
         "table",
         "thesis: orthographic grey images of one random body; table: a pinhole camera over bodies on a table; replay: "
         "recorded frames from path.",
@@ -320,7 +317,7 @@ class SyntheticParameters:
     encoding: str = setting(
         "auto",
         "auto: mono8 for orthographic frames, 32FC1 for others.",
-        choices=("auto", "mono8", "mono16", "16UC1", "32FC1"),
+        choices=("auto", *GREY_ENCODINGS, *DEPTH_ENCODINGS),
     )
     masks: str = setting(
         "auto",
@@ -336,7 +333,7 @@ class SyntheticParameters:
         "camera_info YAML of recorded PNG depth images; also the camera of table scenes, which are published raw where "
         "it distorts.",
     )
-    projection: Projection = setting(  # noqa: RUF009 - a field
+    projection: Projection = setting(
         "pinhole",
         "Camera model of recorded images: 8 bit orthographic images look like depth images.",
         choices=get_args(Projection),
@@ -350,9 +347,9 @@ class SyntheticParameters:
     def __post_init__(self) -> None:
         if self.scene == "replay" and not self.path:
             raise ParameterError("path: expected a recorded frame or a folder of them for scene = replay, got nothing")
-        grey = self.encoding in ("mono8", "mono16")
+        grey = self.encoding in GREY_ENCODINGS
         if self.encoding != "auto" and self.scene != "replay" and grey != (self.scene == "thesis"):
-            expected = "mono8 or mono16" if self.scene == "thesis" else "16UC1 or 32FC1"
+            expected = " or ".join(GREY_ENCODINGS if self.scene == "thesis" else DEPTH_ENCODINGS)
             raise ParameterError(f"encoding: expected {expected} for scene = {self.scene}, got {self.encoding}")
         if self.sensor != IDEAL and self.scene == "thesis":
             raise ParameterError(f"sensor: expected {IDEAL} for scene = thesis, got {self.sensor}")
@@ -432,9 +429,7 @@ class LiveParameters(Generic[P]):
     def _declare(self, node: Node, one: Field[Any]) -> Any:
         try:
             node.declare_parameter(one.name, one.default, describe(one, self._locked is None))
-        except InvalidParameterTypeException as error:
-            raise ParameterError(f"{one.name}: expected a value like {one.default!r}, {error}") from error
-        except InvalidParameterValueException as error:
+        except (InvalidParameterTypeException, InvalidParameterValueException) as error:
             raise ParameterError(str(error)) from error
         given = node.get_parameter(one.name)
         (kept,) = self._as_doubles([given])

@@ -175,9 +175,9 @@ class RemoteNode:
         future.add_done_callback(done)
         self._calls.append((monotonic() + patience, future))
 
-    def _say(self, words: str, good: bool) -> None:
+    def _say(self, text: str, good: bool) -> None:
         with self._lock:
-            self._new_answer = words, good
+            self._new_answer = text, good
 
     # In the drawing thread
 

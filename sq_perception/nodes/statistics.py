@@ -28,7 +28,7 @@ SECONDS = 10.0
 _MOST = 5000
 """Events that are kept: more than any camera causes in that time."""
 _SLOW = 3.0
-"""Seconds after which a frame without a verdict tells of more than a start."""
+"""Seconds after which a frame without an outcome tells of more than a start."""
 Standing = tuple[bytes, str]
 """Level and message of a DiagnosticStatus."""
 
@@ -75,7 +75,7 @@ class Snapshot:
 
     @property
     def in_work(self) -> int:
-        """Frames that were received and have no verdict yet."""
+        """Frames that were received and have no outcome yet."""
         return self.received - self.answered - self.dropped - self.refused
 
 

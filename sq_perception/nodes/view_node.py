@@ -40,10 +40,11 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.calibration import Calibration
 from sq_perception.imaging.camera import Camera
-from sq_perception.nodes.frame import decode
+from sq_perception.nodes.frame import decode, stamp_of
 from sq_perception.nodes.remote_node import RemoteNode
 from sq_perception.nodes.statistics import THROTTLE
 from sq_perception.nodes.tracking import CameraPoses, PoseError
+from sq_perception.recordings.publication import superquadrics
 from sq_perception.viewing import tables
 from sq_perception.viewing.drawings import Bodies
 from sq_perception.viewing.page import Change, Page, Transition
@@ -51,7 +52,7 @@ from sq_perception.viewing.tables import NodeState
 
 _IMAGES = 8
 """Depth images that are kept until the result of their stamp comes."""
-_WORDS_PERIOD = 0.5
+_STATUS_PERIOD = 0.5
 """Seconds between two looks at states and ages where nothing new has come."""
 _SERVICE_PERIOD = 0.1
 _RATE_SECONDS = 3.0
@@ -159,7 +160,7 @@ class ViewNode(Node):
     def _on_image(self, message: Image) -> None:
         with self._lock:
             self._arrivals.append(monotonic())
-            self._images[_stamp(message)] = message
+            self._images[stamp_of(message)] = message
             while len(self._images) > _IMAGES:
                 self._images.popitem(last=False)
         # The image waits for its result, where results come at all.
@@ -189,7 +190,7 @@ class ViewNode(Node):
     def _draw_on(self) -> None:
         drawer, due = _Drawer(self), 0.0
         while not self._closed.is_set():
-            self._news.wait(_WORDS_PERIOD)
+            self._news.wait(_STATUS_PERIOD)
             self._news.clear()
             if self._closed.wait(max(0.0, due - monotonic())):
                 return
@@ -208,16 +209,6 @@ class ViewNode(Node):
             count = sum(1 for time in self._arrivals if now - time <= _RATE_SECONDS)
             return list(self._images.values()), count / _RATE_SECONDS
 
-    def pose(self, header: Any, frame: str) -> tuple[np.ndarray, np.ndarray]:
-        """Quaternion and translation from the frame of a header to ``frame``.
-
-        Raises
-        ------
-        PoseError
-            If it is not known.
-        """
-        return self._poses.at(header, frame)
-
 
 class _Drawer:
     """What the drawing thread knows of what it has drawn; uses the node's stores."""
@@ -226,7 +217,7 @@ class _Drawer:
         self._node, self._page = node, node._page
         self._image: Image | None = None
         self._bodies: dict[str, tuple[Result, Bodies | None, str]] = {}
-        self._words_due = 0.0
+        self._status_due = 0.0
         self._was_watched = False
 
     def draw(self) -> None:
@@ -235,27 +226,27 @@ class _Drawer:
             return
         if not self._was_watched:
             # Controls have changed, perhaps, while nobody looked.
-            self._was_watched, self._words_due = True, 0.0
+            self._was_watched, self._status_due = True, 0.0
         for remote in self._node._remote.values():
             remote.show(self._page)
-        words_due = monotonic() >= self._words_due
+        status_due = monotonic() >= self._status_due
         results = dict(self._node._results)
         images, rate = self._node.newest_images()
-        header = self._draw_depth(images, rate, results, words_due)
+        header = self._draw_depth(images, rate, results, status_due)
         for name in self._node._remote:
-            self._draw_node(name, results.get(name), header, words_due)
-        if words_due:
-            self._words_due = monotonic() + _WORDS_PERIOD
+            self._draw_node(name, results.get(name), header, status_due)
+        if status_due:
+            self._status_due = monotonic() + _STATUS_PERIOD
 
-    def _draw_depth(self, images: list[Image], rate: float, results: dict[str, Result], words_due: bool) -> Any:
+    def _draw_depth(self, images: list[Image], rate: float, results: dict[str, Result], status_due: bool) -> Any:
         """Draw the image that belongs to the newest results, else the newest; the header of what is drawn."""
         topic = self._node._topics[0]
         if not images:
-            if words_due:
+            if status_due:
                 self._page.show_source(tables.source_status(topic, None, 0.0, "", "no depth image has come yet"))
             return None
-        stamps = {_stamp(one.message) for one in results.values() if monotonic() - one.time < tables.SILENT_SECONDS}
-        image = next((one for one in reversed(images) if _stamp(one) in stamps), images[-1])
+        stamps = {stamp_of(one.message) for one in results.values() if monotonic() - one.time < tables.SILENT_SECONDS}
+        image = next((one for one in reversed(images) if stamp_of(one) in stamps), images[-1])
         remark = "" if rate > 0 else "no depth images come any more"
         if image is not self._image:
             try:
@@ -264,7 +255,7 @@ class _Drawer:
                 self._image = image
             except ValueError as error:
                 remark = str(error)
-        if words_due or remark:
+        if status_due or remark:
             size = int(image.width), int(image.height)
             self._page.show_source(tables.source_status(topic, size, rate, image.header.frame_id, remark))
         return image.header
@@ -282,10 +273,10 @@ class _Drawer:
             raise ValueError(size_mismatch((int(image.width), int(image.height)), calibration.size))
         return calibration
 
-    def _draw_node(self, name: str, result: Result | None, header: Any, words_due: bool) -> None:
+    def _draw_node(self, name: str, result: Result | None, header: Any, status_due: bool) -> None:
         last = self._bodies.get(name)
         is_new = result is not None and (last is None or last[0] is not result)
-        if not (is_new or words_due):
+        if not (is_new or status_due):
             return
         bodies, remark = (last[1], last[2]) if last is not None else (None, "")
         if result is not None and is_new:
@@ -301,47 +292,38 @@ class _Drawer:
             remote.is_there,
             remark,
         )
-        stamp = 0.0 if result is None else 1e-9 * _stamp(result.message)
+        stamp = 0.0 if result is None else 1e-9 * stamp_of(result.message)
         self._page.show_bodies(name, bodies, stamp, state)
-        if words_due:
+        if status_due:
             self._page.show_state(state)
 
     def _converted(self, message: PointCloud2, header: Any) -> tuple[Bodies | None, str]:
         """The bodies in the frame of the depth image, and why they cannot be drawn."""
         try:
             array = from_message(message)
-            kept = array.status != FAILED
-            bodies = Superquadric(
-                array.size[kept].astype(float),
-                array.shape[kept].astype(float),
-                array.translation[kept].astype(float),
-                array.rotation[kept].astype(float),
-            )
+            bodies = superquadrics(array.recovered)
             if self._image is not None and self._image.encoding in GREY_ENCODINGS:
                 bodies = unit_cube.optical_from_cube(bodies)
             elif header is not None and message.header.frame_id != header.frame_id:
-                turn, shift = self._node.pose(header, message.header.frame_id)
+                turn, shift = self._node._poses.at(header, message.header.frame_id)
                 back = rotation.conjugate(turn)
                 bodies = bodies.transformed(back, -(rotation.to_matrix(back) @ shift))
-            return _bodies(array, kept, bodies), ""
+            return _bodies(array, bodies), ""
         except PoseError as error:
             return None, f"bodies are in {message.header.frame_id}, the image in {header.frame_id}: {error}"
         except ValueError as error:
             return None, str(error)
 
 
-def _bodies(array: SuperquadricArray, kept: np.ndarray, bodies: Superquadric) -> Bodies:
-    ids = [int(number) for number in array.id[kept]]
+def _bodies(array: SuperquadricArray, bodies: Superquadric) -> Bodies:
+    shown = array.recovered
+    ids = [int(number) for number in shown.id]
     return Bodies(
         superquadrics=bodies,
-        sigma_size=array.sigma_size[kept].astype(float),
-        score=array.score[kept].astype(float),
+        sigma_size=shown.sigma_size.astype(float),
+        score=shown.score.astype(float),
         ids=ids,
-        is_weak=[bool(status == WEAK) for status in array.status[kept]],
+        is_weak=[bool(status == WEAK) for status in shown.status],
         colours=PALETTE[np.array(ids, dtype=int) % len(PALETTE)].reshape(-1, 3),
-        failed=[int(number) % 2**31 for number in array.id[~kept]],
+        failed=[int(number) % 2**31 for number in array.id[array.status == FAILED]],
     )
-
-
-def _stamp(message: Any) -> int:
-    return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)

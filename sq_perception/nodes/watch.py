@@ -20,7 +20,8 @@ from sq_msgs_py.depth_image import GREY_ENCODINGS
 from sq_msgs_py.superquadrics import from_message
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.calibration import Calibration
-from sq_perception.nodes.frame import Frame, decode
+from sq_perception.nodes.frame import Frame, decode, stamp_of
+from sq_perception.recordings.publication import superquadrics
 
 CAMERA = "synthetic_depth_node"
 _REMEMBERED = 40
@@ -126,7 +127,7 @@ class Watch:
         self._check(shot)
 
     def _shot(self, message: Any) -> Shot:
-        stamp = message.header.stamp.sec * 10**9 + message.header.stamp.nanosec
+        stamp = stamp_of(message)
         shot = self._shots.setdefault(stamp, Shot(stamp))
         while len(self._shots) > _REMEMBERED:
             self._shots.popitem(last=False)
@@ -143,4 +144,4 @@ class Watch:
 
 def _found(message: PointCloud2, latency: float) -> Found:
     kept = from_message(message).recovered
-    return Found(Superquadric(kept.size, kept.shape, kept.translation, kept.rotation), kept.residual, latency)
+    return Found(superquadrics(kept), kept.residual, latency)

@@ -255,6 +255,12 @@ def superquadric_array(found: Identified, is_cube: bool) -> SuperquadricArray:
     )
 
 
+def superquadrics(array: SuperquadricArray) -> Superquadric:
+    """The bodies (n,) of a message, in its frame."""
+    columns = (array.size, array.shape, array.translation, array.rotation)
+    return Superquadric(*(column.astype(float) for column in columns))
+
+
 def truth_array(bodies: Superquadric) -> SuperquadricArray:
     """A batch (n,) of known bodies: score 1, residual and deviations 0, ids 1 to n."""
     count = len(bodies)

@@ -32,9 +32,9 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from sq_msgs_py import depth_image
-from sq_msgs_py.depth_image import Intrinsics
 from sq_msgs_py.superquadrics import to_message
 from sq_perception.files.output_file import OutputFile
+from sq_perception.imaging.calibration import intrinsics
 from sq_perception.recordings import publication
 from sq_perception.recordings.bag_file import camera_info_topic, raw_topic
 from sq_perception.recordings.frame_file import FrameError, RecordedFrame, Stamp
@@ -170,8 +170,8 @@ class ResultBag:
             encoding = frame.encoding or ("mono16" if frame.is_cube else "32FC1")
             if not frame.is_cube:
                 camera = frame.camera
-                known = Intrinsics(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-                messages.append((camera_info_topic(topic), depth_image.intrinsics_to_message(known, header, types)))
+                info = depth_image.intrinsics_to_message(intrinsics(camera), header, types)
+                messages.append((camera_info_topic(topic), info))
             depth = publication.depth_message(frame.depth, header, encoding, frame.is_cube, types)
             messages.append((topic, depth))
         if "labels" in self._images:

@@ -26,8 +26,10 @@ from sq_perception.simulation.sensor_model import Ideal, SensorNoise
 from sq_perception.simulation.time_of_flight import TimeOfFlight
 from sq_perception.simulation.triangulation import Stereo, StructuredLight
 
-__all__ = ["PRESETS", "Ideal", "SensorNoise", "Stereo", "StructuredLight", "TimeOfFlight", "preset"]
+__all__ = ["IDEAL", "PRESETS", "Ideal", "SensorNoise", "Stereo", "StructuredLight", "TimeOfFlight", "preset"]
 
+IDEAL = "ideal"
+"""Name of the sensor with Gaussian noise and nothing else, whose noise the user chooses."""
 KINECT_V1 = StructuredLight(
     focal=580.0, baseline=0.075, step=1 / 8, window=(9, 5), near=0.5, far=5.0, edge_wander=0.8, grazing=70.0, blind=88.0
 )

@@ -106,10 +106,10 @@ class Bench(SpunNodes):
 
     def put_info(self, message: CameraInfo) -> None:
         self.until(lambda: self.infos.get_subscription_count() == 1)
-        before = sum(1 for _ in self.node._input.inbox._infos)
-        assert before < self.node._input.inbox._infos.maxlen
+        before = sum(1 for _ in self.node._input._infos)
+        assert before < self.node._input._infos.maxlen
         self.infos.publish(message)
-        self.until(lambda: len(self.node._input.inbox._infos) > before)
+        self.until(lambda: len(self.node._input._infos) > before)
 
     def send(self, message: Image) -> Any:
         """Publish an image and wait for its verdict: the counts after it."""

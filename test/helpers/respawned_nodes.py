@@ -7,6 +7,7 @@ silence of those that live on.
 
 from __future__ import annotations
 
+import fcntl
 import math
 import os
 import signal
@@ -24,7 +25,7 @@ from running_nodes import Peer, arguments, environment, until
 from sensor_msgs.msg import CameraInfo
 
 from sq_perception.nodes.children import Child
-from sq_perception.nodes.fast_dds import FOLDER, orphans
+from sq_perception.nodes.fast_dds import FOLDER
 
 CAMERA, NODE, VIEWER = "camera", "node", "viewer"
 MEMBERS = (CAMERA, NODE, VIEWER)
@@ -208,6 +209,20 @@ class Robot:
     def left(self) -> list[int]:
         """Processes that were ever started and still exist."""
         return [pid for pid in self.pids if Path(f"/proc/{pid}").exists()]
+
+
+def orphans() -> list[str]:
+    """Names of those whose owner is dead: nobody holds the lock beside them."""
+    return [name for name in segments() if (FOLDER / f"{name}_el").exists() and not _is_locked(FOLDER / f"{name}_el")]
+
+
+def _is_locked(path: Path) -> bool:
+    with path.open("rb") as lock:
+        try:
+            fcntl.flock(lock, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except OSError:
+            return True
+    return False
 
 
 def segments() -> list[str]:

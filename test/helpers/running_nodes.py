@@ -46,7 +46,7 @@ BODIES = Superquadric(
 
 def environment(**more: str) -> dict[str, str]:
     """What the processes of nodes get: this one's environment, the shipped Fast DDS profile, and ``more``."""
-    return {**fast_dds.environment(), "RCUTILS_COLORIZED_OUTPUT": "0", **more}
+    return {**os.environ, **fast_dds.additions(), "RCUTILS_COLORIZED_OUTPUT": "0", **more}
 
 
 def arguments(*parameters: str, remap: Sequence[str] = ()) -> list[str]:

@@ -26,6 +26,7 @@ from sq_perception.evaluation.demo_table import demo_table
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast, unit_cube
 from sq_perception.imaging.camera import Camera
+from sq_perception.nodes import children as children_module
 from sq_perception.nodes import fast_dds
 from sq_perception.nodes.children import Children, parameter_arguments
 
@@ -245,7 +246,7 @@ def test_a_frame_that_cannot_be_read_is_refused_before_anything_starts(
 
 
 def test_a_child_that_cannot_start_says_why() -> None:
-    with Children(fast_dds.environment()) as children:
+    with Children() as children:
         children.start("synthetic_depth_node", parameter_arguments({"rate": -1.0}))
         wait_for(lambda: children.dead() is not None)
         ended = children.dead()
@@ -255,7 +256,8 @@ def test_a_child_that_cannot_start_says_why() -> None:
 
 
 def test_a_child_that_does_not_listen_is_killed_and_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    children = Children(fast_dds.environment(), patience=0.5)
+    monkeypatch.setattr(children_module, "_PATIENCE", 0.5)
+    children = Children()
     child = children.start("synthetic_depth_node")
     monkeypatch.setattr(child, "interrupt", lambda: None)
     children.stop()
@@ -263,9 +265,9 @@ def test_a_child_that_does_not_listen_is_killed_and_named(monkeypatch: pytest.Mo
     assert child.exit_code == -signal.SIGKILL
 
 
-def test_the_profile_is_only_set_where_the_user_has_not_chosen_one() -> None:
-    name = fast_dds.VARIABLE
+def test_the_profile_is_only_set_where_the_user_has_not_chosen_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(fast_dds.VARIABLE, raising=False)
     assert fast_dds.profile_path().is_file()
-    assert fast_dds.environment({})[name] == str(fast_dds.profile_path())
-    assert fast_dds.environment({name: "mine.xml"}) == {name: "mine.xml"}
-    assert fast_dds.environment({name: "mine.xml"}) == {name: "mine.xml"}
+    assert fast_dds.additions() == {fast_dds.VARIABLE: str(fast_dds.profile_path())}
+    monkeypatch.setenv(fast_dds.VARIABLE, "mine.xml")
+    assert fast_dds.additions() == {}

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from sq_perception.nodes.fast_dds import FOLDER, LEAST_AGE, orphans, remove_orphans
+from sq_perception.nodes.fast_dds import FOLDER, LEAST_AGE, remove_orphans
 
 PARTICIPANT = """
 import rclpy, time
@@ -42,31 +42,33 @@ def test_only_old_segments_without_an_owner_are_freed(tmp_path):
         path.touch()
     with alive[1].open("rb") as owner:
         fcntl.flock(owner, fcntl.LOCK_EX)
-        assert orphans(tmp_path) == tuple(sorted(memory.name for memory, _ in (*dead, young)))
         assert remove_orphans(tmp_path) == tuple(memory.name for memory, _ in dead)
         assert sorted(tmp_path.iterdir()) == sorted([*young, *alive, *others])
-    assert len(remove_orphans(tmp_path, least_age=0.0)) == 2
+    os.utime(young[1], (time.time() - 2 * LEAST_AGE,) * 2)
+    assert len(remove_orphans(tmp_path)) == 2
     assert sorted(tmp_path.iterdir()) == sorted(others)
 
 
 def test_what_is_no_segment_is_no_reason_to_fail(tmp_path):
     assert remove_orphans(tmp_path / "missing") == ()
-    assert orphans(tmp_path / "missing") == ()
     target = tmp_path / "precious"
     target.touch()
     (tmp_path / "fastrtps_0123456789abcdef_el").symlink_to(target)
     (tmp_path / "fastrtps_0123456789abcdee_el").mkdir()
-    remove_orphans(tmp_path, least_age=0.0)
-    assert target.exists()
-    assert (tmp_path / "fastrtps_0123456789abcdef_el").is_symlink()
     lock = tmp_path / "fastrtps_00000000000000cc_el"
     lock.touch()
-    assert remove_orphans(tmp_path, least_age=0.0) == ("fastrtps_00000000000000cc",)
+    for path in (target, tmp_path / "fastrtps_0123456789abcdee_el", lock):
+        os.utime(path, (time.time() - 2 * LEAST_AGE,) * 2)
+    assert remove_orphans(tmp_path) == ("fastrtps_00000000000000cc",)
+    assert target.exists()
+    assert (tmp_path / "fastrtps_0123456789abcdef_el").is_symlink()
     assert not lock.exists()
 
 
 def test_a_killed_participant_leaves_a_segment_that_is_freed():
     pytest.importorskip("rclpy", reason="needs the extra 'ros'")
+    from respawned_nodes import orphans
+
     before = set(orphans())
     process = subprocess.Popen([sys.executable, "-c", PARTICIPANT], stdout=subprocess.PIPE, text=True)
     try:

@@ -317,7 +317,7 @@ class TestLifecycle:
         monkeypatch.setattr(managed_node, "_PAUSE", 0.1)
         bench = make_bench().active()
         withdrawn = []
-        monkeypatch.setattr(bench.node._outputs, "withdraw", lambda: withdrawn.append(bench.node.state))
+        monkeypatch.setattr(bench.node._outputs.optional, "withdraw", lambda: withdrawn.append(bench.node.state))
         bench.node._fail("device lost")
         bench.until(lambda: len(bench.made) == 1 and bench.node.state == "unconfigured")
         bench.active()

@@ -24,7 +24,7 @@ from sq_perception.imaging.distortion import Distortion
 from sq_perception.imaging.rectification import Rectification
 from sq_perception.nodes.frame import depth_of, image_topic, packed, size_of
 from sq_perception.nodes.parameters import ParameterError, SyntheticParameters
-from sq_perception.nodes.synthetic_depth_node import FrameSource, SyntheticDepthNode
+from sq_perception.nodes.synthetic_depth_node import SyntheticDepthNode, frame_source
 
 PATIENCE = 20.0
 LENS = Distortion("plumb_bob", (-0.2, 0.05, 0.001, -0.001, 0.0))
@@ -146,7 +146,7 @@ def test_a_distorting_synthetic_camera_sends_raw_images_packed_and_plain(hear, d
     calibration = Calibration.of(info, "/depth/image")
     assert calibration.rectification == Rectification(Camera(320, 240, 262.0, 262.0, 159.5, 119.5), LENS)
     assert size_of(small) == calibration.size == (320, 240)
-    true = FrameSource(SyntheticParameters(**parameters)).next(0.0)
+    true = frame_source(SyntheticParameters(**parameters)).next(0.0)
     found = calibration.rectified(depth_from_message(image))
     both = np.isfinite(found) & np.isfinite(true.depth)
     assert both.mean() > 0.85

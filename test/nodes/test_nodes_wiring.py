@@ -323,7 +323,7 @@ def test_triggers_leave_nothing_behind(bench):
 def test_masks_without_a_stamp_belong_to_no_image(bench):
     masks = bench.peer.create_publisher(Image, "mask/image", 5)
     bench.until(lambda: masks.get_subscription_count() == 1)
-    bench.node._input.inbox.put_mask(labels_to_message(np.ones((48, 64), np.int32), Header()))
+    bench.node._input._on_mask(labels_to_message(np.ones((48, 64), np.int32), Header()))
     image = bench.depth()
     image.header = Header(frame_id=FRAME_ID)
     bench.answer(image)
@@ -509,7 +509,7 @@ def test_a_camera_info_that_was_published_once_before_is_received(make_bench):
     bench.peer.destroy_publisher(bench.infos)
     latched = bench.peer.create_publisher(CameraInfo, "depth/camera_info", once)
     latched.publish(bench.info())
-    bench.until(lambda: len(bench.node._input.inbox._infos) == 1)
+    bench.until(lambda: len(bench.node._input._infos) == 1)
     assert len(bench.answer(bench.depth())[1]) == 1
 
 

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import signal
 import sys
 import time
 from contextlib import nullcontext
@@ -29,7 +30,7 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Projection
 from sq_perception.nodes import fast_dds
-from sq_perception.nodes.children import Children, interruptible, parameter_arguments
+from sq_perception.nodes.children import Children, parameter_arguments
 from sq_perception.nodes.watch import CAMERA, Shot, Watch
 from sq_perception.recordings.frame_file import FrameError, read
 
@@ -62,14 +63,15 @@ def show(options: argparse.Namespace) -> int:
     except (FrameError, OSError) as error:
         print(error, file=sys.stderr)
         return 2
-    with interruptible():
-        try:
-            return run(camera, options.seconds, options.output_dir)
-        except DemoError as error:
-            print(error, file=sys.stderr)
-            return 1
-        except KeyboardInterrupt:
-            return 0
+    for number in (signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.default_int_handler)  # as Ctrl-C: no child may outlive its parent
+    try:
+        return run(camera, options.seconds, options.output_dir)
+    except DemoError as error:
+        print(error, file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        return 0
 
 
 def run(camera: dict[str, Any], seconds: float, folder: Path) -> int:
@@ -91,7 +93,7 @@ def run(camera: dict[str, Any], seconds: float, folder: Path) -> int:
     """
     os.environ.update(_own_domain())
     console = Console(width=None if sys.stdout.isatty() else _FILE_WIDTH)
-    with Children(fast_dds.environment()) as children:
+    with Children() as children:
         for name in TITLES:
             children.start(name, parameter_arguments({"projection": camera["projection"]}))
         children.start(CAMERA, parameter_arguments(camera))
@@ -128,8 +130,11 @@ def _is_grey(frame: Path) -> bool:
 
 def _own_domain() -> dict[str, str]:
     """Keeps the demonstration to itself, as far as the user has not decided."""
-    wanted = {"ROS_DOMAIN_ID": str(1 + os.getpid() % 100), "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST"}
-    wanted.update({"RCUTILS_COLORIZED_OUTPUT": "0"})
+    wanted = {
+        "ROS_DOMAIN_ID": str(1 + os.getpid() % 100),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+        "RCUTILS_COLORIZED_OUTPUT": "0",
+    }
     return {**{name: value for name, value in wanted.items() if not os.environ.get(name)}, **fast_dds.additions()}
 
 

@@ -1,0 +1,156 @@
+"""Images in the order in which a camera would take them: generated scenes with known truth, or recorded frames.
+
+A maker gives the k-th image without noise, the same one for each call; :class:`FrameSource` holds it for some frames,
+in which only the noise changes, and goes on to the next.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging import unit_cube
+from sq_perception.imaging.calibration import Calibration
+from sq_perception.imaging.camera import Camera, Projection
+from sq_perception.recordings import frame_file
+from sq_perception.simulation.scenes import table_scene, thesis_scene
+from sq_perception.simulation.sensor_noise import IDEAL, Ideal, preset
+
+SUFFIXES = (".npz", ".png", ".bmp")
+_SCENES, _NOISE = 1, 2
+"""Streams of random numbers under one seed."""
+
+
+@dataclass(frozen=True, eq=False)
+class SourceFrame:
+    """One image.
+
+    Attributes
+    ----------
+    depth : float32 (height, width)
+        Metres in the optical frame, NaN where nothing is seen.
+    camera : Camera
+    labels : int32 (height, width) or None
+    truth : Superquadric or None
+        The bodies (n,) in the frame that results are published in: cube frame if ``is_cube``, else optical frame.
+    is_cube : bool
+    name : str
+    calibration : Calibration or None
+        Of the camera that publishes the image, where that distorts.
+    """
+
+    depth: np.ndarray
+    camera: Camera
+    labels: np.ndarray | None
+    truth: Superquadric | None
+    is_cube: bool
+    name: str
+    calibration: Calibration | None = None
+
+
+Maker = Callable[[int], SourceFrame]
+
+
+class FrameSource:
+    """Frames in their order: each of ``count`` images (0: endless) for ``hold`` frames, in a ``loop`` or once.
+
+    Raises
+    ------
+    ValueError
+        If the first image cannot be read or made.
+    """
+
+    def __init__(self, make: Maker, count: int, *, seed: int, hold: int, loop: bool) -> None:
+        self._make, self._count, self._hold, self._loop = make, count, hold, loop
+        self._noise = np.random.default_rng([seed, _NOISE])
+        self._position, self._left = 0, hold
+        self.clean = make(0)
+        """The current image without noise."""
+
+    def next(self, noise: float, sensor: str = IDEAL) -> SourceFrame | None:
+        """The next image as the sensor measures it; None after the last one.
+
+        ``noise`` is that of the ideal sensor, metres, or grey levels of 255 for the unit cube.
+
+        Raises
+        ------
+        ValueError
+            If a recording cannot be read (the one after it is next), or the sensor is unknown or cannot have taken the
+            image, as it is orthographic.
+        """
+        if self._left == 0:
+            self._position += 1
+            if self._count and self._position >= self._count:
+                if not self._loop:
+                    self._position = self._count
+                    return None
+                self._position = 0
+            self.clean = self._make(self._position)
+            self._left = self._hold
+        self._left -= 1
+        model = Ideal(noise / 255 if self.clean.is_cube else noise) if sensor == IDEAL else preset(sensor)
+        return replace(self.clean, depth=model.measured(self.clean.depth, self.clean.camera, self._noise))
+
+
+def generated(
+    scene: Literal["thesis", "table"],
+    seed: int,
+    *,
+    objects: int,
+    pixels: int,
+    calibration: Calibration | None,
+    with_labels: bool,
+) -> Maker:
+    """Random scenes: a thesis' image of ``pixels``, or ``objects`` on a table before the camera of ``calibration``."""
+
+    def make(position: int) -> SourceFrame:
+        rng = np.random.default_rng([seed, _SCENES, position])
+        if scene == "thesis":
+            made = thesis_scene(rng, pixels)
+            truth, distorting = unit_cube.cube_from_optical(made.bodies), None
+        else:
+            options = {} if calibration is None else {"camera": calibration.camera}
+            made = table_scene(rng, objects, **options)
+            truth = made.bodies
+            distorting = None if calibration is None or calibration.rectification is None else calibration
+        depth, labels = made.render()
+        shown = labels if with_labels else None
+        return SourceFrame(depth, made.camera, shown, truth, scene == "thesis", f"{scene} scene {position}", distorting)
+
+    return make
+
+
+def recorded(
+    paths: Sequence[Path], camera_info: Path | str | None, projection: Projection, *, with_labels: bool
+) -> Maker:
+    """Recorded frames one after the other."""
+
+    def make(position: int) -> SourceFrame:
+        frame = frame_file.read(paths[position], camera_info, projection)
+        labels = frame.labels if with_labels else None
+        return SourceFrame(frame.depth, frame.camera, labels, None, frame.is_cube, frame.name)
+
+    return make
+
+
+def recordings(path: Path) -> list[Path]:
+    """A recorded frame, or those of a folder by name.
+
+    Raises
+    ------
+    ValueError
+        If there is none.
+    """
+    if path.is_file():
+        return [path]
+    if not path.is_dir():
+        raise ValueError(f"path: expected a recorded frame or a folder of them, {path} does not exist")
+    found = sorted(one for one in path.iterdir() if one.suffix.lower() in SUFFIXES and one.is_file())
+    if not found:
+        raise ValueError(f"path: expected recorded frames ({', '.join(SUFFIXES)}) in {path}, there are none")
+    return found
