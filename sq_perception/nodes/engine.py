@@ -171,7 +171,8 @@ class Engine:
         in_force = replace(parameters, **{name: getattr(built.parameters, name) for name in _MADE_OF})
         origin = (built.weights, *(getattr(in_force, name) for name in _ANSWERS))
         known = previous[0] if previous is not None and previous[1] == origin else None
-        recovery = built.recoverer.recover(frame.depth, frame.camera, frame.labels, options(in_force, pose), known)
+        asked = options(in_force, pose, frame.has_free_space)
+        recovery = built.recoverer.recover(frame.depth, frame.camera, frame.labels, asked, known)
         return recovery, origin
 
     @property
@@ -206,8 +207,8 @@ class Engine:
                 log.error(f"{fault}; what was there before goes on")
 
 
-def options(parameters: RecoverParameters, pose: Pose | None = None) -> RecoveryOptions:
-    """What the parameters say to each frame, whose pose in ``target_frame`` is given."""
+def options(parameters: RecoverParameters, pose: Pose | None = None, has_free_space: bool = True) -> RecoveryOptions:
+    """What the parameters say to a frame, whose pose in ``target_frame`` is given."""
     return RecoveryOptions(
         method=parameters.method,
         refine=parameters.refine,
@@ -218,6 +219,7 @@ def options(parameters: RecoverParameters, pose: Pose | None = None) -> Recovery
         max_size=parameters.max_size,
         workspace=parameters.box,
         workspace_pose=pose,
+        free_space=has_free_space,
         time_budget=parameters.seconds,
         repair=parameters.repair,
     )

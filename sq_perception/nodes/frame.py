@@ -4,8 +4,9 @@
 | --- | --- | --- |
 | `raw` | `<image topic>` | sensor_msgs/Image |
 | `compressedDepth` | `<image topic>/compressedDepth` | sensor_msgs/CompressedImage: PNG or RVL |
+| `points` | depth/points | sensor_msgs/PointCloud2 in the optical frame, organised |
 
-Whoever decodes a message need not know which of the two it has.
+Whoever decodes a message need not know which of them it has.  The camera of a cloud is found from its points.
 """
 
 from __future__ import annotations
@@ -13,11 +14,11 @@ from __future__ import annotations
 import array
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from rclpy.node import Node
-from sensor_msgs.msg import CompressedImage, Image
+from sensor_msgs.msg import CompressedImage, Image, PointCloud2
 
 from sq_msgs_py.depth_image import (
     DEPTH_ENCODINGS,
@@ -26,11 +27,16 @@ from sq_msgs_py.depth_image import (
     grey_from_message,
     labels_from_message,
 )
+from sq_msgs_py.points import points_from_message
 from sq_perception.imaging import compressed_depth, unit_cube
 from sq_perception.imaging.calibration import Calibration
 from sq_perception.imaging.camera import Camera
-from sq_perception.nodes.parameters import RAW
-from sq_perception.recordings import publication
+from sq_perception.nodes.parameters import POINTS, RAW
+from sq_perception.recordings import cloud_file, publication
+
+DepthMessage: TypeAlias = Image | CompressedImage | PointCloud2
+_DIGITS = 3
+"""Of the pixels that the camera of a cloud is rounded to: the same camera for each frame, whatever its noise."""
 
 
 class Refused(ValueError):  # noqa: N818 - a verdict on a frame rather than a defect
@@ -52,6 +58,9 @@ class Frame:
     calibration : Calibration
     labels : int32 (height, width) or None
         Rectified as well.
+    has_free_space : bool
+        Whether a pixel beside an object tells that there is nothing before what it measured; not so for a cloud that is
+        no image.
     """
 
     header: Any
@@ -59,6 +68,7 @@ class Frame:
     depth: np.ndarray
     calibration: Calibration
     labels: np.ndarray | None = None
+    has_free_space: bool = True
 
     @property
     def camera(self) -> Camera:
@@ -92,22 +102,28 @@ class Frame:
         return image
 
 
-def decode(message: Image | CompressedImage, calibration_of: Callable[[], Calibration] | None) -> Frame:
+def decode(message: DepthMessage, calibration_of: Callable[[], Calibration] | None) -> Frame:
     """The frame of a depth image message.
 
     Parameters
     ----------
     message
         16UC1 or 32FC1, plain or packed, where there is a camera; mono8 or mono16, an image of the unit cube, where
-        there is none.
+        there is none; or points.
     calibration_of
-        Looks up the calibration; only called for an image that is sound itself.  None for orthographic images.
+        Looks up the calibration; only called for an image that is sound itself.  None for orthographic images, not
+        asked for clouds.
 
     Raises
     ------
     Refused, ImageError
         For anything that keeps the image from being processed.
     """
+    if isinstance(message, PointCloud2):
+        depth, seen, is_image = cloud_file.as_image(points_from_message(message))
+        numbers = {name: round(getattr(seen, name), _DIGITS) for name in ("fx", "fy", "cx", "cy")}
+        calibration = Calibration(replace(seen, **numbers), (seen.width, seen.height))
+        return Frame(message.header, "32FC1", depth, calibration, has_free_space=is_image)
     if calibration_of is None:
         if message.encoding in DEPTH_ENCODINGS:
             raise Refused(
@@ -131,9 +147,13 @@ def decode(message: Image | CompressedImage, calibration_of: Callable[[], Calibr
 def image_topic(node: Node, name: str, transport: str) -> str:
     """The topic to listen to for the images of ``name``, with the node's namespace and remappings.
 
+    Points have a topic of their own beside it, ``depth/points`` for ``depth/image``, which is remapped by itself.
+
     A remapping holds for the image's topic, and the transport's part comes behind that; one that names it already is
     left as it is.
     """
+    if transport == POINTS:
+        return str(node.resolve_topic_name(f"{name.rpartition('/')[0]}/{POINTS}"))
     resolved: str = node.resolve_topic_name(name)
     if transport == RAW or resolved.endswith(f"/{transport}"):
         return resolved
@@ -145,7 +165,7 @@ def stamp_of(message: Any) -> int:
     return int(message.header.stamp.sec) * 10**9 + int(message.header.stamp.nanosec)
 
 
-def size_of(message: Image | CompressedImage) -> tuple[int, int]:
+def size_of(message: DepthMessage) -> tuple[int, int]:
     """Width and height of a depth image; of a packed one from its header alone.
 
     Raises

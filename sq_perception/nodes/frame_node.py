@@ -4,7 +4,8 @@
 | --- | --- | --- |
 | `depth/image` | sensor_msgs/Image | in: 16UC1 mm, 32FC1 m; mono8 and mono16 for orthographic frames |
 | `depth/image/compressedDepth` | sensor_msgs/CompressedImage | in, instead, for `image_transport: compressedDepth` |
-| `depth/camera_info` | sensor_msgs/CameraInfo | in: not needed for orthographic frames |
+| `depth/points` | sensor_msgs/PointCloud2 | in, instead, for `image_transport: points`: organised |
+| `depth/camera_info` | sensor_msgs/CameraInfo | in: not needed for orthographic frames and points |
 | `mask/image` | sensor_msgs/Image | in, optional: label image with the stamp of the depth image |
 | `~/superquadrics` | sensor_msgs/PointCloud2 | out: one point per body, see sq_msgs_py.superquadrics |
 | `~/markers` | visualization_msgs/MarkerArray | out, while somebody listens |

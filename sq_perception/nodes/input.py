@@ -30,14 +30,15 @@ from rclpy.qos import (
 )
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
 from sq_msgs_py.depth_image import size_mismatch
 from sq_perception.imaging.calibration import Calibration
 from sq_perception.nodes import fast_dds
-from sq_perception.nodes.frame import Frame, Refused, decode, image_topic, size_of, stamp_of
-from sq_perception.nodes.parameters import RAW, RecoverParameters
+from sq_perception.nodes.frame import DepthMessage, Frame, Refused, decode, image_topic, size_of, stamp_of
+from sq_perception.nodes.parameters import POINTS, RAW, RecoverParameters
 from sq_perception.nodes.statistics import THROTTLE, Statistics
+from sq_perception.recordings.cloud_file import UNORGANISED
 
 _INFOS = 16
 _MASKS = 8
@@ -49,14 +50,14 @@ _WAITING = 64
 class Arrival:
     """A depth image, when it came, in seconds of the monotonic clock, and its mask if one came."""
 
-    message: Image | CompressedImage
+    message: DepthMessage
     time: float
     mask: Image | None = None
 
 
 @dataclass(frozen=True)
 class _Waiting:
-    message: Image | CompressedImage
+    message: DepthMessage
     size: tuple[int, int] | None
     """None for what is no image, which is to be refused at once."""
     time: float
@@ -98,7 +99,7 @@ class Input:
     ) -> None:
         self._node, self._parameters, self._is_wanted, self._statistics = node, parameters, is_wanted, statistics
         self._transport = parameters().image_transport
-        self._has_infos = parameters().projection == "pinhole"
+        self._has_infos = parameters().projection == "pinhole" and self._transport != POINTS
         self.topic = image_topic(node, "depth/image", self._transport)
         """Of the depth images."""
         self._note = ""
@@ -121,7 +122,8 @@ class Input:
         if self._has_infos:
             self._info = self._listen(CameraInfo, "depth/camera_info", self._on_info)
         self._mask = self._listen(Image, "mask/image", self._on_mask)
-        self._image = self._listen(Image if self._transport == RAW else CompressedImage, self.topic, self._on_image)
+        kind = {RAW: Image, POINTS: PointCloud2}.get(self._transport, CompressedImage)
+        self._image = self._listen(kind, self.topic, self._on_image)
 
     def look_for_latched(self) -> None:
         """Subscribe to a camera_info that was published once and is kept for late comers, if there is one; each second.
@@ -195,12 +197,14 @@ class Input:
         """
         message, use = arrival.message, parameters.use_masks
         frame = decode(message, (lambda: self._calibration_of(message)) if self._has_infos else None)
+        if not frame.has_free_space:
+            self._node.get_logger().warning(f"{self.topic}: {UNORGANISED}", throttle_duration_sec=THROTTLE)
         if use == "always" and arrival.mask is None:
             where = f" on {self._mask.topic_name}" if self._mask is not None else ""
             raise Refused(f"mask: expected one with the stamp of the image (use_masks is always), none came{where}")
         return frame if arrival.mask is None or use == "never" else frame.with_mask(arrival.mask)
 
-    def _calibration_of(self, image: Image | CompressedImage) -> Calibration:
+    def _calibration_of(self, image: DepthMessage) -> Calibration:
         size = size_of(image)
         with self._changed:
             info = self._info_for(size, stamp_of(image))
@@ -219,7 +223,7 @@ class Input:
 
     # Callbacks, in the executor's thread: quick, and nothing in them can fail on a message's content
 
-    def _on_image(self, message: Image | CompressedImage) -> None:
+    def _on_image(self, message: DepthMessage) -> None:
         now = self._last_image = monotonic()
         self._statistics.count("received")
         if not self._is_wanted():

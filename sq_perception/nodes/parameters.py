@@ -36,6 +36,8 @@ from sq_perception.simulation.sensor_noise import IDEAL, PRESETS
 RAW = "raw"
 TRANSPORTS = (RAW, compressed_depth.TRANSPORT)
 """As image_transport names them."""
+POINTS = "points"
+"""Depth images as clouds of points."""
 
 
 class ParameterError(ValueError):
@@ -90,9 +92,10 @@ class RecoverParameters:
     )
     image_transport: str = setting(
         RAW,
-        "How depth images come: raw on depth/image, or compressedDepth (16 bit PNG or RVL) on "
-        "depth/image/compressedDepth.",
-        choices=TRANSPORTS,
+        "How depth images come: raw on depth/image, compressedDepth (16 bit PNG or RVL) on "
+        "depth/image/compressedDepth, or points (organised sensor_msgs/PointCloud2 in the optical frame) on "
+        "depth/points, which need no camera_info. Of a cloud that is not organised less is known: see docs/nodes.md.",
+        choices=(*TRANSPORTS, POINTS),
     )
     distortion: Treatment = setting(
         "auto",

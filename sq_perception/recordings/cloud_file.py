@@ -1,4 +1,4 @@
-"""Point clouds of PCD and PLY files as depth images: metres of the optical frame, seen from its origin.
+"""Point clouds, of PCD and PLY files or messages, as depth images: metres of the optical frame, seen from its origin.
 
 An ORGANISED cloud (a PCD of several rows) of a pinhole camera IS a depth image: z, and the camera from the points
 themselves, as u = fx x / z + cx.  Any other cloud is looked at from the origin: each pixel takes its nearest point.
@@ -24,8 +24,14 @@ UNORGANISED = (
     "that is not seen is less sure; a depth image or an organised cloud tells more"
 )
 _NUMBERS = {"F": "f", "I": "i", "U": "u"}
+_NEAREST, _FARTHEST = 1e-4, 1e5
+"""Metres; no depth camera measures nearer or farther."""
 _PIXEL_ERROR = 0.1
-"""Of 99 % of the points of an organised cloud, between their place in it and in the image of its camera."""
+"""Between the place of a point in an organised cloud and in the image of its camera."""
+_ON_PIXELS = 0.99
+"""Least share of coordinates of an organised cloud with a smaller error."""
+_FITTED = 20000
+"""About so many points of an organised cloud tell its camera: a VGA image's is found in a third of the time of all."""
 _LEAST_POINTS = 100
 _POINTS_A_PIXEL = 2.0
 """Of a cloud that is no image, so that few pixels of a surface stay empty."""
@@ -63,22 +69,31 @@ def as_image(points: np.ndarray) -> tuple[np.ndarray, Camera, bool]:
     """
     with np.errstate(invalid="ignore"):
         there = np.isfinite(points).all(axis=2) & (points[..., 2] != 0)
-        before = there & (points[..., 2] > 0)
+        before = there & (points[..., 2] > _NEAREST) & (points[..., 2] < _FARTHEST)
     if np.count_nonzero(before) < max(_LEAST_POINTS, 0.5 * np.count_nonzero(there)):
         raise UnpackingError(
             f"expected {_LEAST_POINTS} points or more, most of them before the camera: z forward, y down"
         )
-    v, u = np.nonzero(before)
-    x, y, z = points[before].T
-    tangents = np.stack([x / z, y / z], axis=1)
     if points.shape[0] > 1:
-        fx, cx = np.polyfit(tangents[:, 0], u, 1)
-        fy, cy = np.polyfit(tangents[:, 1], v, 1)
+        v, u = (index[:: 1 + np.count_nonzero(before) // _FITTED] for index in np.nonzero(before))
+        x, y, z = points[v, u].astype(float).T
+        tangents = np.stack([x / z, y / z], axis=1)
+        (fx, cx), (fy, cy) = _line(tangents[:, 0], u), _line(tangents[:, 1], v)
         off = np.abs(tangents * [fx, fy] + [cx, cy] - np.stack([u, v], axis=1))
-        if np.quantile(off, 0.99) < _PIXEL_ERROR:
+        if min(fx, fy) > 0 and np.count_nonzero(off < _PIXEL_ERROR) > _ON_PIXELS * off.size:
             depth = np.where(before, points[..., 2], np.nan).astype(np.float32)
-            return depth, Camera(points.shape[1], points.shape[0], float(fx), float(fy), float(cx), float(cy)), True
-    return (*_seen(tangents, z), False)
+            return depth, Camera(points.shape[1], points.shape[0], fx, fy, cx, cy), True
+    x, y, z = points[before].astype(float).T
+    return (*_seen(np.stack([x / z, y / z], axis=1), z), False)
+
+
+def _line(tangents: np.ndarray, pixels: np.ndarray) -> tuple[float, float]:
+    """f and c of the line pixel = f tangent + c with the least squares; (0, 0) where all tangents are one."""
+    middle = tangents.mean()
+    spread = tangents - middle
+    square = spread @ spread
+    focal = float(spread @ pixels / square) if square > 0 else 0.0
+    return focal, float(pixels.mean() - focal * middle) if focal else 0.0
 
 
 def _seen(tangents: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, Camera]:

@@ -1,4 +1,4 @@
-"""Images as cameras send them: packed, and raw from a lens that distorts."""
+"""Images as cameras send them: packed, raw from a lens that distorts, and as points."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
-from frame_node_bench import Bench
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from frame_node_bench import CAMERA, Bench
+from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2, PointField
+from std_msgs.msg import Header
 
 from sq_perception.imaging import compressed_depth
 
@@ -69,3 +70,60 @@ def test_raw_images_of_a_lens_are_rectified_and_rendered_as_they_were_sent(make_
     assert np.nanmax(np.abs(depth - 0.5)) < 1e-6
     bench.until(lambda: rendered)
     assert (rendered[-1].width, rendered[-1].height) == (64, 48)
+
+
+def cloud(points: np.ndarray, header: Header) -> PointCloud2:
+    """As drivers send (height, width, 3): coordinates among other fields, points and rows padded."""
+    height, width, _ = points.shape
+    layout = {"names": ["rgb", "x", "y", "z"], "formats": ["<u4", "<f4", "<f4", "<f4"], "offsets": [0, 4, 8, 16]}
+    rows = np.zeros((height, width + 3), np.dtype({**layout, "itemsize": 32}))
+    for k, name in enumerate("xyz"):
+        rows[name][:, :width] = points[..., k]
+    found = PointCloud2(header=header, height=height, width=width, point_step=32, row_step=32 * (width + 3))
+    kinds = (PointField.UINT32, *[PointField.FLOAT32] * 3)
+    found.fields = [
+        PointField(name=name, offset=offset, datatype=kind, count=1)
+        for name, offset, kind in zip(layout["names"], layout["offsets"], kinds, strict=True)
+    ]
+    found.data = rows.tobytes()
+    return found
+
+
+def test_an_organised_cloud_is_its_depth_image_and_any_other_one_tells_less(make_bench):
+    bench = make_bench("-p", "image_transport:=points", "-r", "depth/points:=/camera/points")
+    clouds = bench.peer.create_publisher(PointCloud2, "/camera/points", 5)
+    bench.until(lambda: clouds.get_subscription_count() == 1)
+    assert bench.infos.get_subscription_count() == 0, "the points say where the camera is"
+    depth = 0.5 + 0.2 * np.random.default_rng(5).random((48, 64))
+    v, u = np.mgrid[:48, :64]
+    points = CAMERA.unproject(u, v, depth)
+    points[:5] = np.nan
+    points[5, :9] = 0.0  # what some drivers send for nothing
+
+    def answered(message: PointCloud2) -> tuple:
+        clouds.publish(message)
+        bench.until(lambda: any(one.header == message.header for one in bench.answers))
+        return bench.recoverer.asked[-1]
+
+    seen, camera, labels, options = answered(cloud(points, bench.header()))
+    assert (camera, labels, options.free_space) == (CAMERA, None, True)
+    assert np.isnan(seen[:5]).all()
+    assert np.isnan(seen[5, :9]).all()
+    np.testing.assert_array_equal(seen[6:], depth[6:].astype(np.float32))
+
+    measured = points[np.isfinite(points).all(axis=2) & (points[..., 2] > 0)]
+    np.random.default_rng(6).shuffle(measured)
+    seen, camera, _, options = answered(cloud(measured[None], bench.header()))
+    assert not options.free_space
+    assert set(seen[np.isfinite(seen)]) <= set(measured[:, 2].astype(np.float32))
+    assert np.isfinite(seen).sum() > 0.5 * len(measured)
+
+    unnamed, short, nowhere = (cloud(points, bench.header()) for _ in range(3))
+    unnamed.fields = unnamed.fields[:3]
+    short.data = short.data[:-1]
+    nowhere.fields[3].offset = 30
+    behind, nothing = cloud(-points, bench.header()), cloud(points[:0], bench.header())
+    for number, hostile in enumerate((unnamed, short, nowhere, behind, nothing), start=1):
+        clouds.publish(hostile)
+        bench.until(lambda number=number: bench.counts.refused == number)
+    answered(cloud(points, bench.header()))

@@ -134,7 +134,7 @@ def test_messages_that_a_robot_may_lack_are_imported_when_they_are_made() -> Non
 def test_only_the_commands_that_run_nodes_import_them() -> None:
     importing = {path for path in PERCEPTION.rglob("*.py") if any(room(name) == "nodes" for name, _ in imports(path))}
     here = {path for path in importing if not is_node(path)}
-    assert here == {PERCEPTION / "commands" / name for name in ("demo.py", "view.py")}
+    assert here == {PERCEPTION / "commands" / name for name in ("demonstration.py", "view.py")}
 
 
 def test_no_module_waits_for_itself() -> None:

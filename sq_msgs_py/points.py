@@ -1,0 +1,27 @@
+"""Measured points of a sensor_msgs/PointCloud2: x, y, z in metres, one a pixel where the cloud is organised."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from sq_msgs_py.superquadrics import FLOAT32, cloud_points
+
+if TYPE_CHECKING:
+    from sensor_msgs.msg import PointCloud2
+
+
+def points_from_message(message: PointCloud2) -> np.ndarray:
+    """Points, float32 (height, width, 3), as they stand in the message: NaN or (0, 0, 0) where nothing was measured.
+
+    Raises
+    ------
+    MessageError
+        As :func:`~sq_msgs_py.superquadrics.from_message`, for the fields x, y, z.
+    """
+    found = cloud_points(message, [(name, FLOAT32) for name in "xyz"], "xyz")
+    points = np.empty((len(found), 3), np.float32)
+    for k, name in enumerate("xyz"):
+        points[:, k] = found[name]
+    return points.reshape(int(message.height), int(message.width), 3)

@@ -1,0 +1,60 @@
+"""Points of a cloud as they lie in it: any byte order, number type, padding and order of fields."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from sq_msgs_py.points import points_from_message
+from sq_msgs_py.superquadrics import MessageError
+
+POINTS = np.arange(24, dtype=float).reshape(2, 4, 3)
+KINDS = {"f4": 7, "f8": 8, "i2": 3}
+
+
+def message(kind: str = "f4", order: str = "<", names: str = "zyx", padding: int = 0) -> Any:
+    size = np.dtype(kind).itemsize
+    step = 3 * size + padding
+    layout = np.dtype(
+        {"names": list(names), "formats": [order + kind] * 3, "offsets": [k * size for k in range(3)], "itemsize": step}
+    )
+    rows = np.zeros((2, 4 + padding), layout)
+    for name in names:
+        rows[name][:, :4] = POINTS[..., "xyz".index(name)]
+    fields = [
+        SimpleNamespace(name=name, offset=k * size, datatype=KINDS[kind], count=1) for k, name in enumerate(names)
+    ]
+    return SimpleNamespace(
+        height=2,
+        width=4,
+        fields=fields,
+        is_bigendian=order == ">",
+        point_step=step,
+        row_step=step * (4 + padding),
+        data=rows.tobytes(),
+    )
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("order", ["<", ">"])
+@pytest.mark.parametrize(("names", "padding"), [("xyz", 0), ("zyx", 5)])
+def test_points_are_read_whatever_their_layout(kind, order, names, padding):
+    np.testing.assert_array_equal(points_from_message(message(kind, order, names, padding)), POINTS)
+
+
+def test_what_is_no_cloud_of_points_is_named():
+    for change, words in (
+        ({"fields": []}, "missing: x y z"),
+        ({"data": b""}, "data: expected"),
+        ({"row_step": 3}, "row_step"),
+    ):
+        cloud = message()
+        vars(cloud).update(change)
+        with pytest.raises(MessageError, match=words):
+            points_from_message(cloud)
+    empty = message()
+    vars(empty).update(height=0, data=b"")
+    assert points_from_message(empty).shape == (0, 4, 3)
