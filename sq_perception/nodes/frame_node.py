@@ -31,7 +31,7 @@ from __future__ import annotations
 
 import threading
 import traceback
-from collections.abc import Callable, Hashable
+from collections.abc import Hashable
 from dataclasses import dataclass, fields
 from time import monotonic, perf_counter
 from typing import Any
@@ -79,16 +79,7 @@ class _Result:
 
 
 class FrameNode(ManagedNode):
-    """See the module.
-
-    Parameters
-    ----------
-    name, namespace
-        Of the node.
-    kind
-        The dataclass of its parameters.
-    context
-        rclpy's default if not given.
+    """See the module; ``kind`` is the dataclass of its parameters.
 
     Raises
     ------
@@ -312,11 +303,10 @@ class FrameNode(ManagedNode):
             response.success, response.message = False, f"the node is {self.state}, not active"
             return response
         timeout = self._settings.current.trigger_timeout
-
-        def why_none() -> str:
-            return f"no frame on {source.topic} within {timeout:g} s: {source.heard}"
-
-        response.success, response.message = await self._triggers.next_outcome(timeout, why_none)
+        outcome = await self._triggers.next_outcome(timeout)
+        if outcome is None:
+            outcome = False, f"no frame on {source.topic} within {timeout:g} s: {source.heard}"
+        response.success, response.message = outcome
         return response
 
     def _on_second(self) -> None:
@@ -362,7 +352,6 @@ Outcome = tuple[bool, str]
 class _Caller:
     since: float
     until: float
-    why_none: Callable[[], str]
     outcome: Future
 
 
@@ -380,14 +369,14 @@ class _Triggers:
     def __len__(self) -> int:
         return len(self._waiting)
 
-    async def next_outcome(self, timeout: float, why_none: Callable[[], str]) -> Outcome:
-        """The outcome of the next frame, or what ``why_none()`` says if none comes in time."""
+    async def next_outcome(self, timeout: float) -> Outcome | None:
+        """The outcome of the next frame; None if none comes in time."""
         now = monotonic()
-        caller = _Caller(now, now + timeout, why_none, Future(executor=self._node.executor))
+        caller = _Caller(now, now + timeout, Future(executor=self._node.executor))
         with self._lock:
             self._waiting.append(caller)
             self._timer.reset()
-        outcome: Outcome = await caller.outcome
+        outcome: Outcome | None = await caller.outcome
         return outcome
 
     def answer(self, outcome: Outcome, arrived: float = float("inf")) -> None:
@@ -408,4 +397,4 @@ class _Triggers:
             if not self._waiting:
                 self._timer.cancel()
         for one in late:
-            one.outcome.set_result((False, one.why_none()))
+            one.outcome.set_result(None)

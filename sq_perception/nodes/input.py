@@ -76,18 +76,8 @@ class _Info:
 class Input:
     """The subscriptions of an active node, and what came.
 
-    Inputs are best effort, keep last 1: a slow subscriber with a queue answers old images.
-
-    Parameters
-    ----------
-    node
-        Subscribes.
-    parameters
-        Asked for those in force.
-    is_wanted
-        Asked for each image: whether it is processed, or dropped at once.
-    statistics
-        Counts received, dropped and lost messages.
+    Inputs are best effort, keep last 1: a slow subscriber with a queue answers old images.  ``parameters`` returns
+    those in force; an image that comes while none ``is_wanted`` is dropped at once.
     """
 
     def __init__(

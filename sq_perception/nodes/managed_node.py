@@ -57,15 +57,7 @@ _END = 4.0
 
 
 class ManagedNode(LifecycleNodeMixin, Node):
-    """See the module.
-
-    Parameters
-    ----------
-    name, namespace
-        Of the node.
-    context
-        rclpy's default if not given.
-    """
+    """See the module."""
 
     def __init__(self, name: str, *, namespace: str | None = None, context: Any = None) -> None:
         Node.__init__(self, name, namespace=namespace, context=context)

@@ -63,15 +63,7 @@ _ARRIVAL = Duration(seconds=0.5)
 
 
 class Outputs:
-    """Publishes frames; used by one thread at a time.
-
-    Parameters
-    ----------
-    node
-        Whose publishers they are.
-    poses
-        Where the camera is in ``target_frame``.
-    """
+    """Publishes frames; used by one thread at a time.  ``poses`` know where the camera is in ``target_frame``."""
 
     def __init__(self, node: Node, poses: CameraPoses) -> None:
         self._node, self._poses = node, poses

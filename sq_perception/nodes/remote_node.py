@@ -36,15 +36,7 @@ _TRANSITIONS = ("configure", "cleanup", "activate", "deactivate")
 
 
 class RemoteNode:
-    """One node.
-
-    Parameters
-    ----------
-    node
-        Asks.
-    name
-        Fully qualified, of the node that is asked.
-    """
+    """One node of a fully qualified ``name``; ``node`` asks it."""
 
     def __init__(self, node: Node, name: str) -> None:
         self.name = name

@@ -100,14 +100,7 @@ class CameraPoses:
 class Tracking:
     """Gives the bodies of a node's frames their ids; used by one thread, except for ``tally``.
 
-    Ids outlive a restart after a fault: a body keeps its name.
-
-    Parameters
-    ----------
-    node
-        Whose log hears of resets and of poses that are not known.
-    poses
-        Where the camera is; asked only while there is a fixed frame.
+    Ids outlive a restart after a fault: a body keeps its name.  ``poses`` are asked only while there is a fixed frame.
     """
 
     def __init__(self, node: Node, poses: CameraPoses) -> None:
@@ -138,8 +131,8 @@ class Tracking:
         arrival
             The time, seconds, of an image without stamp.
         origin
-            Of the bodies, as :meth:`~sq_perception.nodes.engine.Engine.recover` tells it.  Numbers that another method
-            or model found, with deviations of another kind, are not fused with these: a change ends the tracks.
+            Of the bodies, as :meth:`~sq_perception.nodes.engine.Engine.recover` returns it.  Numbers that another
+            method or model found, with deviations of another kind, are not fused with these: a change ends the tracks.
 
         Raises
         ------

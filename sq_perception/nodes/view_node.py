@@ -62,7 +62,7 @@ _DRAWER_END = 5.0
 
 @dataclass(frozen=True)
 class Result:
-    """Superquadrics as they came, and when, in seconds of the monotonic clock."""
+    """Superquadrics as they came, when, in seconds of the monotonic clock, and after how many milliseconds."""
 
     message: PointCloud2
     time: float
