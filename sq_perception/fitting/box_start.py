@@ -12,14 +12,14 @@ import cv2
 import numpy as np
 
 from sq_perception.fitting.levenberg_marquardt import State
-from sq_perception.fitting.symmetry_start import three_orders
+from sq_perception.fitting.observation import span
+from sq_perception.fitting.symmetry_start import ORDERS
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 
-_START_EXPONENTS = (0.3,)
+_START_EXPONENT = 0.3
 _THINNEST = 0.15
 """A box side is at least this share of the longest side: one visible face says nothing of the depth."""
-_OUTLIER_SHARE = 0.01
 
 
 def enclosing_box(points: np.ndarray, footprint: float) -> Superquadric:
@@ -34,20 +34,19 @@ def enclosing_box(points: np.ndarray, footprint: float) -> Superquadric:
 
 def principal(points: np.ndarray) -> list[State]:
     """Boxes along the principal axes of the points, for each choice of z."""
-    axes = _axes_of(points)
-    return _box_states(points, axes, away=None)
+    return _box_states(points, _axes_of(points))
 
 
 def on_plane(points: np.ndarray, plane: np.ndarray) -> list[State]:
     """Boxes that stand on the plane: smallest rectangle around the footprint of the points, down to the plane."""
     axes = standing_axes(points, plane[:3])
-    ground = -plane[3] * plane[:3]
-    return _box_states(points, axes, away=points.mean(axis=0), ground=ground)
+    return _box_states(points, axes, ground=float(-plane[3] * plane[:3] @ axes[:, 2]))
 
 
 def standing_axes(points: np.ndarray, normal: np.ndarray) -> np.ndarray:
     """Columns (3, 3): the sides of the smallest rectangle around the footprint of the points, and the unit normal."""
-    first = quaternions.cross(normal, np.array([0.0, 0.0, 1.0] if abs(normal[2]) < 0.9 else [1.0, 0.0, 0.0]))
+    x, y, z = normal
+    first = np.array([y, -x, 0.0] if abs(z) < 0.9 else [0.0, z, -y])  # across z, or across x
     first /= np.linalg.norm(first)
     second = quaternions.cross(normal, first)
     flat = np.stack([points @ first, points @ second], axis=1)
@@ -64,12 +63,11 @@ def _axes_of(points: np.ndarray) -> np.ndarray:
     return axes
 
 
-def _box_states(
-    points: np.ndarray, axes: np.ndarray, away: np.ndarray | None, ground: np.ndarray | None = None
-) -> list[State]:
-    low, high = np.quantile(axes.T @ points.T, [_OUTLIER_SHARE, 1 - _OUTLIER_SHARE], axis=1)
+def _box_states(points: np.ndarray, axes: np.ndarray, ground: float | None = None) -> list[State]:
+    """Boxes along the axes, as measured and deeper on the narrow side; down to the ground on the third axis."""
+    low, high = span(points, axes.T).T
     if ground is not None:
-        low[2] = min(float(ground @ axes[:, 2]), high[2] - 1e-4)
+        low[2] = min(ground, high[2] - 1e-4)
     boxes = [(low, high)]
     thin = int(np.argmin((high - low)[:2] if ground is not None else high - low))
     view = points.mean(axis=0) @ axes
@@ -88,8 +86,7 @@ def _box_states(
     for lower, upper in boxes:
         half = np.maximum((upper - lower) / 2, _THINNEST * longest / 2)
         centre = axes @ ((lower + upper) / 2)
-        for rotation in three_orders(axes):
-            order = np.argmax(np.abs(axes.T @ rotation), axis=0)
-            for exponent in _START_EXPONENTS:
-                found.append(State(np.concatenate([half[order], [exponent, exponent], centre]), rotation, math.inf, 0))
+        for order in ORDERS:
+            parameters = np.concatenate([half[list(order)], [_START_EXPONENT, _START_EXPONENT], centre])
+            found.append(State(parameters, np.ascontiguousarray(axes[:, order]), math.inf, 0))
     return found

@@ -19,7 +19,8 @@ import numpy as np
 from sq_perception.geometry.kernels import kernel
 
 _SAMPLES = 1500
-_MEDIAN_TO_SIGMA = 1.4826
+MEDIAN_TO_SIGMA = 1.4826
+"""Of absolute values of a normal distribution."""
 _FEWEST = 8
 
 
@@ -51,7 +52,7 @@ class DepthNoise:
 
 
 def estimate(depth: np.ndarray, inside: np.ndarray, least: float) -> DepthNoise:
-    """The noise of the depth image within a mask (h, w); ``least`` metres if it is smaller or cannot be told."""
+    """The noise of the depth image within a mask (h, w); ``least`` metres if it is smaller or cannot be estimated."""
     step = max(1, int(2 * np.count_nonzero(inside) / _SAMPLES))
     third, first = _differences(depth, inside, step)
     if third.size < _FEWEST:
@@ -63,7 +64,7 @@ def estimate(depth: np.ndarray, inside: np.ndarray, least: float) -> DepthNoise:
         smallest = float(np.partition(moved, rank)[rank])
         if np.mean(np.abs(moved / smallest - np.rint(moved / smallest)) < 0.02) > 0.8:
             quantum = smallest
-    spread = _median(third, quantum) * _MEDIAN_TO_SIGMA / np.sqrt(20.0)
+    spread = _median(third, quantum) * MEDIAN_TO_SIGMA / np.sqrt(20.0)
     if spread < 0.5 * quantum:
         return DepthNoise(max(quantum / float(np.sqrt(12.0)), least), quantum=quantum)
     return DepthNoise(max(float(spread), least))

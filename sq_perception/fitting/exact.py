@@ -26,6 +26,7 @@ import numpy as np
 
 from sq_perception.fitting import revolution, rounding, starts, tolerant, unseen
 from sq_perception.fitting.covariance import Alternative
+from sq_perception.fitting.depth_noise import MEDIAN_TO_SIGMA
 from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.observation import Observation
 from sq_perception.fitting.outline import sharpened, without_shrunk_edge
@@ -59,8 +60,6 @@ _FINE_NOISE = 0.3
 _OUTLIER = 5.0
 """Object rays this many standard deviations off the surface of the winner are dropped: noise reaches there once in two
 million."""
-_MEDIAN_TO_SIGMA = 1.4826
-"""Of absolute values of a normal distribution."""
 _SETTLED, _UNSURE = 1.03, 0.01
 """A last mean squared residual above the one, or a half size less certain than the other, as a share of it, make other
 valleys of the cost worth a look; chosen on benchmarks/single_body."""
@@ -99,7 +98,7 @@ def solve_cheaply(problem: Problem, given: Sequence[State], later: Callable[[], 
     ``later`` returns further starts that cost time: it is called only if those before do not suffice.
     """
     finalists: list[State] = []
-    groups: list[Callable[[], Sequence[State]]] = [lambda: given, lambda: starts.symmetric(problem.observation)[0]]
+    groups: list[Callable[[], Sequence[State]]] = [lambda: given, lambda: next(starts.symmetric(problem.observation))]
     for group in groups if later is None else [*groups, later]:
         candidates = group()
         tried = coarse(problem, candidates) if candidates else []
@@ -151,8 +150,8 @@ def _enough_rays(observation: Observation) -> int:
 
 def _without_outliers(observation: Observation, hits: np.ndarray, state: State) -> np.ndarray:
     """The rays whose points lie near the surface, as seen by the majority."""
-    distance = surface_distance(hits, state.parameters, state.rotation)
-    spread = max(observation.sigma, _MEDIAN_TO_SIGMA * float(np.median(distance)))
+    distance = np.abs(surface_distance(hits, state.parameters, state.rotation))
+    spread = max(observation.sigma, MEDIAN_TO_SIGMA * float(np.median(distance)))
     return hits[distance < _OUTLIER * spread]
 
 

@@ -46,7 +46,7 @@ class State(NamedTuple):
 
     @classmethod
     def of(cls, body: Superquadric) -> State:
-        """A single body, not yet judged."""
+        """A single body, its cost unknown."""
         flat = np.array(body.to_flat(), dtype=float)
         return cls(flat[:8], np.ascontiguousarray(body.rotation_matrix, dtype=float), math.inf, 0)
 

@@ -16,6 +16,7 @@ Both become rays (:mod:`sq_perception.fitting.rays`) when a stage of the fit dra
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -24,17 +25,7 @@ import numpy as np
 
 from sq_perception.fitting import depth_noise
 from sq_perception.fitting.depth_noise import DepthNoise
-from sq_perception.fitting.rays import (
-    DEPTH,
-    DIRECTION_X,
-    DIRECTION_Y,
-    LAST,
-    ORIGIN_X,
-    ORIGIN_Y,
-    RAY_COLUMNS,
-    STIFFNESS,
-    WEIGHT,
-)
+from sq_perception.fitting.rays import DEPTH, DIRECTION_X, DIRECTION_Y, ORIGIN_X, ORIGIN_Y, drawn, through
 from sq_perception.geometry.kernels import kernel
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.coherence import coherent
@@ -53,10 +44,12 @@ _BACKGROUND_SHARE = 0.1
 """Of the pixels next to the object: if fewer were measured, there is no background within range."""
 _COARSE = 3
 """Far from the mask, only every third pixel in each direction is a free pixel."""
-_FREE_MARGIN, _FREE_MODEL_MARGIN = 3.0, 2.0
-"""Free space ends this many noise levels, or model errors, in front of the measured depth."""
+_FREE_MARGIN = 3.0
+"""Free space ends this many standard deviations in front of the measured depth."""
 _POINTS = 2000
 """Enough for moments, boxes and quantiles of the object to settle."""
+OUTLIER_SHARE = 0.01
+"""Of the points, at either end of a direction: readings of something else that got into the mask."""
 _NO_NOISE = 1e-6
 """The least noise, as a share of the distance: what single precision can tell."""
 
@@ -115,8 +108,8 @@ class Observation:
 
         Draws with other offsets (0 to 1) take other pixels.
         """
-        chosen = self.pixels if len(self.pixels) <= count else _draw(self.pixels, self.areas, count, offset)
-        return self._rays(chosen, 0.0)
+        chosen = self.pixels if len(self.pixels) <= count else drawn(self.pixels, self.areas, count, offset)
+        return self._through(chosen, 0.0)
 
     def free_rays(self, count: int, offset: float = 0.5) -> np.ndarray:
         """At most ``count`` rays (k, 8) through free space, likewise; z is where free space ends."""
@@ -126,7 +119,7 @@ class Observation:
         """The same through some of the free pixels."""
         if len(pixels) > count:
             pixels = pixels[((np.arange(count) + offset) * (len(pixels) / count)).astype(np.int64)]
-        return self._rays(pixels, 1.0)
+        return self._through(pixels, _FREE_MARGIN)
 
     def rim(self) -> np.ndarray:
         """The free pixels that touch the mask."""
@@ -157,68 +150,84 @@ class Observation:
         distance = cv2.distanceTransform((~self.mask).view(np.uint8), cv2.DIST_L2, 3)
         return distance.ravel()[self.free]
 
-    def _rays(self, pixels: np.ndarray, free: float) -> np.ndarray:
+    def _through(self, pixels: np.ndarray, margin: float) -> np.ndarray:
         c, n = self.camera, self.noise
-        return _rays(
-            pixels,
+        noise = (n.constant, n.quadratic, self.model_error)
+        return through(pixels, self.depth, (c.fx, c.fy, c.cx, c.cy), c.is_pinhole, noise, margin)
+
+
+@dataclass(frozen=True)
+class Crop:
+    """An object and its surroundings in an image, as far as they do not depend on how far the object strays.
+
+    ``depth`` (h, w), NaN where nothing was measured, the caller's ``mask`` (h, w), their ``camera``; ``band``: width,
+    in pixels, of the band around the mask whose every pixel counts; the others as in :class:`Observation`.
+    """
+
+    depth: np.ndarray
+    mask: np.ndarray
+    camera: Camera
+    band: int
+    noise: DepthNoise
+    distance: float
+    footprint: float
+
+    @classmethod
+    def around(
+        cls, depth: np.ndarray, mask: np.ndarray, camera: Camera, noise: float | DepthNoise | None
+    ) -> Crop | None:
+        """The crop around a mask of an image; None if it holds no depth at all.  ``noise`` None estimates it."""
+        x, y, width, height = cv2.boundingRect(np.ascontiguousarray(mask).view(np.uint8))
+        extent = max(width, height)
+        band = max(_BAND_PIXELS, math.ceil(_BAND_SHARE * extent))
+        margin = max(band, math.ceil(_WIDER * extent / 2))
+        top, left = max(y - margin, 0), max(x - margin, 0)
+        bottom, right = min(y + height + margin, camera.height), min(x + width + margin, camera.width)
+        crop = np.ascontiguousarray(depth[top:bottom, left:right], dtype=np.float32)
+        if camera.is_pinhole:
+            crop = np.where(crop > 0, crop, np.float32(np.nan))
+        inside = np.ascontiguousarray(mask[top:bottom, left:right])
+        distance = _mean_depth(crop, inside)
+        if not math.isfinite(distance):
+            return None
+        if noise is None:
+            noise = depth_noise.estimate(crop, inside, _NO_NOISE * max(abs(distance), 1e-3))
+        elif not isinstance(noise, DepthNoise):
+            noise = DepthNoise(noise)
+        footprint = (distance if camera.is_pinhole else 1.0) / math.sqrt(camera.fx * camera.fy)
+        view = camera.cropped(left, top, right - left, bottom - top)
+        return cls(crop, inside, view, band, noise, distance, footprint)
+
+    def observed(self, model_error: float, nan_is_empty: bool | None) -> Observation:
+        """Its pixels sorted; ``model_error`` in metres, ``nan_is_empty`` as in the options."""
+        sigma = math.hypot(self.noise.at(self.distance), model_error)
+        inside = coherent(self.depth, self.mask, _JUMP_PIXELS * self.footprint + _JUMP_NOISE * sigma)
+        filled = cv2.morphologyEx(inside.view(np.uint8), cv2.MORPH_CLOSE, np.ones((_HOLE, _HOLE), np.uint8))
+        claimed = cv2.bitwise_or(filled, self.mask.view(np.uint8))
+        near = cv2.dilate(filled, np.ones((2 * self.band + 1, 2 * self.band + 1), np.uint8))
+        if nan_is_empty is None:
+            beside = np.isfinite(self.depth[(near > 0) & (claimed == 0)])
+            nan_is_empty = beside.size == 0 or float(beside.mean()) < _BACKGROUND_SHARE
+        lost = _convex_hull(claimed) if nan_is_empty else np.ones_like(claimed)
+        return Observation(
+            *_sort(self.depth, inside, claimed, near, lost, self.footprint),
+            self.noise,
+            model_error,
+            self.distance,
+            self.footprint,
             self.depth,
-            (c.fx, c.fy, c.cx, c.cy),
-            c.is_pinhole,
-            (n.constant, n.quadratic, self.model_error),
-            (free * _FREE_MARGIN, free * _FREE_MODEL_MARGIN),
+            filled.view(bool),
+            self.camera,
         )
 
 
-def observe(
-    depth: np.ndarray,
-    mask: np.ndarray,
-    camera: Camera,
-    noise: float | DepthNoise | None,
-    model_error: float,
-    nan_is_empty: bool | None,
-) -> Observation | None:
-    """Sort the pixels of an image; None if the mask holds no depth at all.
-
-    ``noise`` None estimates it; ``model_error`` (metres) adds to it in squares.  ``nan_is_empty`` as in the options.
-    """
-    rows = np.flatnonzero(mask.any(axis=1))
-    if rows.size == 0:
-        return None
-    columns = np.flatnonzero(mask[rows[0] : rows[-1] + 1].any(axis=0))
-    extent = max(rows[-1] - rows[0], columns[-1] - columns[0]) + 1
-    band = max(_BAND_PIXELS, int(np.ceil(_BAND_SHARE * extent)))
-    margin = max(band, int(np.ceil(_WIDER * extent / 2)))
-    top, left = max(int(rows[0]) - margin, 0), max(int(columns[0]) - margin, 0)
-    bottom = min(int(rows[-1]) + margin + 1, camera.height)
-    right = min(int(columns[-1]) + margin + 1, camera.width)
-    window = (slice(top, bottom), slice(left, right))
-    crop = np.ascontiguousarray(depth[window], dtype=np.float32)
-    if camera.is_pinhole:
-        crop = np.where(crop > 0, crop, np.float32(np.nan))
-    inside = np.ascontiguousarray(mask[window], dtype=bool)
-    view = camera.cropped(left, top, right - left, bottom - top)
-    distance = _mean_depth(crop, inside)
-    if not np.isfinite(distance):
-        return None
-    if noise is None:
-        noise = depth_noise.estimate(crop, inside, _NO_NOISE * max(abs(distance), 1e-3))
-    elif not isinstance(noise, DepthNoise):
-        noise = DepthNoise(noise)
-    sigma = float(np.hypot(noise.at(distance), model_error))
-    focal = np.sqrt(view.fx * view.fy)
-    footprint = float(distance / focal if view.is_pinhole else 1 / focal)
-    inside = coherent(crop, inside, _JUMP_PIXELS * footprint + _JUMP_NOISE * sigma)
-    filled = cv2.morphologyEx(inside.view(np.uint8), cv2.MORPH_CLOSE, np.ones((_HOLE, _HOLE), np.uint8))
-    claimed = cv2.bitwise_or(filled, np.ascontiguousarray(mask[window]).view(np.uint8))
-    near = cv2.dilate(filled, np.ones((2 * band + 1, 2 * band + 1), np.uint8))
-    if nan_is_empty is None:
-        beside = np.isfinite(crop[(near > 0) & (claimed == 0)])
-        nan_is_empty = beside.size == 0 or float(beside.mean()) < _BACKGROUND_SHARE
-    lost = _convex_hull(claimed) if nan_is_empty else np.ones_like(claimed)
-    pixels, areas, free, free_pixels = _sort(crop, inside, claimed, near, lost, footprint)
-    return Observation(
-        pixels, areas, free, free_pixels, noise, model_error, distance, footprint, crop, filled.view(bool), view
-    )
+def span(points: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    """From where to where (k, 2) points (n, 3) reach along directions (k, 3), but for outliers at either end."""
+    along = np.sort(directions @ points.T, axis=1)
+    place = (len(points) - 1) * np.array([OUTLIER_SHARE, 1 - OUTLIER_SHARE])
+    before = place.astype(int)
+    lower, upper = along[:, before], along[:, np.minimum(before + 1, len(points) - 1)]
+    return np.asarray(lower + (upper - lower) * (place - before))
 
 
 def _convex_hull(mask: np.ndarray) -> np.ndarray:
@@ -227,60 +236,6 @@ def _convex_hull(mask: np.ndarray) -> np.ndarray:
     hull = np.zeros_like(mask)
     cv2.fillConvexPoly(hull, cv2.convexHull(np.concatenate(outlines)), 1)
     return hull
-
-
-@kernel
-def _draw(pixels: np.ndarray, areas: np.ndarray, count: int, offset: float) -> np.ndarray:
-    total = 0.0
-    for i in range(areas.shape[0]):
-        total += areas[i]
-    chosen = np.empty(count, np.int32)
-    step = total / count
-    ahead = step * offset
-    passed = 0.0
-    k = 0
-    for i in range(pixels.shape[0]):
-        passed += areas[i]
-        if passed > ahead and k < count:
-            chosen[k] = pixels[i]
-            k += 1
-            while passed > ahead:
-                ahead += step
-    return chosen[:k]
-
-
-@kernel
-def _rays(
-    pixels: np.ndarray,
-    depth: np.ndarray,
-    intrinsics: tuple[float, float, float, float],
-    pinhole: bool,
-    noise: tuple[float, float, float],
-    margins: tuple[float, float],
-) -> np.ndarray:
-    """Rays (n, 8) of pixels; their z is nearer by the margins, in noise levels and model errors."""
-    fx, fy, cx, cy = intrinsics
-    constant, quadratic, model_error = noise
-    width = depth.shape[1]
-    rays = np.zeros((pixels.shape[0], RAY_COLUMNS))
-    for i in range(pixels.shape[0]):
-        v, u = pixels[i] // width, pixels[i] % width
-        x, y = (u - cx) / fx, (v - cy) / fy
-        if pinhole:
-            rays[i, DIRECTION_X], rays[i, DIRECTION_Y] = x, y
-        else:
-            rays[i, ORIGIN_X], rays[i, ORIGIN_Y] = x, y
-        z = np.float64(depth[v, u])
-        rays[i, STIFFNESS] = rays[i, WEIGHT] = 1.0
-        if not np.isfinite(z):
-            rays[i, DEPTH] = 1e300
-            continue
-        growing = quadratic * z * z
-        sigma = np.sqrt(constant * constant + growing * growing + model_error * model_error)
-        rays[i, DEPTH] = rays[i, LAST] = z - max(margins[0] * sigma, margins[1] * model_error)
-        if margins[0] == 0.0:
-            rays[i, STIFFNESS] = 1.0 / sigma
-    return rays
 
 
 @kernel

@@ -106,6 +106,11 @@ class Problem:
         return time.perf_counter() > self.deadline
 
     @property
+    def is_predicted(self) -> bool:
+        """Whether a prediction of the thing's hull is known."""
+        return len(self.terms.hull_directions) > 0
+
+    @property
     def outline(self) -> float:
         """Standard deviation of the outline where it is not known better, metres."""
         return outline_sigma(self.observation)
@@ -132,7 +137,7 @@ class Problem:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """A body on its way through the last steps of a course; what the verdict reads in the end.
+    """A body on its way through the last steps of a course; what :mod:`sq_perception.fitting.quality` reads in the end.
 
     Attributes
     ----------
@@ -143,7 +148,7 @@ class Solution:
     alternatives
         Other bodies that explain the image almost as well.
     notes
-        What the body rests on beyond the image, in words.
+        What the body rests on beyond the image, for the message.
     spread_factor
         Of the covariance, where residuals err alike.
     as_hull

@@ -10,6 +10,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sq_perception.geometry.kernels import kernel
+
 ORIGIN_X, ORIGIN_Y, DIRECTION_X, DIRECTION_Y, DEPTH, STIFFNESS, WEIGHT, LAST = range(8)
 """Columns of a ray.
 
@@ -43,3 +45,62 @@ class Rays(NamedTuple):
     def every(self, stride: int) -> Rays:
         """Each ``stride``-th ray."""
         return Rays(self.hits[::stride].copy(), self.free[::stride].copy())
+
+
+@kernel
+def drawn(pixels: np.ndarray, areas: np.ndarray, count: int, offset: float) -> np.ndarray:
+    """About ``count`` of the pixels (n,), systematically by their areas; other offsets (0 to 1) take other pixels."""
+    total = 0.0
+    for i in range(areas.shape[0]):
+        total += areas[i]
+    chosen = np.empty(count, np.int32)
+    step = total / count
+    ahead = step * offset
+    passed = 0.0
+    k = 0
+    for i in range(pixels.shape[0]):
+        passed += areas[i]
+        if passed > ahead and k < count:
+            chosen[k] = pixels[i]
+            k += 1
+            while passed > ahead:
+                ahead += step
+    return chosen[:k]
+
+
+@kernel
+def through(
+    pixels: np.ndarray,
+    depth: np.ndarray,
+    intrinsics: tuple[float, float, float, float],
+    pinhole: bool,
+    noise: tuple[float, float, float],
+    margin: float,
+) -> np.ndarray:
+    """Rays (n, 8) through pixels, indices into the depth image; object rays, or free ones that end a margin before.
+
+    ``intrinsics``: fx, fy, cx, cy; ``noise``: its constant and quadratic part and the model error, which join in
+    squares; ``margin``: in such standard deviations, 0 for rays of the object.
+    """
+    fx, fy, cx, cy = intrinsics
+    constant, quadratic, model_error = noise
+    width = depth.shape[1]
+    rays = np.zeros((pixels.shape[0], RAY_COLUMNS))
+    for i in range(pixels.shape[0]):
+        v, u = pixels[i] // width, pixels[i] % width
+        x, y = (u - cx) / fx, (v - cy) / fy
+        if pinhole:
+            rays[i, DIRECTION_X], rays[i, DIRECTION_Y] = x, y
+        else:
+            rays[i, ORIGIN_X], rays[i, ORIGIN_Y] = x, y
+        z = np.float64(depth[v, u])
+        rays[i, STIFFNESS] = rays[i, WEIGHT] = 1.0
+        if not np.isfinite(z):
+            rays[i, DEPTH] = 1e300
+            continue
+        growing = quadratic * z * z
+        sigma = np.sqrt(constant * constant + growing * growing + model_error * model_error)
+        rays[i, DEPTH] = rays[i, LAST] = z - margin * sigma
+        if margin == 0.0:
+            rays[i, STIFFNESS] = 1.0 / sigma
+    return rays

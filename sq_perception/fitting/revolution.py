@@ -26,6 +26,7 @@ import numpy as np
 from sq_perception.fitting.box_start import standing_axes
 from sq_perception.fitting.covariance import Alternative
 from sq_perception.fitting.levenberg_marquardt import State
+from sq_perception.fitting.observation import span
 from sq_perception.fitting.problem import (
     BASIN_RAYS,
     FIRST_STEPS,
@@ -37,7 +38,7 @@ from sq_perception.fitting.problem import (
     settle,
 )
 from sq_perception.fitting.rivals import resized
-from sq_perception.fitting.symmetry_start import three_orders
+from sq_perception.fitting.symmetry_start import ORDERS
 from sq_perception.geometry import rotation as quaternions
 
 SPARED = 3
@@ -52,8 +53,6 @@ OPEN, EXPLAINED = 0.05, 0.5
 """Half sizes more certain than this share of them, of a body with a mean squared residual below that: not asked."""
 _FINALISTS = 2
 """Round bodies that go on from the few steps on few rays."""
-_OUTLIER_SHARE = 0.01
-"""Of the points, at either end of an axis."""
 _START_EXPONENT = 0.4
 """Of a start: between a can's and a fruit's."""
 
@@ -98,11 +97,11 @@ def from_body(state: State) -> list[State]:
     """Round bodies about each axis of a body; of the two half sizes across, the one across the line of sight holds."""
     found = []
     sight = state.parameters[5:8] / np.linalg.norm(state.parameters[5:8])
-    for k, rotation in enumerate(three_orders(state.rotation)):
-        order = [(k + 1) % 3, (k + 2) % 3, k]
+    for order in ORDERS:
+        rotation = np.ascontiguousarray(state.rotation[:, order])
         parameters = state.parameters.copy()
-        parameters[:3] = parameters[order]
-        parameters[3] = state.parameters[3] if k == 2 else _START_EXPONENT
+        parameters[:3] = parameters[list(order)]
+        parameters[3] = state.parameters[3] if order[2] == 2 else _START_EXPONENT
         parameters[4] = 1.0
         turned = State(parameters, rotation, math.inf, state.iterations)
         hidden = int(np.argmax(np.abs(sight @ rotation[:, :2])))
@@ -123,7 +122,7 @@ def on_plane(points: np.ndarray, plane: np.ndarray) -> list[State]:
     ahead /= max(float(np.linalg.norm(ahead)), 1e-9)
     side = quaternions.cross(normal, ahead)
     directions = np.stack([normal, side, ahead, axes[:, 0], axes[:, 1]])
-    spans = np.quantile(directions @ points.T, [_OUTLIER_SHARE, 1 - _OUTLIER_SHARE], axis=1).T
+    spans = span(points, directions)
     ground = -float(plane[3])
     high = max(float(spans[0, 1]) - ground, 1e-4)
     found = [_round(normal, (ground, ground + high), side, spans[1], ahead, spans[2, 0])]

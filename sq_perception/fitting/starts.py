@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 
@@ -28,14 +29,16 @@ def automatic(problem: Problem) -> list[State]:
     return found
 
 
-def symmetric(observation: Observation) -> list[list[State]]:
-    """Starts from central symmetry; from the points' box where nothing shows the symmetry."""
+def symmetric(observation: Observation) -> Iterator[list[State]]:
+    """Groups of starts from central symmetry; the points' box where nothing shows the symmetry."""
     completed = symmetry_start.completed_moments(observation)
     if completed is None:
-        return [box_start.principal(observation.points)]
+        yield box_start.principal(observation.points)
+        return
     centre, moments = completed
     axes = symmetry_start.principal_axes(moments)
-    return [symmetry_start.states(centre, moments, turned) for turned in [axes, *symmetry_start.eighth_turns(axes)]]
+    for turned in [axes, *symmetry_start.eighth_turns(axes)]:
+        yield symmetry_start.states(centre, moments, turned)
 
 
 def everything(observation: Observation) -> list[State]:
@@ -54,8 +57,10 @@ def everything(observation: Observation) -> list[State]:
     return found
 
 
-def _tiers(problem: Problem) -> list[list[State]]:
-    first, *others = symmetric(problem.observation)
+def _tiers(problem: Problem) -> Iterator[list[State]]:
+    groups = symmetric(problem.observation)
+    first = next(groups)
     if problem.options.plane is not None:
-        first = first + box_start.on_plane(problem.observation.points, problem.options.plane)
-    return [first, *others]
+        first += box_start.on_plane(problem.observation.points, problem.options.plane)
+    yield first
+    yield from groups

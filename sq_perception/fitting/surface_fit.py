@@ -4,7 +4,7 @@ Residuals run along the true rays of the pixels, so that one code serves orthogr
 pixels pull the surface onto what they measured, the pixels beside it keep the body out of the space they saw to be
 empty.  See :mod:`sq_perception.fitting.residuals` for the equations, :mod:`sq_perception.fitting.problem` for a fit as
 data, :mod:`sq_perception.fitting.exact` and :mod:`sq_perception.fitting.tolerant` for its two courses, and
-:mod:`sq_perception.fitting.verdict` for what it says about itself.
+:mod:`sq_perception.fitting.quality` for the status and accuracy of the result.
 
 Frames and units: optical frame, metres, radians.
 """
@@ -22,10 +22,10 @@ import numpy as np
 from sq_perception.fitting import box_start, exact, tolerant
 from sq_perception.fitting.fit import Fit
 from sq_perception.fitting.levenberg_marquardt import State
-from sq_perception.fitting.observation import Observation, observe
+from sq_perception.fitting.observation import Crop, Observation
 from sq_perception.fitting.options import MIN_PIXELS, FitOptions
 from sq_perception.fitting.problem import Problem
-from sq_perception.fitting.verdict import failed, verdict
+from sq_perception.fitting.quality import assessed, failed
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
@@ -72,23 +72,24 @@ def fit(
     depth, mask = _checked_images(depth, mask, camera)
     later = cache(lambda: _checked_starts(start())) if callable(start) else None
     given = [] if callable(start) else _checked_starts(start)
+    crop = Crop.around(depth, mask, camera, options.noise)
+    if crop is None:
+        raise ValueError("the mask holds no pixel with a depth: there is nothing to fit")
     if options.model_error is None and (options.plane is not None or later is not None):
-        trusted = observe(depth, mask, camera, options.noise, 0.0, options.nan_is_empty)
-        if trusted is not None and not _hopeless(trusted):
+        trusted = crop.observed(0.0, options.nan_is_empty)
+        if not _hopeless(trusted):
             problem = Problem.of(trusted, replace(options, model_error=0.0), began)
             solution = exact.solve_cheaply(problem, given, later)
             if solution is not None:
-                return verdict(solution, began)
-    observation = observe(depth, mask, camera, options.noise, options.tolerated, options.nan_is_empty)
-    if observation is None:
-        raise ValueError("the mask holds no pixel with a depth: there is nothing to fit")
+                return assessed(solution, began)
+    observation = crop.observed(options.tolerated, options.nan_is_empty)
     reason = _hopeless(observation)
     if reason:
         body = box_start.enclosing_box(observation.points, observation.footprint)
         return failed(body, observation, reason, began)
     course = tolerant if options.tolerated > 0 else exact
     given = given if later is None else later()
-    return verdict(course.solve(Problem.of(observation, options, began), given), began)
+    return assessed(course.solve(Problem.of(observation, options, began), given), began)
 
 
 def warm_up() -> None:

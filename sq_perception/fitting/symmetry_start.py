@@ -31,6 +31,8 @@ _RANK = 4
 """The centre's depth is the largest mean depth but for this many pairs, in case of a stray pixel."""
 _MOST_PAIRS = 2500
 _EIGHTH_TURN = math.pi / 4
+ORDERS = ((1, 2, 0), (2, 0, 1), (0, 1, 2))
+"""Which of three right-handed axes are x, y and z, so that each is z once."""
 
 
 def completed_moments(observation: Observation) -> tuple[np.ndarray, np.ndarray] | None:
@@ -113,7 +115,7 @@ def _opposite_pairs(
 
 def three_orders(axes: np.ndarray) -> list[np.ndarray]:
     """The rotations (3, 3) with these axes (columns, right-handed) whose z axis is each of them in turn."""
-    return [np.ascontiguousarray(axes[:, [(k + 1) % 3, (k + 2) % 3, k]]) for k in range(3)]
+    return [np.ascontiguousarray(axes[:, order]) for order in ORDERS]
 
 
 def eighth_turns(axes: np.ndarray) -> list[np.ndarray]:

@@ -35,6 +35,7 @@ from dataclasses import replace
 import numpy as np
 
 from sq_perception.fitting import box_start, revolution, unseen
+from sq_perception.fitting.depth_noise import MEDIAN_TO_SIGMA
 from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.problem import (
     INDEPENDENT_RAYS,
@@ -57,8 +58,6 @@ _FEW, _RAYS = 150, 800
 _KEPT = 4
 _FIRST_STEPS, _MORE_STEPS, _LAST_STEPS = 5, 12, 40
 _LEFT_OVER_RAYS, _LOSS_RAYS = 3000, 400
-_MEDIAN_TO_SIGMA = 1.4826
-"""Of absolute values of a normal distribution."""
 _HOLLOW = 3.0
 """Noise levels that the points of a solid thing typically stray at the most.  Where nothing is predicted, what is more
 hollow or notched than that, such as a bowl or a pair of pliers, is fitted as its hull instead."""
@@ -79,7 +78,7 @@ def solve(problem: Problem, given: Sequence[State]) -> Solution:
     boxes = box_start.principal(points) if plane is None else box_start.on_plane(points, plane)
     starts = [*given, *boxes]
     solution = _best(problem, starts)
-    if _is_predicted(problem):
+    if problem.is_predicted:
         if _mean_loss(problem, solution.state) > _typical_of_hollow(problem):
             return replace(solution, notes=_AS_HULL, as_hull=True)
         return solution
@@ -92,7 +91,7 @@ def _best(problem: Problem, starts: Sequence[State]) -> Solution:
     few = draw(problem, _FEW, 0.7)
     begun = _tried(problem, starts, few, _FIRST_STEPS)
     settled = _tried(problem, begun[:_KEPT], few, _MORE_STEPS)
-    if _is_predicted(problem) and not problem.late:
+    if problem.is_predicted and not problem.late:
         misfit = max(1.0, _mean_loss(problem, settled[0]) / EXPLAINED)
         problem = replace(problem, independent=INDEPENDENT_OF_PREDICTED / misfit)
         settled = _tried(problem, settled[:2], draw(problem, _FEW, 0.7), _MORE_STEPS)
@@ -124,13 +123,10 @@ def _hollow_as_hull(solution: Solution, starts: Sequence[State]) -> Solution:
 def take_over(problem: Problem, best: State, given: Sequence[State]) -> Solution:
     """The same where an exact body was sought in vain: what ``best`` leaves becomes the model error."""
     hits = problem.observation.object_rays(_LEFT_OVER_RAYS)
-    left_over = _MEDIAN_TO_SIGMA * float(np.median(surface_distance(hits, best.parameters, best.rotation)))
+    distance = np.abs(surface_distance(hits, best.parameters, best.rotation))
+    left_over = MEDIAN_TO_SIGMA * float(np.median(distance))
     observation = problem.observation.coarsened(left_over)
     return solve(replace(problem, observation=observation, terms=terms_of(observation, problem.options)), given)
-
-
-def _is_predicted(problem: Problem) -> bool:
-    return len(problem.terms.hull_directions) > 0
 
 
 def _with_priors(problem: Problem) -> Problem:

@@ -10,8 +10,8 @@ import pytest
 from sq_perception.fitting import revolution, surface_fit
 from sq_perception.fitting.fit import Fit
 from sq_perception.fitting.levenberg_marquardt import State
+from sq_perception.fitting.quality import seen_extents
 from sq_perception.fitting.surface_fit import FitOptions
-from sq_perception.fitting.verdict import seen_extents
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast

@@ -1,4 +1,4 @@
-"""The verdict on a fit: residual, inliers, covariance, and words."""
+"""How good a fit is: residual, share of inliers, covariance, status and its reason."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from sq_perception.fitting.covariance import carried_over, spread, undetermined
 from sq_perception.fitting.fit import CUT_SHORT, Fit, Status
-from sq_perception.fitting.observation import Observation
+from sq_perception.fitting.observation import OUTLIER_SHARE, Observation, span
 from sq_perception.fitting.problem import Solution
 from sq_perception.fitting.residuals import surface_distance
 from sq_perception.geometry.superquadric import Superquadric
@@ -22,29 +22,26 @@ _FAILED_SHARE, _FAILED_LEVELS = 0.25, 3.0
 both is none.  Of a plate or a pen, a quarter of the thickness is less than what any thing strays."""
 _REACHED = 0.9
 """Of the points of a thing that was fitted as a hull: what the rest sticks out tells whether the body encloses it."""
-_TAIL = 0.01
-"""Of the points, at either end of an axis: outliers."""
 _AXES = "xyz"
 
 
-def verdict(solution: Solution, began: float) -> Fit:
-    """The result of a fit, with everything that can be said about its quality."""
+def assessed(solution: Solution, began: float) -> Fit:
+    """The result of a fit, with its residual, inliers, covariance and status."""
     observation, state = solution.problem.observation, solution.state
     body = state.body
     covariance = solution.covariance() + spread(state, solution.alternatives)
     canonical = body.canonical_form()
     covariance = carried_over(covariance, body, canonical)
     everything = observation.object_rays(_RAYS)
-    distance = surface_distance(everything, state.parameters, state.rotation)
+    outside = surface_distance(everything, state.parameters, state.rotation)
+    distance = np.abs(outside)
     inlying = distance < _INLIER * observation.sigma
     typical = float(np.median(distance))
     kept = distance < max(_INLIER * observation.sigma, _INLIER * typical)
     residual = float(np.sqrt(np.mean(distance[kept] ** 2))) if kept.any() else typical
     if solution.as_hull:
         # A hollow thing lies inside its hull: only what sticks out speaks against the body.
-        outside = body.gauge(observation.points) > 1
-        sticking_out = np.where(outside, np.abs(body.sampson_distance(observation.points)), 0.0)
-        typical = float(np.quantile(sticking_out, _REACHED))
+        typical = float(np.quantile(np.maximum(outside, 0.0), _REACHED))
     status, message = _status(canonical, covariance, typical, _FAILED_LEVELS * observation.sigma)
     cut = (CUT_SHORT,) if solution.problem.late else ()
     return Fit(
@@ -64,10 +61,9 @@ def verdict(solution: Solution, began: float) -> Fit:
 
 def seen_extents(body: Superquadric, points: np.ndarray) -> np.ndarray:
     """Share (3,) of each full size of a single body that points (n, 3) span along its axis, 0 to 1."""
-    local = (points - body.translation) @ body.rotation_matrix
-    low, high = np.quantile(local, [_TAIL, 1 - _TAIL], axis=0)
+    low, high = span(points - body.translation, body.rotation_matrix.T).T
     low, high = np.maximum(low, -body.size), np.minimum(high, body.size)
-    return np.clip((high - low) / (2 * body.size * (1 - 2 * _TAIL)), 0.0, 1.0)
+    return np.clip((high - low) / (2 * body.size * (1 - 2 * OUTLIER_SHARE)), 0.0, 1.0)
 
 
 def failed(body: Superquadric, observation: Observation, reason: str, began: float) -> Fit:
@@ -86,7 +82,7 @@ def failed(body: Superquadric, observation: Observation, reason: str, began: flo
 
 
 def _status(body: Superquadric, covariance: np.ndarray, typical: float, strays: float) -> tuple[Status, str]:
-    """The verdict and its reason, without lengths: only the reader of the image knows their unit."""
+    """The status and its reason, without lengths: only the reader of the image knows their unit."""
     smallest = float(body.size.min())
     if typical > max(_FAILED_SHARE * smallest, strays):
         off = f"{typical / smallest:.0%} of its smallest half size"

@@ -1,0 +1,254 @@
+"""Rays and a superquadric, a block of rays at a time: where they meet it, and how near they pass; compiled.
+
+A block is an array ``lanes`` (ROWS, LANES), a ray a column, its values in the rows named below, in the object frame.
+Every line of the mathematics is a loop over the block without a branch, which the compiler turns into vector code.  A
+number of lanes is a multiple of the length of a vector (:func:`padded`): a lane by itself takes as long as eight.
+
+The gauge g is convex along a ray.  Where the ray enters the body, g = 1 with a falling slope, is found by Newton's
+method; how near a ray that misses passes, by a bracket around the smallest g.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from sq_perception.fitting.normal_equations import LANES
+from sq_perception.fitting.rays import DEPTH, DIRECTION_X, DIRECTION_Y, LAST, ORIGIN_X, ORIGIN_Y, STIFFNESS, WEIGHT
+from sq_perception.fitting.terms import Terms
+from sq_perception.geometry.kernels import box_interval, gauge_derivatives, inline_kernel, kernel
+
+QX, QY, QZ, EX, EY, EZ, SHIFT = range(7)
+"""A ray in the object frame, q + shift e;"""
+G, GX, GY, GZ, G1, G2, SLOPE = range(7, 14)
+"""the gauge there and its derivatives, the last one along the ray;"""
+MEASURED, PRECISION, SHARE, START = range(14, 18)
+"""what the pixel measured, 1 / sigma and weight of the ray, and the depth of q;"""
+LOW, HIGH, G_LOW, G_HIGH, S_LOW, S_HIGH = range(18, 24)
+"""a bracket around the smallest gauge."""
+ROWS = 24
+_VECTOR = 8
+"""Doubles of the longest vectors of today's processors, 512 bits."""
+
+_HIT_STEPS = 12
+"""Of Newton's method on a convex function; it converges quadratically, most rays need 2."""
+_LOWEST_STEPS, LOWEST_TOLERANCE = 20, 1e-9
+"""Most steps to the smallest gauge on a ray, and how near to a lower bound it ends."""
+_ANY, _COVERED_TOLERANCE = 1e300, 1e-6
+"""The same for a ray that should meet the body but misses it: how far it passes always matters."""
+_NEAREST = 1e-3
+"""A free ray starts this far in front of a pinhole camera, metres."""
+_FAR_OUTSIDE = 2.0
+"""From a gauge above this, Newton's method starts where the ray enters the bounding box instead."""
+
+
+@kernel
+def place(part: np.ndarray, resume: bool, parameters: np.ndarray, rotation: np.ndarray, lanes: np.ndarray) -> None:
+    """Rays of the object, in its frame; q at the measured depth, or where the ray met the body last time."""
+    t1, t2, t3 = parameters[5], parameters[6], parameters[7]
+    m11, m12, m13 = rotation[0]
+    m21, m22, m23 = rotation[1]
+    m31, m32, m33 = rotation[2]
+    for i in range(part.shape[0]):
+        dx, dy = part[i, DIRECTION_X], part[i, DIRECTION_Y]
+        start = part[i, LAST] if resume else part[i, DEPTH]
+        x, y, z = part[i, ORIGIN_X] - t1 + start * dx, part[i, ORIGIN_Y] - t2 + start * dy, start - t3
+        lanes[QX, i] = m11 * x + m21 * y + m31 * z
+        lanes[QY, i] = m12 * x + m22 * y + m32 * z
+        lanes[QZ, i] = m13 * x + m23 * y + m33 * z
+        lanes[EX, i] = m11 * dx + m21 * dy + m31
+        lanes[EY, i] = m12 * dx + m22 * dy + m32
+        lanes[EZ, i] = m13 * dx + m23 * dy + m33
+        lanes[SHIFT, i] = 0.0
+        lanes[MEASURED, i] = part[i, DEPTH]
+        lanes[PRECISION, i], lanes[SHARE, i] = part[i, STIFFNESS], part[i, WEIGHT]
+        lanes[START, i] = start
+
+
+@kernel
+def padded(count: int, lanes: np.ndarray) -> int:
+    """The number of lanes to work on: ``count`` and repetitions of the last, without weight, up to whole vectors."""
+    filled = (count + _VECTOR - 1) // _VECTOR * _VECTOR
+    for i in range(count, filled):
+        lanes[:, i] = lanes[:, count - 1]
+        lanes[SHARE, i] = 0.0
+    return filled
+
+
+@kernel
+def gauge_along(filled: int, parameters: np.ndarray, lanes: np.ndarray) -> None:
+    """The gauge and its derivatives at q + shift e."""
+    a1, a2, a3, e1, e2 = parameters[0], parameters[1], parameters[2], parameters[3], parameters[4]
+    for i in range(filled):
+        ex, ey, ez, shift = lanes[EX, i], lanes[EY, i], lanes[EZ, i], lanes[SHIFT, i]
+        x, y, z = lanes[QX, i] + shift * ex, lanes[QY, i] + shift * ey, lanes[QZ, i] + shift * ez
+        g, gx, gy, gz, g1, g2 = gauge_derivatives(x, y, z, a1, a2, a3, e1, e2)
+        lanes[G, i], lanes[GX, i], lanes[GY, i], lanes[GZ, i] = g, gx, gy, gz
+        lanes[G1, i], lanes[G2, i] = g1, g2
+        lanes[SLOPE, i] = gx * ex + gy * ey + gz * ez
+
+
+@kernel
+def meet(
+    filled: int, tolerance: float, parameters: np.ndarray, lanes: np.ndarray, missed: np.ndarray, again: np.ndarray
+) -> None:
+    """Where the rays meet the surface: shift along the ray and the gauge there; ``missed`` where they do not.
+
+    Newton's method along the ray.  From a point on the near side of the body it cannot fail, as g is convex along the
+    ray; from the far side, from far outside, and where it passes the smallest g, it starts again at the bounding box.
+    The last point lies within the tolerance of the surface; the caller takes the last step in first order.  For a miss
+    it is the point of the smallest g, or q if even the bounding box is missed.  ``again`` (ROWS, LANES) is scratch.
+    """
+    gauge_along(filled, parameters, lanes)
+    for i in range(filled):
+        missed[i] = lanes[SLOPE, i] >= 0.0 or lanes[G, i] > _FAR_OUTSIDE
+    for _ in range(_HIT_STEPS):
+        moving = 0
+        for i in range(filled):
+            over = 1.0 - lanes[G, i]
+            moves = abs(over) >= tolerance and lanes[SLOPE, i] < 0.0 and not missed[i]
+            lanes[SHIFT, i] += over / lanes[SLOPE, i] if moves else 0.0
+            moving += moves
+        if moving == 0:
+            break
+        gauge_along(filled, parameters, lanes)
+        for i in range(filled):
+            missed[i] = missed[i] or lanes[SLOPE, i] >= 0.0
+    count = 0
+    for i in range(filled):
+        if missed[i]:
+            for row in range(QX, SHIFT):
+                again[row, count] = lanes[row, i]
+            count += 1
+    if count == 0:
+        return
+    _meet_from_box(padded(count, again), tolerance, parameters, again)
+    count = 0
+    for i in range(filled):
+        if missed[i]:
+            for row in range(SHIFT, SLOPE + 1):
+                lanes[row, i] = again[row, count]
+            missed[i] = again[SHARE, count] == 0.0
+            count += 1
+
+
+@kernel
+def _meet_from_box(filled: int, tolerance: float, parameters: np.ndarray, lanes: np.ndarray) -> None:
+    """The same from where the rays enter the bounding box; SHARE says whether one meets the surface, 1 or 0."""
+    for i in range(filled):
+        qx, qy, qz = lanes[QX, i], lanes[QY, i], lanes[QZ, i]
+        ex, ey, ez = lanes[EX, i], lanes[EY, i], lanes[EZ, i]
+        t_in, t_out = box_interval(qx, qy, qz, ex, ey, ez, parameters[0], parameters[1], parameters[2])
+        inside = t_in <= t_out
+        lanes[SHARE, i] = 1.0 if inside else 0.0
+        lanes[SHIFT, i] = lanes[LOW, i] = t_in if inside else 0.0
+    gauge_along(filled, parameters, lanes)
+    for _ in range(_HIT_STEPS):
+        moving = 0
+        for i in range(filled):
+            moves = lanes[SHARE, i] > 0.0 and lanes[SLOPE, i] < 0.0 and abs(lanes[G, i] - 1.0) >= tolerance
+            lanes[LOW, i] = lanes[SHIFT, i] if moves else lanes[LOW, i]
+            lanes[SHIFT, i] += (1.0 - lanes[G, i]) / lanes[SLOPE, i] if moves else 0.0
+            moving += moves
+        if moving == 0:
+            break
+        gauge_along(filled, parameters, lanes)
+    # Newton's method passes the smallest g of a ray that misses: it lies between the last two points.
+    passed = 0
+    for i in range(filled):
+        open_bracket = lanes[SHARE, i] > 0.0 and lanes[SLOPE, i] >= 0.0 and abs(lanes[G, i] - 1.0) >= tolerance
+        lanes[HIGH, i] = lanes[SHIFT, i]
+        lanes[LOW, i] = lanes[LOW, i] if open_bracket else lanes[SHIFT, i]
+        lanes[SHARE, i] = 0.0 if open_bracket else lanes[SHARE, i]
+        passed += open_bracket
+    if passed > 0:
+        above = np.empty(LANES, np.bool_)
+        lowest(filled, _ANY, _COVERED_TOLERANCE, parameters, lanes, above)
+
+
+@inline_kernel
+def enter(
+    ray: np.ndarray, terms: Terms, parameters: np.ndarray, rotation: np.ndarray, i: int, lanes: np.ndarray
+) -> int:
+    """Put a free ray into lane i if it crosses the bounding box in free space; 1 if so, 0 if not."""
+    m = rotation
+    x, y, z = ray[ORIGIN_X] - parameters[5], ray[ORIGIN_Y] - parameters[6], -parameters[7]
+    dx, dy = ray[DIRECTION_X], ray[DIRECTION_Y]
+    ox = m[0, 0] * x + m[1, 0] * y + m[2, 0] * z
+    oy = m[0, 1] * x + m[1, 1] * y + m[2, 1] * z
+    oz = m[0, 2] * x + m[1, 2] * y + m[2, 2] * z
+    ex = m[0, 0] * dx + m[1, 0] * dy + m[2, 0]
+    ey = m[0, 1] * dx + m[1, 1] * dy + m[2, 1]
+    ez = m[0, 2] * dx + m[1, 2] * dy + m[2, 2]
+    t_in, t_out = box_interval(ox, oy, oz, ex, ey, ez, parameters[0], parameters[1], parameters[2])
+    low = max(t_in, _NEAREST if terms.pinhole > 0.0 else -1e300)
+    high = min(t_out, ray[DEPTH])
+    if low >= high:
+        return 0
+    lanes[QX, i], lanes[QY, i], lanes[QZ, i], lanes[EX, i], lanes[EY, i], lanes[EZ, i] = ox, oy, oz, ex, ey, ez
+    lanes[LOW, i], lanes[HIGH, i] = low, high
+    lanes[PRECISION, i], lanes[SHARE, i] = ray[STIFFNESS], ray[WEIGHT]
+    return 1
+
+
+@kernel
+def lowest(
+    filled: int, matters: float, tolerance: float, parameters: np.ndarray, lanes: np.ndarray, missed: np.ndarray
+) -> None:
+    """The smallest gauge on each ray between LOW and HIGH, as far as it matters: shift and gauge there.
+
+    Convexity brackets the minimum between two tangents; their intersection is a lower bound, and the search of a ray
+    ends once that is above ``matters`` (``missed``) or within the tolerance of the best point.  The next point is the
+    minimum of the cubic through both ends, exact for smooth g, or the intersection, exact for edges, by turns.
+    """
+    for i in range(filled):
+        missed[i] = False
+        lanes[SHIFT, i] = lanes[LOW, i]
+    gauge_along(filled, parameters, lanes)
+    for i in range(filled):
+        lanes[G_LOW, i], lanes[S_LOW, i] = lanes[G, i], lanes[SLOPE, i]
+        lanes[SHIFT, i] = lanes[HIGH, i]
+    gauge_along(filled, parameters, lanes)
+    for i in range(filled):
+        lanes[G_HIGH, i], lanes[S_HIGH, i] = lanes[G, i], lanes[SLOPE, i]
+        # A minimum at an end closes the bracket there.
+        if lanes[S_LOW, i] >= 0.0:
+            lanes[HIGH, i] = lanes[LOW, i]
+        elif lanes[S_HIGH, i] <= 0.0:
+            lanes[LOW, i] = lanes[HIGH, i]
+        lanes[SHIFT, i] = lanes[HIGH, i]
+    for step in range(_LOWEST_STEPS):
+        searching = 0
+        for i in range(filled):
+            low, high, shift = lanes[LOW, i], lanes[HIGH, i], lanes[SHIFT, i]
+            g_low, g_high, s_low, s_high = lanes[G_LOW, i], lanes[G_HIGH, i], lanes[S_LOW, i], lanes[S_HIGH, i]
+            width = high - low
+            tangents = (g_low - g_high + s_high * width) / (s_high - s_low)
+            bound = g_low + s_low * tangents
+            open_bracket = width > 0.0
+            missed[i] = missed[i] or (open_bracket and bound > matters)
+            best = min(g_low, g_high)
+            goes_on = open_bracket and not missed[i] and best - bound > tolerance
+            bend = 3.0 * (g_low - g_high) / width + s_low + s_high
+            root = math.sqrt(max(bend * bend - s_low * s_high, 0.0))
+            cubic = width - width * (s_high + root - bend) / (s_high - s_low + 2.0 * root)
+            ahead = tangents if step % 2 == 1 else cubic
+            ahead = min(max(ahead, 0.02 * width), 0.98 * width)
+            settled = (low if g_low < g_high else high) if open_bracket else shift
+            lanes[SHIFT, i] = low + ahead if goes_on else settled
+            searching += goes_on
+        gauge_along(filled, parameters, lanes)
+        if searching == 0:
+            break
+        for i in range(filled):
+            shift, slope = lanes[SHIFT, i], lanes[SLOPE, i]
+            within = shift > lanes[LOW, i] and shift < lanes[HIGH, i]
+            above = within and slope > 0.0
+            below = within and slope <= 0.0
+            lanes[HIGH, i] = shift if above else lanes[HIGH, i]
+            lanes[G_HIGH, i] = lanes[G, i] if above else lanes[G_HIGH, i]
+            lanes[S_HIGH, i] = slope if above else lanes[S_HIGH, i]
+            lanes[LOW, i] = shift if below else lanes[LOW, i]
+            lanes[G_LOW, i] = lanes[G, i] if below else lanes[G_LOW, i]
+            lanes[S_LOW, i] = slope if below else lanes[S_LOW, i]
