@@ -45,6 +45,9 @@ bags = [
 view = [
     "viser>=1.1.1,<1.2",  # the page of `sq-perception view`, all of it local; its server is guarded by a way of calling
 ]
+cluster = [
+    "distributed>=2024.5",  # `recover --cluster` hands frames to a running Dask cluster; 36 MB with what it needs
+]
 train = [
     "tensorboard>=2.14",  # curves of a running training
 ]
@@ -108,12 +111,14 @@ setup(
         # Never among the requirements: they would shadow the rclpy of a ROS installation.
         "ros": ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"],
         "bags": bags,
+        "cluster": cluster,
         "train": train,
         "view": view,
         "picking": picking,
         "docs": docs,
         "test": [
             *bags,
+            *cluster,
             *train,
             *view,
             *picking,

@@ -43,11 +43,11 @@ NAMES = ("round bottle", "oval bottle")
 WAYS = ("standing", "lying", "leaning", "stacked")
 
 
-def scene(seed: int, sensor: str | None) -> tabletop.Tabletop:
-    """The scene of a seed through a sensor, as the judge of scenes takes it."""
+def scene(seed: int, sensor: str | None, count: int | None = None) -> tabletop.Tabletop:
+    """The scene of a seed, of ``count`` things or 1 to 8, through a sensor, as the judge of scenes takes it."""
     sensor = sensor or list(tabletop.SENSORS)[seed % len(tabletop.SENSORS)]
     rng = np.random.default_rng([SEED, seed])
-    truth = things_on_table(rng)
+    truth = things_on_table(rng, count)
     depth = sensor_noise.preset(tabletop.SENSORS[sensor]).measured(truth.depth, truth.camera, rng)
     placed = tuple(_known(each) for each in truth.placed)
     return tabletop.Tabletop(

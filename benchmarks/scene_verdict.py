@@ -152,7 +152,7 @@ def judge(scene: Tabletop) -> SceneVerdict:
         "given": recoverer().recover(depth, camera, labels),
         "own": recoverer().recover(depth, camera),
     }
-    matches = _matches(frames["own"].labels, labels)
+    known = matches(frames["own"].labels, labels)
     judged = []
     for placed in scene.placed:
         if placed.pixels < FEWEST_PIXELS:
@@ -160,7 +160,7 @@ def judge(scene: Tabletop) -> SceneVerdict:
         measured = int(((labels == placed.label) & np.isfinite(depth)).sum())
         answers = {
             "given": of_frame(frames["given"], placed.label, placed, scene),
-            "own": of_frame(frames["own"], matches.get(placed.label, 0), placed, scene),
+            "own": of_frame(frames["own"], known.get(placed.label, 0), placed, scene),
             **_simple(_inner_points(placed.label, scene), placed, scene),
         }
         judged.append(
@@ -179,7 +179,7 @@ def judge(scene: Tabletop) -> SceneVerdict:
             )
         )
     own = frames["own"]
-    taken = set(matches.values())
+    taken = set(known.values())
     plane_error = np.full(2, np.nan)
     if own.plane is not None:
         found = own.plane / np.linalg.norm(own.plane[:3])
@@ -229,7 +229,7 @@ def _answer(
     return Answer(iou, errors, excess, covered, status, message, np.array(body.to_flat(), dtype=float))
 
 
-def _matches(own: np.ndarray, true: np.ndarray) -> dict[int, int]:
+def matches(own: np.ndarray, true: np.ndarray) -> dict[int, int]:
     """The own label of each true one whose masks agree."""
     found = {}
     for label in np.unique(true[true > 0]):

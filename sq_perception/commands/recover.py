@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from sq_perception.recordings.result_json import ResultLines
     from sq_perception.recordings.still_page import StillPage
     from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, Recovery, RecoveryOptions
+    from sq_perception.recovery.workers import Cluster, Processes
 
 
 HELP = """\
@@ -57,6 +58,7 @@ examples:
   sq-perception recover depth_*.png --camera-info 525,525,319.5,239.5 --csv out.csv --html out.html
   sq-perception recover recording/ --topic /camera/depth/image_rect_raw --every 10 --meshes meshes/
   sq-perception recover thousand_frames/ --jobs 8 --jsonl out.jsonl    # again after Ctrl-C: goes on
+  sq-perception recover thousand_frames/ --cluster tcp://10.0.0.1:8786 --jsonl out.jsonl
   sq-perception recover recording/ --track --mcap results.mcap
   sq-perception recover views/*.bmp --projection orthographic --method network --json -
 
@@ -83,7 +85,7 @@ distortion:
 tracking:
   --track follows bodies over the frames of each bag and folder, for a camera that stands still: the same body keeps its
   id and the names of its axes, and "track" has the numbers of all frames so far.  What reads the same as in the frame
-  before, but for noise, is not recovered again; with --jobs each frame is recovered for itself.
+  before, but for noise, is not recovered again; with --jobs or --cluster each frame is recovered for itself.
 
 bags:
   --mcap writes what recover_node would have published, and what it would have read, with stamps, frame ids and times of
@@ -184,6 +186,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="recover N frames at a time, in processes of one thread each: for many frames (default 1: one frame at a "
         "time, its objects in threads)",
     )
+    parser.add_argument(
+        "--cluster",
+        metavar="ADDRESS",
+        help="recover frames on a running Dask cluster, as tcp://10.0.0.1:8786; its workers have this package, too "
+        "(extra 'cluster')",
+    )
     parser.add_argument("--min-score", type=float, default=0.0, metavar="S", help="leave out bodies with a lower score")
     parser.add_argument("-q", "--quiet", action="store_true", help="no table and no summary; what went wrong is said")
     parser.add_argument(
@@ -216,6 +224,8 @@ def run(options: argparse.Namespace) -> int:
         value = getattr(options, name)
         if value is not None and value < 1:
             return misused(f"--{name.replace('_', '-')}: expected at least 1, got {value}")
+    if options.cluster and options.jobs > 1:
+        return misused("--jobs, --cluster: one of them; a cluster has as many processes as it has")
     if not options.time_budget > 0:
         return misused(f"--time-budget: expected a positive number of seconds, got {options.time_budget:g}")
     if options.masks and not Path(options.masks).is_dir():
@@ -228,10 +238,13 @@ def run(options: argparse.Namespace) -> int:
     import torch
 
     from sq_perception.commands.recover_lines import lines as lines_of
+    from sq_perception.learning import checkpoint
     from sq_perception.learning.checkpoint import CheckpointError
     from sq_perception.recordings.frame_file import FrameError, Reading
     from sq_perception.recordings.inputs import RecordedInput
     from sq_perception.recordings.result_json import Recovered, ResultLines
+    from sq_perception.recovery import workers
+    from sq_perception.recovery.options import NEEDS_NETWORK
     from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
 
     torch.set_num_threads(1)  # the network's layers are so small that threads cost more than they save
@@ -261,7 +274,10 @@ def run(options: argparse.Namespace) -> int:
         )
         if problem := recover_outputs.replaced_input(options, recorded.files):
             return misused(problem)
-        recoverer = Recoverer(options.model, method=options.method, consensus=options.consensus)
+        crew: Recoverer | workers.Processes | workers.Cluster
+        setup = workers.Setup(options.model, settings, options.consensus)
+        if options.method in NEEDS_NETWORK:
+            checkpoint.check(options.model)
         if options.jsonl:
             lines = ResultLines(recover_outputs.place(options.jsonl), recover_outputs.decisive(options))
             if lines.done and (options.track or options.mcap or options.html):
@@ -271,12 +287,18 @@ def run(options: argparse.Namespace) -> int:
             done.add(lines.done)
         bag = recover_outputs.bag(options)
         page = recover_outputs.page(options)
+        if options.cluster:
+            crew = workers.Cluster(setup, options.cluster)
+        elif options.jobs > 1:
+            crew = workers.Processes(setup, options.jobs)
+        else:
+            crew = Recoverer(options.model, method=options.method, consensus=options.consensus)
     except (FrameError, CheckpointError, OSError, ImportError) as error:
         return failed(str(error))
     except ValueError as error:
         return misused(str(error))
 
-    run = _Run(options, recoverer, settings, lines, bag, page)
+    run = _Run(options, crew, settings, lines, bag, page)
     try:
         code = run.over(recorded)
     finally:
@@ -300,7 +322,7 @@ class _Run:
     def __init__(
         self,
         options: argparse.Namespace,
-        recoverer: Recoverer,
+        crew: Recoverer | Processes | Cluster,
         settings: RecoveryOptions,
         lines: ResultLines | None,
         bag: ResultBag | None,
@@ -312,7 +334,7 @@ class _Run:
         self.unreadable = 0
         self.is_whole = False
         """Whether all frames were tried."""
-        self._options, self._recoverer, self._settings = options, recoverer, settings
+        self._options, self._crew, self._settings = options, crew, settings
         self._lines, self._bag, self._page = lines, bag, page
         self._tracks = RecordedTracks(lambda text: complain(f"warning: {text}")) if options.track else None
         self._warm: set[Any] = set()
@@ -367,10 +389,10 @@ class _Run:
             settings = replace(self._settings, free_space=frame.has_free_space)
             return workers.Work(frame.depth, frame.camera, labels, settings)
 
-        if self._options.jobs > 1:
-            setup = workers.Setup(self._options.model, self._settings, self._options.consensus)
+        crew = self._crew
+        if isinstance(crew, workers.Processes | workers.Cluster):
             asked = ((pair, work(pair[1]) if isinstance(pair[1], RecordedFrame) else None) for pair in pairs)
-            yield from workers.recovered(asked, setup, self._options.jobs)
+            yield from workers.recovered(asked, crew)
             return
         previous: FrameRecovery | None = None
         for pair in pairs:
@@ -378,10 +400,10 @@ class _Run:
             if isinstance(frame := pair[1], RecordedFrame):
                 try:
                     if frame.camera not in self._warm:
-                        self._recoverer.warm_up(frame.camera)
+                        crew.warm_up(frame.camera)
                         self._warm.add(frame.camera)
                     one = work(frame)
-                    answer = self._recoverer.recover(one.depth, one.camera, one.labels, one.options, previous)
+                    answer = crew.recover(one.depth, one.camera, one.labels, one.options, previous)
                     previous = answer if self._tracks else None
                 except (ValueError, ArithmeticError) as error:
                     answer = error

@@ -1,15 +1,16 @@
-"""Frames recovered by several processes at a time, answered in their order.
+"""Frames recovered by several processes at a time, of this machine or of a Dask cluster, answered in their order.
 
 Each process has a Recoverer of its own, of one thread.  A few frames a process are under way, so that none waits while
 results are written, and that no more are read than that.  Where a process dies, killed or out of memory, new ones
 begin.  What had no answer then is asked again when its turn comes, so that a frame at which processes die takes no
-other with it; it is given up after some tries.
+other with it; it is given up after some tries.  A cluster's scheduler does the same by itself.
 """
 
 from __future__ import annotations
 
 import multiprocessing
 import signal
+import threading
 from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ProcessPoolExecutor
@@ -33,6 +34,7 @@ AHEAD = 3
 TRIES = 3
 """Deaths of its process after which a frame is given up: one may be an operator's, or another frame's memory."""
 
+_one_at_a_time = threading.Lock()
 _Key = TypeVar("_Key")
 _Answer: TypeAlias = "Future[FrameRecovery | None]"
 
@@ -61,58 +63,101 @@ class WorkerLostError(RuntimeError):
 
 
 def recovered(
-    frames: Iterable[tuple[_Key, Work | None]], setup: Setup, jobs: int
+    frames: Iterable[tuple[_Key, Work | None]], crew: Processes | Cluster
 ) -> Iterator[tuple[_Key, FrameRecovery | Exception | None]]:
     """In the order of the frames, the recovery of each or what it raised, None for no work.
 
-    An answer may be a :class:`WorkerLostError`.
+    An answer may be a :class:`WorkerLostError`.  The crew is dismissed in the end.
     """
-    processes = _Processes(setup, jobs)
     asked: deque[tuple[_Key, Work | None, _Answer]] = deque()
+
+    def begun(work: Work | None) -> _Answer:
+        if work is not None:
+            return crew.ask(work)
+        answer: _Answer = Future()
+        answer.set_result(None)
+        return answer
 
     def first() -> tuple[_Key, FrameRecovery | Exception | None]:
         key, work, answer = asked.popleft()
-        for _ in range(TRIES):
+        deaths = 0
+        while True:
             try:
                 return key, answer.result()
-            except BrokenProcessPool:
-                answer = processes.ask(work)
+            except crew.lost:
+                deaths += 1
+                if deaths == crew.tries:
+                    return key, WorkerLostError("the process that recovered it died, again and again")
+                answer = begun(work)
             except Exception as error:  # whatever it raised there is for the one that asked
                 return key, error
-        return key, WorkerLostError(f"the process that recovered it died, {TRIES} times")
 
     try:
         for key, work in frames:
-            asked.append((key, work, processes.ask(work)))
-            while asked and (len(asked) >= AHEAD * jobs or asked[0][2].done()):
+            asked.append((key, work, begun(work)))
+            while asked and (len(asked) >= AHEAD * crew.size or asked[0][2].done()):
                 yield first()
         while asked:
             yield first()
     finally:
-        processes.end()
+        crew.end()
 
 
-class _Processes:
-    """A pool that is made anew where it broke."""
+class Processes:
+    """A pool of ``size`` processes that is made anew where it broke."""
 
-    def __init__(self, setup: Setup, jobs: int) -> None:
-        self._setup, self._jobs = setup, jobs
-        self._pool = _pool(setup, jobs)
+    lost: type[Exception] = BrokenProcessPool
+    tries = TRIES
 
-    def ask(self, work: Work | None) -> _Answer:
-        if work is None:
-            answer: _Answer = Future()
-            answer.set_result(None)
-            return answer
+    def __init__(self, setup: Setup, size: int) -> None:
+        self._setup, self.size = setup, size
+        self._pool = _pool(setup, size)
+
+    def ask(self, work: Work) -> _Answer:
         try:
             return self._pool.submit(_recover, self._setup, work)
         except BrokenProcessPool:
             self.end()
-            self._pool = _pool(self._setup, self._jobs)
+            self._pool = _pool(self._setup, self.size)
             return self._pool.submit(_recover, self._setup, work)
 
     def end(self) -> None:
         self._pool.shutdown(wait=False, cancel_futures=True)
+
+
+class Cluster:
+    """The workers of a running Dask cluster, which have this package and, at the same path, a model that is named.
+
+    What is sent there is pickled: whoever reaches a scheduler can run programs on its workers.
+
+    Raises
+    ------
+    ImportError
+        Without ``distributed``, the extra 'cluster'.
+    OSError, ValueError
+        If nothing answers at the address, or it is none.
+    """
+
+    tries = 1  # for a scheduler that has tried ``distributed.scheduler.allowed-failures`` times
+
+    def __init__(self, setup: Setup, address: str) -> None:
+        import distributed
+
+        self._setup, self.lost = setup, distributed.KilledWorker
+        self._client = distributed.Client(address, set_as_default=False)
+
+    @property
+    def size(self) -> int:
+        """Processes at the moment; one where none has come yet."""
+        return max(1, len(self._client.nthreads()))
+
+    def ask(self, work: Work) -> _Answer:
+        # Frames alike are frames all the same: none is answered from what another one came to.
+        answer: _Answer = self._client.submit(_recover, self._setup, work, pure=False)
+        return answer
+
+    def end(self) -> None:
+        self._client.close()
 
 
 def _pool(setup: Setup, jobs: int) -> ProcessPoolExecutor:
@@ -137,5 +182,6 @@ def _recoverer(setup: Setup) -> Recoverer:
     return Recoverer(setup.model, method=setup.options.method, consensus=setup.consensus, threads=1)
 
 
-def _recover(setup: Setup, work: Work) -> FrameRecovery | None:
-    return _recoverer(setup).recover(work.depth, work.camera, work.labels, work.options)
+def _recover(setup: Setup, work: Work) -> FrameRecovery:
+    with _one_at_a_time:  # workers of a cluster may have several threads
+        return _recoverer(setup).recover(work.depth, work.camera, work.labels, work.options)

@@ -1,0 +1,110 @@
+"""Household things that stand still before a still camera: what a frame costs that follows another, and how good it is.
+
+    python benchmarks/still_scenes.py [--scenes 4] [--frames 16] [--sensor stereo] [--name still_scenes]
+
+Scenes of 1, 5 and 8 things as in :mod:`household_things`, VGA, own masks; each frame has new noise.  After the first
+one, each is recovered alone and with the one before it (``previous``), in turn, in one thread of one process, so that
+what slows the machine slows both.
+
+    alone, following  milliseconds of processor time a frame, medians, and the mean of the latter, which has the frames
+                      in which a body is recovered anew
+    ratio             of the means
+    repeated          share of bodies that were taken from the frame before
+    IoU               of volumes with the true hulls, of things at least half visible; a missed one counts as 0
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+
+if __name__ == "__main__":  # as a script only: a process that imports this has threads already
+    for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
+        os.environ.setdefault(variable, "1")
+
+import time
+from typing import Any
+
+import household_things
+import numpy as np
+import real_scenes
+import report
+import scene_verdict
+import tabletop
+import torch
+
+from sq_perception.recovery.recoverer import FrameRecovery, Recoverer
+from sq_perception.simulation import sensor_noise
+
+COUNTS = (1, 5, 8)
+HEADER = ["things", "alone ms", "following ms", "mean", "ratio", "repeated %", "IoU % alone", "following"]
+
+
+def ious(frame: FrameRecovery, scene: tabletop.Tabletop) -> list[float]:
+    """Of the things that are at least half visible."""
+    labels = scene_verdict.matches(frame.labels, scene.labels)
+    half = [each for each in scene.placed if each.visible_share >= real_scenes.HALF]
+    return [scene_verdict.of_frame(frame, labels.get(each.label, 0), each, scene).iou for each in half]
+
+
+def measured(recoverer: Recoverer, count: int, scenes: int, frames: int, sensor: str) -> dict[str, Any]:
+    """The figures of scenes of so many things."""
+    times: list[tuple[float, float]] = []
+    quality: dict[str, list[float]] = {"alone": [], "following": []}
+    repeated: list[bool] = []
+    for seed in range(scenes):
+        scene = household_things.scene(seed, sensor, count)
+        noise, previous = sensor_noise.preset(tabletop.SENSORS[sensor]), None
+        for number in range(frames):
+            rng = np.random.default_rng([household_things.SEED, seed, count, number])
+            depth = noise.measured(scene.true_depth, scene.camera, rng)
+            moments = [time.process_time()]
+            alone = recoverer.recover(depth, scene.camera)
+            moments.append(time.process_time())
+            following = recoverer.recover(depth, scene.camera, previous=previous)
+            moments.append(time.process_time())
+            if previous is not None:
+                spent = 1e3 * np.diff(moments)
+                times.append((float(spent[0]), float(spent[1])))
+                quality["alone"] += ious(alone, scene)
+                quality["following"] += ious(following, scene)
+                repeated += [body.repeats > 0 for body in following.bodies]
+            previous = following
+    alone_ms, following_ms = np.array(times).T
+    return {
+        "alone": report.spread(alone_ms),
+        "following": report.spread(following_ms),
+        "repeated": float(np.mean(repeated)),
+        "iou": {name: report.spread(np.array(values)) for name, values in quality.items()},
+    }
+
+
+def line(count: int, row: dict[str, Any]) -> list[str]:
+    """A row of the table."""
+    alone, following, iou = row["alone"], row["following"], row["iou"]
+    spent = [f"{alone['median']:.0f}", f"{following['median']:.1f}", f"{following['mean']:.1f}"]
+    ratio = f"{following['mean'] / alone['mean']:.2f}"
+    quality = [f"{100 * iou[name]['mean']:.1f}" for name in ("alone", "following")]
+    return [str(count), *spent, ratio, f"{100 * row['repeated']:.0f}", *quality]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("--scenes", type=int, default=4)
+    parser.add_argument("--frames", type=int, default=16, help="of each scene")
+    parser.add_argument("--sensor", choices=list(tabletop.SENSORS), default="stereo")
+    parser.add_argument("--name", default="still_scenes", help="name of the result files")
+    options = parser.parse_args()
+    torch.set_num_threads(1)
+    recoverer = Recoverer(threads=1)
+    recoverer.warm_up(household_things.scene(0, options.sensor, 1).camera)
+    rows = {}
+    for count in COUNTS:
+        rows[str(count)] = measured(recoverer, count, options.scenes, options.frames, options.sensor)
+        print(" | ".join(line(count, rows[str(count)])), flush=True)
+    table = report.table(HEADER, [line(int(count), row) for count, row in rows.items()])
+    report.write(options.name, {"options": vars(options), "rows": rows}, table)
+
+
+if __name__ == "__main__":
+    main()
