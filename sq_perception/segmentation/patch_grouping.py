@@ -30,8 +30,6 @@ from sq_perception.segmentation.surface_patches import Patches
 
 _HOLLOW_RADIUS = 0.1
 """A patch is hollow if the curvatures of its two directions sum up to more than one by this, metres."""
-_HOLLOW_DEPTH = 0.3
-"""A step down into a hollow is not deeper, metres."""
 _PLANE_ANGLE, _PLANE_DISTANCE = float(np.deg2rad(12)), 0.02
 """Two patches lie in one plane if their normals, and each centre from the other's plane, are no farther apart, radians
 and metres."""
@@ -39,11 +37,16 @@ _LEAST_AREA = 1.6e-3
 """A body that shows less, square metres across the line of sight, and is attached to another, is a part of that."""
 _ATTACHED = 0.03
 """Surfaces no farther apart than this along the line of sight are attached, metres."""
+_HOLLOW_DEPTH = 0.3
+"""A step down into a hollow is not deeper, metres; no vessel on a table is."""
 _FLAT = 0.3
-_CLEARLY = 1.0
+"""What a border scores at which the surface goes on: less than an edge, as noise makes flat borders of folds."""
 _UNKNOWN = 0.1
+"""The same where nothing is told: patches that nothing parts are one body."""
 _SIGHT_SAMPLES = 24
+"""Along a line between two patches; a nearer thing of a tenth of it is met by two or three."""
 _SEEN_THROUGH = 0.1
+"""Share of such a line over which something farther, or nearer, counts: single samples may lie on a smeared edge."""
 
 
 def bodies(patches: Patches, camera: Camera) -> np.ndarray:
@@ -59,13 +62,6 @@ def bodies(patches: Patches, camera: Camera) -> np.ndarray:
     weights += _continued(patches, body, camera)
     body = _contracted(member @ weights @ member.T)[body]
     return _without_fragments(body, areas, joint, _LEAST_AREA)
-
-
-def hollow_share(patches: Patches, body: np.ndarray) -> np.ndarray:
-    """Share (bodies + 1,) of each body's samples that lie on hollow patches; ``body`` is what :func:`bodies` found."""
-    samples = np.bincount(patches.labels.ravel(), minlength=patches.count + 1).astype(float)
-    hollow = np.bincount(body, samples * (patches.curvature > 1 / _HOLLOW_RADIUS))
-    return hollow / np.maximum(np.bincount(body, samples), 1)
 
 
 def _sample_area(patches: Patches, camera: Camera) -> float:
@@ -86,7 +82,7 @@ def _borders(patches: Patches) -> tuple[np.ndarray, ...]:
     known = np.nan_to_num(patches.fold)
     square = np.ones((5, 5), np.uint8)
     concave, convex = cv2.dilate(known, square), -cv2.erode(known, square)
-    fold = np.where((concave > convex) | (concave > _CLEARLY), concave, -convex)
+    fold = np.where(concave > convex, concave, -convex)
     weights, dents, over, joint = np.zeros((4, n * n))
     for here, there in (
         ((slice(None), slice(None, -1)), (slice(None), slice(1, None))),

@@ -41,12 +41,13 @@ from sq_perception.segmentation.support_plane import Plane
 from sq_perception.segmentation.support_surface import SupportSurface
 
 _FOOT_PIXELS = 3
+"""Up to which the foot of a thing reaches below what is clearly above the support."""
 _AROUND = 40
 """Pixels around all that is above the support in which its noise is measured; two of the longest chords at VGA."""
 _LEAST_SIGMA = 5e-4
+"""Noise of the depth at one metre that is assumed at least, metres: rendered images have none."""
 _UNKNOWN_SIGMA = 1.5e-3
-_VESSEL = 0.15
-"""A segment with more hollow surface than this share may be a vessel."""
+"""The same where no support shows it: that of structured light (Khoshelham and Oude Elberink, Sensors 2012)."""
 
 
 @dataclass(frozen=True)
@@ -168,10 +169,12 @@ def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | No
         return Segmentation(labels, None, ids)
     support = support_surface.measured(plane, known, valid, camera, options.plane_tolerance)
     walls = [other for other in planes if other is not plane]
-    labels = _above(known, valid, camera, support, walls, options)
     # What is out of range holds things up and hides them all the same.
     everything, measured = _checked(depth, camera, (0.0, np.inf))
-    test = standing.standing(everything, measured, camera, support, walls, limits)
+    everything = np.where(measured, everything, np.float32(0))
+    relative = support.image_relative(everything, camera)
+    labels = _above(known, relative * valid, valid, camera, support, walls, options)
+    test = standing.standing(everything, relative, camera, support, walls, limits)
     labels, ids = _ordered(labels, least, options.max_objects, test)
     return Segmentation(labels, plane.equation, ids, max(support.sigma, _LEAST_SIGMA))
 
@@ -282,15 +285,15 @@ def _least_pixels(options: SegmentationOptions, depth: np.ndarray) -> int:
 
 def _above(
     known: np.ndarray,
+    relative: np.ndarray,
     valid: np.ndarray,
     camera: Camera,
     support: SupportSurface,
     walls: list[Plane],
     options: SegmentationOptions,
 ) -> np.ndarray:
-    """Bodies (labels from 1, unordered) of what is above the support."""
+    """Bodies (labels from 1, unordered) of what is above the support; heights are 0 where depths are."""
     labels = np.zeros(known.shape, np.int32)
-    relative = support.image_relative(known, camera)
     # Half of the tolerance band is a compromise: bent depth of real cameras stays below, thin objects stay above.
     clear = cv2.blur(relative, (3, 3)) > max(0.5 * options.plane_tolerance, 4 * support.sigma)
     # The mean beside a tall body is that of its height: the pixel itself decides there.
@@ -326,9 +329,8 @@ def _bodies(
     if patches is None:
         return depth_steps.separated(depth, wanted, options.depth_step)
     body = patch_grouping.bodies(patches, camera)
-    vessels = patch_grouping.hollow_share(patches, body) > _VESSEL
     labels = _refined(body[patches.labels].astype(np.int32), patches, depth, wanted, options.depth_step)
-    labels = convex_parts.corrected(labels, depth, camera, sigma, vessels)
+    labels = convex_parts.corrected(labels, depth, camera, sigma)
     # What is too small for a patch stays what the steps made of it.
     rest = cv2.morphologyEx((wanted & (labels == 0)).view(np.uint8), cv2.MORPH_OPEN, depth_steps.CROSS)
     rest = depth_steps.components(rest)

@@ -39,7 +39,7 @@ _GAIN = 1.05
 """A support is bent if that brings so many times the samples within half of the tolerance."""
 _RAMP = float(np.sin(np.deg2rad(30)))
 """Slope against the support up to which it rises; sides of things are steeper where they meet it."""
-_HIGHEST = 5.0
+HIGHEST = 5.0
 """Tolerances that such a rise is high at most."""
 _WIDE = 0.1
 """Share of its largest part that a part of the support has at least."""
@@ -156,7 +156,7 @@ def risen(
     reached = (counts > _WIDE * counts.max())[flat] & (flat > 0)
     if not reached.any():
         return np.zeros(depth.shape, bool)
-    passable = known & (height < _HIGHEST * tolerance) & _shallow(height * noise_growth(z), z, known, width)
+    passable = known & (height < HIGHEST * tolerance) & _shallow(height * noise_growth(z), z, known, width)
     joined = [
         (here, there, np.abs(z[here] - z[there]) < k * step * z[here])
         for here, there in (

@@ -123,6 +123,20 @@ def test_a_low_thing_whose_sides_the_sensor_smooths_is_no_ramp(seed):
     assert overlap(board, found.labels) > 0.7
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_bumps_where_the_noise_is_large_are_no_things(seed, monkeypatch):
+    """A third of a table has ten times the noise of the rest, whose noise alone would make things of its bumps."""
+    table = plane_image(slanted(90), 0.8)
+    v, u = np.indices(table.shape)
+    thing = np.hypot(u - 80, v - 120) < 15
+    waves = cv2.blur(np.random.default_rng(seed).standard_normal(table.shape), (9, 9), borderType=cv2.BORDER_REFLECT)
+    depth = noisy(table - 0.025 * thing, 1e-3, seed) + np.where(u > 210, 0.01 * waves / waves.std(), 0)
+    found = segment(depth.astype(np.float32), CAMERA)
+    assert overlap(thing, found.labels) > 0.8
+    monkeypatch.setattr(standing, "_spread", lambda *_: 0.0)
+    assert 3 * len(found.ids) < len(segment(depth.astype(np.float32), CAMERA).ids)
+
+
 def test_walls_are_furniture_and_faces_of_things_are_not():
     """The same plane holds a wall and, apart from it, the front of a box as a thing may be."""
     wall = support_plane.Plane(np.array([0.0, 0.0, -1.0, 2.0]), 0.5, 1e-3)
