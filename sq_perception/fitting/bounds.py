@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 
 SMALLEST_SIZE = 0.02
-"""Smallest half size, as a share of the observed extent, when the data set the bounds."""
+"""Smallest size, as a share of the observed extent, when the data set the bounds: 6 mm of 30 cm."""
 LARGEST_SIZE = 2.0
-"""Largest half size, likewise: a body may hide a few times more than it shows."""
+"""Largest size, likewise: a body may hide as much again as it shows."""
 WIDEST_EXPONENT = 2.0
-_FREE_MOVE = 4.0
-"""How far, in observed extents, the centre may leave the observed points."""
+"""Beyond, a superquadric is not convex and its gauge no norm."""
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Bounds:
         low, high = points.min(axis=0), points.max(axis=0)
         extent = max(float(np.linalg.norm(high - low)), 1e-9)
         size = self.size if self.size is not None else (SMALLEST_SIZE * extent / 2, LARGEST_SIZE * extent / 2)
-        reach = _FREE_MOVE * max(extent, size[1])
+        reach = math.sqrt(3.0) * max(extent, size[1])  # no point of a body is farther from its centre
         lower = np.concatenate([np.full(3, size[0]), np.full(2, self.shape[0]), low - reach])
         upper = np.concatenate([np.full(3, size[1]), np.full(2, self.shape[1]), high + reach])
         return lower, upper

@@ -34,7 +34,7 @@ from sq_perception.fitting.problem import (
     BASIN_RAYS,
     BASIN_STEPS,
     COARSE_RAYS,
-    ESCALATED_FINALISTS,
+    FINAL_RAYS,
     FINALISTS,
     FIRST_STEPS,
     RIVAL_SLACK,
@@ -53,8 +53,8 @@ from sq_perception.fitting.rays import Rays
 from sq_perception.fitting.residuals import surface_distance
 from sq_perception.fitting.rivals import SIGNIFICANT, alike, other_axes, other_depths
 
-_MORE_RAYS = 1500
-_FINAL_RAYS, _MOST_FINAL_RAYS = 3000, 6000
+_MORE_RAYS, _MOST_FINAL_RAYS = 1500, 6000
+"""Half of and twice :data:`~sq_perception.fitting.problem.FINAL_RAYS`: where few rays tie, and under much noise."""
 _FINE_NOISE = 0.3
 """Noise in pixel widths that the fewest rays of the last stage average out; more noise asks for more, by its square."""
 _OUTLIER = 5.0
@@ -63,7 +63,6 @@ million."""
 _SETTLED, _UNSURE = 1.03, 0.01
 """A last mean squared residual above the one, or a half size less certain than the other, as a share of it, make other
 valleys of the cost worth a look; chosen on benchmarks/single_body."""
-_MOST_VARIATIONS = 2
 _PROMISING = 2.0
 """Mean squared residual after the few steps from a cheap start, above which it is not followed.  Of 42 images that a
 body explains, none left more than 0.8; of 80 that none explains, nine in ten left more than this."""
@@ -86,7 +85,7 @@ def solve(problem: Problem, given: Sequence[State]) -> Solution:
         if _goes_on(problem, finalists):
             found = coarse(problem, starts.everything(problem.observation))
             tried += found
-            finalists = select(problem, found, finalists, ESCALATED_FINALISTS)
+            finalists = select(problem, found, finalists)
         if _goes_on(problem, finalists):
             return tolerant.take_over(problem, finalists[0], [*given, *by_cost(tried)[:_HANDED_OVER]])
     return _decide(problem, finalists)
@@ -145,7 +144,7 @@ def _decide(problem: Problem, finalists: list[State]) -> Solution:
 def _enough_rays(observation: Observation) -> int:
     """Rays that bring the noise of the mean well below a pixel's width."""
     ratio = observation.sigma / observation.footprint
-    return int(np.clip(_FINAL_RAYS * (ratio / _FINE_NOISE) ** 2, _FINAL_RAYS, _MOST_FINAL_RAYS))
+    return int(np.clip(FINAL_RAYS * (ratio / _FINE_NOISE) ** 2, FINAL_RAYS, _MOST_FINAL_RAYS))
 
 
 def _without_outliers(observation: Observation, hits: np.ndarray, state: State) -> np.ndarray:
@@ -192,7 +191,7 @@ def _varied(solution: Solution) -> Solution:
     They go on with the rendered residual: Sampson's would make them grow, as g is convex and noise enters it.
     """
     found: list[State] = []
-    for _ in range(_MOST_VARIATIONS):
+    while True:
         best = solution.state
         unexplained = best.cost > _SETTLED * solution.rays.weight
         unsure = solution.unsure()

@@ -10,6 +10,10 @@ import numpy as np
 
 from sq_perception.geometry.superquadric import Superquadric
 
+INLIER = 3.0
+"""Noise levels: noise alone stays within for 99.7 % of the pixels."""
+FAILED_SHARE = 0.25
+"""Of the smallest half size: a body that half of the points miss by more describes none of its faces."""
 CUT_SHORT = "cut short by the time budget"
 """In the message of a body whose fit had to end before it was done."""
 

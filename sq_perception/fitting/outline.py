@@ -13,11 +13,10 @@ from dataclasses import replace
 import numpy as np
 
 from sq_perception.fitting.levenberg_marquardt import State
-from sq_perception.fitting.problem import BASIN_STEPS, Problem, draw, refine, settle
+from sq_perception.fitting.problem import BASIN_STEPS, FINAL_RAYS, Problem, draw, refine, settle
 from sq_perception.fitting.rays import Rays
 from sq_perception.fitting.residuals import penetration
 
-_RAYS = 3000
 _SHARP = 0.3
 """Standard deviation of a perfect outline, in pixels: the body covers exactly the centres of the mask's pixels, a
 uniform error of up to half a pixel (1 / sqrt(12))."""
@@ -26,6 +25,7 @@ _SHRUNK, _MOST = 0.25, 0.7
 _WIDEST_BAND = 4
 """Pixels of a mask's edge that may be missing."""
 _RING_RAYS = 200
+"""Of a ring around the mask: its quantiles are known to 3 %."""
 _FEWEST = 3
 """Covered rays that it takes to tell a standard deviation."""
 _READINGS, _STEPS, _SHARPER = 4, 6, 0.7
@@ -39,7 +39,7 @@ def without_shrunk_edge(problem: Problem, state: State) -> tuple[Problem, State]
     if _depth_inside(problem, state, full.rim()) < _SHRUNK:
         return problem, state
     problem = replace(problem, observation=full.beyond(_WIDEST_BAND))
-    state = refine(problem, state, draw(problem, _RAYS, 0.6), BASIN_STEPS)
+    state = refine(problem, state, draw(problem, FINAL_RAYS, 0.6), BASIN_STEPS)
     rings = (k for k in range(1, _WIDEST_BAND + 1) if _depth_inside(problem, state, full.ring(k)) < _SHRUNK)
     band = next(rings, _WIDEST_BAND + 1) - 1
     return replace(problem, observation=full.beyond(band) if band > 0 else full), state

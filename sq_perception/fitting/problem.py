@@ -33,6 +33,9 @@ BASIN_RAYS, BASIN_STEPS = 300, 15
 FIRST_STEPS = 5
 """Steps after which a rival that costs far more than the body at hand is given up."""
 REFINE_STEPS = 15
+FINAL_RAYS = 3000
+"""An error of the depth by a third of a pixel's width averages out to a two hundredth: chosen on
+benchmarks/single_body, like those above."""
 FREE_SHARE = 0.25
 """Free rays per object ray: an outline has fewer pixels than an area."""
 TOLERANCE, FINAL_TOLERANCE = 1e-3, 1e-4
@@ -45,8 +48,8 @@ DOUBT = 25.0
 of them, bodies go on together,"""
 RIVAL = 1.3
 """and so do those within this factor of the best, as they have not converged yet."""
-FINALISTS, ESCALATED_FINALISTS = 3, 6
-"""Bodies that go on from a selection, and from one among starts of every kind; chosen on benchmarks/single_body."""
+FINALISTS = 3
+"""Bodies that go on from a selection; chosen on benchmarks/single_body."""
 RIVAL_SLACK = 4.0
 """Cost that few rays may hide: one such standard deviation."""
 INDEPENDENT_RAYS = 50.0
@@ -224,15 +227,13 @@ def coarse(problem: Problem, starts: Iterable[State]) -> list[State]:
     return found
 
 
-def select(
-    problem: Problem, candidates: Sequence[State], kept: Sequence[State] = (), most: int = FINALISTS
-) -> list[State]:
+def select(problem: Problem, candidates: Sequence[State], kept: Sequence[State] = ()) -> list[State]:
     """The best of some candidates, refined, and of those kept before: at most FINALISTS, best first."""
     rays = draw(problem, BASIN_RAYS, 0.7)
     for stage in (SAMPSON, RENDERED):
         candidates = [
             _minimized(problem, stage, candidate, rays, BASIN_STEPS, TOLERANCE)
-            for candidate in within_doubt(candidates)[:most]
+            for candidate in within_doubt(candidates)[:FINALISTS]
         ]
     return within_doubt([*kept, *candidates])[:FINALISTS]
 

@@ -7,19 +7,17 @@ import time
 import numpy as np
 
 from sq_perception.fitting.covariance import carried_over, spread, undetermined
-from sq_perception.fitting.fit import CUT_SHORT, Fit, Status
+from sq_perception.fitting.fit import CUT_SHORT, FAILED_SHARE, INLIER, Fit, Status
 from sq_perception.fitting.observation import OUTLIER_SHARE, Observation, span
 from sq_perception.fitting.problem import Solution
 from sq_perception.fitting.residuals import surface_distance
 from sq_perception.geometry.superquadric import Superquadric
 
-_INLIER = 3.0
-"""Noise levels: noise alone stays within for 99.7 % of the pixels."""
 _RAYS = 800
 """Enough for a share to one or two percent."""
-_FAILED_SHARE, _FAILED_LEVELS = 0.25, 3.0
-"""Of the smallest half size, and in levels of noise and model error: a body that half of the points miss by more than
-both is none.  Of a plate or a pen, a quarter of the thickness is less than what any thing strays."""
+_FAILED_LEVELS = 3.0
+"""Levels of noise and model error that half of the points of a failed body miss it by besides: of a plate or a pen, a
+quarter of the thickness is less than what any thing strays."""
 _REACHED = 0.9
 """Of the points of a thing that was fitted as a hull: what the rest sticks out tells whether the body encloses it."""
 _AXES = "xyz"
@@ -35,9 +33,9 @@ def assessed(solution: Solution, began: float) -> Fit:
     everything = observation.object_rays(_RAYS)
     outside = surface_distance(everything, state.parameters, state.rotation)
     distance = np.abs(outside)
-    inlying = distance < _INLIER * observation.sigma
+    inlying = distance < INLIER * observation.sigma
     typical = float(np.median(distance))
-    kept = distance < max(_INLIER * observation.sigma, _INLIER * typical)
+    kept = distance < max(INLIER * observation.sigma, INLIER * typical)
     residual = float(np.sqrt(np.mean(distance[kept] ** 2))) if kept.any() else typical
     if solution.as_hull:
         # A hollow thing lies inside its hull: only what sticks out speaks against the body.
@@ -84,7 +82,7 @@ def failed(body: Superquadric, observation: Observation, reason: str, began: flo
 def _status(body: Superquadric, covariance: np.ndarray, typical: float, strays: float) -> tuple[Status, str]:
     """The status and its reason, without lengths: only the reader of the image knows their unit."""
     smallest = float(body.size.min())
-    if typical > max(_FAILED_SHARE * smallest, strays):
+    if typical > max(FAILED_SHARE * smallest, strays):
         off = f"{typical / smallest:.0%} of its smallest half size"
         return Status.FAILED, f"no superquadric found: many of the points lie {off} and more off the best one"
     weak = [_AXES[k] for k in np.flatnonzero(undetermined(covariance, body.size))]

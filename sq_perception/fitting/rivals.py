@@ -16,6 +16,7 @@ from sq_perception.fitting.levenberg_marquardt import State
 SIGNIFICANT = 0.5
 """A difference of costs, by which one body is exp(0.25) = 1.3 times as likely as the other; smaller ones are ties."""
 _ALIKE = 0.01
+"""Half sizes that differ by less than this share are the same."""
 
 
 def alike(one: State, other: State) -> bool:

@@ -31,6 +31,7 @@ _FACE_SHARE = 0.04
 _DEAD_ZONE = math.sqrt(3.0) * 1.01
 """Half a step in standard deviations q / sqrt(12) of its noise, and a little for single precision."""
 _RAYS, _STEPS, _TOLERANCE = 1000, 12, 1e-3
+"""Of the search for each of up to 21 bodies, which begins at a neighbour's."""
 _PACES = (1.05, 1.08, 1.12, 1.18, 1.25, 1.25, 1.25, 1.25, 1.25, 1.25)
 """Factors from one half size to the next, up and down from the one at hand."""
 _UNLIKELY = 12.0
@@ -40,9 +41,8 @@ _ALLOWED = 3.0
 _CERTAIN = 0.02
 """A standard deviation of the log size below this leaves nothing open."""
 _OPEN = 0.1
-"""Above this, the mean of all bodies replaces the one of least squares."""
-_VERY_OPEN = 0.1
-"""Without rounding, a half size less certain than this share of it is walked along."""
+"""A half size less certain than this share of it: the mean of all bodies replaces the one of least squares; without
+rounding, it is walked along."""
 _FACE_SPREAD = 1.5
 """Of the other standard deviations: all readings of a face err alike."""
 
@@ -55,7 +55,7 @@ def spread_along_view(solution: Solution) -> Solution:
         solution = replace(solution, state=best)
         if allowed:
             solution = replace(solution, alternatives=tuple(allowed), spread_factor=_FACE_SPREAD**2)
-    elif quantum == 0 and (solution.unsure() > _VERY_OPEN).any():
+    elif quantum == 0 and (solution.unsure() > _OPEN).any():
         solution = replace(solution, alternatives=tuple(uncertain(solution)))
     return solution
 

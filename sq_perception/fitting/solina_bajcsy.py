@@ -28,21 +28,19 @@ import time
 import numpy as np
 
 from sq_perception.fitting.bounds import Bounds
-from sq_perception.fitting.fit import Fit, Status
+from sq_perception.fitting.fit import FAILED_SHARE, INLIER, Fit, Status
 from sq_perception.fitting.levenberg_marquardt import State, minimize
+from sq_perception.fitting.options import MIN_PIXELS
 from sq_perception.fitting.rays import DEPTH, LAST, ORIGIN_X, ORIGIN_Y, RAY_COLUMNS, STIFFNESS, WEIGHT
 from sq_perception.fitting.residuals import CLASSIC
 from sq_perception.fitting.terms import Terms
 from sq_perception.geometry import rotation as quaternions
 
-MIN_POINTS = 12
 _NO_FREE_SPACE = np.empty((0, RAY_COLUMNS))
 _UNIT = 0.01
 """Residuals count in this share of the extent to the power 3/2, which makes the damping independent of units."""
-_FAILED_SHARE = 0.25
 _ESCAPE = 0.3
 """Standard deviation of a disturbance: of log sizes, exponents, angles, and of the centre in mean half sizes."""
-_INLIER = 3.0
 
 
 def fit(
@@ -95,8 +93,8 @@ def fit(
     extent = float(np.linalg.norm(np.ptp(points, axis=0)))
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     reason = ""
-    if len(points) < MIN_POINTS:
-        reason = f"{len(points)} points; a fit needs {MIN_POINTS}"
+    if len(points) < MIN_PIXELS:
+        reason = f"{len(points)} points; a fit needs {MIN_PIXELS}"
     elif spread[1] < 1e-3 * spread[0] or spread[1] == 0:
         reason = "the points lie on one line"
     state = start
@@ -115,7 +113,7 @@ def fit(
     body = state.body.canonical_form()
     distance = np.abs(body.sampson_distance(points))
     residual = float(np.sqrt(np.mean(distance**2)))
-    if not reason and float(np.median(distance)) > _FAILED_SHARE * float(body.size.min()):
+    if not reason and float(np.median(distance)) > FAILED_SHARE * float(body.size.min()):
         off = float(np.median(distance) / body.size.min())
         reason = f"no superquadric found: half of the points lie more than {off:.0%} of its smallest half size off"
     return Fit(
@@ -124,7 +122,7 @@ def fit(
         status=Status.FAILED if reason else Status.CONVERGED,
         message=reason or "converged",
         noise=residual,
-        inlier_share=float(np.mean(distance <= _INLIER * residual)),
+        inlier_share=float(np.mean(distance <= INLIER * residual)),
         iterations=state.iterations,
         milliseconds=(time.perf_counter() - began) * 1e3,
     )

@@ -27,9 +27,11 @@ from sq_perception.geometry.kernels import kernel
 
 MOMENT_SHARE = 0.27
 START_EXPONENT = 0.5
+"""Both between those of an ellipsoid (0.2, 1) and of a box (1/3, 0)."""
 _RANK = 4
 """The centre's depth is the largest mean depth but for this many pairs, in case of a stray pixel."""
 _MOST_PAIRS = 2500
+"""Enough for second moments to 2 %."""
 _EIGHTH_TURN = math.pi / 4
 ORDERS = ((1, 2, 0), (2, 0, 1), (0, 1, 2))
 """Which of three right-handed axes are x, y and z, so that each is z once."""

@@ -17,7 +17,8 @@ points behind its surface count by Cauchy's loss, and the space within the outli
 object then counts as INDEPENDENT_OF_PREDICTED / max(1, c / EXPLAINED) rays, c their mean loss: the variance of the
 model's error is not known beforehand, and the likelihood that is largest over it divides by what is found.
 
-1. Starts: the given bodies (the prediction), and boxes on the plane, or along the points' axes without one.
+1. Starts: the given bodies (the prediction), and boxes on the plane, or along the points' axes without one; where
+   nothing is predicted, deeper ones too.
 2. A few steps from each on few rays; more from the best, which tells c.
 3. To the end, on all rays, from the best one or two.
 4. Without a prediction: what is hollow or notched, once more as its convex hull; and all the same as a body of
@@ -38,6 +39,8 @@ from sq_perception.fitting import box_start, revolution, unseen
 from sq_perception.fitting.depth_noise import MEDIAN_TO_SIGMA
 from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.problem import (
+    COARSE_RAYS,
+    FINAL_RAYS,
     INDEPENDENT_RAYS,
     VOLUME_PRICE,
     Problem,
@@ -50,14 +53,20 @@ from sq_perception.fitting.problem import (
 )
 from sq_perception.fitting.rays import STIFFNESS, Rays
 from sq_perception.fitting.residuals import surface_distance
+from sq_perception.fitting.symmetry_start import ORDERS
 
 INDEPENDENT_OF_PREDICTED, EXPLAINED = 100.0, 0.5
 """Most rays that an object counts for beside a predicted hull, and the mean loss up to which it does: what cartons and
 cans leave.  Chosen on benchmarks/household_things: 200 rays gain on boxes what bottles lose, 50 the other way."""
-_FEW, _RAYS = 150, 800
-_KEPT = 4
+_RAYS = 800
+"""Of the last steps: eight times the independent ones, so that which are drawn hardly matters."""
+_KEPT, _KEPT_OF_PREDICTED = 4, 2
+"""Starts that go on from the first few steps.  Beside a predicted hull, more changed nothing on
+benchmarks/household_things, and neither did the deeper boxes."""
 _FIRST_STEPS, _MORE_STEPS, _LAST_STEPS = 5, 12, 40
-_LEFT_OVER_RAYS, _LOSS_RAYS = 3000, 400
+"""To tell valleys apart, to come near their floor, and at most: most searches end before."""
+_LOSS_RAYS = 400
+"""Enough for a mean to 5 %."""
 _HOLLOW = 3.0
 """Noise levels that the points of a solid thing typically stray at the most.  Where nothing is predicted, what is more
 hollow or notched than that, such as a bowl or a pair of pliers, is fitted as its hull instead."""
@@ -76,7 +85,8 @@ def solve(problem: Problem, given: Sequence[State]) -> Solution:
     problem = _with_priors(problem)
     points, plane = problem.observation.points, problem.options.plane
     boxes = box_start.principal(points) if plane is None else box_start.on_plane(points, plane)
-    starts = [*given, *boxes]
+    # How far a box goes on behind what was seen, the prediction says.
+    starts = [*given, *(boxes[: len(ORDERS)] if problem.is_predicted else boxes)]
     solution = _best(problem, starts)
     if problem.is_predicted:
         if _mean_loss(problem, solution.state) > _typical_of_hollow(problem):
@@ -88,13 +98,14 @@ def solve(problem: Problem, given: Sequence[State]) -> Solution:
 
 
 def _best(problem: Problem, starts: Sequence[State]) -> Solution:
-    few = draw(problem, _FEW, 0.7)
+    few = draw(problem, COARSE_RAYS, 0.7)
     begun = _tried(problem, starts, few, _FIRST_STEPS)
-    settled = _tried(problem, begun[:_KEPT], few, _MORE_STEPS)
+    kept = _KEPT_OF_PREDICTED if problem.is_predicted else _KEPT
+    settled = _tried(problem, begun[:kept], few, _MORE_STEPS)
     if problem.is_predicted and not problem.late:
         misfit = max(1.0, _mean_loss(problem, settled[0]) / EXPLAINED)
         problem = replace(problem, independent=INDEPENDENT_OF_PREDICTED / misfit)
-        settled = _tried(problem, settled[:2], draw(problem, _FEW, 0.7), _MORE_STEPS)
+        settled = _tried(problem, settled[:2], draw(problem, COARSE_RAYS, 0.7), _MORE_STEPS)
     rays = draw(problem, problem.options.pixels or _RAYS, 0.3)
     return Solution(problem, refined_best(problem, settled, rays, _LAST_STEPS), rays, spread_factor=_SPREAD)
 
@@ -122,7 +133,7 @@ def _hollow_as_hull(solution: Solution, starts: Sequence[State]) -> Solution:
 
 def take_over(problem: Problem, best: State, given: Sequence[State]) -> Solution:
     """The same where an exact body was sought in vain: what ``best`` leaves becomes the model error."""
-    hits = problem.observation.object_rays(_LEFT_OVER_RAYS)
+    hits = problem.observation.object_rays(FINAL_RAYS)
     distance = np.abs(surface_distance(hits, best.parameters, best.rotation))
     left_over = MEDIAN_TO_SIGMA * float(np.median(distance))
     observation = problem.observation.coarsened(left_over)
