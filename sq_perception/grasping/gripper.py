@@ -129,29 +129,32 @@ ROBOTIQ_2F_85 = Gripper(
     opening=0.085,
     finger_width=0.022,
     finger_thickness=0.014,
-    tip=0.018,
-    palm=0.050,
-    hand=(0.075, 0.150, 0.095),
+    tip=0.019,
+    palm=0.0335,
+    hand=(0.075, 0.165, 0.108),
     force=100.0,
     link="robotiq_85_base_link",
-    link_from_tcp=((0.0, 0.0, 0.145), _QUARTER_TURN),
+    link_from_tcp=((0.0, 0.0, 0.1415), _QUARTER_TURN),
 )
-"""Robotiq 2F-85.  Stroke 85 mm, 20 to 235 N, pads of 22 x 37.5 mm: its manual.  Thickness, palm and hand enclose the
-linkage at any opening, to half a centimetre; the TCP is for parallel pads at mid stroke and moves by 14 mm over it."""
+"""Robotiq 2F-85.  Stroke 85 mm, 20 to 235 N: its manual.  The rest follows from the joints in ROS-Industrial's model of
+it (robotiq_2f_85_gripper_visualization): pads of 22 x 37.5 mm; their middle, the TCP, at half of the stroke, from which
+it moves by -11 and +3 mm when the gripper opens and closes; the hand reaches 10 mm beyond the joints of the fingers
+when they are wide open.  The thickness of a finger, to half a centimetre, is that of its end."""
 
 ROBOTIQ_2F_140 = Gripper(
     name="robotiq_2f_140",
     opening=0.140,
     finger_width=0.027,
     finger_thickness=0.018,
-    tip=0.025,
-    palm=0.095,
-    hand=(0.075, 0.200, 0.110),
+    tip=0.0325,
+    palm=0.0535,
+    hand=(0.075, 0.210, 0.141),
     force=100.0,
     link="robotiq_140_base_link",
-    link_from_tcp=((0.0, 0.0, 0.205), (0.0, 0.0, 0.0, 1.0)),
+    link_from_tcp=((0.0, 0.0, 0.1945), (0.0, 0.0, 0.0, 1.0)),
 )
-"""Robotiq 2F-140.  Stroke 140 mm, 10 to 125 N: its manual; the rest as for the 2F-85, to a centimetre."""
+"""Robotiq 2F-140.  Stroke 140 mm, 10 to 125 N: its manual; the rest as for the 2F-85: pads of 27 x 65 mm; the TCP moves
+by -18 and +6 mm."""
 
 GRIPPERS: Mapping[str, Gripper] = MappingProxyType({one.name: one for one in (PANDA, ROBOTIQ_2F_85, ROBOTIQ_2F_140)})
 
