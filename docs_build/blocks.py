@@ -201,6 +201,30 @@ def latency() -> str:
     ) + measured("node_latency")
 
 
+def still() -> str:
+    """What a frame of things that stand still costs after another one."""
+    return table(
+        [
+            "things",
+            "processor ms alone",
+            "after another, median / mean",
+            "taken from it %",
+            "IoU % alone",
+            "after another",
+        ],
+        [
+            [
+                count,
+                f"{row['alone']['median']:.0f}",
+                f"{row['following']['median']:.1f} / {row['following']['mean']:.1f}",
+                f"{100 * row['repeated']:.0f}",
+                *(f"{100 * row['iou'][name]['mean']:.1f}" for name in ("alone", "following")),
+            ]
+            for count, row in results("still_scenes")["rows"].items()
+        ],
+    ) + measured("still_scenes")
+
+
 def tracks() -> str:
     """Errors of sizes of tracked bodies by frame, per cent."""
     frames = ("1", "10", "30", "300")
@@ -381,6 +405,7 @@ BLOCKS: dict[str, Callable[[], str]] = {
         frame_time,
         speed,
         latency,
+        still,
         picking,
         tracks,
         layers,
