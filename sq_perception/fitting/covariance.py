@@ -37,9 +37,7 @@ def covariance_at(state: State, rays: Rays, terms: Terms, outline: float) -> np.
     ``outline`` is the standard deviation of the outline, metres.
     """
     stride = max(1, len(rays.hits) // _RAYS)
-    hits, free = (np.ascontiguousarray(part[::stride]) for part in rays)
-    hits[:, WEIGHT] *= stride
-    free[:, WEIGHT] *= stride
+    hits, free = rays.every(stride).weighing(stride)
     sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
     terms = terms._replace(outline_stiffness=1 / outline)
     cost = evaluate(RENDERED, hits, free, terms, state.parameters, state.rotation, sums)

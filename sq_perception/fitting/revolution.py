@@ -60,7 +60,7 @@ _START_EXPONENT = 0.4
 def weighed(solution: Solution) -> Solution:
     """The body of revolution where it describes the image better, unless the image leaves nothing open."""
     problem, free, rays = solution.problem, solution.state, solution.rays
-    if (solution.unsure() < OPEN).all() and free.cost < EXPLAINED * rays.weight:
+    if free.cost < EXPLAINED * rays.weight and (solution.unsure() < OPEN).all():
         return solution
     round_ = problem.with_terms(roundness_stiffness=1 / SIGMA)
     starts = from_body(free)
