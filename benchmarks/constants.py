@@ -91,7 +91,7 @@ FIXED = {
 """Numbers that cannot be varied."""
 
 
-class Outcome(NamedTuple):
+class Measured(NamedTuple):
     """The results of a fixed set: numbers that are compared to the bit, and one that says how good they are."""
 
     results: list[bytes]
@@ -196,7 +196,7 @@ def single_images() -> list[tuple[Superquadric, single_body.Image]]:
     return made
 
 
-def of_tables(own: bool) -> Outcome:
+def of_tables(own: bool) -> Measured:
     """Every thing of the tables; one that is missed or failed has an IoU of 0."""
     results, ious = [], []
     for scene in tables():
@@ -209,16 +209,16 @@ def of_tables(own: bool) -> Outcome:
             results.append(answer.body.tobytes() + answer.status.encode() + answer.message.encode())
         if own:
             results.append(frame.labels.tobytes())
-    return Outcome(results, 100 * float(np.mean(ious)))
+    return Measured(results, 100 * float(np.mean(ious)))
 
 
-def of_single_images() -> Outcome:
+def of_single_images() -> Measured:
     fits = [surface_fit.fit(image.depth, image.mask, image.camera) for _, image in single_images()]
     bodies = Superquadric.stack([fit.superquadric for fit in fits])
     iou = metrics.volume_iou(bodies, Superquadric.stack([body for body, _ in single_images()]))
     iou *= np.array([fit.status != Status.FAILED for fit in fits])
     results = [fit.superquadric.to_flat().tobytes() + fit.covariance.tobytes() + fit.message.encode() for fit in fits]
-    return Outcome(results, 100 * float(iou.mean()))
+    return Measured(results, 100 * float(iou.mean()))
 
 
 class Seen(NamedTuple):
@@ -254,7 +254,7 @@ def tracked_frames() -> list[tuple[tracking.View, list[Seen], list[Superquadric]
     return made
 
 
-def of_tracked_frames() -> Outcome:
+def of_tracked_frames() -> Measured:
     """Quality is the mean error of half sizes, per cent."""
     session, results, errors, stamp = TrackingSession(), [], [], 0.0
     for number, gap in enumerate(PASSES):
@@ -267,17 +267,17 @@ def of_tracked_frames() -> Outcome:
                 results.append(one.superquadric.to_flat().tobytes() + one.covariance.tobytes() + str(one.id).encode())
                 errors.append(np.abs(tracking.size_errors(one.superquadric, truth)[0]).mean())
             results.append(str(session.hidden).encode())
-    return Outcome(results, 100 * float(np.mean(errors)))
+    return Measured(results, 100 * float(np.mean(errors)))
 
 
-SETS: dict[str, dict[str, Callable[[], Outcome]]] = {
+SETS: dict[str, dict[str, Callable[[], Measured]]] = {
     "fitting": {"single bodies": of_single_images, "things": partial(of_tables, False)},
     "segmentation": {"things": partial(of_tables, True)},
     "tracking": {"tracked": of_tracked_frames},
 }
 
 
-def compared(now: Outcome, usual: Outcome) -> dict[str, float]:
+def compared(now: Measured, usual: Measured) -> dict[str, float]:
     """The share of results that are other ones, and how much better they are."""
     same = sum(one == other for one, other in zip(now.results, usual.results, strict=False))
     return {"changed": 1 - same / len(usual.results), "difference": now.quality - usual.quality}
@@ -363,7 +363,7 @@ def _is_number(value: Any) -> bool:
 # The run
 
 
-def row(constant: Constant, usual: dict[str, Outcome]) -> dict[str, Any]:
+def row(constant: Constant, usual: dict[str, Measured]) -> dict[str, Any]:
     """What both sides of a constant change, by part of the fixed set."""
     value, frozen = constant.value, _frozen_in(constant) if not constant.field else set()
     found: dict[str, Any] = {"value": np.asarray(value).tolist(), "sides": {}}
@@ -422,7 +422,7 @@ def main() -> None:
         if module.name.split(".")[1] in SETS:
             importlib.import_module(module.name)
     result: dict[str, Any] = report.previous(options.name, "constants")
-    usual: dict[str, dict[str, Outcome]] = {}
+    usual: dict[str, dict[str, Measured]] = {}
     for room in SETS:
         for constant in constants(room):
             wanted = any(f"{constant.key}.".startswith(f"{each}.") for each in options.only)

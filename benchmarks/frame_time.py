@@ -34,7 +34,7 @@ import numba
 import numpy as np
 import report
 import torch
-from synthetic_tabletop import STAGES, Frame, scored
+from synthetic_tabletop import STAGES, SensedScene, scored
 
 from sq_perception.geometry import Superquadric
 from sq_perception.geometry import rotation as quaternions
@@ -135,7 +135,7 @@ def bodies_on_a_table(count: int, number: int) -> tuple[Superquadric, np.ndarray
     raise RuntimeError(f"no room for {count} bodies on the table")
 
 
-def frame(count: int, number: int, seen_by: Camera, sensor: str) -> Frame:
+def frame(count: int, number: int, seen_by: Camera, sensor: str) -> SensedScene:
     """Scene ``number`` of ``count`` bodies through a sensor."""
     bodies, plane = bodies_on_a_table(count, number)
     scene = Scene(bodies, seen_by, plane)
@@ -143,10 +143,10 @@ def frame(count: int, number: int, seen_by: Camera, sensor: str) -> Frame:
     alone = np.array([np.count_nonzero(raycast.render(body, seen_by)[1] >= 0) for body in bodies])
     visible = np.bincount(labels.ravel(), minlength=count + 1)[1:] / np.maximum(alone, 1)
     depth = sensor_noise.preset(sensor).measured(depth, seen_by, np.random.default_rng([SEED, count, number, 1]))
-    return Frame(scene, depth, np.where(np.isfinite(depth), labels, 0), visible)
+    return SensedScene(scene, depth, np.where(np.isfinite(depth), labels, 0), visible)
 
 
-def measured(recoverer: Recoverer, frames: list[Frame], setting: str, repeats: int) -> dict[str, Any]:
+def measured(recoverer: Recoverer, frames: list[SensedScene], setting: str, repeats: int) -> dict[str, Any]:
     """Times and accuracy of one row."""
     masks, options = SETTINGS[setting]
     before = Busy.now()

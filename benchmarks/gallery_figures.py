@@ -13,7 +13,7 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
-from gallery_scenes import Stood, View
+from gallery_scenes import ComposedView, Stood
 from hull_oracle import Columns
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
@@ -64,7 +64,7 @@ def recoverer() -> Recoverer:
     return Recoverer()
 
 
-def matched(view: View, frame: FrameRecovery) -> list[MatchedThing]:
+def matched(view: ComposedView, frame: FrameRecovery) -> list[MatchedThing]:
     """Each thing with its body."""
     iou = np.zeros((len(view.things), len(frame.recovered)))
     for k in range(len(view.things)):
@@ -84,7 +84,7 @@ def matched(view: View, frame: FrameRecovery) -> list[MatchedThing]:
     ]
 
 
-def scene_figure(view: View, frame: FrameRecovery, azimuth: float = 35.0, elevation: float = 24.0) -> Figure:
+def scene_figure(view: ComposedView, frame: FrameRecovery, azimuth: float = 35.0, elevation: float = 24.0) -> Figure:
     """The three panels of one scene."""
     figure = new_figure(11.8, 3.55)
     axes = figure.subplots(1, 3, gridspec_kw={"wspace": 0.028, "width_ratios": [ASPECT, ASPECT, 1.0]})
@@ -112,7 +112,7 @@ def scene_figure(view: View, frame: FrameRecovery, azimuth: float = 35.0, elevat
     return figure
 
 
-def empty_figure(views: Sequence[View]) -> Figure:
+def empty_figure(views: Sequence[ComposedView]) -> Figure:
     """What each sensor makes of a table with nothing on it."""
     figure = new_figure(11.62, 2.42)
     axes = figure.subplots(1, len(views), gridspec_kw={"wspace": 0.025})
@@ -126,7 +126,7 @@ def empty_figure(views: Sequence[View]) -> Figure:
     return figure
 
 
-def _window(view: View) -> tuple[float, float, float, float]:
+def _window(view: ComposedView) -> tuple[float, float, float, float]:
     """Left, right, top, bottom of the part of the image with the things, in the proportions of a panel."""
     rows, columns = np.nonzero(view.labels)
     low = np.array([columns.min(), rows.min()], dtype=float) - _MARGIN
@@ -138,7 +138,7 @@ def _window(view: View) -> tuple[float, float, float, float]:
     return middle[0] - half[0], middle[0] + half[0], middle[1] - half[1], middle[1] + half[1]
 
 
-def _limits(view: View) -> tuple[float, float]:
+def _limits(view: ComposedView) -> tuple[float, float]:
     """Nearest and farthest depth of the scale: those of the things, and a little behind them."""
     near, far = np.nanquantile(view.depth[view.labels > 0], (0.005, 0.995))
     return float(near) - _BEFORE, float(far) + _BEHIND
@@ -149,7 +149,7 @@ def panel_title(ax: Axes, text: str, detail: str) -> None:
     ax.set_title(detail, loc="right", fontsize=8.5, color=FAINT, pad=4)
 
 
-def _box_around(view: View, k: int) -> Superquadric:
+def _box_around(view: ComposedView, k: int) -> Superquadric:
     """A thing's box in its own frame."""
     hull, (rotation, translation) = view.things[k].thing.hull, view.poses[k]
     low, high = hull.min(axis=0), hull.max(axis=0)
@@ -157,7 +157,7 @@ def _box_around(view: View, k: int) -> Superquadric:
     return Superquadric((high - low) / 2, np.full(2, 0.1), middle, quaternions.from_matrix(rotation))
 
 
-def _cage(view: View, k: int) -> list[np.ndarray]:
+def _cage(view: ComposedView, k: int) -> list[np.ndarray]:
     """Lines (n, 3) in the optical frame that show a thing: edges of a box, rims and sides of a body of revolution."""
     thing = view.things[k].thing
     rotation, translation = view.poses[k]

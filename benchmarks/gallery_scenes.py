@@ -35,7 +35,7 @@ class Stood:
 
 
 @dataclass(frozen=True, eq=False)
-class View:
+class ComposedView:
     """A composed scene through a sensor.
 
     Attributes
@@ -66,7 +66,9 @@ class View:
         return self.things[k].thing.hull @ rotation.T + translation
 
 
-def viewed(things: Sequence[Stood], sensor: str, down: float = 40.0, distance: float = 0.75, seed: int = 0) -> View:
+def viewed(
+    things: Sequence[Stood], sensor: str, down: float = 40.0, distance: float = 0.75, seed: int = 0
+) -> ComposedView:
     """Things on a table whose middle is ``distance`` metres away, looked down on by ``down`` degrees.
 
     Raises
@@ -100,7 +102,7 @@ def viewed(things: Sequence[Stood], sensor: str, down: float = 40.0, distance: f
         alone.append(np.isfinite(own).sum())
     visible = np.bincount(labels.ravel(), minlength=len(things) + 1)[1:] / np.maximum(alone, 1)
     measured = sensor_noise.preset(sensor).measured(depth, camera, np.random.default_rng(seed))
-    return View(camera, sensor, measured, labels, plane, tuple(things), tuple(poses), visible)
+    return ComposedView(camera, sensor, measured, labels, plane, tuple(things), tuple(poses), visible)
 
 
 def carton(width: float, depth: float, height: float) -> MeshThing:

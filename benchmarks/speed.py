@@ -67,7 +67,7 @@ class Work:
     labels: np.ndarray | None
     masks: np.ndarray
     method: Method
-    seen: frame_time.Frame | None
+    seen: frame_time.SensedScene | None
     truth: Any
 
     def iou(self, found: FrameRecovery) -> float:

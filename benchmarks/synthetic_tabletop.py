@@ -59,7 +59,7 @@ SETTINGS: dict[str, tuple[bool, RecoveryOptions]] = {
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
+class SensedScene:
     """A scene as the sensor sees it.
 
     Attributes
@@ -77,7 +77,7 @@ class Frame:
 
 
 @dataclass(frozen=True)
-class Score:
+class FrameScore:
     """One frame: IoU of each true body that is half visible, of its mask, and what was invented."""
 
     ious: tuple[float, ...]
@@ -86,7 +86,7 @@ class Score:
     milliseconds: dict[str, float]
 
 
-def frame(number: int, sensor: str) -> Frame:
+def frame(number: int, sensor: str) -> SensedScene:
     """Scene ``number`` through a sensor."""
     rng = np.random.default_rng([SEED, number])
     scene = crowded_scene(rng, int(rng.integers(BODIES[0], BODIES[1] + 1)))
@@ -98,10 +98,10 @@ def frame(number: int, sensor: str) -> Frame:
     else:
         depth = sensor_noise.preset(sensor).measured(depth, scene.camera, rng)
     depth = depth.astype(np.float32)
-    return Frame(scene, depth, np.where(np.isfinite(depth), labels, 0), seen / np.maximum(whole, 1))
+    return SensedScene(scene, depth, np.where(np.isfinite(depth), labels, 0), seen / np.maximum(whole, 1))
 
 
-def scored(seen: Frame, found: FrameRecovery) -> Score:
+def scored(seen: SensedScene, found: FrameRecovery) -> FrameScore:
     """Compare what was recovered with the truth."""
     truth, bodies = list(seen.scene.bodies), found.recovered
     iou, mask = np.zeros((2, len(truth), len(bodies)))
@@ -117,7 +117,7 @@ def scored(seen: Frame, found: FrameRecovery) -> Score:
     real = np.zeros(len(bodies), bool)
     real[columns] = iou[rows, columns] >= FALSE
     half = seen.visible >= HALF
-    return Score(
+    return FrameScore(
         tuple(best[half].tolist()), tuple(seen_iou[half].tolist()), int(np.count_nonzero(~real)), found.milliseconds
     )
 
@@ -129,7 +129,7 @@ def _volume_iou(body: Superquadric, truth: Superquadric) -> float:
     return float(metrics.volume_iou(body, truth))
 
 
-def figures(scores: list[Score]) -> dict[str, Any]:
+def figures(scores: list[FrameScore]) -> dict[str, Any]:
     """Pooled over all bodies of all frames."""
     ious, masks = (np.concatenate([getattr(each, name) for each in scores]) for name in ("ious", "masks"))
     return {
@@ -189,7 +189,7 @@ def main() -> None:
     result: dict[str, Any] = {}
     rows = []
     for sensor in options.sensors:
-        scores: dict[str, list[Score]] = {name: [] for name in options.settings}
+        scores: dict[str, list[FrameScore]] = {name: [] for name in options.settings}
         recoverer.warm_up(frame(0, sensor).scene.camera)
         for number in range(options.first, options.first + options.scenes):
             seen = frame(number, sensor)

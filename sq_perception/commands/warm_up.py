@@ -31,8 +31,10 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
     from sq_perception.fitting import solina_bajcsy, surface_fit
     from sq_perception.geometry import metrics
     from sq_perception.geometry.superquadric import Superquadric
+    from sq_perception.grasping import planner
     from sq_perception.imaging import raycast
     from sq_perception.imaging.camera import Camera
+    from sq_perception.recovery.recoverer import Recoverer
     from sq_perception.segmentation import convex_parts
     from sq_perception.simulation import view_rendering
 
@@ -47,4 +49,6 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
         ("classic fit", lambda: solina_bajcsy.fit(points)),
         ("surface fit", surface_fit.warm_up),
         ("lines of sight", convex_parts.warm_up),
+        ("grasps", planner.warm_up),
+        ("a whole recovery", lambda: Recoverer().warm_up(Camera(160, 120, 150.0, 150.0, 79.5, 59.5))),
     ]

@@ -21,12 +21,14 @@ import numpy as np
 
 from sq_perception.fitting import box_start, exact, tolerant
 from sq_perception.fitting.fit import Fit
+from sq_perception.fitting.hull_prior import HullPrior
 from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.observation import Crop, Observation
 from sq_perception.fitting.options import MIN_PIXELS, FitOptions
 from sq_perception.fitting.problem import Problem
 from sq_perception.fitting.quality import assessed, failed
 from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.geometry.support_directions import DIRECTIONS
 from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
 
@@ -95,13 +97,17 @@ def fit(
 def warm_up() -> None:
     """Compile, or load from disk, every kernel of the fit by running it once on a small synthetic scene."""
     body = Superquadric([0.05, 0.04, 0.03], [0.5, 0.5], [0.0, 0.0, 0.5], [0.3, 0.2, 0.1, 0.9])
+    plane = np.array([0.0, 0.0, -1.0, 0.7])
+    reach = DIRECTIONS @ body.translation + body.support(DIRECTIONS)
+    hull = HullPrior(DIRECTIONS, reach, 1e-5 * np.eye(len(reach)), 10.0, 0.1)
     cameras = (Camera(48, 48, 60.0, 60.0, 23.5, 23.5), Camera(48, 48, 200.0, 200.0, 23.5, 23.5, "orthographic"))
     for camera in cameras:
         rendered, _ = raycast.render(body, camera)
         mask = np.isfinite(rendered)
         depth = np.where(mask, rendered, 0.7).astype(np.float32)
         fit(depth, mask, camera)
-        fit(depth, mask, camera, options=FitOptions(plane=np.array([0.0, 0.0, -1.0, 0.7])))
+        fit(depth, mask, camera, options=FitOptions(plane=plane))
+        fit(depth, mask, camera, options=FitOptions(plane=plane, model_error=0.0025, hull=hull))
         fit(depth, mask, camera, start=body)
 
 
