@@ -210,10 +210,11 @@ def from_labels(
     camera.check_image(labels)
     depth, valid = _checked(depth, camera, options.depth_range)
     labels = np.maximum(labels, 0).astype(np.int32)
-    values, counts = np.unique(labels[valid], return_counts=True)
+    given = labels[valid & (labels > 0)]  # of a table with few things, few pixels: these are sorted
+    values, counts = np.unique(given, return_counts=True)
     order = np.argsort(-counts, kind="stable")
     least = options.min_pixels or 1
-    ids = tuple(int(values[k]) for k in order if values[k] > 0 and counts[k] >= least)
+    ids = tuple(int(values[k]) for k in order if counts[k] >= least)
     if options.workspace is not None:
         box, pose = options.workspace, options.workspace_pose
         ids = tuple(k for k in ids if standing.within(box, _points(labels == k, depth, valid, camera), pose))

@@ -144,12 +144,13 @@ def around(
     near = np.zeros(labels.shape, bool)
     bodies = []
     for label in ids:
-        rows, columns = np.nonzero((labels == label) & valid)
-        margin = 10 + (int(rows.max() - rows.min()) + int(columns.max() - columns.min())) // 3
-        top, left = max(rows.min() - margin, 0), max(columns.min() - margin, 0)
-        near[top : rows.max() + margin + 1, left : columns.max() + margin + 1] = True
+        mask = (labels == label) & valid
+        left, top, width, height = cv2.boundingRect(mask.view(np.uint8))
+        margin = 10 + (width + height - 2) // 3
+        near[max(top - margin, 0) : top + height + margin, max(left - margin, 0) : left + width + margin] = True
+        rows, columns = np.nonzero(mask[top : top + height, left : left + width])
         step = max(1, rows.size // 500)
-        rows, columns = rows[::step], columns[::step]
+        rows, columns = top + rows[::step], left + columns[::step]
         bodies.append(camera.unproject(columns, rows, depth[rows, columns]))
     labelled = cv2.dilate((labels > 0).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
     near &= valid & ~labelled
