@@ -52,18 +52,21 @@ class HullAnswers:
     support : (n, J)
         Support functions in sides of the view, from its middle (:data:`thing_network.MIDDLE`).
     covariance : (n, J, J)
+    freedom : float
+        nu of the t distribution whose S the covariance is.
     """
 
     bodies: Superquadric
     support: np.ndarray
     covariance: np.ndarray
+    freedom: float
 
     def hull(self, number: int, view: CanonicalView) -> HullPrior:
         """The prediction of one view in the optical frame."""
         directions = DIRECTIONS @ quaternions.to_matrix(view.rotation)
         support = directions @ view.anchor + view.extent * self.support[number]
         covariance = view.extent**2 * self.covariance[number]
-        return HullPrior(directions, support, covariance, thing_network.FREEDOM, view.extent)
+        return HullPrior(directions, support, covariance, self.freedom, view.extent)
 
 
 class ThingPredictor:
@@ -80,21 +83,26 @@ class ThingPredictor:
         fold(self._model.features)
         self._device = next(self._model.parameters()).device
 
-    def predict(self, views: np.ndarray, planes: np.ndarray) -> HullAnswers:
-        """Answers to views (n, p, p) whose supports are planes (n, 4) in their frames, zeros where there is none.
+    def predict(self, views: np.ndarray, planes: np.ndarray, extents: np.ndarray) -> HullAnswers:
+        """Answers to views (n, p, p) of sides ``extents`` (n,), metres, 0 where unknown.
+
+        What the things stand on are planes (n, 4) in the frames of the views, zeros where there is none.
 
         Raises
         ------
         ValueError
-            For views or planes of another form, or not finite.
+            For views, planes or extents of another form, or not finite.
         """
         views = checked_views(views, self.config.regressor())
         if planes.shape != (len(views), 4) or not np.isfinite(planes).all():
             raise ValueError(f"expected finite planes of shape ({len(views)}, 4), got {planes.shape}")
+        if extents.shape != (len(views),) or not np.isfinite(extents).all():
+            raise ValueError(f"expected finite extents of shape ({len(views)},), got {extents.shape}")
         both = np.concatenate([views, views[:, :, ::-1]])
+        sides = np.concatenate([extents, extents]).astype(np.float32)
         supports = np.concatenate([planes, thing_network.mirrored_planes(planes)]).astype(np.float32)
         with torch.inference_mode():
-            said = self._model(torch.from_numpy(both).to(self._device), torch.from_numpy(supports).to(self._device))
+            said = self._model(*(torch.from_numpy(each).to(self._device) for each in (both, supports, sides)))
             flat = said.body.to_flat()[: len(views)].double().cpu().numpy()
             straight, turned = np.split(said.support.double().cpu().numpy(), 2)
             covariance, turned_covariance = np.split(said.covariance().double().cpu().numpy(), 2)
@@ -103,6 +111,7 @@ class ThingPredictor:
             Superquadric.from_flat(flat),
             (straight + turned[:, back]) / 2,
             (covariance + turned_covariance[:, back][:, :, back]) / 2,
+            said.freedom,
         )
 
 

@@ -258,7 +258,7 @@ class Recoverer:
             if not isinstance(network, inference.ThingPredictor):
                 return network.predict(views)
             known = [np.zeros(4) if one.plane is None else view.plane_to_canonical(one.plane) for one, view in seen]
-            return network.predict(views, np.stack(known))
+            return network.predict(views, np.stack(known), np.array([view.extent for view in shown]))
 
         answers: Future[Superquadric | inference.HullAnswers] = Future()
         if options.method == "auto" and options.refine == "surface":

@@ -72,6 +72,8 @@ class ThingViews:
         As :attr:`CanonicalView.marked`: z in (0, 1], 0 background, HIDDEN where the thing may go on unseen.
     planes : float32 (n, 4)
         The plane n.p + d = 0 of the table in the view's frame and unit, n up; zeros where none is given.
+    extents : float32 (n,)
+        Sides of the views, metres.
     support : float32 (n, 42)
         max n.(p - c) over the thing's hull for n of :data:`DIRECTIONS`, c = (1/2, 1/2, NEAREST), in sides of the view.
     kinds : int64 (n,)
@@ -80,6 +82,7 @@ class ThingViews:
 
     images: np.ndarray
     planes: np.ndarray
+    extents: np.ndarray
     support: np.ndarray
     kinds: np.ndarray
 
@@ -122,12 +125,13 @@ def draw_thing_views(
 ) -> ThingViews:
     """Views of ``count`` random things, of the given kinds or of any; arguments as of :func:`household.draw_thing`."""
     images = np.empty((count, pixels, pixels), dtype=np.float32)
-    planes, support = np.zeros((count, 4), np.float32), np.empty((count, len(DIRECTIONS)), np.float32)
-    numbers = np.empty(count, dtype=np.int64)
+    planes, extents = np.zeros((count, 4), np.float32), np.empty(count, np.float32)
+    support, numbers = np.empty((count, len(DIRECTIONS)), np.float32), np.empty(count, dtype=np.int64)
     for k in range(count):
-        thing, image, plane, reach = _draw_one(rng, pixels, kinds)
-        images[k], planes[k], support[k], numbers[k] = image, plane, reach, KINDS.index(thing.kind)
-    return ThingViews(images, planes, support, numbers)
+        thing, view, plane, reach = _draw_one(rng, pixels, kinds)
+        images[k], planes[k], extents[k], support[k] = view.marked, plane, view.extent, reach
+        numbers[k] = KINDS.index(thing.kind)
+    return ThingViews(images, planes, extents, support, numbers)
 
 
 def support_in_view(parts: Superquadric, view: CanonicalView) -> np.ndarray:
@@ -138,7 +142,8 @@ def support_in_view(parts: Superquadric, view: CanonicalView) -> np.ndarray:
 
 def _draw_one(
     rng: np.random.Generator, pixels: int, kinds: Sequence[str] | None
-) -> tuple[Thing, np.ndarray, np.ndarray, np.ndarray]:
+) -> tuple[Thing, CanonicalView, np.ndarray, np.ndarray]:
+    """A thing, its view, the plane in the view's frame and its support function."""
     for _ in range(_ATTEMPTS):
         thing = draw_thing(rng, kinds)
         setting = draw_setting(thing, rng)
@@ -160,7 +165,7 @@ def _draw_one(
         reach = support_in_view(setting.parts, view)
         if np.abs(reach).max() > _LARGEST_SUPPORT or (reach + reach[_OPPOSITE]).max() < _LEAST_WIDTH:
             continue
-        return thing, view.marked, np.zeros(4) if plane is None else view.plane_to_canonical(plane), reach
+        return thing, view, np.zeros(4) if plane is None else view.plane_to_canonical(plane), reach
     raise RuntimeError(f"no view of a thing shows {_LEAST_SEEN} pixels of it in {_ATTEMPTS} attempts")
 
 
