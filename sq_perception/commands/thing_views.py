@@ -24,15 +24,26 @@ def main(arguments: Sequence[str]) -> int:
     command.add_argument("--first", type=int, default=0, help="number of the first one (0)")
     command.add_argument("--views", type=int, default=512, help="views a shard (512)")
     command.add_argument("--seed", type=int, default=0, help="default 0")
+    command.add_argument(
+        "--meshes",
+        type=Path,
+        metavar="FOLDER",
+        help="things of your own, in metres: half of the views show one of them",
+    )
     given = command.parse_args(arguments)
     for name, least in (("shards", 1), ("first", 0), ("views", 1), ("seed", 0)):
         if getattr(given, name) < least:
             command.error(f"--{name}: expected {least} or more, got {getattr(given, name)}")
 
     from sq_perception.learning.thing_training import write_views
+    from sq_perception.simulation.scanned_things import read_things
 
+    shards = range(given.first, given.first + given.shards)
     try:
-        write_views(given.folder, range(given.first, given.first + given.shards), given.views, given.seed, print)
+        own = read_things(given.meshes) if given.meshes is not None else ()
+        write_views(given.folder, shards, given.views, given.seed, print, own)
+    except ValueError as error:
+        return failed(f"thing-views: {error}")
     except OSError as error:
         return failed(f"thing-views: {given.folder}: {error}")
     return SUCCESS

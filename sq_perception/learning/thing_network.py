@@ -141,7 +141,10 @@ class ThingNetwork(nn.Module):
         self.features = compact_backbone(config.widths, config.blocks, channels_in=2)
         inputs = config.widths[-1] * (config.pixels // self._encoding.stride) ** 2
         self.mixer = nn.Sequential(
-            nn.Linear(inputs + _PLANE + _EXTENT, config.hidden), nn.ReLU(), nn.Linear(config.hidden, config.hidden), nn.ReLU()
+            nn.Linear(inputs + _PLANE + _EXTENT, config.hidden),
+            nn.ReLU(),
+            nn.Linear(config.hidden, config.hidden),
+            nn.ReLU(),
         )
         self.body_head = nn.Linear(config.hidden, _PARAMETERS)
         self.support_head = nn.Linear(config.hidden, count)

@@ -20,7 +20,7 @@ import copy
 import json
 import math
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -37,7 +37,7 @@ from sq_perception.learning.checkpoint import CheckpointError
 from sq_perception.learning.schedule import Cosine
 from sq_perception.learning.thing_network import HullPrediction, ThingConfig, ThingNetwork
 from sq_perception.learning.training_state import TrainingState
-from sq_perception.simulation.household import KINDS
+from sq_perception.simulation.household import KINDS, Thing
 from sq_perception.simulation.thing_views import ThingViews, draw_thing_views
 
 BODY, CENTRE = 2.0, 1.0
@@ -72,14 +72,21 @@ class ThingTraining:
     """Weights to begin with, as names of torch parameters: a safetensors file of this network or of a Regressor."""
 
 
-def write_views(folder: Path, shards: Iterable[int], views: int, seed: int, said: Callable[[str], None]) -> None:
-    """Write shards of freshly drawn views that are not there yet; shard k follows from (seed, k) alone."""
+def write_views(
+    folder: Path,
+    shards: Iterable[int],
+    views: int,
+    seed: int,
+    said: Callable[[str], None],
+    own: Sequence[Thing] = (),
+) -> None:
+    """Write shards of freshly drawn views that are not there yet; shard k follows from (seed, k) and ``own`` alone."""
     folder.mkdir(parents=True, exist_ok=True)
     for k in shards:
         path = folder / f"{k:05d}.safetensors"
         if path.exists():
             continue
-        drawn = draw_thing_views(views, np.random.default_rng([seed, k]))
+        drawn = draw_thing_views(views, np.random.default_rng([seed, k]), own=own)
         arrays = {
             "images": drawn.images.astype(np.float16),
             "planes": drawn.planes,
@@ -96,7 +103,9 @@ def write_views(folder: Path, shards: Iterable[int], views: int, seed: int, said
 def read_views(paths: list[Path]) -> ThingViews:
     """All views of some shards."""
     shards = [load_arrays(str(path)) for path in paths]
-    return ThingViews(**{each.name: np.concatenate([shard[each.name] for shard in shards]) for each in fields(ThingViews)})
+    return ThingViews(
+        **{each.name: np.concatenate([shard[each.name] for shard in shards]) for each in fields(ThingViews)}
+    )
 
 
 def train(config: ThingTraining, views: Path, output: Path, form: ThingConfig | None = None) -> ThingNetwork:
@@ -246,9 +255,7 @@ def _shards(folder: Path, held: int) -> list[Path]:
     return found
 
 
-def _batch(
-    views: ThingViews, chosen: np.ndarray, rng: np.random.Generator
-) -> tuple[torch.Tensor, ...]:
+def _batch(views: ThingViews, chosen: np.ndarray, rng: np.random.Generator) -> tuple[torch.Tensor, ...]:
     """Images (b, p, p), planes (b, 4), extents (b,) and support functions (b, J) of some views.
 
     Half of them are mirrored, and the extent of some is kept back.

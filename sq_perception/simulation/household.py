@@ -62,7 +62,7 @@ ON_Y = np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
 INVERTED = np.array([1.0, 0.0, 0.0, 0.0])
 
 SIX_WAYS = np.concatenate([np.eye(3), -np.eye(3)])
-_NO_CAVITY = Superquadric.stack([])
+NO_CAVITY = Superquadric.stack([])
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,6 +90,8 @@ class Thing:
         Their probabilities add up to 1.
     cavities : Superquadric
         Batch (m,), m >= 0: what is cut away from the union.
+    surface : (n, 3), (m, 3), optional
+        Vertices and faces of a mesh that is seen in place of the union, where the parts only tell its hull.
     """
 
     kind: str
@@ -97,6 +99,7 @@ class Thing:
     parts: Superquadric
     rests: tuple[Rest, ...]
     cavities: Superquadric
+    surface: tuple[np.ndarray, np.ndarray] | None = None
 
     def support(self, directions: np.ndarray) -> np.ndarray:
         """max n.p over the convex hull, in the thing's frame, for unit directions (J, 3), shape (J,)."""
@@ -176,7 +179,7 @@ def _thing(
     reach = flat_support(flat, SIX_WAYS)
     middle = 0.5 * (reach[:3] - reach[3:])
     flat[:, 5:8] -= middle
-    cavities = _NO_CAVITY
+    cavities = NO_CAVITY
     if cut:
         cavities = Superquadric.from_flat(np.array(cut) - [*[0.0] * 5, *middle, *[0.0] * 4])
     total = sum(likely for _, _, likely in rests)

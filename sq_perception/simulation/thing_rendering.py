@@ -46,7 +46,7 @@ def render_things(
         Owner of the visible part, -1 where there is none.
     """
     depth, index = render(parts, camera)
-    thing = np.where(index >= 0, np.asarray(owner, dtype=np.int32)[index], np.int32(-1))
+    thing = np.append(np.asarray(owner, dtype=np.int32), np.int32(-1))[index]
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     if len(cavities):
         matrices = np.ascontiguousarray(cavities.rotation_matrix, dtype=float)

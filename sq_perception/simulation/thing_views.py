@@ -35,12 +35,15 @@ from sq_perception.imaging import canonical_view
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.canonical_view import CanonicalView
 from sq_perception.imaging.coherence import coherent
-from sq_perception.simulation.household import KINDS, SIX_WAYS, Thing, draw_thing
+from sq_perception.simulation.household import KINDS, NO_CAVITY, SIX_WAYS, Thing, draw_thing
+from sq_perception.simulation.mesh_rendering import render_mesh
 from sq_perception.simulation.sensor_noise import Ideal, SensorNoise, Stereo, StructuredLight, TimeOfFlight
 from sq_perception.simulation.thing_rendering import render_things
 
 ON_TOP, FREE = 0.10, 0.05
 """Shares of the views in which the thing stands on something on the table, and in which there is no table."""
+OWN = 0.5
+"""Share of the views that show one's own things, where there are such."""
 PLANE_GIVEN = 0.8
 PLANE_TILT, PLANE_SHIFT = float(np.deg2rad(0.7)), 0.002
 """Standard deviations of the given plane: of its tilt in both directions, and of its distance from the thing."""
@@ -95,6 +98,8 @@ class Setting:
     ----------
     parts, cavities : Superquadric
         Of the thing, (k,) and (m,).
+    surface : (n, 3), (m, 3), optional
+        Its mesh, if it is seen as one.
     others : Superquadric
         Batch (j,), j >= 0: neighbours, and what it stands on.
     table : (4,) or None
@@ -110,9 +115,15 @@ class Setting:
     table: np.ndarray | None
     behind: float
     camera: Camera
+    surface: tuple[np.ndarray, np.ndarray] | None = None
 
     def render(self) -> tuple[np.ndarray, np.ndarray]:
         """Depth (height, width), +inf where there is nothing, and where the thing is seen."""
+        if self.surface is not None:
+            owner = np.ones(len(self.others))
+            depth, _ = render_things(self.others, owner, NO_CAVITY, np.zeros(0), self.camera, self.table, self.behind)
+            near = render_mesh(*self.surface, self.camera)
+            return np.minimum(depth, near), near < depth
         bodies = Superquadric.from_flat(np.concatenate([self.parts.to_flat(), self.others.to_flat()]))
         owner = np.arange(len(bodies)) >= len(self.parts)
         whose = np.zeros(len(self.cavities))
@@ -121,14 +132,21 @@ class Setting:
 
 
 def draw_thing_views(
-    count: int, rng: np.random.Generator, pixels: int = 64, kinds: Sequence[str] | None = None
+    count: int,
+    rng: np.random.Generator,
+    pixels: int = 64,
+    kinds: Sequence[str] | None = None,
+    own: Sequence[Thing] = (),
 ) -> ThingViews:
-    """Views of ``count`` random things, of the given kinds or of any; arguments as of :func:`household.draw_thing`."""
+    """Views of ``count`` random things, half of them one's ``own`` where there are such.
+
+    ``kinds`` as of :func:`household.draw_thing`, for the others.
+    """
     images = np.empty((count, pixels, pixels), dtype=np.float32)
     planes, extents = np.zeros((count, 4), np.float32), np.empty(count, np.float32)
     support, numbers = np.empty((count, len(DIRECTIONS)), np.float32), np.empty(count, dtype=np.int64)
     for k in range(count):
-        thing, view, plane, reach = _draw_one(rng, pixels, kinds)
+        thing, view, plane, reach = _draw_one(rng, pixels, kinds, own)
         images[k], planes[k], extents[k], support[k] = view.marked, plane, view.extent, reach
         numbers[k] = KINDS.index(thing.kind)
     return ThingViews(images, planes, extents, support, numbers)
@@ -141,11 +159,11 @@ def support_in_view(parts: Superquadric, view: CanonicalView) -> np.ndarray:
 
 
 def _draw_one(
-    rng: np.random.Generator, pixels: int, kinds: Sequence[str] | None
+    rng: np.random.Generator, pixels: int, kinds: Sequence[str] | None, own: Sequence[Thing]
 ) -> tuple[Thing, CanonicalView, np.ndarray, np.ndarray]:
     """A thing, its view, the plane in the view's frame and its support function."""
     for _ in range(_ATTEMPTS):
-        thing = draw_thing(rng, kinds)
+        thing = own[rng.integers(len(own))] if len(own) and rng.random() < OWN else draw_thing(rng, kinds)
         setting = draw_setting(thing, rng)
         depth, seen = setting.render()
         depth, seen = _something_before(depth, seen, rng)
@@ -195,6 +213,10 @@ def draw_setting(thing: Thing, rng: np.random.Generator) -> Setting:
     lift = np.array([0.0, 0.0, reach[5]])
     shift = distance * ray / np.linalg.norm(ray) - matrix @ (lift + 0.5 * (reach[:3] - reach[3:]))
     parts = moved(parts, look, shift + matrix @ lift)
+    surface = None
+    if thing.surface is not None:
+        vertices, faces = thing.surface
+        surface = vertices @ (matrix @ quaternions.to_matrix(turn)).T + shift + matrix @ lift, faces
     cavities = thing.cavities
     if len(cavities):
         cavities = Superquadric.from_flat(
@@ -204,7 +226,8 @@ def draw_setting(thing: Thing, rng: np.random.Generator) -> Setting:
     behind = distance * rng.uniform(1.3, 3.0) if rng.random() < 0.85 else np.inf
     around = moved(np.array(others).reshape(-1, 12), look, shift)
     camera = _camera(parts, rng)
-    return Setting(Superquadric.from_flat(parts), cavities, Superquadric.from_flat(around), table, behind, camera)
+    thing_parts, others_around = Superquadric.from_flat(parts), Superquadric.from_flat(around)
+    return Setting(thing_parts, cavities, others_around, table, behind, camera, surface)
 
 
 def looking_down(pitch: float, roll: float) -> np.ndarray:

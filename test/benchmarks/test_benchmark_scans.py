@@ -14,7 +14,6 @@ import trimesh
 
 from sq_perception.geometry import Superquadric, metrics, rotation
 from sq_perception.geometry.mesh import mesh
-from sq_perception.imaging import raycast
 
 BODY = Superquadric([0.06, 0.04, 0.03], [0.3, 0.7], [0.05, -0.03, 0.7], [0.3, -0.2, 0.5, 0.8])
 
@@ -37,27 +36,6 @@ def benchmarks_on_path(repository: Path) -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(repository / "benchmarks"))
         yield
-
-
-def test_a_rasterised_superquadric_is_the_ray_cast_one(scene: ModuleType) -> None:
-    fine = mesh(BODY, 128)
-    depth = scene.render(fine.vertices, fine.faces, scene.CAMERA)
-    expected, _ = raycast.render(BODY, scene.CAMERA)
-    seen, truly = np.isfinite(depth), np.isfinite(expected)
-    assert (seen != truly).sum() <= 0.01 * truly.sum()
-    # The facets lie inside the body, the more the flatter the ray: the median is what the sampling of the mesh costs.
-    error = depth[seen & truly] - expected[seen & truly]
-    assert error.min() > -1e-9
-    assert np.median(error) < 5e-5
-
-
-def test_neighbouring_triangles_leave_no_gap(scene: ModuleType) -> None:
-    box = trimesh.creation.box((0.1, 0.2, 0.1)).subdivide().subdivide()
-    vertices = box.vertices @ rotation.to_matrix(rotation.from_rotation_vector(np.array([0.4, 0.3, 0.2]))).T
-    seen = np.isfinite(scene.render(vertices + [0, 0, 0.6], box.faces, scene.CAMERA))
-    for line in (*seen, *seen.T):
-        inside = np.flatnonzero(line)
-        assert len(inside) == 0 or len(inside) == inside[-1] - inside[0] + 1
 
 
 def test_a_resting_mesh_stands_on_the_plane_it_is_seen_on(scene: ModuleType, rng: np.random.Generator) -> None:

@@ -1,0 +1,66 @@
+"""Things of one's own, as meshes: what a network can be trained on besides the simulated household.
+
+A mesh rests on the faces of its hull on which it is stable, as often as it would come to lie there (K. Goldberg et al.,
+"Part pose statistics", 1999, as trimesh computes it for a body of even density).  What is seen is the mesh; what the
+network shall tell is its hull, whose corners stand in :attr:`Thing.parts` as points.
+
+Metres.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from sq_perception.geometry import rotation as quaternions
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.simulation.household import NO_CAVITY, Rest, Thing
+
+SUFFIXES = (".ply", ".obj", ".stl", ".glb", ".off")
+LARGEST, SMALLEST = 1.0, 0.005
+"""Longest edge of the box around a thing, metres: others are taken for other units."""
+_POINT = 1e-5
+"""Half size of a superquadric that stands for a point, metres."""
+_UNLIKELY = 0.01
+"""Share of the falls below which a pose is left out."""
+
+
+def read_things(folder: Path) -> tuple[Thing, ...]:
+    """All meshes of a folder, by name.
+
+    Raises
+    ------
+    ValueError
+        If there are none, one cannot be read or has no faces, or its size is none that one takes in a hand.
+    """
+    paths = sorted(path for path in folder.glob("*") if path.suffix.lower() in SUFFIXES)
+    if not paths:
+        raise ValueError(f"{folder}: expected meshes ({' '.join(SUFFIXES)}), found none")
+    return tuple(_read(path) for path in paths)
+
+
+def _read(path: Path) -> Thing:
+    import trimesh
+
+    try:
+        mesh = trimesh.load(path, force="mesh", process=False)
+        hull = mesh.convex_hull
+        turns, likely = hull.compute_stable_poses(threshold=_UNLIKELY)
+    except Exception as error:  # whatever a reader of one of many formats raises
+        raise ValueError(f"{path}: no mesh with a volume: {error}") from error
+    longest = float(np.ptp(hull.vertices, axis=0).max())
+    if not SMALLEST <= longest <= LARGEST:
+        raise ValueError(
+            f"{path}: expected metres, a thing of {SMALLEST} to {LARGEST}; its longest edge is {longest:.4g}"
+        )
+    middle = hull.bounds.mean(axis=0)
+    corners = hull.vertices - middle
+    points = np.zeros((len(corners), 12))
+    points[:, :3], points[:, 3:5], points[:, 5:8], points[:, 11] = _POINT, 1.0, corners, 1.0
+    rests = tuple(
+        Rest(f"face {k}", quaternions.from_matrix(turn[:3, :3]), float(share))
+        for k, (turn, share) in enumerate(zip(turns, likely / likely.sum(), strict=True))
+    )
+    surface = (np.asarray(mesh.vertices, dtype=float) - middle, np.asarray(mesh.faces))
+    return Thing("union", path.stem, Superquadric.from_flat(points), rests, NO_CAVITY, surface)

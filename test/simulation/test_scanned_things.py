@@ -1,0 +1,123 @@
+"""Things of one's own: a mesh is seen as the body that it is made of, rests on its faces, and tells its hull."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from sq_perception.geometry import rotation as quaternions
+from sq_perception.geometry.mesh import mesh
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.geometry.support_directions import DIRECTIONS
+from sq_perception.imaging import raycast
+from sq_perception.imaging.camera import Camera
+from sq_perception.learning.thing_training import read_views, write_views
+from sq_perception.simulation.mesh_rendering import render_mesh
+from sq_perception.simulation.scanned_things import read_things
+from sq_perception.simulation.thing_views import draw_setting, draw_thing_views, support_in_view
+
+CAMERA = Camera(640, 480, 554.0, 554.0, 319.5, 239.5)
+BODY = Superquadric([0.06, 0.04, 0.03], [0.3, 0.7], [0.05, -0.03, 0.7], [0.3, -0.2, 0.5, 0.8])
+EDGES = np.array([0.06, 0.09, 0.15])
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """Of one box, away from the origin."""
+    box = trimesh.creation.box(EDGES)
+    box.apply_translation([0.3, -0.2, 0.1])
+    box.export(tmp_path / "crate.ply")
+    return tmp_path
+
+
+def test_a_rasterised_superquadric_is_the_ray_cast_one() -> None:
+    fine = mesh(BODY, 128)
+    depth = render_mesh(fine.vertices, fine.faces, CAMERA)
+    expected, _ = raycast.render(BODY, CAMERA)
+    seen, truly = np.isfinite(depth), np.isfinite(expected)
+    assert (seen != truly).sum() <= 0.01 * truly.sum()
+    # The facets lie inside the body, the more the flatter the ray: the median is what the sampling of the mesh costs.
+    error = depth[seen & truly] - expected[seen & truly]
+    assert error.min() > -1e-9
+    assert np.median(error) < 5e-5
+
+
+def test_neighbouring_triangles_leave_no_gap() -> None:
+    box = trimesh.creation.box((0.1, 0.2, 0.1)).subdivide().subdivide()
+    vertices = box.vertices @ quaternions.to_matrix(quaternions.from_rotation_vector(np.array([0.4, 0.3, 0.2]))).T
+    seen = np.isfinite(render_mesh(vertices + [0, 0, 0.6], box.faces, CAMERA))
+    for line in (*seen, *seen.T):
+        inside = np.flatnonzero(line)
+        assert len(inside) == 0 or len(inside) == inside[-1] - inside[0] + 1
+
+
+def test_a_box_rests_on_its_faces_and_mostly_on_large_ones(folder: Path) -> None:
+    (thing,) = read_things(folder)
+    assert thing.name == "crate"
+    np.testing.assert_allclose(thing.box[1] - thing.box[0], EDGES, atol=1e-4)
+    heights: dict[float, float] = {}
+    for rest in thing.rests:
+        up = np.abs(quaternions.to_matrix(rest.turn)[2])
+        assert up.max() == pytest.approx(1, abs=1e-6)
+        height = float(np.round(EDGES[np.argmax(up)], 3))
+        heights[height] = heights.get(height, 0.0) + rest.likely
+    assert sum(heights.values()) == pytest.approx(1)
+    assert heights[0.06] > heights[0.09] > heights[0.15]
+
+
+def test_views_of_a_mesh_tell_its_hull(folder: Path) -> None:
+    """What is seen lies within the true support function, and touches it in some direction."""
+    (thing,) = read_things(folder)
+    rng = np.random.default_rng(3)
+    for _ in range(5):
+        setting = draw_setting(thing, rng)
+        depth, seen = setting.render()
+        if not seen.any():
+            continue
+        rows, columns = np.nonzero(seen)
+        points = setting.camera.unproject(columns, rows, depth[rows, columns])
+        reach = (points @ DIRECTIONS.T).max(axis=0)
+        truth = (setting.parts.translation @ DIRECTIONS.T).max(axis=0)
+        assert (reach < truth + 1e-4).all()
+        assert (truth - reach).min() < 0.005
+
+
+def test_half_of_the_views_show_ones_own_things(folder: Path, tmp_path: Path) -> None:
+    own = read_things(folder)
+    kept: list[str] = []
+    write_views(tmp_path / "views", range(1), 40, 5, kept.append, own)
+    views = read_views([tmp_path / "views" / "00000.safetensors"])
+    drawn = draw_thing_views(40, np.random.default_rng([5, 0]), own=own)
+    np.testing.assert_array_equal(views.support, drawn.support)
+    of_mesh = views.kinds == 6
+    assert 8 <= of_mesh.sum() <= 32
+    assert np.isfinite(views.support).all()
+    assert len(kept) == 1
+
+
+def test_support_in_a_view_is_that_of_the_corners(folder: Path) -> None:
+    from sq_perception.imaging import canonical_view
+
+    (thing,) = read_things(folder)
+    setting = draw_setting(thing, np.random.default_rng(8))
+    depth, seen = setting.render()
+    view = canonical_view.from_mask(depth, seen, setting.camera)
+    assert setting.surface is not None
+    directions = DIRECTIONS @ quaternions.to_matrix(view.rotation)
+    expected = ((setting.surface[0] @ directions.T).max(axis=0) - directions @ view.anchor) / view.extent
+    assert support_in_view(setting.parts, view) == pytest.approx(expected, abs=1e-3)
+
+
+def test_what_is_no_thing_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="expected meshes"):
+        read_things(tmp_path)
+    trimesh.creation.box([60.0, 90.0, 150.0]).export(tmp_path / "millimetres.stl")
+    with pytest.raises(ValueError, match="expected metres"):
+        read_things(tmp_path)
+    (tmp_path / "millimetres.stl").unlink()
+    (tmp_path / "broken.ply").write_bytes(b"ply\nnothing")
+    with pytest.raises(ValueError, match="no mesh with a volume"):
+        read_things(tmp_path)
