@@ -17,7 +17,7 @@ from sq_perception.geometry.support_directions import DIRECTIONS, mirrored
 from sq_perception.imaging.canonical_view import NEAREST
 from sq_perception.learning import checkpoint, thing_network, thing_training
 from sq_perception.learning.inference import ThingPredictor
-from sq_perception.learning.thing_network import FREEDOM, HullPrediction, ThingConfig, ThingNetwork
+from sq_perception.learning.thing_network import HullPrediction, ThingConfig, ThingNetwork
 from sq_perception.simulation.thing_views import draw_thing_views
 
 SMALL = ThingConfig(widths=(8, 16, 16, 16), blocks=1, hidden=16, factors=2)
@@ -41,6 +41,7 @@ def shards(folder: Path, count: int, rng: np.random.Generator) -> None:
         arrays = {
             "images": rng.random((24, 64, 64)).astype(np.float16),
             "planes": rng.standard_normal((24, 4)).astype(np.float32),
+            "extents": rng.uniform(0.05, 0.4, 24).astype(np.float32),
             "support": rng.uniform(0.2, 0.8, (24, J)).astype(np.float32),
             "kinds": rng.integers(3, size=24),
         }
@@ -65,11 +66,15 @@ def test_the_likelihood_is_that_of_a_multivariate_t(rng: np.random.Generator) ->
         torch.tensor(np.tile(mu, (5, 1))),
         torch.tensor(np.tile(log_sigma, (5, 1))),
         torch.tensor(np.tile(factors, (5, 1, 1))),
+        freedom=4.0,
     )
     shape = np.diag(np.exp(2 * log_sigma)) + factors @ factors.T
-    expected = -multivariate_t(mu, shape, df=FREEDOM).logpdf(truth)
+    distribution = multivariate_t(mu, shape, df=4.0)
+    expected = -distribution.logpdf(truth)
     found = said.negative_log_likelihood(torch.tensor(truth)).numpy()
     assert said.covariance()[0].numpy() == pytest.approx(shape)
+    drawn = distribution.rvs(200_000, random_state=1)
+    assert said.deviation()[0].numpy() == pytest.approx(drawn.std(axis=0), rel=0.05)
     # A constant is left out.
     assert found - found[0] == pytest.approx(expected - expected[0], rel=1e-6, abs=1e-6)
 
@@ -88,8 +93,9 @@ def test_a_predictor_answers_a_mirrored_view_with_the_mirrored_hull(rng: np.rand
     torch.manual_seed(3)
     predictor = ThingPredictor(ThingNetwork(SMALL))
     views, planes = rng.random((2, 64, 64)).astype(np.float32), rng.standard_normal((2, 4))
-    straight = predictor.predict(views, planes)
-    turned = predictor.predict(np.ascontiguousarray(views[:, :, ::-1]), thing_network.mirrored_planes(planes))
+    extents = np.array([0.1, 0.0])
+    straight = predictor.predict(views, planes, extents)
+    turned = predictor.predict(np.ascontiguousarray(views[:, :, ::-1]), thing_network.mirrored_planes(planes), extents)
     back = mirrored(0)
     assert turned.support[:, back] == pytest.approx(straight.support, abs=1e-5)
     assert turned.covariance[:, back][:, :, back] == pytest.approx(straight.covariance, abs=1e-5)
@@ -104,13 +110,13 @@ def test_planes_mirror_with_their_points(rng: np.random.Generator) -> None:
 
 
 def test_it_begins_with_the_weights_of_a_regressor() -> None:
-    """The second channel and the plane are not listened to at first: the features are those of the shipped network."""
+    """The second channel, plane and extent are not listened to at first: the features are those of the shipped one."""
     network, given = ThingNetwork(), checkpoint.load("robust")
     thing_training.begin_with(network, checkpoint.resolve("robust"))
     network.eval()
     views = torch.rand(2, 64, 64)
     with torch.inference_mode():
-        body = network(views, torch.randn(2, 4)).body
+        body = network(views, torch.randn(2, 4), torch.rand(2)).body
         expected = given(views[:, None])
     assert torch.allclose(body.to_flat(), expected.to_flat(), atol=2e-2)
 
