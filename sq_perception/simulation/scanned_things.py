@@ -44,7 +44,7 @@ def _read(path: Path) -> Thing:
     import trimesh
 
     try:
-        mesh = trimesh.load(path, force="mesh", process=False)
+        mesh = trimesh.load_mesh(path, process=False)
         hull = mesh.convex_hull
         turns, likely = hull.compute_stable_poses(threshold=_UNLIKELY)
     except Exception as error:  # whatever a reader of one of many formats raises

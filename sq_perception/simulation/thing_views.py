@@ -120,8 +120,8 @@ class Setting:
     def render(self) -> tuple[np.ndarray, np.ndarray]:
         """Depth (height, width), +inf where there is nothing, and where the thing is seen."""
         if self.surface is not None:
-            owner = np.ones(len(self.others))
-            depth, _ = render_things(self.others, owner, NO_CAVITY, np.zeros(0), self.camera, self.table, self.behind)
+            around = np.ones(len(self.others))
+            depth, _ = render_things(self.others, around, NO_CAVITY, np.zeros(0), self.camera, self.table, self.behind)
             near = render_mesh(*self.surface, self.camera)
             return np.minimum(depth, near), near < depth
         bodies = Superquadric.from_flat(np.concatenate([self.parts.to_flat(), self.others.to_flat()]))
@@ -163,7 +163,7 @@ def _draw_one(
 ) -> tuple[Thing, CanonicalView, np.ndarray, np.ndarray]:
     """A thing, its view, the plane in the view's frame and its support function."""
     for _ in range(_ATTEMPTS):
-        thing = own[rng.integers(len(own))] if len(own) and rng.random() < OWN else draw_thing(rng, kinds)
+        thing = own[int(rng.integers(len(own)))] if len(own) and rng.random() < OWN else draw_thing(rng, kinds)
         setting = draw_setting(thing, rng)
         depth, seen = setting.render()
         depth, seen = _something_before(depth, seen, rng)
