@@ -1,0 +1,235 @@
+"""What each source of knowledge about the unseen side is worth: the fit without it, on the same things and masks.
+
+    python benchmarks/ablation.py [--scenes 60] [--first 5000] [--frames FRAMES --hulls HULLS] [--name ablation]
+
+Things of household scenes (:mod:`household_things`), at least half visible, and of recorded frames where they are named
+(:mod:`known_frames`); true masks.  Each is fitted once a row, with the same prediction and the same pixels:
+
+| row | the fit |
+| --- | --- |
+| whole | as it is shipped |
+| no predicted hull | neither the hull nor the predicted body as a start |
+| no covariance | errors of neighbouring directions taken for independent |
+| normal | the hull's errors without tails (nu = 1000) |
+| every ray counts | as 1000 independent rays instead of 100 |
+| as a body | points within count in full, space within the outline's hull must be empty |
+| no plane, no free space | without either |
+| missing is empty | pixels without a reading belong to no part of the body |
+| hull alone | hardly any ray counts: what the network knows |
+| true hull | the true support function in place of the predicted one, 1 % of the view exact |
+
+IoU is with the true convex hull, 0 where no body was found.  The difference to the first row has its standard error.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+
+if __name__ == "__main__":  # as a script only: a process that imports this has threads already
+    for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
+        os.environ.setdefault(variable, "1")
+
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import household_things
+import numpy as np
+import report
+import trimesh
+from hull_oracle import Columns
+
+from sq_perception.fitting import surface_fit, tolerant
+from sq_perception.fitting.fit import Status
+from sq_perception.fitting.hull_prior import HullPrior
+from sq_perception.fitting.observation import Observation
+from sq_perception.fitting.options import FitOptions
+from sq_perception.imaging.camera import Camera
+from sq_perception.recovery import methods
+from sq_perception.recovery.recoverer import Recoverer
+from sq_perception.recovery.seen_object import SeenObject
+
+HALF, FEWEST_PIXELS = 0.5, 200
+EXACT = 0.01
+"""Of a view's side: how well the true hull is said to be known."""
+
+
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """One thing of one image, what the recovery knows of it before its fit, and the corners (n, 3) of its hull."""
+
+    kind: str
+    one: SeenObject
+    depth: np.ndarray
+    camera: Camera
+    known: FitOptions
+    hull: np.ndarray
+
+
+@dataclass(frozen=True)
+class Row:
+    """One way to fit: what is changed in the options, in the predicted hull, and in the program."""
+
+    name: str
+    options: dict[str, Any]
+    hull: Callable[[HullPrior, Seen], HullPrior | None]
+    program: Callable[[], AbstractContextManager[Any]]
+
+
+def _same(hull: HullPrior, _: Seen) -> HullPrior:
+    return hull
+
+
+def _true(hull: HullPrior, seen: Seen) -> HullPrior:
+    exact = (EXACT * hull.extent) ** 2 * np.eye(len(hull.support))
+    return replace(hull, support=(seen.hull @ hull.directions.T).max(axis=0), covariance=exact)
+
+
+def rows() -> tuple[Row, ...]:
+    def row(
+        name: str,
+        hull: Callable[[HullPrior, Seen], HullPrior | None] = _same,
+        program: Callable[[], AbstractContextManager[Any]] = nullcontext,
+        **options: Any,
+    ) -> Row:
+        return Row(name, options, hull, program)
+
+    def rays(count: float) -> Callable[[], AbstractContextManager[Any]]:
+        return lambda: patch.object(tolerant, "INDEPENDENT_OF_PREDICTED", count)
+
+    return (
+        row("whole"),
+        row("no predicted hull", hull=lambda *_: None),
+        row("no covariance", hull=lambda h, _: replace(h, covariance=np.diag(np.diag(h.covariance)))),
+        row("normal", hull=lambda h, _: replace(h, freedom=1000.0)),
+        row("every ray counts", program=rays(1000.0)),
+        row("as a body", program=lambda: patch.multiple(Observation, of_hull=lambda self: self)),
+        row("no plane", plane=None, model_error=methods.MODEL_ERROR_ON_PLANE),
+        row("no free space", nan_is_empty=False),
+        row("missing is empty", nan_is_empty=True),
+        row("hull alone", program=rays(3.0)),
+        row("true hull", hull=_true),
+    )
+
+
+def iou(seen: Seen, columns: Columns, row: Row) -> float:
+    """Of one thing fitted one way."""
+    assert seen.one.prediction is not None
+    hull = seen.one.prediction.hull()
+    assert hull is not None
+    changed = row.hull(hull, seen)
+    body = None if changed is None else seen.one.prediction.body
+    options = replace(seen.known, **row.options, hull=changed, expected=body)
+    depth = seen.depth if row.name != "no free space" else np.where(seen.one.mask, seen.depth, np.float32(np.nan))
+    with row.program():
+        fit = surface_fit.fit(
+            depth, seen.one.mask, seen.camera, start="auto" if body is None else body, options=options
+        )
+    return 0.0 if fit.status == Status.FAILED else columns.iou(fit.superquadric)
+
+
+def shown(
+    depth: np.ndarray, camera: Camera, labels: np.ndarray, recoverer: Recoverer
+) -> dict[int, tuple[SeenObject, FitOptions]]:
+    """What the recovery knows of each labelled thing when it begins to fit."""
+    found = {}
+    fitted = methods._surface_fit
+
+    def kept(one: SeenObject, depth: np.ndarray, camera: Camera, known: FitOptions) -> Any:
+        found[one.label] = one, known
+        return fitted(one, depth, camera, known)
+
+    with patch.object(methods, "_surface_fit", kept):
+        recoverer.recover(depth, camera, labels)
+    return found
+
+
+def simulated(seeds: range, recoverer: Recoverer) -> Iterator[Seen]:
+    for seed in seeds:
+        scene = household_things.scene(seed, None)
+        found = shown(scene.depth, scene.camera, scene.labels, recoverer)
+        for placed in scene.placed:
+            if placed.pixels >= FEWEST_PIXELS and placed.visible_share >= HALF and placed.label in found:
+                yield Seen(
+                    placed.thing.kind,
+                    found[placed.label][0],
+                    scene.depth,
+                    scene.camera,
+                    found[placed.label][1],
+                    placed.hull,
+                )
+
+
+def recorded(frames: Path, hulls: Path, recoverer: Recoverer) -> Iterator[Seen]:
+    for path in sorted(frames.glob("*.npz")):
+        frame = np.load(path)
+        depth, k = frame["depth"], frame["K"]
+        camera = Camera(depth.shape[1], depth.shape[0], k[0, 0], k[1, 1], k[0, 2], k[1, 2])
+        found = shown(depth, camera, frame["labels"].astype(np.int32), recoverer)
+        for number, label in enumerate(frame["ids"]):
+            pose, name = frame["T_cam_mesh"][number], str(frame["mesh"][number])
+            if not name or not np.isfinite(pose).all() or int(label) not in found:
+                continue
+            corners = np.asarray(trimesh.load_mesh(hulls / f"{name}.hull.ply", process=False).vertices)
+            hull = corners @ pose[:3, :3].T + pose[:3, 3]
+            yield Seen(str(frame["kind"][number]), found[int(label)][0], depth, camera, found[int(label)][1], hull)
+
+
+def compared(things: list[Seen]) -> dict[str, Any]:
+    """IoU of every row, by kind, and its difference to the first row, percent."""
+    columns = [Columns.of(seen.hull) for seen in things]
+    kinds = np.array([seen.kind for seen in things])
+    result: dict[str, Any] = {}
+    first = None
+    for row in rows():
+        ious = 100 * np.array([iou(seen, each, row) for seen, each in zip(things, columns, strict=True)])
+        first = ious if first is None else first
+        difference = ious - first
+        result[row.name] = {
+            "iou": float(ious.mean()),
+            "difference": float(difference.mean()),
+            "error": float(difference.std() / np.sqrt(len(ious))),
+            "count": len(ious),
+            **{str(kind): float(ious[kinds == kind].mean()) for kind in np.unique(kinds)},
+        }
+        print(row.name, f"{ious.mean():.1f}", flush=True)
+    return result
+
+
+def table(result: dict[str, Any]) -> str:
+    kinds = [name for name in result["whole"] if name not in ("iou", "difference", "error", "count")]
+    lines = [
+        [
+            name,
+            f"{one['iou']:.1f}",
+            f"{one['difference']:+.1f} +- {one['error']:.1f}",
+            *(f"{one[k]:.1f}" for k in kinds),
+        ]
+        for name, one in result.items()
+    ]
+    return report.table(["fit", "IoU %", "difference", *kinds], lines)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("--scenes", type=int, default=60, help="number of household scenes")
+    parser.add_argument("--first", type=int, default=5000, help="seed of the first one")
+    parser.add_argument("--frames", type=Path, help="recorded frames, as of known_frames")
+    parser.add_argument("--hulls", type=Path, help="their true hulls")
+    parser.add_argument("--name", default="ablation", help="name of the result files")
+    options = parser.parse_args()
+    recoverer = Recoverer()
+    sets = {"household": list(simulated(range(options.first, options.first + options.scenes), recoverer))}
+    if options.frames is not None and options.hulls is not None:
+        sets["recorded"] = list(recorded(options.frames, options.hulls, recoverer))
+    result = {name: compared(things) for name, things in sets.items()}
+    text = "\n\n".join(f"{name}, {one['whole']['count']} things\n\n{table(one)}" for name, one in result.items())
+    report.write(options.name, {"scenes": options.scenes, "first": options.first, **result}, text)
+
+
+if __name__ == "__main__":
+    main()
