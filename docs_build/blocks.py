@@ -345,6 +345,18 @@ def known() -> str:
     return table(heads, rows) + measured("known_frames")
 
 
+def ablation() -> str:
+    """The fit without one source of knowledge at a time."""
+    found = results("ablation")
+    sets = [name for name in ("household", "recorded") if name in found]
+    rows = []
+    for name, whole in found["household"].items():
+        cells = [f"{found[one][name]['iou']:.1f} ({found[one][name]['difference']:+.1f})" for one in sets]
+        rows.append([name, *cells, *(f"{whole[kind]:.1f}" for kind in ("box", "can", "bottle", "vessel", "tool"))])
+    heads = ["fit", *(f"{one}, {found[one]['whole']['count']} things" for one in sets)]
+    return table([*heads, "box", "can", "bottle", "vessel", "tool"], rows) + measured("ablation")
+
+
 def recorded() -> str:
     """The fair kinds of the recorded frames, by method."""
     heads = [
@@ -401,6 +413,7 @@ BLOCKS: dict[str, Callable[[], str]] = {
         kinds,
         prediction,
         known,
+        ablation,
         recorded,
         frame_time,
         speed,

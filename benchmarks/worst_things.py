@@ -1,0 +1,84 @@
+"""A picture of what the fit loses: the worst thing of each kind of household scenes, with true masks.
+
+    python benchmarks/household_things.py --scenes 200 --each runs/things.json
+    python benchmarks/worst_things.py runs/things.json docs/unseen_worst.png
+
+Depth of the surroundings of each; the recovered body in colour, the outline of the true hull as a thin line, both sets
+of edges in millimetres.  Of things at least half visible.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+import household_things
+import numpy as np
+from gallery_figures import WIRE, write_picture
+from matplotlib.axes import Axes
+from scipy.spatial import ConvexHull
+
+from sq_perception.evaluation.plots import colour, draw_depth, draw_outlines, heading_of, new_figure
+from sq_perception.geometry import Superquadric
+from sq_perception.simulation.household import KINDS
+
+METHOD, HALF = "given", 0.5
+AROUND = 0.6
+"""Of a thing's larger side in the image: what is shown beside it."""
+COLUMNS, SIDE = 4, 2.9
+
+
+def worst(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Of each kind the thing with the least IoU."""
+    seen = [row for row in rows if row["visible_share"] >= HALF]
+    of_kinds = [[row for row in seen if row["kind"] == kind] for kind in KINDS]
+    return [min(some, key=lambda row: float(row["answers"][METHOD]["iou"])) for some in of_kinds if some]
+
+
+def draw(ax: Axes, row: dict[str, Any]) -> None:
+    """One thing."""
+    scene = household_things.scene(row["seed"], row["sensor"])
+    placed = next(one for one in scene.placed if one.label == row["label"])
+    corners = scene.camera.project(placed.hull)
+    outline = corners[ConvexHull(corners).vertices]
+    low, high = outline.min(axis=0), outline.max(axis=0)
+    middle, reach = (low + high) / 2, (0.5 + AROUND) * float((high - low).max())
+    draw_depth(ax, scene.depth)
+    closed = np.vstack([outline, outline[:1]])
+    ax.plot(*closed.T, color=WIRE, linewidth=1.0)
+    answer = row["answers"][METHOD]
+    edges = " x ".join(f"{1e3 * edge:.0f}" for edge in sorted(row["edges"]))
+    text = "no body"
+    if answer["body"] is not None:
+        body = Superquadric.from_flat(np.array(answer["body"]))
+        draw_outlines(ax, [body], scene.camera, [colour(0)], width=1.6)
+        text = " x ".join(f"{2e3 * size:.0f}" for size in sorted(body.size))
+    ax.set_xlim(middle[0] - reach, middle[0] + reach)
+    ax.set_ylim(middle[1] + reach, middle[1] - reach)
+    ax.set_xticks([])
+    ax.set_yticks([])
+    heading_of(ax, row["thing"], f"IoU {100 * answer['iou']:.0f} %, {answer['status'].lower()}")
+    ax.set_xlabel(f"{text} mm, true {edges}", fontsize=8)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser.add_argument("each", type=Path, help="what household_things wrote with --each")
+    parser.add_argument("picture", type=Path, help="PNG to write")
+    options = parser.parse_args()
+    chosen = worst(json.loads(options.each.read_text()))
+    lines = -(-len(chosen) // COLUMNS)
+    figure = new_figure(COLUMNS * SIDE, lines * (SIDE + 0.25))
+    axes = figure.subplots(lines, COLUMNS, squeeze=False)
+    figure.subplots_adjust(left=0.01, right=0.99, top=0.94, bottom=0.06, hspace=0.28, wspace=0.06)
+    for ax in axes.flat[len(chosen) :]:
+        ax.set_visible(False)
+    for ax, row in zip(axes.flat, chosen, strict=False):
+        draw(ax, row)
+    print(write_picture(figure, options.picture))
+
+
+if __name__ == "__main__":
+    main()
