@@ -30,6 +30,7 @@ Output  :class:`HullPrediction`
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -71,6 +72,8 @@ class ThingConfig:
     freedom: float = 3.0
     """nu of the t distribution.  A network trained with 10 told errors of unseen views that were likeliest for 2 to 3,
     sigma a third as large: most hulls are plain to see, some are not."""
+    spread: float = 1.0
+    """Factor of S, set when a training ends: batches are normalised otherwise then, and errors smaller."""
 
     def view_of(
         self, depth: np.ndarray, mask: np.ndarray, camera: Camera, plane: np.ndarray | None = None
@@ -119,6 +122,11 @@ class HullPrediction:
     def negative_log_likelihood(self, truth: torch.Tensor) -> torch.Tensor:
         """Of true support functions (b, J); (b,), a constant left out."""
         count = truth.shape[1]
+        distance, log_det = self.distance(truth)
+        return 0.5 * log_det + 0.5 * (self.freedom + count) * torch.log1p(distance / self.freedom)
+
+    def distance(self, truth: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """m and log det S (b,) for true support functions (b, J)."""
         weight = torch.exp(-2 * self.log_sigma)
         error = truth - self.support
         weighted = self.factors * weight[..., None]
@@ -127,7 +135,7 @@ class HullPrediction:
         along = torch.linalg.solve_triangular(root, (weighted.transpose(1, 2) @ error[..., None]), upper=False)[..., 0]
         distance = (weight * error * error).sum(1) - (along * along).sum(1)
         log_det = 2 * self.log_sigma.sum(1) + 2 * torch.log(torch.diagonal(root, dim1=1, dim2=2)).sum(1)
-        return 0.5 * log_det + 0.5 * (self.freedom + count) * torch.log1p(distance.clamp_min(0) / self.freedom)
+        return distance.clamp_min(0), log_det
 
 
 class ThingNetwork(nn.Module):
@@ -165,7 +173,8 @@ class ThingNetwork(nn.Module):
             body = self._encoding.decode(self.body_head(h))
             log_sigma = _LEAST_LOG + nn.functional.softplus(self.sigma_head(h) - _LEAST_LOG)
             factors = self.factor_head(h).unflatten(1, (len(DIRECTIONS), self.config.factors))
-            log_sigma = log_sigma.clamp_max(_MOST_LOG)
+            log_sigma = log_sigma.clamp_max(_MOST_LOG) + 0.5 * math.log(self.config.spread)
+            factors = math.sqrt(self.config.spread) * factors
             return HullPrediction(body, self.support_head(h), log_sigma, factors, self.config.freedom)
 
     def _heights(self, views: torch.Tensor, planes: torch.Tensor) -> torch.Tensor:

@@ -20,8 +20,8 @@ import copy
 import json
 import math
 import time
-from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, dataclass, fields
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ import numpy as np
 import torch
 from safetensors.numpy import load_file as load_arrays
 from safetensors.numpy import save_file as save_arrays
+from scipy.optimize import minimize_scalar
 
 from sq_perception.files import provenance
 from sq_perception.geometry.support_directions import mirrored
@@ -44,6 +45,8 @@ BODY, CENTRE = 2.0, 1.0
 """Weights of the losses beside the likelihood, which is of order 1 where they are of order 0.05."""
 _UNKNOWN_EXTENT = 0.1
 """Share of the views whose extent the network is not told."""
+_CALIBRATED, _LOG_SPREADS = 4096, (-5.0, 3.0)
+"""Views that settle the spread of the errors to 2 %, and between what it is sought."""
 _CLIP = 1.0
 _WARM_UP = 100
 _AVERAGE = 0.998
@@ -169,25 +172,37 @@ def train(config: ThingTraining, views: Path, output: Path, form: ThingConfig | 
             _keep(output, state, {**record, "seconds": state.seconds, **validate(state.average, held)}, config)
             losses.clear()
     state.seconds = time.monotonic() - began
+    sample = ThingViews(*(each[:_CALIBRATED] for each in vars(pool).values()))
+    state.average.config = replace(state.average.config, spread=likeliest_spread(state.average, sample))
     _keep(output, state, {"step": state.step, "seconds": state.seconds, **validate(state.average, held)}, config)
     return state.average
+
+
+def likeliest_spread(network: ThingNetwork, views: ThingViews, batch: int = 256) -> float:
+    """The factor of S for which true hulls are likeliest, now that the network predicts and does not learn.
+
+    As temperature scaling (C. Guo et al., "On calibration of modern neural networks", ICML 2017).
+    """
+    found = []
+    for truth, said in _answers(network, views, batch):
+        found.append(said.distance(truth)[0])
+    m, nu, count = torch.cat(found).numpy(), network.config.freedom, views.support.shape[1]
+    best = minimize_scalar(
+        lambda log: 0.5 * count * log + 0.5 * (nu + count) * float(np.log1p(m / (math.exp(log) * nu)).mean()),
+        bounds=_LOG_SPREADS,
+        method="bounded",
+    )
+    return network.config.spread * float(math.exp(best.x))
 
 
 def validate(network: ThingNetwork, views: ThingViews, batch: int = 256) -> dict[str, Any]:
     """Mean errors of h and of the body's h in sides of the view, and the deviation of error / sigma, by kind."""
     errors, body_errors, ratios = [], [], []
-    network.eval()
-    for i in range(0, len(views.images), batch):
-        part = slice(i, i + batch)
-        truth = torch.from_numpy(views.support[part])
-        with torch.inference_mode():
-            shown = (views.images[part].astype(np.float32), views.planes[part], views.extents[part])
-            said: HullPrediction = network(*map(torch.from_numpy, shown))
-            error = (said.support - truth).numpy()
-            sigma = said.deviation().numpy()
-            body_errors.append(thing_network.body_loss(said.body, truth).numpy())
+    for truth, said in _answers(network, views, batch):
+        error = (said.support - truth).numpy()
+        body_errors.append(thing_network.body_loss(said.body, truth).numpy())
         errors.append(np.abs(error).mean(axis=1))
-        ratios.append(error / sigma)
+        ratios.append(error / said.deviation().numpy())
     error, body_error, ratio = np.concatenate(errors), np.concatenate(body_errors), np.concatenate(ratios)
     found: dict[str, Any] = {
         "error": float(error.mean()),
@@ -199,6 +214,16 @@ def validate(network: ThingNetwork, views: ThingViews, batch: int = 256) -> dict
         if mine.any():
             found[kind] = [float(error[mine].mean()), float(np.sqrt(np.mean(ratio[mine] ** 2)))]
     return found
+
+
+@torch.inference_mode()
+def _answers(network: ThingNetwork, views: ThingViews, batch: int) -> Iterator[tuple[torch.Tensor, HullPrediction]]:
+    """True support functions and what the network says, batch by batch."""
+    network.eval()
+    for i in range(0, len(views.images), batch):
+        part = slice(i, i + batch)
+        shown = (views.images[part].astype(np.float32), views.planes[part], views.extents[part])
+        yield torch.from_numpy(views.support[part]), network(*map(torch.from_numpy, shown))
 
 
 def begin_with(network: ThingNetwork, path: Path) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sq_perception.fitting import surface_fit
-from sq_perception.fitting.hull_prior import MODEL_SHARE, HullPrior
+from sq_perception.fitting.hull_prior import MODEL_SHARE, SAME_IMAGE, HullPrior
 from sq_perception.fitting.levenberg_marquardt import State, move
 from sq_perception.fitting.normal_equations import STEP_LENGTH
 from sq_perception.fitting.priors import prior_cost
@@ -41,7 +41,7 @@ def terms_of(prior: HullPrior) -> Terms:
 def test_the_root_whitens_what_was_predicted_and_what_no_superquadric_reaches(rng: np.random.Generator) -> None:
     spread = rng.normal(size=(42, 42))
     prior = HullPrior(DIRECTIONS, np.zeros(42), 1e-5 * spread @ spread.T, 10.0, 0.2)
-    whole = prior.covariance + (MODEL_SHARE * 0.2) ** 2 * np.eye(42)
+    whole = SAME_IMAGE * prior.covariance + (MODEL_SHARE * 0.2) ** 2 * np.eye(42)
     assert prior.root() @ whole @ prior.root().T == pytest.approx(np.eye(42), abs=1e-8)
 
 

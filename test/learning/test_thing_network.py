@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from sq_perception.imaging.canonical_view import NEAREST
 from sq_perception.learning import checkpoint, thing_network, thing_training
 from sq_perception.learning.inference import ThingPredictor
 from sq_perception.learning.thing_network import HullPrediction, ThingConfig, ThingNetwork
-from sq_perception.simulation.thing_views import draw_thing_views
+from sq_perception.simulation.thing_views import ThingViews, draw_thing_views
 
 SMALL = ThingConfig(widths=(8, 16, 16, 16), blocks=1, hidden=16, factors=2)
 J = len(DIRECTIONS)
@@ -146,7 +147,28 @@ def test_a_run_that_was_stopped_goes_on(tmp_path: Path, rng: np.random.Generator
     assert [row["step"] for row in log] == sorted(row["step"] for row in log)
     assert log[len(first)]["step"] > first[-1]["step"]
     assert log[-1]["seconds"] > first[-1]["seconds"]
-    assert checkpoint.load_things(tmp_path / "run" / "things.safetensors").config == SMALL
+    kept = checkpoint.load_things(tmp_path / "run" / "things.safetensors").config
+    assert replace(kept, spread=1.0) == SMALL
+
+
+def test_the_spread_is_that_of_the_errors(rng: np.random.Generator) -> None:
+    """True hulls drawn from a quarter of the covariance that a network says: it is found, and then nothing is left."""
+    torch.manual_seed(5)
+    network = ThingNetwork(SMALL).eval()
+    count = 1500
+    images, planes = rng.random((count, 64, 64)).astype(np.float32), np.zeros((count, 4), np.float32)
+    extents = np.full(count, 0.2, np.float32)
+    with torch.inference_mode():
+        said = network(*map(torch.from_numpy, (images, planes, extents)))
+    root = np.linalg.cholesky(0.25 * said.covariance().numpy().astype(float))
+    normal = np.einsum("bij,bj->bi", root, rng.standard_normal((count, J)))
+    tails = np.sqrt(SMALL.freedom / rng.chisquare(SMALL.freedom, count))
+    truth = (said.support.numpy() + tails[:, None] * normal).astype(np.float32)
+    views = ThingViews(images, planes, extents, truth, np.zeros(count, np.int64))
+    spread = thing_training.likeliest_spread(network, views)
+    assert spread == pytest.approx(0.25, rel=0.15)
+    network.config = replace(network.config, spread=spread)
+    assert thing_training.likeliest_spread(network, views) == pytest.approx(spread, rel=0.01)
 
 
 def test_a_folder_without_views_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
