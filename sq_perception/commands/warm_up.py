@@ -35,7 +35,7 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
     from sq_perception.imaging import raycast
     from sq_perception.imaging.camera import Camera
     from sq_perception.recovery.recoverer import Recoverer
-    from sq_perception.segmentation import convex_parts
+    from sq_perception.segmentation import segments
     from sq_perception.simulation import view_rendering
 
     batch = Superquadric.from_flat(np.array([[0.1, 0.2, 0.3, 0.5, 0.8, 0, 0, 1, 0, 0, 0, 1]]))
@@ -48,7 +48,7 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
         ("overlap", lambda: metrics.volume_iou(batch, batch, 16)),
         ("classic fit", lambda: solina_bajcsy.fit(points)),
         ("surface fit", surface_fit.warm_up),
-        ("lines of sight", convex_parts.warm_up),
+        ("segmentation", segments.warm_up),
         ("grasps", planner.warm_up),
         ("a whole recovery", lambda: Recoverer().warm_up(Camera(160, 120, 150.0, 150.0, 79.5, 59.5))),
     ]

@@ -50,7 +50,7 @@ from sq_perception.recovery.continuity import Reference
 from sq_perception.recovery.options import FITTED, NEEDS_NETWORK, Method, RecoveryOptions, Refine
 from sq_perception.recovery.recovery import FrameRecovery, Recovery
 from sq_perception.recovery.seen_object import Prediction, SeenObject
-from sq_perception.segmentation import convex_parts, segments
+from sq_perception.segmentation import segments
 
 __all__ = [
     "FrameRecovery",
@@ -132,7 +132,7 @@ class Recoverer:
     def warm_up(self, camera: Camera) -> None:
         """Compile or load every kernel and run the whole chain once on an image of the camera's size."""
         surface_fit.warm_up()
-        convex_parts.warm_up()
+        segments.warm_up()
         depth = 1.0 if camera.is_pinhole else 0.5
         reach = 0.15 * min(camera.width / camera.fx, camera.height / camera.fy)
         centre = camera.unproject(np.array(camera.width / 2), np.array(camera.height / 2), np.array(depth))

@@ -240,6 +240,15 @@ def support_under(
     return support_plane.around(found.labels, (label,), depth, valid, camera, _search(options))
 
 
+def warm_up() -> None:
+    """Compile, or load from disk, every kernel by a ball on a table and by two that touch."""
+    convex_parts.warm_up()
+    camera = Camera(96, 72, 180.0, 180.0, 47.5, 35.5)
+    v, u = np.indices((camera.height, camera.width))
+    radius = np.hypot(u - camera.cx, v - camera.cy) / 20
+    segment((0.7 - 0.08 * np.sqrt(np.maximum(1 - radius**2, 0))).astype(np.float32), camera)
+
+
 def _search(options: SegmentationOptions) -> support_plane.Search:
     return support_plane.Search(options.plane_tolerance, options.min_plane_share, options.seed)
 

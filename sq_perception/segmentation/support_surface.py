@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from sq_perception.geometry.kernels import inline_kernel, kernel
+from sq_perception.geometry.kernels import kernel
 from sq_perception.imaging import depth_steps
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation.support_plane import LEAST_GROWTH, Plane, noise_growth
@@ -72,15 +72,12 @@ class SupportSurface:
     limit: float
     sigma: float
 
-    def relative(self, points: np.ndarray) -> np.ndarray:
-        """Height (n,) of points (n, 3) above the bent surface, as at one metre of depth."""
-        return np.asarray(_relative(points, self.plane.equation, self.bend, self.limit))
-
     def image_relative(self, depth: np.ndarray, camera: Camera) -> np.ndarray:
-        """The same, float32 (height, width), for every pixel of a pinhole camera's depth image, 0 for depth 0."""
+        """Height, float32 (height, width), above the bent surface as at one metre of depth, 0 for depth 0; of a pinhole
+        camera's depth image."""
         x = (np.arange(camera.width) - camera.cx) / camera.fx
         y = (np.arange(camera.height) - camera.cy) / camera.fy
-        return np.asarray(_image_relative(depth, x, y, self.plane.equation, self.bend, self.limit))
+        return np.asarray(_relative(depth, x, y, self.plane.equation, self.bend, self.limit))
 
 
 def measured(plane: Plane, depth: np.ndarray, valid: np.ndarray, camera: Camera, tolerance: float) -> SupportSurface:
@@ -210,24 +207,8 @@ def _shallow(height: np.ndarray, z: np.ndarray, known: np.ndarray, width: np.nda
     return ok
 
 
-@inline_kernel
-def _bent(x: float, y: float, bend: np.ndarray, limit: float) -> float:
-    off = bend[0] + x * (bend[1] + bend[3] * x + bend[4] * y) + y * (bend[2] + bend[5] * y)
-    return min(max(off, -limit), limit)
-
-
 @kernel
-def _relative(points: np.ndarray, plane: np.ndarray, bend: np.ndarray, limit: float) -> np.ndarray:
-    height = np.empty(len(points))
-    for k in range(len(points)):
-        x, y, z = points[k, 0], points[k, 1], points[k, 2]
-        above = x * plane[0] + y * plane[1] + z * plane[2] + plane[3]
-        height[k] = above / max(z * z, LEAST_GROWTH) - _bent(x / z, y / z, bend, limit)
-    return height
-
-
-@kernel
-def _image_relative(
+def _relative(
     depth: np.ndarray, x: np.ndarray, y: np.ndarray, plane: np.ndarray, bend: np.ndarray, limit: float
 ) -> np.ndarray:
     height = np.zeros(depth.shape, np.float32)
@@ -236,7 +217,8 @@ def _image_relative(
             z = np.float64(depth[v, u])
             above = z * (plane[0] * x[u] + plane[1] * y[v] + plane[2]) + plane[3]
             if z > 0:
-                height[v, u] = above / max(z * z, LEAST_GROWTH) - _bent(x[u], y[v], bend, limit)
+                off = bend[0] + x[u] * (bend[1] + bend[3] * x[u] + bend[4] * y[v]) + y[v] * (bend[2] + bend[5] * y[v])
+                height[v, u] = above / max(z * z, LEAST_GROWTH) - min(max(off, -limit), limit)
     return height
 
 
