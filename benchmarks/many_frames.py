@@ -18,6 +18,7 @@ if __name__ == "__main__":  # as a script only: a process that imports this has 
     for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
         os.environ.setdefault(variable, "1")
 
+import multiprocessing
 import time
 from typing import Any
 
@@ -54,17 +55,10 @@ def of_many(works: list[workers.Work], jobs: int) -> dict[str, float]:
     crew = workers.Processes(workers.Setup(None, RecoveryOptions(), consensus=False), jobs)
     for _ in workers.recovered(enumerate(works), crew):
         moments.append(time.perf_counter())
-    while _has_children():
-        time.sleep(0.05)
+    for process in multiprocessing.active_children():
+        process.join()
     warm = len(moments) // 10
     return _figures(len(moments) - 1 - warm, moments[-1] - moments[warm], len(moments), processor_time() - spent)
-
-
-def _has_children() -> bool:
-    try:
-        return os.waitpid(-1, os.WNOHANG)[0] == 0
-    except ChildProcessError:
-        return False
 
 
 def _figures(frames: int, seconds: float, all_frames: int, processor: float) -> dict[str, float]:
