@@ -43,7 +43,7 @@ CAUSES = {
     "slipped": "slipped",
 }
 FILM_CAMERA = Camera(320, 240, 370.0, 370.0, 159.5, 129.5)
-PERIOD, COLOURS = 0.12, 32
+PERIOD, COLOURS = 0.12, 64
 """Seconds between the pictures of a film, and its palette."""
 HAND, TABLE = np.array([0.25, 0.25, 0.28]), np.array([0.93, 0.92, 0.89])
 _SHARP = np.full(2, 0.05)
@@ -134,7 +134,7 @@ def _picture(world: World) -> np.ndarray:
     points = FILM_CAMERA.unproject(columns.ravel(), rows.ravel(), depth.ravel()).reshape(*depth.shape, 3)
     normal = np.cross(np.gradient(points, axis=0), np.gradient(points, axis=1))
     normal /= np.maximum(np.linalg.norm(normal, axis=2, keepdims=True), 1e-12)
-    light = 0.45 + 0.55 * np.clip(normal @ (_LIGHT / np.linalg.norm(_LIGHT)), 0, 1)
+    light = 0.6 + 0.4 * np.clip(normal @ (_LIGHT / np.linalg.norm(_LIGHT)), 0, 1)
     colours = [plots.colour(k) for k in range(len(world.things))] + [HAND, TABLE]
     return np.asarray(255 * light[..., None] * np.array(colours)[thing], dtype=np.uint8)
 

@@ -380,24 +380,65 @@ def recorded() -> str:
     return table(heads, rows) + measured("known_frames")
 
 
+PICKERS = {
+    "ours": "recovered bodies, with their covariance",
+    "ours without sigma": "the same, 10 % of the size as sigma",
+    "ours at any score": "the same as the first, grasps of any score tried",
+    "true bodies": "true bodies",
+    "classic": "`classic` fit",
+    "box": "smallest box of the seen points",
+    "centroid": "straight down on the points' middle, no planner",
+    "cgn in masks": "Contact-GraspNet, contacts in our masks",
+    "cgn": "Contact-GraspNet alone",
+}
+"""Contestants of the picking benchmark."""
+
+
 def picking() -> str:
     """Grasps in physics: how often one holds, and how much is cleared."""
-    names = {
-        "ours": "recovered bodies, with their covariance",
-        "ours without sigma": "the same, 10 % of the size as sigma",
-        "true bodies": "true bodies",
-        "classic": "`classic` fit",
-        "box": "smallest box of the seen points",
-        "centroid": "straight down on the points' middle, no planner",
-    }
     found = results("picking")["rows"]
     rows = []
-    for who, text in names.items():
+    for who, text in PICKERS.items():
         kinds = [found.get(f"{kind}: {who}") for kind in ("packed", "pile")]
         scenes = " / ".join(str(one["scenes"]) if one else "-" for one in kinds)
         rows.append([text, scenes, *(_rate(one[rate]) if one else "-" for one in kinds for rate in ("gsr", "dr"))])
     heads = ["planned on", "scenes, packed / pile", "packed: GSR %", "DR %", "pile: GSR %", "DR %"]
     return table(heads, rows) + measured("picking")
+
+
+def picking_failures() -> str:
+    """Why grasps failed, both kinds of scenes together."""
+    causes = ("collision", "wrong size", "missed", "slipped", "unreachable")
+    rows = []
+    for who, text in PICKERS.items():
+        kinds = [one for name, one in results("picking")["rows"].items() if name.partition(": ")[2] == who]
+        rows.append([text, *(str(sum(one[what] for one in kinds)) for what in ("scenes", "tried"))])
+        rows[-1] += [str(sum(one["causes"][cause] for one in kinds)) for cause in causes]
+    return table(["planned on", "scenes", "tried", *causes], rows)
+
+
+def picking_scores() -> str:
+    """Scores of ours against what held, and differences to others on the same scenes."""
+    found = results("picking")
+    runs = [one for name, one in found["rows"].items() if name.partition(": ")[2] in ("ours", "ours at any score")]
+    rows = []
+    for k in range(5):
+        bins = [one["bins"][k] for one in runs if one["bins"][k][0]]
+        count = sum(one[0] for one in bins)
+        if count:
+            means = [f"{100 * sum(one[0] * one[of] for one in bins) / count:.0f}" for of in (1, 2)]
+            rows.append([f"{0.2 * k:.1f} to {0.2 * k + 0.2:.1f}", str(count), *means])
+    gains = [
+        [
+            name,
+            f"{one['scenes'][0]:.0f}",
+            *("{:+.0f} ({:+.0f} to {:+.0f})".format(*one[rate]) for rate in ("gsr", "dr")),
+        ]
+        for name, one in found["gains"].items()
+        if one
+    ]
+    scores = table(["score", "tried", "mean score %", "held %"], rows)
+    return scores + "\n\n" + table(["difference in %", "scenes", "GSR", "DR"], gains)
 
 
 def _rate(one: list[float]) -> str:
@@ -420,6 +461,8 @@ BLOCKS: dict[str, Callable[[], str]] = {
         latency,
         still,
         picking,
+        picking_failures,
+        picking_scores,
         tracks,
         layers,
         packages,
