@@ -10,7 +10,7 @@ Things of household scenes (:mod:`household_things`), at least half visible, and
 | whole | as it is shipped |
 | no predicted hull | neither the hull nor the predicted body as a start |
 | no covariance | errors of neighbouring directions taken for independent |
-| normal | the hull's errors without tails (nu = 1000) |
+| twice as vague, as sure | the deviations of the predicted hull times and over 2 |
 | every ray counts | as 1000 independent rays instead of 100 |
 | as a body | points within count in full, space within the outline's hull must be empty |
 | no plane, no free space | without either |
@@ -105,7 +105,8 @@ def rows() -> tuple[Row, ...]:
         row("whole"),
         row("no predicted hull", hull=lambda *_: None),
         row("no covariance", hull=lambda h, _: replace(h, covariance=np.diag(np.diag(h.covariance)))),
-        row("normal", hull=lambda h, _: replace(h, freedom=1000.0)),
+        row("twice as vague", hull=lambda h, _: replace(h, covariance=4 * h.covariance)),
+        row("twice as sure", hull=lambda h, _: replace(h, covariance=h.covariance / 4)),
         row("every ray counts", program=rays(1000.0)),
         row("as a body", program=lambda: patch.multiple(Observation, of_hull=lambda self: self)),
         row("no plane", plane=None, model_error=methods.MODEL_ERROR_ON_PLANE),

@@ -8,7 +8,7 @@ proportion  log a_k minus the mean of the three, over sigma: what the image leav
 expectation log a_k minus that of a predicted half size, over sigma, Cauchy: a prediction may be altogether wrong.
 roundness   log(a1 / a2) and 1 - e2, over sigma: a body of revolution about its z axis.
 hull        W (n_j.t + h(R^T n_j) - b_j): the support function in J directions beside a predicted one b, whitened by
-            W^T W = S^-1; all J together by the loss of a t distribution, (nu + J) log(1 + |r|^2 / nu).
+            W^T W = S^-1.
 volume      a linear price on log(a1 a2 a3), for the smaller of two bodies that explain the image alike.
 
 Each function returns its share of the cost and adds its derivatives to the normal equations ``sums``; the unknowns are
@@ -129,10 +129,8 @@ def _hull_cost(terms: Terms, parameters: np.ndarray, rotation: np.ndarray, sums:
     square = 0.0
     for j in range(count):
         square += whitened[STEP_LENGTH, j] * whitened[STEP_LENGTH, j]
-    freedom = terms.hull_freedom
-    whitened *= math.sqrt((freedom + count) / (freedom + square))
     add_block(whitened, count, sums)
-    return (freedom + count) * math.log1p(square / freedom)
+    return square
 
 
 @kernel

@@ -99,7 +99,7 @@ def warm_up() -> None:
     body = Superquadric([0.05, 0.04, 0.03], [0.5, 0.5], [0.0, 0.0, 0.5], [0.3, 0.2, 0.1, 0.9])
     plane = np.array([0.0, 0.0, -1.0, 0.7])
     reach = DIRECTIONS @ body.translation + body.support(DIRECTIONS)
-    hull = HullPrior(DIRECTIONS, reach, 1e-5 * np.eye(len(reach)), 10.0, 0.1)
+    hull = HullPrior(DIRECTIONS, reach, 1e-5 * np.eye(len(reach)), 0.1)
     cameras = (Camera(48, 48, 60.0, 60.0, 23.5, 23.5), Camera(48, 48, 200.0, 200.0, 23.5, 23.5, "orthographic"))
     for camera in cameras:
         rendered, _ = raycast.render(body, camera)

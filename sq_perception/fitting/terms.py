@@ -42,4 +42,3 @@ class Terms(NamedTuple):
     hull_directions: np.ndarray = np.empty((0, 3))
     hull_support: np.ndarray = np.empty(0)
     hull_root: np.ndarray = np.empty((0, 0))
-    hull_freedom: float = 0.0

@@ -5,7 +5,7 @@ One maximum a posteriori fit.  The cost, minus twice the log of the posterior, i
     object  w rho(r)        what the object's pixels measured; sigma is the noise and the model error in squares
     free    w rho(r)        pixels beside it that saw farther: the body keeps out
     plane, rest             it does not reach below its support, and mostly lies on a face
-    hull                    (nu + J) log(1 + |W (h - b)|^2 / nu): its support function beside the predicted one
+    hull                    |W (h - b)|^2: its support function beside the predicted one
     volume, proportion      weak, and only where nothing is predicted (:mod:`sq_perception.fitting.unseen` then too)
 
 (:mod:`sq_perception.fitting.residuals`, :mod:`sq_perception.fitting.priors`, :mod:`sq_perception.fitting.hull_prior`).
@@ -153,7 +153,6 @@ def _with_priors(problem: Problem) -> Problem:
         hull_directions=np.ascontiguousarray(hull.directions),
         hull_support=np.ascontiguousarray(hull.support),
         hull_root=hull.root(),
-        hull_freedom=hull.freedom,
     )
     observation = problem.observation.of_hull()
     return replace(problem, terms=terms, observation=observation, independent=INDEPENDENT_OF_PREDICTED)

@@ -52,21 +52,18 @@ class HullAnswers:
     support : (n, J)
         Support functions in sides of the view, from its middle (:data:`thing_network.MIDDLE`).
     covariance : (n, J, J)
-    freedom : float
-        nu of the t distribution whose S the covariance is.
     """
 
     bodies: Superquadric
     support: np.ndarray
     covariance: np.ndarray
-    freedom: float
 
     def hull(self, number: int, view: CanonicalView) -> HullPrior:
         """The prediction of one view in the optical frame."""
         directions = DIRECTIONS @ quaternions.to_matrix(view.rotation)
         support = directions @ view.anchor + view.extent * self.support[number]
         covariance = view.extent**2 * self.covariance[number]
-        return HullPrior(directions, support, covariance, self.freedom, view.extent)
+        return HullPrior(directions, support, covariance, view.extent)
 
 
 class ThingPredictor:
@@ -111,7 +108,6 @@ class ThingPredictor:
             Superquadric.from_flat(flat),
             (straight + turned[:, back]) / 2,
             (covariance + turned_covariance[:, back][:, :, back]) / 2,
-            said.freedom,
         )
 
 

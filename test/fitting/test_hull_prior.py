@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sq_perception.fitting import surface_fit
-from sq_perception.fitting.hull_prior import MODEL_SHARE, SAME_IMAGE, HullPrior
+from sq_perception.fitting.hull_prior import MODEL_SHARE, HullPrior
 from sq_perception.fitting.levenberg_marquardt import State, move
 from sq_perception.fitting.normal_equations import STEP_LENGTH
 from sq_perception.fitting.priors import prior_cost
@@ -23,10 +23,10 @@ CAMERA = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)
 BODY = Superquadric([0.03, 0.04, 0.06], [0.3, 0.6], [0.01, -0.02, 0.5], [0.3, 0.2, -0.1, 0.9])
 
 
-def told(body: Superquadric, sigma: float, freedom: float = 10.0) -> HullPrior:
+def told(body: Superquadric, sigma: float) -> HullPrior:
     """The support function of a body, each direction with the same deviation in metres."""
     support = DIRECTIONS @ body.translation + body.support(DIRECTIONS)
-    return HullPrior(DIRECTIONS, support, sigma**2 * np.eye(len(DIRECTIONS)), freedom, 0.1)
+    return HullPrior(DIRECTIONS, support, sigma**2 * np.eye(len(DIRECTIONS)), 0.1)
 
 
 def terms_of(prior: HullPrior) -> Terms:
@@ -34,26 +34,24 @@ def terms_of(prior: HullPrior) -> Terms:
         hull_directions=np.array(prior.directions),
         hull_support=prior.support,
         hull_root=prior.root(),
-        hull_freedom=prior.freedom,
     )
 
 
 def test_the_root_whitens_what_was_predicted_and_what_no_superquadric_reaches(rng: np.random.Generator) -> None:
     spread = rng.normal(size=(42, 42))
-    prior = HullPrior(DIRECTIONS, np.zeros(42), 1e-5 * spread @ spread.T, 10.0, 0.2)
-    whole = SAME_IMAGE * prior.covariance + (MODEL_SHARE * 0.2) ** 2 * np.eye(42)
+    prior = HullPrior(DIRECTIONS, np.zeros(42), 1e-5 * spread @ spread.T, 0.2)
+    whole = prior.covariance + (MODEL_SHARE * 0.2) ** 2 * np.eye(42)
     assert prior.root() @ whole @ prior.root().T == pytest.approx(np.eye(42), abs=1e-8)
 
 
-def test_the_true_body_costs_nothing_and_others_by_the_t_distribution() -> None:
+def test_the_true_body_costs_nothing_and_others_by_their_distance() -> None:
     prior, sums = told(BODY, 0.004), np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
     state = State.of(BODY)
     assert prior_cost(terms_of(prior), state.parameters, state.rotation, sums) == pytest.approx(0.0, abs=1e-12)
     moved = state.parameters.copy()
     moved[5] += 0.01
     error = prior.root() @ (DIRECTIONS[:, 0] * 0.01)
-    expected = (10 + 42) * math.log1p(float(error @ error) / 10)
-    assert prior_cost(terms_of(prior), moved, state.rotation, sums) == pytest.approx(expected)
+    assert prior_cost(terms_of(prior), moved, state.rotation, sums) == pytest.approx(float(error @ error))
 
 
 def test_the_gradient_is_that_of_the_cost() -> None:
@@ -72,7 +70,6 @@ def test_the_gradient_is_that_of_the_cost() -> None:
             move(state.parameters, state.rotation, step, *wide, parameters, rotation)
             costs.append(prior_cost(terms, parameters, rotation, spare))
         slope = (costs[0] - costs[1]) / 2e-6
-        # The scale of the t distribution is held: J^T r is half of the gradient.
         assert 2 * sums[STEP_LENGTH, k] == pytest.approx(slope, rel=1e-4, abs=1e-4)
 
 
