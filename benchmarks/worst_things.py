@@ -4,7 +4,8 @@
     python benchmarks/worst_things.py runs/things.json docs/unseen_worst.png
 
 Depth of the surroundings of each; the recovered body in colour, the outline of the true hull as a thin line, both sets
-of edges in millimetres.  Of things at least half visible.
+of edges in millimetres.  Of things at least half visible, at least half of whose pixels were measured: some stand nearer than a sensor
+sees.
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ COLUMNS, SIDE = 4, 2.9
 
 def worst(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     """Of each kind the thing with the least IoU."""
-    seen = [row for row in rows if row["visible_share"] >= HALF]
+    seen = [row for row in rows if row["visible_share"] >= HALF and row["measured"] >= HALF * row["pixels"]]
     of_kinds = [[row for row in seen if row["kind"] == kind] for kind in KINDS]
     return [min(some, key=lambda row: float(row["answers"][METHOD]["iou"])) for some in of_kinds if some]
 
@@ -60,7 +61,7 @@ def draw(ax: Axes, row: dict[str, Any]) -> None:
     ax.set_xticks([])
     ax.set_yticks([])
     heading_of(ax, row["thing"], f"IoU {100 * answer['iou']:.0f} %, {answer['status'].lower()}")
-    ax.set_xlabel(f"{text} mm, true {edges}", fontsize=8)
+    ax.set_xlabel(f"{text}, true {edges} mm", fontsize=8)
 
 
 def main() -> None:
