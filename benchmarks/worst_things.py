@@ -4,7 +4,7 @@
     python benchmarks/worst_things.py runs/things.json docs/unseen_worst.png
 
 Depth of the surroundings of each; the recovered body in colour, the outline of the true hull as a thin line, both sets
-of edges in millimetres.  Of things at least half visible, at least half of whose pixels were measured: some stand nearer than a sensor
+of edges in millimetres.  Of things at least half visible and at least half measured: some stand nearer than a sensor
 sees.
 """
 

@@ -18,7 +18,7 @@ from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeAlias, TypeVar
+from typing import TYPE_CHECKING, TypeAlias, TypeVar, cast
 
 import numpy as np
 
@@ -153,8 +153,8 @@ class Cluster:
 
     def ask(self, work: Work) -> _Answer:
         # Frames alike are frames all the same: none is answered from what another one came to.
-        answer: _Answer = self._client.submit(_recover, self._setup, work, pure=False)
-        return answer
+        # distributed's future says what the standard library's does, but is none by inheritance.
+        return cast(_Answer, self._client.submit(_recover, self._setup, work, pure=False))
 
     def end(self) -> None:
         self._client.close()
