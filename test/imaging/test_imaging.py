@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from unit_axis import cell_centres
 
 from sq_perception.geometry import Superquadric, rotation
 from sq_perception.imaging import canonical_view, raycast, soft_agreement, soft_render, unit_cube
@@ -216,11 +217,6 @@ class TestCanonicalView:
     def test_empty_mask_is_misuse(self) -> None:
         with pytest.raises(ValueError, match="at least one pixel"):
             canonical_view.from_mask(np.full((48, 64), np.nan), np.ones((48, 64), bool), Camera(64, 48, 50, 50, 32, 24))
-
-
-def cell_centres(resolution: int) -> torch.Tensor:
-    """Centres of equal cells of [0, 1], as the pixels of a canonical view."""
-    return (torch.arange(resolution, dtype=torch.float64) + 0.5) / resolution
 
 
 class TestSoftRender:

@@ -7,6 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
+from unit_axis import cell_centres
 
 from sq_perception.geometry import Superquadric
 from sq_perception.geometry import rotation as quaternions
@@ -148,7 +149,7 @@ class TestRenderLoss:
 
 def voxel_loss(guess: Superquadric, view: torch.Tensor, sharpness: float, tau: float) -> torch.Tensor:
     """L_DR (n,) as the thesis defines it: views (n, p, p), grids of p^3 voxels."""
-    axis = soft_render.cell_centres(view.shape[-1], view)
+    axis = cell_centres(view.shape[-1]).to(view)
     return (view - soft_render.render_depth(guess, axis, sharpness, tau)).abs().mean(dim=(-2, -1))
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
+from unit_axis import cell_centres
 
 from sq_perception.geometry import Superquadric
 from sq_perception.imaging import sight_lines, soft_render
@@ -92,7 +93,7 @@ class TestSoftDepth:
         voxels = 2000
         images, bodies = views(6, 3)
         lines, _ = sight_lines.of_view(images, 5, 2, 2)
-        z = soft_render.cell_centres(voxels).flip(0)
+        z = cell_centres(voxels).flip(0)
         points = torch.cat(
             [lines[:, None].expand(-1, voxels, 2), z[None, :, None].expand(len(lines), -1, 1)], dim=-1
         ).reshape(-1, 3)
