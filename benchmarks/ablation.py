@@ -42,6 +42,7 @@ import numpy as np
 import report
 import trimesh
 from hull_oracle import Columns
+from known_frames import camera_of
 
 from sq_perception.fitting import surface_fit, tolerant
 from sq_perception.fitting.fit import Status
@@ -168,8 +169,7 @@ def simulated(seeds: range, recoverer: Recoverer) -> Iterator[Seen]:
 def recorded(frames: Path, hulls: Path, recoverer: Recoverer) -> Iterator[Seen]:
     for path in sorted(frames.glob("*.npz")):
         frame = np.load(path)
-        depth, k = frame["depth"], frame["K"]
-        camera = Camera(depth.shape[1], depth.shape[0], k[0, 0], k[1, 1], k[0, 2], k[1, 2])
+        depth, camera = frame["depth"], camera_of(frame)
         found = shown(depth, camera, frame["labels"].astype(np.int32), recoverer)
         for number, label in enumerate(frame["ids"]):
             pose, name = frame["T_cam_mesh"][number], str(frame["mesh"][number])

@@ -69,6 +69,12 @@ class Answer:
     milliseconds: float
 
 
+def camera_of(frame: Any) -> Camera:
+    """The pinhole camera of a frame."""
+    (height, width), k = frame["depth"].shape, frame["K"]
+    return Camera(width, height, k[0, 0], k[1, 1], k[0, 2], k[1, 2])
+
+
 @cache
 def columns(path: Path) -> Columns:
     return Columns.of(np.asarray(trimesh.load_mesh(path, process=False).vertices))
@@ -97,8 +103,7 @@ def answer(
 
 def answers(name: str, frame: Any, hulls: Path, recoverer: Recoverer, others: Others) -> list[Answer]:
     """Every method on every labelled thing of one frame."""
-    depth, k = frame["depth"], frame["K"]
-    camera = Camera(depth.shape[1], depth.shape[0], k[0, 0], k[1, 1], k[0, 2], k[1, 2])
+    depth, camera = frame["depth"], camera_of(frame)
     labels = frame["labels"].astype(np.int32)
     found: list[Answer] = []
     for method, title in (("auto", METHODS[0]), ("network", METHODS[1]), ("classic", METHODS[3])):

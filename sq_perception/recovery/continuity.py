@@ -2,7 +2,7 @@
 
 A body is what a fit makes of readings.  Where these are the same but for noise, a fit to them would answer the same but
 for what noise makes of it, which is its covariance: the body stands, and neither segmentation nor network nor fit is
-asked again.  It is not refined either: its error is that of the frame it was recovered from, and is told once
+asked again.  It is not refined either: its error is that of the frame it was recovered from, and counts once
 (:attr:`~sq_perception.recovery.recovery.Recovery.repeats`, :mod:`sq_perception.tracking.fusion`).
 
 Equation

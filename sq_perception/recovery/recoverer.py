@@ -196,9 +196,9 @@ class Recoverer:
         with _timed(milliseconds, "segmentation"):
             depth = _plausible(np.asarray(depth), camera)
             camera.check_image(depth)
-            kept = continuity.NOTHING
+            cleaned, kept = _cleaned(depth, camera), continuity.NOTHING
             if previous is not None:
-                kept = continuity.repeated(previous, _cleaned(depth, camera), camera, options)
+                kept = continuity.repeated(previous, cleaned, camera, options)
                 if kept.whole and (labels is None or np.array_equal(labels, previous.labels)):
                     milliseconds["segmentation"] = milliseconds["total"] = 1e3 * (time.perf_counter() - started)
                     bodies = tuple(replace(one, repeats=one.repeats + 1) for one in previous.bodies)
@@ -207,7 +207,7 @@ class Recoverer:
                 found = segments.segment(depth, camera, options.segmentation_options())
             else:
                 found = segments.from_labels(labels, depth, camera, options.segmentation_options())
-            depth = _cleaned(depth, camera)
+            depth = cleaned
             objects = seen_object.objects(depth, found, camera, options.depth_range)
             same = {} if previous is None else continuity.matched(kept, previous.labels, objects)
 

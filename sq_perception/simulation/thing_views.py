@@ -98,8 +98,6 @@ class Setting:
     ----------
     parts, cavities : Superquadric
         Of the thing, (k,) and (m,).
-    surface : (n, 3), (m, 3), optional
-        Its mesh, if it is seen as one.
     others : Superquadric
         Batch (j,), j >= 0: neighbours, and what it stands on.
     table : (4,) or None
@@ -107,6 +105,8 @@ class Setting:
     behind : float
         Depth of the wall behind all, +inf without one.
     camera : Camera
+    surface : (n, 3), (m, 3), optional
+        Vertices and faces of the thing's mesh, if it is seen as one.
     """
 
     parts: Superquadric
