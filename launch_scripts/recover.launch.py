@@ -21,6 +21,7 @@ from sq_perception.nodes import fast_dds
 ARGUMENTS = {
     "depth": ("depth/image", "topic of the depth images"),
     "camera_info": ("depth/camera_info", "topic of their camera_info"),
+    "points": ("", "topic of point clouds in the optical frame, which are read instead of depth images"),
     "mask": ("mask/image", "topic of label images with the same stamps, if there are any"),
     "params_file": ("", "YAML file of parameters, like the one in share/sq_perception/config"),
     "cameras": ("", "namespaces of several cameras: recover_cameras instead of recover_node"),
@@ -61,6 +62,7 @@ def _nodes(context: LaunchContext) -> list[Node]:
         for name, kind in _PARAMETERS.items()
         if given[name]
     ]
+    parameters += [{"image_transport": "points"}] * bool(given["points"])
     nodes = [
         Node(
             package="sq_perception",
@@ -78,6 +80,7 @@ def _nodes(context: LaunchContext) -> list[Node]:
             remappings=[
                 ("depth/image", given["depth"]),
                 ("depth/camera_info", given["camera_info"]),
+                ("depth/points", given["points"] or "depth/points"),
                 ("mask/image", given["mask"]),
             ],
         )

@@ -78,6 +78,7 @@ def test_recover_is_wired_to_the_camera(repository: Path, launch: dict[str, type
     assert dict(node.named["remappings"]) == {
         "depth/image": "/camera/depth",
         "depth/camera_info": "/camera/info",
+        "depth/points": "depth/points",
         "mask/image": "mask/image",
     }
     both = nodes_of(path, launch, fitter="true", params_file="mine.yaml")
@@ -97,6 +98,9 @@ def test_recover_is_wired_to_the_camera(repository: Path, launch: dict[str, type
         {"use_sim_time": True},
     ]
     assert node.named["arguments"] == ["--ros-args", "--log-level", "debug"]
+    (node,) = nodes_of(path, launch, points="/camera/points")
+    assert node.named["parameters"] == [{"image_transport": "points"}]
+    assert dict(node.named["remappings"])["depth/points"] == "/camera/points"
 
 
 def test_several_cameras_are_one_process_with_names_of_their_own(repository: Path, launch: dict[str, type]) -> None:
