@@ -75,11 +75,15 @@ def _weights() -> tuple[str, bool]:
 
 
 def _kernels() -> str:
+    """Whether code of these sources is kept: names of files end in a digest of them, and older files are not used."""
     try:
         from sq_perception.geometry import kernels
     except ImportError as error:
         return f"cannot be loaded: {error}"
     gauge: Any = kernels.gauge
-    folder = Path(gauge.stats.cache_path)
-    kept = any(folder.glob(f"kernels.{gauge.py_func.__qualname__}-*.nbi"))
-    return f"compiled, in {folder}" if kept else f"not compiled yet: sq-perception warm-up; they go to {folder}"
+    folder, changed = Path(gauge.stats.cache_path), Path(kernels.__file__).stat().st_mtime
+    kept = list(folder.glob("kernels.gauge_????????????-*.nbi"))
+    if any(gauge.py_func.__qualname__ in file.name and file.stat().st_mtime > changed for file in kept):
+        return f"compiled, in {folder}"
+    why = "compiled for other sources" if kept else "not compiled yet"
+    return f"{why}: sq-perception warm-up; they go to {folder}"

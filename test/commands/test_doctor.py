@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 
 from sq_perception import __version__
 from sq_perception.commands import doctor, main
@@ -24,3 +26,26 @@ def test_what_is_missing_comes_with_its_remedy(monkeypatch, capsys):
     said = capsys.readouterr().out
     assert "missing no_such_module: pip install 'sq_perception[bags]'" in said
     assert "missing: pip install 'no-such-package>=3'" in said
+
+
+def test_kernels_of_other_sources_are_told_from_none(tmp_path):
+    """As after an update, whose digest is another one, and after an edit, which is younger than the code."""
+    code = """
+import os
+from pathlib import Path
+from sq_perception.commands import doctor
+from sq_perception.geometry import kernels
+said = [doctor._kernels()]
+kernels.gauge(0.1, 0.0, 0.0, 0.1, 0.1, 0.1, 1.0, 1.0)
+said += [doctor._kernels()]
+(file,) = Path(kernels.gauge.stats.cache_path).glob("*.gauge_*.nbi")
+os.utime(file, (0, 0))
+said += [doctor._kernels()]
+file.rename(file.with_name("kernels.gauge_0123456789ab-1.nbi"))
+print(*said, doctor._kernels(), sep="\\n")
+"""
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    told = [line.partition(str(tmp_path))[0].strip() for line in done.stdout.splitlines()]
+    other = "compiled for other sources: sq-perception warm-up; they go to"
+    assert told == [other.replace("compiled for other sources", "not compiled yet"), "compiled, in", other, other]
