@@ -86,6 +86,7 @@ def _recovered(options: argparse.Namespace) -> Iterator[tuple[RecordedFrame, Fra
             continue
         if frame.warning:
             complain(f"warning: {frame.name}: {frame.warning}")
+        print(f"recovering {frame.name}", flush=True)
         labels = None if options.ignore_masks else frame.labels
         settings = RecoveryOptions(method=options.method, free_space=frame.has_free_space)
         yield frame, recoverer.recover(frame.depth, frame.camera, labels, settings)

@@ -77,6 +77,17 @@ def test_frames_are_turned_over_and_recovered_once(shot):
     assert asked == ["b"]
 
 
+def test_what_one_waits_for_is_said(tmp_path, shot, capsys):
+    frame, _ = shot
+    np.savez(tmp_path / "a.npz", depth=frame.depth, K=CAMERA.matrix)
+    given = {"frames": [str(tmp_path / "a.npz")] * 2, "method": "symmetry", "projection": "pinhole", "every": 1}
+    options = SimpleNamespace(**given, camera_info=None, topic=None, ignore_masks=True)
+    frames = view_recording._recovered(options)
+    assert not capsys.readouterr().out
+    next(frames)
+    assert capsys.readouterr().out == "recovering a.npz\n"
+
+
 def test_nothing_to_show_ends_at_once(tmp_path, capsys):
     pytest.importorskip("viser", reason="needs the extra 'view'")
     assert main.main(["view", str(tmp_path / "none.npz"), "--method", "symmetry"]) == 1
