@@ -397,6 +397,20 @@ def table(found: dict[str, Any]) -> str:
     return report.table(heads, rows)
 
 
+def gains_table(gains: dict[str, Any]) -> str:
+    """Of pairs of contestants that tried the same scenes."""
+    rows = [
+        [
+            name,
+            f"{one['scenes'][0]:.0f}",
+            *("{:+.0f} ({:+.0f} to {:+.0f})".format(*one[rate]) for rate in ("gsr", "dr")),
+        ]
+        for name, one in gains.items()
+        if one
+    ]
+    return report.table(["difference on the same scenes", "scenes", "GSR %", "DR %"], rows)
+
+
 def gain(lines: list[dict[str, Any]], kind: str, name: str, other: str) -> dict[str, list[float]]:
     """By how many percent GSR and DR of one contestant are above another's on the same scenes, and 95 % intervals."""
     runs = {
@@ -462,10 +476,11 @@ def main() -> None:
         for kind in KINDS
         for other in ("ours without sigma", "classic", "cgn in masks")
     }
+    text = f"{table(found)}\n\n{gains_table(gains)}"
     if arguments.name:
-        report.write(arguments.name, {"rows": found, "gains": gains}, table(found))
+        report.write(arguments.name, {"rows": found, "gains": gains}, text)
     else:
-        print(table(found))
+        print(text)
 
 
 if __name__ == "__main__":

@@ -146,19 +146,12 @@ def prediction() -> str:
         header = json.loads(file.read(int.from_bytes(file.read(8), "little")))
     validation = json.loads(header["__metadata__"]["validation"])
     kinds = {name: values for name, values in validation.items() if isinstance(values, list)}
+    kinds = {"all": (validation["error"], validation["ratio"]), **kinds}
     return table(
-        ["kind", "all", *kinds],
+        ["kind", *kinds],
         [
-            [
-                "error of h, % of the view",
-                f"{100 * validation['error']:.1f}",
-                *(f"{100 * error:.1f}" for error, _ in kinds.values()),
-            ],
-            [
-                "error over sigma",
-                f"{validation['ratio']:.2f}",
-                *(f"{ratio:.2f}" for _, ratio in kinds.values()),
-            ],
+            ["error, % of the view", *(f"{100 * error:.1f}" for error, _ in kinds.values())],
+            ["error over sigma", *(f"{ratio:.2f}" for _, ratio in kinds.values())],
         ],
     )
 
@@ -345,16 +338,31 @@ def known() -> str:
     return table(heads, rows) + measured("known_frames")
 
 
+ABLATIONS = {
+    "whole": "as shipped",
+    "no predicted hull": "no predicted hull",
+    "no covariance": "errors of the predicted hull independent",
+    "every ray counts": "1000 independent rays instead of 100",
+    "as a body": "as a body, not as a hull",
+    "no plane": "no support plane",
+    "no free space": "no free space",
+    "missing is empty": "missing readings are empty space",
+    "hull alone": "the predicted hull alone",
+    "true hull": "the true hull in place of the predicted",
+}
+"""Rows of the ablation."""
+
+
 def ablation() -> str:
     """The fit without one source of knowledge at a time."""
     found = results("ablation")
-    sets = [name for name in ("household", "recorded") if name in found]
-    rows = []
-    for name, whole in found["household"].items():
-        cells = [f"{found[one][name]['iou']:.1f} ({found[one][name]['difference']:+.1f})" for one in sets]
-        rows.append([name, *cells, *(f"{whole[kind]:.1f}" for kind in ("box", "can", "bottle", "vessel", "tool"))])
+    sets = ("household", "recorded")
+    rows = [
+        [text, *(f"{found[one][name]['iou']:.1f} ({found[one][name]['difference']:+.1f})" for one in sets)]
+        for name, text in ABLATIONS.items()
+    ]
     heads = ["fit", *(f"{one}, {found[one]['whole']['count']} things" for one in sets)]
-    return table([*heads, "box", "can", "bottle", "vessel", "tool"], rows) + measured("ablation")
+    return table(heads, rows) + measured("ablation")
 
 
 def recorded() -> str:
@@ -381,64 +389,46 @@ def recorded() -> str:
 
 
 PICKERS = {
-    "ours": "recovered bodies, with their covariance",
-    "ours without sigma": "the same, 10 % of the size as sigma",
-    "ours at any score": "the same as the first, grasps of any score tried",
+    "ours": "recovered bodies, covariance",
+    "ours without sigma": "with 10 % of the size as sigma",
+    "ours at any score": "as the first, any score tried",
     "true bodies": "true bodies",
     "classic": "`classic` fit",
-    "box": "smallest box of the seen points",
-    "centroid": "straight down on the points' middle, no planner",
-    "cgn in masks": "Contact-GraspNet, contacts in our masks",
+    "box": "smallest box of the points",
+    "centroid": "straight down, no planner",
+    "cgn in masks": "Contact-GraspNet in our masks",
     "cgn": "Contact-GraspNet alone",
 }
 """Contestants of the picking benchmark."""
+PICKERS_OF_ANY_SCORE = ("ours", "ours at any score")
+FAILURES = ("collision", "wrong size", "missed", "slipped")
 
 
 def picking() -> str:
-    """Grasps in physics: how often one holds, and how much is cleared."""
+    """Grasps in physics: how often one holds, how much is cleared, and why others failed."""
     found = results("picking")["rows"]
     rows = []
     for who, text in PICKERS.items():
-        kinds = [found.get(f"{kind}: {who}") for kind in ("packed", "pile")]
-        scenes = " / ".join(str(one["scenes"]) if one else "-" for one in kinds)
-        rows.append([text, scenes, *(_rate(one[rate]) if one else "-" for one in kinds for rate in ("gsr", "dr"))])
-    heads = ["planned on", "scenes, packed / pile", "packed: GSR %", "DR %", "pile: GSR %", "DR %"]
+        kinds = [found[f"{kind}: {who}"] for kind in ("packed", "pile")]
+        cells = [f"{one['scenes']}: {_rate(one['gsr'])} / {_rate(one['dr'])}" for one in kinds]
+        tried = sum(one["tried"] for one in kinds)
+        *failed, unreachable = (sum(one["causes"][cause] for one in kinds) for cause in (*FAILURES, "unreachable"))
+        rows.append([text, *cells, f"{tried}: {' / '.join(map(str, failed))}", str(unreachable)])
+    heads = ["planned on", "packed, scenes: GSR / DR %", "pile", f"tried: {' / '.join(FAILURES)}", "unreachable"]
     return table(heads, rows) + measured("picking")
 
 
-def picking_failures() -> str:
-    """Why grasps failed, both kinds of scenes together."""
-    causes = ("collision", "wrong size", "missed", "slipped", "unreachable")
-    rows = []
-    for who, text in PICKERS.items():
-        kinds = [one for name, one in results("picking")["rows"].items() if name.partition(": ")[2] == who]
-        rows.append([text, *(str(sum(one[what] for one in kinds)) for what in ("scenes", "tried"))])
-        rows[-1] += [str(sum(one["causes"][cause] for one in kinds)) for cause in causes]
-    return table(["planned on", "scenes", "tried", *causes], rows)
-
-
 def picking_scores() -> str:
-    """Scores of ours against what held, and differences to others on the same scenes."""
-    found = results("picking")
-    runs = [one for name, one in found["rows"].items() if name.partition(": ")[2] in ("ours", "ours at any score")]
-    rows = []
+    """Scores of ours against what held."""
+    runs = [one for name, one in results("picking")["rows"].items() if name.partition(": ")[2] in PICKERS_OF_ANY_SCORE]
+    means = []
     for k in range(5):
         bins = [one["bins"][k] for one in runs if one["bins"][k][0]]
         count = sum(one[0] for one in bins)
-        if count:
-            means = [f"{100 * sum(one[0] * one[of] for one in bins) / count:.0f}" for of in (1, 2)]
-            rows.append([f"{0.2 * k:.1f} to {0.2 * k + 0.2:.1f}", str(count), *means])
-    gains = [
-        [
-            name,
-            f"{one['scenes'][0]:.0f}",
-            *("{:+.0f} ({:+.0f} to {:+.0f})".format(*one[rate]) for rate in ("gsr", "dr")),
-        ]
-        for name, one in found["gains"].items()
-        if one
-    ]
-    scores = table(["score", "tried", "mean score %", "held %"], rows)
-    return scores + "\n\n" + table(["difference in %", "scenes", "GSR", "DR"], gains)
+        means.append([f"{100 * sum(one[0] * one[of] for one in bins) / count:.0f}" for of in (1, 2)] + [str(count)])
+    heads = ["score", *(f"{0.2 * k:.1f} to {0.2 * k + 0.2:.1f}" for k in range(5))]
+    names = ("mean score %", "held %", "tried")
+    return table(heads, [[name, *values] for name, values in zip(names, zip(*means, strict=True), strict=True)])
 
 
 def _rate(one: list[float]) -> str:
@@ -461,7 +451,6 @@ BLOCKS: dict[str, Callable[[], str]] = {
         latency,
         still,
         picking,
-        picking_failures,
         picking_scores,
         tracks,
         layers,
