@@ -14,6 +14,7 @@
 | `/diagnostics` | diagnostic_msgs/DiagnosticArray | out, once per second, in every state |
 | `~/enable` | std_srvs/SetBool | drop all frames, or process them again |
 | `~/trigger` | std_srvs/Trigger | process the next frame, also while disabled, and answer with a summary |
+| `~/recover` | std_srvs/Trigger | the same, and answer with its bodies as JSON, see sq_msgs_py.answers |
 
 The way of an image, each room entered once:
 
@@ -34,7 +35,7 @@ import traceback
 from collections.abc import Hashable
 from dataclasses import dataclass, fields
 from time import monotonic, perf_counter
-from typing import Any
+from typing import Any, NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.callback_groups import ReentrantCallbackGroup
@@ -43,6 +44,7 @@ from rclpy.node import Node
 from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
+from sq_msgs_py import answers
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.nodes import fast_dds, process
@@ -54,6 +56,7 @@ from sq_perception.nodes.outputs import Outputs, pose_in
 from sq_perception.nodes.parameters import LiveParameters, RecoverParameters
 from sq_perception.nodes.statistics import THROTTLE, Standing, Statistics, summary, timed
 from sq_perception.nodes.tracking import CameraPoses, Tracking
+from sq_perception.recordings.publication import Findings
 from sq_perception.recovery.recoverer import FrameRecovery
 
 WARM_UP_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
@@ -116,8 +119,10 @@ class FrameNode(ManagedNode):
         self._triggers = _Triggers(self)
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.create_service(SetBool, "~/enable", self._on_enable)
-        # Its answer waits for a frame; in the default group nothing else would run meanwhile.
-        self.create_service(Trigger, "~/trigger", self._on_trigger, callback_group=ReentrantCallbackGroup())
+        # Their answers wait for a frame; in the default group nothing else would run meanwhile.
+        apart = ReentrantCallbackGroup()
+        self.create_service(Trigger, "~/trigger", self._on_trigger, callback_group=apart)
+        self.create_service(Trigger, "~/recover", self._on_recover, callback_group=apart)
         # On a steady clock: simulated time may stand still, and the node still has to say so.
         self.create_timer(1.0, self._on_second, clock=Clock(clock_type=ClockType.STEADY_TIME))
         if self._settings.current.autostart:
@@ -171,7 +176,7 @@ class FrameNode(ManagedNode):
             one, self._input = self._input, None
         if one is not None:
             one.close()
-        self._triggers.answer((False, "the node has been deactivated"))
+        self._triggers.answer(Outcome(False, "the node has been deactivated"))
         if self._worker is not None:
             self._worker.join(_WORKER_END)
             if self._worker.is_alive():
@@ -216,23 +221,23 @@ class FrameNode(ManagedNode):
                 with self._publishing:
                     # Deactivated or disabled meanwhile: nothing is published, least of all a grasped body.
                     if result is not None and self._input is source and self._is_wanted:
-                        outcome = True, self._published(result)
+                        outcome = self._published(result)
                         self._defects = 0
             except ValueError as error:
-                outcome = False, str(error)
+                outcome = Outcome(False, str(error))
             except Exception as error:
                 if not self.context.ok() or self._input is not source:
                     return
-                outcome = False, f"{type(error).__name__}: {error}"
-                self._note_defect(outcome[1])
+                outcome = Outcome(False, f"{type(error).__name__}: {error}")
+                self._note_defect(outcome.words)
             if arrival is None:
                 continue
             if outcome is None:
                 self._statistics.count("dropped")
                 continue
-            if not outcome[0]:
-                self._statistics.refuse(outcome[1])
-                self.get_logger().warning(f"refused a frame: {outcome[1]}", throttle_duration_sec=THROTTLE)
+            if not outcome.is_answered:
+                self._statistics.refuse(outcome.words)
+                self.get_logger().warning(f"refused a frame: {outcome.words}", throttle_duration_sec=THROTTLE)
             was_wanted = self._is_wanted
             self._triggers.answer(outcome, arrival.time)
             if not was_wanted:
@@ -260,8 +265,8 @@ class FrameNode(ManagedNode):
         stages |= {f"recovery: {name}": took for name, took in recovery.milliseconds.items()}
         return _Result(frame, arrival.time, recovery, origin, stages)
 
-    def _published(self, result: _Result) -> str:
-        """Name the bodies and publish them; the summary."""
+    def _published(self, result: _Result) -> Outcome:
+        """Name the bodies and publish them."""
         parameters = self._settings.current
         frame, stages = result.frame, dict(result.milliseconds)
         with timed(stages, "tracking"):
@@ -274,7 +279,7 @@ class FrameNode(ManagedNode):
         text = summary(found.recovery, found.ids)
         self._statistics.answer(stages, text)
         self._statistics.note(self._outputs.accompany(found, findings, frame, parameters))
-        return text
+        return Outcome(True, text, findings)
 
     def _note_defect(self, text: str) -> None:
         """A defect of ours: it costs this frame and leaves its trace in the log, and the node goes on."""
@@ -298,16 +303,23 @@ class FrameNode(ManagedNode):
         return response
 
     async def _on_trigger(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success, response.message, _ = await self._next_outcome()
+        return response
+
+    async def _on_recover(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success, response.message, found = await self._next_outcome()
+        if found is not None:
+            response.message = answers.text_of(found.array, found.header, response.message)
+        return response
+
+    async def _next_outcome(self) -> Outcome:
+        """Of the next frame, or why there is none."""
         source = self._input
         if source is None:
-            response.success, response.message = False, f"the node is {self.state}, not active"
-            return response
+            return Outcome(False, f"the node is {self.state}, not active")
         timeout = self._settings.current.trigger_timeout
         outcome = await self._triggers.next_outcome(timeout)
-        if outcome is None:
-            outcome = False, f"no frame on {source.topic} within {timeout:g} s: {source.heard}"
-        response.success, response.message = outcome
-        return response
+        return outcome or Outcome(False, f"no frame on {source.topic} within {timeout:g} s: {source.heard}")
 
     def _on_second(self) -> None:
         source, parameters = self._input, self._settings.current
@@ -344,8 +356,12 @@ class FrameNode(ManagedNode):
         return (DiagnosticStatus.WARN, "no depth images arrive") if silent else None
 
 
-Outcome = tuple[bool, str]
-"""Whether a frame was answered, and the summary or the reason."""
+class Outcome(NamedTuple):
+    """Whether a frame was answered, the summary or the reason, and what was published."""
+
+    is_answered: bool
+    words: str
+    findings: Findings | None = None
 
 
 @dataclass(frozen=True, eq=False)

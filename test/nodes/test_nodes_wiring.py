@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from dataclasses import fields
 from types import SimpleNamespace
 from typing import Any
 
@@ -20,6 +21,7 @@ from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
 from visualization_msgs.msg import Marker, MarkerArray
 
+from sq_msgs_py.answers import from_response
 from sq_msgs_py.depth_image import (
     depth_from_message,
     depth_to_message,
@@ -27,10 +29,12 @@ from sq_msgs_py.depth_image import (
     labels_to_message,
 )
 from sq_msgs_py.poses import plane_of
+from sq_msgs_py.superquadrics import MessageError
 from sq_perception.fitting.fit import Status
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.nodes import fast_dds
+from sq_perception.nodes.frame import stamp_of
 
 
 @pytest.fixture
@@ -260,6 +264,30 @@ def test_enable_and_trigger(bench):
 
     assert bench.call(SetBool, "/recover_node/enable", SetBool.Request(data=True)).success
     assert len(bench.answer(bench.depth())[1]) == 1
+
+
+def test_who_asks_once_gets_the_bodies_of_the_next_image(bench):
+    """The same columns as the topic's, bit by bit, also while disabled; and why there are none."""
+    assert bench.call(SetBool, "/recover_node/enable", SetBool.Request(data=False)).success
+    client = bench.peer.create_client(Trigger, "/recover_node/recover")
+    bench.until(client.service_is_ready)
+    asked = client.call_async(Trigger.Request())
+    bench.until(lambda: bench.node._triggers)
+    message, bodies = bench.answer(bench.depth())
+    bench.until(asked.done)
+    answer = from_response(asked.result())
+    assert len(bodies) == 1
+    for column in fields(bodies):
+        np.testing.assert_array_equal(getattr(answer.bodies, column.name), getattr(bodies, column.name))
+    assert (answer.frame_id, answer.stamp) == (message.header.frame_id, stamp_of(message))
+    assert answer.words.startswith("1 body in 1 ms")
+
+    refused = client.call_async(Trigger.Request())
+    bench.until(lambda: bench.node._triggers)
+    bench.send(broken("short data", bench.depth()))
+    bench.until(refused.done)
+    with pytest.raises(MessageError, match="data"):
+        from_response(refused.result())
 
 
 def test_a_trigger_without_a_frame_answers_in_time_and_nothing_else_waits(make_bench):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -35,8 +36,8 @@ def names() -> dict[str, Any]:
 
 def run(repository: Path, page: str, given: dict[str, Any]) -> dict[str, Any]:
     text = (repository / "docs" / page).read_text(encoding="utf-8")
-    (snippet,) = re.findall(r"^```python\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
-    exec(compile(snippet, page, "exec"), given)  # noqa: S102
+    for snippet in re.findall(r"^```python\n(.*?)^```$", text, re.MULTILINE | re.DOTALL):
+        exec(compile(snippet, page, "exec"), given)  # noqa: S102
     return given
 
 
@@ -65,15 +66,24 @@ def test_tracking(repository: Path) -> None:
 
 
 def test_outputs(repository: Path) -> None:
+    """The service is a stand-in that has answered; test_nodes_wiring.py asks a real one."""
     pytest.importorskip("shape_msgs", reason="needs the extra 'ros'")
     from std_msgs.msg import Header
+    from std_srvs.srv import Trigger
 
+    from sq_msgs_py.answers import text_of
     from sq_msgs_py.superquadrics import to_message
     from sq_perception.recordings.publication import truth_array
 
-    message = to_message(truth_array(Superquadric.stack([BODY])), Header())
-    given = run(repository, "outputs.md", {"message": message, "quaternion": [0, 0, 0, 1.0], "shift": [0, 0, 1.0]})
+    bodies = truth_array(Superquadric.stack([BODY]))
+    given = {"message": to_message(bodies, Header()), "quaternion": [0, 0, 0, 1.0], "shift": [0, 0, 1.0]}
+    given |= {"node": MagicMock(), "rclpy": MagicMock(), "Trigger": Trigger}
+    asked = given["node"].create_client().call_async()
+    asked.result.return_value = Trigger.Response(success=True, message=text_of(bodies, Header(frame_id="map"), ""))
+    run(repository, "outputs.md", given)
     np.testing.assert_allclose(given["there"].translation, [[0, 0, 1.5]], atol=1e-6)
+    assert given["answer"].frame_id == "map"
+    np.testing.assert_array_equal(given["answer"].bodies.size, bodies.size)
 
 
 def test_bags(repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:

@@ -1,0 +1,61 @@
+"""What ~/recover answers: columns come back as they were, and nothing hostile is taken for an answer."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import fields
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from sq_msgs_py.answers import from_response, text_of
+from sq_msgs_py.superquadrics import MessageError, SuperquadricArray
+
+HEADER = SimpleNamespace(frame_id="camera", stamp=SimpleNamespace(sec=7, nanosec=5))
+
+
+def bodies(count):
+    rng = np.random.default_rng(count)
+    columns = {name: rng.random((count, width)) for name, width in [("size", 3), ("shape", 2), ("translation", 3)]}
+    columns |= {"rotation": rng.random((count, 4)), "score": rng.random(count), "residual": np.full(count, np.nan)}
+    columns |= {"sigma_size": rng.random((count, 3)), "id": 2**31 + np.arange(count), "status": np.arange(count) % 3}
+    return SuperquadricArray(**columns)
+
+
+def answered(text, success=True):
+    return from_response(SimpleNamespace(success=success, message=text))
+
+
+@pytest.mark.parametrize("count", [0, 1, 5])
+def test_every_column_comes_back_bit_by_bit(count):
+    given = bodies(count)
+    text = text_of(given, HEADER, "words")
+    assert "NaN" not in text
+    found = answered(text)
+    assert (found.frame_id, found.stamp, found.words) == ("camera", 7_000_000_005, "words")
+    for column in fields(given):
+        one, other = getattr(found.bodies, column.name), getattr(given, column.name)
+        assert one.dtype == other.dtype
+        np.testing.assert_array_equal(one, other)
+
+
+def test_a_node_of_another_version_knows_more_or_less():
+    document = json.loads(text_of(bodies(2), HEADER, ""))
+    for row in document["superquadrics"]:
+        del row["label"]
+        row["colour"] = "red"
+    assert answered(json.dumps(document)).bodies.label.tolist() == [0, 0]
+
+
+def test_what_is_no_answer_is_refused():
+    with pytest.raises(MessageError, match="no frame within 5 s"):
+        answered("no frame within 5 s", success=False)
+    good = json.loads(text_of(bodies(1), HEADER, ""))
+    row = good["superquadrics"][0]
+    changes = [{"size": [1.0, None, 1.0]}, {"size": [1.0]}, {"id": -1}, {"id": 10**40}, {"id": "a"}, {"score": {}}]
+    hostile = [{**good, "superquadrics": [{**row, **change}]} for change in changes]
+    hostile += [{**good, "superquadrics": [{}]}, {**good, "superquadrics": 3}, {**good, "stamp": None}, {}, [], 3]
+    for text in ["2 bodies in 8 ms", "[" * 10**5, *map(json.dumps, hostile)]:
+        with pytest.raises(MessageError, match="~/recover"):
+            answered(text)
