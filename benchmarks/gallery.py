@@ -111,8 +111,8 @@ def of_scene(
 def _can(found: list[MatchedThing], frame: FrameRecovery) -> str:
     (one,) = found
     return (
-        f"A can of {_edges(one)} mm. The camera never sees its back: that comes from the silhouette and the curvature "
-        f"of the front, the foot from the table. IoU {100 * one.iou:.0f} %."
+        f"A can of {_edges(one)} mm. Its back comes from the silhouette and the curvature of the front, its foot from "
+        f"the table. IoU {100 * one.iou:.0f} %."
     )
 
 
@@ -120,8 +120,8 @@ def _kitchen(found: list[MatchedThing], frame: FrameRecovery) -> str:
     hidden = min(found, key=lambda one: one.visible)
     return (
         f"Six things that stand before each other, the {hidden.stood.name} {100 * hidden.visible:.0f} % visible. "
-        f"{_count(found, frame)} Mean IoU {mean_iou(found):.0f} %. Stereo matches windows, which widens what is near "
-        f"by some pixels: edges are off by {_bias(found):+.1f} mm in the mean."
+        f"{_count(found, frame)} Mean IoU {mean_iou(found):.0f} %. Stereo widens what is near by some pixels: edges "
+        f"are off by {_bias(found):+.1f} mm in the mean."
     )
 
 
@@ -135,8 +135,8 @@ def _kitchen_light(found: list[MatchedThing], frame: FrameRecovery) -> str:
 
 def _touching(found: list[MatchedThing], frame: FrameRecovery) -> str:
     return (
-        f"Three boxes and a can, each touching another. {_count(found, frame)} What parts them are folds in the depth, "
-        f"and lines of sight that pass through the empty space between them. Mean IoU {mean_iou(found):.0f} %."
+        f"Three boxes and a can, parted at folds in the depth and by lines of sight between them. "
+        f"{_count(found, frame)} Mean IoU {mean_iou(found):.0f} %."
     )
 
 
@@ -174,9 +174,9 @@ def _count(found: list[MatchedThing], frame: FrameRecovery) -> str:
     missed = [one.stood.name for one in found if one.body is None]
     matched_bodies = sum(one.body is not None for one in found)
     extra = len(frame.recovered) - matched_bodies
-    text = f"{matched_bodies} of {len(found)} things have a body"
-    text += f" (none: {', '.join(missed)})" if missed else ""
-    return text + (f", and there are {extra} bodies too many{_where(found, frame)}." if extra else ", none too many.")
+    text = f"{matched_bodies} of {len(found)} things found"
+    text += f" (missed: {', '.join(missed)})" if missed else ""
+    return text + (f", {extra} bodies too many{_where(found, frame)}." if extra else ", no body too many.")
 
 
 def _where(found: list[MatchedThing], frame: FrameRecovery) -> str:
@@ -205,8 +205,7 @@ def empty(path: Path) -> Entry:
     reasons = " / ".join(sorted({frame.message for frame in frames if frame.message}))
     return Entry(
         "An empty table",
-        f"Nothing stands on it. Bodies found through {len(views)} sensors together: {number}. `FrameRecovery.message`: "
-        f"{reasons or 'empty'}.",
+        f"Bodies found through {len(views)} sensors together: {number}. `FrameRecovery.message`: {reasons or 'empty'}.",
     )
 
 
@@ -319,13 +318,12 @@ ENTRIES: dict[str, Callable[[Path], Entry]] = {
 }
 
 INTRODUCTION = """
-Synthetic scenes through simulated [sensors](sensors.md), recovered with own masks and default options: one run of
-`python benchmarks/gallery.py` ({facts}). Single scenes prove nothing; [figures over
-many](../README.md#accuracy-and-speed).
+Synthetic scenes through simulated [sensors](sensors.md), own masks and default options, one run of `python
+benchmarks/gallery.py` ({facts}); [figures over many scenes](../README.md#accuracy-and-speed).
 
-Left the depth image, near is light and black is nothing measured; in the middle masks and recovered outlines, hidden
-edges faint; right the recovered bodies, and the true things as thin lines. Edges are full lengths, ± one reported
-standard deviation. IoU is that of volumes with the true convex hull.
+Left the depth image, near is light, black is not measured; in the middle masks and recovered outlines, hidden edges
+faint; right the recovered bodies, with the true things as thin lines. Edges are full lengths, ± one reported standard
+deviation; IoU is with the true convex hull.
 """
 
 

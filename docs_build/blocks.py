@@ -294,26 +294,20 @@ def _rooms_of(path: Path) -> Iterator[str]:
 
 
 def speed() -> str:
-    """What a frame costs, before and now."""
-    found = results("speed")
-
-    def shares(part: dict[str, float]) -> str:
-        return "/".join(f"{100 * share:.0f}" for share in part.values())
-
-    heads = ["frame", "loops before", "now", "times the classic fits before", "now"]
-    heads += [
-        "segmentation/network/fit/repair/score %",
-        "compiled/libraries/interpreter %",
-        "IoU % before",
-        "now",
+    """What a frame costs, and where."""
+    found = results("speed")["rows"]
+    rows = [
+        [
+            name.removesuffix(", own"),
+            f"{row['loops']:.1f}",
+            f"{row['classic']:.1f}",
+            *(" / ".join(f"{100 * share:.0f}" for share in row[part].values()) for part in ("stages", "kinds")),
+        ]
+        for name, row in found.items()
+        if not name.endswith("given")
     ]
-    rows = []
-    for name, row in found["rows"].items():
-        then = found["before"].get(name, row)
-        pairs = [f"{one[key]:.1f}" for key in ("loops", "classic") for one in (then, row)]
-        iou = [f"{100 * one['iou']:.1f}" for one in (then, row)]
-        rows.append([name, *pairs, shares(row["stages"]), shares(row["kinds"]), *iou])
-    return table(heads, rows) + measured("speed")
+    shares = [f"{' / '.join(next(iter(found.values()))[part])} %" for part in ("stages", "kinds")]
+    return table(["frame", "times a loop", "times classic fits", *shares], rows) + measured("speed")
 
 
 def known() -> str:

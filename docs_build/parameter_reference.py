@@ -39,18 +39,15 @@ ros2 run sq_perception recover_node --ros-args --params-file recover_node.yaml  
 The default shows the type; where it has a point, integers are accepted too. A value of another type, out of its range,
 or that does not fit the others is refused with a reason and changes nothing.
 
-Parameters are **live**, so that a change takes effect with the next frame, unless their meaning begins with
-*configure*: these can be set while the node is unconfigured (`ros2 lifecycle set /recover_node deactivate`, then
-`cleanup`), or with *start*: these are given at the start only.
+A change takes effect with the next frame, unless the meaning begins with *configure*: set while the node is
+unconfigured (`ros2 lifecycle set /recover_node deactivate`, then `cleanup`), or with *start*: given at the start only.
 
-`model`, `device`, `method`, `consensus` and `threads` change what computes. The new one is made in the background while
-frames go on with the old one, and takes its place when it is warm; if it cannot be made the old one stays, and
-`/diagnostics` says why. A model file that is missing, cut short or of another kind is refused at once; after the change
-the file is not needed. Another `method`, `refine`, `consensus` or model ends the tracks.
+After a change of `model`, `device`, `method`, `consensus` or `threads` frames go on as before until the new one is
+ready; if it cannot be made the old one stays, and `/diagnostics` says why. Another `method`, `refine`, `consensus` or
+model ends the tracks.
 
-The quality of service of each subscription, and of the cloud, markers and rendered depth, is a parameter too, at the
-start only: `qos_overrides.<topic>.subscription.reliability`, `.depth`, `.history`, or `.publisher.` and also
-`.durability`, with the topic as it is after remapping, such as `/camera/camera/depth/image_rect_raw`.
+Quality of service is a parameter too, at the start only: `qos_overrides.<topic>.subscription.reliability`, `.depth`,
+`.history`, or `.publisher.` and also `.durability`, with the topic as it is after remapping.
 """
 
 
