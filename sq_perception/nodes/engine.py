@@ -23,14 +23,16 @@ from typing import TypeAlias
 import torch
 from rclpy.node import Node
 
+from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.learning import checkpoint
 from sq_perception.nodes.frame import Frame
 from sq_perception.nodes.parameters import RecoverParameters
-from sq_perception.recovery.options import NEEDS_NETWORK, RecoveryOptions
+from sq_perception.recovery.options import NEEDS_NETWORK
 from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, checked_device
 from sq_perception.segmentation.standing import Pose
 
+WARM_UP_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 _MADE_OF = ("device", "consensus", "threads", "method", "model")
 """Parameters that a recoverer is made of."""
 _READ_BY = frozenset(("model", "device"))
@@ -99,7 +101,7 @@ class Engine:
         self.fault = ""
         """Why the last swap came to nothing; empty once one has succeeded."""
 
-    def build(self, parameters: RecoverParameters, camera: Camera) -> None:
+    def build(self, parameters: RecoverParameters) -> None:
         """Make the recoverer and warm it up.
 
         Raises
@@ -108,7 +110,7 @@ class Engine:
             If the model or the device cannot be used.
         """
         self._replace(None)
-        self._replace(_made(parameters, camera, None, lambda: True))
+        self._replace(_made(parameters, None, lambda: True))
 
     def release(self) -> None:
         """Let go of the recoverer, and of one that is being made."""
@@ -133,7 +135,7 @@ class Engine:
             except ValueError as error:
                 raise ValueError(f"model: {error}") from error
 
-    def follow(self, parameters: RecoverParameters, changed: frozenset[str], camera: Camera) -> None:
+    def follow(self, parameters: RecoverParameters, changed: frozenset[str]) -> None:
         """Swap the recoverer where a parameter that it is made of has been set, in the background.
 
         A set that leaves the value as it is counts too: it is how a model file that was replaced is read again.
@@ -144,7 +146,7 @@ class Engine:
             self._request += 1
             self.is_making = True
             self._is_to_read = self._is_to_read or not changed.isdisjoint(_READ_BY)
-            work = self._request, parameters, camera, None if self._is_to_read else self._built
+            work = self._request, parameters, None if self._is_to_read else self._built
         threading.Thread(target=self._swap, args=work, name="recoverer in the making", daemon=True).start()
 
     def recover(
@@ -171,8 +173,8 @@ class Engine:
         in_force = replace(parameters, **{name: getattr(built.parameters, name) for name in _MADE_OF})
         origin = (built.weights, *(getattr(in_force, name) for name in _ANSWERS))
         known = previous[0] if previous is not None and previous[1] == origin else None
-        asked = options(in_force, pose, frame.has_free_space)
-        recovery = built.recoverer.recover(frame.depth, frame.camera, frame.labels, asked, known)
+        options = in_force.recovery_options(pose, frame.has_free_space)
+        recovery = built.recoverer.recover(frame.depth, frame.camera, frame.labels, options, known)
         return recovery, origin
 
     @property
@@ -193,10 +195,10 @@ class Engine:
                 self._built, self._is_to_read = built, False
             return True
 
-    def _swap(self, request: int, parameters: RecoverParameters, camera: Camera, kept: _Built | None) -> None:
+    def _swap(self, request: int, parameters: RecoverParameters, kept: _Built | None) -> None:
         started, log = perf_counter(), self._node.get_logger()
         try:
-            built = _made(parameters, camera, kept, lambda: request == self._request)
+            built = _made(parameters, kept, lambda: request == self._request)
             if self._replace(built, request):
                 log.info(f"changed to {_described(parameters)} within {perf_counter() - started:.1f} s")
         except _Superseded:
@@ -207,25 +209,7 @@ class Engine:
                 log.error(f"{fault}; what was there before goes on")
 
 
-def options(parameters: RecoverParameters, pose: Pose | None = None, has_free_space: bool = True) -> RecoveryOptions:
-    """What the parameters say to a frame, whose pose in ``target_frame`` is given."""
-    return RecoveryOptions(
-        method=parameters.method,
-        refine=parameters.refine,
-        sharpness=parameters.s,
-        tau=parameters.tau,
-        depth_range=parameters.depth_range,
-        max_objects=parameters.max_objects,
-        max_size=parameters.max_size,
-        workspace=parameters.box,
-        workspace_pose=pose,
-        free_space=has_free_space,
-        time_budget=parameters.seconds,
-        repair=parameters.repair,
-    )
-
-
-def _made(parameters: RecoverParameters, camera: Camera, kept: _Built | None, is_wanted: Callable[[], bool]) -> _Built:
+def _made(parameters: RecoverParameters, kept: _Built | None, is_wanted: Callable[[], bool]) -> _Built:
     """A recoverer, warm, with the weights of ``kept`` if given; one that is there already if it is as good.
 
     Raises
@@ -254,7 +238,7 @@ def _made(parameters: RecoverParameters, camera: Camera, kept: _Built | None, is
     with TURNS.turn():
         if not is_wanted():
             raise _Superseded
-        recoverer.warm_up(camera)
+        recoverer.warm_up(unit_cube.camera() if parameters.projection == "orthographic" else WARM_UP_CAMERA)
     return _Built(recoverer, parameters, weights, key)
 
 

@@ -1,20 +1,4 @@
-"""The node behind recover_node and fitter_node: depth images in, superquadrics out.
-
-| name | type | |
-| --- | --- | --- |
-| `depth/image` | sensor_msgs/Image | in: 16UC1 mm, 32FC1 m; mono8 and mono16 for orthographic frames |
-| `depth/image/compressedDepth` | sensor_msgs/CompressedImage | in, instead, for `image_transport: compressedDepth` |
-| `depth/points` | sensor_msgs/PointCloud2 | in, instead, for `image_transport: points`: organised |
-| `depth/camera_info` | sensor_msgs/CameraInfo | in: not needed for orthographic frames and points |
-| `mask/image` | sensor_msgs/Image | in, optional: label image with the stamp of the depth image |
-| `~/superquadrics` | sensor_msgs/PointCloud2 | out: one point per body, see sq_msgs_py.superquadrics |
-| `~/markers` | visualization_msgs/MarkerArray | out, while somebody listens |
-| `~/rendered_depth` | sensor_msgs/Image | out, while somebody listens; in the encoding of the input |
-| `~/support_plane` | geometry_msgs/PoseStamped | out, latched: what the objects stand on, z is its normal |
-| `/diagnostics` | diagnostic_msgs/DiagnosticArray | out, once per second, in every state |
-| `~/enable` | std_srvs/SetBool | drop all frames, or process them again |
-| `~/trigger` | std_srvs/Trigger | process the next frame, also while disabled, and answer with a summary |
-| `~/recover` | std_srvs/Trigger | the same, and answer with its bodies as JSON, see sq_msgs_py.answers |
+"""The node behind recover_node and fitter_node: depth images in, superquadrics out; its topics are in README.md.
 
 The way of an image, each room entered once:
 
@@ -30,23 +14,20 @@ subscribes, deactivating ends the subscriptions after the frame at hand, cleanin
 
 from __future__ import annotations
 
+import math
 import threading
 import traceback
-from collections.abc import Hashable
-from dataclasses import dataclass, fields
+from dataclasses import fields
 from time import monotonic, perf_counter
 from typing import Any, NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rclpy.callback_groups import ReentrantCallbackGroup
 from rclpy.clock import Clock, ClockType
-from rclpy.node import Node
 from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
 from sq_msgs_py import answers
-from sq_perception.imaging import unit_cube
-from sq_perception.imaging.camera import Camera
 from sq_perception.nodes import fast_dds, process
 from sq_perception.nodes.engine import TURNS, Answer, Engine
 from sq_perception.nodes.frame import Frame, stamp_of
@@ -57,28 +38,23 @@ from sq_perception.nodes.parameters import LiveParameters, RecoverParameters
 from sq_perception.nodes.statistics import THROTTLE, Standing, Statistics, summary, timed
 from sq_perception.nodes.tracking import CameraPoses, Tracking
 from sq_perception.recordings.publication import Findings
-from sq_perception.recovery.recoverer import FrameRecovery
 
-WARM_UP_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 _WORKER_END = 3.0
 """Seconds that a deactivation waits for the frame at hand."""
 _OLDEST = 3600.0
 """Seconds; the age of an older frame, or one from the future, says nothing about latency: a bag, or another clock."""
 _DEFECTS = 10
 """Frames in a row that end in a defect of ours or of the device, after which the node starts anew."""
-_TICK = 0.05
-"""Seconds between two looks at whether a caller of ~/trigger has waited long enough."""
+_STEADY = Clock(clock_type=ClockType.STEADY_TIME)
+"""For timers: simulated time may stand still, and the node still has to say so."""
 
 
-@dataclass(frozen=True, eq=False)
-class _Result:
-    """A frame, when it arrived, its bodies, where they come from, and how long that took by stage."""
+class Outcome(NamedTuple):
+    """Whether a frame was answered, the summary or the reason, and what was published."""
 
-    frame: Frame
-    time: float
-    recovery: FrameRecovery
-    origin: Hashable
-    milliseconds: dict[str, float]
+    is_answered: bool
+    words: str
+    findings: Findings | None = None
 
 
 class FrameNode(ManagedNode):
@@ -102,7 +78,7 @@ class FrameNode(ManagedNode):
         super().__init__(name, namespace=namespace, context=context)
         self._engine = Engine(self)
         self._settings: LiveParameters[RecoverParameters] = LiveParameters(
-            self, kind, locked=self._why_locked, check=self._engine.check, changed=self._on_changed
+            self, kind, locked=self._why_locked, check=self._engine.check, changed=self._engine.follow
         )
         self._statistics = Statistics()
         self._poses = CameraPoses(self)
@@ -116,15 +92,15 @@ class FrameNode(ManagedNode):
         self._publishing = threading.Lock()
         """Held while something is published, or it is decided that nothing is any more."""
         self._defects = 0
-        self._triggers = _Triggers(self)
+        self._triggers: dict[Future, float] = {}
+        """Outcomes that callers of ~/trigger and ~/recover wait for, and since when."""
         self._diagnostics = self.create_publisher(DiagnosticArray, "/diagnostics", 10)
         self.create_service(SetBool, "~/enable", self._on_enable)
         # Their answers wait for a frame; in the default group nothing else would run meanwhile.
         apart = ReentrantCallbackGroup()
         self.create_service(Trigger, "~/trigger", self._on_trigger, callback_group=apart)
         self.create_service(Trigger, "~/recover", self._on_recover, callback_group=apart)
-        # On a steady clock: simulated time may stand still, and the node still has to say so.
-        self.create_timer(1.0, self._on_second, clock=Clock(clock_type=ClockType.STEADY_TIME))
+        self.create_timer(1.0, self._on_second, clock=_STEADY)
         if self._settings.current.autostart:
             self.start()
 
@@ -137,10 +113,10 @@ class FrameNode(ManagedNode):
             self.get_logger().info(f"freed {len(freed)} shared-memory segments of processes that were killed")
         started = perf_counter()
         self.get_logger().info("warming up: loading compiled code, or compiling it on the first start")
-        self._engine.build(parameters, self._warm_up_camera)
+        self._engine.build(parameters)
         latest = self._settings.current
         meanwhile = {one.name for one in fields(latest) if getattr(latest, one.name) != getattr(parameters, one.name)}
-        self._engine.follow(latest, frozenset(meanwhile), self._warm_up_camera)
+        self._engine.follow(latest, frozenset(meanwhile))
         self.get_logger().info(f"warm after {perf_counter() - started:.1f} s")
         self._outputs.open(latest)
         if latest.fixed_frame or latest.target_frame:
@@ -150,7 +126,6 @@ class FrameNode(ManagedNode):
     def _activate(self) -> None:
         self._defects = 0
         self._input = one = Input(self, lambda: self._settings.current, lambda: self._is_wanted, self._statistics)
-        one.open()
         self._worker = threading.Thread(target=self._work, args=(one,), name="worker", daemon=True)
         self._worker.start()
         self.get_logger().info(f"ready, listening to {one.topic}")
@@ -176,7 +151,7 @@ class FrameNode(ManagedNode):
             one, self._input = self._input, None
         if one is not None:
             one.close()
-        self._triggers.answer(Outcome(False, "the node has been deactivated"))
+        self._tell(Outcome(False, "the node has been deactivated"))
         if self._worker is not None:
             self._worker.join(_WORKER_END)
             if self._worker.is_alive():
@@ -190,10 +165,6 @@ class FrameNode(ManagedNode):
     def _comes_back(self) -> bool:
         return bool(self._settings.current.autostart)
 
-    @property
-    def _warm_up_camera(self) -> Camera:
-        return unit_cube.camera() if self._settings.current.projection == "orthographic" else WARM_UP_CAMERA
-
     def _why_locked(self) -> str:
         """Why parameters that are read at the configuration cannot change now; empty if they can."""
         if not self.is_configured:
@@ -203,9 +174,6 @@ class FrameNode(ManagedNode):
             f"is read when the node is configured, and it is {self.state}: ros2 lifecycle set {name} deactivate, then "
             "cleanup; set it; configure, activate"
         )
-
-    def _on_changed(self, parameters: Any, names: frozenset[str]) -> None:
-        self._engine.follow(parameters, names, self._warm_up_camera)
 
     # The worker
 
@@ -217,11 +185,11 @@ class FrameNode(ManagedNode):
                 with TURNS.turn():
                     # Taken when the turn has come: while others were computing, a newer one may have arrived.
                     arrival = source.take()
-                    result = self._recovered(source, arrival) if arrival is not None and self._is_wanted else None
+                    found = self._recovered(source, arrival) if arrival is not None and self._is_wanted else None
                 with self._publishing:
                     # Deactivated or disabled meanwhile: nothing is published, least of all a grasped body.
-                    if result is not None and self._input is source and self._is_wanted:
-                        outcome = self._published(result)
+                    if arrival and found and self._input is source and self._is_wanted:
+                        outcome = self._published(arrival, *found)
                         self._defects = 0
             except ValueError as error:
                 outcome = Outcome(False, str(error))
@@ -239,7 +207,7 @@ class FrameNode(ManagedNode):
                 self._statistics.refuse(outcome.words)
                 self.get_logger().warning(f"refused a frame: {outcome.words}", throttle_duration_sec=THROTTLE)
             was_wanted = self._is_wanted
-            self._triggers.answer(outcome, arrival.time)
+            self._tell(outcome, arrival.time)
             if not was_wanted:
                 with self._publishing:
                     self._outputs.hide()
@@ -247,30 +215,29 @@ class FrameNode(ManagedNode):
     @property
     def _is_wanted(self) -> bool:
         """Whether frames are processed, or one is asked for."""
-        return self._enabled or len(self._triggers) > 0
+        return self._enabled or any(not one.done() for one in tuple(self._triggers))
 
-    def _recovered(self, source: Input, arrival: Arrival) -> _Result:
+    def _recovered(self, source: Input, arrival: Arrival) -> tuple[Frame, Answer, dict[str, float]]:
+        """The frame of an image, its bodies, and how long that took by stage, milliseconds."""
         parameters = self._settings.current
         stages = {"wait": 1e3 * (monotonic() - arrival.time)}
         with timed(stages, "decode"):
             frame = source.frame(arrival, parameters)
         pose = None
         if parameters.target_frame and parameters.box is not None:
-            known = pose_in(self._poses, frame.header, parameters.target_frame, parameters.tf_tolerance)
-            turn, shift = (tuple(part.tolist()) for part in known)
-            pose = turn, shift
+            turn, shift = pose_in(self._poses, frame.header, parameters.target_frame, parameters.tf_tolerance)
+            pose = tuple(turn.tolist()), tuple(shift.tolist())
         before = self._before.get(frame.header.frame_id) if parameters.tracking else None
-        recovery, origin = answer = self._engine.recover(frame, parameters, pose, before)
+        answer = self._engine.recover(frame, parameters, pose, before)
         self._before = {frame.header.frame_id: answer}
-        stages |= {f"recovery: {name}": took for name, took in recovery.milliseconds.items()}
-        return _Result(frame, arrival.time, recovery, origin, stages)
+        stages |= {f"recovery: {name}": took for name, took in answer[0].milliseconds.items()}
+        return frame, answer, stages
 
-    def _published(self, result: _Result) -> Outcome:
+    def _published(self, arrival: Arrival, frame: Frame, answer: Answer, stages: dict[str, float]) -> Outcome:
         """Name the bodies and publish them."""
         parameters = self._settings.current
-        frame, stages = result.frame, dict(result.milliseconds)
         with timed(stages, "tracking"):
-            found = self._tracking.identify(result.recovery, frame, result.time, parameters, result.origin)
+            found = self._tracking.identify(*answer, frame, arrival.time, parameters)
         with timed(stages, "publish"):
             findings = self._outputs.answer(found, frame, parameters)
         age = 1e-9 * (self.get_clock().now().nanoseconds - stamp_of(frame))
@@ -280,6 +247,14 @@ class FrameNode(ManagedNode):
         self._statistics.answer(stages, text)
         self._statistics.note(self._outputs.accompany(found, findings, frame, parameters))
         return Outcome(True, text, findings)
+
+    def _tell(self, outcome: Outcome, arrived: float = math.inf) -> None:
+        """Answer who was waiting when the frame arrived, at ``arrived`` of the monotonic clock."""
+        for caller, since in tuple(self._triggers.items()):
+            if since <= arrived and not caller.done():
+                caller.set_result(outcome)
+                if self.executor is not None:
+                    self.executor.wake()  # a future that is awaited does not do that itself
 
     def _note_defect(self, text: str) -> None:
         """A defect of ours: it costs this frame and leaves its trace in the log, and the node goes on."""
@@ -318,7 +293,14 @@ class FrameNode(ManagedNode):
         if source is None:
             return Outcome(False, f"the node is {self.state}, not active")
         timeout = self._settings.current.trigger_timeout
-        outcome = await self._triggers.next_outcome(timeout)
+        caller = Future(executor=self.executor)
+        self._triggers[caller] = monotonic()
+        # In a group of its own: rclpy's remember for good what was destroyed.
+        alone = ReentrantCallbackGroup()
+        late = self.create_timer(timeout, caller.cancel, callback_group=alone, clock=_STEADY)
+        outcome: Outcome | None = await caller
+        self.destroy_timer(late)
+        del self._triggers[caller]
         return outcome or Outcome(False, f"no frame on {source.topic} within {timeout:g} s: {source.heard}")
 
     def _on_second(self) -> None:
@@ -354,63 +336,3 @@ class FrameNode(ManagedNode):
         if not self._enabled:
             return DiagnosticStatus.OK, "disabled"
         return (DiagnosticStatus.WARN, "no depth images arrive") if silent else None
-
-
-class Outcome(NamedTuple):
-    """Whether a frame was answered, the summary or the reason, and what was published."""
-
-    is_answered: bool
-    words: str
-    findings: Findings | None = None
-
-
-@dataclass(frozen=True, eq=False)
-class _Caller:
-    since: float
-    until: float
-    outcome: Future
-
-
-class _Triggers:
-    """Lets service calls wait for the outcome of the next frame; asked in the executor, answered by the worker."""
-
-    def __init__(self, node: Node) -> None:
-        self._node = node
-        self._lock = threading.Lock()
-        self._waiting: list[_Caller] = []
-        # One for all, and on a steady clock: simulated time may stand still.
-        self._timer = node.create_timer(_TICK, self._expire, clock=Clock(clock_type=ClockType.STEADY_TIME))
-        self._timer.cancel()
-
-    def __len__(self) -> int:
-        return len(self._waiting)
-
-    async def next_outcome(self, timeout: float) -> Outcome | None:
-        """The outcome of the next frame; None if none comes in time."""
-        now = monotonic()
-        caller = _Caller(now, now + timeout, Future(executor=self._node.executor))
-        with self._lock:
-            self._waiting.append(caller)
-            self._timer.reset()
-        outcome: Outcome | None = await caller.outcome
-        return outcome
-
-    def answer(self, outcome: Outcome, arrived: float = float("inf")) -> None:
-        """Answer those that were waiting when the frame arrived, at ``arrived`` of the monotonic clock; or all."""
-        with self._lock:
-            waiting = [one for one in self._waiting if one.since <= arrived]
-            self._waiting = [one for one in self._waiting if one not in waiting]
-        for one in waiting:
-            one.outcome.set_result(outcome)
-        if waiting and self._node.executor is not None:
-            self._node.executor.wake()
-
-    def _expire(self) -> None:
-        now = monotonic()
-        with self._lock:
-            late = [one for one in self._waiting if one.until <= now]
-            self._waiting = [one for one in self._waiting if one not in late]
-            if not self._waiting:
-                self._timer.cancel()
-        for one in late:
-            one.outcome.set_result(None)

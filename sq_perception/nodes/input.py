@@ -14,7 +14,7 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict, deque
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from time import monotonic
 from typing import Any
 
@@ -48,21 +48,22 @@ _WAITING = 64
 
 @dataclass(frozen=True)
 class Arrival:
-    """A depth image, when it came, in seconds of the monotonic clock, and its mask if one came."""
+    """A depth image and what came with it.
 
-    message: DepthMessage
-    time: float
-    mask: Image | None = None
+    Attributes
+    ----------
+    size
+        None for what is no image, which is to be refused at once.
+    time, deadline
+        When it came, and until when it waits for its companions, seconds of the monotonic clock.
+    """
 
-
-@dataclass(frozen=True)
-class _Waiting:
     message: DepthMessage
     size: tuple[int, int] | None
-    """None for what is no image, which is to be refused at once."""
     time: float
     deadline: float
     needs_mask: bool
+    mask: Image | None = None
 
 
 @dataclass(frozen=True)
@@ -88,31 +89,25 @@ class Input:
         statistics: Statistics,
     ) -> None:
         self._node, self._parameters, self._is_wanted, self._statistics = node, parameters, is_wanted, statistics
-        self._transport = parameters().image_transport
-        self._has_infos = parameters().projection == "pinhole" and self._transport != POINTS
-        self.topic = image_topic(node, "depth/image", self._transport)
+        transport = parameters().image_transport
+        self.topic = image_topic(node, "depth/image", transport)
         """Of the depth images."""
         self._note = ""
         self._last_image = monotonic()
-        self._info: Subscription | None = None
-        self._latched: Subscription | None = None
-        self._mask: Subscription | None = None
-        self._image: Subscription | None = None
         self._changed = threading.Condition()
         """Guards what follows."""
-        self._waiting: deque[_Waiting] = deque()
+        self._waiting: deque[Arrival] = deque()
         self._ready: Arrival | None = None
         self._infos: deque[_Info] = deque(maxlen=_INFOS)
         self._masks: OrderedDict[int, Image] = OrderedDict()
         self._is_closed = False
-
-    def open(self) -> None:
-        """Subscribe."""
         # Subscriptions are served in this order: what an image needs is there before the image.
-        if self._has_infos:
+        self._info: Subscription | None = None
+        if parameters().projection == "pinhole" and transport != POINTS:
             self._info = self._listen(CameraInfo, "depth/camera_info", self._on_info)
+        self._latched: Subscription | None = None
         self._mask = self._listen(Image, "mask/image", self._on_mask)
-        kind = {RAW: Image, POINTS: PointCloud2}.get(self._transport, CompressedImage)
+        kind = {RAW: Image, POINTS: PointCloud2}.get(transport, CompressedImage)
         self._image = self._listen(kind, self.topic, self._on_image)
 
     def look_for_latched(self) -> None:
@@ -185,31 +180,31 @@ class Input:
         ValueError
             For anything that keeps it from being processed.
         """
-        message, use = arrival.message, parameters.use_masks
-        frame = decode(message, (lambda: self._calibration_of(message)) if self._has_infos else None)
+        message, use, source = arrival.message, parameters.use_masks, self._info
+        frame = decode(message, None if source is None else lambda: self._calibration_of(message, source))
         if not frame.has_free_space:
             self._node.get_logger().warning(f"{self.topic}: {UNORGANISED}", throttle_duration_sec=THROTTLE)
         if use == "always" and arrival.mask is None:
-            where = f" on {self._mask.topic_name}" if self._mask is not None else ""
-            raise Refused(f"mask: expected one with the stamp of the image (use_masks is always), none came{where}")
+            expected = "expected one with the stamp of the image (use_masks is always)"
+            raise Refused(f"mask: {expected}, none came on {self._mask.topic_name}")
         return frame if arrival.mask is None or use == "never" else frame.with_mask(arrival.mask)
 
-    def _calibration_of(self, image: DepthMessage) -> Calibration:
+    def _calibration_of(self, image: DepthMessage, source: Subscription) -> Calibration:
         size = size_of(image)
         with self._changed:
             info = self._info_for(size, stamp_of(image))
             last = self._infos[-1] if self._infos else None
         if info is not None and info.calibration is not None:
             return info.calibration
+        wanted = f"camera_info: expected one for {size[0]} x {size[1]} pixels"
         if info is not None:
             fault = info.fault
-        elif last is not None:
-            why = last.fault or size_mismatch(size, last.size)
-            fault = f"{_wanted(size)}, the last one is for {last.size[0]} x {last.size[1]} ({why})"
+        elif last is None:
+            fault = f"{wanted}, none came"
         else:
-            fault = f"{_wanted(size)}, none came"
-        topic = self._info.topic_name if self._info is not None else "depth/camera_info"
-        raise Refused(f"{fault}, on {topic}: {self._publishers_of(self._info)}")
+            why = last.fault or size_mismatch(size, last.size)
+            fault = f"{wanted}, the last one is for {last.size[0]} x {last.size[1]} ({why})"
+        raise Refused(f"{fault}, on {source.topic_name}: {self._publishers_of(source)}")
 
     # Callbacks, in the executor's thread: quick, and nothing in them can fail on a message's content
 
@@ -224,12 +219,13 @@ class Input:
             size = size_of(message)
         except ValueError:
             size = None
-        waiting = _Waiting(message, size, now, now + parameters.patience, self._expects_mask(parameters.use_masks))
+        use, deadline = parameters.use_masks, now + parameters.patience
+        needs_mask = use == "always" or (use == "auto" and self._node.count_publishers(self._mask.topic_name) > 0)
         with self._changed:
             if self._is_closed:
                 self._statistics.count("dropped")
                 return
-            self._waiting.append(waiting)
+            self._waiting.append(Arrival(message, size, now, deadline, needs_mask))
             self._promote(now)
 
     def _on_info(self, message: CameraInfo) -> None:
@@ -268,18 +264,18 @@ class Input:
         if ready:
             one = self._waiting[ready[-1]]
             dropped += (self._ready is not None) - 1
-            self._ready = Arrival(one.message, one.time, self._masks.pop(stamp_of(one.message), None))
+            self._ready = replace(one, mask=self._masks.pop(stamp_of(one.message), None))
         for _ in range(gone):
             self._waiting.popleft()
         if dropped:
             self._statistics.count("dropped", dropped)
         self._changed.notify_all()
 
-    def _is_complete(self, one: _Waiting) -> bool:
+    def _is_complete(self, one: Arrival) -> bool:
         if one.size is None:
             return True
         stamp = stamp_of(one.message)
-        has_info = not self._has_infos or self._info_for(one.size, stamp) is not None
+        has_info = self._info is None or self._info_for(one.size, stamp) is not None
         return has_info and (not one.needs_mask or stamp in self._masks)
 
     def _info_for(self, size: tuple[int, int], stamp: int) -> _Info | None:
@@ -288,11 +284,6 @@ class Input:
         return best[-1] if best else None
 
     # Subscriptions
-
-    def _expects_mask(self, use: str) -> bool:
-        if self._mask is None:
-            return False
-        return use == "always" or (use == "auto" and bool(self._node.count_publishers(self._mask.topic_name)))
 
     def _listen(self, kind: type[Any], topic: str, callback: Callable[[Any], None]) -> Subscription:
         made = self._node.create_subscription(
@@ -322,10 +313,8 @@ class Input:
         said = f"{event.total_count} messages of {topic} lost before they arrived: {remedy}"
         self._node.get_logger().warning(said, throttle_duration_sec=THROTTLE)
 
-    def _publishers_of(self, subscription: Subscription | None) -> str:
+    def _publishers_of(self, subscription: Subscription) -> str:
         """Who publishes a topic, with which quality of service, and whether the subscription can hear it."""
-        if subscription is None:
-            return "nothing is subscribed to"
         parts = []
         for one in self._node.get_publishers_info_by_topic(subscription.topic_name):
             profile = one.qos_profile
@@ -337,7 +326,3 @@ class Input:
             parts.append(f"{one.node_namespace.rstrip('/')}/{one.node_name} ({one.topic_type}, {said}{note})")
         count = len(parts)
         return f"{count} publisher{'s' * (count > 1)}: {', '.join(parts)}" if parts else "nobody publishes it"
-
-
-def _wanted(size: tuple[int, int]) -> str:
-    return f"camera_info: expected one for {size[0]} x {size[1]} pixels"

@@ -5,21 +5,17 @@ meaning, unit, range or choices, and whether it may change while the node runs. 
 and holds the current values; a worker that takes ``current`` once per frame sees a consistent set, and a change takes
 effect with the next frame.
 
-``ros2 param set /node s 3`` sends an INTEGER, so every number that is a float here is declared with dynamic typing and
-accepts both; it is kept as a double, as readers expect one.  The range is checked here for both, as the range of a
-descriptor holds for doubles alone.
+``ros2 param set /node s 3`` sends an INTEGER: where a float is declared, integers become doubles.
 """
 
 from __future__ import annotations
 
 import math
-from array import array
 from collections.abc import Callable
 from dataclasses import Field, dataclass, field, fields, replace
 from typing import Any, Generic, Literal, TypeVar, cast, get_args
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
-from rclpy.exceptions import InvalidParameterTypeException, InvalidParameterValueException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
@@ -29,8 +25,8 @@ from sq_perception.grasping.planner import FRICTION
 from sq_perception.imaging import compressed_depth
 from sq_perception.imaging.calibration import Treatment
 from sq_perception.imaging.camera import Projection
-from sq_perception.recovery.options import Method, Refine
-from sq_perception.segmentation.standing import Box
+from sq_perception.recovery.options import Method, RecoveryOptions, Refine
+from sq_perception.segmentation.standing import Box, Pose
 from sq_perception.simulation.sensor_noise import IDEAL, PRESETS
 
 RAW = "raw"
@@ -51,7 +47,7 @@ def setting(
     unit: str = "",
     within: tuple[float, float] | None = None,
     choices: tuple[str, ...] = (),
-    live: bool = False,
+    live: bool = True,
 ) -> Any:
     """A dataclass field that becomes a ROS parameter; ``live``: it may change at any time."""
     about = {"description": description, "unit": unit, "within": within, "choices": choices, "live": live}
@@ -59,36 +55,54 @@ def setting(
 
 
 @dataclass(frozen=True)
-class RecoverParameters:
+class Parameters:
+    """Those of a node.  Types and ranges are rclpy's to check, by the descriptors; what fits together is checked here.
+
+    Raises
+    ------
+    ParameterError
+        For a value that is none of the choices, or does not fit the others.
+    """
+
+    def __post_init__(self) -> None:
+        for one in fields(self):
+            choices, value = one.metadata["choices"], getattr(self, one.name)
+            if choices and value not in choices:
+                raise ParameterError(f"{one.name}: expected one of {', '.join(choices)}, got {value!r}")
+
+
+@dataclass(frozen=True)
+class RecoverParameters(Parameters):
     """recover_node, and each node of recover_cameras."""
 
     autostart: bool = setting(
         True,
         "Configure and activate at the start; false: wait for ros2 lifecycle set or a lifecycle manager.",
+        live=False,
     )
     free_shared_memory: bool = setting(
         False,
         "Delete the shared memory that Fast DDS has left behind for killed processes of this user, 17 MB each.",
+        live=False,
     )
     projection: Projection = setting(
         "pinhole",
         "Camera model: pinhole takes 16UC1 and 32FC1 with camera_info; orthographic takes mono8 and mono16 images of "
         "the unit cube and needs no camera_info.",
         choices=get_args(Projection),
+        live=False,
     )
     use_masks: str = setting(
         "auto",
         "Label images on mask/image with the stamp of the depth image: auto uses them where they come and segments "
         "where none does, always refuses frames without, never ignores them.",
         choices=("auto", "always", "never"),
-        live=True,
     )
     patience: float = setting(
         0.25,
         "How long an image waits for its camera_info or mask before it is processed, or refused, without.",
         unit="s",
         within=(0.0, 10.0),
-        live=True,
     )
     image_transport: str = setting(
         RAW,
@@ -96,168 +110,146 @@ class RecoverParameters:
         "depth/image/compressedDepth, or points (organised sensor_msgs/PointCloud2 in the optical frame) on "
         "depth/points, which need no camera_info. Of a cloud that is not organised less is known: see docs/nodes.md.",
         choices=(*TRANSPORTS, POINTS),
+        live=False,
     )
     distortion: Treatment = setting(
         "auto",
         "What a camera_info with distortion coefficients means: apply rectifies the images, ignore takes them for "
         "rectified, auto rectifies unless one of the last two parts of their topic has the word rect or rectified.",
         choices=get_args(Treatment),
+        live=False,
     )
     s: float = setting(
         117.3,
         "Sharpness s of the soft occupancy sigma(s (1 - F^e1)) that the score and refine = soft_render compute with.",
         within=(0.1, 1000.0),
-        live=True,
     )
     tau: float = setting(
         4.82,
         "Sharpness tau of the soft depth projection that the score and refine = soft_render compute with.",
         within=(0.1, 100.0),
-        live=True,
     )
-    depth_min: float = setting(0.0, "Nearer readings are left out.", unit="m", within=(0.0, 100.0), live=True)
-    depth_max: float = setting(
-        100.0, "Farther readings are left out; 100 keeps all.", unit="m", within=(0.001, 100.0), live=True
-    )
-    max_objects: int = setting(20, "At most so many bodies per frame, the largest ones.", within=(1, 100), live=True)
+    depth_min: float = setting(0.0, "Nearer readings are left out.", unit="m", within=(0.0, 100.0))
+    depth_max: float = setting(100.0, "Farther readings are left out; 100 keeps all.", unit="m", within=(0.001, 100.0))
+    max_objects: int = setting(20, "At most so many bodies per frame, the largest ones.", within=(1, 100))
     max_size: float = setting(
-        0.6,
-        "Largest full edge of an object found by the node's own segmentation.",
-        unit="m",
-        within=(0.01, 100.0),
-        live=True,
+        0.6, "Largest full edge of an object found by the node's own segmentation.", unit="m", within=(0.01, 100.0)
     )
     workspace: tuple[float, ...] = setting(
         (-100.0, -100.0, -100.0, 100.0, 100.0, 100.0),
         "Objects outside are left out, by the middle of what is seen of them: least x, y, z, then greatest x, y, z, in "
         "target_frame, or in the image's frame where there is none.",
         unit="m",
-        live=True,
     )
     time_budget: float = setting(
         0.0,
         "Seconds per frame after which no further start is tried; the largest and nearest objects come first. 0: none.",
         unit="s",
         within=(0.0, 60.0),
-        live=True,
     )
     tracking: bool = setting(
         True,
         "Follow bodies from frame to frame: ids are those of tracks, axes keep their names, and numbers are fused over "
         "the frames; false: ids are mask labels and each frame stands for itself.",
-        live=True,
     )
     fixed_frame: str = setting(
         "",
         "tf2 frame that the bodies rest in, for a camera that moves; its pose at the image's stamp is looked up. "
         "Empty: the camera stands still. A change ends the tracks.",
-        live=True,
     )
     marker_colours: str = setting(
-        "id",
-        "Colour of the markers: by id, or by score from red (0) to green (1).",
-        choices=("id", "score"),
-        live=True,
+        "id", "Colour of the markers: by id, or by score from red (0) to green (1).", choices=("id", "score")
     )
-    marker_alpha: float = setting(0.7, "Opacity of the markers' surfaces.", within=(0.0, 1.0), live=True)
-    marker_line_width: float = setting(
-        0.002, "Width of the markers' outlines.", unit="m", within=(0.0001, 0.1), live=True
-    )
+    marker_alpha: float = setting(0.7, "Opacity of the markers' surfaces.", within=(0.0, 1.0))
+    marker_line_width: float = setting(0.002, "Width of the markers' outlines.", unit="m", within=(0.0001, 0.1))
     no_frame_warning: float = setting(
-        5.0, "Warn when no depth image came for so long; 0 never warns.", unit="s", within=(0.0, 3600.0), live=True
+        5.0, "Warn when no depth image came for so long; 0 never warns.", unit="s", within=(0.0, 3600.0)
     )
     trigger_timeout: float = setting(
-        5.0, "~/trigger answers with a failure when no frame came for so long.", unit="s", within=(0.1, 60.0), live=True
+        5.0, "~/trigger answers with a failure when no frame came for so long.", unit="s", within=(0.1, 60.0)
     )
     target_frame: str = setting(
         "",
         "tf2 frame that results are published in, by the transform at the image's stamp; an image without it is "
         "refused. ~/rendered_depth stays the camera's. Empty: the frame of the image.",
-        live=True,
     )
     tf_tolerance: float = setting(
         0.1,
         "How long to wait for a transform (fixed_frame, target_frame) of an image that is already here.",
         unit="s",
         within=(0.0, 5.0),
-        live=True,
     )
     publish_tf: bool = setting(
-        False, "Publish a frame for each body on /tf: tf_prefix and its id, below the results' frame.", live=True
+        False, "Publish a frame for each body on /tf: tf_prefix and its id, below the results' frame."
     )
     tf_prefix: str = setting(
         "superquadric_",
         "Beginning of the names of bodies, before the id: of tf2 frames, detections and collision objects. Two nodes "
         "need different ones.",
-        live=True,
     )
-    publish_detections: bool = setting(
-        False, "Publish ~/detections (vision_msgs/Detection3DArray); needs vision_msgs.", live=True
-    )
+    publish_detections: bool = setting(False, "Publish ~/detections (vision_msgs/Detection3DArray); needs vision_msgs.")
     publish_collision_objects: bool = setting(
         False,
         "Publish the bodies as collision objects on ~/planning_scene (moveit_msgs/PlanningScene, differences); needs "
         "moveit_msgs.",
-        live=True,
     )
     collision_shapes: str = setting(
         "primitive",
         "Collision objects enclose their bodies: primitive is the smallest box, cylinder or sphere, quick to make and "
         "to plan with; mesh fits closely.",
         choices=("primitive", "mesh"),
-        live=True,
     )
 
     model: str = setting(
         "",
         "Network weights: a .safetensors file or the name of shipped ones; empty: the default. Setting the same file "
         "again reads it again.",
-        live=True,
     )
-    device: str = setting("cpu", "Where the network runs: cpu, cuda or cuda:N.", live=True)
+    device: str = setting("cpu", "Where the network runs: cpu, cuda or cuda:N.")
     consensus: bool = setting(
-        False, "Average the network's answers to 8 positions of each view: better alone, and slower.", live=True
+        False, "Average the network's answers to 8 positions of each view: better alone, and slower."
     )
     threads: int = setting(
-        0,
-        "Objects of a frame that are worked on at the same time; 0: as many as there are cores.",
-        within=(0, 256),
-        live=True,
+        0, "Objects of a frame that are worked on at the same time; 0: as many as there are cores.", within=(0, 256)
     )
     method: Method = setting(
         "auto",
         "Where the fit starts: network, symmetry, or auto (the best of them); classic is Solina and Bajcsy's method.",
         choices=get_args(Method),
-        live=True,
     )
     refine: Refine = setting(
         "surface",
         "Refinement: surface fits the measured depth, soft_render the soft-rendered image, none keeps the start.",
         choices=get_args(Refine),
-        live=True,
     )
     repair: bool = setting(
-        True,
-        "Join and split own segments where that describes the image better; masks from outside stay as they are.",
-        live=True,
+        True, "Join and split own segments where that describes the image better; masks from outside stay as they are."
     )
-
-    @property
-    def seconds(self) -> float:
-        """``time_budget``, infinity where there is none."""
-        return self.time_budget if self.time_budget > 0 else math.inf
-
-    @property
-    def depth_range(self) -> tuple[float, float]:
-        """Nearest and farthest depth in metres, infinity where ``depth_max`` is at its upper end."""
-        return self.depth_min, math.inf if self.depth_max >= 100.0 else self.depth_max
 
     @property
     def box(self) -> Box | None:
         """``workspace``; None for the default, which keeps all."""
         return None if self.workspace == RecoverParameters.workspace else cast(Box, self.workspace)
 
+    def recovery_options(self, pose: Pose | None = None, has_free_space: bool = True) -> RecoveryOptions:
+        """What is said of a frame, whose pose in ``target_frame`` is given."""
+        return RecoveryOptions(
+            method=self.method,
+            refine=self.refine,
+            sharpness=self.s,
+            tau=self.tau,
+            depth_range=(self.depth_min, math.inf if self.depth_max >= 100.0 else self.depth_max),
+            max_objects=self.max_objects,
+            max_size=self.max_size,
+            workspace=self.box,
+            workspace_pose=pose,
+            free_space=has_free_space,
+            time_budget=self.time_budget or math.inf,
+            repair=self.repair,
+        )
+
     def __post_init__(self) -> None:
+        super().__post_init__()
         low, high = self.workspace[:3], self.workspace[3:]
         if len(self.workspace) != 6 or not all(a < b for a, b in zip(low, high, strict=True)):
             raise ParameterError(
@@ -287,7 +279,7 @@ class FitterParameters(RecoverParameters):
 
 
 @dataclass(frozen=True)
-class SyntheticParameters:
+class SyntheticParameters(Parameters):
     """synthetic_depth_node."""
 
     scene: Literal["thesis", "table", "replay"] = setting(
@@ -295,59 +287,72 @@ class SyntheticParameters:
         "thesis: orthographic grey images of one random body; table: a pinhole camera over bodies on a table; replay: "
         "recorded frames from path.",
         choices=("thesis", "table", "replay"),
+        live=False,
     )
-    rate: float = setting(10.0, "Frames per second.", unit="Hz", within=(0.1, 200.0), live=True)
-    seed: int = setting(0, "Seed of scenes and noise: the same seed gives the same images.", within=(0, 2**31 - 1))
+    rate: float = setting(10.0, "Frames per second.", unit="Hz", within=(0.1, 200.0))
+    seed: int = setting(
+        0, "Seed of scenes and noise: the same seed gives the same images.", within=(0, 2**31 - 1), live=False
+    )
     noise: float = setting(
         0.0,
         "Standard deviation of the ideal sensor's depth noise: metres, for orthographic frames grey levels of 255.",
         unit="m or grey levels",
         within=(0.0, 50.0),
-        live=True,
     )
     sensor: str = setting(
         IDEAL,
         "Depth sensor to imitate: ideal adds noise alone; the others have noise, steps, edges and holes of their own "
         "(docs/sensors.md).",
         choices=(IDEAL, *PRESETS),
-        live=True,
     )
-    hold: int = setting(30, "Frames that a scene or recording stays; the noise is fresh each time.", within=(1, 10**6))
-    scenes: int = setting(0, "Different scenes before the end or the next round; 0 means endless.", within=(0, 10**6))
-    loop: bool = setting(True, "Begin again after the last scene or recording; otherwise publish nothing more.")
-    objects: int = setting(3, "Bodies on the table.", within=(1, 10))
-    pixels: int = setting(256, "Width and height of the thesis' images.", unit="pixels", within=(16, 1024))
+    hold: int = setting(
+        30, "Frames that a scene or recording stays; the noise is fresh each time.", within=(1, 10**6), live=False
+    )
+    scenes: int = setting(
+        0, "Different scenes before the end or the next round; 0 means endless.", within=(0, 10**6), live=False
+    )
+    loop: bool = setting(
+        True, "Begin again after the last scene or recording; otherwise publish nothing more.", live=False
+    )
+    objects: int = setting(3, "Bodies on the table.", within=(1, 10), live=False)
+    pixels: int = setting(256, "Width and height of the thesis' images.", unit="pixels", within=(16, 1024), live=False)
     encoding: str = setting(
         "auto",
         "auto: mono8 for orthographic frames, 32FC1 for others.",
         choices=("auto", *GREY_ENCODINGS, *DEPTH_ENCODINGS),
+        live=False,
     )
     masks: str = setting(
         "auto",
         "Label images on mask/image: auto publishes those of recordings, always also those of generated scenes.",
         choices=("auto", "always", "never"),
+        live=False,
     )
     frame_id: str = setting(
-        "", "Frame of the images; empty: camera_depth_optical_frame, or unit_cube for orthographic frames."
+        "", "Frame of the images; empty: camera_depth_optical_frame, or unit_cube for orthographic frames.", live=False
     )
-    path: str = setting("", "A recorded frame (NPZ, PNG, BMP) or a folder of them, for scene = replay.")
+    path: str = setting("", "A recorded frame (NPZ, PNG, BMP) or a folder of them, for scene = replay.", live=False)
     camera_info_file: str = setting(
         "",
         "camera_info YAML of recorded PNG depth images; also the camera of table scenes, which are published raw where "
         "it distorts.",
+        live=False,
     )
     projection: Projection = setting(
         "pinhole",
         "Camera model of recorded images: 8 bit orthographic images look like depth images.",
         choices=get_args(Projection),
+        live=False,
     )
     image_transport: str = setting(
         RAW,
         "compressedDepth: depth images are also published packed, on depth/image/compressedDepth.",
         choices=TRANSPORTS,
+        live=False,
     )
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.scene == "replay" and not self.path:
             raise ParameterError("path: expected a recorded frame or a folder of them for scene = replay, got nothing")
         grey = self.encoding in GREY_ENCODINGS
@@ -363,28 +368,24 @@ class SyntheticParameters:
 
 
 @dataclass(frozen=True)
-class GraspParameters:
+class GraspParameters(Parameters):
     """grasp_node."""
 
-    autostart: bool = setting(True, "Configure and activate at the start, as recover_node does.")
-    gripper: str = setting("panda", "The gripper that grasps are for.", choices=tuple(GRIPPERS), live=True)
-    friction: float = setting(
-        FRICTION, "Coefficient of friction between pads and things.", within=(0.05, 2.0), live=True
-    )
-    min_score: float = setting(
-        0.3, "Grasps that hold with less probability are not published.", within=(0.0, 1.0), live=True
-    )
-    only_id: int = setting(-1, "Plan for the body of this id alone; -1: for all.", within=(-1, 2**31 - 1), live=True)
+    autostart: bool = setting(True, "Configure and activate at the start, as recover_node does.", live=False)
+    gripper: str = setting("panda", "The gripper that grasps are for.", choices=tuple(GRIPPERS))
+    friction: float = setting(FRICTION, "Coefficient of friction between pads and things.", within=(0.05, 2.0))
+    min_score: float = setting(0.3, "Grasps that hold with less probability are not published.", within=(0.0, 1.0))
+    only_id: int = setting(-1, "Plan for the body of this id alone; -1: for all.", within=(-1, 2**31 - 1))
 
 
-KINDS: dict[str, type[RecoverParameters] | type[SyntheticParameters] | type[GraspParameters]] = {
+KINDS: dict[str, type[Parameters]] = {
     "recover_node": RecoverParameters,
     "fitter_node": FitterParameters,
     "grasp_node": GraspParameters,
     "synthetic_depth_node": SyntheticParameters,
 }
 """The parameters of each node."""
-P = TypeVar("P", bound="RecoverParameters | SyntheticParameters | GraspParameters")
+P = TypeVar("P", bound=Parameters)
 
 
 class LiveParameters(Generic[P]):
@@ -403,7 +404,7 @@ class LiveParameters(Generic[P]):
 
     Raises
     ------
-    ParameterError
+    InvalidParameterValueException, ParameterError
         If a value given at the start has a wrong type, is out of range, or does not fit the others.
     """
 
@@ -416,117 +417,76 @@ class LiveParameters(Generic[P]):
         check: Callable[[Any, frozenset[str]], None] = lambda _, __: None,
         changed: Callable[[Any, frozenset[str]], None] = lambda _, __: None,
     ) -> None:
-        self._fields: dict[str, Field[Any]] = {one.name: one for one in fields(kind)}
+        self._kinds: dict[str, Any] = {one.name: type(one.default) for one in fields(kind)}
+        self._fixed = {one.name for one in fields(kind) if not one.metadata["live"]}
         self._locked, self._check, self._changed = locked, check, changed
-        values = {name: self._declare(node, one) for name, one in self._fields.items()}
-        self._current: P = kind(**values)
-        node.add_pre_set_parameters_callback(self._as_doubles)
+        self.current: P = kind(**self._values([self._declared(node, one) for one in fields(kind)]))
+        """The values in force: an immutable set, replaced as a whole."""
+        node.add_pre_set_parameters_callback(lambda changes: [self._typed(one) for one in changes])
         node.add_on_set_parameters_callback(self._on_set)
         node.add_post_set_parameters_callback(self._accept)
 
-    @property
-    def current(self) -> P:
-        """The values in force: an immutable set, replaced as a whole."""
-        return self._current
+    def _declared(self, node: Node, one: Field[Any]) -> Parameter:
+        # Of any type at first: declared as a double it would refuse an integer given at the start.
+        node.declare_parameter(one.name, one.default, ParameterDescriptor(dynamic_typing=True))
+        given = self._typed(node.get_parameter(one.name))
+        node.set_descriptor(one.name, describe(one, self._locked is None), given.get_parameter_value())
+        return given
 
-    def _declare(self, node: Node, one: Field[Any]) -> Any:
-        try:
-            node.declare_parameter(one.name, one.default, describe(one, self._locked is None))
-        except (InvalidParameterTypeException, InvalidParameterValueException) as error:
-            raise ParameterError(str(error)) from error
-        given = node.get_parameter(one.name)
-        (kept,) = self._as_doubles([given])
-        if kept is not given:
-            node.set_parameters([kept])
-        return checked(one, kept.value)
+    def _typed(self, given: Parameter) -> Parameter:
+        """A parameter with integers as doubles where it is one, or a list of them."""
+        kind = self._kinds.get(given.name)
+        if kind is float and given.type_ == Parameter.Type.INTEGER:
+            return Parameter(given.name, value=float(given.value))
+        if kind is tuple and given.type_ == Parameter.Type.INTEGER_ARRAY:
+            return Parameter(given.name, value=[float(one) for one in given.value])
+        return given
 
-    def _as_doubles(self, changes: list[Parameter]) -> list[Parameter]:
-        """Integers as doubles where the parameter is one, or a list of them; everything else as it is."""
-        found = []
-        for change in changes:
-            kind = type(self._fields[change.name].default) if change.name in self._fields else None
-            if kind is float and change.type_ == Parameter.Type.INTEGER:
-                change = Parameter(change.name, value=float(change.value))
-            elif kind is tuple and change.type_ == Parameter.Type.INTEGER_ARRAY:
-                change = Parameter(change.name, value=[float(one) for one in change.value])
-            found.append(change)
-        return found
+    def _values(self, changes: list[Parameter]) -> dict[str, Any]:
+        """By name, without those of rclpy's own, which another thread may declare."""
+        return {one.name: self._kinds[one.name](one.value) for one in changes if one.name in self._kinds}
 
     def _on_set(self, changes: list[Parameter]) -> SetParametersResult:
+        values = self._values(changes)
         try:
-            candidate, names = self._merged(changes)
+            candidate = replace(self.current, **values)
             # A value that stays as it is may always be set: `ros2 param load` sets all of a file.
-            other = (name for name in names if getattr(candidate, name) != getattr(self._current, name))
-            frozen = sorted(name for name in other if not self._fields[name].metadata["live"])
-            reason = self._locked() if frozen and self._locked is not None else ""
-            if reason:
+            fixed = sorted(self._fixed.intersection(values))
+            frozen = [name for name in fixed if getattr(candidate, name) != getattr(self.current, name)]
+            if frozen and self._locked is not None and (reason := self._locked()):
                 raise ParameterError(f"{', '.join(frozen)}: {reason}")
-            if names:
-                self._check(candidate, names)
+            if values:
+                self._check(candidate, frozenset(values))
         except (ValueError, OSError) as error:
             return SetParametersResult(successful=False, reason=str(error))
         return SetParametersResult(successful=True)
 
     def _accept(self, changes: list[Parameter]) -> None:
-        merged, names = self._merged(changes)
-        if not names:  # parameters of rclpy's own, which another thread may declare
-            return
-        self._current = merged
-        self._changed(merged, names)
-
-    def _merged(self, changes: list[Parameter]) -> tuple[P, frozenset[str]]:
-        values = {one.name: checked(self._fields[one.name], one.value) for one in changes if one.name in self._fields}
-        return replace(self._current, **values), frozenset(values)
-
-
-def checked(one: Field[Any], value: Any) -> Any:
-    """``value`` in the type of the field.
-
-    Raises
-    ------
-    ParameterError
-        If it has another type, is not finite, out of range or none of the choices.
-    """
-    kind: type = type(one.default)
-    about = one.metadata
-    if kind is float and isinstance(value, int) and not isinstance(value, bool):
-        value = float(value)
-    if kind is tuple and isinstance(value, (list, tuple, array)):
-        value = tuple(map(float, value))
-    if not isinstance(value, kind) or (isinstance(value, bool) and kind is not bool):
-        raise ParameterError(f"{one.name}: expected a value like {one.default!r}, got {value!r}")
-    if about["choices"] and value not in about["choices"]:
-        raise ParameterError(f"{one.name}: expected one of {', '.join(about['choices'])}, got {value!r}")
-    if about["within"] is not None:
-        low, high = about["within"]
-        if not low <= value <= high:
-            raise ParameterError(f"{one.name}: expected {low:g} to {high:g}{_unit(about)}, got {value:g}")
-    return value
+        if values := self._values(changes):
+            self.current = replace(self.current, **values)
+            self._changed(self.current, frozenset(values))
 
 
 def describe(one: Field[Any], is_fixed: bool = True) -> ParameterDescriptor:
-    """The descriptor of a field: its text with the unit, its range or choices.
+    """The descriptor of a field: its type, its text with the unit, its range or choices.
 
     It is read-only where the field is not live and ``is_fixed``, as in nodes without a lifecycle.
     """
-    about, kind = one.metadata, type(one.default)
+    about = one.metadata
+    unit = about["unit"]
     descriptor = ParameterDescriptor(
         name=one.name,
-        description=about["description"] + _unit(about, " [{}]"),
+        type=Parameter.Type.from_parameter_value(one.default).value,
+        description=about["description"] + (f" [{unit}]" if unit else ""),
         read_only=is_fixed and not about["live"],
     )
-    descriptor.dynamic_typing = kind in (float, tuple)
     if about["choices"]:
         descriptor.additional_constraints = "one of: " + ", ".join(about["choices"])
     elif about["within"] is not None:
         low, high = about["within"]
-        descriptor.additional_constraints = f"{low:g} to {high:g}{_unit(about)}"
-        if kind is int:
-            descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high), step=0)]
+        descriptor.additional_constraints = f"{low:g} to {high:g} {unit}".rstrip()
+        if isinstance(one.default, int):
+            descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
         else:
             descriptor.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high))]
     return descriptor
-
-
-def _unit(about: Any, form: str = " {}") -> str:
-    return form.format(about["unit"]) if about["unit"] else ""

@@ -10,7 +10,6 @@ import threading
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from datetime import datetime, timezone
 from time import monotonic, perf_counter
 
@@ -27,6 +26,7 @@ SECONDS = 10.0
 """What rates and latencies are taken over."""
 _MOST = 5000
 """Events that are kept: more than any camera causes in that time."""
+_OUTCOMES = ("answered", "dropped", "refused")
 _SLOW = 3.0
 """Seconds after which a frame without an outcome tells of more than a start."""
 Standing = tuple[bytes, str]
@@ -39,44 +39,6 @@ def timed(milliseconds: dict[str, float], stage: str) -> Iterator[None]:
     started = perf_counter()
     yield
     milliseconds[stage] = 1e3 * (perf_counter() - started)
-
-
-@dataclass(frozen=True)
-class Snapshot:
-    """Frames since the start, and what the last :data:`SECONDS` were like.
-
-    Attributes
-    ----------
-    recent
-        Frames received, answered, dropped and refused in that time.
-    starved
-        Seconds since the first of them came, if none was answered since then; else 0.
-    rate
-        Answers per second.
-    latency
-        (median, 95th percentile) in milliseconds by stage, of the same answers.
-    lost
-        Messages since the start that were never received, by topic.
-    last_error, last_answer
-        Why the last refused frame was refused, and when, and the summary of the last answered one.
-    """
-
-    received: int
-    answered: int
-    dropped: int
-    refused: int
-    recent: Mapping[str, int]
-    starved: float
-    rate: float
-    latency: Mapping[str, tuple[float, float]]
-    lost: Mapping[str, int]
-    last_error: str
-    last_answer: str
-
-    @property
-    def in_work(self) -> int:
-        """Frames that were received and have no outcome yet."""
-        return self.received - self.answered - self.dropped - self.refused
 
 
 class Statistics:
@@ -121,34 +83,6 @@ class Statistics:
         with self._lock:
             self._stages.append((self._clock(), milliseconds))
 
-    def snapshot(self) -> Snapshot:
-        """The state of affairs now."""
-        with self._lock:
-            now = self._clock()
-            since = now - SECONDS
-            recent = [(time, what) for time, what in self._recent if time >= since]
-            kept = [took for time, took in self._stages if time >= since]
-            counts, lost = Counter(self._counts), Counter(self._lost)
-            last_error, last_answer = self._last_error, self._last_answer
-        number = Counter(what for _, what in recent)
-        first = next((time for time, what in recent if what == "received"), now)
-        stages: dict[str, list[float]] = {}
-        for stage, took in (pair for one in kept for pair in one.items()):
-            stages.setdefault(stage, []).append(took)
-        return Snapshot(
-            received=counts["received"],
-            answered=counts["answered"],
-            dropped=counts["dropped"],
-            refused=counts["refused"],
-            recent=number,
-            starved=0.0 if number["answered"] else now - first,
-            rate=number["answered"] / min(SECONDS, max(now - self._started, 1.0)),
-            latency={name: (float(np.median(took)), float(np.percentile(took, 95))) for name, took in stages.items()},
-            lost=lost,
-            last_error=last_error,
-            last_answer=last_answer,
-        )
-
     def status(self, name: str, standing: Standing | None, more: Mapping[str, str]) -> DiagnosticStatus:
         """The diagnostics of a node.
 
@@ -160,34 +94,41 @@ class Statistics:
         more
             What there is to know beside the frames.
         """
-        now = self.snapshot()
-        lost = Counter(now.lost)
-        (refused, known), self._said = self._said, (now.refused, lost)
+        with self._lock:
+            now = self._clock()
+            counts, lost = Counter(self._counts), Counter(self._lost)
+            recent = [(time, what) for time, what in self._recent if time >= now - SECONDS]
+            stages = [took for time, took in self._stages if time >= now - SECONDS]
+            last_error, last_answer = self._last_error, self._last_answer
+        number = Counter(what for _, what in recent)
+        rate = number["answered"] / min(SECONDS, max(now - self._started, 1.0))
+        since = now - next((time for time, what in recent if what == "received"), now)
+        (refused, known), self._said = self._said, (counts["refused"], lost)
         level, message = DiagnosticStatus.WARN, ""
         if standing is not None:
             level, message = standing
-        elif now.refused > refused:
-            message = f"refused a frame: {now.last_error.partition(' ')[2]}"
-        elif now.starved > _SLOW:
-            message = f"{now.recent['received']} frames came within {now.starved:.0f} s, none was answered"
+        elif counts["refused"] > refused:
+            message = f"refused a frame: {last_error.partition(' ')[2]}"
+        elif since > _SLOW and not number["answered"]:
+            message = f"{number['received']} frames came within {since:.0f} s, none was answered"
         elif new := lost - known:
             parts = ", ".join(f"{number} of {topic}" for topic, number in new.items())
             message = f"messages lost before they arrived: {parts}"
         else:
-            level, message = DiagnosticStatus.OK, f"{now.rate:.1f} Hz"
+            level, message = DiagnosticStatus.OK, f"{rate:.1f} Hz"
         values = {
-            "rate [Hz]": f"{now.rate:.2f}",
-            **{what: str(getattr(now, what)) for what in ("received", "answered", "dropped", "refused")},
-            "in work": str(now.in_work),
+            "rate [Hz]": f"{rate:.2f}",
+            **{what: str(counts[what]) for what in ("received", *_OUTCOMES)},
+            "in work": str(counts["received"] - sum(counts[what] for what in _OUTCOMES)),
             "lost": str(lost.total()),
             **{f"lost of {topic}": str(number) for topic, number in lost.items()},
-            "last error": now.last_error,
-            "last answer": now.last_answer,
+            "last error": last_error,
+            "last answer": last_answer,
             **more,
         }
-        for stage, (median, high) in now.latency.items():
-            values[f"{stage}: median [ms]"] = f"{median:.2f}"
-            values[f"{stage}: p95 [ms]"] = f"{high:.2f}"
+        for stage in dict.fromkeys(stage for took in stages for stage in took):
+            median, high = np.percentile([took[stage] for took in stages if stage in took], (50, 95))
+            values |= {f"{stage}: median [ms]": f"{median:.2f}", f"{stage}: p95 [ms]": f"{high:.2f}"}
         pairs = [KeyValue(key=key, value=value) for key, value in values.items()]
         about = f"{name.lstrip('/')}: frames"
         return DiagnosticStatus(level=level, name=about, message=message, hardware_id=name, values=pairs)

@@ -119,20 +119,20 @@ class Tracking:
     def identify(
         self,
         recovery: FrameRecovery,
+        origin: Hashable,
         frame: Frame,
         arrival: float,
         parameters: RecoverParameters,
-        origin: Hashable = None,
     ) -> Identified:
         """Bodies and ids of their tracks; without ``tracking`` ids are labels, and what was tracked is forgotten.
 
         Parameters
         ----------
-        arrival
-            The time, seconds, of an image without stamp.
         origin
             Of the bodies, as :meth:`~sq_perception.nodes.engine.Engine.recover` returns it.  Numbers that another
             method or model found, with deviations of another kind, are not fused with these: a change ends the tracks.
+        arrival
+            The time, seconds, of an image without stamp.
 
         Raises
         ------

@@ -32,6 +32,15 @@ def ball(label: int = 1, status: Status = Status.CONVERGED) -> Recovery:
     return Recovery(Fit(body, 0.001, status, ""), 0.9, label, 100)
 
 
+def counts_of(node: FrameNode) -> Any:
+    """What a node has counted: received, answered, dropped, refused, in_work, lost by topic; and its last error."""
+    one = node._statistics
+    with one._lock:
+        counts = {what: one._counts[what] for what in ("received", "answered", "dropped", "refused")}
+        in_work = 2 * counts["received"] - sum(counts.values())
+        return SimpleNamespace(**counts, in_work=in_work, lost=dict(one._lost), last_error=one._last_error)
+
+
 class Recoverer:
     """Notes what it is asked, and answers ``bodies``, or raises, once ``gate`` is open."""
 
@@ -87,7 +96,7 @@ class Bench(SpunNodes):
 
     @property
     def counts(self) -> Any:
-        return self.node._statistics.snapshot()
+        return counts_of(self.node)
 
     def header(self) -> Header:
         self.stamps += 1

@@ -21,7 +21,7 @@ from sq_perception.imaging import raycast
 from sq_perception.imaging.calibration import Calibration
 from sq_perception.imaging.camera import Camera
 from sq_perception.learning import checkpoint
-from sq_perception.nodes.engine import Engine, options
+from sq_perception.nodes.engine import Engine
 from sq_perception.nodes.frame import Frame
 from sq_perception.nodes.parameters import FitterParameters, RecoverParameters
 
@@ -51,7 +51,7 @@ def set_to(engine: Engine, before: RecoverParameters, **values: Any) -> RecoverP
     """As ``ros2 param set`` does, and wait for the swap."""
     after = replace(before, **values)
     engine.check(after, frozenset(values))
-    engine.follow(after, frozenset(values), CAMERA)
+    engine.follow(after, frozenset(values))
     for thread in threading.enumerate():
         if thread.name == "recoverer in the making":
             thread.join(60)
@@ -60,7 +60,7 @@ def set_to(engine: Engine, before: RecoverParameters, **values: Any) -> RecoverP
 
 def test_what_is_loaded_stays_when_the_file_is_gone(engine, model):
     parameters = RecoverParameters(model=str(model), threads=1, method="network")
-    engine.build(parameters, CAMERA)
+    engine.build(parameters)
     before, origin = engine.recover(frame(), parameters)
     model.unlink()
     parameters = set_to(engine, parameters, threads=2)
@@ -80,7 +80,7 @@ def test_what_is_loaded_stays_when_the_file_is_gone(engine, model):
 
 def test_a_method_that_needs_a_network_whose_file_is_gone_is_refused(engine, model):
     parameters = RecoverParameters(model=str(model), threads=1, method="symmetry")
-    engine.build(parameters, CAMERA)
+    engine.build(parameters)
     model.unlink()
     with pytest.raises(ValueError, match=r"model: .*model.safetensors"):
         set_to(engine, parameters, method="network")
@@ -90,12 +90,12 @@ def test_a_method_that_needs_a_network_whose_file_is_gone_is_refused(engine, mod
 @pytest.mark.parametrize(("name", "value"), [("threads", 2), ("method", "auto"), ("consensus", True)])
 def test_only_a_set_of_the_model_reads_its_file_again(engine, model, name, value):
     parameters = RecoverParameters(model=str(model), threads=1, method="network")
-    engine.build(parameters, CAMERA)
+    engine.build(parameters)
     model.write_bytes(b"another one")
     set_to(engine, parameters, **{name: value})
     assert engine.fault == ""
 
 
 def test_fitter_node_asks_for_the_classic_method_and_nothing_else():
-    one, other = options(FitterParameters()), options(RecoverParameters())
+    one, other = FitterParameters().recovery_options(), RecoverParameters().recovery_options()
     assert one == replace(other, method="classic")

@@ -19,6 +19,7 @@ pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
 from builtin_interfaces.msg import Time
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
+from frame_node_bench import counts_of
 from lifecycle_msgs.msg import Transition, TransitionEvent
 from lifecycle_msgs.srv import ChangeState, GetState
 from rclpy.executors import MultiThreadedExecutor, SingleThreadedExecutor
@@ -170,7 +171,7 @@ class Bench(SpunNodes):
         self.until(lambda: any(condition(one) for one in self.reports[-3:]))
 
     def refused(self) -> int:
-        return int(self.node._statistics.snapshot().refused)
+        return int(counts_of(self.node).refused)
 
 
 @pytest.fixture
@@ -449,10 +450,10 @@ def test_masks_that_come_later_than_newer_images_are_waited_for(make_bench):
     headers = []
     for number in range(4):
         headers.append(bench.publish())
-        bench.until(lambda number=number: bench.node._statistics.snapshot().received == number + 1)
+        bench.until(lambda number=number: counts_of(bench.node).received == number + 1)
     masks.publish(labels_to_message(np.ones((48, 64), np.int32), headers[1]))
     bench.until(lambda: [one.header for one in bench.answers[""]] == [headers[1]])
     masks.publish(labels_to_message(np.ones((48, 64), np.int32), headers[3]))
     bench.until(lambda: [one.header for one in bench.answers[""]] == [headers[1], headers[3]])
-    counts = bench.node._statistics.snapshot()
+    counts = counts_of(bench.node)
     assert (counts.dropped, counts.refused) == (2, 0)

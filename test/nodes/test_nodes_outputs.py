@@ -442,7 +442,7 @@ def test_another_fixed_frame_is_another_world(node, tf2):
 
     def identified(fixed: str) -> tuple[int, ...]:
         parameters = RecoverParameters(fixed_frame=fixed)
-        return tracking.identify(recovery(one(BOX, 1)), frame(), 0.0, parameters).ids
+        return tracking.identify(recovery(one(BOX, 1)), None, frame(), 0.0, parameters).ids
 
     assert [identified(fixed) for fixed in ("", "", "map", "map", "base", "")] == [(1,), (1,), (2,), (2,), (3,), (4,)]
     assert [text.split(":")[0] for text in node.said] == [
@@ -457,7 +457,7 @@ def test_tracks_that_a_frame_does_not_show_are_hidden(node):
     tracking = Tracking(node, CameraPoses(node))
 
     def identified(parameters: RecoverParameters, *bodies: Recovery) -> Identified:
-        return tracking.identify(recovery(*bodies), frame(), 10.0, parameters)
+        return tracking.identify(recovery(*bodies), None, frame(), 10.0, parameters)
 
     first = identified(RecoverParameters(), one(BOX, 1), one(CAN, 2))
     assert (first.ids, first.hidden) == ((1, 2), ())

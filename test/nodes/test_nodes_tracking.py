@@ -238,5 +238,5 @@ def test_without_tf2_ids_remain(make_bench, monkeypatch, capfd):
 def test_a_cube_has_no_fixed_frame_and_no_budget_is_endless():
     with pytest.raises(ParameterError, match="fixed_frame"):
         RecoverParameters(projection="orthographic", fixed_frame="map")
-    assert RecoverParameters().seconds == np.inf
-    assert RecoverParameters(time_budget=0.05).seconds == 0.05
+    assert RecoverParameters().recovery_options().time_budget == np.inf
+    assert RecoverParameters(time_budget=0.05).recovery_options().time_budget == 0.05
