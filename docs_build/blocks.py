@@ -44,14 +44,6 @@ def results(name: str) -> Any:
     return json.loads((ROOT / "benchmarks" / "results" / f"{name}.json").read_text(encoding="utf-8"))
 
 
-def measured(*names: str) -> str:
-    """When and with which commit results were measured; to stand below their table."""
-    found = [results(name) for name in names]
-    sources = [one.get("environment") or one["facts"] for one in found]
-    texts = dict.fromkeys(f"{source['date']}, commit {source['commit']}" for source in sources)
-    return f"\nMeasured {' and '.join(texts)}.\n"
-
-
 def accuracy() -> str:
     """Images of the thesis' protocol: IoU from the evaluation, times of whole recoveries from the occlusion bench."""
     summaries = {one["name"]: one["summary"] for one in results("evaluation")["contestants"]}
@@ -86,7 +78,7 @@ def accuracy() -> str:
             ]
             for name, of, timed, thesis in rows
         ],
-    ) + measured("evaluation", "occlusion")
+    )
 
 
 def household() -> str:
@@ -110,7 +102,7 @@ def household() -> str:
             ]
             for text, row in rows
         ],
-    ) + measured("real_scenes")
+    )
 
 
 def kinds() -> str:
@@ -136,7 +128,7 @@ def kinds() -> str:
             ]
             for name, given, own in rows
         ],
-    ) + measured("real_scenes", "household_things")
+    )
 
 
 def prediction() -> str:
@@ -170,7 +162,7 @@ def frame_time() -> str:
             ]
             for count, row in shown
         ],
-    ) + measured("frame_time")
+    )
 
 
 def latency() -> str:
@@ -191,7 +183,7 @@ def latency() -> str:
             ]
             for name, text in names.items()
         ],
-    ) + measured("node_latency")
+    )
 
 
 def still() -> str:
@@ -215,7 +207,7 @@ def still() -> str:
             ]
             for count, row in results("still_scenes")["rows"].items()
         ],
-    ) + measured("still_scenes")
+    )
 
 
 def tracks() -> str:
@@ -232,7 +224,7 @@ def tracks() -> str:
             ]
             for name, row in results("tracking")["rows"].items()
         ],
-    ) + measured("tracking")
+    )
 
 
 # The packages
@@ -307,7 +299,7 @@ def speed() -> str:
         if not name.endswith("given")
     ]
     shares = [f"{' / '.join(next(iter(found.values()))[part])} %" for part in ("stages", "kinds")]
-    return table(["frame", "times a loop", "times classic fits", *shares], rows) + measured("speed")
+    return table(["frame", "times a loop", "times classic fits", *shares], rows)
 
 
 def known() -> str:
@@ -329,7 +321,7 @@ def known() -> str:
         for kind in ("box", "cylinder", "bottle", "vessel", "other")
     ]
     heads = ["things", "number", "IoU %, masks given / own", "error of edges mm, median", "within 2 sigma %"]
-    return table(heads, rows) + measured("known_frames")
+    return table(heads, rows)
 
 
 ABLATIONS = {
@@ -356,7 +348,7 @@ def ablation() -> str:
         for name, text in ABLATIONS.items()
     ]
     heads = ["fit", *(f"{one}, {found[one]['whole']['count']} things" for one in sets)]
-    return table(heads, rows) + measured("ablation")
+    return table(heads, rows)
 
 
 def recorded() -> str:
@@ -379,7 +371,7 @@ def recorded() -> str:
                 sigma,
             ]
         )
-    return table(heads, rows) + measured("known_frames")
+    return table(heads, rows)
 
 
 PICKERS = {
@@ -409,7 +401,7 @@ def picking() -> str:
         *failed, unreachable = (sum(one["causes"][cause] for one in kinds) for cause in (*FAILURES, "unreachable"))
         rows.append([text, *cells, f"{tried}: {' / '.join(map(str, failed))}", str(unreachable)])
     heads = ["planned on", "packed, scenes: GSR / DR %", "pile", f"tried: {' / '.join(FAILURES)}", "unreachable"]
-    return table(heads, rows) + measured("picking")
+    return table(heads, rows)
 
 
 def picking_scores() -> str:
