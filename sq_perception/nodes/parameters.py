@@ -77,89 +77,84 @@ class RecoverParameters(Parameters):
 
     autostart: bool = setting(
         True,
-        "Configure and activate at the start; false: wait for ros2 lifecycle set or a lifecycle manager.",
+        "Configure and activate at the start; false: wait for a lifecycle manager.",
         live=False,
     )
     free_shared_memory: bool = setting(
         False,
-        "Delete the shared memory that Fast DDS has left behind for killed processes of this user, 17 MB each.",
+        "Delete the shared memory that killed processes of this user have left behind.",
         live=False,
     )
     projection: Projection = setting(
         "pinhole",
-        "Camera model: pinhole takes 16UC1 and 32FC1 with camera_info; orthographic takes mono8 and mono16 images of "
-        "the unit cube and needs no camera_info.",
+        "pinhole: 16UC1 and 32FC1 with camera_info; orthographic: mono8 and mono16 images of the unit cube.",
         choices=get_args(Projection),
         live=False,
     )
     use_masks: str = setting(
         "auto",
-        "Label images on mask/image with the stamp of the depth image: auto uses them where they come and segments "
-        "where none does, always refuses frames without, never ignores them.",
+        "Label images on mask/image: auto segments images without one, always refuses them, never ignores masks.",
         choices=("auto", "always", "never"),
     )
     patience: float = setting(
         0.25,
-        "How long an image waits for its camera_info or mask before it is processed, or refused, without.",
+        "How long an image waits for its camera_info or mask.",
         unit="s",
         within=(0.0, 10.0),
     )
     image_transport: str = setting(
         RAW,
         "How depth images come: raw on depth/image, compressedDepth (16 bit PNG or RVL) on "
-        "depth/image/compressedDepth, or points (organised sensor_msgs/PointCloud2 in the optical frame) on "
-        "depth/points, which need no camera_info. Of a cloud that is not organised less is known: see docs/nodes.md.",
+        "depth/image/compressedDepth, points (sensor_msgs/PointCloud2, see docs/nodes.md) on depth/points.",
         choices=(*TRANSPORTS, POINTS),
         live=False,
     )
     distortion: Treatment = setting(
         "auto",
-        "What a camera_info with distortion coefficients means: apply rectifies the images, ignore takes them for "
-        "rectified, auto rectifies unless one of the last two parts of their topic has the word rect or rectified.",
+        "apply the coefficients of camera_info, ignore them, or auto: apply unless one of the last two parts of the "
+        "images' topic has the word rect or rectified.",
         choices=get_args(Treatment),
         live=False,
     )
     s: float = setting(
         117.3,
-        "Sharpness s of the soft occupancy sigma(s (1 - F^e1)) that the score and refine = soft_render compute with.",
+        "Sharpness of the soft occupancy sigma(s (1 - F^e1)) of the score and of refine = soft_render.",
         within=(0.1, 1000.0),
     )
     tau: float = setting(
         4.82,
-        "Sharpness tau of the soft depth projection that the score and refine = soft_render compute with.",
+        "Sharpness of the soft depth projection of the score and of refine = soft_render.",
         within=(0.1, 100.0),
     )
     depth_min: float = setting(0.0, "Nearer readings are left out.", unit="m", within=(0.0, 100.0))
     depth_max: float = setting(100.0, "Farther readings are left out; 100 keeps all.", unit="m", within=(0.001, 100.0))
-    max_objects: int = setting(20, "At most so many bodies per frame, the largest ones.", within=(1, 100))
+    max_objects: int = setting(20, "Most bodies a frame, the largest ones.", within=(1, 100))
     max_size: float = setting(
-        0.6, "Largest full edge of an object found by the node's own segmentation.", unit="m", within=(0.01, 100.0)
+        0.6, "Largest full edge of an object of the node's own segmentation.", unit="m", within=(0.01, 100.0)
     )
     workspace: tuple[float, ...] = setting(
         (-100.0, -100.0, -100.0, 100.0, 100.0, 100.0),
-        "Objects outside are left out, by the middle of what is seen of them: least x, y, z, then greatest x, y, z, in "
-        "target_frame, or in the image's frame where there is none.",
+        "Least x, y, z, then greatest x, y, z of the middle of what is seen of an object, in target_frame or, without "
+        "one, the image's; objects outside are left out.",
         unit="m",
     )
     time_budget: float = setting(
         0.0,
-        "Seconds per frame after which no further start is tried; the largest and nearest objects come first. 0: none.",
+        "Time per frame after which no further start is tried, the largest and nearest objects first; 0: none.",
         unit="s",
         within=(0.0, 60.0),
     )
     tracking: bool = setting(
         True,
-        "Follow bodies from frame to frame: ids are those of tracks, axes keep their names, and numbers are fused over "
-        "the frames; false: ids are mask labels and each frame stands for itself.",
+        "Follow bodies from frame to frame and fuse their numbers; false: ids are mask labels, each frame stands for "
+        "itself.",
     )
     fixed_frame: str = setting(
         "",
-        "tf2 frame that the bodies rest in, for a camera that moves; its pose at the image's stamp is looked up. "
-        "Empty: the camera stands still. A change ends the tracks.",
+        "tf2 frame that the bodies rest in, for a camera that moves. Empty: the camera stands still. A change ends the "
+        "tracks.",
     )
-    marker_colours: str = setting(
-        "id", "Colour of the markers: by id, or by score from red (0) to green (1).", choices=("id", "score")
-    )
+    marker_colours: str = setting("id", "By id, or by score from red (0) to green (1).", choices=("id", "score"))
     marker_alpha: float = setting(0.7, "Opacity of the markers' surfaces.", within=(0.0, 1.0))
     marker_line_width: float = setting(0.002, "Width of the markers' outlines.", unit="m", within=(0.0001, 0.1))
     no_frame_warning: float = setting(
@@ -170,47 +165,39 @@ class RecoverParameters(Parameters):
     )
     target_frame: str = setting(
         "",
-        "tf2 frame that results are published in, by the transform at the image's stamp; an image without it is "
-        "refused. ~/rendered_depth stays the camera's. Empty: the frame of the image.",
+        "tf2 frame of the results, by the transform at the image's stamp; an image without it is refused. Empty: the "
+        "image's.",
     )
     tf_tolerance: float = setting(
         0.1,
-        "How long to wait for a transform (fixed_frame, target_frame) of an image that is already here.",
+        "How long an image waits for transforms (fixed_frame, target_frame).",
         unit="s",
         within=(0.0, 5.0),
     )
-    publish_tf: bool = setting(
-        False, "Publish a frame for each body on /tf: tf_prefix and its id, below the results' frame."
-    )
+    publish_tf: bool = setting(False, "Publish a frame for each body on /tf.")
     tf_prefix: str = setting(
         "superquadric_",
-        "Beginning of the names of bodies, before the id: of tf2 frames, detections and collision objects. Two nodes "
-        "need different ones.",
+        "Names of tf2 frames, detections and collision objects before the id. Two nodes need different ones.",
     )
-    publish_detections: bool = setting(False, "Publish ~/detections (vision_msgs/Detection3DArray); needs vision_msgs.")
+    publish_detections: bool = setting(False, "Publish ~/detections; needs vision_msgs.")
     publish_collision_objects: bool = setting(
         False,
-        "Publish the bodies as collision objects on ~/planning_scene (moveit_msgs/PlanningScene, differences); needs "
-        "moveit_msgs.",
+        "Publish collision objects on ~/planning_scene; needs moveit_msgs.",
     )
     collision_shapes: str = setting(
         "primitive",
-        "Collision objects enclose their bodies: primitive is the smallest box, cylinder or sphere, quick to make and "
-        "to plan with; mesh fits closely.",
+        "Around each body: the smallest box, cylinder or sphere, quick to plan with, or a mesh that fits closely.",
         choices=("primitive", "mesh"),
     )
 
     model: str = setting(
         "",
-        "Network weights: a .safetensors file or the name of shipped ones; empty: the default. Setting the same file "
-        "again reads it again.",
+        "Weights: a .safetensors file or the name of shipped ones; empty: the default. Setting the same file reads it again.",
     )
     device: str = setting("cpu", "Where the network runs: cpu, cuda or cuda:N.")
-    consensus: bool = setting(
-        False, "Average the network's answers to 8 positions of each view: better alone, and slower."
-    )
+    consensus: bool = setting(False, "Average the network's answers to 8 positions of each view.")
     threads: int = setting(
-        0, "Objects of a frame that are worked on at the same time; 0: as many as there are cores.", within=(0, 256)
+        0, "Objects that are worked on at the same time; 0: as many as there are cores.", within=(0, 256)
     )
     method: Method = setting(
         "auto",
@@ -219,12 +206,10 @@ class RecoverParameters(Parameters):
     )
     refine: Refine = setting(
         "surface",
-        "Refinement: surface fits the measured depth, soft_render the soft-rendered image, none keeps the start.",
+        "surface fits the measured depth, soft_render the soft-rendered image, none keeps the start.",
         choices=get_args(Refine),
     )
-    repair: bool = setting(
-        True, "Join and split own segments where that describes the image better; masks from outside stay as they are."
-    )
+    repair: bool = setting(True, "Join and split own segments where that describes the image better.")
 
     @property
     def box(self) -> Box | None:
