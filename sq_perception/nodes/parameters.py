@@ -161,7 +161,7 @@ class RecoverParameters(Parameters):
         5.0, "Warn when no depth image came for so long; 0 never warns.", unit="s", within=(0.0, 3600.0)
     )
     trigger_timeout: float = setting(
-        5.0, "~/trigger answers with a failure when no frame came for so long.", unit="s", within=(0.1, 60.0)
+        5.0, "~/trigger and ~/recover fail when no frame came for so long.", unit="s", within=(0.1, 60.0)
     )
     target_frame: str = setting(
         "",
@@ -192,7 +192,7 @@ class RecoverParameters(Parameters):
 
     model: str = setting(
         "",
-        "Weights: a .safetensors file or the name of shipped ones; empty: the default. Setting the same file reads it again.",
+        "Weights: a .safetensors file or the name of shipped ones; empty: the default. Set again, it is read again.",
     )
     device: str = setting("cpu", "Where the network runs: cpu, cuda or cuda:N.")
     consensus: bool = setting(False, "Average the network's answers to 8 positions of each view.")
