@@ -45,6 +45,9 @@ bags = [
 view = [
     "viser>=1.1.1,<1.2",  # the page of `sq-perception view`, all of it local; its server is guarded by a way of calling
 ]
+exr = [
+    "OpenEXR>=3.3,<4",  # depth images of renderers; OpenCV's wheels are built without; 2 MB
+]
 cluster = [
     "distributed>=2024.5",  # `recover --cluster` hands frames to a running Dask cluster; 36 MB with what it needs
 ]
@@ -112,6 +115,7 @@ setup(
         "ros": ["ros-jazzy-rclpy[fastrtps]", "ros-jazzy-common-interfaces"],
         "bags": bags,
         "cluster": cluster,
+        "exr": exr,
         "train": train,
         "view": view,
         "picking": picking,
@@ -119,6 +123,7 @@ setup(
         "test": [
             *bags,
             *cluster,
+            *exr,
             *train,
             *view,
             *picking,

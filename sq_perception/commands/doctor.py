@@ -19,6 +19,7 @@ _PACKAGE = Path(__file__).parents[1]
 _EXTRAS = {
     "bags": ("rosbags", "mcap"),
     "view": ("viser",),
+    "exr": ("OpenEXR",),
     "train": ("tensorboard",),
     "ros": ("rclpy", "sensor_msgs", "visualization_msgs"),
 }

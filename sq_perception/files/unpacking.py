@@ -102,6 +102,34 @@ def grey_image(path: Path) -> np.ndarray:
     return image
 
 
+def exr_image(path: Path) -> np.ndarray:
+    """The depth in an EXR of floats, (height, width): its channel Z, V or Y, or what all its channels hold.
+
+    Raises
+    ------
+    UnpackingError
+        If OpenEXR is not installed, or the file holds no such image, or more than MOST_PIXELS numbers.
+    """
+    try:
+        import OpenEXR
+    except ImportError:
+        raise UnpackingError("an EXR needs OpenEXR: pip install 'sq_perception[exr]'") from None
+    try:
+        with OpenEXR.File(str(path), header_only=True) as file:
+            heads = [(part.header["dataWindow"], len(part.header["channels"])) for part in file.parts]
+        count = sum(math.prod((int(side) + 1 for side in high - low), start=number) for (low, high), number in heads)
+        if not 0 < count <= MOST_PIXELS:
+            raise UnpackingError(f"expected 1 to {MOST_PIXELS} numbers, got {count}")
+        with OpenEXR.File(str(path), separate_channels=True, num_threads=1) as file:
+            found = {name.rpartition(".")[2]: channel.pixels for name, channel in file.channels().items()}
+    except Exception as error:  # whatever damaged files lead to
+        raise UnpackingError(f"not a readable EXR: {error}") from error
+    one, *others = [found[name] for name in ("Z", "V", "Y") if name in found][:1] or found.values()
+    if one.dtype.kind != "f" or not all(np.array_equal(one, other, equal_nan=True) for other in others):
+        raise UnpackingError(f"expected floats in a channel Z, V or Y, got {', '.join(found)}")
+    return np.asarray(one)
+
+
 def lzf(packed: bytes, size: int) -> bytearray:
     """What ``packed`` unpacks to by LZF, ``size`` bytes.
 

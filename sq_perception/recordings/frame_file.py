@@ -3,7 +3,7 @@
 | file | needs | depth |
 | --- | --- | --- |
 | ``.npz`` | ``depth`` float (h, w), ``K`` (3, 3) | metres, NaN = nothing |
-| ``.npy``, ``.tif`` of floats | a camera_info | metres, NaN or 0 = nothing; rectified where it is raw |
+| ``.npy``, ``.tif`` of floats, ``.exr`` | a camera_info | metres, NaN or 0 = nothing; rectified where it is raw |
 | 16 bit ``.png``, ``.tif``, ``.npy`` | a camera_info | millimetres, 0 = nothing; likewise |
 | ``.pcd``, ``.ply`` | nothing | points in metres, see :mod:`sq_perception.recordings.cloud_file` |
 | 8 or 16 bit ``.png``, ``.bmp``, orthographic | nothing | grey values of the cube, 0 = nothing |
@@ -33,14 +33,14 @@ from typing import NamedTuple, get_args
 
 import numpy as np
 
-from sq_perception.files.unpacking import UnpackingError, grey_image, npy_array, npz_arrays
+from sq_perception.files.unpacking import UnpackingError, exr_image, grey_image, npy_array, npz_arrays
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.calibration import Treatment
 from sq_perception.imaging.camera import Camera, Projection
 from sq_perception.recordings import cloud_file
 from sq_perception.recordings.camera_file import FrameError, calibrated, camera_info_of, is_transposed
 
-SUFFIXES = (".npz", ".npy", ".png", ".bmp", ".tif", ".tiff", *cloud_file.SUFFIXES)
+SUFFIXES = (".npz", ".npy", ".png", ".bmp", ".tif", ".tiff", ".exr", *cloud_file.SUFFIXES)
 MILLIMETRES = 1000.0
 """Units a metre."""
 TUM_SCALE = 5000.0
@@ -244,7 +244,7 @@ def _read(
     if suffix not in SUFFIXES:
         raise FrameError(f"{path}: expected a name that ends in {', '.join(SUFFIXES)}")
     try:
-        image = npy_array(path) if suffix == ".npy" else grey_image(path)
+        image = {".npy": npy_array, ".exr": exr_image}.get(suffix, grey_image)(path)
     except UnpackingError as error:
         raise FrameError(f"{path}: {error}") from error
     if image.ndim != 2 or not image.size:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 
 import cv2
 import numpy as np
@@ -105,6 +106,50 @@ def test_a_hostile_npy_is_refused(tmp_path):
     path.write_bytes(whole[:-1])
     with pytest.raises(FrameError, match="bytes of numbers"):
         read(path, NUMBERS)
+
+
+@pytest.fixture
+def exr():
+    return pytest.importorskip("OpenEXR", reason="needs the extra 'exr'")
+
+
+def save_exr(exr, path, **channels):
+    with exr.File({"compression": exr.ZIP_COMPRESSION, "type": exr.scanlineimage}, channels) as file:
+        file.write(str(path))
+    return path
+
+
+@pytest.mark.parametrize("names", ["Z", "Depth.V", "RGB", "RAZ"])
+def test_an_exr_is_metres(tmp_path, exr, names):
+    """The depth pass of a renderer, by itself, beside a picture, or as a grey picture."""
+    depth = np.random.default_rng(0).uniform(0.5, 2, (48, 64)).astype(np.float32)
+    depth[2, 3] = np.nan
+    channels = dict.fromkeys([names] if "." in names else names, depth)
+    if "A" in channels:
+        channels["A"] = channels["R"] = np.ones_like(depth)
+    frame = read(save_exr(exr, tmp_path / "a.exr", **channels), NUMBERS)
+    np.testing.assert_array_equal(frame.depth, depth)
+
+
+def test_the_extra_of_an_exr_is_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "OpenEXR", None)
+    (tmp_path / "a.exr").touch()
+    with pytest.raises(FrameError, match=r"sq_perception\[exr\]"):
+        read(tmp_path / "a.exr", NUMBERS)
+
+
+def test_a_hostile_exr_is_refused(tmp_path, exr):
+    plain = np.ones((48, 64), np.float32)
+    path = save_exr(exr, tmp_path / "a.exr", Z=plain)
+    whole = path.read_bytes()
+    window = np.array([0, 0, 63, 47], "<i4").tobytes()
+    huge = whole.replace(window, np.array([0, 0, 2**20, 2**20], "<i4").tobytes())
+    for data, words in ((b"", "not a readable"), (whole[:-9], "not a readable"), (huge, "expected 1 to")):
+        path.write_bytes(data)
+        with pytest.raises(FrameError, match=words):
+            read(path, NUMBERS)
+    with pytest.raises(FrameError, match="channel Z"):
+        read(save_exr(exr, path, R=plain, G=2 * plain), NUMBERS)
 
 
 def test_scale_is_what_is_said_or_what_the_name_says(tmp_path):
