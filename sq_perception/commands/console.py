@@ -1,10 +1,15 @@
-"""What all commands have in common: exit codes, complaints of one line, and how their help is laid out."""
+"""What all commands have in common: exit codes, complaints of one line, help texts, and checks of what was given."""
 
 from __future__ import annotations
 
 import argparse
+import math
 import sys
+from collections.abc import Callable
+from pathlib import Path
 from typing import TYPE_CHECKING
+
+from sq_perception.files import output_file
 
 if TYPE_CHECKING:
     from rich.progress import Progress
@@ -38,6 +43,41 @@ def parser(command: str, description: str, epilog: str | None = None) -> argpars
         epilog=epilog,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+
+
+def at_least(least: int) -> Callable[[str], int]:
+    """The type of an argument that is a whole number of at least so much."""
+
+    def checked(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            raise argparse.ArgumentTypeError(f"expected a whole number, got {text!r}") from None
+        if value < least:
+            raise argparse.ArgumentTypeError(f"expected at least {least}, got {value}")
+        return value
+
+    return checked
+
+
+def positive(text: str) -> float:
+    """The type of an argument that is a finite number above 0."""
+    try:
+        value = float(text)
+    except ValueError:
+        value = math.nan
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"expected a positive number, got {text}")
+    return value
+
+
+def target(text: str) -> Path:
+    """The type of an argument that names a file to be written, which is tried."""
+    try:
+        output_file.check(text)
+    except OSError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+    return Path(text)
 
 
 def progress() -> Progress:

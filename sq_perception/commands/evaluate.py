@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sq_perception.commands.console import FAILURE, SUCCESS, complain, failed, parser, progress
+from sq_perception.commands.console import FAILURE, SUCCESS, at_least, complain, failed, parser, progress
 from sq_perception.evaluation.protocol import BODIES, DEFAULT_SEED, FIT_BODIES, FITS
 
 if TYPE_CHECKING:
@@ -17,15 +17,14 @@ if TYPE_CHECKING:
 
 _HELP = """\
 Compare networks and fits on one test set of the thesis' protocol, and write its tables 6.1 to 6.3 and 7.1 to 7.4 with
-the thesis' figures beside ours, IoU histograms, angles of the rotations (figure 6.3), examples, and training curves.
+the thesis' figures beside ours, IoU histograms, angles of the rotations (figure 6.3), and examples.
 
 A network takes part alone, unrefined, from the 256 x 256 image on; the loss in its file's header says which row of the
 thesis it answers.  Fits: auto (network and surface fit), symmetry (surface fit alone), classic (Solina and Bajcsy).
 """
 _EPILOG = """\
 writes into --output:
-  report.html    all tables and pictures in one file that needs no other and no network
-  report.md      the tables
+  report.md      the tables and pictures
   results.json   every figure, the command, versions, processor, commit and seeds
   *.png          the pictures
 
@@ -44,11 +43,6 @@ def main(arguments: Sequence[str]) -> int:
     """Entry of ``sq-perception evaluate``; the exit code, which is that of a failure if a model could not be read."""
     command = _parser()
     options = command.parse_args(arguments)
-    for name in ("bodies", "fit_bodies"):
-        if getattr(options, name) < 1:
-            command.error(f"--{name.replace('_', '-')}: expected at least 1, got {getattr(options, name)}")
-    if options.seed < 0:
-        command.error(f"--seed: expected a number of at least 0, got {options.seed}")
     methods: list[Method] = list(dict.fromkeys(FITS if options.methods is None else options.methods))
     if options.models == [] and not methods:
         command.error("nothing to evaluate: --models and --methods are both empty")
@@ -124,11 +118,17 @@ def _parser() -> argparse.ArgumentParser:
     command.add_argument(
         "--methods", nargs="*", choices=FITS, metavar="FIT", help=f"fits to compare (default: {' '.join(FITS)})"
     )
-    command.add_argument("--bodies", type=int, default=BODIES, metavar="N", help=f"bodies for networks ({BODIES})")
     command.add_argument(
-        "--fit-bodies", type=int, default=FIT_BODIES, metavar="N", help=f"the first N of them for fits ({FIT_BODIES})"
+        "--bodies", type=at_least(1), default=BODIES, metavar="N", help=f"bodies for networks ({BODIES})"
     )
-    command.add_argument("--seed", type=int, default=DEFAULT_SEED, help=f"of the test set ({DEFAULT_SEED})")
+    command.add_argument(
+        "--fit-bodies",
+        type=at_least(1),
+        default=FIT_BODIES,
+        metavar="N",
+        help=f"the first N of them for fits ({FIT_BODIES})",
+    )
+    command.add_argument("--seed", type=at_least(0), default=DEFAULT_SEED, help=f"of the test set ({DEFAULT_SEED})")
     command.add_argument(
         "--output", type=Path, default=Path("runs/evaluation"), metavar="DIR", help="folder (runs/evaluation)"
     )

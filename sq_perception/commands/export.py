@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
-from sq_perception.commands.console import SUCCESS, failed, parser
+from sq_perception.commands.console import SUCCESS, failed, parser, target
 from sq_perception.files import output_file
 
 _HELP = "Write a network as ONNX: views (n, 1, p, p) in, the 12 parameters of n bodies out."
@@ -16,12 +15,8 @@ def main(arguments: Sequence[str]) -> int:
     """Entry of ``sq-perception export``; the exit code."""
     command = parser("export", _HELP, _EPILOG)
     command.add_argument("--model", metavar="FILE", help="weights: a .safetensors file, or the name of shipped ones")
-    command.add_argument("--output", "-o", type=Path, required=True, metavar="FILE", help="the .onnx file")
+    command.add_argument("--output", "-o", type=target, required=True, metavar="FILE", help="the .onnx file")
     options = command.parse_args(arguments)
-    try:
-        output_file.check(options.output)
-    except OSError as error:
-        command.error(f"--output: {error}")
 
     from sq_perception.learning import checkpoint
     from sq_perception.learning.onnx_export import MissingPackageError, build

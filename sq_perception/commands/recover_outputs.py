@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,8 +17,9 @@ from sq_perception.files import output_file
 if TYPE_CHECKING:
     from sq_perception.recordings.frame_file import RecordedFrame
     from sq_perception.recordings.result_bag import ResultBag
-    from sq_perception.recordings.still_page import StillPage
+    from sq_perception.recordings.result_json import ResultLines
     from sq_perception.recovery.recoverer import FrameRecovery
+    from sq_perception.tracking.session import Followed
 
 STANDARD_OUTPUT = "-"
 _FILES, _FOLDERS = ("json", "jsonl", "csv", "mcap", "html"), ("pictures", "meshes")
@@ -86,28 +87,115 @@ def replaced_input(options: argparse.Namespace, inputs: Sequence[Path]) -> str:
     return ""
 
 
-def place(name: str) -> str:
-    """The path that an output's name means."""
-    return "/dev/stdout" if name == STANDARD_OUTPUT else name
-
-
-def decisive(options: argparse.Namespace) -> dict[str, Any]:
+def _decisive(options: argparse.Namespace) -> dict[str, Any]:
     """Options that decide what is found in a frame, as JSON values; what was not given is None."""
     values = {name: getattr(options, name) for name in _DECISIVE}
-    values = {name: list(value) if isinstance(value, tuple) else value for name, value in values.items()}
+    values["roi"] = values["roi"] and list(values["roi"])
+    values["masks"] = values["masks"] and str(values["masks"])
     return {name: None if value == math.inf else value for name, value in values.items()}
 
 
-def bag(options: argparse.Namespace) -> ResultBag | None:
-    """The bag that was asked for, open.
+class Outputs:
+    """Everything that is written of a run, open before the first frame.
+
+    Attributes
+    ----------
+    done : list
+        Elements of ``frames`` that the file of lines had at the beginning.
+    results : list
+        Those of this run.
 
     Raises
     ------
     ValueError
-        For a name or kind of image that is none.
+        For a name or kind of image that is none, or a file of lines that cannot be gone on with.
     OSError, ImportError
-        If it cannot be written.
+        If something cannot be written.
     """
+
+    def __init__(self, options: argparse.Namespace) -> None:
+        self._options = options
+        self.results: list[dict[str, Any]] = []
+        self._lines = _lines(options)
+        self.done = [] if self._lines is None else self._lines.done
+        self._bag = _bag(options)
+        self._page = None
+        if options.html:
+            from sq_perception.recordings.still_page import StillPage
+
+            self._page = StillPage(options.html)
+        self._stems = {Path(one["file"]).stem for one in self.done if not one.get("topic")}
+
+    def add(
+        self,
+        frame: RecordedFrame,
+        recovery: FrameRecovery,
+        tracks: Sequence[Followed | None] | None,
+        entry: dict[str, Any],
+    ) -> None:
+        """Write a frame, what was recovered from it, and its element of ``frames``; raises OSError if that fails."""
+        options = self._options
+        self.results.append(entry)
+        stem = _free_stem(frame.name if frame.topic else Path(frame.name).stem, self._stems)
+        if options.pictures:
+            _draw(Path(options.pictures) / f"{stem}.png", frame, recovery)
+        if options.meshes:
+            _write_mesh(Path(options.meshes) / f"{stem}.{options.mesh_format}", frame, recovery)
+        if self._bag is not None:
+            self._bag.add(frame, recovery, tracks)
+        if self._page is not None:
+            self._page.add(frame, recovery)
+        if self._lines is not None:  # last: what has a line has all its files
+            self._lines.add(entry)
+
+    def finish(self, whole: bool) -> Iterator[str]:
+        """Close what grew and write the documents; what could not be done, or went elsewhere, one sentence each.
+
+        ``whole`` says whether all frames were tried.
+        """
+        from sq_perception.recordings import result_json
+
+        if self._lines is not None:
+            self._lines.close()
+        for name, output in (("mcap", self._bag), ("html", self._page)):
+            try:
+                if output is not None and (found := output.close(whole)) is not None:
+                    yield from _elsewhere(name, Path(getattr(self._options, name)), found)
+            except OSError as error:
+                yield f"--{name}: {error}"
+        entries = [*self.done, *self.results]
+        for name, text in (
+            ("json", lambda: result_json.document(_decisive(self._options), entries)),
+            ("csv", lambda: result_json.table(entries)),
+        ):
+            if getattr(self._options, name) == STANDARD_OUTPUT:
+                sys.stdout.write(text())
+            elif getattr(self._options, name):
+                path = Path(getattr(self._options, name))
+                try:
+                    if not entries and path.is_file() and path.stat().st_size:
+                        yield f"--{name}: no frame was read, so {path} stays as it is"
+                    else:
+                        yield from _elsewhere(name, path, output_file.write(path, text().encode(), whole))
+                except OSError as error:
+                    yield f"--{name}: {error}"
+
+
+def _lines(options: argparse.Namespace) -> ResultLines | None:
+    if not options.jsonl:
+        return None
+    from sq_perception.recordings.result_json import ResultLines
+
+    path = "/dev/stdout" if options.jsonl == STANDARD_OUTPUT else options.jsonl
+    lines = ResultLines(path, _decisive(options))
+    needing = [name for name in ("track", "mcap", "html") if getattr(options, name)]
+    if lines.done and needing:
+        lines.close()
+        raise ValueError(f"--jsonl: {path} has {len(lines.done)} frames already, and --{needing[0]} needs all")
+    return lines
+
+
+def _bag(options: argparse.Namespace) -> ResultBag | None:
     if not options.mcap:
         return None
     try:
@@ -121,48 +209,13 @@ def bag(options: argparse.Namespace) -> ResultBag | None:
         raise ImportError(f"--mcap: {error}") from error
 
 
-def page(options: argparse.Namespace) -> StillPage | None:
-    """The page that was asked for, open; raises OSError if it cannot be written."""
-    if not options.html:
-        return None
-    from sq_perception.recordings.still_page import StillPage
-
-    return StillPage(options.html)
-
-
-def finish(
-    options: argparse.Namespace,
-    entries: Sequence[Mapping[str, Any]],
-    growing: Mapping[str, ResultBag | StillPage | None],
-    whole: bool,
-) -> Iterator[str]:
-    """Close what grew and write the documents; what could not be done, or went elsewhere, one sentence each.
-
-    ``whole`` says whether all frames were tried.
-    """
-    for name, output in growing.items():
-        try:
-            if output is not None and (found := output.close(whole)) is not None:
-                yield from _elsewhere(name, Path(getattr(options, name)), found)
-        except OSError as error:
-            yield f"--{name}: {error}"
-    from sq_perception.recordings import result_json
-
-    for name, text in (
-        ("json", lambda: result_json.document(decisive(options), entries)),
-        ("csv", lambda: result_json.table(entries)),
-    ):
-        if getattr(options, name) == STANDARD_OUTPUT:
-            sys.stdout.write(text())
-        elif getattr(options, name):
-            path = Path(getattr(options, name))
-            try:
-                if not entries and path.is_file() and path.stat().st_size:
-                    yield f"--{name}: no frame was read, so {path} stays as it is"
-                else:
-                    yield from _elsewhere(name, path, output_file.write(path, text().encode(), whole))
-            except OSError as error:
-                yield f"--{name}: {error}"
+def _free_stem(stem: str, taken: set[str]) -> str:
+    """A name for a frame's files that no other frame of this call has."""
+    name, k = stem, 2
+    while name in taken:
+        name, k = f"{stem}_{k}", k + 1
+    taken.add(name)
+    return name
 
 
 def _elsewhere(name: str, path: Path, found: Path) -> Iterator[str]:
@@ -170,7 +223,7 @@ def _elsewhere(name: str, path: Path, found: Path) -> Iterator[str]:
         yield f"--{name}: unfinished, so {path} stays as it is: see {found}"
 
 
-def draw(path: Path, frame: RecordedFrame, recovery: FrameRecovery) -> None:
+def _draw(path: Path, frame: RecordedFrame, recovery: FrameRecovery) -> None:
     """The picture of a frame."""
     from sq_perception.evaluation import plots
 
@@ -179,7 +232,7 @@ def draw(path: Path, frame: RecordedFrame, recovery: FrameRecovery) -> None:
         plots.save(plots.recovery_figure(frame.depth, frame.camera, recovery, frame.name, unit), partial)
 
 
-def write_mesh(path: Path, frame: RecordedFrame, recovery: FrameRecovery) -> None:
+def _write_mesh(path: Path, frame: RecordedFrame, recovery: FrameRecovery) -> None:
     """The bodies of a frame; no file where there is none."""
     from sq_perception.fitting.fit import Status
     from sq_perception.geometry import mesh

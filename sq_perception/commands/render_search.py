@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 
-from sq_perception.commands.console import SUCCESS, parser
+from sq_perception.commands.console import SUCCESS, at_least, parser, target
 
 _HELP = "The best s and tau of the soft renderer: the grid search of the thesis' figure 7.6."
 _EPILOG = "example:\n  sq-perception render-search --picture render_search.png"
@@ -14,17 +13,12 @@ _EPILOG = "example:\n  sq-perception render-search --picture render_search.png"
 def main(arguments: Sequence[str]) -> int:
     """Entry of ``sq-perception render-search``; the exit code."""
     command = parser("render-search", _HELP, _EPILOG)
-    command.add_argument("--bodies", type=int, default=20, help="random bodies (default %(default)s)")
-    command.add_argument("--resolution", type=int, default=64, help="pixels and voxels a side (default %(default)s)")
-    command.add_argument("--steps", type=int, default=21, help="values of s and of tau (default %(default)s)")
+    command.add_argument("--bodies", type=at_least(2), default=20, help="random bodies (default %(default)s)")
+    command.add_argument("--resolution", type=at_least(2), default=64, help="pixels and voxels a side (%(default)s)")
+    command.add_argument("--steps", type=at_least(2), default=21, help="values of s and of tau (default %(default)s)")
     command.add_argument("--seed", type=int, default=2020, help="default %(default)s")
-    command.add_argument("--picture", type=Path, metavar="FILE", help="draw the heat map there")
+    command.add_argument("--picture", type=target, metavar="FILE", help="draw the heat map there")
     options = command.parse_args(arguments)
-    for name in ("bodies", "resolution", "steps"):
-        if getattr(options, name) < 2:
-            command.error(f"--{name}: expected at least 2, got {getattr(options, name)}")
-    if options.picture and not options.picture.resolve().parent.is_dir():
-        command.error(f"--picture: the folder of {options.picture} does not exist")
 
     import numpy as np
 

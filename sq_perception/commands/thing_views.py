@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from sq_perception.commands.console import SUCCESS, failed, parser
+from sq_perception.commands.console import SUCCESS, at_least, failed, parser
 
 _HELP = """\
 Draw canonical views of simulated household things into a folder, shard by shard.
@@ -20,10 +20,10 @@ def main(arguments: Sequence[str]) -> int:
     """Entry of ``sq-perception thing-views``; the exit code."""
     command = parser("thing-views", _HELP, _EPILOG)
     command.add_argument("folder", type=Path, help="of the shards")
-    command.add_argument("--shards", type=int, default=100, help="how many there shall be (100)")
-    command.add_argument("--first", type=int, default=0, help="number of the first one (0)")
-    command.add_argument("--views", type=int, default=512, help="views a shard (512)")
-    command.add_argument("--seed", type=int, default=0, help="default 0")
+    command.add_argument("--shards", type=at_least(1), default=100, help="how many there shall be (100)")
+    command.add_argument("--first", type=at_least(0), default=0, help="number of the first one (0)")
+    command.add_argument("--views", type=at_least(1), default=512, help="views a shard (512)")
+    command.add_argument("--seed", type=at_least(0), default=0, help="default 0")
     command.add_argument(
         "--meshes",
         type=Path,
@@ -31,9 +31,6 @@ def main(arguments: Sequence[str]) -> int:
         help="things of your own, in metres: half of the views show one of them",
     )
     given = command.parse_args(arguments)
-    for name, least in (("shards", 1), ("first", 0), ("views", 1), ("seed", 0)):
-        if getattr(given, name) < least:
-            command.error(f"--{name}: expected {least} or more, got {getattr(given, name)}")
 
     from sq_perception.learning.thing_training import write_views
     from sq_perception.simulation.scanned_things import read_things

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from sq_perception.commands.console import FAILURE, SUCCESS, failed, parser
+from sq_perception.commands.console import SUCCESS, at_least, failed, parser, positive
 
 _HELP = """\
 Train the network that predicts the unseen side of things, on views that `thing-views` wrote (or still writes).
@@ -24,37 +24,26 @@ def main(arguments: Sequence[str]) -> int:
     command = parser("train-things", _HELP, _EPILOG)
     command.add_argument("views", type=Path, metavar="FOLDER", help="of the shards of views")
     command.add_argument("--output", "-o", type=Path, default=Path("runs/things"), help="folder (runs/things)")
-    command.add_argument("--minutes", type=float, default=120.0, help="training time in all, over which the rate falls")
-    command.add_argument("--batch", type=int, default=64, help="views a step (64)")
-    command.add_argument("--rate", type=float, default=8e-4, help="largest learning rate (0.0008)")
-    command.add_argument("--threads", type=int, default=0, help="of torch; 0: its own choice")
-    command.add_argument("--held", type=int, default=2, help="shards that are kept for validation (2)")
-    command.add_argument("--seed", type=int, default=0, help="default 0")
+    command.add_argument(
+        "--minutes", type=positive, default=120.0, help="training time, over which the rate falls (120)"
+    )
+    command.add_argument("--batch", type=at_least(1), default=64, help="views a step (64)")
+    command.add_argument("--rate", type=positive, default=8e-4, help="largest learning rate (0.0008)")
+    command.add_argument("--threads", type=at_least(0), default=0, help="of torch; 0: its own choice")
+    command.add_argument("--held", type=at_least(1), default=2, help="shards that are kept for validation (2)")
+    command.add_argument("--seed", type=at_least(0), default=0, help="default 0")
     command.add_argument("--start", default="", metavar="MODEL", help="weights to begin with: a file, or shipped ones")
     command.add_argument("--bfloat16", action="store_true", help="half the bits, faster on processors that have them")
-    given = command.parse_args(arguments)
-    for name in ("minutes", "batch", "rate", "held"):
-        if not getattr(given, name) > 0:
-            command.error(f"--{name}: expected a positive number, got {getattr(given, name)}")
+    options = vars(command.parse_args(arguments))
+    views, output = options.pop("views"), options.pop("output")
 
     from sq_perception.learning.checkpoint import CheckpointError
     from sq_perception.learning.thing_training import ThingTraining, train
 
-    config = ThingTraining(
-        given.minutes,
-        given.batch,
-        given.rate,
-        seed=given.seed,
-        threads=given.threads,
-        held=given.held,
-        bfloat16=given.bfloat16,
-        start=given.start,
-    )
     try:
-        train(config, given.views, given.output)
+        train(ThingTraining(**options), views, output)
     except (CheckpointError, ValueError, ArithmeticError, OSError) as error:
         return failed(f"train-things: {error}")
     except KeyboardInterrupt:
-        failed("train-things: stopped; the same command goes on from the last validation")
-        return FAILURE
+        return failed("train-things: stopped; the same command goes on from the last validation")
     return SUCCESS

@@ -24,61 +24,19 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.metrics import volume_iou
 from sq_perception.geometry.superquadric import FLAT_LENGTH, Superquadric
 from sq_perception.imaging import canonical_view, raycast, unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.canonical_view import CanonicalView
-from sq_perception.learning.choices import WITHOUT_SHARPNESS
 from sq_perception.learning.objective import Objective
 from sq_perception.learning.regressor import RegressorConfig
 from sq_perception.segmentation import segments
 from sq_perception.simulation.scenes import thesis_bodies
 
-_DISTURBANCE = {"size": 0.25, "shape": 0.2, "translation": 0.06, "rotation": 0.3}
-"""Standard deviations: of log sizes, exponents, the centre in sides of the view, and of each angle in radians."""
-_SHAPE_ROOM = 0.05
 _REST = 1e-7
 _POINTS = 1024
 """Comparison points, or about so many lines of sight."""
-
-
-@dataclass(frozen=True)
-class WalkOptions:
-    """How to walk.
-
-    Attributes
-    ----------
-    loss
-        By its name in :mod:`sq_perception.learning.objective`.
-    learning_rate
-        Of Adam, at the first step.
-    sharpness
-        s at the first and at the last step, geometric in between; None is the s with which trainings end, throughout.
-
-    Raises
-    ------
-    ValueError
-        For an unknown loss, a loss without s that is given one, or numbers that are not positive.
-    """
-
-    loss: str = "occupancy"
-    steps: int = 200
-    learning_rate: float = 0.05
-    sharpness: tuple[float, float] | None = None
-
-    def __post_init__(self) -> None:
-        Objective(self.loss)
-        if self.sharpness is not None and self.loss in WITHOUT_SHARPNESS:
-            raise ValueError(f"s: the loss {self.loss} has none")
-        for name, values in (
-            ("steps", (self.steps,)),
-            ("learning_rate", (self.learning_rate,)),
-            ("s", self.sharpness or ()),
-        ):
-            if not all(math.isfinite(value) and value > 0 for value in values):
-                raise ValueError(f"{name}: expected positive numbers, got {' '.join(f'{value:g}' for value in values)}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,97 +49,17 @@ class Walk:
         NumPy batch (n,), n = steps + 1, in the frame of the view.  Parameters that a loss is given (all but the
         rotation for ``occupancy_rotation``) are the true ones.
     losses : (n,)
-        What was descended on, at the s of the step.
-    sharpness : (n,)
-        That s; meaningless for losses without one.
+        What was descended on.
     iou : (n,) or None
         Volume IoU with the true body, where that is known.
     """
 
     bodies: Superquadric
     losses: np.ndarray
-    sharpness: np.ndarray
     iou: np.ndarray | None
 
     def __len__(self) -> int:
         return len(self.losses)
-
-
-def walk(
-    view: np.ndarray,
-    start: Superquadric,
-    options: WalkOptions | None = None,
-    truth: Superquadric | None = None,
-    ranges: RegressorConfig | None = None,
-) -> Walk:
-    """Walk down a loss.
-
-    Parameters
-    ----------
-    view : (p, p)
-        Canonical view of the object, 0 for background.
-    start, truth : Superquadric
-        Single NumPy bodies in the frame of the view.
-    ranges : RegressorConfig, optional
-        Whose ranges the parameters stay in; the defaults of the network.
-
-    Returns
-    -------
-    Walk
-        Shorter than asked for where the gradient was not finite any more.
-
-    Raises
-    ------
-    ValueError
-        For a view that is not square and finite, a start outside of the ranges, or a loss that compares with the true
-        body where there is none.
-    """
-    options, ranges = options or WalkOptions(), ranges or RegressorConfig()
-    view = np.asarray(view, dtype=float)
-    if view.ndim != 2 or view.shape[0] != view.shape[1] or not np.isfinite(view).all():
-        raise ValueError(f"view: expected a finite square image, got {view.shape}")
-    if truth is None and Objective(options.loss).needs_labels:
-        raise ValueError(f"the loss {options.loss} compares with the true body, which is not known here")
-    image = torch.from_numpy(view)[None, None]
-    given = None if truth is None else Superquadric.from_flat(torch.from_numpy(np.array(truth.to_flat())[None]))
-    raw = torch.from_numpy(ranges.encode(start)[None]).requires_grad_()
-    optimiser = torch.optim.Adam([raw], lr=options.learning_rate)
-    flats, losses, sharpness = [], [], []
-    for step in range(options.steps + 1):
-        objective = _objective(options, step, len(view))
-        body = ranges.decode(raw)
-        generator = torch.Generator().manual_seed(0)
-        loss = objective.loss(body, image, given, 1.0, generator)[0]
-        optimiser.zero_grad()
-        loss.backward()
-        if not (torch.isfinite(loss) and raw.grad is not None and torch.isfinite(raw.grad).all()):
-            break
-        compared = body if given is None else objective.with_given(body, given)
-        flats.append(compared.to_flat()[0].detach().numpy())
-        losses.append(loss.item())
-        sharpness.append(objective.sharpness_end)
-        for group in optimiser.param_groups:
-            group["lr"] = options.learning_rate * 0.5 * (1 + math.cos(math.pi * step / options.steps))
-        if raw.grad.abs().max() > _REST:
-            optimiser.step()
-    if not flats:
-        raise ValueError(f"start: the loss {options.loss} is not finite there")
-    bodies = Superquadric.from_flat(np.array(flats))
-    iou = None
-    if truth is not None:
-        iou = volume_iou(bodies, Superquadric.from_flat(np.broadcast_to(truth.to_flat(), (len(flats), FLAT_LENGTH))))
-    return Walk(bodies, np.array(losses), np.array(sharpness), iou)
-
-
-def _objective(options: WalkOptions, step: int, pixels: int) -> Objective:
-    """The loss of one step, before a view of so many pixels a side."""
-    start, end = options.sharpness or (Objective(options.loss).sharpness(1.0),) * 2
-    s = start * (end / start) ** (step / options.steps)
-    stride = max(1, round(pixels / math.sqrt(_POINTS)))
-    return Objective(options.loss, _POINTS, sharpness_start=s, sharpness_end=s, stride=stride)
-
-
-# What is walked before, and from where
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,17 +111,70 @@ class Subject:
         return unit_cube.cube_from_optical(self.view.from_canonical(bodies))
 
 
-def disturbed(body: Superquadric, ranges: RegressorConfig, rng: np.random.Generator) -> Superquadric:
-    """Another single body nearby: sizes by about a quarter, exponents by 0.2, angles by 17 degrees an axis.
+def walk(
+    subject: Subject,
+    start: Superquadric,
+    loss: str,
+    steps: int,
+    learning_rate: float = 0.05,
+    ranges: RegressorConfig | None = None,
+) -> Walk:
+    """Walk down a loss.
 
-    It is within the ranges, its exponents clear of their limits: on them the parametrisation is all but level.
+    Parameters
+    ----------
+    subject
+        The object.
+    start : Superquadric
+        A single NumPy body in the frame of the view.
+    loss
+        By its name in :mod:`sq_perception.learning.objective`, with the s with which trainings end.
+    steps, learning_rate
+        Of Adam; the rate is that of the first step.
+    ranges : RegressorConfig, optional
+        Whose ranges the parameters stay in; the defaults of the network.
+
+    Returns
+    -------
+    Walk
+        Shorter than asked for where the gradient was not finite any more.
+
+    Raises
+    ------
+    ValueError
+        For a loss that is unknown or compares with a true body that is not, a start outside of the ranges, or one at
+        which the loss is not finite.
     """
-    noise = {name: sigma * rng.standard_normal(getattr(body, name).shape) for name, sigma in _DISTURBANCE.items()}
-    low, high = ranges.shape_range
-    room = _SHAPE_ROOM * (high - low)
-    return Superquadric(
-        np.clip(body.size * np.exp(noise["size"]), *ranges.size_range),
-        np.clip(np.clip(body.shape + noise["shape"], 0.1, 1.0), low + room, high - room),
-        np.clip(body.translation + noise["translation"], *ranges.translation_range),
-        quaternions.multiply(body.rotation, quaternions.from_rotation_vector(noise["rotation"][:3])),
-    )
+    ranges = ranges or RegressorConfig()
+    view = np.asarray(subject.view.image, dtype=float)
+    objective = Objective(loss, _POINTS, stride=max(1, round(len(view) / math.sqrt(_POINTS))))
+    truth = subject.truth
+    if truth is None and objective.needs_labels:
+        raise ValueError(f"the loss {loss} compares with the true body, which is not known here")
+    image = torch.from_numpy(view)[None, None]
+    given = None if truth is None else Superquadric.from_flat(torch.from_numpy(np.array(truth.to_flat())[None]))
+    raw = torch.from_numpy(ranges.encode(start)[None]).requires_grad_()
+    optimiser = torch.optim.Adam([raw], lr=learning_rate)
+    flats, losses = [], []
+    for step in range(steps + 1):
+        body = ranges.decode(raw)
+        generator = torch.Generator().manual_seed(0)
+        value = objective.loss(body, image, given, 1.0, generator)[0]
+        optimiser.zero_grad()
+        value.backward()
+        if not (torch.isfinite(value) and raw.grad is not None and torch.isfinite(raw.grad).all()):
+            break
+        compared = body if given is None else objective.with_given(body, given)
+        flats.append(compared.to_flat()[0].detach().numpy())
+        losses.append(value.item())
+        for group in optimiser.param_groups:
+            group["lr"] = learning_rate * 0.5 * (1 + math.cos(math.pi * step / steps))
+        if raw.grad.abs().max() > _REST:
+            optimiser.step()
+    if not flats:
+        raise ValueError(f"start: the loss {loss} is not finite there")
+    bodies = Superquadric.from_flat(np.array(flats))
+    iou = None
+    if truth is not None:
+        iou = volume_iou(bodies, Superquadric.from_flat(np.broadcast_to(truth.to_flat(), (len(flats), FLAT_LENGTH))))
+    return Walk(bodies, np.array(losses), iou)

@@ -7,9 +7,7 @@ at the end.  The thesis' figures were measured there, on its own images, and on 
 
 from __future__ import annotations
 
-import html
 import math
-import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
@@ -18,7 +16,6 @@ from sq_perception.evaluation.figures_of_merit import Summary
 NOTHING = "none given"
 """In the cells of a row of the thesis that no contestant answers."""
 NOT_IN_THESIS = "not in the thesis"
-_LOSS_SYMBOL = re.compile(r"\bL_([A-Z]+)")
 
 
 @dataclass(frozen=True)
@@ -35,24 +32,6 @@ class Table:
         escaped = [[cell.replace("|", "\\|") for cell in line] for line in (self.header, *self.rows)]
         lines = [escaped[0], ["---"] * len(self.header), *escaped[1:]]
         return "\n".join("| " + " | ".join(line) + " |" for line in lines)
-
-    @property
-    def html_title(self) -> str:
-        """The title, escaped, with the symbols of the losses set as such."""
-        return _marked_up(self.title)
-
-    def html(self) -> str:
-        """As an HTML table, without the title."""
-        head = "".join(f"<th>{_marked_up(cell)}</th>" for cell in self.header)
-        body = []
-        for row in self.rows:
-            cells = "".join(
-                f'<td class="none">{_marked_up(cell)}</td>' if cell in (NOTHING, NOT_IN_THESIS, "") else
-                f"<td>{_marked_up(cell)}</td>"
-                for cell in row
-            )  # fmt: skip
-            body.append(f"<tr>{cells}</tr>")
-        return f"<table><thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody></table>"
 
 
 @dataclass(frozen=True)
@@ -194,8 +173,8 @@ def percent(value: float, digits: int = 2) -> str:
 
 
 def signed(value: float) -> str:
-    """A relative error as per cent with its sign."""
-    return f"{_no_negative_zero(100 * value):+.2f} %" if math.isfinite(value) else "unknown"
+    """A relative error as per cent with its sign; none is -0."""
+    return f"{round(100 * value, 2) + 0.0:+.2f} %" if math.isfinite(value) else "unknown"
 
 
 def spread(mean: float, deviation: float) -> str:
@@ -263,12 +242,3 @@ def _degrees(radians: float) -> str:
 
 def _triple(values: Sequence[float]) -> str:
     return f"({', '.join(signed(value) for value in values)})"
-
-
-def _no_negative_zero(value: float, digits: int = 2) -> float:
-    return round(value, digits) + 0.0
-
-
-def _marked_up(cell: str) -> str:
-    """Escaped text with the symbols of the losses set as such."""
-    return _LOSS_SYMBOL.sub(r"<i>L</i><sub>\1</sub>", html.escape(cell))

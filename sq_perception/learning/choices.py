@@ -13,7 +13,5 @@ Loss = Literal["occupancy", "occupancy_rotation", "parameters", "dual", "least_s
 LOSSES: tuple[str, ...] = get_args(Loss)
 UNSUPERVISED = ("least_squares", "least_squares_free", "render")
 """Losses that see the view alone, no label."""
-WITHOUT_SHARPNESS = ("parameters", "least_squares", "least_squares_free")
-"""Losses that have no sharpness s."""
 SIZE_RANGE = (0.04, 1.2)
 """Half sizes that a network for cropped views can express, in sides of the view; the thesis' bodies reach 0.8."""

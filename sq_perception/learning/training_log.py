@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import sys
-from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -55,20 +54,6 @@ class TrainingLog:
             self._file.close()
         if self._events is not None:
             self._events.close()
-
-
-def read(folder: Path) -> list[dict[str, Any]]:
-    """The records of a run, oldest first; of a step that was validated twice, the later.
-
-    A line that a killed run left unfinished is passed over; a folder without a log has no records.
-    """
-    path = folder / "log.jsonl"
-    records = {}
-    for line in path.read_text(encoding="utf-8").splitlines() if path.is_file() else ():
-        with suppress(json.JSONDecodeError):
-            record = json.loads(line)
-            records[record["step"]] = record
-    return [records[step] for step in sorted(records)]
 
 
 def _event_writer(folder: Path) -> Any:

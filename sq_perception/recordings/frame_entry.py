@@ -18,14 +18,18 @@ from sq_perception.tracking.session import Followed
 
 
 def frame_entry(
-    file: str, frame: RecordedFrame, recovery: FrameRecovery, tracks: Sequence[Followed | None], has_masks: bool
+    file: str,
+    frame: RecordedFrame,
+    recovery: FrameRecovery,
+    tracks: Sequence[Followed | None] | None,
+    has_masks: bool,
 ) -> dict[str, Any]:
-    """The element; ``tracks`` has one entry for each body, None where it is not tracked.
+    """The element; ``tracks`` has one entry for each body, None for a failed one, and is None without tracking.
 
     ``has_masks`` says whether labels are those of masks that came with the frame.
     """
     bodies = []
-    for body, track in zip(recovery.bodies, tracks, strict=True):
+    for body, track in zip(recovery.bodies, tracks or [None] * len(recovery.bodies), strict=True):
         superquadric = in_result_frame(body.superquadric, frame.is_cube)
         bodies.append(
             {

@@ -233,7 +233,7 @@ def test_evaluate_has_its_own_help(capsys):
     assert main.main(["evaluate", "--help"]) == main.SUCCESS
     help_text = capsys.readouterr().out
     assert "--fit-bodies" in help_text
-    assert "report.html" in help_text
+    assert "report.md" in help_text
 
 
 def test_author_renders(shared_data, tmp_path):

@@ -11,7 +11,7 @@ import trimesh
 import yaml
 
 from sq_perception.commands import main
-from sq_perception.commands.recover import complain
+from sq_perception.commands.console import complain
 from sq_perception.commands.recover_lines import lines
 from sq_perception.fitting.fit import CUT_SHORT
 from sq_perception.geometry.mesh import COLOURS

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numba
 import numpy as np
@@ -31,6 +32,11 @@ from sq_perception.simulation.scenes import thesis_bodies
 
 SMALL = RegressorConfig(pixels=32, widths=(4, 8, 8), blocks=1, hidden=32)
 RUN = TrainingConfig(steps=40, batch=16, points=64, validation=20, warm_up=5, threads=1)
+
+
+def log_of(folder: Path) -> list[dict[str, Any]]:
+    """The records of a run."""
+    return [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
 
 
 class TestConfig:
@@ -108,7 +114,7 @@ class TestSchedule:
         """With a rate of almost nothing there is no progress, and a run of a million steps ends soon."""
         config = replace(RUN, schedule="plateau", learning_rate=1e-12, steps=10**6, validation=2, batch=4, average=0.0)
         train.train(config, tmp_path, SMALL)
-        records = training_log.read(tmp_path)
+        records = log_of(tmp_path)
         assert 42 <= records[-1]["step"] < 120
 
 
@@ -190,18 +196,6 @@ class TestInterruptions:
 
 
 class TestLog:
-    def test_of_a_step_validated_twice_the_later_counts(self, tmp_path: Path) -> None:
-        for loss in (2.0, 1.0):
-            log = training_log.TrainingLog(tmp_path, 10, 0)
-            log.record({"step": 5, "loss": loss})
-            log.record({"step": 10, "loss": loss})
-            log.close()
-        assert training_log.read(tmp_path) == [{"step": 5, "loss": 1.0}, {"step": 10, "loss": 1.0}]
-        assert training_log.read(tmp_path / "nowhere") == []
-        with (tmp_path / "log.jsonl").open("a") as file:
-            file.write('{"step": 15, "lo')
-        assert len(training_log.read(tmp_path)) == 2
-
     def test_tensorboard_gets_the_same_numbers(self, tmp_path: Path) -> None:
         events = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator", reason="no tensorboard")
         log = training_log.TrainingLog(tmp_path, 10, 0)
@@ -224,7 +218,7 @@ class TestContinuation:
 
     def test_best_network_is_kept(self, tmp_path: Path) -> None:
         train.train(RUN, tmp_path, SMALL)
-        records = training_log.read(tmp_path)
+        records = log_of(tmp_path)
         kept = json.loads(checkpoint.read_header(tmp_path / "model.safetensors")["metrics"])
         assert kept["iou"] == max(r["iou"] for r in records)
         header = checkpoint.read_header(tmp_path / "model.safetensors")
@@ -236,7 +230,7 @@ class TestContinuation:
         config = replace(RUN, steps=2, start=str(tmp_path / "start.safetensors"), occluded_share=0.5, noisy_share=0.5)
         model = train.train(config, tmp_path / "run")
         assert model.config == replace(SMALL, marks_hidden=True)
-        record = training_log.read(tmp_path / "run")[-1]
+        record = log_of(tmp_path / "run")[-1]
         assert {"iou", "iou_hidden", "iou_worn"} <= set(record)
 
 
@@ -268,7 +262,7 @@ class TestThesisSetting:
     def test_from_a_fixed_set(self, tmp_path: Path) -> None:
         generate(tmp_path / "set", Settings("full", 64, train=24, test=0, seed=1))
         train.train(replace(self.RUN, data=str(tmp_path / "set")), tmp_path / "run", self.FORM)
-        assert training_log.read(tmp_path / "run")[-1]["step"] == 3
+        assert log_of(tmp_path / "run")[-1]["step"] == 3
         other = replace(RUN, data=str(tmp_path / "set"))
         with pytest.raises(ValueError, match="expected cropped views of 32 pixels, got full ones of 64"):
             train.train(other, tmp_path / "other", SMALL)
@@ -311,4 +305,4 @@ def test_two_processes_learn_one_network(tmp_path: Path) -> None:
     weights = [load_file(str(tmp_path / f"rank{rank}.safetensors")) for rank in (0, 1)]
     for name, first in weights[0].items():
         torch.testing.assert_close(weights[1][name], first, rtol=0, atol=0)
-    assert len(training_log.read(tmp_path / "run")) == 1
+    assert len(log_of(tmp_path / "run")) == 1

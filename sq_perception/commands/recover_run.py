@@ -1,0 +1,143 @@
+"""One pass of ``sq-perception recover`` over its frames, and what it has come to."""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from typing import Any
+
+from sq_perception.commands.console import FAILURE, INTERRUPTED, SUCCESS, complain, progress
+from sq_perception.commands.recover_outputs import Outputs
+from sq_perception.fitting.fit import Status
+from sq_perception.recordings import frame_entry
+from sq_perception.recordings.frame_file import FrameError, RecordedFrame
+from sq_perception.recordings.inputs import RecordedInput
+from sq_perception.recordings.tracks import RecordedTracks
+from sq_perception.recovery import workers
+from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, Recovery, RecoveryOptions
+
+
+class RecoverRun:
+    """One pass.
+
+    Parameters
+    ----------
+    options
+        Of the command.
+    settings
+        Of the recovery, made of them.
+    crew
+        Who recovers.
+    outputs
+        Where what was recovered goes.
+
+    Attributes
+    ----------
+    is_whole : bool
+        Whether all frames were tried.
+    """
+
+    def __init__(
+        self,
+        options: argparse.Namespace,
+        settings: RecoveryOptions,
+        crew: Recoverer | workers.Processes | workers.Cluster,
+        outputs: Outputs,
+    ) -> None:
+        self.is_whole = False
+        self._options, self._settings, self._crew, self._outputs = options, settings, crew, outputs
+        self._tracks = RecordedTracks(lambda text: complain(f"warning: {text}")) if options.track else None
+        self._unreadable = 0
+        self._warm: set[Any] = set()
+        self._warnings: set[str] = set()
+
+    def over(self, recorded: RecordedInput) -> int:
+        """All frames; the exit code."""
+        try:
+            for (file, frame), answer in self._answered(_progress(recorded)):
+                try:
+                    if isinstance(frame, FrameError):
+                        raise frame
+                    self._frame(file, frame, answer)
+                except FrameError as error:
+                    complain(str(error))
+                    self._unreadable += 1
+                except OSError as error:  # of a file that is written: the disk is full, and will be for the next frame
+                    complain(str(error))
+                    return FAILURE
+        except KeyboardInterrupt:
+            complain("interrupted; what is done so far is kept")
+            return INTERRUPTED
+        self.is_whole = True
+        return FAILURE if self._unreadable else SUCCESS
+
+    def summary(self) -> str:
+        """The run in one line."""
+        entries = self._outputs.results
+        bodies = [body for entry in entries for body in entry["superquadrics"]]
+        failed = sum(body["status"] == "failed" for body in bodies)
+        parts = [_count(len(entries), "frame"), f"{_count(len(bodies), 'object')} ({failed} failed)"]
+        if self._unreadable:
+            parts.append(f"{_count(self._unreadable, 'frame or source', 'frames or sources')} unreadable")
+        if entries:
+            parts.append(f"median {statistics.median(entry['ms'] for entry in entries):.0f} ms")
+        return ", ".join(parts)
+
+    def _is_wanted(self, body: Recovery) -> bool:
+        return body.status == Status.FAILED or body.score >= self._options.min_score
+
+    def _work(self, frame: RecordedFrame) -> workers.Work:
+        labels = None if self._options.ignore_masks else frame.labels
+        return workers.Work(frame.depth, frame.camera, labels, replace(self._settings, free_space=frame.has_free_space))
+
+    def _answered(self, pairs: Iterable[tuple[str, Any]]) -> Iterator[tuple[tuple[str, Any], Any]]:
+        """The frames with what was recovered of each, or the error that it raised; None for what is no frame."""
+        crew = self._crew
+        if isinstance(crew, workers.Processes | workers.Cluster):
+            asked = ((pair, self._work(pair[1]) if isinstance(pair[1], RecordedFrame) else None) for pair in pairs)
+            yield from workers.recovered(asked, crew)
+            return
+        previous: FrameRecovery | None = None
+        for pair in pairs:
+            answer: Any = None
+            if isinstance(frame := pair[1], RecordedFrame):
+                try:
+                    if frame.camera not in self._warm:
+                        crew.warm_up(frame.camera)
+                        self._warm.add(frame.camera)
+                    one = self._work(frame)
+                    answer = crew.recover(one.depth, one.camera, one.labels, one.options, previous)
+                    previous = answer if self._tracks else None
+                except (ValueError, ArithmeticError) as error:
+                    answer = error
+            yield pair, answer
+
+    def _frame(self, file: str, frame: RecordedFrame, answer: FrameRecovery | Exception) -> None:
+        if frame.warning and frame.warning not in self._warnings:
+            complain(f"warning: {frame.warning}")
+            self._warnings.add(frame.warning)
+        if isinstance(answer, (ValueError, ArithmeticError, workers.WorkerLostError)):  # such as a camera of no image
+            raise FrameError(f"{file}: {frame.name}: {answer}") from answer
+        if isinstance(answer, Exception):
+            raise answer
+        recovery = replace(answer, bodies=tuple(body for body in answer.bodies if self._is_wanted(body)))
+        tracks = self._tracks.follow(file, frame, recovery) if self._tracks else None
+        has_masks = not self._options.ignore_masks and frame.labels is not None
+        entry = frame_entry.frame_entry(file, frame, recovery, tracks, has_masks)
+        self._outputs.add(frame, recovery, tracks, entry)
+
+
+def _count(number: int, one: str, many: str | None = None) -> str:
+    return f"{number} {one if number == 1 else many or one + 's'}"
+
+
+def _progress(recorded: RecordedInput) -> Iterator[tuple[str, Any]]:
+    """The frames, with a bar on a terminal where there are several."""
+    with progress() as bar:
+        task = bar.add_task("recovering", total=recorded.total, visible=recorded.total > 1)
+        for pair in recorded:
+            bar.update(task, total=recorded.total, visible=recorded.total > 1)
+            yield pair
+            bar.advance(task)
