@@ -18,7 +18,7 @@ from mesh_things import MeshThing
 
 from sq_perception.imaging.camera import Camera
 from sq_perception.simulation import sensor_noise
-from sq_perception.simulation.mesh_rendering import render_mesh
+from sq_perception.simulation.mesh_rendering import Mesh, render_mesh
 from sq_perception.simulation.scenes import plane_depth
 
 _CONTACT = 3e-4
@@ -96,7 +96,7 @@ def viewed(
             raise ValueError(f"{each.name}: stands where another thing is")
         rotation, translation = table @ turn, table @ place + origin
         vertices = each.thing.mesh.vertices @ rotation.T + translation
-        own = render_mesh(vertices, np.asarray(each.thing.mesh.faces), camera)
+        own = render_mesh(Mesh(vertices, np.asarray(each.thing.mesh.faces)), camera)
         nearer = own < depth
         depth, labels = np.where(nearer, own, depth), np.where(nearer, np.int32(k + 1), labels)
         poses.append((rotation, translation))

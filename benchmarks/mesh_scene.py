@@ -13,7 +13,7 @@ import trimesh
 
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.imaging.camera import Camera
-from sq_perception.simulation.mesh_rendering import render_mesh
+from sq_perception.simulation.mesh_rendering import Mesh, render_mesh
 from sq_perception.simulation.scenes import plane_depth
 
 CAMERA = Camera(640, 480, 320 / np.tan(np.deg2rad(30)), 320 / np.tan(np.deg2rad(30)), 319.5, 239.5)
@@ -95,7 +95,7 @@ def view(mesh: trimesh.Trimesh, pose: Poser, rng: np.random.Generator) -> MeshVi
         pixels = CAMERA.project(vertices)
         if (pixels > 1).all() and (pixels < [CAMERA.width - 2, CAMERA.height - 2]).all():
             break
-    depth = render_mesh(vertices, mesh.faces, CAMERA)
+    depth = render_mesh(Mesh(vertices, mesh.faces), CAMERA)
     mask = np.isfinite(depth)
     if plane is not None:
         depth = np.where(mask, depth, plane_depth(plane, CAMERA))

@@ -27,9 +27,11 @@ from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.union import flat_support, moved
 from sq_perception.grasping.gripper import PANDA
-from sq_perception.simulation import household, sensor_noise
+from sq_perception.simulation import sensor_noise
+from sq_perception.simulation.household import draw_thing
+from sq_perception.simulation.thing import ON_X, ON_Y, UPRIGHT
 from sq_perception.simulation.thing_rendering import render_things
-from sq_perception.simulation.thing_views import looking_down
+from sq_perception.simulation.thing_setting import looking_down
 
 KINDS = ("packed", "pile")
 THINGS = 5
@@ -47,7 +49,7 @@ _LEVEL = np.stack([np.cos(_BEARINGS), np.sin(_BEARINGS), 0 * _BEARINGS], axis=1)
 _FRICTION = (0.5, 1.0)
 _UPRIGHT = np.deg2rad(10.0)
 _CALIBRATION = 0.002, float(np.deg2rad(0.3))
-_RESTS = (household.UPRIGHT, household.ON_X, household.ON_Y)
+_RESTS = (UPRIGHT, ON_X, ON_Y)
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,10 +120,10 @@ def to_world(position: np.ndarray, rotation: np.ndarray) -> tuple[np.ndarray, np
 
 def _thing(rng: np.random.Generator, packed: bool) -> Thing:
     while True:
-        drawn = household.draw_thing(rng)
+        drawn = draw_thing(rng)
         cavity = drawn.cavities[:1] if drawn.kind == "vessel" else NO_CAVITY
         thing = Thing(drawn.parts, rng.uniform(*_FRICTION), drawn.name, cavity)
-        turn = household.UPRIGHT
+        turn = UPRIGHT
         if not packed:
             turn = min(_RESTS, key=lambda turn: np.ptp(_points(thing, turn)[:, 2]))
         if can_be_taken(thing, turn):
@@ -133,7 +135,7 @@ def can_be_taken(thing: Thing, turn: np.ndarray) -> bool:
     points = _points(thing, turn)
     if np.ptp(points, axis=0).max() > LONGEST or np.ptp(points[:, 2]) < LOWEST:
         return False
-    if len(thing.cavity) and turn is household.UPRIGHT and (thing.cavity.size[0, [0, 2]] > RIM).all():
+    if len(thing.cavity) and turn is UPRIGHT and (thing.cavity.size[0, [0, 2]] > RIM).all():
         return True
     cap = points[points[:, 2] > points[:, 2].max() - CAP]
     return bool(min(np.ptp(one @ _LEVEL.T, axis=0).min() for one in (points, cap)) < WIDEST)

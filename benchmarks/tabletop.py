@@ -26,7 +26,7 @@ from scipy.spatial import ConvexHull
 
 from sq_perception.imaging.camera import Camera
 from sq_perception.simulation import sensor_noise
-from sq_perception.simulation.mesh_rendering import render_mesh
+from sq_perception.simulation.mesh_rendering import Mesh, render_mesh
 from sq_perception.simulation.scenes import plane_depth
 
 SENSORS = {"stereo": "realsense_d435", "structured light": "kinect_v1"}
@@ -254,7 +254,7 @@ def _seen(
     turns = [stand.table @ pose[:3, :3] for _, pose in poses]
     places = [stand.table @ pose[:3, 3] + stand.origin for _, pose in poses]
     for k, (thing, turn, place) in enumerate(zip(things, turns, places, strict=True)):
-        own = render_mesh(thing.mesh.vertices @ turn.T + place, np.asarray(thing.mesh.faces), camera)
+        own = render_mesh(Mesh(thing.mesh.vertices @ turn.T + place, np.asarray(thing.mesh.faces)), camera)
         alone.append(int(np.isfinite(own).sum()))
         nearer = own < depth
         depth, labels = np.where(nearer, own, depth), np.where(nearer, np.int32(k + 1), labels)

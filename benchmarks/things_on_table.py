@@ -25,9 +25,10 @@ from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.union import flat_support, moved
 from sq_perception.imaging.camera import Camera
-from sq_perception.simulation.household import SIX_WAYS, Thing, draw_thing
+from sq_perception.simulation.household import draw_thing
+from sq_perception.simulation.thing import SIX_WAYS, Thing
 from sq_perception.simulation.thing_rendering import render_things
-from sq_perception.simulation.thing_views import looking_down
+from sq_perception.simulation.thing_setting import looking_down
 
 MOST_THINGS = 8
 TABLE_CAMERA = Camera(640, 480, 554.3, 554.3, 319.5, 239.5)

@@ -10,10 +10,11 @@ import importlib.util
 import math
 import re
 import socket
-import sys
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
+from sq_perception.commands import console
+from sq_perception.commands.console import at_least, failed
 from sq_perception.nodes import process
 
 if TYPE_CHECKING:
@@ -22,6 +23,20 @@ if TYPE_CHECKING:
 NAME = "sq_view"
 DEFAULT_NODE = "/recover_node"
 DEFAULT_DEPTH = "depth/image"
+_HELP = """\
+A page in the browser: depth as points, superquadrics with their uncertainty, rates, latencies, and parameters to change
+while the nodes run. Everything comes from this machine, nothing from the internet.
+"""
+_EPILOG = """\
+recordings, without ROS:
+  sq-perception view FRAME ...    # sq-perception view FRAME --help
+
+examples:
+  sq-perception view
+  sq-perception view --depth /camera/camera/depth/image_rect_raw --node /recover_node --node /fitter_node
+  sq-perception view --ros-args -r depth/image:=/camera/depth/image_raw
+  ssh -L 8080:localhost:8080 robot    # on the machine with the screen; then http://localhost:8080
+"""
 _NODE_NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 _ROS = "--ros-args"
 _NEEDED = (
@@ -30,9 +45,8 @@ _NEEDED = (
 )
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
+def main(given: Sequence[str]) -> int:
     """Entry point of ``sq-perception view``; the exit code."""
-    given = list(sys.argv[1:] if arguments is None else arguments)
     cut = given.index(_ROS) if _ROS in given else len(given)
     parser = _parser()
     options = parser.parse_args(given[:cut])
@@ -40,26 +54,21 @@ def main(arguments: Sequence[str] | None = None) -> int:
     for one in nodes:
         if not _NODE_NAME.fullmatch(one):
             parser.error(f"--node: expected a name like {DEFAULT_NODE}, got {one!r}")
-    if options.max_points < 1:
-        parser.error(f"--max-points: expected at least 1, got {options.max_points}")
     if not (math.isfinite(options.rate) and 0 < options.rate <= 60):
         parser.error(f"--rate: expected a number above 0, at most 60, got {options.rate:g}")
     if options.port is not None and not 0 <= options.port <= 65535:
         parser.error(f"--port: expected 0 to 65535, got {options.port}")
     for module, remedy in _NEEDED:
         if importlib.util.find_spec(module) is None:
-            print(f"view needs {remedy}", file=sys.stderr)
-            return 1
+            return failed(f"view needs {remedy}")
     try:
         from sq_perception.viewing import server
     except ImportError as error:
-        print(f"view: viser cannot be imported, {error}: pip install '.[view]' in a checkout", file=sys.stderr)
-        return 1
+        return failed(f"view: viser cannot be imported, {error}: pip install '.[view]' in a checkout")
     try:
         bound = server.listening_socket(options.host, options.port)
     except server.ServerError as error:
-        print(error, file=sys.stderr)
-        return 1
+        return failed(str(error))
     camera_info = options.camera_info or camera_info_beside(options.depth)
     try:
         return process.run(
@@ -91,10 +100,9 @@ def _node(
         page.close()
         raise
     if not is_local(host):
-        print(
+        console.complain(
             f"warning: there is no password: whoever reaches port {port} of this machine sees the page and changes "
-            "parameters; without --host, `ssh -L` brings the page to another machine",
-            file=sys.stderr,
+            "parameters; without --host, `ssh -L` brings the page to another machine"
         )
     shown = "localhost" if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host  # noqa: S104
     print(f"http://{shown}:{port}  shows {', '.join(nodes)}; Ctrl-C ends", flush=True)
@@ -102,17 +110,7 @@ def _node(
 
 
 def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="sq-perception view",
-        description="A page in the browser: depth as points, superquadrics with their uncertainty, rates, latencies, "
-        "and parameters to change while the nodes run. Everything comes from this machine, nothing from the internet.",
-        epilog="recordings, without ROS:\n  sq-perception view FRAME ...    # sq-perception view FRAME --help\n\n"
-        "examples:\n  sq-perception view\n"
-        "  sq-perception view --depth /camera/camera/depth/image_rect_raw --node /recover_node --node /fitter_node\n"
-        "  sq-perception view --ros-args -r depth/image:=/camera/depth/image_raw\n"
-        "  ssh -L 8080:localhost:8080 robot    # on the machine with the screen; then http://localhost:8080",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = console.parser("view", _HELP, _EPILOG)
     parser.add_argument("--node", action="append", metavar="NAME", help=f"a frame node; may be given more than once "
                         f"({DEFAULT_NODE})")  # fmt: skip
     parser.add_argument("--depth", default=DEFAULT_DEPTH, metavar="TOPIC", help="depth image (%(default)s)")
@@ -120,10 +118,7 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--host", default="127.0.0.1", metavar="ADDRESS", help="address to serve on (%(default)s, this "
                         "machine alone); 0.0.0.0 is open to the network, without a password")  # fmt: skip
     parser.add_argument("--port", type=int, help="port to serve on, 0 for any free one (8080, or the next free one)")
-    parser.add_argument("--max-points", type=int, default=40000, metavar="N", help="points of the cloud (%(default)s)")
+    parser.add_argument("--max-points", type=at_least(1), default=40000, metavar="N",
+                        help="points of the cloud (%(default)s)")  # fmt: skip
     parser.add_argument("--rate", type=float, default=10.0, metavar="HZ", help="pictures per second (%(default)g)")
     return parser
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -38,7 +38,8 @@ from sq_perception.learning.checkpoint import CheckpointError
 from sq_perception.learning.schedule import Cosine
 from sq_perception.learning.thing_network import HullPrediction, ThingConfig, ThingNetwork
 from sq_perception.learning.training_state import TrainingState
-from sq_perception.simulation.household import KINDS, Thing
+from sq_perception.simulation.household import KINDS
+from sq_perception.simulation.thing import Thing
 from sq_perception.simulation.thing_views import ThingViews, draw_thing_views
 
 BODY, CENTRE = 2.0, 1.0

@@ -10,14 +10,24 @@ interpolation.  Pinhole cameras only; the mesh lies in front of the camera.  Met
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from sq_perception.geometry.kernels import kernel
 from sq_perception.imaging.camera import Camera
 
 
-def render_mesh(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> np.ndarray:
-    """Depth (height, width) of a mesh, vertices (n, 3) and faces (m, 3); +inf where there is none.
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Triangles: vertices (n, 3), and faces (m, 3) of vertex indices."""
+
+    vertices: np.ndarray
+    faces: np.ndarray
+
+
+def render_mesh(mesh: Mesh, camera: Camera) -> np.ndarray:
+    """Depth (height, width) of a mesh in the optical frame; +inf where there is none.
 
     Faces are seen from both sides.
 
@@ -26,10 +36,10 @@ def render_mesh(vertices: np.ndarray, faces: np.ndarray, camera: Camera) -> np.n
     ValueError
         For another camera than a pinhole one, or a mesh that is not wholly in front of it.
     """
-    if not camera.is_pinhole or vertices[:, 2].min() <= 0:
+    if not camera.is_pinhole or mesh.vertices[:, 2].min() <= 0:
         raise ValueError("expected a pinhole camera and a mesh in front of it")
     depth = np.full((camera.height, camera.width), np.inf)
-    corners = np.ascontiguousarray(vertices[faces], dtype=float)
+    corners = np.ascontiguousarray(mesh.vertices[mesh.faces], dtype=float)
     pixels = camera.project(corners)
     windows = np.concatenate([np.ceil(pixels.min(axis=1) - 1e-6), np.floor(pixels.max(axis=1) + 1e-6) + 1], axis=1)
     limits = np.array([camera.width, camera.height, camera.width, camera.height])

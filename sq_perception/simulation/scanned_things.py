@@ -15,7 +15,8 @@ import numpy as np
 
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.simulation.household import NO_CAVITY, Rest, Thing
+from sq_perception.simulation.mesh_rendering import Mesh
+from sq_perception.simulation.thing import NO_CAVITY, Rest, Thing
 
 SUFFIXES = (".ply", ".obj", ".stl", ".glb", ".off")
 LARGEST, SMALLEST = 1.0, 0.005
@@ -23,7 +24,7 @@ LARGEST, SMALLEST = 1.0, 0.005
 _POINT = 1e-5
 """Half size of a superquadric that stands for a point, metres."""
 _UNLIKELY = 0.01
-"""Share of the falls below which a pose is left out."""
+"""Share of the falls below which a pose is left out; not of a ball, which lies in so many that each is unlikely."""
 
 
 def read_things(folder: Path) -> tuple[Thing, ...]:
@@ -46,7 +47,7 @@ def _read(path: Path) -> Thing:
     try:
         mesh = trimesh.load_mesh(path, process=False)
         hull = mesh.convex_hull
-        turns, likely = hull.compute_stable_poses(threshold=_UNLIKELY)
+        turns, likely = hull.compute_stable_poses()
     except Exception as error:  # whatever a reader of one of many formats raises
         raise ValueError(f"{path}: no mesh with a volume: {error}") from error
     longest = float(np.ptp(hull.vertices, axis=0).max())
@@ -58,9 +59,11 @@ def _read(path: Path) -> Thing:
     corners = hull.vertices - middle
     points = np.zeros((len(corners), 12))
     points[:, :3], points[:, 3:5], points[:, 5:8], points[:, 11] = _POINT, 1.0, corners, 1.0
+    kept = likely > _UNLIKELY if likely.max() > _UNLIKELY else likely > 0
+    turns, likely = turns[kept], likely[kept]
     rests = tuple(
         Rest(f"face {k}", quaternions.from_matrix(turn[:3, :3]), float(share))
         for k, (turn, share) in enumerate(zip(turns, likely / likely.sum(), strict=True))
     )
-    surface = (np.asarray(mesh.vertices, dtype=float) - middle, np.asarray(mesh.faces))
+    surface = Mesh(np.asarray(mesh.vertices, dtype=float) - middle, np.asarray(mesh.faces))
     return Thing("union", path.stem, Superquadric.from_flat(points), rests, NO_CAVITY, surface)

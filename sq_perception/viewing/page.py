@@ -1,6 +1,4 @@
-"""The page: a scene in three dimensions, a column of numbers, and controls for parameters.
-
-World frame of the scene: the optical frame of the depth image, metres, y down.
+"""The page: a scene in three dimensions (:mod:`~sq_perception.viewing.scene`), numbers, and controls for parameters.
 
 One thread, the drawing thread, calls the methods; only :attr:`Page.watched` and :meth:`Page.requests` may be called
 from others.  What a user does on the page waits in a queue until :meth:`Page.requests` takes it.
@@ -11,9 +9,8 @@ from __future__ import annotations
 import contextlib
 import queue
 import socket
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from time import monotonic
 from typing import Any
 
@@ -21,26 +18,14 @@ import numpy as np
 import viser
 
 from sq_perception.imaging.camera import Camera
-from sq_perception.viewing import drawings, server, tables
+from sq_perception.viewing import drawings, scene, server, tables
 from sq_perception.viewing.controls import GROUPS, Control
-from sq_perception.viewing.drawings import Bodies, Cloud
+from sq_perception.viewing.drawings import Bodies
+from sq_perception.viewing.scene import Scene
 from sq_perception.viewing.tables import NodeState
 
 TITLE = "sq_perception: superquadrics from depth"
 _PANEL_WIDTH = 420
-_UP = (0.0, -1.0, 0.0)
-_VIEW_ANGLE = np.deg2rad(42.0)
-_BACKGROUND = np.full((2, 2, 3), (22, 24, 28), np.uint8)
-_BODY_ALPHA, _FADED_ALPHA, _SHELL_ALPHA = 0.85, 0.2, 0.2
-_FRUSTUM, _BARS = (150, 160, 175), (245, 245, 245)
-_START, _CAMERA = "behind", "camera"
-_PLACES = {
-    _START: (1.0, np.array([0.28, -0.38, -1.25])),
-    _CAMERA: (1.0, np.zeros(3)),
-    "above": (0.6, np.array([0.0, -1.7, -0.03])),
-    "side": (0.55, np.array([1.6, -0.4, -0.2])),
-}
-"""Where to look from: at what share of the way to the middle of the scene, and from where, in units of that way."""
 _MUTED = "muted"
 _SHOWN = {
     "Points": "The measured depth",
@@ -52,10 +37,6 @@ _SHOWN = {
     "Depth image": None,
 }
 """Check boxes of what is drawn, with their hints."""
-_FIRST_DISTANCE = 1.0
-"""What the start view looks at, metres, until an image tells."""
-_NEAR_SHARE = 0.4
-"""Length of the view volume that is drawn, of the nearest depth."""
 
 
 @dataclass(frozen=True)
@@ -112,13 +93,9 @@ class Page:
         self._most_points = most_points
         self._requests: queue.SimpleQueue[Request] = queue.SimpleQueue()
         self._span: tuple[float, float] | None = None
-        self._target: np.ndarray | None = None
         self._aimed_at_bodies = False
-        self._camera: Camera | None = None
-        self._faces = drawings.mesh_faces()
-        self._handles: dict[tuple[str, str], Any] = {}
-        """What is drawn, by the node that it is of, empty for the camera, and its path."""
         self._server = server.serve(bound)
+        self._scene = Scene(self._server, has_one_node=len(nodes) == 1)
         self._nodes = {name: _NodePart(name) for name in nodes}
         self._furnish(parameters)
 
@@ -162,13 +139,13 @@ class Page:
         shown = self._span or (0.0, 1.0)
         points = drawings.cloud(depth, camera, shown, self._most_points, is_muted=self._point_colours.value == _MUTED)
         with self._server.atomic():
-            self._draw_cloud(points)
-            self._draw_view_volume(camera, shown)
-        if self._wanted["Depth image"].value:
+            self._scene.draw_cloud(points, self._is_wanted("Points"))
+            self._scene.draw_camera(camera, shown, self._is_wanted("Camera"))
+        if self._is_wanted("Depth image"):
             self._picture.image = drawings.picture(depth, shown)
         self._legend.content = tables.legend(shown, "m" if camera.is_pinhole else "")
-        if span is not None and self._target is None:
-            self._aim(np.median(points.points, axis=0))
+        if span is not None and not self._scene.is_aimed:
+            self._scene.aim(np.median(points.points, axis=0))
 
     def show_bodies(self, node: str, bodies: Bodies | None, stamp: float, state: NodeState) -> None:
         """Draw the bodies of a node, remove those that are gone, and fill its table.
@@ -178,17 +155,16 @@ class Page:
         part = self._nodes[node]
         if bodies is not None and len(bodies) and not state.remark and not self._aimed_at_bodies:
             self._aimed_at_bodies = True
-            self._aim(bodies.superquadrics.translation.mean(axis=0))
+            self._scene.aim(bodies.superquadrics.translation.mean(axis=0))
         is_wanted = part.wanted is None or part.wanted.value
         drawn = bodies if bodies is not None and not state.remark and is_wanted else None
         with self._server.atomic():
             kept: set[str] = set()
             for k in range(len(drawn) if drawn is not None else 0):
                 assert drawn is not None
-                kept |= self._draw_body(node, drawn, k, state.is_silent)
-            for key in [key for key in self._handles if key[0] == node and key[1] not in kept]:
-                self._handles.pop(key).remove()
-        is_cube = self._camera is not None and not self._camera.is_pinhole
+                kept |= self._scene.draw_body(node, drawn, k, state.is_silent, self._is_wanted)
+            self._scene.keep(node, kept)
+        is_cube = self._scene.camera is not None and not self._scene.camera.is_pinhole
         part.table.content = tables.bodies_table(node, bodies, stamp, state, is_cube=is_cube)
 
     def show_state(self, state: NodeState) -> None:
@@ -247,16 +223,11 @@ class Page:
     # Furniture
 
     def _furnish(self, parameters: bool) -> None:
-        gui, world = self._server.gui, self._server.scene
+        gui = self._server.gui
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, brand_color=(64, 130, 200))
         gui.set_panel_label(TITLE)
         gui.main_panel.dock_right()
         gui.main_panel.set_width(_PANEL_WIDTH)
-        world.set_up_direction(_UP)
-        world.configure_default_lights(True, cast_shadow=False)
-        world.set_background_image(_BACKGROUND, format="png")
-        world.add_frame("/optical_frame", axes_length=0.08, axes_radius=0.002)
-        self._set_start_view()
 
         self._source = gui.add_html("")
         for part in self._nodes.values():
@@ -284,7 +255,7 @@ class Page:
 
     def _furnish_view(self) -> None:
         gui = self._server.gui
-        places = gui.add_button_group("Look from", tuple(_PLACES), hint="Camera: as the depth camera sees it")
+        places = gui.add_button_group("Look from", tuple(scene.PLACES), hint="Camera: as the depth camera sees it")
         self._point_colours = gui.add_dropdown("Point colours", (_MUTED, "depth"), initial_value=_MUTED)
         self._wanted = {name: gui.add_checkbox(name, True, hint=hint) for name, hint in _SHOWN.items()}
         if len(self._nodes) > 1:
@@ -293,13 +264,15 @@ class Page:
 
         @places.on_click
         def _(event: viser.GuiEvent) -> None:
-            if event.client is not None and (places.value != _CAMERA or self._camera is not None):
-                self._look(event.client.camera, places.value)
+            if event.client is not None and (places.value != scene.CAMERA or self._scene.camera is not None):
+                self._scene.look(event.client.camera, places.value)
 
         @self._wanted["Depth image"].on_update
         def _(_: viser.GuiEvent) -> None:
-            self._picture.visible = self._wanted["Depth image"].value
-            self._legend.visible = self._wanted["Depth image"].value
+            self._picture.visible = self._legend.visible = self._is_wanted("Depth image")
+
+    def _is_wanted(self, what: str) -> bool:
+        return bool(self._wanted[what].value)
 
     def _add_button(self, part: _NodePart, label: str) -> Any:
         button = self._server.gui.add_button(label.capitalize(), visible=False)
@@ -333,91 +306,6 @@ class Page:
                     part.pending[about.name] = _Pending(wanted, monotonic() + about.patience)
 
         return handle
-
-    # Drawing
-
-    def _put(self, node: str, path: str, add: Callable[..., Any], **state: Any) -> str:
-        """Draw something, or give what is drawn there another state; returns the path."""
-        handle = self._handles.get((node, path))
-        if handle is None:
-            self._handles[node, path] = add(path, **state)
-        else:
-            for name, value in state.items():
-                setattr(handle, name, value)
-        return path
-
-    def _draw_cloud(self, points: Cloud) -> None:
-        look = {"point_shape": "circle", "point_shading": "flat", "precision": "float32"}
-        add = partial(self._server.scene.add_point_cloud, **look)  # type: ignore[arg-type]
-        state = {"points": points.points, "colors": points.colours, "point_size": round(points.point_size, 5)}
-        self._put("", "/depth", add, **state, visible=self._wanted["Points"].value)
-
-    def _draw_view_volume(self, camera: Camera, span: tuple[float, float]) -> None:
-        length = max(_NEAR_SHARE * span[0] if camera.is_pinhole else 1.0, 1e-3)
-        state: dict[str, Any] = {"visible": self._wanted["Camera"].value}
-        if camera != self._camera:
-            self._camera, state["points"] = camera, drawings.view_volume(camera, length)
-        self._put("", "/camera", partial(self._add_lines, _FRUSTUM, 1.5), **state)
-
-    def _add_lines(self, colour: tuple[int, int, int], width: float, path: str, **state: Any) -> Any:
-        look: dict[str, Any] = {"colors": colour, "thickness": width, "thickness_units": "screen"}
-        return self._server.scene.add_line_segments(path, **look, **state)
-
-    def _draw_body(self, node: str, bodies: Bodies, k: int, is_silent: bool) -> set[str]:
-        """Surface, label, shell and error bars of a body, as far as they are wanted and known; their paths."""
-        body, sigma, number = bodies.superquadrics[k], bodies.sigma_size[k], int(bodies.ids[k])
-        colour: Any = tuple(round(255 * float(channel)) for channel in bodies.colours[k])
-        x, y, z, w = body.rotation
-        pose = {"position": body.translation, "wxyz": np.array([w, x, y, z])}
-        world, path = self._server.scene, f"/bodies{node}/{number}"
-        surface = partial(world.add_mesh_simple, faces=self._faces, color=colour)
-        # The same id of two nodes is not the same body.
-        title = str(number) if len(self._nodes) == 1 else f"{node.rsplit('/', 1)[-1]} {number}"
-        label = partial(world.add_label, text=title, anchor="bottom-center", font_screen_scale=1.4)
-        look = {"opacity": _FADED_ALPHA if is_silent else _BODY_ALPHA, "visible": self._wanted["Bodies"].value}
-        where = {"position": drawings.label_position(body), "visible": self._wanted["Ids"].value}
-        paths = {
-            self._put(node, f"{path}/surface", surface, vertices=drawings.mesh_vertices(body), **look, **pose),
-            self._put(node, f"{path}/id", label, **where),
-        }
-        around, bars = drawings.shell(body, sigma), drawings.error_bars(body, sigma)
-        if around is not None and self._wanted["Shells"].value:
-            add = partial(surface, opacity=_SHELL_ALPHA, side="front")
-            paths.add(self._put(node, f"{path}/shell", add, vertices=drawings.mesh_vertices(around), **pose))
-        if len(bars) and self._wanted["Error bars"].value:
-            paths.add(self._put(node, f"{path}/bars", partial(self._add_lines, _BARS, 2.5), points=bars, **pose))
-        return paths
-
-    # Views
-
-    def _aim(self, target: np.ndarray) -> None:
-        """Let every view look at a point of the scene."""
-        self._target = np.asarray(target, dtype=float)
-        self._set_start_view()
-        for client in self._server.get_clients().values():
-            self._look(client.camera, _START)
-
-    def _from(self, place: str) -> tuple[np.ndarray, np.ndarray]:
-        """Position and target of a name in _PLACES."""
-        share, offset = _PLACES[place]
-        middle = np.array([0.0, 0.0, _FIRST_DISTANCE]) if self._target is None else self._target
-        return share * middle + float(np.linalg.norm(middle)) * offset, share * middle
-
-    def _set_start_view(self) -> None:
-        start = self._server.initial_camera
-        start.position, start.look_at = self._from(_START)
-        start.up, start.fov = _UP, float(_VIEW_ANGLE)
-
-    def _look(self, view: Any, place: str) -> None:
-        """Let a view look from a place, or as the depth camera does."""
-        (position, target), angle, camera = self._from(place), _VIEW_ANGLE, self._camera
-        if place == _CAMERA and camera is not None and camera.is_pinhole:
-            angle = 2 * np.arctan(0.5 * camera.height / camera.fy)
-            position, target = np.zeros(3), np.array([0.0, 0.0, _FIRST_DISTANCE])
-        elif place == _CAMERA:
-            position, target = np.array([0.5, 0.5, -1.0]), np.array([0.5, 0.5, 1.0])
-        view.up_direction, view.fov = _UP, float(angle)
-        view.position, view.look_at = position, target
 
 
 @dataclass(eq=False)

@@ -15,9 +15,10 @@ from sq_perception.geometry.support_directions import DIRECTIONS
 from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
 from sq_perception.learning.thing_training import read_views, write_views
-from sq_perception.simulation.mesh_rendering import render_mesh
+from sq_perception.simulation.mesh_rendering import Mesh, render_mesh
 from sq_perception.simulation.scanned_things import read_things
-from sq_perception.simulation.thing_views import draw_setting, draw_thing_views, support_in_view
+from sq_perception.simulation.thing_setting import draw_setting
+from sq_perception.simulation.thing_views import draw_thing_views, support_in_view
 
 CAMERA = Camera(640, 480, 554.0, 554.0, 319.5, 239.5)
 BODY = Superquadric([0.06, 0.04, 0.03], [0.3, 0.7], [0.05, -0.03, 0.7], [0.3, -0.2, 0.5, 0.8])
@@ -35,7 +36,7 @@ def folder(tmp_path: Path) -> Path:
 
 def test_a_rasterised_superquadric_is_the_ray_cast_one() -> None:
     fine = mesh(BODY, 128)
-    depth = render_mesh(fine.vertices, fine.faces, CAMERA)
+    depth = render_mesh(Mesh(fine.vertices, fine.faces), CAMERA)
     expected, _ = raycast.render(BODY, CAMERA)
     seen, truly = np.isfinite(depth), np.isfinite(expected)
     assert (seen != truly).sum() <= 0.01 * truly.sum()
@@ -48,7 +49,7 @@ def test_a_rasterised_superquadric_is_the_ray_cast_one() -> None:
 def test_neighbouring_triangles_leave_no_gap() -> None:
     box = trimesh.creation.box((0.1, 0.2, 0.1)).subdivide().subdivide()
     vertices = box.vertices @ quaternions.to_matrix(quaternions.from_rotation_vector(np.array([0.4, 0.3, 0.2]))).T
-    seen = np.isfinite(render_mesh(vertices + [0, 0, 0.6], box.faces, CAMERA))
+    seen = np.isfinite(render_mesh(Mesh(vertices + [0, 0, 0.6], box.faces), CAMERA))
     for line in (*seen, *seen.T):
         inside = np.flatnonzero(line)
         assert len(inside) == 0 or len(inside) == inside[-1] - inside[0] + 1
@@ -66,6 +67,13 @@ def test_a_box_rests_on_its_faces_and_mostly_on_large_ones(folder: Path) -> None
         heights[height] = heights.get(height, 0.0) + rest.likely
     assert sum(heights.values()) == pytest.approx(1)
     assert heights[0.06] > heights[0.09] > heights[0.15]
+
+
+def test_a_ball_rests_in_many_ways_of_which_each_is_unlikely(tmp_path: Path) -> None:
+    trimesh.creation.icosphere(radius=0.05).export(tmp_path / "ball.ply")
+    (thing,) = read_things(tmp_path)
+    assert len(thing.rests) > 100
+    assert sum(rest.likely for rest in thing.rests) == pytest.approx(1)
 
 
 def test_views_of_a_mesh_tell_its_hull(folder: Path) -> None:
@@ -107,7 +115,7 @@ def test_support_in_a_view_is_that_of_the_corners(folder: Path) -> None:
     view = canonical_view.from_mask(depth, seen, setting.camera)
     assert setting.surface is not None
     directions = DIRECTIONS @ quaternions.to_matrix(view.rotation)
-    expected = ((setting.surface[0] @ directions.T).max(axis=0) - directions @ view.anchor) / view.extent
+    expected = ((setting.surface.vertices @ directions.T).max(axis=0) - directions @ view.anchor) / view.extent
     assert support_in_view(setting.parts, view) == pytest.approx(expected, abs=1e-3)
 
 

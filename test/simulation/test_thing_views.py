@@ -13,10 +13,11 @@ from sq_perception.imaging import canonical_view
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.canonical_view import HIDDEN, NEAREST
 from sq_perception.imaging.raycast import render
-from sq_perception.simulation import thing_views
 from sq_perception.simulation.household import KINDS, draw_thing
 from sq_perception.simulation.thing_rendering import render_things
-from sq_perception.simulation.thing_views import Setting, draw_setting, draw_thing_views, support_in_view
+from sq_perception.simulation.thing_sensing import draw_sensor
+from sq_perception.simulation.thing_setting import Setting, draw_setting
+from sq_perception.simulation.thing_views import draw_thing_views, support_in_view
 
 NOTHING = Superquadric.stack([])
 
@@ -230,7 +231,7 @@ def test_a_shadow_lies_on_one_side() -> None:
     found = []
     for _ in range(30):
         setting = draw_setting(draw_thing(rng, ["can"]), rng)
-        sensor = thing_views.draw_sensor(setting.camera, rng)
+        sensor = draw_sensor(setting.camera, rng)
         baseline = getattr(sensor, "baseline", 0.0)
         if not baseline or setting.table is None or len(setting.others):
             continue

@@ -319,7 +319,7 @@ def test_the_page_draws_what_is_there_and_takes_away_what_is_not() -> None:
         try:
             for camera, lines in ((CAMERA, 8), (unit_cube.camera(64, 48), 12)):
                 page.show_depth(np.full((48, 64), 0.8, np.float32), camera)
-                assert page._handles["", "/camera"].points.shape == (lines, 2, 3)
+                assert page._scene._handles["", "/camera"].points.shape == (lines, 2, 3)
             page.show_bodies("/a/b", bodies(), 0.0, NodeState("/a/b", age=99.0))
             for found, parts in (
                 (bodies(), {"surface", "id", "shell", "bars"}),
@@ -328,13 +328,15 @@ def test_the_page_draws_what_is_there_and_takes_away_what_is_not() -> None:
                 (bodies(), {"surface", "id", "shell", "bars"}),
             ):
                 page.show_bodies("/a", found, 0.0, NodeState("/a", age=0.0))
-                assert {path for node, path in page._handles if node == "/a"} == {f"/bodies/a/7/{x}" for x in parts}
-            fresh, silent = (page._handles[node, f"/bodies{node}/7/surface"].opacity for node in ("/a", "/a/b"))
+                assert {path for node, path in page._scene._handles if node == "/a"} == {
+                    f"/bodies/a/7/{x}" for x in parts
+                }
+            fresh, silent = (page._scene._handles[node, f"/bodies{node}/7/surface"].opacity for node in ("/a", "/a/b"))
             assert silent < fresh
-            assert page._handles["/a/b", "/bodies/a/b/7/id"].text == "b 7"
+            assert page._scene._handles["/a/b", "/bodies/a/b/7/id"].text == "b 7"
             page._wanted["Shells"].value = False
             page.show_bodies("/a", bodies(), 0.0, NodeState("/a", age=0.0))
-            assert ("/a", "/bodies/a/7/shell") not in page._handles
+            assert ("/a", "/bodies/a/7/shell") not in page._scene._handles
         finally:
             page.close()
 
@@ -357,11 +359,11 @@ def test_the_command_says_what_is_wrong(taken: int, capsys: pytest.CaptureFixtur
     pytest.importorskip("viser", reason="needs the extra 'view'")
     assert view.main(["--port", str(taken)]) == 1
     said = capsys.readouterr().err
-    assert said.startswith("--port: ")
+    assert said.startswith("sq-perception: --port: ")
     assert said.count("\n") == 1
     monkeypatch.setattr(view, "_NEEDED", (("no_such_module", "this: pip install 'sq_perception[view]'"),))
     assert view.main([]) == 1
-    assert capsys.readouterr().err == "view needs this: pip install 'sq_perception[view]'\n"
+    assert capsys.readouterr().err == "sq-perception: view needs this: pip install 'sq_perception[view]'\n"
 
 
 def test_the_camera_info_is_beside_the_image() -> None:

@@ -1,0 +1,153 @@
+"""A household thing: a union of superquadrics with its ways to rest, and what families of things are built of.
+
+A thing is a union of superquadrics in its own frame: metres, z up when it stands, the middle of its box at the origin.
+What a planner needs of it, its convex hull, has the support function
+
+    h(n) = max over the parts of  n.t + h_part(R^T n),
+
+closed form through :meth:`Superquadric.support`.  An open vessel has cavities besides, superquadrics that are cut away
+from the union; its hull does not know them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from sq_perception.geometry import rotation as quaternions
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.geometry.union import flat_support, support_of_union
+from sq_perception.simulation.mesh_rendering import Mesh
+
+_STRAIGHT = (0.0, 0.0, 0.0, 1.0)
+_LEAN = (np.deg2rad(4.0), np.deg2rad(35.0))
+
+UPRIGHT = np.array([0.0, 0.0, 0.0, 1.0])
+ON_X = np.array([0.0, -np.sqrt(0.5), 0.0, np.sqrt(0.5)])
+"""The thing's x axis points up: it lies on a side."""
+ON_Y = np.array([np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)])
+"""The thing's y axis, of an oval bottle the shorter one, points up."""
+INVERTED = np.array([1.0, 0.0, 0.0, 0.0])
+
+SIX_WAYS = np.concatenate([np.eye(3), -np.eye(3)])
+NO_CAVITY = Superquadric.stack([])
+
+CARTON_RESTS = (("standing", UPRIGHT, 0.45), ("flat", ON_X, 0.3), ("on its side", ON_Y, 0.25))
+ROUND_RESTS = (("standing", UPRIGHT, 0.78), ("lying", ON_Y, 0.19), ("inverted", INVERTED, 0.03))
+OVAL_RESTS = (("standing", UPRIGHT, 0.75), ("lying", ON_Y, 0.2), ("on its side", ON_X, 0.05))
+
+Numbers = Sequence[float] | np.ndarray
+Row = tuple[float, ...]
+"""A part: a1 a2 a3 e1 e2 x y z qx qy qz qw."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rest:
+    """A way to rest: the rotation, a quaternion (4,), from the thing's frame to one with z up, and its probability."""
+
+    name: str
+    turn: np.ndarray
+    likely: float
+
+
+@dataclass(frozen=True, eq=False)
+class Thing:
+    """One household thing.
+
+    Attributes
+    ----------
+    kind : str
+        One of :data:`household.KINDS <sq_perception.simulation.household.KINDS>`.
+    name : str
+        The family within the kind.
+    parts : Superquadric
+        Batch (k,) in the thing's own frame, metres.
+    rests : tuple of Rest
+        Their probabilities add up to 1.
+    cavities : Superquadric
+        Batch (m,), m >= 0: what is cut away from the union.
+    surface : Mesh, optional
+        What is seen in place of the union, where the parts only tell its hull.
+    """
+
+    kind: str
+    name: str
+    parts: Superquadric
+    rests: tuple[Rest, ...]
+    cavities: Superquadric
+    surface: Mesh | None = None
+
+    def support(self, directions: np.ndarray) -> np.ndarray:
+        """max n.p over the convex hull, in the thing's frame, for unit directions (J, 3), shape (J,)."""
+        return support_of_union(self.parts, directions)
+
+    @cached_property
+    def box(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lower and upper corner (3,) of the box around the thing in its own frame."""
+        reach = self.support(SIX_WAYS)
+        return -reach[3:], reach[:3]
+
+    def pose(self, rng: np.random.Generator, leaning: float = 0.06) -> tuple[str, np.ndarray]:
+        """A way to rest, turned about the vertical by any angle: its name and the quaternion (4,) to a frame with z up.
+
+        ``leaning`` is the share of things that are tilted by 4 to 35 degrees, as by something under or beside them.
+        """
+        rest = self.rests[one_of([rest.likely for rest in self.rests], rng)]
+        name, turn = rest.name, rest.turn
+        if rng.random() < leaning:
+            tilt, way = rng.uniform(*_LEAN), rng.uniform(0, 2 * np.pi)
+            name, turn = "leaning", quaternions.multiply(_turn(np.cos(way), np.sin(way), 0.0, tilt), turn)
+        return name, quaternions.multiply(_turn(0.0, 0.0, 1.0, rng.uniform(0, 2 * np.pi)), turn)
+
+
+def _turn(x: float, y: float, z: float, angle: float) -> np.ndarray:
+    """The quaternion of a turn about a unit axis by an angle in radians."""
+    s = np.sin(angle / 2)
+    return np.array([x * s, y * s, z * s, np.cos(angle / 2)])
+
+
+def one_of(weights: Sequence[float], rng: np.random.Generator) -> int:
+    """A random index with these weights."""
+    return min(int(np.searchsorted(np.cumsum(weights), rng.random() * sum(weights), side="right")), len(weights) - 1)
+
+
+def part(
+    size: Numbers,
+    shape: Numbers,
+    at: Numbers = (0.0, 0.0, 0.0),
+    turn: Numbers = _STRAIGHT,
+) -> Row:
+    """A superquadric: half sizes, exponents, centre, quaternion."""
+    return (*size, *shape, *at, *turn)
+
+
+def about(axis: int, degrees: float) -> Row:
+    """The quaternion of a turn about a coordinate axis."""
+    half = np.deg2rad(degrees) / 2
+    turn = [0.0, 0.0, 0.0, float(np.cos(half))]
+    turn[axis] = float(np.sin(half))
+    return tuple(turn)
+
+
+def assembled(
+    kind: str, name: str, rows: list[Row], rests: Sequence[tuple[str, np.ndarray, float]], cut: Sequence[Row] = ()
+) -> Thing:
+    """The thing of some parts, less what is cut away, moved to the middle of its box; rests by name, turn, weight."""
+    flat = np.array(rows)
+    reach = flat_support(flat, SIX_WAYS)
+    middle = 0.5 * (reach[:3] - reach[3:])
+    flat[:, 5:8] -= middle
+    cavities = NO_CAVITY
+    if cut:
+        cavities = Superquadric.from_flat(np.array(cut) - [*[0.0] * 5, *middle, *[0.0] * 4])
+    total = sum(likely for _, _, likely in rests)
+    ways = tuple(Rest(name, turn, likely / total) for name, turn, likely in rests)
+    return Thing(kind, name, Superquadric.from_flat(flat), ways, cavities)
+
+
+def log_uniform(rng: np.random.Generator, low: float, high: float) -> float:
+    """A random number whose logarithm is uniform."""
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))

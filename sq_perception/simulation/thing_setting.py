@@ -1,0 +1,163 @@
+"""A thing before a camera, in a random pose with what is around it; metres, optical frame where nothing else is said.
+
+pose        standing, lying, leaning (:meth:`Thing.pose`), on the table, on top of something, or free in any pose
+camera      5 to 85 degrees above the table, most 20 to 70; a roll of some degrees; off the image's middle by up to
+            27 degrees; 0.35 to 2 m away; the thing is 30 to 80 pixels wide
+around it   up to three neighbours on the table, the table's end, a wall or nothing behind it
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sq_perception.geometry import rotation as quaternions
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.geometry.union import flat_support, moved
+from sq_perception.imaging.camera import Camera
+from sq_perception.simulation.mesh_rendering import Mesh, render_mesh
+from sq_perception.simulation.thing import NO_CAVITY, SIX_WAYS, Thing
+from sq_perception.simulation.thing_rendering import render_things
+
+ON_TOP, FREE = 0.10, 0.05
+"""Shares of the views in which the thing stands on something on the table, and in which there is no table."""
+_DISTANCE = (0.35, 1.3, 2.0)
+_FARTHEST = 12.0
+"""Diagonals of its box, more than which no thing is away."""
+_FOCALS = (425.0, 525.0, 580.0, 615.0, 700.0, 920.0)
+"""Pixels: depth cameras at VGA to HD."""
+_PIXELS_ACROSS = (30.0, 80.0)
+_OFF_AXIS = (0.5, 0.4)
+_AROUND = 0.7
+"""Half of the image's side over the thing's width."""
+
+
+@dataclass(frozen=True, eq=False)
+class Setting:
+    """A thing before a camera, in the optical frame.
+
+    Attributes
+    ----------
+    parts, cavities : Superquadric
+        Of the thing, (k,) and (m,).
+    others : Superquadric
+        Batch (j,), j >= 0: neighbours, and what it stands on.
+    table : (4,) or None
+        n.p + d = 0, n up.
+    behind : float
+        Depth of the wall behind all, +inf without one.
+    camera : Camera
+    surface : Mesh, optional
+        Of the thing, if it is seen as one.
+    """
+
+    parts: Superquadric
+    cavities: Superquadric
+    others: Superquadric
+    table: np.ndarray | None
+    behind: float
+    camera: Camera
+    surface: Mesh | None = None
+
+    def render(self) -> tuple[np.ndarray, np.ndarray]:
+        """Depth (height, width), +inf where there is nothing, and where the thing is seen."""
+        if self.surface is not None:
+            around = np.ones(len(self.others))
+            depth, _ = render_things(self.others, around, NO_CAVITY, np.zeros(0), self.camera, self.table, self.behind)
+            near = render_mesh(self.surface, self.camera)
+            return np.minimum(depth, near), near < depth
+        bodies = Superquadric.from_flat(np.concatenate([self.parts.to_flat(), self.others.to_flat()]))
+        owner = np.arange(len(bodies)) >= len(self.parts)
+        whose = np.zeros(len(self.cavities))
+        depth, index = render_things(bodies, owner, self.cavities, whose, self.camera, self.table, self.behind)
+        return depth, index == 0
+
+
+def draw_setting(thing: Thing, rng: np.random.Generator) -> Setting:
+    """The thing in a random pose before a random camera; see the module."""
+    free = rng.random() < FREE
+    turn = quaternions.random(1, rng)[0] if free else thing.pose(rng)[1]
+    parts = moved(thing.parts.to_flat(), turn, np.zeros(3))
+    reach = flat_support(parts, SIX_WAYS)
+    others, floor = [], 0.0
+    if not free:
+        if rng.random() < ON_TOP:
+            floor = -rng.uniform(0.02, 0.2)
+            others.append(_stand(reach, floor, rng))
+        others += _neighbours(parts, floor, rng)
+
+    elevation = np.deg2rad(rng.uniform(20, 70) if rng.random() < 0.75 else rng.uniform(5, 85))
+    roll = rng.normal(0, np.deg2rad(4.0)) if rng.random() < 0.93 else rng.uniform(-np.pi, np.pi)
+    aside, below = rng.uniform(-1, 1, 2) * _OFF_AXIS
+    look = looking_down(elevation - np.arctan(below), roll)
+    matrix = quaternions.to_matrix(look)
+    near, usual, far = _DISTANCE
+    distance = np.exp(rng.uniform(np.log(near), np.log(usual if rng.random() < 0.85 else far)))
+    distance = min(distance, _FARTHEST * float(np.linalg.norm(reach[:3] + reach[3:])))
+    ray = np.array([aside, below, 1.0])
+    # The table's frame has its origin below the thing, at the height of its lowest point.
+    lift = np.array([0.0, 0.0, reach[5]])
+    shift = distance * ray / np.linalg.norm(ray) - matrix @ (lift + 0.5 * (reach[:3] - reach[3:]))
+    parts = moved(parts, look, shift + matrix @ lift)
+    surface = None
+    if thing.surface is not None:
+        placed = thing.surface.vertices @ (matrix @ quaternions.to_matrix(turn)).T + shift + matrix @ lift
+        surface = Mesh(placed, thing.surface.faces)
+    cavities = thing.cavities
+    if len(cavities):
+        cavities = Superquadric.from_flat(
+            moved(cavities.to_flat(), quaternions.multiply(look, turn), shift + matrix @ lift)
+        )
+    table = None if free else np.append(matrix[:, 2], -(matrix[:, 2] @ shift) - floor)
+    behind = distance * rng.uniform(1.3, 3.0) if rng.random() < 0.85 else np.inf
+    around = moved(np.array(others).reshape(-1, 12), look, shift)
+    camera = _camera(parts, rng)
+    thing_parts, others_around = Superquadric.from_flat(parts), Superquadric.from_flat(around)
+    return Setting(thing_parts, cavities, others_around, table, behind, camera, surface)
+
+
+def looking_down(pitch: float, roll: float) -> np.ndarray:
+    """Optical from table frame, a quaternion: the axis ``pitch`` radians below the horizon, towards the table's y."""
+    half, other = 0.5 * (np.pi / 2 + pitch), 0.5 * roll
+    c, s = np.cos(half), np.sin(half)
+    return np.array([s * np.cos(other), s * np.sin(other), c * np.sin(other), c * np.cos(other)])
+
+
+def _camera(parts: np.ndarray, rng: np.random.Generator) -> Camera:
+    """A camera whose image is the thing and what is around it."""
+    right, down, _, left, up, _ = flat_support(parts, SIX_WAYS)
+    z = float(parts[:, 7].mean())
+    width = max(right + left, down + up)
+    focal = rng.choice(_FOCALS) * rng.uniform(0.9, 1.1)
+    across = min(max(focal * width / z, _PIXELS_ACROSS[0]), rng.uniform(*_PIXELS_ACROSS))
+    focal = across * z / width
+    half = int(np.ceil(_AROUND * across)) + 4
+    u, v = focal * 0.5 * (right - left) / z, focal * 0.5 * (down - up) / z
+    return Camera(2 * half, 2 * half, focal, focal, half - u, half - v)
+
+
+def _stand(reach: np.ndarray, floor: float, rng: np.random.Generator) -> np.ndarray:
+    """A flat part (12,) under the thing, from the table up to height 0."""
+    half = np.array([0.5 * (reach[0] + reach[3]), 0.5 * (reach[1] + reach[4])]) * rng.uniform(0.6, 1.8, 2)
+    middle = 0.5 * (reach[:2] - reach[3:5])
+    e2 = 1.0 if rng.random() < 0.2 else 0.08
+    return np.array([*half, -floor / 2, 0.05, e2, *middle, floor / 2, 0.0, 0.0, 0.0, 1.0])
+
+
+def _neighbours(parts: np.ndarray, floor: float, rng: np.random.Generator) -> list[np.ndarray]:
+    """Up to three parts (12,) beside the thing, as seen from above; many between it and the camera, many touch it."""
+    rows = []
+    for _ in range(rng.choice((0, 0, 0, 0, 1, 1, 1, 2, 2, 3))):
+        size = np.exp(rng.uniform(np.log(0.02), np.log(0.1), 3))
+        shape = rng.uniform(0.1, 1.0, 2) ** [1.0, 0.7]
+        turn = rng.uniform(0, np.pi)
+        bearing = rng.uniform(-np.pi, np.pi) if rng.random() < 0.6 else rng.normal(-np.pi / 2, 0.7)
+        way = np.array([np.cos(bearing), np.sin(bearing), 0.0])
+        rotation = np.array([0.0, 0.0, np.sin(turn / 2), np.cos(turn / 2)])
+        row = np.array([*size, *shape, 0.0, 0.0, floor + size[2], *rotation])
+        gap = 0.0 if rng.random() < 0.3 else rng.uniform(0, 0.08)
+        far = flat_support(parts, way[None])[0] + flat_support(row[None], -way[None])[0] + gap
+        row[5:7] = far * way[:2] + rng.normal(0, 0.02) * np.array([-way[1], way[0]])
+        rows.append(row)
+    return rows
