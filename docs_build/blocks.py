@@ -138,13 +138,10 @@ def prediction() -> str:
         header = json.loads(file.read(int.from_bytes(file.read(8), "little")))
     validation = json.loads(header["__metadata__"]["validation"])
     kinds = {name: values for name, values in validation.items() if isinstance(values, list)}
-    kinds = {"all": (validation["error"], validation["ratio"]), **kinds}
-    return table(
-        ["kind", *kinds],
-        [
-            ["error, % of the view", *(f"{100 * error:.1f}" for error, _ in kinds.values())],
-            ["error over sigma", *(f"{ratio:.2f}" for _, ratio in kinds.values())],
-        ],
+    least, most = (choose(kinds, key=lambda name: kinds[name][1]) for choose in (min, max))
+    return (
+        f"Mean error {100 * validation['error']:.1f} % of the view, {validation['ratio']:.2f} times sigma; by kind "
+        f"{kinds[least][1]:.2f} ({least}) to {kinds[most][1]:.2f} ({most})."
     )
 
 
@@ -261,9 +258,9 @@ def packages() -> str:
 
 
 def purpose(room: str) -> str:
-    """The first paragraph of a package's docstring."""
+    """The beginning of a package's docstring, up to a colon or the end of the sentence."""
     docstring = ast.get_docstring(ast.parse((PACKAGE / room / "__init__.py").read_text(encoding="utf-8"))) or ""
-    return " ".join(docstring.partition("\n\n")[0].split())
+    return re.split(r"[:.]\s|[:.]$", " ".join(docstring.split()), maxsplit=1)[0]
 
 
 @cache
@@ -374,7 +371,6 @@ def recorded() -> str:
 PICKERS = {
     "ours": "recovered bodies, covariance",
     "ours without sigma": "with 10 % of the size as sigma",
-    "ours at any score": "as the first, any score tried",
     "true bodies": "true bodies",
     "classic": "`classic` fit",
     "box": "smallest box of the points",

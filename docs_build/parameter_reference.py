@@ -31,12 +31,11 @@ Made by `{COMMAND}` from what the nodes declare; `ros2 param describe` says the 
 
 ```sh
 ros2 param set /recover_node s 100             # while it runs
-ros2 run sq_perception recover_node --ros-args -p s:=100 -p model:=supervised
+ros2 run sq_perception recover_node --ros-args -p model:=supervised
 ros2 run sq_perception recover_node --ros-args --params-file recover_node.yaml     # like the ones in config/
 ```
 
-The default shows the type; where it has a point, integers are accepted too. A value of another type, out of its range,
-or that does not fit the others is refused with a reason and changes nothing.
+A value of another type, out of its range, or that does not fit the others is refused with a reason and changes nothing.
 
 A change takes effect with the next frame, unless the meaning begins with *configure*: set while the node is
 unconfigured (`ros2 lifecycle set /recover_node deactivate`, then `cleanup`), or with *start*: given at the start only.
