@@ -31,15 +31,15 @@ def enclosing_box(points: np.ndarray, footprint: float) -> Superquadric:
     return Superquadric(size, np.array([0.2, 0.2]), centre + axes @ ((low + high) / 2), quaternions.from_matrix(axes))
 
 
-def principal(points: np.ndarray) -> list[State]:
-    """Boxes along the principal axes of the points, for each choice of z."""
-    return _box_states(points, _axes_of(points))
+def principal(points: np.ndarray, deeper: bool = True) -> list[State]:
+    """Boxes along the principal axes of the points, for each choice of z; deeper ones behind them if asked for."""
+    return _box_states(points, _axes_of(points), deeper)
 
 
-def on_plane(points: np.ndarray, plane: np.ndarray) -> list[State]:
+def on_plane(points: np.ndarray, plane: np.ndarray, deeper: bool = True) -> list[State]:
     """Boxes that stand on the plane: smallest rectangle around the footprint of the points, down to the plane."""
     axes = standing_axes(points, plane[:3])
-    return _box_states(points, axes, ground=float(-plane[3] * plane[:3] @ axes[:, 2]))
+    return _box_states(points, axes, deeper, ground=float(-plane[3] * plane[:3] @ axes[:, 2]))
 
 
 def standing_axes(points: np.ndarray, normal: np.ndarray) -> np.ndarray:
@@ -62,8 +62,8 @@ def _axes_of(points: np.ndarray) -> np.ndarray:
     return axes
 
 
-def _box_states(points: np.ndarray, axes: np.ndarray, ground: float | None = None) -> list[State]:
-    """Boxes along the axes, as measured and deeper on the narrow side; down to the ground on the third axis."""
+def _box_states(points: np.ndarray, axes: np.ndarray, deeper: bool, ground: float | None = None) -> list[State]:
+    """Boxes along the axes, as measured, and deeper on the narrow side; down to the ground on the third axis."""
     low, high = span(points, axes.T).T
     if ground is not None:
         low[2] = min(ground, high[2] - 1e-4)
@@ -71,7 +71,7 @@ def _box_states(points: np.ndarray, axes: np.ndarray, ground: float | None = Non
     thin = int(np.argmin((high - low)[:2] if ground is not None else high - low))
     view = points.mean(axis=0) @ axes
     longest = float((high - low).max())
-    for share in (0.5, 1.0):
+    for share in (0.5, 1.0) if deeper else ():
         deeper_low, deeper_high = low.copy(), high.copy()
         extra = share * longest - (high - low)[thin]
         if extra <= 0:

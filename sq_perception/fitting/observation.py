@@ -223,10 +223,11 @@ class Crop:
 
 def span(points: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """From where to where (k, 2) points (n, 3) reach along directions (k, 3), but for outliers at either end."""
-    along = np.sort(directions @ points.T, axis=1)
     place = (len(points) - 1) * np.array([OUTLIER_SHARE, 1 - OUTLIER_SHARE])
     before = place.astype(int)
-    lower, upper = along[:, before], along[:, np.minimum(before + 1, len(points) - 1)]
+    after = np.minimum(before + 1, len(points) - 1)
+    along = np.partition(directions @ points.T, np.unique([before, after]), axis=1)
+    lower, upper = along[:, before], along[:, after]
     return np.asarray(lower + (upper - lower) * (place - before))
 
 

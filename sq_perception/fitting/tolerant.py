@@ -53,7 +53,6 @@ from sq_perception.fitting.problem import (
 )
 from sq_perception.fitting.rays import STIFFNESS, Rays
 from sq_perception.fitting.residuals import surface_distance
-from sq_perception.fitting.symmetry_start import ORDERS
 
 INDEPENDENT_OF_PREDICTED, EXPLAINED = 100.0, 0.5
 """Most rays that an object counts for beside a predicted hull, and the mean loss up to which it does: what cartons and
@@ -84,9 +83,10 @@ def solve(problem: Problem, given: Sequence[State]) -> Solution:
     """The most probable body, from the given starts and boxes."""
     problem = _with_priors(problem)
     points, plane = problem.observation.points, problem.options.plane
-    boxes = box_start.principal(points) if plane is None else box_start.on_plane(points, plane)
     # How far a box goes on behind what was seen, the prediction says.
-    starts = [*given, *(boxes[: len(ORDERS)] if problem.is_predicted else boxes)]
+    deeper = not problem.is_predicted
+    boxes = box_start.principal(points, deeper) if plane is None else box_start.on_plane(points, plane, deeper)
+    starts = [*given, *boxes]
     solution = _best(problem, starts)
     if problem.is_predicted:
         if _mean_loss(problem, solution.state) > _typical_of_hollow(problem):

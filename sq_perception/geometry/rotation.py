@@ -21,24 +21,23 @@ Array = Any
 
 def normalize(quaternion: Array) -> Array:
     """Scale quaternions (..., 4) to unit length; a zero quaternion becomes NaN, as there is no rotation to name."""
+    if _is_one(quaternion):
+        return quaternion / np.sqrt(quaternion @ quaternion)
     xp = array_namespace(quaternion)
     return quaternion / xp.sqrt(xp.sum(quaternion * quaternion, axis=-1, keepdims=True))
 
 
 def multiply(left: Array, right: Array) -> Array:
     """Hamilton product (..., 4): first the right rotation, then the left one."""
-    xp = array_namespace(left, right)
-    x1, y1, z1, w1 = left[..., 0], left[..., 1], left[..., 2], left[..., 3]
-    x2, y2, z2, w2 = right[..., 0], right[..., 1], right[..., 2], right[..., 3]
-    return xp.stack(
-        [
-            w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
-            w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
-            w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
-            w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
-        ],
-        axis=-1,
-    )
+    x1, y1, z1, w1 = _components(left)
+    x2, y2, z2, w2 = _components(right)
+    product = [
+        w1 * x2 + x1 * w2 + y1 * z2 - z1 * y2,
+        w1 * y2 - x1 * z2 + y1 * w2 + z1 * x2,
+        w1 * z2 + x1 * y2 - y1 * x2 + z1 * w2,
+        w1 * w2 - x1 * x2 - y1 * y2 - z1 * z2,
+    ]
+    return _joined(product, left, right)
 
 
 def conjugate(quaternion: Array) -> Array:
@@ -49,9 +48,8 @@ def conjugate(quaternion: Array) -> Array:
 
 def to_matrix(quaternion: Array) -> Array:
     """Rotation matrices (..., 3, 3) of quaternions (..., 4) of any non-zero length (thesis, equation 3.8)."""
-    xp = array_namespace(quaternion)
     q = normalize(quaternion)
-    x, y, z, w = q[..., 0], q[..., 1], q[..., 2], q[..., 3]
+    x, y, z, w = _components(q)
     entries = [
         1 - 2 * (y * y + z * z),
         2 * (x * y - z * w),
@@ -63,7 +61,7 @@ def to_matrix(quaternion: Array) -> Array:
         2 * (y * z + x * w),
         1 - 2 * (x * x + y * y),
     ]
-    return xp.reshape(xp.stack(entries, axis=-1), (*q.shape[:-1], 3, 3))
+    return _joined(entries, q).reshape((*q.shape[:-1], 3, 3))
 
 
 def from_matrix(matrix: Array) -> Array:
@@ -72,20 +70,25 @@ def from_matrix(matrix: Array) -> Array:
     The four products 4 q_i q_j are read off the matrix for each choice of i; the row with the largest q_i is the well
     conditioned one (Shepperd 1978).  Only that row is divided by its root, so gradients stay finite for every rotation.
     """
+    if isinstance(matrix, np.ndarray) and matrix.ndim == 2:
+        squares, rows = _products(matrix.tolist())
+        return normalize(np.array(rows[squares.index(max(squares))], dtype=matrix.dtype))
     xp = array_namespace(matrix)
-    m = [[matrix[..., i, j] for j in range(3)] for i in range(3)]
+    squares, rows = _products([[matrix[..., i, j] for j in range(3)] for i in range(3)])
+    best = xp.argmax(xp.stack(squares, axis=-1), axis=-1)
+    row = xp.stack(rows[0], axis=-1)
+    for i in range(1, 4):
+        row = xp.where((best == i)[..., None], xp.stack(rows[i], axis=-1), row)
+    return normalize(row)
+
+
+def _products(m: list[list[Any]]) -> tuple[list[Any], list[list[Any]]]:
+    """The products 4 q_i q_j of the quaternion of a matrix: those of i = j, and the rows of all."""
     xx, yy = 1 + m[0][0] - m[1][1] - m[2][2], 1 - m[0][0] + m[1][1] - m[2][2]
     zz, ww = 1 - m[0][0] - m[1][1] + m[2][2], 1 + m[0][0] + m[1][1] + m[2][2]
     xy, xz, yz = m[0][1] + m[1][0], m[0][2] + m[2][0], m[1][2] + m[2][1]
     xw, yw, zw = m[2][1] - m[1][2], m[0][2] - m[2][0], m[1][0] - m[0][1]
-    products = xp.stack([xx, xy, xz, xw, xy, yy, yz, yw, xz, yz, zz, zw, xw, yw, zw, ww], axis=-1)
-    rows = xp.reshape(products, (*matrix.shape[:-2], 4, 4))
-    squares = xp.stack([xx, yy, zz, ww], axis=-1)
-    best = xp.argmax(squares, axis=-1)
-    row = xp.zeros_like(rows[..., 0, :])
-    for i in range(4):
-        row = xp.where((best == i)[..., None], rows[..., i, :], row)
-    return normalize(row)
+    return [xx, yy, zz, ww], [[xx, xy, xz, xw], [xy, yy, yz, yw], [xz, yz, zz, zw], [xw, yw, zw, ww]]
 
 
 def from_rotation_vector(vector: Array) -> Array:
@@ -122,10 +125,9 @@ def from_six(six: Array) -> Array:
 
 def cross(left: Array, right: Array) -> Array:
     """Vector product of (..., 3) arrays."""
-    xp = array_namespace(left, right)
-    a1, a2, a3 = left[..., 0], left[..., 1], left[..., 2]
-    b1, b2, b3 = right[..., 0], right[..., 1], right[..., 2]
-    return xp.stack([a2 * b3 - a3 * b2, a3 * b1 - a1 * b3, a1 * b2 - a2 * b1], axis=-1)
+    a1, a2, a3 = _components(left)
+    b1, b2, b3 = _components(right)
+    return _joined([a2 * b3 - a3 * b2, a3 * b1 - a1 * b3, a1 * b2 - a2 * b1], left, right)
 
 
 def random(count: int, rng: np.random.Generator) -> np.ndarray:
@@ -142,6 +144,23 @@ def geodesic_angle(left: Array, right: Array) -> Array:
     difference = multiply(conjugate(left), right)
     vector = xp.sqrt(xp.sum(difference[..., :3] ** 2, axis=-1))
     return 2 * xp.atan2(vector, xp.abs(difference[..., 3]))
+
+
+def _is_one(array: Array) -> bool:
+    """Whether this is a single NumPy vector: Python computes with its numbers ten times as fast as NumPy does."""
+    return isinstance(array, np.ndarray) and array.ndim == 1
+
+
+def _components(array: Array) -> Any:
+    """The entries along the last axis: numbers of a single NumPy vector, arrays of others."""
+    return array.tolist() if _is_one(array) else [array[..., k] for k in range(array.shape[-1])]
+
+
+def _joined(components: list[Any], *parts: Array) -> Array:
+    """What was computed from the components of some arrays as one array."""
+    if all(_is_one(part) for part in parts):
+        return np.array(components, dtype=np.result_type(*parts))
+    return array_namespace(*parts).stack(components, axis=-1)
 
 
 def _unit(vector: Array) -> Array:

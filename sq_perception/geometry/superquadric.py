@@ -87,18 +87,21 @@ class Superquadric:
                 raise ValueError(f"{name}: expected shape (..., {length}), got {tuple(value.shape)}")
         if tensors[0]:
             return
-        for name in lengths:
-            if not np.isfinite(getattr(self, name)).all():
-                raise ValueError(f"{name}: expected finite numbers, got {getattr(self, name)}")
+        parts = [getattr(self, name) for name in lengths]
+        if not np.isfinite(np.concatenate(parts, axis=None)).all():
+            name, part = next(each for each in zip(lengths, parts, strict=True) if not np.isfinite(each[1]).all())
+            raise ValueError(f"{name}: expected finite numbers, got {part}")
         if (self.size <= 0).any():
             raise ValueError(f"size: expected positive half sizes, got {self.size}")
-        if (self.shape <= 0).any() or (self.shape > 2).any():
+        if ((self.shape <= 0) | (self.shape > 2)).any():
             raise ValueError(f"shape: expected exponents in (0, 2], got {self.shape}")
-        norm = np.linalg.norm(self.rotation, axis=-1, keepdims=True)
-        if (norm < 1e-9).any():
+        square = np.einsum("...i,...i->...", self.rotation, self.rotation)
+        if (square < 1e-18).any():
             raise ValueError("rotation: expected a quaternion of non-zero length")
-        object.__setattr__(self, "rotation", self.rotation / norm)
-        batch = np.broadcast_shapes(*(getattr(self, name).shape[:-1] for name in lengths))
+        object.__setattr__(self, "rotation", self.rotation / np.sqrt(square)[..., None])
+        if all(part.ndim == 1 for part in parts):
+            return
+        batch = np.broadcast_shapes(*(part.shape[:-1] for part in parts))
         for name, length in lengths.items():
             object.__setattr__(self, name, np.broadcast_to(getattr(self, name), (*batch, length)))
 
