@@ -62,8 +62,8 @@ def fit(
         Pixels of the object.
     camera : Camera
     start : "auto", one body, a batch of bodies or a sequence of bodies, in the optical frame
-        Where to begin.  A function that returns them is called only if the cheapest automatic starts leave something
-        unexplained: for starts that cost time, or are still being computed.
+        Where to begin.  A function that returns them is not called where the cheapest automatic starts explain the
+        image down to a fine noise: for starts that cost time, or are still being computed.
     options : FitOptions
 
     Returns

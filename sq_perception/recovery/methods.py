@@ -59,10 +59,9 @@ def _body(one: SeenObject, depth: np.ndarray, camera: Camera, options: RecoveryO
 
 
 def _surface_fit(one: SeenObject, depth: np.ndarray, camera: Camera, known: FitOptions) -> Fit:
-    """From the cheapest starts of central symmetry; where those leave something, from the network's prediction too.
+    """From the network's prediction, which may still be computed; images without noise may not need it.
 
-    The network computes beside the fit.  What the image leaves open after all, such as the depth of a box seen
-    face-on, its prediction tells again.
+    What the image leaves open after all, such as the depth of a box seen face-on, the prediction tells again.
     """
     if one.prediction is None:
         return surface_fit.fit(depth, one.mask, camera, options=known)
