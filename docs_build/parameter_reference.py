@@ -92,7 +92,7 @@ def main() -> None:
 
 
 def _table(rows: Sequence[Field[Any]], otherwise: str) -> str:
-    lines = ["| name | default; range | meaning |", "| --- | --- | --- |"]
+    lines = ["| name | default; range | meaning |", "|---|---|---|"]
     for one in rows:
         about = one.metadata
         when = "" if about["live"] else "*start*: " if one.name == "autostart" else f"*{otherwise}*: "
