@@ -12,7 +12,9 @@ from __future__ import annotations
 
 import hashlib
 import math
+import re
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -21,6 +23,8 @@ from sq_perception.geometry.elementary import exp2, exp2_to_half, log2, log2_fro
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 
+_ROOT = Path(__file__).resolve().parents[1]
+_IMPORT = re.compile(rf"^ *from ({_ROOT.name}[.\w]*) import (\([^)]*\)|[^\n]*)", re.MULTILINE)
 FAST = {"contract", "arcp", "reassoc", "nsz", "afn"}
 """Fast arithmetic that still treats NaN and infinity as IEEE 754 does."""
 
@@ -41,27 +45,39 @@ def inline_kernel(function: _F) -> _F:
 
 
 def _compiled(function: _F, **more: bool) -> _F:
-    function.__qualname__ += f"_{_FINGERPRINT}"
+    function.__qualname__ += f"_{_fingerprint(Path(function.__code__.co_filename))}"
     options: dict[str, Any] = {"nogil": True, "fastmath": FAST, "error_model": "numpy", **more}
     return kernel_cache.compiled(function, options)
 
 
-def _fingerprint() -> str:
-    """A digest of every source file with kernels.
+@cache
+def _fingerprint(file: Path) -> str:
+    """A digest of a source file with all those of this package that it imports, and these import.
 
     numba keeps machine code under the name of a function and checks the file that holds it, but not the files of the
     kernels that were compiled into it: an update of this module alone would leave the old code at work elsewhere.  With
     the digest in the name, code of other sources is never found.
     """
+    known, ahead = {file}, [file]
+    while ahead:
+        new = _imported(ahead.pop()) - known
+        known |= new
+        ahead += new
     digest = hashlib.sha256()
-    for path in sorted(Path(__file__).resolve().parents[1].rglob("*.py")):
-        source = path.read_bytes()
-        if b"numba" in source or b"geometry.kernels" in source:
-            digest.update(source)
+    for path in sorted(known):
+        digest.update(path.read_bytes())
     return digest.hexdigest()[:12]
 
 
-_FINGERPRINT = _fingerprint()
+@cache
+def _imported(file: Path) -> set[Path]:
+    """The modules of this package that a source file names in its imports."""
+    found = set()
+    for package, names in _IMPORT.findall(file.read_text(encoding="utf-8")):
+        folder = _ROOT.joinpath(*package.split(".")[1:])
+        found |= {folder.with_suffix(".py"), *(folder / f"{name}.py" for name in re.findall(r"\w+", names))}
+    return {path for path in found if path.is_file()}
+
 
 RAY_TOLERANCE = 1e-9
 MAX_NEWTON_STEPS = 60

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 
 import sq_perception
+from sq_perception.geometry import kernels
 
 PATIENCE = 600
 READ_ONLY = 'mount --bind "$0" "$0" && mount -o remount,bind,ro "$0" && exec "$@"'
@@ -83,3 +84,28 @@ def test_a_named_place_goes_first(installation: Path, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert not done.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["named"]
+
+
+def test_the_name_of_a_kernel_follows_what_its_module_imports(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Machine code is compiled again after a change of what was compiled into it, and after no other."""
+    package = tmp_path / "sq_perception"
+    sources = {
+        "fitting/residuals.py": "from sq_perception.fitting import terms\n"
+        "from sq_perception.geometry.ray import (\n    meet,\n)\n",
+        "fitting/terms.py": "HUBER = 3.0\n",
+        "geometry/ray.py": "from sq_perception.fitting import residuals\n",
+        "geometry/mesh.py": "",
+    }
+    for name, text in sources.items():
+        (package / name).parent.mkdir(parents=True, exist_ok=True)
+        (package / name).write_text(text)
+    monkeypatch.setattr(kernels, "_ROOT", package)
+    kept = {}
+    for name in [*sources, ""]:
+        if name:
+            (package / name).write_text(sources[name] + "# changed\n")
+        kernels._fingerprint.cache_clear()
+        kernels._imported.cache_clear()
+        kept[name] = kernels._fingerprint(package / "fitting" / "residuals.py")
+    assert kept["geometry/mesh.py"] == kept[""] == kept["geometry/ray.py"]
+    assert len({kept[name] for name in ("fitting/residuals.py", "fitting/terms.py", "geometry/ray.py")}) == 3
