@@ -19,7 +19,6 @@ import torch
 from torch import nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
-COLOURS = 3
 _CLASSIFIER = "fc."
 _COUNTER = "num_batches_tracked"
 """Of normalisations; older weight files have none, and inference needs none."""
@@ -93,7 +92,6 @@ class ResNet18(nn.Module):
         x = self.layer4(self.layer3(self.layer2(self.layer1(x))))
         return x.mean(dim=(2, 3))
 
-    @torch.no_grad()
     def load_imagenet(self, state: Mapping[str, torch.Tensor]) -> None:
         """Take over the weights of torchvision's ResNet-18, those of ``conv1`` summed over the three colours.
 
@@ -109,24 +107,15 @@ class ResNet18(nn.Module):
         Raises
         ------
         ValueError
-            If a weight is missing, unknown, of another shape or not finite; then nothing has changed.
+            If a weight is missing, unknown or of another shape.
         """
-        mine = {name: tensor for name, tensor in self.state_dict().items() if not name.endswith(_COUNTER)}
-        given = {k: v for k, v in state.items() if not k.startswith(_CLASSIFIER) and not k.endswith(_COUNTER)}
-        for reason, names in (("misses", mine.keys() - given.keys()), ("does not know", given.keys() - mine.keys())):
-            if names:
-                shown = ", ".join(sorted(names)[:3]) + (", ..." if len(names) > 3 else "")
-                raise ValueError(f"expected the weights of torchvision's ResNet-18: the network {reason} {shown}")
-        for name, tensor in given.items():
-            expected = tuple(mine[name].shape)
-            if name == "conv1.weight":
-                expected = (expected[0], COLOURS, *expected[2:])
-            if tuple(tensor.shape) != expected:
-                raise ValueError(f"{name}: expected shape {expected}, got {tuple(tensor.shape)}")
-            if not bool(torch.isfinite(tensor).all()):
-                raise ValueError(f"{name}: expected finite weights")
-        for name, tensor in given.items():
-            mine[name].copy_(tensor.sum(dim=1, keepdim=True) if name == "conv1.weight" else tensor)
+        given = {name: tensor for name, tensor in state.items() if not name.startswith(_CLASSIFIER)}
+        counters = {name: tensor for name, tensor in self.state_dict().items() if name.endswith(_COUNTER)}
+        try:
+            given["conv1.weight"] = given["conv1.weight"].sum(dim=1, keepdim=True)
+            self.load_state_dict({**counters, **given})
+        except (KeyError, RuntimeError) as error:
+            raise ValueError(f"expected the weights of torchvision's ResNet-18: {error}") from error
 
 
 def fold(module: nn.Module) -> None:

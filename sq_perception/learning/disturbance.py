@@ -3,8 +3,8 @@
 Everything here is relative to the side of the view, so that one description serves objects of any size.  Values of a
 view: z in (0, 1] where the object is seen, 0 background, HIDDEN where it may go on unseen.
 
-    occluder    hides a share of the body, uniform up to ``most_hidden`` (see view_rendering.Occluder)
-    noise       sigma log-uniform from 1/2000 of the side up to ``noise``; a part of it is common to blocks of pixels,
+    occluder    hides a share of the body, uniform up to 0.4 (see view_rendering.Occluder)
+    noise       sigma log-uniform from 1/2000 to 3/100 of the side; a part of it is common to blocks of pixels,
                 as where one measurement covers several pixels of the view or a matching window smooths
     steps       quantised depth, 1/400 to 1/25 of the side
     holes       up to 15 % of the object in blobs of any width: HIDDEN, as pixels without a measurement are
@@ -21,7 +21,10 @@ import numpy as np
 from sq_perception.imaging.canonical_view import HIDDEN
 from sq_perception.simulation.view_rendering import Occluder
 
-_LEAST_NOISE = 1 / 2000
+_MOST_HIDDEN = 0.4
+"""Largest share of a body that an occluder hides."""
+_LEAST_NOISE, _MOST_NOISE = 1 / 2000, 0.03
+"""Standard deviations of a depth, in sides of the view."""
 _STEPS = (1 / 400, 1 / 25)
 _MOST_HOLES = 0.15
 _FRAMING = np.array([0.012, 0.012, 0.012, 0.02])
@@ -34,27 +37,19 @@ class Disturbance:
 
     occluded_share: float = 0.0
     """Share of the views with an occluder."""
-    most_hidden: float = 0.4
-    """Largest share of a body that it hides."""
     noisy_share: float = 0.0
     """Share of the views with noise, steps, holes and wrong edges, each of them in some of those."""
-    noise: float = 0.03
-    """Largest standard deviation of a depth, in sides of the view."""
 
     def __post_init__(self) -> None:
         for name in ("occluded_share", "noisy_share"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name}: expected a share from 0 to 1, got {getattr(self, name)}")
-        if not 0 <= self.most_hidden < 1:
-            raise ValueError(f"most_hidden: expected a share from 0 to below 1, got {self.most_hidden}")
-        if not self.noise > _LEAST_NOISE:
-            raise ValueError(f"noise: expected more than {_LEAST_NOISE} sides of the view, got {self.noise}")
 
     def occluder(self, count: int, rng: np.random.Generator) -> Occluder | None:
         """Occluders for ``count`` bodies, some of which hide nothing; None where no view is to have one."""
         if self.occluded_share == 0:
             return None
-        share = np.where(rng.random(count) < self.occluded_share, rng.uniform(0, self.most_hidden, count), 0.0)
+        share = np.where(rng.random(count) < self.occluded_share, rng.uniform(0, _MOST_HIDDEN, count), 0.0)
         return any_occluder(share, rng)
 
     def framing(self, count: int, rng: np.random.Generator) -> np.ndarray | None:
@@ -69,7 +64,7 @@ class Disturbance:
             return views
         worn = views.copy()
         chosen = np.flatnonzero(rng.random(len(views)) < self.noisy_share)
-        worn[chosen] = _holes(_steps(_noise(_edges(views[chosen], rng), self.noise, rng), rng), rng)
+        worn[chosen] = _holes(_steps(_noise(_edges(views[chosen], rng), rng), rng), rng)
         return worn
 
 
@@ -82,9 +77,9 @@ def any_occluder(share: np.ndarray, rng: np.random.Generator) -> Occluder:
     return Occluder(rng.uniform(-np.pi, np.pi, count), bow, rng.uniform(-0.2, 0.2, count), power, thickness, share)
 
 
-def _noise(views: np.ndarray, largest: float, rng: np.random.Generator) -> np.ndarray:
+def _noise(views: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     count, pixels = views.shape[:2]
-    sigma = _LEAST_NOISE * (largest / _LEAST_NOISE) ** rng.random((count, 1, 1))
+    sigma = _LEAST_NOISE * (_MOST_NOISE / _LEAST_NOISE) ** rng.random((count, 1, 1))
     common = rng.random((count, 1, 1))
     fine = rng.standard_normal(views.shape, dtype=np.float32)
     coarse = _blocks(rng.standard_normal((count, pixels, pixels), dtype=np.float32), rng)

@@ -2,7 +2,7 @@
 
 Parameters (thesis, equation 6.10)
 
-    L_MSE = 1/N sum (y - y_hat)^2      over the named groups; rotation as the nearer one of the quaternions q and -q.
+    L_MSE(a, e, t) = 1/8 sum (y - y_hat)^2      over sizes, exponents and centre
 
 Occupancy (6.6 to 6.8): the mean squared difference of two soft occupancies
 
@@ -24,27 +24,17 @@ Bodies are torch batches (n,) in the frame of the canonical view, lengths in sid
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 
 from sq_perception.geometry.superquadric import Superquadric
 
-NOT_ROTATION = ("size", "shape", "translation")
-ALL_GROUPS = (*NOT_ROTATION, "rotation")
+_NOT_ROTATION = ("size", "shape", "translation")
 
 
-def parameter_loss(prediction: Superquadric, truth: Superquadric, groups: Sequence[str] = NOT_ROTATION) -> torch.Tensor:
-    """L_MSE of each body over the parameters of ``groups`` (fields of a Superquadric), shape (n,)."""
-    differences = []
-    for group in groups:
-        mine, theirs = getattr(prediction, group), getattr(truth, group)
-        if group == "rotation":
-            opposite = (mine * theirs).sum(dim=-1, keepdim=True) < 0
-            theirs = torch.where(opposite, -theirs, theirs)
-        differences.append(mine - theirs)
-    difference = torch.cat(differences, dim=-1)
-    return (difference * difference).mean(dim=-1)
+def parameter_loss(prediction: Superquadric, truth: Superquadric) -> torch.Tensor:
+    """L_MSE(a, e, t) of each body, shape (n,)."""
+    differences = [getattr(prediction, group) - getattr(truth, group) for group in _NOT_ROTATION]
+    return torch.cat(differences, dim=-1).square().mean(dim=-1)
 
 
 def occupancy_loss(
@@ -80,12 +70,6 @@ def rotation_loss(
 def dual_loss(prediction: Superquadric, truth: Superquadric, points: torch.Tensor, sharpness: float) -> torch.Tensor:
     """L_DUAL of each body, shape (n,)."""
     return parameter_loss(prediction, truth) + rotation_loss(prediction, truth, points, sharpness)
-
-
-def grid(resolution: int, low: float = 0.0, high: float = 1.0, **like: torch.dtype | torch.device) -> torch.Tensor:
-    """The thesis' grid of points (resolution^3, 3) in [low, high]^3, ends included (chapter 6.3.3)."""
-    axis = torch.linspace(low, high, resolution, **like)  # type: ignore[call-overload]
-    return torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1).reshape(-1, 3)
 
 
 def points_around(bodies: Superquadric, count: int, generator: torch.Generator, scale: float = 1.25) -> torch.Tensor:

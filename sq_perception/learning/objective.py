@@ -4,7 +4,6 @@
 | --- | --- | --- | --- |
 | occupancy | L_OC at random points | labels | 6 to 25 |
 | occupancy_rotation | L_OC(q): size, shape and place given | labels | 6 to 25 |
-| parameters | L_MSE over all 12 parameters | labels | |
 | dual | L_DUAL | labels | 6 to 25 |
 | least_squares | L_LS | the view | |
 | least_squares_free | L_LS and free space | the view | |
@@ -35,6 +34,10 @@ _OTHER_SHARPNESS = (6.0, 25.0)
 _TYPICAL_VOLUME = 0.05
 _CURRICULUM = 0.8
 _ROOT_FLOOR = 1e-6
+_DENSITY = 2.0
+"""D of the soft depth, in units of s."""
+_FREE_SPACE = 4.0
+"""Weight w of the free space."""
 
 
 @dataclass(frozen=True)
@@ -55,13 +58,6 @@ class Objective:
     """s at the start and the end of the run; 0 takes the values of the table."""
     stride: int = 2
     """Every ``stride``-th row and column of the view is a line of sight."""
-    density: float = 2.0
-    """D of the soft depth, in units of s."""
-    free_space: float = 4.0
-    """Weight w of the free space."""
-    root: bool = True
-    """Take the root of each body's least_squares_free: the same optimum, but a few badly seen bodies, whose squares are
-    a hundred times those of the others, no longer make the whole gradient."""
 
     def __post_init__(self) -> None:
         if self.name not in LOSSES:
@@ -89,8 +85,6 @@ class Objective:
         s = self.sharpness(progress)
         if self.needs_labels:
             assert truth is not None
-            if self.name == "parameters":
-                return losses.parameter_loss(prediction, truth, losses.ALL_GROUPS)
             around = [losses.points_around(truth, self.points // 2, generator, scale) for scale in (1.15, 2.0)]
             compare = {
                 "occupancy": losses.occupancy_loss,
@@ -101,13 +95,15 @@ class Objective:
         row, column = torch.randint(self.stride, (2,), generator=generator, device=views.device).tolist()
         lines, depth = sight_lines.of_view(views[:, 0], self.stride, row, column)
         if self.name == "render":
-            return depth_losses.render_loss(prediction, lines, depth, s, self.density * s)
+            return depth_losses.render_loss(prediction, lines, depth, s, _DENSITY * s)
         smallness = max(0.0, 1 - progress / _CURRICULUM)
         loss = depth_losses.least_squares_loss(prediction, lines, depth)
         loss = loss * (prediction.size.prod(dim=-1) / _TYPICAL_VOLUME) ** smallness
         if self.name == "least_squares_free":
-            loss = loss + self.free_space * depth_losses.free_space_loss(prediction, lines, depth)
-            loss = torch.sqrt(loss + _ROOT_FLOOR) if self.root else loss
+            loss = loss + _FREE_SPACE * depth_losses.free_space_loss(prediction, lines, depth)
+            # The same optimum, but a few badly seen bodies, whose squares are a hundred times those of the others, do
+            # not make the whole gradient.
+            loss = torch.sqrt(loss + _ROOT_FLOOR)
         return loss
 
     def with_given(self, prediction: Superquadric, truth: Superquadric) -> Superquadric:

@@ -16,7 +16,6 @@ Output Superquadric  batch (n,) in the frame of the views: a unit cube, y up, z 
 from __future__ import annotations
 
 import copy
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, get_args
 
@@ -229,19 +228,6 @@ class Regressor(nn.Module):
     @property
     def _dtype(self) -> torch.dtype:
         return next(self.features.parameters()).dtype
-
-
-def load_imagenet(model: Regressor, state: Mapping[str, torch.Tensor]) -> None:
-    """Begin with ImageNet weights: :meth:`sq_perception.learning.backbone.ResNet18.load_imagenet`.
-
-    Raises
-    ------
-    ValueError
-        If the backbone is another than resnet18, or the weights do not fit.
-    """
-    if not isinstance(model.features, ResNet18):
-        raise ValueError(f"backbone: ImageNet weights are for resnet18, got {model.config.backbone}")
-    model.features.load_imagenet(state)
 
 
 def checked_views(views: np.ndarray, config: RegressorConfig) -> np.ndarray:

@@ -29,17 +29,22 @@ from sq_perception.files import provenance
 from sq_perception.geometry.metrics import volume_iou
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.learning import checkpoint
+from sq_perception.learning.backbone import ResNet18
 from sq_perception.learning.dataset import ViewPool, ViewSource, draw_views
 from sq_perception.learning.disturbance import Disturbance, any_occluder
 from sq_perception.learning.fixed_set import FixedSet, ShuffledBatches
 from sq_perception.learning.objective import Objective
 from sq_perception.learning.processes import Processes, joined
-from sq_perception.learning.regressor import Regressor, RegressorConfig, load_imagenet
+from sq_perception.learning.regressor import Regressor, RegressorConfig
 from sq_perception.learning.training_config import TrainingConfig
 from sq_perception.learning.training_log import TrainingLog
 from sq_perception.learning.training_state import TrainingState, recalibrate
 
 CALIBRATION_VIEWS = 2048
+_CLIP = 1.0
+"""Largest norm of the gradient."""
+_SAVE_SECONDS = 300.0
+"""Longest time between two saved states."""
 VALIDATION_HIDDEN = 0.3
 """Share of each body that is hidden in the validation set ``hidden``."""
 
@@ -128,7 +133,7 @@ def _train(
             loss = objective.loss(prediction, views, truth, progress, generator).mean()
             state.optimizer.zero_grad(set_to_none=True)
             loss.backward()
-            norm = torch.nn.utils.clip_grad_norm_(model.parameters(), config.clip)
+            norm = torch.nn.utils.clip_grad_norm_(model.parameters(), _CLIP)
             if processes.any(not bool(torch.isfinite(loss) & torch.isfinite(norm))):
                 raise DivergedError(
                     f"step {state.step}: loss {loss.item():.4g}, norm of the gradient {norm.item():.4g}; "
@@ -156,7 +161,7 @@ def _train(
                     _keep(output, state, record, notes)
                 state.schedule.validated(1 - processes.from_first(record.get("iou", 0.0)))
                 losses.clear()
-            due = time.monotonic() - saved > 60 * config.save_minutes
+            due = time.monotonic() - saved > _SAVE_SECONDS
             if processes.is_first and (state.step % config.validation == 0 or finished or stopping or due):
                 state.seconds, saved = time.monotonic() - started, time.monotonic()
                 state.save(path)
@@ -183,7 +188,8 @@ def _new_network(config: TrainingConfig, form: RegressorConfig | None) -> Regres
     if not config.start:
         model = Regressor(form or config.regressor())
         if config.imagenet:
-            load_imagenet(model, _state_dict(Path(config.imagenet)))
+            assert isinstance(model.features, ResNet18)
+            model.features.load_imagenet(_state_dict(Path(config.imagenet)))
         return model
     model = checkpoint.load(config.start)
     model.config = replace(model.config, marks_hidden=model.config.marks_hidden or config.marks_hidden)

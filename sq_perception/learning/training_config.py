@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from sq_perception.files import plain_yaml
-from sq_perception.learning.choices import LOSSES, SIZE_RANGE, UNSUPERVISED, Backbone, Framing
+from sq_perception.learning.choices import LOSSES, UNSUPERVISED, Backbone, Framing
 
 if TYPE_CHECKING:
     from sq_perception.learning.dataset import ViewSource
@@ -53,8 +53,6 @@ class TrainingConfig:
     """What the network sees: cropped canonical views, or full frames of the unit cube as in the thesis."""
     pixels: int = 64
     """Side of the views: a multiple of 16 for compact, of 32 for resnet18; 256 in the thesis."""
-    largest: float = SIZE_RANGE[1]
-    """Largest half size a network for cropped views can express, in their sides; the thesis' bodies reach 0.8."""
     start: str = ""
     """A model file whose weights the network begins with; empty begins at random."""
     imagenet: str = ""
@@ -69,8 +67,6 @@ class TrainingConfig:
     """Share of bodies with proportions up to 1 : 6; the others are those of the thesis' protocol."""
     occluded_share: float = 0.0
     """Share of the views with an occluder before the body."""
-    most_hidden: float = 0.4
-    """Largest share of a body that an occluder hides."""
     noisy_share: float = 0.0
     """Share of the views with noise, steps, holes and wrong edges."""
     reuse: int = 4
@@ -81,14 +77,6 @@ class TrainingConfig:
     """Views a step, in each process."""
     points: int = 256
     """Comparison points a body: half close around it, half in twice its box."""
-    stride: int = 2
-    """Losses of the view take every stride-th row and column, from a random one on."""
-    free_space: float = 4.0
-    """Weight of the free space in least_squares_free."""
-    root: bool = True
-    """Whether least_squares_free is the root of its squares."""
-    density: float = 2.0
-    """Density n tau of the soft image in render, in units of s."""
     sharpness_start: float = 0.0
     """s at the start of the run: far basins first, fine fit last; 0 takes the loss's own value."""
     sharpness_end: float = 0.0
@@ -103,14 +91,10 @@ class TrainingConfig:
     """Steps over which the learning rate rises under the cosine schedule."""
     average: float = 0.999
     """The averaged weights keep this much of themselves at each step; they are what is validated and saved."""
-    clip: float = 1.0
-    """Largest norm of the gradient."""
     bfloat16: bool = True
     """Compute the network in bfloat16 where it is safe (automatic mixed precision)."""
     validation: int = 1000
     """Bodies in each validation set, and steps between validations."""
-    save_minutes: float = 5.0
-    """Longest time between two saved states."""
     seed: int = 1
     threads: int = 0
     """CPU threads of the network, and of the rendering of its views; 0 leaves both their own choice."""
@@ -121,12 +105,11 @@ class TrainingConfig:
         for name, choices in CHOICES.items():
             if getattr(self, name) not in choices:
                 raise ValueError(f"{name}: expected one of {', '.join(choices)}, got {getattr(self, name)!r}")
-        for name in ("steps", "batch", "points", "stride", "validation", "reuse"):
+        for name in ("steps", "batch", "points", "validation", "reuse"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}: expected at least 1, got {getattr(self, name)}")
-        for name in ("learning_rate", "clip", "density", "save_minutes"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}")
+        if not self.learning_rate > 0:
+            raise ValueError(f"learning_rate: expected a positive number, got {self.learning_rate}")
         if not 0 <= self.average < 1:
             raise ValueError(f"average: expected 0 to below 1, got {self.average}")
         if self.loss in UNSUPERVISED and (self.occluded_share or self.noisy_share):
@@ -141,22 +124,13 @@ class TrainingConfig:
         """What happens to the views."""
         from sq_perception.learning.disturbance import Disturbance
 
-        return Disturbance(self.occluded_share, self.most_hidden, self.noisy_share)
+        return Disturbance(self.occluded_share, self.noisy_share)
 
     def objective(self) -> Objective:
         """What is minimised."""
         from sq_perception.learning.objective import Objective
 
-        return Objective(
-            self.loss,
-            self.points,
-            self.sharpness_start,
-            self.sharpness_end,
-            self.stride,
-            self.density,
-            self.free_space,
-            self.root,
-        )
+        return Objective(self.loss, self.points, self.sharpness_start, self.sharpness_end)
 
     @property
     def marks_hidden(self) -> bool:
@@ -167,9 +141,7 @@ class TrainingConfig:
         """The network's form, unless ``start`` brings its own."""
         from sq_perception.learning.regressor import RegressorConfig
 
-        form = RegressorConfig.thesis()
-        if self.framing == "cropped":
-            form = RegressorConfig(size_range=(RegressorConfig().size_range[0], self.largest))
+        form = RegressorConfig() if self.framing == "cropped" else RegressorConfig.thesis()
         changes = {"backbone": self.backbone, "pixels": self.pixels, "marks_hidden": self.marks_hidden}
         return replace(form, **changes)  # type: ignore[arg-type]
 

@@ -1,4 +1,4 @@
-"""The axis of grids that canonical views are compared with."""
+"""Grids of the unit cube: what canonical views are compared with, and where the thesis compares occupancies."""
 
 from __future__ import annotations
 
@@ -8,3 +8,9 @@ import torch
 def cell_centres(resolution: int) -> torch.Tensor:
     """Centres of equal cells of [0, 1], as the pixels of a canonical view."""
     return (torch.arange(resolution, dtype=torch.float64) + 0.5) / resolution
+
+
+def grid(resolution: int) -> torch.Tensor:
+    """The thesis' grid of points (resolution^3, 3) in [0, 1]^3, ends included (chapter 6.3.3)."""
+    axis = torch.linspace(0, 1, resolution, dtype=torch.float64)
+    return torch.stack(torch.meshgrid(axis, axis, axis, indexing="ij"), dim=-1).reshape(-1, 3)

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 from safetensors.torch import load_file, save_file
+from unit_axis import grid
 
 from sq_perception.geometry import Superquadric
 from sq_perception.learning import checkpoint, losses
@@ -43,14 +44,14 @@ class TestOccupancyLoss:
 
     def test_zero_for_all_eight_forms(self) -> None:
         bodies = thesis_bodies(5, np.random.default_rng(0))
-        points = losses.grid(10, dtype=torch.float64)
+        points = grid(10)
         for form in bodies.equivalent_forms():
             assert losses.occupancy_loss(tensors(form), tensors(bodies), points, 10.0).max() < 1e-18
 
     def test_full_turn_has_the_period_of_the_body(self) -> None:
         """Figure 6.2: zero at 0, 180 and 360 degrees, largest at 90; about y (0.1 against 0.3) more than about x."""
         body = Superquadric(np.array([0.1, 0.2, 0.3]), np.ones(2), np.full(3, 0.5), np.array([0, 0, 0, 1.0]))
-        points = losses.grid(32, dtype=torch.float64)
+        points = grid(32)
         angles = np.deg2rad(np.arange(0, 361, 15))
         peaks = []
         for axis in np.eye(3):

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
-from unit_axis import cell_centres
+from unit_axis import cell_centres, grid
 
 from sq_perception.geometry import Superquadric
 from sq_perception.geometry import rotation as quaternions
@@ -41,17 +41,10 @@ class TestParameterLoss:
         truth = body(0.2, 0.3, 0.4, 0.5, 0.6, 0.5, 0.5, 0.5, *IDENTITY)
         guess = body(0.3, 0.3, 0.4, 0.5, 0.8, 0.5, 0.5, 0.5, 0.0, 0.0, 1.0, 0.0)
         assert losses.parameter_loss(guess, truth).item() == pytest.approx((0.1**2 + 0.2**2) / 8)
-        assert losses.parameter_loss(guess, truth, ["rotation"]).item() == pytest.approx(2 / 4)
-        assert losses.parameter_loss(guess, truth, losses.ALL_GROUPS).item() == pytest.approx((0.05 + 2) / 12)
-
-    def test_both_signs_of_a_quaternion_are_one_rotation(self) -> None:
-        truth = tensors(thesis_bodies(5, np.random.default_rng(0)))
-        opposite = Superquadric(truth.size, truth.shape, truth.translation, -truth.rotation)
-        assert losses.parameter_loss(opposite, truth, losses.ALL_GROUPS).max() == 0
 
 
 class TestDualLoss:
-    POINTS = losses.grid(24, dtype=DOUBLE)
+    POINTS = grid(24)
 
     def test_is_the_sum_of_its_parts_and_sees_each_parameter_in_one_of_them(self) -> None:
         truth, guess = (tensors(thesis_bodies(4, np.random.default_rng(seed))) for seed in (1, 2))
@@ -85,7 +78,7 @@ class TestDualLoss:
         """Figure 6.4: with the sizes given, the loss has a valley at a quarter turn from the truth that is not zero."""
         flat = [0.2, 0.25, 0.3, 0.1, 0.1, 0.5, 0.5, 0.5]
         angles = np.deg2rad(np.arange(0, 181, 10))
-        still, points = turned(0 * angles, [1, 0, 0], flat), losses.grid(40, dtype=DOUBLE)
+        still, points = turned(0 * angles, [1, 0, 0], flat), grid(40)
         curve = losses.rotation_loss(turned(angles, [1, 0, 0], flat), still, points, 20.0)
         valley = curve[7:12].min()
         assert valley > 0.02
