@@ -21,16 +21,15 @@ from matplotlib.figure import Figure
 from PIL import Image
 from scipy.optimize import linear_sum_assignment
 
+from sq_perception.evaluation.body_pictures import draw_bodies_3d, picture_axes
 from sq_perception.evaluation.plots import (
     INK,
     WIRE,
     colour,
-    draw_bodies_3d,
     draw_depth,
     draw_masks,
     draw_outlines,
     new_figure,
-    picture_axes,
     save,
 )
 from sq_perception.geometry import Superquadric

@@ -10,7 +10,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from sq_perception.evaluation.plots import recovery_figure
+    from sq_perception.evaluation.recovery_figure import recovery_figure
     from sq_perception.fitting.fit import Fit, Status
     from sq_perception.fitting.options import FitOptions
     from sq_perception.fitting.surface_fit import fit
@@ -56,7 +56,7 @@ _HOMES = {
     "Superquadric": "geometry.superquadric",
     "fit": "fitting.surface_fit",
     "read_frame": "recordings.frame_file:read",
-    "recovery_figure": "evaluation.plots",
+    "recovery_figure": "evaluation.recovery_figure",
     "render": "imaging.raycast",
     "write_mesh": "geometry.mesh:export",
 }

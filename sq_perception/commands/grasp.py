@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sq_perception.commands.console import FAILURE, SUCCESS, complain, misused, parser
+from sq_perception.commands.console import FAILURE, SUCCESS, complain, failed, misused, parser, positive
 from sq_perception.files import output_file
 
 if TYPE_CHECKING:
@@ -50,16 +49,15 @@ def main(arguments: Sequence[str]) -> int:
     command = parser("grasp", HELP, EPILOG)
     command.add_argument("frames", nargs="+", metavar="FRAME", help="recorded depth images, folders or bags of them")
     command.add_argument("--gripper", default="panda", help="panda, robotiq_2f_85 or robotiq_2f_140 (default panda)")
-    command.add_argument("--friction", type=float, help="between pads and things (default 0.5)")
+    command.add_argument("--friction", type=positive, help="between pads and things (default 0.5)")
     command.add_argument("--camera-info", metavar="FILE", help="the intrinsics of images, as for recover")
     command.add_argument("--json", metavar="OUT", help="write the grasps there; - is the standard output")
     command.add_argument("--pictures", metavar="DIR", help="draw a picture per frame into this folder")
     command.add_argument("--meshes", metavar="DIR", help="write bodies and best grasps of each frame as a GLB there")
-    return run(command.parse_args(arguments))
+    return _run(command.parse_args(arguments))
 
 
-def run(options: argparse.Namespace) -> int:
-    """Run the command; returns the exit code."""
+def _run(options: argparse.Namespace) -> int:
     from sq_perception.grasping import planner
     from sq_perception.grasping.gripper import gripper
 
@@ -72,9 +70,7 @@ def run(options: argparse.Namespace) -> int:
                 output_file.check_folder(folder)
     except (ValueError, OSError) as error:
         return misused(str(error))
-    friction = planner.FRICTION if options.friction is None else options.friction
-    if not 0 < friction < math.inf:
-        return misused(f"--friction: expected a positive number, got {friction}")
+    friction = options.friction or planner.FRICTION
 
     from sq_perception.learning.checkpoint import CheckpointError
     from sq_perception.recordings.frame_file import FrameError
@@ -85,8 +81,7 @@ def run(options: argparse.Namespace) -> int:
     try:
         recorded, recoverer = RecordedInput(options.frames, options.camera_info), Recoverer()
     except (FrameError, CheckpointError) as error:
-        complain(str(error))
-        return FAILURE
+        return failed(str(error))
     for file, frame in recorded:
         if isinstance(frame, FrameError):
             complain(str(frame))
@@ -96,16 +91,9 @@ def run(options: argparse.Namespace) -> int:
             code = FAILURE
         else:
             entries.append(_frame(file, frame, recoverer, hand, friction, options))
-    text = json.dumps(
-        {
-            "format": FORMAT,
-            "version": VERSION,
-            "options": {"gripper": hand.name, "friction": friction},
-            "frames": entries,
-        },
-        indent=1,
-        allow_nan=False,
-    )
+    chosen = {"gripper": hand.name, "friction": friction}
+    document = {"format": FORMAT, "version": VERSION, "options": chosen, "frames": entries}
+    text = json.dumps(document, indent=1, allow_nan=False)
     if options.json == "-":
         sys.stdout.write(f"{text}\n")
     elif options.json and entries:

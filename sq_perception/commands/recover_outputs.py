@@ -225,11 +225,12 @@ def _elsewhere(name: str, path: Path, found: Path) -> Iterator[str]:
 
 def _draw(path: Path, frame: RecordedFrame, recovery: FrameRecovery) -> None:
     """The picture of a frame."""
-    from sq_perception.evaluation import plots
+    from sq_perception.evaluation.plots import save
+    from sq_perception.evaluation.recovery_figure import recovery_figure
 
     unit = "of the cube" if frame.is_cube else "m"
     with output_file.writing(path) as partial:
-        plots.save(plots.recovery_figure(frame.depth, frame.camera, recovery, frame.name, unit), partial)
+        save(recovery_figure(frame.depth, frame.camera, recovery, frame.name, unit), partial)
 
 
 def _write_mesh(path: Path, frame: RecordedFrame, recovery: FrameRecovery) -> None:

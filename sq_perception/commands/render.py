@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sq_perception.commands.console import SUCCESS, complain, failed, misused, parser
+from sq_perception.commands.console import SUCCESS, complain, failed, misused, parser, target
 from sq_perception.files import output_file
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ def main(arguments: Sequence[str]) -> int:
     command = parser("render", _HELP, _EPILOG)
     for name in PARAMETERS:
         command.add_argument(name, type=float)
-    command.add_argument("--output", "-o", required=True, metavar="FILE", help=".png, .bmp or .npz")
+    command.add_argument("--output", "-o", type=target, required=True, metavar="FILE", help=".png, .bmp or .npz")
     command.add_argument("--projection", choices=("orthographic", "pinhole"), default="orthographic")
     command.add_argument("--width", type=int, help="pixels (256 orthographic, 640 pinhole)")
     command.add_argument("--height", type=int, help="pixels (as the width orthographic, 480 pinhole)")
@@ -61,16 +61,12 @@ def _plain_number(word: str) -> str:
 
 
 def _render(options: argparse.Namespace) -> int:
-    output = Path(options.output)
+    output: Path = options.output
     suffix = output.suffix.lower()
     pinhole = options.projection == "pinhole"
     if suffix not in ((".png", ".npz") if pinhole else (".png", ".bmp", ".npz")):
         kinds = ".png or .npz" if pinhole else ".png, .bmp or .npz"
         return misused(f"--output: {output.name}: an image of this projection is a {kinds}")
-    try:
-        output_file.check(output)
-    except OSError as error:
-        return misused(f"--output: {error}")
     if options.bits == 16 and (pinhole or suffix != ".png"):
         return misused("--bits: only orthographic PNGs have a choice")
 

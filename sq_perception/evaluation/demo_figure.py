@@ -12,12 +12,12 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from sq_perception.evaluation.body_pictures import draw_bodies_3d
 from sq_perception.evaluation.plots import (
     FAINT,
     INK,
     WIRE,
     colour,
-    draw_bodies_3d,
     draw_depth,
     draw_outlines,
     heading_of,

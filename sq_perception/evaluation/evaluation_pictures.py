@@ -14,13 +14,13 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from sq_perception.evaluation.body_pictures import draw_bodies_3d
 from sq_perception.evaluation.contest import Outcome
 from sq_perception.evaluation.figures_of_merit import GOOD_IOU
 from sq_perception.evaluation.plots import (
     FAINT,
     INK,
     WIRE,
-    draw_bodies_3d,
     draw_depth,
     heading_of,
     new_figure,

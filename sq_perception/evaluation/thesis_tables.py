@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from sq_perception.evaluation.figures_of_merit import Summary
 
@@ -45,59 +45,84 @@ class TableEntry:
 
 @dataclass(frozen=True)
 class _Row:
-    """A row of the thesis: its label, who answers it, and the thesis' cells."""
+    """A row of the thesis: its label, the loss of the networks that answer it, and the thesis' cells by column."""
 
     label: str
-    answered_by: Callable[[TableEntry], bool]
-    iou: str = ""
-    time: str = ""
-    errors: tuple[str, str, str] = ("", "", "")
+    loss: str
+    thesis: Mapping[str, str]
+
+    def is_answered_by(self, result: TableEntry) -> bool:
+        return result.loss == self.loss if self.loss else not result.loss and result.name == "classic"
 
 
-def _trained_by(loss: str) -> Callable[[TableEntry], bool]:
-    return lambda result: result.loss == loss
-
-
+_IOU, _TIME = "IoU", "Execution time [ms]"
+_ERRORS = ("ΔA", "ΔE", "ΔT")
+_SPREAD = ("min", "max", "over 85 %")
 _ITERATIVE = _Row(
     "Iterative (Solina and Bajcsy)",
-    lambda result: not result.loss and result.name == "classic",
-    "84.51 ± 8.89 %",
-    "690.52 ± 275.62",
-    ("-10.30 %", "+6.07 %", "(+0.00 %, +0.00 %, +1.56 %)"),
+    "",
+    {
+        _IOU: "84.51 ± 8.89 %",
+        _TIME: "690.52 ± 275.62",
+        **dict(zip(_ERRORS, ("-10.30 %", "+6.07 %", "(+0.00 %, +0.00 %, +1.56 %)"), strict=True)),
+    },
 )
 _OCCUPANCY = _Row(
     "supervised, L_OC",
-    _trained_by("occupancy"),
-    "94.62 ± 3.18 %",
-    "2.88 ± 0.92",
-    ("+0.14 %", "-0.36 %", "(+0.01 %, +0.01 %, -0.03 %)"),
+    "occupancy",
+    {
+        _IOU: "94.62 ± 3.18 %",
+        _TIME: "2.88 ± 0.92",
+        **dict(zip(_ERRORS, ("+0.14 %", "-0.36 %", "(+0.01 %, +0.01 %, -0.03 %)"), strict=True)),
+        **dict(zip(_SPREAD, ("52.71 %", "99.24 %", "99.06 %"), strict=True)),
+    },
 )
-_OCCUPANCY_7_4 = _Row(_OCCUPANCY.label, _OCCUPANCY.answered_by, _OCCUPANCY.iou, "2.82 ± 0.76")
+_OCCUPANCY_7_4 = replace(_OCCUPANCY, thesis={**_OCCUPANCY.thesis, _TIME: "2.82 ± 0.76"})
 _LEAST_SQUARES = _Row(
     "unsupervised, L_LS",
-    _trained_by("least_squares"),
-    "74.82 ± 14.50 %",
-    "2.83 ± 0.22",
-    ("+13.69 %", "-19.27 %", "(+0.41 %, -0.05 %, -2.67 %)"),
+    "least_squares",
+    {
+        _IOU: "74.82 ± 14.50 %",
+        _TIME: "2.83 ± 0.22",
+        **dict(zip(_ERRORS, ("+13.69 %", "-19.27 %", "(+0.41 %, -0.05 %, -2.67 %)"), strict=True)),
+    },
 )
 _RENDER = _Row(
     "unsupervised, L_DR",
-    _trained_by("render"),
-    "85.64 ± 5.72 %",
-    "2.77 ± 0.16",
-    ("+8.22 %", "+4.01 %", "(+0.76 %, -0.63 %, -0.12 %)"),
+    "render",
+    {
+        _IOU: "85.64 ± 5.72 %",
+        _TIME: "2.77 ± 0.16",
+        **dict(zip(_ERRORS, ("+8.22 %", "+4.01 %", "(+0.76 %, -0.63 %, -0.12 %)"), strict=True)),
+        "min": "44.18 %",
+        "max": "95.25 %",
+    },
 )
-_FREE_SPACE = _Row("unsupervised, L_LS and free space", _trained_by("least_squares_free"))
-_DUAL_6_1 = _Row("Model 1, L_DUAL", _trained_by("dual"), "62.76 ± 11.34 %")
-_OCCUPANCY_6_1 = _Row("Model 2, L_OC", _trained_by("occupancy"), "94.62 ± 3.18 %")
-_ROTATION = _Row("rotation alone, L_OC(q)", _trained_by("occupancy_rotation"), "75.02 %")
-
+_FREE_SPACE = _Row("unsupervised, L_LS and free space", "least_squares_free", {})
+_DUAL_6_1 = _Row("Model 1, L_DUAL", "dual", {_IOU: "62.76 ± 11.34 %"})
+_OCCUPANCY_6_1 = replace(_OCCUPANCY, label="Model 2, L_OC")
+_ROTATION = _Row("rotation alone, L_OC(q)", "occupancy_rotation", {_IOU: "75.02 %"})
 _UNSUPERVISED = (_LEAST_SQUARES, _RENDER, _FREE_SPACE)
 
-_DISTRIBUTIONS: Mapping[str, tuple[str, str, str]] = {
-    "supervised, L_OC": ("52.71 %", "99.24 %", "99.06 %"),
-    "unsupervised, L_DR": ("44.18 %", "95.25 %", ""),
+_COLUMNS: Mapping[str, Callable[[Summary], str]] = {
+    _IOU: lambda s: spread(s.iou_mean, s.iou_std),
+    "min": lambda s: percent(s.iou_min),
+    "median": lambda s: percent(s.iou_median),
+    "max": lambda s: percent(s.iou_max),
+    "over 85 %": lambda s: percent(s.over_85),
+    "volume IoU": lambda s: spread(s.volume_iou_mean, s.volume_iou_std),
+    "recovered": lambda s: f"{s.recovered} of {s.bodies}",
+    "ΔA": lambda s: signed(s.delta_a),
+    "ΔE": lambda s: signed(s.delta_e),
+    "ΔT": lambda s: f"({', '.join(signed(value) for value in s.delta_t)})",
+    "quarter turns": lambda s: percent(s.quarter_turns, 1),
+    "angle": lambda s: _degrees(s.symmetric_angle_median),
+    "axes in any order": lambda s: _degrees(s.any_order_angle_median),
+    "ms median / p95": lambda s: f"{s.milliseconds_median:.1f} / {s.milliseconds_p95:.1f}" if s.timed else "not timed",
+    _TIME: lambda s: f"{s.milliseconds_mean:.2f} ± {s.milliseconds_std:.2f}" if s.timed else "not timed",
+    "timed": lambda s: str(s.timed),
 }
+"""What a column says of a contestant, by its title."""
 
 
 def thesis_tables(results: Sequence[TableEntry]) -> list[Table]:
@@ -107,61 +132,34 @@ def thesis_tables(results: Sequence[TableEntry]) -> list[Table]:
         "Ours is the whole recovery of one image on this machine, from segmentation to score; the thesis' times of "
         "networks were measured on a GPU."
     )
+    iou, times = (_IOU,), (_IOU, _TIME)
     return [
-        _table("Table 6.1: networks of all 12 parameters, supervised", (_DUAL_6_1, _OCCUPANCY_6_1), results, _iou),
-        _table("Section 6.5.2: rotation alone, the other parameters given", (_ROTATION,), results, _iou,
+        _table("Table 6.1: networks of all 12 parameters, supervised", (_DUAL_6_1, _OCCUPANCY_6_1), results, iou),
+        _table("Section 6.5.2: rotation alone, the other parameters given", (_ROTATION,), results, iou,
                "A random rotation reaches about 58 % in the thesis."),
-        _table("Figures 6.6 and 7.7, in words: how IoU is distributed", (_OCCUPANCY, _RENDER), results, _distribution),
-        _table("Table 6.2: errors of each parameter group", (_ITERATIVE, _OCCUPANCY), results, _errors),
-        _table("Table 6.3: against the classic method", (_ITERATIVE, _OCCUPANCY), results, _iou_and_time, time),
-        _table("Table 7.1: errors under L_LS", (_LEAST_SQUARES,), results, _errors),
-        _table("Table 7.2: unsupervised networks", _UNSUPERVISED, results, _iou, own),
-        _table("Table 7.3: errors of all", (_ITERATIVE, _OCCUPANCY, *_UNSUPERVISED), results, _errors, own),
-        _table("Table 7.4: all in comparison", (_ITERATIVE, _OCCUPANCY_7_4, *_UNSUPERVISED), results, _iou_and_time,
+        _table("Figures 6.6 and 7.7, in words: how IoU is distributed", (_OCCUPANCY, _RENDER), results, _SPREAD),
+        _table("Table 6.2: errors of each parameter group", (_ITERATIVE, _OCCUPANCY), results, _ERRORS),
+        _table("Table 6.3: against the classic method", (_ITERATIVE, _OCCUPANCY), results, times, time),
+        _table("Table 7.1: errors under L_LS", (_LEAST_SQUARES,), results, _ERRORS),
+        _table("Table 7.2: unsupervised networks", _UNSUPERVISED, results, iou, own),
+        _table("Table 7.3: errors of all", (_ITERATIVE, _OCCUPANCY, *_UNSUPERVISED), results, _ERRORS, own),
+        _table("Table 7.4: all in comparison", (_ITERATIVE, _OCCUPANCY_7_4, *_UNSUPERVISED), results, times,
                f"{time} {own}"),
     ]  # fmt: skip
 
 
 def overview(results: Sequence[TableEntry]) -> list[Table]:
     """Every contestant: how well the bodies overlap, and what is wrong about them, with the time it took."""
-    accuracy, errors = [], []
-    for result in results:
-        s = result.summary
-        accuracy.append(
-            (
-                result.name,
-                spread(s.iou_mean, s.iou_std),
-                percent(s.iou_min),
-                percent(s.iou_median),
-                percent(s.iou_max),
-                percent(s.over_85),
-                spread(s.volume_iou_mean, s.volume_iou_std),
-                f"{s.recovered} of {s.bodies}",
-            )
-        )
-        errors.append(
-            (
-                result.name,
-                signed(s.delta_a),
-                signed(s.delta_e),
-                _triple(s.delta_t),
-                percent(s.quarter_turns, 1),
-                _degrees(s.symmetric_angle_median),
-                _degrees(s.any_order_angle_median),
-                f"{s.milliseconds_median:.1f} / {s.milliseconds_p95:.1f}" if s.timed else "not timed",
-                str(s.timed),
-            )
-        )
+
+    def listed(title: str, columns: Sequence[str], note: str = "") -> Table:
+        rows = tuple((one.name, *(_COLUMNS[name](one.summary) for name in columns)) for one in results)
+        return Table(title, ("Contestant", *columns), rows, note)
+
     return [
-        Table(
-            "All contestants: IoU",
-            ("Contestant", "IoU", "min", "median", "max", "over 85 %", "volume IoU", "recovered"),
-            tuple(accuracy),
-        ),
-        Table(
+        listed("All contestants: IoU", (_IOU, "min", "median", "max", "over 85 %", "volume IoU", "recovered")),
+        listed(
             "All contestants: errors, rotations and times",
-            ("Contestant", "ΔA", "ΔE", "ΔT", "quarter turns", "angle", "axes in any order", "ms median / p95", "timed"),
-            tuple(errors),
+            (*_ERRORS, "quarter turns", "angle", "axes in any order", "ms median / p95", "timed"),
             "Angles are medians, symmetries aside; times are those of one image by itself, on so many images.",
         ),
     ]
@@ -183,62 +181,23 @@ def spread(mean: float, deviation: float) -> str:
 
 
 def _table(
-    title: str,
-    rows: Sequence[_Row],
-    results: Sequence[TableEntry],
-    columns: Callable[[_Row, TableEntry | None], dict[str, str]],
-    note: str = "",
+    title: str, rows: Sequence[_Row], results: Sequence[TableEntry], columns: Sequence[str], note: str = ""
 ) -> Table:
+    """Our cells beside the thesis'."""
+    header = ["Method", "Contestant"]
+    for name in columns:
+        header += [name, f"{name}, thesis"]
     lines = []
-    header: tuple[str, ...] = ()
     for row in rows:
-        answers: list[TableEntry | None] = [result for result in results if row.answered_by(result)]
+        answers: list[TableEntry | None] = [result for result in results if row.is_answered_by(result)]
         for result in answers or [None]:
-            cells = {"Method": row.label, "Contestant": result.name if result else NOTHING, **columns(row, result)}
-            header = tuple(cells)
-            lines.append(tuple(cells.values()))
-    return Table(title, header, tuple(lines), note)
-
-
-def _iou(row: _Row, result: TableEntry | None) -> dict[str, str]:
-    s = result.summary if result else None
-    return {"IoU": spread(s.iou_mean, s.iou_std) if s else NOTHING, "IoU, thesis": row.iou or NOT_IN_THESIS}
-
-
-def _iou_and_time(row: _Row, result: TableEntry | None) -> dict[str, str]:
-    s = result.summary if result else None
-    time = NOTHING
-    if s:
-        time = f"{s.milliseconds_mean:.2f} ± {s.milliseconds_std:.2f}" if s.timed else "not timed"
-    return {
-        **_iou(row, result),
-        "Execution time [ms]": time,
-        "[ms], thesis": row.time or NOT_IN_THESIS,
-        "bodies, timed": f"{s.bodies}, {s.timed}" if s else NOTHING,
-    }
-
-
-def _errors(row: _Row, result: TableEntry | None) -> dict[str, str]:
-    s = result.summary if result else None
-    ours = (signed(s.delta_a), signed(s.delta_e), _triple(s.delta_t)) if s else (NOTHING,) * 3
-    cells = {}
-    for name, mine, theirs in zip(("ΔA", "ΔE", "ΔT"), ours, row.errors, strict=True):
-        cells[name], cells[f"{name}, thesis"] = mine, theirs or NOT_IN_THESIS
-    return cells
-
-
-def _distribution(row: _Row, result: TableEntry | None) -> dict[str, str]:
-    s = result.summary if result else None
-    ours = [percent(value) for value in (s.iou_min, s.iou_max, s.over_85)] if s else [NOTHING] * 3
-    cells = {}
-    for name, mine, theirs in zip(("least", "largest", "over 85 %"), ours, _DISTRIBUTIONS[row.label], strict=True):
-        cells[name], cells[f"{name}, thesis"] = mine, theirs or NOT_IN_THESIS
-    return cells
+            cells = [row.label, result.name if result else NOTHING]
+            for name in columns:
+                ours = _COLUMNS[name](result.summary) if result else NOTHING
+                cells += [ours, row.thesis.get(name, NOT_IN_THESIS)]
+            lines.append(tuple(cells))
+    return Table(title, tuple(header), tuple(lines), note)
 
 
 def _degrees(radians: float) -> str:
     return f"{math.degrees(radians):.1f}°" if math.isfinite(radians) else "unknown"
-
-
-def _triple(values: Sequence[float]) -> str:
-    return f"({', '.join(signed(value) for value in values)})"

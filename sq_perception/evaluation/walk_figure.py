@@ -16,6 +16,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from sq_perception.evaluation import plots
+from sq_perception.evaluation.body_pictures import draw_bodies_3d
 from sq_perception.evaluation.gradient_search import Subject, Walk
 
 _BODY = plots.colour(0)
@@ -44,7 +45,7 @@ def walk_figure(subject: Subject, found: Walk, step: int, title: str = "") -> Fi
     image.patch.set_facecolor(plots.NOTHING)
 
     space = figure.add_axes((0.325, 0.03, 0.305, 0.854))
-    plots.draw_bodies_3d(
+    draw_bodies_3d(
         space,
         [optical[step]],
         colours=[_BODY],

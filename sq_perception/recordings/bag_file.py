@@ -16,17 +16,14 @@ The camera is that of the sibling topic ``camera_info``, as image_transport pair
 stamp; failing that, the last one before the image; failing that, the bag's first, however late.  The name of their
 topic decides whether images are raw and have to be rectified (:mod:`sq_perception.imaging.calibration`).
 
-A bag may be damaged or hostile.  Its message definitions are not used: they would become Python code, and the three
-types read here are the same in every ROS 2.  What unpacks is bounded before it unpacks, and pixels are only allocated
-for data that is there.
-
-Reference: rosbags, https://ternaris.gitlab.io/rosbags; MCAP, https://mcap.dev/spec
+A bag may be damaged or hostile (:mod:`sq_perception.recordings.bag_reader`); pixels are only allocated for data that
+is there.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator
-from dataclasses import dataclass
+from contextlib import closing
 from itertools import islice
 from pathlib import Path
 from types import TracebackType
@@ -35,23 +32,16 @@ from typing import Any
 import numpy as np
 
 from sq_msgs_py import depth_image
-from sq_perception.files import plain_yaml
 from sq_perception.imaging import compressed_depth, unit_cube
 from sq_perception.imaging.calibration import Calibration, Treatment
 from sq_perception.imaging.camera import Projection
+from sq_perception.recordings.bag_reader import CAMERA_INFO, COMPRESSED, IMAGE, BagReader, Message, said
 from sq_perception.recordings.frame_file import MILLIMETRES, FrameError, Reading, RecordedFrame, Stamp
 
 SUFFIXES = (".mcap", ".db3")
-LARGEST = 2**29
-"""Bytes of one message, or of one unpacked chunk of messages."""
-
-_IMAGE, _COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
-_CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
 _MASKS = "/mask/image"
 _PEEKED = 10
 """Messages of a topic after which it shows no depth: the first ones may be damaged."""
-_ZSTD = b"\x28\xb5\x2f\xfd"
-"""What packed messages begin with; a plain one begins with the byte 0."""
 
 
 def is_bag(path: str | Path) -> bool:
@@ -123,7 +113,7 @@ class RecordedBag:
         self._orthographic = projection == "orthographic"
         self._every, self._limit = every, limit
         self._reading, self._is_done = reading or Reading(), is_done
-        self._reader, self._types = _open(self._path)
+        self._reader = BagReader(self._path)
         try:
             self.topic = self._chosen(topic)
         except BaseException:
@@ -147,7 +137,7 @@ class RecordedBag:
 
     def __len__(self) -> int:
         """Images that will be read, as the bag counts them; a damaged bag may count wrong."""
-        count = sum(max(0, one.msgcount) for one in self._connections((_IMAGE, _COMPRESSED), self.topic))
+        count = sum(max(0, one.msgcount) for one in self._reader.connections(IMAGE, COMPRESSED, topic=self.topic))
         count = -(-count // self._every)
         return count if self._limit is None else min(count, self._limit)
 
@@ -155,7 +145,7 @@ class RecordedBag:
         needs_info = self._camera_info is None and not self._orthographic
         try:
             latest = self._first_info() if needs_info else None
-            waiting: _Message | None = None
+            waiting: Message | None = None
             for message in self._selected(needs_info):
                 if isinstance(message, FrameError):
                     yield message
@@ -179,12 +169,9 @@ class RecordedBag:
 
     # topics
 
-    def _connections(self, kinds: tuple[str, ...], topic: str) -> list[Any]:
-        return [one for one in self._reader.connections if one.msgtype in kinds and one.topic == topic]
-
     def _chosen(self, wanted: str | None) -> str:
         """The topic that was asked for, or the one that shows depth."""
-        images = sorted({one.topic for one in self._reader.connections if one.msgtype in (_IMAGE, _COMPRESSED)})
+        images = sorted({one.topic for one in self._reader.connections(IMAGE, COMPRESSED)})
         encodings: dict[str, str | None] = {}
         damage: FrameError | None = None
         for topic in images:
@@ -212,7 +199,7 @@ class RecordedBag:
 
     def _encoding(self, topic: str) -> str | None:
         """Of the first readable image of a topic."""
-        for message in islice(self._messages(self._connections((_IMAGE, _COMPRESSED), topic)), _PEEKED):
+        for message in islice(self._reader.messages(self._reader.connections(IMAGE, COMPRESSED, topic=topic)), _PEEKED):
             if isinstance(message, FrameError):
                 continue
             if message.is_packed:
@@ -222,63 +209,26 @@ class RecordedBag:
 
     # messages
 
-    def _first_info(self) -> _Message | None:
-        infos = self._messages(self._connections((_CAMERA_INFO,), self._info_topic))
+    def _first_info(self) -> Message | None:
+        infos = self._reader.messages(self._reader.connections(CAMERA_INFO, topic=self._info_topic))
         return next((info for info in infos if not isinstance(info, FrameError)), None)
 
-    def _selected(self, with_infos: bool) -> Iterator[_Message | FrameError]:
+    def _selected(self, with_infos: bool) -> Iterator[Message | FrameError]:
         """The images that count, in between all camera_infos."""
-        connections = self._connections((_IMAGE, _COMPRESSED), self.topic)
+        connections = self._reader.connections(IMAGE, COMPRESSED, topic=self.topic)
         if with_infos:
-            connections += self._connections((_CAMERA_INFO,), self._info_topic)
-        yield from self._messages(connections, self._every, self._limit)
-
-    def _messages(
-        self, connections: list[Any], every: int = 1, limit: int | None = None
-    ) -> Iterator[_Message | FrameError]:
-        """Messages in the order they were recorded; of images every n-th, at most ``limit``."""
-        if not connections:  # which rosbags would take for all
-            return
-        stored = self._reader.messages(connections)
-        seen = taken = 0
-        while True:
-            try:
-                connection, nanoseconds, data = next(stored)
-            except StopIteration:
-                return
-            except Exception as error:  # whatever damaged indices, chunks and pages lead to
-                raise FrameError(f"{self._path}: cannot be read any further: {_said(error)}") from error
-            is_info = connection.msgtype == _CAMERA_INFO
-            if not is_info:
-                seen += 1
-                if (seen - 1) % every:
-                    continue
-                if limit is not None and taken == limit:
-                    return
-                taken += 1
-            try:
-                content: Any = self._types.deserialize_cdr(_plain(data), connection.msgtype)
-                stamp = Stamp(int(content.header.stamp.sec), int(content.header.stamp.nanosec))
-            except Exception as error:  # whatever damaged bytes lead to
-                recorded = Stamp(*divmod(nanoseconds, 10**9))
-                yield FrameError(
-                    f"{self._path}: {connection.topic} recorded at {recorded}: not a readable {connection.msgtype}: "
-                    f"{_said(error)}"
-                )
-                continue
-            yield _Message(content, stamp, nanoseconds, is_info, is_packed=connection.msgtype == _COMPRESSED)
+            connections += self._reader.connections(CAMERA_INFO, topic=self._info_topic)
+        yield from self._reader.messages(connections, self._every, self._limit)
 
     # frames
 
-    def _recorded_masks(self) -> Generator[_Message, None, None]:
+    def _recorded_masks(self) -> Generator[Message, None, None]:
         """The messages of the mask topic, in a reading of their own, as they come at any distance from their images."""
-        topics = {
-            one.topic for one in self._reader.connections if one.msgtype == _IMAGE and one.topic.endswith(_MASKS)
-        } - {self.topic}
+        topics = {one.topic for one in self._reader.connections(IMAGE) if one.topic.endswith(_MASKS)} - {self.topic}
         if len(topics) != 1:
             return
-        with RecordedBag(self._path, topics.pop()) as masks:
-            for message in masks._messages(masks._connections((_IMAGE,), masks.topic)):
+        with closing(BagReader(self._path)) as reader:
+            for message in reader.messages(reader.connections(IMAGE, topic=topics.pop())):
                 if not isinstance(message, FrameError):
                     yield message
 
@@ -296,16 +246,16 @@ class RecordedBag:
             raise ValueError(f"mask: expected labels of the depth's shape {image.shape}, got {labels.shape}")
         return labels
 
-    def _frame(self, message: _Message, info: _Message | None) -> Iterator[RecordedFrame | FrameError]:
+    def _frame(self, message: Message, info: Message | None) -> Iterator[RecordedFrame | FrameError]:
         """The frame of an image, unless it is done."""
         if self._is_done(message.stamp):
             return
         try:
             yield self._decoded(message, info)
         except (ValueError, MemoryError) as error:
-            yield FrameError(f"{self._path}: {self.topic} at {message.stamp}: {_said(error)}")
+            yield FrameError(f"{self._path}: {self.topic} at {message.stamp}: {said(error)}")
 
-    def _decoded(self, message: _Message, info: _Message | None) -> RecordedFrame:
+    def _decoded(self, message: Message, info: Message | None) -> RecordedFrame:
         warning = ""
         encoding = str(getattr(message.content, "encoding", ""))
         name, labels = f"{self._name}_{message.stamp}", None
@@ -342,7 +292,7 @@ class RecordedBag:
             )
         )
 
-    def _calibration(self, info: _Message | None, depth: np.ndarray) -> Calibration:
+    def _calibration(self, info: Message | None, depth: np.ndarray) -> Calibration:
         if self._camera_info is not None:
             given = self._camera_info
             known = given(depth.shape[1], depth.shape[0]) if callable(given) else given
@@ -350,92 +300,3 @@ class RecordedBag:
         if info is None:
             raise ValueError(f"no camera_info on {self._info_topic}: name the camera with --camera-info")
         return Calibration.of(info.content, self.topic, self._distortion)
-
-
-@dataclass(frozen=True, eq=False)
-class _Message:
-    """A message that could be read as what it claims to be; its fields may still hold anything."""
-
-    content: Any
-    stamp: Stamp
-    received: int
-    is_info: bool
-    is_packed: bool
-
-
-def _open(path: Path) -> tuple[Any, Any]:
-    """rosbags' reader of a bag, open, and its table of types."""
-    try:
-        import apsw
-        from rosbags import rosbag2
-        from rosbags.rosbag2 import storage_mcap, storage_sqlite3
-        from rosbags.typesys import Stores, get_typestore
-    except ImportError as error:
-        raise FrameError(
-            f"{path}: reading bags needs the module 'rosbags': pip install 'sq_perception[bags]'"
-        ) from error
-    storage_mcap.DECOMPRESSORS.update({"zstd": _unpacked, "lz4": _unpacked_lz4})
-    if path.is_dir():
-        _refuse_packed_files(path)
-    try:
-        reader = rosbag2.Reader(path)
-        reader.open()
-    except Exception as error:  # whatever damaged files lead to
-        raise FrameError(f"{path}: not a readable bag: {_said(error)}") from error
-    storages: list[Any] = [reader.storage]
-    if isinstance(reader.storage, rosbag2.reader.DirectoryReader):
-        # Messages packed one by one would be unpacked without a bound; so they come as they are, for _plain.
-        reader.storage.metadata = reader.storage.metadata._replace(compression_mode=None)
-        storages = reader.storage.storages
-    for storage in storages:
-        if isinstance(storage, storage_sqlite3.Sqlite3Reader) and storage.dbconn is not None:
-            storage.dbconn.limit(apsw.SQLITE_LIMIT_LENGTH, LARGEST)
-    return reader, get_typestore(Stores.ROS2_JAZZY)
-
-
-def _refuse_packed_files(folder: Path) -> None:
-    """rosbags would unpack a bag that was packed as a whole into a temporary folder, whatever its size."""
-    try:
-        document = plain_yaml.read(folder / "metadata.yaml")
-    except plain_yaml.YamlError as error:
-        raise FrameError(f"{folder}: metadata.yaml: {_said(error)}") from error
-    information = document.get("rosbag2_bagfile_information") if isinstance(document, dict) else None
-    if not isinstance(information, dict):
-        raise FrameError(f"{folder}: metadata.yaml: expected rosbag2_bagfile_information")
-    if str(information.get("compression_mode", "")).lower() == "file":
-        raise FrameError(f"{folder}: packed as whole files: unpack them (zstd -d) and name the .mcap or .db3 file")
-
-
-def _plain(data: bytes) -> bytes:
-    """A message's bytes, unpacked where it was packed by itself."""
-    return _unpacked(data, LARGEST) if bytes(data[:4]) == _ZSTD else data
-
-
-def _unpacked(data: bytes, size: int) -> bytes:
-    """zstd, never more than ``size`` bytes: a megabyte can claim to be 32 GB."""
-    try:
-        from compression import zstd  # Python 3.14
-    except ImportError:
-        from backports import zstd
-    return _bounded(zstd.ZstdDecompressor(), data, size)
-
-
-def _unpacked_lz4(data: bytes, size: int) -> bytes:
-    from lz4.frame import LZ4FrameDecompressor
-
-    return _bounded(LZ4FrameDecompressor(), data, size)
-
-
-def _bounded(decompressor: Any, data: bytes, size: int) -> bytes:
-    if size > LARGEST:
-        raise ValueError(f"expected at most {LARGEST} bytes unpacked, {size} are announced")
-    unpacked: bytes = decompressor.decompress(data, max_length=size + 1)
-    if len(unpacked) > size or not decompressor.eof:
-        raise ValueError(f"expected at most {size} bytes unpacked and a whole stream")
-    return unpacked
-
-
-def _said(error: Exception) -> str:
-    """An error's message in one line, with its kind where it says nothing by itself."""
-    text = " ".join(str(error).split())[:300]
-    return text if isinstance(error, ValueError) and text else f"{type(error).__name__}: {text}".rstrip(": ")

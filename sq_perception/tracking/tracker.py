@@ -60,8 +60,6 @@ FORGET_POSE_AFTER, FORGET_AFTER = 5.0, 30.0
 """Seconds without observation until a body may be anywhere within reach, and until it is given up.  Chosen."""
 MOST = 100
 """Tracks that are kept; beyond them those die first that were not observed for longest.  Bounds the time of a frame."""
-_EXPECTED_SHARE = 0.5
-"""Of the near side that is seen through: the greater part."""
 _RESTART = 3.0
 """A restarted pose is unsure by this many times the displacement.  Chosen."""
 _MOTION_SHARE = 0.5
@@ -166,7 +164,7 @@ class Tracker:
         self._predict(stamp)
         self._stamp = stamp
 
-        expected = partial(_expected, camera=camera, depth=depth, rotation=rotation, position=position)
+        expected = partial(sight.expected, camera=camera, depth=depth, rotation=rotation, position=position)
         pairs, missing = self._pairs(observed, covariance, stamp, expected)
         to_camera = _towards(observed[:, 5:8], rotation, position, orthographic)
         taken = set(pairs.observed.tolist())
@@ -222,7 +220,7 @@ class Tracker:
         observed: np.ndarray,
         covariance: np.ndarray,
         stamp: float,
-        expected: Callable[[list[_Body]], list[bool]],
+        expected: Callable[[np.ndarray], np.ndarray],
     ) -> tuple[Pairs, set[int]]:
         """In place first, then what was moved; and the ids of tracks that should have been in place and were not."""
         if not self._bodies:
@@ -232,7 +230,7 @@ class Tracker:
         here = association.in_place(states, covariances, observed, covariance)
         left = np.setdiff1d(np.arange(len(states)), here.track)
         new = np.setdiff1d(np.arange(len(observed)), here.observed)
-        open_place = expected([self._bodies[k] for k in left])
+        open_place = expected(states[left])
         missing = {self._bodies[k].id for k, visible in zip(left, open_place, strict=True) if visible}
         # What is hidden has rather stayed where it was than become one more body of its kind far away.
         free = np.array([visible or self._bodies[k].is_moving for k, visible in zip(left, open_place, strict=True)])
@@ -370,18 +368,6 @@ class Tracker:
     @staticmethod
     def _stacked(some: list[_Body]) -> tuple[np.ndarray, np.ndarray]:
         return np.array([one.state for one in some]), np.array([one.covariance for one in some])
-
-
-def _expected(
-    unseen: list[_Body], camera: Camera | None, depth: np.ndarray | None, rotation: np.ndarray, position: np.ndarray
-) -> list[bool]:
-    """Whether tracks without observation should have been seen, by what is known of the frame."""
-    if camera is None or depth is None or not unseen:
-        return [True] * len(unseen)
-    back = quaternions.conjugate(rotation)
-    home = -quaternions.to_matrix(back) @ position
-    places = state.bodies(np.array([one.state for one in unseen])).transformed(back, home)
-    return [bool(visible) for visible in sight.open_share(places, camera, depth) >= _EXPECTED_SHARE]
 
 
 def _published(one: _Body) -> Track:

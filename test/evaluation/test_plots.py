@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from sq_perception.evaluation import plots
+from sq_perception.evaluation.body_pictures import draw_bodies_3d
+from sq_perception.evaluation.recovery_figure import recovery_figure
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast, unit_cube
 from sq_perception.imaging.camera import Camera
@@ -68,7 +70,7 @@ def test_a_view_from_the_camera_s_side_looks_like_the_image():
     def middle(azimuth):
         figure = plots.new_figure(4, 4)
         ax = figure.add_axes((0, 0, 1, 1))
-        plots.draw_bodies_3d(ax, [left, right], colours=[red, blue], elevation=0, azimuth=azimuth)
+        draw_bodies_3d(ax, [left, right], colours=[red, blue], elevation=0, azimuth=azimuth)
         picture = drawn(figure)
         difference = picture[..., 0] - picture[..., 2]
         return np.nonzero(difference > 60)[1], np.nonzero(difference < -60)[1]
@@ -85,10 +87,10 @@ def test_figures_of_full_and_empty_frames(tmp_path):
     depth, labels = shot()
     recoverer = Recoverer(method="symmetry")
     found = recoverer.recover(depth, CAMERA, labels)
-    full = cv2.imread(str(plots.save(plots.recovery_figure(depth, CAMERA, found, "one"), tmp_path / "one.png")))
+    full = cv2.imread(str(plots.save(recovery_figure(depth, CAMERA, found, "one"), tmp_path / "one.png")))
     nothing = np.full_like(depth, np.nan)
     empty_frame = recoverer.recover(nothing, CAMERA)
-    empty = cv2.imread(str(plots.save(plots.recovery_figure(nothing, CAMERA, empty_frame), tmp_path / "none.png")))
+    empty = cv2.imread(str(plots.save(recovery_figure(nothing, CAMERA, empty_frame), tmp_path / "none.png")))
     assert full.shape == empty.shape
     assert full.std() > 20
 
@@ -98,10 +100,10 @@ def test_draw_on_a_plane_with_points_and_true_wires():
     ax = figure.add_axes((0, 0, 1, 1))
     depth, labels = shot()
     v, u = np.nonzero(labels)
-    plots.draw_bodies_3d(ax, [BODY], [CAMERA.unproject(u, v, depth[v, u])], PLANE, wires=[BODY])
+    draw_bodies_3d(ax, [BODY], [CAMERA.unproject(u, v, depth[v, u])], PLANE, wires=[BODY])
     assert drawn(figure).std() > 20
     empty = plots.new_figure(2, 2)
-    plots.draw_bodies_3d(empty.add_axes((0, 0, 1, 1)), [])
+    draw_bodies_3d(empty.add_axes((0, 0, 1, 1)), [])
     assert drawn(empty).min() == 255
 
 

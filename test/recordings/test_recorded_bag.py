@@ -27,7 +27,7 @@ from sq_perception.imaging import compressed_depth, raycast, unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.distortion import Distortion
 from sq_perception.imaging.rectification import Rectification
-from sq_perception.recordings import bag_file
+from sq_perception.recordings import bag_file, bag_reader
 from sq_perception.recordings.bag_file import RecordedBag
 from sq_perception.recordings.frame_file import FrameError, RecordedFrame, Stamp
 
@@ -379,7 +379,7 @@ def test_bombs_do_not_unpack():
     import lz4.frame
 
     zeros = bytes(2**26)
-    for unpack, pack in ((bag_file._unpacked, zstd.compress), (bag_file._unpacked_lz4, lz4.frame.compress)):
+    for unpack, pack in ((bag_reader._unpacked, zstd.compress), (bag_reader._unpacked_lz4, lz4.frame.compress)):
         bomb = pack(zeros)
         assert unpack(bomb, 2**26) == zeros
         tracemalloc.start()
@@ -530,6 +530,6 @@ def test_a_database_cannot_make_up_large_messages(tmp_path, grey):
     bag = write(tmp_path / "bag", [(INFO, 1, info(1)), (TOPIC, 1, image(grey, 1, "16UC1"))], StoragePlugin.SQLITE3)
     with sqlite3.connect(lone(bag)) as database:
         database.execute("ALTER TABLE messages RENAME COLUMN data TO stored")
-        database.execute(f"ALTER TABLE messages ADD COLUMN data AS (zeroblob({bag_file.LARGEST + 1}))")
+        database.execute(f"ALTER TABLE messages ADD COLUMN data AS (zeroblob({bag_reader.LARGEST + 1}))")
     with pytest.raises(FrameError, match="TooBig"):
         RecordedBag(bag)

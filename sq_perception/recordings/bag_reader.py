@@ -1,0 +1,164 @@
+"""The messages of a rosbag2 recording, by rosbags: bounded whatever the file claims, and errors in their place.
+
+A bag may be damaged or hostile.  Its message definitions are not used: they would become Python code, and the types
+read here are the same in every ROS 2.  What unpacks is bounded before it unpacks.
+
+Reference: rosbags, https://ternaris.gitlab.io/rosbags; MCAP, https://mcap.dev/spec
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from sq_perception.files import plain_yaml
+from sq_perception.recordings.frame_file import FrameError, Stamp
+
+LARGEST = 2**29
+"""Bytes of one message, or of one unpacked chunk of messages."""
+IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
+CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+_ZSTD = b"\x28\xb5\x2f\xfd"
+"""What packed messages begin with; a plain one begins with the byte 0."""
+
+
+@dataclass(frozen=True, eq=False)
+class Message:
+    """A message that could be read as what it claims to be; its fields may still hold anything."""
+
+    content: Any
+    stamp: Stamp
+    received: int
+    is_info: bool
+    is_packed: bool
+
+
+class BagReader:
+    """An open bag; raises FrameError if it cannot be read."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._reader, self._types = _open(path)
+
+    def close(self) -> None:
+        """Close the files."""
+        self._reader.close()
+
+    def connections(self, *kinds: str, topic: str | None = None) -> list[Any]:
+        """rosbags' connections of these types, of one topic or of all."""
+        return [one for one in self._reader.connections if one.msgtype in kinds and topic in (None, one.topic)]
+
+    def messages(
+        self, connections: list[Any], every: int = 1, limit: int | None = None
+    ) -> Iterator[Message | FrameError]:
+        """Messages in the order they were recorded; of images every n-th, at most ``limit``."""
+        if not connections:  # which rosbags would take for all
+            return
+        stored = self._reader.messages(connections)
+        seen = taken = 0
+        while True:
+            try:
+                connection, nanoseconds, data = next(stored)
+            except StopIteration:
+                return
+            except Exception as error:  # whatever damaged indices, chunks and pages lead to
+                raise FrameError(f"{self.path}: cannot be read any further: {said(error)}") from error
+            is_info = connection.msgtype == CAMERA_INFO
+            if not is_info:
+                seen += 1
+                if (seen - 1) % every:
+                    continue
+                if limit is not None and taken == limit:
+                    return
+                taken += 1
+            try:
+                content: Any = self._types.deserialize_cdr(_plain(data), connection.msgtype)
+                stamp = Stamp(int(content.header.stamp.sec), int(content.header.stamp.nanosec))
+            except Exception as error:  # whatever damaged bytes lead to
+                recorded = Stamp(*divmod(nanoseconds, 10**9))
+                yield FrameError(
+                    f"{self.path}: {connection.topic} recorded at {recorded}: not a readable {connection.msgtype}: "
+                    f"{said(error)}"
+                )
+                continue
+            yield Message(content, stamp, nanoseconds, is_info, is_packed=connection.msgtype == COMPRESSED)
+
+
+def _open(path: Path) -> tuple[Any, Any]:
+    """rosbags' reader of a bag, open, and its table of types."""
+    try:
+        import apsw
+        from rosbags import rosbag2
+        from rosbags.rosbag2 import storage_mcap, storage_sqlite3
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        raise FrameError(
+            f"{path}: reading bags needs the module 'rosbags': pip install 'sq_perception[bags]'"
+        ) from error
+    storage_mcap.DECOMPRESSORS.update({"zstd": _unpacked, "lz4": _unpacked_lz4})
+    if path.is_dir():
+        _refuse_packed_files(path)
+    try:
+        reader = rosbag2.Reader(path)
+        reader.open()
+    except Exception as error:  # whatever damaged files lead to
+        raise FrameError(f"{path}: not a readable bag: {said(error)}") from error
+    storages: list[Any] = [reader.storage]
+    if isinstance(reader.storage, rosbag2.reader.DirectoryReader):
+        # Messages packed one by one would be unpacked without a bound; so they come as they are, for _plain.
+        reader.storage.metadata = reader.storage.metadata._replace(compression_mode=None)
+        storages = reader.storage.storages
+    for storage in storages:
+        if isinstance(storage, storage_sqlite3.Sqlite3Reader) and storage.dbconn is not None:
+            storage.dbconn.limit(apsw.SQLITE_LIMIT_LENGTH, LARGEST)
+    return reader, get_typestore(Stores.ROS2_JAZZY)
+
+
+def _refuse_packed_files(folder: Path) -> None:
+    """rosbags would unpack a bag that was packed as a whole into a temporary folder, whatever its size."""
+    try:
+        document = plain_yaml.read(folder / "metadata.yaml")
+    except plain_yaml.YamlError as error:
+        raise FrameError(f"{folder}: metadata.yaml: {said(error)}") from error
+    information = document.get("rosbag2_bagfile_information") if isinstance(document, dict) else None
+    if not isinstance(information, dict):
+        raise FrameError(f"{folder}: metadata.yaml: expected rosbag2_bagfile_information")
+    if str(information.get("compression_mode", "")).lower() == "file":
+        raise FrameError(f"{folder}: packed as whole files: unpack them (zstd -d) and name the .mcap or .db3 file")
+
+
+def _plain(data: bytes) -> bytes:
+    """A message's bytes, unpacked where it was packed by itself."""
+    return _unpacked(data, LARGEST) if bytes(data[:4]) == _ZSTD else data
+
+
+def _unpacked(data: bytes, size: int) -> bytes:
+    """zstd, never more than ``size`` bytes: a megabyte can claim to be 32 GB."""
+    try:
+        from compression import zstd  # Python 3.14
+    except ImportError:
+        from backports import zstd
+    return _bounded(zstd.ZstdDecompressor(), data, size)
+
+
+def _unpacked_lz4(data: bytes, size: int) -> bytes:
+    from lz4.frame import LZ4FrameDecompressor
+
+    return _bounded(LZ4FrameDecompressor(), data, size)
+
+
+def _bounded(decompressor: Any, data: bytes, size: int) -> bytes:
+    if size > LARGEST:
+        raise ValueError(f"expected at most {LARGEST} bytes unpacked, {size} are announced")
+    unpacked: bytes = decompressor.decompress(data, max_length=size + 1)
+    if len(unpacked) > size or not decompressor.eof:
+        raise ValueError(f"expected at most {size} bytes unpacked and a whole stream")
+    return unpacked
+
+
+def said(error: Exception) -> str:
+    """An error's message in one line, with its kind where it says nothing by itself."""
+    text = " ".join(str(error).split())[:300]
+    return text if isinstance(error, ValueError) and text else f"{type(error).__name__}: {text}".rstrip(": ")
