@@ -114,6 +114,20 @@ def test_a_body_that_is_found_elsewhere_keeps_the_names_of_its_axes(turn, rng):
     assert angle_between(found.superquadric, last.superquadric) < 0.3
 
 
+@pytest.mark.parametrize(("deviation", "shown"), [(0.6, 0.0), (0.1, 0.7)])
+def test_a_turn_that_the_image_leaves_open_is_that_of_the_track(deviation, shown):
+    """0.7 radians about the axis of a can: chance where the fit says that it knows no better, and else a hand."""
+    truth, one = body((0.04, 0.04, 0.03), (0.2, 0.95)), TrackingSession()
+    covariance = noise(turn=0.01)
+    one.follow([Seen(truth, state.from_log(covariance, truth.size))], 0.0)
+    error = np.zeros(11)
+    error[10], covariance[10, 10] = 0.7, deviation**2
+    turned = Superquadric.from_flat(state.moved(truth.to_flat(), error))
+    (found,) = one.follow([Seen(turned, state.from_log(covariance, truth.size))], 0.1, is_pose_known=False)
+    assert angle_between(found.superquadric, truth) == pytest.approx(shown, abs=0.02)
+    np.testing.assert_allclose(found.superquadric.size, truth.size)
+
+
 @pytest.mark.parametrize("height", [0.03, 0.06])
 def test_a_can_that_is_tipped_over_stays_a_can(height, rng):
     """Sizes and exponents are those of the track about another axis: it has been turned, and is shown as it is."""
