@@ -51,8 +51,14 @@ exr = [
 cluster = [
     "distributed>=2024.5",  # `recover --cluster` hands frames to a running Dask cluster; 36 MB with what it needs
 ]
+torch = "torch==2.13.0"  # an open range may fetch several GB
 train = [
+    torch,  # training, graphics cards, ResNet-18 and the soft renderer
     "tensorboard>=2.14",  # curves of a running training
+]
+export = [
+    torch,
+    "onnx>=1.16",  # the network as a graph for other runtimes
 ]
 picking = [
     "mujoco==3.3.7",  # the physics of benchmarks/picking.py; another release, another physics
@@ -97,11 +103,6 @@ setup(
         "numba>=0.60",  # ray casting and residuals, compiled
         "opencv-python-headless>=4.8",  # images and contours
         "trimesh>=4",  # meshes and GLB
-        "torch==2.13.0",  # the network; an open range may fetch several GB
-        "onnx>=1.16",  # the network as a graph for other runtimes
-        # Computes that graph in half of torch's time for a single view.  Its wheels send telemetry from 1.29 on unless
-        # they are told not to (learning/onnx_export.py); a newer one has to be looked at before it is let in.
-        "onnxruntime>=1.18,<1.32",
         "safetensors>=0.4",  # weights that cannot carry code
         "array-api-compat>=1.9",  # one geometry for NumPy and torch
         "threadpoolctl>=3",  # keeps BLAS from threading products of 2000 x 3, which took the second core from the fits
@@ -118,6 +119,7 @@ setup(
         "exr": exr,
         "train": train,
         "view": view,
+        "export": export,
         "picking": picking,
         "docs": docs,
         "test": [
@@ -126,10 +128,14 @@ setup(
             *exr,
             *train,
             *view,
+            *export,
             *picking,
             *docs,
             "pytest>=7,<8.4",  # later ones break the launch_testing plugins of a ROS installation
             "hypothesis>=6",
+            # Reads exported graphs.  Its wheels send telemetry from 1.29 on unless ORT_DISABLE_TELEMETRY=1 is set; a
+            # newer one has to be looked at before it is let in.
+            "onnxruntime>=1.18,<1.32",
             "jsonschema>=4.18",  # what recover writes against its schema
             "mcap-ros2-support>=0.5",  # reads bags independently of the code that wrote them
             "ruff>=0.6",

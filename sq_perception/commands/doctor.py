@@ -20,7 +20,8 @@ _EXTRAS = {
     "bags": ("rosbags", "mcap"),
     "view": ("viser",),
     "exr": ("OpenEXR",),
-    "train": ("tensorboard",),
+    "train": ("torch", "tensorboard"),
+    "export": ("torch", "onnx"),
     "ros": ("rclpy", "sensor_msgs", "visualization_msgs"),
 }
 """What tells that an extra is there."""

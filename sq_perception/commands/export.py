@@ -19,12 +19,15 @@ def main(arguments: Sequence[str]) -> int:
     options = command.parse_args(arguments)
 
     from sq_perception.learning import checkpoint
-    from sq_perception.learning.onnx_export import MissingPackageError, build
 
     path = checkpoint.resolve(options.model)
     try:
+        from sq_perception.learning.onnx_export import build
+
         content = build(checkpoint.load(path), checkpoint.read_header(path)).SerializeToString()
         output_file.write(options.output, content)
-    except (MissingPackageError, checkpoint.CheckpointError, OSError) as error:
+    except ModuleNotFoundError as error:
+        return failed(f"export needs the module {error.name!r}: pip install 'sq_perception[export]'")
+    except (checkpoint.CheckpointError, OSError) as error:
         return failed(f"export: {error}")
     return SUCCESS

@@ -16,6 +16,7 @@ from collections.abc import Sequence
 
 from sq_perception import __version__
 from sq_perception.commands.console import FAILURE, INTERRUPTED, SUCCESS, USAGE, complain
+from sq_perception.learning.choices import NEEDS_TORCH
 
 COMMANDS = {
     "recover": ("sq_perception.commands.recover", "depth images in, superquadrics out"),
@@ -66,6 +67,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         complain("interrupted")
         return INTERRUPTED
+    except ModuleNotFoundError as error:
+        if error.name is None or error.name.partition(".")[0] != "torch":
+            raise
+        complain(f"{given[0]} {NEEDS_TORCH}")
+        return FAILURE
     except BrokenPipeError:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return FAILURE

@@ -221,8 +221,6 @@ def _run(options: argparse.Namespace) -> int:
     if options.verbose:
         logging.basicConfig(level=logging.INFO, format="sq-perception: %(message)s")
 
-    import torch
-
     from sq_perception.commands.recover_lines import lines
     from sq_perception.commands.recover_run import RecoverRun
     from sq_perception.learning import checkpoint
@@ -233,7 +231,6 @@ def _run(options: argparse.Namespace) -> int:
     from sq_perception.recovery.options import NEEDS_NETWORK
     from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
 
-    torch.set_num_threads(1)  # the network's layers are so small that threads cost more than they save
     done = Recovered()
     try:
         settings = RecoveryOptions(

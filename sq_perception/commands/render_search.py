@@ -23,7 +23,7 @@ def main(arguments: Sequence[str]) -> int:
     import numpy as np
 
     from sq_perception.evaluation import plots, render_search
-    from sq_perception.imaging.soft_render import THESIS_SHARPNESS, THESIS_TAU
+    from sq_perception.imaging.soft_agreement import THESIS_SHARPNESS, THESIS_TAU
     from sq_perception.simulation.scenes import thesis_bodies
 
     bodies = thesis_bodies(options.bodies, np.random.default_rng(options.seed))

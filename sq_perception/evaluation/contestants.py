@@ -86,13 +86,12 @@ class Network:
         CheckpointError
             If the file is missing, damaged or of another kind, or its header names a loss that is not known.
         """
-        model = checkpoint.load(path)
+        predictor = inference.load(path)
         header = checkpoint.read_header(path)
         training, found = (_note(header, key, path) for key in ("training", "metrics"))
         if training.get("loss", LOSSES[0]) not in LOSSES:
             raise checkpoint.CheckpointError(f"{path}: the header names an unknown loss: {training['loss']!r}")
         recoverer = Recoverer(path, method="network", consensus=consensus)
-        predictor = inference.prepare(model)
         return cls(
             name or default_name(path),
             path,

@@ -29,8 +29,8 @@ from sq_perception.geometry.superquadric import FLAT_LENGTH, Superquadric
 from sq_perception.imaging import canonical_view, raycast, unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.canonical_view import CanonicalView
+from sq_perception.learning.network_config import RegressorConfig
 from sq_perception.learning.objective import Objective
-from sq_perception.learning.regressor import RegressorConfig
 from sq_perception.segmentation import segments
 from sq_perception.simulation.scenes import thesis_bodies
 

@@ -22,7 +22,7 @@ from matplotlib.figure import Figure
 
 from sq_perception.evaluation import plots
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.imaging import raycast, soft_render, unit_cube
+from sq_perception.imaging import raycast, soft_agreement, soft_render, unit_cube
 
 SHARPNESS = (10.0, 1000.0)
 TAU = (0.25, 32.0)
@@ -78,7 +78,7 @@ def draw(ax: Axes, found: RenderSearch) -> None:
     bar.set_label("MAE, sides of the cube")
     s, tau, error = found.best
     ax.plot(tau, s, "o", color="white", label=f"least {error:.4f}: s = {s:.1f}, tau = {tau:.2f}")
-    ax.plot(soft_render.THESIS_TAU, soft_render.THESIS_SHARPNESS, "x", color="white", label="thesis: 117.3, 4.82")
+    ax.plot(soft_agreement.THESIS_TAU, soft_agreement.THESIS_SHARPNESS, "x", color="white", label="thesis: 117.3, 4.82")
     ax.set(xscale="log", yscale="log", xlabel="tau", ylabel="s", title="Soft against exact images")
     ax.legend(loc="lower right", facecolor=plots.INK, labelcolor="white", fontsize=8)
 

@@ -23,7 +23,7 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast, unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.canonical_view import CanonicalView
-from sq_perception.learning.regressor import RegressorConfig
+from sq_perception.learning.network_config import RegressorConfig
 from sq_perception.segmentation import segments
 from sq_perception.simulation.scenes import thesis_bodies
 

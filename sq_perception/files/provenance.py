@@ -11,7 +11,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-PACKAGES = ("sq-perception", "numpy", "numba", "torch", "onnxruntime", "ros-jazzy-rclpy")
+PACKAGES = ("sq-perception", "numpy", "numba", "torch", "ros-jazzy-rclpy")
 
 
 def facts(command: str, file: str | Path = __file__, packages: Sequence[str] = PACKAGES) -> dict[str, Any]:

@@ -20,7 +20,7 @@ import torch
 from sq_perception.fitting.bounds import Bounds
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.imaging import soft_render
+from sq_perception.imaging import soft_agreement, soft_render
 
 _GRID = 48
 """Pixels and voxels a side: 2 % of the cube, in 40 % of the time of the thesis' 64."""
@@ -33,8 +33,8 @@ _STEP = 0.02
 def refine(
     view: np.ndarray,
     start: Superquadric,
-    sharpness: float = soft_render.THESIS_SHARPNESS,
-    tau: float = soft_render.THESIS_TAU,
+    sharpness: float = soft_agreement.THESIS_SHARPNESS,
+    tau: float = soft_agreement.THESIS_TAU,
     *,
     iterations: int = 60,
     bounds: Bounds | None = None,

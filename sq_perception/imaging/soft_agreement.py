@@ -17,6 +17,9 @@ import numpy as np
 
 from sq_perception.geometry.kernels import box_interval, gauge, kernel
 
+THESIS_SHARPNESS = 117.3
+"""s."""
+THESIS_TAU = 4.82
 _NEGLIGIBLE = 30.0
 
 

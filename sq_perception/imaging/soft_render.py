@@ -23,9 +23,6 @@ import torch
 
 from sq_perception.geometry.superquadric import Superquadric
 
-THESIS_SHARPNESS = 117.3
-THESIS_TAU = 4.82
-
 
 def grid_points(resolution: int) -> torch.Tensor:
     """Points (resolution,) of [0, 1], ends included: an axis of the thesis' grid and of its images."""

@@ -71,7 +71,6 @@ class BasicBlock(nn.Module):
 class ResNet18(nn.Module):
     """Views (n, 1, p, p), p a multiple of 32, to features (n, 512)."""
 
-    STRIDE = 32
     CHANNELS = 512
 
     def __init__(self) -> None:

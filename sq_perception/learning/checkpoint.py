@@ -1,5 +1,7 @@
 """Network weights on disk: safetensors with a header that says what they are.
 
+What a file holds is read into NumPy arrays; torch is imported where one of its modules is made or written.
+
 The header (strings, as the format demands) holds ``format`` and its version, the network's ``config`` and whatever the
 training noted (``training``, ``metrics``: JSON).  Reading executes nothing, and every name and shape must fit.
 Half precision on disk halves the file; networks compute in single precision.
@@ -15,23 +17,31 @@ the header, JSON; the tensors, as one block that the header's offsets cover with
 from __future__ import annotations
 
 import json
+import math
 import struct
+from collections.abc import Mapping
 from dataclasses import asdict
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import torch
+import numpy as np
 from safetensors import SafetensorError
-from safetensors.torch import load as tensors_of
-from safetensors.torch import save as bytes_of
+from safetensors.numpy import load as arrays_of
+from safetensors.numpy import save as bytes_of
 
 from sq_perception.files import output_file
-from sq_perception.learning.regressor import Regressor, RegressorConfig
-from sq_perception.learning.thing_network import ThingConfig, ThingNetwork
+from sq_perception.learning import layout
+from sq_perception.learning.network_config import RegressorConfig, ThingConfig
+
+if TYPE_CHECKING:
+    import torch
+
+    from sq_perception.learning.regressor import Regressor
+    from sq_perception.learning.thing_network import ThingNetwork
 
 FORMAT, THING_FORMAT = "sq_perception.regressor", "sq_perception.things"
-_FORMATS = {Regressor: FORMAT, ThingNetwork: THING_FORMAT}
+_FORMATS = {RegressorConfig: FORMAT, ThingConfig: THING_FORMAT}
 VERSION = "1"
 DEFAULT = "robust"
 """Name of the weights that are used where none are named."""
@@ -72,56 +82,96 @@ def save(
     path: Path | str,
     model: Regressor | ThingNetwork,
     notes: dict[str, Any] | None = None,
-    dtype: torch.dtype = torch.float16,
+    dtype: type[np.floating[Any]] = np.float16,
 ) -> None:
     """Write a network and ``notes`` (JSON values) to ``path``; replaced at once, never half written."""
     path = Path(path)
     state = {}
     for name, tensor in model.state_dict().items():
-        state[name] = (tensor.to(dtype) if tensor.is_floating_point() else tensor).contiguous().cpu()
-    header = {"format": _FORMATS[type(model)], "version": VERSION, "config": json.dumps(asdict(model.config))}
+        array = tensor.detach().cpu().numpy()
+        state[name] = np.ascontiguousarray(array, dtype if array.dtype.kind == "f" else None)
+    header = {"format": _FORMATS[type(model.config)], "version": VERSION, "config": json.dumps(asdict(model.config))}
     header.update({key: json.dumps(value) for key, value in (notes or {}).items()})
     path.parent.mkdir(parents=True, exist_ok=True)
     output_file.write(path, bytes_of(state, metadata=header))
 
 
 def load(path: Path | str | None = None, device: str | torch.device = "cpu") -> Regressor:
-    """Read a network, in evaluation mode; the path as :func:`resolve` takes it.
+    """A network as a module of torch, in evaluation mode; the path as :func:`resolve` takes it.
+
+    Raises
+    ------
+    CheckpointError
+        As :func:`read`.
+    """
+    from sq_perception.learning.regressor import Regressor
+
+    config, weights = read(path)
+    return _module(Regressor, config, weights).to(device).eval()
+
+
+def load_things(path: Path | str | None = None, device: str | torch.device = "cpu") -> ThingNetwork:
+    """The network of things, None for the one that ships; otherwise as :func:`load`."""
+    from sq_perception.learning.thing_network import ThingNetwork
+
+    config, weights = read_things(path)
+    return _module(ThingNetwork, config, weights).to(device).eval()
+
+
+def _module(kind: Any, config: RegressorConfig | ThingConfig, weights: Mapping[str, np.ndarray]) -> Any:
+    import torch
+
+    with torch.device("meta"):
+        model = kind(config)
+    model.load_state_dict({name: torch.from_numpy(array) for name, array in weights.items()}, assign=True)
+    return model
+
+
+def read(path: Path | str | None = None) -> tuple[RegressorConfig, dict[str, np.ndarray]]:
+    """The form of a network and its weights by name, in single precision; the path as :func:`resolve` takes it.
 
     Raises
     ------
     CheckpointError
         If the file is missing, no safetensors file, of another format or version, or does not fit its own config.
     """
-    model = _loaded(resolve(path), FORMAT)
-    assert isinstance(model, Regressor)
-    return model.to(device).eval()
+    config, weights = _read(resolve(path), FORMAT)
+    assert isinstance(config, RegressorConfig)
+    return config, weights
 
 
-def load_things(path: Path | str | None = None, device: str | torch.device = "cpu") -> ThingNetwork:
-    """The network of things, None for the one that ships; otherwise as :func:`load`."""
-    model = _loaded(resolve(THINGS if path is None else path), THING_FORMAT)
-    assert isinstance(model, ThingNetwork)
-    return model.to(device).eval()
+def read_things(path: Path | str | None = None) -> tuple[ThingConfig, dict[str, np.ndarray]]:
+    """Those of a network of things, None for the one that ships; otherwise as :func:`read`."""
+    config, weights = _read(resolve(THINGS if path is None else path), THING_FORMAT)
+    assert isinstance(config, ThingConfig)
+    return config, weights
 
 
-def _loaded(path: Path, form: str) -> Regressor | ThingNetwork:
+def _read(path: Path, form: str) -> tuple[RegressorConfig | ThingConfig, dict[str, np.ndarray]]:
     data, _ = _bytes(path)
-    model = _described(path, _strings(path, data, len(data)), form)
+    config = _described(path, _strings(path, data, len(data)), form)
     try:
-        state = tensors_of(data)
+        stored = arrays_of(data)
     except (SafetensorError, ValueError, KeyError) as error:
         raise CheckpointError(f"{path}: not a readable safetensors file: {error}") from error
-    try:
-        model.load_state_dict(
-            {name: t.to(torch.float32 if t.is_floating_point() else t.dtype, copy=True) for name, t in state.items()},
-            assign=True,
-        )
-    except RuntimeError as error:
-        raise CheckpointError(f"{path}: the weights do not fit the config: {error}") from error
-    if not all(bool(torch.isfinite(t).all()) for t in model.state_dict().values()):
-        raise CheckpointError(f"{path}: the weights are not all finite")
-    return model
+    expected = layout.shapes(config)
+    found = {name: array for name, array in stored.items() if not name.endswith(layout.COUNTER)}
+    for what, names in (("misses", expected.keys() - found.keys()), ("has no", found.keys() - expected.keys())):
+        if names:
+            shown = ", ".join(sorted(names)[:3]) + (", ..." if len(names) > 3 else "")
+            subject = "the file" if what == "misses" else "the network"
+            raise CheckpointError(f"{path}: the weights do not fit the config: {subject} {what} {shown}")
+    weights = {}
+    for name, array in found.items():
+        if array.shape != expected[name] or array.dtype.kind != "f":
+            raise CheckpointError(
+                f"{path}: the weights do not fit the config: {name}: expected numbers of shape {expected[name]}, "
+                f"got {array.dtype} {array.shape}"
+            )
+        weights[name] = array.astype(np.float32)
+        if not np.isfinite(weights[name]).all():
+            raise CheckpointError(f"{path}: the weights are not all finite")
+    return config, weights
 
 
 def read_header(path: Path | str | None = None) -> dict[str, str]:
@@ -184,8 +234,8 @@ def _strings(path: Path, data: bytes, size: int) -> dict[str, str]:
     return strings
 
 
-def _described(path: Path, header: dict[str, str], form: str) -> Regressor | ThingNetwork:
-    """The network that a header describes, without weights.
+def _described(path: Path, header: dict[str, str], form: str) -> RegressorConfig | ThingConfig:
+    """The form that a header describes.
 
     Raises
     ------
@@ -197,9 +247,12 @@ def _described(path: Path, header: dict[str, str], form: str) -> Regressor | Thi
     if header.get("version") != VERSION:
         raise CheckpointError(f"{path}: expected format version {VERSION}, got {header.get('version')!r}")
     try:
-        return _network(_config(json.loads(header["config"]), form))
-    except (KeyError, TypeError, ValueError, RuntimeError, ArithmeticError, AttributeError, RecursionError) as error:
+        config = _config(json.loads(header["config"]), form)
+        if sum(math.prod(shape) for shape in layout.shapes(config).values()) > _MAX_PARAMETERS:
+            raise ValueError("the network would be larger than any this package trains")
+    except (KeyError, TypeError, ValueError, ArithmeticError, AttributeError, RecursionError) as error:
         raise CheckpointError(f"{path}: the header's config describes no network: {error}") from error
+    return config
 
 
 def _config(values: dict[str, Any], form: str) -> RegressorConfig | ThingConfig:
@@ -208,12 +261,3 @@ def _config(values: dict[str, Any], form: str) -> RegressorConfig | ThingConfig:
     if config.pixels > _MAX_PIXELS or config.blocks > _MAX_BLOCKS:
         raise ValueError(f"expected at most {_MAX_PIXELS} pixels and {_MAX_BLOCKS} blocks a stage")
     return config
-
-
-def _network(config: RegressorConfig | ThingConfig) -> Regressor | ThingNetwork:
-    """The network without memory of its own: only what the file really holds is ever allocated."""
-    with torch.device("meta"):
-        model = Regressor(config) if isinstance(config, RegressorConfig) else ThingNetwork(config)
-    if sum(parameter.numel() for parameter in model.parameters()) > _MAX_PARAMETERS:
-        raise ValueError("the network would be larger than any this package trains")
-    return model

@@ -19,7 +19,7 @@ from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.learning.dihedral import MIRROR, TURNS, moved_back, moved_images
 from sq_perception.learning.inference import Predictor
-from sq_perception.learning.regressor import checked_views
+from sq_perception.learning.network_config import checked_views
 
 _POSITIONS = len(TURNS)
 _SAME = 0.6
@@ -34,7 +34,7 @@ class Consensus:
         self._predictor = predictor
 
     def predict(self, views: np.ndarray) -> Superquadric:
-        """NumPy superquadrics (n,) of NumPy views (n, p, p); errors as of :meth:`Regressor.predict`."""
+        """NumPy superquadrics (n,) of NumPy views (n, p, p); errors as of :meth:`Predictor.predict`."""
         views = checked_views(views, self.config)
         turns, mirror = np.tile(TURNS, len(views)), np.tile(MIRROR, len(views))
         moved = moved_images(np.repeat(views, _POSITIONS, axis=0), turns, mirror)

@@ -1,35 +1,32 @@
-"""A loaded network made ready to predict, by the fastest engine that is there.
+"""The network of a weights file, made ready to predict, by what computes it fastest.
 
-| engine | device | type | needs |
-| --- | --- | --- | --- |
-| onnxruntime | cpu | float32 | the packages onnx and onnxruntime |
-| torch | any | float32, bfloat16, float16 | |
+| network | device | computed by |
+| --- | --- | --- |
+| compact | cpu | :mod:`sq_perception.learning.forward`, without torch |
+| resnet18 | cpu | torch, on one thread |
+| any | cuda | torch |
 
-``auto`` takes onnxruntime for single precision on a CPU where it is installed: one view at a time, it needs less than
-half of torch's time (``benchmarks/network_speed.py``), and the bodies are the same to 1e-6.
+torch is imported where it computes.
 """
 
 from __future__ import annotations
 
-import copy
+import importlib
 from dataclasses import dataclass
-from importlib.util import find_spec
-from typing import Literal, Protocol, get_args
+from pathlib import Path
+from typing import Protocol
 
 import numpy as np
-import torch
 
 from sq_perception.fitting.hull_prior import HullPrior
 from sq_perception.geometry import rotation as quaternions
+from sq_perception.geometry.one_thread import one_torch_thread
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.support_directions import DIRECTIONS, mirrored
 from sq_perception.imaging.canonical_view import CanonicalView
-from sq_perception.learning import onnx_export, thing_network
-from sq_perception.learning.backbone import fold
-from sq_perception.learning.regressor import Regressor, RegressorConfig, checked_views
-from sq_perception.learning.thing_network import ThingNetwork
-
-Engine = Literal["auto", "torch", "onnxruntime"]
+from sq_perception.learning import checkpoint, forward
+from sq_perception.learning.choices import NEEDS_TORCH
+from sq_perception.learning.network_config import RegressorConfig, ThingConfig, checked_views, mirrored_planes
 
 
 class Predictor(Protocol):
@@ -38,7 +35,24 @@ class Predictor(Protocol):
     config: RegressorConfig
 
     def predict(self, views: np.ndarray) -> Superquadric:
-        """NumPy superquadrics (n,) of NumPy views (n, p, p); see :meth:`Regressor.predict`."""
+        """NumPy superquadrics (n,) of NumPy views (n, p, p).
+
+        Raises
+        ------
+        ValueError
+            If the views are not (n, p, p) with p = ``config.pixels``, or not finite.
+        """
+
+
+class Things(Protocol):
+    """A network of things, whatever computes it."""
+
+    config: ThingConfig
+
+    def answers(
+        self, views: np.ndarray, planes: np.ndarray, extents: np.ndarray
+    ) -> tuple[Superquadric, np.ndarray, np.ndarray]:
+        """Bodies (n,), support functions (n, J) and their S (n, J, J) of views (n, p, p), planes and extents."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +64,7 @@ class HullAnswers:
     bodies : Superquadric
         Batch (n,).
     support : (n, J)
-        Support functions in sides of the view, from its middle (:data:`thing_network.MIDDLE`).
+        Support functions in sides of the view, from its middle (:data:`sq_perception.learning.thing_network.MIDDLE`).
     covariance : (n, J, J)
     """
 
@@ -74,11 +88,9 @@ class ThingPredictor:
     body is that of the view itself.
     """
 
-    def __init__(self, model: ThingNetwork) -> None:
-        self.config = model.config
-        self._model = copy.deepcopy(model).eval()
-        fold(self._model.features)
-        self._device = next(self._model.parameters()).device
+    def __init__(self, network: Things) -> None:
+        self.config = network.config
+        self._network = network
 
     def predict(self, views: np.ndarray, planes: np.ndarray, extents: np.ndarray) -> HullAnswers:
         """Answers to views (n, p, p) of sides ``extents`` (n,), metres, 0 where unknown.
@@ -97,62 +109,60 @@ class ThingPredictor:
             raise ValueError(f"expected finite extents of shape ({len(views)},), got {extents.shape}")
         both = np.concatenate([views, views[:, :, ::-1]])
         sides = np.concatenate([extents, extents]).astype(np.float32)
-        supports = np.concatenate([planes, thing_network.mirrored_planes(planes)]).astype(np.float32)
-        with torch.inference_mode():
-            said = self._model(*(torch.from_numpy(each).to(self._device) for each in (both, supports, sides)))
-            flat = said.body.to_flat()[: len(views)].double().cpu().numpy()
-            straight, turned = np.split(said.support.double().cpu().numpy(), 2)
-            covariance, turned_covariance = np.split(said.covariance().double().cpu().numpy(), 2)
+        supports = np.concatenate([planes, mirrored_planes(planes)]).astype(np.float32)
+        bodies, support, covariance = self._network.answers(both, supports, sides)
+        straight, turned = np.split(support, 2)
+        of_straight, of_turned = np.split(covariance, 2)
         back = mirrored(0)
         return HullAnswers(
-            Superquadric.from_flat(flat),
+            bodies[: len(views)],
             (straight + turned[:, back]) / 2,
-            (covariance + turned_covariance[:, back][:, :, back]) / 2,
+            (of_straight + of_turned[:, back][:, :, back]) / 2,
         )
 
 
-class OnnxPredictor:
-    """A network computed by onnxruntime on the CPU, on as many threads as torch has at its construction."""
-
-    def __init__(self, model: Regressor) -> None:
-        runtime = onnx_export.require("onnxruntime")
-        options = runtime.SessionOptions()
-        options.intra_op_num_threads = torch.get_num_threads()
-        options.inter_op_num_threads = 1
-        options.add_session_config_entry(
-            "session.intra_op.allow_spinning", "0"
-        )  # idle threads leave the cores to others
-        graph = onnx_export.build(model).SerializeToString()
-        self.config = model.config
-        self._session = runtime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
-
-    def predict(self, views: np.ndarray) -> Superquadric:
-        """As :meth:`Regressor.predict`, errors included."""
-        batch = checked_views(views, self.config)[:, None]
-        (parameters,) = self._session.run([onnx_export.OUTPUT], {onnx_export.INPUT: batch})
-        return Superquadric.from_flat(parameters.astype(float))
-
-
-def prepare(model: Regressor, engine: Engine = "auto", dtype: torch.dtype = torch.float32) -> Predictor:
-    """A predictor of the same bodies as ``model``, which stays as it is.
+def load(path: Path | str | None = None, device: str = "cpu") -> Predictor:
+    """A predictor of bodies; the path as :func:`checkpoint.resolve` takes it.
 
     Raises
     ------
-    ValueError
-        For an unknown engine, or onnxruntime with a type or on a device that it does not compute here.
-    MissingPackageError
-        If onnxruntime is asked for by name and it or onnx is missing.
+    CheckpointError
+        As :func:`checkpoint.read`, and for a network that only torch computes where there is no torch.
     """
-    if engine not in get_args(Engine):
-        raise ValueError(f"engine: expected one of {', '.join(get_args(Engine))}, got {engine!r}")
-    device = next(model.parameters()).device
-    able = device.type == "cpu" and dtype == torch.float32
-    if engine == "onnxruntime" and not able:
-        raise ValueError(f"engine: onnxruntime computes float32 on the CPU here, got {dtype} on {device}")
-    if engine == "onnxruntime" or (engine == "auto" and able and _installed()):
-        return OnnxPredictor(model)
-    return model.for_inference(dtype)
+    config, weights = checkpoint.read(path)
+    if _is_cpu(device) and config.backbone == "compact":
+        return forward.CompactRegressor(config, weights)
+    _need_torch(f"a network of the backbone {config.backbone} on {device}")
+    model = checkpoint.load(path, device).for_inference()
+    return _OnOneThread(model) if _is_cpu(device) else model
 
 
-def _installed() -> bool:
-    return all(find_spec(name) is not None for name in ("onnx", "onnxruntime"))
+def load_things(path: Path | str | None = None, device: str = "cpu") -> ThingPredictor:
+    """A predictor of hulls, None for the network that ships; otherwise as :func:`load`."""
+    if _is_cpu(device):
+        return ThingPredictor(forward.CompactThings(*checkpoint.read_things(path)))
+    _need_torch(f"a network of things on {device}")
+    return ThingPredictor(checkpoint.load_things(path, device))
+
+
+class _OnOneThread:
+    """A predictor of torch: on busy cores the slowest of several threads sets the time, and one image is small."""
+
+    def __init__(self, model: Predictor) -> None:
+        self.config = model.config
+        self._model = model
+
+    def predict(self, views: np.ndarray) -> Superquadric:
+        with one_torch_thread():
+            return self._model.predict(views)
+
+
+def _is_cpu(device: str) -> bool:
+    return device.partition(":")[0] == "cpu"
+
+
+def _need_torch(what: str) -> None:
+    try:
+        importlib.import_module("torch")
+    except ModuleNotFoundError as error:
+        raise checkpoint.CheckpointError(f"{what} {NEEDS_TORCH}") from error

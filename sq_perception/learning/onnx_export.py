@@ -7,15 +7,13 @@ Input   ``views``       float32 (n, 1, p, p), as :mod:`sq_perception.learning.re
 Output  ``parameters``  float32 (n, 12), a1 a2 a3 e1 e2 t1 t2 t3 qx qy qz qw in the frame of the views
 
 The graph is written down from the folded modules, node by node.  That takes milliseconds, where torch's exporter takes
-seconds and two more packages; :mod:`sq_perception.learning.inference` so can build it whenever a network is loaded.
+seconds and two more packages.
 The file's metadata is the header of the weights (:mod:`sq_perception.learning.checkpoint`), the config among it.
 """
 
 from __future__ import annotations
 
-import importlib
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
@@ -25,7 +23,8 @@ from torch import nn
 
 from sq_perception.learning import checkpoint
 from sq_perception.learning.backbone import BasicBlock, ResidualBlock, ResNet18
-from sq_perception.learning.regressor import Regressor, RegressorConfig
+from sq_perception.learning.network_config import RegressorConfig
+from sq_perception.learning.regressor import Regressor
 
 INPUT, OUTPUT = "views", "parameters"
 PARAMETERS = ("a1", "a2", "a3", "e1", "e2", "t1", "t2", "t3", "qx", "qy", "qz", "qw")
@@ -38,36 +37,16 @@ OPSET, IR_VERSION = 18, 8
 """Of ONNX 1.13 (2022): runtimes of any age read it."""
 
 
-TELEMETRY_OFF = "ORT_DISABLE_TELEMETRY"
-"""https://github.com/microsoft/onnxruntime/blob/main/docs/Privacy.md; processes started from here inherit it."""
-
-
-class MissingPackageError(ImportError):
-    """onnx or onnxruntime is not installed; the message says what to do."""
-
-
-def require(name: str) -> Any:
-    """Import ``onnx`` or ``onnxruntime``; raises MissingPackageError where it is not installed.
-
-    The one way by which this package imports onnxruntime: since 1.29 its wheels report their use to their maker, and
-    keep a number for the user under HOME, unless they are told not to before they are loaded.
-    """
-    os.environ[TELEMETRY_OFF] = "1"
-    try:
-        return importlib.import_module(name)
-    except ModuleNotFoundError as error:
-        raise MissingPackageError(f"ONNX needs the package {name!r}: pip install {name}") from error
-
-
 def build(model: Regressor, notes: Mapping[str, str] | None = None) -> Any:
     """The ``onnx.ModelProto`` of a network; ``notes`` go into its metadata beside format, version and config.
 
     Raises
     ------
-    MissingPackageError
-        If ``onnx`` is not installed.
+    ModuleNotFoundError
+        Without onnx, the extra 'export'.
     """
-    onnx = require("onnx")
+    import onnx
+
     helper, kind = onnx.helper, onnx.TensorProto.FLOAT
     folded = model.for_inference().cpu()
     graph = _Graph(onnx)

@@ -39,51 +39,22 @@ from torch import nn
 
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.support_directions import DIRECTIONS
-from sq_perception.imaging import canonical_view
-from sq_perception.imaging.camera import Camera
-from sq_perception.imaging.canonical_view import NEAREST, CanonicalView
+from sq_perception.imaging.canonical_view import NEAREST
 from sq_perception.learning.backbone import compact_backbone
-from sq_perception.learning.regressor import RegressorConfig
+from sq_perception.learning.network_config import (
+    BODY_OUTPUTS,
+    EXTENT,
+    HALF_WAY,
+    LEAST_LOG,
+    MOST_LOG,
+    PLANE,
+    USUAL_EXTENT,
+    ThingConfig,
+)
 
 MIDDLE = (0.5, 0.5, NEAREST)
 """c: what h is measured from."""
-_HALF_WAY = 0.5
-"""Depth at which a pixel without a surface is given its height above the plane."""
-_LEAST_LOG, _MOST_LOG = -5.0, 0.5
-"""Limits of log sigma: 0.7 % of the view's side, what a mask's pixel is, and more than the side."""
-_PARAMETERS, _PLANE, _EXTENT = 14, 4, 1
-_USUAL_EXTENT = 0.2
-"""Metres; that the logarithm of a view's side is 0 for it."""
 _FIRST_SUPPORT, _FIRST_LOG = 0.4, -2.5
-
-
-@dataclass(frozen=True)
-class ThingConfig:
-    """Everything that fixes the network's form; travels in the checkpoint's header."""
-
-    pixels: int = 64
-    widths: tuple[int, ...] = (32, 64, 128, 256)
-    """Channels of the stem and of each stage; every stage halves the resolution."""
-    blocks: int = 2
-    """Residual blocks a stage."""
-    hidden: int = 256
-    factors: int = 8
-    """K, the columns of L."""
-    freedom: float = 3.0
-    """nu of the t distribution.  A network trained with 10 told errors of unseen views that were likeliest for 2 to 3,
-    sigma a third as large: most hulls are plain to see, some are not."""
-    spread: float = 1.0
-    """Factor of S, set when a training ends: batches are normalised otherwise then, and errors smaller."""
-
-    def view_of(
-        self, depth: np.ndarray, mask: np.ndarray, camera: Camera, plane: np.ndarray | None = None
-    ) -> CanonicalView:
-        """What the network is shown of the object under a mask, as :meth:`RegressorConfig.view_of`."""
-        return canonical_view.from_mask(depth, mask, camera, self.pixels, plane=plane, missing_is_hidden=True)
-
-    def regressor(self) -> RegressorConfig:
-        """How the superquadric's parameters are encoded."""
-        return RegressorConfig(pixels=self.pixels, widths=self.widths, blocks=self.blocks, hidden=self.hidden)
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,17 +120,17 @@ class ThingNetwork(nn.Module):
         self.features = compact_backbone(config.widths, config.blocks, channels_in=2)
         inputs = config.widths[-1] * (config.pixels // self._encoding.stride) ** 2
         self.mixer = nn.Sequential(
-            nn.Linear(inputs + _PLANE + _EXTENT, config.hidden),
+            nn.Linear(inputs + PLANE + EXTENT, config.hidden),
             nn.ReLU(),
             nn.Linear(config.hidden, config.hidden),
             nn.ReLU(),
         )
-        self.body_head = nn.Linear(config.hidden, _PARAMETERS)
+        self.body_head = nn.Linear(config.hidden, BODY_OUTPUTS)
         self.support_head = nn.Linear(config.hidden, count)
         self.sigma_head = nn.Linear(config.hidden, count)
         self.factor_head = nn.Linear(config.hidden, count * config.factors)
         with torch.no_grad():
-            self.body_head.bias[_PARAMETERS - 6 :].copy_(torch.tensor([1.0, 0, 0, 0, 1, 0]))
+            self.body_head.bias[BODY_OUTPUTS - 6 :].copy_(torch.tensor([1.0, 0, 0, 0, 1, 0]))
             self.support_head.bias.fill_(_FIRST_SUPPORT)
             self.sigma_head.bias.fill_(_FIRST_LOG)
             self.factor_head.weight.mul_(0.1)
@@ -167,15 +138,31 @@ class ThingNetwork(nn.Module):
     def forward(self, views: torch.Tensor, planes: torch.Tensor, extents: torch.Tensor) -> HullPrediction:
         h = self.features(torch.stack([views, self._heights(views, planes)], dim=1)).flatten(1)
         known = extents > 0
-        scale = torch.where(known, torch.log(torch.where(known, extents, 1.0) / _USUAL_EXTENT), 0.0)
+        scale = torch.where(known, torch.log(torch.where(known, extents, 1.0) / USUAL_EXTENT), 0.0)
         h = self.mixer(torch.cat([h, planes.to(h.dtype), scale[:, None].to(h.dtype)], dim=1)).float()
         with torch.autocast(views.device.type, enabled=False):  # eight bits of mantissa are too few for a size
             body = self._encoding.decode(self.body_head(h))
-            log_sigma = _LEAST_LOG + nn.functional.softplus(self.sigma_head(h) - _LEAST_LOG)
+            log_sigma = LEAST_LOG + nn.functional.softplus(self.sigma_head(h) - LEAST_LOG)
             factors = self.factor_head(h).unflatten(1, (len(DIRECTIONS), self.config.factors))
-            log_sigma = log_sigma.clamp_max(_MOST_LOG) + 0.5 * math.log(self.config.spread)
+            log_sigma = log_sigma.clamp_max(MOST_LOG) + 0.5 * math.log(self.config.spread)
             factors = math.sqrt(self.config.spread) * factors
             return HullPrediction(body, self.support_head(h), log_sigma, factors, self.config.freedom)
+
+    def answers(
+        self, views: np.ndarray, planes: np.ndarray, extents: np.ndarray
+    ) -> tuple[Superquadric, np.ndarray, np.ndarray]:
+        """What is said of NumPy views (b, p, p), planes (b, 4) and extents (b,), in float32, in evaluation mode.
+
+        Bodies (b,), support functions (b, J) and their S (b, J, J), in the views' frames; NumPy.
+        """
+        self.eval()
+        device = next(self.parameters()).device
+        with torch.inference_mode():
+            said = self(*(torch.from_numpy(each).to(device) for each in (views, planes, extents)))
+            flat, support, covariance = (
+                each.double().cpu().numpy() for each in (said.body.to_flat(), said.support, said.covariance())
+            )
+        return Superquadric.from_flat(flat), support, covariance
 
     def _heights(self, views: torch.Tensor, planes: torch.Tensor) -> torch.Tensor:
         """Height above the plane of what each pixel shows, of a point half way down where it shows nothing."""
@@ -183,7 +170,7 @@ class ThingNetwork(nn.Module):
         across = (torch.arange(pixels, device=views.device) + 0.5) / pixels
         n = planes[:, :, None, None]
         flat = n[:, 0] * across[None, None, :] + n[:, 1] * (1 - across)[None, :, None] + n[:, 3]
-        return flat + n[:, 2] * torch.where(views > 0, views, torch.full_like(views, _HALF_WAY))
+        return flat + n[:, 2] * torch.where(views > 0, views, torch.full_like(views, HALF_WAY))
 
 
 def support_of(body: Superquadric) -> torch.Tensor:
@@ -197,8 +184,3 @@ def support_of(body: Superquadric) -> torch.Tensor:
 def body_loss(body: Superquadric, truth: torch.Tensor) -> torch.Tensor:
     """Mean distance (b,) between the support functions of bodies and the true ones (b, J), in sides of the view."""
     return (support_of(body) - truth).abs().mean(dim=1)
-
-
-def mirrored_planes(planes: np.ndarray) -> np.ndarray:
-    """Planes (b, 4) of views whose x runs the other way."""
-    return np.stack([-planes[:, 0], planes[:, 1], planes[:, 2], planes[:, 3] + planes[:, 0]], axis=1)

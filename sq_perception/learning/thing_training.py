@@ -35,6 +35,7 @@ from sq_perception.files import provenance
 from sq_perception.geometry.support_directions import mirrored
 from sq_perception.learning import checkpoint, thing_network
 from sq_perception.learning.checkpoint import CheckpointError
+from sq_perception.learning.network_config import mirrored_planes
 from sq_perception.learning.schedule import Cosine
 from sq_perception.learning.thing_network import HullPrediction, ThingConfig, ThingNetwork
 from sq_perception.learning.training_state import TrainingState
@@ -291,7 +292,7 @@ def _batch(views: ThingViews, chosen: np.ndarray, rng: np.random.Generator) -> t
     extents = np.where(rng.random(len(chosen)) < _UNKNOWN_EXTENT, np.float32(0), views.extents[chosen])
     turned = rng.random(len(chosen)) < 0.5
     images[turned] = images[turned][:, :, ::-1]
-    planes = np.where(turned[:, None], thing_network.mirrored_planes(planes), planes)
+    planes = np.where(turned[:, None], mirrored_planes(planes), planes)
     support = np.where(turned[:, None], support[:, mirrored(0)], support)
     return tuple(map(torch.from_numpy, (images, planes, extents, support)))
 

@@ -18,8 +18,8 @@ from sq_perception.learning.choices import LOSSES, UNSUPERVISED, Backbone, Frami
 if TYPE_CHECKING:
     from sq_perception.learning.dataset import ViewSource
     from sq_perception.learning.disturbance import Disturbance
+    from sq_perception.learning.network_config import RegressorConfig
     from sq_perception.learning.objective import Objective
-    from sq_perception.learning.regressor import RegressorConfig
     from sq_perception.learning.schedule import Cosine, Plateau
 
 Optimizer = Literal["adamw", "adam"]
@@ -139,7 +139,7 @@ class TrainingConfig:
 
     def regressor(self) -> RegressorConfig:
         """The network's form, unless ``start`` brings its own."""
-        from sq_perception.learning.regressor import RegressorConfig
+        from sq_perception.learning.network_config import RegressorConfig
 
         form = RegressorConfig() if self.framing == "cropped" else RegressorConfig.thesis()
         changes = {"backbone": self.backbone, "pixels": self.pixels, "marks_hidden": self.marks_hidden}

@@ -20,7 +20,6 @@ from dataclasses import dataclass, replace
 from time import perf_counter
 from typing import TypeAlias
 
-import torch
 from rclpy.node import Node
 
 from sq_perception.imaging import unit_cube
@@ -220,8 +219,6 @@ def _made(parameters: RecoverParameters, kept: _Built | None, is_wanted: Callabl
     weights = _file(parameters.model) if kept is None else kept.weights
     # Without the model: the same file may have several names.
     key = (weights, *(getattr(parameters, name) for name in _MADE_OF if name != "model"))
-    # On a robot's busy cores the slowest of several threads sets the time; one image is too small to gain from them.
-    torch.set_num_threads(1)
     with _making:
         if not is_wanted():
             raise _Superseded

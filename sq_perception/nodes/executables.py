@@ -1,7 +1,7 @@
 """The programs that `ros2 run sq_perception` knows: recover_node, fitter_node, recover_cameras, grasp_node,
 synthetic_depth_node.
 
-Each imports its node inside :func:`sq_perception.nodes.process.run`: torch, numba and rclpy take seconds to import, and
+Each imports its node inside :func:`sq_perception.nodes.process.run`: numba and rclpy take seconds to import, and
 a Ctrl-C meanwhile must end the process without a traceback.
 """
 

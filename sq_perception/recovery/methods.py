@@ -7,9 +7,10 @@ from dataclasses import replace
 
 import numpy as np
 
-from sq_perception.fitting import soft_render_fit, solina_bajcsy, surface_fit
+from sq_perception.fitting import solina_bajcsy, surface_fit
 from sq_perception.fitting.fit import Fit, Status
 from sq_perception.fitting.options import MIN_PIXELS, MODEL_ERROR_ON_PLANE, FitOptions
+from sq_perception.geometry.one_thread import one_torch_thread
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import soft_agreement
 from sq_perception.imaging.camera import Camera
@@ -77,10 +78,13 @@ def _predicted(one: SeenObject) -> Superquadric:
 
 
 def _soft_rendered(start: Superquadric, one: SeenObject, options: RecoveryOptions) -> Fit:
+    from sq_perception.fitting import soft_render_fit  # needs torch, which robots may lack
+
     assert one.view is not None
-    body, before, after = soft_render_fit.refine(
-        one.view.image, one.view.to_canonical(start), options.sharpness, options.tau
-    )
+    with one_torch_thread():
+        body, before, after = soft_render_fit.refine(
+            one.view.image, one.view.to_canonical(start), options.sharpness, options.tau
+        )
     refined = one.view.from_canonical(body).canonical_form()
     return _unfitted(refined, one, f"soft-rendered residual {before:.4f} before, {after:.4f} after the refinement")
 

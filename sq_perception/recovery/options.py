@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Literal, get_args
 
 import numpy as np
 
-from sq_perception.imaging import soft_render
+from sq_perception.imaging import soft_agreement
+from sq_perception.learning.choices import NEEDS_TORCH
 from sq_perception.segmentation import segments, standing
 
 Method = Literal["auto", "network", "symmetry", "classic"]
@@ -53,13 +55,13 @@ class RecoveryOptions:
     Raises
     ------
     ValueError
-        For a value outside its range.
+        For a value outside its range, or ``soft_render`` where there is no torch.
     """
 
     method: Method = "auto"
     refine: Refine = "surface"
-    sharpness: float = soft_render.THESIS_SHARPNESS
-    tau: float = soft_render.THESIS_TAU
+    sharpness: float = soft_agreement.THESIS_SHARPNESS
+    tau: float = soft_agreement.THESIS_TAU
     depth_range: tuple[float, float] = (0.0, np.inf)
     max_objects: int = 20
     min_pixels: int | None = None
@@ -75,6 +77,8 @@ class RecoveryOptions:
         for name, value, known in (("method", self.method, Method), ("refine", self.refine, Refine)):
             if value not in get_args(known):
                 raise ValueError(f"{name}: expected one of {', '.join(get_args(known))}, got {value!r}")
+        if self.refine == "soft_render" and find_spec("torch") is None:
+            raise ValueError(f"refine: soft_render {NEEDS_TORCH}")
         for name, number in (("sharpness", self.sharpness), ("tau", self.tau)):
             if not (np.isfinite(number) and number > 0):
                 raise ValueError(f"{name}: expected a positive number, got {number}")

@@ -35,15 +35,15 @@ from pathlib import Path
 from typing import TypeAlias, TypeVar
 
 import numpy as np
-import torch
-from threadpoolctl import ThreadpoolController
 
 from sq_perception.fitting import surface_fit
 from sq_perception.fitting.fit import Fit, Status
+from sq_perception.geometry.one_thread import one_blas_thread
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
 from sq_perception.learning import checkpoint, inference
+from sq_perception.learning.choices import NEEDS_TORCH
 from sq_perception.learning.consensus import Consensus
 from sq_perception.recovery import continuity, methods, seen_object, segment_repair
 from sq_perception.recovery.continuity import Reference
@@ -118,7 +118,6 @@ class Recoverer:
         self._consensus = consensus
         self._loaded: dict[bool, Network] = {} if weights_of is None else weights_of._loaded
         self._lock = threading.Lock()
-        self._blas = ThreadpoolController()
         self._beside = ThreadPoolExecutor(1, thread_name_prefix="network")
         self._pool = ThreadPoolExecutor(self._threads, thread_name_prefix="fit")
         if method in NEEDS_NETWORK:
@@ -174,8 +173,7 @@ class Recoverer:
         CheckpointError
             If the method needs the network and it cannot be loaded.
         """
-        # Threads of a BLAS spin after products as small as these, on the cores that fits of other objects want.
-        with self._blas.limit(limits=1, user_api="blas"):
+        with one_blas_thread():
             return self._recover(depth, camera, labels, options or self._options, previous)
 
     def _recover(
@@ -284,8 +282,8 @@ class Recoverer:
 
     def _read_network(self, of_things: bool) -> Network:
         if (self._path is None and of_things) or checkpoint.tells_hulls(self._path):
-            return inference.ThingPredictor(checkpoint.load_things(self._path, self._device))
-        return inference.prepare(checkpoint.load(self._path, self._device))
+            return inference.load_things(self._path, self._device)
+        return inference.load(self._path, self._device)
 
 
 def render_recovery(frame: FrameRecovery, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
@@ -304,13 +302,19 @@ def render_recovery(frame: FrameRecovery, camera: Camera) -> tuple[np.ndarray, n
 
 
 def checked_device(device: str) -> str:
-    """The name of a torch device that is there.
+    """The name of a device that is there, as torch names it.
 
     Raises
     ------
     ValueError
-        If torch does not know the name or sees no such device.
+        If it is not the cpu and there is no torch, or torch does not know the name or sees no such device.
     """
+    if device == "cpu":
+        return device
+    try:
+        import torch
+    except ModuleNotFoundError as error:
+        raise ValueError(f"device: {device!r} {NEEDS_TORCH}") from error
     try:
         kind = torch.device(device).type
     except RuntimeError as error:

@@ -18,8 +18,7 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.canonical_view import CanonicalView
 from sq_perception.imaging.coherence import coherent
 from sq_perception.learning.inference import HullAnswers
-from sq_perception.learning.regressor import RegressorConfig
-from sq_perception.learning.thing_network import ThingConfig
+from sq_perception.learning.network_config import RegressorConfig, ThingConfig
 from sq_perception.segmentation import segments
 
 _POINTS = 2000

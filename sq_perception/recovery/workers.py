@@ -161,7 +161,7 @@ class Cluster:
 
 
 def _pool(setup: Setup, jobs: int) -> ProcessPoolExecutor:
-    # Not forked: a process that has threads of torch, OpenMP and numba cannot be copied.
+    # Not forked: a process that has threads of BLAS and numba cannot be copied.
     context = multiprocessing.get_context("spawn")
     return ProcessPoolExecutor(jobs, context, initializer=_begin, initargs=(setup,))
 
@@ -174,11 +174,8 @@ def _begin(setup: Setup) -> None:
 
 @cache
 def _recoverer(setup: Setup) -> Recoverer:
-    import torch
-
     from sq_perception.recovery.recoverer import Recoverer
 
-    torch.set_num_threads(1)
     return Recoverer(setup.model, method=setup.options.method, consensus=setup.consensus, threads=1)
 
 

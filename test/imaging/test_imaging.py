@@ -232,7 +232,9 @@ class TestSoftRender:
         bodies = thesis_bodies(10, np.random.default_rng(8))
         tensors = Superquadric.from_flat(torch.tensor(bodies.to_flat()))
         axis = soft_render.grid_points(64)
-        soft = soft_render.render_depth(tensors, axis, soft_render.THESIS_SHARPNESS, soft_render.THESIS_TAU).numpy()
+        soft = soft_render.render_depth(
+            tensors, axis, soft_agreement.THESIS_SHARPNESS, soft_agreement.THESIS_TAU
+        ).numpy()
         for body, image in zip(bodies, soft, strict=True):
             depth, _ = raycast.render(unit_cube.optical_from_cube(body), unit_cube.camera(64))
             exact = np.where(np.isfinite(depth), 1 - depth, 0)
@@ -246,7 +248,7 @@ class TestSoftRender:
             lambda f: soft_render.render_depth(Superquadric.from_flat(f), axis, 8.0, 1.5), flat
         )
 
-    @pytest.mark.parametrize(("s", "tau"), [(soft_render.THESIS_SHARPNESS, soft_render.THESIS_TAU), (8.0, 0.5)])
+    @pytest.mark.parametrize(("s", "tau"), [(soft_agreement.THESIS_SHARPNESS, soft_agreement.THESIS_TAU), (8.0, 0.5)])
     def test_the_compiled_agreement_is_that_of_the_soft_image(self, s: float, tau: float) -> None:
         """Bodies against images of others, as of themselves; sharp and soft, thick and thin to the light."""
         bodies = thesis_bodies(4, np.random.default_rng(10))

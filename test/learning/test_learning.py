@@ -232,7 +232,7 @@ class TestCheckpoint:
     def test_round_trip(self, tmp_path: Path) -> None:
         torch.manual_seed(1)
         model = Regressor(SMALL)
-        checkpoint.save(tmp_path / "m.safetensors", model, {"metrics": {"iou": 0.5}}, torch.float32)
+        checkpoint.save(tmp_path / "m.safetensors", model, {"metrics": {"iou": 0.5}}, np.float32)
         views = np.random.default_rng(8).random((3, 32, 32))
         again = checkpoint.load(tmp_path / "m.safetensors")
         assert again.config == SMALL

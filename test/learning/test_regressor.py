@@ -215,7 +215,7 @@ class TestCheckpoint:
     def test_the_thesis_network_round_trips(self, tmp_path: Path) -> None:
         torch.manual_seed(1)
         model = Regressor(THESIS)
-        checkpoint.save(tmp_path / "m.safetensors", model, dtype=torch.float32)
+        checkpoint.save(tmp_path / "m.safetensors", model, dtype=np.float32)
         again = checkpoint.load(tmp_path / "m.safetensors")
         assert again.config == THESIS
         assert isinstance(again.features, ResNet18)
@@ -226,7 +226,7 @@ class TestCheckpoint:
     def test_files_from_before_there_were_backbones(self, tmp_path: Path) -> None:
         path = tmp_path / "m.safetensors"
         model = Regressor(COMPACT)
-        checkpoint.save(path, model, dtype=torch.float32)
+        checkpoint.save(path, model, dtype=np.float32)
         header, state = checkpoint.read_header(path), load_file(str(path))
         config = json.loads(header["config"])
         for name in ("backbone", "framing"):
@@ -237,7 +237,7 @@ class TestCheckpoint:
 
     def test_a_loaded_network_does_not_live_in_its_file(self, tmp_path: Path) -> None:
         path = tmp_path / "m.safetensors"
-        checkpoint.save(path, Regressor(COMPACT), dtype=torch.float32)
+        checkpoint.save(path, Regressor(COMPACT), dtype=np.float32)
         model = checkpoint.load(path)
         before = model.size_head.weight.detach().clone()
         with path.open("r+b") as file:
@@ -293,4 +293,4 @@ class TestCheckpoint:
             patch.setattr(torch.nn.Linear, "reset_parameters", watched)
             with pytest.raises(checkpoint.CheckpointError, match="the weights do not fit"):
                 checkpoint.load(tmp_path / "m.safetensors")
-        assert {device.type for device in allocated} == {"meta"}
+        assert not allocated

@@ -18,6 +18,7 @@ from sq_perception.geometry.support_directions import DIRECTIONS, mirrored
 from sq_perception.imaging.canonical_view import NEAREST
 from sq_perception.learning import checkpoint, thing_network, thing_training
 from sq_perception.learning.inference import ThingPredictor
+from sq_perception.learning.network_config import mirrored_planes
 from sq_perception.learning.thing_network import HullPrediction, ThingConfig, ThingNetwork
 from sq_perception.simulation.thing_views import ThingViews, draw_thing_views
 
@@ -96,7 +97,7 @@ def test_a_predictor_answers_a_mirrored_view_with_the_mirrored_hull(rng: np.rand
     views, planes = rng.random((2, 64, 64)).astype(np.float32), rng.standard_normal((2, 4))
     extents = np.array([0.1, 0.0])
     straight = predictor.predict(views, planes, extents)
-    turned = predictor.predict(np.ascontiguousarray(views[:, :, ::-1]), thing_network.mirrored_planes(planes), extents)
+    turned = predictor.predict(np.ascontiguousarray(views[:, :, ::-1]), mirrored_planes(planes), extents)
     back = mirrored(0)
     assert turned.support[:, back] == pytest.approx(straight.support, abs=1e-5)
     assert turned.covariance[:, back][:, :, back] == pytest.approx(straight.covariance, abs=1e-5)
@@ -105,7 +106,7 @@ def test_a_predictor_answers_a_mirrored_view_with_the_mirrored_hull(rng: np.rand
 
 def test_planes_mirror_with_their_points(rng: np.random.Generator) -> None:
     plane, points = rng.standard_normal(4), rng.random((10, 3))
-    there = thing_network.mirrored_planes(plane[None])[0]
+    there = mirrored_planes(plane[None])[0]
     moved = points * [-1, 1, 1] + [1, 0, 0]
     assert moved @ there[:3] + there[3] == pytest.approx(points @ plane[:3] + plane[3])
 

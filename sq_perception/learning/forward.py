@@ -1,0 +1,136 @@
+"""The compact networks computed without torch: weights of a file in, outputs of the heads out.
+
+:mod:`sq_perception.learning.convolution` has the layers.  One thread computes: the layers are small, and one
+that fits bodies meanwhile wants the other cores (:mod:`sq_perception.geometry.one_thread`).
+
+A test compares with the modules of torch (:mod:`sq_perception.learning.regressor`,
+:mod:`sq_perception.learning.thing_network`), which state the same networks.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from sq_perception.geometry.one_thread import one_blas_thread
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.geometry.support_directions import DIRECTIONS
+from sq_perception.learning import layout
+from sq_perception.learning.convolution import Block, Direct, Memory, Weights, contiguous
+from sq_perception.learning.network_config import (
+    BODY_OUTPUTS,
+    HALF_WAY,
+    LEAST_LOG,
+    MOST_LOG,
+    USUAL_EXTENT,
+    RegressorConfig,
+    ThingConfig,
+    checked_views,
+)
+
+_AT_ONCE = 10
+"""Views that pass through the layers together; their numbers fit into a processor's cache."""
+
+
+class CompactRegressor:
+    """:class:`sq_perception.learning.regressor.Regressor` with a compact backbone, ready to predict."""
+
+    def __init__(self, config: RegressorConfig, weights: Weights) -> None:
+        self.config = config
+        self._network = _Network(config, weights, channels=1)
+
+    def predict(self, views: np.ndarray) -> Superquadric:
+        """As :meth:`sq_perception.learning.regressor.Regressor.predict`, errors included."""
+        views = checked_views(views, self.config)
+        raw = self._network.outputs(views[..., None], np.empty((len(views), 0), np.float32))
+        return self.config.decode(raw.astype(float))
+
+
+class CompactThings:
+    """:class:`sq_perception.learning.thing_network.ThingNetwork`, ready to predict."""
+
+    def __init__(self, config: ThingConfig, weights: Weights) -> None:
+        self.config = config
+        self._encoding = config.regressor()
+        self._network = _Network(config, weights, channels=2)
+
+    def answers(
+        self, views: np.ndarray, planes: np.ndarray, extents: np.ndarray
+    ) -> tuple[Superquadric, np.ndarray, np.ndarray]:
+        """As :meth:`sq_perception.learning.thing_network.ThingNetwork.answers`, without torch."""
+        known = extents > 0
+        scale = np.where(known, np.log(np.where(known, extents, 1.0) / USUAL_EXTENT), 0.0)
+        images = np.stack([views, _heights(views, planes)], axis=-1)
+        raw = self._network.outputs(images, np.column_stack([planes, scale]))
+        count = len(DIRECTIONS)
+        body, support, sigma, factors = np.split(raw.astype(float), np.cumsum([BODY_OUTPUTS, count, count]), axis=1)
+        variance = np.exp(2 * np.minimum(LEAST_LOG + np.logaddexp(0, sigma - LEAST_LOG), MOST_LOG))
+        factors = factors.reshape(len(raw), count, self.config.factors)
+        covariance = factors @ factors.transpose(0, 2, 1)
+        covariance[:, np.arange(count), np.arange(count)] += variance
+        return self._encoding.decode(body), support, self.config.spread * covariance
+
+
+def _heights(views: np.ndarray, planes: np.ndarray) -> np.ndarray:
+    """Height above the plane of what each pixel shows, of a point half way down where it shows nothing."""
+    across = (np.arange(views.shape[-1]) + 0.5) / views.shape[-1]
+    n = planes[:, :, None, None]
+    flat = n[:, 0] * across[None, None, :] + n[:, 1] * (1 - across)[None, :, None] + n[:, 3]
+    return np.asarray(flat + n[:, 2] * np.where(views > 0, views, HALF_WAY))
+
+
+class _Network:
+    """Images (n, p, p, c) and further numbers (n, m) to the outputs of all heads, side by side."""
+
+    def __init__(self, config: RegressorConfig | ThingConfig, weights: Weights, channels: int) -> None:
+        self._pixels, self._channels = config.pixels, channels
+        self._stem = Direct.folded(weights, "features.0", "features.1", stride=2)
+        self._blocks: list[Block] = []
+        while f"features.{3 + len(self._blocks)}.first.weight" in weights:
+            self._blocks.append(Block.folded(weights, f"features.{3 + len(self._blocks)}"))
+        first, second = sorted({name.rsplit(".", 1)[0] for name in weights if name.startswith("mixer.")})
+        names = layout.heads(config)
+        self._mixer = [_linear(weights, [first]), _linear(weights, [second])]
+        self._heads = _linear(weights, list(names))
+        # Cells lie channels last here and channels first in torch's weights.
+        width, side = config.widths[-1], config.pixels // 2 ** len(config.widths)
+        matrix, cells = self._mixer[0][0], width * side**2
+        matrix[:cells] = matrix[:cells].reshape(width, side**2, -1).transpose(1, 0, 2).reshape(cells, -1)
+        self._free: deque[Memory] = deque()
+
+    def outputs(self, images: np.ndarray, more: np.ndarray) -> np.ndarray:
+        """Outputs (n, k), float32."""
+        try:
+            memory = self._free.pop()  # one for each thread that computes
+        except IndexError:
+            memory = Memory()
+        with one_blas_thread():
+            parts = [
+                self._outputs(images[first : first + _AT_ONCE], more[first : first + _AT_ONCE], memory)
+                for first in range(0, len(images), _AT_ONCE)
+            ]
+        self._free.append(memory)
+        return np.concatenate(parts) if parts else np.empty((0, self._heads[0].shape[1]), np.float32)
+
+    def _outputs(self, images: np.ndarray, more: np.ndarray, memory: Memory) -> np.ndarray:
+        count, side = len(images), self._pixels
+        margin = self._stem.size // 2
+        framed = memory.zeros("images", (count, side + 2 * margin, side + 2 * margin, self._channels))
+        framed[:, margin:-margin, margin:-margin] = images
+        side //= 2
+        x = self._stem.computed(framed, side, memory, "stem")
+        for number, block in enumerate(self._blocks):
+            x, side = block.computed(x, side, memory, str(number))
+        cells = x[:, 1 : side + 1, 1 : side + 1].reshape(count, -1)
+        h = np.concatenate([cells, more.astype(np.float32, copy=False)], axis=1)
+        for matrix, bias in self._mixer:
+            h = np.maximum(h @ matrix + bias, 0)
+        matrix, bias = self._heads
+        return h @ matrix + bias
+
+
+def _linear(weights: Weights, names: list[str]) -> tuple[np.ndarray, np.ndarray]:
+    """Matrix (inputs, outputs) and bias of fully connected layers side by side."""
+    matrix = np.concatenate([weights[f"{name}.weight"] for name in names]).T
+    return contiguous(matrix), np.concatenate([weights[f"{name}.bias"] for name in names])

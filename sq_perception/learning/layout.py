@@ -1,0 +1,97 @@
+"""Names and shapes of all weights of a network, from its config alone: what a file must hold, without torch.
+
+Names are those of the modules' state dicts (a test compares); the counters of normalisations are left out, as older
+files have none.
+"""
+
+from __future__ import annotations
+
+from sq_perception.geometry.support_directions import DIRECTIONS
+from sq_perception.learning.network_config import BODY_OUTPUTS, EXTENT, PLANE, RegressorConfig, ThingConfig
+
+Shapes = dict[str, tuple[int, ...]]
+
+COUNTER = ".num_batches_tracked"
+"""How the names of those counters end."""
+_RESNET18_CHANNELS, _RESNET18_BLOCKS = (64, 128, 256, 512), 2
+_HEADS = {"size_head": 3, "shape_head": 2, "translation_head": 3, "rotation_head": 6}
+
+
+def shapes(config: RegressorConfig | ThingConfig) -> Shapes:
+    """Name and shape of every weight.
+
+    Raises
+    ------
+    ValueError
+        For numbers of channels or outputs that are no positive integers.
+    """
+    found: Shapes = {}
+    of_things = isinstance(config, ThingConfig)
+    encoding = config.regressor() if isinstance(config, ThingConfig) else config
+    if encoding.backbone == "resnet18":
+        inputs = _resnet18(found)
+    else:
+        cells = (config.pixels // encoding.stride) ** 2
+        inputs = _compact(found, config.widths, config.blocks, 2 if of_things else 1) * cells
+    first, second = ("mixer.0", "mixer.2") if of_things else ("mixer.1", "mixer.3")
+    _linear(found, first, inputs + (PLANE + EXTENT if of_things else 0), config.hidden)
+    _linear(found, second, config.hidden, config.hidden)
+    for head, outputs in heads(config).items():
+        _linear(found, head, config.hidden, outputs)
+    if not all(isinstance(side, int) and side > 0 for shape in found.values() for side in shape):
+        raise ValueError("expected positive integers as numbers of channels and outputs")
+    return found
+
+
+def heads(config: RegressorConfig | ThingConfig) -> dict[str, int]:
+    """Name and number of outputs of every head, in the order of the outputs."""
+    if isinstance(config, RegressorConfig):
+        return dict(_HEADS)
+    count = len(DIRECTIONS)
+    return {
+        "body_head": BODY_OUTPUTS,
+        "support_head": count,
+        "sigma_head": count,
+        "factor_head": count * config.factors,
+    }
+
+
+def _compact(found: Shapes, widths: tuple[int, ...], blocks: int, channels: int) -> int:
+    """The weights of :func:`sq_perception.learning.backbone.compact_backbone`; its channels."""
+    stem, *stages = widths
+    _convolution(found, "features.0", "features.1", channels, stem, 5)
+    channels, number = stem, 3
+    for width in stages:
+        for k in range(max(blocks, 1)):
+            name = f"features.{number}"
+            _convolution(found, f"{name}.first", f"{name}.first_norm", channels, width, 3)
+            _convolution(found, f"{name}.second", f"{name}.second_norm", width, width, 3)
+            if k == 0:
+                _convolution(found, f"{name}.shortcut.0", f"{name}.shortcut.1", channels, width, 1)
+            channels, number = width, number + 1
+    return channels
+
+
+def _resnet18(found: Shapes) -> int:
+    """The weights of :class:`sq_perception.learning.backbone.ResNet18`; its channels."""
+    channels = _RESNET18_CHANNELS[0]
+    _convolution(found, "features.conv1", "features.bn1", 1, channels, 7)
+    for stage, width in enumerate(_RESNET18_CHANNELS, 1):
+        for k in range(_RESNET18_BLOCKS):
+            name = f"features.layer{stage}.{k}"
+            _convolution(found, f"{name}.conv1", f"{name}.bn1", channels, width, 3)
+            _convolution(found, f"{name}.conv2", f"{name}.bn2", width, width, 3)
+            if channels != width:
+                _convolution(found, f"{name}.downsample.0", f"{name}.downsample.1", channels, width, 1)
+            channels = width
+    return channels
+
+
+def _convolution(found: Shapes, name: str, norm: str, channels_in: int, channels_out: int, size: int) -> None:
+    found[f"{name}.weight"] = (channels_out, channels_in, size, size)
+    for part in ("weight", "bias", "running_mean", "running_var"):
+        found[f"{norm}.{part}"] = (channels_out,)
+
+
+def _linear(found: Shapes, name: str, inputs: int, outputs: int) -> None:
+    found[f"{name}.weight"], found[f"{name}.bias"] = (outputs, inputs), (outputs,)

@@ -1,0 +1,145 @@
+"""The networks without torch answer as the modules of torch do, for shipped weights and for random ones."""
+
+from __future__ import annotations
+
+import threading
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from threadpoolctl import threadpool_info
+
+from sq_perception.geometry.one_thread import one_blas_thread
+from sq_perception.learning import checkpoint, inference, layout
+from sq_perception.learning.forward import CompactRegressor, CompactThings
+from sq_perception.learning.network_config import RegressorConfig, ThingConfig
+from sq_perception.learning.regressor import Regressor
+from sq_perception.learning.thing_network import ThingNetwork
+
+FORMS = [
+    RegressorConfig(pixels=32, widths=(4, 8, 8), blocks=1, hidden=32),
+    RegressorConfig(pixels=64, widths=(8, 16, 12), blocks=3, hidden=24),
+    RegressorConfig(pixels=48, widths=(4, 8, 8, 8), blocks=2, hidden=16),  # 24, 12, 6 and 3 pixels a side
+    RegressorConfig(pixels=16, widths=(3, 5, 7, 9), blocks=2, hidden=16),  # down to one pixel
+    RegressorConfig(pixels=8, widths=(4,), hidden=16),
+]
+THINGS = [ThingConfig(), ThingConfig(pixels=32, widths=(8, 16, 16), blocks=3, hidden=16, factors=2, spread=0.3)]
+
+
+def lively(model: Any) -> Any:
+    """The module with measured normalisations and outputs that differ from view to view."""
+    pixels = model.config.pixels
+    with torch.no_grad():
+        for name, parameter in model.named_parameters():
+            if name.endswith("bias") or "norm" in name or name.startswith("features.1"):
+                parameter.add_(0.3 * torch.randn_like(parameter))
+            if "mixer" in name or name.endswith("head.weight"):
+                parameter.mul_(4)
+        for _ in range(3):
+            shown = torch.rand(16, pixels, pixels)
+            inputs = (shown, torch.randn(16, 4), torch.rand(16))
+            model.train()(*(inputs if isinstance(model, ThingNetwork) else (shown[:, None],)))
+    return model.eval()
+
+
+def weights(model: Any) -> dict[str, np.ndarray]:
+    return {name: tensor.numpy() for name, tensor in model.state_dict().items()}
+
+
+@pytest.mark.parametrize("config", [*FORMS, RegressorConfig(), RegressorConfig.thesis(), *THINGS], ids=str)
+def test_the_layout_is_that_of_the_modules(config: RegressorConfig | ThingConfig) -> None:
+    with torch.device("meta"):
+        model = Regressor(config) if isinstance(config, RegressorConfig) else ThingNetwork(config)
+    held = {name: tuple(tensor.shape) for name, tensor in model.state_dict().items()}
+    assert layout.shapes(config) == {name: shape for name, shape in held.items() if not name.endswith(layout.COUNTER)}
+
+
+@pytest.mark.parametrize("config", FORMS, ids=str)
+def test_a_random_regressor(config: RegressorConfig, rng: np.random.Generator) -> None:
+    torch.manual_seed(1)
+    model = lively(Regressor(config))
+    predictor = CompactRegressor(config, weights(model))
+    views = (rng.random((23, 1, 1)) * rng.random((23, config.pixels, config.pixels))).astype(np.float32)
+    for some in (views[:3], views, views[:0], views[:1]):
+        expected = model.predict(some).to_flat()
+        np.testing.assert_allclose(predictor.predict(some).to_flat(), expected, atol=1e-5)
+    assert model.predict(views).to_flat().std(axis=0).max() > 1e-3, "views differ"
+
+
+@pytest.mark.parametrize("name", ["robust", "supervised"])
+def test_the_shipped_regressors(name: str, rng: np.random.Generator) -> None:
+    views = np.where(rng.random((5, 64, 64)) < 0.4, 0, rng.random((5, 64, 64))).astype(np.float32)
+    expected, found = checkpoint.load(name).predict(views), inference.load(name).predict(views)
+    np.testing.assert_allclose(found.to_flat(), expected.to_flat(), atol=1e-5)
+
+
+@pytest.mark.parametrize("config", [*THINGS, None], ids=str)
+def test_networks_of_things(config: ThingConfig | None, rng: np.random.Generator) -> None:
+    """None: the one that ships.  Half of the planes and extents are unknown."""
+    torch.manual_seed(2)
+    model = checkpoint.load_things() if config is None else lively(ThingNetwork(config))
+    predictor = CompactThings(model.config, weights(model))
+    pixels = model.config.pixels
+    views = np.where(rng.random((12, pixels, pixels)) < 0.4, -0.5, rng.random((12, pixels, pixels))).astype(np.float32)
+    known = np.arange(12) % 2
+    planes = (known[:, None] * rng.standard_normal((12, 4))).astype(np.float32)
+    extents = (known * rng.uniform(0.05, 0.4, 12)).astype(np.float32)
+    expected, found = model.answers(views, planes, extents), predictor.answers(views, planes, extents)
+    np.testing.assert_allclose(found[0].to_flat(), expected[0].to_flat(), atol=2e-5)
+    for one, other in zip(found[1:], expected[1:], strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5)
+
+
+def test_threads_do_not_share_what_they_compute_in(rng: np.random.Generator) -> None:
+    predictor = inference.load("robust")
+    batches = [rng.random((k, 64, 64)).astype(np.float32) for k in (1, 4, 2, 7)]
+    expected = [predictor.predict(views).to_flat() for views in batches]
+    found: dict[int, np.ndarray] = {}
+
+    def ask(k: int) -> None:
+        for _ in range(5):
+            found[k] = predictor.predict(batches[k]).to_flat()
+
+    threads = [threading.Thread(target=ask, args=(k,)) for k in range(4)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    for k in range(4):
+        np.testing.assert_allclose(found[k], expected[k], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "views", [np.zeros((64, 64)), np.zeros((1, 63, 64)), np.full((1, 64, 64), np.nan)], ids=["flat", "narrow", "nan"]
+)
+def test_refuses_other_views(views: np.ndarray) -> None:
+    with pytest.raises(ValueError, match="expected"):
+        inference.load("robust").predict(views)
+
+
+def test_torch_computes_what_is_no_compact_network(tmp_path: Path, rng: np.random.Generator) -> None:
+    torch.manual_seed(3)
+    model = Regressor(replace(RegressorConfig.thesis(), pixels=64)).eval()
+    checkpoint.save(tmp_path / "m.safetensors", model, dtype=np.float32)
+    views, before = rng.random((2, 64, 64)), torch.get_num_threads()
+    found = inference.load(tmp_path / "m.safetensors").predict(views)
+    np.testing.assert_allclose(found.to_flat(), model.predict(views).to_flat(), atol=1e-4)
+    assert torch.get_num_threads() == before
+
+
+def threads_of_blas() -> set[int]:
+    return {one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas"}
+
+
+def test_the_last_block_gives_blas_its_threads_back() -> None:
+    before = threads_of_blas()
+    first, second = one_blas_thread(), one_blas_thread()
+    first.__enter__()
+    second.__enter__()
+    first.__exit__(None, None, None)
+    assert threads_of_blas() == {1}
+    second.__exit__(None, None, None)
+    assert threads_of_blas() == before
