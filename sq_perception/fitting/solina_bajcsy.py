@@ -39,35 +39,25 @@ from sq_perception.geometry import rotation as quaternions
 _NO_FREE_SPACE = np.empty((0, RAY_COLUMNS))
 _UNIT = 0.01
 """Residuals count in this share of the extent to the power 3/2, which makes the damping independent of units."""
+_MOST_POINTS = 1000
+"""Budget.  Chosen: what the method costs grows with them, what it finds does not."""
+_MOST_STEPS, _TOLERANCE = 100, 1e-6
+"""Levenberg-Marquardt stops after so many, or when one gains less than this share of the cost.  Chosen: beyond need."""
 _ESCAPE = 0.3
 """Standard deviation of a disturbance: of log sizes, exponents, angles, and of the centre in mean half sizes."""
 
 
-def fit(
-    points: np.ndarray,
-    *,
-    bounds: Bounds | None = None,
-    max_points: int | None = 1000,
-    max_iterations: int = 100,
-    tolerance: float = 1e-6,
-    escapes: int = 0,
-    seed: int = 0,
-) -> Fit:
+def fit(points: np.ndarray, *, escapes: int = 0) -> Fit:
     """Fit one superquadric to points (n, 3) of its visible surface.
 
     Parameters
     ----------
     points : (n, 3)
-        Metres, in any frame; the body comes back in the same.  Rows that are not finite are ignored.
-    bounds : Bounds, optional
-        Limits of sizes and exponents.
-    max_points
-        Budget; more points are thinned evenly in their given order.  None uses all.
-    max_iterations, tolerance
-        Levenberg-Marquardt stops after so many steps, or when a step gains less than this share of the cost.
-    escapes, seed
-        How often to disturb the result at random and to start again from there, and the seed of the disturbances; the
-        best of all results counts.  The original adds noise to the cost for the same end: to leave shallow minima.
+        Metres, in any frame; the body comes back in the same.  Rows that are not finite are ignored, and more than
+        1000 points are thinned evenly in their given order.
+    escapes
+        How often to disturb the result at random and to start again from there; the best of all results counts.  The
+        original adds noise to the cost for the same end: to leave shallow minima.
 
     Returns
     -------
@@ -87,8 +77,8 @@ def fit(
     points = points[np.isfinite(points).all(axis=1)]
     if len(points) == 0:
         raise ValueError("no finite point: there is nothing to fit")
-    if max_points is not None and len(points) > max_points:
-        points = points[np.linspace(0, len(points) - 1, max_points).astype(int)]
+    if len(points) > _MOST_POINTS:
+        points = points[np.linspace(0, len(points) - 1, _MOST_POINTS).astype(int)]
     start = moment_start(points)
     extent = float(np.linalg.norm(np.ptp(points, axis=0)))
     spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
@@ -102,13 +92,12 @@ def fit(
         rays = np.zeros((len(points), RAY_COLUMNS))
         rays[:, ORIGIN_X], rays[:, ORIGIN_Y], rays[:, DEPTH] = points.T
         rays[:, STIFFNESS], rays[:, WEIGHT], rays[:, LAST] = 1 / (_UNIT * extent**1.5), 1.0, points[:, 2]
-        limits = (bounds or Bounds()).limits(points)
-        terms = Terms(huber=math.inf)
-        state = minimize(CLASSIC, rays, _NO_FREE_SPACE, terms, start, limits, max_iterations, tolerance)
-        rng = np.random.default_rng(seed)
+        limits, terms = Bounds().limits(points), Terms(huber=math.inf)
+        state = minimize(CLASSIC, rays, _NO_FREE_SPACE, terms, start, limits, _MOST_STEPS, _TOLERANCE)
+        rng = np.random.default_rng(0)
         for _ in range(escapes):
             other = _disturbed(state, rng)
-            other = minimize(CLASSIC, rays, _NO_FREE_SPACE, terms, other, limits, max_iterations, tolerance)
+            other = minimize(CLASSIC, rays, _NO_FREE_SPACE, terms, other, limits, _MOST_STEPS, _TOLERANCE)
             state = min(state, other, key=lambda each: each.cost)
     body = state.body.canonical_form()
     distance = np.abs(body.sampson_distance(points))

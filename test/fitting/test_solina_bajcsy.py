@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from sq_perception.fitting import solina_bajcsy
-from sq_perception.fitting.bounds import Bounds
 from sq_perception.fitting.fit import Fit, Status
 from sq_perception.geometry import metrics
 from sq_perception.geometry import rotation as quaternions
@@ -54,19 +53,11 @@ def test_the_lone_axis_becomes_z() -> None:
         assert np.linalg.det(start.rotation) == pytest.approx(1.0)
 
 
-def test_bounds_are_kept(rng: np.random.Generator) -> None:
-    truth = Superquadric([0.05, 0.04, 0.09], [0.9, 0.9], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
-    bounds = Bounds(shape=(0.1, 0.5), size=(0.02, 0.06))
-    fit = solina_bajcsy.fit(truth.sample_surface(400, rng), bounds=bounds)
-    assert fit.superquadric.shape.max() <= 0.5 + 1e-12
-    assert fit.superquadric.size.max() <= 0.06 + 1e-12
-
-
-def test_the_budget_thins_the_cloud_and_none_keeps_all(rng: np.random.Generator) -> None:
+def test_the_budget_thins_the_cloud(rng: np.random.Generator) -> None:
     truth = Superquadric([0.04, 0.03, 0.1], [0.5, 0.7], [0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0])
-    points = truth.sample_surface(1000, rng)
-    few, all_of_them = solina_bajcsy.fit(points, max_points=100), solina_bajcsy.fit(points, max_points=None)
-    assert metrics.volume_iou(few.superquadric, all_of_them.superquadric) > 0.97
+    points = truth.sample_surface(3000, rng)
+    few, many = solina_bajcsy.fit(points[::3]), solina_bajcsy.fit(points)
+    assert metrics.volume_iou(few.superquadric, many.superquadric) > 0.97
 
 
 @pytest.mark.parametrize(
@@ -111,20 +102,20 @@ def cost(fit: Fit, points: np.ndarray) -> float:
     return float(residual @ residual)
 
 
-@pytest.mark.parametrize("seed", [5, 6, 18, 42])
+@pytest.mark.parametrize("seed", [5, 112, 464, 621])
 def test_escapes_leave_a_shallow_minimum_and_repeat(seed: int) -> None:
     """From the start alone, the fit of these clouds ends in a minimum at least four times as high."""
     points = noisy_cloud(seed)
     plain = solina_bajcsy.fit(points)
-    escaped = solina_bajcsy.fit(points, escapes=8, seed=3)
+    escaped = solina_bajcsy.fit(points, escapes=8)
     assert cost(escaped, points) < 0.5 * cost(plain, points)
     assert escaped.iterations > plain.iterations
-    again = solina_bajcsy.fit(points, escapes=8, seed=3)
+    again = solina_bajcsy.fit(points, escapes=8)
     np.testing.assert_array_equal(again.superquadric.to_flat(), escaped.superquadric.to_flat())
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_escapes_never_make_it_worse(seed: int) -> None:
     points = noisy_cloud(seed)
-    plain, escaped = solina_bajcsy.fit(points), solina_bajcsy.fit(points, escapes=3, seed=seed)
+    plain, escaped = solina_bajcsy.fit(points), solina_bajcsy.fit(points, escapes=3)
     assert cost(escaped, points) <= cost(plain, points) * (1 + 1e-6)
