@@ -77,6 +77,7 @@ def groups(everything: list[Judged]) -> dict[str, list[Judged]]:
     rows |= {kind: [one for one in half if one.kind == kind] for kind in KINDS}
     rows |= {name: [one for one in half if one.name == name] for name in NAMES}
     rows |= {way: [one for one in half if one.rest.startswith(way)] for way in WAYS}
+    rows["half of its pixels measured"] = [one for one in half if 2 * one.measured >= one.pixels]
     return rows | real_scenes.by_sensor_and_share(half, everything)
 
 
