@@ -27,6 +27,7 @@ import cv2
 import numpy as np
 
 from sq_perception.geometry import rotation as quaternions
+from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
 
@@ -42,8 +43,8 @@ _SURROUNDINGS = 1.2
 """More than MARGIN: under perspective the view's edges are not where those of the silhouette's box are."""
 _NEARER = 0.04
 """What stands nearer than the object by this share of the view's side hides what is behind it."""
-_NOTHING = -1e300
-_BEHIND = -2e300
+_ROUNDS = 3
+"""Readings of z that settle where a pixel of the view looks."""
 _FLIP = np.diag([1.0, -1.0, -1.0])
 
 
@@ -163,21 +164,17 @@ def from_mask(
 
     image = np.full((camera.height, camera.width), np.nan, dtype=np.float32)
     image[seen] = z
-    filled = _filled(image) if camera.is_pinhole or find_hidden else None
-    points = _looked_at(filled, middle, matrix, anchor, extent, camera, pixels)
-    z_view = _read(image, points, camera, cv2.BORDER_CONSTANT)
-    value = (z_view - anchor[2]) / extent + NEAREST
-    value = np.where(np.isfinite(value), np.clip(value, 1 / 255, 1.0), 0.0).astype(np.float32)
-    hidden = np.zeros(value.shape, dtype=bool)
+    filled = _filled(image) if camera.is_pinhole or find_hidden else image
+    covered = np.zeros(mask.shape, dtype=bool)
     if find_hidden:
-        assert filled is not None
         covered = _covered(depth, mask, filled, camera, matrix, plane, _NEARER * extent)
-        if missing_is_hidden:
-            covered |= ~np.isfinite(depth)
-        hidden = _read(covered.astype(np.float32), points, camera, cv2.BORDER_CONSTANT) > 0
-        if missing_is_hidden:
-            hidden |= ~_within(points, whole)
-        hidden &= value == 0
+    if missing_is_hidden:
+        covered |= ~np.isfinite(depth)
+    beyond = (-left, -top, whole.width - left, whole.height - top) if missing_is_hidden else (0, 0, 0, 0)
+    intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
+    value, hidden = _resampled(
+        image, filled, covered, beyond, intrinsics, camera.is_pinhole, matrix, anchor, extent, middle, pixels
+    )
     return CanonicalView(value, hidden, quaternions.from_matrix(matrix), matrix.T @ anchor, float(extent))
 
 
@@ -202,7 +199,8 @@ def full_frame(depth: np.ndarray, mask: np.ndarray, camera: Camera, pixels: int)
     camera.check_image(mask)
     x, y = np.meshgrid(np.linspace(0, 1, pixels), np.linspace(0, 1, pixels))
     seen = np.where(mask, depth, np.nan).astype(np.float32)
-    image = 1 - _read(seen, np.stack([x, y, np.zeros_like(x)], axis=-1), camera, cv2.BORDER_CONSTANT)
+    u, v = np.moveaxis(camera.project(np.stack([x, y, np.zeros_like(x)], axis=-1)).astype(np.float32), -1, 0)
+    image = 1 - cv2.remap(seen, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=float("nan"))
     image = np.where(np.isfinite(image), np.clip(image, 1 / 255, 1.0), 0.0).astype(np.float32)
     # The cube is the optical frame turned by _FLIP and shifted by (0, 1, 1).
     anchor = _FLIP @ (np.array([0.5, 0.5, NEAREST]) - np.array([0.0, 1.0, 1.0]))
@@ -255,41 +253,57 @@ def _coordinates(camera: Camera, u: np.ndarray, v: np.ndarray, depth: np.ndarray
     return points
 
 
-def _looked_at(
-    filled: np.ndarray | None,
-    z_guess: float,
+@kernel
+def _resampled(
+    image: np.ndarray,
+    filled: np.ndarray,
+    covered: np.ndarray,
+    whole: tuple[int, int, int, int],
+    intrinsics: tuple[float, float, float, float],
+    pinhole: bool,
     matrix: np.ndarray,
     anchor: np.ndarray,
     extent: float,
-    camera: Camera,
+    z_guess: float,
     pixels: int,
-) -> np.ndarray:
-    """The point (pixels, pixels, 3) of the optical frame that each pixel of the view looks at.
+) -> tuple[np.ndarray, np.ndarray]:
+    """Values and hidden pixels (pixels, pixels) of a view, by the nearest pixel of a crop of the image (height, width).
 
     A view pixel fixes turned x and y but not z, and a pinhole pixel depends on all three.  Reading z at the projection
     of the last guess is a contraction wherever the surface is not almost parallel to the ray; three rounds suffice.
     Guesses that fall beside the object go on with the z of its nearest pixel, which ``filled`` (turned z) holds.
+    The object may go on where ``covered`` is, and beyond ``whole``: left, top, right and bottom of the image, unless it
+    is empty.
     """
-    steps = ((np.arange(pixels) + 0.5) / pixels - 0.5) * extent
-    x, y = np.meshgrid(anchor[0] + steps, anchor[1] - steps)
-    z = np.full((pixels, pixels), z_guess)
-    if camera.is_pinhole:
-        assert filled is not None
-        for _ in range(3):
-            z = _read(filled, np.stack([x, y, z], axis=-1) @ matrix, camera, cv2.BORDER_REPLICATE)
-    return np.stack([x, y, z], axis=-1) @ matrix
-
-
-def _read(image: np.ndarray, points: np.ndarray, camera: Camera, border: int) -> np.ndarray:
-    """The image at the projections of points (n, n, 3); NaN beyond a constant border."""
-    uv = camera.project(points).astype(np.float32)
-    return cv2.remap(image, uv[..., 0], uv[..., 1], cv2.INTER_NEAREST, borderMode=border, borderValue=float("nan"))
-
-
-def _within(points: np.ndarray, camera: Camera) -> np.ndarray:
-    """Whether points (n, n, 3) are projected into the image."""
-    u, v = np.moveaxis(camera.project(points), -1, 0)
-    return (u >= -0.5) & (u < camera.width - 0.5) & (v >= -0.5) & (v < camera.height - 0.5)
+    fx, fy, cx, cy = intrinsics
+    height, width = image.shape
+    left, top, right, bottom = whole
+    value, hidden = np.zeros((pixels, pixels), np.float32), np.zeros((pixels, pixels), np.bool_)
+    for i in range(pixels):
+        y = anchor[1] - ((i + 0.5) / pixels - 0.5) * extent
+        for j in range(pixels):
+            x = anchor[0] + ((j + 0.5) / pixels - 0.5) * extent
+            z = z_guess
+            u, v = 0.0, 0.0
+            for step in range(_ROUNDS + 1):
+                px = x * matrix[0, 0] + y * matrix[1, 0] + z * matrix[2, 0]
+                py = x * matrix[0, 1] + y * matrix[1, 1] + z * matrix[2, 1]
+                pz = x * matrix[0, 2] + y * matrix[1, 2] + z * matrix[2, 2]
+                if pinhole:
+                    px, py = (px / pz, py / pz) if pz > 0 else (np.inf, np.inf)
+                u, v = np.rint(fx * px + cx), np.rint(fy * py + cy)
+                if not pinhole or step == _ROUNDS:
+                    break
+                z = np.float64(filled[int(min(max(v, 0), height - 1)), int(min(max(u, 0), width - 1))])
+            if 0 <= u < width and 0 <= v < height:
+                seen = image[int(v), int(u)]
+                if np.isfinite(seen):
+                    value[i, j] = min(max((seen - anchor[2]) / extent + NEAREST, 1 / 255), 1.0)
+                else:
+                    hidden[i, j] = covered[int(v), int(u)]
+            if right > left and not (left <= u < right and top <= v < bottom):
+                hidden[i, j] = True
+    return value, hidden
 
 
 def _filled(image: np.ndarray) -> np.ndarray:
