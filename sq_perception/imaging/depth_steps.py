@@ -15,6 +15,8 @@ import numpy as np
 from sq_perception.geometry.kernels import kernel
 
 CROSS = cv2.getStructuringElement(cv2.MORPH_CROSS, (3, 3))
+STEP = 0.015
+"""Share of the depth by which neighbouring pixels of one surface differ at most."""
 
 
 def edges(filled: np.ndarray, wanted: np.ndarray, step: float) -> np.ndarray:
@@ -29,12 +31,12 @@ def components(mask: np.ndarray) -> np.ndarray:
     return labels
 
 
-def separated(depth: np.ndarray, wanted: np.ndarray, step: float) -> np.ndarray:
+def separated(depth: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     """Components of the wanted pixels, cut where neighbouring depths jump; the cut pixels are given back."""
     filled = np.where(wanted, depth, np.float32(0))
-    kept = wanted & ~edges(filled, wanted, step)
+    kept = wanted & ~edges(filled, wanted, STEP)
     labels = components(cv2.morphologyEx(kept.astype(np.uint8), cv2.MORPH_OPEN, CROSS))
-    return grown(labels, wanted & (labels == 0), depth, 2, step)
+    return grown(labels, wanted & (labels == 0), depth, 2, STEP)
 
 
 def grown(labels: np.ndarray, free: np.ndarray, depth: np.ndarray, rounds: int, step: float) -> np.ndarray:

@@ -62,10 +62,6 @@ class SegmentationOptions:
         The largest ones are kept.
     min_pixels
         Smaller components are dropped; None: 0.05 % of the image, at least 30.
-    min_height
-        An object reaches at least this far above the plane, metres.
-    depth_step
-        Neighbouring pixels whose depths differ by more than this share of the depth belong to different objects.
     max_size
         Largest edge of an object, metres; what is larger is furniture.  Not asked of labels from outside.
     workspace
@@ -73,25 +69,14 @@ class SegmentationOptions:
         anywhere.
     workspace_pose
         Quaternion x y z w and translation of the optical frame in the frame of the box; None: they are the same.
-    plane_tolerance
-        Half thickness of a plane while it is searched, metres at a depth of one metre.
-    min_plane_share
-        Share of the valid pixels that a support plane has at least.
-    seed
-        Of the random sample; the same image gives the same result.
     """
 
     depth_range: tuple[float, float] = (0.0, np.inf)
     max_objects: int = 20
     min_pixels: int | None = None
-    min_height: float = 0.012
     max_size: float = 0.6
     workspace: standing.Box | None = None
     workspace_pose: standing.Pose | None = None
-    depth_step: float = 0.015
-    plane_tolerance: float = 0.008
-    min_plane_share: float = 0.1
-    seed: int = 0
 
     def __post_init__(self) -> None:
         near, far = self.depth_range
@@ -105,9 +90,8 @@ class SegmentationOptions:
                 raise ValueError(
                     f"workspace: expected least x, y, z and greater x, y, z in metres, got {self.workspace}"
                 )
-        for name in ("min_height", "max_size", "depth_step", "plane_tolerance"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}")
+        if not self.max_size > 0:
+            raise ValueError(f"max_size: expected a positive number, got {self.max_size}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,21 +143,21 @@ def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | No
         return Segmentation(labels, None, ids)
     if np.count_nonzero(valid) < least:
         return Segmentation(np.zeros(depth.shape, np.int32), None, ())
-    planes = support_plane.planes(depth, valid, camera, _search(options))
-    plane = support_plane.support(planes, depth, valid, camera, options.depth_step)
+    planes = support_plane.planes(depth, valid, camera)
+    plane = support_plane.support(planes, depth, valid, camera)
     known = np.where(valid, depth, np.float32(0))
-    limits = _limits(options)
+    limits = standing.Limits(options.max_size, options.workspace, options.workspace_pose)
     if plane is None:
-        labels = _bodies(known, valid, camera, _UNKNOWN_SIGMA, options)
+        labels = _bodies(known, valid, camera, _UNKNOWN_SIGMA)
         labels, ids = _ordered(labels, least, options.max_objects, standing.alone(known, camera, limits))
         return Segmentation(labels, None, ids)
-    support = support_surface.measured(plane, known, valid, camera, options.plane_tolerance)
+    support = support_surface.measured(plane, known, valid, camera)
     walls = [other for other in planes if other is not plane]
     # What is out of range holds things up and hides them all the same.
     everything, measured = _checked(depth, camera, (0.0, np.inf))
     everything = np.where(measured, everything, np.float32(0))
     relative = support.image_relative(everything, camera)
-    labels = _above(known, relative * valid, valid, camera, support, walls, options)
+    labels = _above(known, relative * valid, valid, camera, support, walls, limits)
     test = standing.standing(everything, relative, camera, support, walls, limits)
     labels, ids = _ordered(labels, least, options.max_objects, test)
     return Segmentation(labels, plane.equation, ids, max(support.sigma, _LEAST_SIGMA))
@@ -221,7 +205,7 @@ def from_labels(
     ids = ids[: options.max_objects]
     plane = None
     if ids and camera.is_pinhole:
-        plane = support_plane.around(labels, ids, depth, valid, camera, _search(options))
+        plane = support_plane.around(labels, ids, depth, valid, camera)
     return Segmentation(labels, plane, ids)
 
 
@@ -237,7 +221,7 @@ def support_under(
     depth, valid = _checked(depth, camera, options.depth_range)
     if not camera.is_pinhole or not ((found.labels == label) & valid).any():
         return None
-    return support_plane.around(found.labels, (label,), depth, valid, camera, _search(options))
+    return support_plane.around(found.labels, (label,), depth, valid, camera)
 
 
 def warm_up() -> None:
@@ -249,24 +233,9 @@ def warm_up() -> None:
     segment((0.7 - 0.08 * np.sqrt(np.maximum(1 - radius**2, 0))).astype(np.float32), camera)
 
 
-def _search(options: SegmentationOptions) -> support_plane.Search:
-    return support_plane.Search(options.plane_tolerance, options.min_plane_share, options.seed)
-
-
 def _points(mask: np.ndarray, depth: np.ndarray, valid: np.ndarray, camera: Camera) -> np.ndarray:
     rows, columns = np.nonzero(mask & valid)
     return camera.unproject(columns, rows, depth[rows, columns])
-
-
-def _limits(options: SegmentationOptions) -> standing.Limits:
-    return standing.Limits(
-        options.min_height,
-        options.max_size,
-        options.workspace,
-        options.workspace_pose,
-        options.plane_tolerance,
-        options.depth_step,
-    )
 
 
 def _checked(depth: np.ndarray, camera: Camera, limits: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
@@ -300,28 +269,28 @@ def _above(
     camera: Camera,
     support: SupportSurface,
     walls: list[Plane],
-    options: SegmentationOptions,
+    limits: standing.Limits,
 ) -> np.ndarray:
     """Bodies (labels from 1, unordered) of what is above the support; heights are 0 where depths are."""
     labels = np.zeros(known.shape, np.int32)
     # Half of the tolerance band is a compromise: bent depth of real cameras stays below, thin objects stay above.
-    clear = cv2.blur(relative, (3, 3)) > max(0.5 * options.plane_tolerance, 4 * support.sigma)
+    clear = cv2.blur(relative, (3, 3)) > max(0.5 * support_plane.TOLERANCE, 4 * support.sigma)
     # The mean beside a tall body is that of its height: the pixel itself decides there.
-    above = relative > max(0.25 * options.plane_tolerance, 2 * support.sigma)
-    above &= ~support_surface.risen(relative, known, valid, camera, options.plane_tolerance, options.depth_step)
+    above = relative > max(0.25 * support_plane.TOLERANCE, 2 * support.sigma)
+    above &= ~support_surface.risen(relative, known, valid, camera)
     clear &= above
-    clear &= ~standing.furniture(known, clear, camera, walls, _limits(options))
+    clear &= ~standing.furniture(known, clear, camera, walls, limits)
     left, top, width, height = cv2.boundingRect(clear.view(np.uint8))
     if width == 0:
         return labels
     top, left = max(top - _AROUND, 0), max(left - _AROUND, 0)
     window = slice(top, top + height + 2 * _AROUND), slice(left, left + width + 2 * _AROUND)
-    flat = (valid & (np.abs(relative) < options.plane_tolerance))[window]
+    flat = (valid & (np.abs(relative) < support_plane.TOLERANCE))[window]
     known = known[window]
     seen = camera.cropped(left, top, known.shape[1], known.shape[0])
-    inside = _bodies(known, clear[window], seen, support.sigma, options, flat)
+    inside = _bodies(known, clear[window], seen, support.sigma, flat)
     foot = above[window] & (inside == 0)
-    labels[window] = depth_steps.grown(inside, foot, known, _FOOT_PIXELS, options.depth_step)
+    labels[window] = depth_steps.grown(inside, foot, known, _FOOT_PIXELS, depth_steps.STEP)
     return labels
 
 
@@ -330,16 +299,15 @@ def _bodies(
     wanted: np.ndarray,
     camera: Camera,
     sigma: float,
-    options: SegmentationOptions,
     flat: np.ndarray | None = None,
 ) -> np.ndarray:
     """Bodies (labels from 1, unordered) of the wanted pixels, taken apart at steps and concave edges."""
     sigma = max(sigma, _LEAST_SIGMA)
-    patches = surface_patches.find(depth, wanted, camera, sigma, options.depth_step, flat)
+    patches = surface_patches.find(depth, wanted, camera, sigma, flat)
     if patches is None:
-        return depth_steps.separated(depth, wanted, options.depth_step)
+        return depth_steps.separated(depth, wanted)
     body = patch_grouping.bodies(patches, camera)
-    labels = _refined(body[patches.labels].astype(np.int32), patches, depth, wanted, options.depth_step)
+    labels = _refined(body[patches.labels].astype(np.int32), patches, depth, wanted)
     labels = convex_parts.corrected(labels, depth, camera, sigma)
     # What is too small for a patch stays what the steps made of it.
     rest = cv2.morphologyEx((wanted & (labels == 0)).view(np.uint8), cv2.MORPH_OPEN, depth_steps.CROSS)
@@ -347,13 +315,11 @@ def _bodies(
     return np.where(rest > 0, rest + labels.max(), labels).astype(np.int32)
 
 
-def _refined(
-    body: np.ndarray, patches: surface_patches.Patches, depth: np.ndarray, wanted: np.ndarray, step: float
-) -> np.ndarray:
+def _refined(body: np.ndarray, patches: surface_patches.Patches, depth: np.ndarray, wanted: np.ndarray) -> np.ndarray:
     """Labels (height, width) from those of the samples; beside a step, of the one whose depth is most alike."""
     unsure = patches.stepped | (body == 0)
     known = np.pad(np.where(body > 0, patches.depth, np.float32(np.inf)), 1, constant_values=np.inf)
-    return np.asarray(_fine(body, unsure, known, depth, wanted, patches.stride, np.float32(step)))
+    return np.asarray(_fine(body, unsure, known, depth, wanted, patches.stride, np.float32(depth_steps.STEP)))
 
 
 @kernel

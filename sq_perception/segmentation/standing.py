@@ -23,7 +23,7 @@ from sq_perception.geometry import rotation
 from sq_perception.imaging import depth_steps
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation import support_plane
-from sq_perception.segmentation.support_plane import Plane, noise_growth
+from sq_perception.segmentation.support_plane import TOLERANCE, Plane, noise_growth
 from sq_perception.segmentation.support_surface import HIGHEST, SupportSurface
 
 ObjectTest = Callable[[np.ndarray, np.ndarray], bool]
@@ -32,6 +32,8 @@ Box = tuple[float, float, float, float, float, float]
 Pose = tuple[tuple[float, float, float, float], tuple[float, float, float]]
 """Quaternion x y z w and translation."""
 
+MIN_HEIGHT = 0.012
+"""Metres that a thing reaches above the support at least: one and a half tolerances of a plane a metre away."""
 _SAMPLES = 400
 """Of a segment, evenly taken: the 5 % above a height, or the 1 % that may stick out, are a few still."""
 _COARSE_PIXELS, _FEWEST = 120, 30
@@ -60,26 +62,17 @@ class Limits:
 
     Attributes
     ----------
-    min_height
-        It reaches at least this far above the support, metres.
     max_size
         Largest edge of a box around what is seen of it, metres.
     workspace
         The middle of what is seen of it lies in this box: least x, y, z and greatest x, y, z.
     workspace_pose
         Of the optical frame in the frame of the box; None: they are the same.
-    tolerance
-        Half thickness of a plane, metres at a depth of one metre.
-    step
-        Share of the depth by which neighbouring pixels of one surface differ at most.
     """
 
-    min_height: float
     max_size: float
     workspace: Box | None
     workspace_pose: Pose | None
-    tolerance: float
-    step: float
 
     def hold(self, points: np.ndarray, up: np.ndarray | None = None) -> bool:
         """Whether points (n, 3) are no larger than a thing and in the workspace; ``up`` is the support's normal."""
@@ -132,7 +125,7 @@ def furniture(depth: np.ndarray, valid: np.ndarray, camera: Camera, walls: list[
     points = camera.unproject(k * columns, k * rows, depth[::k, ::k][rows, columns])
     large = np.zeros(kept.shape, np.uint8)
     for wall in walls:
-        reach = max(0.5 * limits.tolerance, _ON_WALL * wall.sigma) * noise_growth(points[:, 2])
+        reach = max(0.5 * TOLERANCE, _ON_WALL * wall.sigma) * noise_growth(points[:, 2])
         on = np.abs(wall.height(points)) < reach
         lies = np.zeros(kept.shape, bool)
         lies[rows[on], columns[on]] = True
@@ -193,8 +186,8 @@ def standing(
         points = camera.unproject(c, r, depth[r, c])
         growth = noise_growth(points[:, 2])
         height = relative[r, c]
-        noise = max(support.sigma, _spread(around, rows, columns, HIGHEST * limits.tolerance))
-        if _top(height * growth) < limits.min_height or _top(height) < _BUMP * noise:
+        noise = max(support.sigma, _spread(around, rows, columns, HIGHEST * TOLERANCE))
+        if _top(height * growth) < MIN_HEIGHT or _top(height) < _BUMP * noise:
             return False
         at_border = rows.min() == 0 or columns.min() == 0 or rows.max() == last_row or columns.max() == last_column
         for wall in walls:
@@ -202,11 +195,11 @@ def standing(
             on_it = rows.size < _FACE_SHARE * wall.share * measured
             if on_it and _top(off) < _BUMP * wall.sigma:
                 return False
-            if at_border and np.mean(off < 2 * limits.tolerance) > 0.5:
+            if at_border and np.mean(off < 2 * TOLERANCE) > 0.5:
                 return False
         if not limits.hold(points, plane.equation[:3]):
             return False
-        if not _stands(points, depth, relative, camera, plane, limits.tolerance):
+        if not _stands(points, depth, relative, camera, plane):
             return False
         around[rows, columns] = np.inf
         return True
@@ -228,18 +221,16 @@ def _spread(around: np.ndarray, rows: np.ndarray, columns: np.ndarray, highest: 
     return float(1.4826 * np.median(heights)) if heights.size >= _FEWEST else 0.0
 
 
-def _stands(
-    points: np.ndarray, depth: np.ndarray, relative: np.ndarray, camera: Camera, plane: Plane, tolerance: float
-) -> bool:
+def _stands(points: np.ndarray, depth: np.ndarray, relative: np.ndarray, camera: Camera, plane: Plane) -> bool:
     """Whether the support is under points (n, 3), as far as the camera tells; what the image cuts off tells nothing."""
     normal = plane.equation[:3]
-    under = plane.height(points) + _UNDER * tolerance * noise_growth(points[:, 2])
+    under = plane.height(points) + _UNDER * TOLERANCE * noise_growth(points[:, 2])
     feet = points - under[:, None] * normal
     feet = feet[feet[:, 2] > 0]
     at = np.rint(camera.project(feet))
     inside = (at >= 0).all(axis=1) & (at[:, 0] < camera.width) & (at[:, 1] < camera.height)
     columns, rows = at[inside].astype(int).T
     told = depth[rows, columns] > 0
-    past = np.count_nonzero(relative[rows, columns][told] < -_BELOW * tolerance)
+    past = np.count_nonzero(relative[rows, columns][told] < -_BELOW * TOLERANCE)
     held = np.count_nonzero(told) - past
     return past <= held and held + np.count_nonzero(~inside) >= _TOLD * len(feet)

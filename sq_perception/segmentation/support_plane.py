@@ -25,12 +25,17 @@ import numpy as np
 from sq_perception.imaging import depth_steps
 from sq_perception.imaging.camera import Camera
 
+TOLERANCE = 0.008
+"""Half thickness of a plane while it is searched, metres at a depth of one metre."""
+_LEAST_SHARE = 0.1
+"""Of the valid pixels that a plane has."""
+_SEED = 0
+"""Of the random sample; the same image gives the same planes."""
 _PLANE_POINTS = 1500
 _REFINE_POINTS = 8000
 _HYPOTHESES = 200
 _PLANES = 3
 _COARSE_PIXELS = 120
-_FACE_TOLERANCE = 0.008
 _BENT_SHARE = 0.08
 _ISLAND_SHARE = 0.25
 _CARRIED_SHARE, _WELL_WITHIN, _FACING_DOWN = 0.01, 4.0, 0.3
@@ -44,25 +49,6 @@ LEAST_GROWTH = 0.1
 """Of the noise: nearer than 0.3 m it falls no further, as a sensor's own quantisation and calibration remain."""
 
 _Surface = tuple[np.ndarray, bool]
-
-
-@dataclass(frozen=True)
-class Search:
-    """How planes are searched.
-
-    Attributes
-    ----------
-    tolerance
-        Half thickness of a plane, metres at a depth of one metre.
-    min_share
-        Share of the points that a plane has at least.
-    seed
-        Of the random sample; the same image gives the same planes.
-    """
-
-    tolerance: float
-    min_share: float
-    seed: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,18 +79,18 @@ def noise_growth(z: np.ndarray) -> np.ndarray:
     return np.maximum(z * z, LEAST_GROWTH)
 
 
-def planes(depth: np.ndarray, valid: np.ndarray, camera: Camera, search: Search) -> list[Plane]:
+def planes(depth: np.ndarray, valid: np.ndarray, camera: Camera) -> list[Plane]:
     """Up to three planes, the one with most points first; each is taken away before the next is searched."""
     pixels = np.flatnonzero(valid)
     rows, columns = np.divmod(pixels[:: max(1, pixels.size // _REFINE_POINTS)], camera.width)
     points = camera.unproject(columns, rows, depth[rows, columns])
-    rng = np.random.default_rng(search.seed)
+    rng = np.random.default_rng(_SEED)
     total, found = len(points), []
     for _ in range(_PLANES):
-        if len(points) < max(12, search.min_share * total):
+        if len(points) < max(12, _LEAST_SHARE * total):
             break
-        plane, inside = _dominant_plane(points, search.tolerance, rng)
-        if plane is None or inside.sum() < search.min_share * total:
+        plane, inside = _dominant_plane(points, rng)
+        if plane is None or inside.sum() < _LEAST_SHARE * total:
             break
         near = points[inside]
         spread = np.abs(near @ plane[:3] + plane[3]) / noise_growth(near[:, 2])
@@ -113,16 +99,14 @@ def planes(depth: np.ndarray, valid: np.ndarray, camera: Camera, search: Search)
     return found
 
 
-def support(
-    candidates: list[Plane], depth: np.ndarray, valid: np.ndarray, camera: Camera, depth_step: float
-) -> Plane | None:
+def support(candidates: list[Plane], depth: np.ndarray, valid: np.ndarray, camera: Camera) -> Plane | None:
     """The plane that things stand on: many points, and rather below the camera than in front of it or above it.
 
     A camera is mounted upright or looks straight down.  The table seen from straight above and a wall look alike; a
     wall counts less, as a floor or a table in the same picture then has a normal that points up.  Of a table and the
     floor below it things stand on the table, though the picture may show more of the floor.
     """
-    surfaces = _on_one_surface(depth, valid, camera, depth_step)
+    surfaces = _on_one_surface(depth, valid, camera)
     chosen = [plane for plane in candidates if not _is_face(plane, surfaces) or _carries(plane, surfaces)]
     if not chosen:
         return None
@@ -138,7 +122,7 @@ def support(
 
 
 def around(
-    labels: np.ndarray, ids: tuple[int, ...], depth: np.ndarray, valid: np.ndarray, camera: Camera, search: Search
+    labels: np.ndarray, ids: tuple[int, ...], depth: np.ndarray, valid: np.ndarray, camera: Camera
 ) -> np.ndarray | None:
     """The support plane (4,) from the unlabelled pixels near the bodies: below all of them, and touched."""
     near = np.zeros(labels.shape, bool)
@@ -157,23 +141,21 @@ def around(
     if np.count_nonzero(near) < 30:
         return None
     best, best_vote = None, 0.0
-    for plane in planes(depth, near, camera, search):
+    for plane in planes(depth, near, camera):
         contact = []
         for points in bodies:
             heights = plane.height(points) / noise_growth(points[:, 2])
             lowest, middle = np.quantile(heights, (0.02, 0.5))
             # What a body lies behind is not what it stands on, but perhaps the front of its occluder.
-            contact.append(np.exp(-np.abs(lowest) / (4 * search.tolerance)) if middle > 0 else 0.0)
+            contact.append(np.exp(-np.abs(lowest) / (4 * TOLERANCE)) if middle > 0 else 0.0)
         vote = _vote(plane) * float(np.mean(contact))
         if vote > best_vote:
             best, best_vote = plane.equation, vote
     return best
 
 
-def _dominant_plane(
-    points: np.ndarray, tolerance: float, rng: np.random.Generator
-) -> tuple[np.ndarray | None, np.ndarray]:
-    """The plane (4,) with most points within tolerance * z^2, and which points these are."""
+def _dominant_plane(points: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray | None, np.ndarray]:
+    """The plane (4,) with most points within the tolerance * z^2, and which points these are."""
     few = points[:: max(1, len(points) // _PLANE_POINTS)]
     corners = few[rng.integers(len(few), size=(_HYPOTHESES, 3))]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -183,13 +165,13 @@ def _dominant_plane(
         return None, np.zeros(len(points), bool)
     normals = normals[usable] / length[usable, None]
     offsets = -np.einsum("ij,ij->i", normals, corners[usable, 0])
-    weight = (1 / (tolerance * noise_growth(few[:, 2]))).astype(np.float32)
+    weight = (1 / (TOLERANCE * noise_growth(few[:, 2]))).astype(np.float32)
     weighted = np.concatenate([few, np.ones((len(few), 1))], axis=1).astype(np.float32) * weight[:, None]
     heights = np.column_stack([normals, offsets]).astype(np.float32) @ weighted.T
     votes = np.count_nonzero(np.abs(heights) < 1, axis=1)
     best = int(np.argmax(votes))
     plane = np.append(normals[best], offsets[best])
-    reach = tolerance * noise_growth(points[:, 2])
+    reach = TOLERANCE * noise_growth(points[:, 2])
     for share in (1.0, 1.0, 0.5):
         inside = np.abs(points @ plane[:3] + plane[3]) < share * reach
         if inside.sum() < 12:
@@ -217,7 +199,7 @@ def _is_face(plane: Plane, surfaces: list[_Surface]) -> bool:
     """
     on, below, alone = 0, 0, False
     for points, is_island in surfaces:
-        height = plane.height(points) / (_FACE_TOLERANCE * noise_growth(points[:, 2]))
+        height = plane.height(points) / (TOLERANCE * noise_growth(points[:, 2]))
         inside = int(np.count_nonzero(np.abs(height) < 1))
         if inside > on:
             on = inside
@@ -235,7 +217,7 @@ def _carries(plane: Plane, surfaces: list[_Surface]) -> bool:
     spread = [points for points, is_island in surfaces if not is_island]
     points = np.concatenate(spread) if spread else np.zeros((0, 3))
     height = plane.height(points)
-    tolerance = _FACE_TOLERANCE * noise_growth(points[:, 2])
+    tolerance = TOLERANCE * noise_growth(points[:, 2])
     on = points[np.abs(height) < tolerance] @ axes
     feet = points[(height > 2 * tolerance) & (height < _STOREY)] @ axes
     if len(on) < 3 or len(feet) == 0 or plane.equation[1] > _FACING_DOWN:
@@ -257,11 +239,11 @@ def across(normal: np.ndarray) -> np.ndarray:
     return np.stack([first, np.cross(normal, first)], axis=1)
 
 
-def _on_one_surface(depth: np.ndarray, valid: np.ndarray, camera: Camera, depth_step: float) -> list[_Surface]:
+def _on_one_surface(depth: np.ndarray, valid: np.ndarray, camera: Camera) -> list[_Surface]:
     """Each connected surface of a coarse image, as far as it is of any size, and whether it is a small island."""
     k = max(1, min(depth.shape) // _COARSE_PIXELS)
     coarse, kept = depth[::k, ::k], valid[::k, ::k]
-    jumps = depth_steps.edges(np.where(kept, coarse, np.float32(0)), kept, k * depth_step)
+    jumps = depth_steps.edges(np.where(kept, coarse, np.float32(0)), kept, k * depth_steps.STEP)
     labels = depth_steps.components(kept & ~jumps)
     rows, columns = np.nonzero(labels)
     numbers = labels[rows, columns]

@@ -28,7 +28,7 @@ import numpy as np
 from sq_perception.geometry.kernels import kernel
 from sq_perception.imaging import depth_steps
 from sq_perception.imaging.camera import Camera
-from sq_perception.segmentation.support_plane import LEAST_GROWTH, Plane, noise_growth
+from sq_perception.segmentation.support_plane import LEAST_GROWTH, TOLERANCE, Plane, noise_growth
 
 _COARSE_PIXELS = 120
 _ROUNDS = 6
@@ -80,7 +80,7 @@ class SupportSurface:
         return np.asarray(_relative(depth, x, y, self.plane.equation, self.bend, self.limit))
 
 
-def measured(plane: Plane, depth: np.ndarray, valid: np.ndarray, camera: Camera, tolerance: float) -> SupportSurface:
+def measured(plane: Plane, depth: np.ndarray, valid: np.ndarray, camera: Camera) -> SupportSurface:
     """The surface that a plane was seen as.
 
     Parameters
@@ -91,8 +91,6 @@ def measured(plane: Plane, depth: np.ndarray, valid: np.ndarray, camera: Camera,
         Metres, and where they are a measurement.
     camera
         A pinhole camera.
-    tolerance
-        Half thickness of a plane, metres at a depth of one metre.
     """
     k = _stride(depth.shape)
     rows, columns = np.nonzero(valid[::k, ::k])
@@ -101,7 +99,7 @@ def measured(plane: Plane, depth: np.ndarray, valid: np.ndarray, camera: Camera,
     height = plane.height(points) / growth
     flat = SupportSurface(plane, np.zeros(_TERMS), 0.0, plane.sigma)
     terms = _terms(points[:, 0] / points[:, 2], points[:, 1] / points[:, 2])
-    on = np.abs(height) < tolerance
+    on = np.abs(height) < TOLERANCE
     if not on.any():
         return flat
     limit = _DISTORTION * float(np.median(points[on, 2] / growth[on]))
@@ -112,19 +110,17 @@ def measured(plane: Plane, depth: np.ndarray, valid: np.ndarray, camera: Camera,
         some = terms[on]
         bend = np.linalg.lstsq(some.T @ some, some.T @ height[on], rcond=None)[0]
         off = height - np.clip(terms @ bend, -limit, limit)
-        grown = np.abs(off) < tolerance
+        grown = np.abs(off) < TOLERANCE
         if np.array_equal(grown, on):
             break
         on = grown
-    gained = np.count_nonzero(np.abs(off) < 0.5 * tolerance)
-    if gained < _GAIN * np.count_nonzero(np.abs(height) < 0.5 * tolerance):
+    gained = np.count_nonzero(np.abs(off) < 0.5 * TOLERANCE)
+    if gained < _GAIN * np.count_nonzero(np.abs(height) < 0.5 * TOLERANCE):
         return flat
     return SupportSurface(plane, bend, limit, float(1.4826 * np.median(np.abs(off[on]))))
 
 
-def risen(
-    relative: np.ndarray, depth: np.ndarray, valid: np.ndarray, camera: Camera, tolerance: float, step: float
-) -> np.ndarray:
+def risen(relative: np.ndarray, depth: np.ndarray, valid: np.ndarray, camera: Camera) -> np.ndarray:
     """Where the support was seen raised, bool (height, width): reached from it on a ramp.
 
     Parameters
@@ -133,10 +129,8 @@ def risen(
         Heights (height, width) above the support, metres at a depth of one metre.
     depth, valid : (height, width)
         Metres, and where they are a measurement; both images are 0 elsewhere.
-    camera, tolerance
+    camera
         As in :func:`measured`.
-    step
-        Share of the depth by which neighbouring pixels of one surface differ at most.
     """
     k = _stride(depth.shape)
     size = (-(-depth.shape[1] // k), -(-depth.shape[0] // k))
@@ -147,15 +141,15 @@ def risen(
     z = cv2.resize(depth, size, interpolation=cv2.INTER_AREA) * weight
     width = z * np.float32(k / np.sqrt(camera.fx * camera.fy))
     # Only from where it is wide: the bottom of a bowl is as low.
-    flat = depth_steps.components(known & (height < 0.5 * tolerance))
+    flat = depth_steps.components(known & (height < 0.5 * TOLERANCE))
     counts = np.bincount(flat.ravel())
     counts[0] = 0
     reached = (counts > _WIDE * counts.max())[flat] & (flat > 0)
     if not reached.any():
         return np.zeros(depth.shape, bool)
-    passable = known & (height < HIGHEST * tolerance) & _shallow(height * noise_growth(z), z, known, width)
+    passable = known & (height < HIGHEST * TOLERANCE) & _shallow(height * noise_growth(z), z, known, width)
     joined = [
-        (here, there, np.abs(z[here] - z[there]) < k * step * z[here])
+        (here, there, np.abs(z[here] - z[there]) < k * depth_steps.STEP * z[here])
         for here, there in (
             ((slice(1, None), slice(None)), (slice(None, -1), slice(None))),
             ((slice(None), slice(1, None)), (slice(None), slice(None, -1))),
@@ -168,12 +162,12 @@ def risen(
             reached[there] |= reached[here] & near & passable[there]
         if np.count_nonzero(reached) == before:
             break
-    reached &= ~_low_things(height, known, reached, tolerance)
+    reached &= ~_low_things(height, known, reached)
     full = cv2.resize(reached.view(np.uint8), (size[0] * k, size[1] * k), interpolation=cv2.INTER_NEAREST)
     return full[: depth.shape[0], : depth.shape[1]] > 0
 
 
-def _low_things(height: np.ndarray, known: np.ndarray, reached: np.ndarray, tolerance: float) -> np.ndarray:
+def _low_things(height: np.ndarray, known: np.ndarray, reached: np.ndarray) -> np.ndarray:
     """Samples of what is no ramp although it was reached, as it does not lead up to anything.
 
     A ramp belongs to the tall thing beside which it rises.  Where the samples above some level hold together and what
@@ -182,11 +176,11 @@ def _low_things(height: np.ndarray, known: np.ndarray, reached: np.ndarray, tole
     """
     own = np.zeros(height.shape, bool)
     for level in _LEVELS:
-        parts = depth_steps.components(known & (height > level * tolerance))
+        parts = depth_steps.components(known & (height > level * TOLERANCE))
         rows, columns = np.nonzero(parts)
         tops = np.zeros((2, int(parts.max()) + 1), np.float32)
         np.maximum.at(tops, (reached[rows, columns].astype(int), parts[rows, columns]), height[rows, columns])
-        own |= (tops[1] > tops[0] - 0.5 * tolerance)[parts] & (parts > 0)
+        own |= (tops[1] > tops[0] - 0.5 * TOLERANCE)[parts] & (parts > 0)
     return own
 
 

@@ -112,7 +112,6 @@ def find(
     wanted: np.ndarray,
     camera: Camera,
     sigma: float,
-    depth_step: float,
     flat: np.ndarray | None = None,
 ) -> Patches | None:
     """Patches of the wanted pixels of a pinhole camera.
@@ -124,8 +123,6 @@ def find(
     wanted : bool (height, width)
     sigma
         Noise of the depth at one metre, metres.
-    depth_step
-        Share of the depth by which neighbouring pixels of one surface differ at most.
     flat : bool (height, width), optional
         Measured pixels of a plane, where all that chords tell is noise.
 
@@ -157,8 +154,8 @@ def find(
     stride, rho = chord.stride, chord.rho
     inverse, known = _mean(every_inverse, wanted, chord)
     coarse = filled[::stride, ::stride]
-    step = max(depth_step, float(np.tan(_STEEPEST)) * stride / focal)
-    stepped = _steps(filled, wanted, depth_step, stride)
+    step = max(depth_steps.STEP, float(np.tan(_STEEPEST)) * stride / focal)
+    stepped = _steps(filled, wanted, stride)
     known &= coarse > 0
     fold = _fold(inverse, known & ~stepped, rho, stride / focal)
     angular = noise * focal / (rho * stride) * coarse
@@ -232,9 +229,9 @@ def _mean(image: np.ndarray, wanted: np.ndarray, chord: _Chord) -> tuple[np.ndar
     return np.where(known, total / np.maximum(share, np.float32(1e-6)), np.float32(0)), known
 
 
-def _steps(filled: np.ndarray, wanted: np.ndarray, step: float, stride: int) -> np.ndarray:
+def _steps(filled: np.ndarray, wanted: np.ndarray, stride: int) -> np.ndarray:
     """Grid samples that have the near side of a depth step in their square or beside it."""
-    near = depth_steps.edges(filled, wanted, step).astype(np.uint8)
+    near = depth_steps.edges(filled, wanted, depth_steps.STEP).astype(np.uint8)
     size = 2 * (stride // 2) + 3
     return cv2.dilate(near, np.ones((size, size), np.uint8))[::stride, ::stride] > 0
 

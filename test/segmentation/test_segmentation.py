@@ -207,7 +207,7 @@ def test_misuse_is_refused():
         from_labels(truth.astype(float), depth, CAMERA)
     with pytest.raises(ValueError, match="float image"):
         segment((1000 * np.nan_to_num(depth)).astype(np.uint16), CAMERA)
-    for wrong in ({"depth_range": (2.0, 1.0)}, {"max_objects": 0}, {"depth_step": 0.0}):
+    for wrong in ({"depth_range": (2.0, 1.0)}, {"max_objects": 0}, {"max_size": 0.0}):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             SegmentationOptions(**wrong)
 

@@ -15,7 +15,7 @@ from sq_perception.segmentation.segments import SegmentationOptions, from_labels
 
 CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)
 STRAIGHT = np.array([0.0, 0.0, 0.0, 1.0])
-TOLERANCE = SegmentationOptions().plane_tolerance
+TOLERANCE = support_plane.TOLERANCE
 
 
 def plane_image(normal, distance, camera=CAMERA):
@@ -83,18 +83,18 @@ def test_the_bend_is_measured_and_a_flat_table_has_none():
     """Of the paraboloid, the curvature in x follows from its definition: h = bulge (1 - r^2), in units of z^2."""
     away, bulge = 0.6, 0.012
     depth = noisy(bulging(away, bulge), 5e-4)
-    plane = support_plane.planes(depth, np.isfinite(depth), CAMERA, support_plane.Search(TOLERANCE, 0.1, 0))[0]
-    surface = support_surface.measured(plane, depth, np.isfinite(depth), CAMERA, TOLERANCE)
+    plane = support_plane.planes(depth, np.isfinite(depth), CAMERA)[0]
+    surface = support_surface.measured(plane, depth, np.isfinite(depth), CAMERA)
     expected = -bulge * CAMERA.fx**2 / (CAMERA.cx**2 + CAMERA.cy**2) / away**2
     assert surface.bend[[3, 5]] == pytest.approx([expected, expected], rel=0.15)
     assert surface.sigma == pytest.approx(5e-4, rel=0.25)
     flat = noisy(np.full((240, 320), away), 5e-4)
-    surface = support_surface.measured(plane_of(flat), flat, np.isfinite(flat), CAMERA, TOLERANCE)
+    surface = support_surface.measured(plane_of(flat), flat, np.isfinite(flat), CAMERA)
     assert not surface.bend.any()
 
 
 def plane_of(depth):
-    return support_plane.planes(depth, np.isfinite(depth), CAMERA, support_plane.Search(TOLERANCE, 0.1, 0))[0]
+    return support_plane.planes(depth, np.isfinite(depth), CAMERA)[0]
 
 
 def test_a_ramp_is_support_and_the_side_of_a_thing_is_not():
@@ -140,7 +140,7 @@ def test_bumps_where_the_noise_is_large_are_no_things(seed, monkeypatch):
 def test_walls_are_furniture_and_faces_of_things_are_not():
     """The same plane holds a wall and, apart from it, the front of a box as a thing may be."""
     wall = support_plane.Plane(np.array([0.0, 0.0, -1.0, 2.0]), 0.5, 1e-3)
-    limits = standing.Limits(0.012, 0.6, None, None, TOLERANCE, 0.015)
+    limits = standing.Limits(0.6, None, None)
     depth = np.zeros((240, 320), np.float32)
     depth[:, :150] = 2.0  # 1.1 m wide, 1.8 m high
     depth[100:160, 220:280] = 2.0  # 0.44 m

@@ -14,7 +14,6 @@ from sq_perception.segmentation import surface_patches
 from sq_perception.segmentation.surface_patches import find
 
 CAMERA = Camera(320, 240, 525.0, 525.0, 159.5, 119.5)
-STEP = 0.015
 
 
 def plane_depth(normal, distance):
@@ -25,7 +24,7 @@ def plane_depth(normal, distance):
 
 def patches(depth, wanted=None, sigma=1e-4):
     depth = np.where(np.isfinite(depth), depth, 0).astype(np.float32)
-    return find(depth, depth > 0 if wanted is None else wanted, CAMERA, sigma, STEP)
+    return find(depth, depth > 0 if wanted is None else wanted, CAMERA, sigma)
 
 
 def turned(angle):
@@ -97,8 +96,8 @@ def test_noise_that_is_alike_over_windows_makes_no_folds(seed):
     depth = 1.0 + 0.005 * noise / noise.std()
     wanted = np.zeros(depth.shape, bool)
     wanted[:, 160:] = True
-    measured = find(depth.astype(np.float32), wanted, CAMERA, 0.005, STEP, ~wanted)
-    assumed = find(depth.astype(np.float32), wanted, CAMERA, 0.005, STEP)
+    measured = find(depth.astype(np.float32), wanted, CAMERA, 0.005, ~wanted)
+    assumed = find(depth.astype(np.float32), wanted, CAMERA, 0.005)
     assert measured.count < 6
     assert assumed.count > 10 * measured.count
 
