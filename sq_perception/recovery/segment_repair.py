@@ -33,7 +33,7 @@ from sq_perception.segmentation.convex_parts import SightOptions
 FitMask = Callable[[np.ndarray], Fit]
 """The fit of a mask, bool (height, width)."""
 
-_SPLITTING = SightOptions(suspicious=0.04, convex=0.15, apart=0.35)
+_SPLITTING = SightOptions(suspicious=0.04, apart=0.35)
 _MOST_FITS = 6
 _DEEPEST = 2
 _LEAST_GAIN = 5.0

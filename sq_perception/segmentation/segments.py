@@ -305,7 +305,7 @@ def _bodies(
     sigma = max(sigma, _LEAST_SIGMA)
     patches = surface_patches.find(depth, wanted, camera, sigma, flat)
     if patches is None:
-        return depth_steps.separated(depth, wanted)
+        return convex_parts.corrected(depth_steps.separated(depth, wanted), depth, camera, sigma)
     body = patch_grouping.bodies(patches, camera)
     labels = _refined(body[patches.labels].astype(np.int32), patches, depth, wanted)
     labels = convex_parts.corrected(labels, depth, camera, sigma)

@@ -138,6 +138,9 @@ def find(
         return None
     focal = float(np.sqrt(camera.fx * camera.fy))
     middle = float(np.median(some))
+    if flat is not None and (under := depth[::4, ::4][flat[::4, ::4]]).size:
+        # Things stand where the support is seen; behind them a wall may fill more pixels than they do.
+        middle = min(middle, float(np.median(under)))
     longest = min(depth.shape) / 8
     pixels = min(_RADIUS * focal / middle, longest)
     if pixels < _LEAST_RADIUS:

@@ -59,6 +59,20 @@ def test_bodies_that_touch_are_parted(noise):
     assert min(ious(found, truth)) > 0.9
 
 
+def test_what_is_not_convex_is_parted_from_what_it_touches():
+    """An angle of two bars, whose own lines are crossed for a sixth, with a ball at its end."""
+    bars = [
+        Superquadric(np.array(size), np.array([0.1, 0.1]), np.array(place), UPRIGHT)
+        for size, place in (((0.032, 0.09, 0.032), (-0.12, 0.0, 0.7)), ((0.07, 0.032, 0.032), (-0.082, 0.058, 0.7)))
+    ]
+    ball = Superquadric(np.full(3, 0.035), np.array([1.0, 1.0]), np.array([0.023, 0.058, 0.7]), UPRIGHT)
+    depth, index = seen([*bars, ball])
+    truth = np.where(index == 3, 2, np.minimum(index, 1))
+    found = convex_parts.corrected((truth > 0).astype(np.int32), depth, CAMERA, NOISE)
+    assert len(names(found)) == 2
+    assert min(ious(found, truth)) > 0.9
+
+
 def test_pieces_of_one_body_are_joined_and_those_of_two_are_not():
     depth, truth = seen([body(-0.05), body(0.05)])
     v, u = np.indices(truth.shape)

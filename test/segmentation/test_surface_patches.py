@@ -106,5 +106,22 @@ def test_bodies_too_far_for_a_chord_have_no_patches():
     assert patches(np.full((240, 320), 50.0)) is None
 
 
+@pytest.mark.parametrize("wall", [1.5, 50.0])
+def test_a_wall_behind_does_not_make_the_chords_of_things_longer_or_shorter(wall):
+    """A ridge a little above its support, and a wall of more pixels than the ridge."""
+    depth = np.maximum(*(plane_depth(turned(side * np.deg2rad(30)), 0.6) for side in (-1, 1)))
+    wanted = np.zeros(depth.shape, bool)
+    wanted[120:200, 100:220] = True
+    support = np.zeros(depth.shape, bool)
+    support[205:], depth[205:] = True, 0.6
+    alone = find(depth.astype(np.float32), wanted, CAMERA, 1e-4, support)
+    before = np.where(np.arange(240)[:, None] < 100, wall, depth).astype(np.float32)
+    both = find(before, wanted | (before == np.float32(wall)), CAMERA, 1e-4, support)
+    assert both.stride == alone.stride
+    inside = slice(130 // alone.stride, 190 // alone.stride), slice(110 // alone.stride, 210 // alone.stride)
+    np.testing.assert_allclose(both.fold[inside], alone.fold[inside], rtol=1e-5)
+    assert len(np.unique(both.labels[inside])) == len(np.unique(alone.labels[inside])) == 2
+
+
 def test_nothing_wanted():
     assert patches(np.full((240, 320), np.nan)) is None

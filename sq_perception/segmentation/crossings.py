@@ -1,0 +1,148 @@
+"""Lines of sight between samples of segments, walked in a depth image: which are crossed, and where pixels go.
+
+The equation is that of :mod:`sq_perception.segmentation.convex_parts`.  A line is crossed where what was seen lies
+behind it by ``noise`` times the square of the depth, and by ``least``, metres.  Depth is 0 where there is none.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from sq_perception.geometry.kernels import inline_kernel, kernel
+
+_STEPS = 8
+"""In which a line is walked."""
+_HOME = 0.1
+"""A pixel leaves the part of its nearest sample only if another one's lines are so much freer."""
+
+
+@inline_kernel
+def _crossed(
+    v0: float, u0: float, z0: float, v1: float, u1: float, z1: float, depth: np.ndarray, noise: float, least: float
+) -> bool:
+    """Whether something lies behind the line between two pixels."""
+    for k in range(1, _STEPS):
+        t = k / _STEPS
+        seen = np.float64(depth[int((1 - t) * v0 + t * v1 + 0.5), int((1 - t) * u0 + t * u1 + 0.5)])
+        line = 1.0 / ((1 - t) / z0 + t / z1)
+        if seen - line > max(noise * line * line, least):
+            return True
+    return False
+
+
+@kernel
+def between(
+    pixels: np.ndarray,
+    points: np.ndarray,
+    ends: np.ndarray,
+    reach: np.ndarray,
+    depth: np.ndarray,
+    noise: float,
+    least: float,
+) -> np.ndarray:
+    """Share (n, n) of crossed lines between the samples of segments, the rows between two ``ends``; inf where the
+    nearest samples are farther apart than the sum of their reaches."""
+    n = len(ends) - 1
+    share = np.full((n, n), np.inf)
+    for a in range(n):
+        for b in range(a):
+            nearest, count = np.inf, 0
+            for i in range(ends[a], ends[a + 1]):
+                for j in range(ends[b], ends[b + 1]):
+                    x, y, z = points[i, 0] - points[j, 0], points[i, 1] - points[j, 1], points[i, 2] - points[j, 2]
+                    nearest = min(nearest, x * x + y * y + z * z)
+            if nearest > (reach[a] + reach[b]) ** 2:
+                continue
+            for i in range(ends[a], ends[a + 1]):
+                for j in range(ends[b], ends[b + 1]):
+                    p, q = pixels[i], pixels[j]
+                    count += _crossed(p[0], p[1], points[i, 2], q[0], q[1], points[j, 2], depth, noise, least)
+            share[a, b] = share[b, a] = count / ((ends[a + 1] - ends[a]) * (ends[b + 1] - ends[b]))
+    return share
+
+
+@kernel
+def within(
+    pixels: np.ndarray, points: np.ndarray, depth: np.ndarray, labels: np.ndarray, noise: float, least: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Of each pair of samples (n, n): 1 where the line is crossed, the mean gap behind it over its own segment, and the
+    distance, metres."""
+    n = pixels.shape[0]
+    crossed, gaps, far = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n))
+    for i in range(n):
+        own = labels[pixels[i, 0], pixels[i, 1]]
+        for j in range(i):
+            total, count, over = 0.0, 0, 0.0
+            for k in range(1, _STEPS):
+                t = k / _STEPS
+                v = int((1 - t) * pixels[i, 0] + t * pixels[j, 0] + 0.5)
+                u = int((1 - t) * pixels[i, 1] + t * pixels[j, 1] + 0.5)
+                seen = np.float64(depth[v, u])
+                line = 1.0 / ((1 - t) / points[i, 2] + t / points[j, 2])
+                gap = seen - line
+                if gap > max(noise * line * line, least):
+                    over = 1.0
+                if seen > 0.0 and labels[v, u] == own:
+                    total += gap
+                    count += 1
+            crossed[i, j] = crossed[j, i] = over
+            if count > 0:
+                gaps[i, j] = gaps[j, i] = total / count
+            x, y, z = points[i, 0] - points[j, 0], points[i, 1] - points[j, 1], points[i, 2] - points[j, 2]
+            far[i, j] = far[j, i] = math.sqrt(x * x + y * y + z * z)
+    return crossed, gaps, far
+
+
+@kernel
+def assigned(
+    rows: np.ndarray,
+    columns: np.ndarray,
+    samples: np.ndarray,
+    z: np.ndarray,
+    part: np.ndarray,
+    parts: int,
+    depth: np.ndarray,
+    focal: float,
+    spacing: float,
+    noise: float,
+    least: float,
+) -> np.ndarray:
+    """The part (n,) of each pixel: that of the nearest sample, or, of those almost as near, of the one to whose
+    samples most lines are free."""
+    chosen = np.zeros(rows.size, np.int64)
+    nearest = np.empty(parts)
+    over, count = np.empty(parts), np.empty(parts)
+    for i in range(rows.size):
+        v, u = rows[i], columns[i]
+        here = np.float64(depth[v, u])
+        nearest[:] = np.inf
+        for j in range(samples.shape[0]):
+            down, right = (samples[j, 0] - v) * here / focal, (samples[j, 1] - u) * here / focal
+            square = down * down + right * right + (z[j] - here) ** 2
+            if square < nearest[part[j]]:
+                nearest[part[j]] = square
+        best = int(np.argmin(nearest))
+        chosen[i] = best
+        limit = (math.sqrt(nearest[best]) + spacing) ** 2
+        rivals = 0
+        for k in range(parts):
+            rivals += 1 if nearest[k] <= limit else 0
+        if rivals < 2:
+            continue
+        over[:] = 0.0
+        count[:] = 0.0
+        for j in range(samples.shape[0]):
+            k = part[j]
+            if nearest[k] > limit:
+                continue
+            count[k] += 1
+            if _crossed(v, u, here, samples[j, 0], samples[j, 1], z[j], depth, noise, least):
+                over[k] += 1
+        least_share = over[best] / count[best] - _HOME
+        for k in range(parts):
+            if nearest[k] <= limit and over[k] / count[k] < least_share:
+                least_share = over[k] / count[k]
+                chosen[i] = k
+    return chosen
