@@ -45,7 +45,8 @@ a bump of correlated noise seldom reaches 6, and of 374 simulated things that we
 _SMEARED, _BESIDE = 2, 12
 """Pixels about a segment that a sensor smears, and up to which the support is beside it; 5 to 20 do as well."""
 _FACE_SHARE = 0.5
-"""What makes up this share of a plane's points is no part of it: the plane is a face of the thing."""
+"""What makes up this share of a plane's points is no part of it: the plane is a face of the thing.  The larger part
+decides; without it 3 of 81 recorded and simulated frames lose a body."""
 _OUTLIERS = 0.01
 """Share of the points at either end that do not count for the extent: sensors smear edges."""
 _TURNS = np.stack([np.cos(np.deg2rad(np.arange(0, 180, 10))), np.sin(np.deg2rad(np.arange(0, 180, 10)))])
