@@ -117,9 +117,10 @@ def assigned(
     for i in range(rows.size):
         v, u = rows[i], columns[i]
         here = np.float64(depth[v, u])
+        width = here / focal
         nearest[:] = np.inf
         for j in range(samples.shape[0]):
-            down, right = (samples[j, 0] - v) * here / focal, (samples[j, 1] - u) * here / focal
+            down, right = (samples[j, 0] - v) * width, (samples[j, 1] - u) * width
             square = down * down + right * right + (z[j] - here) ** 2
             if square < nearest[part[j]]:
                 nearest[part[j]] = square
