@@ -1,12 +1,6 @@
 """A depth image on its way through a node: decoded from its message, and back into messages like it.
 
-| image_transport | topic | type |
-| --- | --- | --- |
-| `raw` | `<image topic>` | sensor_msgs/Image |
-| `compressedDepth` | `<image topic>/compressedDepth` | sensor_msgs/CompressedImage: PNG or RVL |
-| `points` | depth/points | sensor_msgs/PointCloud2 in the optical frame, organised |
-
-Whoever decodes a message need not know which of them it has.  The camera of a cloud is found from its points.
+The message is an Image, a CompressedImage (PNG or RVL) or a PointCloud2, as ``image_transport`` says.
 """
 
 from __future__ import annotations
@@ -14,7 +8,7 @@ from __future__ import annotations
 import array
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, TypeAlias
+from typing import Any, TypeAlias, cast
 
 import numpy as np
 from rclpy.node import Node
@@ -49,16 +43,13 @@ class Frame:
 
     Attributes
     ----------
-    header
-        std_msgs/Header of the message: stamp and frame of every output.
     encoding
         Of the message, before it was packed.
     depth : float32 (height, width)
         Metres in the optical frame, NaN where nothing was measured; rectified.
-    calibration : Calibration
     labels : int32 (height, width) or None
         Rectified as well.
-    has_free_space : bool
+    has_free_space
         Whether a pixel beside an object tells that there is nothing before what it measured; not so for a cloud that is
         no image.
     """
@@ -81,13 +72,7 @@ class Frame:
         return not self.camera.is_pinhole
 
     def with_mask(self, message: Image) -> Frame:
-        """The frame with the label image of its objects.
-
-        Raises
-        ------
-        Refused, ImageError
-            If the mask has another size than the depth image, or is no label image.
-        """
+        """The frame with the label image of its objects.  Raises ValueError for one of another size or kind."""
         labels = labels_from_message(message)
         (rows, columns), (width, height) = labels.shape, self.calibration.size
         if (columns, rows) != (width, height):
@@ -96,10 +81,8 @@ class Frame:
 
     def encode(self, depth: np.ndarray) -> Image:
         """A message like the frame's own with another depth (height, width), NaN or inf for nothing."""
-        image: Image = publication.depth_message(
-            self.calibration.as_sent(depth), self.header, self.encoding, self.is_cube
-        )
-        return image
+        sent = self.calibration.as_sent(depth)
+        return cast(Image, publication.depth_message(sent, self.header, self.encoding, self.is_cube))
 
 
 def decode(message: DepthMessage, calibration_of: Callable[[], Calibration] | None) -> Frame:
@@ -108,15 +91,15 @@ def decode(message: DepthMessage, calibration_of: Callable[[], Calibration] | No
     Parameters
     ----------
     message
-        16UC1 or 32FC1, plain or packed, where there is a camera; mono8 or mono16, an image of the unit cube, where
-        there is none; or points.
+        16UC1 or 32FC1, plain or packed; mono8 or mono16, an image of the unit cube; or points, whose camera is found
+        from them.
     calibration_of
-        Looks up the calibration; only called for an image that is sound itself.  None for orthographic images, not
+        Looks up the calibration; only called for an image that is sound itself.  None for images of the unit cube, not
         asked for clouds.
 
     Raises
     ------
-    Refused, ImageError
+    ValueError
         For anything that keeps the image from being processed.
     """
     if isinstance(message, PointCloud2):
@@ -139,7 +122,11 @@ def decode(message: DepthMessage, calibration_of: Callable[[], Calibration] | No
             f"encoding: expected 16UC1 or 32FC1 for projection = pinhole, got {message.encoding!r}; "
             "grey images of the unit cube need projection = orthographic"
         )
-    depth, encoding = depth_of(message)
+    if isinstance(message, CompressedImage):
+        depth = compressed_depth.decode(message.format, message.data)
+        encoding = compressed_depth.encoding(message.format) or ""
+    else:
+        depth, encoding = depth_from_message(message), message.encoding
     calibration = calibration_of()
     return Frame(message.header, encoding, calibration.rectified(depth), calibration)
 
@@ -147,10 +134,8 @@ def decode(message: DepthMessage, calibration_of: Callable[[], Calibration] | No
 def image_topic(node: Node, name: str, transport: str) -> str:
     """The topic to listen to for the images of ``name``, with the node's namespace and remappings.
 
-    Points have a topic of their own beside it, ``depth/points`` for ``depth/image``, which is remapped by itself.
-
-    A remapping holds for the image's topic, and the transport's part comes behind that; one that names it already is
-    left as it is.
+    The transport's part comes behind the remapped topic, unless that names it already.  Points have a topic beside it,
+    ``depth/points`` for ``depth/image``, which is remapped by itself.
     """
     if transport == POINTS:
         return str(node.resolve_topic_name(f"{name.rpartition('/')[0]}/{POINTS}"))
@@ -166,30 +151,10 @@ def stamp_of(message: Any) -> int:
 
 
 def size_of(message: DepthMessage) -> tuple[int, int]:
-    """Width and height of a depth image; of a packed one from its header alone.
-
-    Raises
-    ------
-    ValueError
-        If a packed image is none.
-    """
+    """Width and height of a depth image; of a packed one from its header alone, ValueError if it is none."""
     if isinstance(message, CompressedImage):
         return compressed_depth.size(message.format, message.data)
     return int(message.width), int(message.height)
-
-
-def depth_of(message: Image | CompressedImage) -> tuple[np.ndarray, str]:
-    """Depth in metres, float32 (height, width), NaN for nothing, and its encoding, 16UC1 or 32FC1, before packing.
-
-    Raises
-    ------
-    ValueError
-        If the message is no depth image; says what was expected and what arrived.
-    """
-    if isinstance(message, CompressedImage):
-        depth = compressed_depth.decode(message.format, message.data)
-        return depth, compressed_depth.encoding(message.format) or ""
-    return depth_from_message(message), message.encoding
 
 
 def packed(depth: np.ndarray, header: Any, encoding: str = "16UC1") -> CompressedImage:

@@ -315,7 +315,7 @@ class FrameNode(ManagedNode):
             source.look_for_latched()
         more = {"state": self.state, "enabled": str(self._enabled).lower(), "engine": self._engine.description}
         if absent := self._outputs.optional.absent:
-            more["missing packages"] = " ".join(absent)
+            more["missing packages"] = " ".join(absent.values())
         if self.is_active and parameters.tracking:
             tally = self._tracking.tally
             more |= {"tracks": str(tally.tracks), "track ids given": str(tally.births)}

@@ -1,15 +1,8 @@
 """What a frame node publishes of a frame's bodies: the point cloud, pictures, and what other stacks understand.
 
-The point cloud is the answer to a frame; what goes with it comes afterwards and cannot take the answer back.
-
-| parameter | name | type | package |
-| --- | --- | --- | --- |
-| `publish_tf` | `/tf` | tf2_msgs/TFMessage | tf2_msgs |
-| `publish_detections` | `~/detections` | vision_msgs/Detection3DArray | vision_msgs |
-| `publish_collision_objects` | `~/planning_scene` | moveit_msgs/PlanningScene, differences | moveit_msgs |
-
-Neither package is on PyPI, and a robot may lack each: it is imported only when its output is asked for, and one that is
-missing is named once in the log and stays in ``absent``.  Messages are made only while somebody listens.
+The point cloud is the answer to a frame; what goes with it comes afterwards and cannot take the answer back.  Messages
+of tf2_msgs, vision_msgs and moveit_msgs are not on PyPI, and a robot may lack each: a package is imported only when its
+output is asked for, and one that is missing is named once in the log and stays in ``absent``.
 
 /tf is published as tf2_ros.TransformBroadcaster does it, with the same queue of 100; a publisher of our own needs
 tf2_msgs alone, knows whether anybody listens, and can be taken down again.
@@ -25,7 +18,6 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Collection
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -144,13 +136,7 @@ def marker_style(parameters: RecoverParameters) -> MarkerStyle:
 
 
 def pose_in(poses: CameraPoses, header: Any, frame_id: str, patience: float) -> Pose:
-    """The pose of a header's frame in another tf2 frame, at its stamp.
-
-    Raises
-    ------
-    Refused
-        If it is not known.
-    """
+    """The pose of a header's frame in another tf2 frame, at its stamp.  Raises Refused if it is not known."""
     try:
         return poses.at(header, frame_id, patience)
     except PoseError as error:
@@ -164,19 +150,12 @@ def in_frame(found: Findings, poses: CameraPoses, frame_id: str, patience: float
     return found.moved(frame_id, *pose_in(poses, found.header, frame_id, patience)) if frame_id else found
 
 
-@dataclass(frozen=True)
-class _Kind:
-    package: str
-    type: str
-    topic: str
-    queue: int
-
-
 _KINDS = {
-    "publish_tf": _Kind("tf2_msgs", "TFMessage", "/tf", 100),
-    "publish_detections": _Kind("vision_msgs", "Detection3DArray", "~/detections", 10),
-    "publish_collision_objects": _Kind("moveit_msgs", "PlanningScene", "~/planning_scene", 10),
+    "publish_tf": ("tf2_msgs", "TFMessage", "/tf", 100),
+    "publish_detections": ("vision_msgs", "Detection3DArray", "~/detections", 10),
+    "publish_collision_objects": ("moveit_msgs", "PlanningScene", "~/planning_scene", 10),
 }
+"""Package, message, topic and queue of what a parameter asks for."""
 
 
 class OptionalOutputs:
@@ -184,33 +163,28 @@ class OptionalOutputs:
 
     def __init__(self, node: Node) -> None:
         self._node = node
-        self._publishers: dict[str, tuple[type[Any], Publisher]] = {}
-        self._absent: dict[str, str] = {}
+        self._publishers: dict[str, Publisher] = {}
+        self.absent: dict[str, str] = {}
+        """Packages that are missing, by what asks for them; replaced as a whole, for other threads."""
         self._known: dict[str, SuperquadricArray | None] = {}
         """Bodies as planners know them, by name; None for those that have to be sent again."""
         self._known_as = "", ""
         self._listeners = 0
         self._last_header: Any = None
-        self._said_no_frame = False
-
-    @property
-    def absent(self) -> tuple[str, ...]:
-        """Packages that are asked for and missing; may be read from another thread."""
-        return tuple(self._absent.values())
 
     def follow(self, parameters: RecoverParameters) -> None:
         """Create the publishers that are asked for, and destroy the others."""
-        for parameter, kind in _KINDS.items():
+        self.absent = {
+            parameter: package for parameter, package in self.absent.items() if getattr(parameters, parameter)
+        }
+        for parameter in _KINDS:
             if getattr(parameters, parameter):
-                if parameter not in self._publishers and parameter not in self._absent:
-                    self._create(parameter, kind)
-                continue
-            if parameter in self._absent:
-                self._absent = {other: package for other, package in self._absent.items() if other != parameter}
-            if parameter == "publish_collision_objects" and self._known:
+                if parameter not in self._publishers and parameter not in self.absent:
+                    self._create(parameter)
+            elif parameter == "publish_collision_objects" and self._known:
                 self.withdraw()  # the publisher lasts until the next call, so that its last message arrives
             elif parameter in self._publishers:
-                self._node.destroy_publisher(self._publishers.pop(parameter)[1])
+                self._node.destroy_publisher(self._publishers.pop(parameter))
 
     def publish(self, found: Findings, parameters: RecoverParameters, hidden: Collection[int] = ()) -> None:
         """Publish what a frame showed, where it is asked for and somebody listens.
@@ -222,19 +196,18 @@ class OptionalOutputs:
         """
         self.follow(parameters)
         has_frame = bool(found.header.frame_id)
-        if (
-            not has_frame
-            and not self._said_no_frame
-            and (parameters.publish_tf or parameters.publish_collision_objects)
-        ):
-            self._said_no_frame = True
-            self._node.get_logger().warning("expected images with a frame_id, got none: no transforms, no objects")
-        if parameters.publish_tf and has_frame and self._is_heard("publish_tf"):
-            self._publish_transforms(found, parameters)
-        if parameters.publish_detections and self._is_heard("publish_detections"):
-            message = detections(found.array, found.header, covariances=found.covariances, prefix=parameters.tf_prefix)
-            self._publishers["publish_detections"][1].publish(message)
-        if not self._is_heard("publish_collision_objects"):
+        if not has_frame and (parameters.publish_tf or parameters.publish_collision_objects):
+            said = "expected images with a frame_id, got none: no transforms, no objects"
+            self._node.get_logger().warning(said, once=True)
+        frames = transforms(found.array, found.header, prefix=parameters.tf_prefix) if has_frame else []
+        if frames and (heard := self._heard("publish_tf")):
+            message: Any = heard.msg_type
+            heard.publish(message(transforms=frames))
+        if heard := self._heard("publish_detections"):
+            heard.publish(
+                detections(found.array, found.header, covariances=found.covariances, prefix=parameters.tf_prefix)
+            )
+        if not self._heard("publish_collision_objects"):
             self._listeners = 0
         elif parameters.publish_collision_objects and has_frame:
             self._publish_collision_objects(found, parameters, hidden)
@@ -248,36 +221,31 @@ class OptionalOutputs:
 
     def close(self) -> None:
         """Destroy the publishers; what is in the planning scene stays there, and is remembered."""
-        for _, publisher in self._publishers.values():
+        for publisher in self._publishers.values():
             self._node.destroy_publisher(publisher)
         self._publishers = {}
 
-    def _create(self, parameter: str, kind: _Kind) -> None:
+    def _create(self, parameter: str) -> None:
+        package, kind, topic, queue = _KINDS[parameter]
         try:
-            message_type: Any = getattr(importlib.import_module(f"{kind.package}.msg"), kind.type)
-            publisher = self._node.create_publisher(message_type, kind.topic, kind.queue)
+            message_type = getattr(importlib.import_module(f"{package}.msg"), kind)
+            self._publishers[parameter] = self._node.create_publisher(message_type, topic, queue)
         except Exception as error:  # a package that is there in part fails in other ways than ImportError
-            self._absent = {**self._absent, parameter: kind.package}
+            self.absent = {**self.absent, parameter: package}
             self._node.get_logger().warning(
-                f"{parameter}: expected {kind.package}, which cannot be used ({error}): {kind.topic} is not "
-                f"published; Debian package ros-$ROS_DISTRO-{kind.package.replace('_', '-')}"
+                f"{parameter}: expected {package}, which cannot be used ({error}): {topic} is not published; Debian "
+                f"package ros-$ROS_DISTRO-{package.replace('_', '-')}"
             )
-            return
-        self._publishers[parameter] = message_type, publisher
 
-    def _is_heard(self, parameter: str) -> bool:
-        return parameter in self._publishers and bool(self._publishers[parameter][1].get_subscription_count())
-
-    def _publish_transforms(self, found: Findings, parameters: RecoverParameters) -> None:
-        message_type, publisher = self._publishers["publish_tf"]
-        frames = transforms(found.array, found.header, prefix=parameters.tf_prefix)
-        if frames:
-            publisher.publish(message_type(transforms=frames))
+    def _heard(self, parameter: str) -> Publisher | None:
+        """The publisher of what is asked for, if somebody listens."""
+        publisher = self._publishers.get(parameter)
+        return publisher if publisher is not None and publisher.get_subscription_count() else None
 
     def _publish_collision_objects(
         self, found: Findings, parameters: RecoverParameters, hidden: Collection[int]
     ) -> None:
-        listeners = self._publishers["publish_collision_objects"][1].get_subscription_count()
+        listeners = self._publishers["publish_collision_objects"].get_subscription_count()
         known_as = found.header.frame_id, parameters.collision_shapes
         if listeners > self._listeners or known_as != self._known_as:
             self._known = dict.fromkeys(self._known)
@@ -297,7 +265,7 @@ class OptionalOutputs:
             self._publish_scene(objects)
 
     def _publish_scene(self, objects: list[Any]) -> None:
-        self._publishers["publish_collision_objects"][1].publish(collision_objects.planning_scene(objects))
+        self._publishers["publish_collision_objects"].publish(collision_objects.planning_scene(objects))
 
 
 def _has_changed(known: SuperquadricArray | None, shown: SuperquadricArray, k: int) -> bool:

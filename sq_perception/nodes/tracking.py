@@ -1,9 +1,7 @@
 """Which track each body of a frame belongs to, in the camera's frame or a fixed one, and what is published of it.
 
 tf2_ros comes with a ROS installation and is not on PyPI: it is imported, and /tf listened to, only once a frame is
-asked for; all frames share that one buffer.
-
-A pose is (quaternion x y z w, translation), p_frame = R p_optical + t, metres.
+asked for.  A pose is (quaternion x y z w, translation), p_frame = R p_optical + t, metres.
 """
 
 from __future__ import annotations
@@ -17,7 +15,7 @@ from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.time import Time
 
-from sq_perception.nodes.frame import Frame
+from sq_perception.nodes.frame import Frame, stamp_of
 from sq_perception.nodes.parameters import RecoverParameters
 from sq_perception.nodes.statistics import THROTTLE
 from sq_perception.recordings import publication
@@ -56,15 +54,10 @@ class CameraPoses:
         self._listener = tf2.TransformListener(self._buffer, self._node)
 
     def at(self, header: Any, frame: str, patience: float = 0.1) -> Pose:
-        """The pose of a header's frame in ``frame`` at its stamp, the newest for a stamp of 0.
+        """The pose of a header's frame in ``frame`` at its stamp, the newest for a stamp of 0.  Raises PoseError.
 
         It is waited for, ``patience`` seconds at most; transforms arrive in the node's executor, in whose thread this
         must not be called.
-
-        Raises
-        ------
-        PoseError
-            If it is not known.
         """
         if header.frame_id == frame:
             return np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3)
@@ -129,8 +122,8 @@ class Tracking:
         Parameters
         ----------
         origin
-            Of the bodies, as :meth:`~sq_perception.nodes.engine.Engine.recover` returns it.  Numbers that another
-            method or model found, with deviations of another kind, are not fused with these: a change ends the tracks.
+            Of the bodies.  Numbers that another method or model found, with deviations of another kind, are not fused
+            with these: a change ends the tracks.
         arrival
             The time, seconds, of an image without stamp.
 
@@ -139,9 +132,9 @@ class Tracking:
         ValueError
             If the tracker cannot go on; it begins anew with the next frame.
         """
+        stamp = 1e-9 * stamp_of(frame)
         if not parameters.tracking:
             self._session.reset()
-            stamp = _seconds(frame.header)
             if stamp < self._untracked_stamp:
                 self._poses.clear()  # a recording begins again
             self._untracked_stamp = stamp
@@ -149,19 +142,18 @@ class Tracking:
         if self._origin not in (None, origin):
             self._forget("bodies come from another method, refine, consensus or model from now on")
         self._origin = origin
-        fixed_frame = parameters.fixed_frame
-        if self._fixed_frame not in (None, fixed_frame):
-            self._forget(f"fixed_frame is {fixed_frame or 'none'} from now on")
-        self._fixed_frame = fixed_frame
-        if not fixed_frame and frame.header.frame_id != self._frame_id:
+        before, self._fixed_frame = self._fixed_frame, parameters.fixed_frame
+        if before not in (None, self._fixed_frame):
+            self._forget(f"fixed_frame is {self._fixed_frame or 'none'} from now on")
+        if not self._fixed_frame and frame.header.frame_id != self._frame_id:
             self._session.reset()  # another camera: its world is another one
             self._frame_id = frame.header.frame_id
-        stamp, resets = _seconds(frame.header) or arrival, self._session.tally.resets
+        stamp, resets = stamp or arrival, self._session.tally.resets
         pose: Pose | None = None
         is_known = True
-        if fixed_frame:
+        if self._fixed_frame:
             try:
-                pose = self._poses.at(frame.header, fixed_frame, parameters.tf_tolerance)
+                pose = self._poses.at(frame.header, self._fixed_frame, parameters.tf_tolerance)
             except PoseError as error:
                 is_known = False
                 self._node.get_logger().warning(
@@ -182,7 +174,3 @@ class Tracking:
     def _forget(self, why: str) -> None:
         self._session.reset()
         self._node.get_logger().info(f"{why}: tracks are forgotten, ids go on")
-
-
-def _seconds(header: Any) -> float:
-    return float(header.stamp.sec) + 1e-9 * float(header.stamp.nanosec)

@@ -18,11 +18,12 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 from std_msgs.msg import Header
 
 from sq_msgs_py.depth_image import depth_from_message, depth_to_message, labels_from_message
+from sq_perception.imaging import compressed_depth
 from sq_perception.imaging.calibration import Calibration
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.distortion import Distortion
 from sq_perception.imaging.rectification import Rectification
-from sq_perception.nodes.frame import depth_of, image_topic, packed, size_of
+from sq_perception.nodes.frame import decode, image_topic, packed, size_of
 from sq_perception.nodes.parameters import ParameterError, SyntheticParameters
 from sq_perception.nodes.synthetic_depth_node import SyntheticDepthNode, frame_source
 
@@ -64,18 +65,18 @@ def test_packed_and_plain_are_read_alike(rng):
     depth[3, 4] = np.nan
     header = Header(frame_id="camera")
     for message in (depth_to_message(depth, header, "16UC1"), packed(depth, header, "16UC1")):
-        found, encoding = depth_of(message)
-        np.testing.assert_array_equal(found, depth)
-        assert found.dtype == np.float32
-        assert encoding == "16UC1"
+        frame = decode(message, lambda: Calibration(Camera(16, 12, 15.0, 15.0, 7.5, 5.5), (16, 12)))
+        np.testing.assert_array_equal(frame.depth, depth)
+        assert frame.depth.dtype == np.float32
+        assert frame.encoding == "16UC1"
         assert size_of(message) == (16, 12)
         assert message.header == header
     hostile = packed(depth, header)
     hostile.data = hostile.data[:40]
     with pytest.raises(ValueError, match="not readable"):
-        depth_of(hostile)
+        decode(hostile, pytest.fail)
     hostile.format = "jpeg"
-    for read in (depth_of, size_of):
+    for read in (lambda message: decode(message, pytest.fail), size_of):
         with pytest.raises(ValueError, match="format: expected"):
             read(hostile)
 
@@ -142,7 +143,7 @@ def test_a_distorting_synthetic_camera_sends_raw_images_packed_and_plain(hear, d
     heard = hear(**parameters, image_transport="compressedDepth", encoding="16UC1")
     topics = ("depth/image", "depth/image/compressedDepth", "depth/camera_info", "mask/image")
     image, small, info, mask = heard.together(*topics)
-    np.testing.assert_array_equal(depth_of(small)[0], depth_from_message(image))
+    np.testing.assert_array_equal(compressed_depth.decode(small.format, small.data), depth_from_message(image))
     calibration = Calibration.of(info, "/depth/image")
     assert calibration.rectification == Rectification(Camera(320, 240, 262.0, 262.0, 159.5, 119.5), LENS)
     assert size_of(small) == calibration.size == (320, 240)
