@@ -32,7 +32,7 @@ from running_nodes import Peer, arguments, environment, until, usage
 from sensor_msgs.msg import Image
 
 from sq_msgs_py.superquadrics import from_message
-from sq_perception.nodes.children import Children
+from sq_perception.commands.children import Children
 
 EVERY = 100
 _UNDISTURBED = 30

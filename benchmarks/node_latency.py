@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 import report
 
-from sq_perception.nodes import children
+from sq_perception.commands import children
 
 os.environ.setdefault("ROS_DOMAIN_ID", "77")
 os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")

@@ -49,7 +49,7 @@ from running_nodes import (
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import SetBool
 
-from sq_perception.nodes.children import Child, Children
+from sq_perception.commands.children import Child, Children
 
 CAMERA_NODE = "synthetic_depth_node"
 SCENES = 8

@@ -4,9 +4,8 @@ A change of the parameters that a recoverer is made of (model, device ...) makes
 warmed up before it is used.  Frames go on with the old one, and with those parameters as they were, until the new one
 is ready.  One that cannot be made leaves the old one at work, and :attr:`Engine.fault` says why.
 
-Nodes of one process that ask for equal recoverers get one: several cameras need the memory of one network.  One frame
-is computed at a time in a process, in the order of asking (:class:`Turns`): a frame already uses every core, two at
-once would each take twice as long, and a GPU serves one of them at a time anyway.
+Nodes of one process that ask for equal recoverers get one.  One frame is computed at a time in a process, in the order
+of asking (:class:`Turns`): a frame already uses every core, two at once would each take twice as long.
 """
 
 from __future__ import annotations
@@ -101,13 +100,7 @@ class Engine:
         """Why the last swap came to nothing; empty once one has succeeded."""
 
     def build(self, parameters: RecoverParameters) -> None:
-        """Make the recoverer and warm it up.
-
-        Raises
-        ------
-        CheckpointError, ValueError
-            If the model or the device cannot be used.
-        """
+        """Make the recoverer and warm it up.  Raises ValueError if the model or the device cannot be used."""
         self._replace(None)
         self._replace(_made(parameters, None, lambda: True))
 
@@ -160,11 +153,6 @@ class Engine:
         previous
             Of the same camera's frame before this one: what did not change since then, if its origin is the same, is
             taken from it.
-
-        Raises
-        ------
-        RuntimeError
-            If there is no recoverer.
         """
         built = self._built
         if built is None:
@@ -211,10 +199,7 @@ class Engine:
 def _made(parameters: RecoverParameters, kept: _Built | None, is_wanted: Callable[[], bool]) -> _Built:
     """A recoverer, warm, with the weights of ``kept`` if given; one that is there already if it is as good.
 
-    Raises
-    ------
-    _Superseded
-        If nobody wants it any more.
+    Raises _Superseded if nobody wants it any more.
     """
     weights = _file(parameters.model) if kept is None else kept.weights
     # Without the model: the same file may have several names.

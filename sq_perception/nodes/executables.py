@@ -1,5 +1,4 @@
-"""The programs that `ros2 run sq_perception` knows: recover_node, fitter_node, recover_cameras, grasp_node,
-synthetic_depth_node.
+"""The programs of ``ros2 run sq_perception``: one function each, which returns the exit code.
 
 Each imports its node inside :func:`sq_perception.nodes.process.run`: numba and rclpy take seconds to import, and
 a Ctrl-C meanwhile must end the process without a traceback.
@@ -11,12 +10,8 @@ import argparse
 import re
 import sys
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING
 
 from sq_perception.nodes import process
-
-if TYPE_CHECKING:
-    from sq_perception.nodes.frame_node import FrameNode
 
 _CAMERAS = """\
 recover_cameras: one process with a recover_node for each of several cameras, which share one network.
@@ -24,14 +19,7 @@ recover_cameras: one process with a recover_node for each of several cameras, wh
     ros2 run sq_perception recover_cameras front wrist --ros-args --params-file cameras.yaml
 
 makes /front/recover_node and /wrist/recover_node, which take /front/depth/image, /wrist/depth/image and so on.
-Parameters are those of recover_node, by node name or by wildcard:
-
-    /**:
-      ros__parameters:
-        max_objects: 5
-    /wrist/recover_node:
-      ros__parameters:
-        depth_max: 1.0
+Parameters are those of recover_node: in a file /**: is for all, /wrist/recover_node: for one.
 
 Frames are computed one after the other, in the order in which they ask: a process per camera would hold the network
 once each and let them compete for the same cores."""
@@ -39,17 +27,27 @@ _NAMESPACE = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 
 
 def recover_node(arguments: Sequence[str] | None = None) -> int:
-    """Run recover_node; the exit code."""
-    return process.run("recover_node", lambda: [_frame_node("recover_node")], arguments)
+    """Network and surface fit."""
+    return process.run("recover_node", lambda: [_node("recover_node")], arguments)
 
 
 def fitter_node(arguments: Sequence[str] | None = None) -> int:
-    """Run fitter_node; the exit code."""
-    return process.run("fitter_node", lambda: [_frame_node("fitter_node")], arguments)
+    """The classic fit."""
+    return process.run("fitter_node", lambda: [_node("fitter_node")], arguments)
+
+
+def grasp_node(arguments: Sequence[str] | None = None) -> int:
+    """Grasps on recovered bodies."""
+    return process.run("grasp_node", lambda: [_node("grasp_node")], arguments)
+
+
+def synthetic_depth_node(arguments: Sequence[str] | None = None) -> int:
+    """A simulated camera."""
+    return process.run("synthetic_depth_node", lambda: [_node("synthetic_depth_node")], arguments)
 
 
 def recover_cameras(arguments: Sequence[str] | None = None) -> int:
-    """Run a recover_node for each camera of the command line; the exit code."""
+    """A recover_node for each camera of the command line."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     cut = given.index("--ros-args") if "--ros-args" in given else len(given)
     parser = argparse.ArgumentParser(
@@ -60,10 +58,10 @@ def recover_cameras(arguments: Sequence[str] | None = None) -> int:
     if len(set(cameras)) != len(cameras):
         parser.error(f"expected different cameras, got {' '.join(cameras)}")
 
-    def create() -> Iterator[FrameNode]:
+    def create() -> Iterator[process.Stoppable]:
         names: dict[str, str] = {}
         for camera in cameras:
-            node = _frame_node("recover_node", camera)
+            node = _node("recover_node", camera)
             yield node
             other = names.setdefault(node.get_fully_qualified_name(), camera)
             if other != camera:
@@ -75,34 +73,19 @@ def recover_cameras(arguments: Sequence[str] | None = None) -> int:
     return process.run("recover_cameras", create, given[cut:])
 
 
-def grasp_node(arguments: Sequence[str] | None = None) -> int:
-    """Run grasp_node; the exit code."""
-
-    def create() -> list[process.Stoppable]:
+def _node(name: str, namespace: str | None = None) -> process.Stoppable:
+    if name == "grasp_node":
         from sq_perception.nodes.grasp_node import GraspNode
 
-        return [GraspNode("grasp_node")]
-
-    return process.run("grasp_node", create, arguments)
-
-
-def synthetic_depth_node(arguments: Sequence[str] | None = None) -> int:
-    """Run synthetic_depth_node; the exit code."""
-
-    def create() -> list[process.Stoppable]:
+        return GraspNode(name)
+    if name == "synthetic_depth_node":
         from sq_perception.nodes.synthetic_depth_node import SyntheticDepthNode
 
-        return [SyntheticDepthNode("synthetic_depth_node")]
-
-    return process.run("synthetic_depth_node", create, arguments)
-
-
-def _frame_node(name: str, namespace: str | None = None) -> FrameNode:
+        return SyntheticDepthNode(name)
     from sq_perception.nodes.frame_node import FrameNode
     from sq_perception.nodes.parameters import FitterParameters, RecoverParameters
 
-    kind = FitterParameters if name == "fitter_node" else RecoverParameters
-    return FrameNode(name, kind, namespace=namespace)
+    return FrameNode(name, FitterParameters if name == "fitter_node" else RecoverParameters, namespace=namespace)
 
 
 def _namespace(text: str) -> str:

@@ -35,7 +35,7 @@ from sq_perception.nodes.input import Arrival, Input
 from sq_perception.nodes.managed_node import ManagedNode
 from sq_perception.nodes.outputs import Outputs, pose_in
 from sq_perception.nodes.parameters import LiveParameters, RecoverParameters
-from sq_perception.nodes.statistics import THROTTLE, Standing, Statistics, summary, timed
+from sq_perception.nodes.statistics import THROTTLE, Standing, Statistics, timed
 from sq_perception.nodes.tracking import CameraPoses, Tracking
 from sq_perception.recordings.publication import Findings
 
@@ -162,9 +162,6 @@ class FrameNode(ManagedNode):
         is_still = super().close()
         return is_still and not self._engine.is_making and (self._worker is None or not self._worker.is_alive())
 
-    def _comes_back(self) -> bool:
-        return bool(self._settings.current.autostart)
-
     def _why_locked(self) -> str:
         """Why parameters that are read at the configuration cannot change now; empty if they can."""
         if not self.is_configured:
@@ -243,10 +240,9 @@ class FrameNode(ManagedNode):
         age = 1e-9 * (self.get_clock().now().nanoseconds - stamp_of(frame))
         if abs(age) < _OLDEST:
             stages["stamp to result"] = 1e3 * age
-        text = summary(found.recovery, found.ids)
-        self._statistics.answer(stages, text)
+        self._statistics.answer(stages, found.summary)
         self._statistics.note(self._outputs.accompany(found, findings, frame, parameters))
-        return Outcome(True, text, findings)
+        return Outcome(True, found.summary, findings)
 
     def _tell(self, outcome: Outcome, arrived: float = math.inf) -> None:
         """Answer who was waiting when the frame arrived, at ``arrived`` of the monotonic clock."""

@@ -30,14 +30,13 @@ from sq_msgs_py import grasps as messages
 from sq_msgs_py.markers import markers
 from sq_msgs_py.poses import plane_of
 from sq_msgs_py.superquadrics import SuperquadricArray, from_message
-from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.grasping.gripper import Gripper, gripper
 from sq_perception.grasping.planner import GraspPlan, grasps, warm_up
 from sq_perception.grasping.surroundings import Surroundings
 from sq_perception.nodes.managed_node import ManagedNode
 from sq_perception.nodes.parameters import GraspParameters, LiveParameters
 from sq_perception.nodes.statistics import THROTTLE
-from sq_perception.recordings.publication import superquadrics
+from sq_perception.recordings.publication import covariances, superquadrics
 
 _LATCHED = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 
@@ -84,9 +83,6 @@ class GraspNode(ManagedNode):
     def _cleanup(self) -> None:
         self._deactivate()
         self._last = self._plane = None
-
-    def _comes_back(self) -> bool:
-        return self._settings.current.autostart
 
     def _on_plane(self, message: PoseStamped) -> None:
         self._plane = message
@@ -141,9 +137,8 @@ class GraspNode(ManagedNode):
 
 def planned(bodies: SuperquadricArray, parameters: GraspParameters, plane: np.ndarray | None = None) -> GraspPlan:
     """The plan that the parameters ask for; bodies that they leave out are minded, and have no grasp."""
-    batch = superquadrics(bodies)
     hand = gripper(parameters.gripper)
-    plan = grasps(batch, hand, covariances(bodies, batch), Surroundings(plane), parameters.friction)
+    plan = grasps(superquadrics(bodies), hand, covariances(bodies), Surroundings(plane), parameters.friction)
     wanted = [parameters.only_id in (-1, int(number)) for number in bodies.id]
     kept = tuple(one for one in plan.grasps if one.score >= parameters.min_score and wanted[one.body])
     have = {one.body for one in kept}
@@ -152,16 +147,3 @@ def planned(bodies: SuperquadricArray, parameters: GraspParameters, plane: np.nd
         for k, why in enumerate(plan.reasons)
     )
     return GraspPlan(kept, reasons)
-
-
-def covariances(bodies: SuperquadricArray, batch: Superquadric) -> np.ndarray:
-    """(n, 11, 11) from the deviations of sizes, centre and turn; NaN where those are unknown."""
-    found = np.zeros((len(bodies), 11, 11))
-    size, centre, turn = (
-        np.asarray(sigma, dtype=float) ** 2 for sigma in (bodies.sigma_size, bodies.sigma_centre, bodies.sigma_turn)
-    )
-    found[:, :3, :3] = size[:, :, None] * np.eye(3)
-    axes = batch.rotation_matrix
-    found[:, 5:8, 5:8] = (axes * centre[:, None]) @ axes.transpose(0, 2, 1)
-    found[:, 8:, 8:] = turn[:, :, None] * np.eye(3)
-    return found

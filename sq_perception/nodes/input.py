@@ -2,11 +2,9 @@
 
 Callbacks of the executor store, one worker thread takes; the newest complete depth image wins.  It is complete with the
 camera_info of its own stamp, or else the latest one of its size, and, where masks are expected, with the mask of its
-own stamp.  What is missing may come a moment later: the image waits for it for ``patience`` seconds, beside newer
-images.  As soon as an image is complete, or its patience is at an end, it takes the place of every older one.
-
-So a frame is never computed without its mask only because the network that makes the mask is slower than the camera,
-and nobody who has the turn to compute waits for a message.
+own stamp.  What is missing may come within ``patience`` seconds, in which newer images come too: nobody who has the
+turn to compute waits for a message, and a frame has its mask though the network that makes it is slower than the
+camera.  As soon as an image is complete, or its patience is at an end, it takes the place of every older one.
 """
 
 from __future__ import annotations
@@ -259,16 +257,12 @@ class Input:
     def _promote(self, now: float) -> None:
         """Make the newest image ready that is complete or has waited long enough; it takes the place of older ones."""
         ready = [k for k, one in enumerate(self._waiting) if one.deadline <= now or self._is_complete(one)]
-        gone = ready[-1] + 1 if ready else max(len(self._waiting) - _WAITING, 0)
-        dropped = gone
+        gone = [self._waiting.popleft() for _ in range(ready[-1] + 1 if ready else len(self._waiting) - _WAITING)]
         if ready:
-            one = self._waiting[ready[-1]]
-            dropped += (self._ready is not None) - 1
+            one = gone.pop()
+            gone += [self._ready] if self._ready is not None else []
             self._ready = replace(one, mask=self._masks.pop(stamp_of(one.message), None))
-        for _ in range(gone):
-            self._waiting.popleft()
-        if dropped:
-            self._statistics.count("dropped", dropped)
+        self._statistics.count("dropped", len(gone))
         self._changed.notify_all()
 
     def _is_complete(self, one: Arrival) -> bool:

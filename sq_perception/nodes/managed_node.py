@@ -4,15 +4,14 @@
          ^  ^---------cleanup------'  ^----deactivate----'
          '---- errorprocessing <---- whatever raises in a transition, or a fault while active
 
-``autostart`` (the default) configures and activates at the start, so that plain ``ros2 run`` works without a manager.
-A transition that takes seconds, such as loading a model, leaves the executor free: services answer meanwhile.  A
-transition that the state does not allow is refused; rclpy raises there, which would end the executor.
+Started by :meth:`ManagedNode.start` it configures and activates itself, so that plain ``ros2 run`` works without a
+manager.  A transition that takes seconds, such as loading a model, leaves the executor free: services answer meanwhile.
 
 What a subclass does in a transition it does in :meth:`_configure`, :meth:`_activate`, :meth:`_deactivate` and
 :meth:`_cleanup`; any exception leads through ``errorprocessing``, where everything is released, to ``unconfigured``,
 from where the node can be configured again.  :attr:`fault` is the reason until it succeeds.  A fault while active
-(:meth:`_fail`) takes the same way, and with ``autostart`` the node comes back by itself after a pause, or ends its
-process if it cannot.
+(:meth:`_fail`) takes the same way; a node that started itself comes back after a pause, or ends its process if it
+cannot.
 
 Transitions create and destroy publishers and subscriptions outside of the executor's thread.  rclpy's executors may
 raise InvalidHandle then (ros2/rclpy issue 1284), which :mod:`sq_perception.nodes.process` takes for nothing; a program
@@ -36,17 +35,14 @@ from rclpy.lifecycle import LifecycleNodeMixin, LifecycleState, TransitionCallba
 from rclpy.node import Node
 from rclpy.task import Future
 
-_SHUTDOWNS = (
-    Transition.TRANSITION_UNCONFIGURED_SHUTDOWN,
-    Transition.TRANSITION_INACTIVE_SHUTDOWN,
-    Transition.TRANSITION_ACTIVE_SHUTDOWN,
-)
 _NAMES = {
     Transition.TRANSITION_CONFIGURE: "configure",
     Transition.TRANSITION_CLEANUP: "cleanup",
     Transition.TRANSITION_ACTIVATE: "activate",
     Transition.TRANSITION_DEACTIVATE: "deactivate",
-    **dict.fromkeys(_SHUTDOWNS, "shutdown"),
+    Transition.TRANSITION_UNCONFIGURED_SHUTDOWN: "shutdown",
+    Transition.TRANSITION_INACTIVE_SHUTDOWN: "shutdown",
+    Transition.TRANSITION_ACTIVE_SHUTDOWN: "shutdown",
 }
 _EXPECTED = (ValueError, OSError, RuntimeError)
 """What a wrong file, parameter or device raises; anything else is a defect and leaves its trace in the log."""
@@ -71,6 +67,7 @@ class ManagedNode(LifecycleNodeMixin, Node):
         """Why the last transition failed; empty once one has succeeded."""
         self.start_failure = ""
         """Why the node could not bring itself up; its process then ends."""
+        self._starts_itself = False
         self._closing = threading.Event()
         self._tasks: queue.SimpleQueue[Callable[[], None] | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._run_tasks, name="transitions", daemon=True)
@@ -93,7 +90,8 @@ class ManagedNode(LifecycleNodeMixin, Node):
         return self.state not in ("unconfigured", "finalized", "unknown")
 
     def start(self) -> None:
-        """Configure and activate, in the thread of the transitions; :attr:`start_failure` tells of a failure."""
+        """Configure and activate, now and after a fault; :attr:`start_failure` tells of a failure."""
+        self._starts_itself = True
         self._tasks.put(self._bring_up)
 
     def close(self) -> bool:
@@ -157,8 +155,7 @@ class ManagedNode(LifecycleNodeMixin, Node):
         fault = self.fault
         answer = self._attempt("release", self._cleanup)
         self.fault = fault
-        succeeded = answer == TransitionCallbackReturn.SUCCESS
-        return TransitionCallbackReturn.SUCCESS if succeeded else TransitionCallbackReturn.FAILURE
+        return TransitionCallbackReturn.FAILURE if answer == TransitionCallbackReturn.ERROR else answer
 
     def _attempt(self, name: str, action: Callable[[], None]) -> TransitionCallbackReturn:
         try:
@@ -192,15 +189,11 @@ class ManagedNode(LifecycleNodeMixin, Node):
     def _leave_by_fault(self, reason: str) -> None:
         if not self.is_active or self._closing.is_set():
             return
-        self.get_logger().error(f"{reason}: trying again in {_PAUSE:g} s" if self._comes_back() else reason)
+        self.get_logger().error(f"{reason}: trying again in {_PAUSE:g} s" if self._starts_itself else reason)
         self.fault = reason
         self._change("deactivate")
-        if self._comes_back() and not self._closing.wait(_PAUSE):
+        if self._starts_itself and not self._closing.wait(_PAUSE):
             self._bring_up()
-
-    def _comes_back(self) -> bool:
-        """Whether nobody else brings the node up."""
-        return True
 
     def _end(self) -> None:
         if self.is_configured or self.state == "unconfigured":
@@ -217,11 +210,10 @@ class ManagedNode(LifecycleNodeMixin, Node):
     async def _on_change_state(
         self, request: ChangeState.Request, response: ChangeState.Response
     ) -> ChangeState.Response:
-        label = str(request.transition.label)
-        name = label if label in _NAMES.values() else "" if label else _NAMES.get(request.transition.id, "")
-        if not name:
-            asked = label or request.transition.id
-            self.get_logger().warning(f"expected one of {', '.join(dict.fromkeys(_NAMES.values()))}, got {asked!r}")
+        asked = str(request.transition.label) or _NAMES.get(request.transition.id, request.transition.id)
+        if asked not in _NAMES.values():
+            expected = ", ".join(dict.fromkeys(_NAMES.values()))
+            self.get_logger().warning(f"expected one of {expected}, got {asked!r}")
             response.success = False
             return response
         done: Future = Future(executor=self.executor)
@@ -229,7 +221,7 @@ class ManagedNode(LifecycleNodeMixin, Node):
         def task() -> None:
             succeeded = False
             try:
-                succeeded = self._change(name)
+                succeeded = self._change(str(asked))
             finally:
                 done.set_result(succeeded)
                 if self.executor is not None:

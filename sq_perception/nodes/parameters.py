@@ -338,18 +338,22 @@ class SyntheticParameters(Parameters):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.scene == "replay" and not self.path:
+        if self.scene != "replay":
+            self.check(self.scene == "thesis", f"scene = {self.scene}")
+        elif not self.path:
             raise ParameterError("path: expected a recorded frame or a folder of them for scene = replay, got nothing")
-        grey = self.encoding in GREY_ENCODINGS
-        if self.encoding != "auto" and self.scene != "replay" and grey != (self.scene == "thesis"):
-            expected = " or ".join(GREY_ENCODINGS if self.scene == "thesis" else DEPTH_ENCODINGS)
-            raise ParameterError(f"encoding: expected {expected} for scene = {self.scene}, got {self.encoding}")
-        if self.sensor != IDEAL and self.scene == "thesis":
-            raise ParameterError(f"sensor: expected {IDEAL} for scene = thesis, got {self.sensor}")
-        if self.image_transport != RAW and (grey or self.scene == "thesis"):
+        if self.image_transport != RAW and (self.scene == "thesis" or self.encoding in GREY_ENCODINGS):
             raise ParameterError(f"image_transport: expected {RAW} for grey images, got {self.image_transport}")
         if self.sensor != IDEAL and self.noise != 0:
             raise ParameterError(f"noise: expected 0 for sensor = {self.sensor}, which has its own, got {self.noise:g}")
+
+    def check(self, is_cube: bool, what: str) -> None:
+        """Raise ParameterError where ``what`` has images of the unit cube, or has none, and these say otherwise."""
+        if self.encoding != "auto" and is_cube != (self.encoding in GREY_ENCODINGS):
+            expected = " or ".join(GREY_ENCODINGS if is_cube else DEPTH_ENCODINGS)
+            raise ParameterError(f"encoding: expected {expected} for {what}, got {self.encoding}")
+        if is_cube and self.sensor != IDEAL:
+            raise ParameterError(f"sensor: expected {IDEAL} for {what}, got {self.sensor}")
 
 
 @dataclass(frozen=True)

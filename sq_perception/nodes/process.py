@@ -49,7 +49,7 @@ class Stoppable(Protocol):
 
     def destroy_node(self) -> None: ...
 
-    def get_name(self) -> str: ...
+    def get_fully_qualified_name(self) -> str: ...
 
 
 def run(name: str, create: Callable[[], Iterable[Stoppable]], arguments: Sequence[str] | None = None) -> int:
@@ -158,7 +158,7 @@ def _spin(nodes: Sequence[Any], executor: Executor, stop: _Stop) -> int:
                 executor.spin_once(timeout_sec=_LOOK)
             failed = next((node for node in nodes if node.start_failure), None)
             if failed is not None:
-                _explain(failed.get_name(), failed.start_failure)
+                _explain(failed.get_fully_qualified_name().lstrip("/"), failed.start_failure)
                 return 1
     except ExternalShutdownException:
         pass

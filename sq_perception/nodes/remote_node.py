@@ -1,15 +1,13 @@
 """Another node as the page sees it: its parameters, its lifecycle state, whether it is there.
 
-All calls of services are made from the executor's thread and waited for by nobody: answers arrive as callbacks, and a
-call without an answer is given up after a while, as the node may have died.  What is to be shown waits, and the drawing
-thread takes it with :meth:`RemoteNode.show`.
+Services are called by tasks of the executor; a call without an answer is given up after a while, as the node may have
+died.  What is to be shown waits, and the drawing thread takes it with :meth:`RemoteNode.show`.
 """
 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable
-from functools import partial
+from contextlib import suppress
 from time import monotonic
 from typing import Any
 
@@ -42,10 +40,11 @@ class RemoteNode:
         self.name = name
         self.is_there = False
         self.lifecycle = ""
+        self._node = node
         self._parameters = AsyncParameterClient(node, name)
         self._state = node.create_client(GetState, f"{name}/get_state")
         self._transit = node.create_client(ChangeState, f"{name}/change_state")
-        self._calls: list[tuple[float, Future]] = []
+        self._deadlines: dict[Future, float] = {}
         self._known: set[str] = set()
         self._look_due = 0.0
         self._load_due: float | None = None
@@ -58,17 +57,17 @@ class RemoteNode:
 
     def tick(self) -> None:
         """Look after the node; called often."""
-        now = monotonic()
-        late = [future for deadline, future in self._calls if now > deadline]
-        self._calls = [(deadline, future) for deadline, future in self._calls if now <= deadline and not future.done()]
-        for future in late:
-            future.cancel()  # nothing happens to one that is done
+        now, executor = monotonic(), self._node.executor
+        assert executor is not None, "this is called by its thread"
+        for call, deadline in tuple(self._deadlines.items()):
+            if now > deadline:
+                call.cancel()  # nothing happens to one that is done
         if now >= self._look_due:
             self._look_due = now + _LOOK_PERIOD
             self._look()
         if self._load_due is not None and now >= self._load_due and self.is_there:
             self._load_due = None
-            self._load()
+            executor.create_task(self._load)
 
     def on_event(self, event: ParameterEvent) -> None:
         """Follow a message of /parameter_events of this node."""
@@ -78,39 +77,37 @@ class RemoteNode:
         with self._lock:
             self._new_values.update({one.name: parameter_value_to_python(one.value) for one in values})
 
-    def change(self, name: str, value: Any) -> None:
-        """Ask for another value of a parameter; what the node says to it is shown."""
+    async def change(self, name: str, value: Any) -> None:
+        """Ask for another value of a parameter; what the node says to it is shown, and what it holds then."""
         if not self.is_there:
             self._say(f"{name}: {self.name} is not there", False)
             return
-
-        def answered(response: Any) -> None:
-            result = response.results[0]
-            # Not every reason of rclpy's own says which parameter it is about.
-            reason = result.reason if name in result.reason else f"{name}: {result.reason or 'refused'}"
-            self._say(f"{name} is now {_shown(value)}" if result.successful else reason, result.successful)
-            self._call(self._parameters.get_parameters([name]), read)
-
-        def read(response: Any) -> None:
-            with self._lock:  # what the node holds, whatever was asked for
+        try:
+            response = await self._answer(self._parameters.set_parameters([Parameter(name, value=value)]))
+        except TimeoutError:
+            self._say(f"{name}: no answer from {self.name} within {_PATIENCE:g} s", False)
+            return
+        result = response.results[0]
+        # Not every reason of rclpy's own says which parameter it is about.
+        reason = result.reason if name in result.reason else f"{name}: {result.reason or 'refused'}"
+        self._say(f"{name} is now {_shown(value)}" if result.successful else reason, result.successful)
+        with suppress(TimeoutError):
+            response = await self._answer(self._parameters.get_parameters([name]))
+            with self._lock:
                 self._new_values.update((name, parameter_value_to_python(one)) for one in response.values)
 
-        call = self._parameters.set_parameters([Parameter(name, value=value)])
-        silence = f"{name}: no answer from {self.name} within {_PATIENCE:g} s"
-        self._call(call, answered, partial(self._say, silence, False))
-
-    def transit(self, label: str) -> None:
+    async def transit(self, label: str) -> None:
         """Ask for a lifecycle transition."""
         if label not in _TRANSITIONS or not self._transit.service_is_ready():
             return
-
-        def answered(response: ChangeState.Response) -> None:
-            self._say(f"{label}: {'done' if response.success else 'the node could not'}", response.success)
-            self._look_due = 0.0
-
         request = ChangeState.Request(transition=Transition(id=getattr(Transition, f"TRANSITION_{label.upper()}")))
-        give_up = partial(self._say, f"{label}: no answer", False)
-        self._call(self._transit.call_async(request), answered, give_up, _TRANSITION_PATIENCE)
+        try:
+            response = await self._answer(self._transit.call_async(request), _TRANSITION_PATIENCE)
+        except TimeoutError:
+            self._say(f"{label}: no answer", False)
+            return
+        self._say(f"{label}: {'done' if response.success else 'the node could not'}", response.success)
+        self._look_due = 0.0
 
     def _look(self) -> None:
         was_there, self.is_there = self.is_there, self._parameters.services_are_ready()
@@ -119,53 +116,42 @@ class RemoteNode:
         if not self.is_there:
             self.lifecycle = ""
         elif self._state.service_is_ready():
+            call = self._state.call_async(GetState.Request())
+            self._deadlines[call] = monotonic() + _PATIENCE
+            call.add_done_callback(self._on_state)  # no task: one that is left at the end of the process complains
 
-            def answered(response: GetState.Response) -> None:
-                self.lifecycle = str(response.current_state.label)
+    def _on_state(self, call: Future) -> None:
+        del self._deadlines[call]
+        if call.result() is not None:
+            self.lifecycle = str(call.result().current_state.label)
 
-            self._call(self._state.call_async(GetState.Request()), answered)
-
-    def _load(self) -> None:
+    async def _load(self) -> None:
         """Names, then descriptors, then values, then controls; all over again where an answer stays away."""
+        try:
+            listed = await self._answer(self._parameters.list_parameters())
+            described = await self._answer(self._parameters.describe_parameters(list(listed.result.names)))
+            names = [one.name for one in described.descriptors]
+            got = await self._answer(self._parameters.get_parameters(names))
+        except TimeoutError:
+            self._load_due = monotonic() + _LOOK_PERIOD
+            return
+        self._known = set(names)
+        read = [parameter_value_to_python(one) for one in got.values]
+        about = [_description(one, value) for one, value in zip(described.descriptors, read, strict=True)]
+        with self._lock:
+            self._new_controls = arranged(about)
+            self._new_values.clear()
 
-        def listed(response: Any) -> None:
-            names = list(response.result.names)
-            self._call(self._parameters.describe_parameters(names), described, self._load_again)
-
-        def described(response: Any) -> None:
-            descriptors = list(response.descriptors)
-            names = [one.name for one in descriptors]
-
-            def got(response: Any) -> None:
-                self._known = set(names)
-                read = [parameter_value_to_python(one) for one in response.values]
-                about = [_description(one, value) for one, value in zip(descriptors, read, strict=True)]
-                with self._lock:
-                    self._new_controls = arranged(about)
-                    self._new_values.clear()
-
-            self._call(self._parameters.get_parameters(names), got, self._load_again)
-
-        self._call(self._parameters.list_parameters(), listed, self._load_again)
-
-    def _load_again(self) -> None:
-        self._load_due = monotonic() + _LOOK_PERIOD
-
-    def _call(
-        self,
-        future: Future,
-        answered: Callable[[Any], None],
-        give_up: Callable[[], None] = lambda: None,
-        patience: float = _PATIENCE,
-    ) -> None:
-        def done(finished: Future) -> None:
-            if finished.cancelled() or finished.exception() is not None or finished.result() is None:
-                give_up()
-            else:
-                answered(finished.result())
-
-        future.add_done_callback(done)
-        self._calls.append((monotonic() + patience, future))
+    async def _answer(self, call: Future, patience: float = _PATIENCE) -> Any:
+        """The answer of a service.  Raises TimeoutError if there is none."""
+        self._deadlines[call] = monotonic() + patience
+        try:
+            answer = await call
+        finally:
+            del self._deadlines[call]
+        if answer is None:
+            raise TimeoutError
+        return answer
 
     def _say(self, text: str, good: bool) -> None:
         with self._lock:

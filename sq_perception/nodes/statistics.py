@@ -1,4 +1,4 @@
-"""Counts and latencies of a node, and what it says about them: diagnostics, summaries.
+"""Counts and latencies of a node, and what diagnostics say about them.
 
 Every received frame ends as exactly one of answered, dropped (a newer one came first, or the node is disabled) and
 refused (bad input); the rest is in work.  Counts are since the start, rates and latencies of the last seconds.
@@ -8,16 +8,13 @@ from __future__ import annotations
 
 import threading
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from datetime import datetime, timezone
 from time import monotonic, perf_counter
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
-
-from sq_perception.fitting.fit import Status
-from sq_perception.recovery.recoverer import FrameRecovery
 
 THROTTLE = 5.0
 """Seconds between two messages of the same place in the log."""
@@ -136,22 +133,3 @@ class Statistics:
     def _add(self, what: str, number: int) -> None:
         self._counts[what] += number
         self._recent.extend([(self._clock(), what)] * number)
-
-
-def summary(recovery: FrameRecovery, ids: Sequence[int]) -> str:
-    """One frame's results in a line, with the ids of its bodies."""
-    took = f"in {recovery.milliseconds.get('total', 0.0):.0f} ms"
-    if not recovery.bodies:
-        return f"no bodies {took}" + (f": {recovery.message}" if recovery.message else "")
-    parts = []
-    for one, number in zip(recovery.bodies, ids, strict=True):
-        if one.status == Status.FAILED:
-            parts.append(f"{number}: failed, {one.message}")
-            continue
-        size, shape = one.superquadric.size, one.superquadric.shape
-        parts.append(
-            f"{number}: a = {size[0]:.4f} {size[1]:.4f} {size[2]:.4f}, e = {shape[0]:.2f} {shape[1]:.2f}, "
-            f"score {one.score:.2f}"
-        )
-    count = len(recovery.bodies)
-    return f"{count} {'body' if count == 1 else 'bodies'} {took}; " + "; ".join(parts)

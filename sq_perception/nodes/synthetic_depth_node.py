@@ -28,8 +28,6 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 from std_msgs.msg import Header
 
 from sq_msgs_py.depth_image import (
-    DEPTH_ENCODINGS,
-    GREY_ENCODINGS,
     RawIntrinsics,
     depth_to_message,
     grey_to_message,
@@ -41,11 +39,10 @@ from sq_msgs_py.superquadrics import to_message
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.calibration import intrinsics
 from sq_perception.nodes.frame import image_topic, packed
-from sq_perception.nodes.parameters import RAW, LiveParameters, ParameterError, SyntheticParameters
+from sq_perception.nodes.parameters import RAW, LiveParameters, SyntheticParameters
 from sq_perception.recordings import camera_file
 from sq_perception.recordings.frame_source import FrameSource, SourceFrame, generated, recorded, recordings
 from sq_perception.recordings.publication import CAMERA_FRAME, CUBE_FRAME, truth_array
-from sq_perception.simulation.sensor_noise import IDEAL
 
 
 def frame_source(parameters: SyntheticParameters) -> FrameSource:
@@ -74,12 +71,7 @@ def frame_source(parameters: SyntheticParameters) -> FrameSource:
             with_labels=parameters.masks == "always",
         )
     source = FrameSource(make, count, seed=parameters.seed, hold=parameters.hold, loop=parameters.loop)
-    name, is_cube = source.clean.name, source.clean.is_cube
-    if parameters.encoding != "auto" and is_cube != (parameters.encoding in GREY_ENCODINGS):
-        expected = " or ".join(GREY_ENCODINGS if is_cube else DEPTH_ENCODINGS)
-        raise ParameterError(f"encoding: expected {expected} for {name}, got {parameters.encoding}")
-    if is_cube and parameters.sensor != IDEAL:
-        raise ParameterError(f"sensor: expected {IDEAL} for {name}, got {parameters.sensor}")
+    parameters.check(source.clean.is_cube, source.clean.name)
     return source
 
 

@@ -1,15 +1,10 @@
 """The node behind ``sq-perception view``: listens to a camera and some frame nodes, and keeps what a page shows.
 
-| name | type | |
-| --- | --- | --- |
-| depth topic | sensor_msgs/Image | in: 16UC1 mm, 32FC1 m; mono8 and mono16 images of the unit cube |
-| camera_info topic | sensor_msgs/CameraInfo | in: not needed for images of the unit cube |
-| `<node>/superquadrics` | sensor_msgs/PointCloud2 | in, of each frame node |
-| `/diagnostics`, `/parameter_events` | | in |
-| `<node>/...parameters`, `get_state`, `change_state` | services | asked, see :mod:`sq_perception.nodes.remote_node` |
+Images, camera_info and superquadrics are subscribed to while a browser shows the page, /diagnostics and
+/parameter_events always; parameters and lifecycle go by services (:mod:`sq_perception.nodes.remote_node`).
 
 The executor's thread stores messages and talks to services; one drawing thread decodes the newest and draws them, at a
-limited rate and only while a browser shows the page.  While none does, images and results are not even subscribed to.
+limited rate and only while a browser shows the page.
 """
 
 from __future__ import annotations
@@ -29,7 +24,6 @@ from rcl_interfaces.msg import ParameterEvent
 from rclpy.node import Node
 from rclpy.qos import QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
 from rclpy.subscription import Subscription
-from rclpy.time import Time
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
 from sq_msgs_py.depth_image import GREY_ENCODINGS, size_mismatch
@@ -39,7 +33,6 @@ from sq_perception.geometry import rotation
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.calibration import Calibration
-from sq_perception.imaging.camera import Camera
 from sq_perception.nodes.frame import decode, stamp_of
 from sq_perception.nodes.remote_node import RemoteNode
 from sq_perception.nodes.statistics import THROTTLE
@@ -47,7 +40,7 @@ from sq_perception.nodes.tracking import CameraPoses, PoseError
 from sq_perception.recordings.publication import superquadrics
 from sq_perception.viewing import tables
 from sq_perception.viewing.drawings import Bodies
-from sq_perception.viewing.page import Change, Page, Transition
+from sq_perception.viewing.page import Change, Page
 from sq_perception.viewing.tables import NodeState
 
 _IMAGES = 8
@@ -106,6 +99,10 @@ class ViewNode(Node):
         self._diagnosed: dict[str, dict[str, str]] = {}
         self._poses = CameraPoses(self)
         self._inputs: list[Subscription] = []
+        self._drawn: Image | None = None
+        self._bodies: dict[str, tuple[Result, Bodies | None, str]] = {}
+        """Of each node: the result that was drawn last, and its bodies, or why they cannot be drawn."""
+        self._status_due = 0.0
         self._remote = {one: RemoteNode(self, one) for one in nodes}
         self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
         self.create_subscription(ParameterEvent, "/parameter_events", self._on_parameter_event, 1000)
@@ -134,12 +131,14 @@ class ViewNode(Node):
             for one in self._inputs:
                 self.destroy_subscription(one)
             self._inputs = []
+        executor = self.executor
+        assert executor is not None, "it calls this"
         for request in self._page.requests():
             remote = self._remote[request.node]
             if isinstance(request, Change):
-                remote.change(request.name, request.value)
-            elif isinstance(request, Transition):
-                remote.transit(request.label)
+                executor.create_task(remote.change, request.name, request.value)
+            else:
+                executor.create_task(remote.transit, request.label)
         for remote in self._remote.values():
             remote.tick()
 
@@ -168,8 +167,7 @@ class ViewNode(Node):
             self._news.set()
 
     def _on_result(self, name: str, message: PointCloud2) -> None:
-        age = self.get_clock().now() - Time.from_msg(message.header.stamp, clock_type=self.get_clock().clock_type)
-        milliseconds = 1e-6 * age.nanoseconds
+        milliseconds = 1e-6 * (self.get_clock().now().nanoseconds - stamp_of(message))
         latency = milliseconds if 0 <= milliseconds < 60e3 else None
         self._results[name] = Result(message, monotonic(), latency)
         self._news.set()
@@ -188,7 +186,7 @@ class ViewNode(Node):
     # The drawing thread
 
     def _draw_on(self) -> None:
-        drawer, due = _Drawer(self), 0.0
+        due = 0.0
         while not self._closed.is_set():
             self._news.wait(_STATUS_PERIOD)
             self._news.clear()
@@ -196,51 +194,33 @@ class ViewNode(Node):
                 return
             due = monotonic() + self._period
             try:
-                drawer.draw()
+                self._draw()
             except Exception:
                 # A defect of ours or of a message: it costs this picture, and the page goes on.
                 if not self._closed.is_set():
                     self.get_logger().error(traceback.format_exc(), throttle_duration_sec=THROTTLE)
 
-    def newest_images(self) -> tuple[list[Image], float]:
-        """Kept depth images, oldest first, and how many come per second."""
-        with self._lock:
-            now = monotonic()
-            count = sum(1 for time in self._arrivals if now - time <= _RATE_SECONDS)
-            return list(self._images.values()), count / _RATE_SECONDS
-
-
-class _Drawer:
-    """What the drawing thread knows of what it has drawn; uses the node's stores."""
-
-    def __init__(self, node: ViewNode) -> None:
-        self._node, self._page = node, node._page
-        self._image: Image | None = None
-        self._bodies: dict[str, tuple[Result, Bodies | None, str]] = {}
-        self._status_due = 0.0
-        self._was_watched = False
-
-    def draw(self) -> None:
+    def _draw(self) -> None:
         if not self._page.watched:
-            self._was_watched = False
+            self._status_due = 0.0  # controls may have changed when somebody looks again
             return
-        if not self._was_watched:
-            # Controls have changed, perhaps, while nobody looked.
-            self._was_watched, self._status_due = True, 0.0
-        for remote in self._node._remote.values():
+        for remote in self._remote.values():
             remote.show(self._page)
-        status_due = monotonic() >= self._status_due
-        results = dict(self._node._results)
-        images, rate = self._node.newest_images()
+        now = monotonic()
+        status_due = now >= self._status_due
+        results = dict(self._results)
+        with self._lock:
+            images = list(self._images.values())
+            rate = sum(1 for time in self._arrivals if now - time <= _RATE_SECONDS) / _RATE_SECONDS
         header = self._draw_depth(images, rate, results, status_due)
-        for name in self._node._remote:
+        for name in self._remote:
             self._draw_node(name, results.get(name), header, status_due)
         if status_due:
             self._status_due = monotonic() + _STATUS_PERIOD
 
     def _draw_depth(self, images: list[Image], rate: float, results: dict[str, Result], status_due: bool) -> Any:
         """Draw the image that belongs to the newest results, else the newest; the header of what is drawn."""
-        topic = self._node._topics[0]
+        topic = self._topics[0]
         if not images:
             if status_due:
                 self._page.show_source(tables.source_status(topic, None, 0.0, "", "no depth image has come yet"))
@@ -248,11 +228,11 @@ class _Drawer:
         stamps = {stamp_of(one.message) for one in results.values() if monotonic() - one.time < tables.SILENT_SECONDS}
         image = next((one for one in reversed(images) if stamp_of(one) in stamps), images[-1])
         remark = "" if rate > 0 else "no depth images come any more"
-        if image is not self._image:
+        if image is not self._drawn:
             try:
-                depth, camera = self._decoded(image)
-                self._page.show_depth(depth, camera)
-                self._image = image
+                frame = decode(image, None if image.encoding in GREY_ENCODINGS else lambda: self._calibration(image))
+                self._page.show_depth(frame.depth, frame.camera)
+                self._drawn = image
             except ValueError as error:
                 remark = str(error)
         if status_due or remark:
@@ -260,12 +240,8 @@ class _Drawer:
             self._page.show_source(tables.source_status(topic, size, rate, image.header.frame_id, remark))
         return image.header
 
-    def _decoded(self, image: Image) -> tuple[np.ndarray, Camera]:
-        frame = decode(image, None if image.encoding in GREY_ENCODINGS else lambda: self._calibration(image))
-        return frame.depth, frame.camera
-
     def _calibration(self, image: Image) -> Calibration:
-        info, (image_topic, info_topic) = self._node._info, self._node._topics
+        info, (image_topic, info_topic) = self._info, self._topics
         if info is None:
             raise ValueError(f"no camera_info has come on {info_topic}")
         calibration = Calibration.of(info, image_topic)
@@ -274,21 +250,19 @@ class _Drawer:
         return calibration
 
     def _draw_node(self, name: str, result: Result | None, header: Any, status_due: bool) -> None:
-        last = self._bodies.get(name)
-        is_new = result is not None and (last is None or last[0] is not result)
-        if not (is_new or status_due):
+        drawn, bodies, remark = self._bodies.get(name, (None, None, ""))
+        if result is drawn and not status_due:
             return
-        bodies, remark = (last[1], last[2]) if last is not None else (None, "")
-        if result is not None and is_new:
+        if result is not None and result is not drawn:
             bodies, remark = self._converted(result.message, header)
             self._bodies[name] = result, bodies, remark
-        remote = self._node._remote[name]
+        remote = self._remote[name]
         state = NodeState(
             name,
             None if result is None else monotonic() - result.time,
             None if result is None else result.latency,
             remote.lifecycle,
-            self._node._diagnosed.get(name, {}) if remote.is_there else {},
+            self._diagnosed.get(name, {}) if remote.is_there else {},
             remote.is_there,
             remark,
         )
@@ -302,10 +276,10 @@ class _Drawer:
         try:
             array = from_message(message)
             bodies = superquadrics(array.recovered)
-            if self._image is not None and self._image.encoding in GREY_ENCODINGS:
+            if self._drawn is not None and self._drawn.encoding in GREY_ENCODINGS:
                 bodies = unit_cube.optical_from_cube(bodies)
             elif header is not None and message.header.frame_id != header.frame_id:
-                turn, shift = self._node._poses.at(header, message.header.frame_id)
+                turn, shift = self._poses.at(header, message.header.frame_id)
                 back = rotation.conjugate(turn)
                 bodies = bodies.transformed(back, -(rotation.to_matrix(back) @ shift))
             return _bodies(array, bodies), ""

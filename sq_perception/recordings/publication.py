@@ -67,6 +67,26 @@ class Identified:
     fused: tuple[bool, ...] = ()
     reasons: tuple[int, ...] = ()
 
+    @property
+    def summary(self) -> str:
+        """One frame's results in a line."""
+        recovery = self.recovery
+        took = f"in {recovery.milliseconds.get('total', 0.0):.0f} ms"
+        if not recovery.bodies:
+            return f"no bodies {took}" + (f": {recovery.message}" if recovery.message else "")
+        parts = []
+        for one, number in zip(recovery.bodies, self.ids, strict=True):
+            if one.status == Status.FAILED:
+                parts.append(f"{number}: failed, {one.message}")
+                continue
+            size, shape = one.superquadric.size, one.superquadric.shape
+            parts.append(
+                f"{number}: a = {size[0]:.4f} {size[1]:.4f} {size[2]:.4f}, e = {shape[0]:.2f} {shape[1]:.2f}, "
+                f"score {one.score:.2f}"
+            )
+        count = len(recovery.bodies)
+        return f"{count} {'body' if count == 1 else 'bodies'} {took}; " + "; ".join(parts)
+
 
 @dataclass(frozen=True)
 class MarkerStyle:
@@ -259,6 +279,19 @@ def superquadrics(array: SuperquadricArray) -> Superquadric:
     """The bodies (n,) of a message, in its frame."""
     columns = (array.size, array.shape, array.translation, array.rotation)
     return Superquadric(*(column.astype(float) for column in columns))
+
+
+def covariances(array: SuperquadricArray) -> np.ndarray:
+    """(n, 11, 11) of the bodies of a message, from the deviations of sizes, centre and turn; NaN where unknown."""
+    found = np.zeros((len(array), 11, 11))
+    size, centre, turn = (
+        np.asarray(sigma, dtype=float) ** 2 for sigma in (array.sigma_size, array.sigma_centre, array.sigma_turn)
+    )
+    axes = superquadrics(array).rotation_matrix
+    found[:, :3, :3] = size[:, :, None] * np.eye(3)
+    found[:, _CENTRE, _CENTRE] = (axes * centre[:, None]) @ axes.transpose(0, 2, 1)
+    found[:, _TURN, _TURN] = turn[:, :, None] * np.eye(3)
+    return found
 
 
 def truth_array(bodies: Superquadric) -> SuperquadricArray:

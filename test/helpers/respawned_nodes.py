@@ -24,7 +24,7 @@ from typing import Any
 from running_nodes import Peer, arguments, environment, until
 from sensor_msgs.msg import CameraInfo
 
-from sq_perception.nodes.children import Child
+from sq_perception.commands.children import Child
 from sq_perception.nodes.fast_dds import FOLDER
 
 CAMERA, NODE, VIEWER = "camera", "node", "viewer"

@@ -26,10 +26,10 @@ from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from std_msgs.msg import Header
 
 from sq_msgs_py.depth_image import Intrinsics, depth_to_message, intrinsics_to_message
+from sq_perception.commands.children import Child
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
 from sq_perception.nodes import fast_dds
-from sq_perception.nodes.children import Child
 from sq_perception.simulation.scenes import Scene
 
 PATIENCE = 90.0

@@ -20,15 +20,15 @@ from rich.console import Console
 pytest.importorskip("rclpy", reason="rclpy missing: install the extra 'ros' or source ROS 2")
 
 import sq_perception
+from sq_perception.commands import children as children_module
+from sq_perception.commands.children import Children, parameter_arguments
 from sq_perception.evaluation.comparison import alike, pair
 from sq_perception.evaluation.demo_figure import demo_figure
 from sq_perception.evaluation.demo_table import demo_table
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast, unit_cube
 from sq_perception.imaging.camera import Camera
-from sq_perception.nodes import children as children_module
 from sq_perception.nodes import fast_dds
-from sq_perception.nodes.children import Children, parameter_arguments
 
 ROOT = str(Path(sq_perception.__file__).parent.parent)
 IDENTITY = np.array([0.0, 0.0, 0.0, 1.0])

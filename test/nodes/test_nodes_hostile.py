@@ -25,8 +25,8 @@ from sq_msgs_py.depth_image import (
     labels_from_message,
 )
 from sq_msgs_py.superquadrics import from_message
+from sq_perception.commands.children import Children
 from sq_perception.imaging.camera import Camera
-from sq_perception.nodes.children import Children
 from sq_perception.recovery.recoverer import Recoverer
 
 FIELDS = ("encoding", "image size", "step", "data")

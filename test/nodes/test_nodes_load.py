@@ -20,10 +20,10 @@ from running_nodes import BODIES, CAMERA, Peer, arguments, environment, until
 from std_srvs.srv import SetBool
 
 from sq_msgs_py.superquadrics import from_message
+from sq_perception.commands.children import Child, Children
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
 from sq_perception.learning import checkpoint
-from sq_perception.nodes.children import Child, Children
 
 QUIET = ("no_frame_warning:=0.0", "tracking:=false")
 STORM_SECONDS, STORM_RATE = 3.0, 200.0

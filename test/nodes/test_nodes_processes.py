@@ -29,10 +29,10 @@ from std_srvs.srv import SetBool, Trigger
 
 from sq_msgs_py.depth_image import Intrinsics, depth_to_message, intrinsics_to_message
 from sq_msgs_py.superquadrics import SuperquadricArray, from_message
+from sq_perception.commands.children import command
 from sq_perception.geometry.metrics import thesis_iou, volume_iou
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
-from sq_perception.nodes.children import command
 from sq_perception.simulation.scenes import Scene
 
 PATIENCE = 90.0
