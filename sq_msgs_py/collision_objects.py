@@ -15,13 +15,14 @@ camera that moves therefore wants its results in a frame that does not (``target
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
+from itertools import compress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from geometry_msgs.msg import Pose, Quaternion
 
-from sq_msgs_py.poses import pose_messages
+from sq_msgs_py.poses import pose_messages, unit_quaternions
 from sq_msgs_py.shapes import enclosing_factor, mesh_message, primitive
 from sq_msgs_py.superquadrics import SuperquadricArray
 from sq_msgs_py.transforms import PREFIX, name
@@ -30,11 +31,89 @@ if TYPE_CHECKING:
     from moveit_msgs.msg import CollisionObject, PlanningScene
 
 
+Mesh = tuple[np.ndarray, np.ndarray]
+"""Vertices (k, 3) and faces (m, 3)."""
+_STEP = 0.002
+"""Metres: a body of which no point has moved farther is not sent again to planners, whose paddings are larger."""
+
+
+class Scene:
+    """The bodies of one source as planners know them: what each frame changes.
+
+    An object is sent again when it has changed, as a planner copies its world for each message, and all of them in
+    another frame or as other shapes.  One is removed when its id is gone, that is neither shown nor hidden: what a
+    robot's arm hides is still there.
+    """
+
+    def __init__(self) -> None:
+        self._known: dict[str, SuperquadricArray | None] = {}
+        """By name; None for those that have to be sent again."""
+        self._known_as = "", False
+        self._header: Any = None
+
+    def forget(self) -> None:
+        """Let the next frame send every object again: another planner listens."""
+        self._known = dict.fromkeys(self._known)
+
+    def changes(
+        self,
+        superquadrics: SuperquadricArray,
+        header: Any,
+        hidden: Iterable[int] = (),
+        *,
+        meshes: Callable[[], Sequence[Mesh]] | None = None,
+        prefix: str = PREFIX,
+    ) -> list[CollisionObject]:
+        """Objects to ADD and to REMOVE after another frame, by :func:`collision_objects` and :func:`removals`.
+
+        Parameters
+        ----------
+        hidden
+            Ids of bodies that the frame does not show and that are not given up.
+        meshes
+            Makes those of the bodies that did not fail, where they are needed.
+        """
+        known_as = header.frame_id, meshes is not None
+        if known_as != self._known_as:
+            self.forget()
+        self._known_as, self._header = known_as, header
+        shown = superquadrics.recovered
+        names = [name(number, prefix) for number in shown.id]
+        new = np.array([_has_changed(self._known.get(one), shown, k) for k, one in enumerate(names)], dtype=bool)
+        surfaces = None
+        if meshes is not None:
+            surfaces = list(compress(meshes(), new)) if new.any() else []
+        objects = collision_objects(shown.where(new), header, meshes=surfaces, prefix=prefix)
+        kept = {*names, *(name(number, prefix) for number in hidden)}
+        objects += removals(self._known.keys() - kept, header)
+        self._known = {one: state for one, state in self._known.items() if one in kept}
+        self._known.update({names[k]: shown.where(np.arange(len(shown)) == k) for k in np.flatnonzero(new)})
+        return objects
+
+    def clear(self) -> list[CollisionObject]:
+        """Objects that REMOVE all that planners know of."""
+        gone, self._known = self._known, {}
+        return removals(gone, self._header) if gone else []
+
+
+def _has_changed(known: SuperquadricArray | None, shown: SuperquadricArray, k: int) -> bool:
+    """Whether a point of a body may have moved by more than a step since planners were sent it."""
+    if known is None:
+        return True
+    largest = float(known.size.max())
+    turn = 2 * np.arccos(
+        min(1.0, abs(float(np.vdot(unit_quaternions(known.rotation[0]), unit_quaternions(shown.rotation[k])))))
+    )
+    moves = np.linalg.norm(known.translation[0] - shown.translation[k]), np.abs(known.size[0] - shown.size[k]).max()
+    rounds = largest * np.abs(known.shape[0] - shown.shape[k]).max()
+    return bool(sum(moves) + rounds + largest * turn > _STEP)
+
+
 def collision_objects(
     superquadrics: SuperquadricArray,
     header: Any,
     *,
-    meshes: Sequence[tuple[np.ndarray, np.ndarray]] | None = None,
+    meshes: Sequence[Mesh] | None = None,
     prefix: str = PREFIX,
 ) -> list[CollisionObject]:
     """One object to ADD for each body that did not fail; one of the same id that is there already is replaced.
@@ -44,8 +123,8 @@ def collision_objects(
     header
         std_msgs/Header of the bodies.
     meshes
-        Vertices (k, 3) and faces (m, 3) for each body that did not fail, on its surface and in its own frame; they are
-        grown by :func:`~sq_msgs_py.shapes.enclosing_factor`.  None: enclosing primitives.
+        One for each body that did not fail, on its surface and in its own frame; they are grown by
+        :func:`~sq_msgs_py.shapes.enclosing_factor`.  None: enclosing primitives.
     prefix
         Of the ids.
 

@@ -6,9 +6,8 @@ FASTDDS_DEFAULT_PROFILES_FILE, means nothing to it.
 
 It keeps one segment per participant in /dev/shm, ``fastrtps_<16 hex digits>``, 17 MB with this profile, whose owner
 holds a lock on ``fastrtps_<16 hex digits>_el`` for as long as it lives.  After kill -9 the kernel frees the lock, but
-nothing frees the segment: a node that is killed and started again for weeks would fill the memory
-(docs/nodes.md).  :func:`remove_orphans` deletes such segments, by the test that ``fastdds shm clean`` applies; as
-these are files of the middleware's, nodes call it only if ``free_shared_memory`` says so.
+nothing frees the segment (docs/nodes.md).  :func:`remove_orphans` deletes such segments, by the test that ``fastdds shm
+clean`` applies; as these are files of the middleware's, nodes call it only if ``free_shared_memory`` says so.
 """
 
 from __future__ import annotations
@@ -28,13 +27,7 @@ _LOCK = re.compile(r"(fastrtps_[0-9a-f]{16})_el")
 
 
 def profile_path() -> Path:
-    """The shipped profile: beside the package's modules where it is installed, ``config/`` in a source tree.
-
-    Raises
-    ------
-    FileNotFoundError
-        If the installation is incomplete.
-    """
+    """The shipped profile: beside the package's modules where it is installed, ``config/`` in a source tree."""
     package = Path(__file__).resolve().parent.parent
     for folder in (package / "config", package.parent / "config"):
         if (folder / _FILE).is_file():

@@ -33,10 +33,6 @@ _DIGITS = 3
 """Of the pixels that the camera of a cloud is rounded to: the same camera for each frame, whatever its noise."""
 
 
-class Refused(ValueError):  # noqa: N818 - a verdict on a frame rather than a defect
-    """A frame that cannot be processed; says what was expected and what arrived."""
-
-
 @dataclass(frozen=True, eq=False)
 class Frame:
     """A depth image that is fit to be processed.
@@ -76,7 +72,7 @@ class Frame:
         labels = labels_from_message(message)
         (rows, columns), (width, height) = labels.shape, self.calibration.size
         if (columns, rows) != (width, height):
-            raise Refused(f"mask: expected the size of the depth image, {width} x {height}, got {columns} x {rows}")
+            raise ValueError(f"mask: expected the size of the depth image, {width} x {height}, got {columns} x {rows}")
         return replace(self, labels=self.calibration.rectified_labels(labels))
 
     def encode(self, depth: np.ndarray) -> Image:
@@ -109,7 +105,7 @@ def decode(message: DepthMessage, calibration_of: Callable[[], Calibration] | No
         return Frame(message.header, "32FC1", depth, calibration, has_free_space=is_image)
     if calibration_of is None:
         if message.encoding in DEPTH_ENCODINGS:
-            raise Refused(
+            raise ValueError(
                 f"encoding: expected mono8 or mono16 for projection = orthographic, got {message.encoding!r}; "
                 "metric depth images of a camera need projection = pinhole"
             )
@@ -118,7 +114,7 @@ def decode(message: DepthMessage, calibration_of: Callable[[], Calibration] | No
         calibration = Calibration(unit_cube.camera(width, height), (width, height))
         return Frame(message.header, message.encoding, unit_cube.depth_from_grey(grey), calibration)
     if isinstance(message, Image) and message.encoding in GREY_ENCODINGS:
-        raise Refused(
+        raise ValueError(
             f"encoding: expected 16UC1 or 32FC1 for projection = pinhole, got {message.encoding!r}; "
             "grey images of the unit cube need projection = orthographic"
         )

@@ -1,17 +1,8 @@
-"""grasp_node: superquadrics in, grasps of a parallel gripper out.
+"""grasp_node: superquadrics in, grasps of a parallel gripper out; its topics are in docs/grasping.md.
 
-| name | type | |
-| --- | --- | --- |
-| `superquadrics` | sensor_msgs/PointCloud2 | in: the cloud of recover_node; remap it to `/recover_node/superquadrics` |
-| `support_plane` | geometry_msgs/PoseStamped | in: what the bodies stand on, of recover_node too |
-| `~/grasps` | geometry_msgs/PoseArray | out: tool centre points, the most probable grasp first |
-| `~/grasp_details` | sensor_msgs/PointCloud2 | out: the same in their order: opening, width, score, the body's id |
-| `~/markers` | visualization_msgs/MarkerArray | out: the gripper at the best grasp of each body |
-| `~/plan` | std_srvs/Trigger | the last cloud again, with the parameters as they are; says what came of it |
-
-All have the header of the cloud.  The last plane in its frame counts; without one, grippers come from the side of the
-frame's origin, that of the camera.  What no message holds, measured points and unseen space, is not looked at; the
-command ``sq-perception grasp`` does.  Correlations of a body's numbers are not in the cloud either.
+All outputs have the header of the cloud.  The last plane in its frame counts; without one, grippers come from the side
+of the frame's origin, that of the camera.  What no message holds, measured points and unseen space, is not looked at;
+the command ``sq-perception grasp`` does.  Correlations of a body's numbers are not in the cloud either.
 """
 
 from __future__ import annotations

@@ -33,7 +33,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 from sq_msgs_py.depth_image import size_mismatch
 from sq_perception.imaging.calibration import Calibration
 from sq_perception.nodes import fast_dds
-from sq_perception.nodes.frame import DepthMessage, Frame, Refused, decode, image_topic, size_of, stamp_of
+from sq_perception.nodes.frame import DepthMessage, Frame, decode, image_topic, size_of, stamp_of
 from sq_perception.nodes.parameters import POINTS, RAW, RecoverParameters
 from sq_perception.nodes.statistics import THROTTLE, Statistics
 from sq_perception.recordings.cloud_file import UNORGANISED
@@ -184,7 +184,7 @@ class Input:
             self._node.get_logger().warning(f"{self.topic}: {UNORGANISED}", throttle_duration_sec=THROTTLE)
         if use == "always" and arrival.mask is None:
             expected = "expected one with the stamp of the image (use_masks is always)"
-            raise Refused(f"mask: {expected}, none came on {self._mask.topic_name}")
+            raise ValueError(f"mask: {expected}, none came on {self._mask.topic_name}")
         return frame if arrival.mask is None or use == "never" else frame.with_mask(arrival.mask)
 
     def _calibration_of(self, image: DepthMessage, source: Subscription) -> Calibration:
@@ -202,7 +202,7 @@ class Input:
         else:
             why = last.fault or size_mismatch(size, last.size)
             fault = f"{wanted}, the last one is for {last.size[0]} x {last.size[1]} ({why})"
-        raise Refused(f"{fault}, on {source.topic_name}: {self._publishers_of(source)}")
+        raise ValueError(f"{fault}, on {source.topic_name}: {self._publishers_of(source)}")
 
     # Callbacks, in the executor's thread: quick, and nothing in them can fail on a message's content
 

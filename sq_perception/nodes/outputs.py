@@ -7,11 +7,9 @@ output is asked for, and one that is missing is named once in the log and stays 
 /tf is published as tf2_ros.TransformBroadcaster does it, with the same queue of 100; a publisher of our own needs
 tf2_msgs alone, knows whether anybody listens, and can be taken down again.
 
-An object of the planning scene is sent again when it has changed, and all of them when another planner listens, as a
-planner copies its world for each message.  One is removed when its id is gone, that is neither in a frame nor that of a
-track which the frame does not show: what a robot's arm hides is still there.  Switching the output off removes all
-objects that were added.  A node that ends removes nothing: a planner must not lose its obstacles because a camera
-fails; and what planners know outlives a restart after a fault, so that an object that is gone is still removed.
+The planning scene is sent again when another planner listens.  Switching it off removes all objects that were added.  A
+node that ends removes nothing: a planner must not lose its obstacles because a camera fails; and what planners know
+outlives a restart after a fault, so that an object that is gone is still removed.
 """
 
 from __future__ import annotations
@@ -21,7 +19,6 @@ from collections.abc import Collection
 from functools import partial
 from typing import Any
 
-import numpy as np
 from geometry_msgs.msg import PoseStamped
 from rclpy.duration import Duration
 from rclpy.node import Node
@@ -34,10 +31,10 @@ from visualization_msgs.msg import MarkerArray
 from sq_msgs_py import collision_objects
 from sq_msgs_py.detections import detections
 from sq_msgs_py.markers import markers
-from sq_msgs_py.poses import plane_message, unit_quaternions
-from sq_msgs_py.superquadrics import SuperquadricArray, to_message
-from sq_msgs_py.transforms import name, transforms
-from sq_perception.nodes.frame import Frame, Refused
+from sq_msgs_py.poses import plane_message
+from sq_msgs_py.superquadrics import to_message
+from sq_msgs_py.transforms import transforms
+from sq_perception.nodes.frame import Frame
 from sq_perception.nodes.parameters import RecoverParameters
 from sq_perception.nodes.statistics import THROTTLE, timed
 from sq_perception.nodes.tracking import CameraPoses, Pose, PoseError
@@ -48,8 +45,6 @@ from sq_perception.recovery.recoverer import render_recovery
 _OVERRIDABLE = tuple(getattr(QoSPolicyKind, name) for name in ("HISTORY", "DEPTH", "RELIABILITY", "DURABILITY"))
 _LATCHED = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 """Late comers get the last one: a table that is hidden by an arm is still there."""
-_STEP = 0.002
-"""Metres: a body of which no point has moved farther is not sent again to planners, whose paddings are larger."""
 _ARRIVAL = Duration(seconds=0.5)
 """How long the last markers may take to arrive before their publisher goes."""
 
@@ -94,10 +89,7 @@ class Outputs:
     def answer(self, found: Identified, frame: Frame, parameters: RecoverParameters) -> Findings:
         """Publish the point cloud, in ``target_frame`` if there is one; what was found as every output shows it.
 
-        Raises
-        ------
-        Refused
-            If the transform to that frame is not known: nothing may be published in a wrong frame.
+        Raises ValueError if the transform to that frame is not known: nothing may be published in a wrong frame.
         """
         findings = publication.findings(found, frame.header, frame.is_cube)
         findings = in_frame(findings, self._poses, parameters.target_frame, parameters.tf_tolerance)
@@ -136,17 +128,17 @@ def marker_style(parameters: RecoverParameters) -> MarkerStyle:
 
 
 def pose_in(poses: CameraPoses, header: Any, frame_id: str, patience: float) -> Pose:
-    """The pose of a header's frame in another tf2 frame, at its stamp.  Raises Refused if it is not known."""
+    """The pose of a header's frame in another tf2 frame, at its stamp.  Raises ValueError if it is not known."""
     try:
         return poses.at(header, frame_id, patience)
     except PoseError as error:
-        raise Refused(
+        raise ValueError(
             f"target_frame: expected a transform from {header.frame_id!r} to {frame_id!r}: {error}"
         ) from error
 
 
 def in_frame(found: Findings, poses: CameraPoses, frame_id: str, patience: float = 0.1) -> Findings:
-    """Findings in another tf2 frame; as they are for an empty ``frame_id``.  Raises Refused as :func:`pose_in`."""
+    """Findings in another tf2 frame; as they are for an empty ``frame_id``.  Raises ValueError as :func:`pose_in`."""
     return found.moved(frame_id, *pose_in(poses, found.header, frame_id, patience)) if frame_id else found
 
 
@@ -166,11 +158,8 @@ class OptionalOutputs:
         self._publishers: dict[str, Publisher] = {}
         self.absent: dict[str, str] = {}
         """Packages that are missing, by what asks for them; replaced as a whole, for other threads."""
-        self._known: dict[str, SuperquadricArray | None] = {}
-        """Bodies as planners know them, by name; None for those that have to be sent again."""
-        self._known_as = "", ""
+        self._scene = collision_objects.Scene()
         self._listeners = 0
-        self._last_header: Any = None
 
     def follow(self, parameters: RecoverParameters) -> None:
         """Create the publishers that are asked for, and destroy the others."""
@@ -181,9 +170,9 @@ class OptionalOutputs:
             if getattr(parameters, parameter):
                 if parameter not in self._publishers and parameter not in self.absent:
                     self._create(parameter)
-            elif parameter == "publish_collision_objects" and self._known:
-                self.withdraw()  # the publisher lasts until the next call, so that its last message arrives
             elif parameter in self._publishers:
+                if parameter == "publish_collision_objects" and self.withdraw():
+                    continue  # the publisher lasts until the next call, so that its last message arrives
                 self._node.destroy_publisher(self._publishers.pop(parameter))
 
     def publish(self, found: Findings, parameters: RecoverParameters, hidden: Collection[int] = ()) -> None:
@@ -199,25 +188,31 @@ class OptionalOutputs:
         if not has_frame and (parameters.publish_tf or parameters.publish_collision_objects):
             said = "expected images with a frame_id, got none: no transforms, no objects"
             self._node.get_logger().warning(said, once=True)
-        frames = transforms(found.array, found.header, prefix=parameters.tf_prefix) if has_frame else []
-        if frames and (heard := self._heard("publish_tf")):
+        if has_frame and (heard := self._heard("publish_tf")):
             message: Any = heard.msg_type
-            heard.publish(message(transforms=frames))
+            if frames := transforms(found.array, found.header, prefix=parameters.tf_prefix):
+                heard.publish(message(transforms=frames))
         if heard := self._heard("publish_detections"):
             heard.publish(
                 detections(found.array, found.header, covariances=found.covariances, prefix=parameters.tf_prefix)
             )
-        if not self._heard("publish_collision_objects"):
-            self._listeners = 0
-        elif parameters.publish_collision_objects and has_frame:
-            self._publish_collision_objects(found, parameters, hidden)
+        heard = self._heard("publish_collision_objects")
+        before, self._listeners = self._listeners, heard.get_subscription_count() if heard is not None else 0
+        if self._listeners > before:
+            self._scene.forget()
+        if heard is not None and parameters.publish_collision_objects and has_frame:
+            meshes = (lambda: found.meshes) if parameters.collision_shapes == "mesh" else None
+            objects = self._scene.changes(found.array, found.header, hidden, meshes=meshes, prefix=parameters.tf_prefix)
+            if objects:
+                heard.publish(collision_objects.planning_scene(objects))
 
-    def withdraw(self) -> None:
-        """Remove every object that was added to the planning scene: nobody looks after it from now on."""
-        if not self._known:
-            return
-        self._publish_scene(collision_objects.removals(self._known, self._last_header))
-        self._known = {}
+    def withdraw(self) -> bool:
+        """Remove every object that was added to the planning scene, as nobody looks after it; whether there was one."""
+        publisher = self._publishers.get("publish_collision_objects")
+        objects = self._scene.clear() if publisher is not None else []
+        if publisher is not None and objects:
+            publisher.publish(collision_objects.planning_scene(objects))
+        return bool(objects)
 
     def close(self) -> None:
         """Destroy the publishers; what is in the planning scene stays there, and is remembered."""
@@ -241,41 +236,3 @@ class OptionalOutputs:
         """The publisher of what is asked for, if somebody listens."""
         publisher = self._publishers.get(parameter)
         return publisher if publisher is not None and publisher.get_subscription_count() else None
-
-    def _publish_collision_objects(
-        self, found: Findings, parameters: RecoverParameters, hidden: Collection[int]
-    ) -> None:
-        listeners = self._publishers["publish_collision_objects"].get_subscription_count()
-        known_as = found.header.frame_id, parameters.collision_shapes
-        if listeners > self._listeners or known_as != self._known_as:
-            self._known = dict.fromkeys(self._known)
-        self._listeners, self._known_as, self._last_header = listeners, known_as, found.header
-        shown = found.array.recovered
-        names = [name(number, parameters.tf_prefix) for number in shown.id]
-        new = np.array([_has_changed(self._known.get(one), shown, k) for k, one in enumerate(names)], dtype=bool)
-        meshes = [found.meshes[k] for k in np.flatnonzero(new)] if parameters.collision_shapes == "mesh" else None
-        objects = collision_objects.collision_objects(
-            shown.where(new), found.header, meshes=meshes, prefix=parameters.tf_prefix
-        )
-        kept = {*names, *(name(number, parameters.tf_prefix) for number in hidden)}
-        objects += collision_objects.removals(self._known.keys() - kept, found.header)
-        self._known = {one: state for one, state in self._known.items() if one in kept}
-        self._known.update({names[k]: shown.where(np.arange(len(shown)) == k) for k in np.flatnonzero(new)})
-        if objects:
-            self._publish_scene(objects)
-
-    def _publish_scene(self, objects: list[Any]) -> None:
-        self._publishers["publish_collision_objects"].publish(collision_objects.planning_scene(objects))
-
-
-def _has_changed(known: SuperquadricArray | None, shown: SuperquadricArray, k: int) -> bool:
-    """Whether a point of a body may have moved by more than a step since planners were sent it."""
-    if known is None:
-        return True
-    largest = float(known.size.max())
-    turn = 2 * np.arccos(
-        min(1.0, abs(float(np.vdot(unit_quaternions(known.rotation[0]), unit_quaternions(shown.rotation[k])))))
-    )
-    moves = np.linalg.norm(known.translation[0] - shown.translation[k]), np.abs(known.size[0] - shown.size[k]).max()
-    rounds = largest * np.abs(known.shape[0] - shown.shape[k]).max()
-    return bool(sum(moves) + rounds + largest * turn > _STEP)

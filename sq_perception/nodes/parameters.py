@@ -76,14 +76,10 @@ class RecoverParameters(Parameters):
     """recover_node, and each node of recover_cameras."""
 
     autostart: bool = setting(
-        True,
-        "Configure and activate at the start; false: wait for a lifecycle manager.",
-        live=False,
+        True, "Configure and activate at the start; false: wait for a lifecycle manager.", live=False
     )
     free_shared_memory: bool = setting(
-        False,
-        "Delete the shared memory that killed processes of this user have left behind.",
-        live=False,
+        False, "Delete the shared memory that killed processes of this user have left behind.", live=False
     )
     projection: Projection = setting(
         "pinhole",
@@ -97,10 +93,7 @@ class RecoverParameters(Parameters):
         choices=("auto", "always", "never"),
     )
     patience: float = setting(
-        0.25,
-        "How long an image waits for its camera_info or mask.",
-        unit="s",
-        within=(0.0, 10.0),
+        0.25, "How long an image waits for its camera_info or mask.", unit="s", within=(0.0, 10.0)
     )
     image_transport: str = setting(
         RAW,
@@ -122,9 +115,7 @@ class RecoverParameters(Parameters):
         within=(0.1, 1000.0),
     )
     tau: float = setting(
-        4.82,
-        "Sharpness of the soft depth projection of the score and of refine = soft_render.",
-        within=(0.1, 100.0),
+        4.82, "Sharpness of the soft depth projection of the score and of refine = soft_render.", within=(0.1, 100.0)
     )
     depth_min: float = setting(0.0, "Nearer readings are left out.", unit="m", within=(0.0, 100.0))
     depth_max: float = setting(100.0, "Farther readings are left out; 100 keeps all.", unit="m", within=(0.001, 100.0))
@@ -169,10 +160,7 @@ class RecoverParameters(Parameters):
         "image's.",
     )
     tf_tolerance: float = setting(
-        0.1,
-        "How long an image waits for transforms (fixed_frame, target_frame).",
-        unit="s",
-        within=(0.0, 5.0),
+        0.1, "How long an image waits for transforms (fixed_frame, target_frame).", unit="s", within=(0.0, 5.0)
     )
     publish_tf: bool = setting(False, "Publish a frame for each body on /tf.")
     tf_prefix: str = setting(
@@ -181,8 +169,7 @@ class RecoverParameters(Parameters):
     )
     publish_detections: bool = setting(False, "Publish ~/detections; needs vision_msgs.")
     publish_collision_objects: bool = setting(
-        False,
-        "Publish collision objects on ~/planning_scene; needs moveit_msgs.",
+        False, "Publish collision objects on ~/planning_scene; needs moveit_msgs."
     )
     collision_shapes: str = setting(
         "primitive",
@@ -191,8 +178,7 @@ class RecoverParameters(Parameters):
     )
 
     model: str = setting(
-        "",
-        "Weights: a .safetensors file or the name of shipped ones; empty: the default. Set again, it is read again.",
+        "", "Weights: a .safetensors file or the name of shipped ones; empty: the default. Set again, it is read again."
     )
     device: str = setting("cpu", "Where the network runs: cpu, cuda or cuda:N.")
     consensus: bool = setting(False, "Average the network's answers to 8 positions of each view.")

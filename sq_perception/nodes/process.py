@@ -56,7 +56,7 @@ def run(name: str, create: Callable[[], Iterable[Stoppable]], arguments: Sequenc
     """Create nodes and spin them until they are told to stop; the exit code.
 
     ``create`` imports what the nodes need, so that a signal during seconds of imports finds this function in charge.
-    It may make them one by one: those that were made are closed also where a later one cannot be.
+    Nodes that it has yielded are closed also where a later one cannot be made.
     """
     stop = _Stop()
     for number in _SIGNALS:

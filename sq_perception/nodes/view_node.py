@@ -54,8 +54,8 @@ _DRAWER_END = 5.0
 
 
 @dataclass(frozen=True)
-class Result:
-    """Superquadrics as they came, when, in seconds of the monotonic clock, and after how many milliseconds."""
+class _Result:
+    """Superquadrics, when they came, in seconds of the monotonic clock, and after how many milliseconds."""
 
     message: PointCloud2
     time: float
@@ -68,11 +68,9 @@ class ViewNode(Node):
     Parameters
     ----------
     page
-        Shows the nodes named ``nodes``; closed with the node.
+        Shows the nodes named ``nodes``, fully qualified; closed with the node.
     depth, camera_info
         Topics, resolved and remapped as those of a node are.
-    nodes
-        Fully qualified names of frame nodes.
     rate
         Of drawing, Hz, at most.
     """
@@ -95,12 +93,12 @@ class ViewNode(Node):
         self._images: OrderedDict[int, Image] = OrderedDict()
         self._arrivals: deque[float] = deque(maxlen=1000)
         self._info: CameraInfo | None = None
-        self._results: dict[str, Result] = {}
+        self._results: dict[str, _Result] = {}
         self._diagnosed: dict[str, dict[str, str]] = {}
         self._poses = CameraPoses(self)
         self._inputs: list[Subscription] = []
         self._drawn: Image | None = None
-        self._bodies: dict[str, tuple[Result, Bodies | None, str]] = {}
+        self._bodies: dict[str, tuple[_Result, Bodies | None, str]] = {}
         """Of each node: the result that was drawn last, and its bodies, or why they cannot be drawn."""
         self._status_due = 0.0
         self._remote = {one: RemoteNode(self, one) for one in nodes}
@@ -169,7 +167,7 @@ class ViewNode(Node):
     def _on_result(self, name: str, message: PointCloud2) -> None:
         milliseconds = 1e-6 * (self.get_clock().now().nanoseconds - stamp_of(message))
         latency = milliseconds if 0 <= milliseconds < 60e3 else None
-        self._results[name] = Result(message, monotonic(), latency)
+        self._results[name] = _Result(message, monotonic(), latency)
         self._news.set()
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
@@ -218,7 +216,7 @@ class ViewNode(Node):
         if status_due:
             self._status_due = monotonic() + _STATUS_PERIOD
 
-    def _draw_depth(self, images: list[Image], rate: float, results: dict[str, Result], status_due: bool) -> Any:
+    def _draw_depth(self, images: list[Image], rate: float, results: dict[str, _Result], status_due: bool) -> Any:
         """Draw the image that belongs to the newest results, else the newest; the header of what is drawn."""
         topic = self._topics[0]
         if not images:
@@ -249,7 +247,7 @@ class ViewNode(Node):
             raise ValueError(size_mismatch((int(image.width), int(image.height)), calibration.size))
         return calibration
 
-    def _draw_node(self, name: str, result: Result | None, header: Any, status_due: bool) -> None:
+    def _draw_node(self, name: str, result: _Result | None, header: Any, status_due: bool) -> None:
         drawn, bodies, remark = self._bodies.get(name, (None, None, ""))
         if result is drawn and not status_due:
             return

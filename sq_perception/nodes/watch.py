@@ -30,13 +30,7 @@ _REMEMBERED = 40
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """The bodies (n,) of one result, without failed ones, their residuals (n,), and when they came here.
-
-    Attributes
-    ----------
-    latency
-        From the image's stamp to the arrival, milliseconds.
-    """
+    """Bodies (n,) without failed ones, their residuals (n,), and milliseconds from their stamp to their arrival."""
 
     bodies: Superquadric
     residual: np.ndarray
@@ -45,23 +39,26 @@ class Found:
 
 @dataclass(eq=False)
 class Shot:
-    """All that belongs to one stamp; image and truth are None while they have not come."""
+    """All that belongs to one stamp: the image, once it has come, and bodies by the node that they are of."""
 
     stamp: int
     image: Image | None = None
-    truth: Superquadric | None = None
     results: dict[str, Found] = field(default_factory=dict)
-    """By the node that found them."""
+
+    @property
+    def truth(self) -> Superquadric | None:
+        """What the camera says that there is."""
+        return self.results[CAMERA].bodies if CAMERA in self.results else None
 
 
 class Watch:
     """Collects, image by image, depth, truth and the results of ``nodes``; lives as long as a ``with`` block."""
 
     def __init__(self, nodes: tuple[str, ...]) -> None:
-        self._names = nodes
+        self._wanted = set(nodes)
+        """Whose bodies belong to an image: the nodes', and those of a camera that knows them."""
         self._shots: OrderedDict[int, Shot] = OrderedDict()
         self._info: CameraInfo | None = None
-        self._truth_comes = False
         self.images = 0
         """How many images came."""
         self.latest: Shot | None = None
@@ -77,9 +74,9 @@ class Watch:
         fast = QoSProfile(depth=5, reliability=QoSReliabilityPolicy.BEST_EFFORT)
         node.create_subscription(CameraInfo, "depth/camera_info", self._on_info, fast)
         node.create_subscription(Image, "depth/image", self._on_image, fast)
-        node.create_subscription(PointCloud2, f"{CAMERA}/truth", self._on_truth, fast)
-        for name in self._names:
-            node.create_subscription(PointCloud2, f"{name}/superquadrics", partial(self._on_result, name), 10)
+        node.create_subscription(PointCloud2, f"{CAMERA}/truth", partial(self._on_bodies, CAMERA), fast)
+        for name in self.latencies:
+            node.create_subscription(PointCloud2, f"{name}/superquadrics", partial(self._on_bodies, name), 10)
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -114,16 +111,13 @@ class Watch:
         shot.image = message
         self._check(shot)
 
-    def _on_truth(self, message: PointCloud2) -> None:
-        shot = self._shot(message)
-        shot.truth = _found(message, 0.0).bodies
-        self._truth_comes = self._truth_comes or len(shot.truth) > 0
-        self._check(shot)
-
-    def _on_result(self, name: str, message: PointCloud2) -> None:
-        shot = self._shot(message)
-        shot.results[name] = found = _found(message, 1e-6 * (time.time_ns() - shot.stamp))
-        self.latencies[name].append(found.latency)
+    def _on_bodies(self, name: str, message: PointCloud2) -> None:
+        shot, kept = self._shot(message), from_message(message).recovered
+        shot.results[name] = found = Found(superquadrics(kept), kept.residual, 1e-6 * (time.time_ns() - shot.stamp))
+        if name in self.latencies:
+            self.latencies[name].append(found.latency)
+        elif len(found.bodies):
+            self._wanted.add(name)
         self._check(shot)
 
     def _shot(self, message: Any) -> Shot:
@@ -135,13 +129,6 @@ class Watch:
 
     def _check(self, shot: Shot) -> None:
         """Make a shot the latest once nothing is missing any more."""
-        is_complete = shot.image is not None and set(shot.results) == set(self._names)
-        if not is_complete or (self._truth_comes and shot.truth is None):
-            return
-        if self.latest is None or shot.stamp > self.latest.stamp:
+        is_newer = self.latest is None or shot.stamp > self.latest.stamp
+        if is_newer and shot.image is not None and self._wanted <= set(shot.results):
             self.latest = shot
-
-
-def _found(message: PointCloud2, latency: float) -> Found:
-    kept = from_message(message).recovered
-    return Found(superquadrics(kept), kept.residual, latency)

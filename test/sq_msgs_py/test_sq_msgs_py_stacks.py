@@ -15,7 +15,7 @@ from builtin_interfaces.msg import Time
 from std_msgs.msg import Header
 
 from sq_msgs_py import poses
-from sq_msgs_py.collision_objects import collision_objects, planning_scene, removals
+from sq_msgs_py.collision_objects import Scene, collision_objects, planning_scene, removals
 from sq_msgs_py.detections import detections
 from sq_msgs_py.superquadrics import CONVERGED, FAILED, WEAK, SuperquadricArray
 from sq_msgs_py.transforms import name, transforms
@@ -217,6 +217,26 @@ def test_scenes_are_differences_and_removals_never_mean_everything():
     assert not len(gone.primitives)
     with pytest.raises(ValueError, match="MoveIt would remove all objects"):
         removals([""], HEADER)
+
+
+def test_a_scene_tells_what_changes():
+    scene, array = Scene(), three()
+
+    def said(*frame: Any, **how: Any) -> list[tuple[str, bool]]:
+        return [(one.id[-1], one.operation == one.REMOVE) for one in scene.changes(*frame, **how)]
+
+    assert said(array, HEADER) == [("4", False), ("6", False)]
+    assert said(array, HEADER) == []
+    moved = replace(array, translation=array.translation + [[0.001, 0, 0], [0, 0, 0], [0.01, 0, 0]])
+    assert said(moved, HEADER) == [("6", False)], "a millimetre is no change"
+    only = moved.where(moved.id == 4)
+    assert said(only, HEADER, hidden=[6]) == [], "what is hidden is still there"
+    assert said(only, HEADER) == [("6", True)]
+    scene.forget()
+    assert said(only, HEADER) == [("4", False)]
+    assert said(only, Header(frame_id="map")) == [("4", False)]
+    assert [(one.id, one.header.frame_id) for one in scene.clear()] == [("superquadric_4", "map")]
+    assert scene.clear() == []
 
 
 def test_names():
