@@ -24,6 +24,7 @@ Parameters are those of recover_node: in a file /**: is for all, /wrist/recover_
 Frames are computed one after the other, in the order in which they ask: a process per camera would hold the network
 once each and let them compete for the same cores."""
 _NAMESPACE = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
+"""Checked here as well as by rclpy, which has begun to make a node by then and complains of its rest."""
 
 
 def recover_node(arguments: Sequence[str] | None = None) -> int:

@@ -20,7 +20,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from rclpy.node import Node
 from rclpy.qos import QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
@@ -28,21 +27,19 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 from std_msgs.msg import Header
 
 from sq_msgs_py.depth_image import (
+    GREY_ENCODINGS,
     RawIntrinsics,
-    depth_to_message,
-    grey_to_message,
     intrinsics_to_message,
     labels_to_message,
     raw_intrinsics_to_message,
 )
 from sq_msgs_py.superquadrics import to_message
-from sq_perception.imaging import unit_cube
 from sq_perception.imaging.calibration import intrinsics
 from sq_perception.nodes.frame import image_topic, packed
 from sq_perception.nodes.parameters import RAW, LiveParameters, SyntheticParameters
 from sq_perception.recordings import camera_file
 from sq_perception.recordings.frame_source import FrameSource, SourceFrame, generated, recorded, recordings
-from sq_perception.recordings.publication import CAMERA_FRAME, CUBE_FRAME, truth_array
+from sq_perception.recordings.publication import CAMERA_FRAME, CUBE_FRAME, depth_message, truth_array
 
 
 def frame_source(parameters: SyntheticParameters) -> FrameSource:
@@ -130,6 +127,8 @@ class SyntheticDepthNode(Node):
     def _publish(self, frame: SourceFrame, settings: SyntheticParameters) -> None:
         frame_id = settings.frame_id or (CUBE_FRAME if frame.is_cube else CAMERA_FRAME)
         header = Header(stamp=self.get_clock().now().to_msg(), frame_id=frame_id)
+        fitting = GREY_ENCODINGS if frame.is_cube else ("32FC1", "16UC1")
+        encoding = settings.encoding if settings.encoding in fitting else fitting[0]
         if self._truth is not None and frame.truth is not None:
             self._truth.publish(to_message(truth_array(frame.truth), header))
         if self._info is not None and not frame.is_cube:
@@ -143,8 +142,8 @@ class SyntheticDepthNode(Node):
                 self._mask = self._output(Image, "mask/image")
             self._mask.publish(labels_to_message(labels, header))
         if self._packed is not None and not frame.is_cube and self._packed.get_subscription_count():
-            self._packed.publish(packed(depth, header, _encoding(settings.encoding)))
-        self._image.publish(_image(frame, depth, settings.encoding, header))
+            self._packed.publish(packed(depth, header, encoding))
+        self._image.publish(depth_message(depth, header, encoding, frame.is_cube))
 
 
 def _camera_info(frame: SourceFrame, header: Header) -> CameraInfo:
@@ -152,14 +151,3 @@ def _camera_info(frame: SourceFrame, header: Header) -> CameraInfo:
         return intrinsics_to_message(intrinsics(frame.camera), header)
     raw, lens = frame.calibration.rectification.raw, frame.calibration.rectification.distortion
     return raw_intrinsics_to_message(RawIntrinsics(intrinsics(raw), lens.model, lens.coefficients), header)
-
-
-def _encoding(wanted: str) -> str:
-    return "16UC1" if wanted == "16UC1" else "32FC1"
-
-
-def _image(frame: SourceFrame, depth: np.ndarray, encoding: str, header: Header) -> Image:
-    if frame.is_cube:
-        kind = np.uint16 if encoding == "mono16" else np.uint8
-        return grey_to_message(unit_cube.grey_from_depth(depth, kind), header)
-    return depth_to_message(depth, header, _encoding(encoding))
