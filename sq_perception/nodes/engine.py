@@ -35,9 +35,6 @@ _MADE_OF = ("device", "consensus", "threads", "method", "model")
 """Parameters that a recoverer is made of."""
 _READ_BY = frozenset(("model", "device"))
 """Those whose setting reads the weights; the others keep what is loaded, whatever became of the file."""
-_ANSWERS = ("method", "refine", "consensus")
-"""Parameters that change what bodies come out, beside the weights."""
-
 
 Answer: TypeAlias = tuple[FrameRecovery, Hashable]
 """The bodies of a frame, and what tells their origin from another."""
@@ -157,10 +154,10 @@ class Engine:
         built = self._built
         if built is None:
             raise RuntimeError("the recoverer has been released")
-        in_force = replace(parameters, **{name: getattr(built.parameters, name) for name in _MADE_OF})
-        origin = (built.weights, *(getattr(in_force, name) for name in _ANSWERS))
+        method = built.parameters.method  # others may be set already, and still in the making
+        origin = built.weights, method, built.parameters.consensus, parameters.refine
         known = previous[0] if previous is not None and previous[1] == origin else None
-        options = in_force.recovery_options(pose, frame.has_free_space)
+        options = replace(parameters.recovery_options(pose, frame.has_free_space), method=method)
         recovery = built.recoverer.recover(frame.depth, frame.camera, frame.labels, options, known)
         return recovery, origin
 

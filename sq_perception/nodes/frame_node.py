@@ -125,7 +125,7 @@ class FrameNode(ManagedNode):
 
     def _activate(self) -> None:
         self._defects = 0
-        self._input = one = Input(self, lambda: self._settings.current, lambda: self._is_wanted, self._statistics)
+        self._input = one = Input(self, self._settings, self._is_wanted, self._statistics)
         self._worker = threading.Thread(target=self._work, args=(one,), name="worker", daemon=True)
         self._worker.start()
         self.get_logger().info(f"ready, listening to {one.topic}")
@@ -182,10 +182,10 @@ class FrameNode(ManagedNode):
                 with TURNS.turn():
                     # Taken when the turn has come: while others were computing, a newer one may have arrived.
                     arrival = source.take()
-                    found = self._recovered(source, arrival) if arrival is not None and self._is_wanted else None
+                    found = self._recovered(source, arrival) if arrival is not None and self._is_wanted() else None
                 with self._publishing:
                     # Deactivated or disabled meanwhile: nothing is published, least of all a grasped body.
-                    if arrival and found and self._input is source and self._is_wanted:
+                    if arrival and found and self._input is source and self._is_wanted():
                         outcome = self._published(arrival, *found)
                         self._defects = 0
             except ValueError as error:
@@ -203,13 +203,12 @@ class FrameNode(ManagedNode):
             if not outcome.is_answered:
                 self._statistics.refuse(outcome.words)
                 self.get_logger().warning(f"refused a frame: {outcome.words}", throttle_duration_sec=THROTTLE)
-            was_wanted = self._is_wanted
+            was_wanted = self._is_wanted()
             self._tell(outcome, arrival.time)
             if not was_wanted:
                 with self._publishing:
                     self._outputs.hide()
 
-    @property
     def _is_wanted(self) -> bool:
         """Whether frames are processed, or one is asked for."""
         return self._enabled or any(not one.done() for one in tuple(self._triggers))
@@ -240,9 +239,10 @@ class FrameNode(ManagedNode):
         age = 1e-9 * (self.get_clock().now().nanoseconds - stamp_of(frame))
         if abs(age) < _OLDEST:
             stages["stamp to result"] = 1e3 * age
-        self._statistics.answer(stages, found.summary)
+        words = found.summary
+        self._statistics.answer(stages, words)
         self._statistics.note(self._outputs.accompany(found, findings, frame, parameters))
-        return Outcome(True, found.summary, findings)
+        return Outcome(True, words, findings)
 
     def _tell(self, outcome: Outcome, arrived: float = math.inf) -> None:
         """Answer who was waiting when the frame arrived, at ``arrived`` of the monotonic clock."""
@@ -264,7 +264,7 @@ class FrameNode(ManagedNode):
 
     def _on_enable(self, request: SetBool.Request, response: SetBool.Response) -> SetBool.Response:
         self._enabled = bool(request.data)
-        if not self._is_wanted and self._publishing.acquire(blocking=False):  # otherwise the worker does it
+        if not self._is_wanted() and self._publishing.acquire(blocking=False):  # otherwise the worker does it
             try:
                 self._outputs.hide()
             finally:

@@ -34,7 +34,7 @@ from sq_msgs_py.depth_image import size_mismatch
 from sq_perception.imaging.calibration import Calibration
 from sq_perception.nodes import fast_dds
 from sq_perception.nodes.frame import DepthMessage, Frame, decode, image_topic, size_of, stamp_of
-from sq_perception.nodes.parameters import POINTS, RAW, RecoverParameters
+from sq_perception.nodes.parameters import POINTS, RAW, LiveParameters, RecoverParameters
 from sq_perception.nodes.statistics import THROTTLE, Statistics
 from sq_perception.recordings.cloud_file import UNORGANISED
 
@@ -75,19 +75,19 @@ class _Info:
 class Input:
     """The subscriptions of an active node, and what came.
 
-    Inputs are best effort, keep last 1: a slow subscriber with a queue answers old images.  ``parameters`` returns
-    those in force; an image that comes while none ``is_wanted`` is dropped at once.
+    Inputs are best effort, keep last 1: a slow subscriber with a queue answers old images.  An image that comes while
+    none ``is_wanted`` is dropped at once.
     """
 
     def __init__(
         self,
         node: Node,
-        parameters: Callable[[], RecoverParameters],
+        settings: LiveParameters[RecoverParameters],
         is_wanted: Callable[[], bool],
         statistics: Statistics,
     ) -> None:
-        self._node, self._parameters, self._is_wanted, self._statistics = node, parameters, is_wanted, statistics
-        transport = parameters().image_transport
+        self._node, self._settings, self._is_wanted, self._statistics = node, settings, is_wanted, statistics
+        transport = settings.current.image_transport
         self.topic = image_topic(node, "depth/image", transport)
         """Of the depth images."""
         self._note = ""
@@ -101,7 +101,7 @@ class Input:
         self._is_closed = False
         # Subscriptions are served in this order: what an image needs is there before the image.
         self._info: Subscription | None = None
-        if parameters().projection == "pinhole" and transport != POINTS:
+        if settings.current.projection == "pinhole" and transport != POINTS:
             self._info = self._listen(CameraInfo, "depth/camera_info", self._on_info)
         self._latched: Subscription | None = None
         self._mask = self._listen(Image, "mask/image", self._on_mask)
@@ -212,7 +212,7 @@ class Input:
         if not self._is_wanted():
             self._statistics.count("dropped")
             return
-        parameters = self._parameters()
+        parameters = self._settings.current
         try:
             size = size_of(message)
         except ValueError:
@@ -230,7 +230,7 @@ class Input:
         """Keep a camera_info; a useless one is kept as the reason for refusing frames of its size."""
         size, calibration, fault = (int(message.width), int(message.height)), None, ""
         try:
-            calibration = Calibration.of(message, self.topic, self._parameters().distortion)
+            calibration = Calibration.of(message, self.topic, self._settings.current.distortion)
             size = calibration.size
             if calibration.note != self._note:
                 self._note = calibration.note
