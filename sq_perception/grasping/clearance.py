@@ -6,7 +6,8 @@ Two convex sets are apart by at least the gap along any direction n,
 
 with the support functions h of body and box in closed form.  The greatest gap over some directions is a lower bound of
 their distance: towards the body's centre from the box's nearest point, and along the axes of both.  It is negative
-where none of them parts the two: a collision, or at worst a near miss that is taken for one.
+where none of them parts the two: a collision, or at worst a near miss that is taken for one.  Likewise the distance of
+a point inside a box is negative: by how much it would have to move to leave it.
 
 Boxes are those of :meth:`Gripper.boxes`.  Metres.
 """
@@ -30,8 +31,10 @@ _STRAY = 3
 @kernel
 def gaps_to_bodies(
     frames: np.ndarray, boxes: np.ndarray, owner: np.ndarray, flat: np.ndarray, turns: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Least gap (k,) of each gripper to all bodies but its own, and which body that is, -1 for none within reach.
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Least gap (k,) of each gripper to all bodies but its own, which body that is, -1 for none within reach, and n.
+
+    The unit vector n (k, 3) points to the body, in the frame of the bodies; 0 for none.
 
     Parameters
     ----------
@@ -46,7 +49,8 @@ def gaps_to_bodies(
     """
     least = np.full(len(frames), FAR)
     which = np.full(len(frames), -1)
-    centre, axes, reach = np.empty(3), np.empty((3, 3)), np.empty(3)
+    ways = np.zeros((len(frames), 3))
+    centre, axes, reach, way = np.empty(3), np.empty((3, 3)), np.empty(3), np.empty(3)
     for k in range(len(frames)):
         frame = frames[k]
         for body in range(len(flat)):
@@ -68,40 +72,62 @@ def gaps_to_bodies(
                                 axes[i, j] += frame[m, i] * turns[body, m, j]
                     for i in range(3):
                         reach[i] = _reach(axes[i], flat[body])
-                gap = _gap(boxes[k, box], centre, axes, reach, flat[body], least[k])
+                gap = _gap(boxes[k, box], centre, axes, reach, flat[body], least[k], way)
                 if gap < least[k]:
                     least[k], which[k] = gap, body
-    return least, which
+                    for i in range(3):
+                        ways[k, i] = frame[i, 0] * way[0] + frame[i, 1] * way[1] + frame[i, 2] * way[2]
+    return least, which, ways
 
 
 @kernel
 def _gap(
-    box: np.ndarray, centre: np.ndarray, axes: np.ndarray, reach: np.ndarray, body: np.ndarray, enough: float
+    box: np.ndarray,
+    centre: np.ndarray,
+    axes: np.ndarray,
+    reach: np.ndarray,
+    body: np.ndarray,
+    enough: float,
+    way: np.ndarray,
 ) -> float:
-    """The gap of a box to a body whose centre and axes are given in the box's frame; any that is ``enough`` will do."""
+    """The gap of a box to a body whose centre and axes are given in the box's frame, along ``way`` (3,), written there.
+
+    Any gap that is ``enough`` will do.
+    """
     best = -1.0
     for i in range(3):
-        best = max(best, abs(centre[i] - box[i]) - box[3 + i] - reach[i])
+        gap = abs(centre[i] - box[i]) - box[3 + i] - reach[i]
+        if gap > best:
+            best = gap
+            way[:] = 0.0
+            way[i] = 1.0 if centre[i] > box[i] else -1.0
     for j in range(3):
         along, half = 0.0, 0.0
         for i in range(3):
             along += axes[i, j] * (centre[i] - box[i])
             half += abs(axes[i, j]) * box[3 + i]
-        best = max(best, abs(along) - half - body[j])
+        gap = abs(along) - half - body[j]
+        if gap > best:
+            best = gap
+            for i in range(3):
+                way[i] = axes[i, j] if along > 0 else -axes[i, j]
     distance = _distance(centre, box)
     if best >= enough or distance < 1e-9:
         return best
-    way = np.empty(3)
+    straight, local = np.empty(3), np.empty(3)
     along, half = 0.0, 0.0
     for i in range(3):
         away = centre[i] - box[i]
-        way[i] = (away - min(max(away, -box[3 + i]), box[3 + i])) / distance
-        along += way[i] * away
-        half += abs(way[i]) * box[3 + i]
-    local = np.empty(3)
+        straight[i] = (away - min(max(away, -box[3 + i]), box[3 + i])) / distance
+        along += straight[i] * away
+        half += abs(straight[i]) * box[3 + i]
     for j in range(3):
-        local[j] = way[0] * axes[0, j] + way[1] * axes[1, j] + way[2] * axes[2, j]
-    return max(best, along - half - _reach(local, body))
+        local[j] = straight[0] * axes[0, j] + straight[1] * axes[1, j] + straight[2] * axes[2, j]
+    gap = along - half - _reach(local, body)
+    if gap > best:
+        best = gap
+        way[:] = straight
+    return best
 
 
 @inline_kernel
@@ -112,15 +138,17 @@ def _reach(m: np.ndarray, body: np.ndarray) -> float:
 
 @inline_kernel
 def _distance(place: np.ndarray, box: np.ndarray) -> float:
-    """Of a place (3,) to a box (6,) in the same frame."""
-    square = 0.0
+    """Of a place (3,) to a box (6,) in the same frame; negative inside."""
+    square, deep = 0.0, -np.inf
     for i in range(3):
-        square += max(abs(place[i] - box[i]) - box[3 + i], 0.0) ** 2
-    return math.sqrt(square)
+        beyond = abs(place[i] - box[i]) - box[3 + i]
+        square += max(beyond, 0.0) ** 2
+        deep = max(deep, beyond)
+    return math.sqrt(square) + min(deep, 0.0)
 
 
 def gaps_to_points(frames: np.ndarray, boxes: np.ndarray, points: np.ndarray) -> np.ndarray:
-    """Distance (k,) of each gripper to the points (j, 3), but for the few nearest; 0 where they are inside."""
+    """Distance (k,) of each gripper to the points (j, 3), but for the few nearest; negative where they are inside."""
     cell = np.floor(points / _CELL)
     key = cell @ [1.0, 1e4, 1e8]
     order = np.argsort(key)

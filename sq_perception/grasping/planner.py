@@ -6,17 +6,19 @@ Every margin m_k is what may be lost before the grasp fails, sigma_k how sure it
 
 | margin | of what | sigma |
 | --- | --- | --- |
-| opening | pads to the body's side, on either side, as the open fingers come | of the side, and the model |
-| engagement | fingers' ends beyond the body's near end | of the near end |
-| palm | the body's near end before the palm | of the near end |
+| opening | pads to the body's side, on either side, as the open fingers come | of that side, the model, the hand |
+| engagement | fingers' ends beyond the body's near end | of the near end, the model, the hand |
+| palm | the body's near end before the palm | the same |
 | friction | atan(mu) less the angle between pads and surface | of the surface's turn |
 | weight | friction of both pads against gravity, as a force and as a torque about the closing line | of the mass |
-| table, bodies, points | the gripper's least distance | of the obstacle |
+| table, bodies, points | the gripper's least distance | of the obstacle where it is nearest, the hand |
 | unseen | share of the fingers in space that nobody has seen | a share of it is taken |
 
 The opening is the body's width and, on either side, a clearance and twice the sigma of that side; less where the
-gripper opens no wider.  A side that was not seen is uncertain, so that a body of unknown depth is taken by its known
-sides.  Margins are taken for independent of each other.
+gripper opens no wider.  The hand stands farther from the side that is less sure.  A side that was not seen is
+uncertain, so that a body of unknown depth is taken by its known sides.  The hand comes to be where it is sent to but
+for the error of its calibration.  Margins are taken for independent of each other, but for measured points: they are
+those of the bodies, so that what counts is what they take beyond opening, palm and other bodies.
 
 Metres, newtons, kilograms; the pose of a grasp is that of the TCP (:mod:`sq_perception.grasping.gripper`) in the frame
 of the bodies.
@@ -25,7 +27,7 @@ of the bodies.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 from scipy.special import ndtr
@@ -42,6 +44,8 @@ DENSITY = 500.0
 """kg/m^3, between empty and full packages; a mass is thought to be known to half of it."""
 PER_BODY = 8
 """Grasps a body that are told at most."""
+PLACEMENT = 0.002
+"""Metres, standard deviation along each axis of where the hand comes to be: a careful calibration of camera and arm."""
 _GRAVITY, _LIFT = 9.81, 2.0
 """m/s^2; of the lift beside gravity."""
 _CLEARANCE, _ABOVE_TABLE = 0.005, 0.004
@@ -54,16 +58,18 @@ _PAD_RADIUS = 0.006
 _SQUARE = np.deg2rad(8.0)
 """How sure normals are."""
 _TABLE_SIGMA, _POINT_SIGMA, _BODY_SIGMA = 0.002, 0.002, 0.004
-_POINT_INSIDE = 0.004
-"""Metres that a point counts for which is inside the gripper: of its depth there the point says nothing."""
 _HIDDEN = 0.15
 """Probability that space which nobody has seen beside a body is taken."""
 _SWINGS = np.deg2rad([0.0, 25.0, -25.0, 50.0, -50.0, 80.0, -80.0])
 """Of the approach about the closing line, away from the steepest one."""
 _SLIDES = np.array([0.0, 0.4, -0.4, 0.8, -0.8])
 """Along the third axis, shares of the way to where the finger's width is no more wholly on the body."""
-_CHECKED, _CHECKED_CLOSELY = 60, 20
+_TOO_WIDE = 0.8
+"""A body that is wider than the opening by so many sigmas of its width is not tried: once in five it would fit."""
+_CHECKED, _CHECKED_CLOSELY = 40, 16
 """Grasps a body whose distance to the other bodies is looked at, and of the best of these that to measured points."""
+_CHECKED_IF_DOUBTFUL, _SURE = 200, 0.5
+"""The same of bodies whose best grasp is then less probable than that."""
 _LEAST = 0.05
 """Grasps less probable than that are not told."""
 _MARGINS = ("opening", "engagement", "palm", "friction", "weight", "table", "other bodies", "measured points", "unseen")
@@ -140,6 +146,9 @@ class _Trials:
     def at(self, which: np.ndarray) -> _Trials:
         return _Trials(self.owner[which], self.frames[which], self.opening[which], self.width[which], self.logs[which])
 
+    def and_(self, other: _Trials) -> _Trials:
+        return _Trials(*(np.concatenate([getattr(one, part.name) for one in (self, other)]) for part in fields(self)))
+
     @property
     def weakest(self) -> np.ndarray:
         """Which margin takes most from each."""
@@ -147,15 +156,27 @@ class _Trials:
 
     def first(self, count: int) -> _Trials:
         """The most probable ones of each body, each body's in order."""
+        order, rank = self._ranked()
+        return self.at(order[rank < count])
+
+    def after(self, count: int) -> _Trials:
+        """The others."""
+        order, rank = self._ranked()
+        return self.at(order[rank >= count])
+
+    def _ranked(self) -> tuple[np.ndarray, np.ndarray]:
+        """Order by body and probability, and the rank (k,) within the body."""
         order = np.lexsort((-self.logs.sum(axis=1), self.owner))
         owner = self.owner[order]
-        rank = np.arange(len(owner)) - np.searchsorted(owner, owner)
-        return self.at(order[rank < count])
+        return order, np.arange(len(owner)) - np.searchsorted(owner, owner)
 
 
 @dataclass(frozen=True, eq=False)
 class _Closings:
-    """Directions (k, 3) in which a body ``owner`` may be closed upon, with their reaches and sigmas (k,)."""
+    """Directions (k, 3) in which a body ``owner`` may be closed upon, reaches (k,), and sigmas (k, 2) of both sides.
+
+    The direction points to the first side.
+    """
 
     owner: np.ndarray
     along: np.ndarray
@@ -169,6 +190,7 @@ def grasps(
     covariance: np.ndarray | None = None,
     around: Surroundings | None = None,
     friction: float = FRICTION,
+    placement: float = PLACEMENT,
 ) -> GraspPlan:
     """Plan grasps of some bodies; those that have none come with the reason.
 
@@ -182,16 +204,21 @@ def grasps(
         Table, measured points and what was seen; nothing but the bodies if not given.
     friction
         mu between pads and bodies.
+    placement
+        Standard deviation of where the hand comes to be, metres along each axis: calibration of arm and camera.
 
     Raises
     ------
     ValueError
-        If the bodies are no batch, arrays do not belong to them, or the friction is not positive.
+        If the bodies are no batch, arrays do not belong to them, the friction is not positive, or the placement is
+        negative.
     """
     if len(bodies.batch_shape) != 1:
         raise ValueError(f"bodies: expected a batch (n,), got {bodies.batch_shape}")
     if not (np.isfinite(friction) and friction > 0):
         raise ValueError(f"friction: expected a positive number, got {friction}")
+    if not (np.isfinite(placement) and placement >= 0):
+        raise ValueError(f"placement: expected metres, not negative, got {placement}")
     if not len(bodies):
         return GraspPlan()
     around = around or Surroundings()
@@ -200,13 +227,17 @@ def grasps(
         [f"wider than the opening of {1e3 * gripper.opening:.0f} mm in every direction"] * len(bodies), dtype=object
     )
     closings = _closings(bodies, spread, gripper, friction)
-    trials = _trials(bodies, spread, closings, gripper, around, friction)
+    trials = _trials(bodies, spread, closings, gripper, around, friction, placement)
     reasons[np.unique(closings.owner)] = "no way for the fingers to come with the table and the palm in their way"
-    trials = _probable(trials, _CHECKED, reasons, "nothing holds")
+    trials = _probable(trials, _CHECKED_IF_DOUBTFUL, reasons, "nothing holds")
     if not len(trials.owner):
         return GraspPlan((), tuple(reasons))
-    trials = _among_others(bodies, spread, trials, gripper, around)
-    trials = _probable(trials, PER_BODY, reasons, "in the way")
+    looked_at = _among_others(bodies, spread, trials.first(_CHECKED), gripper, around, placement)
+    doubtful = ~np.isin(trials.owner, looked_at.owner[looked_at.logs.sum(axis=1) > np.log(_SURE)])
+    if doubtful.any():
+        more = trials.at(doubtful).after(_CHECKED)
+        looked_at = looked_at.and_(_among_others(bodies, spread, more, gripper, around, placement))
+    trials = _probable(looked_at, PER_BODY, reasons, "in the way")
     reasons[trials.owner] = ""
     return GraspPlan(tuple(_as_grasps(trials)), tuple(reasons))
 
@@ -232,9 +263,14 @@ def _closings(bodies: Superquadric, spread: np.ndarray, gripper: Gripper, fricti
     owner = np.repeat(np.arange(len(bodies)), len(closing.DIRECTIONS))
     local = np.tile(closing.DIRECTIONS, (len(bodies), 1))
     along = (local[:, None] @ bodies.rotation_matrix[owner].transpose(0, 2, 1))[:, 0]
-    reach, sigma = closing.reaches(bodies, spread, owner, along)
-    fits = (2 * reach < gripper.opening) & (closing.middle_angles(bodies, owner, along) < np.arctan(friction))
-    return _Closings(owner[fits], along[fits], reach[fits], sigma[fits])
+    reach, there = closing.reaches(bodies, spread, owner, along)
+    _, here = closing.reaches(bodies, spread, owner, -along)
+    in_place = spread.copy()
+    in_place[:, 3:6] = in_place[:, :, 3:6] = 0.0
+    _, half = closing.reaches(bodies, in_place, owner, along)
+    fits = reach - _TOO_WIDE * half < 0.5 * gripper.opening
+    fits &= closing.middle_angles(bodies, owner, along) < np.arctan(friction)
+    return _Closings(owner[fits], along[fits], reach[fits], np.stack([there, here], axis=1)[fits])
 
 
 def _trials(
@@ -244,12 +280,13 @@ def _trials(
     gripper: Gripper,
     around: Surroundings,
     friction: float,
+    placement: float,
 ) -> _Trials:
     """Every closing from every side, at every depth and slide, with the margins that the body alone decides."""
     # From every side: z the approach, y the closing line, x the third.
     y = np.repeat(closings.along, len(_SWINGS), axis=0)
     owner = np.repeat(closings.owner, len(_SWINGS))
-    half, side = np.repeat(closings.reach, len(_SWINGS)), np.repeat(closings.sigma, len(_SWINGS))
+    half, side = (np.repeat(one, len(_SWINGS), axis=0) for one in (closings.reach, closings.sigma))
     down = around.down(bodies.translation[owner])
     steep = down - y * (y * down).sum(axis=1, keepdims=True)
     length = np.linalg.norm(steep, axis=1, keepdims=True)
@@ -259,18 +296,21 @@ def _trials(
     possible = (length[:, 0] > 0.3) & ((z * down).sum(axis=1) > -0.1)
     owner, y, z, half, side = owner[possible], y[possible], z[possible], half[possible], side[possible]
     x = np.cross(y, z)
-    near, near_sigma = closing.reaches(bodies, spread, owner, z)
+    near, near_sigma = closing.reaches(bodies, spread, owner, -z)
     across, _ = closing.reaches(bodies, spread, owner, x)
 
     # At every depth: where the palm or the table stops the gripper or the middle is reached, shallow, and between.
-    spare = np.minimum(0.5 * gripper.opening - half, _CLEARANCE + 2 * side)
-    opening = 2 * (half + spare)
+    side = np.hypot(side, placement)
+    wanted = _CLEARANCE + 2 * side
+    room = np.minimum(gripper.opening - 2 * half, wanted.sum(axis=1))
+    opening = 2 * half + room
+    # Of the room each side has its share: the hand is moved towards the side that is less sure.
+    shift = 0.5 * np.maximum(room, 0.0) * (wanted[:, 0] - wanted[:, 1]) / wanted.sum(axis=1)
     boxes = gripper.boxes_at(opening)
     deepest = np.minimum(gripper.palm - _CLEARANCE - near, 0.0)
-    centre = bodies.translation[owner]
+    frames = np.stack([x, y, z, bodies.translation[owner]], axis=2)
     height = np.full(len(owner), np.inf)
     if around.plane is not None:
-        frames = np.concatenate([np.stack([x, y, z], axis=2), centre[:, :, None]], axis=2)
         height = clearance.heights_above(around.plane, frames, boxes)
         sink = -(z @ around.plane[:3])
         low = np.where(sink > 1e-3, (height - _ABOVE_TABLE) / np.maximum(sink, 1e-3), np.inf)
@@ -288,50 +328,63 @@ def _trials(
     distinct = (np.abs(v) > 1e-3) | (np.tile(np.arange(places) % len(_SLIDES), len(rows)) == 0)
     u, v, at = u[distinct], v[distinct], at[distinct]
 
-    owner, half, side, opening = owner[at], half[at], side[at], opening[at]
-    near, near_sigma = near[at], near_sigma[at]
-    offset = u[:, None] * z[at] + v[:, None] * x[at]
+    owner, half, side, opening, shift = owner[at], half[at], side[at], opening[at], shift[at]
+    near, near_sigma, frames = near[at], near_sigma[at], frames[at]
+    x, y, z, position = (frames[:, :, k] for k in range(4))
+    offset = u[:, None] * z + v[:, None] * x
     # A pad touches where it overlaps the body, which may lie wholly beyond the TCP.
     touch = 0.5 * (np.maximum(u - gripper.tip, -near) + np.minimum(u + gripper.tip, near))
-    ends, angle = closing.chords(bodies, owner, offset + (touch - u)[:, None] * z[at], y[at])
-    aside = np.nan_to_num(0.5 * (ends[:, 0] - ends[:, 1]))
-    position = bodies.translation[owner] + offset + aside[:, None] * y[at]
-    frames = np.concatenate([np.stack([x[at], y[at], z[at]], axis=2), position[:, :, None]], axis=2)
+    ends, angle = closing.chords(bodies, owner, offset + (touch - u)[:, None] * z, y)
+    aside = np.nan_to_num(0.5 * (ends[:, 0] - ends[:, 1])) + shift
+    down = around.down(position)
+    lever = np.abs((np.cross(offset, down) * y).sum(axis=1))
+    offset += aside[:, None] * y
+    position += offset
 
     edge = np.hypot(side, closing.MODEL_ERROR)
-    deep = np.hypot(near_sigma, closing.MODEL_ERROR)
-    down = around.down(bodies.translation[owner])
+    deep = np.sqrt(near_sigma**2 + closing.MODEL_ERROR**2 + placement**2)
     weight = DENSITY * bodies.volume()[owner] * _GRAVITY
-    lever = np.abs((np.cross(offset + aside[:, None] * y[at], down) * y[at]).sum(axis=1))
     force = 2 * friction * gripper.force
     load = np.maximum(weight * (1 + _LIFT / _GRAVITY) / force, weight * lever / (force * _PAD_RADIUS))
     logs = np.zeros((len(owner), len(_MARGINS)))
-    logs[:, 0] = _log(0.5 * opening - half - aside, edge) + _log(0.5 * opening - half + aside, edge)
+    logs[:, 0] = _opening(0.5 * opening - half, aside, edge)
     logs[:, 1] = _log(u + gripper.tip + near - _LEAST_ENGAGED, deep)
     logs[:, 2] = _log(gripper.palm - near - u, deep)
     logs[:, 3] = np.where(np.isfinite(angle), _log(np.arctan(friction) - np.nan_to_num(angle), _SQUARE), -np.inf)
     logs[:, 4] = _log(1 / np.maximum(load, 1e-9) - 1, 0.5)
     if around.plane is not None:  # moved without a turn, so that the lowest corner is the same
-        logs[:, 5] = _log(height[at] + (offset + aside[:, None] * y[at]) @ around.plane[:3], _TABLE_SIGMA)
+        logs[:, 5] = _log(height[at] + offset @ around.plane[:3], np.hypot(_TABLE_SIGMA, placement))
     return _Trials(owner, frames, opening, 2 * half, logs)
 
 
 def _among_others(
-    bodies: Superquadric, spread: np.ndarray, trials: _Trials, gripper: Gripper, around: Surroundings
+    bodies: Superquadric,
+    spread: np.ndarray,
+    trials: _Trials,
+    gripper: Gripper,
+    around: Surroundings,
+    placement: float,
 ) -> _Trials:
     """The same with the margins that the surroundings decide."""
-    boxes = gripper.boxes_at(trials.opening)
     flat, turns = np.ascontiguousarray(bodies.to_flat(), dtype=float), np.ascontiguousarray(bodies.rotation_matrix)
-    gap, other = clearance.gaps_to_bodies(trials.frames, boxes, trials.owner, flat, turns)
-    vague = np.sqrt(np.diagonal(spread, axis1=1, axis2=2)[:, :6].mean(axis=1))
-    trials.logs[:, 6] = np.where(other >= 0, _log(gap, np.hypot(_BODY_SIGMA, vague[other])), 0.0)
+    boxes = gripper.boxes_at(trials.opening)
+    gap, other, way = clearance.gaps_to_bodies(trials.frames, boxes, trials.owner, flat, turns)
+    near = np.flatnonzero(other >= 0)
+    _, sigma = closing.reaches(bodies, spread, other[near], -way[near])
+    trials.logs[near, 6] = _log(gap[near], np.sqrt(sigma**2 + _BODY_SIGMA**2 + placement**2))
     trials = trials.first(_CHECKED_CLOSELY)
     boxes = gripper.boxes_at(trials.opening)
     if len(around.points):
         gap = clearance.gaps_to_points(trials.frames, boxes, around.points)
-        trials.logs[:, 7] = _log(np.where(gap > 0, gap, -_POINT_INSIDE), _POINT_SIGMA)
+        doubt = _log(gap, np.hypot(_POINT_SIGMA, placement))
+        trials.logs[:, 7] = np.minimum(doubt - trials.logs[:, [0, 2, 6]].sum(axis=1), 0.0)
     trials.logs[:, 8] = np.log1p(-_HIDDEN * around.unseen(trials.frames, boxes[:, :2]))
     return trials
+
+
+def _opening(room: np.ndarray, aside: np.ndarray, edge: np.ndarray) -> np.ndarray:
+    """Of the opening (k,): ``room`` on either side of the body, the hand ``aside``, sigmas ``edge`` (k, 2)."""
+    return _log(room + aside, edge[:, 0]) + _log(room - aside, edge[:, 1])
 
 
 def _log(margin: np.ndarray, sigma: np.ndarray | float) -> np.ndarray:

@@ -7,7 +7,7 @@ import pytest
 
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.grasping import closing
+from sq_perception.grasping import clearance, closing
 from sq_perception.grasping.gripper import GRIPPERS, PANDA, Gripper, gripper
 from sq_perception.grasping.planner import grasps
 from sq_perception.grasping.surroundings import Surroundings
@@ -117,6 +117,56 @@ def test_an_uncertain_width_is_given_room_and_believed_less():
     assert vague.score < known.score
 
 
+def test_the_hand_stands_farther_from_the_side_that_is_less_sure():
+    """Size and place along y fall together: the side along +y is sure to 1 mm, the other one to 6 mm."""
+    spread = sure(1, sigma=1e-5)
+    half, place = 0.5 * (0.001**2 + 0.006**2), 0.5 * (0.001**2 - 0.006**2)
+    spread[0][np.ix_([1, 6], [1, 6])] = 0.5 * np.array([[half, place], [place, half]])
+    body = standing([0.05, 0.015, 0.06], [0.1, 0.1])
+    found = [
+        grasp for grasp in plan(body, covariance=spread, placement=0.0).grasps if abs(closing_line(grasp)[1]) > 0.99
+    ]
+    assert found
+    for grasp in found:
+        assert grasp.opening == pytest.approx(0.03 + (0.005 + 2 * 0.001) + (0.005 + 2 * 0.006), abs=2e-4)
+        assert grasp.position[1] == pytest.approx(-0.5 * 2 * (0.006 - 0.001), abs=2e-4)
+
+
+def test_the_error_of_the_hand_adds_to_that_of_the_sides():
+    body = standing([0.05, 0.015, 0.06], [0.1, 0.1])
+    best = {sigma: plan(body, placement=sigma).grasps[0] for sigma in (0.0, 0.002, 0.006)}
+    assert best[0.006].score < best[0.002].score
+    side = 0.5 * (0.5 * (best[0.0].opening - 0.03) - 0.005)
+    for sigma, grasp in best.items():
+        assert grasp.opening == pytest.approx(0.03 + 2 * (0.005 + 2 * np.hypot(side, sigma)), abs=5e-4)
+
+
+def test_a_width_that_may_be_less_is_tried_and_doubted():
+    wide = standing([0.041, 0.041, 0.05], [0.1, 0.1])
+    assert not plan(wide).grasps
+    found = plan(wide, covariance=sure(1, sigma=0.015)).grasps
+    assert found
+    assert found[0].score < 0.5
+
+
+def test_gaps_to_spheres_and_depths_of_points():
+    """One finger-sized box at the origin: the gap to a sphere is known along any axis, a point's depth inside too."""
+    frame = np.concatenate([np.eye(3), np.zeros((3, 1))], axis=1)[None]
+    box = np.array([[[0.0, 0.0, 0.0, 0.01, 0.02, 0.03]]])
+    for way, half in ((np.array([1.0, 0, 0]), 0.01), (np.array([0, -1.0, 0]), 0.02), (np.array([0, 0.6, 0.8]), None)):
+        corner = np.array([0.0, 0.02, 0.03]) if half is None else half * way
+        ball = Superquadric.stack([Superquadric([0.02] * 3, [1.0, 1.0], corner + 0.03 * way, UPRIGHT)])
+        gap, which, found = clearance.gaps_to_bodies(
+            frame, box, np.array([-1]), ball.to_flat(), np.ascontiguousarray(ball.rotation_matrix)
+        )
+        assert which[0] == 0
+        assert gap[0] == pytest.approx(0.01, abs=1e-4)
+        np.testing.assert_allclose(found[0], way, atol=1e-6)
+    for x in (0.004, 0.012):
+        points = np.tile([x, 0.0, 0.0], (4, 1))
+        assert clearance.gaps_to_points(frame, box, points)[0] == pytest.approx(x - 0.01)
+
+
 def test_a_body_of_unknown_depth_is_taken_by_its_known_sides():
     doubtful = sure(1)
     doubtful[0, 0, 0] = 0.02**2  # along x; y is as narrow
@@ -148,6 +198,14 @@ def test_measured_points_of_no_body_are_kept_clear_of():
     assert any(abs(closing_line(grasp)[1]) > 0.9 for grasp in plan(body).grasps)
     found = plan(body, around=Surroundings(TABLE, wall))
     assert all(abs(closing_line(grasp)[1]) < 0.3 for grasp in found.grasps)
+
+
+def test_a_bodys_own_points_say_nothing_new():
+    body = standing([0.03, 0.02, 0.05], [0.1, 0.1])
+    way = np.random.default_rng(4).standard_normal((600, 3))
+    points = body.translation + 0.1 * way / body.gauge(body.translation + 0.1 * way)[:, None]
+    seen = Surroundings(TABLE, points[points[:, 2] > 0.01])
+    assert plan(body, around=seen).grasps[0].score == pytest.approx(plan(body).grasps[0].score, rel=1e-6)
 
 
 def test_space_that_nobody_saw_makes_a_grasp_less_sure():
@@ -199,6 +257,7 @@ def test_hostile_input_gets_an_answer_with_a_reason():
         ({"covariance": np.zeros((2, 11, 11))}, "covariance"),
         ({"friction": 0.0}, "friction"),
         ({"friction": np.nan}, "friction"),
+        ({"placement": -0.001}, "placement"),
     ],
 )
 def test_misuse_is_told(wrong, what):
