@@ -234,8 +234,8 @@ def grasps(
         return GraspPlan((), tuple(reasons))
     looked_at = _among_others(bodies, spread, trials.first(_CHECKED), gripper, around, placement)
     doubtful = ~np.isin(trials.owner, looked_at.owner[looked_at.logs.sum(axis=1) > np.log(_SURE)])
-    if doubtful.any():
-        more = trials.at(doubtful).after(_CHECKED)
+    more = trials.at(doubtful).after(_CHECKED)
+    if len(more.owner):
         looked_at = looked_at.and_(_among_others(bodies, spread, more, gripper, around, placement))
     trials = _probable(looked_at, PER_BODY, reasons, "in the way")
     reasons[trials.owner] = ""

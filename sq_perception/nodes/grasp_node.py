@@ -129,7 +129,8 @@ class GraspNode(ManagedNode):
 def planned(bodies: SuperquadricArray, parameters: GraspParameters, plane: np.ndarray | None = None) -> GraspPlan:
     """The plan that the parameters ask for; bodies that they leave out are minded, and have no grasp."""
     hand = gripper(parameters.gripper)
-    plan = grasps(superquadrics(bodies), hand, covariances(bodies), Surroundings(plane), parameters.friction)
+    friction, placement = parameters.friction, parameters.placement
+    plan = grasps(superquadrics(bodies), hand, covariances(bodies), Surroundings(plane), friction, placement)
     wanted = [parameters.only_id in (-1, int(number)) for number in bodies.id]
     kept = tuple(one for one in plan.grasps if one.score >= parameters.min_score and wanted[one.body])
     have = {one.body for one in kept}

@@ -21,7 +21,7 @@ from rclpy.parameter import Parameter
 
 from sq_msgs_py.depth_image import DEPTH_ENCODINGS, GREY_ENCODINGS
 from sq_perception.grasping.gripper import GRIPPERS
-from sq_perception.grasping.planner import FRICTION
+from sq_perception.grasping.planner import FRICTION, PLACEMENT
 from sq_perception.imaging import compressed_depth
 from sq_perception.imaging.calibration import Treatment
 from sq_perception.imaging.camera import Projection
@@ -349,6 +349,9 @@ class GraspParameters(Parameters):
     autostart: bool = setting(True, "Configure and activate at the start, as recover_node does.", live=False)
     gripper: str = setting("panda", "The gripper that grasps are for.", choices=tuple(GRIPPERS))
     friction: float = setting(FRICTION, "Coefficient of friction between pads and things.", within=(0.05, 2.0))
+    placement: float = setting(
+        PLACEMENT, "Metres, one sigma, by which the hand is beside where it is sent to.", within=(0.0, 0.05)
+    )
     min_score: float = setting(0.3, "Grasps that hold with less probability are not published.", within=(0.0, 1.0))
     only_id: int = setting(-1, "Plan for the body of this id alone; -1: for all.", within=(-1, 2**31 - 1))
 

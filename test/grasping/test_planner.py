@@ -218,6 +218,15 @@ def test_space_that_nobody_saw_makes_a_grasp_less_sure():
     assert plan(body, around=Surroundings(depth=hidden, camera=camera)).grasps[0].score < 0.95 * free
 
 
+def test_a_doubtful_body_with_few_ways_is_planned_in_an_image_too():
+    """All ways are looked at in the first round, so that none is left for the second."""
+    camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+    around = Surroundings(depth=np.full((48, 64), 0.5), camera=camera)
+    body = Superquadric([0.038, 0.2, 0.2], [0.1, 0.1], [0.0, 0.0, 0.8], UPRIGHT)
+    found = plan(body, around=around, covariance=sure(1, sigma=0.006)).grasps
+    assert 0 < found[0].score < 0.5
+
+
 def test_a_plan_moves_with_the_scene():
     turn, shift = np.array([0.2, -0.4, 0.1, 0.88]), np.array([0.3, -0.1, 0.7])
     turn /= np.linalg.norm(turn)
