@@ -193,7 +193,7 @@ def _is_face(plane: Plane, surfaces: list[_Surface]) -> bool:
     """Whether most of a plane's points are on a small island before nothing: a body, seen face-on."""
     on, alone = 0, False
     for points, is_island in surfaces:
-        inside = np.count_nonzero(np.abs(plane.height(points)) < TOLERANCE * noise_growth(points[:, 2]))
+        inside = int(np.count_nonzero(np.abs(plane.height(points)) < TOLERANCE * noise_growth(points[:, 2])))
         if inside > on:
             on, alone = inside, is_island
     return alone
