@@ -243,8 +243,9 @@ def begin_with(network: ThingNetwork, path: Path) -> None:
         given = load_file(str(path))
     except (OSError, SafetensorError) as error:
         raise CheckpointError(f"{path}: not a readable safetensors file: {error}") from error
-    # A Regressor flattens in its mixer's first layer, and has one channel in and no plane.
-    given = {_mixer_without_flatten(name): tensor.float() for name, tensor in given.items()}
+    given = {name: tensor.float() for name, tensor in given.items()}
+    if "mixer.0.weight" not in given:  # a Regressor flattens there, and has one channel in and no plane
+        given = {_mixer_without_flatten(name): tensor for name, tensor in given.items()}
     taken = 0
     with torch.no_grad():
         for name, mine in network.state_dict().items():

@@ -42,6 +42,7 @@ from sq_perception.geometry.one_thread import one_blas_thread
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
+from sq_perception.imaging.canonical_view import CanonicalView
 from sq_perception.learning import checkpoint, inference
 from sq_perception.learning.choices import NEEDS_TORCH
 from sq_perception.learning.consensus import Consensus
@@ -49,7 +50,7 @@ from sq_perception.recovery import continuity, methods, seen_object, segment_rep
 from sq_perception.recovery.continuity import Reference
 from sq_perception.recovery.options import FITTED, NEEDS_NETWORK, Method, RecoveryOptions, Refine
 from sq_perception.recovery.recovery import FrameRecovery, Recovery
-from sq_perception.recovery.seen_object import Prediction, SeenObject
+from sq_perception.recovery.seen_object import Answers, Prediction, SeenObject
 from sq_perception.segmentation import segments
 
 __all__ = [
@@ -245,25 +246,23 @@ class Recoverer:
         return FrameRecovery(bodies, milliseconds, found.labels, found.plane, message, reference)
 
     def _predicted(self, objects: Sequence[SeenObject], network: Network, options: RecoveryOptions) -> list[SeenObject]:
-        """The objects with their predictions, which may still be computed beside a fit that begins without them."""
+        """The objects with their predictions; those of bodies may still be computed, beside fits that begin without."""
+        if isinstance(network, inference.ThingPredictor):
+            # The network computes on one thread: each thread asks it about its share of the objects.
+            parts = [part for part in np.array_split(np.arange(len(objects)), self._threads) if part.size]
+            found = self._mapped(lambda part: _hulls([objects[k] for k in part], network), parts)
+            return [one for part in found for one in part]
         shown = [one.shown for one in objects if one.shown is not None]
         if not shown:
             return []
-        seen = list(zip(objects, shown, strict=True))
         views = np.stack([view.marked for view in shown])
 
-        def asked() -> Superquadric | inference.HullAnswers:
-            if not isinstance(network, inference.ThingPredictor):
-                return network.predict(views)
-            known = [np.zeros(4) if one.plane is None else view.plane_to_canonical(one.plane) for one, view in seen]
-            return network.predict(views, np.stack(known), np.array([view.extent for view in shown]))
+        def asked() -> Answers:
+            return network.predict(views)
 
-        answers: Future[Superquadric | inference.HullAnswers] = Future()
-        if options.method == "auto" and options.refine == "surface":
-            answers = self._beside.submit(asked)
-        else:
-            answers.set_result(asked())
-        return [replace(one, prediction=Prediction(view, answers, k)) for k, (one, view) in enumerate(seen)]
+        is_fitted = options.method == "auto" and options.refine == "surface"
+        answers = self._beside.submit(asked) if is_fitted else _done(asked())
+        return _answered(objects, shown, answers)
 
     def _mapped(self, function: Callable[[_Item], _Answer], items: Sequence[_Item]) -> list[_Answer]:
         """The function of each item; several at a time in threads that stay, as new ones cost memory and time."""
@@ -344,6 +343,28 @@ def _cleaned(depth: np.ndarray, camera: Camera) -> np.ndarray:
     if camera.is_pinhole:
         bad |= depth <= 0
     return np.where(bad, np.float32(np.nan), depth)
+
+
+def _hulls(objects: Sequence[SeenObject], network: inference.ThingPredictor) -> list[SeenObject]:
+    """Some objects with the predictions of their hulls."""
+    shown = [one.shown for one in objects if one.shown is not None]
+    seen = zip(objects, shown, strict=True)
+    planes = [np.zeros(4) if one.plane is None else view.plane_to_canonical(one.plane) for one, view in seen]
+    views, extents = np.stack([view.marked for view in shown]), np.array([view.extent for view in shown])
+    return _answered(objects, shown, _done(network.predict(views, np.stack(planes), extents)))
+
+
+def _answered(objects: Sequence[SeenObject], shown: Sequence[CanonicalView], answers: Future[Answers]) -> list[SeenObject]:
+    """The objects with what a network answers about their views."""
+    seen = zip(objects, shown, strict=True)
+    return [replace(one, prediction=Prediction(view, answers, k)) for k, (one, view) in enumerate(seen)]
+
+
+def _done(answers: Answers) -> Future[Answers]:
+    """What need not be waited for any more."""
+    found: Future[Answers] = Future()
+    found.set_result(answers)
+    return found
 
 
 def _viewed(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 
@@ -34,6 +35,9 @@ _JUMP_PIXELS, _JUMP = 10.0, 0.002
 """What a network is shown, and a score is measured on: metres above the table; steps in pixel widths, and metres."""
 
 
+Answers: TypeAlias = "Superquadric | HullAnswers"
+
+
 @dataclass(frozen=True, eq=False)
 class Prediction:
     """What a network says of one object; perhaps it is still being computed.
@@ -43,11 +47,11 @@ class Prediction:
     view
         What the network was shown.
     answers, number
-        Its answers for all objects of the frame, each in the frame of its view, and which of them is this one's.
+        Its answers for several objects, each in the frame of its view, and which of them is this one's.
     """
 
     view: CanonicalView
-    answers: Future[Superquadric | HullAnswers]
+    answers: Future[Answers]
     number: int
 
     def body(self) -> Superquadric:
