@@ -305,5 +305,6 @@ def _keep(output: Path, state: TrainingState[ThingNetwork], record: dict[str, An
     state.save(output / "state.safetensors")
     made = provenance.facts("sq-perception train-things")
     validation = {name: value for name, value in record.items() if name in ("step", "error", "body", "ratio", *KINDS)}
-    facts = {"training": asdict(config), "made": made, "validation": validation}
+    training = {**asdict(config), "start": Path(config.start).name}
+    facts = {"training": training, "made": made, "validation": validation}
     checkpoint.save(output / "things.safetensors", state.average, facts)

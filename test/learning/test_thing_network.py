@@ -123,6 +123,14 @@ def test_it_begins_with_the_weights_of_a_regressor() -> None:
     assert torch.allclose(body.to_flat(), expected.to_flat(), atol=2e-2)
 
 
+def test_it_begins_with_all_weights_of_another_of_its_kind(tmp_path: Path) -> None:
+    path, given, network = tmp_path / "things.safetensors", ThingNetwork(SMALL), ThingNetwork(SMALL)
+    checkpoint.save(path, given)
+    thing_training.begin_with(network, path)
+    for name, weights in given.state_dict().items():
+        assert torch.equal(weights, network.state_dict()[name]), name
+
+
 def test_weights_of_another_kind_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "things.safetensors"
     checkpoint.save(path, ThingNetwork(SMALL))
