@@ -354,7 +354,9 @@ def _hulls(objects: Sequence[SeenObject], network: inference.ThingPredictor) -> 
     return _answered(objects, shown, _done(network.predict(views, np.stack(planes), extents)))
 
 
-def _answered(objects: Sequence[SeenObject], shown: Sequence[CanonicalView], answers: Future[Answers]) -> list[SeenObject]:
+def _answered(
+    objects: Sequence[SeenObject], shown: Sequence[CanonicalView], answers: Future[Answers]
+) -> list[SeenObject]:
     """The objects with what a network answers about their views."""
     seen = zip(objects, shown, strict=True)
     return [replace(one, prediction=Prediction(view, answers, k)) for k, (one, view) in enumerate(seen)]

@@ -128,7 +128,8 @@ def test_it_begins_with_all_weights_of_another_of_its_kind(tmp_path: Path) -> No
     checkpoint.save(path, given)
     thing_training.begin_with(network, path)
     for name, weights in given.state_dict().items():
-        assert torch.equal(weights, network.state_dict()[name]), name
+        # Files keep 11 bits.
+        assert torch.allclose(weights.float(), network.state_dict()[name].float(), rtol=1e-3, atol=1e-4), name
 
 
 def test_weights_of_another_kind_are_refused(tmp_path: Path) -> None:
