@@ -378,7 +378,7 @@ PICKERS = {
     "cgn in masks": "Contact-GraspNet in our masks",
     "cgn": "Contact-GraspNet alone",
 }
-"""Contestants of the picking benchmark."""
+"""Contestants of the picking benchmark; those that tried both kinds of scenes are shown."""
 PICKERS_OF_ANY_SCORE = ("ours", "ours at any score")
 FAILURES = ("collision", "wrong size", "missed", "slipped")
 
@@ -387,12 +387,12 @@ def picking() -> str:
     """Grasps in physics: how often one holds, how much is cleared, and why others failed."""
     found = results("picking")["rows"]
     rows = []
-    for who, text in PICKERS.items():
+    for who in (one for one in PICKERS if {f"packed: {one}", f"pile: {one}"} <= set(found)):
         kinds = [found[f"{kind}: {who}"] for kind in ("packed", "pile")]
         cells = [f"{one['scenes']}: {_rate(one['gsr'])} / {_rate(one['dr'])}" for one in kinds]
         tried = sum(one["tried"] for one in kinds)
         *failed, unreachable = (sum(one["causes"][cause] for one in kinds) for cause in (*FAILURES, "unreachable"))
-        rows.append([text, *cells, f"{tried}: {' / '.join(map(str, failed))}", str(unreachable)])
+        rows.append([PICKERS[who], *cells, f"{tried}: {' / '.join(map(str, failed))}", str(unreachable)])
     heads = ["planned on", "packed, scenes: GSR / DR %", "pile", f"tried: {' / '.join(FAILURES)}", "unreachable"]
     return table(heads, rows)
 
