@@ -154,21 +154,21 @@ class _Trials:
         """Which margin takes most from each."""
         return np.asarray(np.argmin(self.logs, axis=1))
 
-    def first(self, count: int) -> _Trials:
-        """The most probable ones of each body, each body's in order."""
-        order, rank = self._ranked()
-        return self.at(order[rank < count])
+    def first(self, count: int, least: float = -np.inf) -> _Trials:
+        """The most probable ones of each body, each body's in order, of those whose logarithm is above ``least``."""
+        total = self.logs.sum(axis=1)
+        found = np.flatnonzero(total > least)
+        found = found[np.lexsort((-total[found], self.owner[found]))]
+        return self.at(found[_rank(self.owner[found]) < count])
 
     def after(self, count: int) -> _Trials:
-        """The others."""
-        order, rank = self._ranked()
-        return self.at(order[rank >= count])
+        """The others, of trials that are in order."""
+        return self.at(np.flatnonzero(_rank(self.owner) >= count))
 
-    def _ranked(self) -> tuple[np.ndarray, np.ndarray]:
-        """Order by body and probability, and the rank (k,) within the body."""
-        order = np.lexsort((-self.logs.sum(axis=1), self.owner))
-        owner = self.owner[order]
-        return order, np.arange(len(owner)) - np.searchsorted(owner, owner)
+
+def _rank(owner: np.ndarray) -> np.ndarray:
+    """Of each (k,) among those of the same body; bodies are in order."""
+    return np.asarray(np.arange(len(owner)) - np.searchsorted(owner, owner))
 
 
 @dataclass(frozen=True, eq=False)
@@ -244,7 +244,7 @@ def grasps(
 
 def _probable(trials: _Trials, count: int, reasons: np.ndarray, why: str) -> _Trials:
     """The ``count`` best of each body that has any; what the best of the others suffer from is their reason."""
-    found = trials.at(trials.logs.sum(axis=1) > np.log(_LEAST)).first(count)
+    found = trials.first(count, np.log(_LEAST))
     without = trials.at(~np.isin(trials.owner, found.owner)).first(1)
     for k, weakest in zip(without.owner, without.weakest, strict=True):
         reasons[k] = f"{why}: {_MARGINS[weakest]}"
