@@ -37,6 +37,7 @@ _DECISIVE = (
     "masks",
     "min_score",
     "max_size",
+    "workspace",
     "distortion",
     "topic",
     "model",

@@ -412,4 +412,5 @@ def test_a_folder_is_resumed_where_it_ended(tmp_path, monkeypatch):
     monkeypatch.setattr(Recoverer, "recover", None)
     assert run(folder, "--jsonl", lines) == 0, "nothing is left to do"
     assert run(folder, "--jsonl", lines, "--max-objects", "3") == 2
+    assert run(folder, "--jsonl", lines, "--workspace", *"001112") == 2
     assert run(folder, "--jsonl", lines, "--mcap", tmp_path / "out.mcap") == 2
