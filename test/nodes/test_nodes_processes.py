@@ -298,7 +298,7 @@ def test_parameters_change_from_another_process(recover_node, client):
         ("s", -1, "out of range"),
         ("s", -1.0, "out of range"),
         ("s", float("nan"), "s"),
-        ("s", "high", "s: expected"),
+        ("s", "high", "expected 'Type.DOUBLE' got 'Type.STRING'"),
         ("tau", 0, "tau out of range"),
         ("refine", "perhaps", "surface, soft_render, none"),
         ("model", "other.safetensors", "no such model file"),
