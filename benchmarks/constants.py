@@ -226,6 +226,7 @@ class Seen(NamedTuple):
 
     superquadric: Superquadric
     covariance: np.ndarray
+    repeats: int = 0
 
 
 @cache
