@@ -11,6 +11,7 @@ model.safetensors (the best one so far).
 from __future__ import annotations
 
 import copy
+import json
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -40,6 +41,8 @@ from sq_perception.learning.training_config import TrainingConfig
 from sq_perception.learning.training_log import TrainingLog
 from sq_perception.learning.training_state import TrainingState, recalibrate
 
+_OF_A_RUN = ("loss", "backbone", "framing", "pixels", "canonical_labels", "optimizer")
+"""Settings whose change makes another run; others may change when it goes on."""
 CALIBRATION_VIEWS = 2048
 _CLIP = 1.0
 """Largest norm of the gradient."""
@@ -90,6 +93,20 @@ def train(config: TrainingConfig, output: Path, network: RegressorConfig | None 
         return _train(config, output, network, processes, stop_requested)
 
 
+def _check_same_run(config: TrainingConfig, output: Path) -> None:
+    """Raise CheckpointError where a folder holds the state of a run of another kind, naming what differs."""
+    newest = output / "last.safetensors"
+    if not ((output / "state.safetensors").exists() and newest.exists()):
+        return
+    before = json.loads(checkpoint.read_header(newest).get("training", "{}"))
+    other = [name for name in _OF_A_RUN if before.get(name, getattr(config, name)) != getattr(config, name)]
+    if other:
+        said = ", ".join(f"{name} {before[name]!r}, not {getattr(config, name)!r}" for name in other)
+        raise checkpoint.CheckpointError(
+            f"{output}: holds a run with {said}: expected another --output, or the same settings"
+        )
+
+
 def _train(
     config: TrainingConfig,
     output: Path,
@@ -99,6 +116,7 @@ def _train(
 ) -> Regressor:
     device, objective = processes.device, config.objective()
     output.mkdir(parents=True, exist_ok=True)
+    _check_same_run(config, output)
     torch.manual_seed(config.seed)
     model = _new_network(config, network).to(device)
     model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]

@@ -184,6 +184,13 @@ class TestInterruptions:
         assert (tmp_path / "state.safetensors").read_bytes() == before
         checkpoint.load(tmp_path / "model.safetensors")
 
+    def test_a_folder_of_another_run_is_refused_with_what_differs(self, tmp_path: Path) -> None:
+        train.train(replace(RUN, steps=2), tmp_path, SMALL)
+        before = (tmp_path / "state.safetensors").read_bytes()
+        with pytest.raises(checkpoint.CheckpointError, match=f"loss '{RUN.loss}', not 'render'"):
+            train.train(replace(RUN, steps=4, loss="render"), tmp_path, SMALL)
+        assert (tmp_path / "state.safetensors").read_bytes() == before
+
     @pytest.mark.parametrize("content", [b"not a state", None])
     def test_foreign_state_is_refused(self, content: bytes | None, tmp_path: Path) -> None:
         path = tmp_path / "state.safetensors"
