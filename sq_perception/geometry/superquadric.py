@@ -100,6 +100,10 @@ class Superquadric:
             raise ValueError("rotation: expected a quaternion of non-zero length")
         object.__setattr__(self, "rotation", self.rotation / np.sqrt(square)[..., None])
         if all(part.ndim == 1 for part in parts):
+            for name in lengths:  # not to be written to, as those of a batch
+                fixed = getattr(self, name).view()
+                fixed.flags.writeable = False
+                object.__setattr__(self, name, fixed)
             return
         batch = np.broadcast_shapes(*(part.shape[:-1] for part in parts))
         for name, length in lengths.items():

@@ -282,3 +282,13 @@ def test_kept_machine_code_is_bound_to_all_kernel_sources(tmp_path: Path) -> Non
         answers.append(done.stdout.strip())
         edited.write_text(edited.read_text().replace("return True, first, -last", "return True, first, first"))
     assert answers == ["(2, 6)", "(2, 2)"]
+
+
+@pytest.mark.parametrize("batch", [(), (2,)])
+def test_bodies_cannot_be_written_to(batch: tuple[int, ...]) -> None:
+    given = np.full((*batch, 3), 0.1)
+    body = Superquadric(given, np.ones((*batch, 2)), np.zeros((*batch, 3)), np.full((*batch, 4), 0.5))
+    for part in (body.size, body.shape, body.translation, body.rotation):
+        with pytest.raises(ValueError, match="read-only"):
+            part[...] = 0.0
+    given[...] = 0.2  # the caller's own array stays his
