@@ -110,7 +110,7 @@ def p_norm(u: float, v: float, e: float) -> tuple[float, float, float, float]:
     return norm, (of_big if u >= v else of_small), (of_small if u >= v else of_big), of_e
 
 
-@kernel
+@inline_kernel
 def gauge(x: float, y: float, z: float, a1: float, a2: float, a3: float, e1: float, e2: float) -> float:
     """g at a point."""
     h, _, _, _ = p_norm(abs(x) / a1, abs(y) / a2, e2)
