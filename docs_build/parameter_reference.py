@@ -14,12 +14,7 @@ from dataclasses import Field, fields
 from pathlib import Path
 from typing import Any
 
-from sq_perception.nodes.parameters import (
-    KINDS,
-    FitterParameters,
-    GraspParameters,
-    RecoverParameters,
-)
+from sq_perception.nodes.parameters import KINDS, FitterParameters, GraspParameters, RecoverParameters
 
 PAGE = Path("docs/parameters.md")
 COMMAND = "python docs_build/parameter_reference.py"

@@ -131,7 +131,7 @@ class Outputs:
         self,
         frame: RecordedFrame,
         recovery: FrameRecovery,
-        tracks: Sequence[Followed | None] | None,
+        tracks: Sequence[Followed] | None,
         entry: dict[str, Any],
     ) -> None:
         """Write a frame, what was recovered from it, and its element of ``frames``; raises OSError if that fails."""

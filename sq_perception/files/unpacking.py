@@ -45,8 +45,6 @@ def npz_arrays(path: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
         with zipfile.ZipFile(path) as archive:
             held = {info.filename: info for info in archive.infolist()}
             return {name: _array(archive, held[f"{name}.npy"]) for name in names if f"{name}.npy" in held}
-    except UnpackingError as error:
-        raise UnpackingError(f"not a readable NPZ archive: {error}") from error
     except (OSError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
         raise UnpackingError(f"not a readable NPZ archive: {error}") from error
 

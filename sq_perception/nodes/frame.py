@@ -14,13 +14,7 @@ import numpy as np
 from rclpy.node import Node
 from sensor_msgs.msg import CompressedImage, Image, PointCloud2
 
-from sq_msgs_py.depth_image import (
-    DEPTH_ENCODINGS,
-    GREY_ENCODINGS,
-    depth_from_message,
-    grey_from_message,
-    labels_from_message,
-)
+from sq_msgs_py.depth_image import DEPTH_ENCODINGS, GREY_ENCODINGS, labels_from_message
 from sq_msgs_py.points import points_from_message
 from sq_perception.imaging import compressed_depth, unit_cube
 from sq_perception.imaging.calibration import Calibration
@@ -78,7 +72,7 @@ class Frame:
     def encode(self, depth: np.ndarray) -> Image:
         """A message like the frame's own with another depth (height, width), NaN or inf for nothing."""
         sent = self.calibration.as_sent(depth)
-        return cast(Image, publication.depth_message(sent, self.header, self.encoding, self.is_cube))
+        return cast(Image, publication.depth_message(sent, self.header, self.encoding))
 
 
 def decode(message: DepthMessage, calibration_of: Callable[[], Calibration] | None) -> Frame:
@@ -109,20 +103,15 @@ def decode(message: DepthMessage, calibration_of: Callable[[], Calibration] | No
                 f"encoding: expected mono8 or mono16 for projection = orthographic, got {message.encoding!r}; "
                 "metric depth images of a camera need projection = pinhole"
             )
-        grey = grey_from_message(message)
-        height, width = grey.shape
-        calibration = Calibration(unit_cube.camera(width, height), (width, height))
-        return Frame(message.header, message.encoding, unit_cube.depth_from_grey(grey), calibration)
+        depth, encoding = publication.depth_of(message, is_cube=True)
+        height, width = depth.shape
+        return Frame(message.header, encoding, depth, Calibration(unit_cube.camera(width, height), (width, height)))
     if isinstance(message, Image) and message.encoding in GREY_ENCODINGS:
         raise ValueError(
             f"encoding: expected 16UC1 or 32FC1 for projection = pinhole, got {message.encoding!r}; "
             "grey images of the unit cube need projection = orthographic"
         )
-    if isinstance(message, CompressedImage):
-        depth = compressed_depth.decode(message.format, message.data)
-        encoding = compressed_depth.encoding(message.format) or ""
-    else:
-        depth, encoding = depth_from_message(message), message.encoding
+    depth, encoding = publication.depth_of(message, is_cube=False)
     calibration = calibration_of()
     return Frame(message.header, encoding, calibration.rectified(depth), calibration)
 

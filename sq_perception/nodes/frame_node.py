@@ -32,9 +32,10 @@ from sq_perception.nodes import fast_dds, process
 from sq_perception.nodes.engine import TURNS, Answer, Engine
 from sq_perception.nodes.frame import Frame, stamp_of
 from sq_perception.nodes.input import Arrival, Input
+from sq_perception.nodes.live_parameters import LiveParameters
 from sq_perception.nodes.managed_node import ManagedNode
 from sq_perception.nodes.outputs import Outputs, pose_in
-from sq_perception.nodes.parameters import LiveParameters, RecoverParameters
+from sq_perception.nodes.parameters import RecoverParameters
 from sq_perception.nodes.statistics import THROTTLE, Standing, Statistics, timed
 from sq_perception.nodes.tracking import CameraPoses, Tracking
 from sq_perception.recordings.publication import Findings

@@ -24,8 +24,9 @@ from sq_msgs_py.superquadrics import SuperquadricArray, from_message
 from sq_perception.grasping.gripper import Gripper, gripper
 from sq_perception.grasping.planner import GraspPlan, grasps, warm_up
 from sq_perception.grasping.surroundings import Surroundings
+from sq_perception.nodes.live_parameters import LiveParameters
 from sq_perception.nodes.managed_node import ManagedNode
-from sq_perception.nodes.parameters import GraspParameters, LiveParameters
+from sq_perception.nodes.parameters import GraspParameters
 from sq_perception.nodes.statistics import THROTTLE
 from sq_perception.recordings.publication import covariances, superquadrics
 

@@ -34,7 +34,8 @@ from sq_msgs_py.depth_image import size_mismatch
 from sq_perception.imaging.calibration import Calibration
 from sq_perception.nodes import fast_dds
 from sq_perception.nodes.frame import DepthMessage, Frame, decode, image_topic, size_of, stamp_of
-from sq_perception.nodes.parameters import POINTS, RAW, LiveParameters, RecoverParameters
+from sq_perception.nodes.live_parameters import LiveParameters
+from sq_perception.nodes.parameters import POINTS, RAW, RecoverParameters
 from sq_perception.nodes.statistics import THROTTLE, Statistics
 from sq_perception.recordings.cloud_file import UNORGANISED
 

@@ -39,7 +39,7 @@ from sq_perception.nodes.parameters import RecoverParameters
 from sq_perception.nodes.statistics import THROTTLE, timed
 from sq_perception.nodes.tracking import CameraPoses, Pose, PoseError
 from sq_perception.recordings import publication
-from sq_perception.recordings.publication import Findings, Identified, MarkerStyle
+from sq_perception.recordings.publication import Findings, Identified
 from sq_perception.recovery.recoverer import render_recovery
 
 _OVERRIDABLE = tuple(getattr(QoSPolicyKind, name) for name in ("HISTORY", "DEPTH", "RELIABILITY", "DURABILITY"))
@@ -109,7 +109,14 @@ class Outputs:
             with timed(stages, "pictures"):
                 if self.markers.get_subscription_count():
                     before = self._shown.shown_ids if self._shown is not None else ()
-                    self.markers.publish(findings.markers(before, marker_style(parameters)))
+                    self.markers.publish(
+                        findings.markers(
+                            before,
+                            parameters.marker_colours == "score",
+                            alpha=parameters.marker_alpha,
+                            line_width=parameters.marker_line_width,
+                        )
+                    )
                     self._shown = findings
                 if self.rendered_depth.get_subscription_count():
                     self.rendered_depth.publish(frame.encode(render_recovery(found.recovery, frame.camera)[0]))
@@ -120,11 +127,6 @@ class Outputs:
                     throttle_duration_sec=THROTTLE,
                 )
         return stages
-
-
-def marker_style(parameters: RecoverParameters) -> MarkerStyle:
-    """How markers look."""
-    return MarkerStyle(parameters.marker_colours, parameters.marker_alpha, parameters.marker_line_width)
 
 
 def pose_in(poses: CameraPoses, header: Any, frame_id: str, patience: float) -> Pose:

@@ -1,23 +1,10 @@
-"""ROS parameters of the nodes: one frozen dataclass per node, declared with descriptors and checked as a whole.
-
-Each field of such a dataclass is one parameter of the same name; :func:`setting` carries what its descriptor says:
-meaning, unit, range or choices, and whether it may change while the node runs.  :class:`LiveParameters` declares them
-and holds the current values; a worker that takes ``current`` once per frame sees a consistent set, and a change takes
-effect with the next frame.
-
-``ros2 param set /node s 3`` sends an INTEGER: where a float is declared, integers become doubles.
-"""
+"""The parameters of the nodes, one frozen dataclass per node, by :mod:`sq_perception.nodes.live_parameters`."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import Field, dataclass, field, fields, replace
-from typing import Any, Generic, Literal, TypeVar, cast, get_args
-
-from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
-from rclpy.node import Node
-from rclpy.parameter import Parameter
+from dataclasses import dataclass, field
+from typing import Literal, cast, get_args
 
 from sq_msgs_py.depth_image import DEPTH_ENCODINGS, GREY_ENCODINGS
 from sq_perception.grasping.gripper import GRIPPERS
@@ -25,6 +12,7 @@ from sq_perception.grasping.planner import FRICTION, PLACEMENT
 from sq_perception.imaging import compressed_depth
 from sq_perception.imaging.calibration import Treatment
 from sq_perception.imaging.camera import Projection
+from sq_perception.nodes.live_parameters import ParameterError, Parameters, setting
 from sq_perception.recovery.options import Method, RecoveryOptions, Refine
 from sq_perception.segmentation.standing import Box, Pose
 from sq_perception.simulation.sensor_noise import IDEAL, PRESETS
@@ -34,41 +22,6 @@ TRANSPORTS = (RAW, compressed_depth.TRANSPORT)
 """As image_transport names them."""
 POINTS = "points"
 """Depth images as clouds of points."""
-
-
-class ParameterError(ValueError):
-    """A parameter that cannot be used; names it, what was expected and what arrived."""
-
-
-def setting(
-    default: Any,
-    description: str,
-    *,
-    unit: str = "",
-    within: tuple[float, float] | None = None,
-    choices: tuple[str, ...] = (),
-    live: bool = True,
-) -> Any:
-    """A dataclass field that becomes a ROS parameter; ``live``: it may change at any time."""
-    about = {"description": description, "unit": unit, "within": within, "choices": choices, "live": live}
-    return field(default=default, metadata=about)
-
-
-@dataclass(frozen=True)
-class Parameters:
-    """Those of a node.  Types and ranges are rclpy's to check, by the descriptors; what fits together is checked here.
-
-    Raises
-    ------
-    ParameterError
-        For a value that is none of the choices, or does not fit the others.
-    """
-
-    def __post_init__(self) -> None:
-        for one in fields(self):
-            choices, value = one.metadata["choices"], getattr(self, one.name)
-            if choices and value not in choices:
-                raise ParameterError(f"{one.name}: expected one of {', '.join(choices)}, got {value!r}")
 
 
 @dataclass(frozen=True)
@@ -363,108 +316,3 @@ KINDS: dict[str, type[Parameters]] = {
     "synthetic_depth_node": SyntheticParameters,
 }
 """The parameters of each node."""
-P = TypeVar("P", bound=Parameters)
-
-
-class LiveParameters(Generic[P]):
-    """Declares the fields of a dataclass as parameters of a node and follows their changes.
-
-    Parameters
-    ----------
-    node, kind
-        The node and the dataclass.
-    locked
-        Why what is not live cannot change now; empty where it can.  None: it never can.
-    check
-        Raises ValueError for a set of values that cannot work; gets the names of those that change as well.
-    changed
-        Told the new values and which of them were set.
-
-    Raises
-    ------
-    InvalidParameterValueException, ParameterError
-        If a value given at the start has a wrong type, is out of range, or does not fit the others.
-    """
-
-    def __init__(
-        self,
-        node: Node,
-        kind: type[P],
-        *,
-        locked: Callable[[], str] | None = None,
-        check: Callable[[Any, frozenset[str]], None] = lambda _, __: None,
-        changed: Callable[[Any, frozenset[str]], None] = lambda _, __: None,
-    ) -> None:
-        self._kinds: dict[str, Any] = {one.name: type(one.default) for one in fields(kind)}
-        self._fixed = {one.name for one in fields(kind) if not one.metadata["live"]}
-        self._locked, self._check, self._changed = locked, check, changed
-        self.current: P = kind(**self._values([self._declared(node, one) for one in fields(kind)]))
-        """The values in force: an immutable set, replaced as a whole."""
-        node.add_pre_set_parameters_callback(lambda changes: [self._typed(one) for one in changes])
-        node.add_on_set_parameters_callback(self._on_set)
-        node.add_post_set_parameters_callback(self._accept)
-
-    def _declared(self, node: Node, one: Field[Any]) -> Parameter:
-        # Of any type at first: declared as a double it would refuse an integer given at the start.
-        node.declare_parameter(one.name, one.default, ParameterDescriptor(dynamic_typing=True))
-        given = self._typed(node.get_parameter(one.name))
-        node.set_descriptor(one.name, describe(one, self._locked is None), given.get_parameter_value())
-        return given
-
-    def _typed(self, given: Parameter) -> Parameter:
-        """A parameter with integers as doubles where it is one, or a list of them."""
-        kind = self._kinds.get(given.name)
-        if kind is float and given.type_ == Parameter.Type.INTEGER:
-            return Parameter(given.name, value=float(given.value))
-        if kind is tuple and given.type_ == Parameter.Type.INTEGER_ARRAY:
-            return Parameter(given.name, value=[float(one) for one in given.value])
-        return given
-
-    def _values(self, changes: list[Parameter]) -> dict[str, Any]:
-        """By name, without those of rclpy's own, which another thread may declare."""
-        return {one.name: self._kinds[one.name](one.value) for one in changes if one.name in self._kinds}
-
-    def _on_set(self, changes: list[Parameter]) -> SetParametersResult:
-        values = self._values(changes)
-        try:
-            candidate = replace(self.current, **values)
-            # A value that stays as it is may always be set: `ros2 param load` sets all of a file.
-            fixed = sorted(self._fixed.intersection(values))
-            frozen = [name for name in fixed if getattr(candidate, name) != getattr(self.current, name)]
-            if frozen and self._locked is not None and (reason := self._locked()):
-                raise ParameterError(f"{', '.join(frozen)}: {reason}")
-            if values:
-                self._check(candidate, frozenset(values))
-        except (ValueError, OSError) as error:
-            return SetParametersResult(successful=False, reason=str(error))
-        return SetParametersResult(successful=True)
-
-    def _accept(self, changes: list[Parameter]) -> None:
-        if values := self._values(changes):
-            self.current = replace(self.current, **values)
-            self._changed(self.current, frozenset(values))
-
-
-def describe(one: Field[Any], is_fixed: bool = True) -> ParameterDescriptor:
-    """The descriptor of a field: its type, its text with the unit, its range or choices.
-
-    It is read-only where the field is not live and ``is_fixed``, as in nodes without a lifecycle.
-    """
-    about = one.metadata
-    unit = about["unit"]
-    descriptor = ParameterDescriptor(
-        name=one.name,
-        type=Parameter.Type.from_parameter_value(one.default).value,
-        description=about["description"] + (f" [{unit}]" if unit else ""),
-        read_only=is_fixed and not about["live"],
-    )
-    if about["choices"]:
-        descriptor.additional_constraints = "one of: " + ", ".join(about["choices"])
-    elif about["within"] is not None:
-        low, high = about["within"]
-        descriptor.additional_constraints = f"{low:g} to {high:g} {unit}".rstrip()
-        if isinstance(one.default, int):
-            descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
-        else:
-            descriptor.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high))]
-    return descriptor

@@ -13,13 +13,13 @@ from typing import Any
 
 from lifecycle_msgs.msg import Transition
 from lifecycle_msgs.srv import ChangeState, GetState
-from rcl_interfaces.msg import ParameterDescriptor, ParameterEvent
+from rcl_interfaces.msg import ParameterEvent
 from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.task import Future
 
-from sq_perception.viewing.controls import Control, Description, arranged
+from sq_perception.viewing.controls import Control, arranged
 from sq_perception.viewing.page import Page
 
 _PATIENCE = 3.0
@@ -137,9 +137,8 @@ class RemoteNode:
             return
         self._known = set(names)
         read = [parameter_value_to_python(one) for one in got.values]
-        about = [_description(one, value) for one, value in zip(described.descriptors, read, strict=True)]
         with self._lock:
-            self._new_controls = arranged(about)
+            self._new_controls = arranged(zip(described.descriptors, read, strict=True))
             self._new_values.clear()
 
     async def _answer(self, call: Future, patience: float = _PATIENCE) -> Any:
@@ -171,23 +170,6 @@ class RemoteNode:
             page.show_values(self.name, values)
         if answer is not None:
             page.show_answer(self.name, *answer)
-
-
-def _description(about: ParameterDescriptor, value: Any) -> Description:
-    ranges = [*about.floating_point_range, *about.integer_range]
-    is_float = bool(about.floating_point_range)
-    kind = float if is_float else int
-    return Description(
-        name=about.name,
-        value=value,
-        text=about.description,
-        constraints=about.additional_constraints,
-        read_only=about.read_only,
-        low=kind(ranges[0].from_value) if ranges else None,
-        high=kind(ranges[0].to_value) if ranges else None,
-        step=float(ranges[0].step) if ranges else 0.0,
-        is_float_range=is_float,
-    )
 
 
 def _shown(value: Any) -> str:

@@ -36,7 +36,8 @@ from sq_msgs_py.depth_image import (
 from sq_msgs_py.superquadrics import to_message
 from sq_perception.imaging.calibration import intrinsics
 from sq_perception.nodes.frame import image_topic, packed
-from sq_perception.nodes.parameters import RAW, LiveParameters, SyntheticParameters
+from sq_perception.nodes.live_parameters import LiveParameters
+from sq_perception.nodes.parameters import RAW, SyntheticParameters
 from sq_perception.recordings import camera_file
 from sq_perception.recordings.frame_source import FrameSource, SourceFrame, generated, recorded, recordings
 from sq_perception.recordings.publication import CAMERA_FRAME, CUBE_FRAME, depth_message, truth_array
@@ -143,7 +144,7 @@ class SyntheticDepthNode(Node):
             self._mask.publish(labels_to_message(labels, header))
         if self._packed is not None and not frame.is_cube and self._packed.get_subscription_count():
             self._packed.publish(packed(depth, header, encoding))
-        self._image.publish(depth_message(depth, header, encoding, frame.is_cube))
+        self._image.publish(depth_message(depth, header, encoding))
 
 
 def _camera_info(frame: SourceFrame, header: Header) -> CameraInfo:

@@ -138,7 +138,7 @@ class Tracking:
             if stamp < self._untracked_stamp:
                 self._poses.clear()  # a recording begins again
             self._untracked_stamp = stamp
-            return publication.untracked(recovery)
+            return publication.identified(recovery)
         if self._origin not in (None, origin):
             self._forget("bodies come from another method, refine, consensus or model from now on")
         self._origin = origin
@@ -169,7 +169,7 @@ class Tracking:
         if self._session.tally.resets > resets:
             self._node.get_logger().info(f"the stamps jumped back to {stamp:.3f} s: tracks are forgotten, ids go on")
             self._poses.clear()
-        return publication.tracked(recovery, list(tracks), self._session.hidden)
+        return publication.identified(recovery, tracks, self._session.hidden)
 
     def _forget(self, why: str) -> None:
         self._session.reset()

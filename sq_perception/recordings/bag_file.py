@@ -35,6 +35,7 @@ from sq_msgs_py import depth_image
 from sq_perception.imaging import compressed_depth, unit_cube
 from sq_perception.imaging.calibration import Calibration, Treatment
 from sq_perception.imaging.camera import Projection
+from sq_perception.recordings import publication
 from sq_perception.recordings.bag_reader import CAMERA_INFO, COMPRESSED, IMAGE, BagReader, Message, said
 from sq_perception.recordings.frame_file import MILLIMETRES, FrameError, Reading, RecordedFrame, Stamp
 
@@ -256,23 +257,15 @@ class RecordedBag:
             yield FrameError(f"{self._path}: {self.topic} at {message.stamp}: {said(error)}")
 
     def _decoded(self, message: Message, info: Message | None) -> RecordedFrame:
-        warning = ""
-        encoding = str(getattr(message.content, "encoding", ""))
-        name, labels = f"{self._name}_{message.stamp}", None
+        depth, encoding = publication.depth_of(message.content, self._orthographic)
+        name, warning = f"{self._name}_{message.stamp}", ""
+        labels = self._labels(message.stamp, name, depth)
         if self._orthographic:
-            grey = depth_image.grey_from_message(message.content)
-            depth, camera = unit_cube.depth_from_grey(grey), unit_cube.camera(grey.shape[1], grey.shape[0])
-            labels = self._labels(message.stamp, name, depth)
+            camera = unit_cube.camera(depth.shape[1], depth.shape[0])
         else:
-            if message.is_packed:
-                depth = compressed_depth.decode(message.content.format, message.content.data)
-                encoding = compressed_depth.encoding(message.content.format) or ""
-            else:
-                depth = depth_image.depth_from_message(message.content)
             if self._reading.scale is not None:
                 depth = depth * np.float32((MILLIMETRES if encoding.startswith("16UC1") else 1.0) / self._reading.scale)
             calibration = self._calibration(info, depth)
-            labels = self._labels(message.stamp, name, depth)
             labels = None if labels is None else calibration.rectified_labels(labels)
             depth, camera = calibration.rectified(depth), calibration.camera
             warning = f"{self._path}: {self.topic}: {calibration.note}" if calibration.note else ""
@@ -282,7 +275,6 @@ class RecordedBag:
                 camera,
                 labels,
                 name,
-                is_cube=self._orthographic,
                 stamp=message.stamp,
                 topic=self.topic,
                 frame_id=message.content.header.frame_id,

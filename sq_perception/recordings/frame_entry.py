@@ -10,6 +10,7 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+from sq_perception.fitting.fit import Status
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
 from sq_perception.recordings.frame_file import RecordedFrame
@@ -21,15 +22,16 @@ def frame_entry(
     file: str,
     frame: RecordedFrame,
     recovery: FrameRecovery,
-    tracks: Sequence[Followed | None] | None,
+    tracks: Sequence[Followed] | None,
     has_masks: bool,
 ) -> dict[str, Any]:
-    """The element; ``tracks`` has one entry for each body, None for a failed one, and is None without tracking.
+    """The element; ``tracks`` are those of the bodies that did not fail, None without tracking.
 
     ``has_masks`` says whether labels are those of masks that came with the frame.
     """
-    bodies = []
-    for body, track in zip(recovery.bodies, tracks or [None] * len(recovery.bodies), strict=True):
+    bodies, left = [], iter(tracks or ())
+    for body in recovery.bodies:
+        track = None if body.status == Status.FAILED else next(left, None)
         superquadric = in_result_frame(body.superquadric, frame.is_cube)
         bodies.append(
             {

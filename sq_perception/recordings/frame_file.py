@@ -74,8 +74,6 @@ class RecordedFrame:
         Instance masks, 0 for background.
     name : str
         The file's name; of a frame in a bag, the bag's and the stamp.
-    is_cube : bool
-        A view of the unit cube: results belong in the cube frame (:func:`unit_cube.cube_from_optical`).
     plane : (4,) or None
         Support plane of the recording, height above it = n.p + d.
     stamp : Stamp or None
@@ -96,7 +94,6 @@ class RecordedFrame:
     camera: Camera
     labels: np.ndarray | None
     name: str
-    is_cube: bool
     plane: np.ndarray | None = None
     stamp: Stamp | None = None
     topic: str = ""
@@ -105,6 +102,11 @@ class RecordedFrame:
     encoding: str = ""
     received: int | None = None
     has_free_space: bool = True
+
+    @property
+    def is_cube(self) -> bool:
+        """Whether it is a view of the unit cube: results belong in the cube frame (:mod:`unit_cube`)."""
+        return not self.camera.is_pinhole
 
 
 @dataclass(frozen=True)
@@ -228,12 +230,19 @@ def read(
     if not path.is_file():
         raise FrameError(f"{path}: no such file")
     reading = reading or Reading()
-    return reading.of(replace(_read(path, camera_info, projection, distortion, reading), stamp=stamp_of(path)))
+    try:
+        frame = _read(path, camera_info, projection, distortion, reading)
+    except FrameError:
+        raise
+    except ValueError as error:
+        raise FrameError(f"{path}: {error}") from error
+    return reading.of(replace(frame, stamp=stamp_of(path)))
 
 
 def _read(
     path: Path, camera_info: str | Path | None, projection: Projection, distortion: Treatment, reading: Reading
 ) -> RecordedFrame:
+    """The frame; a ValueError that is no FrameError is about the file."""
     suffix = path.suffix.lower()
     if suffix == ".npz":
         frame = _read_npz(path, projection, reading.scale)
@@ -242,25 +251,24 @@ def _read(
     if suffix in cloud_file.SUFFIXES:
         return _read_cloud(path, reading)
     if suffix not in SUFFIXES:
-        raise FrameError(f"{path}: expected a name that ends in {', '.join(SUFFIXES)}")
-    try:
-        image = {".npy": npy_array, ".exr": exr_image}.get(suffix, grey_image)(path)
-    except UnpackingError as error:
-        raise FrameError(f"{path}: {error}") from error
+        raise ValueError(f"expected a name that ends in {', '.join(SUFFIXES)}")
+    image = {".npy": npy_array, ".exr": exr_image}.get(suffix, grey_image)(path)
     if image.ndim != 2 or not image.size:
-        raise FrameError(f"{path}: expected an image (height, width), got {image.shape}")
+        raise ValueError(f"expected an image (height, width), got {image.shape}")
     if projection == "orthographic":
         if image.dtype not in (np.uint8, np.uint16):
-            raise FrameError(f"{path}: expected 8 or 16 bit, got {image.dtype}")
-        return replace(_from_grey(path, image), labels=reading.labels(path.stem, image))
+            raise ValueError(f"expected 8 or 16 bit, got {image.dtype}")
+        depth, camera = unit_cube.depth_from_grey(image), unit_cube.camera(image.shape[1], image.shape[0])
+        encoding = "mono8" if image.dtype == np.uint8 else "mono16"
+        return RecordedFrame(depth, camera, reading.labels(path.stem, image), path.name, encoding=encoding)
     is_metric = image.dtype.kind == "f"
     if not is_metric and image.dtype != np.uint16:
-        raise FrameError(
-            f"{path}: a pinhole depth image has 16 bit (millimetres) or floats (metres), this one {image.dtype}; "
+        raise ValueError(
+            f"a pinhole depth image has 16 bit (millimetres) or floats (metres), this one {image.dtype}; "
             "for grey images of the thesis' kind choose the orthographic projection"
         )
     if camera_info is None:
-        raise FrameError(f"{path}: a depth image needs a camera_info file with the camera's intrinsics")
+        raise ValueError("a depth image needs a camera_info file with the camera's intrinsics")
     info = camera_info_of(camera_info, image.shape[1], image.shape[0])
     calibration = calibrated(camera_info, info, path.with_suffix("").as_posix(), distortion)
     scale, warnings = 1.0 if is_metric else MILLIMETRES, [f"{camera_info}: {calibration.note}"] * bool(calibration.note)
@@ -274,17 +282,11 @@ def _read(
         )
     with np.errstate(invalid="ignore", over="ignore"):
         depth = np.where(np.isfinite(image) & (image > 0), image / np.float32(scale), np.nan).astype(np.float32)
-    try:
-        depth = calibration.rectified(depth)
-        labels = reading.labels(path.stem, image)
-        labels = None if labels is None else calibration.rectified_labels(labels)
-    except FrameError:
-        raise
-    except ValueError as error:
-        raise FrameError(f"{path}: {error}") from error
+    depth, labels = calibration.rectified(depth), reading.labels(path.stem, image)
+    labels = None if labels is None else calibration.rectified_labels(labels)
     encoding = "16UC1" if scale == MILLIMETRES and not is_metric else "32FC1"
     warning = "; ".join(warnings)
-    return RecordedFrame(depth, calibration.camera, labels, path.name, False, warning=warning, encoding=encoding)
+    return RecordedFrame(depth, calibration.camera, labels, path.name, warning=warning, encoding=encoding)
 
 
 def stamp_of(path: Path) -> Stamp | None:
@@ -294,15 +296,10 @@ def stamp_of(path: Path) -> Stamp | None:
 
 
 def _read_cloud(path: Path, reading: Reading) -> RecordedFrame:
-    try:
-        depth, camera, is_image = cloud_file.as_image(cloud_file.read_points(path) / (reading.scale or 1.0))
-    except UnpackingError as error:
-        raise FrameError(f"{path}: {error}") from error
+    depth, camera, is_image = cloud_file.as_image(cloud_file.read_points(path) / (reading.scale or 1.0))
     labels = reading.labels(path.stem, depth) if is_image else None
     warning = "" if is_image else cloud_file.UNORGANISED
-    return RecordedFrame(
-        depth, camera, labels, path.name, False, warning=warning, encoding="32FC1", has_free_space=is_image
-    )
+    return RecordedFrame(depth, camera, labels, path.name, warning=warning, encoding="32FC1", has_free_space=is_image)
 
 
 def _likely_mistake(frame: RecordedFrame) -> str:
@@ -322,64 +319,36 @@ def _likely_mistake(frame: RecordedFrame) -> str:
 
 
 def _read_npz(path: Path, projection: Projection, scale: float | None) -> RecordedFrame:
-    try:
-        fields = npz_arrays(path, ("depth", "K", "labels", "plane", "projection"))
-    except UnpackingError as error:
-        raise FrameError(f"{path}: {error}") from error
+    fields = npz_arrays(path, ("depth", "K", "labels", "plane", "projection"))
     if "depth" not in fields:
-        raise FrameError(f"{path}: expected a field 'depth' in metres")
-    depth = fields["depth"]
+        raise ValueError("expected a field 'depth' in metres")
+    depth, labels, plane = fields["depth"], fields.get("labels"), fields.get("plane")
     if depth.ndim != 2 or depth.dtype.kind != "f" or depth.size == 0:
-        raise FrameError(f"{path}: depth: expected floats (height, width) in metres, got {depth.dtype} {depth.shape}")
-    labels = _labels(path, fields.get("labels"), depth)
+        raise ValueError(f"depth: expected floats (height, width) in metres, got {depth.dtype} {depth.shape}")
+    if labels is not None:
+        if labels.shape != depth.shape or labels.dtype.kind not in "iub":
+            expected = f"expected integers of the depth's shape {depth.shape}"
+            raise ValueError(f"labels: {expected}, got {labels.dtype} {labels.shape}")
+        labels = labels.astype(np.int32)
     height, width = depth.shape
     is_cube = str(fields.get("projection", "")) == "orthographic"
     if projection == "orthographic" or is_cube:
         depth = np.where(np.isfinite(depth), depth, np.nan).astype(np.float32)
         has_camera = "K" in fields and not is_cube
         warning = "orthographic was asked for, and a file has the matrix K of a pinhole camera" if has_camera else ""
-        return RecordedFrame(depth, _cube_camera(path, width, height), labels, path.name, is_cube=True, warning=warning)
+        return RecordedFrame(depth, unit_cube.camera(width, height), labels, path.name, warning=warning)
     if "K" not in fields:
-        raise FrameError(f"{path}: expected a field 'K', the 3 x 3 camera matrix")
+        raise ValueError("expected a field 'K', the 3 x 3 camera matrix")
     if fields["K"].shape == (3, 3) and is_transposed(fields["K"].ravel()):
-        raise FrameError(f"{path}: K: expected 0 0 1 in its last row; it seems to be transposed")
+        raise ValueError("K: expected 0 0 1 in its last row; it seems to be transposed")
     try:
         camera = Camera.from_matrix(fields["K"], width, height)
     except (ValueError, TypeError) as error:
-        raise FrameError(f"{path}: K: {error}") from error
+        raise ValueError(f"K: {error}") from error
     with np.errstate(invalid="ignore"):
         depth = np.where(np.isfinite(depth) & (depth > 0), depth / (scale or 1.0), np.nan).astype(np.float32)
-    plane = _plane(path, fields.get("plane"))
-    return RecordedFrame(depth, camera, labels, path.name, is_cube=False, plane=plane, encoding="32FC1")
-
-
-def _labels(path: Path, labels: np.ndarray | None, depth: np.ndarray) -> np.ndarray | None:
-    if labels is None:
-        return None
-    if labels.shape != depth.shape or labels.dtype.kind not in "iub":
-        raise FrameError(
-            f"{path}: labels: expected integers of the depth's shape {depth.shape}, got {labels.dtype} {labels.shape}"
-        )
-    return labels.astype(np.int32)
-
-
-def _plane(path: Path, plane: np.ndarray | None) -> np.ndarray | None:
-    if plane is None:
-        return None
-    if plane.shape != (4,) or plane.dtype.kind not in "fiu" or not np.isfinite(plane).all():
-        raise FrameError(f"{path}: plane: expected four finite numbers, got {plane.dtype} {plane.shape}")
-    return plane.astype(float)
-
-
-def _from_grey(path: Path, image: np.ndarray) -> RecordedFrame:
-    height, width = image.shape
-    depth, camera = unit_cube.depth_from_grey(image), _cube_camera(path, width, height)
-    encoding = "mono8" if image.dtype == np.uint8 else "mono16"
-    return RecordedFrame(depth, camera, None, path.name, is_cube=True, encoding=encoding)
-
-
-def _cube_camera(path: Path, width: int, height: int) -> Camera:
-    try:
-        return unit_cube.camera(width, height)
-    except ValueError as error:
-        raise FrameError(f"{path}: {error}") from error
+    if plane is not None:
+        if plane.shape != (4,) or plane.dtype.kind not in "fiu" or not np.isfinite(plane).all():
+            raise ValueError(f"plane: expected four finite numbers, got {plane.dtype} {plane.shape}")
+        plane = plane.astype(float)
+    return RecordedFrame(depth, camera, labels, path.name, plane=plane, encoding="32FC1")

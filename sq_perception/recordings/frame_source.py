@@ -16,8 +16,9 @@ import numpy as np
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.calibration import Calibration
-from sq_perception.imaging.camera import Camera, Projection
+from sq_perception.imaging.camera import Projection
 from sq_perception.recordings import frame_file
+from sq_perception.recordings.frame_file import RecordedFrame
 from sq_perception.simulation.scenes import table_scene, thesis_scene
 from sq_perception.simulation.sensor_noise import IDEAL, Ideal, preset
 
@@ -27,29 +28,18 @@ _SCENES, _NOISE = 1, 2
 
 
 @dataclass(frozen=True, eq=False)
-class SourceFrame:
+class SourceFrame(RecordedFrame):
     """One image.
 
     Attributes
     ----------
-    depth : float32 (height, width)
-        Metres in the optical frame, NaN where nothing is seen.
-    camera : Camera
-    labels : int32 (height, width) or None
     truth : Superquadric or None
         The bodies (n,) in the frame that results are published in: cube frame if ``is_cube``, else optical frame.
-    is_cube : bool
-    name : str
     calibration : Calibration or None
         Of the camera that publishes the image, where that distorts.
     """
 
-    depth: np.ndarray
-    camera: Camera
-    labels: np.ndarray | None
-    truth: Superquadric | None
-    is_cube: bool
-    name: str
+    truth: Superquadric | None = None
     calibration: Calibration | None = None
 
 
@@ -120,7 +110,8 @@ def generated(
             distorting = None if calibration is None or calibration.rectification is None else calibration
         depth, labels = made.render()
         shown = labels if with_labels else None
-        return SourceFrame(depth, made.camera, shown, truth, scene == "thesis", f"{scene} scene {position}", distorting)
+        name = f"{scene} scene {position}"
+        return SourceFrame(depth, made.camera, shown, name, truth=truth, calibration=distorting)
 
     return make
 
@@ -133,7 +124,7 @@ def recorded(
     def make(position: int) -> SourceFrame:
         frame = frame_file.read(paths[position], camera_info, projection)
         labels = frame.labels if with_labels else None
-        return SourceFrame(frame.depth, frame.camera, labels, None, frame.is_cube, frame.name)
+        return SourceFrame(frame.depth, frame.camera, labels, frame.name)
 
     return make
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from sq_msgs_py import poses
-from sq_msgs_py.depth_image import depth_to_message, grey_to_message
+from sq_msgs_py.depth_image import depth_from_message, depth_to_message, grey_from_message, grey_to_message
 from sq_msgs_py.markers import markers
 from sq_msgs_py.message_types import MessageTypes, installed
 from sq_msgs_py.superquadrics import CONVERGED, Reason, SuperquadricArray
@@ -25,7 +25,7 @@ from sq_perception.fitting.covariance import undetermined
 from sq_perception.fitting.fit import Fit, Status
 from sq_perception.geometry.mesh import MARKER_RESOLUTION, outline, triangles
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.imaging import unit_cube
+from sq_perception.imaging import compressed_depth, unit_cube
 from sq_perception.recovery.recoverer import FrameRecovery
 from sq_perception.tracking.session import FIRST_FAILED_ID, Followed
 
@@ -88,65 +88,28 @@ class Identified:
         return f"{count} {'body' if count == 1 else 'bodies'} {took}; " + "; ".join(parts)
 
 
-@dataclass(frozen=True)
-class MarkerStyle:
-    """How markers look.
+def identified(
+    recovery: FrameRecovery, tracks: Sequence[Followed] | None = None, hidden: tuple[int, ...] = ()
+) -> Identified:
+    """Bodies and ids of their tracks, of which there is one for each body that did not fail, in their order.
 
-    Attributes
-    ----------
-    colours
-        By id, or by score from red (0) to green (1).
-    alpha
-        Opacity of the surfaces.
-    line_width
-        Of the outlines, metres.
-
-    Raises
-    ------
-    ValueError
-        For colours by anything else.
+    Without tracks bodies are the frame's, and ids their labels.
     """
-
-    colours: str = "id"
-    alpha: float = 0.7
-    line_width: float = 0.002
-
-    def __post_init__(self) -> None:
-        if self.colours not in ("id", "score"):
-            raise ValueError(f"colours: expected id or score, got {self.colours!r}")
-
-
-DEFAULT_STYLE = MarkerStyle()
-"""A node's, unless its parameters say otherwise."""
-
-
-def untracked(recovery: FrameRecovery) -> Identified:
-    """Ids are labels."""
-    reasons = tuple(_reason(one.fit, one.superquadric) for one in recovery.bodies)
-    return Identified(recovery, tuple(one.label for one in recovery.bodies), reasons=reasons)
-
-
-def tracked(recovery: FrameRecovery, tracks: Sequence[Followed], hidden: tuple[int, ...] = ()) -> Identified:
-    """Bodies and ids of their tracks, of which there is one for each body that did not fail, in their order."""
-    found = iter(tracks)
-    bodies, ids, seen, fused, reasons = [], [], [], [], []
+    if tracks is None:
+        reasons = tuple(_reason(one.fit, one.superquadric) for one in recovery.bodies)
+        return Identified(recovery, tuple(one.label for one in recovery.bodies), reasons=reasons)
+    left = iter(tracks)
+    bodies, known = [], []
     for one in recovery.bodies:
         if one.status == Status.FAILED:
             bodies.append(one)
-            ids.append(FIRST_FAILED_ID + one.label)
-            seen.append(0)
-            fused.append(False)
-            reasons.append(0)
+            known.append((FIRST_FAILED_ID + one.label, 0, False, 0))
             continue
-        track = next(found)
-        fit = replace(one.fit, superquadric=track.superquadric, covariance=track.covariance)
-        bodies.append(replace(one, fit=fit))
-        ids.append(track.id)
-        seen.append(track.seen)
-        fused.append(track.is_fused)
-        reasons.append(_reason(one.fit, track.superquadric))
-    shown = replace(recovery, bodies=tuple(bodies))
-    return Identified(shown, tuple(ids), hidden, tuple(seen), tuple(fused), tuple(reasons))
+        track = next(left)
+        bodies.append(replace(one, fit=replace(one.fit, superquadric=track.superquadric, covariance=track.covariance)))
+        known.append((track.id, track.seen, track.is_fused, _reason(one.fit, track.superquadric)))
+    ids, seen, fused, reasons = zip(*known, strict=True) if known else ((), (), (), ())
+    return Identified(replace(recovery, bodies=tuple(bodies)), ids, hidden, seen, fused, reasons)
 
 
 def _reason(fit: Fit, shown: Superquadric) -> int:
@@ -204,9 +167,12 @@ class Findings:
         )
 
     def markers(
-        self, previous_ids: Iterable[int] = (), style: MarkerStyle = DEFAULT_STYLE, types: MessageTypes = installed
+        self, previous_ids: Iterable[int] = (), by_score: bool = False, types: MessageTypes = installed, **look: Any
     ) -> Any:
-        """A MarkerArray of the bodies that did not fail; markers of ``previous_ids`` that are gone are deleted."""
+        """A MarkerArray of the bodies that did not fail; markers of ``previous_ids`` that are gone are deleted.
+
+        Colours are by id, or by score from red (0) to green (1); ``look`` as of :func:`sq_msgs_py.markers.markers`.
+        """
         shown = self.array.recovered
         turns = poses.matrices(poses.unit_quaternions(shown.rotation))
         surfaces = []
@@ -215,18 +181,11 @@ class Findings:
             lines = outline(_at_origin(shown.size[k], shown.shape[k]))
             surfaces.append((vertices @ turn + centre, faces, lines @ turn + centre))
         colours = None
-        if style.colours == "score" and len(shown):
+        if by_score:
             share = np.clip(np.nan_to_num(shown.score), 0, 1)[:, None]
             colours = (1 - share) * _WORST + share * _BEST
         return markers(
-            surfaces,
-            self.shown_ids,
-            self.header,
-            colours=colours,
-            alpha=style.alpha,
-            line_width=style.line_width,
-            previous_ids=previous_ids,
-            types=types,
+            surfaces, self.shown_ids, self.header, colours=colours, previous_ids=previous_ids, types=types, **look
         )
 
 
@@ -234,13 +193,11 @@ def findings(found: Identified, header: Any, is_cube: bool) -> Findings:
     """What a frame showed, in the frame of its image, whose header it is."""
     recovery = found.recovery
     array = superquadric_array(found, is_cube)
-    covariances = np.full((len(array), 6, 6), np.nan)
-    for k, one in enumerate(recovery.bodies):
-        covariances[k] = one.covariance[_CENTRE_AND_TURN, _CENTRE_AND_TURN]
+    covariances = np.array([one.covariance[_CENTRE_AND_TURN, _CENTRE_AND_TURN] for one in recovery.bodies])
     change = np.zeros((len(array), 6, 6))
     change[:, :3, :3] = np.diag([1.0, -1.0, -1.0]) if is_cube else np.eye(3)
     change[:, 3:, 3:] = poses.matrices(poses.unit_quaternions(array.rotation))
-    return Findings(array, change @ covariances @ np.swapaxes(change, 1, 2), header, recovery.plane)
+    return Findings(array, change @ covariances.reshape(-1, 6, 6) @ np.swapaxes(change, 1, 2), header, recovery.plane)
 
 
 def superquadric_array(found: Identified, is_cube: bool) -> SuperquadricArray:
@@ -313,11 +270,32 @@ def truth_array(bodies: Superquadric) -> SuperquadricArray:
     )
 
 
-def depth_message(depth: np.ndarray, header: Any, encoding: str, is_cube: bool, types: MessageTypes = installed) -> Any:
-    """An Image of depth (height, width) in metres, NaN or inf for nothing; of the cube as grey values."""
-    if is_cube:
+def depth_message(depth: np.ndarray, header: Any, encoding: str, types: MessageTypes = installed) -> Any:
+    """An Image of depth (height, width) in metres, NaN or inf for nothing; mono8 and mono16: of the cube."""
+    if encoding in _GREY_TYPES:
         return grey_to_message(unit_cube.grey_from_depth(depth, _GREY_TYPES[encoding]), header, types)
     return depth_to_message(np.where(np.isfinite(depth), depth, np.nan), header, encoding, types)
+
+
+def depth_of(message: Any, is_cube: bool) -> tuple[np.ndarray, str]:
+    """Depth (height, width) in metres, NaN for nothing, of an image message, and its encoding before it was packed.
+
+    Parameters
+    ----------
+    message
+        sensor_msgs/Image of 16UC1 or 32FC1, or CompressedImage of the compressedDepth transport; if ``is_cube`` Image
+        of mono8 or mono16, grey values of the unit cube.
+
+    Raises
+    ------
+    ValueError
+        For anything else.
+    """
+    if is_cube:
+        return unit_cube.depth_from_grey(grey_from_message(message)), str(message.encoding)
+    if hasattr(message, "format"):
+        return compressed_depth.decode(message.format, message.data), compressed_depth.encoding(message.format) or ""
+    return depth_from_message(message), str(message.encoding)
 
 
 def _at_origin(size: np.ndarray, shape: np.ndarray) -> Superquadric:

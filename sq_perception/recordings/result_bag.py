@@ -107,7 +107,7 @@ class ResultBag:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
         self.close(whole=error is None)
 
-    def add(self, frame: RecordedFrame, recovery: FrameRecovery, tracks: Sequence[Followed | None] | None) -> None:
+    def add(self, frame: RecordedFrame, recovery: FrameRecovery, tracks: Sequence[Followed] | None) -> None:
         """Write a frame and what was recovered from it.
 
         Parameters
@@ -115,7 +115,7 @@ class ResultBag:
         frame, recovery
             Of each other.
         tracks
-            For each body its track, None for a failed one; None if bodies are not tracked.
+            Of each body that did not fail, in their order; None if bodies are not tracked.
 
         Raises
         ------
@@ -124,11 +124,7 @@ class ResultBag:
         OSError
             If the disk is full; the file is then closed with what there is.
         """
-        found = (
-            publication.untracked(recovery)
-            if tracks is None
-            else publication.tracked(recovery, [one for one in tracks if one is not None])
-        )
+        found = publication.identified(recovery, tracks)
         stamp = self._stamp(frame)
         received = frame.received if frame.received is not None else stamp.sec * _SECOND + stamp.nanosec
         shown = publication.findings(found, self._header(frame, stamp), frame.is_cube)
@@ -165,26 +161,23 @@ class ResultBag:
     def _messages(self, frame: RecordedFrame, found: Identified, shown: Findings) -> list[tuple[str, Any]]:
         """Topics and messages of a frame."""
         types, header, messages = bag_messages.types, shown.header, []
+        encoding = frame.encoding or ("mono16" if frame.is_cube else "32FC1")
         if "depth" in self._images:
             topic = _depth_topic(frame.topic)
-            encoding = frame.encoding or ("mono16" if frame.is_cube else "32FC1")
             if not frame.is_cube:
-                camera = frame.camera
-                info = depth_image.intrinsics_to_message(intrinsics(camera), header, types)
+                info = depth_image.intrinsics_to_message(intrinsics(frame.camera), header, types)
                 messages.append((camera_info_topic(topic), info))
-            depth = publication.depth_message(frame.depth, header, encoding, frame.is_cube, types)
-            messages.append((topic, depth))
+            messages.append((topic, publication.depth_message(frame.depth, header, encoding, types)))
         if "labels" in self._images:
             labels = np.maximum(found.recovery.labels, 0)
             # Not 16UC1, which would look like depth to whoever reads the file.
-            encoding = "mono16" if labels.max(initial=0) <= np.iinfo(np.uint16).max else "32SC1"
-            messages.append((LABELS, depth_image.labels_to_message(labels, header, encoding, types)))
+            kind = "mono16" if labels.max(initial=0) <= np.iinfo(np.uint16).max else "32SC1"
+            messages.append((LABELS, depth_image.labels_to_message(labels, header, kind, types)))
         messages.append((SUPERQUADRICS, to_message(shown.array, header, types)))
         messages.append((MARKERS, shown.markers(self._shown_ids, types=types)))
         if "rendered" in self._images:
-            encoding = frame.encoding or ("mono16" if frame.is_cube else "32FC1")
             depth, _ = render_recovery(found.recovery, frame.camera)
-            messages.append((RENDERED, publication.depth_message(depth, header, encoding, frame.is_cube, types)))
+            messages.append((RENDERED, publication.depth_message(depth, header, encoding, types)))
         return messages
 
     def _header(self, frame: RecordedFrame, stamp: Stamp) -> Any:

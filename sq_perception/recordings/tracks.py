@@ -9,7 +9,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from sq_perception.fitting.fit import Status
 from sq_perception.recordings.frame_file import RecordedFrame
 from sq_perception.recovery.recoverer import FrameRecovery
 from sq_perception.tracking.session import Followed, TrackingSession
@@ -28,8 +27,8 @@ class RecordedTracks:
         self._number = 0
         self._warned = False
 
-    def follow(self, file: str, frame: RecordedFrame, recovery: FrameRecovery) -> list[Followed | None]:
-        """For each of the frame's bodies what is known of its track, None for failed ones; ``file`` is its source."""
+    def follow(self, file: str, frame: RecordedFrame, recovery: FrameRecovery) -> tuple[Followed, ...]:
+        """What is known of the track of each body that did not fail, in their order; ``file`` is the frame's source."""
         sequence = (file, frame.topic) if frame.topic else (str(Path(file).parent), "")
         if sequence != self._sequence:
             self._session.reset()
@@ -39,5 +38,4 @@ class RecordedTracks:
         if frame.stamp is None and not self._warned:
             self._warn(f"{file}: no stamp; such frames are taken to be {INTERVAL:g} s apart")
             self._warned = True
-        tracks = iter(self._session.follow(recovery.recovered, stamp, camera=frame.camera, depth=frame.depth))
-        return [None if one.status == Status.FAILED else next(tracks) for one in recovery.bodies]
+        return self._session.follow(recovery.recovered, stamp, camera=frame.camera, depth=frame.depth)

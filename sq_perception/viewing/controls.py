@@ -1,6 +1,7 @@
 """How a parameter is shown: the control that fits what its descriptor says, and the value as the node wants it.
 
-A control is made from plain values, so that this module needs no ROS.  The rules:
+A control is made from what the fields of a rcl_interfaces/ParameterDescriptor say and the value that the node holds,
+None where it is not set; nothing is imported for that.  The rules:
 
     bool                                          a check box
     string with "one of: a, b" as constraint      a list to choose from
@@ -16,7 +17,7 @@ it.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -33,31 +34,6 @@ _SLIDER_STEPS = 100
 _SLIDER_SPAN = 1.0
 QUICK, TYPED = 0.0, 0.8
 """Seconds without another change before a value is sent: at once, or when the typing has ended."""
-
-
-@dataclass(frozen=True)
-class Description:
-    """A parameter as its node describes it.
-
-    Attributes
-    ----------
-    value
-        bool, int, float, str, or a list; None where it has not been set.
-    low, high, step
-        Of its range; None where there is none, a step of 0 for any.
-    is_float_range
-        Whether that range is one of floats.
-    """
-
-    name: str
-    value: Any
-    text: str = ""
-    constraints: str = ""
-    read_only: bool = False
-    low: float | None = None
-    high: float | None = None
-    step: float = 0.0
-    is_float_range: bool = False
 
 
 @dataclass(frozen=True)
@@ -108,49 +84,49 @@ class Control:
         return str(value)
 
 
-def control(about: Description) -> Control:
-    """The control of a parameter; see the module for the rules."""
-    hint = " ".join(part for part in (about.text, f"({about.constraints})" if about.constraints else "") if part)
+def control(about: Any, value: Any) -> Control:
+    """The control of a parameter, ``about`` its descriptor; see the module for the rules."""
+    constraints: str = about.additional_constraints
+    hint = " ".join(part for part in (about.description, f"({constraints})" if constraints else "") if part)
     group: Group = "start" if about.read_only else "live"
     if "." in about.name or about.name in _OF_EVERY_NODE:
         group = "other"
-    made = Control(about.name, "fixed", _plain(about.value), hint, group)
+    made = Control(about.name, "fixed", _plain(value), hint, group)
     if about.read_only or group == "other":
         return made
-    if isinstance(about.value, bool):
-        return replace(made, kind="bool", value=about.value)
-    if isinstance(about.value, str):
-        choices = _choices(about.constraints)
+    if isinstance(value, bool):
+        return replace(made, kind="bool", value=value)
+    if isinstance(value, str):
+        choices = _choices(constraints)
         if choices:
-            choices = choices if about.value in choices else (*choices, about.value)
-            return replace(made, kind="choice", value=about.value, choices=choices)
-        return replace(made, kind="text", value=about.value, patience=TYPED)
-    if isinstance(about.value, (int, float)) and math.isfinite(about.value):
-        return _number(about, made)
+            choices = choices if value in choices else (*choices, value)
+            return replace(made, kind="choice", value=value, choices=choices)
+        return replace(made, kind="text", value=value, patience=TYPED)
+    if isinstance(value, (int, float)) and math.isfinite(value):
+        return _number(about, value, made)
     return made
 
 
-def arranged(descriptions: Sequence[Description]) -> list[Control]:
-    """Controls by group, in the order of GROUPS, and in the given order within each."""
-    controls = [control(about) for about in descriptions]
+def arranged(parameters: Iterable[tuple[Any, Any]]) -> list[Control]:
+    """Controls of descriptors and values by group, in the order of GROUPS, and in the given order within each."""
+    controls = [control(about, value) for about, value in parameters]
     return [one for group in GROUPS for one in controls if one.group == group]
 
 
-def _number(about: Description, made: Control) -> Control:
-    is_float = about.is_float_range or isinstance(about.value, float)
-    value = float(about.value) if is_float else int(about.value)
-    low, high = about.low, about.high
-    if low is None or high is None or not low < high:
-        return replace(made, kind="number", value=value, is_float=is_float, patience=TYPED)
+def _number(about: Any, value: float, made: Control) -> Control:
+    is_float = bool(about.floating_point_range) or isinstance(value, float)
+    kind = float if is_float else int
+    made = replace(made, kind="number", value=kind(value), is_float=is_float, patience=TYPED)
+    ranges = [*about.floating_point_range, *about.integer_range]
+    if not ranges or not ranges[0].from_value < ranges[0].to_value:
+        return made
     # What the node holds is shown, even where its descriptor rules it out.
-    low, high = min(low, value), max(high, value)
+    low, high = kind(min(ranges[0].from_value, value)), kind(max(ranges[0].to_value, value))
     short = high - low <= (_SLIDER_SPAN if is_float else _SLIDER_STEPS)
-    step = about.step or (10.0 ** (math.floor(math.log10(high - low)) - 2) if is_float else 1)
+    step = float(ranges[0].step) or (10.0 ** (math.floor(math.log10(high - low)) - 2) if is_float else 1)
     if short and step <= high - low:
-        return replace(
-            made, kind="slider", value=value, is_float=is_float, low=low, high=high, step=step, patience=0.15
-        )
-    return replace(made, kind="number", value=value, is_float=is_float, low=low, high=high, patience=TYPED)
+        return replace(made, kind="slider", low=low, high=high, step=step, patience=0.15)
+    return replace(made, low=low, high=high)
 
 
 def _choices(constraints: str) -> tuple[str, ...]:

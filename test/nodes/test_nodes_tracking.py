@@ -24,7 +24,8 @@ from sq_msgs_py.depth_image import depth_to_message
 from sq_perception.fitting.fit import Fit, Status
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.nodes.parameters import ParameterError, RecoverParameters
+from sq_perception.nodes.live_parameters import ParameterError
+from sq_perception.nodes.parameters import RecoverParameters
 from sq_perception.recovery.recoverer import Recovery
 
 DEVIATIONS = np.diag(np.square([0.002] * 3 + [0.03] * 2 + [0.001] * 3 + [0.02] * 3))

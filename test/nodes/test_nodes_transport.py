@@ -24,7 +24,8 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.distortion import Distortion
 from sq_perception.imaging.rectification import Rectification
 from sq_perception.nodes.frame import decode, image_topic, packed, size_of
-from sq_perception.nodes.parameters import ParameterError, SyntheticParameters
+from sq_perception.nodes.live_parameters import ParameterError
+from sq_perception.nodes.parameters import SyntheticParameters
 from sq_perception.nodes.synthetic_depth_node import SyntheticDepthNode, frame_source
 
 PATIENCE = 20.0

@@ -18,14 +18,8 @@ from rclpy.exceptions import InvalidParameterValueException
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 
-from sq_perception.nodes.parameters import (
-    KINDS,
-    LiveParameters,
-    ParameterError,
-    RecoverParameters,
-    SyntheticParameters,
-    describe,
-)
+from sq_perception.nodes.live_parameters import LiveParameters, ParameterError, describe
+from sq_perception.nodes.parameters import KINDS, RecoverParameters, SyntheticParameters
 
 
 @pytest.fixture(scope="module")

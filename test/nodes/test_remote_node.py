@@ -24,7 +24,8 @@ from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
 from rclpy.node import Node
 
-from sq_perception.nodes.parameters import FitterParameters, LiveParameters
+from sq_perception.nodes.live_parameters import LiveParameters
+from sq_perception.nodes.parameters import FitterParameters
 from sq_perception.nodes.remote_node import RemoteNode
 from sq_perception.viewing.controls import Control
 

@@ -10,7 +10,8 @@ pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
 
 from sq_perception.imaging import unit_cube
-from sq_perception.nodes.parameters import ParameterError, SyntheticParameters
+from sq_perception.nodes.live_parameters import ParameterError
+from sq_perception.nodes.parameters import SyntheticParameters
 from sq_perception.nodes.synthetic_depth_node import frame_source
 from sq_perception.recordings.frame_file import FrameError
 from sq_perception.recordings.frame_source import FrameSource

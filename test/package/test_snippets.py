@@ -94,7 +94,7 @@ def test_bags(repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
 
     given = names()
     monkeypatch.chdir(tmp_path)
-    frame = RecordedFrame(given["depth"], CAMERA, None, "a", False)
+    frame = RecordedFrame(given["depth"], CAMERA, None, "a")
     recovery = Recoverer(method="symmetry").recover(frame.depth, CAMERA, given["mask"].astype(np.int32))
     with ResultBag("results.mcap") as bag:
         bag.add(frame, recovery, None)

@@ -102,7 +102,7 @@ def messages(path):
 @pytest.fixture(scope="module")
 def scene():
     """A frame of two bodies and what is recovered from it."""
-    frame = RecordedFrame(depth_of(), CAMERA, None, "scene", is_cube=False, encoding="32FC1")
+    frame = RecordedFrame(depth_of(), CAMERA, None, "scene", encoding="32FC1")
     return frame, Recoverer(method="symmetry").recover(frame.depth, frame.camera)
 
 
@@ -457,7 +457,6 @@ def test_the_file_holds_what_the_node_publishes(tmp_path, scene):
     from sq_msgs_py import superquadrics
     from sq_perception.imaging.calibration import Calibration
     from sq_perception.nodes.frame import Frame
-    from sq_perception.nodes.outputs import marker_style
     from sq_perception.nodes.parameters import RecoverParameters
     from sq_perception.recordings import publication
     from sq_perception.recovery.recoverer import render_recovery
@@ -465,11 +464,13 @@ def test_the_file_holds_what_the_node_publishes(tmp_path, scene):
     frame, recovery = scene
     calibration = Calibration(frame.camera, (frame.camera.width, frame.camera.height))
     live = Frame(Header(stamp=Time(sec=3, nanosec=4), frame_id="optical"), "32FC1", frame.depth, calibration)
-    ids = tuple(one.label for one in recovery.bodies)
+    ids, defaults = tuple(one.label for one in recovery.bodies), RecoverParameters()
     shown = publication.findings(publication.Identified(recovery, ids), live.header, is_cube=False)
     expected = {
         SUPERQUADRICS: superquadrics.to_message(shown.array, live.header),
-        MARKERS: shown.markers(style=marker_style(RecoverParameters())),
+        MARKERS: shown.markers(
+            (), defaults.marker_colours == "score", alpha=defaults.marker_alpha, line_width=defaults.marker_line_width
+        ),
         RENDERED: live.encode(render_recovery(recovery, frame.camera)[0]),
         "/a/image": live.encode(frame.depth),
     }

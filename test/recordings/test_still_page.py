@@ -36,7 +36,7 @@ def page(tmp_path, shot):
     depth, recovery = shot
     page = StillPage(tmp_path / "out.html")
     for name in ("one", HOSTILE):
-        page.add(RecordedFrame(depth, CAMERA, None, name, False), recovery)
+        page.add(RecordedFrame(depth, CAMERA, None, name), recovery)
     assert page.close() == tmp_path / "out.html"
     return tmp_path / "out.html"
 

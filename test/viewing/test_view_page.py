@@ -29,7 +29,8 @@ from sq_msgs_py.superquadrics import CONVERGED, WEAK, SuperquadricArray, to_mess
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
-from sq_perception.nodes.parameters import LiveParameters, RecoverParameters
+from sq_perception.nodes.live_parameters import LiveParameters
+from sq_perception.nodes.parameters import RecoverParameters
 from sq_perception.nodes.view_node import ViewNode
 from sq_perception.viewing import server
 from sq_perception.viewing.page import Page

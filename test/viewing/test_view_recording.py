@@ -31,7 +31,7 @@ def shot():
     depth, index = raycast.render(BODIES, CAMERA)
     depth = np.where(np.isfinite(depth), depth, np.nan).astype(np.float32)
     recovery = Recoverer(method="symmetry").recover(depth, CAMERA, (index + 1).astype(np.int32))
-    return RecordedFrame(depth, CAMERA, None, "a", False), recovery
+    return RecordedFrame(depth, CAMERA, None, "a"), recovery
 
 
 def test_what_is_drawn_keeps_its_place_among_the_bodies(shot):

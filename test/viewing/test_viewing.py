@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import socket
 from collections.abc import Iterator
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,7 +16,7 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.viewing import controls, drawings, tables
-from sq_perception.viewing.controls import Control, Description
+from sq_perception.viewing.controls import Control
 from sq_perception.viewing.drawings import Bodies
 from sq_perception.viewing.tables import NodeState
 
@@ -133,49 +134,65 @@ def test_misuse_is_refused() -> None:
 # Controls
 
 
+def describing(
+    name: str, within: tuple[float, float] | None = None, constraints: str = "", read_only: bool = False
+) -> SimpleNamespace:
+    """The fields of a rcl_interfaces/ParameterDescriptor; the type of the range is that of its ends."""
+    ranges = [] if within is None else [SimpleNamespace(from_value=within[0], to_value=within[1], step=0)]
+    is_float = within is not None and isinstance(within[0], float)
+    return SimpleNamespace(
+        name=name,
+        description="",
+        additional_constraints=constraints,
+        read_only=read_only,
+        floating_point_range=ranges if is_float else [],
+        integer_range=[] if is_float else ranges,
+    )
+
+
 @pytest.mark.parametrize(
-    ("about", "kind", "value"),
+    ("about", "given", "kind", "value"),
     [
-        (Description("tracking", True), "bool", True),
-        (Description("refine", "surface", "", "one of: surface, none"), "choice", "surface"),
-        (Description("frame", "map"), "text", "map"),
-        (Description("s", 117.3, low=0.1, high=1000.0, is_float_range=True), "number", 117.3),
-        (Description("alpha", 0.7, low=0.0, high=1.0, is_float_range=True), "slider", 0.7),
-        (Description("alpha", 1, low=0.0, high=1.0, is_float_range=True), "slider", 1.0),
-        (Description("objects", 20, low=1, high=100), "slider", 20),
-        (Description("seed", 0, low=0, high=2**31 - 1), "number", 0),
-        (Description("free", 2.5), "number", 2.5),
-        (Description("model", "", read_only=True), "fixed", ""),
-        (Description("list", [1, 2]), "fixed", "1, 2"),
-        (Description("unset", None), "fixed", "(not set)"),
-        (Description("odd", float("nan")), "fixed", "nan"),
-        (Description("use_sim_time", False), "fixed", "false"),
-        (Description("qos_overrides./depth/image.subscription.depth", 1), "fixed", "1"),
+        (describing("tracking"), True, "bool", True),
+        (describing("refine", constraints="one of: surface, none"), "surface", "choice", "surface"),
+        (describing("frame"), "map", "text", "map"),
+        (describing("s", (0.1, 1000.0)), 117.3, "number", 117.3),
+        (describing("alpha", (0.0, 1.0)), 0.7, "slider", 0.7),
+        (describing("alpha", (0.0, 1.0)), 1, "slider", 1.0),
+        (describing("objects", (1, 100)), 20, "slider", 20),
+        (describing("seed", (0, 2**31 - 1)), 0, "number", 0),
+        (describing("free"), 2.5, "number", 2.5),
+        (describing("model", read_only=True), "", "fixed", ""),
+        (describing("list"), [1, 2], "fixed", "1, 2"),
+        (describing("unset"), None, "fixed", "(not set)"),
+        (describing("odd"), float("nan"), "fixed", "nan"),
+        (describing("use_sim_time"), False, "fixed", "false"),
+        (describing("qos_overrides./depth/image.subscription.depth"), 1, "fixed", "1"),
     ],
 )
-def test_a_control_fits_its_parameter(about: Description, kind: str, value: object) -> None:
-    made = controls.control(about)
+def test_a_control_fits_its_parameter(about: SimpleNamespace, given: object, kind: str, value: object) -> None:
+    made = controls.control(about, given)
     assert (made.kind, made.value) == (kind, value)
     assert type(made.value) is type(value)
     if made.can_change:
-        again = made.wanted(made.shown(about.value))
-        assert again == about.value
+        again = made.wanted(made.shown(given))
+        assert again == given
         assert type(again) is type(value)
 
 
 def test_what_the_node_holds_is_shown_even_outside_of_its_range() -> None:
-    made = controls.control(Description("s", 5.0, low=0.0, high=1.0, is_float_range=True))
+    made = controls.control(describing("s", (0.0, 1.0)), 5.0)
     assert (made.low, made.high) == (0.0, 5.0)
-    made = controls.control(Description("refine", "new", "", "one of: a, b"))
+    made = controls.control(describing("refine", constraints="one of: a, b"), "new")
     assert made.choices == ("a", "b", "new")
 
 
 def test_half_a_number_is_no_wish() -> None:
-    assert controls.control(Description("s", 1.0)).wanted(float("nan")) is None
+    assert controls.control(describing("s"), 1.0).wanted(float("nan")) is None
 
 
 def test_controls_that_change_come_first() -> None:
-    given = [Description("model", "", read_only=True), Description("a.b", 1), Description("s", 1.0)]
+    given = [(describing("model", read_only=True), ""), (describing("a.b"), 1), (describing("s"), 1.0)]
     assert [one.name for one in controls.arranged(given)] == ["s", "model", "a.b"]
 
 
@@ -184,11 +201,11 @@ def test_every_parameter_of_the_nodes_has_a_control() -> None:
     pytest.importorskip("rclpy", reason="needs the extra 'ros'")
     from dataclasses import fields
 
-    from sq_perception.nodes.parameters import RecoverParameters, describe
-    from sq_perception.nodes.remote_node import _description
+    from sq_perception.nodes.live_parameters import describe
+    from sq_perception.nodes.parameters import RecoverParameters
 
     made: dict[str, Control] = {
-        one.name: controls.control(_description(describe(one), one.default)) for one in fields(RecoverParameters)
+        one.name: controls.control(describe(one), one.default) for one in fields(RecoverParameters)
     }
     for one in fields(RecoverParameters):
         is_list = isinstance(one.default, tuple)
