@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
 SUCCESS, FAILURE, USAGE, INTERRUPTED = 0, 1, 2, 130
+STANDARD_OUTPUT = "-"
 
 
 def complain(message: str) -> None:
@@ -73,11 +74,56 @@ def positive(text: str) -> float:
 
 def target(text: str) -> Path:
     """The type of an argument that names a file to be written, which is tried."""
+    if not Path(text).resolve().parent.is_dir():
+        raise argparse.ArgumentTypeError(f"{text}: its folder does not exist")
     try:
         output_file.check(text)
     except OSError as error:
         raise argparse.ArgumentTypeError(str(error)) from error
     return Path(text)
+
+
+def text_target(text: str) -> str:
+    """As :func:`target`, or - for the standard output."""
+    return text if text == STANDARD_OUTPUT else str(target(text))
+
+
+def folder(text: str) -> Path:
+    """The type of an argument that names a folder for results, which is made if need be, and tried."""
+    try:
+        output_file.check_folder(text)
+    except OSError as error:
+        raise argparse.ArgumentTypeError(str(error)) from error
+    return Path(text)
+
+
+def add_frames(command: argparse.ArgumentParser) -> None:
+    """Which recorded frames are read, and how bodies are recovered from them."""
+    add = command.add_argument
+    add("frames", nargs="+", metavar="FRAME", help="recorded depth images, folders or bags of them")
+    add("--projection", choices=("pinhole", "orthographic"), default="pinhole")
+    add(
+        "--camera-info",
+        metavar="FILE",
+        help="intrinsics of images and bags, before their own: YAML, JSON or fx,fy,cx,cy",
+    )
+    add("--topic", metavar="NAME", help="depth images of a bag, where it has several such topics")
+    add("--every", type=at_least(1), default=1, metavar="N", help="only every Nth frame of a bag or folder")
+    methods = ("auto", "network", "symmetry", "classic")
+    add("--method", choices=methods, default="auto", help="where a fit starts; see recover --help")
+    add("--ignore-masks", action="store_true", help="segment, even where a frame brings labels")
+
+
+def add_address(command: argparse.ArgumentParser) -> None:
+    """Where a page is served."""
+    add = command.add_argument
+    add(
+        "--host",
+        default="127.0.0.1",
+        metavar="ADDRESS",
+        help="%(default)s, this machine; 0.0.0.0 is open to the network, no password",
+    )
+    add("--port", type=int, help="port to serve on, 0 for any free one (8080, or the next free one)")
 
 
 def progress() -> Progress:

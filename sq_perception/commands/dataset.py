@@ -24,13 +24,14 @@ _FULL_PIXELS, _PIXELS = 256, 64
 def main(arguments: Sequence[str]) -> int:
     """Entry of ``sq-perception dataset``; the exit code."""
     command = parser("dataset", _HELP, _EPILOG)
-    command.add_argument("folder", type=Path, help="of the set")
-    command.add_argument("--full-frame", action="store_true", help="images of the whole cube instead of cropped views")
-    command.add_argument("--pixels", type=int, help=f"side of the images ({_PIXELS}; {_FULL_PIXELS} if full)")
-    command.add_argument("--train", type=int, default=150_000, help="bodies to train on (default %(default)s)")
-    command.add_argument("--test", type=int, default=20_000, help="bodies to test on (default %(default)s)")
-    command.add_argument("--seed", type=int, default=1, help="default %(default)s")
-    command.add_argument("--verify", action="store_true", help="check all checksums and make nothing")
+    add = command.add_argument
+    add("folder", type=Path, help="of the set")
+    add("--full-frame", action="store_true", help="images of the whole cube instead of cropped views")
+    add("--pixels", type=int, help=f"side of the images ({_PIXELS}; {_FULL_PIXELS} if full)")
+    add("--train", type=int, default=150_000, help="bodies to train on (default %(default)s)")
+    add("--test", type=int, default=20_000, help="bodies to test on (default %(default)s)")
+    add("--seed", type=int, default=1, help="default %(default)s")
+    add("--verify", action="store_true", help="check all checksums and make nothing")
     given = command.parse_args(arguments)
 
     from sq_perception.learning.fixed_set import FixedSetError, Settings, generate, read_manifest, verify

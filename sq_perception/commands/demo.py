@@ -22,15 +22,16 @@ examples:
 def main(arguments: Sequence[str]) -> int:
     """Entry of ``sq-perception demo``; the exit code."""
     command = parser("demo", _HELP, _EPILOG)
-    command.add_argument("--frame", type=Path, help="recorded frame: NPZ, 16 bit PNG, or grey image of the unit cube")
-    command.add_argument("--camera-info", type=Path, metavar="YAML", help="intrinsics of a 16 bit PNG")
-    command.add_argument(
+    add = command.add_argument
+    add("--frame", type=Path, help="recorded frame: NPZ, 16 bit PNG, or grey image of the unit cube")
+    add("--camera-info", type=Path, metavar="YAML", help="intrinsics of a 16 bit PNG")
+    add(
         "--projection",
         choices=("pinhole", "orthographic"),
-        help="of the frame; an 8 bit image is orthographic, others are pinhole",
+        help="of the frame; 8 bit images are orthographic, others pinhole",
     )
-    command.add_argument("--seconds", type=float, default=20.0, help="how long (default: %(default)g)")
-    command.add_argument("--output-dir", type=Path, default=Path(), metavar="DIR", help="for demo.png and demo.glb")
+    add("--seconds", type=float, default=20.0, help="how long (default: %(default)g)")
+    add("--output-dir", type=Path, default=Path(), metavar="DIR", help="for demo.png and demo.glb")
     options = command.parse_args(arguments)
     if not options.seconds > 0:
         command.error(f"--seconds: expected a number above 0, got {options.seconds:g}")

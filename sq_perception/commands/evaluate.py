@@ -109,27 +109,12 @@ def _contestants(options: argparse.Namespace, methods: list[Method]) -> tuple[li
 
 def _parser() -> argparse.ArgumentParser:
     command = parser("evaluate", _HELP, _EPILOG)
-    command.add_argument(
-        "--consensus", action="store_true", help="each network a second time, asked in 8 positions of each view"
-    )
-    command.add_argument(
-        "--models", type=Path, nargs="*", metavar="FILE", help="weights to compare (default: all that are shipped)"
-    )
-    command.add_argument(
-        "--methods", nargs="*", choices=FITS, metavar="FIT", help=f"fits to compare (default: {' '.join(FITS)})"
-    )
-    command.add_argument(
-        "--bodies", type=at_least(1), default=BODIES, metavar="N", help=f"bodies for networks ({BODIES})"
-    )
-    command.add_argument(
-        "--fit-bodies",
-        type=at_least(1),
-        default=FIT_BODIES,
-        metavar="N",
-        help=f"the first N of them for fits ({FIT_BODIES})",
-    )
-    command.add_argument("--seed", type=at_least(0), default=DEFAULT_SEED, help=f"of the test set ({DEFAULT_SEED})")
-    command.add_argument(
-        "--output", type=Path, default=Path("runs/evaluation"), metavar="DIR", help="folder (runs/evaluation)"
-    )
+    add = command.add_argument
+    add("--consensus", action="store_true", help="each network a second time, asked in 8 positions of each view")
+    add("--models", type=Path, nargs="*", metavar="FILE", help="weights to compare (default: all that are shipped)")
+    add("--methods", nargs="*", choices=FITS, metavar="FIT", help=f"fits to compare (default: {' '.join(FITS)})")
+    add("--bodies", type=at_least(1), default=BODIES, metavar="N", help=f"bodies for networks ({BODIES})")
+    add("--fit-bodies", type=at_least(1), default=FIT_BODIES, metavar="N", help=f"the first N for fits ({FIT_BODIES})")
+    add("--seed", type=at_least(0), default=DEFAULT_SEED, help=f"of the test set ({DEFAULT_SEED})")
+    add("--output", type=Path, default=Path("runs/evaluation"), metavar="DIR", help="folder (runs/evaluation)")
     return command

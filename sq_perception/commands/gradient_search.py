@@ -75,18 +75,25 @@ def main(arguments: Sequence[str]) -> int:
 
 def _parser() -> argparse.ArgumentParser:
     command = parser("gradient-search", _HELP, _EPILOG)
-    command.add_argument("image", nargs="?", metavar="IMAGE", help="grey image of the unit cube (.png, .bmp, .npz)")
-    command.add_argument("--seed", type=at_least(0), metavar="K", help="a random body of the thesis' protocol instead")
-    command.add_argument("--loss", choices=LOSSES, default="occupancy", help="default %(default)s")
+    add = command.add_argument
+    add("image", nargs="?", metavar="IMAGE", help="grey image of the unit cube (.png, .bmp, .npz)")
+    add("--seed", type=at_least(0), metavar="K", help="a random body of the thesis' protocol instead")
+    add("--loss", choices=LOSSES, default="occupancy", help="default %(default)s")
     starts = ("network", "truth")
-    command.add_argument("--start", choices=starts, default="network", help="what a network predicts, or the true body")
-    command.add_argument("--turn", type=float, nargs=3, default=(0.0, 0.0, 0.0), metavar=("X", "Y", "Z"),
-                         help="turn the start: rotation vector in its own frame, deg")  # fmt: skip
-    command.add_argument("--steps", type=at_least(1), default=200, help="gradient steps (default %(default)s)")
-    command.add_argument("--learning-rate", type=positive, default=0.05, help="of Adam, at the first (%(default)s)")
-    command.add_argument("--model", metavar="FILE", help="the network's weights: a file or a shipped name")
-    command.add_argument("--output", type=Path, metavar="OUT", help="a film, .gif, or a folder of PNGs")
-    command.add_argument("--table", type=target, metavar="CSV", help="every step as CSV")
+    add("--start", choices=starts, default="network", help="what a network predicts, or the true body")
+    add(
+        "--turn",
+        type=float,
+        nargs=3,
+        default=(0.0, 0.0, 0.0),
+        metavar=("X", "Y", "Z"),
+        help="turn the start: rotation vector in its own frame, deg",
+    )
+    add("--steps", type=at_least(1), default=200, help="gradient steps (default %(default)s)")
+    add("--learning-rate", type=positive, default=0.05, help="of Adam, at the first (%(default)s)")
+    add("--model", metavar="FILE", help="the network's weights: a file or a shipped name")
+    add("--output", type=Path, metavar="OUT", help="a film, .gif, or a folder of PNGs")
+    add("--table", type=target, metavar="CSV", help="every step as CSV")
     return command
 
 

@@ -12,7 +12,18 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sq_perception.commands.console import FAILURE, SUCCESS, complain, failed, misused, parser, positive
+from sq_perception.commands.console import (
+    FAILURE,
+    STANDARD_OUTPUT,
+    SUCCESS,
+    complain,
+    failed,
+    folder,
+    misused,
+    parser,
+    positive,
+    text_target,
+)
 from sq_perception.files import output_file
 
 if TYPE_CHECKING:
@@ -47,13 +58,14 @@ _SHARP = 0.02
 def main(arguments: Sequence[str]) -> int:
     """Entry of ``sq-perception grasp``; the exit code."""
     command = parser("grasp", HELP, EPILOG)
-    command.add_argument("frames", nargs="+", metavar="FRAME", help="recorded depth images, folders or bags of them")
-    command.add_argument("--gripper", default="panda", help="panda, robotiq_2f_85 or robotiq_2f_140 (default panda)")
-    command.add_argument("--friction", type=positive, help="between pads and things (default 0.5)")
-    command.add_argument("--camera-info", metavar="FILE", help="the intrinsics of images, as for recover")
-    command.add_argument("--json", metavar="OUT", help="write the grasps there; - is the standard output")
-    command.add_argument("--pictures", metavar="DIR", help="draw a picture per frame into this folder")
-    command.add_argument("--meshes", metavar="DIR", help="write bodies and best grasps of each frame as a GLB there")
+    add = command.add_argument
+    add("frames", nargs="+", metavar="FRAME", help="recorded depth images, folders or bags of them")
+    add("--gripper", default="panda", help="panda, robotiq_2f_85 or robotiq_2f_140 (default panda)")
+    add("--friction", type=positive, help="between pads and things (default 0.5)")
+    add("--camera-info", metavar="FILE", help="the intrinsics of images, as for recover")
+    add("--json", type=text_target, metavar="OUT", help="write the grasps there; - is the standard output")
+    add("--pictures", type=folder, metavar="DIR", help="draw a picture per frame into this folder")
+    add("--meshes", type=folder, metavar="DIR", help="write bodies and best grasps of each frame as a GLB there")
     return _run(command.parse_args(arguments))
 
 
@@ -63,12 +75,7 @@ def _run(options: argparse.Namespace) -> int:
 
     try:
         hand = gripper(options.gripper)
-        if options.json not in (None, "-"):
-            output_file.check(options.json)
-        for folder in (options.pictures, options.meshes):
-            if folder:
-                output_file.check_folder(folder)
-    except (ValueError, OSError) as error:
+    except ValueError as error:
         return misused(str(error))
     friction = options.friction or planner.FRICTION
 
@@ -94,11 +101,11 @@ def _run(options: argparse.Namespace) -> int:
     chosen = {"gripper": hand.name, "friction": friction}
     document = {"format": FORMAT, "version": VERSION, "options": chosen, "frames": entries}
     text = json.dumps(document, indent=1, allow_nan=False)
-    if options.json == "-":
+    if options.json == STANDARD_OUTPUT:
         sys.stdout.write(f"{text}\n")
     elif options.json and entries:
         output_file.write(options.json, f"{text}\n".encode())
-    if options.json != "-":
+    if options.json != STANDARD_OUTPUT:
         _print_table(entries)
     return code
 
@@ -120,9 +127,9 @@ def _frame(
     plan = grasps(bodies, hand, covariance, around, friction)
     stem = Path(frame.name).stem
     if options.pictures:
-        _draw(Path(options.pictures) / f"{stem}.png", frame, found, plan, hand)
+        _draw(options.pictures / f"{stem}.png", frame, found, plan, hand)
     if options.meshes and found:
-        _write_mesh(Path(options.meshes) / f"{stem}.glb", found, plan, hand)
+        _write_mesh(options.meshes / f"{stem}.glb", found, plan, hand)
     return {
         "file": file,
         "bodies": [

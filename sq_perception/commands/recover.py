@@ -14,7 +14,20 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sq_perception.commands import recover_outputs
-from sq_perception.commands.console import FAILURE, at_least, complain, failed, misused, parser, positive
+from sq_perception.commands.console import (
+    FAILURE,
+    STANDARD_OUTPUT,
+    add_frames,
+    at_least,
+    complain,
+    failed,
+    folder,
+    misused,
+    parser,
+    positive,
+    target,
+    text_target,
+)
 
 HELP = """\
 Recover superquadrics from recorded depth images.
@@ -91,111 +104,74 @@ def main(arguments: Sequence[str]) -> int:
 
 
 def _add_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("frames", nargs="+", metavar="FRAME", help="recorded depth images, folders or bags of them")
-    parser.add_argument("--json", metavar="OUT", help="write the results there; - is the standard output")
-    parser.add_argument(
-        "--jsonl",
-        metavar="OUT",
-        help="add a line there for each frame when it is done, and skip those it has; see below",
-    )
-    parser.add_argument("--csv", metavar="OUT", help="write the bodies there as a table; - is the standard output")
-    parser.add_argument("--html", metavar="OUT", help="write one page with points, bodies and numbers, for any browser")
-    parser.add_argument("--projection", choices=("pinhole", "orthographic"), default="pinhole")
-    methods = ("auto", "network", "symmetry", "classic")
-    parser.add_argument("--method", choices=methods, default="auto", help="see below")
-    parser.add_argument(
+    add_frames(parser)
+    add = parser.add_argument
+    add("--json", type=text_target, metavar="OUT", help="write the results there; - is the standard output")
+    add("--jsonl", type=text_target, metavar="OUT", help="a line for each frame; those it has are skipped, see below")
+    add("--csv", type=text_target, metavar="OUT", help="write the bodies there as a table; - is the standard output")
+    add("--html", type=target, metavar="OUT", help="write one page with points, bodies and numbers, for any browser")
+    add(
         "--refine",
         choices=("surface", "soft_render", "none"),
         default="surface",
-        help="what follows the start: the exact fit, descent on the soft-rendered depth, or nothing",
+        help="the exact fit, descent on the soft-rendered depth, or nothing",
     )
-    parser.add_argument(
-        "--camera-info",
-        metavar="FILE",
-        help="the intrinsics of images and bags: YAML, JSON of librealsense or Open3D, or fx,fy,cx,cy; goes before "
-        "what a folder or bag has",
-    )
-    parser.add_argument(
+    add(
         "--depth-scale",
         type=float,
         metavar="N",
-        help="units a metre (default 1000 of whole numbers, TUM RGB-D has 5000; 1 of floats)",
+        help="units a metre (1000 of whole numbers, 5000 of TUM RGB-D, 1 of floats)",
     )
-    parser.add_argument("--depth-min", type=float, default=0.0, metavar="M", help="metres; nearer readings are none")
-    parser.add_argument("--depth-max", type=float, default=math.inf, metavar="M", help="metres; farther ones likewise")
-    parser.add_argument("--roi", type=_region, metavar="X,Y,W,H", help="only this part of each image, in pixels")
-    parser.add_argument(
-        "--masks", type=_folder, metavar="DIR", help="label images, one a frame: its name and .png, 0 is background"
-    )
-    parser.add_argument(
+    add("--depth-min", type=float, default=0.0, metavar="M", help="metres; nearer readings are none")
+    add("--depth-max", type=float, default=math.inf, metavar="M", help="metres; farther ones likewise")
+    add("--roi", type=_region, metavar="X,Y,W,H", help="only this part of each image, in pixels")
+    add("--masks", type=_existing, metavar="DIR", help="label images, one a frame: its name and .png, 0 is background")
+    add(
         "--distortion",
         choices=("auto", "apply", "ignore"),
         default="auto",
-        help="of PNGs and bags: undo it (apply), take images for rectified (ignore), or go by their names, see below",
+        help="undo it, take images for rectified, or go by their names; see below",
     )
-    parser.add_argument("--topic", metavar="NAME", help="depth images of a bag, where it has several such topics")
-    parser.add_argument(
-        "--every", type=at_least(1), default=1, metavar="N", help="only every Nth frame of a bag or folder"
-    )
-    parser.add_argument("--limit", type=at_least(1), metavar="N", help="at most N frames of each bag or folder")
-    parser.add_argument("--pictures", metavar="DIR", help="draw a picture per frame into this folder")
-    parser.add_argument("--meshes", metavar="DIR", help="write the bodies of each frame as a mesh into this folder")
-    parser.add_argument("--mesh-format", choices=("glb", "ply"), default="glb", help="of --meshes (default glb)")
-    parser.add_argument("--mcap", metavar="OUT", help="write results and depth as a bag (extra 'bags'), see below")
-    parser.add_argument(
+    add("--limit", type=at_least(1), metavar="N", help="at most N frames of each bag or folder")
+    add("--pictures", type=folder, metavar="DIR", help="draw a picture per frame into this folder")
+    add("--meshes", type=folder, metavar="DIR", help="write the bodies of each frame as a mesh into this folder")
+    add("--mesh-format", choices=("glb", "ply"), default="glb", help="of --meshes (default glb)")
+    add("--mcap", type=target, metavar="OUT", help="write results and depth as a bag (extra 'bags'), see below")
+    add(
         "--mcap-images",
         metavar="LIST",
         default="depth",
-        help="which images it has: depth, rendered, labels, with commas, or none (default depth)",
+        help="its images: depth (default), rendered, labels, with commas, or none",
     )
-    parser.add_argument("--model", metavar="FILE", help="weights: a .safetensors file, or the name of shipped ones")
-    parser.add_argument(
-        "--consensus", action="store_true", help="average the network's answers to 8 positions of each view"
-    )
-    parser.add_argument("--ignore-masks", action="store_true", help="segment, even where a frame brings labels")
-    parser.add_argument(
-        "--track",
-        action="store_true",
-        help="follow bodies over the frames of each bag or folder, see below; not for folders of unrelated frames",
-    )
-    parser.add_argument(
+    add("--model", metavar="FILE", help="weights: a .safetensors file, or the name of shipped ones")
+    add("--consensus", action="store_true", help="average the network's answers to 8 positions of each view")
+    add("--track", action="store_true", help="follow bodies over the frames of each bag or folder, see below")
+    add(
         "--time-budget",
         type=positive,
         default=math.inf,
         metavar="S",
-        help="seconds per frame after which no further start is tried; the largest and nearest objects come first",
+        help="seconds per frame after which no new start is tried",
     )
-    parser.add_argument(
+    add(
         "--jobs",
         type=at_least(1),
         default=1,
         metavar="N",
-        help="recover N frames at a time, in processes of one thread each: for many frames (default 1: one frame at a "
-        "time, its objects in threads)",
+        help="frames at a time, in processes of one thread (1: one, its objects in threads)",
     )
-    parser.add_argument(
-        "--cluster",
-        metavar="ADDRESS",
-        help="recover frames on a running Dask cluster, as tcp://10.0.0.1:8786; its workers have this package, too "
-        "(extra 'cluster')",
-    )
-    parser.add_argument("--min-score", type=float, default=0.0, metavar="S", help="leave out bodies with a lower score")
-    parser.add_argument("-q", "--quiet", action="store_true", help="no table and no summary; what went wrong is said")
-    parser.add_argument(
-        "-v", "--verbose", action="store_true", help="also say the time of each stage, and what is logged"
-    )
-    parser.add_argument(
-        "--max-objects", type=at_least(1), default=20, metavar="N", help="largest ones first (default 20)"
-    )
-    parser.add_argument(
-        "--max-size", type=float, default=0.6, metavar="M", help="largest edge of an object in metres (default 0.6)"
-    )
-    parser.add_argument(
+    add("--cluster", metavar="ADDRESS", help="a running Dask cluster whose workers have this package (extra 'cluster')")
+    add("--min-score", type=float, default=0.0, metavar="S", help="leave out bodies with a lower score")
+    add("-q", "--quiet", action="store_true", help="no table and no summary; what went wrong is said")
+    add("-v", "--verbose", action="store_true", help="also say the time of each stage, and what is logged")
+    add("--max-objects", type=at_least(1), default=20, metavar="N", help="largest ones first (default 20)")
+    add("--max-size", type=float, default=0.6, metavar="M", help="largest edge of an object in metres (default 0.6)")
+    add(
         "--workspace",
         type=float,
         nargs=6,
         metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
-        help="box of the optical frame, in metres, that the middle of what is seen of an object lies in",
+        help="box of the optical frame, metres, that the middle of an object lies in",
     )
 
 
@@ -207,7 +183,7 @@ def _region(text: str) -> tuple[int, int, int, int]:
     return left, top, width, height
 
 
-def _folder(text: str) -> Path:
+def _existing(text: str) -> Path:
     if not Path(text).is_dir():
         raise argparse.ArgumentTypeError(f"{text}: expected a folder")
     return Path(text)
@@ -216,8 +192,8 @@ def _folder(text: str) -> Path:
 def _run(options: argparse.Namespace) -> int:
     if options.cluster and options.jobs > 1:
         return misused("--jobs, --cluster: one of them; a cluster has as many processes as it has")
-    if problem := recover_outputs.misuse(options):
-        return misused(problem)
+    if [options.json, options.jsonl, options.csv].count(STANDARD_OUTPUT) > 1:
+        return misused("--json, --jsonl, --csv: only one of them can be the standard output")
     if options.verbose:
         logging.basicConfig(level=logging.INFO, format="sq-perception: %(message)s")
 
@@ -276,7 +252,7 @@ def _run(options: argparse.Namespace) -> int:
     for problem in outputs.finish(run.is_whole):
         complain(problem)
         code = code or FAILURE
-    if "-" not in (options.json, options.jsonl, options.csv) and not options.quiet:
+    if STANDARD_OUTPUT not in (options.json, options.jsonl, options.csv) and not options.quiet:
         for line in lines(outputs.results, options.verbose):
             print(line)
     if not options.quiet:

@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sq_perception.commands.console import STANDARD_OUTPUT
 from sq_perception.files import output_file
 
 if TYPE_CHECKING:
@@ -21,10 +22,7 @@ if TYPE_CHECKING:
     from sq_perception.recovery.recoverer import FrameRecovery
     from sq_perception.tracking.session import Followed
 
-STANDARD_OUTPUT = "-"
-_FILES, _FOLDERS = ("json", "jsonl", "csv", "mcap", "html"), ("pictures", "meshes")
-_BINARY = ("mcap", "html")
-"""Never on the standard output."""
+_FILES = ("json", "jsonl", "csv", "mcap", "html")
 _DECISIVE = (
     "projection",
     "method",
@@ -48,31 +46,6 @@ _DECISIVE = (
     "max_objects",
 )
 """Options that decide what is found in a frame."""
-
-
-def misuse(options: argparse.Namespace) -> str:
-    """What is wrong with the names of the outputs; empty if nothing.  Folders that are missing are made."""
-    if [options.json, options.jsonl, options.csv].count(STANDARD_OUTPUT) > 1:
-        return "--json, --jsonl, --csv: only one of them can be the standard output"
-    for name in _FILES:
-        path = getattr(options, name)
-        if not path or (path == STANDARD_OUTPUT and name not in _BINARY):
-            continue
-        if not Path(path).resolve().parent.is_dir():
-            return f"--{name}: {path}: its folder does not exist"
-        if name == "mcap" and Path(path).is_dir():
-            return f"--{name}: {path}: expected the name of a file that ends in .mcap"
-        try:
-            output_file.check(path)
-        except OSError as error:
-            return f"--{name}: {error}"
-    for name in _FOLDERS:
-        if folder := getattr(options, name):
-            try:
-                output_file.check_folder(folder)
-            except OSError as error:
-                return f"--{name}: {error}"
-    return ""
 
 
 def replaced_input(options: argparse.Namespace, inputs: Sequence[Path]) -> str:
@@ -139,9 +112,9 @@ class Outputs:
         self.results.append(entry)
         stem = _free_stem(frame.name if frame.topic else Path(frame.name).stem, self._stems)
         if options.pictures:
-            _draw(Path(options.pictures) / f"{stem}.png", frame, recovery)
+            _draw(options.pictures / f"{stem}.png", frame, recovery)
         if options.meshes:
-            _write_mesh(Path(options.meshes) / f"{stem}.{options.mesh_format}", frame, recovery)
+            _write_mesh(options.meshes / f"{stem}.{options.mesh_format}", frame, recovery)
         if self._bag is not None:
             self._bag.add(frame, recovery, tracks)
         if self._page is not None:

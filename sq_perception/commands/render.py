@@ -43,15 +43,16 @@ files:
 def main(arguments: Sequence[str]) -> int:
     """Entry of ``sq-perception render``; the exit code."""
     command = parser("render", _HELP, _EPILOG)
+    add = command.add_argument
     for name in PARAMETERS:
-        command.add_argument(name, type=float)
-    command.add_argument("--output", "-o", type=target, required=True, metavar="FILE", help=".png, .bmp or .npz")
-    command.add_argument("--projection", choices=("orthographic", "pinhole"), default="orthographic")
-    command.add_argument("--width", type=int, help="pixels (256 orthographic, 640 pinhole)")
-    command.add_argument("--height", type=int, help="pixels (as the width orthographic, 480 pinhole)")
-    command.add_argument("--focal", type=float, default=525.0, help="focal length of the pinhole camera, pixels (525)")
-    command.add_argument("--camera-info", metavar="FILE", help="a pinhole camera from YAML instead")
-    command.add_argument("--bits", type=int, choices=(8, 16), default=8, help="depth of an orthographic PNG")
+        add(name, type=float)
+    add("--output", "-o", type=target, required=True, metavar="FILE", help=".png, .bmp or .npz")
+    add("--projection", choices=("orthographic", "pinhole"), default="orthographic")
+    add("--width", type=int, help="pixels (256 orthographic, 640 pinhole)")
+    add("--height", type=int, help="pixels (as the width orthographic, 480 pinhole)")
+    add("--focal", type=float, default=525.0, help="focal length of the pinhole camera, pixels (525)")
+    add("--camera-info", metavar="FILE", help="a pinhole camera from YAML instead")
+    add("--bits", type=int, choices=(8, 16), default=8, help="depth of an orthographic PNG")
     return _render(command.parse_args([_plain_number(word) for word in arguments]))
 
 

@@ -13,11 +13,12 @@ _EPILOG = "example:\n  sq-perception render-search --picture render_search.png"
 def main(arguments: Sequence[str]) -> int:
     """Entry of ``sq-perception render-search``; the exit code."""
     command = parser("render-search", _HELP, _EPILOG)
-    command.add_argument("--bodies", type=at_least(2), default=20, help="random bodies (default %(default)s)")
-    command.add_argument("--resolution", type=at_least(2), default=64, help="pixels and voxels a side (%(default)s)")
-    command.add_argument("--steps", type=at_least(2), default=21, help="values of s and of tau (default %(default)s)")
-    command.add_argument("--seed", type=int, default=2020, help="default %(default)s")
-    command.add_argument("--picture", type=target, metavar="FILE", help="draw the heat map there")
+    add = command.add_argument
+    add("--bodies", type=at_least(2), default=20, help="random bodies (default %(default)s)")
+    add("--resolution", type=at_least(2), default=64, help="pixels and voxels a side (%(default)s)")
+    add("--steps", type=at_least(2), default=21, help="values of s and of tau (default %(default)s)")
+    add("--seed", type=int, default=2020, help="default %(default)s")
+    add("--picture", type=target, metavar="FILE", help="draw the heat map there")
     options = command.parse_args(arguments)
 
     import numpy as np

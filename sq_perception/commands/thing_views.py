@@ -19,17 +19,13 @@ _EPILOG = "example:\n  sq-perception thing-views sets/things --shards 200 && sq-
 def main(arguments: Sequence[str]) -> int:
     """Entry of ``sq-perception thing-views``; the exit code."""
     command = parser("thing-views", _HELP, _EPILOG)
-    command.add_argument("folder", type=Path, help="of the shards")
-    command.add_argument("--shards", type=at_least(1), default=100, help="how many there shall be (100)")
-    command.add_argument("--first", type=at_least(0), default=0, help="number of the first one (0)")
-    command.add_argument("--views", type=at_least(1), default=512, help="views a shard (512)")
-    command.add_argument("--seed", type=at_least(0), default=0, help="default 0")
-    command.add_argument(
-        "--meshes",
-        type=Path,
-        metavar="FOLDER",
-        help="things of your own, in metres: half of the views show one of them",
-    )
+    add = command.add_argument
+    add("folder", type=Path, help="of the shards")
+    add("--shards", type=at_least(1), default=100, help="how many there shall be (100)")
+    add("--first", type=at_least(0), default=0, help="number of the first one (0)")
+    add("--views", type=at_least(1), default=512, help="views a shard (512)")
+    add("--seed", type=at_least(0), default=0, help="default 0")
+    add("--meshes", type=Path, metavar="FOLDER", help="things of your own, in metres, for half of the views")
     given = command.parse_args(arguments)
 
     from sq_perception.learning.thing_training import write_views

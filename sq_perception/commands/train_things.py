@@ -22,18 +22,17 @@ example:
 def main(arguments: Sequence[str]) -> int:
     """Entry of ``sq-perception train-things``; the exit code."""
     command = parser("train-things", _HELP, _EPILOG)
-    command.add_argument("views", type=Path, metavar="FOLDER", help="of the shards of views")
-    command.add_argument("--output", "-o", type=Path, default=Path("runs/things"), help="folder (runs/things)")
-    command.add_argument(
-        "--minutes", type=positive, default=120.0, help="training time, over which the rate falls (120)"
-    )
-    command.add_argument("--batch", type=at_least(1), default=64, help="views a step (64)")
-    command.add_argument("--rate", type=positive, default=8e-4, help="largest learning rate (0.0008)")
-    command.add_argument("--threads", type=at_least(0), default=0, help="of torch; 0: its own choice")
-    command.add_argument("--held", type=at_least(1), default=2, help="shards that are kept for validation (2)")
-    command.add_argument("--seed", type=at_least(0), default=0, help="default 0")
-    command.add_argument("--start", default="", metavar="MODEL", help="weights to begin with: a file, or shipped ones")
-    command.add_argument("--bfloat16", action="store_true", help="half the bits, faster on processors that have them")
+    add = command.add_argument
+    add("views", type=Path, metavar="FOLDER", help="of the shards of views")
+    add("--output", "-o", type=Path, default=Path("runs/things"), help="folder (runs/things)")
+    add("--minutes", type=positive, default=120.0, help="training time, over which the rate falls (120)")
+    add("--batch", type=at_least(1), default=64, help="views a step (64)")
+    add("--rate", type=positive, default=8e-4, help="largest learning rate (0.0008)")
+    add("--threads", type=at_least(0), default=0, help="of torch; 0: its own choice")
+    add("--held", type=at_least(1), default=2, help="shards that are kept for validation (2)")
+    add("--seed", type=at_least(0), default=0, help="default 0")
+    add("--start", default="", metavar="MODEL", help="weights to begin with: a file, or shipped ones")
+    add("--bfloat16", action="store_true", help="half the bits, faster on processors that have them")
     options = vars(command.parse_args(arguments))
     views, output = options.pop("views"), options.pop("output")
 

@@ -111,14 +111,11 @@ def _node(
 
 def _parser() -> argparse.ArgumentParser:
     parser = console.parser("view", _HELP, _EPILOG)
-    parser.add_argument("--node", action="append", metavar="NAME", help=f"a frame node; may be given more than once "
-                        f"({DEFAULT_NODE})")  # fmt: skip
-    parser.add_argument("--depth", default=DEFAULT_DEPTH, metavar="TOPIC", help="depth image (%(default)s)")
-    parser.add_argument("--camera-info", metavar="TOPIC", help="its camera_info (the one in its name space)")
-    parser.add_argument("--host", default="127.0.0.1", metavar="ADDRESS", help="address to serve on (%(default)s, this "
-                        "machine alone); 0.0.0.0 is open to the network, without a password")  # fmt: skip
-    parser.add_argument("--port", type=int, help="port to serve on, 0 for any free one (8080, or the next free one)")
-    parser.add_argument("--max-points", type=at_least(1), default=40000, metavar="N",
-                        help="points of the cloud (%(default)s)")  # fmt: skip
-    parser.add_argument("--rate", type=float, default=10.0, metavar="HZ", help="pictures per second (%(default)g)")
+    add = parser.add_argument
+    add("--node", action="append", metavar="NAME", help=f"a frame node; may be given more than once ({DEFAULT_NODE})")
+    add("--depth", default=DEFAULT_DEPTH, metavar="TOPIC", help="depth image (%(default)s)")
+    add("--camera-info", metavar="TOPIC", help="its camera_info (the one in its name space)")
+    console.add_address(parser)
+    add("--max-points", type=at_least(1), default=40000, metavar="N", help="points of the cloud (%(default)s)")
+    add("--rate", type=float, default=10.0, metavar="HZ", help="pictures per second (%(default)g)")
     return parser

@@ -8,7 +8,7 @@ import queue
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, NoReturn
 
-from sq_perception.commands.console import FAILURE, SUCCESS, at_least, complain, failed, parser
+from sq_perception.commands.console import FAILURE, SUCCESS, add_address, add_frames, complain, failed, parser
 
 if TYPE_CHECKING:
     from sq_perception.recordings.frame_file import RecordedFrame
@@ -31,18 +31,8 @@ _REDRAWN = 0.5
 def main(arguments: Sequence[str]) -> int:
     """Entry of ``sq-perception view FRAME``; the exit code."""
     command = parser("view", _HELP)
-    command.add_argument("frames", nargs="+", metavar="FRAME", help="recorded depth images, folders or bags of them")
-    command.add_argument("--projection", choices=("pinhole", "orthographic"), default="pinhole")
-    command.add_argument("--camera-info", metavar="FILE", help="the intrinsics of images and bags, or fx,fy,cx,cy")
-    command.add_argument("--topic", metavar="NAME", help="depth images of a bag, where it has several such topics")
-    command.add_argument(
-        "--every", type=at_least(1), default=1, metavar="N", help="only every Nth frame of a bag or folder"
-    )
-    methods = ("auto", "network", "symmetry", "classic")
-    command.add_argument("--method", choices=methods, default="auto", help="as `sq-perception recover` has them")
-    command.add_argument("--ignore-masks", action="store_true", help="segment, even where a frame brings labels")
-    command.add_argument("--host", default="127.0.0.1", metavar="ADDRESS", help="address to serve on (%(default)s)")
-    command.add_argument("--port", type=int, help="port to serve on, 0 for any free one (8080, or the next free one)")
+    add_frames(command)
+    add_address(command)
     options = command.parse_args(arguments)
     try:
         from sq_perception.viewing import server

@@ -68,10 +68,6 @@ _shared: weakref.WeakValueDictionary[Hashable, Recoverer] = weakref.WeakValueDic
 _making = threading.Lock()
 
 
-class _Superseded(Exception):  # noqa: N818 - no fault
-    """Another request came meanwhile."""
-
-
 @dataclass(frozen=True)
 class _Built:
     recoverer: Recoverer
@@ -98,7 +94,7 @@ class Engine:
 
     def build(self, parameters: RecoverParameters) -> None:
         """Make the recoverer and warm it up.  Raises ValueError if the model or the device cannot be used."""
-        self._replace(None)
+        self.release()
         self._replace(_made(parameters, None, lambda: True))
 
     def release(self) -> None:
@@ -183,27 +179,25 @@ class Engine:
         started, log = perf_counter(), self._node.get_logger()
         try:
             built = _made(parameters, kept, lambda: request == self._request)
-            if self._replace(built, request):
+            if built is not None and self._replace(built, request):
                 log.info(f"changed to {_described(parameters)} within {perf_counter() - started:.1f} s")
-        except _Superseded:
-            return
         except Exception as error:  # whatever it is: the old one goes on
             fault = f"cannot change to {_described(parameters)}: {' '.join(str(error).split())}"
             if self._replace(None, request, fault):
                 log.error(f"{fault}; what was there before goes on")
 
 
-def _made(parameters: RecoverParameters, kept: _Built | None, is_wanted: Callable[[], bool]) -> _Built:
+def _made(parameters: RecoverParameters, kept: _Built | None, is_wanted: Callable[[], bool]) -> _Built | None:
     """A recoverer, warm, with the weights of ``kept`` if given; one that is there already if it is as good.
 
-    Raises _Superseded if nobody wants it any more.
+    None if nobody wants it any more.
     """
     weights = _file(parameters.model) if kept is None else kept.weights
     # Without the model: the same file may have several names.
     key = (weights, *(getattr(parameters, name) for name in _MADE_OF if name != "model"))
     with _making:
         if not is_wanted():
-            raise _Superseded
+            return None
         if (known := _shared.get(key)) is not None:
             return _Built(known, parameters, weights, key)
         recoverer = _shared[key] = Recoverer(
@@ -216,7 +210,7 @@ def _made(parameters: RecoverParameters, kept: _Built | None, is_wanted: Callabl
         )
     with TURNS.turn():
         if not is_wanted():
-            raise _Superseded
+            return None
         recoverer.warm_up(unit_cube.camera() if parameters.projection == "orthographic" else WARM_UP_CAMERA)
     return _Built(recoverer, parameters, weights, key)
 

@@ -55,7 +55,8 @@ class Statistics:
     def count(self, what: str, number: int = 1) -> None:
         """Add to received or dropped."""
         with self._lock:
-            self._add(what, number)
+            self._counts[what] += number
+            self._recent.extend([(self._clock(), what)] * number)
 
     def lose(self, topic: str, number: int) -> None:
         """Count messages of a topic that were never received."""
@@ -64,15 +65,13 @@ class Statistics:
 
     def refuse(self, reason: str) -> None:
         """Count a refused frame."""
-        with self._lock:
-            self._add("refused", 1)
-            self._last_error = f"{datetime.now(timezone.utc):%Y-%m-%dT%H:%M:%SZ} {reason}"
+        self._last_error = f"{datetime.now(timezone.utc):%Y-%m-%dT%H:%M:%SZ} {reason}"
+        self.count("refused")
 
     def answer(self, milliseconds: Mapping[str, float], summary: str = "") -> None:
         """Count an answered frame with the duration of its stages; the summary also says why there are no bodies."""
-        with self._lock:
-            self._add("answered", 1)
-            self._last_answer = summary
+        self._last_answer = summary
+        self.count("answered")
         self.note(milliseconds)
 
     def note(self, milliseconds: Mapping[str, float]) -> None:
@@ -129,7 +128,3 @@ class Statistics:
         pairs = [KeyValue(key=key, value=value) for key, value in values.items()]
         about = f"{name.lstrip('/')}: frames"
         return DiagnosticStatus(level=level, name=about, message=message, hardware_id=name, values=pairs)
-
-    def _add(self, what: str, number: int) -> None:
-        self._counts[what] += number
-        self._recent.extend([(self._clock(), what)] * number)

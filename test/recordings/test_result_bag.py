@@ -308,7 +308,7 @@ def test_a_name_that_cannot_be_written_is_said_at_once(tmp_path, capsys):
     for source, arguments, said in (
         (path, ["--mcap", tmp_path / "nowhere" / "results.mcap"], "folder does not exist"),
         (path, ["--mcap", tmp_path / "results.bag"], "ends in .mcap"),
-        (path, ["--mcap", tmp_path / "folder.mcap"], "a file that ends in .mcap"),
+        (path, ["--mcap", tmp_path / "folder.mcap"], "Is a directory"),
         (path, ["--mcap", tmp_path / "results.mcap", "--mcap-images", "depth,colour"], "colour"),
         (lone, ["--mcap", lone], "this is an input"),
     ):
