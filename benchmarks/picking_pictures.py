@@ -28,7 +28,8 @@ from sq_perception.evaluation import plots
 from sq_perception.evaluation.grasp_figure import draw_grasps
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.grasping.planner import GraspPlan, grasps
+from sq_perception.grasping.plan import GraspPlan
+from sq_perception.grasping.planner import grasps
 from sq_perception.grasping.surroundings import Surroundings
 from sq_perception.imaging.camera import Camera
 from sq_perception.recovery.recoverer import Recoverer

@@ -28,7 +28,7 @@ from sq_perception.files import output_file
 
 if TYPE_CHECKING:
     from sq_perception.grasping.gripper import Gripper
-    from sq_perception.grasping.planner import GraspPlan
+    from sq_perception.grasping.plan import GraspPlan
     from sq_perception.recordings.frame_file import RecordedFrame
     from sq_perception.recovery.recoverer import Recoverer, Recovery
 

@@ -8,7 +8,7 @@ from matplotlib.axes import Axes
 from sq_perception.evaluation import plots
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.grasping.gripper import Gripper
-from sq_perception.grasping.planner import GraspPlan
+from sq_perception.grasping.plan import GraspPlan
 from sq_perception.imaging.camera import Camera
 
 

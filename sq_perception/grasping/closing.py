@@ -26,8 +26,6 @@ import numpy as np
 from sq_perception.geometry.kernels import gauge_derivatives, kernel, p_norm
 from sq_perception.geometry.superquadric import Superquadric, nested_norm_and_slopes
 
-MODEL_ERROR = 0.0025
-"""Metres by which real things stray from superquadrics, as the repair of segments has it."""
 UNKNOWN = 0.1
 """Of a half size: its standard deviation where a body comes without one."""
 _STEP = np.pi / 12

@@ -22,7 +22,8 @@ from sq_msgs_py.markers import markers
 from sq_msgs_py.poses import plane_of
 from sq_msgs_py.superquadrics import SuperquadricArray, from_message
 from sq_perception.grasping.gripper import Gripper, gripper
-from sq_perception.grasping.planner import GraspPlan, grasps, warm_up
+from sq_perception.grasping.plan import GraspPlan
+from sq_perception.grasping.planner import grasps, warm_up
 from sq_perception.grasping.surroundings import Surroundings
 from sq_perception.nodes.live_parameters import LiveParameters
 from sq_perception.nodes.managed_node import ManagedNode

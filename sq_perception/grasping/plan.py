@@ -1,0 +1,70 @@
+"""What a plan of grasps is made of.
+
+The pose of a grasp is that of the TCP (:mod:`sq_perception.grasping.gripper`) in the frame of the bodies; metres.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sq_perception.geometry import rotation as quaternions
+
+
+@dataclass(frozen=True, eq=False)
+class Grasp:
+    """One grasp.
+
+    Attributes
+    ----------
+    body
+        Position of its body in the batch.
+    position, rotation : (3,), (4,)
+        Of the TCP, a quaternion x y z w, in the frame of the bodies.
+    opening
+        Of the fingers before they close.
+    width
+        Of the body between them.
+    score
+        Probability that it holds.
+    weakest
+        The margin that takes most from the score.
+    """
+
+    body: int
+    position: np.ndarray
+    rotation: np.ndarray
+    opening: float
+    width: float
+    score: float
+    weakest: str
+
+    @property
+    def approach(self) -> np.ndarray:
+        """The unit vector (3,) along which the gripper comes."""
+        return np.asarray(quaternions.to_matrix(self.rotation))[:, 2]
+
+    def placed(self, points: np.ndarray) -> np.ndarray:
+        """Points (j, 3) of the TCP's frame in the frame of the bodies."""
+        return points @ np.asarray(quaternions.to_matrix(self.rotation)).T + self.position
+
+
+@dataclass(frozen=True, eq=False)
+class GraspPlan:
+    """Grasps of all bodies, the most probable first, and why bodies have none.
+
+    Attributes
+    ----------
+    grasps
+        At most :data:`sq_perception.grasping.planner.PER_BODY` a body.
+    reasons
+        One a body, empty for those with a grasp.
+    """
+
+    grasps: tuple[Grasp, ...] = ()
+    reasons: tuple[str, ...] = ()
+
+    def of(self, body: int) -> tuple[Grasp, ...]:
+        """The grasps of one body, best first."""
+        return tuple(grasp for grasp in self.grasps if grasp.body == body)
