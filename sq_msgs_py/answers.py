@@ -1,9 +1,11 @@
-"""What ``~/recover`` of a frame node answers: the bodies of one image, as JSON in the message of a std_srvs/Trigger.
+"""What ``~/recover`` and ``~/plan`` answer: bodies of one image, or grasps, as JSON in a std_srvs/Trigger's message.
 
     {"frame_id": "camera", "stamp": {"sec": 7, "nanosec": 5}, "words": "1 body in 80 ms; ...", "superquadrics": [...]}
+    {"frame_id": "base_link", "stamp": {...}, "words": "8 grasps of 1 bodies", "grasps": [...]}
 
-Each superquadric has the columns of :class:`~sq_msgs_py.superquadrics.SuperquadricArray` by their names, in its units
-and order; null where a number is not known.  Where the answer is no success, its message says why, in words.
+Each superquadric has the columns of :class:`~sq_msgs_py.superquadrics.SuperquadricArray` by their names, each grasp
+those of :class:`~sq_msgs_py.grasps.GraspArray`, in its units and order; null where a number is not known.  Where the
+answer is no success, its message says why, in words.
 """
 
 from __future__ import annotations
@@ -15,9 +17,11 @@ from typing import Any
 
 import numpy as np
 
+from sq_msgs_py.grasps import GraspArray
 from sq_msgs_py.superquadrics import FIELDS, UINT32, MessageError, SuperquadricArray
 
-_COLUMNS = tuple(column.name for column in fields(SuperquadricArray))
+_NAMES: dict[type[Any], str] = {SuperquadricArray: "superquadrics", GraspArray: "grasps"}
+_SERVICES: dict[type[Any], str] = {SuperquadricArray: "~/recover", GraspArray: "~/plan"}
 _WHOLE = tuple(name for name, kind in FIELDS if kind == UINT32)
 
 
@@ -31,16 +35,26 @@ class Answer:
     words: str
 
 
-def text_of(bodies: SuperquadricArray, header: Any, words: str) -> str:
+@dataclass(frozen=True, eq=False)
+class GraspAnswer:
+    """Grasps, the frame they are in, the stamp of the bodies' image, nanoseconds, and a summary."""
+
+    grasps: GraspArray
+    frame_id: str
+    stamp: int
+    words: str
+
+
+def text_of(found: SuperquadricArray | GraspArray, header: Any, words: str) -> str:
     """The message of an answer; ``header`` is that of the cloud."""
-    columns = {name: getattr(bodies, name) for name in _COLUMNS}
+    columns = {column.name: getattr(found, column.name) for column in fields(found)}
     return json.dumps(
         {
             "frame_id": header.frame_id,
             "stamp": {"sec": header.stamp.sec, "nanosec": header.stamp.nanosec},
             "words": words,
-            "superquadrics": [
-                {name: _plain(column[k]) for name, column in columns.items()} for k in range(len(bodies))
+            _NAMES[type(found)]: [
+                {name: _plain(column[k]) for name, column in columns.items()} for k in range(len(found))
             ],
         },
         allow_nan=False,
@@ -48,27 +62,39 @@ def text_of(bodies: SuperquadricArray, header: Any, words: str) -> str:
 
 
 def from_response(response: Any) -> Answer:
-    """The answer in a std_srvs/Trigger response.
+    """The answer of ``~/recover`` in a std_srvs/Trigger response.
 
     Raises
     ------
     MessageError
         If it was no success, by its words, or is of another service.
     """
+    return Answer(*_parts(response, SuperquadricArray))
+
+
+def grasps_from_response(response: Any) -> GraspAnswer:
+    """The answer of ``~/plan``; raises as :func:`from_response` does."""
+    return GraspAnswer(*_parts(response, GraspArray))
+
+
+def _parts(response: Any, kind: type[Any]) -> tuple[Any, str, int, str]:
+    """Array, frame, stamp and words of an answer."""
     if not response.success:
         raise MessageError(response.message)
     try:
         found = json.loads(response.message)
-        rows, stamp = found["superquadrics"], found["stamp"]
+        rows, stamp = found[_NAMES[kind]], found["stamp"]
         columns = {
-            name: np.array([row[name] for row in rows], np.int64 if name in _WHOLE else float)
-            for name in _COLUMNS
-            if all(name in row for row in rows)  # a node of another version may know less
+            column.name: np.array([row[column.name] for row in rows], np.int64 if column.name in _WHOLE else float)
+            for column in fields(kind)
+            if all(column.name in row for row in rows)  # a node of another version may know less
         }
         nanoseconds = int(stamp["sec"]) * 10**9 + int(stamp["nanosec"])
-        return Answer(SuperquadricArray(**columns), str(found["frame_id"]), nanoseconds, str(found["words"]))
+        return kind(**columns), str(found["frame_id"]), nanoseconds, str(found["words"])
     except (ValueError, TypeError, LookupError, OverflowError, RecursionError) as error:
-        raise MessageError(f"expected the answer of a ~/recover service: {type(error).__name__}: {error}") from error
+        raise MessageError(
+            f"expected the answer of a {_SERVICES[kind]} service: {type(error).__name__}: {error}"
+        ) from error
 
 
 def _plain(value: np.ndarray | np.generic) -> Any:

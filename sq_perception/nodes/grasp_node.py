@@ -17,6 +17,7 @@ from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
+from sq_msgs_py import answers
 from sq_msgs_py import grasps as messages
 from sq_msgs_py.markers import markers
 from sq_msgs_py.poses import plane_of
@@ -88,26 +89,29 @@ class GraspNode(ManagedNode):
         if not self.is_active or self._last is None:
             response.message = "no superquadrics have come yet" if self.is_active else f"the node is {self.state}"
             return response
-        response.success, response.message = self._answered(self._last)
+        found, response.message = self._answered(self._last)
+        if found:
+            response.success = True
+            response.message = answers.text_of(found, self._last.header, response.message)
         return response
 
-    def _answered(self, message: PointCloud2) -> tuple[bool, str]:
-        """Plan and publish; whether there is a grasp, and why not.  No message ends the node."""
+    def _answered(self, message: PointCloud2) -> tuple[messages.GraspArray | None, str]:
+        """Plan and publish; the grasps, and of how many bodies, and why others have none.  No message ends the node."""
         try:
             bodies = from_message(message).recovered
             plane = None
             if self._plane is not None and self._plane.header.frame_id == message.header.frame_id:
                 plane = plane_of(self._plane)
             plan = planned(bodies, self._settings.current, plane)
-            self._publish(message.header, bodies, plan, gripper(self._settings.current.gripper))
+            found = self._published(message.header, bodies, plan, gripper(self._settings.current.gripper))
         except Exception as error:
             reason = f"refused superquadrics: {type(error).__name__}: {error}"
             self.get_logger().warning(reason, throttle_duration_sec=THROTTLE)
-            return False, reason
+            return None, reason
         reasons = [f"{number}: {why}" for number, why in zip(bodies.id, plan.reasons, strict=True) if why]
-        return bool(plan.grasps), "; ".join([f"{len(plan.grasps)} grasps of {len(bodies)} bodies", *reasons])
+        return found, "; ".join([f"{len(found)} grasps of {len(bodies)} bodies", *reasons])
 
-    def _publish(self, header: Any, bodies: SuperquadricArray, plan: GraspPlan, hand: Gripper) -> None:
+    def _published(self, header: Any, bodies: SuperquadricArray, plan: GraspPlan, hand: Gripper) -> messages.GraspArray:
         found = messages.GraspArray(
             np.array([grasp.position for grasp in plan.grasps]).reshape(-1, 3),
             np.array([grasp.rotation for grasp in plan.grasps]).reshape(-1, 4),
@@ -126,6 +130,7 @@ class GraspNode(ManagedNode):
             meshes.append((grasp.placed(vertices), faces, grasp.placed(edges)))
         shown.publish(markers(meshes, list(best), header, namespace="grasps", previous_ids=self._shown))
         self._shown = tuple(best)
+        return found
 
 
 def planned(bodies: SuperquadricArray, parameters: GraspParameters, plane: np.ndarray | None = None) -> GraspPlan:
@@ -133,7 +138,9 @@ def planned(bodies: SuperquadricArray, parameters: GraspParameters, plane: np.nd
     hand = gripper(parameters.gripper)
     friction, placement = parameters.friction, parameters.placement
     plan = grasps(superquadrics(bodies), hand, covariances(bodies), Surroundings(plane), friction, placement)
-    wanted = [parameters.only_id in (-1, int(number)) for number in bodies.id]
+    low, high = parameters.region[:3], parameters.region[3:]
+    wanted = np.all((bodies.translation >= low) & (bodies.translation <= high), axis=1)
+    wanted &= (parameters.only_id == -1) | (bodies.id == parameters.only_id)
     kept = tuple(one for one in plan.grasps if one.score >= parameters.min_score and wanted[one.body])
     have = {one.body for one in kept}
     reasons = tuple(

@@ -22,6 +22,12 @@ TRANSPORTS = (RAW, compressed_depth.TRANSPORT)
 """As image_transport names them."""
 POINTS = "points"
 """Depth images as clouds of points."""
+EVERYWHERE = (-100.0, -100.0, -100.0, 100.0, 100.0, 100.0)
+
+
+def _check_box(name: str, box: tuple[float, ...]) -> None:
+    if len(box) != 6 or not all(a < b for a, b in zip(box[:3], box[3:], strict=True)):
+        raise ParameterError(f"{name}: expected least x, y, z and greater x, y, z in metres, got {list(box)}")
 
 
 @dataclass(frozen=True)
@@ -77,7 +83,7 @@ class RecoverParameters(Parameters):
         0.6, "Largest full edge of an object of the node's own segmentation.", unit="m", within=(0.01, 100.0)
     )
     workspace: tuple[float, ...] = setting(
-        (-100.0, -100.0, -100.0, 100.0, 100.0, 100.0),
+        EVERYWHERE,
         "Least x, y, z, then greatest x, y, z of the middle of what is seen of an object, in target_frame or, without "
         "one, the image's; objects outside are left out.",
         unit="m",
@@ -174,11 +180,7 @@ class RecoverParameters(Parameters):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        low, high = self.workspace[:3], self.workspace[3:]
-        if len(self.workspace) != 6 or not all(a < b for a, b in zip(low, high, strict=True)):
-            raise ParameterError(
-                f"workspace: expected least x, y, z and greater x, y, z in metres, got {list(self.workspace)}"
-            )
+        _check_box("workspace", self.workspace)
         if not self.depth_min < self.depth_max:
             raise ParameterError(
                 f"depth_min, depth_max: expected depth_min < depth_max, got {self.depth_min:g} and {self.depth_max:g}"
@@ -307,6 +309,15 @@ class GraspParameters(Parameters):
     )
     min_score: float = setting(0.3, "Grasps that hold with less probability are not published.", within=(0.0, 1.0))
     only_id: int = setting(-1, "Plan for the body of this id alone; -1: for all.", within=(-1, 2**31 - 1))
+    region: tuple[float, ...] = setting(
+        EVERYWHERE,
+        "Plan for bodies whose centre is within least x, y, z and greatest x, y, z, in the frame of the cloud.",
+        unit="m",
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _check_box("region", self.region)
 
 
 KINDS: dict[str, type[Parameters]] = {

@@ -16,6 +16,7 @@ from std_msgs.msg import Header
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import Marker, MarkerArray
 
+from sq_msgs_py import answers
 from sq_msgs_py import grasps as messages
 from sq_msgs_py.poses import plane_message
 from sq_msgs_py.superquadrics import SuperquadricArray, to_message
@@ -109,6 +110,24 @@ def test_one_body_may_be_asked_for_and_the_reason_of_none_is_told(bench):
     assert f"{WALL}: wider than the opening" in answer.message
     bench.until(lambda: not bench.heard["grasps"].poses)
     assert {marker.action for marker in bench.heard["markers"].markers} == {Marker.DELETE}
+
+
+def test_a_region_may_be_asked_for_and_the_answer_has_its_grasps(bench):
+    bench.answer(to_message(bodies(), HEADER))
+    bench.heard.clear()
+    (refused,) = bench.node.set_parameters([Parameter("region", value=[0.5, -0.1, 0.0, 0.4, 0.1, 0.2])])
+    assert "region: expected least x, y, z and greater" in refused.reason
+    bench.node.set_parameters([Parameter("region", value=[0.5, -0.1, 0.0, 0.7, 0.1, 0.2])])
+    answer = answers.grasps_from_response(bench.call(Trigger, "/grasp_node/plan", Trigger.Request()))
+    assert answer.frame_id == "base_link"
+    assert set(answer.grasps.id) == {CAN}
+    bench.until(lambda: "grasp_details" in bench.heard)
+    told = messages.from_message(bench.heard["grasp_details"])
+    np.testing.assert_array_equal(answer.grasps.position, told.position)
+    bench.node.set_parameters([Parameter("only_id", value=BOX)])
+    answer = bench.call(Trigger, "/grasp_node/plan", Trigger.Request())
+    assert not answer.success
+    assert answer.message == "0 grasps of 3 bodies"
 
 
 def test_a_cloud_of_something_else_is_refused_and_the_next_one_answered(bench):

@@ -1,4 +1,4 @@
-"""What ~/recover answers: columns come back as they were, and nothing hostile is taken for an answer."""
+"""What ~/recover and ~/plan answer: columns come back as they were, and nothing hostile is taken for an answer."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from sq_msgs_py.answers import from_response, text_of
+from sq_msgs_py.answers import from_response, grasps_from_response, text_of
+from sq_msgs_py.grasps import GraspArray
 from sq_msgs_py.superquadrics import MessageError, SuperquadricArray
 
 HEADER = SimpleNamespace(frame_id="camera", stamp=SimpleNamespace(sec=7, nanosec=5))
@@ -38,6 +39,22 @@ def test_every_column_comes_back_bit_by_bit(count):
         one, other = getattr(found.bodies, column.name), getattr(given, column.name)
         assert one.dtype == other.dtype
         np.testing.assert_array_equal(one, other)
+
+
+def test_grasps_come_back_bit_by_bit_and_are_not_taken_for_bodies():
+    rng = np.random.default_rng(1)
+    given = GraspArray(rng.random((3, 3)), rng.random((3, 4)), *rng.random((3, 3)), np.array([7, 2**31, 7]))
+    response = SimpleNamespace(success=True, message=text_of(given, HEADER, "words"))
+    found = grasps_from_response(response)
+    assert (found.frame_id, found.stamp, found.words) == ("camera", 7_000_000_005, "words")
+    for column in fields(given):
+        one, other = getattr(found.grasps, column.name), getattr(given, column.name)
+        assert one.dtype == other.dtype
+        np.testing.assert_array_equal(one, other)
+    with pytest.raises(MessageError, match="~/recover"):
+        from_response(response)
+    with pytest.raises(MessageError, match="~/plan"):
+        grasps_from_response(SimpleNamespace(success=True, message=text_of(bodies(1), HEADER, "")))
 
 
 def test_a_node_of_another_version_knows_more_or_less():
