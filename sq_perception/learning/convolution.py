@@ -6,30 +6,38 @@ Normalisations are folded into the convolutions before them: with g, b, m, v of 
 
 Images lie channels last with a margin of zeros, in memory that is kept.  A convolution that halves the resolution is a
 product of matrices, its windows written side by side.  The others, 3 x 3, take Winograd's short way from tiles d of
-4 x 4 pixels to tiles of 2 x 2 (Lavin and Gray, Fast algorithms for convolutional neural networks, 2016):
+s x s pixels to tiles of s - 2 (Lavin and Gray, Fast algorithms for convolutional neural networks, 2016):
 
-    A^T ((G w G^T) * (B^T d B)) A,    * the product of 16 matrices (tiles, channels) (channels, channels)
+    A^T ((G w G^T) * (B^T d B)) A,    * the product of s^2 matrices (tiles, channels) (channels, channels)
 
-with 16 products instead of 36 for each tile and pair of channels.
+with 36 products instead of 144 for each tile and pair of channels where s = 6, 16 instead of 36 where s = 4.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from sq_perception.geometry.kernels import kernel
+from sq_perception.geometry.kernels import inline_kernel, kernel
 
 Weights = Mapping[str, np.ndarray]
 """float32, by the names of :mod:`sq_perception.learning.layout`."""
 
 _EPSILON = 1e-5
 """Of torch's normalisations."""
-_G = np.array([[1, 0, 0], [0.5, 0.5, 0.5], [0.5, -0.5, 0.5], [0, 0, 1]])
-_ZERO = np.float32(0)
+_G = {
+    4: np.array([[2, 0, 0], [1, 1, 1], [1, -1, 1], [0, 0, 2]]) / 2,
+    6: np.array([[6, 0, 0], [-4, -4, -4], [-4, 4, -4], [1, 2, 4], [1, -2, 4], [0, 0, 24]]) / 24,
+}
+_WIDE = 256
+"""Channels: here tiles of 4 x 4 are taken, as to read matrices of those of 6 x 6 takes longer than they save."""
+_ZERO, _2, _4, _5, _8 = (np.float32(number) for number in (0, 2, 4, 5, 8))
+_CACHED, _FEWEST_ROWS = 130_000, 40
+"""Numbers that stay in a processor's cache between two steps of a layer, and rows of a product that are worth reading
+its matrix: chosen on a cache of 1 MB a core."""
 
 
 class Memory:
@@ -46,8 +54,8 @@ class Memory:
         return known[: shape[0]]
 
     def framed(self, name: str, count: int, side: int, channels: int) -> np.ndarray:
-        """Square images with a margin of one pixel, and one more where tiles of 2 x 2 reach beyond."""
-        whole = side + 2 + side % 2
+        """Square images with a margin of one pixel, and more where tiles of 4 x 4 reach beyond."""
+        whole = side + 2 + -side % 4
         return self.zeros(name, (count, whole, whole, channels))
 
     def loose(self, name: str, shape: tuple[int, ...]) -> np.ndarray:
@@ -76,9 +84,14 @@ class Direct:
 
     def products(self, x: np.ndarray, first: int, side: int, memory: Memory, name: str) -> np.ndarray:
         """(n side^2, k) for the windows of images (n, s, s, c) from their pixel (first, first) on."""
-        windows = memory.loose("windows", (len(x) * side * side, len(self.matrix)))
-        _write_windows(x, first, self.size, self.stride, side, windows)
-        return np.matmul(windows, self.matrix, out=memory.loose(name, (len(windows), self.channels)))
+        pixels = side * side
+        out = memory.loose(name, (len(x) * pixels, self.channels))
+        for part in _parts(len(x), pixels, len(self.matrix)):
+            rows = out[part.start * pixels : part.stop * pixels]
+            windows = memory.loose("windows", (len(rows), len(self.matrix)))
+            _write_windows(x[part], first, self.size, self.stride, side, windows)
+            np.matmul(windows, self.matrix, out=rows)
+        return out
 
     def computed(self, x: np.ndarray, side: int, memory: Memory, name: str) -> np.ndarray:
         """Framed images of ``side`` pixels a side."""
@@ -90,7 +103,7 @@ class Direct:
 
 @dataclass(frozen=True, eq=False)
 class _Tiled:
-    """A 3 x 3 convolution that keeps the resolution, then max(0, .): ``matrices`` (16, c, k)."""
+    """A 3 x 3 convolution that keeps the resolution, then max(0, .): ``matrices`` (s^2, c, k)."""
 
     matrices: np.ndarray
     bias: np.ndarray
@@ -98,20 +111,26 @@ class _Tiled:
     @classmethod
     def folded(cls, weights: Weights, name: str, norm: str) -> _Tiled:
         kernels, bias = _folded(weights, name, norm)
-        matrices = np.einsum("ai,bj,kcij->abck", _G, _G, kernels).reshape(16, kernels.shape[1], -1)
-        return cls(contiguous(matrices), bias)
+        inputs = kernels.shape[1]
+        g = _G[4 if inputs >= _WIDE else 6]
+        return cls(contiguous(np.einsum("ai,bj,kcij->abck", g, g, kernels).reshape(len(g) ** 2, inputs, -1)), bias)
 
     def computed(
         self, x: np.ndarray, side: int, memory: Memory, name: str, skip: np.ndarray | None = None, margin: int = 0
     ) -> np.ndarray:
         """Framed images of framed ones; ``skip``, images with that margin, is added to the sums."""
-        tiles = len(x) * ((side + 1) // 2) ** 2
-        _, inputs, outputs = self.matrices.shape
-        there = memory.loose("tiles", (16, tiles, inputs))
-        _write_tiles(x, side, there)
-        back = np.matmul(there, self.matrices, out=memory.loose("products", (16, tiles, outputs)))
+        squares, inputs, outputs = self.matrices.shape
+        size = math.isqrt(squares)
         out = memory.framed(name, len(x), side, outputs)
-        _write_pixels(back, self.bias, out if skip is None else skip, skip is not None, margin, side, out)
+        tiles = math.ceil(side / (size - 2)) ** 2
+        for part in _parts(len(x), tiles, squares * inputs):
+            count = (part.stop - part.start) * tiles
+            there = memory.loose("tiles", (count, squares, inputs))
+            _write_tiles(x[part], side, size, there)
+            back = memory.loose("products", (count, squares, outputs))
+            np.matmul(there.transpose(1, 0, 2), self.matrices, out=back.transpose(1, 0, 2))
+            added = out[part] if skip is None else skip[part]
+            _write_pixels(back, size, self.bias, added, skip is not None, margin, side, out[part])
         return out
 
 
@@ -143,6 +162,12 @@ class Block:
         return self.second.computed(y, side, memory, f"{name} second", skip, margin), side
 
 
+def _parts(images: int, rows: int, columns: int) -> Iterator[slice]:
+    """Slices of some images that go through a layer's product together, each (rows, columns) in it."""
+    at_once = max(1, _CACHED // (rows * columns), _FEWEST_ROWS // rows)
+    return (slice(first, min(first + at_once, images)) for first in range(0, images, at_once))
+
+
 def _folded(weights: Weights, name: str, norm: str) -> tuple[np.ndarray, np.ndarray]:
     """Kernels (k, c, s, s) with their normalisation, and their biases."""
     scale, shift, mean, variance = (
@@ -160,17 +185,17 @@ def contiguous(values: np.ndarray) -> np.ndarray:
 def _write_windows(x: np.ndarray, first: int, size: int, stride: int, side: int, windows: np.ndarray) -> None:
     """The windows of images (n, s, s, c) from a pixel on, side by side: (n side^2, size^2 c)."""
     channels = x.shape[3]
+    length = size * channels
     row = 0
     for image in range(x.shape[0]):
+        lines = x[image].reshape(x.shape[1], x.shape[2] * channels)
         for i in range(side):
             for j in range(side):
-                written = windows[row]
-                for di in range(size):
-                    for dj in range(size):
-                        pixel = x[image, first + stride * i + di, first + stride * j + dj]
-                        there = written[(di * size + dj) * channels : (di * size + dj + 1) * channels]
-                        for c in range(channels):
-                            there[c] = pixel[c]
+                written, begin = windows[row], (first + stride * j) * channels
+                for d in range(size):
+                    line = lines[first + stride * i + d]
+                    for k in range(length):
+                        written[d * length + k] = line[begin + k]
                 row += 1
 
 
@@ -188,70 +213,96 @@ def _write_sums(products: np.ndarray, bias: np.ndarray, side: int, out: np.ndarr
 
 
 @kernel
-def _write_tiles(x: np.ndarray, side: int, tiles: np.ndarray) -> None:
-    """B^T d B of every tile of framed images: (16, tiles, channels)."""
-    channels, count = x.shape[3], (side + 1) // 2
-    half = np.empty((4, 4, channels), np.float32)  # B^T d
+def _write_tiles(x: np.ndarray, side: int, size: int, tiles: np.ndarray) -> None:
+    """B^T d B of every tile of framed images: (tiles, size^2, channels)."""
+    channels, step = x.shape[3], size - 2
+    count = (side + step - 1) // step
+    half = np.empty((size, (count * step + 2) * channels), np.float32)  # B^T d of a row of tiles
     tile = 0
     for image in range(x.shape[0]):
+        rows = x[image].reshape(x.shape[1], x.shape[2] * channels)
         for i in range(count):
+            _forward(rows[step * i : step * i + size], half)
             for j in range(count):
-                for k in range(4):
-                    d0, d1 = x[image, 2 * i, 2 * j + k], x[image, 2 * i + 1, 2 * j + k]
-                    d2, d3 = x[image, 2 * i + 2, 2 * j + k], x[image, 2 * i + 3, 2 * j + k]
-                    h0, h1, h2, h3 = half[0, k], half[1, k], half[2, k], half[3, k]
-                    for c in range(channels):
-                        h0[c] = d0[c] - d2[c]
-                        h1[c] = d1[c] + d2[c]
-                        h2[c] = d2[c] - d1[c]
-                        h3[c] = d1[c] - d3[c]
-                for k in range(4):
-                    h0, h1, h2, h3 = half[k, 0], half[k, 1], half[k, 2], half[k, 3]
-                    t0, t1 = tiles[4 * k, tile], tiles[4 * k + 1, tile]
-                    t2, t3 = tiles[4 * k + 2, tile], tiles[4 * k + 3, tile]
-                    for c in range(channels):
-                        t0[c] = h0[c] - h2[c]
-                        t1[c] = h1[c] + h2[c]
-                        t2[c] = h2[c] - h1[c]
-                        t3[c] = h1[c] - h3[c]
+                for k in range(size):
+                    row = half[k].reshape(count * step + 2, channels)
+                    _forward(row[step * j : step * j + size], tiles[tile, size * k : size * (k + 1)])
                 tile += 1
 
 
 @kernel
 def _write_pixels(
-    tiles: np.ndarray, bias: np.ndarray, skip: np.ndarray, is_added: bool, margin: int, side: int, out: np.ndarray
+    tiles: np.ndarray,
+    size: int,
+    bias: np.ndarray,
+    skip: np.ndarray,
+    is_added: bool,
+    margin: int,
+    side: int,
+    out: np.ndarray,
 ) -> None:
     """max(0, A^T m A + bias + skip) of every tile into framed images."""
-    channels, count = bias.shape[0], (side + 1) // 2
-    half = np.empty((2, 4, channels), np.float32)  # A^T m
-    pixel = np.empty(channels, np.float32)
+    channels, step = bias.shape[0], size - 2
+    count = (side + step - 1) // step
+    half = np.empty((step, size * channels), np.float32)  # A^T m
+    pixels = np.empty((step, channels), np.float32)
     tile = 0
     for image in range(out.shape[0]):
         for i in range(count):
             for j in range(count):
-                for k in range(4):
-                    m0, m1, m2, m3 = tiles[k, tile], tiles[4 + k, tile], tiles[8 + k, tile], tiles[12 + k, tile]
-                    h0, h1 = half[0, k], half[1, k]
-                    for c in range(channels):
-                        h0[c] = m0[c] + m1[c] + m2[c]
-                        h1[c] = m1[c] - m2[c] - m3[c]
-                for k in range(4):
-                    y, x = 2 * i + k // 2, 2 * j + k % 2
-                    if y >= side or x >= side:
-                        continue
-                    h0, h1, h2, h3 = half[k // 2, 0], half[k // 2, 1], half[k // 2, 2], half[k // 2, 3]
-                    if k % 2 == 0:
-                        for c in range(channels):
-                            pixel[c] = h0[c] + h1[c] + h2[c] + bias[c]
-                    else:
-                        for c in range(channels):
-                            pixel[c] = h1[c] - h2[c] - h3[c] + bias[c]
-                    shown = out[image, y + 1, x + 1]
-                    if is_added:
-                        added = skip[image, y + margin, x + margin]
-                        for c in range(channels):
-                            shown[c] = max(pixel[c] + added[c], _ZERO)
-                    else:
-                        for c in range(channels):
-                            shown[c] = max(pixel[c], _ZERO)
+                _back(tiles[tile].reshape(size, size * channels), half)
+                for y in range(step * i, min(step * (i + 1), side)):
+                    _back(half[y - step * i].reshape(size, channels), pixels)
+                    for x in range(step * j, min(step * (j + 1), side)):
+                        pixel, shown = pixels[x - step * j], out[image, y + 1, x + 1]
+                        if is_added:
+                            added = skip[image, y + margin, x + margin]
+                            for c in range(channels):
+                                shown[c] = max(pixel[c] + bias[c] + added[c], _ZERO)
+                        else:
+                            for c in range(channels):
+                                shown[c] = max(pixel[c] + bias[c], _ZERO)
                 tile += 1
+
+
+@inline_kernel
+def _forward(d: np.ndarray, out: np.ndarray) -> None:
+    """B^T d for rows d (s, n); each loop works on few enough rows to become vector code."""
+    d0, d1, d2, d3 = d[0], d[1], d[2], d[3]
+    t0, t1, t2, t3 = out[0], out[1], out[2], out[3]
+    count = len(d0)
+    if len(d) == 4:
+        for c in range(count):
+            t0[c], t1[c] = d0[c] - d2[c], d1[c] + d2[c]
+        for c in range(count):
+            t2[c], t3[c] = d2[c] - d1[c], d1[c] - d3[c]
+        return
+    d4, d5, t4, t5 = d[4], d[5], out[4], out[5]
+    for c in range(count):
+        t0[c] = _4 * d0[c] - _5 * d2[c] + d4[c]
+    for c in range(count):
+        even, odd = d4[c] - _4 * d2[c], d3[c] - _4 * d1[c]
+        t1[c], t2[c] = even + odd, even - odd
+    for c in range(count):
+        even, odd = d4[c] - d2[c], _2 * (d3[c] - d1[c])
+        t3[c], t4[c] = even + odd, even - odd
+    for c in range(count):
+        t5[c] = _4 * d1[c] - _5 * d3[c] + d5[c]
+
+
+@inline_kernel
+def _back(m: np.ndarray, out: np.ndarray) -> None:
+    """A^T m for rows m (s, n), likewise."""
+    m0, m1, m2, m3, y0, y1 = m[0], m[1], m[2], m[3], out[0], out[1]
+    count = len(m0)
+    if len(m) == 4:
+        for c in range(count):
+            y0[c], y1[c] = m0[c] + m1[c] + m2[c], m1[c] - m2[c] - m3[c]
+        return
+    m4, m5, y2, y3 = m[4], m[5], out[2], out[3]
+    for c in range(count):
+        once, twice = m1[c] + m2[c], m3[c] + m4[c]
+        y0[c], y2[c] = m0[c] + once + twice, once + _4 * twice
+    for c in range(count):
+        once, twice = m1[c] - m2[c], m3[c] - m4[c]
+        y1[c], y3[c] = once + _2 * twice, once + _8 * twice + m5[c]

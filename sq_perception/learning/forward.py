@@ -29,8 +29,8 @@ from sq_perception.learning.network_config import (
     checked_views,
 )
 
-_AT_ONCE = 10
-"""Views that pass through the layers together; their numbers fit into a processor's cache."""
+_AT_ONCE = 40
+"""Views that pass through the layers together: 20 things, each seen twice."""
 
 
 class CompactRegressor:
