@@ -16,7 +16,7 @@ from sq_perception.recordings.frame_file import FrameError, RecordedFrame
 from sq_perception.recordings.inputs import RecordedInput
 from sq_perception.recordings.tracks import RecordedTracks
 from sq_perception.recovery import workers
-from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, Recovery, RecoveryOptions
+from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, RecoveryOptions
 
 
 class RecoverRun:
@@ -85,9 +85,6 @@ class RecoverRun:
             parts.append(f"median {statistics.median(entry['ms'] for entry in entries):.0f} ms")
         return ", ".join(parts)
 
-    def _is_wanted(self, body: Recovery) -> bool:
-        return body.status == Status.FAILED or body.score >= self._options.min_score
-
     def _work(self, frame: RecordedFrame) -> workers.Work:
         labels = None if self._options.ignore_masks else frame.labels
         return workers.Work(frame.depth, frame.camera, labels, replace(self._settings, free_space=frame.has_free_space))
@@ -122,7 +119,9 @@ class RecoverRun:
             raise FrameError(f"{file}: {frame.name}: {answer}") from answer
         if isinstance(answer, Exception):
             raise answer
-        recovery = replace(answer, bodies=tuple(body for body in answer.bodies if self._is_wanted(body)))
+        least = self._options.min_score
+        wanted = tuple(body for body in answer.bodies if body.status == Status.FAILED or body.score >= least)
+        recovery = replace(answer, bodies=wanted)
         tracks = self._tracks.follow(file, frame, recovery) if self._tracks else None
         has_masks = not self._options.ignore_masks and frame.labels is not None
         entry = frame_entry.frame_entry(file, frame, recovery, tracks, has_masks)

@@ -118,7 +118,10 @@ def draw_bodies_3d(
 
 def picture_axes(elevation: float, azimuth: float, plane: np.ndarray | None = None) -> np.ndarray:
     """Rows: right, down, forward of a picture of :func:`draw_bodies_3d`, in the optical frame."""
-    return _view_matrix(elevation, azimuth) @ _upright(plane)
+    tilt, turn = np.radians([elevation, azimuth])
+    forward = np.array([-np.sin(turn) * np.cos(tilt), np.cos(turn) * np.cos(tilt), -np.sin(tilt)])
+    right = np.array([np.cos(turn), np.sin(turn), 0.0])
+    return np.stack([right, np.cross(forward, right), forward]) @ _upright(plane)
 
 
 def _upright(plane: np.ndarray | None) -> np.ndarray:
@@ -130,14 +133,6 @@ def _upright(plane: np.ndarray | None) -> np.ndarray:
     right = np.cross(forward, up)
     right /= np.linalg.norm(right)
     return np.stack([right, np.cross(up, right), up])
-
-
-def _view_matrix(elevation: float, azimuth: float) -> np.ndarray:
-    """Rows: right, down, forward of the picture, in (right, away, up)."""
-    tilt, turn = np.radians([elevation, azimuth])
-    forward = np.array([-np.sin(turn) * np.cos(tilt), np.cos(turn) * np.cos(tilt), -np.sin(tilt)])
-    right = np.array([np.cos(turn), np.sin(turn), 0.0])
-    return np.stack([right, np.cross(forward, right), forward])
 
 
 def _shaded(

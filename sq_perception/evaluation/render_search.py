@@ -16,7 +16,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
@@ -68,10 +67,13 @@ def search(bodies: Superquadric, sharpness: np.ndarray, tau: np.ndarray, resolut
     return RenderSearch(np.asarray(sharpness, dtype=float), np.asarray(tau, dtype=float), error / len(bodies))
 
 
-def draw(ax: Axes, found: RenderSearch) -> None:
+def figure(found: RenderSearch) -> Figure:
     """The errors as a heat map on logarithmic scales, the optimum and the thesis' one marked."""
+    sheet = Figure(figsize=(6.4, 4.8), layout="constrained")
+    FigureCanvasAgg(sheet)
+    ax = sheet.add_subplot()
     mesh = ax.pcolormesh(found.tau, found.sharpness, np.log10(found.error), shading="nearest", cmap="viridis")
-    bar = ax.figure.colorbar(mesh, ax=ax)
+    bar = sheet.colorbar(mesh, ax=ax)
     ticks = np.array([0.003, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2])
     ticks = ticks[(ticks >= found.error.min()) & (ticks <= found.error.max())]
     bar.set_ticks(np.log10(ticks), labels=[f"{tick:g}" for tick in ticks])
@@ -81,11 +83,4 @@ def draw(ax: Axes, found: RenderSearch) -> None:
     ax.plot(soft_agreement.THESIS_TAU, soft_agreement.THESIS_SHARPNESS, "x", color="white", label="thesis: 117.3, 4.82")
     ax.set(xscale="log", yscale="log", xlabel="tau", ylabel="s", title="Soft against exact images")
     ax.legend(loc="lower right", facecolor=plots.INK, labelcolor="white", fontsize=8)
-
-
-def figure(found: RenderSearch) -> Figure:
-    """The heat map alone."""
-    sheet = Figure(figsize=(6.4, 4.8), layout="constrained")
-    FigureCanvasAgg(sheet)
-    draw(sheet.add_subplot(), found)
     return sheet

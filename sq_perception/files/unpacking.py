@@ -60,8 +60,6 @@ def npy_array(path: Path) -> np.ndarray:
     try:
         with path.open("rb") as file:
             return _numbers(file, path.stat().st_size)
-    except UnpackingError:
-        raise
     except (OSError, ValueError, EOFError) as error:
         raise UnpackingError(f"not a readable NPY file: {error}") from error
 

@@ -72,7 +72,7 @@ def triangles(body: Superquadric, resolution: int = 32) -> tuple[np.ndarray, np.
         np.linspace(-np.pi, np.pi, resolution, endpoint=False),
         indexing="ij",
     )
-    unit = _at_unit_size(body)
+    unit = Superquadric.at_origin(np.ones(3), body.shape)
     points = unit.parametric_points(eta.ravel(), omega.ravel())
     _, kept = np.unique(np.round(points, _SAME_POINT_DIGITS), axis=0, return_index=True)
     points = points[np.sort(kept)]
@@ -152,7 +152,7 @@ def export(
     suffix = path.suffix.lower()
     if suffix not in (".glb", ".ply"):
         raise ValueError(f"{path.name}: expected a name that ends in .glb or .ply")
-    singles = _singles(bodies)
+    singles = [bodies] if isinstance(bodies, Superquadric) and not bodies.batch_shape else list(bodies)
     if not singles:
         raise ValueError(f"{path.name}: no body to write")
     names = [f"body_{k}" for k in range(len(singles))] if names is None else list(names)
@@ -179,13 +179,3 @@ def export(
 def _check_single(body: Superquadric) -> None:
     if body.batch_shape:
         raise ValueError(f"expected a single body, got a batch of shape {body.batch_shape}")
-
-
-def _singles(bodies: Superquadric | Sequence[Superquadric]) -> list[Superquadric]:
-    if isinstance(bodies, Superquadric) and not bodies.batch_shape:
-        return [bodies]
-    return list(bodies)
-
-
-def _at_unit_size(body: Superquadric) -> Superquadric:
-    return Superquadric(np.ones(3), body.shape, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))

@@ -145,6 +145,11 @@ class Superquadric:
         return cls(flat[..., 0:3], flat[..., 3:5], flat[..., 5:8], flat[..., 8:12])
 
     @classmethod
+    def at_origin(cls, size: np.ndarray, shape: np.ndarray) -> Superquadric:
+        """Bodies of these sizes (..., 3) and exponents (..., 2) in their own frame."""
+        return cls(np.asarray(size, float), np.asarray(shape, float), np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
+
+    @classmethod
     def stack(cls, bodies: list[Superquadric]) -> Superquadric:
         """A batch (n, ...) of equally shaped bodies; an empty list gives an empty NumPy batch."""
         if not bodies:

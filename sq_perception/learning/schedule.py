@@ -16,47 +16,23 @@ _LONGEST = 20
 _FACTOR = 0.1
 
 
-@dataclass
-class Cosine:
-    """Warm up, then fall to zero at the last step."""
-
-    rate: float
-    warm_up: int
-    steps: int
-
-    def at(self, step: int) -> float:
-        """The learning rate of a step."""
-        return (
-            self.rate * min(1.0, (step + 1) / max(self.warm_up, 1)) * 0.5 * (1 + math.cos(math.pi * step / self.steps))
-        )
-
-    def validated(self, loss: float) -> None:
-        """Take note of a validation; this schedule does not look at it."""
-
-    @property
-    def exhausted(self) -> bool:
-        return False
-
-    def state(self) -> list[float]:
-        """What a continued run has to know."""
-        return []
-
-    def restore(self, state: list[float]) -> None:
-        """Go on from :meth:`state`."""
+def cosine(step: int, warm_up: int, steps: int) -> float:
+    """The share of the rate at a step."""
+    return min(1.0, (step + 1) / max(warm_up, 1)) * 0.5 * (1 + math.cos(math.pi * step / steps))
 
 
 @dataclass
 class Plateau:
-    """The thesis' schedule."""
+    """What the validations of a run have come to."""
 
-    rate: float
     best: float = math.inf
     without_progress: int = 0
     reductions: int = 0
 
-    def at(self, step: int) -> float:
-        """The learning rate of a step."""
-        return self.rate * _FACTOR**self.reductions
+    @property
+    def share(self) -> float:
+        """Of the rate."""
+        return _FACTOR**self.reductions
 
     def validated(self, loss: float) -> None:
         """Take note of a validation's loss."""
@@ -71,11 +47,3 @@ class Plateau:
     def exhausted(self) -> bool:
         """Whether nothing has become better for so long that the run should end."""
         return self.without_progress >= _LONGEST
-
-    def state(self) -> list[float]:
-        """What a continued run has to know."""
-        return [self.best, self.without_progress, self.reductions]
-
-    def restore(self, state: list[float]) -> None:
-        """Go on from :meth:`state`."""
-        self.best, self.without_progress, self.reductions = state[0], int(state[1]), int(state[2])

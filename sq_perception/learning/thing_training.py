@@ -28,15 +28,14 @@ from typing import Any
 import numpy as np
 import torch
 from safetensors.numpy import load_file as load_arrays
-from safetensors.numpy import save_file as save_arrays
+from safetensors.numpy import save as bytes_of
 from scipy.optimize import minimize_scalar
 
-from sq_perception.files import provenance
+from sq_perception.files import output_file, provenance
 from sq_perception.geometry.support_directions import mirrored
 from sq_perception.learning import checkpoint, thing_network
 from sq_perception.learning.checkpoint import CheckpointError
 from sq_perception.learning.network_config import mirrored_planes
-from sq_perception.learning.schedule import Cosine
 from sq_perception.learning.thing_network import HullPrediction, ThingConfig, ThingNetwork
 from sq_perception.learning.training_state import TrainingState
 from sq_perception.simulation.household import KINDS
@@ -99,9 +98,7 @@ def write_views(
             "support": drawn.support,
             "kinds": drawn.kinds,
         }
-        partial = path.with_suffix(".partial")
-        save_arrays(arrays, str(partial))
-        partial.replace(path)
+        output_file.write(path, bytes_of(arrays))
         said(f"{path}: {views} views")
 
 
@@ -134,7 +131,7 @@ def train(config: ThingTraining, views: Path, output: Path, form: ThingConfig | 
         begin_with(network, checkpoint.resolve(config.start))
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = torch.optim.AdamW(network.parameters(), lr=config.rate, weight_decay=config.weight_decay)
-    state = TrainingState(network, copy.deepcopy(network), optimizer, Cosine(config.rate, _WARM_UP, 1))
+    state = TrainingState(network, copy.deepcopy(network), optimizer)
     path = output / "state.safetensors"
     if path.exists():
         state.restore(path)
@@ -260,11 +257,10 @@ def begin_with(network: ThingNetwork, path: Path) -> None:
             else:
                 continue
             taken += 1
-        heads = [given.get(f"{part}_head.weight") for part in ("size", "shape", "translation", "rotation")]
-        biases = [given.get(f"{part}_head.bias") for part in ("size", "shape", "translation", "rotation")]
-        if all(head is not None for head in heads):
-            network.body_head.weight.copy_(torch.cat([h for h in heads if h is not None]))
-            network.body_head.bias.copy_(torch.cat([b for b in biases if b is not None]))
+        for name, mine in network.body_head.named_parameters():  # a Regressor has one for each part of the body
+            heads = [f"{part}_head.{name}" for part in ("size", "shape", "translation", "rotation")]
+            if given.keys() >= set(heads):
+                mine.copy_(torch.cat([given[head] for head in heads]))
     if taken == 0:
         raise CheckpointError(f"{path}: none of its weights fits the network")
 

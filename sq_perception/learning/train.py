@@ -120,7 +120,7 @@ def _train(
     torch.manual_seed(config.seed)
     model = _new_network(config, network).to(device)
     model.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-    state = TrainingState(model, copy.deepcopy(model), _optimizer(config, model), config.learning_schedule())
+    state = TrainingState(model, copy.deepcopy(model), _optimizer(config, model))
     path = output / "state.safetensors"
     if path.exists():
         state.restore(path)
@@ -135,8 +135,8 @@ def _train(
     log = TrainingLog(output if processes.is_first else None, config.steps, state.step)
     started, saved, losses = time.monotonic() - state.seconds, time.monotonic(), []
     try:
-        while state.step < config.steps and not state.schedule.exhausted:
-            progress, rate = state.step / config.steps, state.schedule.at(state.step)
+        while state.step < config.steps and not (config.schedule == "plateau" and state.plateau.exhausted):
+            progress, rate = state.step / config.steps, config.rate(state.step, state.plateau)
             for group in state.optimizer.param_groups:
                 group["lr"] = rate
             images, bodies = batches.batch(config.batch)
@@ -177,7 +177,7 @@ def _train(
                     record |= _validated(state.average, validation, objective)
                     log.record(record)
                     _keep(output, state, record, notes)
-                state.schedule.validated(1 - processes.from_first(record.get("iou", 0.0)))
+                state.plateau.validated(1 - processes.from_first(record.get("iou", 0.0)))
                 losses.clear()
             due = time.monotonic() - saved > _SAVE_SECONDS
             if processes.is_first and (state.step % config.validation == 0 or finished or stopping or due):

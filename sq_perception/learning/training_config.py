@@ -14,13 +14,13 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from sq_perception.files import plain_yaml
 from sq_perception.learning.choices import LOSSES, UNSUPERVISED, Backbone, Framing
+from sq_perception.learning.schedule import Plateau, cosine
 
 if TYPE_CHECKING:
     from sq_perception.learning.dataset import ViewSource
     from sq_perception.learning.disturbance import Disturbance
     from sq_perception.learning.network_config import RegressorConfig
     from sq_perception.learning.objective import Objective
-    from sq_perception.learning.schedule import Cosine, Plateau
 
 Optimizer = Literal["adamw", "adam"]
 _SHIPPED = Path(__file__).with_name("configurations")
@@ -151,13 +151,10 @@ class TrainingConfig:
 
         return ViewSource(network.pixels, self.pinhole_share, self.wide_share, self.disturbance(), network.framing)
 
-    def learning_schedule(self) -> Cosine | Plateau:
-        """How the learning rate goes."""
-        from sq_perception.learning.schedule import Cosine, Plateau
-
-        if self.schedule == "plateau":
-            return Plateau(self.learning_rate)
-        return Cosine(self.learning_rate, self.warm_up, self.steps)
+    def rate(self, step: int, plateau: Plateau) -> float:
+        """The learning rate of a step, by what the validations so far have come to."""
+        share = plateau.share if self.schedule == "plateau" else cosine(step, self.warm_up, self.steps)
+        return self.learning_rate * share
 
 
 def read(path: str | Path, **changes: Any) -> TrainingConfig:

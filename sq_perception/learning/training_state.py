@@ -7,7 +7,7 @@ whole state again.  Like every file of weights it is safetensors and can carry n
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass, field
 from pathlib import Path
 from typing import Generic, TypeVar
 
@@ -19,7 +19,7 @@ from torch import nn
 
 from sq_perception.files import output_file
 from sq_perception.learning.checkpoint import CheckpointError
-from sq_perception.learning.schedule import Cosine, Plateau
+from sq_perception.learning.schedule import Plateau
 
 Network = TypeVar("Network", bound=nn.Module)
 
@@ -31,7 +31,7 @@ class TrainingState(Generic[Network]):
     model: Network
     average: Network
     optimizer: torch.optim.Optimizer
-    schedule: Cosine | Plateau
+    plateau: Plateau = field(default_factory=Plateau)
     step: int = 0
     """Steps done."""
     seconds: float = 0.0
@@ -45,7 +45,7 @@ class TrainingState(Generic[Network]):
             "step": torch.tensor(self.step),
             "seconds": torch.tensor(self.seconds, dtype=torch.float64),
             "best": torch.tensor(self.best, dtype=torch.float64),
-            "schedule": torch.tensor(self.schedule.state(), dtype=torch.float64),
+            "schedule": torch.tensor(astuple(self.plateau), dtype=torch.float64),
         }
         for prefix, network in (("model", self.model), ("average", self.average)):
             tensors.update({f"{prefix}.{k}": v.contiguous() for k, v in network.state_dict().items()})
@@ -59,7 +59,7 @@ class TrainingState(Generic[Network]):
         Raises
         ------
         CheckpointError
-            If the file is damaged, or of a run with another network or schedule.
+            If the file is damaged, or of a run with another network.
         """
         try:
             tensors = load_file(str(path), device=str(next(self.model.parameters()).device))
@@ -72,7 +72,8 @@ class TrainingState(Generic[Network]):
                     _, index, slot = key.split(".")
                     state["state"].setdefault(int(index), {})[slot] = value
             self.optimizer.load_state_dict(state)
-            self.schedule.restore(tensors["schedule"].tolist())
+            best, without_progress, reductions = tensors["schedule"].tolist() or astuple(Plateau())
+            self.plateau = Plateau(best, int(without_progress), int(reductions))
             self.step, self.seconds = int(tensors["step"]), float(tensors["seconds"])
             self.best = float(tensors["best"])
         except (SafetensorError, OSError, KeyError, IndexError, RuntimeError, ValueError) as error:

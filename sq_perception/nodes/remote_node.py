@@ -19,7 +19,7 @@ from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.task import Future
 
-from sq_perception.viewing.controls import Control, arranged
+from sq_perception.viewing.controls import Control, arranged, plain
 from sq_perception.viewing.page import Page
 
 _PATIENCE = 3.0
@@ -90,7 +90,7 @@ class RemoteNode:
         result = response.results[0]
         # Not every reason of rclpy's own says which parameter it is about.
         reason = result.reason if name in result.reason else f"{name}: {result.reason or 'refused'}"
-        self._say(f"{name} is now {_shown(value)}" if result.successful else reason, result.successful)
+        self._say(f"{name} is now {plain(value)}" if result.successful else reason, result.successful)
         with suppress(TimeoutError):
             response = await self._answer(self._parameters.get_parameters([name]))
             with self._lock:
@@ -170,7 +170,3 @@ class RemoteNode:
             page.show_values(self.name, values)
         if answer is not None:
             page.show_answer(self.name, *answer)
-
-
-def _shown(value: Any) -> str:
-    return f"{value:g}" if isinstance(value, float) else str(value).lower() if isinstance(value, bool) else str(value)

@@ -26,14 +26,13 @@ from rclpy.qos import QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
-from sq_msgs_py.depth_image import GREY_ENCODINGS, size_mismatch
+from sq_msgs_py.depth_image import GREY_ENCODINGS
 from sq_msgs_py.markers import PALETTE
 from sq_msgs_py.superquadrics import FAILED, WEAK, SuperquadricArray, from_message
 from sq_perception.geometry import rotation
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
-from sq_perception.imaging.calibration import Calibration
-from sq_perception.nodes.frame import decode, stamp_of
+from sq_perception.nodes.frame import decode_by, size_of, stamp_of
 from sq_perception.nodes.remote_node import RemoteNode
 from sq_perception.nodes.statistics import THROTTLE
 from sq_perception.nodes.tracking import CameraPoses, PoseError
@@ -228,24 +227,14 @@ class ViewNode(Node):
         remark = "" if rate > 0 else "no depth images come any more"
         if image is not self._drawn:
             try:
-                frame = decode(image, None if image.encoding in GREY_ENCODINGS else lambda: self._calibration(image))
+                frame = decode_by(self._info, image, topic)
                 self._page.show_depth(frame.depth, frame.camera)
                 self._drawn = image
             except ValueError as error:
                 remark = str(error)
         if status_due or remark:
-            size = int(image.width), int(image.height)
-            self._page.show_source(tables.source_status(topic, size, rate, image.header.frame_id, remark))
+            self._page.show_source(tables.source_status(topic, size_of(image), rate, image.header.frame_id, remark))
         return image.header
-
-    def _calibration(self, image: Image) -> Calibration:
-        info, (image_topic, info_topic) = self._info, self._topics
-        if info is None:
-            raise ValueError(f"no camera_info has come on {info_topic}")
-        calibration = Calibration.of(info, image_topic)
-        if calibration.size != (int(image.width), int(image.height)):
-            raise ValueError(size_mismatch((int(image.width), int(image.height)), calibration.size))
-        return calibration
 
     def _draw_node(self, name: str, result: _Result | None, header: Any, status_due: bool) -> None:
         drawn, bodies, remark = self._bodies.get(name, (None, None, ""))

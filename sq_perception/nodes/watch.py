@@ -6,7 +6,7 @@ import time
 from collections import OrderedDict
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import rclpy
@@ -16,11 +16,9 @@ from rclpy.qos import QoSProfile, QoSReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
-from sq_msgs_py.depth_image import GREY_ENCODINGS
 from sq_msgs_py.superquadrics import from_message
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.imaging.calibration import Calibration
-from sq_perception.nodes.frame import Frame, decode, stamp_of
+from sq_perception.nodes.frame import Frame, decode_by, stamp_of
 from sq_perception.recordings.publication import superquadrics
 
 CAMERA = "synthetic_depth_node"
@@ -28,8 +26,7 @@ _REMEMBERED = 40
 """Images that wait for what belongs to them."""
 
 
-@dataclass(frozen=True, eq=False)
-class Found:
+class Found(NamedTuple):
     """Bodies (n,) without failed ones, their residuals (n,), and milliseconds from their stamp to their arrival."""
 
     bodies: Superquadric
@@ -95,12 +92,7 @@ class Watch:
             If the image or its camera_info cannot be used.
         """
         assert shot.image is not None
-        return decode(shot.image, None if shot.image.encoding in GREY_ENCODINGS else self._calibration)
-
-    def _calibration(self) -> Calibration:
-        if self._info is None:
-            raise ValueError("no camera_info came with the depth image")
-        return Calibration.of(self._info, self._image_topic)
+        return decode_by(self._info, shot.image, self._image_topic)
 
     def _on_info(self, message: CameraInfo) -> None:
         self._info = message

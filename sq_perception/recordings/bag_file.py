@@ -145,9 +145,14 @@ class RecordedBag:
     def __iter__(self) -> Iterator[RecordedFrame | FrameError]:
         needs_info = self._camera_info is None and not self._orthographic
         try:
-            latest = self._first_info() if needs_info else None
+            latest: Message | None = None
+            connections = self._reader.connections(IMAGE, COMPRESSED, topic=self.topic)
+            if needs_info:
+                infos = self._reader.connections(CAMERA_INFO, topic=self._info_topic)
+                latest = next((one for one in self._reader.messages(infos) if isinstance(one, Message)), None)
+                connections += infos
             waiting: Message | None = None
-            for message in self._selected(needs_info):
+            for message in self._reader.messages(connections, self._every, self._limit):
                 if isinstance(message, FrameError):
                     yield message
                 elif message.is_info:
@@ -207,19 +212,6 @@ class RecordedBag:
                 return compressed_depth.encoding(message.content.format) or message.content.format
             return str(message.content.encoding)
         return None
-
-    # messages
-
-    def _first_info(self) -> Message | None:
-        infos = self._reader.messages(self._reader.connections(CAMERA_INFO, topic=self._info_topic))
-        return next((info for info in infos if not isinstance(info, FrameError)), None)
-
-    def _selected(self, with_infos: bool) -> Iterator[Message | FrameError]:
-        """The images that count, in between all camera_infos."""
-        connections = self._reader.connections(IMAGE, COMPRESSED, topic=self.topic)
-        if with_infos:
-            connections += self._reader.connections(CAMERA_INFO, topic=self._info_topic)
-        yield from self._reader.messages(connections, self._every, self._limit)
 
     # frames
 

@@ -99,31 +99,32 @@ def read_camera_info(path: str | Path) -> CameraInfo:
     ------
     FrameError
     """
-    path = Path(path)
     try:
-        if path.suffix.lower() == ".json":
-            documents: list[Any] = [read_json(path)]
-        else:
-            documents = [entry for entry in plain_yaml.read_all(path) if entry is not None]
+        return _camera_info(Path(path))
     except (plain_yaml.YamlError, FrameError) as error:
         raise FrameError(f"{path}: cannot read the camera_info: {error}") from error
-    if not documents or not isinstance(documents[0], dict):
-        raise FrameError(f"{path}: expected a camera_info as a YAML mapping")
-    info = documents[0]
-    width, height = (_size(path, info, names) for names in (("image_width", "width"), ("image_height", "height")))
-    matrix = _matrix(path, info, ("camera_matrix", "k", "K"), 9)
-    distortion = _matrix(path, info, ("distortion_coefficients", "d", "D"), None)
-    projection = _matrix(path, info, ("projection_matrix", "p", "P"), 12)
+
+
+def _camera_info(path: Path) -> CameraInfo:
+    if path.suffix.lower() == ".json":
+        info: Any = _read_json(path)
+    else:
+        info = next((entry for entry in plain_yaml.read_all(path) if entry is not None), None)
+    if not isinstance(info, dict):
+        raise FrameError("expected a camera_info as a YAML mapping")
+    width, height = (_size(info, names) for names in (("image_width", "width"), ("image_height", "height")))
+    matrix = _matrix(info, ("camera_matrix", "k", "K"), 9)
+    distortion = _matrix(info, ("distortion_coefficients", "d", "D"), None)
+    projection = _matrix(info, ("projection_matrix", "p", "P"), 12)
     if matrix is None and projection is None:
-        raise FrameError(f"{path}: expected a camera_matrix (or k) of 9 numbers, or a projection_matrix (or p) of 12")
+        raise FrameError("expected a camera_matrix (or k) of 9 numbers, or a projection_matrix (or p) of 12")
     if matrix is not None and is_transposed(matrix):
-        raise FrameError(f"{path}: camera matrix: expected 0 0 1 in its last row; it seems to be transposed")
+        raise FrameError("camera matrix: expected 0 0 1 in its last row; it seems to be transposed")
     if matrix is not None and abs(matrix[1]) > _SKEW * abs(matrix[0]):
-        raise FrameError(f"{path}: camera matrix: expected no skew, got {matrix[1]:g}")
+        raise FrameError(f"camera matrix: expected no skew, got {matrix[1]:g}")
     region = info.get("roi", {})
     if not isinstance(region, dict):
-        raise FrameError(f"{path}: roi: expected a mapping, got {reprlib.repr(region)}")
-    offsets = (_count(path, region, name) for name in ("x_offset", "y_offset", "width", "height"))
+        raise FrameError(f"roi: expected a mapping, got {reprlib.repr(region)}")
     return CameraInfo(
         width,
         height,
@@ -131,9 +132,9 @@ def read_camera_info(path: str | Path) -> CameraInfo:
         () if distortion is None else tuple(distortion.tolist()),
         (0.0,) * 9 if matrix is None else tuple(matrix.tolist()),
         (0.0,) * 12 if projection is None else tuple(projection.tolist()),
-        _count(path, info, "binning_x"),
-        _count(path, info, "binning_y"),
-        Region(*offsets),
+        _count(info, "binning_x"),
+        _count(info, "binning_y"),
+        Region(*(_count(region, name) for name in ("x_offset", "y_offset", "width", "height"))),
     )
 
 
@@ -152,7 +153,7 @@ def four_numbers(text: str) -> tuple[float, float, float, float] | None:
     return (numbers[0], numbers[1], numbers[2], numbers[3]) if len(numbers) == 4 else None
 
 
-def read_json(path: Path) -> dict[str, Any]:
+def _read_json(path: Path) -> dict[str, Any]:
     """The mapping of a file.
 
     Raises
@@ -200,24 +201,24 @@ def _of_open3d(found: dict[str, Any]) -> dict[str, Any]:
     return {"width": found.get("width"), "height": found.get("height"), "k": rows}
 
 
-def _size(path: Path, info: dict[Any, Any], names: tuple[str, ...]) -> int:
+def _size(info: dict[Any, Any], names: tuple[str, ...]) -> int:
     for name in names:
         if name in info:
-            value = _count(path, info, name)
+            value = _count(info, name)
             if value < 1:
-                raise FrameError(f"{path}: {name}: expected a positive integer, got {value!r}")
+                raise FrameError(f"{name}: expected a positive integer, got {value!r}")
             return value
-    raise FrameError(f"{path}: expected {names[0]} (or {names[1]})")
+    raise FrameError(f"expected {names[0]} (or {names[1]})")
 
 
-def _count(path: Path, info: dict[Any, Any], name: str) -> int:
+def _count(info: dict[Any, Any], name: str) -> int:
     value = info.get(name, 0)
     if isinstance(value, bool) or not isinstance(value, int) or value < 0:
-        raise FrameError(f"{path}: {name}: expected a positive integer or 0, got {value!r}")
+        raise FrameError(f"{name}: expected a positive integer or 0, got {value!r}")
     return value
 
 
-def _matrix(path: Path, info: dict[Any, Any], names: tuple[str, ...], length: int | None) -> np.ndarray | None:
+def _matrix(info: dict[Any, Any], names: tuple[str, ...], length: int | None) -> np.ndarray | None:
     for name in names:
         if name not in info:
             continue
@@ -226,9 +227,9 @@ def _matrix(path: Path, info: dict[Any, Any], names: tuple[str, ...], length: in
         try:
             numbers = np.array(values, dtype=float).ravel()
         except (TypeError, ValueError) as error:
-            raise FrameError(f"{path}: {name}: expected numbers, got {reprlib.repr(values)}") from error
+            raise FrameError(f"{name}: expected numbers, got {reprlib.repr(values)}") from error
         if not np.isfinite(numbers).all() or (length is not None and numbers.size != length):
             wanted = "finite numbers" if length is None else f"{length} finite numbers"
-            raise FrameError(f"{path}: {name}: expected {wanted}, got {reprlib.repr(values)}")
+            raise FrameError(f"{name}: expected {wanted}, got {reprlib.repr(values)}")
         return numbers
     return None

@@ -154,7 +154,8 @@ class Findings:
         """Surface of each body that did not fail, in the body's own frame; made when it is first asked for."""
         shown = self.array.recovered
         return tuple(
-            triangles(_at_origin(*one), MARKER_RESOLUTION) for one in zip(shown.size, shown.shape, strict=True)
+            triangles(Superquadric.at_origin(*one), MARKER_RESOLUTION)
+            for one in zip(shown.size, shown.shape, strict=True)
         )
 
     def moved(self, frame_id: str, rotation: np.ndarray, translation: np.ndarray) -> Findings:
@@ -178,7 +179,7 @@ class Findings:
         surfaces = []
         for k, (vertices, faces) in enumerate(self.meshes):
             turn, centre = turns[k].T, shown.translation[k].astype(float)
-            lines = outline(_at_origin(shown.size[k], shown.shape[k]))
+            lines = outline(Superquadric.at_origin(shown.size[k], shown.shape[k]))
             surfaces.append((vertices @ turn + centre, faces, lines @ turn + centre))
         colours = None
         if by_score:
@@ -296,7 +297,3 @@ def depth_of(message: Any, is_cube: bool) -> tuple[np.ndarray, str]:
     if hasattr(message, "format"):
         return compressed_depth.decode(message.format, message.data), compressed_depth.encoding(message.format) or ""
     return depth_from_message(message), str(message.encoding)
-
-
-def _at_origin(size: np.ndarray, shape: np.ndarray) -> Superquadric:
-    return Superquadric(size.astype(float), shape.astype(float), np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))

@@ -24,7 +24,7 @@ from sq_perception.geometry.mesh import COLOURS, triangles
 from sq_perception.recordings.frame_entry import in_result_frame
 from sq_perception.recordings.frame_file import RecordedFrame
 from sq_perception.recovery import wording
-from sq_perception.recovery.recovery import FrameRecovery, Recovery
+from sq_perception.recovery.recovery import FrameRecovery
 from sq_perception.viewing import drawings
 
 _MOST_POINTS = 30000
@@ -101,7 +101,9 @@ def _scene(frame: RecordedFrame, recovery: FrameRecovery) -> trimesh.Scene:
     if len(cloud.points):
         middle = np.median(cloud.points, axis=0).astype(float)
         whole.add_geometry(trimesh.PointCloud(cloud.points, cloud.colours), node_name="points")
-    for k, body in _found(recovery):
+    for k, body in enumerate(recovery.bodies):
+        if body.status == Status.FAILED:
+            continue
         vertices, faces = triangles(body.superquadric)
         matt = PBRMaterial(baseColorFactor=np.append(COLOURS[k % len(COLOURS)], 1.0), metallicFactor=0.0)
         whole.add_geometry(
@@ -124,10 +126,6 @@ def _looking(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
     pose = np.eye(4)
     pose[:3] = np.column_stack([right, np.cross(back, right), back, eye])
     return pose
-
-
-def _found(recovery: FrameRecovery) -> list[tuple[int, Recovery]]:
-    return [(k, body) for k, body in enumerate(recovery.bodies) if body.status != Status.FAILED]
 
 
 def _numbers(frame: RecordedFrame, recovery: FrameRecovery) -> str:

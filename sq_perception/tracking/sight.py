@@ -63,7 +63,7 @@ def open_share(bodies: Superquadric, camera: Camera, depth: np.ndarray) -> np.nd
 def _near_side(bodies: Superquadric, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Surface points (n, 26, 3), and which of them (n, 26) face the camera."""
     along = _DIRECTIONS * bodies.size[:, None]
-    local = Superquadric(bodies.size, bodies.shape, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
+    local = Superquadric.at_origin(bodies.size, bodies.shape)
     points = bodies.to_parent(along / local.gauge(along)[..., None])
     normals = bodies.gauge_gradient(points)
     sight = points if camera.is_pinhole else np.array([0.0, 0.0, 1.0])

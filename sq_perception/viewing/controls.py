@@ -65,7 +65,7 @@ class Control:
     def shown(self, value: Any) -> Any:
         """A value of the node in the type of the control."""
         if self.kind == "fixed":
-            return _plain(value)
+            return plain(value)
         if self.kind == "bool":
             return bool(value)
         if self.kind in ("slider", "number"):
@@ -91,7 +91,7 @@ def control(about: Any, value: Any) -> Control:
     group: Group = "start" if about.read_only else "live"
     if "." in about.name or about.name in _OF_EVERY_NODE:
         group = "other"
-    made = Control(about.name, "fixed", _plain(value), hint, group)
+    made = Control(about.name, "fixed", plain(value), hint, group)
     if about.read_only or group == "other":
         return made
     if isinstance(value, bool):
@@ -135,7 +135,8 @@ def _choices(constraints: str) -> tuple[str, ...]:
     return tuple(word.strip() for word in constraints[len(_CHOICES) :].split(",") if word.strip())
 
 
-def _plain(value: Any) -> str:
+def plain(value: Any) -> str:
+    """A value of a parameter in words."""
     if value is None:
         return "(not set)"
     if isinstance(value, bool):
@@ -145,6 +146,6 @@ def _plain(value: Any) -> str:
     if isinstance(value, (str, int)):
         return str(value)
     try:
-        return ", ".join(_plain(one) for one in value)
+        return ", ".join(plain(one) for one in value)
     except TypeError:
         return str(value)

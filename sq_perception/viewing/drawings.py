@@ -93,7 +93,7 @@ def depth_span(depth: np.ndarray) -> tuple[float, float] | None:
 
     One reading in a hundred lies beyond either end.
     """
-    seen = depth[:: _stride(depth.size, _SPAN_POINTS), :]
+    seen = depth[:: max(1, depth.size // _SPAN_POINTS), :]
     seen = seen[np.isfinite(seen)]
     if not seen.size:
         return None
@@ -185,8 +185,7 @@ def mesh_vertices(body: Superquadric) -> np.ndarray:
     eta = np.linspace(-np.pi / 2, np.pi / 2, ROWS + 1)[1:-1]
     omega = np.linspace(-np.pi, np.pi, COLUMNS, endpoint=False)
     grid = np.meshgrid(eta, omega, indexing="ij")
-    centred = _centred(body)
-    rows = centred.parametric_points(grid[0].ravel(), grid[1].ravel())
+    rows = Superquadric.at_origin(body.size, body.shape).parametric_points(grid[0].ravel(), grid[1].ravel())
     top = np.array([[0.0, 0.0, body.size[2]]])
     return np.concatenate([-top, rows, top]).astype(np.float32)
 
@@ -235,15 +234,7 @@ def view_volume(camera: Camera, length: float) -> np.ndarray:
     return np.concatenate(edges).astype(np.float32)
 
 
-def _centred(body: Superquadric) -> Superquadric:
-    return Superquadric(body.size, body.shape, np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
-
-
 def _muted(depth: np.ndarray, span: tuple[float, float]) -> np.ndarray:
     near, far = span
     share = np.clip((depth - near) / (far - near), 0.0, 1.0)[:, None]
     return np.rint((1 - share) * _MUTED_NEAR + share * _MUTED_FAR).astype(np.uint8)
-
-
-def _stride(count: int, most: int) -> int:
-    return max(1, count // most)

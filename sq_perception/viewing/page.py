@@ -94,24 +94,20 @@ class Page:
         self._requests: queue.SimpleQueue[Request] = queue.SimpleQueue()
         self._span: tuple[float, float] | None = None
         self._aimed_at_bodies = False
-        self._server = server.serve(bound)
-        self._scene = Scene(self._server, has_one_node=len(nodes) == 1)
+        self.server = server.serve(bound)
+        """viser's."""
+        self._scene = Scene(self.server, has_one_node=len(nodes) == 1)
         self._nodes = {name: _NodePart(name) for name in nodes}
         self._furnish(parameters)
 
     @property
     def watched(self) -> bool:
         """Whether a browser shows the page."""
-        return bool(self._server.get_clients())
-
-    @property
-    def server(self) -> viser.ViserServer:
-        """viser's server."""
-        return self._server
+        return bool(self.server.get_clients())
 
     def close(self) -> None:
         """Stop serving; browsers say that the connection is lost."""
-        self._server.stop()
+        self.server.stop()
 
     def requests(self) -> list[Request]:
         """What users have asked for since the last call, in order; of several values of a parameter the last."""
@@ -138,7 +134,7 @@ class Page:
             self._span = drawings.steady_span(self._span, span)
         shown = self._span or (0.0, 1.0)
         points = drawings.cloud(depth, camera, shown, self._most_points, is_muted=self._point_colours.value == _MUTED)
-        with self._server.atomic():
+        with self.server.atomic():
             self._scene.draw_cloud(points, self._is_wanted("Points"))
             self._scene.draw_camera(camera, shown, self._is_wanted("Camera"))
         if self._is_wanted("Depth image"):
@@ -158,7 +154,7 @@ class Page:
             self._scene.aim(bodies.superquadrics.translation.mean(axis=0))
         is_wanted = part.wanted is None or part.wanted.value
         drawn = bodies if bodies is not None and not state.remark and is_wanted else None
-        with self._server.atomic():
+        with self.server.atomic():
             kept: set[str] = set()
             for k in range(len(drawn) if drawn is not None else 0):
                 assert drawn is not None
@@ -198,7 +194,7 @@ class Page:
             if not members:
                 continue
             with part.tab:
-                folder = self._server.gui.add_folder(title, expand_by_default=group == "live")
+                folder = self.server.gui.add_folder(title, expand_by_default=group == "live")
             part.folders.append(folder)
             with folder:
                 for one in members:
@@ -223,7 +219,7 @@ class Page:
     # Furniture
 
     def _furnish(self, parameters: bool) -> None:
-        gui = self._server.gui
+        gui = self.server.gui
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, brand_color=(64, 130, 200))
         gui.set_panel_label(TITLE)
         gui.main_panel.dock_right()
@@ -254,7 +250,7 @@ class Page:
             self._legend = gui.add_html("")
 
     def _furnish_view(self) -> None:
-        gui = self._server.gui
+        gui = self.server.gui
         places = gui.add_button_group("Look from", tuple(scene.PLACES), hint="Camera: as the depth camera sees it")
         self._point_colours = gui.add_dropdown("Point colours", (_MUTED, "depth"), initial_value=_MUTED)
         self._wanted = {name: gui.add_checkbox(name, True, hint=hint) for name, hint in _SHOWN.items()}
@@ -275,7 +271,7 @@ class Page:
         return bool(self._wanted[what].value)
 
     def _add_button(self, part: _NodePart, label: str) -> Any:
-        button = self._server.gui.add_button(label.capitalize(), visible=False)
+        button = self.server.gui.add_button(label.capitalize(), visible=False)
 
         @button.on_click
         def _(_: viser.GuiEvent) -> None:
@@ -284,7 +280,7 @@ class Page:
         return button
 
     def _add_control(self, part: _NodePart, about: Control) -> Any:
-        gui, value = self._server.gui, about.value
+        gui, value = self.server.gui, about.value
         common: dict[str, Any] = {"hint": about.hint or None}
         part.known[about.name] = value
         if about.kind == "bool":

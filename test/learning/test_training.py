@@ -25,7 +25,7 @@ from sq_perception.learning import checkpoint, train, training_config, training_
 from sq_perception.learning.dataset import full_frames
 from sq_perception.learning.fixed_set import Settings, generate
 from sq_perception.learning.regressor import Regressor, RegressorConfig
-from sq_perception.learning.schedule import Cosine, Plateau
+from sq_perception.learning.schedule import Plateau, cosine
 from sq_perception.learning.training_config import TrainingConfig
 from sq_perception.recovery.recoverer import Recoverer
 from sq_perception.simulation.scenes import thesis_bodies
@@ -47,7 +47,7 @@ class TestConfig:
     def test_thesis_setting_is_that_of_the_thesis(self) -> None:
         config = training_config.read("thesis")
         assert (config.optimizer, config.learning_rate, config.batch) == ("adam", 1e-4, 32)
-        assert isinstance(config.learning_schedule(), Plateau)
+        assert config.rate(10**5, Plateau(reductions=1)) == pytest.approx(1e-5)
         form = config.regressor()
         assert (form.backbone, form.pixels, form.framing) == ("resnet18", 256, "full")
 
@@ -86,27 +86,26 @@ class TestConfig:
 
 class TestSchedule:
     def test_cosine_rises_and_falls_to_zero(self) -> None:
-        schedule = Cosine(2.0, 10, 100)
-        assert schedule.at(0) == pytest.approx(0.2)
-        assert schedule.at(50) == pytest.approx(1.0)
-        assert schedule.at(100) == pytest.approx(0.0, abs=1e-12)
+        assert cosine(0, 10, 100) == pytest.approx(0.1)
+        assert cosine(50, 10, 100) == pytest.approx(0.5)
+        assert cosine(100, 10, 100) == pytest.approx(0.0, abs=1e-12)
+        assert TrainingConfig(learning_rate=2.0, warm_up=10, steps=100).rate(50, Plateau()) == pytest.approx(1.0)
 
     def test_plateau_divides_after_ten_and_ends_after_twenty(self) -> None:
-        schedule = Plateau(1.0)
+        schedule = Plateau()
         for loss in (3.0, 2.0):
             schedule.validated(loss)
         for _ in range(9):
             schedule.validated(2.0)
-        assert schedule.at(0) == 1.0
+        assert schedule.share == 1.0
         schedule.validated(2.5)
-        assert schedule.at(0) == pytest.approx(0.1)
-        continued = Plateau(1.0)
-        continued.restore(schedule.state())
+        assert schedule.share == pytest.approx(0.1)
+        continued = replace(schedule)
         for _ in range(10):
             assert not continued.exhausted
             continued.validated(2.0)
         assert continued.exhausted
-        assert continued.at(0) == pytest.approx(0.01)
+        assert continued.share == pytest.approx(0.01)
         schedule.validated(1.0)
         assert not schedule.exhausted
 
