@@ -16,6 +16,7 @@ Every pixel is a ray p = o + z d with d_z = 1 and o_z = 0, so that the ray param
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -47,9 +48,9 @@ class Camera:
             raise ValueError(f"projection: expected 'pinhole' or 'orthographic', got {self.projection!r}")
         if self.width < 1 or self.height < 1:
             raise ValueError(f"image size: expected at least 1 x 1, got {self.width} x {self.height}")
-        numbers = np.array([self.fx, self.fy, self.cx, self.cy], dtype=float)
-        if not np.isfinite(numbers).all():
-            raise ValueError(f"fx fy cx cy: expected finite numbers, got {numbers.tolist()}")
+        numbers = [float(number) for number in (self.fx, self.fy, self.cx, self.cy)]
+        if not all(map(math.isfinite, numbers)):
+            raise ValueError(f"fx fy cx cy: expected finite numbers, got {numbers}")
         if self.fx <= 0 or self.fy <= 0:
             raise ValueError(f"focal lengths: expected positive, got fx = {self.fx:g}, fy = {self.fy:g}")
 

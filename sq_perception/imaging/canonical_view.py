@@ -27,7 +27,7 @@ import cv2
 import numpy as np
 
 from sq_perception.geometry import rotation as quaternions
-from sq_perception.geometry.kernels import kernel
+from sq_perception.geometry.kernels import inline_kernel, kernel
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
 
@@ -134,44 +134,42 @@ def from_mask(
     """
     camera.check_image(depth)
     camera.check_image(mask)
-    left, top, width, height = cv2.boundingRect((mask & np.isfinite(depth)).view(np.uint8))
+    left, top, width, height = _box(depth, mask)
     if width == 0:
         raise ValueError("a canonical view needs at least one pixel with a depth under the mask")
     find_hidden |= missing_is_hidden
     whole = camera
     look = np.eye(3)
     if camera.is_pinhole:
-        _, toward = camera.rays(left + 0.5 * (width - 1), top + 0.5 * (height - 1))
+        middle_u, middle_v = left + 0.5 * (width - 1), top + 0.5 * (height - 1)
+        toward = camera.unproject(np.array(middle_u), np.array(middle_v), np.array(1.0))
         look = _rotation_to_z(toward / np.linalg.norm(toward))
     if find_hidden:
         left, top, width, height = _with_surroundings(left, top, width, height, camera)
     camera = camera.cropped(left, top, width, height)
     window = np.s_[top : top + height, left : left + width]
-    depth, mask = depth[window], mask[window]
-    seen = mask & np.isfinite(depth)
-    rows, columns = np.nonzero(seen)
-    measured = depth[seen].astype(np.float32)
+    depth, mask = np.ascontiguousarray(depth[window], dtype=np.float32), np.ascontiguousarray(mask[window])
+    intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
 
     matrix = _FLIP @ look
-    x, y, z = matrix.astype(np.float32) @ _coordinates(camera, columns, rows, measured)
-    low, high = np.array([x.min(), y.min()]), np.array([x.max(), y.max()])
+    image, low, high, closest = _turned(depth, mask, intrinsics, camera.is_pinhole, matrix)
+    z = image[np.isfinite(image)]
     outliers = int(z.size * OUTLIERS_PER_END)
     ordered = np.partition(z, [outliers, z.size // 2, z.size - 1 - outliers])
     farthest, middle, nearest = (float(ordered[k]) for k in (outliers, z.size // 2, z.size - 1 - outliers))
-    pixel = max(1 / camera.fx, 1 / camera.fy) * (measured.min() if camera.is_pinhole else 1.0)
+    pixel = max(1 / camera.fx, 1 / camera.fy) * (closest if camera.is_pinhole else 1.0)
     extent = MARGIN * max(*(high - low + pixel), nearest - farthest)
     anchor = np.array([*(0.5 * (low + high)), nearest])
 
-    image = np.full((camera.height, camera.width), np.nan, dtype=np.float32)
-    image[seen] = z
     filled = _filled(image) if camera.is_pinhole or find_hidden else image
     covered = np.zeros(mask.shape, dtype=bool)
     if find_hidden:
-        covered = _covered(depth, mask, filled, camera, matrix, plane, _NEARER * extent)
-    if missing_is_hidden:
-        covered |= ~np.isfinite(depth)
+        lost = np.ones_like(mask) if missing_is_hidden else _within_hull(mask & np.isfinite(depth))
+        ground = np.array([0.0, 0.0, 0.0, np.inf]) if plane is None else np.asarray(plane, dtype=float)
+        covered = _covered(
+            depth, mask, filled, lost, intrinsics, camera.is_pinhole, matrix, ground, _NEARER * float(extent)
+        )
     beyond = (-left, -top, whole.width - left, whole.height - top) if missing_is_hidden else (0, 0, 0, 0)
-    intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
     value, hidden = _resampled(
         image, filled, covered, beyond, intrinsics, camera.is_pinhole, matrix, anchor, extent, middle, pixels
     )
@@ -216,41 +214,85 @@ def _with_surroundings(left: int, top: int, width: int, height: int, camera: Cam
     return left, top, min(camera.width, right + beside) - left, min(camera.height, bottom + above) - top
 
 
+def _box(depth: np.ndarray, mask: np.ndarray) -> tuple[int, int, int, int]:
+    """Left, top, width and height of the pixels of a mask that have a depth; widths of 0 where there are none."""
+    left, top, width, height = cv2.boundingRect(np.ascontiguousarray(mask).view(np.uint8))
+    window = np.s_[top : top + height, left : left + width]
+    inner_left, inner_top, width, height = cv2.boundingRect((mask[window] & np.isfinite(depth[window])).view(np.uint8))
+    return left + inner_left, top + inner_top, width, height
+
+
+def _within_hull(mask: np.ndarray) -> np.ndarray:
+    """The pixels (height, width) within the convex hull of a mask."""
+    hull = np.zeros(mask.shape, dtype=np.uint8)
+    outline, _ = cv2.findContours(mask.view(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    cv2.fillConvexPoly(hull, cv2.convexHull(np.concatenate(outline)), 1)
+    # The hull's own border passes outside of a convex set of pixels.
+    return cv2.erode(hull, np.ones((3, 3), np.uint8)).view(bool)
+
+
+@inline_kernel
+def _point(
+    u: int, v: int, z: float, intrinsics: tuple[float, float, float, float], pinhole: bool
+) -> tuple[float, float, float]:
+    fx, fy, cx, cy = intrinsics
+    scale = z if pinhole else 1.0
+    return (u - cx) / fx * scale, (v - cy) / fy * scale, z
+
+
+@kernel
+def _turned(
+    depth: np.ndarray,
+    mask: np.ndarray,
+    intrinsics: tuple[float, float, float, float],
+    pinhole: bool,
+    matrix: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Turned z (height, width) of the measured pixels of a mask, NaN elsewhere.
+
+    And the least and the largest turned (x, y), and the least depth.
+    """
+    image = np.full(depth.shape, np.float32(np.nan))
+    low, high, closest = np.full(2, np.inf), np.full(2, -np.inf), np.inf
+    for v in range(depth.shape[0]):
+        for u in range(depth.shape[1]):
+            if mask[v, u] and np.isfinite(depth[v, u]):
+                x, y, z = _point(u, v, np.float64(depth[v, u]), intrinsics, pinhole)
+                image[v, u] = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z
+                for k in range(2):
+                    along = matrix[k, 0] * x + matrix[k, 1] * y + matrix[k, 2] * z
+                    low[k], high[k] = min(low[k], along), max(high[k], along)
+                closest = min(closest, z)
+    return image, low, high, closest
+
+
+@kernel
 def _covered(
     depth: np.ndarray,
     mask: np.ndarray,
     filled: np.ndarray,
-    camera: Camera,
+    lost: np.ndarray,
+    intrinsics: tuple[float, float, float, float],
+    pinhole: bool,
     matrix: np.ndarray,
-    plane: np.ndarray | None,
+    plane: np.ndarray,
     tolerance: float,
 ) -> np.ndarray:
-    """Pixels (height, width) of the surroundings where the object may go on unseen; see :class:`CanonicalView`."""
-    measured = np.isfinite(depth)
-    hull = np.zeros(mask.shape, dtype=np.uint8)
-    outline, _ = cv2.findContours((mask & measured).view(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    cv2.fillConvexPoly(hull, cv2.convexHull(np.concatenate(outline)), 1)
-    # The hull's own border passes outside of a convex set of pixels.
-    inside = cv2.erode(hull, np.ones((3, 3), np.uint8)) > 0
-    rows, columns = np.nonzero(measured & ~mask)
-    points = _coordinates(camera, columns, rows, depth[rows, columns].astype(np.float32))
-    nearer = matrix[2].astype(np.float32) @ points > filled[rows, columns] + tolerance
-    if plane is not None:
-        nearer &= np.abs(np.asarray(plane[:3], dtype=np.float32) @ points + np.float32(plane[3])) > tolerance
-    covered = ~measured & inside
-    covered[rows[nearer], columns[nearer]] = True
+    """Pixels (height, width) where the object may go on unseen; ``lost``: at these if nothing was measured there.
+
+    What stands nearer than the object, ``filled``, hides it, unless it is the plane.
+    """
+    covered = np.zeros(depth.shape, np.bool_)
+    for v in range(depth.shape[0]):
+        for u in range(depth.shape[1]):
+            if not np.isfinite(depth[v, u]):
+                covered[v, u] = lost[v, u]
+            elif not mask[v, u]:
+                x, y, z = _point(u, v, np.float64(depth[v, u]), intrinsics, pinhole)
+                nearer = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z > filled[v, u] + tolerance
+                height = plane[0] * x + plane[1] * y + plane[2] * z + plane[3]
+                covered[v, u] = nearer and abs(height) > tolerance
     return covered
-
-
-def _coordinates(camera: Camera, u: np.ndarray, v: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """Points of pixels as (3, n): one contiguous row a coordinate, several times as fast to turn as (n, 3)."""
-    points = np.empty((3, depth.size), dtype=np.float32)
-    points[0] = ((np.arange(camera.width) - camera.cx) / camera.fx).astype(np.float32)[u]
-    points[1] = ((np.arange(camera.height) - camera.cy) / camera.fy).astype(np.float32)[v]
-    points[2] = depth
-    if camera.is_pinhole:
-        points[:2] *= depth
-    return points
 
 
 @kernel
@@ -270,7 +312,8 @@ def _resampled(
     """Values and hidden pixels (pixels, pixels) of a view, by the nearest pixel of a crop of the image (height, width).
 
     A view pixel fixes turned x and y but not z, and a pinhole pixel depends on all three.  Reading z at the projection
-    of the last guess is a contraction wherever the surface is not almost parallel to the ray; three rounds suffice.
+    of the last guess is a contraction wherever the surface is not almost parallel to the ray; three rounds suffice, and
+    fewer where the same z is read again.
     Guesses that fall beside the object go on with the z of its nearest pixel, which ``filled`` (turned z) holds.
     The object may go on where ``covered`` is, and beyond ``whole``: left, top, right and bottom of the image, unless it
     is empty.
@@ -294,7 +337,10 @@ def _resampled(
                 u, v = np.rint(fx * px + cx), np.rint(fy * py + cy)
                 if not pinhole or step == _ROUNDS:
                     break
-                z = np.float64(filled[int(min(max(v, 0), height - 1)), int(min(max(u, 0), width - 1))])
+                there = np.float64(filled[int(min(max(v, 0), height - 1)), int(min(max(u, 0), width - 1))])
+                if there == z:
+                    break
+                z = there
             if 0 <= u < width and 0 <= v < height:
                 seen = image[int(v), int(u)]
                 if np.isfinite(seen):
