@@ -13,6 +13,8 @@ from typing import TypeAlias
 import numpy as np
 
 from sq_perception.fitting.hull_prior import HullPrior
+from sq_perception.geometry.kernels import kernel
+from sq_perception.geometry.quantiles import quantile
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import canonical_view
 from sq_perception.imaging.camera import Camera
@@ -108,6 +110,17 @@ class SeenObject:
         rows, columns = rows[::step], columns[::step]
         return self.camera_crop.unproject(columns, rows, self.depth_crop[rows, columns])
 
+    def heights(self, plane: np.ndarray) -> np.ndarray:
+        """Metres above a plane (4,): of the pixels of ``mask_crop``, NaN elsewhere."""
+        c = self.camera_crop
+        return _heights(self.depth_crop, self.mask_crop, (c.fx, c.fy, c.cx, c.cy), c.is_pinhole, plane)
+
+    def levels(self, plane: np.ndarray) -> tuple[float, float]:
+        """The height of its lowest pixels above a plane, and the median of all, metres; of some thousand pixels."""
+        heights = self.heights(plane)[self.mask_crop]
+        ordered = np.sort(heights[:: max(1, heights.size // _POINTS)])
+        return quantile(ordered, _LOWEST), quantile(ordered, 0.5)
+
 
 def objects(
     depth: np.ndarray, found: segments.Segmentation, camera: Camera, depth_range: tuple[float, float]
@@ -142,15 +155,13 @@ def support(
     """
     if found.plane is None:
         return None
-    points = one.points
-    heights = points @ found.plane[:3] + found.plane[3]
-    low, median = np.quantile(heights, [_LOWEST, 0.5])
+    low, median = one.levels(found.plane)
     behind = median <= 0
     if not behind and low < _HOVERING:
         return found.plane
     other = segments.support_under(found, one.label, depth, camera, options)
     if other is not None:
-        lowest, middle = np.quantile(points @ other[:3] + other[3], [_LOWEST, 0.5])
+        lowest, middle = one.levels(other)
         if abs(lowest) < _HOVERING < middle + _HOVERING:
             return other
     return None if behind or low > _HIGHEST_STACK else found.plane
@@ -177,12 +188,9 @@ def core(one: SeenObject, depth: np.ndarray, camera: Camera) -> np.ndarray:
         return one.mask
     inner = one.mask_crop
     if one.plane is not None:
-        rows, columns = np.nonzero(inner)
-        points = one.camera_crop.unproject(columns, rows, one.depth_crop[rows, columns])
-        above = inner.copy()
-        above[rows, columns] = points @ one.plane[:3] + one.plane[3] > _ON_TABLE
-        inner = above if 2 * np.count_nonzero(above) > rows.size else inner
-    footprint = float(np.median(one.depth_crop[one.mask_crop])) / np.sqrt(camera.fx * camera.fy)
+        above = one.heights(one.plane) > _ON_TABLE
+        inner = above if 2 * np.count_nonzero(above) > one.pixels else inner
+    footprint = quantile(np.sort(one.depth_crop[one.mask_crop]), 0.5) / np.sqrt(camera.fx * camera.fy)
     whole = np.zeros_like(one.mask)
     whole[one.window] = inner
     # With a margin, as a part that goes on beyond the mask is something else.
@@ -192,3 +200,23 @@ def core(one: SeenObject, depth: np.ndarray, camera: Camera) -> np.ndarray:
         np.ascontiguousarray(depth[around]), np.ascontiguousarray(whole[around]), _JUMP_PIXELS * footprint + _JUMP
     )
     return whole
+
+
+@kernel
+def _heights(
+    depth: np.ndarray,
+    mask: np.ndarray,
+    intrinsics: tuple[float, float, float, float],
+    pinhole: bool,
+    plane: np.ndarray,
+) -> np.ndarray:
+    fx, fy, cx, cy = intrinsics
+    heights = np.full(depth.shape, np.nan)
+    for v in range(depth.shape[0]):
+        for u in range(depth.shape[1]):
+            if mask[v, u]:
+                z = np.float64(depth[v, u])
+                scale = z if pinhole else 1.0
+                x, y = (u - cx) / fx * scale, (v - cy) / fy * scale
+                heights[v, u] = plane[0] * x + plane[1] * y + plane[2] * z + plane[3]
+    return heights
