@@ -26,7 +26,7 @@ from sq_perception.geometry import mesh
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.grasping.gripper import Gripper
-from sq_perception.grasping.planner import DENSITY
+from sq_perception.grasping.trials import DENSITY
 
 NO_CAVITY = Superquadric.stack([])
 STEP = 0.002

@@ -14,6 +14,8 @@ Every margin m_k is what may be lost before the grasp fails, sigma_k how sure it
 | table, bodies, points | the gripper's least distance | of the obstacle where it is nearest, the hand |
 | unseen | share of the fingers in space that nobody has seen | a share of it is taken |
 
+Vessels that none of these is sure of are also tried by their rims (:mod:`sq_perception.grasping.rims`).
+
 The opening is the body's width and, on either side, a clearance and twice the sigma of that side; less where the
 gripper opens no wider.  The hand stands farther from the side that is less sure.  A side that was not seen is
 uncertain, so that a body of unknown depth is taken by its known sides.  The hand comes to be where it is sent to but
@@ -28,45 +30,43 @@ of the bodies.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.special import ndtr
 
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.grasping import clearance, closing
 from sq_perception.grasping.gripper import PANDA, Gripper
 from sq_perception.grasping.plan import Grasp, GraspPlan
+from sq_perception.grasping.rims import at_rims
 from sq_perception.grasping.surroundings import Surroundings
+from sq_perception.grasping.trials import (
+    CLEARANCE,
+    DENSITY,
+    LEAST_ENGAGED,
+    MARGINS,
+    PASSES,
+    POINT_SIGMA,
+    TABLE_SIGMA,
+    Trials,
+    log_phi,
+    passing,
+    weight,
+)
 
 FRICTION = 0.5
 """Of rubber pads on cartons and plastics, at the least; the benchmark draws 0.5 to 1."""
-DENSITY = 500.0
-"""kg/m^3, between empty and full packages; a mass is thought to be known to half of it."""
 PER_BODY = 8
 """Grasps a body that are told at most."""
 PLACEMENT = 0.002
 """Metres, standard deviation along each axis of where the hand comes to be: a careful calibration of camera and arm."""
-_GRAVITY, _LIFT = 9.81, 2.0
-"""m/s^2; of the lift beside gravity."""
-_CLEARANCE, _ABOVE_TABLE = 0.005, 0.004
-"""Metres on either side of the body and before the palm; above the table."""
+_ABOVE_TABLE = 0.004
+"""Metres."""
 _ENGAGED = 0.012
 """Metres of finger beyond the near end that a shallow grasp has."""
-_LEAST_ENGAGED = 0.004
-_PAD_RADIUS = 0.006
-"""Mean arm of the friction of a pad of some 18 mm, metres."""
 _SQUARE = np.deg2rad(8.0)
 """How sure normals are."""
-_TABLE_SIGMA, _POINT_SIGMA = 0.002, 0.001
-_PASSES = 0.001
-"""Metres by which a finger may come down on the edge of a thing: half of those that did passed it and pushed it aside
-(60 household things in known places in the physics of benchmarks/picking_world.py; a quarter at 2 mm, few at 3)."""
-_NEARER = 0.4
-"""Sigmas by which sides are nearer than fits say: the median of 680 tried sides that were known to more than 3.5 mm (50
-scenes of benchmarks/picking_scenes.py from seed 20000 on, none of which is reported); where they are known better it
-is too little to matter."""
 _HIDDEN = 0.15
 """Probability that space which nobody has seen beside a body is taken."""
 _SWINGS = np.deg2rad([0.0, 25.0, -25.0, 50.0, -50.0, 80.0, -80.0])
@@ -81,45 +81,6 @@ _CHECKED_IF_DOUBTFUL, _SURE = 200, 0.5
 """The same of bodies whose best grasp is then less probable than that."""
 _LEAST = 0.05
 """Grasps less probable than that are not told."""
-_MARGINS = ("opening", "engagement", "palm", "friction", "weight", "table", "other bodies", "measured points", "unseen")
-
-
-@dataclass(frozen=True, eq=False)
-class _Trials:
-    """Grasps under trial, k of them, and the logarithm of the probability of each margin so far."""
-
-    owner: np.ndarray
-    frames: np.ndarray
-    opening: np.ndarray
-    width: np.ndarray
-    logs: np.ndarray
-
-    def at(self, which: np.ndarray) -> _Trials:
-        return _Trials(self.owner[which], self.frames[which], self.opening[which], self.width[which], self.logs[which])
-
-    def and_(self, other: _Trials) -> _Trials:
-        return _Trials(*(np.concatenate([getattr(one, part.name) for one in (self, other)]) for part in fields(self)))
-
-    @property
-    def weakest(self) -> np.ndarray:
-        """Which margin takes most from each."""
-        return np.asarray(np.argmin(self.logs, axis=1))
-
-    def first(self, count: int, least: float = -np.inf) -> _Trials:
-        """The most probable ones of each body, each body's in order, of those whose logarithm is above ``least``."""
-        total = self.logs.sum(axis=1)
-        found = np.flatnonzero(total > least)
-        found = found[np.lexsort((-total[found], self.owner[found]))]
-        return self.at(found[_rank(self.owner[found]) < count])
-
-    def after(self, count: int) -> _Trials:
-        """The others, of trials that are in order."""
-        return self.at(np.flatnonzero(_rank(self.owner) >= count))
-
-
-def _rank(owner: np.ndarray) -> np.ndarray:
-    """Of each (k,) among those of the same body; bodies are in order."""
-    return np.asarray(np.arange(len(owner)) - np.searchsorted(owner, owner))
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,24 +142,22 @@ def grasps(
     trials = _trials(bodies, spread, closings, gripper, around, friction, placement)
     reasons[np.unique(closings.owner)] = "no way for the fingers to come with the table and the palm in their way"
     trials = _probable(trials, _CHECKED_IF_DOUBTFUL, reasons, "nothing holds")
-    if not len(trials.owner):
-        return GraspPlan((), tuple(reasons))
     looked_at = _among_others(bodies, spread, trials.first(_CHECKED), gripper, around, placement)
-    doubtful = ~np.isin(trials.owner, looked_at.owner[looked_at.logs.sum(axis=1) > np.log(_SURE)])
-    more = trials.at(doubtful).after(_CHECKED)
-    if len(more.owner):
-        looked_at = looked_at.and_(_among_others(bodies, spread, more, gripper, around, placement))
+    doubtful = np.setdiff1d(np.arange(len(bodies)), looked_at.owner[looked_at.logs.sum(axis=1) > np.log(_SURE)])
+    more = trials.at(np.isin(trials.owner, doubtful)).after(_CHECKED)
+    more = more.and_(at_rims(bodies, doubtful, gripper, around, friction, placement))
+    looked_at = looked_at.and_(_among_others(bodies, spread, more, gripper, around, placement))
     trials = _probable(looked_at, PER_BODY, reasons, "in the way")
     reasons[trials.owner] = ""
     return GraspPlan(tuple(_as_grasps(trials)), tuple(reasons))
 
 
-def _probable(trials: _Trials, count: int, reasons: np.ndarray, why: str) -> _Trials:
+def _probable(trials: Trials, count: int, reasons: np.ndarray, why: str) -> Trials:
     """The ``count`` best of each body that has any; what the best of the others suffer from is their reason."""
     found = trials.first(count, np.log(_LEAST))
     without = trials.at(~np.isin(trials.owner, found.owner)).first(1)
     for k, weakest in zip(without.owner, without.weakest, strict=True):
-        reasons[k] = f"{why}: {_MARGINS[weakest]}"
+        reasons[k] = f"{why}: {MARGINS[weakest]}"
     return found
 
 
@@ -232,7 +191,7 @@ def _trials(
     around: Surroundings,
     friction: float,
     placement: float,
-) -> _Trials:
+) -> Trials:
     """Every closing from every side, at every depth and slide, with the margins that the body alone decides."""
     # From every side: z the approach, y the closing line, x the third.
     y = np.repeat(closings.along, len(_SWINGS), axis=0)
@@ -251,13 +210,13 @@ def _trials(
     across, _ = closing.reaches(bodies, spread, owner, x)
 
     # At every depth: where the palm or the table stops the gripper or the middle is reached, shallow, and between.
-    wanted = _CLEARANCE + 2 * np.hypot(side, placement)
+    wanted = CLEARANCE + 2 * np.hypot(side, placement)
     room = np.minimum(gripper.opening - 2 * half, wanted.sum(axis=1))
     opening = 2 * half + room
     # Of the room each side has its share: the hand is moved towards the side that is less sure.
     shift = 0.5 * np.maximum(room, 0.0) * (wanted[:, 0] - wanted[:, 1]) / wanted.sum(axis=1)
     boxes = gripper.boxes_at(opening)
-    deepest = np.minimum(gripper.palm - _CLEARANCE - near, 0.0)
+    deepest = np.minimum(gripper.palm - CLEARANCE - near, 0.0)
     frames = np.stack([x, y, z, bodies.translation[owner]], axis=2)
     height = np.full(len(owner), np.inf)
     if around.plane is not None:
@@ -266,7 +225,7 @@ def _trials(
         low = np.where(sink > 1e-3, (height - _ABOVE_TABLE) / np.maximum(sink, 1e-3), np.inf)
         deepest = np.minimum(deepest, low)
     shallow = np.minimum(_ENGAGED - near - gripper.tip, deepest)
-    reachable = deepest > _LEAST_ENGAGED - near - gripper.tip
+    reachable = deepest > LEAST_ENGAGED - near - gripper.tip
     rows = np.flatnonzero(reachable)
     depth = np.stack([deepest, 0.5 * (deepest + shallow), shallow], axis=1)[rows]
     free = np.maximum(across[rows] - 0.5 * gripper.finger_width, 0.0)
@@ -293,56 +252,45 @@ def _trials(
 
     deep = np.hypot(near_sigma, placement)
     room = 0.5 * opening - half
-    weight = DENSITY * bodies.volume()[owner] * _GRAVITY
-    force = 2 * friction * gripper.force
-    load = np.maximum(weight * (1 + _LIFT / _GRAVITY) / force, weight * lever / (force * _PAD_RADIUS))
-    logs = np.zeros((len(owner), len(_MARGINS)))
-    logs[:, 0] = _passing(room + aside, side[:, 0], placement) + _passing(room - aside, side[:, 1], placement)
-    logs[:, 1] = _log(u + gripper.tip + near - _LEAST_ENGAGED, deep)
-    logs[:, 2] = _log(gripper.palm - near - u, deep)
-    logs[:, 3] = np.where(np.isfinite(angle), _log(np.arctan(friction) - np.nan_to_num(angle), _SQUARE), -np.inf)
-    logs[:, 4] = _log(1 / np.maximum(load, 1e-9) - 1, 0.5)
+    logs = np.zeros((len(owner), len(MARGINS)))
+    logs[:, 0] = passing(room + aside, side[:, 0], placement) + passing(room - aside, side[:, 1], placement)
+    logs[:, 1] = log_phi(u + gripper.tip + near - LEAST_ENGAGED, deep)
+    logs[:, 2] = log_phi(gripper.palm - near - u, deep)
+    logs[:, 3] = np.where(np.isfinite(angle), log_phi(np.arctan(friction) - np.nan_to_num(angle), _SQUARE), -np.inf)
+    logs[:, 4] = weight(DENSITY * bodies.volume()[owner], lever, 2 * friction * gripper.force)
     if around.plane is not None:  # moved without a turn, so that the lowest corner is the same
-        logs[:, 5] = _log(height[at] + offset @ around.plane[:3], np.hypot(_TABLE_SIGMA, placement))
-    return _Trials(owner, frames, opening, 2 * half, logs)
+        logs[:, 5] = log_phi(height[at] + offset @ around.plane[:3], np.hypot(TABLE_SIGMA, placement))
+    return Trials(owner, frames, opening, 2 * half, logs)
 
 
 def _among_others(
     bodies: Superquadric,
     spread: np.ndarray,
-    trials: _Trials,
+    trials: Trials,
     gripper: Gripper,
     around: Surroundings,
     placement: float,
-) -> _Trials:
+) -> Trials:
     """The same with the margins that the surroundings decide."""
+    if not len(trials.owner):
+        return trials
     flat, turns = np.ascontiguousarray(bodies.to_flat(), dtype=float), np.ascontiguousarray(bodies.rotation_matrix)
     boxes = gripper.boxes_at(trials.opening)
     gap, other, way = clearance.gaps_to_bodies(trials.frames, boxes, trials.owner, flat, turns)
     near = np.flatnonzero(other >= 0)
     _, sigma = closing.reaches(bodies, spread, other[near], -way[near])
-    trials.logs[near, 6] = _passing(gap[near], sigma, placement)
+    trials.logs[near, 6] = passing(gap[near], sigma, placement)
     trials = trials.first(_CHECKED_CLOSELY)
     boxes = gripper.boxes_at(trials.opening)
     if len(around.points):
         gap = clearance.gaps_to_points(trials.frames, boxes, around.points)
-        doubt = _log(gap + _PASSES, np.hypot(_POINT_SIGMA, placement))
+        doubt = log_phi(gap + PASSES, np.hypot(POINT_SIGMA, placement))
         trials.logs[:, 7] = np.minimum(doubt - trials.logs[:, [0, 2, 6]].sum(axis=1), 0.0)
     trials.logs[:, 8] = np.log1p(-_HIDDEN * around.unseen(trials.frames, boxes[:, :2]))
     return trials
 
 
-def _passing(gap: np.ndarray, sigma: np.ndarray, placement: float) -> np.ndarray:
-    """log P (k,) that the gripper passes sides that are ``gap`` away and known to ``sigma``."""
-    return _log(gap + _PASSES + _NEARER * sigma, np.hypot(sigma, placement))
-
-
-def _log(margin: np.ndarray, sigma: np.ndarray | float) -> np.ndarray:
-    """log Phi(m / sigma), never below log(1e-12); nothing is known to less than a micrometre."""
-    return np.asarray(np.log(np.maximum(ndtr(margin / np.maximum(sigma, 1e-6)), 1e-12)))
-
-
-def _as_grasps(trials: _Trials) -> Iterator[Grasp]:
+def _as_grasps(trials: Trials) -> Iterator[Grasp]:
     """All of them, the most probable first."""
     total = trials.logs.sum(axis=1)
     order = np.argsort(-total, kind="stable")
@@ -356,5 +304,5 @@ def _as_grasps(trials: _Trials) -> Iterator[Grasp]:
             float(trials.opening[k]),
             float(trials.width[k]),
             float(scores[k]),
-            _MARGINS[weakest[k]],
+            MARGINS[weakest[k]],
         )

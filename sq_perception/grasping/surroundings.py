@@ -88,14 +88,16 @@ class Surroundings:
 
     def unseen(self, frames: np.ndarray, boxes: np.ndarray) -> np.ndarray:
         """Share (k,) of some boxes (k, m, 6) at frames (k, 3, 4) that lies behind what the image shows."""
-        if self.depth is None or self.camera is None:
-            return np.zeros(len(frames))
         corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (0, 1)])
         local = boxes[:, :, None, :3] + corners * boxes[:, :, None, 3:]
         places = local.reshape(len(frames), -1, 3) @ frames[:, :, :3].transpose(0, 2, 1) + frames[:, None, :, 3]
+        return np.asarray(np.mean(self.beyond(places) < -_BEHIND, axis=1))
+
+    def beyond(self, places: np.ndarray) -> np.ndarray:
+        """By how much what the image shows is farther away than places (..., 3); NaN where it shows nothing."""
+        if self.depth is None or self.camera is None:
+            return np.full(places.shape[:-1], np.nan)
         pixels = np.round(self.camera.project(np.where(places[..., 2:] > 1e-3, places, [0.0, 0.0, 1e-3]))).astype(int)
         inside = np.all((pixels >= 0) & (pixels < [self.camera.width, self.camera.height]), axis=-1)
         pixels = np.where(inside[..., None], pixels, 0)
-        shown = self.depth[pixels[..., 1], pixels[..., 0]]
-        hidden = np.logical_and(inside, places[..., 2] > shown + _BEHIND)
-        return np.asarray(np.mean(hidden, axis=1))
+        return np.where(inside, self.depth[pixels[..., 1], pixels[..., 0]] - places[..., 2], np.nan)

@@ -1,0 +1,111 @@
+"""Grasps of open vessels by their rim: one finger inside, one outside, straight down.
+
+Bodies are convex and know of no cavity, measured points do.  At a bearing around a body the rim is what was measured
+within some millimetres of the highest points there, if that is as thin as a wall.  There is a cavity behind it if the
+image shows something farther away than the places where the end of the inner finger comes to be.
+
+The margins are those of :mod:`sq_perception.grasping.planner` with the points' sigma.  Walls weigh
+a share of what a full body would; the pads hold their torque about the tangent by as much as they overlap.
+
+Metres, in the frame of the bodies.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.grasping import clearance
+from sq_perception.grasping.gripper import Gripper
+from sq_perception.grasping.surroundings import Surroundings
+from sq_perception.grasping.trials import (
+    CLEARANCE,
+    DENSITY,
+    LEAST_ENGAGED,
+    MARGINS,
+    PASSES,
+    POINT_SIGMA,
+    TABLE_SIGMA,
+    Trials,
+    log_phi,
+    weight,
+)
+
+_BEARINGS = np.arange(24) * np.pi / 12
+_INSETS = np.array([0.012, 0.02, 0.03])
+"""Of the fingers' ends below the rim."""
+_BEYOND = 0.015
+"""Points so far outside of a body may be its rim."""
+_HIGH, _THIN = 0.006, 0.012
+"""The rim is so high, and no thicker."""
+_FEWEST, _STRAY = 5, 3
+"""Points of a bearing; of these the highest, up to flying pixels, is the top."""
+_UPRIGHT = 0.9
+"""Share of rims that held where all other margins were sure: 30 of 34 that scenes of benchmarks/picking_scenes.py from
+seed 20000 on, none of which is reported, ended with.  In place of friction: how steep a wall is, is not looked at."""
+_WALLS = 0.3
+"""Of the volume of a vessel: walls of 4 mm of one 8 cm wide and 10 cm high."""
+
+
+def at_rims(
+    bodies: Superquadric, which: np.ndarray, gripper: Gripper, around: Surroundings, friction: float, placement: float
+) -> Trials:
+    """Grasps of bodies ``which`` by their rims, with all margins but those that the surroundings decide."""
+    found = [] if around.plane is None else [one for k in which for one in _rims(bodies[k], int(k), gripper, around)]
+    owner = np.array([one[0] for one in found], dtype=int).repeat(len(_INSETS))
+    inset = np.tile(_INSETS, len(found))
+    width = np.array([one[2] for one in found]).repeat(len(_INSETS))
+    frames = np.array([one[1] for one in found]).reshape(-1, 3, 4).repeat(len(_INSETS), axis=0)
+    frames[:, :, 3] += (inset - gripper.tip)[:, None] * frames[:, :, 2]
+    sigma = np.hypot(POINT_SIGMA, placement)
+    opening = np.minimum(width + 2 * (CLEARANCE + 2 * sigma), gripper.opening)
+    boxes = gripper.boxes_at(opening)
+    middle = np.linalg.norm(frames[:, :, 3] - bodies.translation[owner], axis=1)
+    mass = _WALLS * DENSITY * bodies.volume()[owner]
+    logs = np.zeros((len(owner), len(MARGINS)))
+    logs[:, 0] = 2 * log_phi(0.5 * (opening - width) + PASSES, sigma)
+    logs[:, 1] = log_phi(inset - LEAST_ENGAGED, sigma)
+    logs[:, 2] = log_phi(gripper.palm + gripper.tip - inset, sigma)
+    logs[:, 3] = np.log(_UPRIGHT)
+    logs[:, 4] = weight(mass, middle, 2 * friction * gripper.force, inset)
+    if around.plane is not None:
+        heights = clearance.heights_above(around.plane, frames, boxes)
+        logs[:, 5] = log_phi(heights, np.hypot(TABLE_SIGMA, placement))
+    trials = Trials(owner, frames, opening, width, logs)
+    is_free = clearance.gaps_to_points(frames, boxes, around.points) > 0
+    return trials.at(np.flatnonzero(is_free & _is_open(trials, boxes[:, 1], around)))
+
+
+def _rims(
+    body: Superquadric, owner: int, gripper: Gripper, around: Surroundings
+) -> Iterator[tuple[int, np.ndarray, float]]:
+    """Owner, frame (3, 4) on the rim, y outwards, and thickness of the wall of each bearing that has one."""
+    assert around.plane is not None
+    up = around.plane[:3]
+    first = np.cross(up, np.eye(3)[np.argmin(np.abs(up))])
+    first /= np.linalg.norm(first)
+    outwards = np.outer(np.cos(_BEARINGS), first) + np.outer(np.sin(_BEARINGS), np.cross(up, first))
+    reach, high = body.support(outwards), float(body.support(up[None])[0])
+    points = around.points - body.translation
+    points = points[(np.abs(points @ up) < high + _BEYOND) & (np.linalg.norm(points, axis=1) < reach.max() + high)]
+    height, away = points @ up, points @ outwards.T
+    aside = np.abs(points @ np.cross(up, outwards).T)
+    there = (aside < 0.5 * gripper.finger_width) & (away > 0.6 * reach) & (away < reach + _BEYOND)
+    for k in np.flatnonzero(there.sum(axis=0) >= _FEWEST):
+        top = np.sort(height[there[:, k]])[-_STRAY]
+        inner, outer = np.percentile(away[there[:, k] & (height > top - _HIGH), k], [10, 90])
+        if outer - inner <= _THIN:
+            axes = np.stack([np.cross(up, outwards[k]), outwards[k], -up], axis=1)
+            axes[:, 0] = np.cross(axes[:, 1], axes[:, 2])
+            place = body.translation + 0.5 * (inner + outer) * outwards[k] + top * up
+            yield owner, np.concatenate([axes, place[:, None]], axis=1), float(outer - inner)
+
+
+def _is_open(trials: Trials, fingers: np.ndarray, around: Surroundings) -> np.ndarray:
+    """Whether the image shows something beyond most of the end of each finger (k, 6)."""
+    grid = np.array([[x, y, 1.0] for x in (-0.8, 0.0, 0.8) for y in (-0.8, 0.0, 0.8)])
+    local = fingers[:, None, :3] + grid * fingers[:, None, 3:]
+    ends = local @ trials.frames[:, :, :3].transpose(0, 2, 1) + trials.frames[:, None, :, 3]
+    return np.mean(around.beyond(ends) > 0, axis=1) > 0.7

@@ -1,0 +1,88 @@
+"""Grasps under trial: the probabilities of their margins, and what all ways of grasping have in common.
+
+Metres, newtons, kilograms.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+
+import numpy as np
+from scipy.special import ndtr
+
+DENSITY = 500.0
+"""kg/m^3, between empty and full packages; a mass is thought to be known to half of it."""
+CLEARANCE = 0.005
+"""Metres on either side of the body and before the palm."""
+LEAST_ENGAGED = 0.004
+"""Metres of finger that have to be beyond the near end."""
+TABLE_SIGMA, POINT_SIGMA = 0.002, 0.001
+PASSES = 0.001
+"""Metres by which a finger may come down on the edge of a thing: half of those that did passed it and pushed it aside
+(60 household things in known places in the physics of benchmarks/picking_world.py; a quarter at 2 mm, few at 3)."""
+NEARER = 0.4
+"""Sigmas by which sides are nearer than fits say, of 797 tried ones that were known to more than 3.5 mm: medians of 0.3
+to 0.6 by how well (120 scenes of benchmarks/picking_scenes.py from seed 20000 on, none of which is reported); where
+they are known better it is too little to matter."""
+MARGINS = ("opening", "engagement", "palm", "friction", "weight", "table", "other bodies", "measured points", "unseen")
+_GRAVITY, _LIFT = 9.81, 2.0
+"""m/s^2; of the lift beside gravity."""
+_PAD_RADIUS = 0.006
+"""Mean arm of the friction of a pad of some 18 mm, metres."""
+
+
+@dataclass(frozen=True, eq=False)
+class Trials:
+    """Grasps under trial, k of them, and the logarithm of the probability of each margin so far."""
+
+    owner: np.ndarray
+    frames: np.ndarray
+    opening: np.ndarray
+    width: np.ndarray
+    logs: np.ndarray
+
+    def at(self, which: np.ndarray) -> Trials:
+        return Trials(self.owner[which], self.frames[which], self.opening[which], self.width[which], self.logs[which])
+
+    def and_(self, other: Trials) -> Trials:
+        return Trials(*(np.concatenate([getattr(one, part.name) for one in (self, other)]) for part in fields(self)))
+
+    @property
+    def weakest(self) -> np.ndarray:
+        """Which margin takes most from each."""
+        return np.asarray(np.argmin(self.logs, axis=1))
+
+    def first(self, count: int, least: float = -np.inf) -> Trials:
+        """The most probable ones of each body, each body's in order, of those whose logarithm is above ``least``."""
+        total = self.logs.sum(axis=1)
+        found = np.flatnonzero(total > least)
+        found = found[np.lexsort((-total[found], self.owner[found]))]
+        return self.at(found[_rank(self.owner[found]) < count])
+
+    def after(self, count: int) -> Trials:
+        """The others, of trials that are in order."""
+        return self.at(np.flatnonzero(_rank(self.owner) >= count))
+
+
+def _rank(owner: np.ndarray) -> np.ndarray:
+    """Of each (k,) among those of the same body; bodies are in order."""
+    return np.asarray(np.arange(len(owner)) - np.searchsorted(owner, owner))
+
+
+def passing(gap: np.ndarray, sigma: np.ndarray, placement: float) -> np.ndarray:
+    """log P (k,) that the gripper passes sides that are ``gap`` away and known to ``sigma``."""
+    return log_phi(gap + PASSES + NEARER * sigma, np.hypot(sigma, placement))
+
+
+def log_phi(margin: np.ndarray, sigma: np.ndarray | float) -> np.ndarray:
+    """log Phi(m / sigma), never below log(1e-12); nothing is known to less than a micrometre."""
+    return np.asarray(np.log(np.maximum(ndtr(margin / np.maximum(sigma, 1e-6)), 1e-12)))
+
+
+def weight(mass: np.ndarray, lever: np.ndarray, force: float, arm: float | np.ndarray = _PAD_RADIUS) -> np.ndarray:
+    """log P (k,) that a friction of both pads of ``force`` lifts a mass, ``lever`` beside the closing line.
+
+    As a force, and as a torque that the friction holds by its mean ``arm``.
+    """
+    load = np.maximum(1 + _LIFT / _GRAVITY, lever / arm) * _GRAVITY * mass / force
+    return log_phi(1 / np.maximum(load, 1e-9) - 1, 0.5)
