@@ -97,7 +97,7 @@ def run(camera: dict[str, Any], seconds: float, folder: Path) -> int:
         for name in TITLES:
             children.start(name, parameter_arguments({"projection": camera["projection"]}))
         children.start(CAMERA, parameter_arguments(camera))
-        with Watch(tuple(TITLES)) as watch:
+        with Watch(tuple(TITLES), has_truth=camera["scene"] != "replay") as watch:
             _wait_for_results(watch, children, console)
             _show(watch, children, console, seconds, camera["projection"])
     if children.killed:

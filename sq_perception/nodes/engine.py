@@ -139,13 +139,8 @@ class Engine:
     ) -> Answer:
         """The bodies of a frame by the parameters in force, and what tells their origin from another.
 
-        Parameters
-        ----------
-        pose
-            Of the frame in ``target_frame``; None where there is none.
-        previous
-            Of the same camera's frame before this one: what did not change since then, if its origin is the same, is
-            taken from it.
+        ``pose`` is that of the frame in ``target_frame``, if there is one.  What did not change since the ``previous``
+        frame of the same camera is taken from its answer, if its origin is the same.
         """
         built = self._built
         if built is None:

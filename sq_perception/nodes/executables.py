@@ -9,7 +9,7 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 from sq_perception.nodes import process
 
@@ -27,24 +27,17 @@ _NAMESPACE = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 """Checked here as well as by rclpy, which has begun to make a node by then and complains of its rest."""
 
 
-def recover_node(arguments: Sequence[str] | None = None) -> int:
-    """Network and surface fit."""
-    return process.run("recover_node", lambda: [_node("recover_node")], arguments)
+def _program(name: str) -> Callable[..., int]:
+    def program(arguments: Sequence[str] | None = None) -> int:
+        return process.run(name, lambda: [_node(name)], arguments)
+
+    return program
 
 
-def fitter_node(arguments: Sequence[str] | None = None) -> int:
-    """The classic fit."""
-    return process.run("fitter_node", lambda: [_node("fitter_node")], arguments)
-
-
-def grasp_node(arguments: Sequence[str] | None = None) -> int:
-    """Grasps on recovered bodies."""
-    return process.run("grasp_node", lambda: [_node("grasp_node")], arguments)
-
-
-def synthetic_depth_node(arguments: Sequence[str] | None = None) -> int:
-    """A simulated camera."""
-    return process.run("synthetic_depth_node", lambda: [_node("synthetic_depth_node")], arguments)
+recover_node = _program("recover_node")
+fitter_node = _program("fitter_node")
+grasp_node = _program("grasp_node")
+synthetic_depth_node = _program("synthetic_depth_node")
 
 
 def recover_cameras(arguments: Sequence[str] | None = None) -> int:

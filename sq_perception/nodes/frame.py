@@ -31,17 +31,9 @@ _DIGITS = 3
 class Frame:
     """A depth image that is fit to be processed.
 
-    Attributes
-    ----------
-    encoding
-        Of the message, before it was packed.
-    depth : float32 (height, width)
-        Metres in the optical frame, NaN where nothing was measured; rectified.
-    labels : int32 (height, width) or None
-        Rectified as well.
-    has_free_space
-        Whether a pixel beside an object tells that there is nothing before what it measured; not so for a cloud that is
-        no image.
+    ``depth`` (height, width) is float32, metres in the optical frame, NaN where nothing was measured, rectified as the
+    int32 ``labels`` are; ``encoding`` is that of the message before it was packed.  ``has_free_space`` says whether a
+    pixel beside an object tells that there is nothing before what it measured; not so for a cloud that is no image.
     """
 
     header: Any
@@ -76,7 +68,7 @@ class Frame:
 
 
 def decode(message: DepthMessage, calibration_of: Callable[[], Calibration] | None) -> Frame:
-    """The frame of a depth image message.
+    """The frame of a depth image message; raises ValueError for anything that keeps it from being processed.
 
     Parameters
     ----------
@@ -86,11 +78,6 @@ def decode(message: DepthMessage, calibration_of: Callable[[], Calibration] | No
     calibration_of
         Looks up the calibration; only called for an image that is sound itself.  None for images of the unit cube, not
         asked for clouds.
-
-    Raises
-    ------
-    ValueError
-        For anything that keeps the image from being processed.
     """
     if isinstance(message, PointCloud2):
         depth, seen, is_image = cloud_file.as_image(points_from_message(message))

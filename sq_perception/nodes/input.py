@@ -49,12 +49,8 @@ _WAITING = 64
 class Arrival:
     """A depth image and what came with it.
 
-    Attributes
-    ----------
-    size
-        None for what is no image, which is to be refused at once.
-    time, deadline
-        When it came, and until when it waits for its companions, seconds of the monotonic clock.
+    Its size is None for what is no image, which is to be refused at once.  It came at a time and waits for its
+    companions until a deadline, seconds of the monotonic clock.
     """
 
     message: DepthMessage

@@ -41,10 +41,7 @@ def setting(
 class Parameters:
     """Those of a node.  Types and ranges are rclpy's to check, by the descriptors; what fits together is checked here.
 
-    Raises
-    ------
-    ParameterError
-        For a value that is none of the choices, or does not fit the others.
+    Raises ParameterError for a value that is none of the choices, or does not fit the others.
     """
 
     def __post_init__(self) -> None:
@@ -58,12 +55,10 @@ P = TypeVar("P", bound=Parameters)
 
 
 class LiveParameters(Generic[P]):
-    """Declares the fields of a dataclass as parameters of a node and follows their changes.
+    """Declares the fields of a dataclass ``kind`` as parameters of a node and follows their changes.
 
     Parameters
     ----------
-    node, kind
-        The node and the dataclass.
     locked
         Why what is not live cannot change now; empty where it can.  None: it never can.
     check

@@ -34,9 +34,7 @@ def _check_box(name: str, box: tuple[float, ...]) -> None:
 class RecoverParameters(Parameters):
     """recover_node, and each node of recover_cameras."""
 
-    autostart: bool = setting(
-        True, "Configure and activate at the start; false: wait for a lifecycle manager.", live=False
-    )
+    autostart: bool = setting(True, "Configure and activate at start; false: wait for a lifecycle manager.", live=False)
     free_shared_memory: bool = setting(
         False, "Delete the shared memory that killed processes of this user have left behind.", live=False
     )
@@ -51,9 +49,7 @@ class RecoverParameters(Parameters):
         "Label images on mask/image: auto segments images without one, always refuses them, never ignores masks.",
         choices=("auto", "always", "never"),
     )
-    patience: float = setting(
-        0.25, "How long an image waits for its camera_info or mask.", unit="s", within=(0.0, 10.0)
-    )
+    patience: float = setting(0.25, "How long an image waits for camera_info or mask.", unit="s", within=(0.0, 10.0))
     image_transport: str = setting(
         RAW,
         "How depth images come: raw on depth/image, compressedDepth (16 bit PNG or RVL) on "
@@ -73,14 +69,12 @@ class RecoverParameters(Parameters):
         "Sharpness of the soft occupancy sigma(s (1 - F^e1)) of the score and of refine = soft_render.",
         within=(0.1, 1000.0),
     )
-    tau: float = setting(
-        4.82, "Sharpness of the soft depth projection of the score and of refine = soft_render.", within=(0.1, 100.0)
-    )
+    tau: float = setting(4.82, "Sharpness of the soft depth projection, likewise.", within=(0.1, 100.0))
     depth_min: float = setting(0.0, "Nearer readings are left out.", unit="m", within=(0.0, 100.0))
     depth_max: float = setting(100.0, "Farther readings are left out; 100 keeps all.", unit="m", within=(0.001, 100.0))
     max_objects: int = setting(20, "Most bodies a frame, the largest ones.", within=(1, 100))
     max_size: float = setting(
-        0.6, "Largest full edge of an object of the node's own segmentation.", unit="m", within=(0.01, 100.0)
+        0.6, "Largest full edge of objects that the node segments.", unit="m", within=(0.01, 100.0)
     )
     workspace: tuple[float, ...] = setting(
         EVERYWHERE,
@@ -127,9 +121,7 @@ class RecoverParameters(Parameters):
         "Names of tf2 frames, detections and collision objects before the id. Two nodes need different ones.",
     )
     publish_detections: bool = setting(False, "Publish ~/detections; needs vision_msgs.")
-    publish_collision_objects: bool = setting(
-        False, "Publish collision objects on ~/planning_scene; needs moveit_msgs."
-    )
+    publish_collision_objects: bool = setting(False, "Publish ~/planning_scene; needs moveit_msgs.")
     collision_shapes: str = setting(
         "primitive",
         "Around each body: the smallest box, cylinder or sphere, quick to plan with, or a mesh that fits closely.",
@@ -141,9 +133,7 @@ class RecoverParameters(Parameters):
     )
     device: str = setting("cpu", "Where the network runs: cpu, cuda or cuda:N.")
     consensus: bool = setting(False, "Average the network's answers to 8 positions of each view.")
-    threads: int = setting(
-        0, "Objects that are worked on at the same time; 0: as many as there are cores.", within=(0, 256)
-    )
+    threads: int = setting(0, "Objects worked on at the same time; 0: as many as there are cores.", within=(0, 256))
     method: Method = setting(
         "auto",
         "Where the fit starts: network, symmetry, or auto (the best of them); classic is Solina and Bajcsy's method.",
@@ -216,9 +206,7 @@ class SyntheticParameters(Parameters):
         live=False,
     )
     rate: float = setting(10.0, "Frames per second.", unit="Hz", within=(0.1, 200.0))
-    seed: int = setting(
-        0, "Seed of scenes and noise: the same seed gives the same images.", within=(0, 2**31 - 1), live=False
-    )
+    seed: int = setting(0, "Seed of scenes and noise: equal seeds, equal images.", within=(0, 2**31 - 1), live=False)
     noise: float = setting(
         0.0,
         "Standard deviation of the ideal sensor's depth noise: metres, for orthographic frames grey levels of 255.",
@@ -231,15 +219,9 @@ class SyntheticParameters(Parameters):
         "(docs/sensors.md).",
         choices=(IDEAL, *PRESETS),
     )
-    hold: int = setting(
-        30, "Frames that a scene or recording stays; the noise is fresh each time.", within=(1, 10**6), live=False
-    )
-    scenes: int = setting(
-        0, "Different scenes before the end or the next round; 0 means endless.", within=(0, 10**6), live=False
-    )
-    loop: bool = setting(
-        True, "Begin again after the last scene or recording; otherwise publish nothing more.", live=False
-    )
+    hold: int = setting(30, "Frames that a scene or recording stays; noise is fresh.", within=(1, 10**6), live=False)
+    scenes: int = setting(0, "Scenes before the end or the next round; 0: endless.", within=(0, 10**6), live=False)
+    loop: bool = setting(True, "Begin again after the last scene or recording; otherwise publish no more.", live=False)
     objects: int = setting(3, "Bodies on the table.", within=(1, 10), live=False)
     pixels: int = setting(256, "Width and height of the thesis' images.", unit="pixels", within=(16, 1024), live=False)
     encoding: str = setting(

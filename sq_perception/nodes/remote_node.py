@@ -30,7 +30,6 @@ _LOOK_PERIOD = 0.5
 """Seconds between two looks at whether the node is there, and at its lifecycle state."""
 _SETTLED = 0.4
 """Seconds after the last of many parameter events until they are read: a node that starts sends one for each."""
-_TRANSITIONS = ("configure", "cleanup", "activate", "deactivate")
 
 
 class RemoteNode:
@@ -98,7 +97,7 @@ class RemoteNode:
 
     async def transit(self, label: str) -> None:
         """Ask for a lifecycle transition."""
-        if label not in _TRANSITIONS or not self._transit.service_is_ready():
+        if not self._transit.service_is_ready():
             return
         request = ChangeState.Request(transition=Transition(id=getattr(Transition, f"TRANSITION_{label.upper()}")))
         try:

@@ -18,7 +18,6 @@ from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
 
 THROTTLE = 5.0
 """Seconds between two messages of the same place in the log."""
-
 SECONDS = 10.0
 """What rates and latencies are taken over."""
 _MOST = 5000
@@ -80,15 +79,10 @@ class Statistics:
             self._stages.append((self._clock(), milliseconds))
 
     def status(self, name: str, standing: Standing | None, more: Mapping[str, str]) -> DiagnosticStatus:
-        """The diagnostics of a node.
+        """The diagnostics of a node, and ``more`` that there is to know beside the frames.
 
-        Parameters
-        ----------
-        standing
-            Level and message where there is more to say than of the frames; else WARN where they come and none is
-            answered, or were refused or lost since the last status.
-        more
-            What there is to know beside the frames.
+        ``standing`` goes first; without it WARN where frames come and none is answered, or some were refused or lost
+        since the last status.
         """
         with self._lock:
             now = self._clock()

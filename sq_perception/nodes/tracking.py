@@ -119,18 +119,8 @@ class Tracking:
     ) -> Identified:
         """Bodies and ids of their tracks; without ``tracking`` ids are labels, and what was tracked is forgotten.
 
-        Parameters
-        ----------
-        origin
-            Of the bodies.  Numbers that another method or model found, with deviations of another kind, are not fused
-            with these: a change ends the tracks.
-        arrival
-            The time, seconds, of an image without stamp.
-
-        Raises
-        ------
-        ValueError
-            If the tracker cannot go on; it begins anew with the next frame.
+        Numbers of another ``origin``, method or model, are not fused with these: a change ends the tracks.  ``arrival``
+        is the time, seconds, of an image without stamp.  Raises ValueError if the tracker cannot go on; it begins anew.
         """
         stamp = 1e-9 * stamp_of(frame)
         if not parameters.tracking:

@@ -13,10 +13,9 @@ import threading
 import traceback
 from collections import OrderedDict, deque
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
 from time import monotonic
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
@@ -52,8 +51,7 @@ _RESULT_PATIENCE = 1.0
 _DRAWER_END = 5.0
 
 
-@dataclass(frozen=True)
-class _Result:
+class _Result(NamedTuple):
     """Superquadrics, when they came, in seconds of the monotonic clock, and after how many milliseconds."""
 
     message: PointCloud2
@@ -97,8 +95,8 @@ class ViewNode(Node):
         self._poses = CameraPoses(self)
         self._inputs: list[Subscription] = []
         self._drawn: Image | None = None
-        self._bodies: dict[str, tuple[_Result, Bodies | None, str]] = {}
-        """Of each node: the result that was drawn last, and its bodies, or why they cannot be drawn."""
+        self._shown: dict[str, _Result | None] = {}
+        """The result of each node that was drawn last."""
         self._status_due = 0.0
         self._remote = {one: RemoteNode(self, one) for one in nodes}
         self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
@@ -176,9 +174,8 @@ class ViewNode(Node):
                     self._diagnosed[name] = {pair.key: pair.value for pair in status.values}
 
     def _on_parameter_event(self, event: ParameterEvent) -> None:
-        remote = self._remote.get(event.node)
-        if remote is not None:
-            remote.on_event(event)
+        if event.node in self._remote:
+            self._remote[event.node].on_event(event)
 
     # The drawing thread
 
@@ -237,12 +234,10 @@ class ViewNode(Node):
         return image.header
 
     def _draw_node(self, name: str, result: _Result | None, header: Any, status_due: bool) -> None:
-        drawn, bodies, remark = self._bodies.get(name, (None, None, ""))
-        if result is drawn and not status_due:
+        if result is self._shown.get(name) and not status_due:
             return
-        if result is not None and result is not drawn:
-            bodies, remark = self._converted(result.message, header)
-            self._bodies[name] = result, bodies, remark
+        self._shown[name] = result
+        bodies, remark = (None, "") if result is None else self._converted(result.message, header)
         remote = self._remote[name]
         state = NodeState(
             name,

@@ -51,9 +51,9 @@ class Shot:
 class Watch:
     """Collects, image by image, depth, truth and the results of ``nodes``; lives as long as a ``with`` block."""
 
-    def __init__(self, nodes: tuple[str, ...]) -> None:
-        self._wanted = set(nodes)
-        """Whose bodies belong to an image: the nodes', and those of a camera that knows them."""
+    def __init__(self, nodes: tuple[str, ...], has_truth: bool) -> None:
+        self._wanted = {*nodes, CAMERA} if has_truth else set(nodes)
+        """Whose bodies belong to an image."""
         self._shots: OrderedDict[int, Shot] = OrderedDict()
         self._info: CameraInfo | None = None
         self.images = 0
@@ -108,8 +108,6 @@ class Watch:
         shot.results[name] = found = Found(superquadrics(kept), kept.residual, 1e-6 * (time.time_ns() - shot.stamp))
         if name in self.latencies:
             self.latencies[name].append(found.latency)
-        elif len(found.bodies):
-            self._wanted.add(name)
         self._check(shot)
 
     def _shot(self, message: Any) -> Shot:
