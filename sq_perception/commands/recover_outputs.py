@@ -110,7 +110,7 @@ class Outputs:
         """Write a frame, what was recovered from it, and its element of ``frames``; raises OSError if that fails."""
         options = self._options
         self.results.append(entry)
-        stem = _free_stem(frame.name if frame.topic else Path(frame.name).stem, self._stems)
+        stem = output_file.free_name(frame.name if frame.topic else Path(frame.name).stem, self._stems)
         if options.pictures:
             _draw(options.pictures / f"{stem}.png", frame, recovery)
         if options.meshes:
@@ -181,15 +181,6 @@ def _bag(options: argparse.Namespace) -> ResultBag | None:
         raise ValueError(f"--mcap: {error}") from error
     except ImportError as error:
         raise ImportError(f"--mcap: {error}") from error
-
-
-def _free_stem(stem: str, taken: set[str]) -> str:
-    """A name for a frame's files that no other frame of this call has."""
-    name, k = stem, 2
-    while name in taken:
-        name, k = f"{stem}_{k}", k + 1
-    taken.add(name)
-    return name
 
 
 def _elsewhere(name: str, path: Path, found: Path) -> Iterator[str]:

@@ -23,6 +23,7 @@ import numpy as np
 
 from sq_perception.evaluation.protocol import FITS
 from sq_perception.evaluation.thesis_images import ImageChunk
+from sq_perception.files.output_file import free_name
 from sq_perception.fitting.fit import Status
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
@@ -202,16 +203,10 @@ def default_name(path: Path) -> str:
     return re.sub(r"[^\w.+-]+", "_", name) or "network"
 
 
-def unique_names(paths: Sequence[Path], taken: Sequence[str] = FITS) -> list[str]:
-    """A name for each file, none of them twice and none of those taken."""
-    names: list[str] = []
-    for path in paths:
-        base = name = default_name(path)
-        k = 2
-        while name in names or name in taken:
-            name, k = f"{base}_{k}", k + 1
-        names.append(name)
-    return names
+def unique_names(paths: Sequence[Path]) -> list[str]:
+    """A name for each file, none of them twice and none of a fit."""
+    taken = set[str](FITS)
+    return [free_name(default_name(path), taken) for path in paths]
 
 
 def _note(header: dict[str, str], key: str, path: Path) -> dict[str, Any]:

@@ -69,10 +69,8 @@ def demo_figure(
     heading_of(ax, "Depth image", f"{camera.width} x {camera.height}, {limits[0]:.2f} to {limits[1]:.2f} {unit}")
     for k, (name, bodies, remark) in enumerate(methods):
         ax = figure.add_subplot(above[1 + k])
-        draw_depth(ax, depth, limits)
+        draw_depth(ax, depth, limits, window)
         draw_outlines(ax, bodies, camera, [colour(i) for i in range(len(bodies))], width=1.8)
-        ax.set_xlim(left, right)
-        ax.set_ylim(bottom, top)
         heading_of(ax, name, remark)
     for k, (name, bodies, _) in enumerate(methods):
         for i, (elevation, azimuth, direction) in enumerate(_VIEWS):

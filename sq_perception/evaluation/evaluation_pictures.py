@@ -115,9 +115,7 @@ def _draw_example(axes: Sequence[Axes], outcome: Outcome, images: ThesisImages, 
     window = window_of([], images.camera, shown)
     limits = span_within(depth, window)
     for ax, image in zip(axes, (depth, rendered), strict=False):
-        draw_depth(ax, image, limits)
-        ax.set_xlim(window[0], window[1])
-        ax.set_ylim(window[3], window[2])
+        draw_depth(ax, image, limits, window)
     axes[0].set_title(f"{100 * outcome.figures.iou[number]:.1f} %", loc="left", fontsize=10, color=INK, pad=3)
     axes[0].set_title(f"body {number}", loc="right", fontsize=8.5, color=FAINT, pad=3)
     if is_recovered:

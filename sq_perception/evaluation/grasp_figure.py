@@ -15,7 +15,7 @@ from sq_perception.imaging.camera import Camera
 def draw_grasps(
     ax: Axes, depth: np.ndarray, camera: Camera, bodies: list[Superquadric], plan: GraspPlan, hand: Gripper
 ) -> None:
-    """Everything in the optical frame of the camera; the axes get its limits."""
+    """Everything in the optical frame of the camera."""
     plots.draw_depth(ax, depth)
     plots.draw_outlines(ax, bodies, camera, edges=False, width=1.4)
     for k in range(len(bodies)):
@@ -26,5 +26,3 @@ def draw_grasps(
                 ax.plot(*pixels.T, color=plots.colour(k), lw=2.6, solid_capstyle="round")
             where = float(pixels[-1, 0]), float(pixels[-1, 1])
             ax.text(*where, f" {grasp.score:.2f}", color=plots.INK, fontsize=11, weight="bold", clip_on=True)
-    ax.set_xlim(-0.5, camera.width - 0.5)
-    ax.set_ylim(camera.height - 0.5, -0.5)

@@ -35,6 +35,8 @@ DEPTH_MAP = LinearSegmentedColormap.from_list("depth", ["#f4f6f7", "#c3ced6", "#
 _CONTOUR_PIXELS = 1280
 MOST_POINTS = 1500
 """Of the cloud of one body."""
+Window = tuple[float, float, float, float]
+"""Left, right, top, bottom of a part of an image."""
 
 
 def colour(k: int) -> np.ndarray:
@@ -42,8 +44,10 @@ def colour(k: int) -> np.ndarray:
     return COLOURS[k % len(COLOURS)]
 
 
-def draw_depth(ax: Axes, depth: np.ndarray, limits: tuple[float, float] | None = None) -> None:
-    """A depth image (height, width): near is light, far is dark, nothing measured is black.
+def draw_depth(
+    ax: Axes, depth: np.ndarray, limits: tuple[float, float] | None = None, window: Window | None = None
+) -> None:
+    """A depth image (height, width), or its ``window``: near is light, far is dark, nothing measured is black.
 
     ``limits`` are the nearest and farthest depth of the scale; the middle 96 % of the image by default.
     """
@@ -55,6 +59,9 @@ def draw_depth(ax: Axes, depth: np.ndarray, limits: tuple[float, float] | None =
     shades = DEPTH_MAP.with_extremes(bad=NOTHING)
     span = max(limits[1] - limits[0], 1e-6)
     ax.imshow(finite, cmap=shades, vmin=limits[0], vmax=limits[0] + span, interpolation="nearest")
+    left, right, top, bottom = window or (-0.5, depth.shape[1] - 0.5, -0.5, depth.shape[0] - 0.5)
+    ax.set_xlim(left, right)
+    ax.set_ylim(bottom, top)
     ax.set_xticks([])
     ax.set_yticks([])
     for side in ax.spines.values():
@@ -137,10 +144,8 @@ def _faces_camera(body: Superquadric, points: np.ndarray, camera: Camera) -> np.
     return np.sum(body.normals(points) * direction, axis=-1) < 0
 
 
-def window_of(
-    bodies: Sequence[Superquadric], camera: Camera, pixels: np.ndarray | None = None
-) -> tuple[float, float, float, float]:
-    """Left, right, top, bottom of the part of the image with bodies and pixels (n, 2), in the image's proportions."""
+def window_of(bodies: Sequence[Superquadric], camera: Camera, pixels: np.ndarray | None = None) -> Window:
+    """The part of the image with bodies and pixels (n, 2), in the image's proportions."""
     size = np.array([camera.width, camera.height], dtype=float)
     spots = [loop for body in bodies for loop in silhouettes(body, camera)]
     spots += [] if pixels is None or not len(pixels) else [pixels]
@@ -152,7 +157,7 @@ def window_of(
     return middle[0] - half[0], middle[0] + half[0], middle[1] - half[1], middle[1] + half[1]
 
 
-def span_within(depth: np.ndarray, window: tuple[float, float, float, float]) -> tuple[float, float]:
+def span_within(depth: np.ndarray, window: Window) -> tuple[float, float]:
     """Nearest and farthest depth of the scale: those of the window, a few stray readings left out."""
     left, right, top, bottom = (max(0, round(value)) for value in window)
     part = depth[top : bottom + 1, left : right + 1]

@@ -60,10 +60,8 @@ def recovery_figure(
     draw_masks(left, recovery.labels, [body.label for body in recovery.bodies])
     heading_of(left, "Depth and masks", f"{camera.width} x {camera.height}")
     right = figure.add_subplot(top[1])
-    draw_depth(right, depth, limits)
+    draw_depth(right, depth, limits, window)
     draw_outlines(right, bodies, camera, shades)
-    right.set_xlim(window[0], window[1])
-    right.set_ylim(window[3], window[2])
     for k, body in shown:
         _draw_open_axes(right, body, camera)
         _number(right, camera.project(body.superquadric.translation), k)

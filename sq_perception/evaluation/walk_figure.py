@@ -34,14 +34,11 @@ def walk_figure(subject: Subject, found: Walk, step: int, title: str = "") -> Fi
     figure.text(0.988, 0.935, note, fontsize=11, color=plots.WIRE if truth else plots.INK, ha="right")
 
     image = figure.add_axes((0.012, 0.03, 0.305, 0.854))
-    plots.draw_depth(image, subject.depth)
+    plots.draw_depth(image, subject.depth, window=plots.window_of([*extremes, *truth], subject.camera))
     plots.draw_outlines(image, [optical[step]], subject.camera, [_BODY], width=1.8)
     for body in truth:
         for loop in plots.silhouettes(body, subject.camera):
             image.plot(*np.vstack([loop, loop[:1]]).T, color=plots.WIRE, lw=1.4, ls=(0, (4, 2.5)))
-    left, right, top, bottom = plots.window_of([*extremes, *truth], subject.camera)
-    image.set_xlim(left, right)
-    image.set_ylim(bottom, top)
     image.patch.set_facecolor(plots.NOTHING)
 
     space = figure.add_axes((0.325, 0.03, 0.305, 0.854))

@@ -173,6 +173,15 @@ def check_folder(folder: str | Path) -> None:
     tempfile.TemporaryFile(dir=folder).close()
 
 
+def free_name(name: str, taken: set[str]) -> str:
+    """The name, or name_2, name_3 and so on where it is taken; it is taken then."""
+    free, k = name, 2
+    while free in taken:
+        free, k = f"{name}_{k}", k + 1
+    taken.add(free)
+    return free
+
+
 def opened(path: Path, flags: int = 0) -> int:
     """Descriptor of a file, made if need be, that no other caller has open.
 

@@ -121,7 +121,6 @@ class ViewPool:
         self._images[slots], self._flat[slots] = images, bodies.to_flat()
         self._next = int(slots[-1] + 1) % len(self._images)
         chosen = self._rng.integers(len(self._images), size=count)
-        turns, mirror = self._rng.integers(4, size=count), self._rng.random(count) < 0.5
-        views = dihedral.moved_images(self._images[chosen], turns, mirror)
-        bodies = dihedral.moved_bodies(Superquadric.from_flat(self._flat[chosen]), turns, mirror)
+        bodies = Superquadric.from_flat(self._flat[chosen])
+        views, bodies = dihedral.at_random(self._images[chosen], bodies, self._rng)
         return self._source.disturbance.worn(views, self._rng), bodies

@@ -40,6 +40,12 @@ def moved_bodies(bodies: Superquadric, turns: np.ndarray, mirror: np.ndarray) ->
     return Superquadric(bodies.size, bodies.shape, centred, rotation).transformed(turn, np.full(3, 0.5))
 
 
+def at_random(images: np.ndarray, bodies: Superquadric, rng: np.random.Generator) -> tuple[np.ndarray, Superquadric]:
+    """Images (n, p, p) and their bodies (n,), each in any of the 8 positions."""
+    turns, mirror = rng.integers(4, size=len(images)), rng.random(len(images)) < 0.5
+    return moved_images(images, turns, mirror), moved_bodies(bodies, turns, mirror)
+
+
 def moved_back(bodies: Superquadric, turns: np.ndarray, mirror: np.ndarray) -> Superquadric:
     """The inverse of :func:`moved_bodies`: what a prediction for a moved image says about the image itself."""
     straight = moved_bodies(bodies, -np.asarray(turns), np.zeros(len(bodies), bool))

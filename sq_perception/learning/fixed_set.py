@@ -240,9 +240,7 @@ class ShuffledBatches:
         while len(self._order) < count:
             self._order = np.concatenate([self._order, self._rng.permutation(len(self._set))])
         chosen, self._order = self._order[:count], self._order[count:]
-        images, bodies = self._set.batch(chosen)
-        turns, mirror = self._rng.integers(4, size=count), self._rng.random(count) < 0.5
-        return dihedral.moved_images(images, turns, mirror), dihedral.moved_bodies(bodies, turns, mirror)
+        return dihedral.at_random(*self._set.batch(chosen), self._rng)
 
 
 def _write_manifest(folder: Path, settings: Settings, done: dict[str, str]) -> None:

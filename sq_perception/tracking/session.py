@@ -95,25 +95,17 @@ class TrackingSession:
         self._tracker = Tracker()
         self._stamp = -np.inf
         self._pose: tuple[np.ndarray, np.ndarray] = state.as_pose(None)
-        self._tally = Tally()
-        self._hidden: tuple[int, ...] = ()
-
-    @property
-    def hidden(self) -> tuple[int, ...]:
-        """Ids of the tracks that the last frame did not show and that are not given up."""
-        return self._hidden
-
-    @property
-    def tally(self) -> Tally:
+        self.tally = Tally()
         """Counts after the last frame; may be read from another thread."""
-        return self._tally
+        self.hidden: tuple[int, ...] = ()
+        """Ids of the tracks that the last frame did not show and that are not given up."""
 
     def reset(self) -> None:
         """Forget every body; ids go on."""
         self._tracker.reset()
         self._stamp = -np.inf
-        self._tally = replace(self._tally, tracks=0)
-        self._hidden = ()
+        self.tally = replace(self.tally, tracks=0)
+        self.hidden = ()
 
     def follow(
         self,
@@ -147,14 +139,14 @@ class TrackingSession:
         """
         rotation, position = state.as_pose(camera_pose) if is_pose_known else self._pose
         tracks = self._tracker.update(observed, stamp, (rotation, position), camera=camera, depth=depth)
-        self._tally = Tally(
+        self.tally = Tally(
             tracks=len(tracks),
             births=self._tracker.births,
-            resets=self._tally.resets + (stamp < self._stamp),
-            without_pose=self._tally.without_pose + (not is_pose_known),
+            resets=self.tally.resets + (stamp < self._stamp),
+            without_pose=self.tally.without_pose + (not is_pose_known),
         )
         self._stamp, self._pose = stamp, (rotation, position)
-        self._hidden = tuple(one.id for one in tracks if one.observation is None)
+        self.hidden = tuple(one.id for one in tracks if one.observation is None)
 
         back = quaternions.conjugate(rotation)
         matrix = quaternions.to_matrix(back)
