@@ -30,6 +30,8 @@ _PRIOR_LOG_SIZE, _PRIOR_SHAPE, _PRIOR_ANGLE = 1.0, 0.5, 1.0
 _RAYS = 800
 """Few enough to take a tenth of a fit's time."""
 
+_IS_LOWER = np.tri(STEP_LENGTH, dtype=bool)
+
 
 def covariance_at(state: State, rays: Rays, terms: Terms, outline: float) -> np.ndarray:
     """(11, 11) of a1 a2 a3 e1 e2 t1 t2 t3 and the rotation vector in the object frame; metres and radians.
@@ -42,9 +44,9 @@ def covariance_at(state: State, rays: Rays, terms: Terms, outline: float) -> np.
     terms = terms._replace(outline_stiffness=1 / outline)
     cost = evaluate(RENDERED, hits, free, terms, state.parameters, state.rotation, sums)
     variance = max(1.0, cost / float(hits[:, WEIGHT].sum()))
-    lower = np.tril(sums[:STEP_LENGTH, :STEP_LENGTH])
-    full = lower + np.tril(lower, -1).T
-    length = float(np.mean(state.parameters[:3]))
+    lower = sums[:STEP_LENGTH, :STEP_LENGTH]
+    full = np.where(_IS_LOWER, lower, lower.T)
+    length = float(state.parameters[:3].sum()) / 3
     prior = np.array([1 / _PRIOR_LOG_SIZE] * 3 + [1 / _PRIOR_SHAPE] * 2 + [1 / length] * 3 + [1 / _PRIOR_ANGLE] * 3)
     covariance = _inverse(full / variance + np.diag(prior**2), float(prior.min() ** 2))
     units = np.concatenate([state.parameters[:3], np.ones(STEP_LENGTH - 3)])

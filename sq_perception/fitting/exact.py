@@ -52,6 +52,7 @@ from sq_perception.fitting.problem import (
 from sq_perception.fitting.rays import Rays
 from sq_perception.fitting.residuals import surface_distance
 from sq_perception.fitting.rivals import SIGNIFICANT, alike, other_axes, other_depths
+from sq_perception.geometry.quantiles import quantile
 
 _MORE_RAYS, _MOST_FINAL_RAYS = 1500, 6000
 """Half of and twice :data:`~sq_perception.fitting.problem.FINAL_RAYS`: where few rays tie, and under much noise."""
@@ -150,7 +151,7 @@ def _enough_rays(observation: Observation) -> int:
 def _without_outliers(observation: Observation, hits: np.ndarray, state: State) -> np.ndarray:
     """The rays whose points lie near the surface, as seen by the majority."""
     distance = np.abs(surface_distance(hits, state.parameters, state.rotation))
-    spread = max(observation.sigma, MEDIAN_TO_SIGMA * float(np.median(distance)))
+    spread = max(observation.sigma, MEDIAN_TO_SIGMA * quantile(np.sort(distance), 0.5))
     return hits[distance < _OUTLIER * spread]
 
 

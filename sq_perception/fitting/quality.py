@@ -11,6 +11,7 @@ from sq_perception.fitting.fit import CUT_SHORT, FAILED_SHARE, INLIER, Fit, Stat
 from sq_perception.fitting.observation import OUTLIER_SHARE, Observation, span
 from sq_perception.fitting.problem import Solution
 from sq_perception.fitting.residuals import surface_distance
+from sq_perception.geometry.quantiles import quantile
 from sq_perception.geometry.superquadric import Superquadric
 
 _RAYS = 800
@@ -34,12 +35,12 @@ def assessed(solution: Solution, began: float) -> Fit:
     outside = surface_distance(everything, state.parameters, state.rotation)
     distance = np.abs(outside)
     inlying = distance < INLIER * observation.sigma
-    typical = float(np.median(distance))
+    typical = quantile(np.sort(distance), 0.5)
     kept = distance < max(INLIER * observation.sigma, INLIER * typical)
     residual = float(np.sqrt(np.mean(distance[kept] ** 2))) if kept.any() else typical
     if solution.as_hull:
         # A hollow thing lies inside its hull: only what sticks out speaks against the body.
-        typical = float(np.quantile(np.maximum(outside, 0.0), _REACHED))
+        typical = quantile(np.sort(np.maximum(outside, 0.0)), _REACHED)
     status, message = _status(canonical, covariance, typical, _FAILED_LEVELS * observation.sigma)
     cut = (CUT_SHORT,) if solution.problem.late else ()
     return Fit(

@@ -29,6 +29,7 @@ from sq_perception.fitting.options import MIN_PIXELS, MODEL_ERROR_ON_PLANE, FitO
 from sq_perception.fitting.problem import Problem, Solution
 from sq_perception.fitting.quality import assessed, failed
 from sq_perception.fitting.residuals import surface_distance
+from sq_perception.geometry.quantiles import quantile
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.support_directions import DIRECTIONS
 from sq_perception.imaging import raycast
@@ -119,7 +120,7 @@ def _is_explained(solution: Solution, noise: float) -> bool:
     """Whether a body of the tolerant course leaves no more than the noise, so that an exact one may be there."""
     rays = solution.problem.observation.object_rays(_RAYS)
     distance = np.abs(surface_distance(rays, solution.state.parameters, solution.state.rotation))
-    return MEDIAN_TO_SIGMA * float(np.median(distance)) < noise
+    return MEDIAN_TO_SIGMA * quantile(np.sort(distance), 0.5) < noise
 
 
 def warm_up() -> None:

@@ -51,8 +51,9 @@ from sq_perception.fitting.problem import (
     settle,
     terms_of,
 )
-from sq_perception.fitting.rays import STIFFNESS, Rays
-from sq_perception.fitting.residuals import surface_distance
+from sq_perception.fitting.rays import Rays
+from sq_perception.fitting.residuals import mean_loss, surface_distance
+from sq_perception.geometry.quantiles import quantile
 
 INDEPENDENT_OF_PREDICTED, EXPLAINED = 100.0, 0.5
 """Most rays that an object counts for beside a predicted hull, and the mean loss up to which it does: what cartons and
@@ -111,11 +112,9 @@ def _best(problem: Problem, starts: Sequence[State]) -> Solution:
 
 
 def _mean_loss(problem: Problem, body: State) -> float:
-    """Of the object's rays, in front of the surface and behind it alike: c of the module."""
+    """Of the object's rays: c of the module."""
     rays = problem.observation.object_rays(_LOSS_RAYS, 0.1)
-    r = np.abs(surface_distance(rays, body.parameters, body.rotation)) * rays[:, STIFFNESS]
-    k = problem.terms.huber
-    return float(np.mean(np.where(r < k, r * r, k * (2 * r - k))))
+    return mean_loss(rays, problem.terms.huber, body.parameters, body.rotation)
 
 
 def _typical_of_hollow(problem: Problem) -> float:
@@ -135,7 +134,7 @@ def take_over(problem: Problem, best: State, given: Sequence[State]) -> Solution
     """The same where an exact body was sought in vain: what ``best`` leaves becomes the model error."""
     hits = problem.observation.object_rays(FINAL_RAYS)
     distance = np.abs(surface_distance(hits, best.parameters, best.rotation))
-    left_over = MEDIAN_TO_SIGMA * float(np.median(distance))
+    left_over = MEDIAN_TO_SIGMA * quantile(np.sort(distance), 0.5)
     observation = problem.observation.coarsened(left_over)
     return solve(replace(problem, observation=observation, terms=terms_of(observation, problem.options)), given)
 
