@@ -17,8 +17,9 @@ from typing import Any
 
 import numpy as np
 
+from sq_msgs_py.columns import UINT32, MessageError
 from sq_msgs_py.grasps import GraspArray
-from sq_msgs_py.superquadrics import FIELDS, UINT32, MessageError, SuperquadricArray
+from sq_msgs_py.superquadrics import FIELDS, SuperquadricArray
 
 _NAMES: dict[type[Any], str] = {SuperquadricArray: "superquadrics", GraspArray: "grasps"}
 _SERVICES: dict[type[Any], str] = {SuperquadricArray: "~/recover", GraspArray: "~/plan"}

@@ -18,9 +18,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sq_msgs_py import columns
+from sq_msgs_py.columns import FLOAT32, UINT32, Columns
 from sq_msgs_py.message_types import MessageTypes, installed
 from sq_msgs_py.poses import matrices, unit_quaternions
-from sq_msgs_py.superquadrics import FLOAT32, UINT32, MessageError, cloud, cloud_points
 
 if TYPE_CHECKING:
     from geometry_msgs.msg import PoseArray
@@ -43,7 +44,7 @@ _COLUMNS = {
 
 
 @dataclass(frozen=True, eq=False)
-class GraspArray:
+class GraspArray(Columns):
     """n grasps, column by column; see the module for units and conventions.
 
     Attributes
@@ -53,11 +54,12 @@ class GraspArray:
     opening, width, score : (n,) float32
     id : (n,) uint32
 
-    Raises
-    ------
-    ValueError
-        If a column has another shape, or position or rotation is not finite.
+    Raises ValueError as :class:`~sq_msgs_py.columns.Columns` does.
     """
+
+    FIELDS = FIELDS
+    NAMES = _COLUMNS
+    FINITE = ("position", "rotation")
 
     position: np.ndarray
     rotation: np.ndarray
@@ -66,29 +68,10 @@ class GraspArray:
     score: np.ndarray
     id: np.ndarray
 
-    def __post_init__(self) -> None:
-        count = len(self.position)
-        for column, names in _COLUMNS.items():
-            values = np.asarray(getattr(self, column))
-            shape = (count,) if len(names) == 1 else (count, len(names))
-            values = values.reshape(shape) if values.size == 0 == count else values
-            if values.shape != shape:
-                raise ValueError(f"{column}: expected shape {shape}, got {values.shape}")
-            if column in ("position", "rotation") and not np.isfinite(values).all():
-                raise ValueError(f"{column}: expected finite numbers, got {values.tolist()}")
-            object.__setattr__(self, column, values.astype(np.uint32 if column == "id" else np.float32))
-
-    def __len__(self) -> int:
-        return len(self.position)
-
 
 def to_message(grasps: GraspArray, header: Any, types: MessageTypes = installed) -> PointCloud2:
     """The message of n grasps (n may be 0) with the given std_msgs/Header, of the classes in ``types``."""
-    columns: dict[str, np.ndarray] = {}
-    for column, names in _COLUMNS.items():
-        values = getattr(grasps, column).reshape(len(grasps), len(names))
-        columns.update({name: values[:, k] for k, name in enumerate(names)})
-    return cloud(columns, FIELDS, header, types)
+    return columns.to_message(grasps, header, types)
 
 
 def from_message(message: PointCloud2) -> GraspArray:
@@ -99,12 +82,7 @@ def from_message(message: PointCloud2) -> GraspArray:
     MessageError
         As for superquadrics.
     """
-    points = cloud_points(message, FIELDS, [name for name, _ in FIELDS])
-    columns = {column: np.stack([points[name] for name in names], axis=-1) for column, names in _COLUMNS.items()}
-    try:
-        return GraspArray(**{k: v[:, 0] if len(_COLUMNS[k]) == 1 else v for k, v in columns.items()})
-    except ValueError as error:
-        raise MessageError(str(error)) from error
+    return columns.from_message(GraspArray, message, [name for name, _ in FIELDS])
 
 
 def poses(grasps: GraspArray, header: Any, types: MessageTypes = installed) -> PoseArray:

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from sq_msgs_py.superquadrics import FLOAT32, cloud_points
+from sq_msgs_py.columns import FLOAT32, cloud_points
 
 if TYPE_CHECKING:
     from sensor_msgs.msg import PointCloud2

@@ -11,7 +11,7 @@ pytest.importorskip("rosbags", reason="needs the extra 'bags'")
 
 from rosbags.typesys import Stores, get_typestore
 
-from sq_msgs_py import depth_image, superquadrics
+from sq_msgs_py import columns, depth_image, superquadrics
 from sq_msgs_py.depth_image import Intrinsics
 from sq_msgs_py.markers import markers
 from sq_msgs_py.message_types import installed
@@ -86,7 +86,7 @@ def test_constants_are_those_of_ros():
 
     names = {"i1": "INT8", "u1": "UINT8", "i2": "INT16", "u2": "UINT16", "i4": "INT32", "u4": "UINT32"}
     names |= {"f4": "FLOAT32", "f8": "FLOAT64"}
-    assert {getattr(field, names[kind]): kind for kind in names} == superquadrics._NUMPY_TYPES
+    assert {getattr(field, names[kind]): kind for kind in names} == columns._NUMPY_TYPES
     assert {kind for _, kind in FIELDS} == {field.FLOAT32, field.UINT32}
     assert (module._TRIANGLE_LIST, module._LINE_LIST) == (marker.TRIANGLE_LIST, marker.LINE_LIST)
     assert (module._ADD, module._DELETE) == (marker.ADD, marker.DELETE)

@@ -1,0 +1,160 @@
+"""Arrays by columns in a sensor_msgs/PointCloud2: one point a row, one named field a number; of bodies, of grasps.
+
+Readers find fields by name, whatever their order, offset, type and byte order, and leave unknown ones aside.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+
+import numpy as np
+
+from sq_msgs_py.depth_image import byte_array
+from sq_msgs_py.message_types import MessageTypes, installed
+
+if TYPE_CHECKING:
+    from sensor_msgs.msg import PointCloud2
+
+_NUMPY_TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+"""By the datatypes of sensor_msgs/PointField."""
+UINT32, FLOAT32 = 6, 7
+Fields = Sequence[tuple[str, int]]
+"""Name and PointField datatype of every field, in the order of the message."""
+
+
+class MessageError(ValueError):
+    """A message that does not hold what it should; says what was expected and what arrived."""
+
+
+class Columns:
+    """n rows of numbers: what frozen dataclasses of columns (n,) or (n, k) derive from.
+
+    ``NAMES`` are the fields of each column, ``FINITE`` the columns without NaN.  A column that is None is 0 or NaN.
+
+    Raises
+    ------
+    ValueError
+        If a column has another shape than the first one asks for, holds what is not finite and has to be, or one of its
+        integers is no unsigned 32 bit integer.
+    """
+
+    FIELDS: ClassVar[Fields]
+    NAMES: ClassVar[Mapping[str, tuple[str, ...]]]
+    FINITE: ClassVar[tuple[str, ...]]
+
+    def __post_init__(self) -> None:
+        kinds, count = dict(self.FIELDS), len(self)
+        for column, names in self.NAMES.items():
+            given, is_unsigned = getattr(self, column), kinds[names[0]] == UINT32
+            shape = (count,) if len(names) == 1 else (count, len(names))
+            if given is None:
+                given = np.zeros(shape, np.uint32) if is_unsigned else np.full(shape, np.nan)
+            values = np.asarray(given)
+            if values.size == 0 and count == 0:
+                values = values.reshape(shape)
+            if values.shape != shape:
+                raise ValueError(f"{column}: expected shape {shape}, got {values.shape}")
+            if is_unsigned:
+                _check_unsigned(column, values)
+            values = values.astype(np.uint32 if is_unsigned else np.float32)
+            if column in self.FINITE and not np.isfinite(values).all():
+                raise ValueError(f"{column}: expected finite numbers, got {values.tolist()}")
+            object.__setattr__(self, column, values)
+
+    def __len__(self) -> int:
+        return len(np.atleast_1d(getattr(self, next(iter(self.NAMES)))))
+
+
+Rows = TypeVar("Rows", bound=Columns)
+
+
+def to_message(rows: Columns, header: Any, types: MessageTypes = installed) -> PointCloud2:
+    """The message of n rows (n may be 0) with the given std_msgs/Header, of the classes in ``types``."""
+    layout = np.dtype([(name, "<" + _NUMPY_TYPES[datatype]) for name, datatype in rows.FIELDS])
+    points = np.zeros(len(rows), layout)
+    for column, names in rows.NAMES.items():
+        values = getattr(rows, column).reshape(len(rows), len(names))
+        for k, name in enumerate(names):
+            points[name] = values[:, k]
+    field = types("sensor_msgs/msg/PointField")
+    message: PointCloud2 = types("sensor_msgs/msg/PointCloud2")(
+        header=header,
+        height=1,
+        width=len(points),
+        fields=[
+            field(name=name, offset=int(layout.fields[name][1]), datatype=datatype, count=1)  # type: ignore[index]
+            for name, datatype in rows.FIELDS
+        ],
+        is_bigendian=False,
+        point_step=layout.itemsize,
+        row_step=layout.itemsize * len(points),
+        data=byte_array(points),
+        is_dense=all(bool(np.isfinite(points[name]).all()) for name, _ in rows.FIELDS),
+    )
+    return message
+
+
+def from_message(kind: type[Rows], message: PointCloud2, needed: Sequence[str]) -> Rows:
+    """The rows of a message; columns whose fields are not all there, and not ``needed``, are left out.
+
+    Raises
+    ------
+    MessageError
+        As :func:`cloud_points`, or for columns that ``kind`` does not take.
+    """
+    points = cloud_points(message, kind.FIELDS, needed)
+    columns: dict[str, np.ndarray] = {}
+    for column, names in kind.NAMES.items():
+        if set(names) <= set(points.dtype.names or ()):
+            values = np.stack([points[name] for name in names], axis=-1)
+            columns[column] = values[:, 0] if len(names) == 1 else values
+    try:
+        return kind(**columns)
+    except ValueError as error:
+        raise MessageError(str(error)) from error
+
+
+def cloud_points(message: PointCloud2, described: Fields, needed: Sequence[str]) -> np.ndarray:
+    """The points (n,) of a cloud as a structured array of those of the described fields that are there.
+
+    Raises
+    ------
+    MessageError
+        If a field that is needed is missing, one has an unknown datatype, a count other than one or an offset outside
+        the point, or if the data is not as long as width, height and steps say.
+    """
+    order = ">" if message.is_bigendian else "<"
+    present = {field.name: field for field in message.fields}
+    missing = [name for name in needed if name not in present]
+    if missing:
+        raise MessageError(f"expected the fields {' '.join(needed)}; missing: {' '.join(missing)}")
+    names = [name for name, _ in described if name in present]
+    formats = []
+    for name in names:
+        field = present[name]
+        if field.datatype not in _NUMPY_TYPES or field.count != 1:
+            raise MessageError(f"field {name}: expected one number, got datatype {field.datatype} x {field.count}")
+        formats.append(order + _NUMPY_TYPES[field.datatype])
+        if field.offset + np.dtype(formats[-1]).itemsize > message.point_step:
+            raise MessageError(
+                f"field {name}: offset {field.offset} lies outside a point of {message.point_step} bytes"
+            )
+    height, width, row_step = int(message.height), int(message.width), int(message.row_step)
+    if row_step < width * message.point_step:
+        raise MessageError(f"row_step: expected at least {width * message.point_step} bytes, got {row_step}")
+    if len(message.data) != height * row_step:
+        raise MessageError(f"data: expected height x row_step = {height * row_step} bytes, got {len(message.data)}")
+    offsets, step = [present[name].offset for name in names], int(message.point_step)
+    layout = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": step})
+    if height * width == 0:
+        return np.empty(0, layout)
+    rows = np.ndarray((height, width), layout, buffer=memoryview(message.data), strides=(row_step, step))
+    return rows.reshape(-1)
+
+
+def _check_unsigned(name: str, values: np.ndarray) -> None:
+    if values.size and not np.issubdtype(values.dtype, np.integer):
+        raise ValueError(f"{name}: expected integers, got {values.dtype}")
+    if values.size and (values.min() < 0 or values.max() > np.iinfo(np.uint32).max):
+        raise ValueError(f"{name}: expected 0 to {np.iinfo(np.uint32).max}, got {values.min()} to {values.max()}")
