@@ -28,7 +28,7 @@ import os
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -42,15 +42,14 @@ from sq_perception.geometry.one_thread import one_blas_thread
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
-from sq_perception.imaging.canonical_view import CanonicalView
 from sq_perception.learning import checkpoint, inference
 from sq_perception.learning.choices import NEEDS_TORCH
 from sq_perception.learning.consensus import Consensus
-from sq_perception.recovery import continuity, methods, seen_object, segment_repair
+from sq_perception.recovery import continuity, methods, prediction, seen_object, segment_repair
 from sq_perception.recovery.continuity import Reference
 from sq_perception.recovery.options import FITTED, NEEDS_NETWORK, Method, RecoveryOptions, Refine
 from sq_perception.recovery.recovery import FrameRecovery, Recovery
-from sq_perception.recovery.seen_object import Answers, Prediction, SeenObject
+from sq_perception.recovery.seen_object import SeenObject
 from sq_perception.segmentation import segments
 
 __all__ = [
@@ -212,7 +211,8 @@ class Recoverer:
 
         with _timed(milliseconds, "network"):
             fresh = [one for one in objects if one.label not in same]
-            fresh = self._mapped(lambda one: _viewed(one, depth, camera, found, options, network), fresh)
+            config = None if network is None else network.config
+            fresh = self._mapped(lambda one: seen_object.viewed(one, depth, camera, found, options, config), fresh)
             if network is not None:
                 fresh = self._predicted(fresh, network, options)
 
@@ -250,19 +250,11 @@ class Recoverer:
         if isinstance(network, inference.ThingPredictor):
             # The network computes on one thread: each thread asks it about its share of the objects.
             parts = [part for part in np.array_split(np.arange(len(objects)), self._threads) if part.size]
-            found = self._mapped(lambda part: _hulls([objects[k] for k in part], network), parts)
+            found = self._mapped(lambda part: prediction.of_hulls([objects[k] for k in part], network), parts)
             return [one for part in found for one in part]
-        shown = [one.shown for one in objects if one.shown is not None]
-        if not shown:
-            return []
-        views = np.stack([view.marked for view in shown])
-
-        def asked() -> Answers:
-            return network.predict(views)
-
         is_fitted = options.method == "auto" and options.refine == "surface"
-        answers = self._beside.submit(asked) if is_fitted else _done(asked())
-        return _answered(objects, shown, answers)
+        submit = self._beside.submit if is_fitted else prediction.at_once
+        return prediction.of_bodies(objects, network, submit) if objects else []
 
     def _mapped(self, function: Callable[[_Item], _Answer], items: Sequence[_Item]) -> list[_Answer]:
         """The function of each item; several at a time in threads that stay, as new ones cost memory and time."""
@@ -345,44 +337,6 @@ def _cleaned(depth: np.ndarray, camera: Camera) -> np.ndarray:
     return np.where(bad, np.float32(np.nan), depth)
 
 
-def _hulls(objects: Sequence[SeenObject], network: inference.ThingPredictor) -> list[SeenObject]:
-    """Some objects with the predictions of their hulls."""
-    shown = [one.shown for one in objects if one.shown is not None]
-    seen = zip(objects, shown, strict=True)
-    planes = [np.zeros(4) if one.plane is None else view.plane_to_canonical(one.plane) for one, view in seen]
-    views, extents = np.stack([view.marked for view in shown]), np.array([view.extent for view in shown])
-    return _answered(objects, shown, _done(network.predict(views, np.stack(planes), extents)))
-
-
-def _answered(
-    objects: Sequence[SeenObject], shown: Sequence[CanonicalView], answers: Future[Answers]
-) -> list[SeenObject]:
-    """The objects with what a network answers about their views."""
-    seen = zip(objects, shown, strict=True)
-    return [replace(one, prediction=Prediction(view, answers, k)) for k, (one, view) in enumerate(seen)]
-
-
-def _done(answers: Answers) -> Future[Answers]:
-    """What need not be waited for any more."""
-    found: Future[Answers] = Future()
-    found.set_result(answers)
-    return found
-
-
-def _viewed(
-    one: SeenObject,
-    depth: np.ndarray,
-    camera: Camera,
-    found: segments.Segmentation,
-    options: RecoveryOptions,
-    network: Network | None,
-) -> SeenObject:
-    """The object with what it stands on, what a network is shown of it, and what its score is measured on."""
-    plane = seen_object.support(one, depth, camera, found, options.segmentation_options())
-    config = None if network is None else network.config
-    return seen_object.viewed(replace(one, plane=plane), depth, camera, config)
-
-
 def _repaired(
     found: segments.Segmentation,
     objects: list[SeenObject],
@@ -398,7 +352,7 @@ def _repaired(
         label = int(found.labels.max()) + 1
         alone = replace(found, labels=np.where(mask, np.int32(label), found.labels), ids=(label,))
         one = seen_object.objects(depth, alone, camera, options.depth_range)[0]
-        return _viewed(one, depth, camera, alone, options, None)
+        return seen_object.viewed(one, depth, camera, alone, options, None)
 
     known = dict(zip((one.label for one in objects), fits, strict=True))
     repair = segment_repair.repaired(

@@ -6,22 +6,19 @@ optical frame.
 
 from __future__ import annotations
 
-from concurrent.futures import Future
 from dataclasses import dataclass, replace
-from typing import TypeAlias
 
 import numpy as np
 
-from sq_perception.fitting.hull_prior import HullPrior
 from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.quantiles import quantile
-from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import canonical_view
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.canonical_view import CanonicalView
 from sq_perception.imaging.coherence import coherent
-from sq_perception.learning.inference import HullAnswers
 from sq_perception.learning.network_config import RegressorConfig, ThingConfig
+from sq_perception.recovery.options import RecoveryOptions
+from sq_perception.recovery.prediction import Prediction
 from sq_perception.segmentation import segments
 
 _POINTS = 2000
@@ -35,37 +32,6 @@ _HIGHEST_STACK = 0.5
 _ON_TABLE = 0.003
 _JUMP_PIXELS, _JUMP = 10.0, 0.002
 """What a network is shown, and a score is measured on: metres above the table; steps in pixel widths, and metres."""
-
-
-Answers: TypeAlias = "Superquadric | HullAnswers"
-
-
-@dataclass(frozen=True, eq=False)
-class Prediction:
-    """What a network says of one object; perhaps it is still being computed.
-
-    Attributes
-    ----------
-    view
-        What the network was shown.
-    answers, number
-        Its answers for several objects, each in the frame of its view, and which of them is this one's.
-    """
-
-    view: CanonicalView
-    answers: Future[Answers]
-    number: int
-
-    def body(self) -> Superquadric:
-        """The predicted body in the optical frame; waits for it."""
-        answers = self.answers.result()
-        bodies = answers.bodies if isinstance(answers, HullAnswers) else answers
-        return self.view.from_canonical(bodies[self.number]).canonical_form()
-
-    def hull(self) -> HullPrior | None:
-        """The predicted hull in the optical frame, if the network tells of hulls; waits for it."""
-        answers = self.answers.result()
-        return answers.hull(self.number, self.view) if isinstance(answers, HullAnswers) else None
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,9 +134,15 @@ def support(
 
 
 def viewed(
-    one: SeenObject, depth: np.ndarray, camera: Camera, config: RegressorConfig | ThingConfig | None
+    one: SeenObject,
+    depth: np.ndarray,
+    camera: Camera,
+    found: segments.Segmentation,
+    options: RecoveryOptions,
+    config: RegressorConfig | ThingConfig | None,
 ) -> SeenObject:
-    """The object with its views: the one that a network of this configuration is shown, and that of its score."""
+    """The object with what it stands on, what a network of this configuration is shown, and what its score takes."""
+    one = replace(one, plane=support(one, depth, camera, found, options.segmentation_options()))
     inner = core(one, depth, camera)
     shown = None if config is None else config.view_of(depth, inner, camera, one.plane)
     if shown is not None and not (isinstance(config, RegressorConfig) and config.framing == "full"):
