@@ -23,7 +23,7 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from importlib import resources
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from safetensors import SafetensorError
@@ -41,7 +41,8 @@ if TYPE_CHECKING:
     from sq_perception.learning.thing_network import ThingNetwork
 
 FORMAT, THING_FORMAT = "sq_perception.regressor", "sq_perception.things"
-_FORMATS = {RegressorConfig: FORMAT, ThingConfig: THING_FORMAT}
+_FORMATS: dict[type[Any], str] = {RegressorConfig: FORMAT, ThingConfig: THING_FORMAT}
+Config = TypeVar("Config", RegressorConfig, ThingConfig)
 VERSION = "1"
 DEFAULT = "robust"
 """Name of the weights that are used where none are named."""
@@ -135,21 +136,17 @@ def read(path: Path | str | None = None) -> tuple[RegressorConfig, dict[str, np.
     CheckpointError
         If the file is missing, no safetensors file, of another format or version, or does not fit its own config.
     """
-    config, weights = _read(resolve(path), FORMAT)
-    assert isinstance(config, RegressorConfig)
-    return config, weights
+    return _read(resolve(path), RegressorConfig)
 
 
 def read_things(path: Path | str | None = None) -> tuple[ThingConfig, dict[str, np.ndarray]]:
     """Those of a network of things, None for the one that ships; otherwise as :func:`read`."""
-    config, weights = _read(resolve(THINGS if path is None else path), THING_FORMAT)
-    assert isinstance(config, ThingConfig)
-    return config, weights
+    return _read(resolve(THINGS if path is None else path), ThingConfig)
 
 
-def _read(path: Path, form: str) -> tuple[RegressorConfig | ThingConfig, dict[str, np.ndarray]]:
+def _read(path: Path, kind: type[Config]) -> tuple[Config, dict[str, np.ndarray]]:
     data, _ = _bytes(path)
-    config = _described(path, _strings(path, data, len(data)), form)
+    config = _described(path, _strings(path, data, len(data)), kind)
     try:
         stored = arrays_of(data)
     except (SafetensorError, ValueError, KeyError) as error:
@@ -193,7 +190,8 @@ def check(path: Path | str | None = None) -> None:
     """
     path = resolve(path)
     header = read_header(path)
-    _described(path, header, THING_FORMAT if header.get("format") == THING_FORMAT else FORMAT)
+    kind: type[Any] = ThingConfig if header.get("format") == THING_FORMAT else RegressorConfig
+    _described(path, header, kind)
 
 
 def _bytes(path: Path, header_only: bool = False) -> tuple[bytes, int]:
@@ -234,7 +232,7 @@ def _strings(path: Path, data: bytes, size: int) -> dict[str, str]:
     return strings
 
 
-def _described(path: Path, header: dict[str, str], form: str) -> RegressorConfig | ThingConfig:
+def _described(path: Path, header: dict[str, str], kind: type[Config]) -> Config:
     """The form that a header describes.
 
     Raises
@@ -242,22 +240,18 @@ def _described(path: Path, header: dict[str, str], form: str) -> RegressorConfig
     CheckpointError
         If it describes none.
     """
-    if header.get("format") != form:
-        raise CheckpointError(f"{path}: expected a header 'format: {form}', got {header.get('format')!r}")
+    if header.get("format") != _FORMATS[kind]:
+        raise CheckpointError(f"{path}: expected a header 'format: {_FORMATS[kind]}', got {header.get('format')!r}")
     if header.get("version") != VERSION:
         raise CheckpointError(f"{path}: expected format version {VERSION}, got {header.get('version')!r}")
     try:
-        config = _config(json.loads(header["config"]), form)
+        values: dict[str, Any] = json.loads(header["config"])
+        values = {name: tuple(value) if isinstance(value, list) else value for name, value in values.items()}
+        config = kind(**values)
+        if config.pixels > _MAX_PIXELS or config.blocks > _MAX_BLOCKS:
+            raise ValueError(f"expected at most {_MAX_PIXELS} pixels and {_MAX_BLOCKS} blocks a stage")
         if sum(math.prod(shape) for shape in layout.shapes(config).values()) > _MAX_PARAMETERS:
             raise ValueError("the network would be larger than any this package trains")
     except (KeyError, TypeError, ValueError, ArithmeticError, AttributeError, RecursionError) as error:
         raise CheckpointError(f"{path}: the header's config describes no network: {error}") from error
-    return config
-
-
-def _config(values: dict[str, Any], form: str) -> RegressorConfig | ThingConfig:
-    arguments: dict[str, Any] = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
-    config = RegressorConfig(**arguments) if form == FORMAT else ThingConfig(**arguments)
-    if config.pixels > _MAX_PIXELS or config.blocks > _MAX_BLOCKS:
-        raise ValueError(f"expected at most {_MAX_PIXELS} pixels and {_MAX_BLOCKS} blocks a stage")
     return config

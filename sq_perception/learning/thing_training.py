@@ -48,7 +48,6 @@ _UNKNOWN_EXTENT = 0.1
 """Share of the views whose extent the network is not told."""
 _CALIBRATED, _LOG_SPREADS = 4096, (-5.0, 3.0)
 """Views that settle the spread of the errors to 2 %, and between what it is sought."""
-_CLIP = 1.0
 _WARM_UP = 100
 _AVERAGE = 0.998
 """The averaged weights, which are what is kept, remember some 500 steps."""
@@ -145,8 +144,6 @@ def train(config: ThingTraining, views: Path, output: Path, form: ThingConfig | 
             if len(found) > len(shards):
                 shards, pool = found, read_views(found)
         rate = config.rate * min(1.0, (state.step + 1) / _WARM_UP) * (0.5 * (1 + math.cos(math.pi * progress)) + 0.01)
-        for group in optimizer.param_groups:
-            group["lr"] = rate
         images, planes, extents, truth = _batch(pool, rng.integers(len(pool.images), size=config.batch), rng)
         network.train()
         with torch.autocast("cpu", torch.bfloat16, enabled=config.bfloat16):
@@ -156,14 +153,10 @@ def train(config: ThingTraining, views: Path, output: Path, form: ThingConfig | 
             + BODY * thing_network.body_loss(said.body, truth).mean()
             + CENTRE * (said.support - truth).abs().mean()
         )
-        optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        torch.nn.utils.clip_grad_norm_(network.parameters(), _CLIP)
+        state.descend(loss, rate)
         if not bool(torch.isfinite(loss)):
             raise ArithmeticError(f"step {state.step}: the loss is {loss.item()}; {path} is the last good state")
-        optimizer.step()
-        state.follow(_AVERAGE)
-        state.step += 1
+        state.advance(_AVERAGE)
         losses.append(loss.item())
         if state.step % config.validation == 0:
             state.seconds = time.monotonic() - began

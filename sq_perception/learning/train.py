@@ -44,8 +44,6 @@ from sq_perception.learning.training_state import TrainingState, recalibrate
 _OF_A_RUN = ("loss", "backbone", "framing", "pixels", "canonical_labels", "optimizer")
 """Settings whose change makes another run; others may change when it goes on."""
 CALIBRATION_VIEWS = 2048
-_CLIP = 1.0
-"""Largest norm of the gradient."""
 _SAVE_SECONDS = 300.0
 """Longest time between two saved states."""
 VALIDATION_HIDDEN = 0.3
@@ -137,8 +135,6 @@ def _train(
     try:
         while state.step < config.steps and not (config.schedule == "plateau" and state.plateau.exhausted):
             progress, rate = state.step / config.steps, config.rate(state.step, state.plateau)
-            for group in state.optimizer.param_groups:
-                group["lr"] = rate
             images, bodies = batches.batch(config.batch)
             views = torch.from_numpy(images)[:, None].to(device, memory_format=torch.channels_last)
             truth = None
@@ -149,17 +145,13 @@ def _train(
             with torch.autocast(device.type, torch.bfloat16, enabled=config.bfloat16):
                 prediction = parallel(views)
             loss = objective.loss(prediction, views, truth, progress, generator).mean()
-            state.optimizer.zero_grad(set_to_none=True)
-            loss.backward()
-            norm = torch.nn.utils.clip_grad_norm_(model.parameters(), _CLIP)
+            norm = state.descend(loss, rate)
             if processes.any(not bool(torch.isfinite(loss) & torch.isfinite(norm))):
                 raise DivergedError(
                     f"step {state.step}: loss {loss.item():.4g}, norm of the gradient {norm.item():.4g}; "
                     f"{path if path.exists() else 'no state'} is the last good one. A smaller learning rate may help."
                 )
-            state.optimizer.step()
-            state.follow(config.average)
-            state.step += 1
+            state.advance(config.average)
             losses.append(loss.item())
             log.step(state.step, losses[-1])
 

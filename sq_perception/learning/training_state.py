@@ -22,6 +22,8 @@ from sq_perception.learning.checkpoint import CheckpointError
 from sq_perception.learning.schedule import Plateau
 
 Network = TypeVar("Network", bound=nn.Module)
+_CLIP = 1.0
+"""Largest norm of the gradient."""
 
 
 @dataclass(eq=False)
@@ -79,15 +81,25 @@ class TrainingState(Generic[Network]):
         except (SafetensorError, OSError, KeyError, IndexError, RuntimeError, ValueError) as error:
             raise CheckpointError(f"{path}: not the state of such a run: {error}") from error
 
+    def descend(self, loss: torch.Tensor, rate: float) -> torch.Tensor:
+        """Prepare a step down the gradient of a loss at this rate; the norm of the gradient before it is clipped."""
+        for group in self.optimizer.param_groups:
+            group["lr"] = rate
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        return torch.nn.utils.clip_grad_norm_(self.model.parameters(), _CLIP)
+
     @torch.no_grad()
-    def follow(self, keep: float) -> None:
-        """Move the averaged weights towards the trained ones; early in a run they keep less than ``keep``."""
+    def advance(self, keep: float) -> None:
+        """Make the step, and let the averaged weights follow; early in a run they keep less than ``keep``."""
+        self.optimizer.step()
         keep = min(keep, (self.step + 1) / (self.step + 10))
         for mine, theirs in zip(self.average.state_dict().values(), self.model.state_dict().values(), strict=True):
             if mine.is_floating_point():
                 mine.lerp_(theirs, 1 - keep)
             else:
                 mine.copy_(theirs)
+        self.step += 1
 
 
 @torch.no_grad()
