@@ -21,7 +21,7 @@ import numpy as np
 from sq_msgs_py import columns
 from sq_msgs_py.columns import FLOAT32, UINT32, Columns
 from sq_msgs_py.message_types import MessageTypes, installed
-from sq_msgs_py.poses import matrices, unit_quaternions
+from sq_msgs_py.poses import matrices, poses_at, product, unit_quaternions
 
 if TYPE_CHECKING:
     from geometry_msgs.msg import PoseArray
@@ -87,12 +87,7 @@ def from_message(message: PointCloud2) -> GraspArray:
 
 def poses(grasps: GraspArray, header: Any, types: MessageTypes = installed) -> PoseArray:
     """The poses alone as a geometry_msgs/PoseArray, in the same order."""
-    pose, point = types("geometry_msgs/msg/Pose"), types("geometry_msgs/msg/Point")
-    quaternion = types("geometry_msgs/msg/Quaternion")
-    found = [
-        pose(position=point(x=x, y=y, z=z), orientation=quaternion(x=qx, y=qy, z=qz, w=qw))
-        for (x, y, z), (qx, qy, qz, qw) in zip(grasps.position.tolist(), grasps.rotation.tolist(), strict=True)
-    ]
+    found = poses_at(grasps.position, grasps.rotation, types)
     array: PoseArray = types("geometry_msgs/msg/PoseArray")(header=header, poses=found)
     return array
 
@@ -150,9 +145,7 @@ def moveit_grasps(
 
     shift, turn = np.asarray(link_from_tcp[0], dtype=float), np.asarray(link_from_tcp[1], dtype=float)
     back = unit_quaternions(turn) * [-1.0, -1.0, -1.0, 1.0]
-    tcp = unit_quaternions(grasps.rotation)
-    vector_part = tcp[:, 3:] * back[:3] + back[3] * tcp[:, :3] + np.cross(tcp[:, :3], back[:3])
-    turns = np.concatenate([vector_part, tcp[:, 3:] * back[3] - (tcp[:, :3] @ back[:3])[:, None]], axis=1)
+    turns = product(unit_quaternions(grasps.rotation), back)
     places = grasps.position - matrices(turns) @ shift
     placed = GraspArray(places, turns, grasps.opening, grasps.width, grasps.score, grasps.id)
     found = []

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from sq_msgs_py.message_types import MessageTypes, installed
 from sq_msgs_py.superquadrics import SuperquadricArray
 
 if TYPE_CHECKING:
@@ -33,14 +34,15 @@ def pose_messages(superquadrics: SuperquadricArray) -> list[Pose]:
     ValueError
         If a quaternion names no rotation.
     """
-    from geometry_msgs.msg import Point, Pose, Quaternion
+    return poses_at(superquadrics.translation, unit_quaternions(superquadrics.rotation))
 
-    rotations = unit_quaternions(superquadrics.rotation)
+
+def poses_at(places: np.ndarray, turns: np.ndarray, types: MessageTypes = installed) -> list[Pose]:
+    """Poses at places (n, 3), turned by unit quaternions (n, 4)."""
+    pose, point, quaternion = (types(f"geometry_msgs/msg/{name}") for name in ("Pose", "Point", "Quaternion"))
     return [
-        Pose(position=Point(x=x, y=y, z=z), orientation=Quaternion(x=qx, y=qy, z=qz, w=qw))
-        for (x, y, z), (qx, qy, qz, qw) in zip(
-            superquadrics.translation.astype(float).tolist(), rotations.tolist(), strict=True
-        )
+        pose(position=point(x=x, y=y, z=z), orientation=quaternion(x=qx, y=qy, z=qz, w=qw))
+        for (x, y, z), (qx, qy, qz, qw) in zip(places.astype(float).tolist(), turns.tolist(), strict=True)
     ]
 
 
@@ -64,7 +66,7 @@ def moved(superquadrics: SuperquadricArray, rotation: np.ndarray, translation: n
     return replace(
         superquadrics,
         translation=superquadrics.translation.astype(float) @ matrices(turn).T + shift,
-        rotation=_product(turn, unit_quaternions(superquadrics.rotation)),
+        rotation=product(turn, unit_quaternions(superquadrics.rotation)),
     )
 
 
@@ -169,8 +171,9 @@ def _motion(rotation: np.ndarray, translation: np.ndarray) -> tuple[np.ndarray, 
     return turn, shift
 
 
-def _product(left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Quaternions (n, 4) of left (4,) after each of right (n, 4)."""
-    (x, y, z, w), vector, scalar = left, right[:, :3], right[:, 3:]
-    turned = w * vector + scalar * left[:3] + np.cross(left[:3], vector)
-    return np.concatenate([turned, w * scalar - vector @ np.array([[x], [y], [z]])], axis=1)
+def product(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Quaternions (..., 4) of left after right; one of them may be a single one."""
+    (one, w), (other, v) = (np.split(quaternion, [3], axis=-1) for quaternion in (left, right))
+    return np.concatenate(
+        [w * other + v * one + np.cross(one, other), w * v - (one * other).sum(axis=-1, keepdims=True)], axis=-1
+    )

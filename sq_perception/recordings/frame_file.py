@@ -186,7 +186,7 @@ class Reading:
         if left + width > camera.width or top + height > camera.height:
             raise FrameError(f"{frame.name}: region: expected one within {camera.width} x {camera.height} pixels")
         part = np.s_[top : top + height, left : left + width]
-        camera = replace(camera, width=width, height=height, cx=camera.cx - left, cy=camera.cy - top)
+        camera = camera.cropped(left, top, width, height)
         labels = None if frame.labels is None else frame.labels[part]
         return replace(frame, depth=np.ascontiguousarray(depth[part]), camera=camera, labels=labels)
 
