@@ -151,7 +151,7 @@ def _enough_rays(observation: Observation) -> int:
 def _without_outliers(observation: Observation, hits: np.ndarray, state: State) -> np.ndarray:
     """The rays whose points lie near the surface, as seen by the majority."""
     distance = np.abs(surface_distance(hits, state.parameters, state.rotation))
-    spread = max(observation.sigma, MEDIAN_TO_SIGMA * quantile(np.sort(distance), 0.5))
+    spread = max(observation.sigma, MEDIAN_TO_SIGMA * quantile(distance, 0.5))
     return hits[distance < _OUTLIER * spread]
 
 

@@ -35,12 +35,12 @@ def assessed(solution: Solution, began: float) -> Fit:
     outside = surface_distance(everything, state.parameters, state.rotation)
     distance = np.abs(outside)
     inlying = distance < INLIER * observation.sigma
-    typical = quantile(np.sort(distance), 0.5)
+    typical = quantile(distance, 0.5)
     kept = distance < max(INLIER * observation.sigma, INLIER * typical)
     residual = float(np.sqrt(np.mean(distance[kept] ** 2))) if kept.any() else typical
     if solution.as_hull:
         # A hollow thing lies inside its hull: only what sticks out speaks against the body.
-        typical = quantile(np.sort(np.maximum(outside, 0.0)), _REACHED)
+        typical = quantile(np.maximum(outside, 0.0), _REACHED)
     status, message = _status(canonical, covariance, typical, _FAILED_LEVELS * observation.sigma)
     cut = (CUT_SHORT,) if solution.problem.late else ()
     return Fit(

@@ -134,7 +134,7 @@ def take_over(problem: Problem, best: State, given: Sequence[State]) -> Solution
     """The same where an exact body was sought in vain: what ``best`` leaves becomes the model error."""
     hits = problem.observation.object_rays(FINAL_RAYS)
     distance = np.abs(surface_distance(hits, best.parameters, best.rotation))
-    left_over = MEDIAN_TO_SIGMA * quantile(np.sort(distance), 0.5)
+    left_over = MEDIAN_TO_SIGMA * quantile(distance, 0.5)
     observation = problem.observation.coarsened(left_over)
     return solve(replace(problem, observation=observation, terms=terms_of(observation, problem.options)), given)
 

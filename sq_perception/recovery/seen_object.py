@@ -84,8 +84,8 @@ class SeenObject:
     def levels(self, plane: np.ndarray) -> tuple[float, float]:
         """The height of its lowest pixels above a plane, and the median of all, metres; of some thousand pixels."""
         heights = self.heights(plane)[self.mask_crop]
-        ordered = np.sort(heights[:: max(1, heights.size // _POINTS)])
-        return quantile(ordered, _LOWEST), quantile(ordered, 0.5)
+        heights = heights[:: max(1, heights.size // _POINTS)]
+        return quantile(heights, _LOWEST), quantile(heights, 0.5)
 
 
 def objects(
@@ -162,7 +162,7 @@ def core(one: SeenObject, depth: np.ndarray, camera: Camera) -> np.ndarray:
     if one.plane is not None:
         above = one.heights(one.plane) > _ON_TABLE
         inner = above if 2 * np.count_nonzero(above) > one.pixels else inner
-    footprint = quantile(np.sort(one.depth_crop[one.mask_crop]), 0.5) / np.sqrt(camera.fx * camera.fy)
+    footprint = quantile(one.depth_crop[one.mask_crop], 0.5) / np.sqrt(camera.fx * camera.fy)
     whole = np.zeros_like(one.mask)
     whole[one.window] = inner
     # With a margin, as a part that goes on beyond the mask is something else.
