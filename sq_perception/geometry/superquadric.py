@@ -35,6 +35,7 @@ from array_api_compat import array_namespace, is_torch_array
 from scipy.special import beta
 
 from sq_perception.geometry import rotation as quaternions
+from sq_perception.geometry.body_numbers import LENGTHS, check, floating, is_body
 
 Array = Any
 """A NumPy array or a torch tensor."""
@@ -73,41 +74,28 @@ class Superquadric:
     rotation: Array
 
     def __post_init__(self) -> None:
-        lengths = {"size": 3, "shape": 2, "translation": 3, "rotation": 4}
-        tensors = [is_torch_array(getattr(self, name)) for name in lengths]
+        parts = [self.size, self.shape, self.translation, self.rotation]
+        tensors = [is_torch_array(part) for part in parts]
         if any(tensors) and not all(tensors):
             raise ValueError("a Superquadric is all NumPy or all torch, not a mixture")
-        for name, length in lengths.items():
-            value = getattr(self, name)
-            if not tensors[0]:
-                value = np.asarray(value)
-                value = value.astype(np.result_type(value.dtype, np.float32), copy=False)
-                object.__setattr__(self, name, value)
-            if value.ndim == 0 or value.shape[-1] != length:
-                raise ValueError(f"{name}: expected shape (..., {length}), got {tuple(value.shape)}")
+        if not tensors[0]:
+            parts = [floating(part) for part in parts]
+        single = True
+        for (name, length), part in zip(LENGTHS.items(), parts, strict=True):
+            if part.ndim == 0 or part.shape[-1] != length:
+                raise ValueError(f"{name}: expected shape (..., {length}), got {tuple(part.shape)}")
+            single = single and part.ndim == 1
         if tensors[0]:
             return
-        parts = [getattr(self, name) for name in lengths]
-        if not np.isfinite(np.concatenate(parts, axis=None)).all():
-            name, part = next(each for each in zip(lengths, parts, strict=True) if not np.isfinite(each[1]).all())
-            raise ValueError(f"{name}: expected finite numbers, got {part}")
-        if (self.size <= 0).any():
-            raise ValueError(f"size: expected positive half sizes, got {self.size}")
-        if ((self.shape <= 0) | (self.shape > 2)).any():
-            raise ValueError(f"shape: expected exponents in (0, 2], got {self.shape}")
-        square = np.einsum("...i,...i->...", self.rotation, self.rotation)
-        if (square < 1e-18).any():
-            raise ValueError("rotation: expected a quaternion of non-zero length")
-        object.__setattr__(self, "rotation", self.rotation / np.sqrt(square)[..., None])
-        if all(part.ndim == 1 for part in parts):
-            for name in lengths:  # not to be written to, as those of a batch
-                fixed = getattr(self, name).view()
-                fixed.flags.writeable = False
-                object.__setattr__(self, name, fixed)
-            return
-        batch = np.broadcast_shapes(*(part.shape[:-1] for part in parts))
-        for name, length in lengths.items():
-            object.__setattr__(self, name, np.broadcast_to(getattr(self, name), (*batch, length)))
+        if not (single and is_body(*(part.tolist() for part in parts))):
+            check(parts)
+        rotation = parts[3]
+        parts[3] = rotation / np.sqrt(np.einsum("...i,...i->...", rotation, rotation))[..., None]
+        batch = () if single else np.broadcast_shapes(*(part.shape[:-1] for part in parts))
+        for (name, length), part in zip(LENGTHS.items(), parts, strict=True):
+            fixed = part.view() if single else np.broadcast_to(part, (*batch, length))
+            fixed.setflags(write=False)  # as those of a batch
+            object.__setattr__(self, name, fixed)
 
     # Batches and flat vectors
 

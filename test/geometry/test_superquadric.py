@@ -244,13 +244,16 @@ class TestMisuse:
             ("size", [1, 2, 0], "positive half sizes"),
             ("size", [1, 2, np.nan], "finite"),
             ("shape", [0.5, 2.5], "exponents"),
+            ("shape", [0.0, 1.0], "exponents"),
+            ("translation", [0, np.inf, 0], "finite"),
             ("rotation", [0, 0, 0, 0], "non-zero length"),
         ],
     )
-    def test_says_what_was_expected(self, field: str, value: list[float], message: str) -> None:
+    @pytest.mark.parametrize("batch", [(), (2,)])
+    def test_says_what_was_expected(self, batch: tuple[int, ...], field: str, value: list[float], message: str) -> None:
         good = {"size": [1, 1, 1], "shape": [1, 1], "translation": [0, 0, 0], "rotation": [0, 0, 0, 1]}
         with pytest.raises(ValueError, match=message):
-            Superquadric(**{**good, field: np.array(value, dtype=float)})
+            Superquadric(**{**good, field: np.broadcast_to(np.array(value, dtype=float), (*batch, len(value)))})
 
     def test_flat_vectors_have_twelve_numbers(self) -> None:
         with pytest.raises(ValueError, match=r"\(\.\.\., 12\)"):
