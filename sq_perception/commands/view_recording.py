@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import math
 import queue
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, NoReturn
@@ -123,21 +122,8 @@ def _show(page: Page, frame: RecordedFrame, recovery: FrameRecovery) -> None:
 
 def bodies_of(recovery: FrameRecovery) -> Bodies:
     """What the page draws of a frame; ids are places in ``recovery.bodies``."""
-    import numpy as np
+    from sq_perception.recordings import publication
 
-    from sq_perception.fitting.fit import Status
-    from sq_perception.geometry.mesh import COLOURS
-    from sq_perception.geometry.superquadric import Superquadric
-    from sq_perception.viewing.drawings import Bodies
-
-    found = [k for k, body in enumerate(recovery.bodies) if body.status != Status.FAILED]
-    bodies = [recovery.bodies[k] for k in found]
-    return Bodies(
-        superquadrics=Superquadric.stack([body.superquadric for body in bodies]),
-        sigma_size=np.array([body.sigma_size for body in bodies]).reshape(-1, 3),
-        score=np.array([body.score if math.isfinite(body.score) else 0.0 for body in bodies]),
-        ids=found,
-        is_weak=[body.status == Status.WEAK for body in bodies],
-        colours=COLOURS[np.array(found, dtype=int) % len(COLOURS)].reshape(-1, 3),
-        failed=[k for k in range(len(recovery.bodies)) if k not in found],
-    )
+    ids = tuple(range(len(recovery.bodies)))
+    array = publication.superquadric_array(publication.Identified(recovery, ids), is_cube=False)
+    return publication.drawn(array, publication.superquadrics(array.recovered))

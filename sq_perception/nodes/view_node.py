@@ -17,7 +17,6 @@ from functools import partial
 from time import monotonic
 from typing import Any, NamedTuple
 
-import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import ParameterEvent
 from rclpy.node import Node
@@ -26,16 +25,14 @@ from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
 from sq_msgs_py.depth_image import GREY_ENCODINGS
-from sq_msgs_py.markers import PALETTE
-from sq_msgs_py.superquadrics import FAILED, WEAK, SuperquadricArray, from_message
+from sq_msgs_py.superquadrics import from_message
 from sq_perception.geometry import rotation
-from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
 from sq_perception.nodes.frame import decode_by, size_of, stamp_of
 from sq_perception.nodes.remote_node import RemoteNode
 from sq_perception.nodes.statistics import THROTTLE
 from sq_perception.nodes.tracking import CameraPoses, PoseError
-from sq_perception.recordings.publication import superquadrics
+from sq_perception.recordings.publication import drawn, superquadrics
 from sq_perception.viewing import tables
 from sq_perception.viewing.drawings import Bodies
 from sq_perception.viewing.page import Change, Page
@@ -264,22 +261,8 @@ class ViewNode(Node):
                 turn, shift = self._poses.at(header, message.header.frame_id)
                 back = rotation.conjugate(turn)
                 bodies = bodies.transformed(back, -(rotation.to_matrix(back) @ shift))
-            return _bodies(array, bodies), ""
+            return drawn(array, bodies), ""
         except PoseError as error:
             return None, f"bodies are in {message.header.frame_id}, the image in {header.frame_id}: {error}"
         except ValueError as error:
             return None, str(error)
-
-
-def _bodies(array: SuperquadricArray, bodies: Superquadric) -> Bodies:
-    shown = array.recovered
-    ids = [int(number) for number in shown.id]
-    return Bodies(
-        superquadrics=bodies,
-        sigma_size=shown.sigma_size.astype(float),
-        score=shown.score.astype(float),
-        ids=ids,
-        is_weak=[bool(status == WEAK) for status in shown.status],
-        colours=PALETTE[np.array(ids, dtype=int) % len(PALETTE)].reshape(-1, 3),
-        failed=[int(number) % 2**31 for number in array.id[array.status == FAILED]],
-    )

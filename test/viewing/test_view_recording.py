@@ -41,7 +41,7 @@ def test_what_is_drawn_keeps_its_place_among_the_bodies(shot):
     bodies = view_recording.bodies_of(replace(recovery, bodies=(lost, second)))
     assert (list(bodies.ids), list(bodies.failed)) == ([1], [0])
     np.testing.assert_array_equal(bodies.colours, COLOURS[1:2])
-    np.testing.assert_array_equal(bodies.superquadrics.size[0], second.superquadric.size)
+    np.testing.assert_array_equal(bodies.superquadrics.size[0], second.superquadric.size.astype(np.float32))
     assert len(view_recording.bodies_of(replace(recovery, bodies=()))) == 0
 
 
