@@ -273,14 +273,15 @@ def _sort(
     """
     height, width = depth.shape
     pixels, free = np.empty(height * width, np.int32), np.empty(height * width, np.int32)
-    areas = np.empty(height * width, np.float32)
+    areas, row = np.empty(height * width, np.float32), np.empty(width)
     count, free_count, free_pixels = 0, 0, 0
     for v in range(height):
+        _write_areas(depth, inside, v, footprint, row)
         for u in range(width):
             if inside[v, u]:
                 if np.isfinite(depth[v, u]):
                     pixels[count] = v * width + u
-                    areas[count] = _area(depth, inside, v, u, footprint)
+                    areas[count] = row[u]
                     count += 1
                 continue
             chosen = near[v, u] or (u % _COARSE == 0 and v % _COARSE == 0)
@@ -292,16 +293,17 @@ def _sort(
 
 
 @kernel
-def _area(depth: np.ndarray, inside: np.ndarray, v: int, u: int, footprint: float) -> float:
-    """sqrt(1 + slope^2) by central differences, with the slope capped; 1 at the mask's edge."""
+def _write_areas(depth: np.ndarray, inside: np.ndarray, v: int, footprint: float, areas: np.ndarray) -> None:
+    """sqrt(1 + slope^2) along a row by central differences, the slope capped; 1 at the mask's edge: vector code."""
     height, width = depth.shape
-    if not (0 < v < height - 1 and 0 < u < width - 1):
-        return 1.0
-    if not (inside[v - 1, u] and inside[v + 1, u] and inside[v, u - 1] and inside[v, u + 1]):
-        return 1.0
-    across = (depth[v, u + 1] - depth[v, u - 1]) / (2.0 * footprint)
-    down = (depth[v + 1, u] - depth[v - 1, u]) / (2.0 * footprint)
-    square = across * across + down * down
-    if not square >= 0.0:
-        return 1.0
-    return np.sqrt(1.0 + min(square, _STEEPEST * _STEEPEST))
+    areas[:] = 1.0
+    if not 0 < v < height - 1:
+        return
+    above, here, below = depth[v - 1], depth[v], depth[v + 1]
+    inside_above, inside_here, inside_below = inside[v - 1], inside[v], inside[v + 1]
+    for u in range(1, width - 1):
+        across = (here[u + 1] - here[u - 1]) / (2.0 * footprint)
+        down = (below[u] - above[u]) / (2.0 * footprint)
+        square = across * across + down * down
+        known = inside_above[u] & inside_below[u] & inside_here[u - 1] & inside_here[u + 1] & (square >= 0.0)
+        areas[u] = np.sqrt(1.0 + min(square, _STEEPEST * _STEEPEST)) if known else 1.0

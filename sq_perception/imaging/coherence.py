@@ -26,39 +26,41 @@ def coherent(depth: np.ndarray, inside: np.ndarray, jump: float) -> np.ndarray:
     """
     height, width = depth.shape
     label = np.zeros((height, width), np.int32)
-    stack = np.empty(height * width, np.int32)
+    rows, columns = np.empty(height * width, np.int32), np.empty(height * width, np.int32)  # still to look at
     largest, largest_size, pieces = 0, 0, 0
     outside = np.zeros(height * width // 2 + 2, np.int32)
     sizes = np.zeros(height * width // 2 + 2, np.int32)
-    for start in range(height * width):
-        v, u = start // width, start % width
-        if label[v, u] > 0 or not inside[v, u] or not np.isfinite(depth[v, u]) or pieces + 1 >= sizes.shape[0]:
-            continue
-        pieces += 1
-        label[v, u] = pieces
-        stack[0] = start
-        top = 1
-        size, beside = 0, 0
-        while top > 0:
-            top -= 1
-            v, u = stack[top] // width, stack[top] % width
-            size += 1
-            goes_on = False
-            for side in range(4):
-                v2, u2 = v + (side == 0) - (side == 1), u + (side == 2) - (side == 3)
-                if v2 < 0 or u2 < 0 or v2 >= height or u2 >= width or label[v2, u2] > 0:
-                    continue
-                if not inside[v2, u2]:
-                    goes_on |= abs(depth[v2, u2] - depth[v, u]) <= jump
-                    continue
-                if abs(depth[v2, u2] - depth[v, u]) <= jump:
-                    label[v2, u2] = pieces
-                    stack[top] = v2 * width + u2
-                    top += 1
-            beside += goes_on
-        sizes[pieces], outside[pieces] = size, beside
-        if size > largest_size:
-            largest, largest_size = pieces, size
+    for start_v in range(height):
+        for start_u in range(width):
+            if not inside[start_v, start_u] or label[start_v, start_u] > 0:
+                continue
+            if not np.isfinite(depth[start_v, start_u]) or pieces + 1 >= sizes.shape[0]:
+                continue
+            pieces += 1
+            label[start_v, start_u] = pieces
+            rows[0], columns[0] = start_v, start_u
+            top = 1
+            size, beside = 0, 0
+            while top > 0:
+                top -= 1
+                v, u = rows[top], columns[top]
+                size += 1
+                goes_on = False
+                for side in range(4):
+                    v2, u2 = v + (side == 0) - (side == 1), u + (side == 2) - (side == 3)
+                    if v2 < 0 or u2 < 0 or v2 >= height or u2 >= width or label[v2, u2] > 0:
+                        continue
+                    if not inside[v2, u2]:
+                        goes_on |= abs(depth[v2, u2] - depth[v, u]) <= jump
+                        continue
+                    if abs(depth[v2, u2] - depth[v, u]) <= jump:
+                        label[v2, u2] = pieces
+                        rows[top], columns[top] = v2, u2
+                        top += 1
+                beside += goes_on
+            sizes[pieces], outside[pieces] = size, beside
+            if size > largest_size:
+                largest, largest_size = pieces, size
     if pieces <= 1:
         return inside
     kept = np.ones(pieces + 1, np.bool_)
