@@ -59,7 +59,6 @@ def show(options: argparse.Namespace) -> int:
     """What ``sq-perception demo`` does with these options; the exit code."""
     try:
         camera = _camera(options.frame, options.camera_info, options.projection)
-        options.output_dir.mkdir(parents=True, exist_ok=True)
     except (FrameError, OSError) as error:
         print(error, file=sys.stderr)
         return 2

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from sq_perception.commands.console import FAILURE, SUCCESS, at_least, complain, failed, parser, progress
+from sq_perception.commands.console import FAILURE, SUCCESS, at_least, complain, failed, folder, parser, progress
 from sq_perception.evaluation.protocol import BODIES, DEFAULT_SEED, FIT_BODIES, FITS
 
 if TYPE_CHECKING:
@@ -46,10 +46,6 @@ def main(arguments: Sequence[str]) -> int:
     methods: list[Method] = list(dict.fromkeys(FITS if options.methods is None else options.methods))
     if options.models == [] and not methods:
         command.error("nothing to evaluate: --models and --methods are both empty")
-    try:
-        options.output.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        command.error(f"--output: {error}")
     return _evaluate(options, methods, ["sq-perception", "evaluate", *arguments])
 
 
@@ -116,5 +112,5 @@ def _parser() -> argparse.ArgumentParser:
     add("--bodies", type=at_least(1), default=BODIES, metavar="N", help=f"bodies for networks ({BODIES})")
     add("--fit-bodies", type=at_least(1), default=FIT_BODIES, metavar="N", help=f"the first N for fits ({FIT_BODIES})")
     add("--seed", type=at_least(0), default=DEFAULT_SEED, help=f"of the test set ({DEFAULT_SEED})")
-    add("--output", type=Path, default=Path("runs/evaluation"), metavar="DIR", help="folder (runs/evaluation)")
+    add("--output", type=folder, default="runs/evaluation", metavar="DIR", help="folder (runs/evaluation)")
     return command

@@ -177,10 +177,8 @@ def _bag(options: argparse.Namespace) -> ResultBag | None:
 
         images: list[Any] = [one.strip() for one in options.mcap_images.split(",")]
         return ResultBag(options.mcap, [] if images == ["none"] else images)
-    except ValueError as error:
-        raise ValueError(f"--mcap: {error}") from error
-    except ImportError as error:
-        raise ImportError(f"--mcap: {error}") from error
+    except (ValueError, ImportError) as error:
+        raise type(error)(f"--mcap: {error}") from error
 
 
 def _elsewhere(name: str, path: Path, found: Path) -> Iterator[str]:

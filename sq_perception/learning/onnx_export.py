@@ -142,7 +142,7 @@ class _Graph:
 
 
 def _decode(graph: _Graph, raw: str, config: RegressorConfig) -> None:
-    """:meth:`Regressor.decode`, and the flat order."""
+    """:meth:`RegressorConfig.decode`, and the flat order."""
     bounded, first, second = graph.split(raw, [8, 3, 3])
     size, shape, translation = graph.split(graph.add("Sigmoid", bounded), [3, 2, 3])
     low, high = config.size_range

@@ -23,7 +23,7 @@ from torch import nn
 
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.learning.backbone import ResNet18, compact_backbone, fold
-from sq_perception.learning.network_config import Array, RegressorConfig, checked_views
+from sq_perception.learning.network_config import RegressorConfig, checked_views
 
 INFERENCE_DTYPES = (torch.float32, torch.bfloat16, torch.float16)
 
@@ -56,7 +56,7 @@ class Regressor(nn.Module):
 
     def forward(self, views: torch.Tensor) -> Superquadric:
         """Superquadrics (n,) of views (n, 1, p, p)."""
-        return self.decode(self.raw(views))
+        return self.config.decode(self.raw(views))
 
     def raw(self, views: torch.Tensor) -> torch.Tensor:
         """Outputs (n, 14) of the heads: size 3, shape 2, translation 3, rotation 6, all unbounded."""
@@ -64,10 +64,6 @@ class Regressor(nn.Module):
         with torch.autocast(views.device.type, enabled=False):  # eight bits of mantissa are too few for a size
             heads = (self.size_head, self.shape_head, self.translation_head, self.rotation_head)
             return torch.cat([head(h) for head in heads], dim=-1)
-
-    def decode(self, raw: Array) -> Superquadric:
-        """Bodies (n,) of outputs (n, 14), NumPy or torch."""
-        return self.config.decode(raw)
 
     def predict(self, views: np.ndarray) -> Superquadric:
         """NumPy superquadrics (n,) of NumPy views (n, p, p).
@@ -82,7 +78,7 @@ class Regressor(nn.Module):
         device = next(self.parameters()).device
         with torch.inference_mode():
             raw = self.raw(batch.to(device, memory_format=torch.channels_last))
-        return self.decode(raw.cpu().numpy().astype(float))
+        return self.config.decode(raw.cpu().numpy().astype(float))
 
     def for_inference(self, dtype: torch.dtype = torch.float32) -> Regressor:
         """A copy that predicts the same, faster: normalisations folded into their convolutions, channels last.

@@ -90,14 +90,7 @@ def write_views(
         if path.exists():
             continue
         drawn = draw_thing_views(views, np.random.default_rng([seed, k]), own=own)
-        arrays = {
-            "images": drawn.images.astype(np.float16),
-            "planes": drawn.planes,
-            "extents": drawn.extents,
-            "support": drawn.support,
-            "kinds": drawn.kinds,
-        }
-        output_file.write(path, bytes_of(arrays))
+        output_file.write(path, bytes_of({**vars(drawn), "images": drawn.images.astype(np.float16)}))
         said(f"{path}: {views} views")
 
 

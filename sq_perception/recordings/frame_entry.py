@@ -35,10 +35,7 @@ def frame_entry(
         superquadric = in_result_frame(body.superquadric, frame.is_cube)
         bodies.append(
             {
-                "size": _numbers(superquadric.size),
-                "shape": _numbers(superquadric.shape),
-                "translation": _numbers(superquadric.translation),
-                "rotation": _numbers(superquadric.rotation),
+                **_parameters(superquadric),
                 "score": _number(body.score),
                 "residual": _number(body.residual),
                 "sigma_size": _numbers(body.sigma_size),
@@ -78,10 +75,7 @@ def _track_entry(track: Followed, is_cube: bool) -> dict[str, Any]:
         "id": track.id,
         "seen": track.seen,
         "fused": track.is_fused,
-        "size": _numbers(body.size),
-        "shape": _numbers(body.shape),
-        "translation": _numbers(body.translation),
-        "rotation": _numbers(body.rotation),
+        **_parameters(body),
         "sigma_size": _numbers(track.sigma_size),
     }
 
@@ -89,6 +83,10 @@ def _track_entry(track: Followed, is_cube: bool) -> dict[str, Any]:
 def in_result_frame(body: Superquadric, is_cube: bool) -> Superquadric:
     """A body in the coordinates that results are given in."""
     return unit_cube.cube_from_optical(body).canonical_form() if is_cube else body
+
+
+def _parameters(body: Superquadric) -> dict[str, list[float | None]]:
+    return {name: _numbers(getattr(body, name)) for name in ("size", "shape", "translation", "rotation")}
 
 
 def _numbers(values: Iterable[float]) -> list[float | None]:

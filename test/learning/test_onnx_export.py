@@ -81,7 +81,7 @@ def test_quaternions_are_those_of_the_six(runtime: Any, rng: np.random.Generator
     )
     run = runtime.InferenceSession(proto.SerializeToString(), providers=["CPUExecutionProvider"]).run
     found = run(None, {"raw": raw})[0]
-    expected = Regressor(COMPACT).decode(raw.astype(float))
+    expected = COMPACT.decode(raw.astype(float))
     np.testing.assert_allclose(found[:, :8], expected.to_flat()[:, :8], rtol=1e-5, atol=1e-6)
     assert rotation.geodesic_angle(found[:, 8:].astype(float), expected.rotation).max() < 2e-3
     np.testing.assert_allclose(np.abs(found[:4, 8:]), np.eye(4), atol=1e-6)
