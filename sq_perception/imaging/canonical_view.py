@@ -312,8 +312,7 @@ def _resampled(
     """Values and hidden pixels (pixels, pixels) of a view, by the nearest pixel of a crop of the image (height, width).
 
     A view pixel fixes turned x and y but not z, and a pinhole pixel depends on all three.  Reading z at the projection
-    of the last guess is a contraction wherever the surface is not almost parallel to the ray; three rounds suffice, and
-    fewer where the same z is read again.
+    of the last guess is a contraction wherever the surface is not almost parallel to the ray; three rounds suffice.
     Guesses that fall beside the object go on with the z of its nearest pixel, which ``filled`` (turned z) holds.
     The object may go on where ``covered`` is, and beyond ``whole``: left, top, right and bottom of the image, unless it
     is empty.
@@ -322,25 +321,26 @@ def _resampled(
     height, width = image.shape
     left, top, right, bottom = whole
     value, hidden = np.zeros((pixels, pixels), np.float32), np.zeros((pixels, pixels), np.bool_)
+    z, us, vs = np.empty(pixels), np.empty(pixels), np.empty(pixels)
     for i in range(pixels):
         y = anchor[1] - ((i + 0.5) / pixels - 0.5) * extent
+        z[:] = z_guess
+        for step in range(_ROUNDS + 1):
+            for j in range(pixels):  # without a branch: vector code
+                x = anchor[0] + ((j + 0.5) / pixels - 0.5) * extent
+                px = x * matrix[0, 0] + y * matrix[1, 0] + z[j] * matrix[2, 0]
+                py = x * matrix[0, 1] + y * matrix[1, 1] + z[j] * matrix[2, 1]
+                pz = x * matrix[0, 2] + y * matrix[1, 2] + z[j] * matrix[2, 2]
+                scale = 1 / pz if pinhole else 1.0
+                ahead = pz > 0 or not pinhole
+                us[j] = np.rint(fx * px * scale + cx) if ahead else np.inf
+                vs[j] = np.rint(fy * py * scale + cy) if ahead else np.inf
+            if not pinhole or step == _ROUNDS:
+                break
+            for j in range(pixels):
+                z[j] = filled[int(min(max(vs[j], 0), height - 1)), int(min(max(us[j], 0), width - 1))]
         for j in range(pixels):
-            x = anchor[0] + ((j + 0.5) / pixels - 0.5) * extent
-            z = z_guess
-            u, v = 0.0, 0.0
-            for step in range(_ROUNDS + 1):
-                px = x * matrix[0, 0] + y * matrix[1, 0] + z * matrix[2, 0]
-                py = x * matrix[0, 1] + y * matrix[1, 1] + z * matrix[2, 1]
-                pz = x * matrix[0, 2] + y * matrix[1, 2] + z * matrix[2, 2]
-                if pinhole:
-                    px, py = (px / pz, py / pz) if pz > 0 else (np.inf, np.inf)
-                u, v = np.rint(fx * px + cx), np.rint(fy * py + cy)
-                if not pinhole or step == _ROUNDS:
-                    break
-                there = np.float64(filled[int(min(max(v, 0), height - 1)), int(min(max(u, 0), width - 1))])
-                if there == z:
-                    break
-                z = there
+            u, v = us[j], vs[j]
             if 0 <= u < width and 0 <= v < height:
                 seen = image[int(v), int(u)]
                 if np.isfinite(seen):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
 from sq_perception.geometry.kernels import kernel
@@ -99,10 +100,10 @@ def objects(
     seen = []
     for label in found.ids:
         mask = (found.labels == label) & measured
-        rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-        window = slice(rows[0], rows[-1] + 1), slice(columns[0], columns[-1] + 1)
+        left, top, width, height = cv2.boundingRect(mask.view(np.uint8))
+        window = slice(top, top + height), slice(left, left + width)
         crop = mask[window]
-        camera_crop = camera.cropped(int(columns[0]), int(rows[0]), crop.shape[1], crop.shape[0])
+        camera_crop = camera.cropped(left, top, width, height)
         seen.append(SeenObject(label, int(np.count_nonzero(crop)), mask, depth[window], crop, camera_crop, window))
     return seen
 
