@@ -14,8 +14,9 @@ are drawn.
 
 Where a hull is predicted, the body is fitted as the thing's hull, which encloses lids below a rim, necks and handles:
 points behind its surface count by Cauchy's loss, and the space within the outline's convex hull may be empty.  The
-object then counts as INDEPENDENT_OF_PREDICTED / max(1, c / EXPLAINED) rays, c their mean loss: the variance of the
-model's error is not known beforehand, and the likelihood that is largest over it divides by what is found.
+object then counts as INDEPENDENT_OF_PREDICTED / max(1, c / EXPLAINED)^2 rays, c their mean loss.  Once, as the variance
+of the model's error is not known beforehand, and the likelihood that is largest over it divides by what is found; once
+more, as what errs more does so over larger parts: a neck, a spout, a dent are one error each, not one a pixel.
 
 1. Starts: the given bodies (the prediction), and boxes on the plane, or along the points' axes without one; where
    nothing is predicted, deeper ones too.
@@ -105,7 +106,7 @@ def _best(problem: Problem, starts: Sequence[State]) -> Solution:
     settled = _tried(problem, begun[:kept], few, _MORE_STEPS)
     if problem.is_predicted and not problem.late:
         misfit = max(1.0, _mean_loss(problem, settled[0]) / EXPLAINED)
-        problem = replace(problem, independent=INDEPENDENT_OF_PREDICTED / misfit)
+        problem = replace(problem, independent=INDEPENDENT_OF_PREDICTED / misfit**2)
         settled = _tried(problem, settled[:2], draw(problem, COARSE_RAYS, 0.7), _MORE_STEPS)
     rays = draw(problem, problem.options.pixels or _RAYS, 0.3)
     return Solution(problem, refined_best(problem, settled, rays, _LAST_STEPS), rays, spread_factor=_SPREAD)
