@@ -3,12 +3,13 @@
 | method | masks | what |
 | --- | --- | --- |
 | given | true | `Recoverer().recover(depth, camera, labels)` |
-| own | its own | `Recoverer().recover(depth, camera)`; the body of the mask with an IoU of at least 0.5, or none |
+| own | its own | `Recoverer().recover(depth, camera)`; the body of the mask that agrees, or none |
 | classic | true, eroded | Solina and Bajcsy's fit of 1000 of the measured points |
 | oriented box | true, eroded | the smallest box around the measured points |
 | standing box | true, eroded | from the true table to the highest of them, over the smallest rectangle around all |
 
-Eroded by 3 pixels, since those of a sensor's edge lie on what is behind: none of these three would survive them.
+Masks agree with an IoU of at least 0.5 among the pixels that have a reading.  Eroded by 3 pixels, since those of a
+sensor's edge lie on what is behind: none of these three would survive them.
 
 Volume IoU is with the convex hull of the thing, 0 where there is no body or a failed one.  Errors of size are those of
 full edges, both lists ascending (which is the order of axes with the least sum), and their mean over the three; a body
@@ -152,7 +153,7 @@ def judge(scene: Tabletop) -> SceneVerdict:
         "given": recoverer().recover(depth, camera, labels),
         "own": recoverer().recover(depth, camera),
     }
-    known = matches(frames["own"].labels, labels)
+    known = matches(frames["own"].labels, np.where(np.isfinite(depth), labels, 0))
     judged = []
     for placed in scene.placed:
         if placed.pixels < FEWEST_PIXELS:

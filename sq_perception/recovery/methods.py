@@ -48,6 +48,7 @@ def _body(one: SeenObject, depth: np.ndarray, camera: Camera, options: RecoveryO
         return _soft_rendered(_predicted(one), one, options)
     known = FitOptions(
         plane=one.plane if options.use_plane else None,
+        smeared=one.smeared,
         time_budget=max(deadline - time.perf_counter(), _LEAST_BUDGET),
     )
     if not options.free_space:

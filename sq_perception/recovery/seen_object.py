@@ -47,6 +47,8 @@ class SeenObject:
         Number of its measured pixels.
     mask : bool (height, width)
         These pixels; ``mask_crop``, ``depth_crop`` and ``camera_crop`` are their ``window`` of mask, depth and camera.
+    smeared
+        Whether the mask has the edges that a sensor smears, as it was found in the depth.
     plane : (4,) or None
         What it stands on.
     shown
@@ -64,6 +66,7 @@ class SeenObject:
     mask_crop: np.ndarray
     camera_crop: Camera
     window: tuple[slice, slice]
+    smeared: bool = False
     plane: np.ndarray | None = None
     shown: CanonicalView | None = None
     view: CanonicalView | None = None
@@ -104,7 +107,8 @@ def objects(
         window = slice(top, top + height), slice(left, left + width)
         crop = mask[window]
         camera_crop = camera.cropped(left, top, width, height)
-        seen.append(SeenObject(label, int(np.count_nonzero(crop)), mask, depth[window], crop, camera_crop, window))
+        pixels = int(np.count_nonzero(crop))
+        seen.append(SeenObject(label, pixels, mask, depth[window], crop, camera_crop, window, found.of_depth))
     return seen
 
 

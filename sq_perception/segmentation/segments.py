@@ -31,6 +31,7 @@ from sq_perception.imaging import depth_steps, regions
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation import (
     convex_parts,
+    necks,
     patch_grouping,
     standing,
     support_plane,
@@ -108,12 +109,15 @@ class Segmentation:
         Labels in the image, the one with most pixels first.
     sigma
         Noise of the depth at one metre as measured on the plane, or a guess where there is none, metres.
+    of_depth
+        Whether the labels were found in the depth, and have the edges that the sensor smears.
     """
 
     labels: np.ndarray
     plane: np.ndarray | None
     ids: tuple[int, ...]
     sigma: float = _UNKNOWN_SIGMA
+    of_depth: bool = False
 
 
 def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | None = None) -> Segmentation:
@@ -150,7 +154,7 @@ def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | No
     if plane is None:
         labels = _bodies(known, valid, camera, _UNKNOWN_SIGMA)
         labels, ids = _ordered(labels, least, options.max_objects, standing.alone(known, camera, limits))
-        return Segmentation(labels, None, ids)
+        return Segmentation(labels, None, ids, of_depth=True)
     support = support_surface.measured(plane, known, valid, camera)
     walls = [other for other in planes if other is not plane]
     # What is out of range holds things up and hides them all the same.
@@ -160,7 +164,7 @@ def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | No
     labels = _above(known, relative * valid, valid, camera, support, walls, limits)
     test = standing.standing(everything, relative, camera, support, walls, limits)
     labels, ids = _ordered(labels, least, options.max_objects, test)
-    return Segmentation(labels, plane.equation, ids, max(support.sigma, _LEAST_SIGMA))
+    return Segmentation(labels, plane.equation, ids, max(support.sigma, _LEAST_SIGMA), of_depth=True)
 
 
 def from_labels(
@@ -290,7 +294,8 @@ def _above(
     seen = camera.cropped(left, top, known.shape[1], known.shape[0])
     inside = _bodies(known, clear[window], seen, support.sigma, flat)
     foot = above[window] & (inside == 0)
-    labels[window] = depth_steps.grown(inside, foot, known, _FOOT_PIXELS, depth_steps.STEP)
+    grown = depth_steps.grown(inside, foot, known, _FOOT_PIXELS, depth_steps.STEP)
+    labels[window] = necks.joined(grown, known, seen, support.plane.equation)
     return labels
 
 
