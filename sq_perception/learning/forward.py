@@ -74,10 +74,10 @@ class CompactThings:
 
 def _heights(views: np.ndarray, planes: np.ndarray) -> np.ndarray:
     """Height above the plane of what each pixel shows, of a point half way down where it shows nothing."""
-    across = (np.arange(views.shape[-1]) + 0.5) / views.shape[-1]
+    across = ((np.arange(views.shape[-1]) + 0.5) / views.shape[-1]).astype(np.float32)
     n = planes[:, :, None, None]
     flat = n[:, 0] * across[None, None, :] + n[:, 1] * (1 - across)[None, :, None] + n[:, 3]
-    return np.asarray(flat + n[:, 2] * np.where(views > 0, views, HALF_WAY))
+    return np.asarray(flat + n[:, 2] * np.where(views > 0, views, np.float32(HALF_WAY)))
 
 
 class _Network:
