@@ -23,7 +23,7 @@ is there.
 from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator
-from contextlib import closing
+from contextlib import ExitStack, closing
 from itertools import islice
 from pathlib import Path
 from types import TracebackType
@@ -114,15 +114,13 @@ class RecordedBag:
         self._orthographic = projection == "orthographic"
         self._every, self._limit = every, limit
         self._reading, self._is_done = reading or Reading(), is_done
-        self._reader = BagReader(self._path)
-        try:
+        with ExitStack() as opened:
+            self._reader = opened.enter_context(closing(BagReader(self._path)))
             self.topic = self._chosen(topic)
-        except BaseException:
-            self.close()
-            raise
-        self._info_topic = camera_info_topic(self.topic)
-        self._masks = self._recorded_masks()
-        self._mask = next(self._masks, None)
+            self._info_topic = camera_info_topic(self.topic)
+            self._masks = opened.enter_context(closing(self._recorded_masks()))
+            self._mask = next(self._masks, None)
+            self._opened = opened.pop_all()
 
     def __enter__(self) -> RecordedBag:
         return self
@@ -132,9 +130,7 @@ class RecordedBag:
 
     def close(self) -> None:
         """Close the files."""
-        self._reader.close()
-        if hasattr(self, "_masks"):
-            self._masks.close()
+        self._opened.close()
 
     def __len__(self) -> int:
         """Images that will be read, as the bag counts them; a damaged bag may count wrong."""
