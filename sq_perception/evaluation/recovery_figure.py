@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from textwrap import shorten
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -31,6 +32,8 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.recovery import wording
 from sq_perception.recovery.recovery import FrameRecovery, Recovery
 
+_LONGEST = 68
+"""Characters of a verdict that fit in a line."""
 _MOST_LISTED = 8
 
 
@@ -91,14 +94,14 @@ def _draw_numbers(ax: Axes, recovery: FrameRecovery, unit: str) -> None:
         ax.add_patch(Rectangle((0.0, y - 0.032), 0.035, 0.064, color=colour(k), lw=0))
         _number(ax, (0.0175, y), k)
         if body.status == Status.FAILED:
-            ax.text(0.06, y, f"failed: {body.message}"[:70], fontsize=9, color=FAINT, va="center")
+            ax.text(0.06, y, shorten(f"failed: {body.message}", _LONGEST), fontsize=9, color=FAINT, va="center")
             continue
         e1, e2 = body.superquadric.shape
         said = wording.edges(body.superquadric.size, body.sigma_size, unit != "m")
         ax.text(0.06, y + 0.018, said, fontsize=9, color=INK, va="center")
         ax.text(1, y + 0.018, f"e {e1:.2f} {e2:.2f}  {body.score:.2f}", fontsize=9, color=INK, ha="right", va="center")
         verdict = f"{body.status.name.lower()}: {body.message}" if body.status == Status.WEAK else body.message
-        ax.text(0.06, y - 0.032, verdict[:76], fontsize=8, color=FAINT, va="center")
+        ax.text(0.06, y - 0.032, shorten(verdict, _LONGEST), fontsize=8, color=FAINT, va="center")
     if len(recovery.bodies) > _MOST_LISTED:
         ax.text(0, 0.0, f"and {len(recovery.bodies) - _MOST_LISTED} more", fontsize=9, color=FAINT)
 
