@@ -14,6 +14,7 @@ Bottles that lie stay cut.  Metres, optical frame.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -50,25 +51,26 @@ class _Profile:
     across: np.ndarray
     away: float
 
-    @property
-    def foot_and_top(self) -> tuple[float, float]:
-        low, high = np.quantile(self.height, [0.05, 0.95])
-        return float(low), float(high)
+    @cached_property
+    def heights(self) -> list[float]:
+        """Of foot, middle and top."""
+        return _quantiles(self.height, 0.05, 0.5, 0.95)
 
-    @property
-    def sides(self) -> tuple[float, float]:
-        left, right = np.quantile(self.across, [0.03, 0.97])
-        return float(left), float(right)
+    @cached_property
+    def sides(self) -> list[float]:
+        return _quantiles(self.across, 0.03, 0.97)
 
     @property
     def width(self) -> float:
         left, right = self.sides
         return right - left
 
-    def highest_part(self) -> _Profile:
-        foot, top = self.foot_and_top
-        chosen = self.height > top - _HIGHEST * (top - foot)
-        return _Profile(self.height[chosen], self.across[chosen], self.away)
+    @cached_property
+    def shoulder(self) -> float:
+        """Width of the highest part."""
+        foot, _, top = self.heights
+        left, right = _quantiles(self.across[self.height >= top - _HIGHEST * (top - foot)], 0.03, 0.97)
+        return right - left
 
     def with_(self, other: _Profile) -> _Profile:
         both = [np.concatenate(each) for each in ((self.height, other.height), (self.across, other.across))]
@@ -76,12 +78,14 @@ class _Profile:
 
     def narrows_to(self, neck: _Profile) -> bool:
         """Whether the other one is the neck of this one."""
-        foot, top = self.foot_and_top
-        neck_foot, neck_top = neck.foot_and_top
+        foot, _, top = self.heights
+        neck_foot, _, neck_top = neck.heights
         if not -_GAP < neck_foot - top < _GAP or neck_top - neck_foot > _TALLEST * (top - foot):
             return False
-        shoulder = self.highest_part().width
-        if self.width > _WIDEST_BOTTLE or shoulder > _SHOULDER * self.width or abs(self.away - neck.away) > self.width:
+        if self.width > _WIDEST_BOTTLE or abs(self.away - neck.away) > self.width:
+            return False
+        shoulder = self.shoulder
+        if shoulder > _SHOULDER * self.width:
             return False
         off = abs(sum(self.sides) - sum(neck.sides)) / 2
         return _NARROWEST * shoulder < neck.width < _WIDEST * shoulder and off < _OFF_CENTRE * self.width
@@ -105,14 +109,20 @@ def joined(labels: np.ndarray, depth: np.ndarray, camera: Camera, plane: np.ndar
         step = 1 + rows.size // _SAMPLES
         rows, columns = rows[::step], columns[::step]
         points = camera.unproject(columns, rows, depth[rows, columns])
-        away = float(np.median(points @ forward))
+        (away,) = _quantiles(points @ forward, 0.5)
         profiles[label] = _Profile(points @ plane[:3] + plane[3], points @ sideways / slant, away)
     number = np.arange(len(extents), dtype=labels.dtype)
     # From below: a cap stands on a neck that stands on a bottle.
-    for label in sorted(profiles, key=lambda one: float(np.median(profiles[one].height))):
+    for label in sorted(profiles, key=lambda one: profiles[one].heights[1]):
         below = [one for one in profiles if one != label and profiles[one].narrows_to(profiles[label])]
         if below:
             nearest = min(below, key=lambda one: abs(profiles[one].away - profiles[label].away))
             profiles[nearest] = profiles[nearest].with_(profiles.pop(label))
             number[number == label] = nearest
     return number[labels] if (number != np.arange(len(number))).any() else labels
+
+
+def _quantiles(values: np.ndarray, *shares: float) -> list[float]:
+    """Linear between the samples, in a third of numpy.quantile's time."""
+    at = np.arange(len(values)) / max(len(values) - 1, 1)
+    return np.interp(shares, at, np.sort(values)).tolist()
