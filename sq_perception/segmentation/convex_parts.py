@@ -33,6 +33,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sq_perception.geometry.kernels import kernel
+from sq_perception.geometry.quantiles import quantile
 from sq_perception.imaging import regions
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation import crossings
@@ -233,7 +234,7 @@ class _Image:
         if len(rows) < _LEAST_SAMPLES:
             return None
         z = self.depth[rows, columns].astype(float)
-        return _Part(label, np.stack([rows, columns], axis=-1), z, stride * float(np.median(z)) / self.focal)
+        return _Part(label, np.stack([rows, columns], axis=-1), z, stride * quantile(z, 0.5) / self.focal)
 
     def crossed_between(self, parts: list[_Part], near: float) -> np.ndarray:
         """Of each pair of parts (n, n) the share of crossed lines between their samples; inf if they are not near."""

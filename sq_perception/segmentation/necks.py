@@ -18,6 +18,7 @@ from functools import cached_property
 
 import numpy as np
 
+from sq_perception.geometry.quantiles import quantile
 from sq_perception.imaging import regions
 from sq_perception.imaging.camera import Camera
 
@@ -52,13 +53,12 @@ class _Profile:
     away: float
 
     @cached_property
-    def heights(self) -> list[float]:
-        """Of foot, middle and top."""
-        return _quantiles(self.height, 0.05, 0.5, 0.95)
+    def foot_and_top(self) -> tuple[float, float]:
+        return quantile(self.height, 0.05), quantile(self.height, 0.95)
 
     @cached_property
-    def sides(self) -> list[float]:
-        return _quantiles(self.across, 0.03, 0.97)
+    def sides(self) -> tuple[float, float]:
+        return quantile(self.across, 0.03), quantile(self.across, 0.97)
 
     @property
     def width(self) -> float:
@@ -68,9 +68,9 @@ class _Profile:
     @cached_property
     def shoulder(self) -> float:
         """Width of the highest part."""
-        foot, _, top = self.heights
-        left, right = _quantiles(self.across[self.height >= top - _HIGHEST * (top - foot)], 0.03, 0.97)
-        return right - left
+        foot, top = self.foot_and_top
+        across = self.across[self.height >= top - _HIGHEST * (top - foot)]
+        return quantile(across, 0.97) - quantile(across, 0.03)
 
     def with_(self, other: _Profile) -> _Profile:
         both = [np.concatenate(each) for each in ((self.height, other.height), (self.across, other.across))]
@@ -78,8 +78,8 @@ class _Profile:
 
     def narrows_to(self, neck: _Profile) -> bool:
         """Whether the other one is the neck of this one."""
-        foot, _, top = self.heights
-        neck_foot, _, neck_top = neck.heights
+        foot, top = self.foot_and_top
+        neck_foot, neck_top = neck.foot_and_top
         if not -_GAP < neck_foot - top < _GAP or neck_top - neck_foot > _TALLEST * (top - foot):
             return False
         if self.width > _WIDEST_BOTTLE or abs(self.away - neck.away) > self.width:
@@ -109,20 +109,14 @@ def joined(labels: np.ndarray, depth: np.ndarray, camera: Camera, plane: np.ndar
         step = 1 + rows.size // _SAMPLES
         rows, columns = rows[::step], columns[::step]
         points = camera.unproject(columns, rows, depth[rows, columns])
-        (away,) = _quantiles(points @ forward, 0.5)
+        away = quantile(points @ forward, 0.5)
         profiles[label] = _Profile(points @ plane[:3] + plane[3], points @ sideways / slant, away)
     number = np.arange(len(extents), dtype=labels.dtype)
     # From below: a cap stands on a neck that stands on a bottle.
-    for label in sorted(profiles, key=lambda one: profiles[one].heights[1]):
+    for label in sorted(profiles, key=lambda one: quantile(profiles[one].height, 0.5)):
         below = [one for one in profiles if one != label and profiles[one].narrows_to(profiles[label])]
         if below:
             nearest = min(below, key=lambda one: abs(profiles[one].away - profiles[label].away))
             profiles[nearest] = profiles[nearest].with_(profiles.pop(label))
             number[number == label] = nearest
     return number[labels] if (number != np.arange(len(number))).any() else labels
-
-
-def _quantiles(values: np.ndarray, *shares: float) -> list[float]:
-    """Linear between the samples, in a third of numpy.quantile's time."""
-    at = np.arange(len(values)) / max(len(values) - 1, 1)
-    return np.interp(shares, at, np.sort(values)).tolist()

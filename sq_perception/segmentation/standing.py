@@ -20,6 +20,7 @@ import cv2
 import numpy as np
 
 from sq_perception.geometry import rotation
+from sq_perception.geometry.quantiles import quantile
 from sq_perception.imaging import depth_steps
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation import support_plane
@@ -49,8 +50,8 @@ _FACE_SHARE = 0.5
 decides; without it 3 of 81 recorded and simulated frames lose a body."""
 _OUTLIERS = 0.01
 """Share of the points at either end that do not count for the extent: sensors smear edges."""
-_TURNS = np.stack([np.cos(np.deg2rad(np.arange(0, 180, 10))), np.sin(np.deg2rad(np.arange(0, 180, 10)))])
-"""Directions (2, 18) in which edges are measured."""
+_TURNS = np.stack([np.cos(np.deg2rad(np.arange(0, 180, 10))), np.sin(np.deg2rad(np.arange(0, 180, 10)))], axis=1)
+"""Directions (18, 2) in which edges are measured."""
 _UNDER, _BELOW = 3.0, 2.0
 """Tolerances below the support at which is looked for it, and from which on something seen lies below it."""
 _TOLD = 1 / 3
@@ -98,18 +99,18 @@ def largest_edge(points: np.ndarray, up: np.ndarray | None = None) -> float:
     points = points[:: 1 + len(points) // _SAMPLES]
     if up is None:
         axes = np.linalg.eigh(np.cov(points.T))[1] if len(points) > 3 else np.eye(3)
-        return float(_extents(points @ axes).max())
-    edges = _extents(points @ np.concatenate([support_plane.across(up) @ _TURNS, up[:, None]], axis=1))
+        return float(_extents(axes.T @ points.T).max())
+    edges = _extents(np.concatenate([_TURNS @ support_plane.across(up).T, up[None]]) @ points.T)
     # A quarter turn apart, the two edges of one rectangle.
-    half = _TURNS.shape[1] // 2
+    half = len(_TURNS) // 2
     return float(max(np.maximum(edges[:half], edges[half:-1]).min(), edges[-1]))
 
 
 def _extents(values: np.ndarray) -> np.ndarray:
-    """Of each column, without what sticks out."""
-    ordered = np.sort(values, axis=0)
-    out = int(_OUTLIERS * len(values))
-    return np.asarray(ordered[-1 - out] - ordered[out])
+    """Of each row, without what sticks out."""
+    ordered = np.sort(values, axis=1)
+    out = int(_OUTLIERS * values.shape[1])
+    return np.asarray(ordered[:, -1 - out] - ordered[:, out])
 
 
 def _top(values: np.ndarray) -> float:
@@ -219,7 +220,7 @@ def _spread(around: np.ndarray, rows: np.ndarray, columns: np.ndarray, highest: 
     mask[rows - top, columns - left] = 1
     near, ring = (cv2.dilate(mask, np.ones((2 * k + 1, 2 * k + 1), np.uint8)) for k in (_SMEARED, _BESIDE))
     heights = np.abs(beside[(ring > near) & (np.abs(beside) < highest)])
-    return float(1.4826 * np.median(heights)) if heights.size >= _FEWEST else 0.0
+    return 1.4826 * quantile(heights, 0.5) if heights.size >= _FEWEST else 0.0
 
 
 def _stands(points: np.ndarray, depth: np.ndarray, relative: np.ndarray, camera: Camera, plane: Plane) -> bool:

@@ -17,6 +17,7 @@ Metres and pixels.  Reference: M. A. Fischler, R. C. Bolles, Random Sample Conse
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -201,10 +202,10 @@ def _is_face(plane: Plane, surfaces: list[_Surface]) -> bool:
 
 def across(normal: np.ndarray) -> np.ndarray:
     """Two axes (3, 2) at right angles to a normal."""
-    x, y, z = normal
-    first = np.array([z, 0.0, -x] if abs(z) > 0.5 else [-y, x, 0.0])
-    first /= np.linalg.norm(first)
-    return np.stack([first, np.cross(normal, first)], axis=1)
+    x, y, z = normal.tolist()
+    a, b, c = (z, 0.0, -x) if abs(z) > 0.5 else (-y, x, 0.0)
+    axes = np.array([[a, y * c - z * b], [b, z * a - x * c], [c, x * b - y * a]])
+    return axes / math.sqrt(a * a + b * b + c * c)
 
 
 def _on_one_surface(depth: np.ndarray, valid: np.ndarray, camera: Camera) -> list[_Surface]:
