@@ -94,22 +94,22 @@ def measured(plane: Plane, depth: np.ndarray, valid: np.ndarray, camera: Camera)
     """
     k = _stride(depth.shape)
     rows, columns = np.nonzero(valid[::k, ::k])
-    points = camera.unproject(k * columns, k * rows, depth[::k, ::k][rows, columns])
-    growth = noise_growth(points[:, 2])
-    height = plane.height(points) / growth
+    z = depth[::k, ::k][rows, columns].astype(float)
+    growth = noise_growth(z)
+    terms = _terms((k * columns - camera.cx) / camera.fx, (k * rows - camera.cy) / camera.fy)
+    height = (z * (plane.equation[[2, 0, 1]] @ terms[:3]) + plane.equation[3]) / growth
     flat = SupportSurface(plane, np.zeros(_TERMS), 0.0, plane.sigma)
-    terms = _terms(points[:, 0] / points[:, 2], points[:, 1] / points[:, 2])
     on = np.abs(height) < TOLERANCE
     if not on.any():
         return flat
-    limit = _DISTORTION * float(np.median(points[on, 2] / growth[on]))
+    limit = _DISTORTION * float(np.median(z[on] / growth[on]))
     bend, off = flat.bend, height
     for _ in range(_ROUNDS):
         if np.count_nonzero(on) < 10 * _TERMS:
             return flat
-        some = terms[on]
-        bend = np.linalg.lstsq(some.T @ some, some.T @ height[on], rcond=None)[0]
-        off = height - np.clip(terms @ bend, -limit, limit)
+        some = terms * on
+        bend = np.linalg.lstsq(some @ terms.T, some @ height, rcond=None)[0]
+        off = height - np.clip(bend @ terms, -limit, limit)
         grown = np.abs(off) < TOLERANCE
         if np.array_equal(grown, on):
             break
@@ -177,11 +177,21 @@ def _low_things(height: np.ndarray, known: np.ndarray, reached: np.ndarray) -> n
     own = np.zeros(height.shape, bool)
     for level in _LEVELS:
         parts = depth_steps.components(known & (height > level * TOLERANCE))
-        rows, columns = np.nonzero(parts)
-        tops = np.zeros((2, int(parts.max()) + 1), np.float32)
-        np.maximum.at(tops, (reached[rows, columns].astype(int), parts[rows, columns]), height[rows, columns])
+        tops = _tops(parts, reached, height, int(parts.max()))
         own |= (tops[1] > tops[0] - 0.5 * TOLERANCE)[parts] & (parts > 0)
     return own
+
+
+@kernel
+def _tops(parts: np.ndarray, reached: np.ndarray, height: np.ndarray, count: int) -> np.ndarray:
+    """Greatest height (2, count + 1) in each part of what was not reached, and of what was."""
+    tops = np.zeros((2, count + 1), np.float32)
+    for v in range(parts.shape[0]):
+        for u in range(parts.shape[1]):
+            if parts[v, u] > 0:
+                side = 1 if reached[v, u] else 0
+                tops[side, parts[v, u]] = max(tops[side, parts[v, u]], height[v, u])
+    return tops
 
 
 def _shallow(height: np.ndarray, z: np.ndarray, known: np.ndarray, width: np.ndarray) -> np.ndarray:
@@ -205,19 +215,22 @@ def _shallow(height: np.ndarray, z: np.ndarray, known: np.ndarray, width: np.nda
 def _relative(
     depth: np.ndarray, x: np.ndarray, y: np.ndarray, plane: np.ndarray, bend: np.ndarray, limit: float
 ) -> np.ndarray:
-    height = np.zeros(depth.shape, np.float32)
+    """The rest of a row is constant, and no pixel branches: a row becomes vector code."""
+    height = np.empty(depth.shape, np.float32)
     for v in range(depth.shape[0]):
+        slope, first = plane[1] * y[v] + plane[2], bend[0] + y[v] * (bend[2] + bend[5] * y[v])
+        second = bend[1] + bend[4] * y[v]
         for u in range(depth.shape[1]):
             z = np.float64(depth[v, u])
-            above = z * (plane[0] * x[u] + plane[1] * y[v] + plane[2]) + plane[3]
-            if z > 0:
-                off = bend[0] + x[u] * (bend[1] + bend[3] * x[u] + bend[4] * y[v]) + y[v] * (bend[2] + bend[5] * y[v])
-                height[v, u] = above / max(z * z, LEAST_GROWTH) - min(max(off, -limit), limit)
+            above = z * (plane[0] * x[u] + slope) + plane[3]
+            off = first + x[u] * (second + bend[3] * x[u])
+            relative = above / max(z * z, LEAST_GROWTH) - min(max(off, -limit), limit)
+            height[v, u] = relative if z > 0 else 0.0
     return height
 
 
 def _terms(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y], axis=-1)
+    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y])
 
 
 def _stride(shape: tuple[int, ...]) -> int:
