@@ -210,16 +210,47 @@ def _chord_noise(every_inverse: np.ndarray, flat: np.ndarray | None, chord: _Cho
     """
     if flat is not None:
         inverse, known = _mean(every_inverse, flat, chord)
-        reach, rest = chord.rho, 2 * chord.rho
-        both = []
-        for w, ok in ((inverse, known), (inverse.T, known.T)):
-            told = ok[:, rest:] & ok[:, :-rest] & ok[:, reach:-reach] if ok.shape[1] > rest else np.zeros((0, 0), bool)
-            if np.count_nonzero(told) >= _FEWEST_CHORDS:
-                s = 0.5 * (w[:, rest:] + w[:, :-rest]) - w[:, reach:-reach]
-                both.append(1.4826 * float(np.median(np.abs(s[told]))))
+        both = (_bends(inverse, known, 0, chord.rho), _bends(inverse, known, chord.rho, 0))
+        both = [1.4826 * _middle(bends) for bends in both if bends.size >= _FEWEST_CHORDS]
         if both:
             return max(both)
     return _CHORD_NOISE * sigma / (2 * chord.half + 1)
+
+
+@kernel
+def _bends(inverse: np.ndarray, known: np.ndarray, down: int, right: int) -> np.ndarray:
+    """|(w(p - rho) + w(p + rho)) / 2 - w(p)|, float32 (n,), of all known chords in one direction."""
+    rows, columns = inverse.shape
+    found, n = np.empty(inverse.size, np.float32), 0
+    for v in range(down, rows - down):
+        for u in range(right, columns - right):
+            if known[v, u] and known[v - down, u - right] and known[v + down, u + right]:
+                ends = inverse[v - down, u - right] + inverse[v + down, u + right]
+                found[n] = abs(np.float32(0.5) * ends - inverse[v, u])
+                n += 1
+    return found[:n]
+
+
+@kernel
+def _middle(numbers: np.ndarray) -> float:
+    """The median of float32 (n,) >= 0, of two the larger: their bits order as they do, and are counted by halves."""
+    bits = numbers.view(np.uint32)
+    left, high = numbers.size // 2, np.uint32(0)
+    counts = np.zeros(1 << 16, np.int32)
+    for one in bits:
+        counts[one >> 16] += 1
+    while left >= counts[high]:
+        left -= counts[high]
+        high += 1
+    counts[:] = 0
+    for one in bits:
+        if one >> 16 == high:
+            counts[one & 0xFFFF] += 1
+    low = np.uint32(0)
+    while left >= counts[low]:
+        left -= counts[low]
+        low += 1
+    return np.float64(np.array([high << 16 | low], np.uint32).view(np.float32)[0])
 
 
 def _mean(image: np.ndarray, wanted: np.ndarray, chord: _Chord) -> tuple[np.ndarray, np.ndarray]:
