@@ -115,7 +115,9 @@ def _bridged(patches: Patches) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     measured = np.flatnonzero(~gap)
     source = np.zeros(int(nearest.max()) + 1, np.int64)
     source[nearest.ravel()[measured]] = measured
-    return patches.labels.ravel()[source[nearest]], patches.depth.ravel()[source[nearest]], gap
+    labels, depth = patches.labels.copy(), patches.depth.copy()
+    labels[gap], depth[gap] = labels.ravel()[source[nearest[gap]]], depth.ravel()[source[nearest[gap]]]
+    return labels, depth, gap
 
 
 def _continued(patches: Patches, body: np.ndarray, camera: Camera) -> np.ndarray:

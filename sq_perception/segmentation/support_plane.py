@@ -23,7 +23,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from sq_perception.imaging import depth_steps
+from sq_perception.geometry.kernels import kernel
+from sq_perception.imaging import depth_steps, regions
 from sq_perception.imaging.camera import Camera
 
 TOLERANCE = 0.008
@@ -164,20 +165,29 @@ def _dominant_plane(points: np.ndarray, rng: np.random.Generator) -> tuple[np.nd
         return None, np.zeros(len(points), bool)
     normals = normals[usable] / length[usable, None]
     offsets = -np.einsum("ij,ij->i", normals, corners[usable, 0])
+    candidates = np.column_stack([normals, offsets])
     weight = (1 / (TOLERANCE * noise_growth(few[:, 2]))).astype(np.float32)
-    weighted = np.concatenate([few, np.ones((len(few), 1))], axis=1).astype(np.float32) * weight[:, None]
-    heights = np.column_stack([normals, offsets]).astype(np.float32) @ weighted.T
-    votes = np.count_nonzero(np.abs(heights) < 1, axis=1)
-    best = int(np.argmax(votes))
-    plane = np.append(normals[best], offsets[best])
-    reach = TOLERANCE * noise_growth(points[:, 2])
+    weighted = np.stack([*few.T, np.ones(len(few))]).astype(np.float32) * weight
+    plane = candidates[np.argmax(_votes(candidates.astype(np.float32), weighted))]
+    growth = noise_growth(points[:, 2])
+    reach, weights = TOLERANCE * growth, growth**-2
     for share in (1.0, 1.0, 0.5):
         inside = np.abs(points @ plane[:3] + plane[3]) < share * reach
-        if inside.sum() < 12:
+        if np.count_nonzero(inside) < 12:
             return None, inside
-        near = points[inside]
-        plane = _least_squares_plane(near, 1 / noise_growth(near[:, 2]) ** 2)
+        plane = _least_squares_plane(points, weights * inside)
     return plane, np.abs(points @ plane[:3] + plane[3]) < reach
+
+
+@kernel
+def _votes(planes: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Of each plane (n, 4) how many points (4, m), divided by their tolerance, are within it."""
+    votes = np.zeros(len(planes), np.int32)
+    for k in range(len(planes)):
+        a, b, c, d = planes[k]
+        for i in range(points.shape[1]):
+            votes[k] += abs(a * points[0, i] + b * points[1, i] + c * points[2, i] + d * points[3, i]) < 1
+    return votes
 
 
 def _least_squares_plane(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
@@ -214,15 +224,13 @@ def _on_one_surface(depth: np.ndarray, valid: np.ndarray, camera: Camera) -> lis
     coarse, kept = depth[::k, ::k], valid[::k, ::k]
     jumps = depth_steps.edges(np.where(kept, coarse, np.float32(0)), kept, k * depth_steps.STEP)
     labels = depth_steps.components(kept & ~jumps)
-    rows, columns = np.nonzero(labels)
-    numbers = labels[rows, columns]
-    points = camera.unproject(k * columns, k * rows, coarse[rows, columns])
-    surfaces = []
-    for label in np.flatnonzero(np.bincount(numbers) > 0.02 * rows.size):
-        part = numbers == label
-        r, c = rows[part], columns[part]
-        inside = min(r.min(), c.min(), labels.shape[0] - 1 - r.max(), labels.shape[1] - 1 - c.max()) > 0
-        surfaces.append((points[part], bool(inside and r.size < _ISLAND_SHARE * labels.size)))
+    extents, surfaces = regions.extents(labels), []
+    for label in np.flatnonzero(extents[:, 0] > 0.02 * extents[:, 0].sum()):
+        rows, columns = regions.pixels(labels, label, extents[label])
+        size, top, bottom, left, right = extents[label].tolist()
+        inside = min(top, left, labels.shape[0] - bottom, labels.shape[1] - right) > 0
+        points = camera.unproject(k * columns, k * rows, coarse[rows, columns])
+        surfaces.append((points, inside and size < _ISLAND_SHARE * labels.size))
     return surfaces
 
 
