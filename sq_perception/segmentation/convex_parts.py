@@ -28,6 +28,7 @@ Reference: S. Asafi, A. Goren, D. Cohen-Or, Weak Convex Decomposition by Lines-o
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -84,7 +85,13 @@ class SightOptions:
 _USUAL = SightOptions()
 
 
-def corrected(labels: np.ndarray, depth: np.ndarray, camera: Camera, sigma: float) -> np.ndarray:
+def corrected(
+    labels: np.ndarray,
+    depth: np.ndarray,
+    camera: Camera,
+    sigma: float,
+    holds: Callable[[np.ndarray], bool] | None = None,
+) -> np.ndarray:
     """Segments taken apart where they are several convex bodies, and joined where they are one.
 
     Parameters
@@ -97,6 +104,8 @@ def corrected(labels: np.ndarray, depth: np.ndarray, camera: Camera, sigma: floa
         A pinhole camera.
     sigma
         Noise of the depth at one metre, metres; it grows with the square of the depth.
+    holds
+        Whether points (n, 3) may be one thing; segments whose points together may not stay apart.
 
     Returns
     -------
@@ -125,9 +134,11 @@ def corrected(labels: np.ndarray, depth: np.ndarray, camera: Camera, sigma: floa
     number_of = np.arange(count + 1)
     if len(parts) > 1:
         names = np.array([part.label for part in parts])
-        group = _linked(
-            image.crossed_between(parts, _NEAR), np.array([len(part.z) for part in parts], float), _ONE_BODY
-        )
+        crossed = image.crossed_between(parts, _NEAR)
+        for a, b in np.argwhere(np.tril(crossed < _ONE_BODY)):
+            if holds is not None and not holds(np.concatenate([image.points(parts[a]), image.points(parts[b])])):
+                crossed[a, b] = crossed[b, a] = np.inf
+        group = _linked(crossed, np.array([len(part.z) for part in parts], float), _ONE_BODY)
         first = np.unique(group, return_index=True)[1]
         number_of[names] = names[first[group]]
     return number_of[result]
@@ -246,13 +257,13 @@ class _Image:
 
     def pieces(self, part: _Part, extent: np.ndarray, options: SightOptions) -> list[tuple[np.ndarray, np.ndarray]]:
         """Rows and columns of each convex part of a segment; nothing where it has no such parts."""
-        crossed = crossings.within(part.pixels, self._points(part), self.depth, self.labels, *self.limits)[0]
+        crossed = crossings.within(part.pixels, self.points(part), self.depth, self.labels, *self.limits)[0]
         if crossed.mean() < options.suspicious:
             return []
         whole = self.sampled(part.label, extent, _MANY)
         if whole is None:
             return []
-        crossed, gap, far = crossings.within(whole.pixels, self._points(whole), self.depth, self.labels, *self.limits)
+        crossed, gap, far = crossings.within(whole.pixels, self.points(whole), self.depth, self.labels, *self.limits)
         n = len(whole.z)
         group = _linked(crossed + _METRIC * far / max(far.max(), 1e-9), np.ones(n), options.apart)
         size = np.bincount(group)
@@ -273,7 +284,7 @@ class _Image:
         )
         return [(rows[chosen == k], columns[chosen == k]) for k in range(len(pairs)) if (chosen == k).any()]
 
-    def _points(self, part: _Part) -> np.ndarray:
+    def points(self, part: _Part) -> np.ndarray:
         return self.camera.unproject(part.pixels[:, 1], part.pixels[:, 0], part.z)
 
 

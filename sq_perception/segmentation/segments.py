@@ -21,7 +21,9 @@ Metres and pixels.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import cv2
 import numpy as np
@@ -152,7 +154,7 @@ def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | No
     known = np.where(valid, depth, np.float32(0))
     limits = standing.Limits(options.max_size, options.workspace, options.workspace_pose)
     if plane is None:
-        labels = _bodies(known, valid, camera, _UNKNOWN_SIGMA)
+        labels = _bodies(known, valid, camera, _UNKNOWN_SIGMA, limits.is_small)
         labels, ids = _ordered(labels, least, options.max_objects, standing.alone(known, camera, limits))
         return Segmentation(labels, None, ids, of_depth=True)
     support = support_surface.measured(plane, known, valid, camera)
@@ -292,7 +294,8 @@ def _above(
     flat = (valid & (np.abs(relative) < support_plane.TOLERANCE))[window]
     known = known[window]
     seen = camera.cropped(left, top, known.shape[1], known.shape[0])
-    inside = _bodies(known, clear[window], seen, support.sigma, flat)
+    holds = partial(limits.is_small, up=support.plane.equation[:3])
+    inside = _bodies(known, clear[window], seen, support.sigma, holds, flat)
     foot = above[window] & (inside == 0)
     grown = depth_steps.grown(inside, foot, known, _FOOT_PIXELS, depth_steps.STEP)
     labels[window] = necks.joined(grown, known, seen, support.plane.equation)
@@ -304,16 +307,17 @@ def _bodies(
     wanted: np.ndarray,
     camera: Camera,
     sigma: float,
+    holds: Callable[[np.ndarray], bool],
     flat: np.ndarray | None = None,
 ) -> np.ndarray:
     """Bodies (labels from 1, unordered) of the wanted pixels, taken apart at steps and concave edges."""
     sigma = max(sigma, _LEAST_SIGMA)
     patches = surface_patches.find(depth, wanted, camera, sigma, flat)
     if patches is None:
-        return convex_parts.corrected(depth_steps.separated(depth, wanted), depth, camera, sigma)
+        return convex_parts.corrected(depth_steps.separated(depth, wanted), depth, camera, sigma, holds)
     body = patch_grouping.bodies(patches, camera)
     labels = _refined(body[patches.labels].astype(np.int32), patches, depth, wanted)
-    labels = convex_parts.corrected(labels, depth, camera, sigma)
+    labels = convex_parts.corrected(labels, depth, camera, sigma, holds)
     # What is too small for a patch stays what the steps made of it.
     rest = cv2.morphologyEx((wanted & (labels == 0)).view(np.uint8), cv2.MORPH_OPEN, depth_steps.CROSS)
     rest = depth_steps.components(rest)

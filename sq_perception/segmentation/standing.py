@@ -80,6 +80,10 @@ class Limits:
         """Whether points (n, 3) are no larger than a thing and in the workspace; ``up`` is the support's normal."""
         if self.workspace is not None and not within(self.workspace, points, self.workspace_pose):
             return False
+        return self.is_small(points, up)
+
+    def is_small(self, points: np.ndarray, up: np.ndarray | None = None) -> bool:
+        """Whether points (n, 3) are no larger than a thing."""
         return largest_edge(points, up) <= self.max_size
 
 
