@@ -111,12 +111,12 @@ def test_what_is_no_thing_together_stays_apart():
     """A strip that goes far back beside a box may be its side, as far as lines of sight tell."""
     depth = np.full((CAMERA.height, CAMERA.width), 2.0, np.float32)
     depth[80:160, 100:200] = 1.0
-    depth[80:160, 200:210] = np.linspace(1.0, 1.6, 10, dtype=np.float32)
+    depth[80:160, 200:240] = 1 / np.linspace(1.0, 1 / 1.3, 40)
     labels = np.zeros(depth.shape, np.int32)
-    labels[80:160, 100:200], labels[80:160, 200:210] = 1, 2
+    labels[80:160, 100:200], labels[80:160, 200:240] = 1, 2
     together = convex_parts.corrected(labels, depth, CAMERA, NOISE)
     assert len(names(together)) == 1
-    apart = convex_parts.corrected(labels, depth, CAMERA, NOISE, lambda points: np.ptp(points, axis=0).max() < 0.5)
+    apart = convex_parts.corrected(labels, depth, CAMERA, NOISE, lambda points: np.ptp(points[:, 2]) < 0.1)
     assert len(names(apart)) == 2
 
 
