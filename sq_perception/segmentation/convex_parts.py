@@ -174,7 +174,7 @@ def free_pairs(labels: np.ndarray, depth: np.ndarray, camera: Camera, sigma: flo
     found = [part for label in _by_size(extents) if (part := image.sampled(label, extents[label], _FEW)) is not None]
     if len(found) < 2:
         return []
-    crossed = image.crossed_between(found, np.inf)
+    crossed = image.crossed_between(found, np.inf, _ONE_BODY)
     pairs = [(found[i].label, found[j].label) for i in range(len(found)) for j in range(i) if crossed[i, j] < _ONE_BODY]
     return [(min(pair), max(pair)) for pair in pairs]
 
@@ -247,13 +247,14 @@ class _Image:
         z = self.depth[rows, columns].astype(float)
         return _Part(label, np.stack([rows, columns], axis=-1), z, stride * quantile(z, 0.5) / self.focal)
 
-    def crossed_between(self, parts: list[_Part], near: float) -> np.ndarray:
-        """Of each pair of parts (n, n) the share of crossed lines between their samples; inf if they are not near."""
+    def crossed_between(self, parts: list[_Part], near: float, enough: float = 1.0) -> np.ndarray:
+        """Of each pair of parts (n, n) the share of crossed lines between their samples, one above ``enough`` counted
+        up to there; inf if they are not near."""
         pixels, z = np.concatenate([part.pixels for part in parts]), np.concatenate([part.z for part in parts])
         ends = np.cumsum([0] + [len(part.z) for part in parts])
         points = self.camera.unproject(pixels[:, 1], pixels[:, 0], z)
         reach = near / 2 + 0.7 * np.array([part.spacing for part in parts])
-        return crossings.between(pixels, points, ends, reach, self.depth, *self.limits)
+        return crossings.between(pixels, points, ends, reach, self.depth, *self.limits, enough)
 
     def pieces(self, part: _Part, extent: np.ndarray, options: SightOptions) -> list[tuple[np.ndarray, np.ndarray]]:
         """Rows and columns of each convex part of a segment; nothing where it has no such parts."""

@@ -23,10 +23,11 @@ def _crossed(
     v0: float, u0: float, z0: float, v1: float, u1: float, z1: float, depth: np.ndarray, noise: float, least: float
 ) -> bool:
     """Whether something lies behind the line between two pixels."""
+    w0, w1 = 1.0 / z0, 1.0 / z1
     for k in range(1, _STEPS):
         t = k / _STEPS
         seen = np.float64(depth[int((1 - t) * v0 + t * v1 + 0.5), int((1 - t) * u0 + t * u1 + 0.5)])
-        line = 1.0 / ((1 - t) / z0 + t / z1)
+        line = 1.0 / ((1 - t) * w0 + t * w1)
         if seen - line > max(noise * line * line, least):
             return True
     return False
@@ -41,9 +42,11 @@ def between(
     depth: np.ndarray,
     noise: float,
     least: float,
+    enough: float,
 ) -> np.ndarray:
     """Share (n, n) of crossed lines between the samples of segments, the rows between two ``ends``; inf where the
-    nearest samples are farther apart than the sum of their reaches."""
+    nearest samples are farther apart than the sum of their reaches.  A share above ``enough`` is counted up to there.
+    """
     n = len(ends) - 1
     share = np.full((n, n), np.inf)
     for a in range(n):
@@ -55,11 +58,14 @@ def between(
                     nearest = min(nearest, x * x + y * y + z * z)
             if nearest > (reach[a] + reach[b]) ** 2:
                 continue
+            lines = (ends[a + 1] - ends[a]) * (ends[b + 1] - ends[b])
             for i in range(ends[a], ends[a + 1]):
                 for j in range(ends[b], ends[b + 1]):
                     p, q = pixels[i], pixels[j]
                     count += _crossed(p[0], p[1], points[i, 2], q[0], q[1], points[j, 2], depth, noise, least)
-            share[a, b] = share[b, a] = count / ((ends[a + 1] - ends[a]) * (ends[b + 1] - ends[b]))
+                if count > enough * lines:
+                    break
+            share[a, b] = share[b, a] = count / lines
     return share
 
 
