@@ -16,9 +16,21 @@ def extents(labels: np.ndarray) -> np.ndarray:
 
 def pixels(labels: np.ndarray, label: int, extent: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rows and columns of a label's pixels, by its extent."""
-    _, top, bottom, left, right = extent.tolist()
-    rows, columns = np.nonzero(labels[top:bottom, left:right] == label)
-    return rows + top, columns + left
+    rows, columns = _pixels(np.ascontiguousarray(labels, dtype=np.int32), int(label), *extent.tolist())
+    return rows, columns
+
+
+@kernel
+def _pixels(
+    labels: np.ndarray, label: int, count: int, top: int, bottom: int, left: int, right: int
+) -> tuple[np.ndarray, np.ndarray]:
+    rows, columns, n = np.empty(count, np.int64), np.empty(count, np.int64), 0
+    for v in range(top, bottom):
+        for u in range(left, right):
+            if labels[v, u] == label:
+                rows[n], columns[n] = v, u
+                n += 1
+    return rows, columns
 
 
 @kernel
