@@ -225,7 +225,7 @@ def _on_one_surface(depth: np.ndarray, valid: np.ndarray, camera: Camera) -> lis
     jumps = depth_steps.edges(np.where(kept, coarse, np.float32(0)), kept, k * depth_steps.STEP)
     labels = depth_steps.components(kept & ~jumps)
     extents, surfaces = regions.extents(labels), []
-    for label in np.flatnonzero(extents[:, 0] > 0.02 * extents[:, 0].sum()):
+    for label in np.flatnonzero(extents[:, 0] > 0.02 * extents[:, 0].sum()).tolist():
         rows, columns = regions.pixels(labels, label, extents[label])
         size, top, bottom, left, right = extents[label].tolist()
         inside = min(top, left, labels.shape[0] - bottom, labels.shape[1] - right) > 0

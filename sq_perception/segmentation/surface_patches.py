@@ -211,9 +211,9 @@ def _chord_noise(every_inverse: np.ndarray, flat: np.ndarray | None, chord: _Cho
     if flat is not None:
         inverse, known = _mean(every_inverse, flat, chord)
         both = (_bends(inverse, known, 0, chord.rho), _bends(inverse, known, chord.rho, 0))
-        both = [1.4826 * _middle(bends) for bends in both if bends.size >= _FEWEST_CHORDS]
-        if both:
-            return max(both)
+        told = [bends for bends in both if bends.size >= _FEWEST_CHORDS]
+        if told:
+            return 1.4826 * max(map(_middle, told))
     return _CHORD_NOISE * sigma / (2 * chord.half + 1)
 
 
@@ -250,7 +250,7 @@ def _middle(numbers: np.ndarray) -> float:
     while left >= counts[low]:
         left -= counts[low]
         low += 1
-    return np.float64(np.array([high << 16 | low], np.uint32).view(np.float32)[0])
+    return float(np.array([high << 16 | low], np.uint32).view(np.float32)[0])
 
 
 def _mean(image: np.ndarray, wanted: np.ndarray, chord: _Chord) -> tuple[np.ndarray, np.ndarray]:
