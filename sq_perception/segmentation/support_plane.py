@@ -170,13 +170,13 @@ def _dominant_plane(points: np.ndarray, rng: np.random.Generator) -> tuple[np.nd
     weighted = np.stack([*few.T, np.ones(len(few))]).astype(np.float32) * weight
     plane = candidates[np.argmax(_votes(candidates.astype(np.float32), weighted))]
     growth = noise_growth(points[:, 2])
-    reach, weights = TOLERANCE * growth, growth**-2
+    reach, weights, rows = TOLERANCE * growth, growth**-2, np.ascontiguousarray(points.T)
     for share in (1.0, 1.0, 0.5):
-        inside = np.abs(points @ plane[:3] + plane[3]) < share * reach
+        inside = np.abs(plane[:3] @ rows + plane[3]) < share * reach
         if np.count_nonzero(inside) < 12:
             return None, inside
-        plane = _least_squares_plane(points, weights * inside)
-    return plane, np.abs(points @ plane[:3] + plane[3]) < reach
+        plane = _least_squares_plane(rows, weights * inside)
+    return plane, np.abs(plane[:3] @ rows + plane[3]) < reach
 
 
 @kernel
@@ -191,10 +191,10 @@ def _votes(planes: np.ndarray, points: np.ndarray) -> np.ndarray:
 
 
 def _least_squares_plane(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """The plane (4,) through weighted points, normal towards the camera."""
-    middle = weights @ points / weights.sum()
-    centred = points - middle
-    _, axes = np.linalg.eigh((weights[:, None] * centred).T @ centred)
+    """The plane (4,) through weighted points (3, n), normal towards the camera."""
+    middle = points @ weights / weights.sum()
+    centred = points - middle[:, None]
+    _, axes = np.linalg.eigh((weights * centred) @ centred.T)
     normal = axes[:, 0]
     offset = -normal @ middle
     return np.append(normal, offset) * (1.0 if offset > 0 else -1.0)
