@@ -21,6 +21,16 @@ def pixels(labels: np.ndarray, label: int, extent: np.ndarray) -> tuple[np.ndarr
 
 
 @kernel
+def renumbered(labels: np.ndarray, number: np.ndarray) -> np.ndarray:
+    """Labels int32 (height, width) with other ones in their place: number (count + 1,) of each."""
+    found = np.empty(labels.shape, np.int32)
+    for v in range(labels.shape[0]):
+        for u in range(labels.shape[1]):
+            found[v, u] = number[labels[v, u]]
+    return found
+
+
+@kernel
 def _pixels(
     labels: np.ndarray, label: int, count: int, top: int, bottom: int, left: int, right: int
 ) -> tuple[np.ndarray, np.ndarray]:

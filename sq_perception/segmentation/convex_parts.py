@@ -131,7 +131,7 @@ def corrected(
             piece = image.of_pixels(name, *pixels, _FEW)
             if piece is not None:
                 parts.append(piece)
-    number_of = np.arange(count + 1)
+    number_of = np.arange(count + 1, dtype=np.int32)
     if len(parts) > 1:
         names = np.array([part.label for part in parts])
         crossed = image.crossed_between(parts, _NEAR)
@@ -141,7 +141,7 @@ def corrected(
         group = _linked(crossed, np.array([len(part.z) for part in parts], float), _ONE_BODY)
         first = np.unique(group, return_index=True)[1]
         number_of[names] = names[first[group]]
-    return number_of[result]
+    return regions.renumbered(result, number_of)
 
 
 def parts(

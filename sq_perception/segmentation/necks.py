@@ -97,7 +97,7 @@ def joined(labels: np.ndarray, depth: np.ndarray, camera: Camera, plane: np.ndar
     ``depth`` is 0 where nothing was measured; ``plane`` (4,) is the support, height above it = n.p + d.
     """
     up = plane[:3]
-    sideways = np.cross(up, (0.0, 0.0, 1.0))
+    sideways = np.array([up[1], -up[0], 0.0])
     slant = float(np.linalg.norm(sideways))
     if slant < _LEAST_SLANT:
         return labels

@@ -151,7 +151,7 @@ def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | No
         return Segmentation(np.zeros(depth.shape, np.int32), None, ())
     planes = support_plane.planes(depth, valid, camera)
     plane = support_plane.support(planes, depth, valid, camera)
-    known = np.where(valid, depth, np.float32(0))
+    known = cv2.copyTo(depth, valid.view(np.uint8))  # and 0 elsewhere
     limits = standing.Limits(options.max_size, options.workspace, options.workspace_pose)
     if plane is None:
         labels = _bodies(known, valid, camera, _UNKNOWN_SIGMA, limits.is_small)
@@ -161,7 +161,7 @@ def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | No
     walls = [other for other in planes if other is not plane]
     # What is out of range holds things up and hides them all the same.
     everything, measured = _checked(depth, camera, (0.0, np.inf))
-    everything = np.where(measured, everything, np.float32(0))
+    everything = cv2.copyTo(everything, measured.view(np.uint8))
     relative = support.image_relative(everything, camera)
     labels = _above(known, relative * valid, valid, camera, support, walls, limits)
     test = standing.standing(everything, relative, camera, support, walls, limits)
@@ -321,7 +321,8 @@ def _bodies(
     # What is too small for a patch stays what the steps made of it.
     rest = cv2.morphologyEx((wanted & (labels == 0)).view(np.uint8), cv2.MORPH_OPEN, depth_steps.CROSS)
     rest = depth_steps.components(rest)
-    return np.where(rest > 0, rest + labels.max(), labels).astype(np.int32)
+    rest[rest > 0] += labels.max()
+    return labels + rest
 
 
 def _refined(body: np.ndarray, patches: surface_patches.Patches, depth: np.ndarray, wanted: np.ndarray) -> np.ndarray:
@@ -374,4 +375,4 @@ def _ordered(
         if accept is None or accept(*regions.pixels(labels, label, extents[label])):
             kept += 1
             number[label] = kept
-    return number[labels], tuple(range(1, kept + 1))
+    return regions.renumbered(labels, number), tuple(range(1, kept + 1))

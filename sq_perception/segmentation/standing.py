@@ -182,9 +182,9 @@ def standing(
         Other planes of the image.
     """
     last_row, last_column = camera.height - 1, camera.width - 1
-    measured = np.count_nonzero(depth)
+    around = depth > 0
+    measured = np.count_nonzero(around)
     plane = support.plane
-    around = np.where(depth > 0, relative, np.float32(np.inf))
 
     def is_thing(rows: np.ndarray, columns: np.ndarray) -> bool:
         step = max(1, rows.size // _SAMPLES)
@@ -192,7 +192,7 @@ def standing(
         points = camera.unproject(c, r, depth[r, c])
         growth = noise_growth(points[:, 2])
         height = relative[r, c]
-        noise = max(support.sigma, _spread(around, rows, columns, HIGHEST * TOLERANCE))
+        noise = max(support.sigma, _spread(relative, around, rows, columns))
         if _top(height * growth) < MIN_HEIGHT or _top(height) < _BUMP * noise:
             return False
         at_border = rows.min() == 0 or columns.min() == 0 or rows.max() == last_row or columns.max() == last_column
@@ -207,23 +207,24 @@ def standing(
             return False
         if not _stands(points, depth, relative, camera, plane):
             return False
-        around[rows, columns] = np.inf
+        around[rows, columns] = False
         return True
 
     return is_thing
 
 
-def _spread(around: np.ndarray, rows: np.ndarray, columns: np.ndarray, highest: float) -> float:
+def _spread(relative: np.ndarray, around: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> float:
     """Deviation of the support's heights beside a segment from 0, 0 where too little of it is seen.
 
-    Noise grows at the rims of an image and where light is reflected to and fro; things are inf.
+    Noise grows at the rims of an image and where light is reflected to and fro; ``around`` is false on other things.
     """
     top, left = max(int(rows.min()) - _BESIDE, 0), max(int(columns.min()) - _BESIDE, 0)
-    beside = around[top : int(rows.max()) + _BESIDE + 1, left : int(columns.max()) + _BESIDE + 1]
-    mask = np.zeros(beside.shape, np.uint8)
+    window = slice(top, int(rows.max()) + _BESIDE + 1), slice(left, int(columns.max()) + _BESIDE + 1)
+    heights = np.abs(relative[window])
+    mask = np.zeros(heights.shape, np.uint8)
     mask[rows - top, columns - left] = 1
     near, ring = (cv2.dilate(mask, np.ones((2 * k + 1, 2 * k + 1), np.uint8)) for k in (_SMEARED, _BESIDE))
-    heights = np.abs(beside[(ring > near) & (np.abs(beside) < highest)])
+    heights = heights[(ring > near) & around[window] & (heights < HIGHEST * TOLERANCE)]
     return 1.4826 * quantile(heights, 0.5) if heights.size >= _FEWEST else 0.0
 
 

@@ -29,7 +29,7 @@ import cv2
 import numpy as np
 
 from sq_perception.geometry.kernels import kernel
-from sq_perception.imaging import depth_steps
+from sq_perception.imaging import depth_steps, regions
 from sq_perception.imaging.camera import Camera
 
 _RADIUS = 0.01
@@ -131,7 +131,7 @@ def find(
     Patches or None
         None where nothing as large as a patch is wanted, or bodies are too far to show the chord in two pixels.
     """
-    filled = np.where(wanted, depth, np.float32(0))
+    filled = cv2.copyTo(depth, wanted.view(np.uint8))  # and 0 elsewhere
     some = filled[::4, ::4]
     some = some[some > 0]
     if some.size == 0:
@@ -270,43 +270,39 @@ def _steps(filled: np.ndarray, wanted: np.ndarray, stride: int) -> np.ndarray:
     return cv2.dilate(near, np.ones((size, size), np.uint8))[::stride, ::stride] > 0
 
 
+@kernel
 def _fold(inverse: np.ndarray, known: np.ndarray, rho: int, pixel: float) -> np.ndarray:
     """s (rows, columns), the strongest over the directions; NaN where no chord lies within the known."""
     rows, columns = inverse.shape
-    padded = np.pad(inverse, rho)
-    unknown = (~known).astype(np.uint8)
     strongest = np.full(inverse.shape, np.nan, np.float32)
-    size = np.full(inverse.shape, -1, np.float32)
-    reciprocal = 1 / np.where(known, inverse, np.float32(1))
     for down, right in _DIRECTIONS:
-        reach = rho if 0 in (down, right) else max(1, round(rho / np.sqrt(2)))
-        length = reach * float(np.hypot(down, right))
-        kernel = np.zeros((2 * rho + 1, 2 * rho + 1), np.uint8)
-        t = np.arange(-reach, reach + 1)
-        kernel[rho + t * down, rho + t * right] = 1
-        told = cv2.dilate(unknown, kernel, borderType=cv2.BORDER_CONSTANT, borderValue=1) == 0
-        a, b = rho + reach * down, rho + reach * right
-        c, d = rho - reach * down, rho - reach * right
-        s = 0.5 * (padded[a : a + rows, b : b + columns] + padded[c : c + rows, d : d + columns]) - inverse
-        s *= reciprocal / np.float32(length * pixel)
-        better = told & (np.abs(s) > size)
-        strongest[better] = s[better]
-        size[better] = np.abs(s[better])
+        reach = rho if down * right == 0 else max(1, round(rho / np.sqrt(2)))
+        length = np.float32(reach * np.hypot(down, right) * pixel)
+        margin = reach * abs(right)
+        for v in range(reach * down, rows - reach * down):
+            for u in range(margin, columns - margin):
+                told = known[v, u]
+                for t in range(-reach, reach + 1):
+                    told = told and known[v + t * down, u + t * right]
+                if told:
+                    a, b = inverse[v - reach * down, u - reach * right], inverse[v + reach * down, u + reach * right]
+                    s = (np.float32(0.5) * (a + b) - inverse[v, u]) / (inverse[v, u] * length)
+                    if not abs(s) <= abs(strongest[v, u]):
+                        strongest[v, u] = s
     return strongest
 
 
 def _large(mask: np.ndarray, least: int) -> np.ndarray:
     """Components of a mask with at least so many samples, the largest ones if there are very many; labels from 1."""
     labels = depth_steps.components(mask)
-    counts = np.bincount(labels.ravel())
-    counts[0] = 0
+    counts = regions.extents(labels)[:, 0]
     kept = counts >= least
     if np.count_nonzero(kept) > _MOST_PATCHES:
         kept = np.zeros(len(counts), bool)
         kept[np.argsort(-counts, kind="stable")[:_MOST_PATCHES]] = True
     number = np.zeros(len(counts), np.int32)
     number[kept] = np.arange(1, np.count_nonzero(kept) + 1)
-    return number[labels]
+    return regions.renumbered(labels, number)
 
 
 def _shapes(
