@@ -281,9 +281,11 @@ def _fold(inverse: np.ndarray, known: np.ndarray, rho: int, pixel: float) -> np.
         margin = reach * abs(right)
         for v in range(reach * down, rows - reach * down):
             for u in range(margin, columns - margin):
-                told = known[v, u]
+                if not known[v, u]:
+                    continue
+                told = True
                 for t in range(-reach, reach + 1):
-                    told = told and known[v + t * down, u + t * right]
+                    told &= known[v + t * down, u + t * right]
                 if told:
                     a, b = inverse[v - reach * down, u - reach * right], inverse[v + reach * down, u + reach * right]
                     s = (np.float32(0.5) * (a + b) - inverse[v, u]) / (inverse[v, u] * length)
