@@ -176,7 +176,9 @@ def _count(found: list[MatchedThing], frame: FrameRecovery) -> str:
     extra = len(frame.recovered) - matched_bodies
     text = f"{matched_bodies} of {len(found)} things found"
     text += f" (missed: {', '.join(missed)})" if missed else ""
-    return text + (f", {extra} bodies too many{_where(found, frame)}." if extra else ", no body too many.")
+    if not extra:
+        return text + ", no body too many."
+    return text + f", {extra} {'body' if extra == 1 else 'bodies'} too many{_where(found, frame)}."
 
 
 def _where(found: list[MatchedThing], frame: FrameRecovery) -> str:
