@@ -23,7 +23,7 @@ class Status(IntEnum):
 
     CONVERGED = 0
     WEAK = 1
-    """Converged, but the view does not determine every quantity: see the message."""
+    """Converged, but the view does not determine every quantity, or part of a thing sticks out: see the message."""
     FAILED = 2
     """No body: too few points, no convergence, or a residual far above the noise."""
 

@@ -228,6 +228,7 @@ class Crop:
 
 
 def _some(pixels: np.ndarray, areas: np.ndarray, count: int, offset: float) -> np.ndarray:
+    """All pixels, or about ``count`` of them, evenly by area."""
     return pixels if len(pixels) <= count else drawn(pixels, areas, count, offset)
 
 

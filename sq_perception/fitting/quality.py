@@ -44,14 +44,12 @@ def assessed(solution: Solution, began: float) -> Fit:
     if solution.as_hull:
         # A hollow thing lies inside its hull: only what sticks out speaks against the body.
         typical = quantile(np.maximum(outside, 0.0), _REACHED)
-    strays = max(FAILED_SHARE * float(canonical.size.min()), _FAILED_LEVELS * observation.sigma)
-    bearable = max(strays, _ENCLOSED_SHARE * float(canonical.size.min())) if solution.as_hull else strays
-    status, message = _status(canonical, covariance, typical, strays, bearable)
+    reached, message = status(canonical, covariance, typical, observation.sigma, solution.as_hull)
     cut = (CUT_SHORT,) if solution.problem.late else ()
     return Fit(
         superquadric=canonical,
         residual=residual,
-        status=status,
+        status=reached,
         message="; ".join([message, *solution.notes, *cut]),
         noise=observation.sigma,
         inlier_share=float(inlying.mean()),
@@ -85,11 +83,18 @@ def failed(body: Superquadric, observation: Observation, reason: str, began: flo
     )
 
 
-def _status(
-    body: Superquadric, covariance: np.ndarray, typical: float, strays: float, bearable: float
+def status(
+    body: Superquadric, covariance: np.ndarray, typical: float, sigma: float, as_hull: bool
 ) -> tuple[Status, str]:
-    """The status and its reason, without lengths: only the reader of the image knows their unit."""
-    off = f"many of the points lie {typical / float(body.size.min()):.0%} of its smallest half size and more off"
+    """The status and its reason, without lengths: only the reader of the image knows their unit.
+
+    Points miss the body typically by ``typical`` metres, or stick out of one like the hull so far; ``sigma`` is the
+    noise and the model error, metres, ``covariance`` (11, 11).
+    """
+    smallest = float(body.size.min())
+    strays = max(FAILED_SHARE * smallest, _FAILED_LEVELS * sigma)
+    bearable = max(strays, _ENCLOSED_SHARE * smallest) if as_hull else strays
+    off = f"many of the points lie {typical / smallest:.0%} of its smallest half size and more off"
     if typical > bearable:
         return Status.FAILED, f"no superquadric found: {off} the best one"
     weak = [_AXES[k] for k in np.flatnonzero(undetermined(covariance, body.size))]

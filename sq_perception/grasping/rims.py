@@ -4,8 +4,8 @@ Bodies are convex and know of no cavity, measured points do.  At a bearing aroun
 within some millimetres of the highest points there, if that is as thin as a wall.  There is a cavity behind it if the
 image shows something farther away than the places where the end of the inner finger comes to be.
 
-The margins are those of :mod:`sq_perception.grasping.planner` with the points' sigma.  Walls weigh
-a share of what a full body would; the pads hold their torque about the tangent by as much as they overlap.
+The margins are those of :mod:`sq_perception.grasping.planner` with the points' sigma.  Walls weigh a share of what a
+full body would; the pads hold their torque about the tangent by as much as they overlap.
 
 Metres, in the frame of the bodies.
 """

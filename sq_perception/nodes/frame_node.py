@@ -36,9 +36,10 @@ from sq_perception.nodes.live_parameters import LiveParameters
 from sq_perception.nodes.managed_node import ManagedNode
 from sq_perception.nodes.outputs import Outputs, pose_in
 from sq_perception.nodes.parameters import RecoverParameters
-from sq_perception.nodes.statistics import THROTTLE, Standing, Statistics, timed
+from sq_perception.nodes.statistics import THROTTLE, Standing, Statistics
 from sq_perception.nodes.tracking import CameraPoses, Tracking
 from sq_perception.recordings.publication import Findings
+from sq_perception.recovery.recovery import timed
 
 _WORKER_END = 3.0
 """Seconds that a deactivation waits for the frame at hand."""

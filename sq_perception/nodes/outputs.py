@@ -36,11 +36,12 @@ from sq_msgs_py.superquadrics import to_message
 from sq_msgs_py.transforms import transforms
 from sq_perception.nodes.frame import Frame
 from sq_perception.nodes.parameters import RecoverParameters
-from sq_perception.nodes.statistics import THROTTLE, timed
+from sq_perception.nodes.statistics import THROTTLE
 from sq_perception.nodes.tracking import CameraPoses, Pose, PoseError
 from sq_perception.recordings import publication
 from sq_perception.recordings.publication import Findings, Identified
 from sq_perception.recovery.recoverer import render_recovery
+from sq_perception.recovery.recovery import timed
 
 _OVERRIDABLE = tuple(getattr(QoSPolicyKind, name) for name in ("HISTORY", "DEPTH", "RELIABILITY", "DURABILITY"))
 _LATCHED = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)

@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import threading
 from collections import Counter, deque
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from datetime import datetime, timezone
-from time import monotonic, perf_counter
+from time import monotonic
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
@@ -27,14 +26,6 @@ _SLOW = 3.0
 """Seconds after which a frame without an outcome tells of more than a start."""
 Standing = tuple[bytes, str]
 """Level and message of a DiagnosticStatus."""
-
-
-@contextmanager
-def timed(milliseconds: dict[str, float], stage: str) -> Iterator[None]:
-    """Enter the duration of the block."""
-    started = perf_counter()
-    yield
-    milliseconds[stage] = 1e3 * (perf_counter() - started)
 
 
 class Statistics:

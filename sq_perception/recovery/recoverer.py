@@ -27,9 +27,8 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import TypeAlias, TypeVar
@@ -48,7 +47,7 @@ from sq_perception.learning.consensus import Consensus
 from sq_perception.recovery import continuity, methods, prediction, seen_object, segment_repair
 from sq_perception.recovery.continuity import Reference
 from sq_perception.recovery.options import FITTED, NEEDS_NETWORK, Method, RecoveryOptions, Refine
-from sq_perception.recovery.recovery import FrameRecovery, Recovery
+from sq_perception.recovery.recovery import FrameRecovery, Recovery, timed
 from sq_perception.recovery.seen_object import SeenObject
 from sq_perception.segmentation import segments
 
@@ -191,7 +190,7 @@ class Recoverer:
             is_fitted = options.method == "auto" and options.refine == "surface"
             network = self._load_network(camera.is_pinhole and is_fitted)
 
-        with _timed(milliseconds, "segmentation"):
+        with timed(milliseconds, "segmentation"):
             depth = _plausible(np.asarray(depth), camera)
             camera.check_image(depth)
             cleaned, kept = _cleaned(depth, camera), continuity.NOTHING
@@ -209,24 +208,24 @@ class Recoverer:
             objects = seen_object.objects(depth, found, camera, options.depth_range)
             same = {} if previous is None else continuity.matched(kept, previous.labels, objects)
 
-        with _timed(milliseconds, "network"):
+        with timed(milliseconds, "network"):
             fresh = [one for one in objects if one.label not in same]
             config = None if network is None else network.config
             fresh = self._mapped(lambda one: seen_object.viewed(one, depth, camera, found, options, config), fresh)
             if network is not None:
                 fresh = self._predicted(fresh, network, options)
 
-        with _timed(milliseconds, "fit"):
+        with timed(milliseconds, "fit"):
             deadline = started + options.time_budget
             fits = self._mapped(lambda one: methods.fitted(one, depth, camera, options, deadline), fresh)
             fit_of = {one.label: fit for one, fit in zip(fresh, fits, strict=True)}
             known = {one.label: one for one in fresh}
             objects = [known.get(one.label, one) for one in objects]
             fits = [same[one.label].fit if one.label in same else fit_of[one.label] for one in objects]
-        with _timed(milliseconds, "repair"):
+        with timed(milliseconds, "repair"):
             if labels is None and options.repair and options.method in FITTED and options.refine == "surface":
                 found, objects, fits = _repaired(found, objects, fits, depth, camera, options, deadline)
-        with _timed(milliseconds, "score"):
+        with timed(milliseconds, "score"):
             pairs = list(zip(objects, fits, strict=True))
 
             def recovery(pair: tuple[SeenObject, Fit]) -> Recovery:
@@ -381,12 +380,3 @@ def _why_empty(depth: np.ndarray, found: segments.Segmentation) -> str:
     if found.plane is not None:
         return "nothing stands on the plane"
     return "no object of the wanted size and distance"
-
-
-@contextmanager
-def _timed(milliseconds: dict[str, float], stage: str) -> Iterator[None]:
-    started = time.perf_counter()
-    try:
-        yield
-    finally:
-        milliseconds[stage] = 1e3 * (time.perf_counter() - started)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -103,3 +106,13 @@ class FrameRecovery:
     def recovered(self) -> tuple[Recovery, ...]:
         """The bodies that did not fail."""
         return tuple(body for body in self.bodies if body.status != Status.FAILED)
+
+
+@contextmanager
+def timed(milliseconds: dict[str, float], stage: str) -> Iterator[None]:
+    """Enter the duration of the block, by the clock on the wall."""
+    started = time.perf_counter()
+    try:
+        yield
+    finally:
+        milliseconds[stage] = 1e3 * (time.perf_counter() - started)

@@ -119,4 +119,4 @@ def joined(labels: np.ndarray, depth: np.ndarray, camera: Camera, plane: np.ndar
             nearest = min(below, key=lambda one: abs(profiles[one].away - profiles[label].away))
             profiles[nearest] = profiles[nearest].with_(profiles.pop(label))
             number[number == label] = nearest
-    return number[labels] if (number != np.arange(len(number))).any() else labels
+    return regions.renumbered(labels, number)

@@ -232,13 +232,12 @@ def _stands(points: np.ndarray, depth: np.ndarray, relative: np.ndarray, camera:
     """Whether the support is under points (n, 3), as far as the camera tells; what the image cuts off tells nothing."""
     normal = plane.equation[:3]
     under = plane.height(points) + _UNDER * TOLERANCE * noise_growth(points[:, 2])
-    x, y, z = (points - under[:, None] * normal).T
-    ahead = z > 0
-    columns = np.rint(camera.fx * x[ahead] / z[ahead] + camera.cx).astype(int)
-    rows = np.rint(camera.fy * y[ahead] / z[ahead] + camera.cy).astype(int)
-    inside = (columns >= 0) & (rows >= 0) & (columns < camera.width) & (rows < camera.height)
-    columns, rows = columns[inside], rows[inside]
+    feet = points - under[:, None] * normal
+    feet = feet[feet[:, 2] > 0]
+    at = np.rint(camera.project(feet))
+    inside = (at >= 0).all(axis=1) & (at[:, 0] < camera.width) & (at[:, 1] < camera.height)
+    columns, rows = at[inside].astype(int).T
     told = depth[rows, columns] > 0
     past = np.count_nonzero(told & (relative[rows, columns] < -_BELOW * TOLERANCE))
     held = np.count_nonzero(told) - past
-    return past <= held and held + np.count_nonzero(~inside) >= _TOLD * np.count_nonzero(ahead)
+    return past <= held and held + np.count_nonzero(~inside) >= _TOLD * len(feet)

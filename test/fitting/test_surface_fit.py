@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 import pytest
 
-from sq_perception.fitting import covariance, surface_fit
+from sq_perception.fitting import covariance, quality, surface_fit
 from sq_perception.fitting.bounds import Bounds
 from sq_perception.fitting.fit import CUT_SHORT, Fit, Status
 from sq_perception.fitting.observation import Crop
@@ -499,6 +499,24 @@ def test_an_outline_that_a_sensor_smeared_does_not_widen_the_body() -> None:
     pixel = 0.45 / CAMERA.fx
     assert usual > 0.5 * pixel
     assert abs(known) < 0.3 * usual
+
+
+@pytest.mark.parametrize(
+    ("typical", "as_hull", "status"),
+    [
+        (0.004, False, Status.CONVERGED),
+        (0.006, False, Status.FAILED),
+        (0.006, True, Status.WEAK),
+        (0.019, True, Status.WEAK),
+        (0.021, True, Status.FAILED),
+    ],
+)
+def test_a_hull_that_encloses_most_of_a_thing_is_weak(typical: float, as_hull: bool, status: Status) -> None:
+    """A quarter of the smallest half size, 20 mm, may stray; of what sticks out of a hull, all of it."""
+    body = Superquadric([0.02, 0.03, 0.04], [0.5, 0.5], [0.0, 0.0, 0.5], [0.0, 0.0, 0.0, 1.0])
+    found, message = quality.status(body, 1e-8 * np.eye(11), typical, 1e-4, as_hull)
+    assert found == status
+    assert ("off" in message) == (status != Status.CONVERGED)
 
 
 def test_a_thin_thing_keeps_its_edges() -> None:
