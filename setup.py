@@ -108,7 +108,7 @@ setup(
         "threadpoolctl>=3",  # keeps BLAS from threading products of 2000 x 3, which took the second core from the fits
         "pyyaml>=6",  # camera_info files, training configurations
         "matplotlib>=3.7",  # pictures
-        "pillow>=9.1",  # animated GIFs; Matplotlib brings it anyway
+        "pillow>=9.1",  # sizes of images before OpenCV decodes them; Matplotlib brings it anyway
         "rich>=13",  # the live table of the demo
     ],
     extras_require={

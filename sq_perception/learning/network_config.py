@@ -32,8 +32,6 @@ HALF_WAY = 0.5
 """Depth at which a pixel without a surface is given its height above the plane."""
 LEAST_LOG, MOST_LOG = -5.0, 0.5
 """Limits of log sigma: 0.7 % of the view's side, what a mask's pixel is, and more than the side."""
-_EDGE = 1e-3
-"""How near to the ends of their ranges bodies can be encoded."""
 
 
 @dataclass(frozen=True)
@@ -88,30 +86,6 @@ class RegressorConfig:
             _between(self.translation_range, unit[..., 5:8]),
             quaternions.from_six(raw[..., 8:]),
         )
-
-    def encode(self, bodies: Superquadric) -> np.ndarray:
-        """Outputs (n, 14) that :meth:`decode` turns into these NumPy bodies (n,).
-
-        A sigmoid reaches its ends at infinity only, and has no slope there: parameters on a limit, or beyond it by less
-        than a thousandth of the range, are moved that far into it.
-
-        Raises
-        ------
-        ValueError
-            For a body outside of the ranges.
-        """
-        low, high = self.size_range
-        shares = (
-            ("size", np.log(bodies.size / low) / np.log(high / low), self.size_range),
-            ("shape", _share(self.shape_range, bodies.shape), self.shape_range),
-            ("translation", _share(self.translation_range, bodies.translation), self.translation_range),
-        )
-        for name, share, limits in shares:
-            if (share < -_EDGE).any() or (share > 1 + _EDGE).any():
-                raise ValueError(f"{name}: expected values in {limits}, got {getattr(bodies, name)}")
-        unit = np.clip(np.concatenate([share for _, share, _ in shares], axis=-1), _EDGE, 1 - _EDGE)
-        matrix = bodies.rotation_matrix
-        return np.concatenate([np.log(unit / (1 - unit)), matrix[..., :, 0], matrix[..., :, 1]], axis=-1)
 
     def view_of(
         self, depth: np.ndarray, mask: np.ndarray, camera: Camera, plane: np.ndarray | None = None
@@ -189,8 +163,3 @@ def checked_views(views: np.ndarray, config: RegressorConfig) -> np.ndarray:
 def _between(bounds: tuple[float, float], unit: Array) -> Array:
     low, high = bounds
     return low + (high - low) * unit
-
-
-def _share(bounds: tuple[float, float], value: Array) -> Array:
-    low, high = bounds
-    return (value - low) / (high - low)
