@@ -54,7 +54,6 @@ cluster = [
 torch = "torch>=2.3,<2.15"  # the tests of learning pass with 2.3.0, 2.13.0 and 2.14.1
 train = [
     torch,  # training, graphics cards, ResNet-18 and the soft renderer
-    "tensorboard>=2.14",  # curves of a running training
 ]
 export = [
     torch,

@@ -1,4 +1,4 @@
-"""``python -m sq_perception``: the command ``sq-perception``, also for torchrun."""
+"""``python -m sq_perception``: the command ``sq-perception``."""
 
 from sq_perception.commands.main import main
 

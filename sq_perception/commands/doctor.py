@@ -20,7 +20,7 @@ _EXTRAS = {
     "bags": ("rosbags", "mcap"),
     "view": ("viser",),
     "exr": ("OpenEXR",),
-    "train": ("torch", "tensorboard"),
+    "train": ("torch",),
     "export": ("torch", "onnx"),
     "ros": ("rclpy", "sensor_msgs", "visualization_msgs"),
 }

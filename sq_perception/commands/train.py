@@ -22,7 +22,6 @@ _EPILOG = """\
 examples:
   sq-perception train --steps 20000 --output runs/compact
   sq-perception train --config render --output runs/render
-  torchrun --nproc-per-node 2 -m sq_perception train --device cuda --output runs/two
 """
 
 

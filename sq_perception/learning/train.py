@@ -35,7 +35,6 @@ from sq_perception.learning.dataset import ViewPool, ViewSource, draw_views
 from sq_perception.learning.disturbance import Disturbance, any_occluder
 from sq_perception.learning.fixed_set import FixedSet, ShuffledBatches
 from sq_perception.learning.objective import Objective
-from sq_perception.learning.processes import Processes, joined
 from sq_perception.learning.regressor import Regressor, RegressorConfig
 from sq_perception.learning.training_config import TrainingConfig
 from sq_perception.learning.training_log import TrainingLog
@@ -87,8 +86,19 @@ def train(config: TrainingConfig, output: Path, network: RegressorConfig | None 
     ValueError
         For a device that this machine does not have, or data of another form.
     """
-    with _threads(config.threads), joined(config.device) as processes, _stop_requests() as stop_requested:
-        return _train(config, output, network, processes, stop_requested)
+    device = _device(config.device)
+    with _threads(config.threads), _stop_requests() as stop_requested:
+        return _train(config, output, network, device, stop_requested)
+
+
+def _device(name: str) -> torch.device:
+    try:
+        device = torch.device(name)
+    except RuntimeError as error:
+        raise ValueError(f"device: {error}") from error
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise ValueError(f"device: {name!r} was asked for, but torch sees no CUDA device here")
+    return device
 
 
 def _check_same_run(config: TrainingConfig, output: Path) -> None:
@@ -109,10 +119,10 @@ def _train(
     config: TrainingConfig,
     output: Path,
     network: RegressorConfig | None,
-    processes: Processes,
+    device: torch.device,
     stop_requested: Callable[[], bool],
 ) -> Regressor:
-    device, objective = processes.device, config.objective()
+    objective = config.objective()
     output.mkdir(parents=True, exist_ok=True)
     _check_same_run(config, output)
     torch.manual_seed(config.seed)
@@ -122,15 +132,14 @@ def _train(
     path = output / "state.safetensors"
     if path.exists():
         state.restore(path)
-    seed = np.random.SeedSequence([config.seed, state.step, processes.rank])
+    seed = np.random.SeedSequence([config.seed, state.step])
     generator = torch.Generator(device=device).manual_seed(int(seed.generate_state(1)[0]))
     batches = _batches(config, model.config, np.random.default_rng(seed))
-    validation = _validation_sets(config, model.config) if processes.is_first else {}
+    validation = _validation_sets(config, model.config)
     notes = {"training": asdict(config), "made": provenance.facts("sq-perception train")}
     if device.type == "cuda":
         notes["made"]["device"] = torch.cuda.get_device_name(device)
-    parallel = processes.wrapped(model)
-    log = TrainingLog(output if processes.is_first else None, config.steps, state.step)
+    log = TrainingLog(output, config.steps, state.step)
     started, saved, losses = time.monotonic() - state.seconds, time.monotonic(), []
     try:
         while state.step < config.steps and not (config.schedule == "plateau" and state.plateau.exhausted):
@@ -143,10 +152,10 @@ def _train(
                 truth = Superquadric.from_flat(torch.from_numpy(labels.to_flat()).float().to(device))
             model.train()
             with torch.autocast(device.type, torch.bfloat16, enabled=config.bfloat16):
-                prediction = parallel(views)
+                prediction = model(views)
             loss = objective.loss(prediction, views, truth, progress, generator).mean()
             norm = state.descend(loss, rate)
-            if processes.any(not bool(torch.isfinite(loss) & torch.isfinite(norm))):
+            if not torch.isfinite(loss) & torch.isfinite(norm):
                 raise DivergedError(
                     f"step {state.step}: loss {loss.item():.4g}, norm of the gradient {norm.item():.4g}; "
                     f"{path if path.exists() else 'no state'} is the last good one. A smaller learning rate may help."
@@ -156,23 +165,21 @@ def _train(
             log.step(state.step, losses[-1])
 
             finished = state.step == config.steps
-            stopping = processes.any(stop_requested())
+            stopping = stop_requested()
             if state.step % config.validation == 0 or finished:
                 state.seconds = time.monotonic() - started
                 if config.average > 0:
                     calibration = batches.batch(max(CALIBRATION_VIEWS, config.batch))[0]
                     recalibrate(state.average, torch.from_numpy(calibration)[:, None], config.batch)
-                record: dict[str, Any] = {}
-                if processes.is_first:
-                    record = {"step": state.step, "loss": float(np.mean(losses)), "rate": rate}
-                    record |= {"sharpness": objective.sharpness(progress), "seconds": state.seconds}
-                    record |= _validated(state.average, validation, objective)
-                    log.record(record)
-                    _keep(output, state, record, notes)
-                state.plateau.validated(1 - processes.from_first(record.get("iou", 0.0)))
+                record = {"step": state.step, "loss": float(np.mean(losses)), "rate": rate}
+                record |= {"sharpness": objective.sharpness(progress), "seconds": state.seconds}
+                record |= _validated(state.average, validation, objective)
+                log.record(record)
+                _keep(output, state, record, notes)
+                state.plateau.validated(1 - record["iou"])
                 losses.clear()
             due = time.monotonic() - saved > _SAVE_SECONDS
-            if processes.is_first and (state.step % config.validation == 0 or finished or stopping or due):
+            if state.step % config.validation == 0 or finished or stopping or due:
                 state.seconds, saved = time.monotonic() - started, time.monotonic()
                 state.save(path)
             if stopping and not finished:

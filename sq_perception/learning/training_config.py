@@ -99,7 +99,7 @@ class TrainingConfig:
     threads: int = 0
     """CPU threads of the network, and of the rendering of its views; 0 leaves both their own choice."""
     device: str = "cpu"
-    """cpu or cuda; under torchrun each process takes its own device."""
+    """cpu or cuda."""
 
     def __post_init__(self) -> None:
         for name, choices in CHOICES.items():

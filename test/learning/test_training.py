@@ -1,9 +1,8 @@
-"""Training runs: configuration, schedules, what is left after a kill or a divergence, several processes."""
+"""Training runs: configuration, schedules, what is left after a kill or a divergence."""
 
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -21,7 +20,7 @@ from sq_perception.commands import main
 from sq_perception.geometry.metrics import volume_iou
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
-from sq_perception.learning import checkpoint, train, training_config, training_log
+from sq_perception.learning import checkpoint, train, training_config
 from sq_perception.learning.dataset import full_frames
 from sq_perception.learning.fixed_set import Settings, generate
 from sq_perception.learning.regressor import Regressor, RegressorConfig
@@ -201,18 +200,6 @@ class TestInterruptions:
             train.train(RUN, tmp_path, SMALL)
 
 
-class TestLog:
-    def test_tensorboard_gets_the_same_numbers(self, tmp_path: Path) -> None:
-        events = pytest.importorskip("tensorboard.backend.event_processing.event_accumulator", reason="no tensorboard")
-        log = training_log.TrainingLog(tmp_path, 10, 0)
-        log.record({"step": 5, "loss": 0.25, "iou": 0.5})
-        log.close()
-        written = events.EventAccumulator(str(tmp_path))
-        written.Reload()
-        assert [(e.step, e.value) for e in written.Scalars("iou")] == [(5, 0.5)]
-        assert [(e.step, e.value) for e in written.Scalars("loss")] == [(5, 0.25)]
-
-
 class TestContinuation:
     def test_average_follows_and_is_what_is_saved(self, tmp_path: Path) -> None:
         model = train.train(replace(RUN, average=0.0), tmp_path, SMALL)
@@ -272,43 +259,3 @@ class TestThesisSetting:
         other = replace(RUN, data=str(tmp_path / "set"))
         with pytest.raises(ValueError, match="expected cropped views of 32 pixels, got full ones of 64"):
             train.train(other, tmp_path / "other", SMALL)
-
-
-def test_two_processes_learn_one_network(tmp_path: Path) -> None:
-    """torchrun with two processes on the CPU: gradients are averaged, so that both have the same weights all along."""
-    script = tmp_path / "run.py"
-    script.write_text(
-        "import sys\n"
-        "from pathlib import Path\n"
-        "import torch\n"
-        "from safetensors.torch import save_file\n"
-        "from sq_perception.learning import train\n"
-        "from sq_perception.learning.regressor import RegressorConfig\n"
-        "from sq_perception.learning.training_config import TrainingConfig\n"
-        "import os\n"
-        "kept = []\n"
-        "step = torch.optim.AdamW.step\n"
-        "def watched(self, *rest):\n"
-        "    result = step(self, *rest)\n"
-        "    kept[:] = [w.detach().clone().contiguous() for g in self.param_groups for w in g['params']]\n"
-        "    return result\n"
-        "torch.optim.AdamW.step = watched\n"
-        "small = RegressorConfig(pixels=32, widths=(4, 8, 8), blocks=1, hidden=32)\n"
-        "config = TrainingConfig(steps=6, batch=8, points=32, validation=6, warm_up=2, threads=1)\n"
-        "train.train(config, Path(sys.argv[1]) / 'run', small)\n"
-        "save_file({str(k): w for k, w in enumerate(kept)}, f'{sys.argv[1]}/rank{os.environ[\"RANK\"]}.safetensors')\n"
-    )
-    command = [sys.executable, "-m", "torch.distributed.run", "--nproc-per-node", "2", "--standalone"]
-    done = subprocess.run(
-        [*command, str(script), str(tmp_path)],
-        capture_output=True,
-        text=True,
-        timeout=900,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr[-2000:]
-    weights = [load_file(str(tmp_path / f"rank{rank}.safetensors")) for rank in (0, 1)]
-    for name, first in weights[0].items():
-        torch.testing.assert_close(weights[1][name], first, rtol=0, atol=0)
-    assert len(log_of(tmp_path / "run")) == 1
