@@ -37,6 +37,7 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
     from sq_perception.recovery.recoverer import Recoverer
     from sq_perception.segmentation import segments
     from sq_perception.simulation import view_rendering
+    from sq_perception.tracking import association
 
     batch = Superquadric.from_flat(np.array([[0.1, 0.2, 0.3, 0.5, 0.8, 0, 0, 1, 0, 0, 0, 1]]))
     body = batch[0]
@@ -49,6 +50,7 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
         ("classic fit", lambda: solina_bajcsy.fit(points)),
         ("surface fit", surface_fit.warm_up),
         ("segmentation", segments.warm_up),
+        ("tracking", association.warm_up),
         ("grasps", planner.warm_up),
         ("a whole recovery", lambda: Recoverer().warm_up(Camera(160, 120, 150.0, 150.0, 79.5, 59.5))),
     ]

@@ -35,7 +35,7 @@ from array_api_compat import array_namespace, is_torch_array
 from scipy.special import beta
 
 from sq_perception.geometry import rotation as quaternions
-from sq_perception.geometry.body_numbers import LENGTHS, check, floating, is_body
+from sq_perception.geometry.body_numbers import LENGTHS, checked_turn, floating, one_body
 
 Array = Any
 """A NumPy array or a torch tensor."""
@@ -75,27 +75,26 @@ class Superquadric:
 
     def __post_init__(self) -> None:
         parts = [self.size, self.shape, self.translation, self.rotation]
+        if (numbers := one_body(parts)) is not None:
+            fixed = numbers[0:3], numbers[3:5], numbers[5:8], numbers[8:12]
+            self.__dict__.update(zip(LENGTHS, fixed, strict=True))
+            return
         tensors = [is_torch_array(part) for part in parts]
         if any(tensors) and not all(tensors):
             raise ValueError("a Superquadric is all NumPy or all torch, not a mixture")
         if not tensors[0]:
             parts = [floating(part) for part in parts]
-        single = True
         for (name, length), part in zip(LENGTHS.items(), parts, strict=True):
             if part.ndim == 0 or part.shape[-1] != length:
                 raise ValueError(f"{name}: expected shape (..., {length}), got {tuple(part.shape)}")
-            single = single and part.ndim == 1
         if tensors[0]:
             return
-        if not (single and is_body(*(part.tolist() for part in parts))):
-            check(parts)
-        rotation = parts[3]
-        parts[3] = rotation / np.sqrt(np.einsum("...i,...i->...", rotation, rotation))[..., None]
-        batch = () if single else np.broadcast_shapes(*(part.shape[:-1] for part in parts))
+        parts[3] = checked_turn(parts)
+        batch = np.broadcast_shapes(*{part.shape[:-1] for part in parts})
         for (name, length), part in zip(LENGTHS.items(), parts, strict=True):
-            fixed = part.view() if single else np.broadcast_to(part, (*batch, length))
-            fixed.setflags(write=False)  # as those of a batch
-            object.__setattr__(self, name, fixed)
+            shown = part.view() if part.shape[:-1] == batch else np.broadcast_to(part, (*batch, length))
+            shown.setflags(write=False)  # as those that were broadcast
+            self.__dict__[name] = shown
 
     # Batches and flat vectors
 

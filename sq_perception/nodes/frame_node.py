@@ -40,6 +40,7 @@ from sq_perception.nodes.statistics import THROTTLE, Standing, Statistics
 from sq_perception.nodes.tracking import CameraPoses, Tracking
 from sq_perception.recordings.publication import Findings
 from sq_perception.recovery.recovery import timed
+from sq_perception.tracking import association
 
 _WORKER_END = 3.0
 """Seconds that a deactivation waits for the frame at hand."""
@@ -116,6 +117,7 @@ class FrameNode(ManagedNode):
         started = perf_counter()
         self.get_logger().info("warming up: loading compiled code, or compiling it on the first start")
         self._engine.build(parameters)
+        association.warm_up()
         latest = self._settings.current
         meanwhile = {one.name for one in fields(latest) if getattr(latest, one.name) != getattr(parameters, one.name)}
         self._engine.follow(latest, frozenset(meanwhile))

@@ -24,11 +24,13 @@ whose sizes fit best, whatever the rotation.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
 
+from sq_perception.geometry.kernels import inline_kernel, kernel, support
 from sq_perception.tracking import forms, judgement, state
 from sq_perception.tracking.state import CENTRE, LENGTH, SIZE_AND_SHAPE
 
@@ -72,7 +74,8 @@ def in_place(
     """
     if not len(track) or not len(observed):
         return Pairs.none()
-    between, apart = _apart(track, observed)
+    apart = _apart(track, observed)
+    between = observed[None, :, 5:8] - track[:, None, 5:8]
     centres = track_covariance[:, None, CENTRE, CENTRE] + covariance[None, :, CENTRE, CENTRE]
     agree = state.mahalanobis(centres, between) < state.chi2_limit(judgement.GATE, 3)
     deep = apart < _DEEP
@@ -92,10 +95,7 @@ def in_place(
 
 def twins(states: np.ndarray) -> np.ndarray:
     """(n, n) of states (n, 12), whether each is a twin of which one before it."""
-    if not len(states):
-        return np.zeros((0, 0), dtype=bool)
-    _, apart = _apart(states, states)
-    return np.tril(apart < _DEEP, -1)
+    return np.tril(_apart(states, states) < _DEEP, -1)
 
 
 def elsewhere(
@@ -124,13 +124,43 @@ def elsewhere(
     return _assigned(pairs, cost, _alone(total[alike], error[alike]), (len(track), len(observed)))
 
 
-def _apart(some: np.ndarray, others: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Ways (n, m, 3) between the centres of states (n, 12) and (m, 12), their lengths (n, m) over both supports."""
-    between = others[None, :, 5:8] - some[:, None, 5:8]
-    distance = np.linalg.norm(between, axis=-1)
-    line = between / np.maximum(distance, 1e-12)[..., None]
-    extent = state.bodies(some).support(line) + state.bodies(others).support(line.swapaxes(0, 1)).T
-    return between, distance / np.maximum(extent, 1e-12)
+def warm_up() -> None:
+    """Load what is compiled, or compile it."""
+    _apart(np.ones((1, 12)), np.ones((1, 12)))
+
+
+@kernel
+def _apart(some: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Distances (n, m) of the centres of states (n, 12) and (m, 12) over both supports along the way."""
+    found = np.empty((len(some), len(others)))
+    for i in range(len(some)):
+        for j in range(len(others)):
+            x, y, z = others[j, 5] - some[i, 5], others[j, 6] - some[i, 6], others[j, 7] - some[i, 7]
+            distance = math.sqrt(x * x + y * y + z * z)
+            step = 1.0 / max(distance, 1e-12)
+            extent = _extent(some[i], x * step, y * step, z * step) + _extent(others[j], x * step, y * step, z * step)
+            found[i, j] = distance / max(extent, 1e-12)
+    return found
+
+
+@inline_kernel
+def _extent(state: np.ndarray, x: float, y: float, z: float) -> float:
+    """The support of a state (12,) in a direction: half of what it measures along it."""
+    a, b, c, w = state[8], state[9], state[10], state[11]
+    # R^T n = n + 2 v x (v x n - w n) for the quaternion (v, w).
+    dx, dy, dz = b * z - c * y - w * x, c * x - a * z - w * y, a * y - b * x - w * z
+    return float(
+        support(
+            x + 2.0 * (b * dz - c * dy),
+            y + 2.0 * (c * dx - a * dz),
+            z + 2.0 * (a * dy - b * dx),
+            state[0],
+            state[1],
+            state[2],
+            state[3],
+            state[4],
+        )
+    )
 
 
 def _unplaced(covariance: np.ndarray, distance: np.ndarray) -> np.ndarray:

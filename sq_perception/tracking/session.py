@@ -148,14 +148,17 @@ class TrackingSession:
         self._stamp, self._pose = stamp, (rotation, position)
         self.hidden = tuple(one.id for one in tracks if one.observation is None)
 
+        is_world = not position.any() and not rotation[:3].any()
         back = quaternions.conjugate(rotation)
         matrix = quaternions.to_matrix(back)
         by_index = {one.observation: one for one in tracks if one.observation is not None}
         found = []
         for index, one in enumerate(observed):
             track = by_index[index]
-            body = track.superquadric.transformed(back, -matrix @ position)
-            covariance = state.turned(track.covariance, matrix)
+            body, covariance = track.superquadric, track.covariance
+            if not is_world:
+                body = body.transformed(back, -matrix @ position)
+                covariance = state.turned(covariance, matrix)
             is_fused = is_pose_known and track.follows
             if not is_fused:
                 body, covariance = _in_form_of(body, covariance, one)
