@@ -36,8 +36,8 @@ A change takes effect with the next frame, unless the meaning begins with *confi
 unconfigured (`ros2 lifecycle set /recover_node deactivate`, then `cleanup`), or with *start*: given at the start only.
 
 After a change of `model`, `device`, `method`, `consensus` or `threads` frames go on as before until the new one is
-ready; if it cannot be made the old one stays, and `/diagnostics` says why. Another `method`, `refine`, `consensus` or
-model ends the tracks.
+ready; if it cannot be made the old one stays, and `/diagnostics` says why. Another `method`, `consensus` or model
+ends the tracks.
 
 Quality of service is a parameter too, at the start only: `qos_overrides.<topic>.subscription.reliability`, `.depth`,
 `.history`, or `.publisher.` and also `.durability`, with the topic as it is after remapping.

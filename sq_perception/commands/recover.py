@@ -111,12 +111,6 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     add("--csv", type=text_target, metavar="OUT", help="write the bodies there as a table; - is the standard output")
     add("--html", type=target, metavar="OUT", help="write one page with points, bodies and numbers, for any browser")
     add(
-        "--refine",
-        choices=("surface", "soft_render", "none"),
-        default="surface",
-        help="the exact fit, descent on the soft-rendered depth, or nothing",
-    )
-    add(
         "--depth-scale",
         type=float,
         metavar="N",
@@ -211,7 +205,6 @@ def _run(options: argparse.Namespace) -> int:
     try:
         settings = RecoveryOptions(
             method=options.method,
-            refine=options.refine,
             max_objects=options.max_objects,
             time_budget=options.time_budget,
             max_size=options.max_size,

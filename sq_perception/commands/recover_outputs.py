@@ -26,7 +26,6 @@ _FILES = ("json", "jsonl", "csv", "mcap", "html")
 _DECISIVE = (
     "projection",
     "method",
-    "refine",
     "camera_info",
     "depth_scale",
     "depth_min",

@@ -2,7 +2,7 @@
 
     1 - sum |X - T| / sum max(X, T),
 
-X the view and T the body's image of :func:`sq_perception.imaging.soft_render.render_depth` (a test proves it): the
+X the view and T the body's image of :mod:`sq_perception.imaging.soft_render` (a test proves it): the
 intersection over union of the two solids between each surface and the back of the cube, hence one number for a wrong
 silhouette and a wrong depth alike.  A line of sight is walked, some voxels at once, from where it comes near the body
 until nothing more passes: voxels whose occupancy is below e^-NEGLIGIBLE, and what lies behind as much of the body,

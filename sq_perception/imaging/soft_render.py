@@ -29,7 +29,7 @@ def grid_points(resolution: int) -> torch.Tensor:
     return torch.linspace(0, 1, resolution, dtype=torch.float64)
 
 
-def occupancy_grid(bodies: Superquadric, axis: torch.Tensor, sharpness: float, stride: int = 1) -> torch.Tensor:
+def occupancy_grid(bodies: Superquadric, axis: torch.Tensor, sharpness: float) -> torch.Tensor:
     """Soft occupancy of each body, (n, rows, columns, voxels).
 
     Parameters
@@ -41,12 +41,9 @@ def occupancy_grid(bodies: Superquadric, axis: torch.Tensor, sharpness: float, s
         viewer (largest z) away.
     sharpness : float
         s, positive.
-    stride : int
-        Take every ``stride``-th row and column only.
     """
     _check_positive("s", sharpness)
-    rows, columns, voxels = axis.flip(0)[::stride], axis[::stride], axis.flip(0)
-    y, x, z = torch.meshgrid(rows, columns, voxels, indexing="ij")
+    y, x, z = torch.meshgrid(axis.flip(0), axis, axis.flip(0), indexing="ij")
     points = torch.stack([x, y, z], dim=-1).reshape(-1, 3)
     return bodies.occupancy(points, sharpness).reshape(-1, *x.shape)
 
@@ -55,13 +52,6 @@ def depth_projection(occupancy: torch.Tensor, tau: float) -> torch.Tensor:
     """T(V) of occupancy grids (..., voxels), shape (...), in [0, 1] (equations 7.9 and 7.10)."""
     _check_positive("tau", tau)
     return 1 - torch.exp(-tau * occupancy.cumsum(dim=-1)).mean(dim=-1)
-
-
-def render_depth(
-    bodies: Superquadric, axis: torch.Tensor, sharpness: float, tau: float, stride: int = 1
-) -> torch.Tensor:
-    """Soft images (n, rows, columns) of each body alone: :func:`depth_projection` of :func:`occupancy_grid`."""
-    return depth_projection(occupancy_grid(bodies, axis, sharpness, stride), tau)
 
 
 def _check_positive(name: str, value: float) -> None:

@@ -146,7 +146,7 @@ class Engine:
         if built is None:
             raise RuntimeError("the recoverer has been released")
         method = built.parameters.method  # others may be set already, and still in the making
-        origin = built.weights, method, built.parameters.consensus, parameters.refine
+        origin = built.weights, method, built.parameters.consensus
         known = previous[0] if previous is not None and previous[1] == origin else None
         options = replace(parameters.recovery_options(pose, frame.has_free_space), method=method)
         recovery = built.recoverer.recover(frame.depth, frame.camera, frame.labels, options, known)

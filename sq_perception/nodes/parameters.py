@@ -13,7 +13,7 @@ from sq_perception.imaging import compressed_depth
 from sq_perception.imaging.calibration import Treatment
 from sq_perception.imaging.camera import Projection
 from sq_perception.nodes.live_parameters import ParameterError, Parameters, setting
-from sq_perception.recovery.options import Method, RecoveryOptions, Refine
+from sq_perception.recovery.options import Method, RecoveryOptions
 from sq_perception.segmentation.standing import Box, Pose
 from sq_perception.simulation.sensor_noise import IDEAL, PRESETS
 
@@ -66,7 +66,7 @@ class RecoverParameters(Parameters):
     )
     s: float = setting(
         117.3,
-        "Sharpness of the soft occupancy sigma(s (1 - F^e1)) of the score and of refine = soft_render.",
+        "Sharpness of the soft occupancy sigma(s (1 - F^e1)) of the score.",
         within=(0.1, 1000.0),
     )
     tau: float = setting(4.82, "Sharpness of the soft depth projection, likewise.", within=(0.1, 100.0))
@@ -139,11 +139,6 @@ class RecoverParameters(Parameters):
         "Where the fit starts: network, symmetry, or auto (the best of them); classic is Solina and Bajcsy's method.",
         choices=get_args(Method),
     )
-    refine: Refine = setting(
-        "surface",
-        "surface fits the measured depth, soft_render the soft-rendered image, none keeps the start.",
-        choices=get_args(Refine),
-    )
     repair: bool = setting(True, "Join and split own segments where that describes the image better.")
 
     @property
@@ -155,7 +150,6 @@ class RecoverParameters(Parameters):
         """What is said of a frame, whose pose in ``target_frame`` is given."""
         return RecoveryOptions(
             method=self.method,
-            refine=self.refine,
             sharpness=self.s,
             tau=self.tau,
             depth_range=(self.depth_min, math.inf if self.depth_max >= 100.0 else self.depth_max),

@@ -10,7 +10,6 @@ import numpy as np
 from sq_perception.fitting import solina_bajcsy, surface_fit
 from sq_perception.fitting.fit import Fit, Status
 from sq_perception.fitting.options import MIN_PIXELS, MODEL_ERROR_ON_PLANE, FitOptions
-from sq_perception.geometry.one_thread import one_torch_thread
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import soft_agreement
 from sq_perception.imaging.camera import Camera
@@ -42,10 +41,8 @@ def fitted(one: SeenObject, depth: np.ndarray, camera: Camera, options: Recovery
 def _body(one: SeenObject, depth: np.ndarray, camera: Camera, options: RecoveryOptions, deadline: float) -> Fit:
     if options.method == "classic":
         return solina_bajcsy.fit(one.points)
-    if options.method == "network" or (options.method == "auto" and options.refine == "none"):
+    if options.method == "network":
         return _unfitted(_predicted(one), one, "prediction of the network, not refined")
-    if options.method == "auto" and options.refine == "soft_render":
-        return _soft_rendered(_predicted(one), one, options)
     known = FitOptions(
         plane=one.plane if options.use_plane else None,
         smeared=one.smeared,
@@ -54,10 +51,7 @@ def _body(one: SeenObject, depth: np.ndarray, camera: Camera, options: RecoveryO
     if not options.free_space:
         depth = np.where(one.mask, depth, np.float32(np.nan))
         known = replace(known, nan_is_empty=False, model_error=MODEL_ERROR_ON_PLANE)
-    fit = _surface_fit(one, depth, camera, known)
-    if options.refine == "soft_render" and fit.status != Status.FAILED:
-        return _soft_rendered(fit.superquadric, one, options)
-    return fit
+    return _surface_fit(one, depth, camera, known)
 
 
 def _surface_fit(one: SeenObject, depth: np.ndarray, camera: Camera, known: FitOptions) -> Fit:
@@ -76,18 +70,6 @@ def _predicted(one: SeenObject) -> Superquadric:
     if one.prediction is None:
         raise ValueError("no prediction")
     return one.prediction.body()
-
-
-def _soft_rendered(start: Superquadric, one: SeenObject, options: RecoveryOptions) -> Fit:
-    from sq_perception.fitting import soft_render_fit  # needs torch, which robots may lack
-
-    assert one.view is not None
-    with one_torch_thread():
-        body, before, after = soft_render_fit.refine(
-            one.view.image, one.view.to_canonical(start), options.sharpness, options.tau
-        )
-    refined = one.view.from_canonical(body).canonical_form()
-    return _unfitted(refined, one, f"soft-rendered residual {before:.4f} before, {after:.4f} after the refinement")
 
 
 def _unfitted(body: Superquadric, one: SeenObject, message: str) -> Fit:

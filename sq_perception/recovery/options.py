@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from importlib.util import find_spec
 from typing import Literal, get_args
 
 import numpy as np
 
 from sq_perception.imaging import soft_agreement
-from sq_perception.learning.choices import NEEDS_TORCH
 from sq_perception.segmentation import segments, standing
 
 Method = Literal["auto", "network", "symmetry", "classic"]
-Refine = Literal["surface", "soft_render", "none"]
 NEEDS_NETWORK = ("auto", "network")
 FITTED = ("auto", "symmetry")
 
@@ -24,10 +21,10 @@ class RecoveryOptions:
 
     Attributes
     ----------
-    method, refine
+    method
         See :mod:`sq_perception.recovery.recoverer`.
     sharpness, tau
-        s and tau of the soft renderer: of the score, and of the ``soft_render`` refinement.
+        s and tau of the soft renderer, in the score.
     depth_range
         Nearest and farthest depth of an object, metres.
     max_objects
@@ -55,11 +52,10 @@ class RecoveryOptions:
     Raises
     ------
     ValueError
-        For a value outside its range, or ``soft_render`` where there is no torch.
+        For a value outside its range.
     """
 
     method: Method = "auto"
-    refine: Refine = "surface"
     sharpness: float = soft_agreement.THESIS_SHARPNESS
     tau: float = soft_agreement.THESIS_TAU
     depth_range: tuple[float, float] = (0.0, np.inf)
@@ -74,11 +70,8 @@ class RecoveryOptions:
     repair: bool = True
 
     def __post_init__(self) -> None:
-        for name, value, known in (("method", self.method, Method), ("refine", self.refine, Refine)):
-            if value not in get_args(known):
-                raise ValueError(f"{name}: expected one of {', '.join(get_args(known))}, got {value!r}")
-        if self.refine == "soft_render" and find_spec("torch") is None:
-            raise ValueError(f"refine: soft_render {NEEDS_TORCH}")
+        if self.method not in get_args(Method):
+            raise ValueError(f"method: expected one of {', '.join(get_args(Method))}, got {self.method!r}")
         for name, number in (("sharpness", self.sharpness), ("tau", self.tau)):
             if not (np.isfinite(number) and number > 0):
                 raise ValueError(f"{name}: expected a positive number, got {number}")

@@ -4,18 +4,14 @@
 
 Own segments are joined and split by the bodies that were fitted to them (:mod:`sq_perception.recovery.segment_repair`).
 
-| method | body | refine |
-| --- | --- | --- |
-| auto | fit from the starts of central symmetry and, where needed, the network; open sizes predicted | all |
-| symmetry | fit from the starts of central symmetry, no network | surface, soft_render |
-| network | the network alone | ignored |
-| classic | Solina and Bajcsy's fit to the points | ignored |
+| method | body |
+| --- | --- |
+| auto | fit from the starts of central symmetry and, where needed, the network; open sizes predicted |
+| symmetry | fit from the starts of central symmetry, no network |
+| network | the network alone |
+| classic | Solina and Bajcsy's fit to the points |
 
-``refine="surface"`` is the exact surface fit.  ``"soft_render"`` descends on the soft-rendered depth (L_DR) instead,
-from the network's prediction for ``auto`` and after the fit for ``symmetry``.  ``"none"`` leaves the network's
-prediction as it is; ``symmetry`` has no body without its fit and ignores it.
-
-With ``auto`` and ``surface`` the network computes beside the fit's first, cheapest starts.  A body that these explain
+With ``auto`` the network computes beside the fit's first, cheapest starts.  A body that these explain
 down to the noise needs no prediction and does not wait for it.
 
 Everything is metres in the optical frame.  A hard image is no error: an object without a body is listed with
@@ -46,7 +42,7 @@ from sq_perception.learning.choices import NEEDS_TORCH
 from sq_perception.learning.consensus import Consensus
 from sq_perception.recovery import continuity, methods, prediction, seen_object, segment_repair
 from sq_perception.recovery.continuity import Reference
-from sq_perception.recovery.options import FITTED, NEEDS_NETWORK, Method, RecoveryOptions, Refine
+from sq_perception.recovery.options import FITTED, NEEDS_NETWORK, Method, RecoveryOptions
 from sq_perception.recovery.recovery import FrameRecovery, Recovery, timed
 from sq_perception.recovery.seen_object import SeenObject
 from sq_perception.segmentation import segments
@@ -57,7 +53,6 @@ __all__ = [
     "Recoverer",
     "Recovery",
     "RecoveryOptions",
-    "Refine",
     "checked_device",
     "render_recovery",
 ]
@@ -187,8 +182,7 @@ class Recoverer:
         milliseconds = dict.fromkeys(("segmentation", "network", "fit", "repair", "score", "total"), 0.0)
         network = None
         if options.method in NEEDS_NETWORK:
-            is_fitted = options.method == "auto" and options.refine == "surface"
-            network = self._load_network(camera.is_pinhole and is_fitted)
+            network = self._load_network(camera.is_pinhole and options.method == "auto")
 
         with timed(milliseconds, "segmentation"):
             depth = _plausible(np.asarray(depth), camera)
@@ -223,7 +217,7 @@ class Recoverer:
             objects = [known.get(one.label, one) for one in objects]
             fits = [same[one.label].fit if one.label in same else fit_of[one.label] for one in objects]
         with timed(milliseconds, "repair"):
-            if labels is None and options.repair and options.method in FITTED and options.refine == "surface":
+            if labels is None and options.repair and options.method in FITTED:
                 found, objects, fits = _repaired(found, objects, fits, depth, camera, options, deadline)
         with timed(milliseconds, "score"):
             pairs = list(zip(objects, fits, strict=True))
@@ -251,8 +245,7 @@ class Recoverer:
             parts = [part for part in np.array_split(np.arange(len(objects)), self._threads) if part.size]
             found = self._mapped(lambda part: prediction.of_hulls([objects[k] for k in part], network), parts)
             return [one for part in found for one in part]
-        is_fitted = options.method == "auto" and options.refine == "surface"
-        submit = self._beside.submit if is_fitted else prediction.at_once
+        submit = self._beside.submit if options.method == "auto" else prediction.at_once
         return prediction.of_bodies(objects, network, submit) if objects else []
 
     def _mapped(self, function: Callable[[_Item], _Answer], items: Sequence[_Item]) -> list[_Answer]:

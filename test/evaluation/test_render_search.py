@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from unit_axis import soft_images
 
 from sq_perception.commands import main
 from sq_perception.evaluation.render_search import search
@@ -20,7 +21,7 @@ def test_error_is_that_of_the_two_renderers() -> None:
     bodies = thesis_bodies(2, np.random.default_rng(0))
     found = search(bodies, np.array([20.0, 117.3]), np.array([0.5, 4.82]), 32)
     tensors = Superquadric.from_flat(torch.tensor(bodies.to_flat()))
-    soft = soft_render.render_depth(tensors, soft_render.grid_points(32), 117.3, 0.5).numpy()
+    soft = soft_images(tensors, soft_render.grid_points(32), 117.3, 0.5).numpy()
     error = 0.0
     for body, image in zip(bodies, soft, strict=True):
         depth, _ = raycast.render(unit_cube.optical_from_cube(body), unit_cube.camera(32))

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from unit_axis import cell_centres
+from unit_axis import cell_centres, soft_images
 
 from sq_perception.geometry import Superquadric, rotation
 from sq_perception.imaging import canonical_view, raycast, soft_agreement, soft_render, unit_cube
@@ -232,9 +232,7 @@ class TestSoftRender:
         bodies = thesis_bodies(10, np.random.default_rng(8))
         tensors = Superquadric.from_flat(torch.tensor(bodies.to_flat()))
         axis = soft_render.grid_points(64)
-        soft = soft_render.render_depth(
-            tensors, axis, soft_agreement.THESIS_SHARPNESS, soft_agreement.THESIS_TAU
-        ).numpy()
+        soft = soft_images(tensors, axis, soft_agreement.THESIS_SHARPNESS, soft_agreement.THESIS_TAU).numpy()
         for body, image in zip(bodies, soft, strict=True):
             depth, _ = raycast.render(unit_cube.optical_from_cube(body), unit_cube.camera(64))
             exact = np.where(np.isfinite(depth), 1 - depth, 0)
@@ -244,16 +242,14 @@ class TestSoftRender:
         bodies = thesis_bodies(2, np.random.default_rng(9))
         axis = cell_centres(6)
         flat = torch.tensor(bodies.to_flat(), requires_grad=True)
-        assert torch.autograd.gradcheck(
-            lambda f: soft_render.render_depth(Superquadric.from_flat(f), axis, 8.0, 1.5), flat
-        )
+        assert torch.autograd.gradcheck(lambda f: soft_images(Superquadric.from_flat(f), axis, 8.0, 1.5), flat)
 
     @pytest.mark.parametrize(("s", "tau"), [(soft_agreement.THESIS_SHARPNESS, soft_agreement.THESIS_TAU), (8.0, 0.5)])
     def test_the_compiled_agreement_is_that_of_the_soft_image(self, s: float, tau: float) -> None:
         """Bodies against images of others, as of themselves; sharp and soft, thick and thin to the light."""
         bodies = thesis_bodies(4, np.random.default_rng(10))
         tensors = Superquadric.from_flat(torch.tensor(bodies.to_flat()))
-        rendered = soft_render.render_depth(tensors, cell_centres(64), s, tau)
+        rendered = soft_images(tensors, cell_centres(64), s, tau)
         images = (0.7 * rendered + 0.3 * rendered.roll(1, dims=0)).float()
         seen, shown = images[:, ::3, ::3].double(), rendered[:, ::3, ::3]
         expected = 1 - (seen - shown).abs().sum(dim=(1, 2)) / torch.maximum(seen, shown).sum(dim=(1, 2))
@@ -266,4 +262,4 @@ class TestSoftRender:
     def test_refuses_nonsense(self, s: float, tau: float) -> None:
         bodies = Superquadric.from_flat(torch.tensor(thesis_bodies(1, np.random.default_rng(0)).to_flat()))
         with pytest.raises(ValueError, match="positive"):
-            soft_render.render_depth(bodies, cell_centres(4), s, tau)
+            soft_images(bodies, cell_centres(4), s, tau)

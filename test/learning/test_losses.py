@@ -7,12 +7,12 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 import torch
-from unit_axis import cell_centres, grid
+from unit_axis import cell_centres, grid, soft_images
 
 from sq_perception.geometry import Superquadric
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.metrics import volume_iou
-from sq_perception.imaging import sight_lines, soft_render
+from sq_perception.imaging import sight_lines
 from sq_perception.learning import depth_losses, losses
 from sq_perception.learning.objective import LOSSES, UNSUPERVISED, Objective
 from sq_perception.simulation.scenes import thesis_bodies
@@ -143,7 +143,7 @@ class TestRenderLoss:
 def voxel_loss(guess: Superquadric, view: torch.Tensor, sharpness: float, tau: float) -> torch.Tensor:
     """L_DR (n,) as the thesis defines it: views (n, p, p), grids of p^3 voxels."""
     axis = cell_centres(view.shape[-1]).to(view)
-    return (view - soft_render.render_depth(guess, axis, sharpness, tau)).abs().mean(dim=(-2, -1))
+    return (view - soft_images(guess, axis, sharpness, tau)).abs().mean(dim=(-2, -1))
 
 
 def loss_of(name: str, views: torch.Tensor, truth: Superquadric) -> Callable[[torch.Tensor], torch.Tensor]:

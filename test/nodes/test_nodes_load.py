@@ -205,7 +205,7 @@ def change(path: Path, kind: str, node: Child) -> None:
 def test_a_model_file_that_changes_under_a_node_changes_nothing(peer, children, tmp_path):
     path = tmp_path / "model.safetensors"
     shutil.copy(checkpoint.resolve(), path)
-    node = children.start("recover_node", arguments(*QUIET, "refine:=none", f"model:={path}"))
+    node = children.start("recover_node", arguments(*QUIET, "method:=network", f"model:={path}"))
     alive, name = (node,), "/recover_node"
     known = from_message(peer.ask(name, *peer.frame(), alive=alive).message)
     for kind in CHANGES:

@@ -300,7 +300,7 @@ def test_parameters_change_from_another_process(recover_node, client):
         ("s", float("nan"), "s"),
         ("s", "high", "expected 'Type.DOUBLE' got 'Type.STRING'"),
         ("tau", 0, "tau out of range"),
-        ("refine", "perhaps", "surface, soft_render, none"),
+        ("method", "perhaps", "auto, network, symmetry, classic"),
         ("model", "other.safetensors", "no such model file"),
         ("device", "cuda:77", "device"),
         ("projection", "orthographic", "lifecycle set /recover_node deactivate"),

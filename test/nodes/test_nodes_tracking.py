@@ -128,22 +128,22 @@ def test_another_optical_frame_is_another_world_and_no_stamp_is_now(make_bench):
     assert unstamped[0] == unstamped[1] == unstamped[2]
 
 
-def test_another_method_or_refinement_ends_the_tracks(make_bench, capfd):
+def test_another_method_ends_the_tracks(make_bench, capfd):
     """Numbers of a network, with no or other deviations, are not fused with those of a fit."""
     bench = make_bench()
     for k, share in enumerate((0.0, 0.02)):
         bench.recoverer.bodies = (recovery(grown(BOX, share), 1),)
         assert bench.answer(image(10 + 0.1 * k))[1].id.tolist() == [1]
-    assert bench.node.set_parameters([Parameter("refine", value="none")])[0].successful
+    assert bench.node.set_parameters([Parameter("method", value="network")])[0].successful
     bench.recoverer.bodies = (recovery(grown(BOX, 0.05), 1),)
     _, found = bench.answer(image(10.2))
     assert found.id.tolist() == [2]
     np.testing.assert_allclose(found.size[0], 1.05 * BOX.size, rtol=1e-6)
-    assert bench.node.set_parameters([Parameter("method", value="network")])[0].successful
+    assert bench.node.set_parameters([Parameter("method", value="symmetry")])[0].successful
     assert bench.answer(image(10.3))[1].id.tolist() == [3]
     assert bench.node.set_parameters([Parameter("s", value=50.0)])[0].successful
     assert bench.answer(image(10.4))[1].id.tolist() == [3]
-    assert capfd.readouterr().err.count("bodies come from another method, refine, consensus or model") == 2
+    assert capfd.readouterr().err.count("bodies come from another method, consensus or model") == 2
 
 
 def test_without_tracking_ids_are_labels_and_each_frame_stands_for_itself(make_bench):

@@ -69,7 +69,7 @@ def test_stamp_frame_and_numbers_arrive(bench):
     assert camera == CAMERA
     assert labels is None
     assert (depth == np.float32(0.5)).all()
-    assert (options.method, options.refine, options.sharpness, options.tau) == ("auto", "surface", 117.3, 4.82)
+    assert (options.method, options.sharpness, options.tau) == ("auto", 117.3, 4.82)
 
 
 def test_millimetres_become_metres_and_zero_is_no_reading(bench):
@@ -226,7 +226,7 @@ def test_no_bodies_is_an_answer(bench):
 
 def test_parameters_take_effect_with_the_next_frame(bench):
     bench.answer(bench.depth())
-    values = {"s": 3, "tau": 2.5, "refine": "none", "depth_min": 0.2, "depth_max": 3, "max_objects": 4}
+    values = {"s": 3, "tau": 2.5, "depth_min": 0.2, "depth_max": 3, "max_objects": 4}
     values["time_budget"] = 0.5
     for result in bench.node.set_parameters([Parameter(name, value=value) for name, value in values.items()]):
         assert result.successful, result.reason
@@ -234,7 +234,7 @@ def test_parameters_take_effect_with_the_next_frame(bench):
     bench.answer(bench.depth())
     before, after = (asked[3] for asked in bench.recoverer.asked)
     assert (before.sharpness, before.depth_range) == (117.3, (0.0, np.inf))
-    assert (after.sharpness, after.tau, after.refine) == (3.0, 2.5, "none")
+    assert (after.sharpness, after.tau) == (3.0, 2.5)
     assert (after.depth_range, after.max_objects, after.time_budget) == ((0.2, 3.0), 4, 0.5)
     assert before.time_budget == np.inf
 

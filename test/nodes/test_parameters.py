@@ -115,7 +115,7 @@ def test_changes_arrive_as_a_whole_and_integers_pass_as_floats(make_node):
         ({"s": -1.0}, "out of range"),
         ({"s": float("nan")}, "s"),
         ({"s": "sharp"}, "expected 'Type.DOUBLE' got 'Type.STRING'"),
-        ({"refine": "maybe"}, "surface, soft_render, none"),
+        ({"method": "maybe"}, "auto, network, symmetry, classic"),
         ({"max_objects": 0}, "out of range"),
         ({"depth_max": 0.5, "depth_min": 0.6}, "depth_min < depth_max"),
         ({"projection": "orthographic"}, "read-only"),

@@ -10,8 +10,6 @@ import numpy as np
 import pytest
 
 import sq_perception
-from sq_perception.recovery import options
-from sq_perception.recovery.options import RecoveryOptions
 
 ABSENT = f"""
 import sys
@@ -81,9 +79,6 @@ def test_what_needs_torch_says_so(arguments: str, frame: Path) -> None:
     assert "Traceback" not in done.stderr
 
 
-def test_a_device_and_a_refinement_that_need_torch(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_device_that_needs_torch(tmp_path: Path) -> None:
     done = run("from sq_perception import Recoverer; Recoverer(device='cuda')", tmp_path)
     assert f"ValueError: device: 'cuda' {REMEDY}" in done.stderr
-    monkeypatch.setattr(options, "find_spec", lambda name: None)
-    with pytest.raises(ValueError, match="refine: soft_render needs torch"):
-        RecoveryOptions(refine="soft_render")

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 import torch
 
-from sq_perception.fitting import soft_render_fit
 from sq_perception.fitting.fit import Status
 from sq_perception.geometry import rotation
 from sq_perception.geometry.metrics import volume_iou
@@ -182,8 +181,7 @@ def test_methods_do_what_they_say(weights):
     def run(**changes):
         return recoverer.recover(depth, CAMERA, labels, RecoveryOptions(**changes)).bodies[0]
 
-    network, unrefined = run(method="network"), run(refine="none")
-    np.testing.assert_array_equal(network.superquadric.to_flat(), unrefined.superquadric.to_flat())
+    network = run(method="network")
     assert np.isnan(network.sigma_size).all()
     view = canonical_view.from_mask(depth, labels == 1, CAMERA)
     predicted = view.from_canonical(recoverer._load_network(False).predict(view.image[None])[0])
@@ -191,9 +189,6 @@ def test_methods_do_what_they_say(weights):
     assert iou(run(method="auto").superquadric, truth[0]) > 0.9, "whatever the network says"
     assert iou(run(method="symmetry").superquadric, truth[0]) > 0.9
     assert run(method="classic").status != Status.FAILED
-    soft = run(method="auto", refine="soft_render")
-    assert soft.score >= network.score
-    assert "soft-rendered" in soft.message
 
 
 def test_s_and_tau_drive_the_score(symmetry):
@@ -206,27 +201,6 @@ def test_s_and_tau_drive_the_score(symmetry):
     ]
     assert scores[0] > scores[1] + 0.01
     assert scores[0] > scores[2] + 0.05
-
-
-def test_soft_render_refinement_finds_the_way_back():
-    rng = np.random.default_rng(2)
-    truth = Superquadric([0.3, 0.25, 0.2], [0.6, 0.6], [0.5, 0.5, 0.55], rotation.random(1, rng)[0])
-    depth, _ = raycast.render(unit_cube.optical_from_cube(truth), unit_cube.camera(64))
-    image = np.where(np.isfinite(depth), 1 - depth, 0).astype(np.float32)
-    nudge = rotation.from_rotation_vector(np.array([0.1, -0.1, 0.1]))
-    start = Superquadric(
-        truth.size * [1.15, 0.9, 1.1], [0.9, 0.9], truth.translation + 0.03, rotation.multiply(nudge, truth.rotation)
-    )
-    body, before, after = soft_render_fit.refine(image, start)
-    assert after < 0.5 * before
-    assert iou(body, truth) > iou(start, truth) + 0.05
-    again, same, _ = soft_render_fit.refine(image, start, iterations=0)
-    assert same == before
-    assert again is start
-    with pytest.raises(ValueError, match="square"):
-        soft_render_fit.refine(image[:32], start)
-    with pytest.raises(ValueError, match="single body"):
-        soft_render_fit.refine(image, Superquadric.stack([start]))
 
 
 def test_missing_and_foreign_weights(tmp_path):
@@ -254,7 +228,6 @@ def test_misuse_is_refused(symmetry):
     with pytest.raises(ValueError, match="device"):
         Recoverer(method="symmetry", device="abacus")
     for name, value in (
-        ("refine", "magic"),
         ("sharpness", 0.0),
         ("sharpness", np.nan),
         ("tau", -1.0),

@@ -154,7 +154,7 @@ def describing(
     ("about", "given", "kind", "value"),
     [
         (describing("tracking"), True, "bool", True),
-        (describing("refine", constraints="one of: surface, none"), "surface", "choice", "surface"),
+        (describing("method", constraints="one of: auto, network"), "auto", "choice", "auto"),
         (describing("frame"), "map", "text", "map"),
         (describing("s", (0.1, 1000.0)), 117.3, "number", 117.3),
         (describing("alpha", (0.0, 1.0)), 0.7, "slider", 0.7),
@@ -183,7 +183,7 @@ def test_a_control_fits_its_parameter(about: SimpleNamespace, given: object, kin
 def test_what_the_node_holds_is_shown_even_outside_of_its_range() -> None:
     made = controls.control(describing("s", (0.0, 1.0)), 5.0)
     assert (made.low, made.high) == (0.0, 5.0)
-    made = controls.control(describing("refine", constraints="one of: a, b"), "new")
+    made = controls.control(describing("method", constraints="one of: a, b"), "new")
     assert made.choices == ("a", "b", "new")
 
 
