@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from sq_perception.fitting.covariance import Alternative, covariance_at
+from sq_perception.fitting.hull_prior import HullPrior
 from sq_perception.fitting.levenberg_marquardt import State, minimize
 from sq_perception.fitting.observation import Observation
 from sq_perception.fitting.options import FitOptions
@@ -87,6 +88,8 @@ class Problem:
         drawn; None where every ray counts as one.
     prior
         A predicted body whose half sizes weigh in, by ``terms.expectation_stiffness``.
+    hull
+        A prediction of the thing's hull, which weighs in by the terms.
     """
 
     observation: Observation
@@ -96,6 +99,7 @@ class Problem:
     deadline: float
     independent: float | None = None
     prior: Superquadric | None = None
+    hull: HullPrior | None = None
 
     @classmethod
     def of(cls, observation: Observation, options: FitOptions, began: float) -> Problem:
@@ -111,7 +115,7 @@ class Problem:
     @property
     def is_predicted(self) -> bool:
         """Whether a prediction of the thing's hull is known."""
-        return len(self.terms.hull_directions) > 0
+        return self.hull is not None
 
     @property
     def outline(self) -> float:

@@ -5,7 +5,7 @@ One maximum a posteriori fit.  The cost, minus twice the log of the posterior, i
     object  w rho(r)        what the object's pixels measured; sigma is the noise and the model error in squares
     free    w rho(r)        pixels beside it that saw farther: the body keeps out
     plane, rest             it does not reach below its support, and mostly lies on a face
-    hull                    |W (h - b)|^2: its support function beside the predicted one
+    hull                    |W (h - b)|^2: its support function beside the predicted one, W by the misfit m
     volume, proportion      weak, and only where nothing is predicted (:mod:`sq_perception.fitting.unseen` then too)
 
 (:mod:`sq_perception.fitting.residuals`, :mod:`sq_perception.fitting.priors`, :mod:`sq_perception.fitting.hull_prior`).
@@ -14,9 +14,11 @@ are drawn.
 
 Where a hull is predicted, the body is fitted as the thing's hull, which encloses lids below a rim, necks and handles:
 points behind its surface count by Cauchy's loss, and the space within the outline's convex hull may be empty.  The
-object then counts as INDEPENDENT_OF_PREDICTED / max(1, c / EXPLAINED)^2 rays, c their mean loss.  Once, as the variance
-of the model's error is not known beforehand, and the likelihood that is largest over it divides by what is found; once
-more, as what errs more does so over larger parts: a neck, a spout, a dent are one error each, not one a pixel.
+object then counts as INDEPENDENT_OF_PREDICTED / m rays, m = max(1, c / EXPLAINED), c their mean loss: the variance of
+the model's error is not known beforehand, and the likelihood that is largest over it divides by what is found.  And the
+more it misfits, the more the body is drawn to the predicted hull
+(:meth:`~sq_perception.fitting.hull_prior.HullPrior.root`).  How sure the body is, what it is drawn to does not say, and
+its rays count as fewer by m once more: what errs more does so over larger parts, a neck, a spout, a dent.
 
 1. Starts: the given bodies (the prediction), and boxes on the plane, or along the points' axes without one; where
    nothing is predicted, deeper ones too.
@@ -104,10 +106,17 @@ def _best(problem: Problem, starts: Sequence[State]) -> Solution:
     begun = _tried(problem, starts, few, _FIRST_STEPS)
     kept = _KEPT_OF_PREDICTED if problem.is_predicted else _KEPT
     settled = _tried(problem, begun[:kept], few, _MORE_STEPS)
-    if problem.is_predicted and not problem.late:
-        misfit = max(1.0, _mean_loss(problem, settled[0]) / EXPLAINED)
-        problem = replace(problem, independent=INDEPENDENT_OF_PREDICTED / misfit**2)
-        settled = _tried(problem, settled[:2], draw(problem, COARSE_RAYS, 0.7), _MORE_STEPS)
+    if problem.hull is None or problem.late:
+        return _refined(problem, settled)
+    misfit = max(1.0, _mean_loss(problem, settled[0]) / EXPLAINED)
+    terms = problem.terms._replace(hull_root=problem.hull.root(misfit))
+    drawn = replace(problem, independent=INDEPENDENT_OF_PREDICTED / misfit, terms=terms)
+    settled = _tried(drawn, settled[:2], draw(drawn, COARSE_RAYS, 0.7), _MORE_STEPS)
+    solution = _refined(drawn, settled)
+    return replace(solution, problem=problem, rays=solution.rays.weighing(1 / misfit))
+
+
+def _refined(problem: Problem, settled: Sequence[State]) -> Solution:
     rays = draw(problem, problem.options.pixels or _RAYS, 0.3)
     return Solution(problem, refined_best(problem, settled, rays, _LAST_STEPS), rays, spread_factor=_SPREAD)
 
@@ -155,7 +164,7 @@ def _with_priors(problem: Problem) -> Problem:
         hull_root=hull.root(),
     )
     observation = problem.observation.of_hull()
-    return replace(problem, terms=terms, observation=observation, independent=INDEPENDENT_OF_PREDICTED)
+    return replace(problem, terms=terms, observation=observation, independent=INDEPENDENT_OF_PREDICTED, hull=hull)
 
 
 def _tried(problem: Problem, starts: Sequence[State], rays: Rays, steps: int) -> list[State]:

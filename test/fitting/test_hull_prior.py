@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from sq_perception.fitting import surface_fit
-from sq_perception.fitting.hull_prior import MODEL_SHARE, HullPrior
+from sq_perception.fitting.hull_prior import MODEL_SHARE, PULL_SHARE, HullPrior
 from sq_perception.fitting.levenberg_marquardt import State, move
 from sq_perception.fitting.normal_equations import STEP_LENGTH
 from sq_perception.fitting.priors import prior_cost
@@ -42,6 +42,16 @@ def test_the_root_whitens_what_was_predicted_and_what_no_superquadric_reaches(rn
     prior = HullPrior(DIRECTIONS, np.zeros(42), 1e-5 * spread @ spread.T, 0.2)
     whole = prior.covariance + (MODEL_SHARE * 0.2) ** 2 * np.eye(42)
     assert prior.root() @ whole @ prior.root().T == pytest.approx(np.eye(42), abs=1e-8)
+
+
+def test_misfit_draws_each_direction_to_the_prediction_and_leaves_growth_alone(rng: np.random.Generator) -> None:
+    spread = rng.normal(size=(42, 42))
+    prior = HullPrior(DIRECTIONS, np.zeros(42), 1e-5 * spread @ spread.T, 0.2)
+    difference = prior.root(4.0).T @ prior.root(4.0) - prior.root().T @ prior.root()
+    assert difference @ np.ones(42) == pytest.approx(np.zeros(42), abs=1e-6)
+    for other in rng.normal(size=(5, 42)):
+        other -= other.mean()
+        assert other @ difference @ other == pytest.approx(3.0 / (PULL_SHARE * 0.2) ** 2 * float(other @ other))
 
 
 def test_the_true_body_costs_nothing_and_others_by_their_distance() -> None:
