@@ -37,7 +37,10 @@ import cv2
 import numpy as np
 
 from sq_perception.fitting.fit import CUT_SHORT, Status
+from sq_perception.geometry.kernels import inline_kernel, kernel
+from sq_perception.geometry.quantiles import ranked
 from sq_perception.imaging.camera import Camera
+from sq_perception.imaging.regions import extents
 from sq_perception.recovery.options import RecoveryOptions
 
 if TYPE_CHECKING:
@@ -91,7 +94,8 @@ class Reference:
     def of(cls, depth: np.ndarray, camera: Camera, sigma: float, options: RecoveryOptions) -> Reference:
         """Of an image (height, width) that is NaN where nothing was measured."""
         stride = max(1, round(camera.width / _WIDTH))
-        return cls(np.nan_to_num(depth[::stride, ::stride]), stride, sigma, camera, options)
+        seen = np.asarray(depth[::stride, ::stride], dtype=np.float32)
+        return cls(np.where(np.isnan(seen), np.float32(0), seen), stride, sigma, camera, options)
 
     def keeping(self, other: Reference, labels: np.ndarray, kept: Sequence[int]) -> Reference:
         """These readings, but those of another reference around the labels that were recovered from it."""
@@ -132,38 +136,29 @@ def repeated(previous: FrameRecovery, depth: np.ndarray, camera: Camera, options
     if before is None or before.camera != camera or before.options != options or not camera.is_pinhole:
         return NOTHING
     old, new = before.depth, Reference.of(depth, camera, before.sigma, options).depth
-    labels = previous.labels[:: before.stride, :: before.stride]
+    labels = np.ascontiguousarray(previous.labels[:: before.stride, :: before.stride], dtype=np.int32)
     reach = _REACH * float(old[labels > 0].max(initial=0))
-    both = (old > 0) & (new > 0)
-    nearer = np.maximum(np.minimum(old, new), 1e-6)
-    change = np.where(both, (new - old) / (nearer * nearer), 0)
-    near = np.abs(change[both & (old < reach)])
-    spread = float(np.quantile(near, 0.75)) / _QUARTILE if near.size else np.inf
+    change, near = _changed(old, new, reach)
+    spread = ranked(near, 3 * near.size // 4) / _QUARTILE if near.size else np.inf
     if spread > _NOISIER * before.sigma:
         return NOTHING
     level = max(spread, 0.5 * before.sigma)
-    change /= level
-
-    patches = np.clip(change, -_FAR, _FAR)
-    patches[(old == 0) & (new > 0) & (new < reach)] = _FAR
-    still = float(np.abs(cv2.blur(patches, (_PATCH, _PATCH))).max()) < _NEW
-    change = np.clip(change, -_CLIP, _CLIP)
-    share = _shared(change, both & (old < reach))
+    patches, sums = _in_noise_levels(change, old, new, level, reach)
+    share = max((ranked(sums, 3 * sums.size // 4) / _QUARTILE / _BLOCK) ** 2, 1.0) if sums.size else 1.0
     if share > _SHARED:
         return NOTHING
+    still = float(np.abs(cv2.blur(patches, (_PATCH, _PATCH))).max()) < _NEW
     smooth = cv2.blur(old, (3, 3))
 
-    due = _due(previous.bodies)
+    due, windows = _due(previous.bodies), extents(labels)
     kept = {}
     for one in previous.bodies:
-        if one is due or CUT_SHORT in one.message:
+        if one is due or CUT_SHORT in one.message or one.label >= len(windows):
             continue
-        mask = _around(labels == one.label)
-        left, top, width, height = cv2.boundingRect(mask)
-        window = slice(top, top + height), slice(left, left + width)
-        inside = both[window] & (mask[window] > 0)
-        scale = level * nearer[window] ** 2
-        if _statistic(change[window], inside, smooth[window], scale, share) < _CHANGED:
+        _, top, bottom, left, right = windows[one.label].tolist()
+        sums, square = _moments(change, old, new, smooth, labels, one.label, (top, bottom, left, right), level)
+        square = share * square + 1e-6 * share * np.trace(square) * np.eye(len(square))
+        if square.any() and sums @ np.linalg.solve(square, sums) < _CHANGED:
             kept[one.label] = one
     return Repeated(kept, still and 0 < len(kept) == len(previous.bodies))
 
@@ -196,29 +191,93 @@ def _around(mask: np.ndarray) -> np.ndarray:
     return cv2.dilate(mask.astype(np.uint8), np.ones((2 * _BAND + 1, 2 * _BAND + 1), np.uint8))
 
 
-def _shared(change: np.ndarray, both: np.ndarray) -> float:
-    """v: the variance of a sum over a block, a pixel of it; 1 for independent ones of unit variance."""
-    rows, columns = (size // _BLOCK * _BLOCK for size in change.shape)
-    parts = (rows // _BLOCK, _BLOCK, columns // _BLOCK, _BLOCK)
-    full = both[:rows, :columns].reshape(parts).all(axis=(1, 3))
-    sums = np.abs(change[:rows, :columns].reshape(parts).sum(axis=(1, 3))[full])
-    if sums.size == 0:
-        return 1.0
-    return max((float(np.quantile(sums, 0.75)) / _QUARTILE / _BLOCK) ** 2, 1.0)
+@kernel
+def _changed(old: np.ndarray, new: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """(d - r) / z^2 where both images have a reading, 0 elsewhere, and its sizes (n,) within reach."""
+    change, near, count = np.zeros(old.shape, np.float32), np.empty(old.size, np.float32), 0
+    for v in range(old.shape[0]):
+        for u in range(old.shape[1]):
+            r, d = old[v, u], new[v, u]
+            if r > 0 and d > 0:
+                z = max(min(r, d), np.float32(1e-6))
+                change[v, u] = (d - r) / (z * z)
+                if r < reach:
+                    near[count] = abs(change[v, u])
+                    count += 1
+    return change, near[:count]
 
 
-def _statistic(change: np.ndarray, inside: np.ndarray, depth: np.ndarray, scale: np.ndarray, share: float) -> float:
-    """T of one object."""
-    rows, columns = np.nonzero(inside)
-    if rows.size == 0:
-        return np.inf
-    height, width = inside.shape
-    x, y = 2 * columns / max(width - 1, 1) - 1, 2 * rows / max(height - 1, 1) - 1
-    shifts = [
-        np.clip(slope / scale, -1, 1)[inside] for slope in (np.gradient(depth, axis=1), np.gradient(depth, axis=0))
-    ]
-    weights = np.stack([np.ones_like(x), x, y, x * x, x * y, y * y, *shifts])
-    sums = weights @ change[inside]
-    spread = share * (weights @ weights.T)
-    spread += 1e-6 * np.trace(spread) * np.eye(len(spread))
-    return float(sums @ np.linalg.solve(spread, sums))
+@kernel
+def _in_noise_levels(
+    change: np.ndarray, old: np.ndarray, new: np.ndarray, level: float, reach: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """What patches are taken of, and sizes (n,) of the sums over blocks of readings; ``change`` becomes q, clipped."""
+    patches = np.empty(change.shape, np.float32)
+    for v in range(change.shape[0]):
+        for u in range(change.shape[1]):
+            q = change[v, u] / level
+            is_new = old[v, u] == 0 and 0 < new[v, u] < reach
+            patches[v, u] = _FAR if is_new else min(max(q, -_FAR), _FAR)
+            change[v, u] = min(max(q, -_CLIP), _CLIP)
+    rows, columns = change.shape[0] // _BLOCK, change.shape[1] // _BLOCK
+    sums, count = np.empty(rows * columns, np.float32), 0
+    for i in range(rows):
+        for j in range(columns):
+            total, full = 0.0, True
+            for v in range(i * _BLOCK, (i + 1) * _BLOCK):
+                for u in range(j * _BLOCK, (j + 1) * _BLOCK):
+                    full = full and 0 < old[v, u] < reach and new[v, u] > 0
+                    total += change[v, u]
+            if full:
+                sums[count] = abs(total)
+                count += 1
+    return patches, sums[:count]
+
+
+@kernel
+def _moments(
+    change: np.ndarray,
+    old: np.ndarray,
+    new: np.ndarray,
+    smooth: np.ndarray,
+    labels: np.ndarray,
+    label: int,
+    extent: tuple[int, int, int, int],
+    level: float,
+) -> tuple[np.ndarray, np.ndarray]:
+    """V q (8,) and V V^T (8, 8) of the pixels of one object and around it; zeros where none has both readings."""
+    top, bottom = max(extent[0] - _BAND, 0), min(extent[1] + _BAND, labels.shape[0])
+    left, right = max(extent[2] - _BAND, 0), min(extent[3] + _BAND, labels.shape[1])
+    sums, square, w = np.zeros(8), np.zeros((8, 8)), np.ones(8)
+    for v in range(top, bottom):
+        for u in range(left, right):
+            if not (old[v, u] > 0 and new[v, u] > 0 and _is_around(labels, label, v, u)):
+                continue
+            z = np.float64(min(old[v, u], new[v, u]))
+            scale = level * max(z, 1e-6) ** 2
+            x, y = 2.0 * (u - left) / max(right - left - 1, 1) - 1.0, 2.0 * (v - top) / max(bottom - top - 1, 1) - 1.0
+            before, after = max(u - 1, left), min(u + 1, right - 1)
+            across = (np.float64(smooth[v, after]) - smooth[v, before]) / max(after - before, 1)
+            before, after = max(v - 1, top), min(v + 1, bottom - 1)
+            down = (np.float64(smooth[after, u]) - smooth[before, u]) / max(after - before, 1)
+            w[1], w[2], w[3], w[4], w[5] = x, y, x * x, x * y, y * y
+            w[6], w[7] = min(max(across / scale, -1.0), 1.0), min(max(down / scale, -1.0), 1.0)
+            for i in range(8):
+                sums[i] += w[i] * change[v, u]
+                for j in range(i + 1):
+                    square[i, j] += w[i] * w[j]
+    for i in range(8):
+        square[i, i:] = square[i:, i]
+    return sums, square
+
+
+@inline_kernel
+def _is_around(labels: np.ndarray, label: int, v: int, u: int) -> bool:
+    """Whether a pixel belongs to an object, or one near by does."""
+    if labels[v, u] == label:
+        return True
+    for i in range(max(v - _BAND, 0), min(v + _BAND + 1, labels.shape[0])):
+        for j in range(max(u - _BAND, 0), min(u + _BAND + 1, labels.shape[1])):
+            if labels[i, j] == label:
+                return True
+    return False

@@ -135,7 +135,7 @@ class Recoverer:
         rendered, index = raycast.render(body, camera)
         image = np.where(np.isfinite(rendered), rendered, np.nan).astype(np.float32)
         self.recover(image, camera, (index >= 0).astype(np.int32))
-        self.recover(image, camera)
+        self.recover(image, camera, previous=self.recover(image, camera))
 
     def recover(
         self,

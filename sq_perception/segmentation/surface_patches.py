@@ -29,6 +29,7 @@ import cv2
 import numpy as np
 
 from sq_perception.geometry.kernels import kernel
+from sq_perception.geometry.quantiles import ranked
 from sq_perception.imaging import depth_steps, regions
 from sq_perception.imaging.camera import Camera
 
@@ -213,7 +214,7 @@ def _chord_noise(every_inverse: np.ndarray, flat: np.ndarray | None, chord: _Cho
         both = (_bends(inverse, known, 0, chord.rho), _bends(inverse, known, chord.rho, 0))
         told = [bends for bends in both if bends.size >= _FEWEST_CHORDS]
         if told:
-            return 1.4826 * max(map(_middle, told))
+            return 1.4826 * max(ranked(one, one.size // 2) for one in told)
     return _CHORD_NOISE * sigma / (2 * chord.half + 1)
 
 
@@ -229,28 +230,6 @@ def _bends(inverse: np.ndarray, known: np.ndarray, down: int, right: int) -> np.
                 found[n] = abs(np.float32(0.5) * ends - inverse[v, u])
                 n += 1
     return found[:n]
-
-
-@kernel
-def _middle(numbers: np.ndarray) -> float:
-    """The median of float32 (n,) >= 0, of two the larger: their bits order as they do, and are counted by halves."""
-    bits = numbers.view(np.uint32)
-    left, high = numbers.size // 2, np.uint32(0)
-    counts = np.zeros(1 << 16, np.int32)
-    for one in bits:
-        counts[one >> 16] += 1
-    while left >= counts[high]:
-        left -= counts[high]
-        high += 1
-    counts[:] = 0
-    for one in bits:
-        if one >> 16 == high:
-            counts[one & 0xFFFF] += 1
-    low = np.uint32(0)
-    while left >= counts[low]:
-        left -= counts[low]
-        low += 1
-    return float(np.array([high << 16 | low], np.uint32).view(np.float32)[0])
 
 
 def _mean(image: np.ndarray, wanted: np.ndarray, chord: _Chord) -> tuple[np.ndarray, np.ndarray]:

@@ -125,9 +125,3 @@ def test_a_wall_behind_does_not_make_the_chords_of_things_longer_or_shorter(wall
 
 def test_nothing_wanted():
     assert patches(np.full((240, 320), np.nan)) is None
-
-
-@pytest.mark.parametrize("count", [1, 2, 101, 5000])
-def test_the_counted_median_is_a_number_in_the_middle(count: int, rng: np.random.Generator) -> None:
-    numbers = np.abs(rng.standard_normal(count)).astype(np.float32)
-    assert surface_patches._middle(numbers) == np.sort(numbers)[count // 2]
