@@ -153,34 +153,55 @@ def gaps_to_points(frames: np.ndarray, boxes: np.ndarray, points: np.ndarray) ->
     key = cell @ [1.0, 1e4, 1e8]
     order = np.argsort(key)
     starts = np.flatnonzero(np.diff(key[order], prepend=np.nan, append=np.nan) != 0)
-    return _gaps_to_cells(frames, boxes, points[order], (cell[order[starts[:-1]]] + 0.5) * _CELL, starts)
+    middles = (cell[order[starts[:-1]]] + 0.5) * _CELL
+    return _gaps_to_cells(frames, boxes, points[order].T.copy(), middles.T.copy(), starts)
 
 
 @kernel
 def _gaps_to_cells(
     frames: np.ndarray, boxes: np.ndarray, points: np.ndarray, middles: np.ndarray, starts: np.ndarray
 ) -> np.ndarray:
-    """The same of points in cells, those of cell c from ``starts[c]`` on: cells out of reach are passed over."""
-    found = np.full(len(frames), NEAR)
-    reach = NEAR + 0.5 * math.sqrt(3.0) * _CELL
-    at = np.empty(3)
+    """The same of points (3, j) in cells, those of cell c from ``starts[c]`` on: cells out of reach are passed over."""
+    found = np.empty(len(frames))
+    across = 0.5 * math.sqrt(3.0) * _CELL
+    of_cells, of_points = np.empty(middles.shape[1]), np.empty(points.shape[1])
     for k in range(len(frames)):
         nearest = np.full(_STRAY + 1, NEAR)
-        for c in range(len(middles)):
-            _into(frames[k], middles[c], at)
-            if _least_distance(at, boxes[k]) > reach:
+        _distances(frames[k], boxes[k], middles, of_cells)
+        for c in range(len(of_cells)):
+            if of_cells[c] > nearest[_STRAY] + across:
                 continue
+            inside = slice(starts[c], starts[c + 1])
+            _distances(frames[k], boxes[k], points[:, inside], of_points[inside])
             for p in range(starts[c], starts[c + 1]):
-                _into(frames[k], points[p], at)
-                distance = _least_distance(at, boxes[k])
                 slot = _STRAY
-                if distance < nearest[slot]:
-                    while slot > 0 and nearest[slot - 1] > distance:
+                if of_points[p] < nearest[slot]:
+                    while slot > 0 and nearest[slot - 1] > of_points[p]:
                         nearest[slot] = nearest[slot - 1]
                         slot -= 1
-                    nearest[slot] = distance
+                    nearest[slot] = of_points[p]
         found[k] = nearest[_STRAY]
     return found
+
+
+@inline_kernel
+def _distances(frame: np.ndarray, boxes: np.ndarray, places: np.ndarray, least: np.ndarray) -> None:
+    """Write the distance of places (3, j) to the nearest of some boxes (m, 6) of a gripper's frame to ``least``.
+
+    One loop over all places for each box, without a branch, so that it becomes vector code.
+    """
+    least[:] = np.inf
+    for box in range(len(boxes)):
+        x, y, z, long, wide, high = boxes[box]
+        for p in range(len(least)):
+            u, v, w = places[0, p] - frame[0, 3], places[1, p] - frame[1, 3], places[2, p] - frame[2, 3]
+            i = abs(frame[0, 0] * u + frame[1, 0] * v + frame[2, 0] * w - x) - long
+            j = abs(frame[0, 1] * u + frame[1, 1] * v + frame[2, 1] * w - y) - wide
+            k = abs(frame[0, 2] * u + frame[1, 2] * v + frame[2, 2] * w - z) - high
+            square = max(i, 0.0) ** 2 + max(j, 0.0) ** 2 + max(k, 0.0) ** 2
+            least[p] = min(least[p], square - min(max(i, j, k), 0.0) ** 2)
+    for p in range(len(least)):
+        least[p] = math.copysign(math.sqrt(abs(least[p])), least[p])
 
 
 @inline_kernel
@@ -190,15 +211,6 @@ def _into(frame: np.ndarray, place: np.ndarray, at: np.ndarray) -> None:
         at[i] = 0.0
         for j in range(3):
             at[i] += frame[j, i] * (place[j] - frame[j, 3])
-
-
-@inline_kernel
-def _least_distance(place: np.ndarray, boxes: np.ndarray) -> float:
-    """Of a place (3,) to the nearest of some boxes (m, 6) in the same frame."""
-    least = np.inf
-    for box in range(len(boxes)):
-        least = min(least, _distance(place, boxes[box]))
-    return least
 
 
 @kernel

@@ -96,8 +96,10 @@ def _reaches(
         gradient[8] = farthest[0] * m[1] - farthest[1] * m[0]
         variance = 0.0
         for i in range(9):
-            for j in range(9):
-                variance += gradient[i] * covariance[owner[k], i, j] * gradient[j]
+            half = 0.5 * covariance[owner[k], i, i] * gradient[i]
+            for j in range(i):
+                half += covariance[owner[k], i, j] * gradient[j]
+            variance += 2 * half * gradient[i]
         sigma[k] = math.sqrt(max(variance, 0.0))
     return reach, sigma
 
@@ -117,7 +119,7 @@ def middle_angles(bodies: Superquadric, owner: np.ndarray, directions: np.ndarra
 
 
 def chords(
-    bodies: Superquadric, owner: np.ndarray, offset: np.ndarray, direction: np.ndarray
+    bodies: Superquadric, owner: np.ndarray, offset: np.ndarray, direction: np.ndarray, steepest: float = np.pi
 ) -> tuple[np.ndarray, np.ndarray]:
     """Where the line through t + offset (k, 3) along direction (k, 3) leaves body ``owner``, and how squarely.
 
@@ -126,18 +128,36 @@ def chords(
     ends : (k, 2)
         Along +direction and against it, metres from the offset; NaN where the line misses the body.
     angle : (k,)
-        The larger one between direction and the normals at both ends, radians; NaN likewise.
+        The larger one between direction and the normals at both ends, radians; NaN likewise, and above ``steepest``.
     """
     flat, turns = np.ascontiguousarray(bodies.to_flat(), dtype=float), np.ascontiguousarray(bodies.rotation_matrix)
     ends, cosine = np.empty((2, len(owner))), np.empty((2, len(owner)))
+    least = np.cos(steepest)
     starts = np.flatnonzero(np.diff(owner, prepend=-1, append=-1))
     for first, last in pairwise(starts):
-        body = owner[first]
-        at, way = (np.ascontiguousarray((one[first:last] @ turns[body]).T) for one in (offset, direction))
-        for end in range(2):
-            _leave(flat[body], at, way if end == 0 else -way, ends[end, first:last], cosine[end, first:last])
-    angle = np.arccos(np.clip(cosine, -1.0, 1.0)).max(axis=0)
-    return ends.T, np.where(np.isfinite(ends).all(axis=0), angle, np.nan)
+        body, rows = owner[first], slice(first, last)
+        ends[:, rows], cosine[:, rows] = _chords(flat[body], turns[body], offset[rows], direction[rows], least)
+    lower = cosine.min(axis=0)
+    return ends.T, np.arccos(np.clip(np.where(lower >= least, lower, np.nan), -1.0, 1.0))
+
+
+@kernel
+def _chords(
+    body: np.ndarray, turn: np.ndarray, offset: np.ndarray, direction: np.ndarray, least: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Ends and cosines (2, k) of chords of one body; at the second end of those alone whose first cosine is enough."""
+    at, way = np.empty((3, len(offset))), np.empty((3, len(offset)))
+    for k in range(len(offset)):
+        for i in range(3):
+            at[i, k] = offset[k, 0] * turn[0, i] + offset[k, 1] * turn[1, i] + offset[k, 2] * turn[2, i]
+            way[i, k] = direction[k, 0] * turn[0, i] + direction[k, 1] * turn[1, i] + direction[k, 2] * turn[2, i]
+    ends, cosine = np.full((2, len(offset)), np.nan), np.full((2, len(offset)), np.nan)
+    _leave(body, at, way, ends[0], cosine[0])
+    square = np.flatnonzero(cosine[0] >= least)
+    run, cosine_there = np.empty(len(square)), np.empty(len(square))
+    _leave(body, at[:, square], -way[:, square], run, cosine_there)
+    ends[1, square], cosine[1, square] = run, cosine_there
+    return ends, cosine
 
 
 @kernel

@@ -6,10 +6,10 @@ Every margin m_k is what may be lost before the grasp fails, sigma_k how sure it
 
 | margin | of what | sigma |
 | --- | --- | --- |
-| opening | pads to the body's side, on either side, as the open fingers come | of that side, the hand |
+| opening | pads to the body's side, on either side, as far as the open fingers come | of that side, the hand |
 | engagement | fingers' ends beyond the body's near end | of the near end, the hand |
 | palm | the body's near end before the palm | the same |
-| friction | atan(mu) less the angle between pads and surface | of the surface's turn |
+| friction | the cone's half angle less that between pads and surface | of mu, of the surface's turn |
 | weight | friction of both pads against gravity, as a force and as a torque about the closing line | of the mass |
 | table, bodies, points | the gripper's least distance | of the obstacle where it is nearest, the hand |
 | unseen | share of the fingers in space that nobody has seen | a share of it is taken |
@@ -57,6 +57,8 @@ from sq_perception.grasping.trials import (
 
 FRICTION = 0.5
 """Of rubber pads on cartons and plastics, at the least; the benchmark draws 0.5 to 1."""
+_AT_MOST = 2.0
+"""Times the least friction."""
 PER_BODY = 8
 """Grasps a body that are told at most."""
 PLACEMENT = 0.002
@@ -73,6 +75,8 @@ _SWINGS = np.deg2rad([0.0, 25.0, -25.0, 50.0, -50.0, 80.0, -80.0])
 """Of the approach about the closing line, away from the steepest one."""
 _SLIDES = np.array([0.0, 0.4, -0.4, 0.8, -0.8])
 """Along the third axis, shares of the way to where the finger's width is no more wholly on the body."""
+_CLEAR = 0.95
+"""Grasps that pass a body with that probability where it is widest need not be looked at more closely."""
 _TOO_WIDE = 0.8
 """A body that is wider than the opening by so many sigmas of its width is not tried: once in five it would fit."""
 _CHECKED, _CHECKED_CLOSELY = 40, 16
@@ -115,7 +119,7 @@ def grasps(
     around
         Table, measured points and what was seen; nothing but the bodies if not given.
     friction
-        mu between pads and bodies.
+        mu between pads and bodies at the least: the cone of friction is that of mu to twice mu, weights count on mu.
     placement
         Standard deviation of where the hand comes to be, metres along each axis: calibration of arm and camera.
 
@@ -141,12 +145,14 @@ def grasps(
     closings = _closings(bodies, spread, gripper, friction)
     trials = _trials(bodies, spread, closings, gripper, around, friction, placement)
     reasons[np.unique(closings.owner)] = "no way for the fingers to come with the table and the palm in their way"
+    trials = _narrower(bodies, spread, trials.first(_CHECKED_IF_DOUBTFUL), gripper, placement)
     trials = _probable(trials, _CHECKED_IF_DOUBTFUL, reasons, "nothing holds")
     looked_at = _among_others(bodies, spread, trials.first(_CHECKED), gripper, around, placement)
     doubtful = np.setdiff1d(np.arange(len(bodies)), looked_at.owner[looked_at.logs.sum(axis=1) > np.log(_SURE)])
-    more = trials.at(np.isin(trials.owner, doubtful)).after(_CHECKED)
-    more = more.and_(at_rims(bodies, doubtful, gripper, around, friction, placement))
-    looked_at = looked_at.and_(_among_others(bodies, spread, more, gripper, around, placement))
+    if len(doubtful):
+        more = trials.at(np.isin(trials.owner, doubtful)).after(_CHECKED)
+        more = more.and_(at_rims(bodies, doubtful, gripper, around, friction, placement))
+        looked_at = looked_at.and_(_among_others(bodies, spread, more, gripper, around, placement))
     trials = _probable(looked_at, PER_BODY, reasons, "in the way")
     reasons[trials.owner] = ""
     return GraspPlan(tuple(_as_grasps(trials)), tuple(reasons))
@@ -205,7 +211,7 @@ def _trials(
     z = np.cos(swing) * steep + np.sin(swing) * np.cross(y, steep)
     possible = (length[:, 0] > 0.3) & ((z * down).sum(axis=1) > -0.1)
     owner, y, z, half, side = owner[possible], y[possible], z[possible], half[possible], side[possible]
-    x = np.cross(y, z)
+    x, tilting = np.cross(y, z), np.cross(down[possible], y)
     near, near_sigma = closing.reaches(bodies, spread, owner, -z)
     across, _ = closing.reaches(bodies, spread, owner, x)
 
@@ -237,16 +243,22 @@ def _trials(
     distinct = (np.abs(v) > 1e-3) | (np.tile(np.arange(places) % len(_SLIDES), len(rows)) == 0)
     u, v, at = u[distinct], v[distinct], at[distinct]
 
+    # A pad touches where it overlaps the body, which may lie wholly beyond the TCP.
+    touch = 0.5 * (np.maximum(u - gripper.tip, -near[at]) + np.minimum(u + gripper.tip, near[at]))
+    slid = v[:, None] * x[at]
+    narrow, broad = np.arctan([friction, _AT_MOST * friction])
+    cone, doubt = 0.5 * (narrow + broad), np.hypot(_SQUARE, (broad - narrow) / np.sqrt(12))
+    ends, angle = closing.chords(bodies, owner[at], slid + touch[:, None] * z[at], y[at], broad)
+    squarely = np.isfinite(angle)  # two in five; a body without any has that for a reason
+    rows = np.flatnonzero(squarely | ~np.isin(owner[at], owner[at[squarely]]))
+    u, at, slid, ends, angle = u[rows], at[rows], slid[rows], ends[rows], angle[rows]
+
     owner, half, side, opening, shift = owner[at], half[at], side[at], opening[at], shift[at]
     near, near_sigma, frames = near[at], near_sigma[at], frames[at]
-    x, y, z, position = (frames[:, :, k] for k in range(4))
-    offset = u[:, None] * z + v[:, None] * x
-    # A pad touches where it overlaps the body, which may lie wholly beyond the TCP.
-    touch = 0.5 * (np.maximum(u - gripper.tip, -near) + np.minimum(u + gripper.tip, near))
-    ends, angle = closing.chords(bodies, owner, offset + (touch - u)[:, None] * z, y)
+    y, z, position = (frames[:, :, k] for k in (1, 2, 3))
+    offset = u[:, None] * z + slid
     aside = np.nan_to_num(0.5 * (ends[:, 0] - ends[:, 1])) + shift
-    down = around.down(position)
-    lever = np.abs((np.cross(offset, down) * y).sum(axis=1))
+    lever = np.abs((offset * tilting[at]).sum(axis=1))
     offset += aside[:, None] * y
     position += offset
 
@@ -256,11 +268,27 @@ def _trials(
     logs[:, 0] = passing(room + aside, side[:, 0], placement) + passing(room - aside, side[:, 1], placement)
     logs[:, 1] = log_phi(u + gripper.tip + near - LEAST_ENGAGED, deep)
     logs[:, 2] = log_phi(gripper.palm - near - u, deep)
-    logs[:, 3] = np.where(np.isfinite(angle), log_phi(np.arctan(friction) - np.nan_to_num(angle), _SQUARE), -np.inf)
+    logs[:, 3] = np.where(np.isfinite(angle), log_phi(cone - angle, doubt), -np.inf)
     logs[:, 4] = weight(DENSITY * bodies.volume()[owner], lever, 2 * friction * gripper.force)
     if around.plane is not None:  # moved without a turn, so that the lowest corner is the same
         logs[:, 5] = log_phi(height[at] + offset @ around.plane[:3], np.hypot(TABLE_SIGMA, placement))
     return Trials(owner, frames, opening, 2 * half, logs)
+
+
+def _narrower(bodies: Superquadric, spread: np.ndarray, trials: Trials, gripper: Gripper, placement: float) -> Trials:
+    """The same, knowing that fingers which end above the middle do not come down to where a body is widest."""
+    y, z = trials.frames[:, :, 1], trials.frames[:, :, 2]
+    beside = trials.frames[:, :, 3] + gripper.tip * z - bodies.translation[trials.owner]
+    rows = np.flatnonzero((trials.logs[:, 0] < np.log(_CLEAR)) & ((beside * z).sum(axis=1) < 0))
+    owner, y, beside = trials.owner[rows], y[rows], beside[rows]
+    across = 0.5 * gripper.finger_width * trials.frames[rows, :, 0]
+    reached = np.fmax.reduce([closing.chords(bodies, owner, beside + k * across, y)[0] for k in (-1, 0, 1)])
+    aside = (beside * y).sum(axis=1)
+    for end, way in ((0, 1), (1, -1)):
+        reach, sigma = closing.reaches(bodies, spread, owner, way * y)
+        gap = 0.5 * trials.opening[rows] - np.fmin(reached[:, end], reach - way * aside)
+        trials.logs[rows, 0] = passing(gap, sigma, placement) + (trials.logs[rows, 0] if end else 0.0)
+    return trials
 
 
 def _among_others(

@@ -84,6 +84,12 @@ def test_a_can_is_taken_across_its_axis_from_every_side():
     np.testing.assert_allclose(found[0].position[:2], 0, atol=1e-3)
 
 
+def test_fingers_mind_no_width_that_they_do_not_come_down_to():
+    """78 of 80 mm wide: a can all the way, a dome only where its middle is, 6 cm below the fingers' ends."""
+    can, dome = (standing([0.039, 0.039, 0.1], [shape, 1.0]) for shape in (0.1, 1.0))
+    assert plan(can).grasps[0].score < 0.8 < plan(dome).grasps[0].score
+
+
 def test_a_box_is_taken_across_its_narrow_sides_and_along_them():
     found = plan(standing(*BOX)).grasps
     for grasp in found:
