@@ -36,7 +36,7 @@ score" is for the calibration of scores and goes on whatever fails.
 
 Intervals are Wilson's, 95 %; picks of one scene are not independent, so that they are somewhat too narrow.  Those of
 differences are from 2000 draws of scenes.  ``--each`` is a file of lines, one a scene and contestant: the same command
-goes on where it was interrupted.
+goes on where it was interrupted.  Who was not tried keeps the row of the results before, with the commit it is of.
 
 Published for orientation only, other things and another simulator: GIGA (HR) 87.9 / 86.0 packed, 69.8 / 51.1 pile; VGN
 74.5 / 79.2, 60.7 / 44.0; GPD 35.4 / 30.7, 17.7 / 9.2 (GSR / DR).  Physics: mujoco, the extra ``picking``.
@@ -59,7 +59,7 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from functools import lru_cache
-from itertools import pairwise
+from itertools import pairwise, product
 from pathlib import Path
 from typing import Any
 
@@ -385,7 +385,7 @@ def table(found: dict[str, Any]) -> str:
         causes = one["causes"]
         rows.append(
             [
-                name,
+                _named(name, one),
                 str(one["scenes"]),
                 str(one["tried"]),
                 rate(one["gsr"]),
@@ -400,11 +400,15 @@ def table(found: dict[str, Any]) -> str:
     return report.table(heads, rows)
 
 
+def _named(name: str, row: dict[str, Any]) -> str:
+    return f"{name} (commit {row['commit']})" if "commit" in row else name
+
+
 def gains_table(gains: dict[str, Any]) -> str:
     """Of pairs of contestants that tried the same scenes."""
     rows = [
         [
-            name,
+            _named(name, one),
             f"{one['scenes'][0]:.0f}",
             *("{:+.0f} ({:+.0f} to {:+.0f})".format(*one[rate]) for rate in ("gsr", "dr")),
         ]
@@ -436,6 +440,15 @@ def gain(lines: list[dict[str, Any]], kind: str, name: str, other: str) -> dict[
             values.append(100 * (share[0] - share[1]))
         found[rate] = [float(values[0][0]), *np.percentile(values[1], [2.5, 97.5]).tolist()]
     return {"scenes": [len(seeds)], **found}
+
+
+def _with_earlier(results: str, part: str, found: dict[str, Any]) -> dict[str, Any]:
+    """What was found, and what of earlier results was not tried this time, with the commit that it was tried at."""
+    made = report.previous(results, "environment").get("commit")
+    earlier = {name: {"commit": made, **row} for name, row in report.previous(results, part).items() if row}
+    mixed = earlier | {name: row for name, row in found.items() if row}
+    places = {f"{kind}: {name}": k for k, (kind, name) in enumerate(product(KINDS, CONTESTANTS))}
+    return dict(sorted(mixed.items(), key=lambda item: places.get(item[0], len(places))))
 
 
 def main() -> None:
@@ -479,6 +492,8 @@ def main() -> None:
         for kind in KINDS
         for other in ("ours without sigma", "classic", "cgn in masks")
     }
+    if arguments.name:
+        found, gains = _with_earlier(arguments.name, "rows", found), _with_earlier(arguments.name, "gains", gains)
     text = f"{table(found)}\n\n{gains_table(gains)}"
     if arguments.name:
         report.write(arguments.name, {"rows": found, "gains": gains}, text)

@@ -60,7 +60,8 @@ class Reason(IntFlag):
     OPEN_Y = 2
     OPEN_Z = 4
     HULL = 8
-    """No superquadric came near, so that the body was fitted like the convex hull of the object."""
+    """No superquadric came near, so that the body was fitted like the convex hull of the object.  If it is WEAK and no
+    size is open, some of the object sticks out, a trigger or a spout: keep clear of what was measured there."""
 
 
 FIELDS: tuple[tuple[str, int], ...] = tuple(
