@@ -28,7 +28,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from sq_perception.geometry.kernels import kernel
+from sq_perception.geometry.kernels import inline_kernel, kernel
 from sq_perception.geometry.quantiles import ranked
 from sq_perception.imaging import depth_steps, regions
 from sq_perception.imaging.camera import Camera
@@ -59,13 +59,13 @@ _SHAPE_TERMS = 6
 """Of a quadratic surface; twice as many samples tell its shape."""
 _FEWEST_CHORDS = 100
 """Of which a median is taken."""
-_FULL = 0.9
+_FULL = np.float32(0.9)
 """Share of a square that is measured and wanted; with 0.999, the border of each hole is lost, and 1 % of the IoU."""
 _MOST_PATCHES = 150
 """Bounds the time of frames that are noise alone; those of things have some 30."""
 _CONCAVE_BAND = 0.3
 """Of a fold's threshold, from which on patches grow into what is concave last."""
-_SANE = (1e-3, 1e3)
+_NEAREST, _FARTHEST = np.float32(1e-3), np.float32(1e3)
 """Metres between which depths are inverted."""
 _FAR_RADII = 2.0
 """Chords are at most so many times longer where there is noise: 2 found 86.1 % of the same things, 3 84.7 %."""
@@ -147,16 +147,15 @@ def find(
     if pixels < _LEAST_RADIUS:
         return None
     chord = _Chord.of(pixels, int(np.count_nonzero(wanted)))
-    every_inverse = 1 / np.clip(depth, *_SANE)
-    noise = _chord_noise(every_inverse, flat, chord, sigma)
+    noise = _chord_noise(depth, flat, chord, sigma)
     # The noise of a triangulating camera is alike over windows: longer chords see less of it as an angle.
     hidden = _NOISE_MARGIN * noise * middle * focal / pixels / _FOLD
     if hidden > 1:
         pixels = max(pixels, min(pixels * min(hidden, _FAR_RADII), longest))
         chord = _Chord.of(pixels, int(np.count_nonzero(wanted)))
-        noise = _chord_noise(every_inverse, flat, chord, sigma)
+        noise = _chord_noise(depth, flat, chord, sigma)
     stride, rho = chord.stride, chord.rho
-    inverse, known = _mean(every_inverse, wanted, chord)
+    inverse, known = _mean(depth, wanted, chord.half, stride)
     coarse = filled[::stride, ::stride]
     step = max(depth_steps.STEP, float(np.tan(_STEEPEST)) * stride / focal)
     stepped = _steps(filled, wanted, stride)
@@ -203,14 +202,14 @@ class _Chord:
         return cls(max(1, round(pixels / _RADIUS_SAMPLES)), stride, max(2, round(pixels / stride)))
 
 
-def _chord_noise(every_inverse: np.ndarray, flat: np.ndarray | None, chord: _Chord, sigma: float) -> float:
+def _chord_noise(depth: np.ndarray, flat: np.ndarray | None, chord: _Chord, sigma: float) -> float:
     """Standard deviation of (w(p - rho) + w(p + rho)) / 2 - w(p) on a plane, 1 / metres.
 
     It is measured where there is one, since noise that is alike over a window of pixels is no smaller in the mean of
     a square; else it is that of independent noise.
     """
     if flat is not None:
-        inverse, known = _mean(every_inverse, flat, chord)
+        inverse, known = _mean(depth, flat, chord.half, chord.stride)
         both = (_bends(inverse, known, 0, chord.rho), _bends(inverse, known, chord.rho, 0))
         told = [bends for bends in both if bends.size >= _FEWEST_CHORDS]
         if told:
@@ -232,14 +231,44 @@ def _bends(inverse: np.ndarray, known: np.ndarray, down: int, right: int) -> np.
     return found[:n]
 
 
-def _mean(image: np.ndarray, wanted: np.ndarray, chord: _Chord) -> tuple[np.ndarray, np.ndarray]:
-    """An image on the grid, averaged over the wanted pixels of a square, and where nearly all of it is wanted."""
-    mask = wanted.astype(np.float32)
-    side, stride = (2 * chord.half + 1, 2 * chord.half + 1), chord.stride
-    total = cv2.blur(image * mask, side, borderType=cv2.BORDER_CONSTANT)[::stride, ::stride]
-    share = cv2.blur(mask, side, borderType=cv2.BORDER_CONSTANT)[::stride, ::stride]
-    known = share > _FULL
-    return np.where(known, total / np.maximum(share, np.float32(1e-6)), np.float32(0)), known
+@kernel
+def _mean(depth: np.ndarray, wanted: np.ndarray, half: int, stride: int) -> tuple[np.ndarray, np.ndarray]:
+    """1 / depth, float32 on the grid, averaged over the wanted pixels of a square, and where nearly all are wanted.
+
+    Sums of columns go down the image with the squares, and sums of these along its rows.
+    """
+    height, width = depth.shape
+    mean = np.zeros(((height + stride - 1) // stride, (width + stride - 1) // stride), np.float32)
+    known = np.zeros(mean.shape, np.bool_)
+    totals, counts = np.zeros(width), np.zeros(width)
+    share = 1.0 / ((2 * half + 1) * (2 * half + 1))
+    top = bottom = 0
+    for i in range(mean.shape[0]):
+        while bottom < min(i * stride + half + 1, height):
+            _add_row(depth[bottom], wanted[bottom], 1.0, totals, counts)
+            bottom += 1
+        while top < i * stride - half:
+            _add_row(depth[top], wanted[top], -1.0, totals, counts)
+            top += 1
+        total, count, left, right = 0.0, 0.0, 0, 0
+        for j in range(mean.shape[1]):
+            while right < min(j * stride + half + 1, width):
+                total, count, right = total + totals[right], count + counts[right], right + 1
+            while left < j * stride - half:
+                total, count, left = total - totals[left], count - counts[left], left + 1
+            full = np.float32(count * share)
+            if full > _FULL:
+                mean[i, j], known[i, j] = np.float32(total * share) / full, True
+    return mean, known
+
+
+@inline_kernel
+def _add_row(depth: np.ndarray, wanted: np.ndarray, sign: float, totals: np.ndarray, counts: np.ndarray) -> None:
+    """Add what is wanted of a row of pixels to the sums of their columns."""
+    for u in range(len(totals)):
+        known = sign if wanted[u] else 0.0
+        totals[u] += known * np.float32(1.0 / min(max(depth[u], _NEAREST), _FARTHEST))
+        counts[u] += known
 
 
 def _steps(filled: np.ndarray, wanted: np.ndarray, stride: int) -> np.ndarray:
