@@ -33,8 +33,9 @@ Box = tuple[float, float, float, float, float, float]
 Pose = tuple[tuple[float, float, float, float], tuple[float, float, float]]
 """Quaternion x y z w and translation."""
 
-MIN_HEIGHT = 0.012
-"""Metres that a thing reaches above the support at least: one and a half tolerances of a plane a metre away."""
+MIN_HEIGHT, _LEAST_HEIGHT = 0.012, 0.008
+"""Metres that a thing reaches above the support at least, a metre away and farther, and nearer as the noise falls: one
+and a half tolerances of a plane, and a book's thickness, as cloths have folds."""
 _SAMPLES = 400
 """Of a segment, evenly taken: the 5 % above a height, or the 1 % that may stick out, are a few still."""
 _COARSE_PIXELS, _FEWEST = 120, 30
@@ -193,7 +194,8 @@ def standing(
         growth = noise_growth(points[:, 2])
         height = relative[r, c]
         noise = max(support.sigma, _spread(relative, around, rows, columns))
-        if _top(height * growth) < MIN_HEIGHT or _top(height) < _BUMP * noise:
+        least = max(_LEAST_HEIGHT, MIN_HEIGHT * min(1.0, float(quantile(growth, 0.5))))
+        if _top(height * growth) < least or _top(height) < _BUMP * noise:
             return False
         at_border = rows.min() == 0 or columns.min() == 0 or rows.max() == last_row or columns.max() == last_column
         for wall in walls:

@@ -26,7 +26,7 @@ import cv2
 import numpy as np
 
 from sq_perception.geometry.kernels import kernel
-from sq_perception.imaging import depth_steps
+from sq_perception.imaging import depth_steps, regions
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation.support_plane import LEAST_GROWTH, TOLERANCE, Plane, noise_growth
 
@@ -49,6 +49,9 @@ _RAMP_LENGTH = 0.08
 
 _LEVELS = (0.5, 1.0, 2.0, 3.0, 4.0)
 """Tolerances above the support at which is looked for low things: from what counts as above it to the highest ramp."""
+_LEVEL_SHARE, _LEVEL_SAMPLES = 0.5, 8
+"""Share of a part's samples that lie within half a tolerance of one height if it is level, and least samples of it.  Of
+a ramp that is a tenth, or a third where it runs out."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,14 +175,28 @@ def _low_things(height: np.ndarray, known: np.ndarray, reached: np.ndarray) -> n
 
     A ramp belongs to the tall thing beside which it rises.  Where the samples above some level hold together and what
     is highest of them was reached, they are a thing of their own, such as a book or a bag, whose sides the windows of a
-    sensor smooth into ramps.
+    sensor smooth into ramps.  So are those that are level, a book under a box: a ramp has all heights up to what it
+    leads to.
     """
-    own = np.zeros(height.shape, bool)
+    own = _level(height, reached)
     for level in _LEVELS:
         parts = depth_steps.components(known & (height > level * TOLERANCE))
         tops = _tops(parts, reached, height, int(parts.max()))
         own |= (tops[1] > tops[0] - 0.5 * TOLERANCE)[parts] & (parts > 0)
     return own
+
+
+def _level(height: np.ndarray, reached: np.ndarray) -> np.ndarray:
+    """Parts of what was reached of which most samples lie at one height, a tolerance above the support or higher."""
+    parts = depth_steps.components(reached & (height > 0.5 * TOLERANCE))
+    extents = regions.extents(parts)
+    level = np.zeros(len(extents), bool)
+    for part in np.flatnonzero(extents[:, 0] >= _LEVEL_SAMPLES):
+        if part > 0:
+            heights = np.sort(height[regions.pixels(parts, part, extents[part])])
+            about = np.searchsorted(heights, heights + 0.5 * TOLERANCE, side="right") - np.arange(len(heights))
+            level[part] = about[heights > 0.75 * TOLERANCE].max(initial=0) > _LEVEL_SHARE * len(heights)
+    return level[parts]
 
 
 @kernel

@@ -124,6 +124,20 @@ def test_a_low_thing_whose_sides_the_sensor_smooths_is_no_ramp(seed):
 
 
 @pytest.mark.parametrize("seed", range(3))
+def test_a_low_thing_that_leads_up_to_a_tall_one_is_level_and_no_ramp(seed):
+    """The board with a tall box on a part of it, up to which the smeared sides and all of its top lead."""
+    table = plane_image(slanted(90), 0.8)
+    v, u = np.indices(table.shape)
+    board = (np.abs(u - 150) < 50) & (np.abs(v - 120) < 30)
+    box = (np.abs(u - 185) < 15) & (np.abs(v - 120) < 30)
+    depth = cv2.blur((table - 0.02 * board).astype(np.float32), (13, 13)) - 0.1 * box
+    found = segment(noisy(depth, 1e-3, seed), CAMERA)
+    assert len(found.ids) == 2
+    assert overlap(box, found.labels) > 0.9
+    assert overlap(board & ~box, found.labels) > 0.7
+
+
+@pytest.mark.parametrize("seed", range(3))
 def test_bumps_where_the_noise_is_large_are_no_things(seed, monkeypatch):
     """A third of a table has ten times the noise of the rest, whose noise alone would make things of its bumps."""
     table = plane_image(slanted(90), 0.8)
