@@ -193,7 +193,7 @@ def _level(height: np.ndarray, reached: np.ndarray) -> np.ndarray:
     level = np.zeros(len(extents), bool)
     for part in np.flatnonzero(extents[:, 0] >= _LEVEL_SAMPLES):
         if part > 0:
-            heights = np.sort(height[regions.pixels(parts, part, extents[part])])
+            heights = np.sort(height[regions.pixels(parts, int(part), extents[part])])
             about = np.searchsorted(heights, heights + 0.5 * TOLERANCE, side="right") - np.arange(len(heights))
             level[part] = about[heights > 0.75 * TOLERANCE].max(initial=0) > _LEVEL_SHARE * len(heights)
     return level[parts]
