@@ -38,6 +38,8 @@ MIN_HEIGHT, _LEAST_HEIGHT = 0.012, 0.008
 and a half tolerances of a plane, and a book's thickness, as cloths have folds."""
 _SAMPLES = 400
 """Of a segment, evenly taken: the 5 % above a height, or the 1 % that may stick out, are a few still."""
+_SPARSE = 8
+"""Every so many pixels tell the nearest depth of an image."""
 _COARSE_PIXELS, _FEWEST = 120, 30
 """Samples along the shorter side of the image that surfaces are searched on, and least samples of one."""
 _BUMP, _ON_WALL = 6.0, 3.5
@@ -56,7 +58,8 @@ _TURNS = np.stack([np.cos(np.deg2rad(np.arange(0, 180, 10))), np.sin(np.deg2rad(
 _UNDER, _BELOW = 3.0, 2.0
 """Tolerances below the support at which is looked for it, and from which on something seen lies below it."""
 _TOLD = 1 / 3
-"""Share of the feet that must be told to have the support, or something before it, under them."""
+"""Share of the feet that must be told to have the support, or something before it, under them.  Not of what reaches the
+nearest depth of the image: it goes on where the sensor measures nothing, and may itself hide its feet."""
 
 
 @dataclass(frozen=True)
@@ -185,6 +188,8 @@ def standing(
     last_row, last_column = camera.height - 1, camera.width - 1
     around = depth > 0
     measured = np.count_nonzero(around)
+    coarse = depth[::_SPARSE, ::_SPARSE]
+    nearest = quantile(coarse[coarse > 0], _OUTLIERS / 10) * (1 + depth_steps.STEP) if coarse.any() else 0.0
     plane = support.plane
 
     def is_thing(rows: np.ndarray, columns: np.ndarray) -> bool:
@@ -207,7 +212,8 @@ def standing(
                 return False
         if not limits.hold(points, plane.equation[:3]):
             return False
-        if not _stands(points, depth, relative, camera, plane):
+        told = _TOLD if points[:, 2].min() > nearest else 0.0
+        if not _stands(points, told, depth, relative, camera, plane):
             return False
         around[rows, columns] = False
         return True
@@ -230,8 +236,11 @@ def _spread(relative: np.ndarray, around: np.ndarray, rows: np.ndarray, columns:
     return 1.4826 * quantile(heights, 0.5) if heights.size >= _FEWEST else 0.0
 
 
-def _stands(points: np.ndarray, depth: np.ndarray, relative: np.ndarray, camera: Camera, plane: Plane) -> bool:
-    """Whether the support is under points (n, 3), as far as the camera tells; what the image cuts off tells nothing."""
+def _stands(
+    points: np.ndarray, least: float, depth: np.ndarray, relative: np.ndarray, camera: Camera, plane: Plane
+) -> bool:
+    """Whether the support is under points (n, 3), as far as the camera tells, of a share of them at least; what the
+    image cuts off tells nothing."""
     normal = plane.equation[:3]
     under = plane.height(points) + _UNDER * TOLERANCE * noise_growth(points[:, 2])
     feet = points - under[:, None] * normal
@@ -242,4 +251,4 @@ def _stands(points: np.ndarray, depth: np.ndarray, relative: np.ndarray, camera:
     told = depth[rows, columns] > 0
     past = np.count_nonzero(told & (relative[rows, columns] < -_BELOW * TOLERANCE))
     held = np.count_nonzero(told) - past
-    return past <= held and held + np.count_nonzero(~inside) >= _TOLD * len(feet)
+    return past <= held and held + np.count_nonzero(~inside) >= least * len(feet)

@@ -212,6 +212,22 @@ def test_what_stands_behind_the_table_is_not_on_it():
     assert overlap(truth == 2, found.labels) > 0.85
 
 
+def test_what_reaches_the_nearest_depth_may_hide_its_own_feet():
+    """A box of which a sensor measures the far end alone: the rest of it, and the table below, are too near."""
+    normal = slanted(50)
+    table = plane_image(normal, 0.7)
+    base = CAMERA.unproject(np.array(160), np.array(150), np.array(table[150, 160]))
+    box = Superquadric(np.array([0.06, 0.06, 0.05]), np.full(2, 0.2), base + 0.05 * normal, frame_of(normal))
+    depth, truth = with_bodies(table, [box])
+    depth = noisy(depth)
+    depth[depth < 0.78] = np.nan
+    seen = (truth == 1) & np.isfinite(depth)
+    assert 200 < np.count_nonzero(seen) < 0.2 * np.count_nonzero(truth == 1)
+    found = segment(depth, CAMERA)
+    assert len(found.ids) == 1
+    assert overlap(seen, found.labels) > 0.9
+
+
 def frame_of(normal):
     return rotation.from_matrix(np.stack([[1, 0, 0], np.cross(normal, [1, 0, 0]), normal], axis=1))
 
