@@ -1,17 +1,15 @@
 """The exact course: for images that a superquadric explains down to the noise.
 
-1. Starts, cheap ones first: given bodies, central symmetry, boxes on the support plane.  From each, few steps on few
-   rays; the best go on with more rays.  More starts only while the best residual stays above the noise floor: the
-   rivals of the best body, then starts of every kind.  What no superquadric explains after that is left to
-   :mod:`sq_perception.fitting.tolerant`, which goes on from the bodies that were tried.
-2. The winner on all rays: free rays where the mask lost its edge are let go, object rays far off the surface are
-   dropped, the outline's precision is read from its misfit.
-3. The finalists that few rays do not tell apart are refined on all of them.
+1. Starts, cheap ones first: given bodies, central symmetry.  From each, few steps on few rays; the best go on with more
+   rays.  More starts, of every kind, only while the best residual stays above the noise floor.  What no superquadric
+   explains after that is left to :mod:`sq_perception.fitting.tolerant`, which goes on from the bodies that were tried.
+2. The winner on all rays: free rays where the mask lost its edge are let go, the outline's precision is read from its
+   misfit.
+3. All finalists are refined on all rays.
 4. Where something is left unexplained, or a half size is not certain to 1 %, the rivals of the result are tried.  Those
    that explain the image almost as well stay as alternatives and add to the covariance.
 5. Half sizes along the view that the readings leave open are walked along (:mod:`sq_perception.fitting.rounding`).
-6. On a plane, the body is also tried as one of revolution (:mod:`sq_perception.fitting.revolution`).
-7. A half size that stays open is weighed against a prediction (:mod:`sq_perception.fitting.unseen`).
+6. A half size that stays open is weighed against a prediction (:mod:`sq_perception.fitting.unseen`).
 
 The noise floor is a mean squared residual of 1, as residuals are in units of the noise.
 """
@@ -24,9 +22,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from sq_perception.fitting import revolution, rounding, starts, tolerant, unseen
+from sq_perception.fitting import rounding, starts, tolerant, unseen
 from sq_perception.fitting.covariance import Alternative
-from sq_perception.fitting.depth_noise import MEDIAN_TO_SIGMA
 from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.observation import Observation
 from sq_perception.fitting.outline import sharpened, without_shrunk_edge
@@ -47,20 +44,14 @@ from sq_perception.fitting.problem import (
     refine,
     select,
     settle,
-    within_doubt,
 )
 from sq_perception.fitting.rays import Rays
-from sq_perception.fitting.residuals import surface_distance
 from sq_perception.fitting.rivals import SIGNIFICANT, alike, other_axes, other_depths
-from sq_perception.geometry.quantiles import quantile
 
 _MORE_RAYS, _MOST_FINAL_RAYS = 1500, 6000
 """Half of and twice :data:`~sq_perception.fitting.problem.FINAL_RAYS`: where few rays tie, and under much noise."""
 _FINE_NOISE = 0.3
 """Noise in pixel widths that the fewest rays of the last stage average out; more noise asks for more, by its square."""
-_OUTLIER = 5.0
-"""Object rays this many standard deviations off the surface of the winner are dropped: noise reaches there once in two
-million."""
 _SETTLED, _UNSURE = 1.03, 0.01
 """A last mean squared residual above the one, or a half size less certain than the other, as a share of it, make other
 valleys of the cost worth a look; chosen on benchmarks/single_body."""
@@ -78,11 +69,9 @@ def solve(problem: Problem, given: Sequence[State]) -> Solution:
     tried = coarse(problem, given)
     finalists = select(problem, tried) if given else []
     if not given or _goes_on(problem, finalists):
-        found = starts.automatic(problem)
+        found = coarse(problem, starts.symmetric(problem.observation))
         tried += found
         finalists = select(problem, found, finalists)
-        if _goes_on(problem, finalists):
-            finalists = _with_rivals(problem, finalists)
         if _goes_on(problem, finalists):
             found = coarse(problem, starts.everything(problem.observation))
             tried += found
@@ -98,7 +87,7 @@ def solve_cheaply(problem: Problem, given: Sequence[State], later: Callable[[], 
     ``later`` returns further starts that cost time: it is called only if those before do not suffice.
     """
     finalists: list[State] = []
-    groups: list[Callable[[], Sequence[State]]] = [lambda: given, lambda: next(starts.symmetric(problem.observation))]
+    groups: list[Callable[[], Sequence[State]]] = [lambda: given, lambda: starts.symmetric(problem.observation)]
     for group in groups if later is None else [*groups, later]:
         candidates = group()
         tried = coarse(problem, candidates) if candidates else []
@@ -115,17 +104,15 @@ def _goes_on(problem: Problem, finalists: list[State]) -> bool:
 
 
 def _decide(problem: Problem, finalists: list[State]) -> Solution:
-    """Steps 2 to 7: the finalists on the full budget of rays, the same terms for all of them."""
+    """Steps 2 to 6: the finalists on the full budget of rays, the same terms for all of them."""
     favourite, *others = finalists
     if not problem.late:
         problem, favourite = without_shrunk_edge(problem, favourite)
     enough = _enough_rays(problem.observation)
     rays = draw(problem, problem.options.pixels or enough, 0.3)
-    rays = rays._replace(hits=_without_outliers(problem.observation, rays.hits, favourite))
     problem, favourite = sharpened(problem, favourite, rays.free, draw(problem, enough // 4, 0.3))
 
-    first, *others = _told_apart(problem, [favourite, *others])
-    best = refine(problem, first, rays)
+    best = refine(problem, favourite, rays)
     for rival in others:
         if problem.late:
             break
@@ -134,9 +121,6 @@ def _decide(problem: Problem, finalists: list[State]) -> Solution:
     solution = _varied(Solution(problem, best, rays))
     if not problem.late:
         solution = rounding.spread_along_view(solution)
-    # An exact body's symmetry is weighed on all its rays, before doubts about the model lessen their weight.
-    if not problem.late and problem.observation.camera.is_pinhole and problem.options.plane is not None:
-        solution = revolution.weighed(solution)
     if not problem.late:
         solution = unseen.weighed(solution)
     return solution
@@ -148,40 +132,7 @@ def _enough_rays(observation: Observation) -> int:
     return int(np.clip(FINAL_RAYS * (ratio / _FINE_NOISE) ** 2, FINAL_RAYS, _MOST_FINAL_RAYS))
 
 
-def _without_outliers(observation: Observation, hits: np.ndarray, state: State) -> np.ndarray:
-    """The rays whose points lie near the surface, as seen by the majority."""
-    distance = np.abs(surface_distance(hits, state.parameters, state.rotation))
-    spread = max(observation.sigma, MEDIAN_TO_SIGMA * quantile(distance, 0.5))
-    return hits[distance < _OUTLIER * spread]
-
-
-def _told_apart(problem: Problem, finalists: list[State]) -> list[State]:
-    """The finalists, best first, that are worth all rays: more rays do not tell them apart."""
-    if len(finalists) == 1:
-        return finalists
-    rays = draw(problem, _MORE_RAYS, 0.3)
-    settled = by_cost(settle(problem, state, rays) for state in finalists)
-    return _distinct(settled, settled[0].cost + RIVAL_SLACK)
-
-
-def _distinct(states: Sequence[State], most: float, known: Sequence[State] = ()) -> list[State]:
-    """Those cheaper than ``most`` that end in valleys of their own."""
-    chosen = list(known)
-    for state in states:
-        if state.cost < most and not any(alike(state, other) for other in chosen):
-            chosen.append(state)
-    return chosen[len(known) :]
-
-
 # Other valleys of the cost
-
-
-def _with_rivals(problem: Problem, finalists: list[State]) -> list[State]:
-    """The finalists, and what the rivals of the first one lead to."""
-    rays = draw(problem, BASIN_RAYS, 0.7)
-    best = settle(problem, finalists[0], rays)
-    rivals = other_depths(best, np.argsort(-np.abs(best.rotation[2]))) + other_axes(best)
-    return within_doubt([*finalists, *_promising(problem, rivals, rays, best.cost)])[:FINALISTS]
 
 
 def _varied(solution: Solution) -> Solution:
@@ -198,7 +149,7 @@ def _varied(solution: Solution) -> Solution:
         unsure = solution.unsure()
         if solution.problem.late or not (unexplained or unsure.max() > _UNSURE):
             break
-        rivals = other_depths(best, np.argsort(-unsure))
+        rivals = other_depths(best, int(np.argmax(unsure)))
         if unexplained:
             rivals += other_axes(best)
         better, refined = _better(solution, rivals)
@@ -217,7 +168,11 @@ def _better(solution: Solution, rivals: list[State]) -> tuple[State, list[State]
     reference = settle(problem, best, few)
     # On other rays the body may already find its way out of a shallow valley.
     settled = [reference, *_promising(problem, rivals, few, reference.cost)]
-    chosen = _distinct(settled, reference.cost + RIVAL_SLACK, [best._replace(cost=reference.cost)])
+    known = [best._replace(cost=reference.cost)]
+    for state in settled:
+        if state.cost < reference.cost + RIVAL_SLACK and not any(alike(state, other) for other in known):
+            known.append(state)
+    chosen = known[1:]
     if not chosen:
         return best, []
     more = draw(problem, _MORE_RAYS, 0.8)

@@ -111,12 +111,13 @@ class Observation:
 
     def free_rays(self, count: int, offset: float = 0.5) -> np.ndarray:
         """At most ``count`` rays (k, 8) through free space, likewise; z is where free space ends."""
-        return self.free_rays_of(self.free, count, offset)
-
-    def free_rays_of(self, pixels: np.ndarray, count: int, offset: float = 0.5) -> np.ndarray:
-        """The same through some of the free pixels."""
+        pixels = self.free
         if len(pixels) > count:
             pixels = pixels[((np.arange(count) + offset) * (len(pixels) / count)).astype(np.int64)]
+        return self.free_rays_of(pixels)
+
+    def free_rays_of(self, pixels: np.ndarray) -> np.ndarray:
+        """The rays through some of the free pixels."""
         return self._through(pixels, _FREE_MARGIN)
 
     def rim(self) -> np.ndarray:

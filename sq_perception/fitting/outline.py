@@ -13,24 +13,20 @@ from dataclasses import replace
 import numpy as np
 
 from sq_perception.fitting.levenberg_marquardt import State
-from sq_perception.fitting.problem import BASIN_STEPS, FINAL_RAYS, Problem, draw, refine, settle
+from sq_perception.fitting.problem import BASIN_STEPS, FINAL_RAYS, FIRST_STEPS, Problem, draw, refine, settle
 from sq_perception.fitting.rays import Rays
 from sq_perception.fitting.residuals import penetration
+from sq_perception.geometry.quantiles import quantile
 
 _SHARP = 0.3
 """Standard deviation of a perfect outline, in pixels: the body covers exactly the centres of the mask's pixels, a
 uniform error of up to half a pixel (1 / sqrt(12))."""
-_SHRUNK, _MOST = 0.25, 0.7
-"""A body that covers this share of the free pixels beside the mask this deep, in pixels, is larger than its mask."""
+_SHRUNK = 0.25
+"""A body that covers half of the free pixels beside the mask this deep, in pixels, is larger than its mask."""
 _WIDEST_BAND = 4
 """Pixels of a mask's edge that may be missing."""
-_RING_RAYS = 200
-"""Of a ring around the mask: its quantiles are known to 3 %."""
-_FEWEST = 3
-"""Covered rays that it takes to tell a standard deviation."""
-_READINGS, _STEPS, _SHARPER = 4, 6, 0.7
-"""Readings of the outline's precision at most, steps after each, and how much smaller than the one before it has to be
-for another one."""
+_SHARPER = 0.7
+"""How much smaller than the one before a reading of the outline's precision has to be for another one."""
 
 
 def without_shrunk_edge(problem: Problem, state: State) -> tuple[Problem, State]:
@@ -48,25 +44,24 @@ def without_shrunk_edge(problem: Problem, state: State) -> tuple[Problem, State]
 def sharpened(problem: Problem, state: State, free: np.ndarray, rays: Rays) -> tuple[Problem, State]:
     """Read the outline's precision from a body's misfit to free rays, and again from the better body it allows."""
     sigma = math.inf
-    for _ in range(_READINGS):
+    while True:
         before, sigma = sigma, _sigma(problem, state, free)
         if sigma > _SHARPER * before:
-            break
+            return problem, state
         problem = problem.with_terms(outline_stiffness=1 / sigma)
-        state = settle(problem, state, rays, _STEPS)
-    return problem, state
+        state = settle(problem, state, rays, FIRST_STEPS)
 
 
 def _depth_inside(problem: Problem, state: State, pixels: np.ndarray) -> float:
-    """Depth, in pixels, to which the body covers most of these free pixels.
+    """Depth, in pixels, to which the body covers half of these free pixels.
 
-    Most: a body that is merely too long covers those around the mask on one side only.
+    Half: a body that is merely too long covers those around the mask on one side only.
     """
-    rays = problem.observation.free_rays_of(pixels, _RING_RAYS)
+    rays = problem.observation.free_rays_of(pixels)
     if len(rays) == 0:
         return 0.0
     depth = penetration(rays, problem.terms, state.parameters, state.rotation)
-    return float(np.quantile(depth, 1 - _MOST)) / problem.observation.footprint
+    return quantile(depth, 0.5) / problem.observation.footprint
 
 
 def _sigma(problem: Problem, state: State, free: np.ndarray) -> float:
@@ -76,6 +71,4 @@ def _sigma(problem: Problem, state: State, free: np.ndarray) -> float:
         return sharp
     depth = penetration(free, problem.terms, state.parameters, state.rotation)
     reached = depth[depth > 0]
-    if len(reached) < _FEWEST:
-        return sharp
-    return max(sharp, float(np.sqrt(np.mean(reached**2))))
+    return max(sharp, float(np.sqrt(np.mean(reached**2)))) if len(reached) else sharp

@@ -27,14 +27,10 @@ def alike(one: State, other: State) -> bool:
     return bool((sizes < _ALIKE * np.sort(one.parameters[:3])).all())
 
 
-def other_depths(state: State, axes: np.ndarray) -> list[State]:
-    """The body with another half size along the first of these axes, or the second; thinner with another z; turned."""
-    first, second = int(axes[0]), int(axes[1])
-    size = state.parameters
-    thinner = resized(state, first, 0.5 * size[first])
-    found = [thinner, resized(state, first, 0.35 * size[first]), resized(state, first, 1.4 * size[first])]
-    found += [resized(state, second, share * size[second]) for share in (0.35, 1.4)]
-    return [*found, *other_orders(thinner), _turned(state)]
+def other_depths(state: State, axis: int) -> list[State]:
+    """The body with half of its half size along an axis, with more of it, and turned."""
+    size = state.parameters[axis]
+    return [resized(state, axis, 0.5 * size), resized(state, axis, 1.4 * size), _turned(state)]
 
 
 def _turned(state: State) -> State:

@@ -5,8 +5,7 @@ q of depth with little noise, all those of the face err alike, by up to q / 2, a
 news of the outline.  What is certain is that the true body passes every reading at no more than q / 2.  So the half
 size along the view is held at one value after another, the rest is fitted with residuals that count only beyond q / 2
 (a dead zone), and each value has the weight exp(-cost / 2).  Their mean is the estimate, their spread the standard
-deviation.  Under noise the same walk along the half size, without the dead zone, says how far a covariance, which is
-local, can be trusted (:func:`uncertain`).
+deviation.
 
 Reference for the bounded-error view: M. Milanese, A. Vicino, Optimal estimation theory for dynamic systems with set
 membership uncertainty, Automatica 27(6), 1991.
@@ -21,7 +20,7 @@ import numpy as np
 
 from sq_perception.fitting.covariance import Alternative
 from sq_perception.fitting.levenberg_marquardt import State, minimize
-from sq_perception.fitting.problem import Problem, Solution
+from sq_perception.fitting.problem import BASIN_STEPS, TOLERANCE, Problem, Solution
 from sq_perception.fitting.rays import DEPTH, Rays
 from sq_perception.fitting.residuals import RENDERED
 from sq_perception.fitting.rivals import other_orders, resized
@@ -30,7 +29,7 @@ _FACE_SHARE = 0.04
 """A depth that this share of all rays has in common is that of a face."""
 _DEAD_ZONE = math.sqrt(3.0) * 1.01
 """Half a step in standard deviations q / sqrt(12) of its noise, and a little for single precision."""
-_RAYS, _STEPS, _TOLERANCE = 1000, 12, 1e-3
+_RAYS = 1000
 """Of the search for each of up to 21 bodies, which begins at a neighbour's."""
 _PACES = (1.05, 1.08, 1.12, 1.18, 1.25, 1.25, 1.25, 1.25, 1.25, 1.25)
 """Factors from one half size to the next, up and down from the one at hand."""
@@ -41,22 +40,19 @@ _ALLOWED = 3.0
 _CERTAIN = 0.02
 """A standard deviation of the log size below this leaves nothing open."""
 _OPEN = 0.1
-"""A half size less certain than this share of it: the mean of all bodies replaces the one of least squares; without
-rounding, it is walked along."""
+"""A half size less certain than this share of it: the mean of all bodies replaces the one of least squares."""
 _FACE_SPREAD = 1.5
 """Of the other standard deviations: all readings of a face err alike."""
 
 
 def spread_along_view(solution: Solution) -> Solution:
-    """Ask for all half sizes along the view that the image allows, where readings are rounded or say little."""
+    """Ask for all half sizes along the view that the image allows, where readings are rounded."""
     quantum = solution.problem.observation.noise.quantum
     if quantum > 0 and faces_camera(solution.rays.hits, quantum):
         best, allowed = plausible(solution)
         solution = replace(solution, state=best)
         if allowed:
             solution = replace(solution, alternatives=tuple(allowed), spread_factor=_FACE_SPREAD**2)
-    elif quantum == 0 and (solution.unsure() > _OPEN).any():
-        solution = replace(solution, alternatives=tuple(uncertain(solution)))
     return solution
 
 
@@ -87,14 +83,6 @@ def plausible(solution: Solution) -> tuple[State, list[Alternative]]:
     return walk.mean(), walk.alternatives()
 
 
-def uncertain(solution: Solution) -> list[Alternative]:
-    """The bodies with other half sizes along the view that noise allows, where a covariance is too local to tell."""
-    stride = max(1, len(solution.rays.hits) // _RAYS)
-    walk = _Walk(solution.problem, solution.rays.every(stride).weighing(stride))
-    walk.along_view(solution.state)
-    return walk.alternatives()
-
-
 class _Walk:
     """Bodies held at one half size along the view after another, from starts outwards, and their weights."""
 
@@ -112,7 +100,6 @@ class _Walk:
         here = self._held(start, log_size)
         found = {log_size: here}
         self.least = min(self.least, here.cost)
-        allowed = _ALLOWED if self.problem.terms.dead_zone > 0 else math.inf
         for direction in (1, -1):
             state, position, unlikely = here, log_size, 0
             for pace in _PACES:
@@ -120,7 +107,7 @@ class _Walk:
                 state = found[position] = self._held(state, position)
                 self.least = min(self.least, state.cost)
                 unlikely = unlikely + 1 if state.cost > self.least + _UNLIKELY else 0
-                if unlikely == 2 and self.least < allowed:
+                if unlikely == 2 and self.least < _ALLOWED:
                     break
         sizes = sorted(found)
         self.sizes += sizes
@@ -155,7 +142,7 @@ class _Walk:
         size = min(max(math.exp(log_size), lower[axis]), upper[axis])
         lower[axis] = upper[axis] = size
         start = resized(start, axis, size)
-        return minimize(RENDERED, *self.rays, self.problem.terms, start, (lower, upper), _STEPS, _TOLERANCE)
+        return minimize(RENDERED, *self.rays, self.problem.terms, start, (lower, upper), BASIN_STEPS, TOLERANCE)
 
 
 def _view_axis(state: State) -> int:

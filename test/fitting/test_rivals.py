@@ -44,7 +44,7 @@ def test_other_orders_are_the_same_box(state: State) -> None:
 
 
 def test_rivals_are_bodies_within_reach(state: State) -> None:
-    for other in other_depths(state, np.array([2, 0, 1])) + other_axes(state):
+    for other in other_depths(state, 2) + other_axes(state):
         assert np.linalg.det(other.rotation) == pytest.approx(1)
         assert (other.parameters[:5] > 0).all()
         assert np.linalg.norm(other.parameters[5:8] - state.parameters[5:8]) < 3 * state.parameters[:3].max()
