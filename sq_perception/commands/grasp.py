@@ -61,7 +61,7 @@ def main(arguments: Sequence[str]) -> int:
     add = command.add_argument
     add("frames", nargs="+", metavar="FRAME", help="recorded depth images, folders or bags of them")
     add("--gripper", default="panda", help="panda, robotiq_2f_85 or robotiq_2f_140 (default panda)")
-    add("--friction", type=positive, help="between pads and things (default 0.5)")
+    add("--friction", type=positive, help="between pads and things at the least (default 0.5)")
     add("--camera-info", metavar="FILE", help="the intrinsics of images, as for recover")
     add("--json", type=text_target, metavar="OUT", help="write the grasps there; - is the standard output")
     add("--pictures", type=folder, metavar="DIR", help="draw a picture per frame into this folder")

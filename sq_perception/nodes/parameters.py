@@ -279,7 +279,7 @@ class GraspParameters(Parameters):
 
     autostart: bool = setting(True, "Configure and activate at the start, as recover_node does.", live=False)
     gripper: str = setting("panda", "The gripper that grasps are for.", choices=tuple(GRIPPERS))
-    friction: float = setting(FRICTION, "Coefficient of friction between pads and things.", within=(0.05, 2.0))
+    friction: float = setting(FRICTION, "Least coefficient of friction between pads and things.", within=(0.05, 2.0))
     placement: float = setting(
         PLACEMENT, "Metres, one sigma, by which the hand is beside where it is sent to.", within=(0.0, 0.05)
     )
