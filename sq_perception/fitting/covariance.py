@@ -18,7 +18,7 @@ import numpy as np
 
 from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.normal_equations import STEP_LENGTH
-from sq_perception.fitting.rays import WEIGHT, Rays
+from sq_perception.fitting.rays import SAMPLE, WEIGHT, Rays
 from sq_perception.fitting.residuals import RENDERED, evaluate
 from sq_perception.fitting.terms import Terms
 from sq_perception.geometry.superquadric import Superquadric
@@ -27,8 +27,6 @@ WEAK_SHARE = 0.15
 """A half size whose standard deviation exceeds this share of it is called undetermined."""
 _PRIOR_LOG_SIZE, _PRIOR_SHAPE, _PRIOR_ANGLE = 1.0, 0.5, 1.0
 """Standard deviations of the prior: a factor e, half of the range of an exponent, a radian."""
-_RAYS = 800
-"""Few enough to take a tenth of a fit's time."""
 
 _IS_LOWER = np.tri(STEP_LENGTH, dtype=bool)
 
@@ -38,7 +36,7 @@ def covariance_at(state: State, rays: Rays, terms: Terms, outline: float) -> np.
 
     ``outline`` is the standard deviation of the outline, metres.
     """
-    stride = max(1, len(rays.hits) // _RAYS)
+    stride = max(1, len(rays.hits) // SAMPLE)
     hits, free = rays.every(stride).weighing(stride)
     sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
     terms = terms._replace(outline_stiffness=1 / outline)

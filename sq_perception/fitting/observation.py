@@ -33,8 +33,9 @@ from sq_perception.imaging.coherence import coherent
 
 _STEEPEST = 6.0
 """Slopes above this, 80 degrees, count as this: there a pixel tells little of the depth."""
-_BAND_PIXELS, _BAND_SHARE = 4, 0.03
-"""Width of the band around the mask whose every pixel counts, at least, and as a share of the mask's extent."""
+BAND_PIXELS, _BAND_SHARE = 4, 0.03
+"""Width of the band around the mask whose every pixel counts, at least, as that much of a mask's edge may be missing;
+and as a share of the mask's extent."""
 _WIDER = 0.5
 """Of the mask's extent: what the crop adds around it on both sides together."""
 _HOLE = 5
@@ -178,7 +179,7 @@ class Crop:
         """The crop around a mask of an image; None if it holds no depth at all.  ``noise`` None estimates it."""
         x, y, width, height = cv2.boundingRect(np.ascontiguousarray(mask).view(np.uint8))
         extent = max(width, height)
-        band = max(_BAND_PIXELS, math.ceil(_BAND_SHARE * extent))
+        band = max(BAND_PIXELS, math.ceil(_BAND_SHARE * extent))
         margin = max(band, math.ceil(_WIDER * extent / 2))
         top, left = max(y - margin, 0), max(x - margin, 0)
         bottom, right = min(y + height + margin, camera.height), min(x + width + margin, camera.width)

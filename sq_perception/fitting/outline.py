@@ -13,6 +13,7 @@ from dataclasses import replace
 import numpy as np
 
 from sq_perception.fitting.levenberg_marquardt import State
+from sq_perception.fitting.observation import BAND_PIXELS
 from sq_perception.fitting.problem import BASIN_STEPS, FINAL_RAYS, FIRST_STEPS, Problem, draw, refine, settle
 from sq_perception.fitting.rays import Rays
 from sq_perception.fitting.residuals import penetration
@@ -23,8 +24,6 @@ _SHARP = 0.3
 uniform error of up to half a pixel (1 / sqrt(12))."""
 _SHRUNK = 0.25
 """A body that covers half of the free pixels beside the mask this deep, in pixels, is larger than its mask."""
-_WIDEST_BAND = 4
-"""Pixels of a mask's edge that may be missing."""
 _SHARPER = 0.7
 """How much smaller than the one before a reading of the outline's precision has to be for another one."""
 
@@ -34,10 +33,10 @@ def without_shrunk_edge(problem: Problem, state: State) -> tuple[Problem, State]
     full = problem.observation
     if _depth_inside(problem, state, full.rim()) < _SHRUNK:
         return problem, state
-    problem = replace(problem, observation=full.beyond(_WIDEST_BAND))
+    problem = replace(problem, observation=full.beyond(BAND_PIXELS))
     state = refine(problem, state, draw(problem, FINAL_RAYS, 0.6), BASIN_STEPS)
-    rings = (k for k in range(1, _WIDEST_BAND + 1) if _depth_inside(problem, state, full.ring(k)) < _SHRUNK)
-    band = next(rings, _WIDEST_BAND + 1) - 1
+    rings = (k for k in range(1, BAND_PIXELS + 1) if _depth_inside(problem, state, full.ring(k)) < _SHRUNK)
+    band = next(rings, BAND_PIXELS + 1) - 1
     return replace(problem, observation=full.beyond(band) if band > 0 else full), state
 
 

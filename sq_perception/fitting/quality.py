@@ -10,15 +10,11 @@ from sq_perception.fitting.covariance import carried_over, spread, undetermined
 from sq_perception.fitting.fit import CUT_SHORT, FAILED_SHARE, INLIER, Fit, Status
 from sq_perception.fitting.observation import OUTLIER_SHARE, Observation, span
 from sq_perception.fitting.problem import Solution
+from sq_perception.fitting.rays import SAMPLE
 from sq_perception.fitting.residuals import surface_distance
 from sq_perception.geometry.quantiles import quantile
 from sq_perception.geometry.superquadric import Superquadric
 
-_RAYS = 800
-"""Enough for a share to one or two percent."""
-_FAILED_LEVELS = 3.0
-"""Levels of noise and model error that half of the points of a failed body miss it by besides: of a plate or a pen, a
-quarter of the thickness is less than what any thing strays."""
 _REACHED = 0.9
 """Of the points of a thing that was fitted as a hull: what the rest sticks out tells whether the body encloses it."""
 _ENCLOSED_SHARE = 1.0
@@ -34,7 +30,7 @@ def assessed(solution: Solution, began: float) -> Fit:
     covariance = solution.covariance() + spread(state, solution.alternatives)
     canonical = body.canonical_form()
     covariance = carried_over(covariance, body, canonical)
-    everything = observation.object_rays(_RAYS)
+    everything = observation.object_rays(SAMPLE)
     outside = surface_distance(everything, state.parameters, state.rotation)
     distance = np.abs(outside)
     inlying = distance < INLIER * observation.sigma
@@ -92,7 +88,8 @@ def status(
     noise and the model error, metres, ``covariance`` (11, 11).
     """
     smallest = float(body.size.min())
-    strays = max(FAILED_SHARE * smallest, _FAILED_LEVELS * sigma)
+    # Of a plate or a pen, a quarter of the thickness is less than what any thing strays.
+    strays = max(FAILED_SHARE * smallest, INLIER * sigma)
     bearable = max(strays, _ENCLOSED_SHARE * smallest) if as_hull else strays
     off = f"many of the points lie {typical / smallest:.0%} of its smallest half size and more off"
     if typical > bearable:

@@ -20,6 +20,8 @@ DEPTH, metres: what the pixel measured; for a free ray, up to where its space is
 metres: where the ray met the body last time, which is where the next search for the intersection starts.
 """
 RAY_COLUMNS = 8
+SAMPLE = 800
+"""Rays that tell a mean, a share or a median of the object's to 1 to 3 %, and take a tenth of a fit's time."""
 
 
 class Rays(NamedTuple):

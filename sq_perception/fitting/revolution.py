@@ -29,7 +29,6 @@ from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.observation import span
 from sq_perception.fitting.problem import (
     BASIN_RAYS,
-    FIRST_STEPS,
     Solution,
     by_cost,
     coarse,
@@ -45,12 +44,8 @@ SPARED = 3
 """Parameters that a body of revolution has less."""
 ODDS = 3.0
 """Of the things whose unseen side is in question, so many more are round than any other one oval shape."""
-HOPELESS = 15.0
-"""A round reading worse by so much on few rays is given up."""
 SIGMA = 0.01
 """Of log(a1 / a2) and of 1 - e2: how exactly round."""
-OPEN, EXPLAINED = 0.05, 0.5
-"""Half sizes more certain than this share of them, of a body with a mean squared residual below that: not asked."""
 _FINALISTS = 2
 """Round bodies that go on from the few steps on few rays."""
 _START_EXPONENT = 0.4
@@ -58,10 +53,8 @@ _START_EXPONENT = 0.4
 
 
 def weighed(solution: Solution) -> Solution:
-    """The body of revolution where it describes the image better, unless the image leaves nothing open."""
+    """The body of revolution where it describes the image better."""
     problem, free, rays = solution.problem, solution.state, solution.rays
-    if free.cost < EXPLAINED * rays.weight and (solution.unsure() < OPEN).all():
-        return solution
     round_ = problem.with_terms(roundness_stiffness=1 / SIGMA)
     starts = from_body(free)
     if problem.options.plane is not None:
@@ -69,9 +62,6 @@ def weighed(solution: Solution) -> Solution:
     promising = by_cost(coarse(round_, starts))[:_FINALISTS]
     few = draw(problem, BASIN_RAYS, 0.7)
     settled = by_cost(settle(round_, state, few) for state in promising)
-    reference = settle(problem, free, few, FIRST_STEPS)
-    if gain(reference.cost, settled[0].cost, few.weight) < -HOPELESS:
-        return solution
     best = refined_best(round_, settled, rays)
     better = gain(free.cost, best.cost, rays.weight)
     weight = math.exp(-0.5 * abs(better))

@@ -28,6 +28,7 @@ from sq_perception.fitting.observation import Crop, Observation
 from sq_perception.fitting.options import MIN_PIXELS, MODEL_ERROR_ON_PLANE, FitOptions
 from sq_perception.fitting.problem import Problem, Solution
 from sq_perception.fitting.quality import assessed, failed
+from sq_perception.fitting.rays import SAMPLE
 from sq_perception.fitting.residuals import surface_distance
 from sq_perception.geometry.quantiles import quantile
 from sq_perception.geometry.superquadric import Superquadric
@@ -41,8 +42,6 @@ _FINE_NOISE = 0.1
 """Of what things on a plane stray from superquadrics: under less noise the exact course goes first, as what the
 tolerant one leaves of a true superquadric may then be more than the noise.  Under more, true superquadrics were left
 0.5 to 0.8 of it, and things of benchmarks/household_things 1.2 and more."""
-_RAYS = 400
-"""Enough for a median to 5 %."""
 
 
 def fit(
@@ -118,7 +117,7 @@ def _exactly(
 
 def _is_explained(solution: Solution, noise: float) -> bool:
     """Whether a body of the tolerant course leaves no more than the noise, so that an exact one may be there."""
-    rays = solution.problem.observation.object_rays(_RAYS)
+    rays = solution.problem.observation.object_rays(SAMPLE)
     distance = np.abs(surface_distance(rays, solution.state.parameters, solution.state.rotation))
     return MEDIAN_TO_SIGMA * quantile(distance, 0.5) < noise
 

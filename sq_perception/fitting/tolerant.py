@@ -40,11 +40,15 @@ import numpy as np
 
 from sq_perception.fitting import box_start, revolution, unseen
 from sq_perception.fitting.depth_noise import MEDIAN_TO_SIGMA
+from sq_perception.fitting.fit import INLIER
 from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.problem import (
+    BASIN_STEPS,
     COARSE_RAYS,
     FINAL_RAYS,
+    FIRST_STEPS,
     INDEPENDENT_RAYS,
+    REFINE_STEPS,
     VOLUME_PRICE,
     Problem,
     Solution,
@@ -54,25 +58,16 @@ from sq_perception.fitting.problem import (
     settle,
     terms_of,
 )
-from sq_perception.fitting.rays import Rays
+from sq_perception.fitting.rays import SAMPLE, Rays
 from sq_perception.fitting.residuals import mean_loss, surface_distance
 from sq_perception.geometry.quantiles import quantile
 
 INDEPENDENT_OF_PREDICTED, EXPLAINED = 100.0, 0.5
 """Most rays that an object counts for beside a predicted hull, and the mean loss up to which it does: what cartons and
 cans leave.  Chosen on benchmarks/household_things: 200 rays gain on boxes what bottles lose, 50 the other way."""
-_RAYS = 800
-"""Of the last steps: eight times the independent ones, so that which are drawn hardly matters."""
 _KEPT, _KEPT_OF_PREDICTED = 4, 2
 """Starts that go on from the first few steps.  Beside a predicted hull, more changed nothing on
 benchmarks/household_things, and neither did the deeper boxes."""
-_FIRST_STEPS, _MORE_STEPS, _LAST_STEPS = 5, 12, 40
-"""To tell valleys apart, to come near their floor, and at most: most searches end before."""
-_LOSS_RAYS = 400
-"""Enough for a mean to 5 %."""
-_HOLLOW = 3.0
-"""Noise levels that the points of a solid thing typically stray at the most.  Where nothing is predicted, what is more
-hollow or notched than that, such as a bowl or a pair of pliers, is fitted as its hull instead."""
 _INNER_CAUCHY = 1.0
 """Noise levels behind the surface of a hull, beyond which a point hardly counts."""
 _AS_HULL = ("like the convex hull of the object",)
@@ -103,32 +98,33 @@ def solve(problem: Problem, given: Sequence[State]) -> Solution:
 
 def _best(problem: Problem, starts: Sequence[State]) -> Solution:
     few = draw(problem, COARSE_RAYS, 0.7)
-    begun = _tried(problem, starts, few, _FIRST_STEPS)
+    begun = _tried(problem, starts, few, FIRST_STEPS)
     kept = _KEPT_OF_PREDICTED if problem.is_predicted else _KEPT
-    settled = _tried(problem, begun[:kept], few, _MORE_STEPS)
+    settled = _tried(problem, begun[:kept], few, BASIN_STEPS)
     if problem.hull is None or problem.late:
         return _refined(problem, settled)
     misfit = max(1.0, _mean_loss(problem, settled[0]) / EXPLAINED)
     terms = problem.terms._replace(hull_root=problem.hull.root(misfit))
     drawn = replace(problem, independent=INDEPENDENT_OF_PREDICTED / misfit, terms=terms)
-    settled = _tried(drawn, settled[:2], draw(drawn, COARSE_RAYS, 0.7), _MORE_STEPS)
+    settled = _tried(drawn, settled[:2], draw(drawn, COARSE_RAYS, 0.7), BASIN_STEPS)
     solution = _refined(drawn, settled)
     return replace(solution, problem=problem, rays=solution.rays.weighing(1 / misfit))
 
 
 def _refined(problem: Problem, settled: Sequence[State]) -> Solution:
-    rays = draw(problem, problem.options.pixels or _RAYS, 0.3)
-    return Solution(problem, refined_best(problem, settled, rays, _LAST_STEPS), rays, spread_factor=_SPREAD)
+    rays = draw(problem, problem.options.pixels or SAMPLE, 0.3)
+    return Solution(problem, refined_best(problem, settled, rays, 2 * REFINE_STEPS), rays, spread_factor=_SPREAD)
 
 
 def _mean_loss(problem: Problem, body: State) -> float:
     """Of the object's rays: c of the module."""
-    rays = problem.observation.object_rays(_LOSS_RAYS, 0.1)
+    rays = problem.observation.object_rays(SAMPLE, 0.1)
     return mean_loss(rays, problem.terms.huber, body.parameters, body.rotation)
 
 
 def _typical_of_hollow(problem: Problem) -> float:
-    return problem.terms.huber * (2 * _HOLLOW - problem.terms.huber)
+    """Loss of points that stray as far as noise does at the most: a bowl's or a pair of pliers' typically do."""
+    return problem.terms.huber * (2 * INLIER - problem.terms.huber)
 
 
 def _hollow_as_hull(solution: Solution, starts: Sequence[State]) -> Solution:

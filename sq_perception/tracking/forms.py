@@ -38,8 +38,6 @@ _SIZE_PER_SHAPE = 0.1
 """Deviation of the log sizes after an exchange, for each |e1 - e2|; see the module.  Chosen."""
 _SAME_NAME = np.pi / 4
 """Radians: nearer to an axis than to any other one."""
-_OPEN = _SAME_NAME / 3
-"""Deviation of a turn about an axis, radians: three of them reach the next name."""
 _SELDOM_TURNED = 2 * np.log(100)
 """Of d^2 + log det S: of the bodies that a frame shows, a hand has turned fewer than one in a hundred so far."""
 
@@ -151,7 +149,7 @@ def named(
     names are kept.  The turn about an axis that the observation leaves open, as something round does, is the track's.
     """
     form, changed = _form(track, track_covariance, observed, covariance)
-    is_open = np.diag(changed)[TURN] > _OPEN**2
+    is_open = np.diag(changed)[TURN] > state.TOLD**2
     turn = np.where(is_open, state.difference(form, track)[TURN], 0)
     return np.append(form[:8], quaternions.multiply(form[8:], quaternions.from_rotation_vector(turn))), changed
 

@@ -50,9 +50,6 @@ VIEW_ANGLE = 0.25
 """Radians: views closer than this share their systematic error.  Chosen: outlines change little within 14 degrees."""
 VIEWS = 16
 """Directions that are remembered for each body: two thirds of a circle at ``VIEW_ANGLE``.  Each costs time."""
-_TOLD = 0.2
-"""Radians: a turn about an axis whose standard deviation is larger is not told by an observation.  Chosen,
-below ``VIEW_ANGLE``: it could pass for another side."""
 
 
 @dataclass
@@ -134,7 +131,7 @@ def fused(
     seen_as = track[:, 8:12]
     if turning.any():
         turn = state.difference(track, observed)[:, TURN]
-        told = np.einsum("nii->ni", white + common)[:, TURN] < _TOLD**2
+        told = np.einsum("nii->ni", white + common)[:, TURN] < state.TOLD**2
         turn = np.where(told & turning[:, None], turn, 0.0)
         seen_as = quaternions.multiply(seen_as, quaternions.from_rotation_vector(turn))
     local = np.einsum("nji,nj->ni", quaternions.to_matrix(seen_as), direction)

@@ -17,8 +17,6 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.tracking import state
 
 _DIRECTIONS = np.array([d for d in np.ndindex(3, 3, 3) if d != (1, 1, 1)], dtype=float) - 1
-_EXPECTED_SHARE = 0.5
-"""Of the near side that is seen through: the greater part."""
 _TOLERANCE = 0.25
 """Of the smallest half size: a depth that differs by less is the body's own.  Chosen: above noise and misfit, below
 a thing that stands behind."""
@@ -29,13 +27,14 @@ def expected(
 ) -> np.ndarray:
     """Whether unseen tracks (n, 12) should have been seen, (n,), by a camera with this pose in the world.
 
-    All of them where the frame's camera or depth image is not known.
+    Those whose near side it sees through for the greater part; all of them where the frame's camera or depth image is
+    not known.
     """
     if camera is None or depth is None or not len(states):
         return np.ones(len(states), dtype=bool)
     back = quaternions.conjugate(rotation)
     home = -quaternions.to_matrix(back) @ position
-    return open_share(state.bodies(states).transformed(back, home), camera, depth) >= _EXPECTED_SHARE
+    return open_share(state.bodies(states).transformed(back, home), camera, depth) >= 0.5
 
 
 def open_share(bodies: Superquadric, camera: Camera, depth: np.ndarray) -> np.ndarray:
