@@ -24,7 +24,7 @@ from sq_perception.geometry.quantiles import quantile
 from sq_perception.imaging import depth_steps
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation import support_plane
-from sq_perception.segmentation.support_plane import TOLERANCE, Plane, noise_growth
+from sq_perception.segmentation.support_plane import COARSE_PIXELS, TOLERANCE, Plane, noise_growth
 from sq_perception.segmentation.support_surface import HIGHEST, SupportSurface
 
 ObjectTest = Callable[[np.ndarray, np.ndarray], bool]
@@ -40,8 +40,8 @@ _SAMPLES = 400
 """Of a segment, evenly taken: the 5 % above a height, or the 1 % that may stick out, are a few still."""
 _SPARSE = 8
 """Every so many pixels tell the nearest depth of an image."""
-_COARSE_PIXELS, _FEWEST = 120, 30
-"""Samples along the shorter side of the image that surfaces are searched on, and least samples of one."""
+_FEWEST = 30
+"""Samples that a surface has at least."""
 _BUMP, _ON_WALL = 6.0, 3.5
 """A thing rises so many deviations of the support's own points above it, as they are beside the thing, and is that far
 off any other plane; pixels within so many of another plane are a part of that.  Of normal noise 0.05 % lies beyond 3.5;
@@ -129,7 +129,7 @@ def _top(values: np.ndarray) -> float:
 
 def furniture(depth: np.ndarray, valid: np.ndarray, camera: Camera, walls: list[Plane], limits: Limits) -> np.ndarray:
     """Pixels, bool (height, width), of surfaces in one of some planes that are larger than a thing."""
-    k = max(1, min(depth.shape) // _COARSE_PIXELS)
+    k = max(1, min(depth.shape) // COARSE_PIXELS)
     kept = valid[::k, ::k]
     rows, columns = np.nonzero(kept)
     points = camera.unproject(k * columns, k * rows, depth[::k, ::k][rows, columns])

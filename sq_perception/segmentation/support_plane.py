@@ -37,7 +37,8 @@ _PLANE_POINTS = 1500
 _REFINE_POINTS = 8000
 _HYPOTHESES = 200
 _PLANES = 3
-_COARSE_PIXELS = 120
+COARSE_PIXELS = 120
+"""Samples along the shorter side of the image that surfaces are searched on."""
 _ISLAND_SHARE = 0.25
 """Of the image; an island that fills less is a body seen face-on, as a camera that looks at a table shows more of it.
 Chosen: lone bodies are found by it, and 81 recorded and simulated frames of tables are the same without it."""
@@ -220,7 +221,7 @@ def across(normal: np.ndarray) -> np.ndarray:
 
 def _on_one_surface(depth: np.ndarray, valid: np.ndarray, camera: Camera) -> list[_Surface]:
     """Each connected surface of a coarse image, as far as it is of any size, and whether it is a small island."""
-    k = max(1, min(depth.shape) // _COARSE_PIXELS)
+    k = max(1, min(depth.shape) // COARSE_PIXELS)
     coarse, kept = depth[::k, ::k], valid[::k, ::k]
     jumps = depth_steps.edges(np.where(kept, coarse, np.float32(0)), kept, k * depth_steps.STEP)
     labels = depth_steps.components(kept & ~jumps)

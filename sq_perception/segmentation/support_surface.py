@@ -28,9 +28,8 @@ import numpy as np
 from sq_perception.geometry.kernels import kernel
 from sq_perception.imaging import depth_steps, regions
 from sq_perception.imaging.camera import Camera
-from sq_perception.segmentation.support_plane import LEAST_GROWTH, TOLERANCE, Plane, noise_growth
+from sq_perception.segmentation.support_plane import COARSE_PIXELS, LEAST_GROWTH, TOLERANCE, Plane, noise_growth
 
-_COARSE_PIXELS = 120
 _ROUNDS = 6
 _TERMS = 6
 _DISTORTION = 0.02
@@ -251,4 +250,4 @@ def _terms(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def _stride(shape: tuple[int, ...]) -> int:
-    return max(1, min(shape[:2]) // _COARSE_PIXELS)
+    return max(1, min(shape[:2]) // COARSE_PIXELS)
