@@ -48,8 +48,8 @@ from sq_perception.fitting.problem import (
 from sq_perception.fitting.rays import Rays
 from sq_perception.fitting.rivals import SIGNIFICANT, alike, other_axes, other_depths
 
-_MORE_RAYS, _MOST_FINAL_RAYS = 1500, 6000
-"""Half of and twice :data:`~sq_perception.fitting.problem.FINAL_RAYS`: where few rays tie, and under much noise."""
+_MOST_FINAL_RAYS = 6000
+"""Twice :data:`~sq_perception.fitting.problem.FINAL_RAYS`: under much noise."""
 _FINE_NOISE = 0.3
 """Noise in pixel widths that the fewest rays of the last stage average out; more noise asks for more, by its square."""
 _SETTLED, _UNSURE = 1.03, 0.01
@@ -162,7 +162,7 @@ def _varied(solution: Solution) -> Solution:
 
 
 def _better(solution: Solution, rivals: list[State]) -> tuple[State, list[State]]:
-    """The best of a body and its rivals, and those that were refined; few rays first, more for what holds on them."""
+    """The best of a body and its rivals, and those that were refined; few rays first, all for what holds on them."""
     problem, best = solution.problem, solution.state
     few = draw(problem, BASIN_RAYS, 0.2)
     reference = settle(problem, best, few)
@@ -175,14 +175,11 @@ def _better(solution: Solution, rivals: list[State]) -> tuple[State, list[State]
     chosen = known[1:]
     if not chosen:
         return best, []
-    more = draw(problem, _MORE_RAYS, 0.8)
-    reference = settle(problem, best, more)
     found: list[State] = []
     for rival in by_cost(chosen)[:FINALISTS]:
-        state = settle(problem, rival, more)
-        if state.cost > reference.cost + RIVAL_SLACK or problem.late:
-            continue
-        state = refine(problem, state, solution.rays)
+        if problem.late:
+            break
+        state = refine(problem, rival, solution.rays)
         found.append(state)
         if state.cost < best.cost - SIGNIFICANT:
             best = state
