@@ -135,12 +135,10 @@ def risen(relative: np.ndarray, depth: np.ndarray, valid: np.ndarray, camera: Ca
         As in :func:`measured`.
     """
     k = _stride(depth.shape)
-    size = (-(-depth.shape[1] // k), -(-depth.shape[0] // k))
-    share = cv2.resize(valid.astype(np.float32), size, interpolation=cv2.INTER_AREA)
+    share = _cells(valid.astype(np.float32), k)
     known = share > 0.5
     weight = 1 / np.maximum(share, np.float32(0.5))
-    height = cv2.resize(relative, size, interpolation=cv2.INTER_AREA) * weight
-    z = cv2.resize(depth, size, interpolation=cv2.INTER_AREA) * weight
+    height, z = _cells(relative, k) * weight, _cells(depth, k) * weight
     width = z * np.float32(k / np.sqrt(camera.fx * camera.fy))
     # Only from where it is wide: the bottom of a bowl is as low.
     flat = depth_steps.components(known & (height < 0.5 * TOLERANCE))
@@ -165,8 +163,15 @@ def risen(relative: np.ndarray, depth: np.ndarray, valid: np.ndarray, camera: Ca
         if np.count_nonzero(reached) == before:
             break
     reached &= ~_low_things(height, known, reached)
-    full = cv2.resize(reached.view(np.uint8), (size[0] * k, size[1] * k), interpolation=cv2.INTER_NEAREST)
+    full = cv2.resize(reached.view(np.uint8), None, fx=k, fy=k, interpolation=cv2.INTER_NEAREST)
     return full[: depth.shape[0], : depth.shape[1]] > 0
+
+
+def _cells(image: np.ndarray, k: int) -> np.ndarray:
+    """Means over cells of k by k pixels; at the right and at the bottom, of what repeats the last ones."""
+    down, right = -image.shape[0] % k, -image.shape[1] % k
+    whole = cv2.copyMakeBorder(image, 0, down, 0, right, cv2.BORDER_REPLICATE) if down or right else image
+    return cv2.resize(whole, None, fx=1 / k, fy=1 / k, interpolation=cv2.INTER_AREA)
 
 
 def _low_things(height: np.ndarray, known: np.ndarray, reached: np.ndarray) -> np.ndarray:

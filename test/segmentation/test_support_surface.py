@@ -97,6 +97,15 @@ def plane_of(depth):
     return support_plane.planes(depth, np.isfinite(depth), CAMERA)[0]
 
 
+@pytest.mark.parametrize(("height", "width", "k"), [(480, 640, 4), (720, 1280, 6), (424, 512, 3)])
+def test_cells_of_any_image_lie_where_their_pixels_do(height, width, k):
+    """1280 columns are no whole number of cells of 6."""
+    columns = np.broadcast_to(np.arange(width, dtype=np.float32), (height, width))
+    cells = support_surface._cells(columns.copy(), k)
+    back = cells.repeat(k, axis=0).repeat(k, axis=1)[:height, :width]
+    assert np.abs(back - columns).max() <= k / 2
+
+
 def test_a_ramp_is_support_and_the_side_of_a_thing_is_not():
     """A table that seems to rise by 15 degrees over 10 cm beside a tall thing, and a box of 3 cm."""
     normal = slanted(90)
