@@ -29,9 +29,11 @@ from sq_perception.fitting.observation import Observation
 from sq_perception.fitting.outline import sharpened, without_shrunk_edge
 from sq_perception.fitting.problem import (
     BASIN_RAYS,
+    BASIN_STEPS,
     COARSE_RAYS,
     FINAL_RAYS,
     FINALISTS,
+    FIRST_STEPS,
     RIVAL_SLACK,
     Problem,
     Solution,
@@ -43,6 +45,7 @@ from sq_perception.fitting.problem import (
     select,
     settle,
 )
+from sq_perception.fitting.rays import Rays
 from sq_perception.fitting.rivals import SIGNIFICANT, alike, other_axes, other_depths
 
 _MOST_FINAL_RAYS = 6000
@@ -57,6 +60,8 @@ _PROMISING = 2.0
 body explains, none left more than 0.8; of 80 that none explains, nine in ten left more than this."""
 _HANDED_OVER = 8
 """Of the bodies that were tried, so many begin in the tolerant course."""
+_HOPELESS = 2.0
+"""A rival that costs so many times more than the body at hand after its first steps is given up."""
 
 
 def solve(problem: Problem, given: Sequence[State]) -> Solution:
@@ -162,11 +167,7 @@ def _better(solution: Solution, rivals: list[State]) -> tuple[State, list[State]
     few = draw(problem, BASIN_RAYS, 0.2)
     reference = settle(problem, best, few)
     # On other rays the body may already find its way out of a shallow valley.
-    settled = [reference]
-    for rival in rivals:
-        if problem.late:
-            break
-        settled.append(settle(problem, rival, few))
+    settled = [reference, *_promising(problem, rivals, few, reference.cost)]
     known = [best._replace(cost=reference.cost)]
     for state in settled:
         if state.cost < reference.cost + RIVAL_SLACK and not any(alike(state, other) for other in known):
@@ -183,6 +184,18 @@ def _better(solution: Solution, rivals: list[State]) -> tuple[State, list[State]
         if state.cost < best.cost - SIGNIFICANT:
             best = state
     return best, found
+
+
+def _promising(problem: Problem, rivals: list[State], rays: Rays, cost: float) -> list[State]:
+    """Rivals on few rays, some steps at a time: those that stay far behind are given up."""
+    found: list[State] = []
+    for rival in rivals:
+        if problem.late:
+            break
+        state = settle(problem, rival, rays, FIRST_STEPS)
+        if state.cost < _HOPELESS * cost:
+            found.append(settle(problem, state, rays, BASIN_STEPS - FIRST_STEPS))
+    return found
 
 
 def _alternatives(best: State, found: list[State]) -> tuple[Alternative, ...]:

@@ -32,7 +32,7 @@ from sq_perception.geometry.superquadric import Superquadric
 COARSE_RAYS, COARSE_STEPS = 150, 8
 BASIN_RAYS, BASIN_STEPS = 300, 15
 FIRST_STEPS = 5
-"""To tell valleys apart, and of a body at hand whose terms have changed a little."""
+"""Steps after which a rival that costs far more than the body at hand is given up."""
 REFINE_STEPS = 15
 FINAL_RAYS = 3000
 """An error of the depth by a third of a pixel's width averages out to a two hundredth: chosen on
