@@ -1,10 +1,11 @@
 """The exact course: for images that a superquadric explains down to the noise.
 
-1. Starts, cheap ones first: given bodies, central symmetry.  From each, few steps on few rays; the best go on with more
-   rays.  More starts, of every kind, only while the best residual stays above the noise floor.  What no superquadric
-   explains after that is left to :mod:`sq_perception.fitting.tolerant`, which goes on from the bodies that were tried.
-2. The winner on all rays: free rays where the mask lost its edge are let go, the outline's precision is read from its
-   misfit.
+1. Starts, cheap ones first: given bodies, central symmetry, its axes turned by an eighth.  From each, few steps on few
+   rays; the best go on with more rays.  More starts, of every kind, only while the best residual stays above the noise
+   floor.  What no superquadric explains after that is left to :mod:`sq_perception.fitting.tolerant`, which goes on from
+   the bodies that were tried.
+2. The winner on all rays: free rays where the mask lost its edge are let go, object rays far off the surface are
+   dropped, the outline's precision is read from its misfit.
 3. All finalists are refined on all rays.
 4. Where something is left unexplained, or a half size is not certain to 1 %, the rivals of the result are tried.  Those
    that explain the image almost as well stay as alternatives and add to the covariance.
@@ -24,6 +25,7 @@ import numpy as np
 
 from sq_perception.fitting import rounding, starts, tolerant, unseen
 from sq_perception.fitting.covariance import Alternative
+from sq_perception.fitting.depth_noise import MEDIAN_TO_SIGMA
 from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.observation import Observation
 from sq_perception.fitting.outline import sharpened, without_shrunk_edge
@@ -46,12 +48,17 @@ from sq_perception.fitting.problem import (
     settle,
 )
 from sq_perception.fitting.rays import Rays
+from sq_perception.fitting.residuals import surface_distance
 from sq_perception.fitting.rivals import SIGNIFICANT, alike, other_axes, other_depths
+from sq_perception.geometry.quantiles import quantile
 
 _MOST_FINAL_RAYS = 6000
 """Twice :data:`~sq_perception.fitting.problem.FINAL_RAYS`: under much noise."""
 _FINE_NOISE = 0.3
 """Noise in pixel widths that the fewest rays of the last stage average out; more noise asks for more, by its square."""
+_OUTLIER = 5.0
+"""Object rays this many standard deviations off the surface of the winner are dropped: noise reaches there once in two
+million.  Kept, they look like something left to explain, and rivals are sought in vain."""
 _SETTLED, _UNSURE = 1.03, 0.01
 """A last mean squared residual above the one, or a half size less certain than the other, as a share of it, make other
 valleys of the cost worth a look; chosen on benchmarks/single_body."""
@@ -69,7 +76,7 @@ def solve(problem: Problem, given: Sequence[State]) -> Solution:
     tried = coarse(problem, given)
     finalists = select(problem, tried) if given else []
     if not given or _goes_on(problem, finalists):
-        found = coarse(problem, starts.symmetric(problem.observation))
+        found = starts.automatic(problem)
         tried += found
         finalists = select(problem, found, finalists)
         if _goes_on(problem, finalists):
@@ -87,7 +94,7 @@ def solve_cheaply(problem: Problem, given: Sequence[State], later: Callable[[], 
     ``later`` returns further starts that cost time: it is called only if those before do not suffice.
     """
     finalists: list[State] = []
-    groups: list[Callable[[], Sequence[State]]] = [lambda: given, lambda: starts.symmetric(problem.observation)]
+    groups: list[Callable[[], Sequence[State]]] = [lambda: given, lambda: next(starts.symmetric(problem.observation))]
     for group in groups if later is None else [*groups, later]:
         candidates = group()
         tried = coarse(problem, candidates) if candidates else []
@@ -110,6 +117,7 @@ def _decide(problem: Problem, finalists: list[State]) -> Solution:
         problem, favourite = without_shrunk_edge(problem, favourite)
     enough = _enough_rays(problem.observation)
     rays = draw(problem, problem.options.pixels or enough, 0.3)
+    rays = rays._replace(hits=_without_outliers(problem.observation, rays.hits, favourite))
     problem, favourite = sharpened(problem, favourite, rays.free, draw(problem, enough // 4, 0.3))
 
     best = refine(problem, favourite, rays)
@@ -130,6 +138,13 @@ def _enough_rays(observation: Observation) -> int:
     """Rays that bring the noise of the mean well below a pixel's width."""
     ratio = observation.sigma / observation.footprint
     return int(np.clip(FINAL_RAYS * (ratio / _FINE_NOISE) ** 2, FINAL_RAYS, _MOST_FINAL_RAYS))
+
+
+def _without_outliers(observation: Observation, hits: np.ndarray, state: State) -> np.ndarray:
+    """The rays whose points lie near the surface, as seen by the majority."""
+    distance = np.abs(surface_distance(hits, state.parameters, state.rotation))
+    spread = max(observation.sigma, MEDIAN_TO_SIGMA * quantile(distance, 0.5))
+    return hits[distance < _OUTLIER * spread]
 
 
 # Other valleys of the cost
