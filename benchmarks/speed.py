@@ -50,7 +50,7 @@ from sq_perception.geometry import metrics
 from sq_perception.imaging.camera import Camera
 from sq_perception.recovery import recoverer
 from sq_perception.recovery.options import Method, RecoveryOptions
-from sq_perception.recovery.recovery import FrameRecovery
+from sq_perception.recovery.recovery import FrameRecovery, timed
 
 STEPS, LENGTH = 300, 2000
 """Of the loop: as much interpreter as NumPy, some milliseconds."""
@@ -187,7 +187,7 @@ def main() -> None:
     before = report.previous("speed", "rows")
     rows: dict[str, dict[str, Any]] = {}
     chain = recoverer.Recoverer(threads=1)
-    with mock.patch.object(recoverer, "_timed", by_processor):
+    with mock.patch.object(recoverer, timed.__name__, by_processor):
         for work in works():
             chain.warm_up(work.camera)
             rows[work.name] = measured(chain, work, options.repeats)

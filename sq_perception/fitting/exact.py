@@ -6,7 +6,7 @@
    the bodies that were tried.
 2. The winner on all rays: free rays where the mask lost its edge are let go, object rays far off the surface are
    dropped, the outline's precision is read from its misfit.
-3. All finalists are refined on all rays.
+3. The finalists that few rays do not tell apart are refined on all of them.
 4. Where something is left unexplained, or a half size is not certain to 1 %, the rivals of the result are tried.  Those
    that explain the image almost as well stay as alternatives and add to the covariance.
 5. Half sizes along the view that the readings leave open are walked along (:mod:`sq_perception.fitting.rounding`).
@@ -52,8 +52,8 @@ from sq_perception.fitting.residuals import surface_distance
 from sq_perception.fitting.rivals import SIGNIFICANT, alike, other_axes, other_depths
 from sq_perception.geometry.quantiles import quantile
 
-_MOST_FINAL_RAYS = 6000
-"""Twice :data:`~sq_perception.fitting.problem.FINAL_RAYS`: under much noise."""
+_MORE_RAYS, _MOST_FINAL_RAYS = 1500, 6000
+"""Half of and twice :data:`~sq_perception.fitting.problem.FINAL_RAYS`: to tell bodies apart, and under much noise."""
 _FINE_NOISE = 0.3
 """Noise in pixel widths that the fewest rays of the last stage average out; more noise asks for more, by its square."""
 _OUTLIER = 5.0
@@ -120,6 +120,10 @@ def _decide(problem: Problem, finalists: list[State]) -> Solution:
     rays = rays._replace(hits=_without_outliers(problem.observation, rays.hits, favourite))
     problem, favourite = sharpened(problem, favourite, rays.free, draw(problem, enough // 4, 0.3))
 
+    if others:
+        more = draw(problem, _MORE_RAYS, 0.3)
+        settled = by_cost(settle(problem, state, more) for state in [favourite, *others])
+        favourite, *others = _distinct(settled, settled[0].cost + RIVAL_SLACK)
     best = refine(problem, favourite, rays)
     for rival in others:
         if problem.late:
@@ -145,6 +149,15 @@ def _without_outliers(observation: Observation, hits: np.ndarray, state: State) 
     distance = np.abs(surface_distance(hits, state.parameters, state.rotation))
     spread = max(observation.sigma, MEDIAN_TO_SIGMA * quantile(distance, 0.5))
     return hits[distance < _OUTLIER * spread]
+
+
+def _distinct(states: Sequence[State], most: float, known: Sequence[State] = ()) -> list[State]:
+    """Those cheaper than ``most`` that end in valleys of their own."""
+    chosen = list(known)
+    for state in states:
+        if state.cost < most and not any(alike(state, other) for other in chosen):
+            chosen.append(state)
+    return chosen[len(known) :]
 
 
 # Other valleys of the cost
@@ -183,11 +196,7 @@ def _better(solution: Solution, rivals: list[State]) -> tuple[State, list[State]
     reference = settle(problem, best, few)
     # On other rays the body may already find its way out of a shallow valley.
     settled = [reference, *_promising(problem, rivals, few, reference.cost)]
-    known = [best._replace(cost=reference.cost)]
-    for state in settled:
-        if state.cost < reference.cost + RIVAL_SLACK and not any(alike(state, other) for other in known):
-            known.append(state)
-    chosen = known[1:]
+    chosen = _distinct(settled, reference.cost + RIVAL_SLACK, [best._replace(cost=reference.cost)])
     if not chosen:
         return best, []
     found: list[State] = []
