@@ -31,7 +31,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import cv2
 import numpy as np
@@ -42,15 +41,10 @@ from sq_perception.geometry.quantiles import ranked
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.regions import extents
 from sq_perception.recovery.options import RecoveryOptions
+from sq_perception.recovery.recovery import FrameRecovery, Recovery
+from sq_perception.recovery.reference import BAND, Reference
+from sq_perception.recovery.seen_object import SeenObject
 
-if TYPE_CHECKING:
-    from sq_perception.recovery.recovery import FrameRecovery, Recovery
-    from sq_perception.recovery.seen_object import SeenObject
-
-_WIDTH = 320
-"""Columns that are compared: noise of neighbouring pixels is alike in all sensors of sensor_noise.preset."""
-_BAND = 2
-"""Compared pixels around an object that belong to it: free space and outline."""
 _CLIP, _FAR = 3.0, 6.0
 """Noise levels: more is an edge that wandered, in an object's sums and in a patch."""
 _CHANGED = 30.0
@@ -70,39 +64,6 @@ _ANEW = {Status.CONVERGED: 30, Status.WEAK: 10, Status.FAILED: 30}
 """Repetitions after which a body's turn comes: a second at 30 Hz.  Chosen."""
 _ALIKE = 0.8
 """Intersection over union of two segments that are one: what noise leaves of a small object's edge."""
-
-
-@dataclass(frozen=True, eq=False)
-class Reference:
-    """The readings that a frame's bodies were recovered from.
-
-    Attributes
-    ----------
-    depth : float32 (rows, columns)
-        Every ``stride``-th pixel of the image; 0 where nothing was measured.
-    sigma
-        Noise of the depth at one metre, metres.
-    """
-
-    depth: np.ndarray
-    stride: int
-    sigma: float
-    camera: Camera
-    options: RecoveryOptions
-
-    @classmethod
-    def of(cls, depth: np.ndarray, camera: Camera, sigma: float, options: RecoveryOptions) -> Reference:
-        """Of an image (height, width) that is NaN where nothing was measured."""
-        stride = max(1, round(camera.width / _WIDTH))
-        seen = np.asarray(depth[::stride, ::stride], dtype=np.float32)
-        return cls(np.where(np.isnan(seen), np.float32(0), seen), stride, sigma, camera, options)
-
-    def keeping(self, other: Reference, labels: np.ndarray, kept: Sequence[int]) -> Reference:
-        """These readings, but those of another reference around the labels that were recovered from it."""
-        around = np.zeros(self.depth.shape, bool)
-        for label in kept:
-            around |= _around(labels[:: self.stride, :: self.stride] == label) > 0
-        return replace(self, depth=np.where(around, other.depth, self.depth))
 
 
 @dataclass(frozen=True, eq=False)
@@ -186,11 +147,6 @@ def _due(bodies: Sequence[Recovery]) -> Recovery | None:
     return max(waiting, key=lambda one: one.repeats - _ANEW[one.status], default=None)
 
 
-def _around(mask: np.ndarray) -> np.ndarray:
-    """An object with its surroundings, uint8."""
-    return cv2.dilate(mask.astype(np.uint8), np.ones((2 * _BAND + 1, 2 * _BAND + 1), np.uint8))
-
-
 @kernel
 def _changed(old: np.ndarray, new: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
     """(d - r) / z^2 where both images have a reading, 0 elsewhere, and its sizes (n,) within reach."""
@@ -246,8 +202,8 @@ def _moments(
     level: float,
 ) -> tuple[np.ndarray, np.ndarray]:
     """V q (8,) and V V^T (8, 8) of the pixels of one object and around it; zeros where none has both readings."""
-    top, bottom = max(extent[0] - _BAND, 0), min(extent[1] + _BAND, labels.shape[0])
-    left, right = max(extent[2] - _BAND, 0), min(extent[3] + _BAND, labels.shape[1])
+    top, bottom = max(extent[0] - BAND, 0), min(extent[1] + BAND, labels.shape[0])
+    left, right = max(extent[2] - BAND, 0), min(extent[3] + BAND, labels.shape[1])
     sums, square, w = np.zeros(8), np.zeros((8, 8)), np.ones(8)
     for v in range(top, bottom):
         for u in range(left, right):
@@ -276,8 +232,8 @@ def _is_around(labels: np.ndarray, label: int, v: int, u: int) -> bool:
     """Whether a pixel belongs to an object, or one near by does."""
     if labels[v, u] == label:
         return True
-    for i in range(max(v - _BAND, 0), min(v + _BAND + 1, labels.shape[0])):
-        for j in range(max(u - _BAND, 0), min(u + _BAND + 1, labels.shape[1])):
+    for i in range(max(v - BAND, 0), min(v + BAND + 1, labels.shape[0])):
+        for j in range(max(u - BAND, 0), min(u + BAND + 1, labels.shape[1])):
             if labels[i, j] == label:
                 return True
     return False

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, TypeAlias
+from dataclasses import dataclass
+from typing import TypeAlias
 
 import numpy as np
 
@@ -13,9 +13,6 @@ from sq_perception.fitting.hull_prior import HullPrior
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.canonical_view import CanonicalView
 from sq_perception.learning.inference import HullAnswers, Predictor, ThingPredictor
-
-if TYPE_CHECKING:
-    from sq_perception.recovery.seen_object import SeenObject
 
 Answers: TypeAlias = Superquadric | HullAnswers
 
@@ -48,21 +45,25 @@ class Prediction:
         return answers.hull(self.number, self.view) if isinstance(answers, HullAnswers) else None
 
 
-def of_hulls(objects: Sequence[SeenObject], network: ThingPredictor) -> list[SeenObject]:
-    """The objects with the predictions of their hulls."""
-    shown = _shown(objects)
-    seen = zip(objects, shown, strict=True)
-    planes = [np.zeros(4) if one.plane is None else view.plane_to_canonical(one.plane) for one, view in seen]
-    views, extents = np.stack([view.marked for view in shown]), np.array([view.extent for view in shown])
-    return _answered(objects, at_once(lambda: network.predict(views, np.stack(planes), extents)))
+def of_hulls(
+    views: Sequence[CanonicalView], planes: Sequence[np.ndarray | None], network: ThingPredictor
+) -> list[Prediction]:
+    """Predictions of hulls from views and the support planes (4,) under them, optical frame."""
+    shown = np.stack([view.marked for view in views])
+    known = zip(views, planes, strict=True)
+    below = np.stack([np.zeros(4) if plane is None else view.plane_to_canonical(plane) for view, plane in known])
+    extents = np.array([view.extent for view in views])
+    return _answered(views, at_once(lambda: network.predict(shown, below, extents)))
 
 
 def of_bodies(
-    objects: Sequence[SeenObject], network: Predictor, submit: Callable[[Callable[[], Answers]], Future[Answers]]
-) -> list[SeenObject]:
-    """The objects with the predictions of their bodies, which what ``submit`` is given computes, now or beside fits."""
-    views = np.stack([view.marked for view in _shown(objects)])
-    return _answered(objects, submit(lambda: network.predict(views)))
+    views: Sequence[CanonicalView],
+    network: Predictor,
+    submit: Callable[[Callable[[], Answers]], Future[Answers]],
+) -> list[Prediction]:
+    """Predictions of bodies from views, which what ``submit`` is given computes, now or beside fits."""
+    shown = np.stack([view.marked for view in views])
+    return _answered(views, submit(lambda: network.predict(shown)))
 
 
 def at_once(asked: Callable[[], Answers]) -> Future[Answers]:
@@ -72,10 +73,5 @@ def at_once(asked: Callable[[], Answers]) -> Future[Answers]:
     return found
 
 
-def _shown(objects: Sequence[SeenObject]) -> list[CanonicalView]:
-    return [one.shown for one in objects if one.shown is not None]
-
-
-def _answered(objects: Sequence[SeenObject], answers: Future[Answers]) -> list[SeenObject]:
-    seen = zip(objects, _shown(objects), strict=True)
-    return [replace(one, prediction=Prediction(view, answers, k)) for k, (one, view) in enumerate(seen)]
+def _answered(views: Sequence[CanonicalView], answers: Future[Answers]) -> list[Prediction]:
+    return [Prediction(view, answers, k) for k, view in enumerate(views)]

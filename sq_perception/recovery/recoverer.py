@@ -41,9 +41,10 @@ from sq_perception.learning import checkpoint, inference
 from sq_perception.learning.choices import NEEDS_TORCH
 from sq_perception.learning.consensus import Consensus
 from sq_perception.recovery import continuity, methods, prediction, seen_object, segment_repair
-from sq_perception.recovery.continuity import Reference
 from sq_perception.recovery.options import FITTED, NEEDS_NETWORK, Method, RecoveryOptions
+from sq_perception.recovery.prediction import Prediction
 from sq_perception.recovery.recovery import FrameRecovery, Recovery, timed
+from sq_perception.recovery.reference import Reference
 from sq_perception.recovery.seen_object import SeenObject
 from sq_perception.segmentation import segments
 
@@ -240,13 +241,21 @@ class Recoverer:
 
     def _predicted(self, objects: Sequence[SeenObject], network: Network, options: RecoveryOptions) -> list[SeenObject]:
         """The objects with their predictions; those of bodies may still be computed, beside fits that begin without."""
+        views = [one.shown for one in objects if one.shown is not None]
+        if not views:
+            return list(objects)
         if isinstance(network, inference.ThingPredictor):
             # The network computes on one thread: each thread asks it about its share of the objects.
-            parts = [part for part in np.array_split(np.arange(len(objects)), self._threads) if part.size]
-            found = self._mapped(lambda part: prediction.of_hulls([objects[k] for k in part], network), parts)
-            return [one for part in found for one in part]
-        submit = self._beside.submit if options.method == "auto" else prediction.at_once
-        return prediction.of_bodies(objects, network, submit) if objects else []
+            parts = [part for part in np.array_split(np.arange(len(views)), self._threads) if part.size]
+
+            def of_part(part: np.ndarray) -> list[Prediction]:
+                return prediction.of_hulls([views[k] for k in part], [objects[k].plane for k in part], network)
+
+            found = [one for part in self._mapped(of_part, parts) for one in part]
+        else:
+            submit = self._beside.submit if options.method == "auto" else prediction.at_once
+            found = prediction.of_bodies(views, network, submit)
+        return [replace(one, prediction=said) for one, said in zip(objects, found, strict=True)]
 
     def _mapped(self, function: Callable[[_Item], _Answer], items: Sequence[_Item]) -> list[_Answer]:
         """The function of each item; several at a time in threads that stay, as new ones cost memory and time."""

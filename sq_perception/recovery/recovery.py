@@ -11,7 +11,7 @@ import numpy as np
 
 from sq_perception.fitting.fit import Fit, Status
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.recovery.continuity import Reference
+from sq_perception.recovery.reference import Reference
 
 
 @dataclass(frozen=True, eq=False)

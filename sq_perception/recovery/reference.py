@@ -1,0 +1,55 @@
+"""The readings that the bodies of a frame were recovered from: what the next frame is compared with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+
+from sq_perception.imaging.camera import Camera
+from sq_perception.recovery.options import RecoveryOptions
+
+_WIDTH = 320
+"""Columns that are compared: noise of neighbouring pixels is alike in all sensors of sensor_noise.preset."""
+BAND = 2
+"""Compared pixels around an object that belong to it: free space and outline."""
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """The readings that a frame's bodies were recovered from.
+
+    Attributes
+    ----------
+    depth : float32 (rows, columns)
+        Every ``stride``-th pixel of the image; 0 where nothing was measured.
+    sigma
+        Noise of the depth at one metre, metres.
+    """
+
+    depth: np.ndarray
+    stride: int
+    sigma: float
+    camera: Camera
+    options: RecoveryOptions
+
+    @classmethod
+    def of(cls, depth: np.ndarray, camera: Camera, sigma: float, options: RecoveryOptions) -> Reference:
+        """Of an image (height, width) that is NaN where nothing was measured."""
+        stride = max(1, round(camera.width / _WIDTH))
+        seen = np.asarray(depth[::stride, ::stride], dtype=np.float32)
+        return cls(np.where(np.isnan(seen), np.float32(0), seen), stride, sigma, camera, options)
+
+    def keeping(self, other: Reference, labels: np.ndarray, kept: Sequence[int]) -> Reference:
+        """These readings, but those of another reference around the labels that were recovered from it."""
+        taken = np.zeros(self.depth.shape, bool)
+        for label in kept:
+            taken |= around(labels[:: self.stride, :: self.stride] == label) > 0
+        return replace(self, depth=np.where(taken, other.depth, self.depth))
+
+
+def around(mask: np.ndarray) -> np.ndarray:
+    """An object with its surroundings, uint8."""
+    return cv2.dilate(mask.astype(np.uint8), np.ones((2 * BAND + 1, 2 * BAND + 1), np.uint8))
