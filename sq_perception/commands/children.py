@@ -21,6 +21,7 @@ import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 _PATIENCE = 8.0
 """Seconds for all children together to end after an interrupt: a lifecycle node waits 4 s for its transition."""
@@ -85,14 +86,24 @@ class Children:
     def __init__(self, environment: Mapping[str, str] | None = None) -> None:
         self._environment = environment
         self._running: list[Child] = []
+        self._interrupted = False
+        self._before: Any = None
         self.killed: list[str] = []
         """Names of those that did not stop when asked to."""
 
     def __enter__(self) -> Children:
+        if threading.current_thread() is threading.main_thread():
+            self._before = signal.signal(signal.SIGINT, self._interrupt)
         return self
 
     def __exit__(self, *_: object) -> None:
         self.stop()
+        if self._before is not None:
+            signal.signal(signal.SIGINT, self._before)
+
+    def _interrupt(self, *_: object) -> None:
+        self._interrupted = True
+        raise KeyboardInterrupt
 
     def start(self, node: str, arguments: Sequence[str] = ()) -> Child:
         """Start one node."""
@@ -101,7 +112,12 @@ class Children:
         return child
 
     def dead(self) -> Child | None:
-        """The first one that has ended by itself, if any."""
+        """The first one that has ended by itself, if any; a Ctrl-C that got lost is raised here again.
+
+        Python prints and forgets what is raised in a callback of a weak reference, such as imports have.
+        """
+        if self._interrupted:
+            raise KeyboardInterrupt
         return next((child for child in self._running if child.exit_code is not None), None)
 
     def stop(self) -> None:

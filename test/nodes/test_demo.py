@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 import uuid
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
@@ -207,6 +208,17 @@ def test_ctrl_c_ends_it_at_any_time_without_a_trace(tmp_path: Path) -> None:
     assert process.returncode == 0, said
     assert "Traceback" not in said
     assert marked(mark) == {}
+
+
+def test_a_ctrl_c_that_got_lost_is_noticed() -> None:
+    """As in a callback of a weak reference, whose exceptions Python prints and forgets."""
+    before = signal.getsignal(signal.SIGINT)
+    with Children() as children:
+        with suppress(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+        with pytest.raises(KeyboardInterrupt):
+            children.dead()
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_a_node_that_dies_is_named_and_ends_the_demonstration(tmp_path: Path) -> None:
