@@ -48,6 +48,7 @@ class HullPrior:
     def root(self, misfit: float = 1.0) -> np.ndarray:
         """W (J, J) with W^T W = (S + model error)^-1 + (misfit - 1) / pull^2 (1 - mean over the directions).
 
+        ``misfit``, 1 or more: mean loss of the object's rays over that of what a superquadric fits.
         The body that is most probable is not the one that is nearest to what is expected.  A superquadric that fits
         has the thing's form, and S tells which of them are probable.  One that does not is a choice: b is the best
         that is known of the thing's form, and the body shall be near to it in each direction, however unsure.  Growth

@@ -45,7 +45,7 @@ def sharpened(problem: Problem, state: State, free: np.ndarray, rays: Rays) -> t
     sigma = math.inf
     while True:
         before, sigma = sigma, _sigma(problem, state, free)
-        if sigma > _SHARPER * before:
+        if not sigma < _SHARPER * before or problem.late:  # so that it ends for any sigma
             return problem, state
         problem = problem.with_terms(outline_stiffness=1 / sigma)
         state = settle(problem, state, rays, FIRST_STEPS)

@@ -38,8 +38,8 @@ MIN_HEIGHT, _LEAST_HEIGHT = 0.012, 0.008
 and a half tolerances of a plane, and a book's thickness, as cloths have folds."""
 _SAMPLES = 400
 """Of a segment, evenly taken: the 5 % above a height, or the 1 % that may stick out, are a few still."""
-_SPARSE = 8
-"""Every so many pixels tell the nearest depth of an image."""
+_SPARSE, _STRAY = 8, 0.001
+"""Every so many pixels tell the nearest depth of an image, but for that share of them, which may be stray readings."""
 _FEWEST = 30
 """Samples that a surface has at least."""
 _BUMP, _ON_WALL = 6.0, 3.5
@@ -189,7 +189,7 @@ def standing(
     around = depth > 0
     measured = np.count_nonzero(around)
     coarse = depth[::_SPARSE, ::_SPARSE]
-    nearest = quantile(coarse[coarse > 0], _OUTLIERS / 10) * (1 + depth_steps.STEP) if coarse.any() else 0.0
+    nearest = quantile(coarse[coarse > 0], _STRAY) * (1 + depth_steps.STEP) if coarse.any() else 0.0
     plane = support.plane
 
     def is_thing(rows: np.ndarray, columns: np.ndarray) -> bool:
