@@ -77,7 +77,6 @@ def main() -> None:
     options = parser.parse_args()
     torch.set_num_threads(1)
     networks = {path.stem: Recoverer(path, method="network") for path in options.models}
-    networks |= {f"{path.stem} x 8": Recoverer(path, method="network", consensus=True) for path in options.models}
     default = Recoverer(method="auto")
     result: dict[str, Any] = {}
     rows = []

@@ -35,9 +35,8 @@ A value of another type, out of its range, or that does not fit the others is re
 A change takes effect with the next frame, unless the meaning begins with *configure*: set while the node is
 unconfigured (`ros2 lifecycle set /recover_node deactivate`, then `cleanup`), or with *start*: given at the start only.
 
-After a change of `model`, `device`, `method`, `consensus` or `threads` frames go on as before until the new one is
-ready; if it cannot be made the old one stays, and `/diagnostics` says why. Another `method`, `consensus` or model
-ends the tracks.
+After a change of `model`, `device`, `method` or `threads` frames go on as before until the new one is ready;
+if it cannot be made the old one stays, and `/diagnostics` says why. Another `method` or model ends the tracks.
 
 Quality of service is a parameter too, at the start only: `qos_overrides.<topic>.subscription.reliability`, `.depth`,
 `.history`, or `.publisher.` and also `.durability`, with the topic as it is after remapping.

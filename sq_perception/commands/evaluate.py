@@ -91,8 +91,6 @@ def _contestants(options: argparse.Namespace, methods: list[Method]) -> tuple[li
     for path, name in zip(paths, unique_names(paths), strict=True):
         try:
             contestants.append((Network.read(path, name), options.bodies))
-            if options.consensus:
-                contestants.append((Network.read(path, f"{name} x 8", consensus=True), options.bodies))
         except CheckpointError as error:
             failures.append(str(error))
     for method in methods:
@@ -106,7 +104,6 @@ def _contestants(options: argparse.Namespace, methods: list[Method]) -> tuple[li
 def _parser() -> argparse.ArgumentParser:
     command = parser("evaluate", _HELP, _EPILOG)
     add = command.add_argument
-    add("--consensus", action="store_true", help="each network a second time, asked in 8 positions of each view")
     add("--models", type=Path, nargs="*", metavar="FILE", help="weights to compare (default: all that are shipped)")
     add("--methods", nargs="*", choices=FITS, metavar="FIT", help=f"fits to compare (default: {' '.join(FITS)})")
     add("--bodies", type=at_least(1), default=BODIES, metavar="N", help=f"bodies for networks ({BODIES})")

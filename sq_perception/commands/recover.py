@@ -138,7 +138,6 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         help="its images: depth (default), rendered, labels, with commas, or none",
     )
     add("--model", metavar="FILE", help="weights: a .safetensors file, or the name of shipped ones")
-    add("--consensus", action="store_true", help="average the network's answers to 8 positions of each view")
     add("--track", action="store_true", help="follow bodies over the frames of each bag or folder, see below")
     add(
         "--time-budget",
@@ -227,14 +226,14 @@ def _run(options: argparse.Namespace) -> int:
             checkpoint.check(options.model)
         outputs = recover_outputs.Outputs(options)
         done.add(outputs.done)
-        setup = workers.Setup(options.model, settings, options.consensus)
+        setup = workers.Setup(options.model, settings)
         crew: Recoverer | workers.Processes | workers.Cluster
         if options.cluster:
             crew = workers.Cluster(setup, options.cluster)
         elif options.jobs > 1:
             crew = workers.Processes(setup, options.jobs)
         else:
-            crew = Recoverer(options.model, method=options.method, consensus=options.consensus)
+            crew = Recoverer(options.model, method=options.method)
     except (FrameError, checkpoint.CheckpointError, OSError, ImportError) as error:
         return failed(str(error))
     except ValueError as error:

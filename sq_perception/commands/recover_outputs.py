@@ -38,7 +38,6 @@ _DECISIVE = (
     "distortion",
     "topic",
     "model",
-    "consensus",
     "ignore_masks",
     "track",
     "time_budget",

@@ -29,7 +29,6 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
 from sq_perception.learning import checkpoint, inference
 from sq_perception.learning.choices import LOSSES
-from sq_perception.learning.consensus import Consensus
 from sq_perception.learning.inference import Predictor
 from sq_perception.learning.objective import Objective
 from sq_perception.recovery.recoverer import Method, Recoverer, RecoveryOptions
@@ -79,8 +78,8 @@ class Network:
     recoverer: Recoverer
 
     @classmethod
-    def read(cls, path: Path, name: str | None = None, consensus: bool = False) -> Network:
-        """Load a weights file; with ``consensus`` the network is asked in 8 positions of each view.
+    def read(cls, path: Path, name: str | None = None) -> Network:
+        """Load a weights file.
 
         Raises
         ------
@@ -92,15 +91,7 @@ class Network:
         training, found = (_note(header, key, path) for key in ("training", "metrics"))
         if training.get("loss", LOSSES[0]) not in LOSSES:
             raise checkpoint.CheckpointError(f"{path}: the header names an unknown loss: {training['loss']!r}")
-        recoverer = Recoverer(path, method="network", consensus=consensus)
-        return cls(
-            name or default_name(path),
-            path,
-            Consensus(predictor) if consensus else predictor,
-            training,
-            found,
-            recoverer,
-        )
+        return cls(name or default_name(path), path, predictor, training, found, Recoverer(path, method="network"))
 
     @property
     def loss(self) -> str:
@@ -115,8 +106,6 @@ class Network:
         parts.append(f"views of {self.model.config.pixels} x {self.model.config.pixels}")
         if "step" in self.metrics:
             parts.append(f"{self.metrics['step']} steps in its last training")
-        if isinstance(self.model, Consensus):
-            parts.append("asked in 8 positions of each view")
         if self.training.get("start"):
             parts.append("started from another network")
         if self.loss == "occupancy_rotation":

@@ -14,10 +14,6 @@ import numpy as np
 
 from sq_perception.geometry.superquadric import Superquadric
 
-TURNS = np.array([0, 1, 2, 3, 0, 1, 2, 3])
-MIRROR = np.array([False, False, False, False, True, True, True, True])
-"""All 8 positions."""
-
 
 def moved_images(images: np.ndarray, turns: np.ndarray, mirror: np.ndarray) -> np.ndarray:
     """Images (n, p, p) in positions (n,)."""
@@ -44,9 +40,3 @@ def at_random(images: np.ndarray, bodies: Superquadric, rng: np.random.Generator
     """Images (n, p, p) and their bodies (n,), each in any of the 8 positions."""
     turns, mirror = rng.integers(4, size=len(images)), rng.random(len(images)) < 0.5
     return moved_images(images, turns, mirror), moved_bodies(bodies, turns, mirror)
-
-
-def moved_back(bodies: Superquadric, turns: np.ndarray, mirror: np.ndarray) -> Superquadric:
-    """The inverse of :func:`moved_bodies`: what a prediction for a moved image says about the image itself."""
-    straight = moved_bodies(bodies, -np.asarray(turns), np.zeros(len(bodies), bool))
-    return moved_bodies(straight, np.zeros(len(bodies)), mirror)

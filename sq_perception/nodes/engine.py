@@ -31,7 +31,7 @@ from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, checked_d
 from sq_perception.segmentation.standing import Pose
 
 WARM_UP_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
-_MADE_OF = ("device", "consensus", "threads", "method", "model")
+_MADE_OF = ("device", "threads", "method", "model")
 """Parameters that a recoverer is made of."""
 _READ_BY = frozenset(("model", "device"))
 """Those whose setting reads the weights; the others keep what is loaded, whatever became of the file."""
@@ -146,7 +146,7 @@ class Engine:
         if built is None:
             raise RuntimeError("the recoverer has been released")
         method = built.parameters.method  # others may be set already, and still in the making
-        origin = built.weights, method, built.parameters.consensus
+        origin = built.weights, method
         known = previous[0] if previous is not None and previous[1] == origin else None
         options = replace(parameters.recovery_options(pose, frame.has_free_space), method=method)
         recovery = built.recoverer.recover(frame.depth, frame.camera, frame.labels, options, known)
@@ -199,7 +199,6 @@ def _made(parameters: RecoverParameters, kept: _Built | None, is_wanted: Callabl
             parameters.model or None,
             parameters.device,
             parameters.method,
-            parameters.consensus,
             parameters.threads or None,
             weights_of=None if kept is None else kept.recoverer,
         )

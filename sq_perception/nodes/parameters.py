@@ -132,7 +132,6 @@ class RecoverParameters(Parameters):
         "", "Weights: a .safetensors file or the name of shipped ones; empty: the default. Set again, it is read again."
     )
     device: str = setting("cpu", "Where the network runs: cpu, cuda or cuda:N.")
-    consensus: bool = setting(False, "Average the network's answers to 8 positions of each view.")
     threads: int = setting(0, "Objects worked on at the same time; 0: as many as there are cores.", within=(0, 256))
     method: Method = setting(
         "auto",

@@ -130,7 +130,7 @@ class Tracking:
             self._untracked_stamp = stamp
             return publication.identified(recovery)
         if self._origin not in (None, origin):
-            self._forget("bodies come from another method, consensus or model from now on")
+            self._forget("bodies come from another method or model from now on")
         self._origin = origin
         before, self._fixed_frame = self._fixed_frame, parameters.fixed_frame
         if before not in (None, self._fixed_frame):

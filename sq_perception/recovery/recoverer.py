@@ -39,7 +39,6 @@ from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
 from sq_perception.learning import checkpoint, inference
 from sq_perception.learning.choices import NEEDS_TORCH
-from sq_perception.learning.consensus import Consensus
 from sq_perception.recovery import continuity, methods, prediction, seen_object, segment_repair
 from sq_perception.recovery.options import FITTED, NEEDS_NETWORK, Method, RecoveryOptions
 from sq_perception.recovery.prediction import Prediction
@@ -75,9 +74,6 @@ class Recoverer:
         cameras, as it predicts hulls with their uncertainty, and ``robust``, which predicts bodies, for all else.
     device
         Of the network: "cpu", "cuda" ...
-    consensus
-        Ask the network about each view in 8 positions and average its answers: 1 % better alone, and as slow as 8 views
-        (:mod:`sq_perception.learning.consensus`).
     method
         What :meth:`recover` does unless its options say otherwise.  "symmetry" and "classic" load no network; if a
         later call asks for one, it is loaded then.
@@ -99,7 +95,6 @@ class Recoverer:
         model: Path | str | None = None,
         device: str = "cpu",
         method: Method = "auto",
-        consensus: bool = False,
         threads: int | None = None,
         *,
         weights_of: Recoverer | None = None,
@@ -110,7 +105,6 @@ class Recoverer:
         self._options = RecoveryOptions(method=method)
         self._path = model
         self._device = checked_device(device)
-        self._consensus = consensus
         self._loaded: dict[bool, Network] = {} if weights_of is None else weights_of._loaded
         self._lock = threading.Lock()
         self._beside = ThreadPoolExecutor(1, thread_name_prefix="network")
@@ -269,8 +263,7 @@ class Recoverer:
             if of_things not in self._loaded:
                 kinds = (of_things,) if self._path is None else (True, False)
                 self._loaded.update(dict.fromkeys(kinds, self._read_network(of_things)))
-            network = self._loaded[of_things]
-        return Consensus(network) if self._consensus and not isinstance(network, inference.ThingPredictor) else network
+            return self._loaded[of_things]
 
     def _read_network(self, of_things: bool) -> Network:
         if (self._path is None and of_things) or checkpoint.tells_hulls(self._path):

@@ -55,7 +55,6 @@ class Setup:
 
     model: Path | str | None
     options: RecoveryOptions
-    consensus: bool
 
 
 class WorkerLostError(RuntimeError):
@@ -176,7 +175,7 @@ def _begin(setup: Setup) -> None:
 def _recoverer(setup: Setup) -> Recoverer:
     from sq_perception.recovery.recoverer import Recoverer
 
-    return Recoverer(setup.model, method=setup.options.method, consensus=setup.consensus, threads=1)
+    return Recoverer(setup.model, method=setup.options.method, threads=1)
 
 
 def _recover(setup: Setup, work: Work) -> FrameRecovery:

@@ -16,7 +16,7 @@ from unit_axis import grid
 from sq_perception.geometry import Superquadric
 from sq_perception.learning import checkpoint, losses
 from sq_perception.learning.dataset import ViewPool, ViewSource, draw_views
-from sq_perception.learning.dihedral import MIRROR, TURNS, moved_back, moved_bodies, moved_images
+from sq_perception.learning.dihedral import moved_bodies, moved_images
 from sq_perception.learning.disturbance import any_occluder
 from sq_perception.learning.objective import UNSUPERVISED, Objective
 from sq_perception.learning.regressor import Regressor, RegressorConfig
@@ -96,13 +96,6 @@ class TestData:
         again, _ = view_rendering.render_views(moved)
         assert ((again > 0) != (turned > 0)).mean() < 0.001
         assert np.abs(again - turned)[(again > 0) & (turned > 0)].mean() < 0.004
-
-    def test_every_position_has_a_way_back(self) -> None:
-        bodies = thesis_bodies(8, np.random.default_rng(11))
-        back = moved_back(moved_bodies(bodies, TURNS, MIRROR), TURNS, MIRROR)
-        np.testing.assert_allclose(back.size, bodies.size)
-        np.testing.assert_allclose(back.translation, bodies.translation, atol=1e-12)
-        assert np.abs(np.abs(np.sum(back.rotation * bodies.rotation, axis=-1)) - 1).max() < 1e-12
 
     def test_pool_pairs_views_with_their_bodies(self) -> None:
         pool = ViewPool(np.random.default_rng(5), ViewSource(32), capacity=32)

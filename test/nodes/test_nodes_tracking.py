@@ -143,7 +143,7 @@ def test_another_method_ends_the_tracks(make_bench, capfd):
     assert bench.answer(image(10.3))[1].id.tolist() == [3]
     assert bench.node.set_parameters([Parameter("s", value=50.0)])[0].successful
     assert bench.answer(image(10.4))[1].id.tolist() == [3]
-    assert capfd.readouterr().err.count("bodies come from another method, consensus or model") == 2
+    assert capfd.readouterr().err.count("bodies come from another method or model") == 2
 
 
 def test_without_tracking_ids_are_labels_and_each_frame_stands_for_itself(make_bench):

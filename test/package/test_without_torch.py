@@ -41,7 +41,7 @@ def frame(tmp_path: Path) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize("method", ["auto", "network", "network --consensus --model supervised", "symmetry", "classic"])
+@pytest.mark.parametrize("method", ["auto", "network", "network --model supervised", "symmetry", "classic"])
 def test_recover(method: str, frame: Path) -> None:
     done = command(f"recover a.npz --json out.json --method {method}", frame)
     assert done.returncode == 0, done.stderr

@@ -22,7 +22,7 @@ from sq_perception.recovery.workers import Setup, Work
 pytestmark = pytest.mark.process
 _CAMERA = Camera(96, 72, 90.0, 90.0, 47.5, 35.5)
 _OPTIONS = RecoveryOptions(method="symmetry")
-_SETUP = Setup(None, _OPTIONS, consensus=False)
+_SETUP = Setup(None, _OPTIONS)
 
 
 def _frames(count: int) -> list[tuple[int, Work]]:
