@@ -13,6 +13,7 @@ no grasp is found, or two have failed in a row.
 | --- | --- | --- |
 | ours | the recovery | its covariance |
 | ours without sigma | the same | 10 % of the size each |
+| ours without the hull | the recovery with the network of bodies, as in release 0.2.0 | its covariance |
 | ours at any score | the same as ours, but the grasp tried is the one whose score is nearest to a random number | |
 | true bodies | the superquadric nearest to the true hull, at the true place | 2.5 mm of the size each |
 | classic | Solina and Bajcsy's fit to our masks' points | 10 % |
@@ -79,6 +80,7 @@ from sq_perception.grasping import planner
 from sq_perception.grasping.plan import Grasp
 from sq_perception.grasping.planner import grasps
 from sq_perception.grasping.surroundings import Surroundings
+from sq_perception.learning import checkpoint
 from sq_perception.recovery.recoverer import FrameRecovery, Recoverer
 
 MOST_ROUNDS = 12
@@ -231,6 +233,7 @@ def cgn_in_masks(seen: Seen) -> tuple[Grasp, ...]:
 CONTESTANTS: dict[str, Callable[[Seen], tuple[Grasp, ...]]] = {
     "ours": ours,
     "ours without sigma": without_sigma,
+    "ours without the hull": ours,
     "ours at any score": at_any_score,
     "true bodies": true_bodies,
     "classic": classic,
@@ -239,13 +242,15 @@ CONTESTANTS: dict[str, Callable[[Seen], tuple[Grasp, ...]]] = {
     "cgn in masks": cgn_in_masks,
     "cgn": cgn,
 }
-ON_RECOVERED = ("ours", "ours without sigma", "ours at any score", "classic")
+ON_RECOVERED = ("ours", "ours without sigma", "ours without the hull", "ours at any score", "classic")
 PEERS = ("cgn in masks", "cgn")
 
 
-def method_of(contestant: str) -> str:
+def recoverer_of(contestant: str) -> Recoverer:
     """The recovery that a contestant gets."""
-    return "auto" if contestant.startswith("ours") or contestant == "cgn in masks" else "classic"
+    if contestant == "ours without the hull":
+        return Recoverer(model=checkpoint.DEFAULT)
+    return Recoverer(method="auto" if contestant.startswith("ours") or contestant == "cgn in masks" else "classic")
 
 
 @dataclass(frozen=True, eq=False)
@@ -472,7 +477,7 @@ def main() -> None:
     if arguments.each and arguments.each.exists():
         lines = [json.loads(line) for line in arguments.each.read_text().splitlines()]
     have = {(line["kind"], line["seed"], line["contestant"]) for line in lines}
-    recoverers = {name: Recoverer(method=method_of(name)) for name in CONTESTANTS}
+    recoverers = {name: recoverer_of(name) for name in contestants}
     for seed in range(arguments.first, arguments.first + arguments.scenes):
         for kind in arguments.kinds.split(","):
             missing = [name for name in contestants if (kind, seed, name) not in have]
@@ -490,7 +495,7 @@ def main() -> None:
     gains = {
         f"{kind}: ours over {other}": gain(lines, kind, "ours", other)
         for kind in KINDS
-        for other in ("ours without sigma", "classic", "cgn in masks")
+        for other in ("ours without sigma", "ours without the hull", "true bodies", "classic", "cgn in masks", "cgn")
     }
     if arguments.name:
         found, gains = _with_earlier(arguments.name, "rows", found), _with_earlier(arguments.name, "gains", gains)

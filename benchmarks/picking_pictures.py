@@ -79,7 +79,7 @@ def failures(path: Path, lines: list[dict[str, Any]]) -> dict[str, str]:
     figure = plots.new_figure(5.2 * len(panels), 4.6)
     for column, (cause, line, number) in enumerate(panels):
         scene, name = picking_scenes.scene(line["kind"], line["seed"]), line["contestant"]
-        recoverer = Recoverer(method=picking.method_of(name))
+        recoverer = picking.recoverer_of(name)
         one = next(islice(picking.rounds(scene, name, recoverer), number, None))
         bodies = [found.superquadric for found in one.seen.recovery.recovered]
         ax = figure.add_axes((column / len(panels) + 0.002, 0.0, 1 / len(panels) - 0.004, 1.0))
