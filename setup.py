@@ -51,13 +51,9 @@ exr = [
 cluster = [
     "distributed>=2024.5",  # `recover --cluster` hands frames to a running Dask cluster; 36 MB with what it needs
 ]
-torch = "torch>=2.3,<2.15"  # the tests of learning pass with 2.3.0, 2.13.0 and 2.14.1
 train = [
-    torch,  # training, graphics cards, ResNet-18 and the soft renderer
-]
-export = [
-    torch,
-    "onnx>=1.16",  # the network as a graph for other runtimes
+    # Training, graphics cards, ResNet-18 and the soft renderer.  The tests of learning pass with 2.3.0, 2.13.0, 2.14.1.
+    "torch>=2.3,<2.15",
 ]
 picking = [
     "mujoco==3.3.7",  # the physics of benchmarks/picking.py; another release, another physics
@@ -118,7 +114,6 @@ setup(
         "exr": exr,
         "train": train,
         "view": view,
-        "export": export,
         "picking": picking,
         "docs": docs,
         "test": [
@@ -127,15 +122,11 @@ setup(
             *exr,
             *train,
             *view,
-            *export,
             *picking,
             *docs,
             "torch==2.13.0",  # one release for all tests; the newest one may fetch several GB
             "pytest>=7,<8.4",  # later ones break the launch_testing plugins of a ROS installation
             "hypothesis>=6",
-            # Reads exported graphs.  Its wheels send telemetry from 1.29 on unless ORT_DISABLE_TELEMETRY=1 is set; a
-            # newer one has to be looked at before it is let in.
-            "onnxruntime>=1.18,<1.32",
             "jsonschema>=4.18",  # what recover writes against its schema
             "mcap-ros2-support>=0.5",  # reads bags independently of the code that wrote them
             "ruff>=0.6",

@@ -9,7 +9,7 @@ recovery: a 256 x 256 image of one thesis body to its result, segmentation to sc
 
 Every number of threads has a process of its own, in which all libraries know it before they are imported.  The engines
 take turns, so that what else the machine does meets all of them.  Figures are median / 5th / 95th percentile of a call,
-all of its views together; the ratio to onnxruntime is that of the processor time, its least tenth, on one thread.
+all of its views together; the ratio to torch is that of the processor time, its least tenth, on one thread.
 
 The thesis reports 2.88 +- 0.92 ms for its network on its graphics card (table 6.3).
 """
@@ -34,11 +34,11 @@ NETWORKS = ("compact", "resnet18")
 WARM_UP = 3
 LEAST = 10
 """Percentile of the processor times that is compared: a busy machine only ever adds."""
-RIVAL = "onnxruntime"
+RIVAL = "torch, folded"
 THESIS = "The thesis reports 2.88 +- 0.92 ms for its ResNet-18 on 256 x 256 views on a graphics card (table 6.3)."
 
 
-def engines(model: Any, threads: int) -> dict[str, Callable[[np.ndarray], Any]]:
+def engines(model: Any) -> dict[str, Callable[[np.ndarray], Any]]:
     """Every way to compute ``model`` that is there, by name."""
     import torch
 
@@ -48,8 +48,7 @@ def engines(model: Any, threads: int) -> dict[str, Callable[[np.ndarray], Any]]:
     if model.config.backbone == "compact":
         weights = {name: tensor.numpy() for name, tensor in model.state_dict().items()}
         ways["forward"] = CompactRegressor(model.config, weights).predict
-    ways[RIVAL] = through_onnx(model, threads)
-    ways["torch, folded"] = model.for_inference().predict
+    ways[RIVAL] = model.for_inference().predict
     ways["torch, folded, bfloat16"] = model.for_inference(torch.bfloat16).predict
     if torch.cuda.is_available():
         for dtype in (torch.float32, torch.bfloat16, torch.float16):
@@ -57,29 +56,7 @@ def engines(model: Any, threads: int) -> dict[str, Callable[[np.ndarray], Any]]:
     return ways
 
 
-def through_onnx(model: Any, threads: int) -> Callable[[np.ndarray], Any]:
-    """The exported graph by onnxruntime, whose idle threads leave the cores to others."""
-    os.environ["ORT_DISABLE_TELEMETRY"] = "1"
-    import onnxruntime
-
-    from sq_perception.geometry.superquadric import Superquadric
-    from sq_perception.learning import onnx_export
-    from sq_perception.learning.network_config import checked_views
-
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads, options.inter_op_num_threads = threads, 1
-    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    graph = onnx_export.build(model).SerializeToString()
-    session = onnxruntime.InferenceSession(graph, options, providers=["CPUExecutionProvider"])
-
-    def predict(views: np.ndarray) -> Superquadric:
-        batch = checked_views(views, model.config)[:, None]
-        return Superquadric.from_flat(session.run([onnx_export.OUTPUT], {onnx_export.INPUT: batch})[0].astype(float))
-
-    return predict
-
-
-def measure_networks(names: list[str], rounds: int, threads: int) -> dict[str, Any]:
+def measure_networks(names: list[str], rounds: int) -> dict[str, Any]:
     """Times of every network, engine and batch: wall clock, and the processor's of all threads together."""
     import torch
 
@@ -93,7 +70,7 @@ def measure_networks(names: list[str], rounds: int, threads: int) -> dict[str, A
         model = checkpoint.load() if name == "compact" else Regressor(RegressorConfig.thesis()).eval()
         views, _ = draw_views(max(BATCHES), np.random.default_rng(0), ViewSource(model.config.pixels))
         expected = model.predict(views).to_flat()[:, :8]
-        ways = engines(model, threads)
+        ways = engines(model)
         result[name] = {way: {} for way in ways}
         for way, predict in ways.items():
             result[name][way]["difference"] = float(np.abs(predict(views).to_flat()[:, :8] - expected).max())
@@ -137,7 +114,7 @@ def work(options: argparse.Namespace) -> None:
     import torch
 
     torch.set_num_threads(options.work)
-    answer = {"networks": measure_networks(options.networks, options.rounds, options.work)}
+    answer = {"networks": measure_networks(options.networks, options.rounds)}
     answer["recovery"] = measure_recovery(options.images, options.work)
     print(json.dumps(answer))
 
@@ -160,7 +137,7 @@ def counted(number: int, what: str) -> str:
 
 
 def tables(result: dict[str, Any]) -> str:
-    """The times of calls, their processor times as multiples of onnxruntime's, and whole recoveries."""
+    """The times of calls, their processor times as multiples of torch's, and whole recoveries."""
     first = next(iter(result.values()))
     columns = [(batch, threads) for batch in BATCHES for threads in result]
     header = ["network", "engine", *(f"{counted(b, 'view')}, {counted(int(t), 'thread')}, ms" for b, t in columns)]
@@ -172,7 +149,7 @@ def tables(result: dict[str, Any]) -> str:
             ratios.append(
                 [network, engine, *(f"{row[str(b)]['processor'] / rival[str(b)]['processor']:.2f}" for b in BATCHES)]
             )
-    compared = ["network", "engine", *(f"{counted(b, 'view')}, of {RIVAL}'s time" for b in BATCHES)]
+    compared = ["network", "engine", *(f"{counted(b, 'view')}, of torch's time" for b in BATCHES)]
     methods = [
         [method, *(shown(result[threads]["recovery"][method]["total"]) for threads in result)]
         for method in first["recovery"]

@@ -21,7 +21,6 @@ _EXTRAS = {
     "view": ("viser",),
     "exr": ("OpenEXR",),
     "train": ("torch",),
-    "export": ("torch", "onnx"),
     "ros": ("rclpy", "sensor_msgs", "visualization_msgs"),
 }
 """What tells that an extra is there."""

@@ -33,7 +33,6 @@ COMMANDS = {
     "dataset": ("sq_perception.commands.dataset", "write a fixed set of training and test images"),
     "evaluate": ("sq_perception.commands.evaluate", "the thesis' tables and plots, for networks and fits"),
     "render-search": ("sq_perception.commands.render_search", "find the best s and tau of the soft renderer"),
-    "export": ("sq_perception.commands.export", "write a network as ONNX"),
     "doctor": ("sq_perception.commands.doctor", "versions, extras, kernels, cores, and what is missing"),
     "warm-up": ("sq_perception.commands.warm_up", "compile everything once, so that no first image waits"),
 }

@@ -203,4 +203,4 @@ def test_a_node_that_starts_again_waits_for_nothing_that_it_does_not_need() -> N
     pytest.importorskip("rclpy", reason="needs the extra 'ros'")
     modules = loaded_after("import sq_perception.nodes.frame_node")
     assert "numba" in modules
-    assert not modules & {"torch", "scipy.stats", "trimesh", "matplotlib", "rich", "onnx", "onnxruntime"}
+    assert not modules & {"torch", "scipy.stats", "trimesh", "matplotlib", "rich"}

@@ -5,7 +5,6 @@ Real processes, with a HOME that is empty and a network in which every packet is
 
 from __future__ import annotations
 
-import ast
 import os
 import sys
 from pathlib import Path
@@ -79,12 +78,3 @@ def test_a_node(home: Path, tmp_path: Path) -> None:
     assert ready in found.said, found.said
     assert [one for one in found.sent if not one.startswith("239.")] == [], "multicast does not leave this machine"
     assert files(home) == []
-
-
-def test_what_reports_its_use_is_not_imported() -> None:
-    """onnxruntime calls its maker since release 1.29."""
-    for path in PACKAGE.rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
-            names += [str(node.module)] if isinstance(node, ast.ImportFrom) else []
-            assert not any(name.split(".")[0] == "onnxruntime" for name in names), path

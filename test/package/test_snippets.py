@@ -100,20 +100,3 @@ def test_bags(repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
         bag.add(frame, recovery, None)
     run(repository, "bags.md", given)
     assert re.search(r"s  body 1: \[.*\] mm", capsys.readouterr().out)
-
-
-def test_the_exported_network(repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same body as asked in this package, and the graph says itself what it takes."""
-    onnx = pytest.importorskip("onnx")
-    pytest.importorskip("onnxruntime")
-    from sq_perception.commands import main
-    from sq_perception.recovery.recoverer import Recoverer
-
-    monkeypatch.chdir(tmp_path)
-    assert main.main(["export", "--output", "net.onnx"]) == 0
-    graph = onnx.load("net.onnx").graph
-    assert "z to the viewer" in graph.input[0].doc_string
-    assert "quaternion" in graph.output[0].doc_string
-    given = run(repository, "models.md", names())
-    (own,) = Recoverer(method="network").recover(given["depth"], CAMERA, given["mask"].astype(np.int32)).bodies
-    assert np.linalg.norm(given["body"].translation - own.superquadric.translation) < 0.01

@@ -16,7 +16,7 @@ import sys
 sys.path[:1] = [{str(Path(sq_perception.__file__).parents[1])!r}]
 class Absent:
     def find_spec(self, name, path=None, target=None):
-        if name.partition(".")[0] in ("torch", "onnx", "onnxruntime"):
+        if name.partition(".")[0] == "torch":
             raise ModuleNotFoundError(f"No module named {{name!r}}", name=name)
 sys.meta_path.insert(0, Absent())
 """
@@ -58,7 +58,7 @@ rclpy.init(args=["--ros-args", "-p", "method:=auto", "-p", "autostart:=false"])
 node = FrameNode("recover_node")
 assert node.trigger_configure() == TransitionCallbackReturn.SUCCESS
 assert node.trigger_activate() == TransitionCallbackReturn.SUCCESS
-assert not {"torch", "onnxruntime"} & set(sys.modules)
+assert "torch" not in sys.modules
 """
     done = run(code, tmp_path)
     assert done.returncode == 0, done.stderr
