@@ -5,8 +5,7 @@ be bounded, and for arrays must be what the file really holds; only then is memo
 
 Pillow reads the size in an image's header without unpacking it.
 
-References: https://numpy.org/doc/stable/reference/generated/numpy.lib.format.html (an NPZ is a ZIP of such arrays);
-LZF, https://oldhome.schmorp.de/marc/liblzf.html.
+Reference: https://numpy.org/doc/stable/reference/generated/numpy.lib.format.html (an NPZ is a ZIP of such arrays).
 """
 
 from __future__ import annotations
@@ -124,42 +123,6 @@ def exr_image(path: Path) -> np.ndarray:
     if one.dtype.kind != "f" or not all(np.array_equal(one, other, equal_nan=True) for other in others):
         raise UnpackingError(f"expected floats in a channel Z, V or Y, got {', '.join(found)}")
     return np.asarray(one)
-
-
-def lzf(packed: bytes, size: int) -> bytearray:
-    """What ``packed`` unpacks to by LZF, ``size`` bytes.
-
-    Raises
-    ------
-    UnpackingError
-        If it is anything else, or more than 16 times MOST_PIXELS bytes are asked for.
-    """
-    if size > 16 * MOST_PIXELS:
-        raise UnpackingError(f"expected at most {16 * MOST_PIXELS} bytes, got {size}")
-    found, at = bytearray(), 0
-    try:
-        while at < len(packed) and len(found) < size:
-            control = packed[at]
-            if control < 32:  # so many bytes and one as they are
-                found += packed[at + 1 : at + control + 2]
-                at += control + 2
-                continue
-            length = (control >> 5) + 2
-            if length == 9:
-                at += 1
-                length += packed[at]
-            back = ((control & 31) << 8) + packed[at + 1] + 1
-            if back > len(found):
-                raise UnpackingError("not readable as LZF: it refers to what is before its beginning")
-            start = len(found) - back
-            again = found[start : start + length]
-            found += (again * (length // back + 1))[:length]  # it may run into what it has just written
-            at += 2
-    except IndexError:
-        raise UnpackingError("not readable as LZF: it is cut short") from None
-    if at != len(packed) or len(found) != size:
-        raise UnpackingError(f"not readable as LZF: expected {size} bytes, got {len(found)}")
-    return found
 
 
 def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from sq_perception.files.unpacking import MOST_BYTES, MOST_PIXELS, UnpackingError, lzf
+from sq_perception.files.unpacking import MOST_BYTES, MOST_PIXELS, UnpackingError
 from sq_perception.imaging.camera import Camera
 
 SUFFIXES = (".pcd", ".ply")
@@ -140,19 +140,7 @@ def _pcd(data: bytes) -> np.ndarray:
         table = np.array(data[at:].split(), dtype=float).reshape(count, columns[-1])
         return table[:, [columns[k] for k in where]].reshape(height, width, 3)
     layout = np.dtype([(f"{k}", kind, (number,)) for k, (kind, number) in enumerate(zip(kinds, counts, strict=True))])
-    if head["DATA"] == ["binary"]:
-        rows = np.frombuffer(data, layout, count, at)
-        fields = [rows[f"{k}"] for k in where]
-    elif head["DATA"] == ["binary_compressed"]:  # all of the first field, then all of the second
-        packed, size = np.frombuffer(data, "<u4", 2, at).tolist()
-        if size != count * layout.itemsize:
-            raise UnpackingError(f"expected {count * layout.itemsize} bytes of points, got {size}")
-        body = lzf(data[at + 8 : at + 8 + packed], size)
-        starts = [count * layout.fields[f"{k}"][1] for k in where]  # type: ignore[index]
-        fields = [
-            np.frombuffer(body, kinds[k], count * counts[k], start).reshape(count, counts[k])
-            for k, start in zip(where, starts, strict=True)
-        ]
-    else:
-        raise UnpackingError(f"DATA: expected ascii, binary or binary_compressed, got {' '.join(head['DATA'])}")
-    return np.stack([field[:, 0] for field in fields], axis=1).reshape(height, width, 3)
+    if head["DATA"] != ["binary"]:
+        raise UnpackingError(f"DATA: expected ascii or binary, got {' '.join(head['DATA'])}")
+    rows = np.frombuffer(data, layout, count, at)
+    return np.stack([rows[f"{k}"][:, 0] for k in where], axis=1).reshape(height, width, 3)

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from sq_perception.files import unpacking
-from sq_perception.files.unpacking import UnpackingError, grey_image, lzf, npz_arrays
+from sq_perception.files.unpacking import UnpackingError, grey_image, npz_arrays
 from sq_perception.recordings.frame_file import FrameError, read
 
 
@@ -133,31 +133,3 @@ def test_images_that_would_fill_the_memory_are_refused(tmp_path, data, words):
     (tmp_path / "some.png").write_bytes(data)
     with pytest.raises(UnpackingError, match=words):
         grey_image(tmp_path / "some.png")
-
-
-LZF = b"\x02abc\x20\x02\xe0\x09\x00"
-"""abc, then its three bytes again, then the last byte 18 times: written by hand from the format's description."""
-
-
-def test_lzf_written_by_hand_is_read():
-    assert lzf(LZF, 24) == b"abcabc" + 18 * b"c"
-    assert lzf(b"", 0) == b""
-
-
-@pytest.mark.parametrize(
-    ("packed", "size", "words"),
-    [
-        (LZF, 2**32 - 1, "at most"),
-        (LZF, 23, "expected 23 bytes, got 24"),
-        (LZF, 25, "expected 25 bytes, got 24"),
-        (LZF, 3, "expected 3 bytes"),
-        (LZF[:-1], 24, "cut short"),
-        (LZF[:-2], 24, "cut short"),
-        (LZF[:3], 24, "expected 24 bytes"),
-        (b"\x00a\x20\x01", 4, "before its beginning"),
-        (2**16 * b"\xe0\xff\x00", 1, "before its beginning"),
-    ],
-)
-def test_lzf_that_is_not_what_it_claims_is_refused(packed, size, words):
-    with pytest.raises(UnpackingError, match=words):
-        lzf(packed, size)
