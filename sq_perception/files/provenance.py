@@ -5,19 +5,18 @@ from __future__ import annotations
 import os
 import platform
 import subprocess
-from collections.abc import Sequence
 from datetime import datetime, timezone
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-PACKAGES = ("sq-perception", "numpy", "numba", "torch", "ros-jazzy-rclpy")
+_PACKAGES = ("sq-perception", "numpy", "numba", "torch", "ros-jazzy-rclpy")
 
 
-def facts(command: str, file: str | Path = __file__, packages: Sequence[str] = PACKAGES) -> dict[str, Any]:
+def facts(command: str, file: str | Path = __file__) -> dict[str, Any]:
     """JSON values that belong beside every figure, for code in ``file``; what is not known is None."""
     versions: dict[str, str | None] = {}
-    for package in packages:
+    for package in _PACKAGES:
         try:
             versions[package] = metadata.version(package)
         except metadata.PackageNotFoundError:

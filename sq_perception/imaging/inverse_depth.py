@@ -81,12 +81,12 @@ class InverseDepth:
         """Whether pixels and their right (height, width - 1) or lower neighbours (height - 1, width) are apart."""
         return _apart(self.w[:, :-1], self.w[:, 1:], self.camera.fx), _apart(self.w[:-1], self.w[1:], self.camera.fy)
 
-    def hidden_from(self, baseline: float, least: float = 1.0) -> np.ndarray:
+    def hidden_from(self, baseline: float) -> np.ndarray:
         """Which pixels (height, width) an eye at x = ``baseline`` metres, on the camera's own rows, does not see.
 
         A point is hidden where another one of its row falls on the same column of that eye and is nearer, by more than
-        ``least`` pixels of disparity; or where its surface turns its back.  Beside an edge at 1 / w1 before a
-        background at 1 / w2 the shadow is fx |baseline| (w1 - w2) wide, to the left for an eye on the right.
+        a pixel of disparity; or where its surface turns its back.  Beside an edge at 1 / w1 before a background at
+        1 / w2 the shadow is fx |baseline| (w1 - w2) wide, to the left for an eye on the right.
         """
         height, width = self.w.shape
         # The limit is nearer than any sensor reads, and bounds the memory.
@@ -101,7 +101,7 @@ class InverseDepth:
         # A sample covers the two cells around it; a point lies behind whatever covers both of its cells.
         covering = np.maximum(nearest[1:], nearest[:-1])
         covering = np.minimum(covering[1:], covering[:-1])
-        behind = np.abs(np.float32(self.camera.fx * baseline)) * (covering[cell - 1] - self.w) > least
+        behind = np.abs(np.float32(self.camera.fx * baseline)) * (covering[cell - 1] - self.w) > 1
         # Steep surfaces crowd into few cells; they hide themselves only where the order of columns is lost.
         if baseline > 0:
             behind &= column > np.minimum.accumulate(column[:, ::-1], axis=1)[:, ::-1]

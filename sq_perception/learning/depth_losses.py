@@ -56,13 +56,8 @@ def free_space_loss(prediction: Superquadric, lines: torch.Tensor, depth: torch.
 
 
 def render_loss(
-    prediction: Superquadric,
-    lines: torch.Tensor,
-    depth: torch.Tensor,
-    sharpness: float,
-    density: float,
-    cells: int = 8,
+    prediction: Superquadric, lines: torch.Tensor, depth: torch.Tensor, sharpness: float, density: float
 ) -> torch.Tensor:
     """L_DR of each body, (n,), in the limit of fine voxels; ``density`` is D = n tau."""
-    soft = sight_lines.soft_depth(prediction, lines, sharpness, density, cells)
+    soft = sight_lines.soft_depth(prediction, lines, sharpness, density, cells=8)
     return (depth - soft).abs().mean(dim=-1)

@@ -51,6 +51,8 @@ _CALIBRATED, _LOG_SPREADS = 4096, (-5.0, 3.0)
 _WARM_UP = 100
 _AVERAGE = 0.998
 """The averaged weights, which are what is kept, remember some 500 steps."""
+_BATCH = 256
+"""Views of a validation that are computed at once."""
 
 
 @dataclass(frozen=True)
@@ -163,13 +165,13 @@ def train(config: ThingTraining, views: Path, output: Path, form: ThingConfig | 
     return state.average
 
 
-def likeliest_spread(network: ThingNetwork, views: ThingViews, batch: int = 256) -> float:
+def likeliest_spread(network: ThingNetwork, views: ThingViews) -> float:
     """The factor of S for which true hulls are likeliest, now that the network predicts and does not learn.
 
     As temperature scaling (C. Guo et al., "On calibration of modern neural networks", ICML 2017).
     """
     found = []
-    for truth, said in _answers(network, views, batch):
+    for truth, said in _answers(network, views):
         found.append(said.distance(truth)[0])
     m, nu, count = torch.cat(found).numpy(), network.config.freedom, views.support.shape[1]
     best = minimize_scalar(
@@ -180,10 +182,10 @@ def likeliest_spread(network: ThingNetwork, views: ThingViews, batch: int = 256)
     return network.config.spread * float(math.exp(best.x))
 
 
-def validate(network: ThingNetwork, views: ThingViews, batch: int = 256) -> dict[str, Any]:
+def validate(network: ThingNetwork, views: ThingViews) -> dict[str, Any]:
     """Mean errors of h and of the body's h in sides of the view, and the deviation of error / sigma, by kind."""
     errors, body_errors, ratios = [], [], []
-    for truth, said in _answers(network, views, batch):
+    for truth, said in _answers(network, views):
         error = (said.support - truth).numpy()
         body_errors.append(thing_network.body_loss(said.body, truth).numpy())
         errors.append(np.abs(error).mean(axis=1))
@@ -202,11 +204,11 @@ def validate(network: ThingNetwork, views: ThingViews, batch: int = 256) -> dict
 
 
 @torch.inference_mode()
-def _answers(network: ThingNetwork, views: ThingViews, batch: int) -> Iterator[tuple[torch.Tensor, HullPrediction]]:
+def _answers(network: ThingNetwork, views: ThingViews) -> Iterator[tuple[torch.Tensor, HullPrediction]]:
     """True support functions and what the network says, batch by batch."""
     network.eval()
-    for i in range(0, len(views.images), batch):
-        part = slice(i, i + batch)
+    for i in range(0, len(views.images), _BATCH):
+        part = slice(i, i + _BATCH)
         shown = (views.images[part].astype(np.float32), views.planes[part], views.extents[part])
         yield torch.from_numpy(views.support[part]), network(*map(torch.from_numpy, shown))
 

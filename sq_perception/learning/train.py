@@ -45,6 +45,8 @@ _OF_A_RUN = ("loss", "backbone", "framing", "pixels", "canonical_labels", "optim
 CALIBRATION_VIEWS = 2048
 _SAVE_SECONDS = 300.0
 """Longest time between two saved states."""
+_BATCH = 250
+"""Views of a validation that are computed at once."""
 VALIDATION_HIDDEN = 0.3
 """Share of each body that is hidden in the validation set ``hidden``."""
 
@@ -190,13 +192,13 @@ def _train(
 
 
 def validate(
-    model: Regressor, views: np.ndarray, truth: Superquadric, batch: int = 250, objective: Objective | None = None
+    model: Regressor, views: np.ndarray, truth: Superquadric, objective: Objective | None = None
 ) -> np.ndarray:
     """Volume IoU (n,) of the network's bodies with the true ones, both in the views' frames.
 
     With an ``objective`` for which some parameters are given, those are taken from the truth.
     """
-    flats = [model.predict(views[i : i + batch]).to_flat() for i in range(0, len(views), batch)]
+    flats = [model.predict(views[i : i + _BATCH]).to_flat() for i in range(0, len(views), _BATCH)]
     prediction = Superquadric.from_flat(np.concatenate(flats))
     return volume_iou(objective.with_given(prediction, truth) if objective else prediction, truth)
 

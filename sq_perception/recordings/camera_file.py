@@ -79,15 +79,15 @@ def camera_info_of(source: str | Path, width: int, height: int) -> CameraInfo:
     return CameraInfo(width, height, "plumb_bob", (), (fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0), none, 0, 0, Region())
 
 
-def read_calibration(path: str | Path, name: str = "", distortion: Treatment = "auto") -> Calibration:
-    """The calibration that a YAML file tells of; ``name`` is that of the images.
+def read_calibration(path: str | Path, distortion: Treatment = "auto") -> Calibration:
+    """The calibration that a YAML file describes.
 
     Raises
     ------
     FrameError
         As :func:`read_camera_info`, or if the camera is not calibrated or its distortion not known.
     """
-    return calibrated(path, read_camera_info(path), name, distortion)
+    return calibrated(path, read_camera_info(path), "", distortion)
 
 
 def read_camera_info(path: str | Path) -> CameraInfo:

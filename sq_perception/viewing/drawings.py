@@ -101,15 +101,13 @@ def depth_span(depth: np.ndarray) -> tuple[float, float] | None:
     return near, max(far, near + _LEAST_SPAN * max(abs(far), 1e-6))
 
 
-def steady_span(
-    before: tuple[float, float] | None, now: tuple[float, float], tolerance: float = 0.05
-) -> tuple[float, float]:
-    """The span before, unless an end has moved by more than ``tolerance`` of it: colours are not to flicker."""
+def steady_span(before: tuple[float, float] | None, now: tuple[float, float]) -> tuple[float, float]:
+    """The span before, unless an end has moved by more than 5 % of it: colours are not to flicker."""
     if before is None:
         return now
     length = before[1] - before[0]
     moved = max(abs(before[0] - now[0]), abs(before[1] - now[1]))
-    return now if moved > tolerance * length else before
+    return now if moved > 0.05 * length else before
 
 
 def cloud(depth: np.ndarray, camera: Camera, span: tuple[float, float], most: int, *, is_muted: bool = False) -> Cloud:
@@ -153,9 +151,9 @@ def coloured(depth: np.ndarray, span: tuple[float, float]) -> np.ndarray:
     return colours
 
 
-def colour_scale(count: int = 9) -> list[tuple[int, int, int]]:
-    """``count`` colours of :func:`coloured`, from near to far."""
-    shown = coloured(np.linspace(0.0, 1.0, count)[None], (0.0, 1.0))[0]
+def colour_scale() -> list[tuple[int, int, int]]:
+    """Nine colours of :func:`coloured`, from near to far."""
+    shown = coloured(np.linspace(0.0, 1.0, 9)[None], (0.0, 1.0))[0]
     return [(int(red), int(green), int(blue)) for red, green, blue in shown]
 
 
