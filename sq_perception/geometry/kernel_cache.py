@@ -1,6 +1,6 @@
 """Compiling kernels and keeping them, also for a user without a home on a read-only installation.
 
-numba keeps machine code where ``NUMBA_CACHE_DIR`` says, beside the modules, or in the user's cache folder, and
+numba keeps machine code in ``NUMBA_CACHE_DIR``, beside the modules, or in the user's cache folder, and
 otherwise refuses to compile at all.  Service users and containers often have none of these.  For them there is a folder
 of the user's own among the temporary files: numba reads machine code with pickle, so that nobody else may write there.
 """
@@ -41,7 +41,7 @@ def compiled(function: _F, options: dict[str, Any]) -> _F:
 
 @cache
 def temporary_folder() -> Path | None:
-    """A folder that belongs to this user alone and outlives the process, or None; says once what that means."""
+    """A folder that belongs to this user alone and outlives the process, or None; logs once what that means."""
     try:
         path = Path(tempfile.gettempdir()) / f"sq_perception-kernels-{os.geteuid()}"
         path.mkdir(mode=0o700, exist_ok=True)

@@ -1,7 +1,7 @@
 """Unions of superquadrics, as flat parameters (k, 12), compiled: the support function of their hull, and motion.
 
 The hull of a union has the support function h(n) = max over the parts of n.t + h_part(R^T n).  What is drawn by the
-thousand for training needs it some ten times each; :class:`Superquadric` says the same of one body at a time.
+thousand for training needs it some ten times each; :class:`Superquadric` computes the same for one body at a time.
 """
 
 from __future__ import annotations

@@ -1,23 +1,23 @@
-"""The camera that a camera_info tells of: whether its images are raw, and the pinhole camera that they are made to fit.
+"""The camera of a camera_info: whether its images are raw, and the pinhole camera that they are made to fit.
 
 Everything behind expects images of an ideal pinhole camera.  A camera_info describes two images at once, the raw one (K
-and the distortion D) and the rectified one (P), and nothing in it says which of them it came with.  So ``distortion``
+and the distortion D) and the rectified one (P), and nothing in it shows which of them it came with.  So ``distortion``
 decides:
 
     apply     the image is raw
     ignore    the image is rectified
-    auto      the image is raw if D is not all zero, unless its name says otherwise
+    auto      the image is raw if D is not all zero, unless its name shows otherwise
 
-A name says that the image is rectified if one of its last two parts has the word ``rect`` or ``rectified`` in it; words
+A name marks the image as rectified if one of its last two parts has the word ``rect`` or ``rectified`` in it; words
 are what is left between ``/``, ``_`` and other marks.  The transport's own part (``compressedDepth``) does not count.
 ``image_rect``, ``image_rect_raw``, ``depth/rect/image`` and ``depth_registered/image_rect`` are rectified,
-``image_raw``, ``depth/image`` and ``direct/image`` do not say so.  A file's name is its folder's and its own.
+``image_raw``, ``depth/image`` and ``direct/image`` are not.  A file's name is its folder's and its own.
 
 That depth was registered to a colour image changes nothing in this: it has the geometry of that image, and a
 camera_info that describes that image.  ``aligned_depth_to_color/image_raw`` and ``depth_to_rgb/image_raw`` are as
 distorted as their raw colour image, whose D they come with; ``depth_registered/image_rect`` lies on the rectified one.
 
-A rectified image has the intrinsics of P, or of K where P is not set; a raw one those of K, whatever P says, and is
+A rectified image has the intrinsics of P, or of K where P is not set; a raw one those of K, whatever P is, and is
 rectified here (:mod:`sq_perception.imaging.rectification`).
 
 A camera_info is whatever has the fields of the message: one of rclpy, of rosbags, or from a YAML file.
@@ -88,7 +88,7 @@ class Calibration:
         Raises
         ------
         ValueError
-            If the camera_info is not usable; says why, and which setting might help.
+            If the camera_info is not usable; the message gives the reason and the setting that might help.
         """
         if distortion not in get_args(Treatment):
             raise ValueError(f"distortion: expected {', '.join(get_args(Treatment))}, got {distortion!r}")
@@ -117,7 +117,7 @@ class Calibration:
         Raises
         ------
         ValueError
-            If the image has not the size of ``size``; says what may be the reason.
+            If the image has not the size of ``size``; the message names the likely reason.
         """
         self.check(depth)
         return depth if self.rectification is None else self.rectification.rectified(depth)
@@ -151,7 +151,7 @@ class Calibration:
 
 
 def is_rectified_name(name: str) -> bool:
-    """Whether the name of a topic or file says that its images are rectified; see the module."""
+    """Whether the name of a topic or file marks its images as rectified; see the module."""
     parts = [part for part in name.lower().split("/") if part and part != TRANSPORT.lower()]
     return any(_RECTIFIED.fullmatch(word) for part in parts[-2:] for word in _WORDS.split(part))
 
@@ -162,7 +162,7 @@ def is_distorted(coefficients: Sequence[float]) -> bool:
 
 
 def intrinsics(camera: Camera) -> Intrinsics:
-    """What a camera_info says of a camera's images."""
+    """The intrinsics of a camera, as :class:`Calibration` compares them."""
     return Intrinsics(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
 
 

@@ -35,7 +35,7 @@ MARGIN = 1.06
 """Side of the cube over the side of what is seen in it."""
 
 HIDDEN = -0.5
-"""Value of a pixel at which the object may go on unseen, in views that tell this from background."""
+"""Value of a pixel at which the object may go on unseen, in views that distinguish this from background."""
 
 NEAREST = 0.5 * (1 + 1 / MARGIN)
 OUTLIERS_PER_END = 1 / 500
@@ -76,7 +76,7 @@ class CanonicalView:
 
     @property
     def marked(self) -> np.ndarray:
-        """The image with :data:`HIDDEN` at the hidden pixels: the input of networks that tell them from background."""
+        """The image with :data:`HIDDEN` at the hidden pixels, for networks that distinguish them from background."""
         return np.where(self.hidden, np.float32(HIDDEN), self.image)
 
     def to_canonical(self, body: Superquadric) -> Superquadric:

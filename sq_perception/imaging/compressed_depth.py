@@ -71,7 +71,7 @@ def decode(image_format: str, data: bytes | np.ndarray) -> np.ndarray:
     Raises
     ------
     ValueError
-        For another format, or data that is no such image, saying what was expected.
+        For another format, or data that is no such image; the message names what was expected.
     """
     packed = _known(image_format)
     message = bytes(data)

@@ -12,12 +12,12 @@ that the raw pixel is (fx x' + cx, fy y' + cy).  With s = r^2 = x^2 + y^2,
         x' = q x,  y' = q y,  q = theta (1 + k1 theta^2 + k2 theta^4 + k3 theta^6 + k4 theta^8) / r,  theta = atan r
 
 The polynomials only describe a lens as long as a ray farther out has its image farther out.  Beyond, where they turn
-back and would show the scene a second time, both maps say NaN.  So they do for rays within a thousandth of a radian of
+back and would show the scene a second time, both maps give NaN, as they do for rays within a thousandth of a radian of
 the image plane, which no pinhole image can hold.
 
 The inverse has no closed form.  Newton's method solves for both coordinates at once, from a start that a table of
 r -> r' gives: three to five steps to 1e-15, everywhere.  OpenCV's undistortPoints iterates x <- (x' - tangential) / q
-instead, which converges slowly or not at all where distortion is strong, and does not say so.
+instead, which converges slowly or not at all where distortion is strong, and does not report it.
 
 Reference: OpenCV, Camera Calibration and 3D Reconstruction; J. Kannala and S. Brandt, A generic camera model and
 calibration method for conventional, wide-angle, and fish-eye lenses, PAMI 2006; REP 104.
@@ -58,7 +58,7 @@ class Distortion:
     model
         One of ``MODELS``.
     coefficients
-        In OpenCV's order.  As for OpenCV, their number says which terms there are, for plumb_bob and
+        In OpenCV's order.  As for OpenCV, their number determines the terms, for plumb_bob and
         rational_polynomial alike: 4, 5, 8, or 12 and 14 where thin prism and tilt are zero.
 
     Raises

@@ -44,7 +44,7 @@ _KEPT = 16
 _GROWTH = 2.0
 """Of the number of pixels, at most."""
 _BORDER = 64
-"""Places on each side of the raw image whose rays say how far it sees."""
+"""Places on each side of the raw image whose rays bound what it sees."""
 _STEEPEST = 10.0
 """Tangent of the incidence beyond which a step between neighbours is a jump."""
 _CLOSE = 0.01
