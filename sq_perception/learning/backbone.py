@@ -1,6 +1,6 @@
 """Convolutions of the network: a compact residual net for small views, and the thesis' ResNet-18.
 
-Both are residual networks (He et al. 2016): every block adds what two 3 x 3 convolutions say to what it was given.
+Both are residual networks (He et al. 2016): every block adds the output of two 3 x 3 convolutions to its input.
 
 | backbone | view | stem | stages | out |
 | --- | --- | --- | --- | --- |

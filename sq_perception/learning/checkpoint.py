@@ -1,4 +1,4 @@
-"""Network weights on disk: safetensors with a header that says what they are.
+"""Network weights on disk: safetensors with a header that describes them.
 
 What a file holds is read into NumPy arrays; torch is imported where one of its modules is made or written.
 
@@ -7,8 +7,8 @@ training noted (``training``, ``metrics``: JSON).  Reading executes nothing, and
 Half precision on disk halves the file; networks compute in single precision.
 
 A file is taken in as a whole and never mapped: one that is cut short or replaced while it is read, or afterwards, is
-an error or another network, and no fault of memory that ends the process.  Nothing is allocated on the word of a
-header: the file's own length bounds it, and that is looked at first.
+an error or another network, and no fault of memory that ends the process.  No header makes
+anything be allocated: the file's own length bounds it, and that is looked at first.
 
 Reference: the safetensors format, https://huggingface.co/docs/safetensors: 8 bytes little endian, length of the header;
 the header, JSON; the tensors, as one block that the header's offsets cover without gap or overlap.
@@ -47,7 +47,7 @@ VERSION = "1"
 DEFAULT = "robust"
 """Name of the weights that are used where none are named."""
 THINGS = "things"
-"""Name of the weights that tell the unseen side of things."""
+"""Name of the weights that predict the unseen side of things."""
 _MAX_PARAMETERS = 200_000_000
 _MAX_BYTES = 4 * _MAX_PARAMETERS + 2**20
 _MAX_HEADER_BYTES = 2**20
@@ -57,7 +57,7 @@ _MAX_PIXELS = 1024
 
 
 class CheckpointError(ValueError):
-    """A weights file that is missing, damaged, or of another kind; the message says which."""
+    """A weights file that is missing, damaged, or of another kind; the message names which."""
 
 
 def shipped() -> dict[str, Path]:
@@ -67,8 +67,8 @@ def shipped() -> dict[str, Path]:
 
 
 def shipped_regressors() -> dict[str, Path]:
-    """Those among them that tell a body, and no hull."""
-    return {name: path for name, path in shipped().items() if not tells_hulls(path)}
+    """Those among them that predict a body, and no hull."""
+    return {name: path for name, path in shipped().items() if not predicts_hulls(path)}
 
 
 def resolve(model: Path | str | None = None) -> Path:
@@ -178,13 +178,13 @@ def read_header(path: Path | str | None = None) -> dict[str, str]:
     return _strings(path, data, size)
 
 
-def tells_hulls(path: Path | str | None = None) -> bool:
+def predicts_hulls(path: Path | str | None = None) -> bool:
     """Whether a file holds a network of things; raises CheckpointError where it holds no header."""
     return path is not None and read_header(path).get("format") == THING_FORMAT
 
 
 def check(path: Path | str | None = None) -> None:
-    """Raise CheckpointError where a look at the header tells that :func:`load` or :func:`load_things` would.
+    """Raise CheckpointError where :func:`load` or :func:`load_things` would because of the header.
 
     Reads a megabyte at most, whatever the file.
     """
@@ -226,7 +226,7 @@ def _strings(path: Path, data: bytes, size: int) -> dict[str, str]:
         raise CheckpointError(f"{path}: not a readable safetensors file: {error}") from error
     if _LENGTH.size + length + end != size:
         raise CheckpointError(
-            f"{path}: not a readable safetensors file: its header tells of {_LENGTH.size + length + end} bytes, "
+            f"{path}: not a readable safetensors file: its header covers {_LENGTH.size + length + end} bytes, "
             f"the file has {size}"
         )
     return strings

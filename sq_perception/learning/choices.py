@@ -16,4 +16,4 @@ UNSUPERVISED = ("least_squares", "least_squares_free", "render")
 SIZE_RANGE = (0.04, 1.2)
 """Half sizes that a network for cropped views can express, in sides of the view; the thesis' bodies reach 0.8."""
 NEEDS_TORCH = "needs torch: pip install 'sq_perception[train]'"
-"""What is said where torch is not installed: training, graphics cards, ResNet-18 and the soft renderer need it."""
+"""The remedy where torch is not installed: training, graphics cards, ResNet-18 and the soft renderer need it."""

@@ -59,7 +59,7 @@ _PNG_LEVEL = 6
 
 
 class FixedSetError(ValueError):
-    """A set that is missing, unfinished, damaged or of another kind; the message says which."""
+    """A set that is missing, unfinished, damaged or of another kind; the message names which."""
 
 
 @dataclass(frozen=True)

@@ -55,10 +55,10 @@ class CompactThings:
         self._encoding = config.regressor()
         self._network = _Network(config, weights, channels=2)
 
-    def answers(
+    def predict(
         self, views: np.ndarray, planes: np.ndarray, extents: np.ndarray
     ) -> tuple[Superquadric, np.ndarray, np.ndarray]:
-        """As :meth:`sq_perception.learning.thing_network.ThingNetwork.answers`, without torch."""
+        """As :meth:`sq_perception.learning.thing_network.ThingNetwork.predict`, without torch."""
         known = extents > 0
         scale = np.where(known, np.log(np.where(known, extents, 1.0) / USUAL_EXTENT), 0.0)
         images = np.stack([views, _heights(views, planes)], axis=-1)

@@ -49,15 +49,15 @@ class Things(Protocol):
 
     config: ThingConfig
 
-    def answers(
+    def predict(
         self, views: np.ndarray, planes: np.ndarray, extents: np.ndarray
     ) -> tuple[Superquadric, np.ndarray, np.ndarray]:
         """Bodies (n,), support functions (n, J) and their S (n, J, J) of views (n, p, p), planes and extents."""
 
 
 @dataclass(frozen=True, eq=False)
-class HullAnswers:
-    """What the network of things says of a batch of views, each in the frame of its view; NumPy.
+class HullPredictions:
+    """What the network of things predicts for a batch of views, each in the frame of its view; NumPy.
 
     Attributes
     ----------
@@ -92,8 +92,8 @@ class ThingPredictor:
         self.config = network.config
         self._network = network
 
-    def predict(self, views: np.ndarray, planes: np.ndarray, extents: np.ndarray) -> HullAnswers:
-        """Answers to views (n, p, p) of sides ``extents`` (n,), metres, 0 where unknown.
+    def predict(self, views: np.ndarray, planes: np.ndarray, extents: np.ndarray) -> HullPredictions:
+        """Bodies and hulls of views (n, p, p) of sides ``extents`` (n,), metres, 0 where unknown.
 
         What the things stand on are planes (n, 4) in the frames of the views, zeros where there is none.
 
@@ -110,11 +110,11 @@ class ThingPredictor:
         both = np.concatenate([views, views[:, :, ::-1]])
         sides = np.concatenate([extents, extents]).astype(np.float32)
         supports = np.concatenate([planes, mirrored_planes(planes)]).astype(np.float32)
-        bodies, support, covariance = self._network.answers(both, supports, sides)
+        bodies, support, covariance = self._network.predict(both, supports, sides)
         straight, turned = np.split(support, 2)
         of_straight, of_turned = np.split(covariance, 2)
         back = mirrored(0)
-        return HullAnswers(
+        return HullPredictions(
             bodies[: len(views)],
             (straight + turned[:, back]) / 2,
             (of_straight + of_turned[:, back][:, :, back]) / 2,

@@ -59,7 +59,7 @@ class RegressorConfig:
     framing: Framing = "cropped"
     """What the views show; see the module."""
     marks_hidden: bool = False
-    """Whether views tell hidden pixels from background (``CanonicalView.marked``)."""
+    """Whether views distinguish hidden pixels from background (``CanonicalView.marked``)."""
 
     def __post_init__(self) -> None:
         for name, value, known in (("backbone", self.backbone, Backbone), ("framing", self.framing, Framing)):
@@ -129,7 +129,7 @@ class ThingConfig:
     factors: int = 8
     """K, the columns of L."""
     freedom: float = 3.0
-    """nu of the t distribution.  A network trained with 10 told errors of unseen views that were likeliest for 2 to 3,
+    """nu of the t distribution.  Trained with 10, the errors on unseen views were likeliest for 2 to 3,
     sigma a third as large: most hulls are plain to see, some are not."""
     spread: float = 1.0
     """Factor of S, set when a training ends: batches are normalised otherwise then, and errors smaller."""

@@ -15,7 +15,7 @@ view are computed on a random subset of its lines of sight, another one at every
 Least squares needs a curriculum.  Nothing in L_LS holds what lies behind the silhouette, and the first thing a network
 learns, one body for all images, is a column that runs away from the viewer; few images bring it back.  The factor
 sqrt(a1 a2 a3) is therefore multiplied by (a1 a2 a3 / 0.05)^k, k falling from 1 to 0 over the first four fifths of the
-run, which keep bodies small until the residual can tell; what is minimised in the end is equation 7.7.
+run, which keep bodies small until the residual determines them; what is minimised in the end is equation 7.7.
 """
 
 from __future__ import annotations
@@ -81,7 +81,7 @@ class Objective:
         progress: float,
         generator: torch.Generator,
     ) -> torch.Tensor:
-        """The loss of each body (n,); views (n, 1, p, p), and the labels only where :attr:`needs_labels` says so."""
+        """The loss of each body (n,); views (n, 1, p, p), and the labels only where :attr:`needs_labels` is true."""
         s = self.sharpness(progress)
         if self.needs_labels:
             assert truth is not None

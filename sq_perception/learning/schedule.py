@@ -23,7 +23,7 @@ def cosine(step: int, warm_up: int, steps: int) -> float:
 
 @dataclass
 class Plateau:
-    """What the validations of a run have come to."""
+    """What the validations of a run have shown."""
 
     best: float = math.inf
     without_progress: int = 0

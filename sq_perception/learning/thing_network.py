@@ -1,10 +1,10 @@
-"""The network that tells the unseen side of a thing: view and support plane in, support function of its hull out.
+"""The network that predicts the unseen side of a thing: view and support plane in, support function of its hull out.
 
 Equation
 --------
 The support function h(n) = max over the thing of n.(p - c) is what boxes, widths, resting and grasps are made of; it
 exists for every shape and asks for no order of axes.  For the J directions n_j of
-:data:`sq_perception.geometry.support_directions.DIRECTIONS` the network says h ~ t_nu(mu, S), a multivariate t
+:data:`sq_perception.geometry.support_directions.DIRECTIONS` the network predicts h ~ t_nu(mu, S), a multivariate t
 distribution with
 
     S = diag(sigma^2) + L L^T,    L (J, K),
@@ -13,7 +13,7 @@ as directions that look at the same unseen side err alike.  It is trained by the
 
     -log p = 1/2 log det S + (nu + J)/2 log(1 + m / nu) + const,    m = (h - mu)^T S^-1 (h - mu),
 
-with det and m by the matrices of K x K that follow from Woodbury's identity.  Beside that it says a superquadric, whose
+with det and m by the matrices of K x K that follow from Woodbury's identity.  It also predicts a superquadric, whose
 own support function (closed form) is drawn to the true one: where a fit begins.
 
 Frames and units
@@ -59,7 +59,7 @@ _FIRST_SUPPORT, _FIRST_LOG = 0.4, -2.5
 
 @dataclass(frozen=True, eq=False)
 class HullPrediction:
-    """What the network says of a batch of views, in the views' frames; arrays of torch.
+    """What the network predicts for a batch of views, in the views' frames; arrays of torch.
 
     Attributes
     ----------
@@ -148,19 +148,20 @@ class ThingNetwork(nn.Module):
             factors = math.sqrt(self.config.spread) * factors
             return HullPrediction(body, self.support_head(h), log_sigma, factors, self.config.freedom)
 
-    def answers(
+    def predict(
         self, views: np.ndarray, planes: np.ndarray, extents: np.ndarray
     ) -> tuple[Superquadric, np.ndarray, np.ndarray]:
-        """What is said of NumPy views (b, p, p), planes (b, 4) and extents (b,), in float32, in evaluation mode.
+        """The predictions for NumPy views (b, p, p), planes (b, 4) and extents (b,), in float32, in evaluation mode.
 
         Bodies (b,), support functions (b, J) and their S (b, J, J), in the views' frames; NumPy.
         """
         self.eval()
         device = next(self.parameters()).device
         with torch.inference_mode():
-            said = self(*(torch.from_numpy(each).to(device) for each in (views, planes, extents)))
+            predicted = self(*(torch.from_numpy(each).to(device) for each in (views, planes, extents)))
             flat, support, covariance = (
-                each.double().cpu().numpy() for each in (said.body.to_flat(), said.support, said.covariance())
+                each.double().cpu().numpy()
+                for each in (predicted.body.to_flat(), predicted.support, predicted.covariance())
             )
         return Superquadric.from_flat(flat), support, covariance
 

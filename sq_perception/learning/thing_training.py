@@ -10,7 +10,7 @@ The likelihood alone makes the first steps wild; the last term leads.  The learn
 that the run is given, as on a CPU the time is what is known beforehand.  A run that was stopped goes on where it was
 when the same command is given again.
 
-Views of the ``held`` first shards are never trained on; the log tells of them, by kind: the mean error of h, and the
+Views of the ``held`` first shards are never trained on; the log has their figures by kind: the mean error of h, and the
 standard deviation of error / sigma, which an honest network has at 1.
 """
 
@@ -45,7 +45,7 @@ from sq_perception.simulation.thing_views import ThingViews, draw_thing_views
 BODY, CENTRE = 2.0, 1.0
 """Weights of the losses beside the likelihood, which is of order 1 where they are of order 0.05."""
 _UNKNOWN_EXTENT = 0.1
-"""Share of the views whose extent the network is not told."""
+"""Share of the views whose extent is hidden from the network."""
 _CALIBRATED, _LOG_SPREADS = 4096, (-5.0, 3.0)
 """Views that settle the spread of the errors to 2 %, and between what it is sought."""
 _WARM_UP = 100
@@ -82,7 +82,7 @@ def write_views(
     shards: Iterable[int],
     views: int,
     seed: int,
-    said: Callable[[str], None],
+    report: Callable[[str], None],
     own: Sequence[Thing] = (),
 ) -> None:
     """Write shards of freshly drawn views that are not there yet; shard k follows from (seed, k) and ``own`` alone."""
@@ -93,7 +93,7 @@ def write_views(
             continue
         drawn = draw_thing_views(views, np.random.default_rng([seed, k]), own=own)
         output_file.write(path, bytes_of({**vars(drawn), "images": drawn.images.astype(np.float16)}))
-        said(f"{path}: {views} views")
+        report(f"{path}: {views} views")
 
 
 def read_views(paths: list[Path]) -> ThingViews:
@@ -142,11 +142,11 @@ def train(config: ThingTraining, views: Path, output: Path, form: ThingConfig | 
         images, planes, extents, truth = _batch(pool, rng.integers(len(pool.images), size=config.batch), rng)
         network.train()
         with torch.autocast("cpu", torch.bfloat16, enabled=config.bfloat16):
-            said = network(images, planes, extents)
+            predicted = network(images, planes, extents)
         loss = (
-            said.negative_log_likelihood(truth).mean() / truth.shape[1]
-            + BODY * thing_network.body_loss(said.body, truth).mean()
-            + CENTRE * (said.support - truth).abs().mean()
+            predicted.negative_log_likelihood(truth).mean() / truth.shape[1]
+            + BODY * thing_network.body_loss(predicted.body, truth).mean()
+            + CENTRE * (predicted.support - truth).abs().mean()
         )
         state.descend(loss, rate)
         if not bool(torch.isfinite(loss)):
@@ -171,8 +171,8 @@ def likeliest_spread(network: ThingNetwork, views: ThingViews) -> float:
     As temperature scaling (C. Guo et al., "On calibration of modern neural networks", ICML 2017).
     """
     found = []
-    for truth, said in _answers(network, views):
-        found.append(said.distance(truth)[0])
+    for truth, predicted in _predictions(network, views):
+        found.append(predicted.distance(truth)[0])
     m, nu, count = torch.cat(found).numpy(), network.config.freedom, views.support.shape[1]
     best = minimize_scalar(
         lambda log: 0.5 * count * log + 0.5 * (nu + count) * float(np.log1p(m / (math.exp(log) * nu)).mean()),
@@ -185,11 +185,11 @@ def likeliest_spread(network: ThingNetwork, views: ThingViews) -> float:
 def validate(network: ThingNetwork, views: ThingViews) -> dict[str, Any]:
     """Mean errors of h and of the body's h in sides of the view, and the deviation of error / sigma, by kind."""
     errors, body_errors, ratios = [], [], []
-    for truth, said in _answers(network, views):
-        error = (said.support - truth).numpy()
-        body_errors.append(thing_network.body_loss(said.body, truth).numpy())
+    for truth, predicted in _predictions(network, views):
+        error = (predicted.support - truth).numpy()
+        body_errors.append(thing_network.body_loss(predicted.body, truth).numpy())
         errors.append(np.abs(error).mean(axis=1))
-        ratios.append(error / said.deviation().numpy())
+        ratios.append(error / predicted.deviation().numpy())
     error, body_error, ratio = np.concatenate(errors), np.concatenate(body_errors), np.concatenate(ratios)
     found: dict[str, Any] = {
         "error": float(error.mean()),
@@ -204,8 +204,8 @@ def validate(network: ThingNetwork, views: ThingViews) -> dict[str, Any]:
 
 
 @torch.inference_mode()
-def _answers(network: ThingNetwork, views: ThingViews) -> Iterator[tuple[torch.Tensor, HullPrediction]]:
-    """True support functions and what the network says, batch by batch."""
+def _predictions(network: ThingNetwork, views: ThingViews) -> Iterator[tuple[torch.Tensor, HullPrediction]]:
+    """True and predicted support functions, batch by batch."""
     network.eval()
     for i in range(0, len(views.images), _BATCH):
         part = slice(i, i + _BATCH)

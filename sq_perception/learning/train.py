@@ -111,9 +111,9 @@ def _check_same_run(config: TrainingConfig, output: Path) -> None:
     before = json.loads(checkpoint.read_header(newest).get("training", "{}"))
     other = [name for name in _OF_A_RUN if before.get(name, getattr(config, name)) != getattr(config, name)]
     if other:
-        said = ", ".join(f"{name} {before[name]!r}, not {getattr(config, name)!r}" for name in other)
+        differences = ", ".join(f"{name} {before[name]!r}, not {getattr(config, name)!r}" for name in other)
         raise checkpoint.CheckpointError(
-            f"{output}: holds a run with {said}: expected another --output, or the same settings"
+            f"{output}: holds a run with {differences}: expected another --output, or the same settings"
         )
 
 

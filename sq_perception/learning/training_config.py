@@ -152,7 +152,7 @@ class TrainingConfig:
         return ViewSource(network.pixels, self.pinhole_share, self.wide_share, self.disturbance(), network.framing)
 
     def rate(self, step: int, plateau: Plateau) -> float:
-        """The learning rate of a step, by what the validations so far have come to."""
+        """The learning rate of a step, by what the validations so far have shown."""
         share = plateau.share if self.schedule == "plateau" else cosine(step, self.warm_up, self.steps)
         return self.learning_rate * share
 

@@ -1,4 +1,4 @@
-"""What a training tells while it runs: a line of JSON at each validation, printed and written, and a progress bar."""
+"""What a training reports while it runs: a line of JSON at each validation, printed and written, and a progress bar."""
 
 from __future__ import annotations
 

@@ -12,9 +12,9 @@ import numpy as np
 from sq_perception.fitting.hull_prior import HullPrior
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.canonical_view import CanonicalView
-from sq_perception.learning.inference import HullAnswers, Predictor, ThingPredictor
+from sq_perception.learning.inference import HullPredictions, Predictor, ThingPredictor
 
-Answers: TypeAlias = Superquadric | HullAnswers
+Answers: TypeAlias = Superquadric | HullPredictions
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,13 +36,13 @@ class Prediction:
     def body(self) -> Superquadric:
         """The predicted body in the optical frame; waits for it."""
         answers = self.answers.result()
-        bodies = answers.bodies if isinstance(answers, HullAnswers) else answers
+        bodies = answers.bodies if isinstance(answers, HullPredictions) else answers
         return self.view.from_canonical(bodies[self.number]).canonical_form()
 
     def hull(self) -> HullPrior | None:
         """The predicted hull in the optical frame, if the network tells of hulls; waits for it."""
         answers = self.answers.result()
-        return answers.hull(self.number, self.view) if isinstance(answers, HullAnswers) else None
+        return answers.hull(self.number, self.view) if isinstance(answers, HullPredictions) else None
 
 
 def of_hulls(

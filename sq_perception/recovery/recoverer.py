@@ -258,7 +258,7 @@ class Recoverer:
         return list(self._pool.map(function, items))
 
     def _load_network(self, of_things: bool) -> Network:
-        """The network that tells hulls, or the one that tells bodies; if a file of weights was named, that one."""
+        """The network that predicts hulls, or the one that predicts bodies; if a file was named, its network."""
         with self._lock:
             if of_things not in self._loaded:
                 kinds = (of_things,) if self._path is None else (True, False)
@@ -266,7 +266,7 @@ class Recoverer:
             return self._loaded[of_things]
 
     def _read_network(self, of_things: bool) -> Network:
-        if (self._path is None and of_things) or checkpoint.tells_hulls(self._path):
+        if (self._path is None and of_things) or checkpoint.predicts_hulls(self._path):
             return inference.load_things(self._path, self._device)
         return inference.load(self._path, self._device)
 

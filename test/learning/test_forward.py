@@ -87,7 +87,7 @@ def test_networks_of_things(config: ThingConfig | None, rng: np.random.Generator
     known = np.arange(12) % 2
     planes = (known[:, None] * rng.standard_normal((12, 4))).astype(np.float32)
     extents = (known * rng.uniform(0.05, 0.4, 12)).astype(np.float32)
-    expected, found = model.answers(views, planes, extents), predictor.answers(views, planes, extents)
+    expected, found = model.predict(views, planes, extents), predictor.predict(views, planes, extents)
     np.testing.assert_allclose(found[0].to_flat(), expected[0].to_flat(), atol=2e-5)
     for one, other in zip(found[1:], expected[1:], strict=True):
         np.testing.assert_allclose(one, other, rtol=1e-4, atol=1e-5)

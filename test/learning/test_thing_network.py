@@ -136,8 +136,8 @@ def test_weights_of_another_kind_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "things.safetensors"
     checkpoint.save(path, ThingNetwork(SMALL))
     assert checkpoint.load_things(path).config == SMALL
-    assert checkpoint.tells_hulls(path)
-    assert not checkpoint.tells_hulls("robust")
+    assert checkpoint.predicts_hulls(path)
+    assert not checkpoint.predicts_hulls("robust")
     checkpoint.check(path)
     assert set(checkpoint.shipped_regressors()) == {"robust", "supervised"}
     with pytest.raises(checkpoint.CheckpointError, match="expected a header"):
