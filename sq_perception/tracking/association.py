@@ -31,7 +31,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from sq_perception.geometry.kernels import inline_kernel, kernel, support
-from sq_perception.tracking import forms, judgement, state
+from sq_perception.tracking import agreement, forms, state
 from sq_perception.tracking.state import CENTRE, LENGTH, SIZE_AND_SHAPE
 
 _DEEP = 0.5
@@ -77,7 +77,7 @@ def in_place(
     apart = _apart(track, observed)
     between = observed[None, :, 5:8] - track[:, None, 5:8]
     centres = track_covariance[:, None, CENTRE, CENTRE] + covariance[None, :, CENTRE, CENTRE]
-    agree = state.mahalanobis(centres, between) < state.chi2_limit(judgement.GATE, 3)
+    agree = state.mahalanobis(centres, between) < state.chi2_limit(agreement.GATE, 3)
     deep = apart < _DEEP
     i, j = np.nonzero(deep | ((apart < 1) & agree))
     if not len(i):
@@ -116,7 +116,7 @@ def elsewhere(
     match = forms.nearest(track[i], free, observed[j], covariance[j], forms.EXCHANGE)
     total = (track_covariance[i] + match.covariance)[:, SIZE_AND_SHAPE, SIZE_AND_SHAPE]
     error = state.difference(track[i], match.state)[:, SIZE_AND_SHAPE]
-    alike = state.mahalanobis(total, error) < state.chi2_limit(judgement.GATE, 5)
+    alike = state.mahalanobis(total, error) < state.chi2_limit(agreement.GATE, 5)
     pairs = Pairs(i[alike], j[alike], match.state[alike], match.covariance[alike])
     if not alike.any():
         return Pairs.none()

@@ -144,12 +144,12 @@ def named(
     """An observation (12,) that its track does not follow, and its covariance, with the axes named as the track's.
 
     An exact form with axes within 45 degrees of those of the same names is taken.  Otherwise either the fit has taken
-    another axis as z, or somebody has turned the body.  Sizes and exponents tell which: those of the exchange that
-    keeps the names against those of the exact forms, whatever their turn.  Where they tell nothing, as for a cube, the
+    another axis as z, or somebody has turned the body.  Sizes and exponents decide: those of the exchange that
+    keeps the names against those of the exact forms, whatever their turn.  Where they are alike, as for a cube, the
     names are kept.  The turn about an axis that the observation leaves open, as something round does, is the track's.
     """
     form, changed = _form(track, track_covariance, observed, covariance)
-    is_open = np.diag(changed)[TURN] > state.TOLD**2
+    is_open = np.diag(changed)[TURN] > state.DETERMINED**2
     turn = np.where(is_open, state.difference(form, track)[TURN], 0)
     return np.append(form[:8], quaternions.multiply(form[8:], quaternions.from_rotation_vector(turn))), changed
 
@@ -157,7 +157,7 @@ def named(
 def _form(
     track: np.ndarray, track_covariance: np.ndarray, observed: np.ndarray, covariance: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What :func:`named` says, without open turns."""
+    """The result of :func:`named`, before open turns."""
     exact = nearest(track[None], track_covariance[None], observed[None], covariance[None], exchange=0.0)
     if np.linalg.norm(state.difference(track, exact.state[0])[TURN]) <= _SAME_NAME:
         return exact.state[0], exact.covariance[0]

@@ -16,15 +16,15 @@ the error x^ - x of the estimate its correlation C_c = cov(x^ - x, b_c) with eac
     C_j <- (I-K) C_j + K B [j = c].
 
 g is common to all views from anywhere, such as edges that a sensor widens, and no number of views lessens it.  It is
-g = L q with L L^T = gamma R and one unknown q of unit covariance for the life of the track.  What it has come to is
-carried along,
+g = L q with L L^T = gamma R and one unknown q of unit covariance for the life of the track.  Its effect on x^
+is carried along,
 
     M <- (I-K) M + K L,    cov(x^ - x) = P + M M^T,
 
 and K does not know of it: a gain that did would subtract one view from another to cancel what they are supposed to
 share.
 
-An answer that repeats an earlier one, of readings that are the same but for noise, has the same v again and says no
+An answer that repeats an earlier one, of readings that are the same but for noise, has the same v again and shows no
 more than that the body is where it was: it is not fused, K = 0.
 
 Equal views are averaged with equal weights and P falls to B, not to zero; views from elsewhere count as new.  With rho
@@ -131,8 +131,8 @@ def fused(
     seen_as = track[:, 8:12]
     if turning.any():
         turn = state.difference(track, observed)[:, TURN]
-        told = np.einsum("nii->ni", white + common)[:, TURN] < state.TOLD**2
-        turn = np.where(told & turning[:, None], turn, 0.0)
+        determined = np.einsum("nii->ni", white + common)[:, TURN] < state.DETERMINED**2
+        turn = np.where(determined & turning[:, None], turn, 0.0)
         seen_as = quaternions.multiply(seen_as, quaternions.from_rotation_vector(turn))
     local = np.einsum("nji,nj->ni", quaternions.to_matrix(seen_as), direction)
 
@@ -160,7 +160,7 @@ def fused(
 
     correction = step[:, TURN]
     if turning.any():
-        correction = np.where(told & turning[:, None], 0.0, correction)
+        correction = np.where(determined & turning[:, None], 0.0, correction)
     back = quaternions.to_matrix(quaternions.from_rotation_vector(correction))
     views.direction[:] = views.direction @ back
     after = 0.5 * (after + after.swapaxes(1, 2))

@@ -68,7 +68,7 @@ class Followed:
 
 @dataclass(frozen=True)
 class Tally:
-    """What a session has come to.
+    """The counts of a session.
 
     Attributes
     ----------

@@ -2,7 +2,7 @@
 
 26 points of the surface, in the directions of a cube's faces, edges and corners, speak for a body; those on the far
 side are left out.  A point is evidence of absence only where the image measured something farther: beyond the image,
-where nothing was measured, or where something lies in front or at the body's place, nobody can say that it has gone.
+where nothing was measured, or where something lies in front or at the body's place, nothing shows that it has gone.
 
 Optical frame, metres.
 """

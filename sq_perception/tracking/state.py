@@ -27,9 +27,9 @@ LENGTH = 11
 SIZE, SHAPE, CENTRE, TURN = slice(0, 3), slice(3, 5), slice(5, 8), slice(8, 11)
 SIZE_AND_SHAPE, POSE = slice(0, 5), slice(5, 11)
 """Parts of the error."""
-TOLD = 0.2
-"""Radians: a turn about an axis whose standard deviation is larger is not told by an observation.  Chosen: three of
-them reach the next axis of a cube, and fewer another side of the body."""
+DETERMINED = 0.2
+"""Radians: a turn about an axis whose standard deviation is larger is not determined by an observation.  Chosen:
+three of them reach the next axis of a cube, and fewer another side of the body."""
 _SHAPE_LIMITS = (0.01, 2.0)
 """Exponents: down to where the gauge was tried, up to where bodies are convex (:mod:`geometry.superquadric`)."""
 

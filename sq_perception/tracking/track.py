@@ -1,4 +1,4 @@
-"""What a tracker says of one body after a frame."""
+"""What a tracker knows of one body after a frame."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class Track:
     observation
         Index of this frame's observation; None if there is none.
     follows
-        Whether the body is what this frame's observation says.  False where there is none, for one whose centre or
+        Whether the body is as this frame observed it.  False where there is none, for one whose centre or
         rotation is elsewhere and which the track does not believe yet, and for one of other sizes or exponents if it is
         not the first in a row.
     """

@@ -9,7 +9,7 @@ world frame.  A frame is dealt with in this order:
 3. An observation that agrees with its track is fused (:mod:`~sq_perception.tracking.fusion`).  One that does not agree
    counts little; where several in a row disagree in the pose alone, the body has moved: its pose starts again, its
    sizes and exponents are kept.  Where they disagree otherwise, the track is doubted too and learns anew.  An answer
-   that repeats an earlier one says of a body at rest that it is there, and no more.
+   that repeats an earlier one shows that a body at rest is still there, and no more.
 4. Observations without a track start one; ids are never used again.
 5. A track without observation is kept while it is hidden (:mod:`~sq_perception.tracking.sight`), and dies after a
    number of frames in which it should have been seen, or in which another body was seen in its place.
@@ -28,10 +28,10 @@ import numpy as np
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
-from sq_perception.tracking import association, fusion, judgement, sight, state
+from sq_perception.tracking import agreement, association, fusion, sight, state
+from sq_perception.tracking.agreement import STILL_SHARE
 from sq_perception.tracking.association import Pairs
 from sq_perception.tracking.fusion import Views
-from sq_perception.tracking.judgement import STILL_SHARE
 from sq_perception.tracking.state import CENTRE, LENGTH, POSE, TURN, Observed
 from sq_perception.tracking.track import Track, TrackState
 
@@ -268,17 +268,17 @@ class Tracker:
         white = (1 - COMMON_SHARE - LASTING_SHARE) * pairs.covariance
         whole = pairs.covariance + LEAST
         total, error = covariances + whole, state.difference(states, pairs.state)
-        verdict = judgement.judged(states[:, 0:3], total, error)
+        verdict = agreement.compared(states[:, 0:3], total, error)
         turning = np.zeros(len(some), dtype=bool)
-        for k, one in enumerate(some):
+        for k, body in enumerate(some):
             agrees, slid, turned = verdict.agrees[k], verdict.slid[k], verdict.turned[k]
-            one.disagreed = 0 if agrees else one.disagreed + 1
-            impatient = one.disagreed > 0 and (one.is_moving or one.disagreed >= PATIENCE)
-            if not one.is_moving and one.jumps == 0:
-                # What moves strays to the same side again; errors larger than they are said to be do so seldom.
-                slid = slid and judgement.same_side(one.strayed[CENTRE], error[k, CENTRE])
-                turned = turned and judgement.same_side(one.strayed[TURN], error[k, TURN])
-            one.strayed = np.zeros(LENGTH) if agrees else error[k]
+            body.disagreed = 0 if agrees else body.disagreed + 1
+            impatient = body.disagreed > 0 and (body.is_moving or body.disagreed >= PATIENCE)
+            if not body.is_moving and body.jumps == 0:
+                # What moves strays to the same side again; errors larger than their covariance do so seldom.
+                slid = slid and agreement.same_side(body.strayed[CENTRE], error[k, CENTRE])
+                turned = turned and agreement.same_side(body.strayed[TURN], error[k, TURN])
+            body.strayed = np.zeros(LENGTH) if agrees else error[k]
             if impatient and verdict.fits[k] and (slid or turned):
                 turning[k] = turned
                 variance = np.zeros(LENGTH)
@@ -288,17 +288,17 @@ class Tracker:
             else:
                 # One stray observation is doubted itself; of several in a row, both sides are.
                 white[k] += (verdict.excess[k] - 1) * whole[k]
-                if one.disagreed >= PATIENCE:
+                if body.disagreed >= PATIENCE:
                     covariances[k] *= verdict.excess[k]
-            self._follow(one, error[k, CENTRE], slid and impatient, stamp, total[k, CENTRE, CENTRE])
+            self._follow(body, error[k, CENTRE], slid and impatient, stamp, total[k, CENTRE, CENTRE])
             if agrees or impatient:
-                one.agreed = stamp
+                body.agreed = stamp
 
         after, covariances, lasting, views = fusion.fused(
             states,
             covariances,
-            np.array([one.lasting for one in some]),
-            Views.stack([one.views for one in some]),
+            np.array([body.lasting for body in some]),
+            Views.stack([body.views for body in some]),
             pairs.state,
             white,
             common,
@@ -306,13 +306,13 @@ class Tracker:
             to_camera[pairs.observed],
             turning,
         )
-        strays = judgement.judged(after[:, 0:3], whole, state.difference(after, pairs.state))
-        for k, one in enumerate(some):
-            one.state, one.covariance, one.lasting, one.views = after[k], covariances[k], lasting[k], views[k]
-            one.seen, one.missed, one.last = one.seen + 1, 0, stamp
-            one.observation = int(pairs.observed[k])
-            insists = one.disagreed >= PATIENCE and not strays.fits[k]
-            one.follows = not (strays.slid[k] or strays.turned[k] or insists)
+        strays = agreement.compared(after[:, 0:3], whole, state.difference(after, pairs.state))
+        for k, body in enumerate(some):
+            body.state, body.covariance, body.lasting, body.views = after[k], covariances[k], lasting[k], views[k]
+            body.seen, body.missed, body.last = body.seen + 1, 0, stamp
+            body.observation = int(pairs.observed[k])
+            insists = body.disagreed >= PATIENCE and not strays.fits[k]
+            body.follows = not (strays.slid[k] or strays.turned[k] or insists)
 
     def _follow(self, one: _Body, error: np.ndarray, slid: bool, stamp: float, covariance: np.ndarray) -> None:
         """The velocity after an observation of the centre, ``error`` (3,) off its prediction."""

@@ -11,7 +11,7 @@ from sq_perception.fitting import covariance as fit_covariance
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
-from sq_perception.tracking import forms, judgement, state, tracker
+from sq_perception.tracking import agreement, forms, state, tracker
 
 CAMERA = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)
 NOTHING = np.full((CAMERA.height, CAMERA.width), np.nan)
@@ -32,7 +32,7 @@ def nothing_but_the_covariances(patch, common, lasting):
         (tracker, "DRIFT", nought),
         (tracker, "COMMON_SHARE", common),
         (tracker, "LASTING_SHARE", lasting),
-        (judgement, "GATE", 1 - 1e-9),
+        (agreement, "GATE", 1 - 1e-9),
     ):
         patch.setattr(module, name, value)
     return tracker.Tracker()

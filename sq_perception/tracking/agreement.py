@@ -24,7 +24,7 @@ STILL_SHARE = 0.05
 Chosen: a millimetre or two of a household thing, and 3 degrees."""
 
 
-class Judgement(NamedTuple):
+class Agreement(NamedTuple):
     """Of n observations, all (n,).
 
     ``agrees``, ``fits`` (sizes and exponents agree), ``slid``, ``turned``: bool.  ``excess``: e^T S^-1 e over its
@@ -38,8 +38,8 @@ class Judgement(NamedTuple):
     excess: np.ndarray
 
 
-def judged(size: np.ndarray, total: np.ndarray, error: np.ndarray) -> Judgement:
-    """Judge errors (n, 11) with covariances (n, 11, 11) of bodies with half sizes (n, 3)."""
+def compared(size: np.ndarray, total: np.ndarray, error: np.ndarray) -> Agreement:
+    """The agreement of errors (n, 11) with their covariances (n, 11, 11); bodies with half sizes (n, 3)."""
     limit, limit_five, limit_three = state.chi2_limit(GATE, np.array([LENGTH, 5, 3]))
 
     def outside(part: slice, bound: float) -> np.ndarray:
@@ -49,7 +49,7 @@ def judged(size: np.ndarray, total: np.ndarray, error: np.ndarray) -> Judgement:
     turned = outside(TURN, limit_three) & (np.linalg.norm(error[:, TURN], axis=-1) > STILL_SHARE)
     excess = state.mahalanobis(total, error) / limit
     agrees = (excess <= 1) & ~slid & ~turned
-    return Judgement(agrees, ~outside(SIZE_AND_SHAPE, limit_five), slid, turned, np.maximum(excess, 1))
+    return Agreement(agrees, ~outside(SIZE_AND_SHAPE, limit_five), slid, turned, np.maximum(excess, 1))
 
 
 def same_side(before: np.ndarray, now: np.ndarray) -> bool:
