@@ -36,7 +36,7 @@ from sq_perception.imaging import compressed_depth, unit_cube
 from sq_perception.imaging.calibration import Calibration, Treatment
 from sq_perception.imaging.camera import Projection
 from sq_perception.recordings import publication
-from sq_perception.recordings.bag_reader import CAMERA_INFO, COMPRESSED, IMAGE, BagReader, Message, said
+from sq_perception.recordings.bag_reader import CAMERA_INFO, COMPRESSED, IMAGE, BagReader, Message, described
 from sq_perception.recordings.frame_file import MILLIMETRES, FrameError, Reading, RecordedFrame, Stamp
 
 SUFFIXES = (".mcap", ".db3")
@@ -64,7 +64,7 @@ def camera_info_topic(topic: str) -> str:
 class RecordedBag:
     """One depth topic of a bag; iterating gives its frames once, in the order they were recorded.
 
-    A message that cannot be read comes as the FrameError that says why, and the next one follows.  Close it, or use it
+    A message that cannot be read comes as a FrameError with the reason, and the next one follows.  Close it, or use it
     as a context manager.
 
     Parameters
@@ -85,7 +85,7 @@ class RecordedBag:
     reading
         What is taken of each image; masks are files called as the frames are.
     is_done
-        Asked with the stamp of each image that counts; where it says yes, the image is neither decoded nor given.
+        Called with the stamp of each image that counts; where it is true, the image is neither decoded nor given.
 
     Raises
     ------
@@ -242,7 +242,7 @@ class RecordedBag:
         try:
             yield self._decoded(message, info)
         except (ValueError, MemoryError) as error:
-            yield FrameError(f"{self._path}: {self.topic} at {message.stamp}: {said(error)}")
+            yield FrameError(f"{self._path}: {self.topic} at {message.stamp}: {described(error)}")
 
     def _decoded(self, message: Message, info: Message | None) -> RecordedFrame:
         depth, encoding = publication.depth_of(message.content, self._orthographic)

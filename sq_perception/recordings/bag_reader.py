@@ -64,7 +64,7 @@ class BagReader:
             except StopIteration:
                 return
             except Exception as error:  # whatever damaged indices, chunks and pages lead to
-                raise FrameError(f"{self.path}: cannot be read any further: {said(error)}") from error
+                raise FrameError(f"{self.path}: cannot be read any further: {described(error)}") from error
             is_info = connection.msgtype == CAMERA_INFO
             if not is_info:
                 seen += 1
@@ -80,7 +80,7 @@ class BagReader:
                 recorded = Stamp(*divmod(nanoseconds, 10**9))
                 yield FrameError(
                     f"{self.path}: {connection.topic} recorded at {recorded}: not a readable {connection.msgtype}: "
-                    f"{said(error)}"
+                    f"{described(error)}"
                 )
                 continue
             yield Message(content, stamp, nanoseconds, is_info, is_packed=connection.msgtype == COMPRESSED)
@@ -104,7 +104,7 @@ def _open(path: Path) -> tuple[Any, Any]:
         reader = rosbag2.Reader(path)
         reader.open()
     except Exception as error:  # whatever damaged files lead to
-        raise FrameError(f"{path}: not a readable bag: {said(error)}") from error
+        raise FrameError(f"{path}: not a readable bag: {described(error)}") from error
     storages: list[Any] = [reader.storage]
     if isinstance(reader.storage, rosbag2.reader.DirectoryReader):
         # Messages packed one by one would be unpacked without a bound; so they come as they are, for _plain.
@@ -121,7 +121,7 @@ def _refuse_packed_files(folder: Path) -> None:
     try:
         document = plain_yaml.read(folder / "metadata.yaml")
     except plain_yaml.YamlError as error:
-        raise FrameError(f"{folder}: metadata.yaml: {said(error)}") from error
+        raise FrameError(f"{folder}: metadata.yaml: {described(error)}") from error
     information = document.get("rosbag2_bagfile_information") if isinstance(document, dict) else None
     if not isinstance(information, dict):
         raise FrameError(f"{folder}: metadata.yaml: expected rosbag2_bagfile_information")
@@ -158,7 +158,7 @@ def _bounded(decompressor: Any, data: bytes, size: int) -> bytes:
     return unpacked
 
 
-def said(error: Exception) -> str:
-    """An error's message in one line, with its kind where it says nothing by itself."""
+def described(error: Exception) -> str:
+    """An error's message in one line, with its kind where that alone is informative."""
     text = " ".join(str(error).split())[:300]
     return text if isinstance(error, ValueError) and text else f"{type(error).__name__}: {text}".rstrip(": ")

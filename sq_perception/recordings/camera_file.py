@@ -33,7 +33,7 @@ _BROWN_CONRADY = ("brown conrady", "inverse brown conrady", "modified brown conr
 
 
 class FrameError(ValueError):
-    """A file that is missing, damaged, or does not hold what it should; the message says what was expected."""
+    """A file that is missing, damaged, or does not hold what it should; the message names what was expected."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def calibrated(where: str | Path, info: Any, name: str, distortion: Treatment) -
 
 
 def camera_info_of(source: str | Path, width: int, height: int) -> CameraInfo:
-    """What a YAML, JSON or four numbers say of images of this size; raises FrameError as :func:`read_camera_info`."""
+    """That of a YAML, JSON or four numbers, for images of this size; raises FrameError as :func:`read_camera_info`."""
     numbers = None if Path(source).exists() else four_numbers(str(source))
     if numbers is None:
         return read_camera_info(source)

@@ -21,7 +21,7 @@ from sq_perception.imaging.camera import Camera
 SUFFIXES = (".pcd", ".ply")
 UNORGANISED = (
     "a cloud that is no image, seen from its origin: nothing is known of the space beside an object, so that the side "
-    "that is not seen is less sure; a depth image or an organised cloud tells more"
+    "that is not seen is less sure; a depth image or an organised cloud shows more"
 )
 _NUMBERS = {"F": "f", "I": "i", "U": "u"}
 _NEAREST, _FARTHEST = 1e-4, 1e5
@@ -31,13 +31,13 @@ _PIXEL_ERROR = 0.1
 _ON_PIXELS = 0.99
 """Least share of coordinates of an organised cloud with a smaller error."""
 _FITTED = 20000
-"""About so many points of an organised cloud tell its camera: a VGA image's is found in a third of the time of all."""
+"""About so many points of an organised cloud determine its camera, in a third of the time of all of a VGA image's."""
 _LEAST_POINTS = 100
 _POINTS_A_PIXEL = 2.0
 """Of a cloud that is no image, so that few pixels of a surface stay empty."""
 _LARGEST_SIDE = 1024
 _NEIGHBOURS = 2000
-"""Points whose nearest neighbour tells how dense the cloud is."""
+"""Points whose nearest neighbour gives the density of the cloud."""
 
 
 def read_points(path: Path) -> np.ndarray:

@@ -27,7 +27,7 @@ def frame_entry(
 ) -> dict[str, Any]:
     """The element; ``tracks`` are those of the bodies that did not fail, None without tracking.
 
-    ``has_masks`` says whether labels are those of masks that came with the frame.
+    ``has_masks``: whether labels are those of masks that came with the frame.
     """
     bodies, left = [], iter(tracks or ())
     for body in recovery.bodies:

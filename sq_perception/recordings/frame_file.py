@@ -15,7 +15,7 @@ is given.  ``Reading.scale`` goes before all of these units.  A camera_info is a
 :mod:`sq_perception.recordings.camera_file`.
 
 The cube is the thesis' unit cube, :mod:`sq_perception.imaging.unit_cube`.  An NPZ may bring ``labels`` (h, w), a
-support ``plane`` (4,), and the text "orthographic" as ``projection``, which goes before what the caller says.  Nothing
+support ``plane`` (4,), and the text "orthographic" as ``projection``, which goes before the caller's.  Nothing
 in a file is executed: no pickle, plain YAML only; and nothing is unpacked that is larger than any camera's image.
 
 Whether a PNG is raw and its distortion has to be undone is decided by :mod:`sq_perception.imaging.calibration`.
@@ -87,7 +87,7 @@ class RecordedFrame:
     received : int or None
         When a bag received it, nanoseconds.
     has_free_space : bool
-        Whether a pixel beside an object tells that there is nothing before what it measured.
+        Whether a pixel beside an object shows that there is nothing before what it measured.
     """
 
     depth: np.ndarray
@@ -116,7 +116,7 @@ class Reading:
     Attributes
     ----------
     scale : float or None
-        Units a metre; None: 1000 for whole numbers, or what the file's name says, and 1 for floats.
+        Units a metre; None: 1000 for whole numbers, or as the file's name has it, and 1 for floats.
     nearest, farthest : float
         Readings beyond, metres, are none.
     region : (4,) of int or None
@@ -290,7 +290,7 @@ def _read(
 
 
 def stamp_of(path: Path) -> Stamp | None:
-    """The time that a name says, seconds and their fraction."""
+    """The time in a name, seconds and their fraction."""
     parts = _TIME.fullmatch(path.stem)
     return Stamp(int(parts[1]), int(parts[2].ljust(9, "0"))) if parts else None
 

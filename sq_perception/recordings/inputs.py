@@ -3,8 +3,8 @@
 A folder gives its frames and bags in natural order (frame_2 before frame_10), NPYs only where it has nothing else, as
 matrices of calibrations are such files too; one without any gives those of its subfolders.  The camera of its images,
 and of an image that is named by itself, is ``camera_info.yaml``, ``camera.yaml``, ``intrinsics.json`` or
-``camera_intrinsic.json`` beside it, or in the folder that was named.  What cannot be read comes as the error that says
-why, in its place, and the rest follows.
+``camera_intrinsic.json`` beside it, or in the folder that was named.  What cannot be read comes as an error with the
+reason, in its place, and the rest follows.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class RecordedInput:
     reading
         What is taken of each image; all of it by default.
     is_done
-        Asked with file, topic and stamp of each frame that counts; where it says yes, the frame is neither read nor
+        Called with file, topic and stamp of each frame that counts; where it is true, the frame is neither read nor
         given.
 
     Raises
@@ -125,7 +125,7 @@ class RecordedInput:
         """The frames of a folder, or of those in it, with their camera, which may be that of the folder ``above``."""
         camera_info = self._camera_info or _camera_file(folder) or above
         if found := in_folder(folder):
-            _log.info("%s: %d frames, camera %s", folder, len(found), camera_info or "as the files say")
+            _log.info("%s: %d frames, camera %s", folder, len(found), camera_info or "of the files")
             return [(one, camera_info) for one in found[:: self._every][: self._limit]]
         folders = [one for one in folder.iterdir() if one.is_dir() and not one.is_symlink()]
         return [pair for one in sorted(folders, key=_natural) for pair in self._in_folders(one, camera_info)]

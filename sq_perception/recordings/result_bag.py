@@ -76,7 +76,7 @@ class ResultBag:
     Raises
     ------
     OSError
-        If the file cannot be written; the message says what became of it.
+        If the file cannot be written; the message names what became of it.
     ValueError
         For a path or kind of image that is none.
     """
@@ -138,7 +138,7 @@ class ResultBag:
             place = self._end(whole=False)
             written = self._file.groups
             kept = f"the first {written} of {self._frames} frames are kept" if written else "nothing is kept"
-            raise OSError(error.errno, f"{_said(error)}; {kept}", str(place or self._path)) from error
+            raise OSError(error.errno, f"{_reason(error)}; {kept}", str(place or self._path)) from error
 
     def close(self, whole: bool = True) -> Path | None:
         """Finish the file and give it its name; returns where it is, None without a frame.
@@ -212,7 +212,7 @@ class ResultBag:
         except OSError as error:
             with suppress(OSError):  # what was left in its buffer has no more room
                 self._raw.close()
-            text = f"{_said(error)}; kept without an index, from which 'mcap recover' makes a file"
+            text = f"{_reason(error)}; kept without an index, from which 'mcap recover' makes a file"
             raise OSError(error.errno, text, str(self._output.keep())) from error
         return self._output.commit(whole)
 
@@ -221,7 +221,7 @@ class ResultBag:
         self._output.discard()
 
 
-def _said(error: OSError) -> str:
+def _reason(error: OSError) -> str:
     return error.strerror or str(error)
 
 

@@ -31,7 +31,7 @@ LARGEST = 2**30
 
 
 class ResumeError(ValueError):
-    """A file of lines that cannot be gone on with; says why."""
+    """A file of lines that cannot be gone on with; the message has the reason."""
 
 
 def head(options: Mapping[str, Any]) -> dict[str, Any]:

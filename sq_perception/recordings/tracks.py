@@ -18,7 +18,7 @@ INTERVAL = 0.1
 
 
 class RecordedTracks:
-    """Follows the bodies of one sequence after the other; ``warn`` is told once where stamps are missing."""
+    """Follows the bodies of one sequence after the other; ``warn`` is called once where stamps are missing."""
 
     def __init__(self, warn: Callable[[str], None]) -> None:
         self._warn = warn
