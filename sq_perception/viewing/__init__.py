@@ -1,1 +1,1 @@
-"""Depth images and superquadrics in a browser: what is drawn, in arrays and words, and the page.  Knows no ROS."""
+"""Depth images and superquadrics in a browser: what is drawn, as arrays and text, and the page.  Knows no ROS."""

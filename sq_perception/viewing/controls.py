@@ -1,7 +1,7 @@
-"""How a parameter is shown: the control that fits what its descriptor says, and the value as the node wants it.
+"""How a parameter is shown: the control that fits its descriptor, and the value as the node wants it.
 
-A control is made from what the fields of a rcl_interfaces/ParameterDescriptor say and the value that the node holds,
-None where it is not set; nothing is imported for that.  The rules:
+A control is made from the fields of a rcl_interfaces/ParameterDescriptor and the value that the node holds, None where
+it is not set; nothing is imported for that.  The rules:
 
     bool                                          a check box
     string with "one of: a, b" as constraint      a list to choose from
@@ -132,11 +132,11 @@ def _number(about: Any, value: float, made: Control) -> Control:
 def _choices(constraints: str) -> tuple[str, ...]:
     if not constraints.startswith(_CHOICES):
         return ()
-    return tuple(word.strip() for word in constraints[len(_CHOICES) :].split(",") if word.strip())
+    return tuple(name.strip() for name in constraints[len(_CHOICES) :].split(",") if name.strip())
 
 
 def plain(value: Any) -> str:
-    """A value of a parameter in words."""
+    """A value of a parameter as text."""
     if value is None:
         return "(not set)"
     if isinstance(value, bool):
@@ -146,6 +146,6 @@ def plain(value: Any) -> str:
     if isinstance(value, (str, int)):
         return str(value)
     try:
-        return ", ".join(plain(one) for one in value)
+        return ", ".join(plain(item) for item in value)
     except TypeError:
         return str(value)

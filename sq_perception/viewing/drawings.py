@@ -89,7 +89,7 @@ class Cloud:
 
 
 def depth_span(depth: np.ndarray) -> tuple[float, float] | None:
-    """Nearest and farthest depth, metres, that the colours tell apart; None where nothing was measured.
+    """Nearest and farthest depth, metres, that the colours distinguish; None where nothing was measured.
 
     One reading in a hundred lies beyond either end.
     """

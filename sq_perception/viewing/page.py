@@ -106,7 +106,7 @@ class Page:
         return bool(self.server.get_clients())
 
     def close(self) -> None:
-        """Stop serving; browsers say that the connection is lost."""
+        """Stop serving; browsers show that the connection is lost."""
         self.server.stop()
 
     def requests(self) -> list[Request]:
@@ -146,7 +146,7 @@ class Page:
     def show_bodies(self, node: str, bodies: Bodies | None, stamp: float, state: NodeState) -> None:
         """Draw the bodies of a node, remove those that are gone, and fill its table.
 
-        ``bodies`` is None while no result came.  They are not drawn if ``state.remark`` says why.
+        ``bodies`` is None while no result came.  They are not drawn if ``state.remark`` has a reason.
         """
         part = self._nodes[node]
         if bodies is not None and len(bodies) and not state.remark and not self._aimed_at_bodies:
@@ -212,9 +212,9 @@ class Page:
                 part.known[name] = about.shown(value)
                 handle.value = part.known[name]
 
-    def show_answer(self, node: str, words: str, good: bool) -> None:
-        """Write what a node said to a change."""
-        self._nodes[node].answer.content = tables.answer(words, good)
+    def show_answer(self, node: str, text: str, good: bool) -> None:
+        """Show the answer of a node to a change."""
+        self._nodes[node].answer.content = tables.answer(text, good)
 
     # Furniture
 

@@ -30,7 +30,7 @@ PLACES = {
 }
 """Where to look from: at what share of the way to the middle of the scene, and from where, in units of that way."""
 _FIRST_DISTANCE = 1.0
-"""What the start view looks at, metres, until an image tells."""
+"""What the start view looks at, metres, until there is an image."""
 _NEAR_SHARE = 0.4
 """Length of the view volume that is drawn, of the nearest depth."""
 

@@ -3,7 +3,7 @@
 viser accepts a WebSocket from everywhere and offers to open a tunnel to a public server.  A page on the internet that
 the user has open could so change the parameters of a node on this machine.  Here
 
-- the port is bound before viser starts, so that one that is taken is an error in words and never another port;
+- the port is bound before viser starts, so that one that is taken is an error and never another port;
 - a request whose Host is a name that is neither localhost nor this machine's is refused: a name of the internet that
   resolves to this machine (DNS rebinding) is of no use to anybody;
 - a WebSocket whose Origin is another page than the one that was served here is refused;
@@ -48,7 +48,7 @@ _starting = threading.Lock()
 
 
 class ServerError(OSError):
-    """The page cannot be served; says why."""
+    """The page cannot be served; the message has the reason."""
 
 
 class PageServer(viser.ViserServer):
@@ -176,9 +176,9 @@ def _guarding(bound: socket.socket) -> Iterator[tuple[Callable[[], bool], weakre
         def process(connection: Any, request: Any) -> Any:
             why = refusal(request.headers, names)
             if why:
-                words = f"Refused: {why}.\n".encode()
-                fields = Headers({"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(words))})
-                return Response(http.HTTPStatus.FORBIDDEN, "Forbidden", fields, words)
+                text = f"Refused: {why}.\n".encode()
+                fields = Headers({"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(text))})
+                return Response(http.HTTPStatus.FORBIDDEN, "Forbidden", fields, text)
             response = process_request(connection, request)
             if isinstance(response, Response):
                 host = request.headers["Host"]

@@ -1,6 +1,6 @@
-"""Numbers and words of the page, as HTML: a table of bodies, the state of a node, the legend of the colours.
+"""Numbers and texts of the page, as HTML: a table of bodies, the state of a node, the legend of the colours.
 
-Half sizes in millimetres, or thousandths of the unit cube, with their standard deviations.  Every word that comes from
+Half sizes in millimetres, or thousandths of the unit cube, with their standard deviations.  Every text that comes from
 outside is escaped.
 """
 
@@ -72,8 +72,8 @@ def bodies_table(name: str, bodies: Bodies | None, stamp: float, state: NodeStat
         cells += [_size(float(a), float(sigma)) for a, sigma in zip(body.size, bodies.sigma_size[k], strict=True)]
         cells.append(f'<td style="{_NUMBERS}">{body.shape[0]:.2f}<br>{body.shape[1]:.2f}</td>')
         cells.append(f'<td style="{_NUMBERS}">{float(bodies.score[k]):.2f}</td>')
-        colour, word = (_OPEN, "weak") if bodies.is_weak[k] else (_GOOD, "good")
-        cells.append(f'<td style="{_NUMBERS};color:{colour}">{word}</td>')
+        colour, status = (_OPEN, "weak") if bodies.is_weak[k] else (_GOOD, "good")
+        cells.append(f'<td style="{_NUMBERS};color:{colour}">{status}</td>')
         rows.append(f'<tr style="border-top:1px solid rgba(128,128,128,0.25)">{"".join(cells)}</tr>')
     titles = ("id", "a<sub>1</sub>", "a<sub>2</sub>", "a<sub>3</sub>", "e<sub>1</sub> e<sub>2</sub>", "score", "fit")
     head = "".join(
@@ -97,7 +97,7 @@ def bodies_table(name: str, bodies: Bodies | None, stamp: float, state: NodeStat
 
 def node_status(state: NodeState) -> str:
     """One node in a few lines: is it there, how fast, how late, what was lost, what went wrong last."""
-    colour, words = _verdict(state)
+    colour, text = _verdict(state)
     values = state.diagnostics
     facts = []
     if values.get("rate [Hz]"):
@@ -128,18 +128,18 @@ def node_status(state: NodeState) -> str:
     dot = f'<span style="color:{colour}">●</span>'
     return (
         f'<div style="padding:4px 12px"><div>{dot} <b>{html.escape(state.name)}</b> '
-        f'<span style="color:{colour}">{html.escape(words)}</span></div>'
+        f'<span style="color:{colour}">{html.escape(text)}</span></div>'
         f'<table style="font-size:12.5px;line-height:1.35;margin-left:14px">{rows}</table></div>'
     )
 
 
 def source_status(topic: str, size: tuple[int, int] | None, rate: float, frame: str, remark: str) -> str:
     """Where the depth comes from; ``rate`` in images per second."""
-    words = f"{size[0]} × {size[1]}, {rate:.1f} Hz, {frame or 'no frame_id'}" if size and not remark else remark
+    text = f"{size[0]} × {size[1]}, {rate:.1f} Hz, {frame or 'no frame_id'}" if size and not remark else remark
     colour = _GOOD if size and not remark else _OPEN
     return (
         f'<div style="padding:4px 12px"><span style="color:{colour}">●</span> <b>{html.escape(topic)}</b><br>'
-        f'<span style="font-size:12.5px;margin-left:14px;color:{_DIM}">{html.escape(words)}</span></div>'
+        f'<span style="font-size:12.5px;margin-left:14px;color:{_DIM}">{html.escape(text)}</span></div>'
     )
 
 
@@ -155,19 +155,19 @@ def legend(span: tuple[float, float], unit: str = "m") -> str:
     )
 
 
-def answer(words: str, good: bool) -> str:
-    """What a node said to a change."""
-    if not words:
+def answer(text: str, good: bool) -> str:
+    """The answer of a node to a change."""
+    if not text:
         return ""
     colour = _GOOD if good else _BAD
     return (
         f'<div style="margin:2px 12px 6px 12px;padding:6px 9px;border-left:3px solid {colour};'
-        f'background:rgba(128,128,128,0.12);font-size:12.5px;overflow-wrap:anywhere">{html.escape(words)}</div>'
+        f'background:rgba(128,128,128,0.12);font-size:12.5px;overflow-wrap:anywhere">{html.escape(text)}</div>'
     )
 
 
-def _note(words: str) -> str:
-    return f'<div style="padding:4px 17px;font-size:12.5px;color:{_DIM}">{html.escape(words)}</div>'
+def _note(text: str) -> str:
+    return f'<div style="padding:4px 17px;font-size:12.5px;color:{_DIM}">{html.escape(text)}</div>'
 
 
 def _size(half: float, sigma: float) -> str:
@@ -184,17 +184,17 @@ def _rounded(text: str, digits: int = 0) -> str:
 
 
 def _verdict(state: NodeState) -> tuple[str, str]:
-    state_words = f"{state.lifecycle}, " if state.lifecycle else ""
+    lifecycle = f"{state.lifecycle}, " if state.lifecycle else ""
     if state.age is None:
-        words = "no result yet" if state.is_there else "not there"
-        return (_OPEN if state.is_there else _BAD), state_words + words
+        text = "no result yet" if state.is_there else "not there"
+        return (_OPEN if state.is_there else _BAD), lifecycle + text
     if state.is_silent:
-        return (_OPEN if state.is_there else _BAD), f"{state_words}silent for {duration(state.age)}"
-    return _GOOD, f"{state_words}alive"
+        return (_OPEN if state.is_there else _BAD), f"{lifecycle}silent for {duration(state.age)}"
+    return _GOOD, f"{lifecycle}alive"
 
 
 def duration(seconds: float) -> str:
-    """An age in words: 4 s, 3 min, 2 h."""
+    """An age as text: 4 s, 3 min, 2 h."""
     if seconds < 120:
         return f"{seconds:.0f} s"
     return f"{seconds / 60:.0f} min" if seconds < 7200 else f"{seconds / 3600:.0f} h"

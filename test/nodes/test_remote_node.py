@@ -1,4 +1,4 @@
-"""Another node through its services: lifecycle, parameters, words; and the command as a process."""
+"""Another node through its services: lifecycle, parameters, answers; and the command as a process."""
 
 from __future__ import annotations
 
@@ -63,8 +63,8 @@ class Page:
     def show_values(self, node: str, values: dict[str, Any]) -> None:
         self.values.update(values)
 
-    def show_answer(self, node: str, words: str, good: bool) -> None:
-        self.answers.append((words, good))
+    def show_answer(self, node: str, text: str, good: bool) -> None:
+        self.answers.append((text, good))
 
 
 class Bench:
