@@ -2,7 +2,7 @@
 
 A change of the parameters that a recoverer is made of (model, device ...) makes another one in a thread of its own,
 warmed up before it is used.  Frames go on with the old one, and with those parameters as they were, until the new one
-is ready.  One that cannot be made leaves the old one at work, and :attr:`Engine.fault` says why.
+is ready.  One that cannot be made leaves the old one at work, and :attr:`Engine.fault` has the reason.
 
 Nodes of one process that ask for equal recoverers get one.  One frame is computed at a time in a process, in the order
 of asking (:class:`Turns`): a frame already uses every core, two at once would each take twice as long.
@@ -37,7 +37,7 @@ _READ_BY = frozenset(("model", "device"))
 """Those whose setting reads the weights; the others keep what is loaded, whatever became of the file."""
 
 Answer: TypeAlias = tuple[FrameRecovery, Hashable]
-"""The bodies of a frame, and what tells their origin from another."""
+"""The bodies of a frame, and a value that is equal for equal origins."""
 
 
 class Turns:
@@ -90,7 +90,7 @@ class Engine:
         self.is_making = False
         """Whether another one is being made."""
         self.fault = ""
-        """Why the last swap came to nothing; empty once one has succeeded."""
+        """Why the last swap failed; empty once one has succeeded."""
 
     def build(self, parameters: RecoverParameters) -> None:
         """Make the recoverer and warm it up.  Raises ValueError if the model or the device cannot be used."""
@@ -108,7 +108,7 @@ class Engine:
                 del _shared[self._built.key]
 
     def check(self, parameters: RecoverParameters, changed: frozenset[str]) -> None:
-        """Raise ValueError for parameters that :meth:`follow` could not follow, as far as that can be told at once."""
+        """Raise ValueError for parameters that :meth:`follow` could not follow, as far as that is known at once."""
         if "device" in changed:
             checked_device(parameters.device)
         reads = not changed.isdisjoint(_READ_BY)
@@ -137,7 +137,7 @@ class Engine:
     def recover(
         self, frame: Frame, parameters: RecoverParameters, pose: Pose | None = None, previous: Answer | None = None
     ) -> Answer:
-        """The bodies of a frame by the parameters in force, and what tells their origin from another.
+        """The bodies of a frame by the parameters in force, and a value that is equal for equal origins.
 
         ``pose`` is that of the frame in ``target_frame``, if there is one.  What did not change since the ``previous``
         frame of the same camera is taken from its answer, if its origin is the same.

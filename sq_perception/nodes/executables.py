@@ -61,7 +61,7 @@ def recover_cameras(arguments: Sequence[str] | None = None) -> int:
             if other != camera:
                 raise ValueError(
                     f"{other} and {camera} are both {node.get_fully_qualified_name()}: a namespace for the process "
-                    f"(__ns) replaces those of the cameras; say robot/{other} robot/{camera} instead"
+                    f"(__ns) replaces those of the cameras; write robot/{other} robot/{camera} instead"
                 )
 
     return process.run("recover_cameras", create, given[cut:])

@@ -7,7 +7,7 @@ FASTDDS_DEFAULT_PROFILES_FILE, means nothing to it.
 It keeps one segment per participant in /dev/shm, ``fastrtps_<16 hex digits>``, 17 MB with this profile, whose owner
 holds a lock on ``fastrtps_<16 hex digits>_el`` for as long as it lives.  After kill -9 the kernel frees the lock, but
 nothing frees the segment (docs/nodes.md).  :func:`remove_orphans` deletes such segments, by the test that ``fastdds shm
-clean`` applies; as these are files of the middleware's, nodes call it only if ``free_shared_memory`` says so.
+clean`` applies; as these are files of the middleware's, nodes call it only with ``free_shared_memory``.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """A depth image on its way through a node: decoded from its message, and back into messages like it.
 
-The message is an Image, a CompressedImage (PNG or RVL) or a PointCloud2, as ``image_transport`` says.
+The message is an Image, a CompressedImage (PNG or RVL) or a PointCloud2, by ``image_transport``.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ class Frame:
     """A depth image that is fit to be processed.
 
     ``depth`` (height, width) is float32, metres in the optical frame, NaN where nothing was measured, rectified as the
-    int32 ``labels`` are; ``encoding`` is that of the message before it was packed.  ``has_free_space`` says whether a
-    pixel beside an object tells that there is nothing before what it measured; not so for a cloud that is no image.
+    int32 ``labels`` are; ``encoding`` is that of the message before it was packed.  ``has_free_space``: whether a
+    pixel beside an object shows that there is nothing before what it measured; not so for a cloud that is no image.
     """
 
     header: Any

@@ -45,18 +45,18 @@ from sq_perception.tracking import association
 _WORKER_END = 3.0
 """Seconds that a deactivation waits for the frame at hand."""
 _OLDEST = 3600.0
-"""Seconds; the age of an older frame, or one from the future, says nothing about latency: a bag, or another clock."""
+"""Seconds; the age of an older frame, or one from the future, is no latency: it is of a bag, or another clock."""
 _DEFECTS = 10
 """Frames in a row that end in a defect of ours or of the device, after which the node starts anew."""
 _STEADY = Clock(clock_type=ClockType.STEADY_TIME)
-"""For timers: simulated time may stand still, and the node still has to say so."""
+"""For timers: simulated time may stand still, and the node still has to report it."""
 
 
 class Outcome(NamedTuple):
     """Whether a frame was answered, the summary or the reason, and what was published."""
 
     is_answered: bool
-    words: str
+    text: str
     findings: Findings | None = None
 
 
@@ -88,7 +88,7 @@ class FrameNode(ManagedNode):
         self._tracking = Tracking(self, self._poses)
         self._outputs = Outputs(self, self._poses)
         self._before: dict[str, Answer] = {}
-        """What the last frame came to, by its frame_id."""
+        """The answer to the last frame, by its frame_id."""
         self._input: Input | None = None
         self._worker: threading.Thread | None = None
         self._enabled = True
@@ -155,7 +155,7 @@ class FrameNode(ManagedNode):
             one, self._input = self._input, None
         if one is not None:
             one.close()
-        self._tell(Outcome(False, "the node has been deactivated"))
+        self._resolve(Outcome(False, "the node has been deactivated"))
         if self._worker is not None:
             self._worker.join(_WORKER_END)
             if self._worker.is_alive():
@@ -198,17 +198,17 @@ class FrameNode(ManagedNode):
                 if not self.context.ok() or self._input is not source:
                     return
                 outcome = Outcome(False, f"{type(error).__name__}: {error}")
-                self._note_defect(outcome.words)
+                self._note_defect(outcome.text)
             if arrival is None:
                 continue
             if outcome is None:
                 self._statistics.count("dropped")
                 continue
             if not outcome.is_answered:
-                self._statistics.refuse(outcome.words)
-                self.get_logger().warning(f"refused a frame: {outcome.words}", throttle_duration_sec=THROTTLE)
+                self._statistics.refuse(outcome.text)
+                self.get_logger().warning(f"refused a frame: {outcome.text}", throttle_duration_sec=THROTTLE)
             was_wanted = self._is_wanted()
-            self._tell(outcome, arrival.time)
+            self._resolve(outcome, arrival.time)
             if not was_wanted:
                 with self._publishing:
                     self._outputs.hide()
@@ -243,12 +243,11 @@ class FrameNode(ManagedNode):
         age = 1e-9 * (self.get_clock().now().nanoseconds - stamp_of(frame))
         if abs(age) < _OLDEST:
             stages["stamp to result"] = 1e3 * age
-        words = found.summary
-        self._statistics.answer(stages, words)
+        self._statistics.answer(stages, found.summary)
         self._statistics.note(self._outputs.accompany(found, findings, frame, parameters))
-        return Outcome(True, words, findings)
+        return Outcome(True, found.summary, findings)
 
-    def _tell(self, outcome: Outcome, arrived: float = math.inf) -> None:
+    def _resolve(self, outcome: Outcome, arrived: float = math.inf) -> None:
         """Answer who was waiting when the frame arrived, at ``arrived`` of the monotonic clock."""
         for caller, since in tuple(self._triggers.items()):
             if since <= arrived and not caller.done():
@@ -326,7 +325,7 @@ class FrameNode(ManagedNode):
         self._diagnostics.publish(message)
 
     def _standing(self, silent: bool) -> Standing | None:
-        """What diagnostics say of the node before they look at its frames."""
+        """The level and message of diagnostics that do not depend on frames, if any."""
         fault = self.fault or self._engine.fault
         if not self.is_active:
             level = DiagnosticStatus.ERROR if fault else DiagnosticStatus.OK

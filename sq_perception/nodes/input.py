@@ -231,8 +231,8 @@ class Input:
             size = calibration.size
             if calibration.note != self._note:
                 self._note = calibration.note
-                said = f"{self.topic}: {calibration.note or 'no distortion'}"
-                self._node.get_logger().info(said, throttle_duration_sec=THROTTLE)
+                text = f"{self.topic}: {calibration.note or 'no distortion'}"
+                self._node.get_logger().info(text, throttle_duration_sec=THROTTLE)
         except ValueError as error:
             fault = str(error)
         with self._changed:
@@ -301,19 +301,20 @@ class Input:
                 "a reliable publisher's queue was full before they were delivered. Raise the depth of the PUBLISHER "
                 f"(the camera driver), or set qos_overrides.{topic}.subscription.reliability to best_effort"
             )
-        said = f"{event.total_count} messages of {topic} lost before they arrived: {remedy}"
-        self._node.get_logger().warning(said, throttle_duration_sec=THROTTLE)
+        text = f"{event.total_count} messages of {topic} lost before they arrived: {remedy}"
+        self._node.get_logger().warning(text, throttle_duration_sec=THROTTLE)
 
     def _publishers_of(self, subscription: Subscription) -> str:
         """Who publishes a topic, with which quality of service, and whether the subscription can hear it."""
         parts = []
-        for one in self._node.get_publishers_info_by_topic(subscription.topic_name):
-            profile = one.qos_profile
+        for publisher in self._node.get_publishers_info_by_topic(subscription.topic_name):
+            profile = publisher.qos_profile
             verdict, why = qos_check_compatible(profile, subscription.qos_profile)
-            said = ", ".join(
+            offered = ", ".join(
                 policy.name.lower().replace("_", " ") for policy in (profile.reliability, profile.durability)
             )
             note = f"; INCOMPATIBLE: {why.strip().rstrip(';')}" if verdict == QoSCompatibility.ERROR else ""
-            parts.append(f"{one.node_namespace.rstrip('/')}/{one.node_name} ({one.topic_type}, {said}{note})")
+            name = f"{publisher.node_namespace.rstrip('/')}/{publisher.node_name}"
+            parts.append(f"{name} ({publisher.topic_type}, {offered}{note})")
         count = len(parts)
         return f"{count} publisher{'s' * (count > 1)}: {', '.join(parts)}" if parts else "nobody publishes it"

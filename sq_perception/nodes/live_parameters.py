@@ -1,6 +1,6 @@
 """ROS parameters from a frozen dataclass: declared with descriptors, checked as a whole, followed while the node runs.
 
-Each field of such a dataclass is one parameter of the same name; :func:`setting` carries what its descriptor says:
+Each field of such a dataclass is one parameter of the same name; :func:`setting` carries its descriptor:
 meaning, unit, range or choices, and whether it may change while the node runs.  :class:`LiveParameters` declares them
 and holds the current values; a worker that takes ``current`` once per frame sees a consistent set, and a change takes
 effect with the next frame.
@@ -64,7 +64,7 @@ class LiveParameters(Generic[P]):
     check
         Raises ValueError for a set of values that cannot work; gets the names of those that change as well.
     changed
-        Told the new values and which of them were set.
+        Called with the new values and which of them were set.
 
     Raises
     ------

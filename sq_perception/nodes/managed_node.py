@@ -1,4 +1,4 @@
-"""A lifecycle node that brings itself up, does its transitions in a thread of its own, and says why one failed.
+"""A lifecycle node that brings itself up, does its transitions in a thread of its own, and reports why one failed.
 
     unconfigured --configure--> inactive --activate--> active
          ^  ^---------cleanup------'  ^----deactivate----'
@@ -76,7 +76,7 @@ class ManagedNode(LifecycleNodeMixin, Node):
     @property
     def state(self) -> str:
         """Label of the lifecycle state: unconfigured, inactive, active, finalized, or one of the transitions."""
-        # rclpy 7.1 tells the state to callers of ~/get_state only.
+        # rclpy 7.1 gives the state to callers of ~/get_state only.
         return str(self._state_machine.current_state[1])
 
     @property
@@ -90,7 +90,7 @@ class ManagedNode(LifecycleNodeMixin, Node):
         return self.state not in ("unconfigured", "finalized", "unknown")
 
     def start(self) -> None:
-        """Configure and activate, now and after a fault; :attr:`start_failure` tells of a failure."""
+        """Configure and activate, now and after a fault; :attr:`start_failure` has the reason of a failure."""
         self._starts_itself = True
         self._tasks.put(self._bring_up)
 

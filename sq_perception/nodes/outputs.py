@@ -189,8 +189,8 @@ class OptionalOutputs:
         self.follow(parameters)
         has_frame = bool(found.header.frame_id)
         if not has_frame and (parameters.publish_tf or parameters.publish_collision_objects):
-            said = "expected images with a frame_id, got none: no transforms, no objects"
-            self._node.get_logger().warning(said, once=True)
+            text = "expected images with a frame_id, got none: no transforms, no objects"
+            self._node.get_logger().warning(text, once=True)
         if has_frame and (heard := self._heard("publish_tf")):
             message: Any = heard.msg_type
             if frames := transforms(found.array, found.header, prefix=parameters.tf_prefix):

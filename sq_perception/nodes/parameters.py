@@ -146,7 +146,7 @@ class RecoverParameters(Parameters):
         return None if self.workspace == RecoverParameters.workspace else cast(Box, self.workspace)
 
     def recovery_options(self, pose: Pose | None = None, has_free_space: bool = True) -> RecoveryOptions:
-        """What is said of a frame, whose pose in ``target_frame`` is given."""
+        """The options for a frame, whose pose in ``target_frame`` is given."""
         return RecoveryOptions(
             method=self.method,
             sharpness=self.s,
@@ -264,7 +264,7 @@ class SyntheticParameters(Parameters):
             raise ParameterError(f"noise: expected 0 for sensor = {self.sensor}, which has its own, got {self.noise:g}")
 
     def check(self, is_cube: bool, what: str) -> None:
-        """Raise ParameterError where ``what`` has images of the unit cube, or has none, and these say otherwise."""
+        """Raise ParameterError where ``what`` has images of the unit cube, or has none, and these expect the other."""
         if self.encoding != "auto" and is_cube != (self.encoding in GREY_ENCODINGS):
             expected = " or ".join(GREY_ENCODINGS if is_cube else DEPTH_ENCODINGS)
             raise ParameterError(f"encoding: expected {expected} for {what}, got {self.encoding}")

@@ -53,7 +53,7 @@ class Stoppable(Protocol):
 
 
 def run(name: str, create: Callable[[], Iterable[Stoppable]], arguments: Sequence[str] | None = None) -> int:
-    """Create nodes and spin them until they are told to stop; the exit code.
+    """Create nodes and spin them until they are asked to stop; the exit code.
 
     ``create`` imports what the nodes need, so that a signal during seconds of imports finds this function in charge.
     Nodes that it has yielded are closed also where a later one cannot be made.
@@ -133,7 +133,7 @@ def release_objects() -> None:
 
 
 class _Stop:
-    """Interrupts the start; while the node spins, says that it is to end."""
+    """Interrupts the start; while the node spins, asks it to end."""
 
     def __init__(self) -> None:
         self.starting = True

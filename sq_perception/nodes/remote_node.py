@@ -77,19 +77,19 @@ class RemoteNode:
             self._new_values.update({one.name: parameter_value_to_python(one.value) for one in values})
 
     async def change(self, name: str, value: Any) -> None:
-        """Ask for another value of a parameter; what the node says to it is shown, and what it holds then."""
+        """Ask for another value of a parameter; the node's answer is shown, and what it holds then."""
         if not self.is_there:
-            self._say(f"{name}: {self.name} is not there", False)
+            self._note(f"{name}: {self.name} is not there", False)
             return
         try:
             response = await self._answer(self._parameters.set_parameters([Parameter(name, value=value)]))
         except TimeoutError:
-            self._say(f"{name}: no answer from {self.name} within {_PATIENCE:g} s", False)
+            self._note(f"{name}: no answer from {self.name} within {_PATIENCE:g} s", False)
             return
         result = response.results[0]
-        # Not every reason of rclpy's own says which parameter it is about.
+        # Not every reason of rclpy's own names its parameter.
         reason = result.reason if name in result.reason else f"{name}: {result.reason or 'refused'}"
-        self._say(f"{name} is now {plain(value)}" if result.successful else reason, result.successful)
+        self._note(f"{name} is now {plain(value)}" if result.successful else reason, result.successful)
         with suppress(TimeoutError):
             response = await self._answer(self._parameters.get_parameters([name]))
             with self._lock:
@@ -103,9 +103,9 @@ class RemoteNode:
         try:
             response = await self._answer(self._transit.call_async(request), _TRANSITION_PATIENCE)
         except TimeoutError:
-            self._say(f"{label}: no answer", False)
+            self._note(f"{label}: no answer", False)
             return
-        self._say(f"{label}: {'done' if response.success else 'the node could not'}", response.success)
+        self._note(f"{label}: {'done' if response.success else 'the node could not'}", response.success)
         self._look_due = 0.0
 
     def _look(self) -> None:
@@ -151,7 +151,7 @@ class RemoteNode:
             raise TimeoutError
         return answer
 
-    def _say(self, text: str, good: bool) -> None:
+    def _note(self, text: str, good: bool) -> None:
         with self._lock:
             self._new_answer = text, good
 

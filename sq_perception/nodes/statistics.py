@@ -1,4 +1,4 @@
-"""Counts and latencies of a node, and what diagnostics say about them.
+"""Counts and latencies of a node, and their summary for diagnostics.
 
 Every received frame ends as exactly one of answered, dropped (a newer one came first, or the node is disabled) and
 refused (bad input); the rest is in work.  Counts are since the start, rates and latencies of the last seconds.
@@ -23,13 +23,13 @@ _MOST = 5000
 """Events that are kept: more than any camera causes in that time."""
 _OUTCOMES = ("answered", "dropped", "refused")
 _SLOW = 3.0
-"""Seconds after which a frame without an outcome tells of more than a start."""
+"""Seconds after which a frame without an outcome is more than a start."""
 Standing = tuple[bytes, str]
 """Level and message of a DiagnosticStatus."""
 
 
 class Statistics:
-    """Collects from any thread; ``clock`` tells seconds."""
+    """Collects from any thread; ``clock`` gives seconds."""
 
     def __init__(self, clock: Callable[[], float] = monotonic) -> None:
         self._clock, self._started = clock, clock()
@@ -38,7 +38,7 @@ class Statistics:
         self._recent: deque[tuple[float, str]] = deque(maxlen=_MOST)
         self._stages: deque[tuple[float, Mapping[str, float]]] = deque(maxlen=_MOST)
         self._lost: Counter[str] = Counter()
-        self._said: tuple[int, Counter[str]] = 0, Counter()
+        self._reported: tuple[int, Counter[str]] = 0, Counter()
         """Refused and lost when the last status was made."""
         self._last_error = self._last_answer = ""
 
@@ -59,7 +59,7 @@ class Statistics:
         self.count("refused")
 
     def answer(self, milliseconds: Mapping[str, float], summary: str = "") -> None:
-        """Count an answered frame with the duration of its stages; the summary also says why there are no bodies."""
+        """Count an answered frame with the duration of its stages; ``summary`` explains also a lack of bodies."""
         self._last_answer = summary
         self.count("answered")
         self.note(milliseconds)
@@ -84,7 +84,7 @@ class Statistics:
         number = Counter(what for _, what in recent)
         rate = number["answered"] / min(SECONDS, max(now - self._started, 1.0))
         since = now - next((time for time, what in recent if what == "received"), now)
-        (refused, known), self._said = self._said, (counts["refused"], lost)
+        (refused, known), self._reported = self._reported, (counts["refused"], lost)
         level, message = DiagnosticStatus.WARN, ""
         if standing is not None:
             level, message = standing

@@ -29,7 +29,7 @@ _LEAST_LENGTH = 1e-6
 
 
 class PoseError(ValueError):
-    """The pose of a frame is not known; says why."""
+    """The pose of a frame is not known; the message has the reason."""
 
 
 class CameraPoses:

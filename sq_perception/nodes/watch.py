@@ -44,7 +44,7 @@ class Shot:
 
     @property
     def truth(self) -> Superquadric | None:
-        """What the camera says that there is."""
+        """The bodies that the camera shows."""
         return self.results[CAMERA].bodies if CAMERA in self.results else None
 
 
