@@ -1,11 +1,11 @@
 """What ``~/recover`` and ``~/plan`` answer: bodies of one image, or grasps, as JSON in a std_srvs/Trigger's message.
 
-    {"frame_id": "camera", "stamp": {"sec": 7, "nanosec": 5}, "words": "1 body in 80 ms; ...", "superquadrics": [...]}
-    {"frame_id": "base_link", "stamp": {...}, "words": "8 grasps of 1 bodies", "grasps": [...]}
+    {"frame_id": "camera", "stamp": {"sec": 7, "nanosec": 5}, "summary": "1 body in 80 ms; ...", "superquadrics": [...]}
+    {"frame_id": "base_link", "stamp": {...}, "summary": "8 grasps of 1 bodies", "grasps": [...]}
 
 Each superquadric has the columns of :class:`~sq_msgs_py.superquadrics.SuperquadricArray` by their names, each grasp
 those of :class:`~sq_msgs_py.grasps.GraspArray`, in its units and order; null where a number is not known.  Where the
-answer is no success, its message says why, in words.
+answer is no success, its message is the reason.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Answer:
     bodies: SuperquadricArray
     frame_id: str
     stamp: int
-    words: str
+    summary: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,17 +43,17 @@ class GraspAnswer:
     grasps: GraspArray
     frame_id: str
     stamp: int
-    words: str
+    summary: str
 
 
-def text_of(found: SuperquadricArray | GraspArray, header: Any, words: str) -> str:
+def text_of(found: SuperquadricArray | GraspArray, header: Any, summary: str) -> str:
     """The message of an answer; ``header`` is that of the cloud."""
     columns = {column.name: getattr(found, column.name) for column in fields(found)}
     return json.dumps(
         {
             "frame_id": header.frame_id,
             "stamp": {"sec": header.stamp.sec, "nanosec": header.stamp.nanosec},
-            "words": words,
+            "summary": summary,
             _NAMES[type(found)]: [
                 {name: _plain(column[k]) for name, column in columns.items()} for k in range(len(found))
             ],
@@ -68,7 +68,7 @@ def from_response(response: Any) -> Answer:
     Raises
     ------
     MessageError
-        If it was no success, by its words, or is of another service.
+        If it was no success, with its reason, or is of another service.
     """
     return Answer(*_parts(response, SuperquadricArray))
 
@@ -79,7 +79,7 @@ def grasps_from_response(response: Any) -> GraspAnswer:
 
 
 def _parts(response: Any, kind: type[Any]) -> tuple[Any, str, int, str]:
-    """Array, frame, stamp and words of an answer."""
+    """Array, frame, stamp and summary of an answer."""
     if not response.success:
         raise MessageError(response.message)
     try:
@@ -91,7 +91,7 @@ def _parts(response: Any, kind: type[Any]) -> tuple[Any, str, int, str]:
             if all(column.name in row for row in rows)  # a node of another version may know less
         }
         nanoseconds = int(stamp["sec"]) * 10**9 + int(stamp["nanosec"])
-        return kind(**columns), str(found["frame_id"]), nanoseconds, str(found["words"])
+        return kind(**columns), str(found["frame_id"]), nanoseconds, str(found["summary"])
     except (ValueError, TypeError, LookupError, OverflowError, RecursionError) as error:
         raise MessageError(
             f"expected the answer of a {_SERVICES[kind]} service: {type(error).__name__}: {error}"
@@ -99,7 +99,7 @@ def _parts(response: Any, kind: type[Any]) -> tuple[Any, str, int, str]:
 
 
 def _plain(value: np.ndarray | np.generic) -> Any:
-    """Numbers with as many digits as tell one float32 from another; JSON knows neither NaN nor infinity."""
+    """Numbers with as many digits as distinguish any two float32; JSON knows neither NaN nor infinity."""
     if isinstance(value, np.ndarray):
         return [_plain(one) for one in value]
     if isinstance(value, np.integer):

@@ -24,7 +24,7 @@ Fields = Sequence[tuple[str, int]]
 
 
 class MessageError(ValueError):
-    """A message that does not hold what it should; says what was expected and what arrived."""
+    """A message that does not hold what it should; its text names what was expected and what arrived."""
 
 
 class Columns:
@@ -122,7 +122,7 @@ def cloud_points(message: PointCloud2, described: Fields, needed: Sequence[str])
     ------
     MessageError
         If a field that is needed is missing, one has an unknown datatype, a count other than one or an offset outside
-        the point, or if the data is not as long as width, height and steps say.
+        the point, or if the data is not as long as width, height and steps require.
     """
     order = ">" if message.is_bigendian else "<"
     present = {field.name: field for field in message.fields}

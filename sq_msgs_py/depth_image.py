@@ -42,13 +42,13 @@ _MILLIMETRES = np.float32(1000.0)
 
 
 class ImageError(ValueError):
-    """A message that is no image of the expected kind; says what was expected and what arrived."""
+    """A message that is no image of the expected kind; its text names what was expected and what arrived."""
 
 
 def pixels_from_message(message: Image, encodings: tuple[str, ...] = tuple(_DTYPES)) -> np.ndarray:
     """The pixels (height, width) of a single-channel image as they lie in the message: a view, nothing is copied.
 
-    Rows may be padded (``step``) and bytes may be swapped (``is_bigendian``); the array's strides and dtype say so.
+    Rows may be padded (``step``) and bytes may be swapped (``is_bigendian``); the array's strides and dtype follow.
 
     Raises
     ------
@@ -177,7 +177,7 @@ def labels_to_message(
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """What a camera_info says about the image that comes with it: pixels, u = fx x / z + cx, v = fy y / z + cy."""
+    """What a camera_info holds of the image that comes with it: pixels, u = fx x / z + cx, v = fy y / z + cy."""
 
     width: int
     height: int
@@ -189,7 +189,7 @@ class Intrinsics:
 
 @dataclass(frozen=True)
 class RawIntrinsics:
-    """What a camera_info says about the image before rectification.
+    """What a camera_info holds of the image before rectification.
 
     Attributes
     ----------
@@ -243,7 +243,7 @@ def raw_intrinsics_from_message(message: CameraInfo) -> RawIntrinsics:
 
 
 def size_mismatch(image: tuple[int, int], info: tuple[int, int]) -> str:
-    """What to say where an image (width, height) has not the size that its camera_info speaks of; empty if it has."""
+    """The complaint where an image (width, height) has not the size in its camera_info; empty if it has."""
     if image == info:
         return ""
     text = f"the image has {image[0]} x {image[1]} pixels, its camera_info is for {info[0]} x {info[1]}"
@@ -251,7 +251,7 @@ def size_mismatch(image: tuple[int, int], info: tuple[int, int]) -> str:
         return f"{text}: width and height are swapped, as if the image had been rotated and its camera_info had not"
     for part in (2, 3, 4, 6, 8):
         if image == (info[0] // part, info[1] // part):
-            return f"{text}: the image is {part} times smaller, which its camera_info should say as binning"
+            return f"{text}: the image is {part} times smaller, which its camera_info should have as binning"
     if image[0] <= info[0] and image[1] <= info[1]:
         return f"{text}: an image that was cut out should have its region of interest (roi) in the camera_info"
     return text

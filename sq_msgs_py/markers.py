@@ -63,7 +63,7 @@ def markers(
     colours
         (n, 3) RGB or (n, 4) RGBA, 0 to 1; by default the palette's colour of each id.
     alpha
-        Opacity of surfaces whose colour does not say it.
+        Opacity of surfaces whose colour has none.
     line_width
         Width of the outline, metres.
     types

@@ -2,7 +2,7 @@
 
 Everything is in the body's own frame, centred at its origin; the pose of the message is that of the body.  Metres.
 
-A planner must not be told that space is free where the body is.  The flat faces of a mesh cut through a curved body,
+No space may look free to a planner where the body is.  The flat faces of a mesh cut through a curved body,
 and a body is hardly ever a primitive; so a mesh can be grown, and a primitive is chosen, to ENCLOSE the body.
 
 The points of the surface of a body with exponents at most 2 (all of these are convex) are x^2 + y^2 = (a1^2 u^e2 +

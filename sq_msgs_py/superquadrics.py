@@ -163,6 +163,6 @@ def from_message(message: PointCloud2) -> SuperquadricArray:
     ------
     MessageError
         If a field is missing, has an unknown datatype, a count other than one or an offset outside the point, or if the
-        data is not as long as width, height and steps say.
+        data is not as long as width, height and steps require.
     """
     return columns.from_message(SuperquadricArray, message, _NEEDED)

@@ -280,7 +280,7 @@ def test_who_asks_once_gets_the_bodies_of_the_next_image(bench):
     for column in fields(bodies):
         np.testing.assert_array_equal(getattr(answer.bodies, column.name), getattr(bodies, column.name))
     assert (answer.frame_id, answer.stamp) == (message.header.frame_id, stamp_of(message))
-    assert answer.words.startswith("1 body in 1 ms")
+    assert answer.summary.startswith("1 body in 1 ms")
 
     refused = client.call_async(Trigger.Request())
     bench.until(lambda: bench.node._triggers)

@@ -34,7 +34,7 @@ def test_every_column_comes_back_bit_by_bit(count):
     text = text_of(given, HEADER, "words")
     assert "NaN" not in text
     found = answered(text)
-    assert (found.frame_id, found.stamp, found.words) == ("camera", 7_000_000_005, "words")
+    assert (found.frame_id, found.stamp, found.summary) == ("camera", 7_000_000_005, "words")
     for column in fields(given):
         one, other = getattr(found.bodies, column.name), getattr(given, column.name)
         assert one.dtype == other.dtype
@@ -46,7 +46,7 @@ def test_grasps_come_back_bit_by_bit_and_are_not_taken_for_bodies():
     given = GraspArray(rng.random((3, 3)), rng.random((3, 4)), *rng.random((3, 3)), np.array([7, 2**31, 7]))
     response = SimpleNamespace(success=True, message=text_of(given, HEADER, "words"))
     found = grasps_from_response(response)
-    assert (found.frame_id, found.stamp, found.words) == ("camera", 7_000_000_005, "words")
+    assert (found.frame_id, found.stamp, found.summary) == ("camera", 7_000_000_005, "words")
     for column in fields(given):
         one, other = getattr(found.grasps, column.name), getattr(given, column.name)
         assert one.dtype == other.dtype
