@@ -36,12 +36,12 @@ class Child:
 
     def __init__(self, node: str, arguments: Sequence[str], environment: Mapping[str, str] | None = None) -> None:
         self.name = node
-        self._said = tempfile.TemporaryFile()  # noqa: SIM115 - as long as the child
+        self._output = tempfile.TemporaryFile()  # noqa: SIM115 - as long as the child
         self._process = subprocess.Popen(
             command(node, arguments),
             env={**(os.environ if environment is None else environment), "PYTHONUNBUFFERED": "1"},
             stdin=subprocess.DEVNULL,
-            stdout=self._said,
+            stdout=self._output,
             stderr=subprocess.STDOUT,
             start_new_session=True,
         )
@@ -54,8 +54,8 @@ class Child:
         return self._process.poll()
 
     def last_lines(self, count: int = 15) -> list[str]:
-        """What it said last, standard output and error together."""
-        number = self._said.fileno()
+        """Its last output, standard output and error together."""
+        number = self._output.fileno()
         tail = os.pread(number, _TAIL, max(0, os.fstat(number).st_size - _TAIL))
         return tail.decode(errors="replace").splitlines()[-count:]
 

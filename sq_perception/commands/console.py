@@ -19,7 +19,7 @@ STANDARD_OUTPUT = "-"
 
 
 def complain(message: str) -> None:
-    """One line on the standard error; what a recording says of itself must not steer the terminal."""
+    """One line on the standard error; text of a recording must not steer the terminal."""
     line = "".join(c if c.isprintable() else "?" for c in " ".join(message.split()))
     print(f"sq-perception: {line}", file=sys.stderr)
 

@@ -1,7 +1,7 @@
 """The demonstration: a synthetic or recorded camera, recover_node and fitter_node as processes, and a live table.
 
 The processes talk in a ROS domain of their own on this machine only, unless ROS_DOMAIN_ID or
-ROS_AUTOMATIC_DISCOVERY_RANGE say otherwise, and use the shipped Fast DDS profile.  At the end the last complete image
+ROS_AUTOMATIC_DISCOVERY_RANGE are set, and use the shipped Fast DDS profile.  At the end the last complete image
 is drawn to demo.png and its bodies are written to demo.glb.
 
 Exit codes: 0 shown, or stopped with Ctrl-C; 1 a node failed or nothing came; 2 wrong usage or an unreadable frame.
@@ -52,7 +52,7 @@ What next
 
 
 class DemoError(RuntimeError):
-    """The demonstration cannot go on; says why."""
+    """The demonstration cannot go on; the message has the reason."""
 
 
 def show(options: argparse.Namespace) -> int:
@@ -106,7 +106,7 @@ def run(camera: dict[str, Any], seconds: float, folder: Path) -> int:
 
 
 def _camera(frame: Path | None, camera_info: Path | None, projection: Projection | None) -> dict[str, Any]:
-    """Parameters of the synthetic camera; a frame is read once, so that what is wrong with it is said at once."""
+    """Parameters of the synthetic camera; a frame is read once, so that what is wrong with it is reported at once."""
     if frame is None:
         scene = "thesis" if projection == "orthographic" else "table"
         own = {"scene": scene, "projection": projection or "pinhole", "objects": 3, "hold": int(3 * _RATE), "seed": 7}

@@ -14,7 +14,7 @@ from typing import Any
 from sq_perception import __version__
 from sq_perception.commands.console import FAILURE, SUCCESS, parser
 
-_HELP = "Say what is installed, what is missing, and how to get it; the exit code is 1 where the core cannot work."
+_HELP = "Show what is installed, what is missing, and how to get it; the exit code is 1 where the core cannot work."
 _PACKAGE = Path(__file__).parents[1]
 _EXTRAS = {
     "bags": ("rosbags", "mcap"),
@@ -23,15 +23,15 @@ _EXTRAS = {
     "train": ("torch",),
     "ros": ("rclpy", "sensor_msgs", "visualization_msgs"),
 }
-"""What tells that an extra is there."""
+"""The modules of each extra."""
 
 
 def main(arguments: Sequence[str]) -> int:
     """Entry of ``sq-perception doctor``; the exit code."""
     parser("doctor", _HELP).parse_args(arguments)
     faults = 0
-    for what, words, is_fault in findings():
-        print(f"{what:12} {words}")
+    for what, finding, is_fault in findings():
+        print(f"{what:12} {finding}")
         faults += is_fault
     return FAILURE if faults else SUCCESS
 

@@ -19,8 +19,8 @@ _HELP = """\
 Compare networks and fits on one test set of the thesis' protocol, and write its tables 6.1 to 6.3 and 7.1 to 7.4 with
 the thesis' figures beside ours, IoU histograms, angles of the rotations (figure 6.3), and examples.
 
-A network takes part alone, unrefined, from the 256 x 256 image on; the loss in its file's header says which row of the
-thesis it answers.  Fits: auto (network and surface fit), symmetry (surface fit alone), classic (Solina and Bajcsy).
+A network takes part alone, unrefined, from the 256 x 256 image on; the loss in its file's header decides its row of the
+thesis.  Fits: auto (network and surface fit), symmetry (surface fit alone), classic (Solina and Bajcsy).
 """
 _EPILOG = """\
 writes into --output:
@@ -49,7 +49,7 @@ def main(arguments: Sequence[str]) -> int:
     return _evaluate(options, methods, ["sq-perception", "evaluate", *arguments])
 
 
-def _evaluate(options: argparse.Namespace, methods: list[Method], words: list[str]) -> int:
+def _evaluate(options: argparse.Namespace, methods: list[Method], command: list[str]) -> int:
     import numba
     import torch
 
@@ -69,7 +69,7 @@ def _evaluate(options: argparse.Namespace, methods: list[Method], words: list[st
         tasks = {contestant.name: bar.add_task(contestant.name, total=count) for contestant, count in contestants}
         outcomes = compare(contestants, images, advance=lambda name, done: bar.update(tasks[name], completed=done))
     facts = {
-        **provenance.facts(shlex.join(words)),
+        **provenance.facts(shlex.join(command)),
         "threads": {"torch": torch.get_num_threads(), "numba": numba.get_num_threads()},
         "seed": options.seed,
         "spawn_key": "(6, block), blocks of 500 bodies",

@@ -155,8 +155,8 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add("--cluster", metavar="ADDRESS", help="a running Dask cluster whose workers have this package (extra 'cluster')")
     add("--min-score", type=float, default=0.0, metavar="S", help="leave out bodies with a lower score")
-    add("-q", "--quiet", action="store_true", help="no table and no summary; what went wrong is said")
-    add("-v", "--verbose", action="store_true", help="also say the time of each stage, and what is logged")
+    add("-q", "--quiet", action="store_true", help="no table and no summary; errors only")
+    add("-v", "--verbose", action="store_true", help="also the time of each stage, and the log")
     add("--max-objects", type=at_least(1), default=20, metavar="N", help="largest ones first (default 20)")
     add("--max-size", type=float, default=0.6, metavar="M", help="largest edge of an object in metres (default 0.6)")
     add(

@@ -1,4 +1,4 @@
-"""What ``sq-perception recover`` says of the frames: a line a body, each reason once, details where they are wanted.
+"""What ``sq-perception recover`` prints of the frames: a line a body, each reason once, details where they are wanted.
 
     0 converged 480 x 196 x 214 mm (+-5 +-11 +-7) at 0.12 0.03 0.84 m
 
@@ -38,7 +38,7 @@ def lines(entries: Sequence[Mapping[str, Any]], verbose: bool) -> Iterator[str]:
     for (status, reason), count in reasons.most_common():
         yield f"{count} {status}: {reason}"
     if reasons:
-        yield "what to do with them: docs/how_sure.md; -v says more of each body"
+        yield "what to do with them: docs/how_sure.md; -v shows more of each body"
 
 
 def _line(number: int, body: Mapping[str, Any], is_cube: bool) -> str:

@@ -1,6 +1,6 @@
 """The files that ``sq-perception recover`` writes: looked at before the first frame, and finished after the last one.
 
-What is wrong with a name comes back as a sentence; :mod:`sq_perception.files.output_file` says how files are replaced.
+What is wrong with a name comes back as a sentence; :mod:`sq_perception.files.output_file` is how files are replaced.
 """
 
 from __future__ import annotations
@@ -123,7 +123,7 @@ class Outputs:
     def finish(self, whole: bool) -> Iterator[str]:
         """Close what grew and write the documents; what could not be done, or went elsewhere, one sentence each.
 
-        ``whole`` says whether all frames were tried.
+        ``whole``: whether all frames were tried.
         """
         from sq_perception.recordings import result_json
 

@@ -1,4 +1,4 @@
-"""One pass of ``sq-perception recover`` over its frames, and what it has come to."""
+"""One pass of ``sq-perception recover`` over its frames, and its summary."""
 
 from __future__ import annotations
 

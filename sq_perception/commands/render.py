@@ -53,12 +53,12 @@ def main(arguments: Sequence[str]) -> int:
     add("--focal", type=float, default=525.0, help="focal length of the pinhole camera, pixels (525)")
     add("--camera-info", metavar="FILE", help="a pinhole camera from YAML instead")
     add("--bits", type=int, choices=(8, 16), default=8, help="depth of an orthographic PNG")
-    return _render(command.parse_args([_plain_number(word) for word in arguments]))
+    return _render(command.parse_args([_plain_number(argument) for argument in arguments]))
 
 
-def _plain_number(word: str) -> str:
+def _plain_number(argument: str) -> str:
     """argparse takes -1e-3 for an option; -0.001 it understands."""
-    return f"{float(word):.20f}" if _NEGATIVE_WITH_EXPONENT.fullmatch(word) else word
+    return f"{float(argument):.20f}" if _NEGATIVE_WITH_EXPONENT.fullmatch(argument) else argument
 
 
 def _render(options: argparse.Namespace) -> int:

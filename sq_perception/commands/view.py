@@ -1,4 +1,4 @@
-"""The command ``sq-perception view``: a page in the browser with what a camera and the frame nodes say.
+"""The command ``sq-perception view``: a page in the browser with what a camera and the frame nodes publish.
 
 Exit codes: 0 ended with Ctrl-C, 1 something is missing or the port is taken, 2 wrong usage.
 """

@@ -86,7 +86,7 @@ def _turn_over(
     first: tuple[RecordedFrame, FrameRecovery],
     frames: Iterator[tuple[RecordedFrame, FrameRecovery]],
 ) -> NoReturn:
-    """Show frames as the buttons of the page say; never returns."""
+    """Show frames by the buttons of the page; never returns."""
     wishes: queue.SimpleQueue[str] = queue.SimpleQueue()
     buttons = page.server.gui.add_button_group("Frame", (_PREVIOUS, _NEXT))
     buttons.on_click(lambda _: wishes.put(buttons.value))
@@ -113,8 +113,8 @@ def _show(page: Page, frame: RecordedFrame, recovery: FrameRecovery) -> None:
     if not page.watched:
         return
     camera = frame.camera
-    words = f"{frame.name}: {camera.width} x {camera.height}, {recovery.milliseconds['total']:.0f} ms"
-    page.show_source(tables.answer(f"{words}; {recovery.message or frame.warning}".rstrip("; "), not frame.warning))
+    text = f"{frame.name}: {camera.width} x {camera.height}, {recovery.milliseconds['total']:.0f} ms"
+    page.show_source(tables.answer(f"{text}; {recovery.message or frame.warning}".rstrip("; "), not frame.warning))
     page.show_depth(frame.depth, camera)
     stamp = 0.0 if frame.stamp is None else frame.stamp.sec + 1e-9 * frame.stamp.nanosec
     page.show_bodies(_SOURCE, bodies_of(recovery), stamp, NodeState(_SOURCE, age=0.0))

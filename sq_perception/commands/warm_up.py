@@ -14,7 +14,7 @@ _HELP = "Compile every kernel once and keep it on disk (about two minutes), so t
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Entry of ``sq-perception warm-up``: run every step and say how long each took."""
+    """Entry of ``sq-perception warm-up``: run every step and print how long each took."""
     parser("warm-up", _HELP).parse_args(arguments)
     for name, action in steps():
         began = time.perf_counter()

@@ -42,7 +42,7 @@ def compare(
     chunk : int
         Images in memory at a time; changes no result.
     advance
-        Told of the progress.
+        Called with the progress.
 
     Raises
     ------

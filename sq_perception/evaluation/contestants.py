@@ -5,7 +5,7 @@ Predictions are made in batches, which changes no body.  Times are those of :met
 segmentation, view, network or fit, and score, everything that a user waits for.  Networks are timed on the first 300
 images, fits on every image they get.
 
-The loss that a network was trained by, from its file's header, says which row of the thesis' tables it answers and what
+The loss that a network was trained by, from its file's header, decides its row of the thesis' tables and what
 was given to it: under occupancy_rotation, size, shape and place are those of the label.  Labels list their axes as a
 training listed them, with a1 >= a2 for ``canonical_labels`` and for the fits, whose results are in canonical form.
 """
@@ -95,7 +95,7 @@ class Network:
 
     @property
     def loss(self) -> str:
-        """What it was trained by; empty where its file does not say it."""
+        """What it was trained by; empty where its file does not name it."""
         # Headers without a loss are of the time when there was one only.
         return str(self.training.get("loss", "occupancy")) if self.training else ""
 

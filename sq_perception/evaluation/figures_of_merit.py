@@ -19,7 +19,7 @@ Rotations, q^ predicted, q true, r = q^-1 q^ = (v, w):
 
 q and -q are one rotation, so that the first is symmetric about pi wherever signs are arbitrary, and 0, pi (about an
 axis of the body) and 2 pi are the same body.  The symmetric angle does not depend on how a body is written; it takes a
-quarter turn about z for none, whatever the sizes, as the IoU tells those apart.  Where e1 is about e2 and any axis may
+quarter turn about z for none, whatever the sizes, as the IoU shows that.  Where e1 is about e2 and any axis may
 pass for z, only the last one is small for bodies that are alike.  The summary counts as quarter turns the bodies whose
 axes angle is 70 to 110 degrees.
 

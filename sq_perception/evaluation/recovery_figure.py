@@ -97,8 +97,8 @@ def _draw_numbers(ax: Axes, recovery: FrameRecovery, unit: str) -> None:
             ax.text(0.06, y, shorten(f"failed: {body.message}", _LONGEST), fontsize=9, color=FAINT, va="center")
             continue
         e1, e2 = body.superquadric.shape
-        said = wording.edges(body.superquadric.size, body.sigma_size, unit != "m")
-        ax.text(0.06, y + 0.018, said, fontsize=9, color=INK, va="center")
+        text = wording.edges(body.superquadric.size, body.sigma_size, unit != "m")
+        ax.text(0.06, y + 0.018, text, fontsize=9, color=INK, va="center")
         ax.text(1, y + 0.018, f"e {e1:.2f} {e2:.2f}  {body.score:.2f}", fontsize=9, color=INK, ha="right", va="center")
         verdict = f"{body.status.name.lower()}: {body.message}" if body.status == Status.WEAK else body.message
         ax.text(0.06, y - 0.032, shorten(verdict, _LONGEST), fontsize=8, color=FAINT, va="center")

@@ -1,7 +1,7 @@
 """Tables 6.1 to 6.3 and 7.1 to 7.4 of the thesis, with our figures and the thesis' own beside them.
 
 A row of the thesis is answered by every network that was trained by its loss, and the iterative method by the classic
-fit.  Where there is none, the cells say so.  Rows that the thesis does not have (least squares with free space) follow
+fit.  Where there is none, the cells are marked.  Rows that the thesis does not have (least squares with free space) are
 at the end.  The thesis' figures were measured there, on its own images, and on a GPU where a time belongs to a network.
 """
 
@@ -122,7 +122,7 @@ _COLUMNS: Mapping[str, Callable[[Summary], str]] = {
     _TIME: lambda s: f"{s.milliseconds_mean:.2f} ± {s.milliseconds_std:.2f}" if s.timed else "not timed",
     "timed": lambda s: str(s.timed),
 }
-"""What a column says of a contestant, by its title."""
+"""The cell of a contestant in each column, by the column's title."""
 
 
 def thesis_tables(results: Sequence[TableEntry]) -> list[Table]:
@@ -137,7 +137,7 @@ def thesis_tables(results: Sequence[TableEntry]) -> list[Table]:
         _table("Table 6.1: networks of all 12 parameters, supervised", (_DUAL_6_1, _OCCUPANCY_6_1), results, iou),
         _table("Section 6.5.2: rotation alone, the other parameters given", (_ROTATION,), results, iou,
                "A random rotation reaches about 58 % in the thesis."),
-        _table("Figures 6.6 and 7.7, in words: how IoU is distributed", (_OCCUPANCY, _RENDER), results, _SPREAD),
+        _table("Figures 6.6 and 7.7 as numbers: how IoU is distributed", (_OCCUPANCY, _RENDER), results, _SPREAD),
         _table("Table 6.2: errors of each parameter group", (_ITERATIVE, _OCCUPANCY), results, _ERRORS),
         _table("Table 6.3: against the classic method", (_ITERATIVE, _OCCUPANCY), results, times, time),
         _table("Table 7.1: errors under L_LS", (_LEAST_SQUARES,), results, _ERRORS),

@@ -220,7 +220,7 @@ def unfinished(path: Path) -> Path:
 
 
 def open_passage(path: Path) -> int:
-    """Descriptor to write to where :func:`is_passage` says yes: of this program's own ones a copy, with its place."""
+    """Descriptor to write to where :func:`is_passage` is true: of this program's own ones a copy, with its place."""
     for link in _links(path):
         if os.path.realpath(link.parent) == f"{_DESCRIPTORS}{os.getpid()}/fd" and link.name.isdecimal():
             return os.dup(int(link.name))

@@ -19,7 +19,7 @@ DEEPEST = 32
 
 
 class YamlError(ValueError):
-    """A file that cannot be read, or is no plain YAML; says why."""
+    """A file that cannot be read, or is no plain YAML; the message has the reason."""
 
 
 class _PlainLoader(yaml.SafeLoader):
@@ -58,8 +58,8 @@ def read_all(path: Path) -> list[Any]:
     except (OSError, UnicodeDecodeError, yaml.YAMLError, ValueError, RecursionError) as error:
         if isinstance(error, YamlError):
             raise
-        said = " ".join(str(error).split()) or type(error).__name__
-        raise YamlError(f"not YAML: {said}" if isinstance(error, yaml.YAMLError) else said) from error
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise YamlError(f"not YAML: {reason}" if isinstance(error, yaml.YAMLError) else reason) from error
 
 
 def read(path: Path) -> Any:

@@ -29,7 +29,7 @@ MOST_BYTES = 2**28
 
 
 class UnpackingError(ValueError):
-    """A file that cannot be unpacked, or would become too large; says what was expected."""
+    """A file that cannot be unpacked, or would become too large; the message names what was expected."""
 
 
 def npz_arrays(path: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
@@ -154,7 +154,7 @@ def _image_size(encoded: np.ndarray) -> tuple[int, int]:
 
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of large and damaged ones: what it says is looked at here
+            warnings.simplefilter("ignore")  # of large and damaged ones: they are handled here
             with Image.open(io.BytesIO(encoded.tobytes()), formats=("PNG", "BMP", "TIFF")) as image:
                 return image.size
     except Exception as error:  # whatever damaged headers lead to

@@ -1,8 +1,8 @@
 """Things of one's own, as meshes: what a network can be trained on besides the simulated household.
 
-A mesh rests on the faces of its hull on which it is stable, as often as it would come to lie there (K. Goldberg et al.,
+A mesh rests on the faces of its hull on which it is stable, as often as it would settle there (K. Goldberg et al.,
 "Part pose statistics", 1999, as trimesh computes it for a body of even density).  What is seen is the mesh; what the
-network shall tell is its hull, whose corners stand in :attr:`Thing.parts` as points.
+network shall predict is its hull, whose corners stand in :attr:`Thing.parts` as points.
 
 Metres.
 """

@@ -10,7 +10,7 @@ pitch angle p below the horizon and the roll r,
 
     n = (-cos p sin r, -cos p cos r, -sin p),    d = L sin p.
 
-A body touches the plane where its support function h says: its centre t has the height n.t + d = h(n).  It stands on
+A body touches the plane according to its support function h: its centre t has the height n.t + d = h(n).  It stands on
 one of its three axes, turned about n by any angle.  The shortest axis always holds; another one is taken only for
 bodies with flat faces (e1 and e2 below 0.5), since an egg does not stand on its tip.
 

@@ -70,7 +70,7 @@ class Thing:
     cavities : Superquadric
         Batch (m,), m >= 0: what is cut away from the union.
     surface : Mesh, optional
-        What is seen in place of the union, where the parts only tell its hull.
+        What is seen in place of the union, where the parts only have its hull.
     """
 
     kind: str

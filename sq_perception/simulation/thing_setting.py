@@ -1,4 +1,4 @@
-"""A thing before a camera, in a random pose with what is around it; metres, optical frame where nothing else is said.
+"""A thing before a camera, in a random pose with what is around it; metres, optical frame unless noted.
 
 pose        standing, lying, leaning (:meth:`Thing.pose`), on the table, on top of something, or free in any pose
 camera      5 to 85 degrees above the table, most 20 to 70; a roll of some degrees; off the image's middle by up to

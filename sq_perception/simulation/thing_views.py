@@ -10,7 +10,7 @@ follows.
     mask        too small or too large by up to two pixels, with or without what measured the table
     image       a border that cuts the thing
 
-Metres; optical frame of the camera where nothing else is said.
+Metres; optical frame of the camera unless noted.
 """
 
 from __future__ import annotations
