@@ -18,11 +18,11 @@ from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 
 _START_EXPONENT = 0.3
-"""Nearer to a box than to an ellipsoid; a few steps tell the rest."""
+"""Nearer to a box than to an ellipsoid; a few steps find the rest."""
 
 
 def enclosing_box(points: np.ndarray, footprint: float) -> Superquadric:
-    """A valid box-like body around any points (n >= 1, 3): the best that can be said when no fit is possible."""
+    """A valid box-like body around any points (n >= 1, 3): the best that is known when no fit is possible."""
     centre = points.mean(axis=0)
     axes = _axes_of(points)
     local = (points - centre) @ axes

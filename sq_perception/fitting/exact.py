@@ -6,7 +6,7 @@
    the bodies that were tried.
 2. The winner on all rays: free rays where the mask lost its edge are let go, object rays far off the surface are
    dropped, the outline's precision is read from its misfit.
-3. The finalists that few rays do not tell apart are refined on all of them.
+3. The finalists that few rays do not distinguish are refined on all of them.
 4. Where something is left unexplained, or a half size is not certain to 1 %, the rivals of the result are tried.  Those
    that explain the image almost as well stay as alternatives and add to the covariance.
 5. Half sizes along the view that the readings leave open are walked along (:mod:`sq_perception.fitting.rounding`).
@@ -53,7 +53,7 @@ from sq_perception.fitting.rivals import SIGNIFICANT, alike, other_axes, other_d
 from sq_perception.geometry.quantiles import quantile
 
 _MORE_RAYS, _MOST_FINAL_RAYS = 1500, 6000
-"""Half of and twice :data:`~sq_perception.fitting.problem.FINAL_RAYS`: to tell bodies apart, and under much noise."""
+"""Half of and twice :data:`~sq_perception.fitting.problem.FINAL_RAYS`: to distinguish bodies, and under much noise."""
 _FINE_NOISE = 0.3
 """Noise in pixel widths that the fewest rays of the last stage average out; more noise asks for more, by its square."""
 _OUTLIER = 5.0
@@ -166,8 +166,8 @@ def _distinct(states: Sequence[State], most: float, known: Sequence[State] = ())
 def _varied(solution: Solution) -> Solution:
     """Look beyond the valley that the search came down into: noise and poor sight hide that another one is deeper.
 
-    Rivals are the same body with a half size that the image hardly tells made smaller or larger, the seen face in
-    place, and, where something is left unexplained, the same box of axes with another z or turned by 45 degrees.
+    Rivals are the same body with a half size that the image hardly determines made smaller or larger, the seen face
+    in place, and, where something is left unexplained, the same box of axes with another z or turned by 45 degrees.
     They go on with the rendered residual: Sampson's would make them grow, as g is convex and noise enters it.
     """
     found: list[State] = []

@@ -5,7 +5,7 @@
 n_j, b and S are in the optical frame of the camera, metres.  A superquadric is no thing: what the best one leaves over
 joins S as an error of each direction by itself, ``MODEL_SHARE`` of the thing's extent.
 
-The network says h ~ t_nu(b, S) with long tails (:mod:`sq_perception.learning.thing_network`); its S alone, the scale of
+The network predicts h ~ t_nu(b, S) with long tails (:mod:`sq_perception.learning.thing_network`); S alone, the scale of
 most errors, is what the fit takes.  With the tails the fit follows bodies that few directions agree with: that cost
 1.3 % of IoU on 229 things of benchmarks/household_things, seeds from 5000.
 """
@@ -50,9 +50,9 @@ class HullPrior:
 
         ``misfit``, 1 or more: mean loss of the object's rays over that of what a superquadric fits.
         The body that is most probable is not the one that is nearest to what is expected.  A superquadric that fits
-        has the thing's form, and S tells which of them are probable.  One that does not is a choice: b is the best
+        has the thing's form, and S is how probable each of them is.  One that does not is a choice: b is the best
         that is known of the thing's form, and the body shall be near to it in each direction, however unsure.  Growth
-        in all directions is left to S: the outline tells a thing's size.
+        in all directions is left to S: the outline determines a thing's size.
         """
         count = len(self.support)
         model, pull = MODEL_SHARE * self.extent, PULL_SHARE * self.extent

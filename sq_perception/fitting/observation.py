@@ -1,15 +1,16 @@
-"""What one depth image says about one object: pixels that hit it, pixels that must miss it, and the depth noise.
+"""What one depth image shows of one object: pixels that hit it, pixels that must miss it, and the depth noise.
 
 Object pixels: those of the mask with a depth.  Drawn systematically with weight sqrt(1 + slope^2), that is by surface
 area instead of by pixel, since the steep parts of a body are the ones that fix its hidden extent.
 
-Free pixels: those beside the mask.  One that measured something farther says "empty up to there"; one that measured
-something nearer says so up to its own depth only, which binds nothing (what lies behind an occluder is unknown).
+Free pixels: those beside the mask.  One that measured something farther shows that it is empty up to there; one that
+measured something nearer shows it up to its own depth only, which binds nothing (what lies behind an occluder is
+unknown).
 
-A pixel without a reading says nothing where the pixels around the object were measured at all: beside a real thing it
+A pixel without a reading shows nothing where the pixels around the object were measured at all: beside a real thing it
 is the shadow of a baseline, a side seen at a grazing angle, a dark or shiny label, on the thing or beside it.  Where
 nothing around the object was measured, as in an orthographic image of the thesis, or before a background out of range,
-it is no pixel of the object and says "empty", unless it lies within the convex hull of the mask.
+it is no pixel of the object and counts as empty, unless it lies within the convex hull of the mask.
 
 Both become rays (:mod:`sq_perception.fitting.rays`) when a stage of the fit draws them.
 """
@@ -32,7 +33,7 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.coherence import coherent
 
 _STEEPEST = 6.0
-"""Slopes above this, 80 degrees, count as this: there a pixel tells little of the depth."""
+"""Slopes above this, 80 degrees, count as this: there a pixel determines little of the depth."""
 BAND_PIXELS, _BAND_SHARE = 4, 0.03
 """Width of the band around the mask whose every pixel counts, at least, as that much of a mask's edge may be missing;
 and as a share of the mask's extent."""
@@ -55,7 +56,7 @@ _POINTS = 2000
 OUTLIER_SHARE = 0.01
 """Of the points, at either end of a direction: readings of something else that got into the mask."""
 _NO_NOISE = 1e-6
-"""The least noise, as a share of the distance: what single precision can tell."""
+"""The least noise, as a share of the distance: what single precision resolves."""
 
 
 @dataclass(frozen=True)
@@ -135,7 +136,7 @@ class Observation:
         return replace(self, free=self.free[self._distance_to_mask > band + 0.4])
 
     def of_hull(self) -> Observation:
-        """The same observation of the object's convex hull: free pixels within the hull of the mask say nothing."""
+        """The same observation of the object's convex hull: free pixels within the hull of the mask are left out."""
         hull = _convex_hull(np.ascontiguousarray(self.mask).view(np.uint8))
         kept = self.free[hull.ravel()[self.free] == 0]
         count = round(self.free_pixels * len(kept) / max(len(self.free), 1))
@@ -284,7 +285,7 @@ def _sort(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, int]:
     """Object pixels with their areas, free pixels, and how many pixels these stand for.
 
-    A missing depth says nothing where ``lost`` is set, and elsewhere that there is nothing.
+    A missing depth is unknown where ``lost`` is set, and elsewhere empty.
     """
     height, width = depth.shape
     pixels, free = np.empty(height * width, np.int32), np.empty(height * width, np.int32)

@@ -36,17 +36,17 @@ class FitOptions:
         (4,) support plane n.x + d = height in the optical frame, n pointing away from the support; None if the object
         floats.  A body does not reach below it, and is expected to lie on one of its faces.
     expected
-        A body in the optical frame, or a function that returns it, that says how large the object may be where the
+        A body in the optical frame, or a function that returns it, that limits how large the object may be where the
         image does not: the prediction of a network.  A wide prior with long tails; asked for only where it matters.
     hull
         What is known of the thing's convex hull (:mod:`sq_perception.fitting.hull_prior`), or a function that returns
         it: asked for only where no superquadric explains the image down to its noise.
     nan_is_empty
         Whether a pixel without depth, outside the mask's convex hull, belongs to no part of the body, like one that saw
-        farther; if not, it says nothing.  None: as the image has it, see :mod:`sq_perception.fitting.observation`.
+        farther; if not, it is unknown.  None: as the image has it, see :mod:`sq_perception.fitting.observation`.
     smeared
         Whether the mask was found in the depth image itself, so that it has the edges that the sensor smears over what
-        is farther: a thing's outermost pixels before a step then say nothing.
+        is farther: a thing's outermost pixels before a step are then left out.
     pixels
         Budget of object rays in the last stage; a quarter as many free rays come on top.  None: enough that noise
         averages out.

@@ -1,8 +1,8 @@
 """The outline of a body against the mask's: whether the mask shrank, and how exact the outline is.
 
-Free rays beside the mask say where the body ends.  If something ate the mask's edge (sensors lose what they see at
+Free rays beside the mask show where the body ends.  If something ate the mask's edge (sensors lose what they see at
 grazing angles), all around it the body covers pixels that were taken for free: those are let go.  What the body then
-still covers tells the standard deviation of the outline.
+still covers determines the standard deviation of the outline.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
     draw      rays of the object and of free space, for one stage
     coarse    a few Levenberg-Marquardt steps from each start, with Sampson's residual on few rays: a wide basin
-    select    those that the noise does not tell apart, on more rays, then with the rendered residual
+    select    those that the noise does not distinguish, on more rays, then with the rendered residual
     settle    some more steps of one body with the rendered residual, on rays at hand
     refine    the same to convergence, on all rays
 
@@ -64,7 +64,7 @@ plane fitted to a depth image is known, and a wide prior with long tails (:mod:`
 PROPORTION_SIGMA = 1.0
 """Of a log size against the mean of the three: a factor e, a wide prior."""
 VOLUME_PRICE = 0.5
-"""Of log(a1 a2 a3): what the image does not tell, it does not make large.  Chosen on benchmarks/scanned_objects."""
+"""Of log(a1 a2 a3): what the image does not determine is not to grow.  Chosen on benchmarks/scanned_objects."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +74,7 @@ class Problem:
     Attributes
     ----------
     observation
-        What the image says about it.
+        What the image shows of it.
     options
         What the caller wants.
     terms

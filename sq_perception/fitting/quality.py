@@ -16,7 +16,7 @@ from sq_perception.geometry.quantiles import quantile
 from sq_perception.geometry.superquadric import Superquadric
 
 _REACHED = 0.9
-"""Of the points of a thing that was fitted as a hull: what the rest sticks out tells whether the body encloses it."""
+"""Of the points of a thing that was fitted as a hull: how far the rest sticks out decides whether it is enclosed."""
 _ENCLOSED_SHARE = 1.0
 """Of the smallest half size: a body that encloses a thing but for a trigger, a spout or a rim is one that a planner can
 use with care.  On benchmarks/household_things hulls that left less had IoU 0.54 to 0.66, those that left more, none."""

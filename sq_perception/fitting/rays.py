@@ -21,7 +21,7 @@ metres: where the ray met the body last time, which is where the next search for
 """
 RAY_COLUMNS = 8
 SAMPLE = 800
-"""Rays that tell a mean, a share or a median of the object's to 1 to 3 %, and take a tenth of a fit's time."""
+"""Rays that determine a mean, a share or a median of the object's to 1 to 3 %, and take a tenth of a fit's time."""
 
 
 class Rays(NamedTuple):

@@ -1,7 +1,7 @@
 """Bodies of revolution: the simpler family that many things of a household belong to, tried where a side is unseen.
 
 A can, a bottle, a bowl or a fruit shows half of its mantle.  As any superquadric its depth stays open; as a body of
-revolution, a1 = a2 and e2 = 1, the half that is seen tells the half that is not.  The family has 3 parameters less:
+revolution, a1 = a2 and e2 = 1, the half that is seen determines the other one.  The family has 3 parameters less:
 one half size, one exponent, and the turn about z.  By the Bayesian information criterion (G. Schwarz, Annals of
 Statistics 6(2), 1978), and as more things are round than of any one oval shape, it is the better description if
 

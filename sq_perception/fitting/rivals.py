@@ -34,7 +34,7 @@ def other_depths(state: State, axis: int) -> list[State]:
 
 
 def _turned(state: State) -> State:
-    """The body turned by 45 degrees about its z: a square cross-section and a round one are hard to tell apart."""
+    """The body turned by 45 degrees about its z: a square cross-section and a round one are hard to distinguish."""
     parameters = state.parameters.copy()
     parameters[:2] = math.sqrt(0.5 * (parameters[0] ** 2 + parameters[1] ** 2))
     parameters[4] = symmetry_start.START_EXPONENT

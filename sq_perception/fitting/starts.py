@@ -1,4 +1,4 @@
-"""Where a search begins when nobody says where: groups of starts, in the order in which to try them."""
+"""Where a search begins without a given start: groups of starts, in the order in which to try them."""
 
 from __future__ import annotations
 

@@ -17,15 +17,15 @@ points behind its surface count by Cauchy's loss, and the space within the outli
 object then counts as INDEPENDENT_OF_PREDICTED / m rays, m = max(1, c / EXPLAINED), c their mean loss: the variance of
 the model's error is not known beforehand, and the likelihood that is largest over it divides by what is found.  And the
 more it misfits, the more the body is drawn to the predicted hull
-(:meth:`~sq_perception.fitting.hull_prior.HullPrior.root`).  How sure the body is, what it is drawn to does not say, and
-its rays count as fewer by m once more: what errs more does so over larger parts, a neck, a spout, a dent.
+(:meth:`~sq_perception.fitting.hull_prior.HullPrior.root`).  That pull makes the body no surer,
+and its rays count as fewer by m once more: what errs more does so over larger parts, a neck, a spout, a dent.
 
 1. Starts: the given bodies (the prediction), and boxes on the plane, or along the points' axes without one; where
    nothing is predicted, deeper ones too.
-2. A few steps from each on few rays; more from the best, which tells c.
+2. A few steps from each on few rays; more from the best, which determines c.
 3. To the end, on all rays, from the best one or two.
 4. Without a prediction: what is hollow or notched, once more as its convex hull; and all the same as a body of
-   revolution, chosen by evidence (:mod:`sq_perception.fitting.revolution`).  Beside a predicted hull it is not asked:
+   revolution, chosen by evidence (:mod:`sq_perception.fitting.revolution`).  Beside a predicted hull it is not tried:
    on benchmarks/household_things it cost tools 12 % of IoU, and gained no other kind 1 %.
 
 Metres, radians, optical frame.
@@ -74,15 +74,15 @@ _AS_HULL = ("like the convex hull of the object",)
 _SPREAD = 2.5**2
 """Factor of the covariance for things that are no superquadrics, whose errors are alike."""
 _HUBER, _HUBER_OF_PREDICTED = 2.0, 1.0
-"""Noise levels; what strays farther from a superquadric is another part of the thing: a neck, a handle.  Where a
-prediction tells how far the hull reaches, such parts need not."""
+"""Noise levels; what strays farther from a superquadric is another part of the thing: a neck, a handle.  Where the
+reach of the hull is predicted, such parts need not."""
 
 
 def solve(problem: Problem, given: Sequence[State]) -> Solution:
     """The most probable body, from the given starts and boxes."""
     problem = _with_priors(problem)
     points, plane = problem.observation.points, problem.options.plane
-    # How far a box goes on behind what was seen, the prediction says.
+    # How far a box goes on behind what was seen is predicted.
     deeper = not problem.is_predicted
     boxes = box_start.principal(points, deeper) if plane is None else box_start.on_plane(points, plane, deeper)
     starts = [*given, *boxes]

@@ -1,7 +1,7 @@
 """Half sizes that the image leaves open: weighed against what is known beyond it.
 
-Where the image hardly tells a size, small errors of the model would decide it: that is left to the priors instead, and
-to a prediction where there is one.  The same body competes with that size like its others, thin, and as predicted, its
+Where the image hardly determines a size, small errors of the model would decide it: it is left to the priors, and to
+a prediction where there is one.  The same body competes with that size like its others, thin, and as predicted, its
 seen face in place.
 """
 
