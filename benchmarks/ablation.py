@@ -56,7 +56,7 @@ from sq_perception.recovery.seen_object import SeenObject
 
 HALF, FEWEST_PIXELS = 0.5, 200
 EXACT = 0.01
-"""Of a view's side: how well the true hull is said to be known."""
+"""Of a view's side: how well the true hull is taken to be known."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -232,7 +232,7 @@ def tracked(path: Path) -> Entry:
             single[k, j] = 2e3 * tracking.size_errors(frame.recovered[index].superquadric, truth)[0] * truth.size
         if k + 1 in TRACKED:
             kept[k + 1] = view, frame, followed
-    # The body whose first view tells least.
+    # The body whose first view determines least.
     chosen = int(np.nanargmax(np.where(np.isfinite(sigma[0]).all(axis=-1), sigma[0].max(axis=-1), np.nan)))
     axis = int(sigma[0, chosen].argmax())
     figure = new_figure(11.62, 2.62)

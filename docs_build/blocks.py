@@ -1,10 +1,10 @@
-"""The parts of the documents that say what can be measured or read from the source; nobody writes them by hand.
+"""The parts of the documents that can be measured or read from the source; nobody writes them by hand.
 
     python docs_build/blocks.py     rewrites them in README.md and docs/
 
 A document holds such a part between two lines, ``<!-- made by docs_build/blocks.py: NAME -->`` and ``<!-- end -->``.
 Figures come from benchmarks/results/*.json and from the header of the weights, the packages from ``FLOORS`` of
-test/package/test_imports.py and from what they say of themselves.  A test compares.
+test/package/test_imports.py and from their docstrings.  A test compares.
 """
 
 from __future__ import annotations
@@ -246,7 +246,7 @@ def layers() -> str:
 
 
 def packages() -> str:
-    """What each subpackage holds, in its own words."""
+    """What each subpackage holds, by its docstring."""
     return table(
         ["package", "holds"],
         [

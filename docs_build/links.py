@@ -55,7 +55,7 @@ def on_page_markdown(markdown: str, *, page: Any, config: Any, files: Files) -> 
 
 
 def _target(page: Path, link: str) -> Path | None:
-    """The file of the repository that a link means; None if it means none, which MkDocs then says."""
+    """The file of the repository that a link means; None if it means none, which MkDocs then reports."""
     path = (page.parent / link).resolve()
     return path if path.is_file() and path.is_relative_to(ROOT) else None
 

@@ -201,7 +201,7 @@ def test_a_line_a_body_and_a_reason_once():
         "  0 converged 0.480 x 0.196 x 0.214 of the cube (+-0.005 +-0.011 +-0.007) at 0.12 0.03 0.84",
         "2 weak: half size undetermined",
         "1 failed: 5 pixels with a depth are too few for a body",
-        "what to do with them: docs/how_sure.md; -v says more of each body",
+        "what to do with them: docs/how_sure.md; -v shows more of each body",
     ]
     details = list(lines(frames[:1], verbose=True))
     assert "    exponents 0.10 1.00, score 0.900, seen 100% 90% ?, pixels 500: converged" in details
