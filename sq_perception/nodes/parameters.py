@@ -232,7 +232,7 @@ class SyntheticParameters(Parameters):
     frame_id: str = setting(
         "", "Frame of the images; empty: camera_depth_optical_frame, or unit_cube for orthographic frames.", live=False
     )
-    path: str = setting("", "A recorded frame (NPZ, PNG, BMP) or a folder of them, for scene = replay.", live=False)
+    path: str = setting("", "A recorded frame or a folder of them, for scene = replay.", live=False)
     camera_info_file: str = setting(
         "",
         "camera_info YAML of recorded PNG depth images; also the camera of table scenes, which are published raw where "

@@ -17,12 +17,11 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.calibration import Calibration
 from sq_perception.imaging.camera import Projection
-from sq_perception.recordings import frame_file
+from sq_perception.recordings import bag_file, frame_file, inputs
 from sq_perception.recordings.frame_file import RecordedFrame
 from sq_perception.simulation.scenes import table_scene, thesis_scene
 from sq_perception.simulation.sensor_noise import IDEAL, Ideal, preset
 
-SUFFIXES = (".npz", ".png", ".bmp")
 _SCENES, _NOISE = 1, 2
 """Streams of random numbers under one seed."""
 
@@ -130,7 +129,7 @@ def recorded(
 
 
 def recordings(path: Path) -> list[Path]:
-    """A recorded frame, or those of a folder by name.
+    """A recorded frame, or those of a folder in natural order.
 
     Raises
     ------
@@ -141,7 +140,7 @@ def recordings(path: Path) -> list[Path]:
         return [path]
     if not path.is_dir():
         raise ValueError(f"path: expected a recorded frame or a folder of them, {path} does not exist")
-    found = sorted(one for one in path.iterdir() if one.suffix.lower() in SUFFIXES and one.is_file())
+    found = [frame for frame in inputs.in_folder(path) if not bag_file.is_bag(frame)]
     if not found:
-        raise ValueError(f"path: expected recorded frames ({', '.join(SUFFIXES)}) in {path}, there are none")
+        raise ValueError(f"path: expected recorded frames ({', '.join(frame_file.SUFFIXES)}) in {path}, there are none")
     return found
