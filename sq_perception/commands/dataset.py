@@ -1,4 +1,4 @@
-"""``sq-perception dataset``: make a fixed set of images on disk, go on with one, or verify one."""
+"""``sq-perception dataset``: make a fixed set of images on disk, or finish one."""
 
 from __future__ import annotations
 
@@ -6,16 +6,15 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
-from sq_perception.commands.console import FAILURE, SUCCESS, complain, failed, parser, progress
+from sq_perception.commands.console import SUCCESS, failed, parser, progress
 
-_HELP = "Make a fixed set of images on disk, go on with an interrupted one, or verify one."
+_HELP = "Make a fixed set of images on disk.  The same command finishes a set and makes damaged parts again."
 _EPILOG = """\
 170 000 full frames take 0.5 GB, as many views of 64 pixels 0.35 GB.
 
 examples:
   sq-perception dataset sets/thesis --full-frame
   sq-perception dataset sets/views --pixels 64 --train 50000 --test 2000
-  sq-perception dataset sets/thesis --verify
 """
 _FULL_PIXELS, _PIXELS = 256, 64
 """Of the thesis' images, and of the views of the shipped networks."""
@@ -31,10 +30,9 @@ def main(arguments: Sequence[str]) -> int:
     add("--train", type=int, default=150_000, help="bodies to train on (default %(default)s)")
     add("--test", type=int, default=20_000, help="bodies to test on (default %(default)s)")
     add("--seed", type=int, default=1, help="default %(default)s")
-    add("--verify", action="store_true", help="check all checksums and make nothing")
     given = command.parse_args(arguments)
 
-    from sq_perception.learning.fixed_set import FixedSetError, Settings, generate, read_manifest, verify
+    from sq_perception.learning.fixed_set import FixedSetError, Settings, generate
 
     framing, pixels = ("full", _FULL_PIXELS) if given.full_frame else ("cropped", _PIXELS)
     pixels = pixels if given.pixels is None else given.pixels
@@ -42,25 +40,15 @@ def main(arguments: Sequence[str]) -> int:
         settings = Settings(framing, pixels, given.train, given.test, given.seed)  # type: ignore[arg-type]
     except ValueError as error:
         command.error(f"--{error}")
-    folder, faults = given.folder, []
+    folder = given.folder
     try:
-        if given.verify:
-            settings, _ = read_manifest(folder)
         with progress() as bar:
-            task = bar.add_task("verifying" if given.verify else "drawing", total=settings.train + settings.test)
-            advance = partial(bar.advance, task)
-            if given.verify:
-                faults = verify(folder, advance)
-            else:
-                generate(folder, settings, advance)
+            task = bar.add_task("drawing", total=settings.train + settings.test)
+            generate(folder, settings, partial(bar.advance, task))
     except FixedSetError as error:
         return failed(f"dataset: {error}")
     except OSError as error:
         return failed(f"dataset: {folder}: {error}")
-    for fault in faults:
-        complain(f"dataset: {fault}")
-    if faults:
-        return FAILURE
     size = sum(path.stat().st_size for path in folder.glob("*.safetensors"))
     print(f"{folder}: {settings.train} + {settings.test} images, {size / 1e6:.1f} MB, all checksums right")
     return SUCCESS

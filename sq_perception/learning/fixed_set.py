@@ -110,7 +110,7 @@ def draw(settings: Settings, split: str, shard: int, count: int) -> tuple[np.nda
 
 
 def generate(folder: Path, settings: Settings, progress: Callable[[int], None] = lambda bodies: None) -> None:
-    """Make a set, or finish one that was interrupted; ``progress`` is called with the bodies of every finished shard.
+    """Make a set, or finish and mend one; ``progress`` is called with the bodies of every finished shard.
 
     Raises
     ------
@@ -148,18 +148,6 @@ def read_manifest(folder: Path) -> tuple[Settings, dict[str, str]]:
         raise FixedSetError(f"{folder}: no fixed set, there is no readable {MANIFEST} ({error})") from error
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise FixedSetError(f"{path}: not the manifest of a fixed set: {error}") from error
-
-
-def verify(folder: Path, progress: Callable[[int], None] = lambda bodies: None) -> list[str]:
-    """What is wrong with a set, one sentence a shard; empty if nothing is.  Raises FixedSetError without a manifest."""
-    settings, done = read_manifest(folder)
-    faults = []
-    for split in SPLITS:
-        for name, count in settings.shards(split).items():
-            fault = _fault(folder / name, done[name]) if name in done else f"{folder / name}: not made yet"
-            faults += [fault] if fault else []
-            progress(count)
-    return faults
 
 
 class FixedSet:
