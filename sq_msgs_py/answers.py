@@ -101,7 +101,7 @@ def _parts(response: Any, kind: type[Any]) -> tuple[Any, str, int, str]:
 def _plain(value: np.ndarray | np.generic) -> Any:
     """Numbers with as many digits as distinguish any two float32; JSON knows neither NaN nor infinity."""
     if isinstance(value, np.ndarray):
-        return [_plain(one) for one in value]
+        return [_plain(item) for item in value]
     if isinstance(value, np.integer):
         return int(value)
     return float(str(value)) if math.isfinite(value) else None

@@ -79,14 +79,14 @@ class Scene:
         self._known_as, self._header = known_as, header
         shown = superquadrics.recovered
         names = [name(number, prefix) for number in shown.id]
-        new = np.array([_has_changed(self._known.get(one), shown, k) for k, one in enumerate(names)], dtype=bool)
+        new = np.array([_has_changed(self._known.get(key), shown, k) for k, key in enumerate(names)], dtype=bool)
         surfaces = None
         if meshes is not None:
             surfaces = list(compress(meshes(), new)) if new.any() else []
         objects = collision_objects(shown.where(new), header, meshes=surfaces, prefix=prefix)
         kept = {*names, *(name(number, prefix) for number in hidden)}
         objects += removals(self._known.keys() - kept, header)
-        self._known = {one: state for one, state in self._known.items() if one in kept}
+        self._known = {key: state for key, state in self._known.items() if key in kept}
         self._known.update({names[k]: shown.where(np.arange(len(shown)) == k) for k in np.flatnonzero(new)})
         return objects
 
@@ -142,15 +142,15 @@ def collision_objects(
         raise ValueError(f"meshes: expected one for each of {len(bodies)} bodies, got {len(meshes)}")
     objects = []
     for k, pose in enumerate(pose_messages(bodies)):
-        one = CollisionObject(header=header, id=name(bodies.id[k], prefix), pose=pose, operation=CollisionObject.ADD)
+        added = CollisionObject(header=header, id=name(bodies.id[k], prefix), pose=pose, operation=CollisionObject.ADD)
         here = Pose(orientation=Quaternion(w=1.0))
         if meshes is None:
-            one.primitives, one.primitive_poses = [primitive(bodies.size[k], bodies.shape[k]).message], [here]
+            added.primitives, added.primitive_poses = [primitive(bodies.size[k], bodies.shape[k]).message], [here]
         else:
             vertices, faces = meshes[k]
             factor = enclosing_factor(vertices, faces, bodies.size[k], bodies.shape[k])
-            one.meshes, one.mesh_poses = [mesh_message(factor * np.asarray(vertices), faces)], [here]
-        objects.append(one)
+            added.meshes, added.mesh_poses = [mesh_message(factor * np.asarray(vertices), faces)], [here]
+        objects.append(added)
     return objects
 
 
@@ -169,7 +169,7 @@ def removals(names: Iterable[str], header: Any) -> list[CollisionObject]:
     names = sorted(names)
     if "" in names:
         raise ValueError("names: expected none to be empty, as MoveIt would remove all objects")
-    return [CollisionObject(header=header, id=one, operation=CollisionObject.REMOVE) for one in names]
+    return [CollisionObject(header=header, id=key, operation=CollisionObject.REMOVE) for key in names]
 
 
 def planning_scene(objects: Sequence[CollisionObject]) -> PlanningScene:

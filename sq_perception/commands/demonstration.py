@@ -215,8 +215,8 @@ def draw(watch: Watch, shot: Shot, folder: Path) -> tuple[Path, Path | None]:
         if not len(model):
             model = found
         pairs = pair(model, found)
-        ordered = [found[one.recovered] for one in pairs if one.recovered is not None]
-        overlaps = [one.iou or 0.0 for one in pairs[: len(truth)]]
+        ordered = [found[match.recovered] for match in pairs if match.recovered is not None]
+        overlaps = [match.iou or 0.0 for match in pairs[: len(truth)]]
         remark = f"mean IoU {100 * np.mean(overlaps):.1f} %, " if overlaps else ""
         methods.append((title, ordered, f"{remark}{shot.results[name].latency:.0f} ms after the stamp"))
     plane = None if frame.is_cube else segment(frame.depth, frame.camera).plane

@@ -50,11 +50,11 @@ def replaced_input(options: argparse.Namespace, inputs: Sequence[Path]) -> str:
     """Which output would take the place of an input; empty if none."""
     for name in _FILES:
         path = Path(getattr(options, name) or STANDARD_OUTPUT)
-        if path.exists() and any(one.exists() and path.samefile(one) for one in inputs):
+        if path.exists() and any(given.exists() and path.samefile(given) for given in inputs):
             return f"--{name}: {path}: this is an input"
     for name, suffix in (("pictures", ".png"), ("meshes", f".{options.mesh_format}")):
         folder = getattr(options, name)
-        if folder and any(one.suffix.lower() == suffix and one.parent.samefile(folder) for one in inputs):
+        if folder and any(given.suffix.lower() == suffix and given.parent.samefile(folder) for given in inputs):
             return f"--{name}: {folder}: the {suffix} files in this folder are inputs; choose another one"
     return ""
 
@@ -96,7 +96,7 @@ class Outputs:
             from sq_perception.recordings.still_page import StillPage
 
             self._page = StillPage(options.html)
-        self._stems = {Path(one["file"]).stem for one in self.done if not one.get("topic")}
+        self._stems = {Path(entry["file"]).stem for entry in self.done if not entry.get("topic")}
 
     def add(
         self,
@@ -173,7 +173,7 @@ def _bag(options: argparse.Namespace) -> ResultBag | None:
     try:
         from sq_perception.recordings.result_bag import ResultBag
 
-        images: list[Any] = [one.strip() for one in options.mcap_images.split(",")]
+        images: list[Any] = [name.strip() for name in options.mcap_images.split(",")]
         return ResultBag(options.mcap, [] if images == ["none"] else images)
     except (ValueError, ImportError) as error:
         raise type(error)(f"--mcap: {error}") from error

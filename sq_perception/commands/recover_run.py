@@ -104,8 +104,8 @@ class RecoverRun:
                     if frame.camera not in self._warm:
                         crew.warm_up(frame.camera)
                         self._warm.add(frame.camera)
-                    one = self._work(frame)
-                    answer = crew.recover(one.depth, one.camera, one.labels, one.options, previous)
+                    work = self._work(frame)
+                    answer = crew.recover(work.depth, work.camera, work.labels, work.options, previous)
                     previous = answer if self._tracks else None
                 except (ValueError, ArithmeticError) as error:
                     answer = error
@@ -128,8 +128,8 @@ class RecoverRun:
         self._outputs.add(frame, recovery, tracks, entry)
 
 
-def _count(number: int, one: str, many: str | None = None) -> str:
-    return f"{number} {one if number == 1 else many or one + 's'}"
+def _count(number: int, singular: str, many: str | None = None) -> str:
+    return f"{number} {singular if number == 1 else many or singular + 's'}"
 
 
 def _progress(recorded: RecordedInput) -> Iterator[tuple[str, Any]]:

@@ -50,10 +50,10 @@ def main(given: Sequence[str]) -> int:
     cut = given.index(_ROS) if _ROS in given else len(given)
     parser = _parser()
     options = parser.parse_args(given[:cut])
-    nodes = list(dict.fromkeys(f"/{one.strip('/')}" for one in options.node or [DEFAULT_NODE]))
-    for one in nodes:
-        if not _NODE_NAME.fullmatch(one):
-            parser.error(f"--node: expected a name like {DEFAULT_NODE}, got {one!r}")
+    nodes = list(dict.fromkeys(f"/{name.strip('/')}" for name in options.node or [DEFAULT_NODE]))
+    for name in nodes:
+        if not _NODE_NAME.fullmatch(name):
+            parser.error(f"--node: expected a name like {DEFAULT_NODE}, got {name!r}")
     if not (math.isfinite(options.rate) and 0 < options.rate <= 60):
         parser.error(f"--rate: expected a number above 0, at most 60, got {options.rate:g}")
     if options.port is not None and not 0 <= options.port <= 65535:

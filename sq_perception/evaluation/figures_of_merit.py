@@ -147,7 +147,7 @@ class FiguresOfMerit:
     @classmethod
     def concatenated(cls, parts: Sequence[FiguresOfMerit]) -> FiguresOfMerit:
         """The figures of several batches, one after the other."""
-        return cls(*(np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(cls)))
+        return cls(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(cls)))
 
     def summary(self) -> Summary:
         """Means as in the thesis' tables."""

@@ -76,7 +76,7 @@ class ImageChunk:
     @cached_property
     def _masks(self) -> list[np.ndarray | None]:
         found = [segments.segment(depth, self.camera) for depth in self.depth]
-        return [one.labels == one.ids[0] if one.ids else None for one in found]
+        return [segmented.labels == segmented.ids[0] if segmented.ids else None for segmented in found]
 
 
 @dataclass(frozen=True)

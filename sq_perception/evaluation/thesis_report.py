@@ -68,7 +68,9 @@ def overview(outcomes: Sequence[Outcome]) -> list[Table]:
 
 
 def _results(outcomes: Sequence[Outcome]) -> list[TableEntry]:
-    return [TableEntry(one.contestant.name, one.contestant.loss, one.figures.summary()) for one in outcomes]
+    return [
+        TableEntry(outcome.contestant.name, outcome.contestant.loss, outcome.figures.summary()) for outcome in outcomes
+    ]
 
 
 def _file(outcome: Outcome, kind: str) -> str:
@@ -124,7 +126,7 @@ def _protocol(outcomes: Sequence[Outcome]) -> str:
 def _markdown(outcomes: Sequence[Outcome], facts: dict[str, Any], failures: Sequence[str]) -> str:
     lines = ["# Evaluation", "", f"`{facts.get('command')}`", "", _facts_line(facts), "", _protocol(outcomes), ""]
     lines += [f"Left out: {failure}\n" for failure in failures]
-    lines += [f"- {one.contestant.name}: {one.contestant.description}" for one in outcomes]
+    lines += [f"- {outcome.contestant.name}: {outcome.contestant.description}" for outcome in outcomes]
     for table in (*overview(outcomes), *thesis_tables.thesis_tables(_results(outcomes))):
         lines += ["", f"## {table.title}", "", table.markdown()]
         if table.note:

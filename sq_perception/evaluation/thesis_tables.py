@@ -152,7 +152,7 @@ def overview(results: Sequence[TableEntry]) -> list[Table]:
     """Every contestant: how well the bodies overlap, and what is wrong about them, with the time it took."""
 
     def listed(title: str, columns: Sequence[str], note: str = "") -> Table:
-        rows = tuple((one.name, *(_COLUMNS[name](one.summary) for name in columns)) for one in results)
+        rows = tuple((entry.name, *(_COLUMNS[name](entry.summary) for name in columns)) for entry in results)
         return Table(title, ("Contestant", *columns), rows, note)
 
     return [

@@ -119,10 +119,10 @@ def exr_image(path: Path) -> np.ndarray:
             found = {name.rpartition(".")[2]: channel.pixels for name, channel in file.channels().items()}
     except Exception as error:  # whatever damaged files lead to
         raise UnpackingError(f"not a readable EXR: {error}") from error
-    one, *others = [found[name] for name in ("Z", "V", "Y") if name in found][:1] or found.values()
-    if one.dtype.kind != "f" or not all(np.array_equal(one, other, equal_nan=True) for other in others):
+    channel, *others = [found[name] for name in ("Z", "V", "Y") if name in found][:1] or found.values()
+    if channel.dtype.kind != "f" or not all(np.array_equal(channel, other, equal_nan=True) for other in others):
         raise UnpackingError(f"expected floats in a channel Z, V or Y, got {', '.join(found)}")
-    return np.asarray(one)
+    return np.asarray(channel)
 
 
 def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> np.ndarray:

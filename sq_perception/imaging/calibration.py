@@ -174,7 +174,7 @@ def _lens(model: str, coefficients: tuple[float, ...]) -> Distortion:
     if model != FISHEYE and not is_distorted(coefficients):
         return Distortion()
     if model not in MODELS or model == NONE:
-        expected = ", ".join(one for one in MODELS if one != NONE)
+        expected = ", ".join(model for model in MODELS if model != NONE)
         raise ValueError(f"camera_info: distortion_model: expected {expected}, got {model!r}")
     try:
         return Distortion(model, coefficients)

@@ -244,7 +244,7 @@ def _packed(images: np.ndarray, flat: np.ndarray) -> bytes:
     with ThreadPoolExecutor(thread_name_prefix="encode") as pool:
         encode = partial(cv2.imencode, ".png", params=[cv2.IMWRITE_PNG_COMPRESSION, _PNG_LEVEL])
         packed = [encoded.ravel() for _, encoded in pool.map(encode, images)]
-    offset = np.concatenate([[0], np.cumsum([len(one) for one in packed])]).astype(np.int64)
+    offset = np.concatenate([[0], np.cumsum([len(image) for image in packed])]).astype(np.int64)
     return save({"image": np.concatenate(packed), "offset": offset, "body": flat})
 
 

@@ -119,7 +119,9 @@ class FrameNode(ManagedNode):
         self._engine.build(parameters)
         association.warm_up()
         latest = self._settings.current
-        meanwhile = {one.name for one in fields(latest) if getattr(latest, one.name) != getattr(parameters, one.name)}
+        meanwhile = {
+            field.name for field in fields(latest) if getattr(latest, field.name) != getattr(parameters, field.name)
+        }
         self._engine.follow(latest, frozenset(meanwhile))
         self.get_logger().info(f"warm after {perf_counter() - started:.1f} s")
         self._outputs.open(latest)
@@ -129,10 +131,10 @@ class FrameNode(ManagedNode):
 
     def _activate(self) -> None:
         self._defects = 0
-        self._input = one = Input(self, self._settings, self._is_wanted, self._statistics)
-        self._worker = threading.Thread(target=self._work, args=(one,), name="worker", daemon=True)
+        self._input = source = Input(self, self._settings, self._is_wanted, self._statistics)
+        self._worker = threading.Thread(target=self._work, args=(source,), name="worker", daemon=True)
         self._worker.start()
-        self.get_logger().info(f"ready, listening to {one.topic}")
+        self.get_logger().info(f"ready, listening to {source.topic}")
 
     def _deactivate(self) -> None:
         self._stop()
@@ -152,9 +154,9 @@ class FrameNode(ManagedNode):
     def _stop(self) -> None:
         """End subscriptions and worker.  What planners know stays: a camera that fails takes no obstacles."""
         with self._publishing:
-            one, self._input = self._input, None
-        if one is not None:
-            one.close()
+            source, self._input = self._input, None
+        if source is not None:
+            source.close()
         self._resolve(Outcome(False, "the node has been deactivated"))
         if self._worker is not None:
             self._worker.join(_WORKER_END)
@@ -215,7 +217,7 @@ class FrameNode(ManagedNode):
 
     def _is_wanted(self) -> bool:
         """Whether frames are processed, or one is asked for."""
-        return self._enabled or any(not one.done() for one in tuple(self._triggers))
+        return self._enabled or any(not trigger.done() for trigger in tuple(self._triggers))
 
     def _recovered(self, source: Input, arrival: Arrival) -> tuple[Frame, Answer, dict[str, float]]:
         """The frame of an image, its bodies, and how long that took by stage, milliseconds."""

@@ -141,8 +141,8 @@ def planned(bodies: SuperquadricArray, parameters: GraspParameters, plane: np.nd
     low, high = parameters.region[:3], parameters.region[3:]
     wanted = np.all((bodies.translation >= low) & (bodies.translation <= high), axis=1)
     wanted &= (parameters.only_id == -1) | (bodies.id == parameters.only_id)
-    kept = tuple(one for one in plan.grasps if one.score >= parameters.min_score and wanted[one.body])
-    have = {one.body for one in kept}
+    kept = tuple(grasp for grasp in plan.grasps if grasp.score >= parameters.min_score and wanted[grasp.body])
+    have = {grasp.body for grasp in kept}
     reasons = tuple(
         "" if k in have or not wanted[k] else why or f"less probable than {parameters.min_score:g}"
         for k, why in enumerate(plan.reasons)

@@ -113,7 +113,7 @@ class Input:
         if self._info is None or self._latched is not None or self._is_closed:
             return
         offered = self._node.get_publishers_info_by_topic(self._info.topic_name)
-        if any(one.qos_profile.durability == QoSDurabilityPolicy.TRANSIENT_LOCAL for one in offered):
+        if any(publisher.qos_profile.durability == QoSDurabilityPolicy.TRANSIENT_LOCAL for publisher in offered):
             self._latched = self._node.create_subscription(
                 CameraInfo,
                 self._info.topic_name,
@@ -142,9 +142,9 @@ class Input:
             self._ready = None
             self._changed.notify_all()
         self._statistics.count("dropped", left)
-        for one in (self._image, self._mask, self._latched, self._info):
-            if one is not None:
-                self._node.destroy_subscription(one)
+        for subscription in (self._image, self._mask, self._latched, self._info):
+            if subscription is not None:
+                self._node.destroy_subscription(subscription)
 
     # For the worker
 
@@ -156,7 +156,7 @@ class Input:
                 self._promote(now)
                 if self._ready is not None:
                     return True
-                deadline = min((one.deadline for one in self._waiting), default=None)
+                deadline = min((arrival.deadline for arrival in self._waiting), default=None)
                 self._changed.wait(None if deadline is None else max(deadline - now, 0.0))
             return False
 
@@ -253,21 +253,21 @@ class Input:
 
     def _promote(self, now: float) -> None:
         """Make the newest image ready that is complete or has waited long enough; it takes the place of older ones."""
-        ready = [k for k, one in enumerate(self._waiting) if one.deadline <= now or self._is_complete(one)]
+        ready = [k for k, arrival in enumerate(self._waiting) if arrival.deadline <= now or self._is_complete(arrival)]
         gone = [self._waiting.popleft() for _ in range(ready[-1] + 1 if ready else len(self._waiting) - _WAITING)]
         if ready:
-            one = gone.pop()
+            arrival = gone.pop()
             gone += [self._ready] if self._ready is not None else []
-            self._ready = replace(one, mask=self._masks.pop(stamp_of(one.message), None))
+            self._ready = replace(arrival, mask=self._masks.pop(stamp_of(arrival.message), None))
         self._statistics.count("dropped", len(gone))
         self._changed.notify_all()
 
-    def _is_complete(self, one: Arrival) -> bool:
-        if one.size is None:
+    def _is_complete(self, arrival: Arrival) -> bool:
+        if arrival.size is None:
             return True
-        stamp = stamp_of(one.message)
-        has_info = self._info is None or self._info_for(one.size, stamp) is not None
-        return has_info and (not one.needs_mask or stamp in self._masks)
+        stamp = stamp_of(arrival.message)
+        has_info = self._info is None or self._info_for(arrival.size, stamp) is not None
+        return has_info and (not arrival.needs_mask or stamp in self._masks)
 
     def _info_for(self, size: tuple[int, int], stamp: int) -> _Info | None:
         fitting = [info for info in self._infos if info.size == size]

@@ -45,10 +45,10 @@ class Parameters:
     """
 
     def __post_init__(self) -> None:
-        for one in fields(self):
-            choices, value = one.metadata["choices"], getattr(self, one.name)
+        for parameter in fields(self):
+            choices, value = parameter.metadata["choices"], getattr(self, parameter.name)
             if choices and value not in choices:
-                raise ParameterError(f"{one.name}: expected one of {', '.join(choices)}, got {value!r}")
+                raise ParameterError(f"{parameter.name}: expected one of {', '.join(choices)}, got {value!r}")
 
 
 P = TypeVar("P", bound=Parameters)
@@ -81,20 +81,20 @@ class LiveParameters(Generic[P]):
         check: Callable[[Any, frozenset[str]], None] = lambda _, __: None,
         changed: Callable[[Any, frozenset[str]], None] = lambda _, __: None,
     ) -> None:
-        self._kinds: dict[str, Any] = {one.name: type(one.default) for one in fields(kind)}
-        self._fixed = {one.name for one in fields(kind) if not one.metadata["live"]}
+        self._kinds: dict[str, Any] = {parameter.name: type(parameter.default) for parameter in fields(kind)}
+        self._fixed = {parameter.name for parameter in fields(kind) if not parameter.metadata["live"]}
         self._locked, self._check, self._changed = locked, check, changed
-        self.current: P = kind(**self._values([self._declared(node, one) for one in fields(kind)]))
+        self.current: P = kind(**self._values([self._declared(node, parameter) for parameter in fields(kind)]))
         """The values in force: an immutable set, replaced as a whole."""
-        node.add_pre_set_parameters_callback(lambda changes: [self._typed(one) for one in changes])
+        node.add_pre_set_parameters_callback(lambda changes: [self._typed(change) for change in changes])
         node.add_on_set_parameters_callback(self._on_set)
         node.add_post_set_parameters_callback(self._accept)
 
-    def _declared(self, node: Node, one: Field[Any]) -> Parameter:
+    def _declared(self, node: Node, parameter: Field[Any]) -> Parameter:
         # Of any type at first: declared as a double it would refuse an integer given at the start.
-        node.declare_parameter(one.name, one.default, ParameterDescriptor(dynamic_typing=True))
-        given = self._typed(node.get_parameter(one.name))
-        node.set_descriptor(one.name, describe(one, self._locked is None), given.get_parameter_value())
+        node.declare_parameter(parameter.name, parameter.default, ParameterDescriptor(dynamic_typing=True))
+        given = self._typed(node.get_parameter(parameter.name))
+        node.set_descriptor(parameter.name, describe(parameter, self._locked is None), given.get_parameter_value())
         return given
 
     def _typed(self, given: Parameter) -> Parameter:
@@ -103,12 +103,12 @@ class LiveParameters(Generic[P]):
         if kind is float and given.type_ == Parameter.Type.INTEGER:
             return Parameter(given.name, value=float(given.value))
         if kind is tuple and given.type_ == Parameter.Type.INTEGER_ARRAY:
-            return Parameter(given.name, value=[float(one) for one in given.value])
+            return Parameter(given.name, value=[float(number) for number in given.value])
         return given
 
     def _values(self, changes: list[Parameter]) -> dict[str, Any]:
         """By name, without those of rclpy's own, which another thread may declare."""
-        return {one.name: self._kinds[one.name](one.value) for one in changes if one.name in self._kinds}
+        return {change.name: self._kinds[change.name](change.value) for change in changes if change.name in self._kinds}
 
     def _on_set(self, changes: list[Parameter]) -> SetParametersResult:
         values = self._values(changes)
@@ -131,16 +131,16 @@ class LiveParameters(Generic[P]):
             self._changed(self.current, frozenset(values))
 
 
-def describe(one: Field[Any], is_fixed: bool = True) -> ParameterDescriptor:
+def describe(parameter: Field[Any], is_fixed: bool = True) -> ParameterDescriptor:
     """The descriptor of a field: its type, its text with the unit, its range or choices.
 
     It is read-only where the field is not live and ``is_fixed``, as in nodes without a lifecycle.
     """
-    about = one.metadata
+    about = parameter.metadata
     unit = about["unit"]
     descriptor = ParameterDescriptor(
-        name=one.name,
-        type=Parameter.Type.from_parameter_value(one.default).value,
+        name=parameter.name,
+        type=Parameter.Type.from_parameter_value(parameter.default).value,
         description=about["description"] + (f" [{unit}]" if unit else ""),
         read_only=is_fixed and not about["live"],
     )
@@ -149,7 +149,7 @@ def describe(one: Field[Any], is_fixed: bool = True) -> ParameterDescriptor:
     elif about["within"] is not None:
         low, high = about["within"]
         descriptor.additional_constraints = f"{low:g} to {high:g} {unit}".rstrip()
-        if isinstance(one.default, int):
+        if isinstance(parameter.default, int):
             descriptor.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
         else:
             descriptor.floating_point_range = [FloatingPointRange(from_value=float(low), to_value=float(high))]

@@ -70,11 +70,11 @@ class RemoteNode:
 
     def on_event(self, event: ParameterEvent) -> None:
         """Follow a message of /parameter_events of this node."""
-        if any(one.name not in self._known for one in event.new_parameters) or event.deleted_parameters:
+        if any(value.name not in self._known for value in event.new_parameters) or event.deleted_parameters:
             self._load_due = monotonic() + _SETTLED
         values = [*event.new_parameters, *event.changed_parameters]
         with self._lock:
-            self._new_values.update({one.name: parameter_value_to_python(one.value) for one in values})
+            self._new_values.update({value.name: parameter_value_to_python(value.value) for value in values})
 
     async def change(self, name: str, value: Any) -> None:
         """Ask for another value of a parameter; the node's answer is shown, and what it holds then."""
@@ -93,7 +93,7 @@ class RemoteNode:
         with suppress(TimeoutError):
             response = await self._answer(self._parameters.get_parameters([name]))
             with self._lock:
-                self._new_values.update((name, parameter_value_to_python(one)) for one in response.values)
+                self._new_values.update((name, parameter_value_to_python(value)) for value in response.values)
 
     async def transit(self, label: str) -> None:
         """Ask for a lifecycle transition."""
@@ -129,13 +129,13 @@ class RemoteNode:
         try:
             listed = await self._answer(self._parameters.list_parameters())
             described = await self._answer(self._parameters.describe_parameters(list(listed.result.names)))
-            names = [one.name for one in described.descriptors]
+            names = [descriptor.name for descriptor in described.descriptors]
             got = await self._answer(self._parameters.get_parameters(names))
         except TimeoutError:
             self._load_due = monotonic() + _LOOK_PERIOD
             return
         self._known = set(names)
-        read = [parameter_value_to_python(one) for one in got.values]
+        read = [parameter_value_to_python(value) for value in got.values]
         with self._lock:
             self._new_controls = arranged(zip(described.descriptors, read, strict=True))
             self._new_values.clear()

@@ -95,7 +95,7 @@ class ViewNode(Node):
         self._shown: dict[str, _Result | None] = {}
         """The result of each node that was drawn last."""
         self._status_due = 0.0
-        self._remote = {one: RemoteNode(self, one) for one in nodes}
+        self._remote = {name: RemoteNode(self, name) for name in nodes}
         self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
         self.create_subscription(ParameterEvent, "/parameter_events", self._on_parameter_event, 1000)
         self.create_timer(_SERVICE_PERIOD, self._on_tick)
@@ -120,8 +120,8 @@ class ViewNode(Node):
         if watched and not self._inputs:
             self._listen()
         elif not watched and self._inputs:
-            for one in self._inputs:
-                self.destroy_subscription(one)
+            for subscription in self._inputs:
+                self.destroy_subscription(subscription)
             self._inputs = []
         executor = self.executor
         assert executor is not None, "it calls this"
@@ -155,7 +155,7 @@ class ViewNode(Node):
             while len(self._images) > _IMAGES:
                 self._images.popitem(last=False)
         # The image waits for its result, where results come at all.
-        if not any(monotonic() - one.time < _RESULT_PATIENCE for one in self._results.values()):
+        if not any(monotonic() - result.time < _RESULT_PATIENCE for result in self._results.values()):
             self._news.set()
 
     def _on_result(self, name: str, message: PointCloud2) -> None:
@@ -216,8 +216,10 @@ class ViewNode(Node):
             if status_due:
                 self._page.show_source(tables.source_status(topic, None, 0.0, "", "no depth image has come yet"))
             return None
-        stamps = {stamp_of(one.message) for one in results.values() if monotonic() - one.time < tables.SILENT_SECONDS}
-        image = next((one for one in reversed(images) if stamp_of(one) in stamps), images[-1])
+        stamps = {
+            stamp_of(result.message) for result in results.values() if monotonic() - result.time < tables.SILENT_SECONDS
+        }
+        image = next((candidate for candidate in reversed(images) if stamp_of(candidate) in stamps), images[-1])
         remark = "" if rate > 0 else "no depth images come any more"
         if image is not self._drawn:
             try:

@@ -134,7 +134,9 @@ class RecordedBag:
 
     def __len__(self) -> int:
         """Images that will be read, as the bag counts them; a damaged bag may count wrong."""
-        count = sum(max(0, one.msgcount) for one in self._reader.connections(IMAGE, COMPRESSED, topic=self.topic))
+        count = sum(
+            max(0, connection.msgcount) for connection in self._reader.connections(IMAGE, COMPRESSED, topic=self.topic)
+        )
         count = -(-count // self._every)
         return count if self._limit is None else min(count, self._limit)
 
@@ -145,7 +147,9 @@ class RecordedBag:
             connections = self._reader.connections(IMAGE, COMPRESSED, topic=self.topic)
             if needs_info:
                 infos = self._reader.connections(CAMERA_INFO, topic=self._info_topic)
-                latest = next((one for one in self._reader.messages(infos) if isinstance(one, Message)), None)
+                latest = next(
+                    (message for message in self._reader.messages(infos) if isinstance(message, Message)), None
+                )
                 connections += infos
             waiting: Message | None = None
             for message in self._reader.messages(connections, self._every, self._limit):
@@ -173,7 +177,7 @@ class RecordedBag:
 
     def _chosen(self, wanted: str | None) -> str:
         """The topic that was asked for, or the one that shows depth."""
-        images = sorted({one.topic for one in self._reader.connections(IMAGE, COMPRESSED)})
+        images = sorted({connection.topic for connection in self._reader.connections(IMAGE, COMPRESSED)})
         encodings: dict[str, str | None] = {}
         damage: FrameError | None = None
         for topic in images:
@@ -190,7 +194,7 @@ class RecordedBag:
         known = depth_image.GREY_ENCODINGS if self._orthographic else depth_image.DEPTH_ENCODINGS
         found = [topic for topic in images if encodings[topic] in known and not topic.endswith(_MASKS)]
         packed = f"/{compressed_depth.TRANSPORT}"
-        found = [one for one in found if not (one.endswith(packed) and one.removesuffix(packed) in found)]
+        found = [topic for topic in found if not (topic.endswith(packed) and topic.removesuffix(packed) in found)]
         if not found and damage is not None:
             raise damage
         if not found:
@@ -213,7 +217,9 @@ class RecordedBag:
 
     def _recorded_masks(self) -> Generator[Message, None, None]:
         """The messages of the mask topic, in a reading of their own, as they come at any distance from their images."""
-        topics = {one.topic for one in self._reader.connections(IMAGE) if one.topic.endswith(_MASKS)} - {self.topic}
+        topics = {
+            connection.topic for connection in self._reader.connections(IMAGE) if connection.topic.endswith(_MASKS)
+        } - {self.topic}
         if len(topics) != 1:
             return
         with closing(BagReader(self._path)) as reader:

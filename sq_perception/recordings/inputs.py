@@ -126,9 +126,9 @@ class RecordedInput:
         camera_info = self._camera_info or _camera_file(folder) or above
         if found := in_folder(folder):
             _log.info("%s: %d frames, camera %s", folder, len(found), camera_info or "of the files")
-            return [(one, camera_info) for one in found[:: self._every][: self._limit]]
-        folders = [one for one in folder.iterdir() if one.is_dir() and not one.is_symlink()]
-        return [pair for one in sorted(folders, key=_natural) for pair in self._in_folders(one, camera_info)]
+            return [(path, camera_info) for path in found[:: self._every][: self._limit]]
+        folders = [inner for inner in folder.iterdir() if inner.is_dir() and not inner.is_symlink()]
+        return [pair for inner in sorted(folders, key=_natural) for pair in self._in_folders(inner, camera_info)]
 
     def _file(self, path: Path, camera_info: str | Path | None) -> RecordedFrame | FrameError:
         try:
@@ -168,8 +168,8 @@ def in_folder(folder: Path) -> list[Path]:
     def is_frame(path: Path) -> bool:
         return path.suffix.lower() in frame_file.SUFFIXES and path.is_file()
 
-    found = sorted((one for one in folder.iterdir() if is_frame(one) or bag_file.is_bag(one)), key=_natural)
-    return [one for one in found if one.suffix.lower() != ".npy"] or found
+    found = sorted((path for path in folder.iterdir() if is_frame(path) or bag_file.is_bag(path)), key=_natural)
+    return [path for path in found if path.suffix.lower() != ".npy"] or found
 
 
 def _natural(path: Path) -> tuple[list[str | int], str]:

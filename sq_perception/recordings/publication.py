@@ -76,14 +76,14 @@ class Identified:
         if not recovery.bodies:
             return f"no bodies {took}" + (f": {recovery.message}" if recovery.message else "")
         parts = []
-        for one, number in zip(recovery.bodies, self.ids, strict=True):
-            if one.status == Status.FAILED:
-                parts.append(f"{number}: failed, {one.message}")
+        for body, number in zip(recovery.bodies, self.ids, strict=True):
+            if body.status == Status.FAILED:
+                parts.append(f"{number}: failed, {body.message}")
                 continue
-            size, shape = one.superquadric.size, one.superquadric.shape
+            size, shape = body.superquadric.size, body.superquadric.shape
             parts.append(
                 f"{number}: a = {size[0]:.4f} {size[1]:.4f} {size[2]:.4f}, e = {shape[0]:.2f} {shape[1]:.2f}, "
-                f"score {one.score:.2f}"
+                f"score {body.score:.2f}"
             )
         count = len(recovery.bodies)
         return f"{count} {'body' if count == 1 else 'bodies'} {took}; " + "; ".join(parts)
@@ -97,18 +97,20 @@ def identified(
     Without tracks bodies are the frame's, and ids their labels.
     """
     if tracks is None:
-        reasons = tuple(_reason(one.fit, one.superquadric) for one in recovery.bodies)
-        return Identified(recovery, tuple(one.label for one in recovery.bodies), reasons=reasons)
+        reasons = tuple(_reason(body.fit, body.superquadric) for body in recovery.bodies)
+        return Identified(recovery, tuple(body.label for body in recovery.bodies), reasons=reasons)
     left = iter(tracks)
     bodies, known = [], []
-    for one in recovery.bodies:
-        if one.status == Status.FAILED:
-            bodies.append(one)
-            known.append((FIRST_FAILED_ID + one.label, 0, False, 0))
+    for body in recovery.bodies:
+        if body.status == Status.FAILED:
+            bodies.append(body)
+            known.append((FIRST_FAILED_ID + body.label, 0, False, 0))
             continue
         track = next(left)
-        bodies.append(replace(one, fit=replace(one.fit, superquadric=track.superquadric, covariance=track.covariance)))
-        known.append((track.id, track.seen, track.is_fused, _reason(one.fit, track.superquadric)))
+        bodies.append(
+            replace(body, fit=replace(body.fit, superquadric=track.superquadric, covariance=track.covariance))
+        )
+        known.append((track.id, track.seen, track.is_fused, _reason(body.fit, track.superquadric)))
     ids, seen, fused, reasons = zip(*known, strict=True) if known else ((), (), (), ())
     return Identified(replace(recovery, bodies=tuple(bodies)), ids, hidden, seen, fused, reasons)
 
@@ -119,8 +121,8 @@ def _reason(fit: Fit, shown: Superquadric) -> int:
     if fit.status == Status.WEAK:
         partner = np.abs(shown.rotation_matrix.T @ fit.superquadric.rotation_matrix).argmax(axis=1)
         is_open = undetermined(fit.covariance, fit.superquadric.size)[partner]
-        for one in np.array([Reason.OPEN_X, Reason.OPEN_Y, Reason.OPEN_Z])[is_open]:
-            reason |= one
+        for axis in np.array([Reason.OPEN_X, Reason.OPEN_Y, Reason.OPEN_Z])[is_open]:
+            reason |= axis
     return int(reason)
 
 
@@ -155,8 +157,8 @@ class Findings:
         """Surface of each body that did not fail, in the body's own frame; made when it is first asked for."""
         shown = self.array.recovered
         return tuple(
-            triangles(Superquadric.at_origin(*one), MARKER_RESOLUTION)
-            for one in zip(shown.size, shown.shape, strict=True)
+            triangles(Superquadric.at_origin(*form), MARKER_RESOLUTION)
+            for form in zip(shown.size, shown.shape, strict=True)
         )
 
     def moved(self, frame_id: str, rotation: np.ndarray, translation: np.ndarray) -> Findings:
@@ -195,7 +197,7 @@ def findings(found: Identified, header: Any, is_cube: bool) -> Findings:
     """What a frame showed, in the frame of its image, whose header it is."""
     recovery = found.recovery
     array = superquadric_array(found, is_cube)
-    covariances = np.array([one.covariance[_CENTRE_AND_TURN, _CENTRE_AND_TURN] for one in recovery.bodies])
+    covariances = np.array([body.covariance[_CENTRE_AND_TURN, _CENTRE_AND_TURN] for body in recovery.bodies])
     change = np.zeros((len(array), 6, 6))
     change[:, :3, :3] = np.diag([1.0, -1.0, -1.0]) if is_cube else np.eye(3)
     change[:, 3:, 3:] = poses.matrices(poses.unit_quaternions(array.rotation))
@@ -207,11 +209,11 @@ def superquadric_array(found: Identified, is_cube: bool) -> SuperquadricArray:
     recovery = found.recovery
     if not recovery.bodies:
         return SuperquadricArray.empty()
-    bodies = Superquadric.stack([one.superquadric for one in recovery.bodies])
+    bodies = Superquadric.stack([body.superquadric for body in recovery.bodies])
     if is_cube:
         bodies = unit_cube.cube_from_optical(bodies)
-    covariances = np.stack([one.covariance for one in recovery.bodies])
-    turns = np.stack([one.superquadric.rotation_matrix for one in recovery.bodies])
+    covariances = np.stack([body.covariance for body in recovery.bodies])
+    turns = np.stack([body.superquadric.rotation_matrix for body in recovery.bodies])
     centres = np.swapaxes(turns, 1, 2) @ covariances[:, _CENTRE, _CENTRE] @ turns
     deviations = np.sqrt(np.einsum("nii->ni", covariances))
     return SuperquadricArray(
@@ -219,12 +221,12 @@ def superquadric_array(found: Identified, is_cube: bool) -> SuperquadricArray:
         shape=bodies.shape,
         translation=bodies.translation,
         rotation=bodies.rotation,
-        score=np.array([one.score for one in recovery.bodies]),
-        residual=np.array([one.residual for one in recovery.bodies]),
-        sigma_size=np.stack([one.sigma_size for one in recovery.bodies]),
+        score=np.array([body.score for body in recovery.bodies]),
+        residual=np.array([body.residual for body in recovery.bodies]),
+        sigma_size=np.stack([body.sigma_size for body in recovery.bodies]),
         id=np.array(found.ids, dtype=np.uint32),
-        status=np.array([one.status for one in recovery.bodies], dtype=np.uint32),
-        label=np.array([one.label for one in recovery.bodies], dtype=np.uint32),
+        status=np.array([body.status for body in recovery.bodies], dtype=np.uint32),
+        label=np.array([body.label for body in recovery.bodies], dtype=np.uint32),
         seen=np.array(found.seen, dtype=np.uint32) if found.seen else None,
         fused=np.array(found.fused, dtype=np.uint32) if found.fused else None,
         reason=np.array(found.reasons, dtype=np.uint32) if found.reasons else None,

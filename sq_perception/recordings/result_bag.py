@@ -82,7 +82,7 @@ class ResultBag:
     """
 
     def __init__(self, path: str | Path, images: Sequence[BagImage] = ("depth",)) -> None:
-        unknown = [one for one in images if one not in get_args(BagImage)]
+        unknown = [image for image in images if image not in get_args(BagImage)]
         if unknown:
             raise ValueError(f"images: expected {', '.join(get_args(BagImage))}, got {', '.join(unknown)}")
         self._path = Path(path)
@@ -129,7 +129,9 @@ class ResultBag:
         received = frame.received if frame.received is not None else stamp.sec * _SECOND + stamp.nanosec
         shown = publication.findings(found, self._header(frame, stamp), frame.is_cube)
         messages = self._messages(frame, found, shown)
-        group = [(self._channel(topic, one.__msgtype__), bag_messages.as_cdr(one)) for topic, one in messages]
+        group = [
+            (self._channel(topic, message.__msgtype__), bag_messages.as_cdr(message)) for topic, message in messages
+        ]
         self._frames += 1
         self._shown_ids, self._last = shown.shown_ids, stamp
         try:

@@ -186,7 +186,7 @@ class Recovered:
 
     def add(self, entries: Sequence[Mapping[str, Any]]) -> None:
         """Elements of ``frames`` whose frames are done."""
-        self._left.update(_key(one["file"], one.get("topic"), one.get("stamp")) for one in entries)
+        self._left.update(_key(entry["file"], entry.get("topic"), entry.get("stamp")) for entry in entries)
 
     def __call__(self, file: str, topic: str, stamp: Stamp | None) -> bool:
         """Whether this frame is one of them; it is then ticked off."""

@@ -83,10 +83,10 @@ class Views:
     def stack(cls, several: list[Views]) -> Views:
         """A batch (n, ...)."""
         return cls(
-            np.stack([one.direction for one in several]),
-            np.stack([one.bias for one in several]),
-            np.stack([one.correlation for one in several]),
-            np.stack([one.used for one in several]),
+            np.stack([views.direction for views in several]),
+            np.stack([views.bias for views in several]),
+            np.stack([views.correlation for views in several]),
+            np.stack([views.used for views in several]),
         )
 
     def __getitem__(self, index: int) -> Views:

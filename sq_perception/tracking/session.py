@@ -146,14 +146,14 @@ class TrackingSession:
             without_pose=self.tally.without_pose + (not is_pose_known),
         )
         self._stamp, self._pose = stamp, (rotation, position)
-        self.hidden = tuple(one.id for one in tracks if one.observation is None)
+        self.hidden = tuple(track.id for track in tracks if track.observation is None)
 
         is_world = not position.any() and not rotation[:3].any()
         back = quaternions.conjugate(rotation)
         matrix = quaternions.to_matrix(back)
-        by_index = {one.observation: one for one in tracks if one.observation is not None}
+        by_index = {track.observation: track for track in tracks if track.observation is not None}
         found = []
-        for index, one in enumerate(observed):
+        for index, observation in enumerate(observed):
             track = by_index[index]
             body, covariance = track.superquadric, track.covariance
             if not is_world:
@@ -161,22 +161,22 @@ class TrackingSession:
                 covariance = state.turned(covariance, matrix)
             is_fused = is_pose_known and track.follows
             if not is_fused:
-                body, covariance = _in_form_of(body, covariance, one)
-            elif not np.isfinite(one.covariance).all():
+                body, covariance = _in_form_of(body, covariance, observation)
+            elif not np.isfinite(observation.covariance).all():
                 covariance = np.full((LENGTH, LENGTH), np.nan)
             found.append(Followed(track.id, track.seen, is_fused, body, covariance))
         return tuple(found)
 
 
-def _in_form_of(body: Superquadric, covariance: np.ndarray, one: Observed) -> tuple[Superquadric, np.ndarray]:
+def _in_form_of(body: Superquadric, covariance: np.ndarray, observation: Observed) -> tuple[Superquadric, np.ndarray]:
     """What was observed with the axes named as those of a body with this covariance, and its own covariance."""
-    own = np.asarray(one.covariance, dtype=float)
+    own = np.asarray(observation.covariance, dtype=float)
     known = np.isfinite(own).all()
-    size = one.superquadric.size
+    size = observation.superquadric.size
     found, changed = forms.named(
         body.to_flat(),
         state.to_log(covariance, body.size),
-        one.superquadric.to_flat(),
+        observation.superquadric.to_flat(),
         state.to_log(own if known else 0 * np.eye(LENGTH), size),
     )
     named = Superquadric.from_flat(found)

@@ -173,7 +173,7 @@ class Tracker:
             if j not in taken:
                 self._begin(j, observed[j], covariance[j], to_camera[j], stamp)
         self._miss(missing, stamp)
-        return tuple(_published(one) for one in self._bodies)
+        return tuple(_published(body) for body in self._bodies)
 
     def _in_world(
         self, recoveries: Sequence[Observed], rotation: np.ndarray, position: np.ndarray
@@ -181,13 +181,13 @@ class Tracker:
         """States (m, 12) and covariances (m, 11, 11) of what was observed."""
         if not len(recoveries):
             return np.zeros((0, 12)), np.zeros((0, LENGTH, LENGTH))
-        for one in recoveries:
-            if not isinstance(one.superquadric, Superquadric) or one.superquadric.batch_shape:
+        for body in recoveries:
+            if not isinstance(body.superquadric, Superquadric) or body.superquadric.batch_shape:
                 raise ValueError("recoveries: expected a single body in each")
-            if np.shape(one.covariance) != (LENGTH, LENGTH):
-                raise ValueError(f"covariance: expected shape (11, 11), got {np.shape(one.covariance)}")
-        flat = np.array([one.superquadric.to_flat() for one in recoveries], dtype=float)
-        covariance = state.to_log(np.array([one.covariance for one in recoveries], dtype=float), flat[:, 0:3])
+            if np.shape(body.covariance) != (LENGTH, LENGTH):
+                raise ValueError(f"covariance: expected shape (11, 11), got {np.shape(body.covariance)}")
+        flat = np.array([body.superquadric.to_flat() for body in recoveries], dtype=float)
+        covariance = state.to_log(np.array([body.covariance for body in recoveries], dtype=float), flat[:, 0:3])
         unknown = ~np.isfinite(covariance).all(axis=(1, 2))
         if unknown.any():
             log_size, shape, centre, turn = UNKNOWN
@@ -200,20 +200,20 @@ class Tracker:
 
     def _predict(self, stamp: float) -> None:
         elapsed = 0.0 if self._stamp is None else stamp - self._stamp
-        for one in self._bodies:
+        for body in self._bodies:
             variance = np.diag(DRIFT) * elapsed
-            if stamp - one.last > _COASTING:
-                one.velocity = np.zeros(3)
-            if one.is_moving:
-                step = one.velocity * elapsed
-                one.state = one.state.copy()
-                one.state[5:8] += step
+            if stamp - body.last > _COASTING:
+                body.velocity = np.zeros(3)
+            if body.is_moving:
+                step = body.velocity * elapsed
+                body.state = body.state.copy()
+                body.state[5:8] += step
                 variance[CENTRE] += _MOTION_SHARE**2 * (step @ step)
                 variance[TURN] += _MOVING_TURN**2 * min(elapsed, 1.0)
-            if stamp - one.last > FORGET_POSE_AFTER:
+            if stamp - body.last > FORGET_POSE_AFTER:
                 variance[POSE] += _UNPLACED**2
-            one.covariance = one.covariance + np.diag(variance)
-            one.observation = None
+            body.covariance = body.covariance + np.diag(variance)
+            body.observation = None
 
     def _pairs(
         self,
@@ -250,13 +250,13 @@ class Tracker:
         """The pairs that are to be fused.  A moving body's pose is not what was fused before, even in an old answer."""
         new = np.ones(len(pairs.track), dtype=bool)
         for k, (track, index) in enumerate(zip(pairs.track, pairs.observed, strict=True)):
-            one = self._bodies[track]
-            if recoveries[index].repeats == 0 or one.is_moving:
+            body = self._bodies[track]
+            if recoveries[index].repeats == 0 or body.is_moving:
                 continue
             new[k] = False
-            one.seen, one.missed, one.last, one.observation = one.seen + 1, 0, stamp, int(index)
-            if one.follows:
-                one.agreed = stamp
+            body.seen, body.missed, body.last, body.observation = body.seen + 1, 0, stamp, int(index)
+            if body.follows:
+                body.agreed = stamp
         return Pairs(*(part[new] for part in pairs))
 
     def _fuse(self, pairs: Pairs, to_camera: np.ndarray, stamp: float) -> None:
@@ -314,19 +314,19 @@ class Tracker:
             insists = body.disagreed >= PATIENCE and not strays.fits[k]
             body.follows = not (strays.slid[k] or strays.turned[k] or insists)
 
-    def _follow(self, one: _Body, error: np.ndarray, slid: bool, stamp: float, covariance: np.ndarray) -> None:
+    def _follow(self, body: _Body, error: np.ndarray, slid: bool, stamp: float, covariance: np.ndarray) -> None:
         """The velocity after an observation of the centre, ``error`` (3,) off its prediction."""
-        elapsed = stamp - one.agreed
+        elapsed = stamp - body.agreed
         if elapsed <= 0:
             return
-        if one.is_moving:
-            velocity = one.velocity + 0.5 * error / elapsed
+        if body.is_moving:
+            velocity = body.velocity + 0.5 * error / elapsed
             noise = float(np.sqrt(np.trace(covariance)))
-            still = max(STILL_SHARE * float(one.state[0:3].mean()), 0.5 * noise)
-            one.velocity = velocity if np.linalg.norm(velocity) * elapsed > still else np.zeros(3)
-        elif slid and one.jumps != 1:
+            still = max(STILL_SHARE * float(body.state[0:3].mean()), 0.5 * noise)
+            body.velocity = velocity if np.linalg.norm(velocity) * elapsed > still else np.zeros(3)
+        elif slid and body.jumps != 1:
             velocity = error / elapsed
-            one.velocity = velocity * min(1.0, FASTEST / float(np.linalg.norm(velocity)))
+            body.velocity = velocity * min(1.0, FASTEST / float(np.linalg.norm(velocity)))
 
     def _begin(self, index: int, observed: np.ndarray, covariance: np.ndarray, view: np.ndarray, stamp: float) -> None:
         whole, views = (1 - LASTING_SHARE) * covariance + LEAST, Views.none()
@@ -343,46 +343,46 @@ class Tracker:
         """Count misses of what should have been seen, and bury the dead."""
         dead = set()
         ousted = self._ousted()
-        for one in self._bodies:
-            if one.observation is not None:
+        for body in self._bodies:
+            if body.observation is not None:
                 continue
-            one.missed = one.missed + 1 if one.id in missing | ousted else 0
-            patience = MISSES if one.seen >= CONFIRM_AFTER else 1 if one.id in ousted else 2
-            if one.missed >= patience or stamp - one.last > FORGET_AFTER:
-                dead.add(one.id)
-        left = [one for one in self._bodies if one.id not in dead]
+            body.missed = body.missed + 1 if body.id in missing | ousted else 0
+            patience = MISSES if body.seen >= CONFIRM_AFTER else 1 if body.id in ousted else 2
+            if body.missed >= patience or stamp - body.last > FORGET_AFTER:
+                dead.add(body.id)
+        left = [body for body in self._bodies if body.id not in dead]
         if len(left) > MOST:
-            unseen = sorted((one for one in left if one.observation is None), key=lambda one: one.last)
-            dead |= {one.id for one in unseen[: len(left) - MOST]}
-        self._bodies = [one for one in self._bodies if one.id not in dead]
+            unseen = sorted((body for body in left if body.observation is None), key=lambda body: body.last)
+            dead |= {body.id for body in unseen[: len(left) - MOST]}
+        self._bodies = [body for body in self._bodies if body.id not in dead]
 
     def _ousted(self) -> set[int]:
         """Ids of bodies that were not observed and whose place another one takes that was."""
-        if all(one.observation is not None for one in self._bodies):
+        if all(body.observation is not None for body in self._bodies):
             return set()
-        seen = np.array([one.observation is not None for one in self._bodies])
+        seen = np.array([body.observation is not None for body in self._bodies])
         overlap = association.twins(self._stacked(self._bodies)[0])
         ousted = ~seen & ((overlap | overlap.T) & seen).any(axis=1)
         return {self._bodies[k].id for k in np.flatnonzero(ousted)}
 
     @staticmethod
     def _stacked(some: list[_Body]) -> tuple[np.ndarray, np.ndarray]:
-        return np.array([one.state for one in some]), np.array([one.covariance for one in some])
+        return np.array([body.state for body in some]), np.array([body.covariance for body in some])
 
 
-def _published(one: _Body) -> Track:
-    covariance = state.from_log(one.covariance + one.lasting @ one.lasting.T, one.state[0:3])
-    known = TrackState.CONFIRMED if one.seen >= CONFIRM_AFTER else TrackState.TENTATIVE
+def _published(body: _Body) -> Track:
+    covariance = state.from_log(body.covariance + body.lasting @ body.lasting.T, body.state[0:3])
+    known = TrackState.CONFIRMED if body.seen >= CONFIRM_AFTER else TrackState.TENTATIVE
     return Track(
-        id=one.id,
-        superquadric=Superquadric.from_flat(one.state.copy()),
+        id=body.id,
+        superquadric=Superquadric.from_flat(body.state.copy()),
         sigma_size=np.sqrt(np.diag(covariance)[0:3]),
         covariance=covariance,
-        velocity=one.velocity.copy(),
-        seen=one.seen,
-        state=known if one.observation is not None else TrackState.LOST,
-        observation=one.observation,
-        follows=one.follows and one.observation is not None,
+        velocity=body.velocity.copy(),
+        seen=body.seen,
+        state=known if body.observation is not None else TrackState.LOST,
+        observation=body.observation,
+        follows=body.follows and body.observation is not None,
     )
 
 

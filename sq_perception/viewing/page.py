@@ -180,25 +180,25 @@ class Page:
     def show_controls(self, node: str, controls: Sequence[Control]) -> None:
         """Replace the controls of a node; where only values differ, only these."""
         part = self._nodes[node]
-        if [replace(one, value=None) for one in controls] == [
-            replace(one, value=None) for one in part.controls.values()
+        if [replace(control, value=None) for control in controls] == [
+            replace(control, value=None) for control in part.controls.values()
         ]:
-            self.show_values(node, {one.name: one.value for one in controls})
+            self.show_values(node, {control.name: control.value for control in controls})
             return
         for folder in part.folders:
             folder.remove()
-        part.folders, part.handles, part.controls = [], {}, {one.name: one for one in controls}
+        part.folders, part.handles, part.controls = [], {}, {control.name: control for control in controls}
         part.pending.clear()
         for group, title in GROUPS.items():
-            members = [one for one in controls if one.group == group]
+            members = [control for control in controls if control.group == group]
             if not members:
                 continue
             with part.tab:
                 folder = self.server.gui.add_folder(title, expand_by_default=group == "live")
             part.folders.append(folder)
             with folder:
-                for one in members:
-                    part.handles[one.name] = self._add_control(part, one)
+                for control in members:
+                    part.handles[control.name] = self._add_control(part, control)
 
     def show_values(self, node: str, values: Mapping[str, Any]) -> None:
         """Put the node's values into its controls; unknown names are left aside."""

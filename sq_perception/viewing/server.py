@@ -81,10 +81,10 @@ def listening_socket(host: str, port: int | None) -> socket.socket:
     """
     tried = range(PORT, PORT + PORTS_TRIED) if port is None else (port,)
     last: OSError | None = None
-    for one in tried:
+    for number in tried:
         try:
             family, kind, protocol, _, address = socket.getaddrinfo(
-                host, one, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
+                host, number, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
             )[0]
         except (OSError, OverflowError, UnicodeError) as error:
             raise ServerError(f"--host: expected an address of this machine, got {host!r} ({error})") from error

@@ -84,7 +84,7 @@ def bodies_table(name: str, bodies: Bodies | None, stamp: float, state: NodeStat
     unit = "thousandths of the cube" if is_cube else "mm"
     failed = ""
     if bodies.failed:
-        shown = ", ".join(str(one) for one in bodies.failed[:_MOST_FAILED])
+        shown = ", ".join(str(number) for number in bodies.failed[:_MOST_FAILED])
         more = f" and {len(bodies.failed) - _MOST_FAILED} more" if len(bodies.failed) > _MOST_FAILED else ""
         failed = f'<div style="color:{_BAD};padding:3px 5px">no fit: {shown}{more}</div>'
     table = f'<table style="{_TABLE}"><thead><tr>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table>'
