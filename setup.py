@@ -9,7 +9,7 @@ from setuptools import setup
 NAME = "sq_perception"
 NODES = ("recover_node", "recover_cameras", "fitter_node", "grasp_node", "synthetic_depth_node")
 
-ROOMS = (
+SUBPACKAGES = (
     "geometry",
     "files",
     "imaging",
@@ -76,7 +76,7 @@ setup(
     python_requires=">=3.10",
     packages=[
         "sq_perception",
-        *(f"sq_perception.{room}" for room in ROOMS),
+        *(f"sq_perception.{name}" for name in SUBPACKAGES),
         "sq_perception.config",
         "sq_perception.weights",
         "sq_msgs_py",

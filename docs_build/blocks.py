@@ -3,7 +3,7 @@
     python docs_build/blocks.py     rewrites them in README.md and docs/
 
 A document holds such a part between two lines, ``<!-- made by docs_build/blocks.py: NAME -->`` and ``<!-- end -->``.
-Figures come from benchmarks/results/*.json and from the header of the weights, the packages from ``FLOORS`` of
+Figures come from benchmarks/results/*.json and from the header of the weights, the packages from ``LAYERS`` of
 test/package/test_imports.py and from their docstrings.  A test compares.
 """
 
@@ -227,19 +227,19 @@ def tracks() -> str:
 # The packages
 
 
-def floors() -> tuple[tuple[str, ...], ...]:
-    """``FLOORS`` of test/package/test_imports.py, from the ground up."""
+def package_layers() -> tuple[tuple[str, ...], ...]:
+    """``LAYERS`` of test/package/test_imports.py, from the lowest up."""
     tree = ast.parse((ROOT / "test" / "package" / "test_imports.py").read_text(encoding="utf-8"))
     for node in tree.body:
-        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "FLOORS":
+        if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "LAYERS":
             value: tuple[tuple[str, ...], ...] = ast.literal_eval(node.value)
             return value
-    raise LookupError("test/package/test_imports.py has no FLOORS")
+    raise LookupError("test/package/test_imports.py has no LAYERS")
 
 
 def layers() -> str:
-    """A drawing of the floors, the highest first; modules import from their own floor and from those below."""
-    rows = ["   ".join(rooms) for rooms in reversed(floors())]
+    """A drawing of the layers, the highest first; modules import from their own layer and from those below."""
+    rows = ["   ".join(layer) for layer in reversed(package_layers())]
     inner = max(map(len, rows))
     line = f"+{'-' * (inner + 2)}+"
     return "\n".join(["```text", line, *(f"| {row.center(inner)} |\n{line}" for row in rows), "```"])
@@ -251,25 +251,25 @@ def packages() -> str:
         ["package", "holds"],
         [
             [f"[`{name}/`](../sq_perception/{name}/__init__.py)", purpose(name)]
-            for floor in reversed(floors())
-            for name in floor
+            for layer in reversed(package_layers())
+            for name in layer
         ],
     )
 
 
-def purpose(room: str) -> str:
+def purpose(package: str) -> str:
     """The beginning of a package's docstring, up to a colon or the end of the sentence."""
-    docstring = ast.get_docstring(ast.parse((PACKAGE / room / "__init__.py").read_text(encoding="utf-8"))) or ""
+    docstring = ast.get_docstring(ast.parse((PACKAGE / package / "__init__.py").read_text(encoding="utf-8"))) or ""
     return re.split(r"[:.]\s|[:.]$", " ".join(docstring.split()), maxsplit=1)[0]
 
 
 @cache
-def imported(room: str) -> frozenset[str]:
+def imported(package: str) -> frozenset[str]:
     """Other packages that modules of one import, wherever in them."""
-    return frozenset({there for path in (PACKAGE / room).rglob("*.py") for there in _rooms_of(path)}) - {room}
+    return frozenset({there for path in (PACKAGE / package).rglob("*.py") for there in _packages_of(path)}) - {package}
 
 
-def _rooms_of(path: Path) -> Iterator[str]:
+def _packages_of(path: Path) -> Iterator[str]:
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         names: list[str] = []
         if isinstance(node, ast.Import):
@@ -277,8 +277,8 @@ def _rooms_of(path: Path) -> Iterator[str]:
         elif isinstance(node, ast.ImportFrom):
             names = [f"{node.module}.{alias.name}" for alias in node.names]
         for name in names:
-            package, _, rest = name.partition(".")
-            if package == "sq_perception" and (PACKAGE / rest.partition(".")[0]).is_dir():
+            root, _, rest = name.partition(".")
+            if root == "sq_perception" and (PACKAGE / rest.partition(".")[0]).is_dir():
                 yield rest.partition(".")[0]
 
 

@@ -45,7 +45,7 @@ def test_links_lead_somewhere_in_a_checkout(repository: Path) -> None:
     assert not broken
 
 
-def test_figures_and_the_house_are_what_was_measured(repository: Path) -> None:
+def test_figures_and_layers_are_what_was_measured(repository: Path) -> None:
     """Blocks between markers equal what docs_build/blocks.py makes of results, floors and imports."""
     path = repository / "docs_build" / "blocks.py"
     spec = importlib.util.spec_from_file_location("blocks", path)
@@ -59,9 +59,9 @@ def test_figures_and_the_house_are_what_was_measured(repository: Path) -> None:
     used = {name for text in texts.values() for name in re.findall(r"docs_build/blocks\.py: (\w+)", text)}
     assert used == set(blocks.BLOCKS)
     below: set[str] = set()
-    for rooms in blocks.floors():
-        below.update(rooms)
-        assert all(blocks.imported(room) <= below for room in rooms), rooms
+    for packages in blocks.package_layers():
+        below.update(packages)
+        assert all(blocks.imported(package) <= below for package in packages), packages
 
 
 def test_the_workflow_pins_what_it_runs_and_may_only_read(repository: Path) -> None:

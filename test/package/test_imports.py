@@ -17,8 +17,8 @@ PERCEPTION = Path(sq_perception.__file__).parent
 MESSAGES = Path(sq_msgs_py.__file__).parent
 PACKAGES = (PERCEPTION, MESSAGES)
 
-# Floor by floor, from the ground up; a module may import from its own floor and from those below it.
-FLOORS = (
+# From the lowest up; a module may import from its own layer and from those below it.
+LAYERS = (
     ("geometry", "files"),
     ("imaging", "tracking"),
     ("segmentation", "simulation"),
@@ -67,7 +67,7 @@ def is_node(path: Path) -> bool:
     return (PERCEPTION / "nodes") in path.parents
 
 
-def room(name: str) -> str:
+def subpackage(name: str) -> str:
     """The module or subpackage of sq_perception that a dotted name leads into; '' for the package itself."""
     parts = name.split(".")
     if parts[0] != "sq_perception" or len(parts) == 1:
@@ -75,14 +75,14 @@ def room(name: str) -> str:
     return parts[1]
 
 
-def floor(name: str) -> int:
-    (level,) = (k for k, names in enumerate(FLOORS) if name in names)
+def layer(name: str) -> int:
+    (level,) = (k for k, names in enumerate(LAYERS) if name in names)
     return level
 
 
-def test_every_room_has_its_floor() -> None:
-    rooms = {path.stem for path in PERCEPTION.glob("*.py")} | {path.parent.name for path in PERCEPTION.glob("*/*.py")}
-    assert rooms - {"__init__", "__main__", "__pycache__"} <= {name for names in FLOORS for name in names}
+def test_every_subpackage_has_its_layer() -> None:
+    found = {path.stem for path in PERCEPTION.glob("*.py")} | {path.parent.name for path in PERCEPTION.glob("*/*.py")}
+    assert found - {"__init__", "__main__", "__pycache__"} <= {name for names in LAYERS for name in names}
 
 
 @pytest.mark.parametrize("path", sorted(PERCEPTION.rglob("*.py")), ids=lambda path: str(path.relative_to(PERCEPTION)))
@@ -91,9 +91,9 @@ def test_imports_run_one_way(path: Path) -> None:
     if here in ("__init__", "__main__"):
         return
     for name, _ in imports(path):
-        there = room(name)
-        if there and any(there in names for names in FLOORS):
-            assert floor(there) <= floor(here), f"{path.relative_to(PERCEPTION)} imports {name}"
+        there = subpackage(name)
+        if there and any(there in names for names in LAYERS):
+            assert layer(there) <= layer(here), f"{path.relative_to(PERCEPTION)} imports {name}"
 
 
 def test_only_nodes_know_ros() -> None:
@@ -132,7 +132,9 @@ def test_messages_that_a_robot_may_lack_are_imported_when_they_are_made() -> Non
 
 
 def test_only_the_commands_that_run_nodes_import_them() -> None:
-    importing = {path for path in PERCEPTION.rglob("*.py") if any(room(name) == "nodes" for name, _ in imports(path))}
+    importing = {
+        path for path in PERCEPTION.rglob("*.py") if any(subpackage(name) == "nodes" for name, _ in imports(path))
+    }
     here = {path for path in importing if not is_node(path)}
     assert here == {PERCEPTION / "commands" / name for name in ("demonstration.py", "view.py")}
 
