@@ -38,6 +38,9 @@ PALETTE = np.array(
 )
 """Colours that bodies take in turn, by id: those of sq_perception.geometry.mesh, where their choice is explained."""
 
+ALPHA = 0.7
+"""Opacity of surfaces unless given."""
+
 
 def markers(
     meshes: Sequence[Mesh],
@@ -46,7 +49,7 @@ def markers(
     *,
     colours: np.ndarray | None = None,
     outline_colour: Sequence[float] = (0.05, 0.05, 0.05, 1.0),
-    alpha: float = 0.7,
+    alpha: float = ALPHA,
     line_width: float = 0.002,
     namespace: str = "superquadrics",
     previous_ids: Iterable[int] = (),

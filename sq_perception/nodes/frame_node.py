@@ -48,6 +48,8 @@ _OLDEST = 3600.0
 """Seconds; the age of an older frame, or one from the future, is no latency: it is of a bag, or another clock."""
 _DEFECTS = 10
 """Frames in a row that end in a defect of ours or of the device, after which the node starts anew."""
+TRIGGER_TIMEOUT = 5.0
+"""Seconds without a frame after which ~/trigger and ~/recover fail: five periods of the slowest camera in use."""
 _STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 """For timers: simulated time may stand still, and the node still has to report it."""
 
@@ -293,16 +295,15 @@ class FrameNode(ManagedNode):
         source = self._input
         if source is None:
             return Outcome(False, f"the node is {self.state}, not active")
-        timeout = self._settings.current.trigger_timeout
         caller = Future(executor=self.executor)
         self._triggers[caller] = monotonic()
         # In a group of its own: rclpy's remember for good what was destroyed.
         alone = ReentrantCallbackGroup()
-        late = self.create_timer(timeout, caller.cancel, callback_group=alone, clock=_STEADY)
+        late = self.create_timer(TRIGGER_TIMEOUT, caller.cancel, callback_group=alone, clock=_STEADY)
         outcome: Outcome | None = await caller
         self.destroy_timer(late)
         del self._triggers[caller]
-        return outcome or Outcome(False, f"no frame on {source.topic} within {timeout:g} s: {source.heard}")
+        return outcome or Outcome(False, f"no frame on {source.topic} within {TRIGGER_TIMEOUT:g} s: {source.heard}")
 
     def _on_second(self) -> None:
         source, parameters = self._input, self._settings.current

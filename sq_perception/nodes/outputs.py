@@ -115,7 +115,6 @@ class Outputs:
                             before,
                             parameters.marker_colours == "score",
                             alpha=parameters.marker_alpha,
-                            line_width=parameters.marker_line_width,
                         )
                     )
                     self._shown = findings

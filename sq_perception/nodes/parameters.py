@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import Literal, cast, get_args
 
 from sq_msgs_py.depth_image import DEPTH_ENCODINGS, GREY_ENCODINGS
+from sq_msgs_py.markers import ALPHA
 from sq_perception.grasping.gripper import GRIPPERS
 from sq_perception.grasping.planner import FRICTION, PLACEMENT
 from sq_perception.imaging import compressed_depth
@@ -99,13 +100,9 @@ class RecoverParameters(Parameters):
         "tracks.",
     )
     marker_colours: str = setting("id", "By id, or by score from red (0) to green (1).", choices=("id", "score"))
-    marker_alpha: float = setting(0.7, "Opacity of the markers' surfaces.", within=(0.0, 1.0))
-    marker_line_width: float = setting(0.002, "Width of the markers' outlines.", unit="m", within=(0.0001, 0.1))
+    marker_alpha: float = setting(ALPHA, "Opacity of the markers' surfaces.", within=(0.0, 1.0))
     no_frame_warning: float = setting(
         5.0, "Warn when no depth image came for so long; 0 never warns.", unit="s", within=(0.0, 3600.0)
-    )
-    trigger_timeout: float = setting(
-        5.0, "~/trigger and ~/recover fail when no frame came for so long.", unit="s", within=(0.1, 60.0)
     )
     target_frame: str = setting(
         "",
@@ -216,7 +213,6 @@ class SyntheticParameters(Parameters):
     scenes: int = setting(0, "Scenes before the end or the next round; 0: endless.", within=(0, 10**6), live=False)
     loop: bool = setting(True, "Begin again after the last scene or recording; otherwise publish no more.", live=False)
     objects: int = setting(3, "Bodies on the table.", within=(1, 10), live=False)
-    pixels: int = setting(256, "Width and height of the thesis' images.", unit="pixels", within=(16, 1024), live=False)
     encoding: str = setting(
         "auto",
         "auto: mono8 for orthographic frames, 32FC1 for others.",

@@ -64,7 +64,6 @@ def frame_source(parameters: SyntheticParameters) -> FrameSource:
             parameters.scene,
             parameters.seed,
             objects=parameters.objects,
-            pixels=parameters.pixels,
             calibration=calibration,
             with_labels=parameters.masks == "always",
         )

@@ -91,16 +91,15 @@ def generated(
     seed: int,
     *,
     objects: int,
-    pixels: int,
     calibration: Calibration | None,
     with_labels: bool,
 ) -> Maker:
-    """Random scenes: a thesis' image of ``pixels``, or ``objects`` on a table before the camera of ``calibration``."""
+    """Random scenes: a thesis' image, or ``objects`` on a table before the camera of ``calibration``."""
 
     def make(position: int) -> SourceFrame:
         rng = np.random.default_rng([seed, _SCENES, position])
         if scene == "thesis":
-            made = thesis_scene(rng, pixels)
+            made = thesis_scene(rng)
             truth, distorting = unit_cube.cube_from_optical(made.bodies), None
         else:
             options = {} if calibration is None else {"camera": calibration.camera}

@@ -18,7 +18,7 @@ import numpy as np
 
 from sq_msgs_py import poses
 from sq_msgs_py.depth_image import depth_from_message, depth_to_message, grey_from_message, grey_to_message
-from sq_msgs_py.markers import markers
+from sq_msgs_py.markers import ALPHA, markers
 from sq_msgs_py.message_types import MessageTypes, installed
 from sq_msgs_py.superquadrics import CONVERGED, FAILED, WEAK, Reason, SuperquadricArray
 from sq_perception.fitting.covariance import undetermined
@@ -171,11 +171,15 @@ class Findings:
         )
 
     def markers(
-        self, previous_ids: Iterable[int] = (), by_score: bool = False, types: MessageTypes = installed, **look: Any
+        self,
+        previous_ids: Iterable[int] = (),
+        by_score: bool = False,
+        alpha: float = ALPHA,
+        types: MessageTypes = installed,
     ) -> Any:
         """A MarkerArray of the bodies that did not fail; markers of ``previous_ids`` that are gone are deleted.
 
-        Colours are by id, or by score from red (0) to green (1); ``look`` as of :func:`sq_msgs_py.markers.markers`.
+        Colours are by id, or by score from red (0) to green (1); ``alpha`` is their opacity.
         """
         shown = self.array.recovered
         turns = poses.matrices(poses.unit_quaternions(shown.rotation))
@@ -189,7 +193,7 @@ class Findings:
             share = np.clip(np.nan_to_num(shown.score), 0, 1)[:, None]
             colours = (1 - share) * _WORST + share * _BEST
         return markers(
-            surfaces, self.shown_ids, self.header, colours=colours, previous_ids=previous_ids, types=types, **look
+            surfaces, self.shown_ids, self.header, colours=colours, alpha=alpha, previous_ids=previous_ids, types=types
         )
 
 

@@ -85,9 +85,9 @@ def thesis_bodies(count: int, rng: np.random.Generator) -> Superquadric:
     )
 
 
-def thesis_scene(rng: np.random.Generator, pixels: int = unit_cube.THESIS_PIXELS) -> Scene:
+def thesis_scene(rng: np.random.Generator) -> Scene:
     """One random body of the thesis' protocol before the camera of the unit cube."""
-    return Scene(unit_cube.optical_from_cube(thesis_bodies(1, rng)), unit_cube.camera(pixels), None)
+    return Scene(unit_cube.optical_from_cube(thesis_bodies(1, rng)), unit_cube.camera(unit_cube.THESIS_PIXELS), None)
 
 
 def table_scene(rng: np.random.Generator, count: int = 3, camera: Camera = TABLE_CAMERA) -> Scene:

@@ -33,7 +33,7 @@ from sq_msgs_py.superquadrics import MessageError
 from sq_perception.fitting.fit import Status
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
-from sq_perception.nodes import fast_dds
+from sq_perception.nodes import fast_dds, frame_node
 from sq_perception.nodes.frame import stamp_of
 
 
@@ -290,8 +290,9 @@ def test_who_asks_once_gets_the_bodies_of_the_next_image(bench):
         from_response(refused.result())
 
 
-def test_a_trigger_without_a_frame_answers_in_time_and_nothing_else_waits(make_bench):
-    bench = make_bench("-p", "trigger_timeout:=1.0")
+def test_a_trigger_without_a_frame_answers_in_time_and_nothing_else_waits(make_bench, monkeypatch):
+    monkeypatch.setattr(frame_node, "TRIGGER_TIMEOUT", 1.0)
+    bench = make_bench()
     bench.send_info()
     client = bench.peer.create_client(Trigger, "/recover_node/trigger")
     bench.until(client.service_is_ready)
@@ -319,10 +320,11 @@ def test_after_disable_nothing_is_published_any_more(bench):
     assert len(bench.answers) == 1
 
 
-def test_a_clock_that_stands_still_stops_neither_diagnostics_nor_triggers(make_bench):
+def test_a_clock_that_stands_still_stops_neither_diagnostics_nor_triggers(make_bench, monkeypatch):
     from diagnostic_msgs.msg import DiagnosticArray
 
-    bench = make_bench("-p", "use_sim_time:=true", "-p", "trigger_timeout:=0.5")
+    monkeypatch.setattr(frame_node, "TRIGGER_TIMEOUT", 0.5)
+    bench = make_bench("-p", "use_sim_time:=true")
     reports: list[DiagnosticArray] = []
     bench.peer.create_subscription(DiagnosticArray, "/diagnostics", reports.append, 5)
     answer = bench.call(Trigger, "/recover_node/trigger", Trigger.Request())

@@ -81,12 +81,12 @@ def test_scenes_end_or_begin_again():
 
 
 def test_the_truth_of_thesis_scenes_is_in_the_cube_frame():
-    frame = frame_source(SyntheticParameters(scene="thesis", masks="always", pixels=128)).next(0.0)
+    frame = frame_source(SyntheticParameters(scene="thesis", masks="always")).next(0.0)
     assert frame.is_cube
-    assert frame.camera == unit_cube.camera(128)
-    u, v = unit_cube.camera(128).project(unit_cube.optical_from_cube(frame.truth).translation[0])
+    assert frame.camera == unit_cube.camera(256)
+    u, v = unit_cube.camera(256).project(unit_cube.optical_from_cube(frame.truth).translation[0])
     assert frame.labels[round(v), round(u)] == 1
-    assert frame.truth.translation[0, 1] == pytest.approx(1 - v / 127)
+    assert frame.truth.translation[0, 1] == pytest.approx(1 - v / 255)
 
 
 def test_a_folder_is_replayed_in_order(recordings):
