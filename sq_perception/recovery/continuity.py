@@ -19,7 +19,7 @@ whole if its objects do and nowhere does q change, or reading appear, over a pat
 
 Because readings are compared with those at the recovery, slow motion adds up until it is noticed.  And because the test
 may miss what lies below the noise, and a valley of the fit's cost may have been a wrong one, one body at a time is
-recovered anew when its turn comes, sooner where the view does not tell it whole.
+recovered anew when its turn comes, sooner where the view does not determine all of it.
 
 The camera has not moved: where it has, nothing repeats.  Optical frame, metres; pinhole cameras.
 

@@ -44,7 +44,7 @@ class RecoveryOptions:
     workspace_pose
         Quaternion x y z w and translation of the optical frame in the frame of the box; None: they are the same.
     free_space
-        Whether a pixel beside an object tells that there is nothing before what it measured; not so where the image was
+        Whether a pixel beside an object shows that there is nothing before what it measured; not so where the image was
         made of a cloud.  Without it things are fitted by the tolerant course.
     repair
         Join and split own segments where that describes the image more briefly; masks from outside stay as they are.

@@ -1,4 +1,4 @@
-"""What networks say of objects: asked about many views at once, beside other work or before it goes on."""
+"""What networks predict of objects: for many views at once, beside other work or before it goes on."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Answers: TypeAlias = Superquadric | HullPredictions
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """What a network says of one object; perhaps it is still being computed.
+    """What a network predicts of one object; perhaps it is still being computed.
 
     Attributes
     ----------
@@ -40,7 +40,7 @@ class Prediction:
         return self.view.from_canonical(bodies[self.number]).canonical_form()
 
     def hull(self) -> HullPrior | None:
-        """The predicted hull in the optical frame, if the network tells of hulls; waits for it."""
+        """The predicted hull in the optical frame, if the network predicts hulls; waits for it."""
         answers = self.answers.result()
         return answers.hull(self.number, self.view) if isinstance(answers, HullPredictions) else None
 

@@ -1,12 +1,12 @@
-"""How long a depth image is when told by superquadrics: what decides between one body and two.
+"""The description length of a depth image by superquadrics: what decides between one body and two.
 
 Equation
 --------
-The image is told as a list of bodies and what they leave over, in nats:
+The image is described as a list of bodies and what they leave over, in nats:
 
     L = sum_pixels a l  +  sum_bodies (11 / 2) ln n,        l = min(r^2 / 2, L_out),   r = (z - z_bodies) / sigma(z)
 
-with z_bodies the nearest surface along the pixel's ray.  L_out is what a pixel costs that is told by itself: one of the
+with z_bodies the nearest surface along the pixel's ray.  L_out is what a pixel costs that no body describes: one of the
 objects that no body reaches, one that saw something far from its body, and one beside the objects at which a body
 stands in front of what was measured.  A body behind what was measured is hidden there and costs nothing.
 
@@ -14,7 +14,7 @@ stands in front of what was measured.  A body behind what was measured is hidden
 
 is the noise and how far real objects stray from superquadrics.  Both are alike for neighbouring pixels, so that a
 pixel counts as the share a of an independent one: its area across the line of sight over 1 cm^2.  n is the sum of a
-over the objects' pixels; (1 / 2) ln n nats tell a parameter as precisely as n observations determine it.
+over the objects' pixels; (1 / 2) ln n nats describe a parameter as precisely as n observations determine it.
 
 L depends on the bodies as a set: they have no order.
 
@@ -47,7 +47,7 @@ _MARGIN = 0.25
 
 @dataclass(frozen=True, eq=False)
 class Evidence:
-    """The part of an image that some objects are told from.
+    """The part of an image that some objects are described in.
 
     Attributes
     ----------
@@ -109,17 +109,17 @@ class Evidence:
 
 
 def description_length(evidence: Evidence, bodies: Sequence[Superquadric]) -> float:
-    """Nats that tell the image by these bodies, in the optical frame; 0 for an image without objects and bodies."""
+    """Nats that describe the image by these bodies, in the optical frame; 0 for an image without objects and bodies."""
     return unexplained(evidence, bodies) + len(bodies) * price(evidence)
 
 
 def price(evidence: Evidence) -> float:
-    """Nats that tell one body."""
+    """Nats that describe one body."""
     return 0.5 * PARAMETERS * float(np.log(max(evidence.observations, 2.0)))
 
 
 def unexplained(evidence: Evidence, bodies: Sequence[Superquadric]) -> float:
-    """Nats that tell what the bodies leave over."""
+    """Nats that describe what the bodies leave over."""
     return float((pixel_costs(evidence, bodies) * evidence.weight).sum())
 
 

@@ -1,6 +1,6 @@
-"""A body in words, alike in lines, tables and pictures: FULL edges, as a ruler measures them, and how sure they are.
+"""A body as text, alike in lines, tables and pictures: FULL edges, as a ruler measures them, and how sure they are.
 
-Lengths come in metres and are said in millimetres; those of an orthographic image are shares of the unit cube.
+Lengths come in metres and are printed in millimetres; those of an orthographic image are shares of the unit cube.
 """
 
 from __future__ import annotations
@@ -11,10 +11,10 @@ from collections.abc import Iterable
 
 def edges(size: Iterable[float], sigma_size: Iterable[float], is_cube: bool) -> str:
     """``480 x 196 x 214 mm (+-5 +-11 +-7)`` of half sizes and their standard deviations, NaN where unknown."""
-    said = " x ".join(_length(2 * half, is_cube, 10) for half in size)
+    lengths = " x ".join(_length(2 * half, is_cube, 10) for half in size)
     unit = "of the cube" if is_cube else "mm"
     doubts = [f"+-{_length(2 * sigma, is_cube, 1)}" if math.isfinite(sigma) else "+-?" for sigma in sigma_size]
-    return f"{said} {unit}" + ("" if set(doubts) == {"+-?"} else f" ({' '.join(doubts)})")
+    return f"{lengths} {unit}" + ("" if set(doubts) == {"+-?"} else f" ({' '.join(doubts)})")
 
 
 def place(translation: Iterable[float], is_cube: bool) -> str:

@@ -151,8 +151,8 @@ class Cluster:
         return max(1, len(self._client.nthreads()))
 
     def ask(self, work: Work) -> _Answer:
-        # Frames alike are frames all the same: none is answered from what another one came to.
-        # distributed's future says what the standard library's does, but is none by inheritance.
+        # Frames alike are frames all the same: none is answered by the result of another one.
+        # distributed's future behaves as the standard library's, but is none by inheritance.
         return cast(_Answer, self._client.submit(_recover, self._setup, work, pure=False))
 
     def end(self) -> None:
