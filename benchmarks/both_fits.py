@@ -29,7 +29,7 @@ class Both:
 
     @property
     def verdict(self) -> str:
-        """What the surface fit says about itself."""
+        """What the surface fit reports of itself."""
         if self.fit.status == Status.CONVERGED:
             return self.fit.message
         return f"{self.fit.status.name.lower()}: {self.fit.message}"

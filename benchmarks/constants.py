@@ -92,7 +92,7 @@ FIXED = {
 
 
 class Measured(NamedTuple):
-    """The results of a fixed set: numbers that are compared to the bit, and one that says how good they are."""
+    """The results of a fixed set: numbers that are compared to the bit, and one for how good they are."""
 
     results: list[bytes]
     quality: float
@@ -374,7 +374,7 @@ def row(constant: Constant, usual: dict[str, Measured]) -> dict[str, Any]:
         constant.set(other)
         try:
             sides = {part: compared(run(), usual[part]) for part, run in SETS[constant.room].items()}
-        except Exception as error:  # what a value makes impossible is told, and the next one's turn comes
+        except Exception as error:  # what a value makes impossible is reported, and the next one's turn comes
             sides = {"error": f"{type(error).__name__}: {error}".splitlines()[0]}
         finally:
             constant.set(value)

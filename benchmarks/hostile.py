@@ -4,7 +4,7 @@
 
 The frames are those of ``test/hostile_messages.py``: images, camera_infos and masks with wrong encodings, sizes, steps,
 lengths, byte orders, stamps, frames, pixels, matrices, distortions, regions.  Half of them come without masks, half
-with.  Each is sent over DDS to the node's own process and judged by it: ``~/trigger`` answers with what became of it.
+with.  Each is sent over DDS to the node's own process and checked by it: ``~/trigger`` answers with what became of it.
 After every hundred a good frame follows, whose bodies are compared with those of the beginning.
 """
 
@@ -42,7 +42,7 @@ _NUMBERS = re.compile(r"-?\b\d[\d.e+-]*\b|\bnan\b|-?\binf\b|'[^']*'|\"[^\"]*\"",
 
 
 class Benchmark:
-    """Counts what a node says, and asks it now and then whether it still sees."""
+    """Counts what a node answers, and asks it now and then whether it still sees."""
 
     def __init__(self, node: str, peer: Peer, children: Children) -> None:
         self.name, self.peer = f"/{node}", peer
@@ -83,14 +83,14 @@ class Benchmark:
             until(masks.get_subscription_count, (self.child,))
         self.undisturbed[self.phase] = [self._good()[1] for _ in range(_UNDISTURBED)]
         self.good[self.phase] = []
-        judged = settings(
+        configured = settings(
             max_examples=messages,
             deadline=None,
             database=None,
             phases=[Phase.generate],
             suppress_health_check=list(HealthCheck),
         )
-        seed(number)(judged(given(frames(masked=masked))(self.strike)))()
+        seed(number)(configured(given(frames(masked=masked))(self.strike)))()
         self.check()
 
     def result(self) -> dict[str, Any]:

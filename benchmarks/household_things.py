@@ -29,7 +29,7 @@ import real_scenes
 import scene_verdict
 import tabletop
 import trimesh
-from scene_verdict import Judged, SceneVerdict
+from scene_verdict import SceneVerdict, ThingVerdict
 from scipy.spatial import ConvexHull
 from things_on_table import PlacedThing, hull_points, things_on_table
 
@@ -44,7 +44,7 @@ WAYS = ("standing", "lying", "leaning", "stacked")
 
 
 def scene(seed: int, sensor: str | None, count: int | None = None) -> tabletop.Tabletop:
-    """The scene of a seed, of ``count`` things or 1 to 8, through a sensor, as the judge of scenes takes it."""
+    """The scene of a seed, of ``count`` things or 1 to 8, through a sensor, as scene_verdict takes it."""
     sensor = sensor or list(tabletop.SENSORS)[seed % len(tabletop.SENSORS)]
     rng = np.random.default_rng([SEED, seed])
     truth = things_on_table(rng, count)
@@ -66,14 +66,14 @@ def _known(placed: PlacedThing) -> tabletop.Placed:
 
 
 def verdict(seed: int, sensor: str | None) -> SceneVerdict:
-    """Make the scene of a seed and judge every method on it."""
-    return scene_verdict.judge(scene(seed, sensor))
+    """Make the scene of a seed and evaluate every method on it."""
+    return scene_verdict.evaluated(scene(seed, sensor))
 
 
-def groups(everything: list[Judged]) -> dict[str, list[Judged]]:
+def groups(everything: list[ThingVerdict]) -> dict[str, list[ThingVerdict]]:
     """The rows of the table: by kind, bottles apart, by the way a thing came to rest, by sensor, by visible share."""
     half = [one for one in everything if one.visible_share >= real_scenes.HALF]
-    rows: dict[str, list[Judged]] = {real_scenes.ALL: half}
+    rows: dict[str, list[ThingVerdict]] = {real_scenes.ALL: half}
     rows |= {kind: [one for one in half if one.kind == kind] for kind in KINDS}
     rows |= {name: [one for one in half if one.name == name] for name in NAMES}
     rows |= {way: [one for one in half if one.rest.startswith(way)] for way in WAYS}

@@ -38,9 +38,9 @@ import numpy as np
 import report
 import scene_verdict
 import tabletop
-from scene_verdict import EXPLAINED, METHODS, Judged, SceneVerdict
+from scene_verdict import EXPLAINED, METHODS, SceneVerdict, ThingVerdict
 
-Groups = Callable[[list[Judged]], dict[str, list[Judged]]]
+Groups = Callable[[list[ThingVerdict]], dict[str, list[ThingVerdict]]]
 """Makes the rows of a table of all things; the first one, ALL, is what goals are for."""
 ALL = "**all, at least half visible**"
 HALF = 0.5
@@ -104,34 +104,34 @@ def arguments(text: str | None, name: str) -> argparse.ArgumentParser:
 
 
 def run(
-    judge: Callable[[int], SceneVerdict],
+    evaluate: Callable[[int], SceneVerdict],
     options: argparse.Namespace,
     groups: Groups,
     goals: dict[str, str],
     **facts: Any,
 ) -> None:
-    """Judge the scenes that were asked for, and write the results."""
-    verdicts = list(judged(judge, range(options.first, options.first + options.scenes), options.jobs))
+    """Evaluate the scenes that were asked for, and write the results."""
+    verdicts = list(verdicts_of(evaluate, range(options.first, options.first + options.scenes), options.jobs))
     if options.each is not None:
-        everything = [thing_facts(one) for each in verdicts for one in each.judged]
+        everything = [thing_facts(one) for each in verdicts for one in each.things]
         options.each.write_text(json.dumps(everything, indent=1) + "\n")
     result, text = tables(verdicts, groups, goals)
     words = {name: str(value) if isinstance(value, Path) else value for name, value in vars(options).items()}
     report.write(options.name, {**facts, "options": words, **result}, text)
 
 
-def judged(judge: Callable[[int], SceneVerdict], seeds: range, jobs: int) -> Iterator[SceneVerdict]:
+def verdicts_of(evaluate: Callable[[int], SceneVerdict], seeds: range, jobs: int) -> Iterator[SceneVerdict]:
     """The verdicts of scenes in their order, with a line for each."""
     began = time.perf_counter()
     if jobs == 1:
         if hasattr(os, "sched_setaffinity"):
             os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
         warm_up()
-        yield from map(partial(_told, began=began), map(judge, seeds))
+        yield from map(partial(_reported, began=began), map(evaluate, seeds))
         return
     # Spawned: a fork of a process whose threads run may wait for a lock forever.
     with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), initializer=warm_up) as pool:
-        yield from map(partial(_told, began=began), pool.map(judge, seeds))
+        yield from map(partial(_reported, began=began), pool.map(evaluate, seeds))
 
 
 def warm_up() -> None:
@@ -139,19 +139,19 @@ def warm_up() -> None:
     scene_verdict.recoverer().warm_up(mesh_scene.CAMERA)
 
 
-def _told(each: SceneVerdict, began: float) -> SceneVerdict:
-    given = " ".join(f"{one.name} {100 * one.answers['given'].iou:.0f}" for one in each.judged)
-    own = " ".join(f"{100 * one.answers['own'].iou:.0f}" for one in each.judged)
+def _reported(each: SceneVerdict, began: float) -> SceneVerdict:
+    given = " ".join(f"{one.name} {100 * one.answers['given'].iou:.0f}" for one in each.things)
+    own = " ".join(f"{100 * one.answers['own'].iou:.0f}" for one in each.things)
     passed = time.perf_counter() - began
     print(f"scene {each.seed} {each.sensor} | given: {given} | own: {own} | {passed:.0f} s", flush=True)
     return each
 
 
-def groups(everything: list[Judged]) -> dict[str, list[Judged]]:
+def groups(everything: list[ThingVerdict]) -> dict[str, list[ThingVerdict]]:
     """The rows of the table, all first."""
     counted = [one for one in everything if one.kind != APART]
     half = [one for one in counted if one.visible_share >= HALF]
-    rows: dict[str, list[Judged]] = {ALL: half}
+    rows: dict[str, list[ThingVerdict]] = {ALL: half}
     for kind in mesh_things.KINDS:
         chosen = [one for one in everything if one.kind == kind and one.visible_share >= HALF]
         rows[kind] = chosen
@@ -159,7 +159,7 @@ def groups(everything: list[Judged]) -> dict[str, list[Judged]]:
     return rows | by_sensor_and_share(half, counted)
 
 
-def by_sensor_and_share(half: list[Judged], counted: list[Judged]) -> dict[str, list[Judged]]:
+def by_sensor_and_share(half: list[ThingVerdict], counted: list[ThingVerdict]) -> dict[str, list[ThingVerdict]]:
     """Rows of things at least half visible by sensor, and of all by their visible share."""
     rows = {sensor: [one for one in half if one.sensor == sensor] for sensor in tabletop.SENSORS}
     for name, (low, high) in SHARES.items():
@@ -169,7 +169,7 @@ def by_sensor_and_share(half: list[Judged], counted: list[Judged]) -> dict[str, 
 
 def tables(verdicts: list[SceneVerdict], groups: Groups, goals: dict[str, str]) -> tuple[dict[str, Any], str]:
     """All figures, as numbers and as Markdown."""
-    found = groups([one for each in verdicts for one in each.judged])
+    found = groups([one for each in verdicts for one in each.things])
     result: dict[str, Any] = {}
     rows = []
     for name, chosen in found.items():
@@ -187,7 +187,7 @@ def tables(verdicts: list[SceneVerdict], groups: Groups, goals: dict[str, str]) 
     return {**chain_result, **result}, "\n\n".join(text)
 
 
-def summary(chosen: list[Judged], method: str) -> dict[str, Any]:
+def summary(chosen: list[ThingVerdict], method: str) -> dict[str, Any]:
     """The figures of some things with one method."""
     answers = [one.answers[method] for one in chosen]
     iou = 100 * np.array([answer.iou for answer in answers])
@@ -237,7 +237,7 @@ def chain(verdicts: list[SceneVerdict]) -> tuple[dict[str, Any], str]:
         distances = np.concatenate([each.distances for each in chosen])
         below = np.concatenate([each.below for each in chosen])
         medians = np.array([1e3 * np.median(each.distances) for each in chosen if each.distances.size])
-        bodies = sum(len(each.judged) for each in chosen)
+        bodies = sum(len(each.things) for each in chosen)
         figures: dict[str, Any] = {
             "scenes": len(chosen),
             "things": bodies,
@@ -290,7 +290,7 @@ def chain(verdicts: list[SceneVerdict]) -> tuple[dict[str, Any], str]:
     return result, report.table(header, rows)
 
 
-def worst_line(one: Judged, method: str) -> list[str]:
+def worst_line(one: ThingVerdict, method: str) -> list[str]:
     answer = one.answers[method]
     edges = 2e3 * np.sort(answer.body[:3])
     return [
@@ -310,7 +310,7 @@ def _numbers(values: np.ndarray, form: str = ".0f") -> str:
     return " ".join(f"{x:{form}}" for x in values) if np.isfinite(values).all() else "-"
 
 
-def thing_facts(one: Judged) -> dict[str, Any]:
+def thing_facts(one: ThingVerdict) -> dict[str, Any]:
     """One thing, for whoever wants other figures."""
     return {
         "seed": one.seed,

@@ -6,7 +6,7 @@ Nine YCB scans (../shared/data/ycb_meshes), depth rasterised from the mesh, a pi
 degrees wide, at 0.5 to 1 m, noise of sigma = 1.5 mm at 1 m growing with z^2, whole millimetres, true masks.
 
     floating               any orientation, nothing measured behind the object; a pixel without depth is none of its own
-    floating, NaN unknown  the same images, where a pixel without depth says nothing
+    floating, NaN unknown  the same images, where a pixel without depth is unknown
     on plane               lying on a stable face, seen from 30 to 60 degrees above, the plane measured behind and given
 
 Volume IoU is against the convex hull of the scan.  The oracle is the superquadric with the largest such IoU

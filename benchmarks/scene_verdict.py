@@ -87,7 +87,7 @@ class Answer:
 
 
 @dataclass(frozen=True, eq=False)
-class Judged:
+class ThingVerdict:
     """One thing of one scene and every method's answer; figures of its sight as in :class:`tabletop.Placed`."""
 
     seed: int
@@ -109,7 +109,7 @@ class SceneVerdict:
 
     Attributes
     ----------
-    judged
+    things
         Every thing with enough pixels.
     tiny
         How many had too few.
@@ -127,7 +127,7 @@ class SceneVerdict:
 
     seed: int
     sensor: str
-    judged: tuple[Judged, ...]
+    things: tuple[ThingVerdict, ...]
     tiny: int
     milliseconds: dict[str, float]
     false_bodies: int
@@ -142,11 +142,11 @@ def recoverer() -> Recoverer:
 
 
 def verdict(seed: int, kinds: dict[str, float] | None, scans: Path | None, sensor: str | None) -> SceneVerdict:
-    """Make the scene of a seed and judge every method on it."""
-    return judge(tabletop.scene(seed, kinds, scans, sensor))
+    """Make the scene of a seed and evaluate every method on it."""
+    return evaluated(tabletop.scene(seed, kinds, scans, sensor))
 
 
-def judge(scene: Tabletop) -> SceneVerdict:
+def evaluated(scene: Tabletop) -> SceneVerdict:
     """Every method on one scene."""
     depth, camera, labels = scene.depth, scene.camera, scene.labels
     frames = {
@@ -154,7 +154,7 @@ def judge(scene: Tabletop) -> SceneVerdict:
         "own": recoverer().recover(depth, camera),
     }
     known = matches(frames["own"].labels, np.where(np.isfinite(depth), labels, 0))
-    judged = []
+    things = []
     for placed in scene.placed:
         if placed.pixels < FEWEST_PIXELS:
             continue
@@ -164,8 +164,8 @@ def judge(scene: Tabletop) -> SceneVerdict:
             "own": of_frame(frames["own"], known.get(placed.label, 0), placed, scene),
             **_simple(_inner_points(placed.label, scene), placed, scene),
         }
-        judged.append(
-            Judged(
+        things.append(
+            ThingVerdict(
                 scene.seed,
                 scene.sensor,
                 placed.thing.kind,
@@ -190,8 +190,8 @@ def judge(scene: Tabletop) -> SceneVerdict:
     return SceneVerdict(
         scene.seed,
         scene.sensor,
-        tuple(judged),
-        len(scene.placed) - len(judged),
+        tuple(things),
+        len(scene.placed) - len(things),
         {name: frame.milliseconds["total"] for name, frame in frames.items()},
         sum(body.label not in taken for body in own.recovered),
         _distances(own, scene),

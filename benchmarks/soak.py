@@ -3,12 +3,12 @@
     python benchmarks/soak.py [--minutes 30] [--rate 30] [--objects 5] [--offered 90] [--node recover_node]
 
 Three phases with the same node.  First the camera is slow, so that each frame is alone: the latency of one frame.  Then
-it runs at ``rate`` for ``minutes``; memory, latency, services and diagnostics are judged here.  Then it offers more
+it runs at ``rate`` for ``minutes``; memory, latency, services and diagnostics are evaluated here.  Then it offers more
 than anybody could answer.  The camera shows the same scenes in all three, over and over; it runs at low priority on one
 thread, as a real camera takes next to no processor time.
 
 Latency goes from the stamp, the clock at the camera's publish call, to the arrival here.  A scene with an overlap takes
-longer than one without, so that a spread over scenes says nothing about regularity: latencies are also divided by the
+longer than one without, so that a spread over scenes shows nothing of regularity: latencies are also divided by the
 median of their own scene.  Memory is resident memory; its growth is a straight line fitted to all seconds after the
 first minute.
 """
@@ -56,7 +56,7 @@ SCENES = 8
 SCENE_SECONDS = 10.0
 _ALONE_RATE, _ALONE_FRAMES = 3.0, 6
 _WARM = 60.0
-"""Seconds after which memory is judged."""
+"""Seconds after which memory is measured."""
 _SHORTEST_WARM = 0.25
 """Share of a run that is shorter than four minutes."""
 _MEMORY_EVERY = 30

@@ -147,7 +147,7 @@ def test_a_missed_thing_has_no_iou_and_no_size(modules: dict[str, ModuleType]) -
     verdict, tables = modules["scene_verdict"], modules["real_scenes"]
     found = verdict.Answer(0.9, np.array([0.001, -0.002, 0.006]), np.zeros(3), np.array([1.0, 1, 0]), "weak", "")
     things = [
-        verdict.Judged(0, "stereo", "box", "box", "flat", 1, 900, 900, 1.0, np.ones(3), {"own": answer})
+        verdict.ThingVerdict(0, "stereo", "box", "box", "flat", 1, 900, 900, 1.0, np.ones(3), {"own": answer})
         for answer in (found, verdict.Answer())
     ]
     figures = tables.summary(things, "own")
