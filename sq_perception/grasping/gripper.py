@@ -94,6 +94,20 @@ class Gripper:
         closed = self.boxes(0.0)
         return np.asarray(closed + openings[:, None, None] * (self.boxes(1.0) - closed))
 
+    def faces_at(self, openings: np.ndarray) -> np.ndarray:
+        """Places (k, 3, 9, 3) in the TCP's frame that a body must not reach, at many openings (k,).
+
+        On the pads of both fingers, from their middle to their end, and on the palm between them.
+        """
+        x, share = np.repeat([-0.8, 0.0, 0.8], 3), np.tile([0.0, 0.5, 1.0], 3)
+        boxes, places = self.boxes_at(openings), np.empty((len(openings), 3, 9, 3))
+        places[:, :, :, 0] = 0.5 * self.finger_width * x
+        places[:, :2, :, 1] = np.stack([0.5 * openings, -0.5 * openings], axis=1)[:, :, None]
+        places[:, :2, :, 2] = boxes[:, :2, 2, None] + boxes[:, :2, 5, None] * share
+        places[:, 2, :, 1] = 0.8 * openings[:, None] * (share - 0.5)
+        places[:, 2, :, 2] = -self.palm
+        return places
+
     def mesh(self, opening: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Vertices (24, 3), faces (36, 3) and edges (36, 2, 3) of fingers and hand in the TCP's frame."""
         signs = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])

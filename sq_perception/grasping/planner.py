@@ -20,6 +20,8 @@ The opening is the body's width and, on either side, a clearance and twice the s
 gripper opens no wider.  The hand stands farther from the side that is less sure.  A side that was not seen is
 uncertain, so that a body of unknown depth is taken by its known sides.  The hand comes to be where it is sent to but
 for the error of its calibration.  By what real things stray from superquadrics is in the covariance of a fit already.
+Where the image shows that the place of a pad, or of the palm between the fingers, is empty, there is no body: its sides
+and its near end count by the share of that place which is hidden, and how far measured points are tells the rest.
 Margins are taken for independent of each other, but for measured points: they are those of the bodies, so that what
 counts is what they take beyond opening, palm and other bodies.
 
@@ -48,6 +50,7 @@ from sq_perception.grasping.trials import (
     MARGINS,
     PASSES,
     POINT_SIGMA,
+    SIDE_SIGMA,
     TABLE_SIGMA,
     Trials,
     log_phi,
@@ -265,14 +268,15 @@ def _trials(
     deep = np.hypot(near_sigma, placement)
     room = 0.5 * opening - half
     logs = np.zeros((len(owner), len(MARGINS)))
-    logs[:, 0] = passing(room + aside, side[:, 0], placement) + passing(room - aside, side[:, 1], placement)
+    sides = np.stack([passing(room + way * aside, side[:, k], placement) for k, way in ((0, 1), (1, -1))], axis=1)
+    logs[:, 0] = sides.sum(axis=1)
     logs[:, 1] = log_phi(u + gripper.tip + near - LEAST_ENGAGED, deep)
     logs[:, 2] = log_phi(gripper.palm - near - u, deep)
     logs[:, 3] = np.where(np.isfinite(angle), log_phi(cone - angle, doubt), -np.inf)
     logs[:, 4] = weight(DENSITY * bodies.volume()[owner], lever, 2 * friction * gripper.force)
     if around.plane is not None:  # moved without a turn, so that the lowest corner is the same
         logs[:, 5] = log_phi(height[at] + offset @ around.plane[:3], np.hypot(TABLE_SIGMA, placement))
-    return Trials(owner, frames, opening, 2 * half, logs)
+    return Trials(owner, frames, opening, 2 * half, logs, sides)
 
 
 def _narrower(bodies: Superquadric, spread: np.ndarray, trials: Trials, gripper: Gripper, placement: float) -> Trials:
@@ -287,7 +291,8 @@ def _narrower(bodies: Superquadric, spread: np.ndarray, trials: Trials, gripper:
     for end, way in ((0, 1), (1, -1)):
         reach, sigma = closing.reaches(bodies, spread, owner, way * y)
         gap = 0.5 * trials.opening[rows] - np.fmin(reached[:, end], reach - way * aside)
-        trials.logs[rows, 0] = passing(gap, sigma, placement) + (trials.logs[rows, 0] if end else 0.0)
+        trials.sides[rows, end] = passing(gap, sigma, placement)
+    trials.logs[rows, 0] = trials.sides[rows].sum(axis=1)
     return trials
 
 
@@ -310,12 +315,22 @@ def _among_others(
     trials.logs[near, 6] = passing(gap[near], sigma, placement)
     trials = trials.first(_CHECKED_CLOSELY)
     boxes = gripper.boxes_at(trials.opening)
-    if len(around.points):
-        gap = clearance.gaps_to_points(trials.frames, boxes, around.points)
-        doubt = log_phi(gap + PASSES, np.hypot(POINT_SIGMA, placement))
-        trials.logs[:, 7] = np.minimum(doubt - trials.logs[:, [0, 2, 6]].sum(axis=1), 0.0)
+    gap = clearance.gaps_to_points(trials.frames, boxes, around.points)
+    if around.camera is not None:
+        _where_hidden(trials, gap, gripper, around, placement)
+    doubt = log_phi(gap + PASSES, np.hypot(POINT_SIGMA, placement))
+    trials.logs[:, 7] = np.minimum(doubt - trials.logs[:, [0, 2, 6]].sum(axis=1), 0.0)
     trials.logs[:, 8] = np.log1p(-_HIDDEN * around.unseen(trials.frames, boxes[:, :2]))
     return trials
+
+
+def _where_hidden(trials: Trials, gap: np.ndarray, gripper: Gripper, around: Surroundings, placement: float) -> None:
+    """Let sides and near ends count as far as the image does not show that they are not there; points tell the rest."""
+    turn, position = trials.frames[:, :, :3], trials.frames[:, None, None, :, 3]
+    hidden = around.hidden(gripper.faces_at(trials.opening) @ turn.transpose(0, 2, 1)[:, None] + position)
+    shown = (1 - hidden[:, :2].min(axis=1)) * np.expm1(log_phi(gap + PASSES, np.hypot(SIDE_SIGMA, placement)))
+    trials.logs[:, 0] = np.log1p(hidden[:, :2] * np.expm1(trials.sides)).sum(axis=1) + np.log1p(shown)
+    trials.logs[:, 2] = np.log1p(hidden[:, 2] * np.expm1(trials.logs[:, 2]))
 
 
 def _as_grasps(trials: Trials) -> Iterator[Grasp]:

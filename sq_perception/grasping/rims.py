@@ -67,7 +67,8 @@ def at_rims(
     middle = np.linalg.norm(frames[:, :, 3] - bodies.translation[owner], axis=1)
     mass = _WALLS * DENSITY * bodies.volume()[owner]
     logs = np.zeros((len(owner), len(MARGINS)))
-    logs[:, 0] = 2 * log_phi(0.5 * (opening - width) + PASSES, sigma)
+    sides = np.repeat(log_phi(0.5 * (opening - width) + PASSES, sigma)[:, None], 2, axis=1)
+    logs[:, 0] = sides.sum(axis=1)
     logs[:, 1] = log_phi(inset - LEAST_ENGAGED, sigma)
     logs[:, 2] = log_phi(gripper.palm + gripper.tip - inset, sigma)
     logs[:, 3] = np.log(_UPRIGHT)
@@ -75,7 +76,7 @@ def at_rims(
     if around.plane is not None:
         heights = clearance.heights_above(around.plane, frames, boxes)
         logs[:, 5] = log_phi(heights, np.hypot(TABLE_SIGMA, placement))
-    trials = Trials(owner, frames, opening, width, logs)
+    trials = Trials(owner, frames, opening, width, logs, sides)
     is_free = clearance.gaps_to_points(frames, boxes, around.points) > 0
     return trials.at(np.flatnonzero(is_free & _is_open(trials, boxes[:, 1], around)))
 

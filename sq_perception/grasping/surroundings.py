@@ -10,6 +10,8 @@ from sq_perception.imaging.camera import Camera
 
 _BEHIND = 0.015
 """A place so many metres behind what a pixel measured was not seen."""
+_EMPTY = 0.005
+"""A place so many metres before what a pixel measured is empty."""
 _SPACING = 0.005
 """Metres between the points that are kept."""
 _MOST = 6000
@@ -92,6 +94,10 @@ class Surroundings:
         local = boxes[:, :, None, :3] + corners * boxes[:, :, None, 3:]
         places = local.reshape(len(frames), -1, 3) @ frames[:, :, :3].transpose(0, 2, 1) + frames[:, None, :, 3]
         return np.asarray(np.mean(self.beyond(places) < -_BEHIND, axis=1))
+
+    def hidden(self, places: np.ndarray) -> np.ndarray:
+        """Share (...,) of places (..., j, 3) of which the image does not show that they are empty."""
+        return np.asarray(np.mean(~(self.beyond(places) > _EMPTY), axis=-1))
 
     def beyond(self, places: np.ndarray) -> np.ndarray:
         """By how much what the image shows is farther away than places (..., 3); NaN where it shows nothing."""

@@ -17,6 +17,9 @@ CLEARANCE = 0.005
 LEAST_ENGAGED = 0.004
 """Metres of finger that have to be beyond the near end."""
 TABLE_SIGMA, POINT_SIGMA = 0.002, 0.001
+SIDE_SIGMA = 0.0026
+"""Metres to which thinned points tell where the side of a thing is that the image shows a finger to pass: of 247 such
+sides, 3.3 with the 2 mm of the hand (30 scenes of benchmarks/picking_scenes.py from seed 30010 on)."""
 PASSES = 0.001
 """Metres by which a finger may come down on the edge of a thing: half of those that did passed it and pushed it aside
 (60 household things in known places in the physics of benchmarks/picking_world.py; a quarter at 2 mm, few at 3)."""
@@ -33,16 +36,20 @@ _PAD_RADIUS = 0.006
 
 @dataclass(frozen=True, eq=False)
 class Trials:
-    """Grasps under trial, k of them, and the logarithm of the probability of each margin so far."""
+    """Grasps under trial, k of them, and the logarithm of the probability of each margin so far.
+
+    ``sides`` (k, 2) are those of the two sides that the fingers pass, whose sum is the margin of the opening.
+    """
 
     owner: np.ndarray
     frames: np.ndarray
     opening: np.ndarray
     width: np.ndarray
     logs: np.ndarray
+    sides: np.ndarray
 
     def at(self, which: np.ndarray) -> Trials:
-        return Trials(self.owner[which], self.frames[which], self.opening[which], self.width[which], self.logs[which])
+        return Trials(*(getattr(self, part.name)[which] for part in fields(self)))
 
     def and_(self, other: Trials) -> Trials:
         return Trials(*(np.concatenate([getattr(one, part.name) for one in (self, other)]) for part in fields(self)))
