@@ -57,6 +57,7 @@ from sq_perception.grasping.trials import (
     passing,
     weight,
 )
+from sq_perception.imaging.camera import Camera
 
 FRICTION = 0.5
 """Of rubber pads on cartons and plastics, at the least; the benchmark draws 0.5 to 1."""
@@ -174,7 +175,8 @@ def warm_up() -> None:
     """Compile or load every kernel."""
     two = np.array([[0.0, 0.0, 0.5], [0.1, 0.0, 0.5]])
     bodies = Superquadric(np.full((2, 3), 0.02), np.ones((2, 2)), two, np.tile([0.0, 0.0, 0.0, 1.0], (2, 1)))
-    grasps(bodies, PANDA, around=Surroundings(points=two + 0.3))
+    camera = Camera(2, 2, 1.0, 1.0, 0.5, 0.5)
+    grasps(bodies, PANDA, around=Surroundings(points=two + 0.3, depth=np.ones((2, 2)), camera=camera))
 
 
 def _closings(bodies: Superquadric, spread: np.ndarray, gripper: Gripper, friction: float) -> _Closings:
@@ -253,7 +255,9 @@ def _trials(
     cone, doubt = 0.5 * (narrow + broad), np.hypot(_SQUARE, (broad - narrow) / np.sqrt(12))
     ends, angle = closing.chords(bodies, owner[at], slid + touch[:, None] * z[at], y[at], broad)
     squarely = np.isfinite(angle)  # two in five; a body without any has that for a reason
-    rows = np.flatnonzero(squarely | ~np.isin(owner[at], owner[at[squarely]]))
+    has_any = np.zeros(len(bodies), dtype=bool)
+    has_any[owner[at[squarely]]] = True
+    rows = np.flatnonzero(squarely | ~has_any[owner[at]])
     u, at, slid, ends, angle = u[rows], at[rows], slid[rows], ends[rows], angle[rows]
 
     owner, half, side, opening, shift = owner[at], half[at], side[at], opening[at], shift[at]
@@ -269,7 +273,7 @@ def _trials(
     room = 0.5 * opening - half
     logs = np.zeros((len(owner), len(MARGINS)))
     sides = np.stack([passing(room + way * aside, side[:, k], placement) for k, way in ((0, 1), (1, -1))], axis=1)
-    logs[:, 0] = sides.sum(axis=1)
+    logs[:, 0] = sides[:, 0] + sides[:, 1]
     logs[:, 1] = log_phi(u + gripper.tip + near - LEAST_ENGAGED, deep)
     logs[:, 2] = log_phi(gripper.palm - near - u, deep)
     logs[:, 3] = np.where(np.isfinite(angle), log_phi(cone - angle, doubt), -np.inf)

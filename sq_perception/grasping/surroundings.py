@@ -6,12 +6,15 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from sq_perception.geometry.kernels import kernel
 from sq_perception.imaging.camera import Camera
 
 _BEHIND = 0.015
 """A place so many metres behind what a pixel measured was not seen."""
 _EMPTY = 0.005
 """A place so many metres before what a pixel measured is empty."""
+_NEAREST = 1e-3
+"""Metres before the camera that a place is at least, if the image shows it."""
 _SPACING = 0.005
 """Metres between the points that are kept."""
 _MOST = 6000
@@ -103,7 +106,21 @@ class Surroundings:
         """By how much what the image shows is farther away than places (..., 3); NaN where it shows nothing."""
         if self.depth is None or self.camera is None:
             return np.full(places.shape[:-1], np.nan)
-        pixels = np.round(self.camera.project(np.where(places[..., 2:] > 1e-3, places, [0.0, 0.0, 1e-3]))).astype(int)
-        inside = np.all((pixels >= 0) & (pixels < [self.camera.width, self.camera.height]), axis=-1)
-        pixels = np.where(inside[..., None], pixels, 0)
-        return np.where(inside, self.depth[pixels[..., 1], pixels[..., 0]] - places[..., 2], np.nan)
+        camera, flat = self.camera, np.ascontiguousarray(places, dtype=float).reshape(-1, 3)
+        at = _pixels_at(flat, camera.width, camera.height, np.array([camera.fx, camera.fy, camera.cx, camera.cy]))
+        found = np.where(at >= 0, self.depth.ravel()[at] - flat[:, 2], np.nan)
+        return np.asarray(found.reshape(places.shape[:-1]))
+
+
+@kernel
+def _pixels_at(places: np.ndarray, width: int, height: int, intrinsics: np.ndarray) -> np.ndarray:
+    """Position (k,) in a flat image of the pixels that show places (k, 3); -1 beyond the image or not before it."""
+    fx, fy, cx, cy = intrinsics
+    found = np.full(len(places), -1)
+    for k in range(len(places)):
+        z = places[k, 2]
+        if z > _NEAREST:
+            column, row = np.rint(fx * places[k, 0] / z + cx), np.rint(fy * places[k, 1] / z + cy)
+            if 0 <= column < width and 0 <= row < height:
+                found[k] = int(row) * width + int(column)
+    return found
