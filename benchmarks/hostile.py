@@ -24,7 +24,7 @@ import report
 
 os.environ.setdefault("ROS_DOMAIN_ID", "79")
 os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-sys.path.append(str(Path(__file__).resolve().parent.parent / "test"))
+sys.path.append(str(Path(__file__).resolve().parent.parent / "test" / "helpers"))
 
 from hostile_messages import HostileFrame, Siege, Verdict, difference, frames
 from hypothesis import HealthCheck, Phase, given, seed, settings

@@ -25,7 +25,7 @@ import report
 
 os.environ.setdefault("ROS_DOMAIN_ID", "80")
 os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-sys.path.append(str(Path(__file__).resolve().parent.parent / "test"))
+sys.path.append(str(Path(__file__).resolve().parent.parent / "test" / "helpers"))
 
 from respawned_nodes import CAMERA, MEMBERS, NODE, VIEWER, Kill, Robot, orphans
 from running_nodes import Peer

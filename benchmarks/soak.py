@@ -31,7 +31,7 @@ import report
 
 os.environ.setdefault("ROS_DOMAIN_ID", "78")
 os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-sys.path.append(str(Path(__file__).resolve().parent.parent / "test"))
+sys.path.append(str(Path(__file__).resolve().parent.parent / "test" / "helpers"))
 
 from rcl_interfaces.srv import GetParameters
 from running_nodes import (

@@ -1,4 +1,4 @@
-"""A benchmark read by another program changes nothing there: only the script itself asks for one thread."""
+"""A benchmark read by another program changes nothing there; those that share helpers with the tests find them."""
 
 from __future__ import annotations
 
@@ -30,4 +30,12 @@ def test_an_import_leaves_the_number_of_threads_alone(name: str, repository: Pat
         text=True,
         timeout=300,
     )
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("name", ["hostile", "kills", "soak"])
+def test_helpers_of_the_tests_are_found(name: str, repository: Path) -> None:
+    pytest.importorskip("rclpy", reason="needs the extra 'ros'")
+    command = [sys.executable, str(repository / "benchmarks" / f"{name}.py"), "--help"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stderr
