@@ -86,6 +86,7 @@ from sq_perception.learning import checkpoint
 from sq_perception.recovery.recoverer import FrameRecovery, Recoverer
 
 MOST_ROUNDS = 12
+BOTH = "both"
 ASKED = {"packed": (93, 92), "pile": (80, 70)}
 BINS = (0.0, 0.2, 0.4, 0.6, 0.8, 1.0)
 _MANY = 60
@@ -429,10 +430,13 @@ def gains_table(gains: dict[str, Any]) -> str:
 
 
 def gain(lines: list[dict[str, Any]], kind: str, name: str, other: str) -> dict[str, list[float]]:
-    """By how many percent GSR and DR of one contestant are above another's on the same scenes, and 95 % intervals."""
+    """By how many percent GSR and DR of one contestant are above another's on the same scenes, and 95 % intervals.
+
+    ``kind`` is one, or "both".
+    """
+    asked = [run for run in lines if kind in (run["kind"], BOTH)]
     runs = {
-        who: {run["seed"]: run for run in lines if run["kind"] == kind and run["contestant"] == who}
-        for who in (name, other)
+        who: {(run["kind"], run["seed"]): run for run in asked if run["contestant"] == who} for who in (name, other)
     }
     seeds = sorted(set(runs[name]) & set(runs[other]))
     if not seeds:
@@ -499,7 +503,7 @@ def main() -> None:
     found = summary(lines)
     gains = {
         f"{kind}: ours over {other}": gain(lines, kind, "ours", other)
-        for kind in KINDS
+        for kind in (*KINDS, BOTH)
         for other in ("ours without sigma", "ours without the hull", "true bodies", "classic", "cgn in masks", "cgn")
     }
     if arguments.name:

@@ -123,3 +123,5 @@ def test_a_gain_is_that_of_the_same_scenes(picking):
     np.testing.assert_allclose(found["gsr"], 20.0)
     np.testing.assert_allclose(found["dr"], 20.0)
     assert picking[1].gain(lines, "packed", "ours", "box") == {}
+    upright = [{**one, "kind": "packed", "taken": 5, "picks": [{"held": 0}] * 5} for one in lines]
+    assert picking[1].gain(lines + upright, "both", "ours", "box")["gsr"][0] == pytest.approx(10.0)
