@@ -108,11 +108,6 @@ class Evidence:
         return float(self.weight[self.objects].sum())
 
 
-def description_length(evidence: Evidence, bodies: Sequence[Superquadric]) -> float:
-    """Nats that describe the image by these bodies, in the optical frame; 0 for an image without objects and bodies."""
-    return unexplained(evidence, bodies) + len(bodies) * price(evidence)
-
-
 def price(evidence: Evidence) -> float:
     """Nats that describe one body."""
     return 0.5 * PARAMETERS * float(np.log(max(evidence.observations, 2.0)))

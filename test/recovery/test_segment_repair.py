@@ -12,7 +12,7 @@ from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
 from sq_perception.recovery import scene_description, segment_repair
 from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
-from sq_perception.recovery.scene_description import Evidence, description_length
+from sq_perception.recovery.scene_description import Evidence, price, unexplained
 from sq_perception.segmentation import segments
 from sq_perception.segmentation.segments import Segmentation
 from sq_perception.simulation.scenes import plane_depth
@@ -171,6 +171,11 @@ def test_labels_have_no_order():
     assert len(first.fits) == len(second.fits) == 3
     pairs = np.unique(np.stack([first.labels.ravel(), second.labels.ravel()]), axis=1)
     assert pairs.shape[1] == 4  # a one-to-one map of four values
+
+
+def description_length(evidence, bodies):
+    """L of an image by bodies, as the repair compares it."""
+    return unexplained(evidence, bodies) + len(bodies) * price(evidence)
 
 
 def test_the_description_is_that_of_a_set():
