@@ -40,6 +40,7 @@ PALETTE = np.array(
 
 ALPHA = 0.7
 """Opacity of surfaces unless given."""
+_OUTLINE_COLOUR = np.array([0.05, 0.05, 0.05, 1.0])
 
 
 def markers(
@@ -48,7 +49,6 @@ def markers(
     header: Any,
     *,
     colours: np.ndarray | None = None,
-    outline_colour: Sequence[float] = (0.05, 0.05, 0.05, 1.0),
     alpha: float = ALPHA,
     line_width: float = 0.002,
     namespace: str = "superquadrics",
@@ -108,7 +108,6 @@ def markers(
         )
 
     as_it_is, as_wide = make_scale(x=1.0, y=1.0, z=1.0), make_scale(x=float(line_width))
-    line_colour = np.asarray(outline_colour, float)
     found = []
     for number, mesh, colour in zip(ids, meshes, paint, strict=True):
         vertices, faces, outline = _checked(mesh)
@@ -116,7 +115,7 @@ def markers(
         surface = [corners[index] for index in faces.reshape(-1).tolist()]
         found.append(marker("surface", number, _TRIANGLE_LIST, colour, as_it_is, surface))
         lines = [point(x=x, y=y, z=z) for x, y, z in outline.reshape(-1, 3).tolist()]
-        found.append(marker("outline", number, _LINE_LIST, line_colour, as_wide, lines))
+        found.append(marker("outline", number, _LINE_LIST, _OUTLINE_COLOUR, as_wide, lines))
     for number in sorted({int(previous) for previous in previous_ids} - set(ids)):
         for kind in ("surface", "outline"):
             found.append(make_marker(header=header, ns=f"{namespace}/{kind}", id=number, action=_DELETE))
