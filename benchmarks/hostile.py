@@ -105,9 +105,9 @@ class Benchmark:
             "copies_sent": self.siege.sent,
             "answered": sum(one.answered for one in self.verdicts),
             "refused": len(refused),
-            "without_words": sum(not one.words for one in self.verdicts),
-            "defects": Counter(one.words[:160] for one in self.verdicts if one.is_defect),
-            "reasons": Counter(_NUMBERS.sub("#", one.words)[:160] for one in refused).most_common(60),
+            "without_reason": sum(not one.message for one in self.verdicts),
+            "defects": Counter(one.message[:160] for one in self.verdicts if one.is_defect),
+            "reasons": Counter(_NUMBERS.sub("#", one.message)[:160] for one in refused).most_common(60),
             "kinds": Counter(one.kind for one in refused).most_common(),
             "good_frames": len(distances),
             "good_frames_right": int((distances <= _SAME).sum()),
@@ -146,20 +146,20 @@ def main() -> None:
            f"{good[name]['median']:.1f} / {good[name]['max']:.1f}; "
            f"{alone[name]['median']:.1f} / {alone[name]['max']:.1f}"] for name in good),
         ["answered, refused", f"{result['answered']}, {result['refused']}"],
-        ["refused without words", str(result["without_words"])],
+        ["refused without a reason", str(result["without_reason"])],
         ["different reasons, kinds", f"{len(result['reasons'])}, {len(result['kinds'])}"],
-        ["exceptions that nobody put into words", str(sum(result["defects"].values()))],
+        ["exceptions without a message of their own", str(sum(result["defects"].values()))],
         ["received = answered + dropped + refused",
          f"{'yes' if result['balanced'] else 'NO'}: " + ", ".join(f"{value} {key}" for key, value in counters.items())],
         ["results published", str(result["published_results"])],
         ["resident memory, first and last MB", f"{result['memory_mb'][0]:.0f}, {result['memory_mb'][-1]:.0f}"],
     ]  # fmt: skip
-    lines = [[str(times), words.replace("|", "/").replace("\n", " ")] for words, times in result["reasons"]]
+    lines = [[str(times), reason.replace("|", "/").replace("\n", " ")] for reason, times in result["reasons"]]
     reasons = report.table(["times", "reason, numbers and names as #"], lines)
     table = report.table(["", options.node], rows)
     report.write(options.name, {"options": vars(options), **result, "said": said}, f"{table}\n\n{reasons}")
     right = result["good_frames_right"] == result["good_frames"] and result["balanced"]
-    sys.exit(0 if right and not result["defects"] and not result["without_words"] else 1)
+    sys.exit(0 if right and not result["defects"] and not result["without_reason"] else 1)
 
 
 if __name__ == "__main__":

@@ -55,18 +55,18 @@ class Verdict:
     """What a node answered to one frame, after so many milliseconds, to the ``sent``-th copy of it."""
 
     answered: bool
-    words: str
+    message: str
     milliseconds: float
     sent: int
 
     @property
     def kind(self) -> str:
-        """The words before the first colon, where it was refused: what was wrong."""
-        return "" if self.answered else self.words.split(":")[0]
+        """The text before the first colon, where it was refused: what was wrong."""
+        return "" if self.answered else self.message.split(":")[0]
 
     @property
     def is_defect(self) -> bool:
-        """Whether the node was surprised: an exception that nobody has put into words."""
+        """Whether the node was surprised: an exception without a message of its own."""
         return not self.answered and _DEFECT.fullmatch(self.kind) is not None
 
 
@@ -288,20 +288,20 @@ class Siege:
         until(lambda: self._images.get_subscription_count() and self._infos.get_subscription_count(), alive)
 
     def strike(self, frame: HostileFrame) -> Verdict:
-        """Send a frame, and again where it gets lost, until the node has judged it."""
+        """Send a frame, and again where it gets lost, until the node has answered it."""
         verdict = self._peer.start_call(Trigger, f"{self._node}/trigger", Trigger.Request(), self._alive)
-        # The node must know of the question when the image arrives, or the next copy of it is judged.
+        # The node must know of the question when the image arrives, or the next copy of it is answered.
         time.sleep(0.002)
         began, copies, due = time.monotonic(), 0, 0.0
 
-        def judged() -> bool:
+        def answered() -> bool:
             nonlocal copies, due
             if not verdict.done() and time.monotonic() >= due:
                 copies, due = copies + 1, time.monotonic() + _AGAIN
                 self._send(frame)
             return verdict.done()
 
-        until(judged, self._alive)
+        until(answered, self._alive)
         answer = verdict.result()
         return Verdict(answer.success, answer.message, 1e3 * (time.monotonic() - began), copies)
 

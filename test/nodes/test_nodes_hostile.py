@@ -142,8 +142,8 @@ def test_a_node_survives_counts_and_explains():
             last = from_message(peer.ask("/recover_node", *peer.frame(), alive=alive).message)
             assert difference(last, first) < 4e-3
 
-        assert not [one.words for one in verdicts if one.is_defect]
-        assert all(one.words for one in verdicts)
+        assert not [one.message for one in verdicts if one.is_defect]
+        assert all(one.message for one in verdicts)
         assert {"encoding", "step", "data"} <= {one.kind for one in verdicts if not one.answered}
         assert any(one.answered for one in verdicts)
 
@@ -153,7 +153,7 @@ def test_a_node_survives_counts_and_explains():
         assert final.is_balanced
         assert final.count("in work") == 0
         assert final.count("answered") == len(answers)
-        # A frame that was lost was sent again, and perhaps judged twice.
+        # A frame that was lost was sent again, and perhaps answered twice.
         assert final.count("refused") >= sum(not one.answered for one in verdicts)
         assert final.values["last error"]
         assert "Traceback" not in "\n".join(node.last_lines())
