@@ -3,7 +3,7 @@
     python benchmarks/household_things.py [--scenes 1000] [--first 0] [--jobs 1] [--sensor stereo]
                                           [--each FILE] [--name household_things]
 
-Scenes are those of :mod:`things_on_table`: unions of superquadrics (cartons, cans, round and
+Scenes are those of :mod:`sq_perception.simulation.things_on_table`: unions of superquadrics (cartons, cans, round and
 oval bottles, open vessels, fruit, tools, toys, bags) that stand, lie, lean on each other and are stacked; scene k from
 the seed (``SEED``, k) alone.  Sensors alternate (:data:`tabletop.SENSORS`).  Methods and measures are those of
 :mod:`scene_verdict`, rows those of :mod:`real_scenes`.  Counted are things at least half visible, apart from the rows
@@ -31,11 +31,11 @@ import tabletop
 import trimesh
 from scene_verdict import SceneVerdict, ThingVerdict
 from scipy.spatial import ConvexHull
-from things_on_table import PlacedThing, hull_points, things_on_table
 
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.simulation import sensor_noise
 from sq_perception.simulation.household import KINDS
+from sq_perception.simulation.things_on_table import PlacedThing, hull_points, things_on_table
 
 SEED = 7801
 GOALS = {"given": "88", "own": "85"}

@@ -20,7 +20,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from picking_world import NO_CAVITY, Thing, World
-from things_on_table import TABLE_CAMERA
 
 from sq_perception.geometry import mesh
 from sq_perception.geometry import rotation as quaternions
@@ -32,6 +31,7 @@ from sq_perception.simulation.household import draw_thing
 from sq_perception.simulation.thing import ON_X, ON_Y, UPRIGHT
 from sq_perception.simulation.thing_rendering import render_things
 from sq_perception.simulation.thing_setting import looking_down
+from sq_perception.simulation.things_on_table import TABLE_CAMERA
 
 KINDS = ("packed", "pile")
 THINGS = 5

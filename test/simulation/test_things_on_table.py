@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
-from collections.abc import Iterator
-from types import ModuleType
-from typing import Any
-
 import numpy as np
 import pytest
 from scipy.spatial import ConvexHull
@@ -14,23 +9,17 @@ from scipy.spatial import ConvexHull
 from sq_perception.geometry.support_directions import DIRECTIONS
 from sq_perception.geometry.union import support_of_union
 from sq_perception.imaging.camera import Camera
+from sq_perception.simulation.things_on_table import TABLE_CAMERA, ThingsOnTable, hull_points, things_on_table
 
 SMALL = Camera(160, 120, 138.6, 138.6, 79.5, 59.5)
 
 
 @pytest.fixture(scope="module")
-def tables(repository) -> Iterator[ModuleType]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(repository / "benchmarks"))
-        yield importlib.import_module("things_on_table")
+def scenes() -> list[ThingsOnTable]:
+    return [things_on_table(np.random.default_rng([5, seed]), 5, SMALL) for seed in range(12)]
 
 
-@pytest.fixture(scope="module")
-def scenes(tables: ModuleType) -> list[Any]:
-    return [tables.things_on_table(np.random.default_rng([5, seed]), 5, SMALL) for seed in range(12)]
-
-
-def test_things_rest_on_the_table_or_on_each_other(scenes: list[Any]) -> None:
+def test_things_rest_on_the_table_or_on_each_other(scenes: list[ThingsOnTable]) -> None:
     rests = [placed.rest for scene in scenes for placed in scene.placed]
     assert {"standing", "lying"} <= set(rests)
     assert any(rest.startswith("stacked") for rest in rests)
@@ -44,7 +33,7 @@ def test_things_rest_on_the_table_or_on_each_other(scenes: list[Any]) -> None:
                 assert abs(lowest) < 1e-9
 
 
-def test_things_do_not_penetrate(scenes: list[Any]) -> None:
+def test_things_do_not_penetrate(scenes: list[ThingsOnTable]) -> None:
     """No point of one hull's parts is inside of another thing's parts."""
     rng = np.random.default_rng(1)
     for scene in scenes[:6]:
@@ -55,7 +44,7 @@ def test_things_do_not_penetrate(scenes: list[Any]) -> None:
                     assert placed.parts.gauge(points).min() > 1 - 1e-3
 
 
-def test_labels_are_those_of_things_in_the_image(scenes: list[Any]) -> None:
+def test_labels_are_those_of_things_in_the_image(scenes: list[ThingsOnTable]) -> None:
     for scene in scenes:
         assert scene.depth.shape == scene.labels.shape == (120, 160)
         for placed in scene.placed:
@@ -68,24 +57,24 @@ def test_labels_are_those_of_things_in_the_image(scenes: list[Any]) -> None:
                 assert ((points @ DIRECTIONS.T).max(axis=0) < reach + 1e-6).all()
 
 
-def test_hull_points_span_the_hull(tables: ModuleType) -> None:
-    scene = tables.things_on_table(np.random.default_rng(3), 4)
-    assert (scene.camera.width, scene.camera.height) == (tables.TABLE_CAMERA.width, tables.TABLE_CAMERA.height)
+def test_hull_points_span_the_hull() -> None:
+    scene = things_on_table(np.random.default_rng(3), 4)
+    assert scene.camera == TABLE_CAMERA
     for placed in scene.placed:
-        points = tables.hull_points(placed.thing.parts)
+        points = hull_points(placed.thing.parts)
         reach = placed.thing.support(DIRECTIONS)
         spanned = (points[ConvexHull(points).vertices] @ DIRECTIONS.T).max(axis=0)
         assert (spanned <= reach + 1e-9).all()
         assert (reach - spanned).max() < 0.02 * np.linalg.norm(placed.thing.box[1] - placed.thing.box[0])
 
 
-def test_a_seed_is_a_scene_and_misuse_is_told(tables: ModuleType) -> None:
-    first, second = (tables.things_on_table(np.random.default_rng(9), 3, SMALL) for _ in range(2))
+def test_a_seed_is_a_scene_and_misuse_is_told() -> None:
+    first, second = (things_on_table(np.random.default_rng(9), 3, SMALL) for _ in range(2))
     np.testing.assert_array_equal(first.depth, second.depth)
     rng = np.random.default_rng(0)
     with pytest.raises(ValueError, match="expected 1 to 8 things, got 9"):
-        tables.things_on_table(rng, 9)
+        things_on_table(rng, 9)
     with pytest.raises(ValueError, match="expected a pinhole camera"):
-        tables.things_on_table(rng, 2, Camera(64, 64, 64.0, 64.0, 31.5, 31.5, "orthographic"))
+        things_on_table(rng, 2, Camera(64, 64, 64.0, 64.0, 31.5, 31.5, "orthographic"))
     with pytest.raises(ValueError, match="no room for 8 things"):
-        tables.things_on_table(rng, 8, Camera(16, 16, 400.0, 400.0, 7.5, 7.5))
+        things_on_table(rng, 8, Camera(16, 16, 400.0, 400.0, 7.5, 7.5))
