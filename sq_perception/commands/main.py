@@ -30,6 +30,8 @@ COMMANDS = {
         "sq_perception.commands.train_things",
         "train the network that predicts the unseen side of things",
     ),
+    "segment-views": ("sq_perception.commands.segment_views", "draw segments of simulated tables to train on"),
+    "train-masks": ("sq_perception.commands.train_masks", "train the network that finds strays in segments"),
     "dataset": ("sq_perception.commands.dataset", "write a fixed set of training and test images"),
     "evaluate": ("sq_perception.commands.evaluate", "the thesis' tables and plots, for networks and fits"),
     "render-search": ("sq_perception.commands.render_search", "find the best s and tau of the soft renderer"),

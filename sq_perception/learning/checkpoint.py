@@ -32,22 +32,25 @@ from safetensors.numpy import save as bytes_of
 
 from sq_perception.files import output_file
 from sq_perception.learning import layout
-from sq_perception.learning.network_config import RegressorConfig, ThingConfig
+from sq_perception.learning.network_config import MaskConfig, RegressorConfig, ThingConfig
 
 if TYPE_CHECKING:
     import torch
 
+    from sq_perception.learning.mask_network import MaskNetwork
     from sq_perception.learning.regressor import Regressor
     from sq_perception.learning.thing_network import ThingNetwork
 
-FORMAT, THING_FORMAT = "sq_perception.regressor", "sq_perception.things"
-_FORMATS: dict[type[Any], str] = {RegressorConfig: FORMAT, ThingConfig: THING_FORMAT}
-Config = TypeVar("Config", RegressorConfig, ThingConfig)
+FORMAT, THING_FORMAT, MASK_FORMAT = "sq_perception.regressor", "sq_perception.things", "sq_perception.masks"
+_FORMATS: dict[type[Any], str] = {RegressorConfig: FORMAT, ThingConfig: THING_FORMAT, MaskConfig: MASK_FORMAT}
+Config = TypeVar("Config", RegressorConfig, ThingConfig, MaskConfig)
 VERSION = "1"
 DEFAULT = "robust"
 """Name of the weights that are used where none are named."""
 THINGS = "things"
 """Name of the weights that predict the unseen side of things."""
+MASKS = "masks"
+"""Name of the weights that find the readings of a segment that are none of its object."""
 _MAX_PARAMETERS = 200_000_000
 _MAX_BYTES = 4 * _MAX_PARAMETERS + 2**20
 _MAX_HEADER_BYTES = 2**20
@@ -67,8 +70,8 @@ def shipped() -> dict[str, Path]:
 
 
 def shipped_regressors() -> dict[str, Path]:
-    """Those among them that predict a body, and no hull."""
-    return {name: path for name, path in shipped().items() if not predicts_hulls(path)}
+    """Those among them that predict a body."""
+    return {name: path for name, path in shipped().items() if read_header(path).get("format") == FORMAT}
 
 
 def resolve(model: Path | str | None = None) -> Path:
@@ -81,7 +84,7 @@ def resolve(model: Path | str | None = None) -> Path:
 
 def save(
     path: Path | str,
-    model: Regressor | ThingNetwork,
+    model: Regressor | ThingNetwork | MaskNetwork,
     notes: dict[str, Any] | None = None,
     dtype: type[np.floating[Any]] = np.float16,
 ) -> None:
@@ -119,7 +122,15 @@ def load_things(path: Path | str | None = None, device: str | torch.device = "cp
     return _module(ThingNetwork, config, weights).to(device).eval()
 
 
-def _module(kind: Any, config: RegressorConfig | ThingConfig, weights: Mapping[str, np.ndarray]) -> Any:
+def load_masks(path: Path | str | None = None, device: str | torch.device = "cpu") -> MaskNetwork:
+    """The network of masks, None for the one that ships; otherwise as :func:`load`."""
+    from sq_perception.learning.mask_network import MaskNetwork
+
+    config, weights = read_masks(path)
+    return _module(MaskNetwork, config, weights).to(device).eval()
+
+
+def _module(kind: Any, config: RegressorConfig | ThingConfig | MaskConfig, weights: Mapping[str, np.ndarray]) -> Any:
     import torch
 
     with torch.device("meta"):
@@ -142,6 +153,11 @@ def read(path: Path | str | None = None) -> tuple[RegressorConfig, dict[str, np.
 def read_things(path: Path | str | None = None) -> tuple[ThingConfig, dict[str, np.ndarray]]:
     """Those of a network of things, None for the one that ships; otherwise as :func:`read`."""
     return _read(resolve(THINGS if path is None else path), ThingConfig)
+
+
+def read_masks(path: Path | str | None = None) -> tuple[MaskConfig, dict[str, np.ndarray]]:
+    """Those of a network of masks, None for the one that ships; otherwise as :func:`read`."""
+    return _read(resolve(MASKS if path is None else path), MaskConfig)
 
 
 def _read(path: Path, kind: type[Config]) -> tuple[Config, dict[str, np.ndarray]]:

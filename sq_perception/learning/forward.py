@@ -4,18 +4,21 @@
 that fits bodies meanwhile wants the other cores (:mod:`sq_perception.geometry.one_thread`).
 
 A test compares with the modules of torch (:mod:`sq_perception.learning.regressor`,
-:mod:`sq_perception.learning.thing_network`), which state the same networks.
+:mod:`sq_perception.learning.thing_network`, :mod:`sq_perception.learning.mask_network`), which state the same networks.
 """
 
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterator
+from contextlib import contextmanager
 
 import numpy as np
 
 from sq_perception.geometry.one_thread import one_blas_thread
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.support_directions import DIRECTIONS
+from sq_perception.imaging.segment_view import CHANNELS
 from sq_perception.learning import layout
 from sq_perception.learning.convolution import Block, Direct, Memory, Weights, contiguous
 from sq_perception.learning.network_config import (
@@ -24,6 +27,7 @@ from sq_perception.learning.network_config import (
     LEAST_LOG,
     MOST_LOG,
     USUAL_EXTENT,
+    MaskConfig,
     RegressorConfig,
     ThingConfig,
     checked_views,
@@ -80,15 +84,38 @@ def _heights(views: np.ndarray, planes: np.ndarray) -> np.ndarray:
     return np.asarray(flat + n[:, 2] * np.where(views > 0, views, np.float32(HALF_WAY)))
 
 
+class CompactMasks:
+    """:class:`sq_perception.learning.mask_network.MaskNetwork`, ready to predict."""
+
+    def __init__(self, config: MaskConfig, weights: Weights) -> None:
+        self.config = config
+        self._backbone = _Backbone(weights, config.pixels, CHANNELS)
+        steps = range(len(config.widths) - 1)
+        self._up = [_linear(weights, [f"up.{k}"]) for k in steps]
+        self._joined = [Block.folded(weights, f"joined.{k}") for k in steps]
+        self._head = _linear(weights, ["head"])
+        self._memories = _Memories()
+
+    def logits(self, views: np.ndarray) -> np.ndarray:
+        """Logits float32 (n, p, p) of views (n, p, p, CHANNELS)."""
+        with self._memories.one() as memory, one_blas_thread():
+            images = self._backbone.computed(views, memory)
+            stages = [images[0], *images[self.config.blocks :: self.config.blocks]]
+            x, side = stages.pop()
+            for k in reversed(range(len(stages))):
+                x, side = self._joined[k].computed(
+                    _raised(x, side, self._up[k], stages[k][0], memory), 2 * side, memory, f"joined {k}"
+                )
+            matrix, bias = self._head
+            cells = (_inner(x, side) @ matrix + bias).reshape(len(x), side, side, 2, 2)
+            return cells.transpose(0, 1, 3, 2, 4).reshape(len(x), 2 * side, 2 * side)
+
+
 class _Network:
     """Images (n, p, p, c) and further numbers (n, m) to the outputs of all heads, side by side."""
 
     def __init__(self, config: RegressorConfig | ThingConfig, weights: Weights, channels: int) -> None:
-        self._pixels, self._channels = config.pixels, channels
-        self._stem = Direct.folded(weights, "features.0", "features.1", stride=2)
-        self._blocks: list[Block] = []
-        while f"features.{3 + len(self._blocks)}.first.weight" in weights:
-            self._blocks.append(Block.folded(weights, f"features.{3 + len(self._blocks)}"))
+        self._backbone = _Backbone(weights, config.pixels, channels)
         first, second = sorted({name.rsplit(".", 1)[0] for name in weights if name.startswith("mixer.")})
         names = layout.heads(config)
         self._mixer = [_linear(weights, [first]), _linear(weights, [second])]
@@ -97,40 +124,83 @@ class _Network:
         width, side = config.widths[-1], config.pixels // 2 ** len(config.widths)
         matrix, cells = self._mixer[0][0], width * side**2
         matrix[:cells] = matrix[:cells].reshape(width, side**2, -1).transpose(1, 0, 2).reshape(cells, -1)
-        self._free: deque[Memory] = deque()
+        self._memories = _Memories()
 
     def outputs(self, images: np.ndarray, more: np.ndarray) -> np.ndarray:
         """Outputs (n, k), float32."""
-        try:
-            memory = self._free.pop()  # one for each thread that computes
-        except IndexError:
-            memory = Memory()
-        with one_blas_thread():
+        with self._memories.one() as memory, one_blas_thread():
             parts = [
                 self._outputs(images[first : first + _AT_ONCE], more[first : first + _AT_ONCE], memory)
                 for first in range(0, len(images), _AT_ONCE)
             ]
-        self._free.append(memory)
         return np.concatenate(parts) if parts else np.empty((0, self._heads[0].shape[1]), np.float32)
 
     def _outputs(self, images: np.ndarray, more: np.ndarray, memory: Memory) -> np.ndarray:
-        count, side = len(images), self._pixels
-        margin = self._stem.size // 2
-        framed = memory.zeros("images", (count, side + 2 * margin, side + 2 * margin, self._channels))
-        framed[:, margin:-margin, margin:-margin] = images
-        side //= 2
-        x = self._stem.computed(framed, side, memory, "stem")
-        for number, block in enumerate(self._blocks):
-            x, side = block.computed(x, side, memory, str(number))
-        cells = x[:, 1 : side + 1, 1 : side + 1].reshape(count, -1)
-        h = np.concatenate([cells, more.astype(np.float32, copy=False)], axis=1)
+        x, side = self._backbone.computed(images, memory)[-1]
+        h = np.concatenate([_inner(x, side).reshape(len(x), -1), more.astype(np.float32, copy=False)], axis=1)
         for matrix, bias in self._mixer:
             h = np.maximum(h @ matrix + bias, 0)
         matrix, bias = self._heads
         return h @ matrix + bias
 
 
+class _Backbone:
+    """:func:`sq_perception.learning.backbone.compact_backbone`."""
+
+    def __init__(self, weights: Weights, pixels: int, channels: int) -> None:
+        self._pixels, self._channels = pixels, channels
+        self._stem = Direct.folded(weights, "features.0", "features.1", stride=2)
+        self._blocks: list[Block] = []
+        while f"features.{3 + len(self._blocks)}.first.weight" in weights:
+            self._blocks.append(Block.folded(weights, f"features.{3 + len(self._blocks)}"))
+
+    def computed(self, images: np.ndarray, memory: Memory) -> list[tuple[np.ndarray, int]]:
+        """Framed images, and their side, after the stem and after each block."""
+        count, side = len(images), self._pixels
+        margin = self._stem.size // 2
+        framed = memory.zeros("images", (count, side + 2 * margin, side + 2 * margin, self._channels))
+        framed[:, margin:-margin, margin:-margin] = images
+        side //= 2
+        found = [(self._stem.computed(framed, side, memory, "stem"), side)]
+        for number, block in enumerate(self._blocks):
+            found.append(block.computed(*found[-1], memory, str(number)))
+        return found
+
+
+class _Memories:
+    """One memory for each thread that computes."""
+
+    def __init__(self) -> None:
+        self._free: deque[Memory] = deque()
+
+    @contextmanager
+    def one(self) -> Iterator[Memory]:
+        try:
+            memory = self._free.pop()
+        except IndexError:
+            memory = Memory()
+        yield memory
+        self._free.append(memory)
+
+
+def _inner(framed: np.ndarray, side: int) -> np.ndarray:
+    return framed[:, 1 : side + 1, 1 : side + 1]
+
+
+def _raised(
+    x: np.ndarray, side: int, up: tuple[np.ndarray, np.ndarray], finer: np.ndarray, memory: Memory
+) -> np.ndarray:
+    """Framed images of twice the side: those of single pixels by ``up``, doubled, added to ``finer``."""
+    matrix, bias = up
+    sums = memory.framed(f"raised to {2 * side}", len(x), 2 * side, len(bias))
+    more = (_inner(x, side) @ matrix + bias)[:, :, None, :, None]
+    shape = len(x), side, 2, side, 2, len(bias)
+    inner = _inner(sums, 2 * side)
+    inner[...] = _inner(finer, 2 * side) + np.broadcast_to(more, shape).reshape(inner.shape)
+    return sums
+
+
 def _linear(weights: Weights, names: list[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Matrix (inputs, outputs) and bias of fully connected layers side by side."""
-    matrix = np.concatenate([weights[f"{name}.weight"] for name in names]).T
-    return contiguous(matrix), np.concatenate([weights[f"{name}.bias"] for name in names])
+    """Matrix (inputs, outputs) and bias of fully connected layers, or convolutions of single pixels, side by side."""
+    matrix = np.concatenate([weights[f"{name}.weight"] for name in names])
+    return contiguous(matrix.reshape(len(matrix), -1).T), np.concatenate([weights[f"{name}.bias"] for name in names])

@@ -145,6 +145,17 @@ def load_things(path: Path | str | None = None, device: str = "cpu") -> ThingPre
     return ThingPredictor(checkpoint.load_things(path, device))
 
 
+def load_masks(path: Path | str | None = None) -> forward.CompactMasks:
+    """The network of masks, None for the one that ships; a processor computes it.
+
+    Raises
+    ------
+    CheckpointError
+        As :func:`checkpoint.read_masks`.
+    """
+    return forward.CompactMasks(*checkpoint.read_masks(path))
+
+
 class _OnOneThread:
     """A predictor of torch: on busy cores the slowest of several threads sets the time, and one image is small."""
 

@@ -6,18 +6,23 @@ files have none.
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 from sq_perception.geometry.support_directions import DIRECTIONS
-from sq_perception.learning.network_config import BODY_OUTPUTS, EXTENT, PLANE, RegressorConfig, ThingConfig
+from sq_perception.imaging.segment_view import CHANNELS
+from sq_perception.learning.network_config import BODY_OUTPUTS, EXTENT, PLANE, MaskConfig, RegressorConfig, ThingConfig
 
 Shapes = dict[str, tuple[int, ...]]
 
 COUNTER = ".num_batches_tracked"
 """How the names of those counters end."""
+CELLS_AT_ONCE = 4
+"""Outputs of the network of masks at a pixel of its stem's half resolution: 2 x 2 cells."""
 _RESNET18_CHANNELS, _RESNET18_BLOCKS = (64, 128, 256, 512), 2
 _HEADS = {"size_head": 3, "shape_head": 2, "translation_head": 3, "rotation_head": 6}
 
 
-def shapes(config: RegressorConfig | ThingConfig) -> Shapes:
+def shapes(config: RegressorConfig | ThingConfig | MaskConfig) -> Shapes:
     """Name and shape of every weight.
 
     Raises
@@ -25,6 +30,13 @@ def shapes(config: RegressorConfig | ThingConfig) -> Shapes:
     ValueError
         For numbers of channels or outputs that are no positive integers.
     """
+    found = _masks(config) if isinstance(config, MaskConfig) else _bodies(config)
+    if not all(isinstance(side, int) and side > 0 for shape in found.values() for side in shape):
+        raise ValueError("expected positive integers as numbers of channels and outputs")
+    return found
+
+
+def _bodies(config: RegressorConfig | ThingConfig) -> Shapes:
     found: Shapes = {}
     of_things = isinstance(config, ThingConfig)
     encoding = config.regressor() if isinstance(config, ThingConfig) else config
@@ -38,8 +50,18 @@ def shapes(config: RegressorConfig | ThingConfig) -> Shapes:
     _linear(found, second, config.hidden, config.hidden)
     for head, outputs in heads(config).items():
         _linear(found, head, config.hidden, outputs)
-    if not all(isinstance(side, int) and side > 0 for shape in found.values() for side in shape):
-        raise ValueError("expected positive integers as numbers of channels and outputs")
+    return found
+
+
+def _masks(config: MaskConfig) -> Shapes:
+    """The weights of :class:`sq_perception.learning.mask_network.MaskNetwork`."""
+    found: Shapes = {}
+    _compact(found, config.widths, config.blocks, CHANNELS)
+    for k, (fine, coarse) in enumerate(pairwise(config.widths)):
+        _biased(found, f"up.{k}", coarse, fine)
+        _convolution(found, f"joined.{k}.first", f"joined.{k}.first_norm", fine, fine, 3)
+        _convolution(found, f"joined.{k}.second", f"joined.{k}.second_norm", fine, fine, 3)
+    _biased(found, "head", config.widths[0], CELLS_AT_ONCE)
     return found
 
 
@@ -91,6 +113,11 @@ def _convolution(found: Shapes, name: str, norm: str, channels_in: int, channels
     found[f"{name}.weight"] = (channels_out, channels_in, size, size)
     for part in ("weight", "bias", "running_mean", "running_var"):
         found[f"{norm}.{part}"] = (channels_out,)
+
+
+def _biased(found: Shapes, name: str, channels_in: int, channels_out: int) -> None:
+    """A convolution of single pixels."""
+    found[f"{name}.weight"], found[f"{name}.bias"] = (channels_out, channels_in, 1, 1), (channels_out,)
 
 
 def _linear(found: Shapes, name: str, inputs: int, outputs: int) -> None:

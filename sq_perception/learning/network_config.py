@@ -14,7 +14,7 @@ from array_api_compat import array_namespace
 
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.imaging import canonical_view
+from sq_perception.imaging import canonical_view, segment_view
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.canonical_view import CanonicalView
 from sq_perception.learning.choices import SIZE_RANGE, Backbone, Framing
@@ -143,6 +143,17 @@ class ThingConfig:
     def regressor(self) -> RegressorConfig:
         """How the superquadric's parameters are encoded."""
         return RegressorConfig(pixels=self.pixels, widths=self.widths, blocks=self.blocks, hidden=self.hidden)
+
+
+@dataclass(frozen=True)
+class MaskConfig:
+    """Everything that fixes the network's form; travels in the checkpoint's header."""
+
+    pixels: int = segment_view.PIXELS
+    widths: tuple[int, ...] = (16, 32, 64, 64)
+    """Channels of the stem and of each stage; every stage halves the resolution."""
+    blocks: int = 1
+    """Residual blocks a stage on the way down."""
 
 
 def mirrored_planes(planes: np.ndarray) -> np.ndarray:

@@ -131,14 +131,14 @@ def train(config: ThingTraining, views: Path, output: Path, form: ThingConfig | 
         state.restore(path)
     rng = np.random.default_rng([config.seed, state.step])
     shards: list[Path] = []
-    pool = held = read_views(_shards(views, config.held)[: config.held])
+    pool = held = read_views(shards_of(views, config.held)[: config.held])
     began, losses = time.monotonic() - state.seconds, []
     while (progress := (time.monotonic() - began) / (60 * config.minutes)) < 1:
         if state.step % config.validation == 0 or not shards:
-            found = _shards(views, config.held)[config.held :]
+            found = shards_of(views, config.held)[config.held :]
             if len(found) > len(shards):
                 shards, pool = found, read_views(found)
-        rate = config.rate * min(1.0, (state.step + 1) / _WARM_UP) * (0.5 * (1 + math.cos(math.pi * progress)) + 0.01)
+        rate = falling_rate(config.rate, state.step, progress)
         images, planes, extents, truth = _batch(pool, rng.integers(len(pool.images), size=config.batch), rng)
         network.train()
         with torch.autocast("cpu", torch.bfloat16, enabled=config.bfloat16):
@@ -260,7 +260,13 @@ def _mixer_without_flatten(name: str) -> str:
     return ".".join(parts)
 
 
-def _shards(folder: Path, held: int) -> list[Path]:
+def falling_rate(rate: float, step: int, progress: float) -> float:
+    """The learning rate: it rises over some steps and falls as a cosine of the time that passed, 0 to 1."""
+    return rate * min(1.0, (step + 1) / _WARM_UP) * (0.5 * (1 + math.cos(math.pi * progress)) + 0.01)
+
+
+def shards_of(folder: Path, held: int) -> list[Path]:
+    """The shards that a folder holds, in order; raises ValueError if there are none but those kept for validation."""
     found = sorted(folder.glob("*.safetensors"))
     if len(found) <= held:
         raise ValueError(f"{folder}: expected more than {held} shards of views, found {len(found)}")

@@ -13,9 +13,11 @@ import torch
 from threadpoolctl import threadpool_info
 
 from sq_perception.geometry.one_thread import one_blas_thread
+from sq_perception.imaging.segment_view import CHANNELS
 from sq_perception.learning import checkpoint, inference, layout
-from sq_perception.learning.forward import CompactRegressor, CompactThings
-from sq_perception.learning.network_config import RegressorConfig, ThingConfig
+from sq_perception.learning.forward import CompactMasks, CompactRegressor, CompactThings
+from sq_perception.learning.mask_network import MaskNetwork
+from sq_perception.learning.network_config import MaskConfig, RegressorConfig, ThingConfig
 from sq_perception.learning.regressor import Regressor
 from sq_perception.learning.thing_network import ThingNetwork
 
@@ -26,6 +28,7 @@ FORMS = [
     RegressorConfig(pixels=16, widths=(3, 5, 7, 9), blocks=2, hidden=16),  # down to one pixel
     RegressorConfig(pixels=8, widths=(4,), hidden=16),
 ]
+MASKS = [MaskConfig(), MaskConfig(pixels=32, widths=(4, 8, 8), blocks=2), MaskConfig(pixels=16, widths=(3, 5))]
 THINGS = [ThingConfig(), ThingConfig(pixels=32, widths=(8, 16, 16), blocks=3, hidden=16, factors=2, spread=0.3)]
 
 
@@ -49,10 +52,11 @@ def weights(model: Any) -> dict[str, np.ndarray]:
     return {name: tensor.numpy() for name, tensor in model.state_dict().items()}
 
 
-@pytest.mark.parametrize("config", [*FORMS, RegressorConfig(), RegressorConfig.thesis(), *THINGS], ids=str)
-def test_the_layout_is_that_of_the_modules(config: RegressorConfig | ThingConfig) -> None:
+@pytest.mark.parametrize("config", [*FORMS, RegressorConfig(), RegressorConfig.thesis(), *THINGS, *MASKS], ids=str)
+def test_the_layout_is_that_of_the_modules(config: RegressorConfig | ThingConfig | MaskConfig) -> None:
+    module: Any = {RegressorConfig: Regressor, ThingConfig: ThingNetwork, MaskConfig: MaskNetwork}[type(config)]
     with torch.device("meta"):
-        model = Regressor(config) if isinstance(config, RegressorConfig) else ThingNetwork(config)
+        model = module(config)
     held = {name: tuple(tensor.shape) for name, tensor in model.state_dict().items()}
     assert layout.shapes(config) == {name: shape for name, shape in held.items() if not name.endswith(layout.COUNTER)}
 
@@ -74,6 +78,25 @@ def test_the_shipped_regressors(name: str, rng: np.random.Generator) -> None:
     views = np.where(rng.random((5, 64, 64)) < 0.4, 0, rng.random((5, 64, 64))).astype(np.float32)
     expected, found = checkpoint.load(name).predict(views), inference.load(name).predict(views)
     np.testing.assert_allclose(found.to_flat(), expected.to_flat(), atol=1e-5)
+
+
+@pytest.mark.parametrize("config", [*MASKS, None], ids=str)
+def test_networks_of_masks(config: MaskConfig | None, rng: np.random.Generator) -> None:
+    """None: the one that ships."""
+    torch.manual_seed(3)
+    model = checkpoint.load_masks() if config is None else MaskNetwork(config)
+    pixels = model.config.pixels
+    views = rng.standard_normal((21, pixels, pixels, CHANNELS)).astype(np.float32)
+    shown = torch.from_numpy(views).permute(0, 3, 1, 2)
+    if config is not None:
+        for _ in range(3):
+            model.train()(shown)
+    predictor = CompactMasks(model.config, weights(model))
+    for some in (slice(0, 21), slice(3, 4)):
+        with torch.inference_mode():
+            expected = model.eval()(shown[some]).numpy()
+        np.testing.assert_allclose(predictor.logits(views[some]), expected, atol=1e-4)
+    assert expected.std() > 1e-3
 
 
 @pytest.mark.parametrize("config", [*THINGS, None], ids=str)

@@ -1,0 +1,81 @@
+"""The view of a segment in its surroundings: what cells show, and which pixels they lie on."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sq_perception.imaging import segment_view
+from sq_perception.imaging.camera import Camera
+from sq_perception.imaging.segment_view import CHANNELS, HEIGHT, IMAGE, MEASURED, OTHERS, PIXELS, PLANE, SEGMENT
+
+CAMERA = Camera(200, 150, 180.0, 180.0, 99.5, 74.5)
+WINDOW = slice(50, 90), slice(60, 120)
+NEARNESS, SCALE, GRAIN = 1, 6, 7
+
+
+def table() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A block at 0.8 m before a wall at 1 m, another beside it, a hole; the wall is the plane."""
+    depth, labels = np.full((150, 200), 1.0, np.float32), np.zeros((150, 200), np.int32)
+    depth[WINDOW], labels[WINDOW] = 0.8, 1
+    depth[60:80, 125:140], labels[60:80, 125:140] = 0.9, 2
+    depth[65:70, 80:90] = np.nan
+    return depth, labels, np.array([0.0, 0.0, -1.0, 1.0])
+
+
+def view() -> segment_view.SegmentView:
+    depth, labels, plane = table()
+    return segment_view.from_segment(depth, labels, 1, WINDOW, CAMERA, plane)
+
+
+def test_cells_show_the_pixels_under_their_middles() -> None:
+    depth, labels, _ = table()
+    shown = view()
+    assert shown.image.shape == (PIXELS, PIXELS, CHANNELS)
+    assert shown.side == 1.5 * 60 + 8
+    grid = np.ix_(shown.rows, shown.columns)
+    np.testing.assert_array_equal(shown.image[..., SEGMENT], labels[grid] == 1)
+    np.testing.assert_array_equal(shown.image[..., OTHERS], labels[grid] == 2)
+    np.testing.assert_array_equal(shown.image[..., MEASURED], np.isfinite(depth[grid]))
+    scale = shown.side * 0.8 / CAMERA.fx
+    known = np.isfinite(depth[grid])
+    np.testing.assert_allclose(shown.image[known][:, NEARNESS], (0.8 - depth[grid][known]) / scale, atol=1e-6)
+    np.testing.assert_allclose(shown.image[known][:, HEIGHT], (1.0 - depth[grid][known]) / scale, atol=1e-6)
+    assert (shown.image[~known][:, [NEARNESS, HEIGHT]] == 0).all()
+    assert (shown.image[..., [IMAGE, PLANE]] == 1).all()
+    np.testing.assert_allclose(shown.image[..., SCALE], np.log(scale / 0.2), rtol=1e-6)
+    np.testing.assert_allclose(shown.image[..., GRAIN], np.log(shown.side / PIXELS), rtol=1e-6)
+
+
+def test_beyond_the_image_there_is_nothing() -> None:
+    depth, labels = np.full((150, 200), 1.0, np.float32), np.zeros((150, 200), np.int32)
+    labels[:30, :40] = 1
+    shown = segment_view.from_segment(depth, labels, 1, (slice(0, 30), slice(0, 40)), CAMERA, None)
+    outside = (shown.rows < 0)[:, None] | (shown.columns < 0)
+    assert outside.any()
+    assert (shown.image[outside][:, [MEASURED, NEARNESS, HEIGHT, SEGMENT, OTHERS, IMAGE]] == 0).all()
+    assert (shown.image[..., PLANE] == 0).all()
+
+
+@pytest.mark.parametrize("scale", [1.0, 4.0])
+def test_the_same_thing_at_another_grain_looks_alike(scale: float) -> None:
+    """An image of ``scale`` times the pixels shows the same nearness and heights."""
+    depth, labels, plane = table()
+    times = int(scale)
+    large = np.kron(depth, np.ones((times, times), np.float32)), np.kron(labels, np.ones((times, times), np.int32))
+    camera = Camera(200 * times, 150 * times, 180.0 * times, 180.0 * times, 99.5 * times, 74.5 * times)
+    window = tuple(slice(times * each.start, times * each.stop) for each in WINDOW)
+    shown = segment_view.from_segment(*large, 1, (window[0], window[1]), camera, plane)
+    inside = (shown.image[..., SEGMENT] > 0) & (shown.image[..., MEASURED] > 0)
+    other = view()
+    middle = (other.image[..., SEGMENT] > 0) & (other.image[..., MEASURED] > 0)
+    np.testing.assert_allclose(shown.image[inside][:, HEIGHT].mean(), other.image[middle][:, HEIGHT].mean(), rtol=0.08)
+
+
+def test_values_of_cells_come_back_to_their_pixels() -> None:
+    """A linear ramp over the cells is a linear ramp over the pixels, at the places that the cells have."""
+    shown = view()
+    ramp = (shown.left + shown.side * (np.arange(PIXELS) + 0.5) / PIXELS)[None, :].repeat(PIXELS, axis=0)
+    back = shown.at_pixels(ramp.astype(np.float32), WINDOW)
+    assert back.shape == (40, 60)
+    np.testing.assert_allclose(back, np.arange(60, 120)[None, :].repeat(40, axis=0) + 0.5, atol=0.05)

@@ -1,0 +1,99 @@
+"""The network of masks: its loss in closed form, mirrors, a short training, and what the shipped one finds."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from safetensors.numpy import save_file
+
+from sq_perception.commands import main
+from sq_perception.imaging.segment_view import CHANNELS, PIXELS, SEGMENT
+from sq_perception.learning import checkpoint, mask_training
+from sq_perception.learning.checkpoint import CheckpointError
+from sq_perception.learning.mask_network import MaskNetwork
+from sq_perception.learning.network_config import MaskConfig
+from sq_perception.simulation.segment_views import NO, UNKNOWN, YES, draw_segment_views
+
+SMALL = MaskConfig(widths=(4, 8))
+
+
+def shards(folder: Path, count: int, rng: np.random.Generator) -> None:
+    """Shards of random views, in which a reading is the object's where the first channel is more than a half."""
+    folder.mkdir()
+    for k in range(count):
+        images = rng.random((24, PIXELS, PIXELS, CHANNELS)).astype(np.float16)
+        images[..., SEGMENT] = 1
+        truth = np.where(images[..., 0] > 0.5, YES, NO).astype(np.uint8)
+        save_file({"images": images, "truth": truth}, str(folder / f"{k:05d}.safetensors"))
+
+
+def test_the_loss_is_a_weighted_cross_entropy() -> None:
+    """Of a cell within the segment, one beside it and one without a reading."""
+    images = torch.zeros(1, CHANNELS, 1, 3)
+    images[0, SEGMENT, 0, 0] = 1
+    truth = torch.tensor([[[YES, NO, UNKNOWN]]])
+    logits = torch.tensor([[[0.5, -1.0, 7.0]]])
+    inside, beside = np.log1p(np.exp(-0.5)), np.log1p(np.exp(-1.0))
+    expected = (inside + mask_training.AROUND * beside) / (1 + mask_training.AROUND)
+    assert float(mask_training.mask_loss(logits, images, truth)) == pytest.approx(expected, rel=1e-6)
+
+
+def test_nothing_measured_has_no_loss() -> None:
+    images, truth = torch.zeros(1, CHANNELS, 2, 2), torch.full((1, 2, 2), UNKNOWN)
+    assert float(mask_training.mask_loss(torch.zeros(1, 2, 2), images, truth)) == 0
+
+
+@pytest.mark.parametrize("config", [MaskConfig(), MaskConfig(pixels=32, widths=(4, 8, 8), blocks=2)], ids=str)
+def test_every_cell_has_a_logit(config: MaskConfig) -> None:
+    assert MaskNetwork(config)(torch.zeros(2, CHANNELS, config.pixels, config.pixels)).shape == (
+        2,
+        config.pixels,
+        config.pixels,
+    )
+
+
+def test_a_training_learns_goes_on_and_is_read_again(tmp_path: Path, rng: np.random.Generator) -> None:
+    shards(tmp_path / "views", 3, rng)
+    config = mask_training.MaskTraining(minutes=0.1, batch=8, threads=1, held=1, validation=5)
+    first = mask_training.train(config, tmp_path / "views", tmp_path / "run", SMALL)
+    records = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
+    assert records[-1]["strays"] == pytest.approx(1, abs=0.1)
+    assert records[-1]["left"] < records[-1]["strays"]
+    longer = mask_training.MaskTraining(minutes=0.12, batch=8, threads=1, held=1, validation=5)
+    mask_training.train(longer, tmp_path / "views", tmp_path / "run", SMALL)
+    more = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
+    assert more[len(records)]["step"] > records[-1]["step"]
+    again = checkpoint.load_masks(tmp_path / "run" / "masks.safetensors")
+    assert again.config == SMALL == first.config
+
+
+def test_a_folder_without_views_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    tmp_path.joinpath("empty").mkdir()
+    assert main.main(["train-masks", str(tmp_path / "empty"), "--output", str(tmp_path / "run")]) == 1
+    assert "expected more than 2 shards" in capsys.readouterr().err
+
+
+def test_the_command_draws_what_the_training_reads(tmp_path: Path) -> None:
+    assert main.main(["segment-views", str(tmp_path), "--shards", "1", "--scenes", "2"]) == 0
+    drawn = mask_training.read_views([tmp_path / "00000.safetensors"])
+    again = draw_segment_views(2, np.random.default_rng([0, 0]))
+    np.testing.assert_array_equal(drawn.images, again.images)
+    np.testing.assert_array_equal(drawn.truth, again.truth)
+
+
+def test_weights_of_another_kind_are_refused() -> None:
+    with pytest.raises(CheckpointError, match=r"sq_perception\.masks"):
+        checkpoint.load_masks("robust")
+    assert "masks" not in checkpoint.shipped_regressors()
+
+
+def test_the_shipped_network_finds_strays_in_scenes_that_it_has_not_seen() -> None:
+    """More than half of them, for a fiftieth of the objects' readings."""
+    found = mask_training.validate(checkpoint.load_masks(), draw_segment_views(12, np.random.default_rng([77, 5])))
+    assert found["strays"] > 0.03
+    assert found["left"] < 0.6 * found["strays"]
+    assert found["lost"] < 0.03

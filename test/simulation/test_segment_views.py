@@ -1,0 +1,48 @@
+"""Segments to train on: what is the object's, what is not, and what is unknown."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sq_perception.imaging.segment_view import IMAGE, MEASURED, SEGMENT
+from sq_perception.simulation import segment_views
+from sq_perception.simulation.segment_views import NO, UNKNOWN, YES, SegmentViews, draw_segment_views
+
+
+@pytest.fixture(scope="module")
+def drawn() -> SegmentViews:
+    return draw_segment_views(10, np.random.default_rng(4))
+
+
+def test_truth_is_known_where_something_was_measured(drawn: SegmentViews) -> None:
+    assert len(drawn.images) == len(drawn.truth) > 10
+    np.testing.assert_array_equal(drawn.truth == UNKNOWN, drawn.images[..., MEASURED] == 0)
+
+
+def test_most_of_a_segment_is_its_object(drawn: SegmentViews) -> None:
+    inside = (drawn.images[..., SEGMENT] > 0) & (drawn.truth != UNKNOWN)
+    own = (inside & (drawn.truth == YES)).sum(axis=(1, 2)) / inside.sum(axis=(1, 2))
+    assert np.median(own) > 0.85
+    assert (drawn.truth[inside] == NO).any()
+
+
+def test_borders_cut_some(drawn: SegmentViews) -> None:
+    """Cells outside of the image beside cells of the segment."""
+    outside = drawn.images[..., IMAGE] == 0
+    beside = (outside[:, 1:] & (drawn.images[:, :-1, :, SEGMENT] > 0)) | (
+        outside[:, :-1] & (drawn.images[:, 1:, :, SEGMENT] > 0)
+    )
+    assert 0 < np.count_nonzero(beside.any(axis=(1, 2))) < len(drawn.images)
+
+
+def test_the_same_seed_draws_the_same_views() -> None:
+    first, second = (draw_segment_views(2, np.random.default_rng(9)) for _ in range(2))
+    np.testing.assert_array_equal(first.images, second.images)
+    np.testing.assert_array_equal(first.truth, second.truth)
+
+
+def test_scenes_without_segments_give_an_empty_batch(monkeypatch: pytest.MonkeyPatch) -> None:
+    nothing = segment_views.segments.Segmentation(np.zeros((1, 1), np.int32), None, ())
+    monkeypatch.setattr(segment_views.segments, "segment", lambda *_: nothing)
+    assert draw_segment_views(1, np.random.default_rng(1)).truth.shape == (0, 64, 64)
