@@ -12,7 +12,7 @@ pixel by itself, then millimetres.
     seen IoU      the same for masks: true pixels against labels of the matched body
     false         recovered bodies a frame that are left over, or whose IoU with every true body is below ``FALSE``
 
-``own`` are the program's masks, ``own, no repair`` those before segments are joined and split by their bodies, ``true``
+``own`` are the program's masks, ``own, no repair`` those before segments are joined and split, ``true``
 those of the renderer: the difference is what the segmentation costs.  Failed bodies count as not recovered.  Times are
 medians of one pinned thread.
 """

@@ -28,7 +28,6 @@ from sq_perception.fitting import depth_noise
 from sq_perception.fitting.depth_noise import DepthNoise
 from sq_perception.fitting.rays import drawn, through
 from sq_perception.geometry.kernels import kernel
-from sq_perception.imaging import depth_steps
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.coherence import coherent
 
@@ -49,8 +48,6 @@ _COARSE = 3
 """Far from the mask, only every third pixel in each direction is a free pixel."""
 _FREE_MARGIN = 3.0
 """Free space ends this many standard deviations in front of the measured depth."""
-_INNER_SHARE = 0.75
-"""Of a mask's pixels, less than which are not kept of a thin thing: a pen has little but edges."""
 _POINTS = 2000
 """Enough for moments, boxes and quantiles of the object to settle."""
 OUTLIER_SHARE = 0.01
@@ -199,13 +196,12 @@ class Crop:
         view = camera.cropped(left, top, right - left, bottom - top)
         return cls(crop, inside, view, band, noise, distance, footprint)
 
-    def observed(self, model_error: float, nan_is_empty: bool | None, smeared: bool = False) -> Observation:
-        """Its pixels sorted; ``model_error`` in metres, ``nan_is_empty`` and ``smeared`` as in the options."""
+    def observed(self, model_error: float, nan_is_empty: bool | None) -> Observation:
+        """Its pixels sorted; ``model_error`` in metres, ``nan_is_empty`` as in the options."""
         sigma = math.hypot(self.noise.at(self.distance), model_error)
-        mask = _without_edge(self.mask, self.depth) if smeared else self.mask
-        inside = coherent(self.depth, mask, _JUMP_PIXELS * self.footprint + _JUMP_NOISE * sigma)
+        inside = coherent(self.depth, self.mask, _JUMP_PIXELS * self.footprint + _JUMP_NOISE * sigma)
         filled = cv2.morphologyEx(inside.view(np.uint8), cv2.MORPH_CLOSE, np.ones((_HOLE, _HOLE), np.uint8))
-        claimed = cv2.bitwise_or(filled, mask.view(np.uint8))
+        claimed = cv2.bitwise_or(filled, self.mask.view(np.uint8))
         near = cv2.dilate(filled, np.ones((2 * self.band + 1, 2 * self.band + 1), np.uint8))
         if nan_is_empty is None:
             beside = np.isfinite(self.depth[(near > 0) & (claimed == 0)])
@@ -243,14 +239,6 @@ def span(points: np.ndarray, directions: np.ndarray) -> np.ndarray:
     along = np.partition(directions @ points.T, np.unique([before, after]), axis=1)
     lower, upper = along[:, before], along[:, after]
     return np.asarray(lower + (upper - lower) * (place - before))
-
-
-def _without_edge(inside: np.ndarray, depth: np.ndarray) -> np.ndarray:
-    """The mask (h, w) without its pixels beside something farther outside it; a thin thing keeps them."""
-    beside = cv2.dilate(np.where(inside, np.float32(0), np.nan_to_num(depth)), depth_steps.CROSS)
-    inner = inside & ~(beside > (1 + depth_steps.STEP) * depth)
-    enough = np.count_nonzero(inner) >= _INNER_SHARE * np.count_nonzero(inside)
-    return inner if enough else inside
 
 
 def _convex_hull(mask: np.ndarray) -> np.ndarray:

@@ -44,9 +44,6 @@ class FitOptions:
     nan_is_empty
         Whether a pixel without depth, outside the mask's convex hull, belongs to no part of the body, like one that saw
         farther; if not, it is unknown.  None: as the image has it, see :mod:`sq_perception.fitting.observation`.
-    smeared
-        Whether the mask was found in the depth image itself, so that it has the edges that the sensor smears over what
-        is farther: a thing's outermost pixels before a step are then left out.
     pixels
         Budget of object rays in the last stage; a quarter as many free rays come on top.  None: enough that noise
         averages out.
@@ -61,7 +58,6 @@ class FitOptions:
     expected: Superquadric | Callable[[], Superquadric] | None = None
     hull: HullPrior | Callable[[], HullPrior | None] | None = None
     nan_is_empty: bool | None = None
-    smeared: bool = False
     pixels: int | None = None
     time_budget: float = math.inf
 

@@ -92,7 +92,7 @@ def fit(
         exactly = _exactly(crop, options, given, later, began)
         if exactly is not None:
             return assessed(exactly, began)
-    observation = crop.observed(options.tolerated, options.nan_is_empty, options.smeared and options.tolerated > 0)
+    observation = crop.observed(options.tolerated, options.nan_is_empty)
     reason = _hopeless(observation)
     if reason:
         body = box_start.enclosing_box(observation.points, observation.footprint)

@@ -45,7 +45,6 @@ def _body(one: SeenObject, depth: np.ndarray, camera: Camera, options: RecoveryO
         return _unfitted(_predicted(one), one, "prediction of the network, not refined")
     known = FitOptions(
         plane=one.plane if options.use_plane else None,
-        smeared=one.smeared,
         time_budget=max(deadline - time.perf_counter(), _LEAST_BUDGET),
     )
     if not options.free_space:

@@ -34,8 +34,8 @@ class RecoveryOptions:
     use_plane
         Let the fit know the support plane.
     time_budget
-        Seconds per frame after which the surface fit tries no further start for any object, and the repair of segments
-        begins no further fit.  The objects with most pixels, large or near, come first.
+        Seconds per frame after which the surface fit tries no further start for any object, and no segment is split any
+        more.  The objects with most pixels, large or near, come first.
     max_size
         Largest full edge of an object, metres: walls, furniture and tables are larger.  Masks from outside may be, too.
     workspace
@@ -47,7 +47,8 @@ class RecoveryOptions:
         Whether a pixel beside an object shows that there is nothing before what it measured; not so where the image was
         made of a cloud.  Without it things are fitted by the tolerant course.
     repair
-        Join and split own segments where that describes the image more briefly; masks from outside stay as they are.
+        Join own segments, and leave strays in them out of fits, by a network (with the method ``auto`` alone); split
+        them where that describes the image more briefly.  Masks from outside stay as they are.
 
     Raises
     ------

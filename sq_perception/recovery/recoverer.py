@@ -2,7 +2,8 @@
 
     depth -> segmentation -> canonical view of each object -> network -> inverse of the view -> fit -> repair -> score
 
-Own segments are joined and split by the bodies that were fitted to them (:mod:`sq_perception.recovery.segment_repair`).
+Own segments are joined, and rid of strays, by a network (:mod:`sq_perception.recovery.own_segments`), and split where
+fitted bodies show it (:mod:`sq_perception.recovery.segment_split`).
 
 | method | body |
 | --- | --- |
@@ -23,7 +24,7 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -39,8 +40,10 @@ from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
 from sq_perception.learning import checkpoint, inference
 from sq_perception.learning.choices import NEEDS_TORCH
-from sq_perception.recovery import continuity, methods, prediction, seen_object, segment_repair
+from sq_perception.learning.forward import CompactMasks
+from sq_perception.recovery import continuity, methods, prediction, seen_object, segment_split
 from sq_perception.recovery.options import FITTED, NEEDS_NETWORK, Method, RecoveryOptions
+from sq_perception.recovery.own_segments import SegmentNetwork
 from sq_perception.recovery.prediction import Prediction
 from sq_perception.recovery.recovery import FrameRecovery, Recovery, timed
 from sq_perception.recovery.reference import Reference
@@ -106,11 +109,14 @@ class Recoverer:
         self._path = model
         self._device = checked_device(device)
         self._loaded: dict[bool, Network] = {} if weights_of is None else weights_of._loaded
+        self._masks: CompactMasks | None = None if weights_of is None else weights_of._masks
         self._lock = threading.Lock()
         self._beside = ThreadPoolExecutor(1, thread_name_prefix="network")
         self._pool = ThreadPoolExecutor(self._threads, thread_name_prefix="fit")
         if method in NEEDS_NETWORK:
             self._load_network(method == "auto")
+        if method == "auto":
+            self._load_masks()
 
     @property
     def has_weights(self) -> bool:
@@ -194,12 +200,19 @@ class Recoverer:
             else:
                 found = segments.from_labels(labels, depth, camera, options.segmentation_options())
             depth = cleaned
+            own: Mapping[int, np.ndarray] = {}
+            network_of_masks = None
+            if labels is None and options.repair and isinstance(network, inference.ThingPredictor):
+                network_of_masks = SegmentNetwork(self._load_masks(), depth, camera, found.plane)
+                improved = network_of_masks.improved(found)
+                found, own = improved.found, improved.own
             objects = seen_object.objects(depth, found, camera, options.depth_range)
             same = {} if previous is None else continuity.matched(kept, previous.labels, objects)
 
         with timed(milliseconds, "network"):
             fresh = [one for one in objects if one.label not in same]
             config = None if network is None else network.config
+            fresh = [one.only(own[one.label]) if one.label in own else one for one in fresh]
             fresh = self._mapped(lambda one: seen_object.viewed(one, depth, camera, found, options, config), fresh)
             if network is not None:
                 fresh = self._predicted(fresh, network, options)
@@ -213,7 +226,7 @@ class Recoverer:
             fits = [same[one.label].fit if one.label in same else fit_of[one.label] for one in objects]
         with timed(milliseconds, "repair"):
             if labels is None and options.repair and options.method in FITTED:
-                found, objects, fits = _repaired(found, objects, fits, depth, camera, options, deadline)
+                found, objects, fits = _split(found, objects, fits, depth, camera, options, network_of_masks, deadline)
         with timed(milliseconds, "score"):
             pairs = list(zip(objects, fits, strict=True))
 
@@ -264,6 +277,12 @@ class Recoverer:
                 kinds = (of_things,) if self._path is None else (True, False)
                 self._loaded.update(dict.fromkeys(kinds, self._read_network(of_things)))
             return self._loaded[of_things]
+
+    def _load_masks(self) -> CompactMasks:
+        with self._lock:
+            if self._masks is None:
+                self._masks = inference.load_masks()
+            return self._masks
 
     def _read_network(self, of_things: bool) -> Network:
         if (self._path is None and of_things) or checkpoint.predicts_hulls(self._path):
@@ -331,42 +350,45 @@ def _cleaned(depth: np.ndarray, camera: Camera) -> np.ndarray:
     return np.where(bad, np.float32(np.nan), depth)
 
 
-def _repaired(
+def _split(
     found: segments.Segmentation,
     objects: list[SeenObject],
     fits: list[Fit],
     depth: np.ndarray,
     camera: Camera,
     options: RecoveryOptions,
+    network: SegmentNetwork | None,
     deadline: float,
 ) -> tuple[segments.Segmentation, list[SeenObject], list[Fit]]:
-    """Segments, objects and bodies after joining and splitting; new segments are fitted without the network."""
+    """Segments, objects and bodies after splitting; new segments are fitted without the network of things."""
 
     def prepared(mask: np.ndarray) -> SeenObject:
         label = int(found.labels.max()) + 1
         alone = replace(found, labels=np.where(mask, np.int32(label), found.labels), ids=(label,))
         one = seen_object.objects(depth, alone, camera, options.depth_range)[0]
+        own = None if network is None else network.own(alone.labels, label)
+        one = one if own is None else one.only(own)
         return seen_object.viewed(one, depth, camera, alone, options, None)
 
-    known = dict(zip((one.label for one in objects), fits, strict=True))
-    repair = segment_repair.repaired(
+    result = segment_split.split(
         depth,
         camera,
         found.labels,
         found.plane,
-        known,
+        dict(zip((one.label for one in objects), fits, strict=True)),
         lambda mask: methods.fitted(prepared(mask), depth, camera, options, deadline),
         found.sigma,
         deadline - time.perf_counter(),
+        None if network is None else network.are_one,
     )
-    if not repair.changed:
+    if not result.parted:
         return found, objects, fits
-    same = {one.label: one for one in objects if repair.fits.get(one.label) is known[one.label]}
-    for label in repair.fits.keys() - same.keys():
-        same[label] = replace(prepared(repair.labels == label), label=label)
-    ordered = sorted(same.values(), key=lambda one: (-one.pixels, one.label))
+    parted = {label for labels in result.parted for label in labels}
+    known = {one.label: one for one in objects if one.label not in parted}
+    known |= {label: replace(prepared(result.labels == label), label=label) for label in parted}
+    ordered = sorted(known.values(), key=lambda one: (-one.pixels, one.label))
     ids = tuple(one.label for one in ordered)
-    return replace(found, labels=repair.labels, ids=ids), ordered, [repair.fits[label] for label in ids]
+    return replace(found, labels=result.labels, ids=ids), ordered, [result.fits[label] for label in ids]
 
 
 def _why_empty(depth: np.ndarray, found: segments.Segmentation) -> str:

@@ -47,8 +47,6 @@ class SeenObject:
         Number of its measured pixels.
     mask : bool (height, width)
         These pixels; ``mask_crop``, ``depth_crop`` and ``camera_crop`` are their ``window`` of mask, depth and camera.
-    smeared
-        Whether the mask has the edges that a sensor smears, as it was found in the depth.
     plane : (4,) or None
         What it stands on.
     shown
@@ -66,7 +64,6 @@ class SeenObject:
     mask_crop: np.ndarray
     camera_crop: Camera
     window: tuple[slice, slice]
-    smeared: bool = False
     plane: np.ndarray | None = None
     shown: CanonicalView | None = None
     view: CanonicalView | None = None
@@ -91,6 +88,12 @@ class SeenObject:
         heights = heights[:: max(1, heights.size // _POINTS)]
         return quantile(heights, _LOWEST), quantile(heights, 0.5)
 
+    def only(self, pixels: np.ndarray) -> SeenObject:
+        """The object as those of its pixels show it that are set in ``pixels``, of the form of ``mask_crop``."""
+        mask = np.zeros_like(self.mask)
+        mask[self.window] = kept = self.mask_crop & pixels
+        return replace(self, mask=mask, mask_crop=kept)
+
 
 def objects(
     depth: np.ndarray, found: segments.Segmentation, camera: Camera, depth_range: tuple[float, float]
@@ -108,7 +111,7 @@ def objects(
         crop = mask[window]
         camera_crop = camera.cropped(left, top, width, height)
         pixels = int(np.count_nonzero(crop))
-        seen.append(SeenObject(label, pixels, mask, depth[window], crop, camera_crop, window, found.of_depth))
+        seen.append(SeenObject(label, pixels, mask, depth[window], crop, camera_crop, window))
     return seen
 
 

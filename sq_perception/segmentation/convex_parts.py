@@ -162,23 +162,6 @@ def parts(
     return found
 
 
-def free_pairs(labels: np.ndarray, depth: np.ndarray, camera: Camera, sigma: float) -> list[tuple[int, int]]:
-    """Pairs of labels, the smaller first, between which few lines are crossed, wherever they are in the image.
-
-    Parameters as in :func:`corrected`.  As an object casts lines over the table, which is seen to be farther, such
-    segments touch, or something nearer hides all that is between them.
-    """
-    depth = _plain(depth)
-    image = _Image(depth, np.where(depth > 0, labels, 0).astype(np.int32), camera, sigma)
-    extents = regions.extents(image.labels)
-    found = [part for label in _by_size(extents) if (part := image.sampled(label, extents[label], _FEW)) is not None]
-    if len(found) < 2:
-        return []
-    crossed = image.crossed_between(found, np.inf, _ONE_BODY)
-    pairs = [(found[i].label, found[j].label) for i in range(len(found)) for j in range(i) if crossed[i, j] < _ONE_BODY]
-    return [(min(pair), max(pair)) for pair in pairs]
-
-
 def warm_up() -> None:
     """Compile, or load from disk, every kernel by parting and joining two balls."""
     camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)

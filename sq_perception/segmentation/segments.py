@@ -111,15 +111,12 @@ class Segmentation:
         Labels in the image, the one with most pixels first.
     sigma
         Noise of the depth at one metre as measured on the plane, or a guess where there is none, metres.
-    of_depth
-        Whether the labels were found in the depth, and have the edges that the sensor smears.
     """
 
     labels: np.ndarray
     plane: np.ndarray | None
     ids: tuple[int, ...]
     sigma: float = _UNKNOWN_SIGMA
-    of_depth: bool = False
 
 
 def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | None = None) -> Segmentation:
@@ -156,7 +153,7 @@ def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | No
     if plane is None:
         labels = _bodies(known, valid, camera, _UNKNOWN_SIGMA, limits.is_small)
         labels, ids = _ordered(labels, least, options.max_objects, standing.alone(known, camera, limits))
-        return Segmentation(labels, None, ids, of_depth=True)
+        return Segmentation(labels, None, ids)
     support = support_surface.measured(plane, known, valid, camera)
     walls = [other for other in planes if other is not plane]
     # What is out of range holds things up and hides them all the same.
@@ -166,7 +163,7 @@ def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | No
     labels = _above(known, relative * valid, valid, camera, support, walls, limits)
     test = standing.standing(everything, relative, camera, support, walls, limits)
     labels, ids = _ordered(labels, least, options.max_objects, test)
-    return Segmentation(labels, plane.equation, ids, max(support.sigma, _LEAST_SIGMA), of_depth=True)
+    return Segmentation(labels, plane.equation, ids, max(support.sigma, _LEAST_SIGMA))
 
 
 def from_labels(

@@ -13,7 +13,6 @@ import pytest
 from sq_perception.fitting import covariance, quality, surface_fit
 from sq_perception.fitting.bounds import Bounds
 from sq_perception.fitting.fit import CUT_SHORT, Fit, Status
-from sq_perception.fitting.observation import Crop
 from sq_perception.fitting.surface_fit import FitOptions
 from sq_perception.geometry import metrics
 from sq_perception.geometry import rotation as quaternions
@@ -483,24 +482,6 @@ def test_a_hole_that_the_sensor_left_is_no_hole_in_the_body(behind: float) -> No
     assert iou(surface_fit.fit(depth, mask, CAMERA), truth) > 0.97
 
 
-def test_an_outline_that_a_sensor_smeared_does_not_widen_the_body() -> None:
-    """Every pixel beside the thing shows the thing's depth, as a stereo camera has it; a mask of the depth holds it."""
-    too_wide = []
-    for seed in range(8):
-        body = pinhole_body(np.random.default_rng(seed))
-        image, mask = pinhole_image(body)
-        wider = cv2.dilate(mask.view(np.uint8), np.ones((3, 3), np.uint8)) > 0
-        image = np.where(wider & ~mask, cv2.erode(image, np.ones((3, 3), np.uint8)), image)
-        for smeared in (False, True):
-            options = FitOptions(model_error=0.0025, smeared=smeared)
-            found = surface_fit.fit(image, wider, CAMERA, options=options).superquadric
-            too_wide.append((found.support(np.eye(3)[:2]) - body.support(np.eye(3)[:2])).mean())
-    usual, known = np.median(np.reshape(too_wide, (8, 2)), axis=0)
-    pixel = 0.45 / CAMERA.fx
-    assert usual > 0.5 * pixel
-    assert abs(known) < 0.3 * usual
-
-
 @pytest.mark.parametrize(
     ("typical", "as_hull", "status"),
     [
@@ -517,16 +498,6 @@ def test_a_hull_that_encloses_most_of_a_thing_is_weak(typical: float, as_hull: b
     found, message = quality.status(body, 1e-8 * np.eye(11), typical, 1e-4, as_hull)
     assert found == status
     assert ("off" in message) == (status != Status.CONVERGED)
-
-
-def test_a_thin_thing_keeps_its_edges() -> None:
-    depth = np.full((60, 80), 1.0, np.float32)
-    mask = np.zeros(depth.shape, bool)
-    mask[30:32, 10:70] = True
-    depth[mask] = 0.6
-    camera = Camera(80, 60, 70.0, 70.0, 39.5, 29.5)
-    crops = [Crop.around(depth, mask, camera, 0.001).observed(0.0025, False, smeared) for smeared in (False, True)]
-    np.testing.assert_array_equal(crops[0].pixels, crops[1].pixels)
 
 
 def test_a_longer_body_is_not_taken_for_a_smaller_mask() -> None:

@@ -84,17 +84,6 @@ def test_pieces_of_one_body_are_joined_and_those_of_two_are_not():
     assert min(ious(found, truth)) > 0.99
 
 
-def test_what_an_occluder_leaves_visible_is_a_free_pair():
-    """A long body behind a bar: its two ends; with the wall seen between two bodies there is no such pair."""
-    bar = body(0.0, (0.015, 0.09, 0.015), (0.1, 0.1), z=0.55)
-    u = np.arange(CAMERA.width)[None, :]
-    depth, truth = seen([body(0, (0.12, 0.04, 0.04), (0.2, 0.2)), bar])
-    ends = np.where((truth == 1) & (u > 160), 3, truth).astype(np.int32)
-    assert convex_parts.free_pairs(ends, depth, CAMERA, NOISE) == [(1, 3)]
-    depth, truth = seen([body(-0.08, (0.04, 0.04, 0.04)), body(0.08, (0.04, 0.04, 0.04)), bar])
-    assert convex_parts.free_pairs(truth, depth, CAMERA, NOISE) == []
-
-
 def test_a_bowl_has_no_convex_parts():
     """The inside of a hemisphere: every line through it is crossed, and no part of it is convex."""
     v, u = np.indices((CAMERA.height, CAMERA.width))
@@ -136,7 +125,6 @@ def test_nothing_to_say_changes_nothing(depth):
     np.testing.assert_array_equal(convex_parts.corrected(labels, image, CAMERA, NOISE), labels)
     labels[50:100, 50:100] = 3
     np.testing.assert_array_equal(convex_parts.corrected(labels, image, CAMERA, NOISE) > 0, labels > 0)
-    assert convex_parts.free_pairs(labels, image, CAMERA, NOISE) == []
 
 
 def test_options_are_checked():

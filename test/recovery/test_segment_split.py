@@ -1,4 +1,4 @@
-"""Segments joined and split by their bodies: what one tells as well is one, what two tell in fewer words is two."""
+"""Segments split by their bodies: two where two describe the image more briefly, and one otherwise."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from sq_perception.geometry import rotation
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
-from sq_perception.recovery import scene_description, segment_repair
+from sq_perception.recovery import scene_description, segment_split
 from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
 from sq_perception.recovery.scene_description import Evidence, price, unexplained
 from sq_perception.segmentation import segments
@@ -51,15 +51,15 @@ def fit_of(depth):
     return fit
 
 
-def repaired(depth, labels):
-    """The repair of labels with their fits, and how many fits it took."""
+def parted(depth, labels, are_one=None):
+    """Labels with their fits after splitting, and how many fits it took."""
     fit = fit_of(depth)
     fits = {int(k): fit(labels == k) for k in np.unique(labels[labels > 0])}
     fit.calls = 0
-    repair = segment_repair.repaired(depth, CAMERA, labels, PLANE, fits, fit, NOISE)
-    assert set(repair.fits) == set(np.unique(repair.labels)) - {0}
-    assert ((repair.labels > 0) == (labels > 0)).all()
-    return repair, fit.calls
+    result = segment_split.split(depth, CAMERA, labels, PLANE, fits, fit, NOISE, are_one=are_one)
+    assert set(result.fits) == set(np.unique(result.labels)) - {0}
+    assert ((result.labels > 0) == (labels > 0)).all()
+    return result, fit.calls
 
 
 def cut(labels, label, across):
@@ -79,39 +79,34 @@ def overlap(labels, truth):
 LONG_BOX = (0.09, 0.04, 0.035)
 
 
-def test_a_box_cut_in_two_labels_is_joined():
-    depth, truth = seen([standing(0, 0, LONG_BOX, turn=0.4)])
-    repair, _ = repaired(depth, cut(truth, 1, np.median(np.nonzero(truth)[1])))
-    assert len(repair.fits) == 1
-    assert repair.joined == ((1, 2),)
-    np.testing.assert_array_equal(repair.labels, truth)
-    np.testing.assert_allclose(np.sort(repair.fits[1].superquadric.size), np.sort(LONG_BOX), atol=0.003)
-
-
-@pytest.mark.parametrize("shape", [BOX, (0.1, 1.0)])
-def test_what_goes_on_behind_a_bar_is_one_body(shape):
-    """Two segments of one body, a bar before their gap: one fit with the right length."""
-    depth, truth = seen([standing(0, 0.08, (0.09, 0.035, 0.035), shape), standing(0, -0.02, (0.015, 0.015, 0.06))])
-    repair, _ = repaired(depth, cut(truth, 1, 160))
-    assert len(repair.fits) == 2
-    assert repair.joined == ((1, 3),)
-    assert repair.fits[1].superquadric.size.max() == pytest.approx(0.09, abs=0.004)
-
-
 def test_two_boxes_under_one_label_become_two():
     bodies = [standing(-0.055, 0, (0.05, 0.04, 0.03)), standing(0.035, 0.01, (0.04, 0.03, 0.06))]
     depth, truth = seen(bodies)
-    repair, _ = repaired(depth, (truth > 0).astype(np.int32))
-    assert len(repair.fits) == 2
-    assert min(overlap(repair.labels, truth)) > 0.9
+    result, _ = parted(depth, (truth > 0).astype(np.int32))
+    assert len(result.fits) == 2
+    assert min(overlap(result.labels, truth)) > 0.9
+
+
+def test_what_belongs_together_is_not_split():
+    bodies = [standing(-0.055, 0, (0.05, 0.04, 0.03)), standing(0.035, 0.01, (0.04, 0.03, 0.06))]
+    depth, truth = seen(bodies)
+    asked = []
+
+    def are_one(labels, parts):
+        asked.append(parts)
+        return True
+
+    result, calls = parted(depth, (truth > 0).astype(np.int32), are_one)
+    assert not result.parted
+    assert calls == 0
+    assert [len(parts) for parts in asked] == [2]
 
 
 def test_flush_boxes_that_form_one_box_stay_one():
-    """Nothing in the image tells two equal boxes side by side from a long one: one label stays, two are joined."""
+    """Nothing in the image distinguishes two equal boxes side by side from a long one."""
     depth, truth = seen([standing(x, 0, (0.045, 0.04, 0.04)) for x in (-0.045, 0.045)])
-    whole, _ = repaired(depth, (truth > 0).astype(np.int32))
+    whole, _ = parted(depth, (truth > 0).astype(np.int32))
     assert len(whole.fits) == 1
-    assert len(repaired(depth, truth)[0].fits) == 1
     assert whole.fits[1].superquadric.size.max() == pytest.approx(0.09, abs=0.004)
 
 
@@ -120,9 +115,9 @@ def test_flush_boxes_that_form_one_box_stay_one():
 def test_an_l_shape_becomes_two_bodies(side, away):
     bodies = [standing(0, 0, (0.09, 0.025, 0.03)), standing(side * 0.065, away * 0.085, (0.025, 0.06, 0.03))]
     depth, truth = seen(bodies)
-    repair, _ = repaired(depth, (truth > 0).astype(np.int32))
-    assert len(repair.fits) == 2
-    assert repair.split == ((1, 2),)
+    result, _ = parted(depth, (truth > 0).astype(np.int32))
+    assert len(result.fits) == 2
+    assert result.parted == ((1, 2),)
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -131,15 +126,15 @@ def test_an_l_shape_becomes_two_bodies(side, away):
 )
 def test_a_superquadric_on_noise_costs_no_fit_and_stays(seed, size, shape):
     depth, truth = seen([standing(0, 0, size, shape, turn=0.5)], 0.002, seed)
-    repair, calls = repaired(depth, truth)
-    assert not repair.changed
+    result, calls = parted(depth, truth)
+    assert not result.parted
     assert calls == 0
 
 
 def test_bodies_apart_cost_no_fit():
     depth, truth = seen([standing(x, 0, (0.03, 0.03, 0.03), turn=0.3) for x in (-0.1, 0.0, 0.1)])
-    repair, calls = repaired(depth, truth)
-    assert not repair.changed
+    result, calls = parted(depth, truth)
+    assert not result.parted
     assert calls == 0
 
 
@@ -148,8 +143,8 @@ def test_what_hangs_on_another_is_no_body_of_its_own():
     neck = standing(0, 0, (0.012, 0.012, 0.03), (0.1, 1.0))
     neck = Superquadric(neck.size, neck.shape, neck.translation + 0.1 * PLANE[:3], neck.rotation)
     depth, truth = seen([standing(0, 0, (0.03, 0.03, 0.05), (0.1, 1.0)), neck])
-    repair, _ = repaired(depth, (truth > 0).astype(np.int32))
-    assert len(repair.fits) == 1
+    result, _ = parted(depth, (truth > 0).astype(np.int32))
+    assert len(result.fits) == 1
 
 
 def test_a_mug_stays_with_its_handle():
@@ -157,8 +152,8 @@ def test_a_mug_stays_with_its_handle():
     handle = standing(0.042, 0, (0.015, 0.005, 0.03))
     handle = Superquadric(handle.size, handle.shape, handle.translation + 0.03 * PLANE[:3], handle.rotation)
     depth, truth = seen([standing(0, 0, (0.035, 0.035, 0.055), (0.1, 1.0)), handle])
-    repair, _ = repaired(depth, (truth > 0).astype(np.int32))
-    assert len(repair.fits) == 1
+    result, _ = parted(depth, (truth > 0).astype(np.int32))
+    assert len(result.fits) == 1
 
 
 def test_labels_have_no_order():
@@ -166,8 +161,8 @@ def test_labels_have_no_order():
     bodies = [standing(-0.055, 0, (0.05, 0.04, 0.03)), standing(0.035, 0.01, (0.04, 0.03, 0.06))]
     depth, truth = seen([*bodies, standing(0.13, -0.05, (0.03, 0.03, 0.03), BALL)])
     labels = np.where(truth == 3, 2, np.minimum(truth, 1)).astype(np.int32)
-    first, _ = repaired(depth, labels)
-    second, _ = repaired(depth, np.array([0, 7, 4])[labels].astype(np.int32))
+    first, _ = parted(depth, labels)
+    second, _ = parted(depth, np.array([0, 7, 4])[labels].astype(np.int32))
     assert len(first.fits) == len(second.fits) == 3
     pairs = np.unique(np.stack([first.labels.ravel(), second.labels.ravel()]), axis=1)
     assert pairs.shape[1] == 4  # a one-to-one map of four values
@@ -216,20 +211,19 @@ def test_nothing_measured_changes_nothing():
     fit.calls = 0
     blind = np.full_like(depth, np.nan)
     for image in (blind, np.zeros_like(depth), np.full_like(depth, np.inf)):
-        repair = segment_repair.repaired(image, CAMERA, truth, PLANE, fits, fit, NOISE)
-        assert not repair.changed
+        result = segment_split.split(image, CAMERA, truth, PLANE, fits, fit, NOISE)
+        assert not result.parted
         assert fit.calls == 0
-    assert not segment_repair.repaired(depth, CAMERA, np.zeros_like(truth), PLANE, {}, fit, NOISE).changed
+    assert not segment_split.split(depth, CAMERA, np.zeros_like(truth), PLANE, {}, fit, NOISE).parted
 
 
 def test_without_time_nothing_is_fitted():
-    depth, truth = seen([standing(0, 0, LONG_BOX, turn=0.4)])
-    labels = cut(truth, 1, np.median(np.nonzero(truth)[1]))
-    fit = fit_of(depth)
-    fits = {k: fit(labels == k) for k in (1, 2)}
+    depth, truth = seen([standing(-0.055, 0, (0.05, 0.04, 0.03)), standing(0.035, 0.01, (0.04, 0.03, 0.06))])
+    labels, fit = (truth > 0).astype(np.int32), fit_of(depth)
+    fits = {1: fit(labels == 1)}
     fit.calls = 0
-    repair = segment_repair.repaired(depth, CAMERA, labels, PLANE, fits, fit, NOISE, time_budget=1e-9)
-    assert not repair.changed
+    result = segment_split.split(depth, CAMERA, labels, PLANE, fits, fit, NOISE, time_budget=1e-9)
+    assert not result.parted
     assert fit.calls == 0
 
 
@@ -237,7 +231,7 @@ def test_misuse_raises():
     depth, truth = seen([standing(0, 0, LONG_BOX)])
     fit = fit_of(depth)
     with pytest.raises(ValueError, match="fit a camera"):
-        segment_repair.repaired(depth[1:], CAMERA, truth, PLANE, {}, fit, NOISE)
+        segment_split.split(depth[1:], CAMERA, truth, PLANE, {}, fit, NOISE)
     orthographic = Camera(320, 240, 262.5, 262.5, 159.5, 119.5, "orthographic")
     with pytest.raises(ValueError, match="pinhole"):
         Evidence.of(depth, truth > 0, orthographic, NOISE)
@@ -257,12 +251,11 @@ def test_masks_from_outside_win():
 
 
 def test_a_repaired_frame_is_consistent(monkeypatch):
-    """Own segments that merge two bodies and cut one: afterwards labels, bodies, pixels and their order agree."""
+    """Own segments that merge two bodies: afterwards labels, bodies, pixels and their order agree."""
     bodies = [standing(-0.055, 0, (0.05, 0.04, 0.03)), standing(0.035, 0.01, (0.04, 0.03, 0.06))]
     depth, truth = seen([*bodies, standing(0.15, -0.05, (0.035, 0.035, 0.035))])
     merged = np.where(truth == 3, 2, np.minimum(truth, 1)).astype(np.int32)
-    merged = cut(merged, 2, np.median(np.nonzero(merged == 2)[1]))
-    wrong = Segmentation(merged, PLANE, (1, 2, 3), sigma=NOISE)
+    wrong = Segmentation(merged, PLANE, (1, 2), sigma=NOISE)
     monkeypatch.setattr(segments, "segment", lambda *_: wrong)
     frame = Recoverer(method="symmetry").recover(depth, CAMERA)
     assert len(frame.recovered) == 3

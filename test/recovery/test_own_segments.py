@@ -1,0 +1,146 @@
+"""Own segments through the network of masks: strays go, pieces of one thing are joined, two things stay two."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from sq_perception.fitting.options import MIN_PIXELS
+from sq_perception.geometry import rotation
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging import raycast, segment_view
+from sq_perception.imaging.camera import Camera
+from sq_perception.learning import inference
+from sq_perception.recovery.own_segments import SegmentNetwork
+from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
+from sq_perception.segmentation.segments import Segmentation
+from sq_perception.simulation.scenes import plane_depth
+
+CAMERA = Camera(320, 240, 300.0, 300.0, 159.5, 119.5)
+PITCH, DISTANCE = 0.75, 0.7
+PLANE = np.append(-np.array([0.0, np.cos(PITCH), np.sin(PITCH)]), DISTANCE * np.sin(PITCH))
+ACROSS = np.array([-1.0, 0.0, 0.0])
+AXES = np.stack([ACROSS, np.cross(PLANE[:3], ACROSS), PLANE[:3]], axis=1)
+CAN = (0.035, 0.035, 0.05), (0.1, 1.0)
+
+
+def standing(x: float, y: float, size: Any, shape: Any) -> Superquadric:
+    centre = np.array([0, 0, DISTANCE]) + AXES @ np.array([x, y, size[2]])
+    return Superquadric(np.array(size), np.array(shape), centre, rotation.from_matrix(AXES))
+
+
+def seen(bodies: list[Superquadric]) -> tuple[np.ndarray, np.ndarray]:
+    depth, index = raycast.render(Superquadric.stack(bodies), CAMERA)
+    depth = np.where(index >= 0, depth, plane_depth(PLANE, CAMERA))
+    noise = 0.001 * depth**2 * np.random.default_rng(0).standard_normal(depth.shape)
+    return (depth + noise).astype(np.float32), (index + 1).astype(np.int32)
+
+
+def segmentation(labels: np.ndarray) -> Segmentation:
+    counts = np.bincount(labels.ravel())
+    ids = sorted(np.flatnonzero(counts)[1:].tolist(), key=lambda label: -counts[label])
+    return Segmentation(labels, PLANE, tuple(ids))
+
+
+class Says:
+    """A network whose logits are given by a function of its views (n, p, p, CHANNELS)."""
+
+    def __init__(self, function: Any) -> None:
+        self._function = function
+        self.asked = 0
+
+    def logits(self, views: np.ndarray) -> np.ndarray:
+        self.asked += len(views)
+        return np.asarray(self._function(views), np.float32)
+
+
+def of(network: Any, depth: np.ndarray) -> SegmentNetwork:
+    return SegmentNetwork(network, depth, CAMERA, PLANE)
+
+
+@pytest.fixture(scope="module")
+def shipped() -> Any:
+    return inference.load_masks()
+
+
+def test_the_rim_that_a_sensor_adds_is_stray(shipped: Any) -> None:
+    """Every pixel within two of the can shows the can's depth, as stereo matching has it."""
+    depth, truth = seen([standing(0, 0, *CAN)])
+    brush = np.ones((5, 5), np.uint8)
+    wider = cv2.dilate((truth > 0).view(np.uint8), brush) > 0
+    depth = np.where(wider & (truth == 0), cv2.erode(np.where(truth > 0, depth, np.inf), brush), depth)
+    found = of(shipped, depth.astype(np.float32)).improved(segmentation(wider.astype(np.int32)))
+    np.testing.assert_array_equal(found.found.labels, wider)
+    own = np.zeros_like(wider)
+    rows, columns = np.nonzero(wider)
+    own[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1] = found.own[1]
+    rim = wider & (truth == 0)
+    assert np.count_nonzero(own & rim) < 0.6 * np.count_nonzero(rim)
+    assert np.count_nonzero(own & (truth > 0)) > 0.95 * np.count_nonzero(truth)
+
+
+def test_two_halves_of_a_can_are_joined_and_two_cans_are_not(shipped: Any) -> None:
+    depth, truth = seen([standing(-0.06, 0, *CAN), standing(0.06, 0.02, *CAN)])
+    middle = np.median(np.nonzero(truth == 1)[1])
+    halves = np.where((truth == 1) & (np.arange(CAMERA.width) > middle), 3, truth).astype(np.int32)
+    found = of(shipped, depth).improved(segmentation(halves)).found
+    assert len(found.ids) == 2
+    for can in (1, 2):
+        assert len(np.unique(found.labels[truth == can])) == 1
+    assert of(shipped, depth).are_one(truth, [halves == 1, halves == 3])
+    assert not of(shipped, depth).are_one(np.zeros_like(truth), [truth == 1, truth == 2])
+
+
+def test_pieces_are_joined_until_none_belong_together() -> None:
+    """Four quarters of which each is taken for the whole: pairs first, then the pairs; labels from 1, no strays."""
+    depth, truth = seen([standing(0, 0, *CAN)])
+    rows, columns = np.indices(truth.shape)
+    v, u = (np.median(each) for each in np.nonzero(truth))
+    quarters = np.where(truth > 0, 1 + (rows > v) + 2 * (columns > u), 0).astype(np.int32)
+    network = Says(lambda views: np.full(views.shape[:3], 3.0))
+    found = of(network, depth).improved(segmentation(quarters))
+    np.testing.assert_array_equal(found.found.labels, truth)
+    assert found.found.ids == (1,)
+    assert not found.own
+    assert network.asked == 4 + 2 + 1
+
+
+def test_one_sided_belonging_joins_nothing() -> None:
+    """A carton claims the can on it; the can does not claim the carton."""
+    depth, truth = seen([standing(-0.06, 0, *CAN), standing(0.06, 0.02, *CAN)])
+
+    def claims_of_the_first(views: np.ndarray) -> np.ndarray:
+        inside = views[..., segment_view.SEGMENT] > 0
+        claims = np.arange(len(views))[:, None, None] == 0
+        return np.where(inside | claims, 3.0, -3.0)
+
+    found = of(Says(claims_of_the_first), depth).improved(segmentation(truth))
+    assert sorted(found.found.ids) == [1, 2]
+
+
+def test_a_segment_that_is_mostly_stray_keeps_its_pixels() -> None:
+    depth, truth = seen([standing(0, 0, *CAN)])
+    found = of(Says(lambda views: np.full(views.shape[:3], -3.0)), depth).improved(segmentation(truth))
+    np.testing.assert_array_equal(found.found.labels, truth)
+    assert not found.own
+
+
+def test_no_segments_ask_nothing() -> None:
+    depth, truth = seen([standing(0, 0, *CAN)])
+    network = Says(lambda views: views)
+    assert of(network, depth).improved(segmentation(np.zeros_like(truth))).found.ids == ()
+    assert network.asked == 0
+
+
+def test_frames_keep_the_strays_in_their_labels_and_count_them() -> None:
+    depth, _ = seen([standing(-0.06, 0, *CAN), standing(0.06, 0.02, *CAN)])
+    recoverer = Recoverer(threads=1)
+    with_masks, without = (
+        recoverer.recover(depth, CAMERA, options=RecoveryOptions(repair=repair)) for repair in (True, False)
+    )
+    np.testing.assert_array_equal(with_masks.labels, without.labels)
+    assert [body.pixels for body in with_masks.bodies] == [body.pixels for body in without.bodies]
+    assert min(body.pixels for body in with_masks.bodies) > MIN_PIXELS
