@@ -31,8 +31,9 @@ _ONE = 0.4
 the IoU of simulated masks changed by 0.1 %."""
 _LEAST_CELLS = 4
 """Of another segment in a view, for a mean."""
-_MOST_STRAYS = 0.7
-"""Share of a segment beyond which the network knows no such object: the segment keeps its pixels."""
+_MOST_STRAYS = 0.5
+"""Share of a segment beyond which the network contradicts itself, as the object is what most of the segment shows: the
+segment keeps its pixels."""
 _ROUNDS = 3
 """Of joining: eight pieces may become one."""
 
