@@ -132,6 +132,8 @@ def _mutual(labels: np.ndarray, seen: Mapping[int, _Seen]) -> np.ndarray:
     means = np.zeros((len(seen), len(seen)))
     height, width = labels.shape
     for i, one in enumerate(seen.values()):
+        if not one.view.image[..., segment_view.OTHERS].any():
+            continue
         grid = np.ix_(np.clip(one.view.rows, 0, height - 1), np.clip(one.view.columns, 0, width - 1))
         there = np.where(one.view.image[..., segment_view.IMAGE] > 0, place[labels[grid]], 0).ravel()
         counts = np.bincount(there, minlength=len(seen) + 1)[1:]
