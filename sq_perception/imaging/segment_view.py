@@ -48,6 +48,8 @@ class SegmentView:
         See the module.
     rows, columns : int (PIXELS,)
         Pixels of the image under the middles of the cells; some may be outside of it.
+    left, top, side
+        The window, in pixels: its corner, where the image's is (0, 0), and its length.
     """
 
     image: np.ndarray

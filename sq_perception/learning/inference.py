@@ -145,15 +145,15 @@ def load_things(path: Path | str | None = None, device: str = "cpu") -> ThingPre
     return ThingPredictor(checkpoint.load_things(path, device))
 
 
-def load_masks(path: Path | str | None = None) -> forward.CompactMasks:
-    """The network of masks, None for the one that ships; a processor computes it.
+def load_masks() -> forward.CompactMasks:
+    """The network of masks that ships, computed without torch.
 
     Raises
     ------
     CheckpointError
         As :func:`checkpoint.read_masks`.
     """
-    return forward.CompactMasks(*checkpoint.read_masks(path))
+    return forward.CompactMasks(*checkpoint.read_masks())
 
 
 class _OnOneThread:

@@ -230,14 +230,13 @@ class _Image:
         z = self.depth[rows, columns].astype(float)
         return _Part(label, np.stack([rows, columns], axis=-1), z, stride * quantile(z, 0.5) / self.focal)
 
-    def crossed_between(self, parts: list[_Part], near: float, enough: float = 1.0) -> np.ndarray:
-        """Of each pair of parts (n, n) the share of crossed lines between their samples, one above ``enough`` counted
-        up to there; inf if they are not near."""
+    def crossed_between(self, parts: list[_Part], near: float) -> np.ndarray:
+        """Of each pair of parts (n, n) the share of crossed lines between their samples; inf if they are not near."""
         pixels, z = np.concatenate([part.pixels for part in parts]), np.concatenate([part.z for part in parts])
         ends = np.cumsum([0] + [len(part.z) for part in parts])
         points = self.camera.unproject(pixels[:, 1], pixels[:, 0], z)
         reach = near / 2 + 0.7 * np.array([part.spacing for part in parts])
-        return crossings.between(pixels, points, ends, reach, self.depth, *self.limits, enough)
+        return crossings.between(pixels, points, ends, reach, self.depth, *self.limits)
 
     def pieces(self, part: _Part, extent: np.ndarray, options: SightOptions) -> list[tuple[np.ndarray, np.ndarray]]:
         """Rows and columns of each convex part of a segment; nothing where it has no such parts."""

@@ -42,11 +42,9 @@ def between(
     depth: np.ndarray,
     noise: float,
     least: float,
-    enough: float,
 ) -> np.ndarray:
     """Share (n, n) of crossed lines between the samples of segments, the rows between two ``ends``; inf where the
-    nearest samples are farther apart than the sum of their reaches.  A share above ``enough`` is counted up to there.
-    """
+    nearest samples are farther apart than the sum of their reaches."""
     n = len(ends) - 1
     share = np.full((n, n), np.inf)
     for a in range(n):
@@ -63,8 +61,6 @@ def between(
                 for j in range(ends[b], ends[b + 1]):
                     p, q = pixels[i], pixels[j]
                     count += _crossed(p[0], p[1], points[i, 2], q[0], q[1], points[j, 2], depth, noise, least)
-                if count > enough * lines:
-                    break
             share[a, b] = share[b, a] = count / lines
     return share
 

@@ -45,7 +45,7 @@ def segmentation(labels: np.ndarray) -> Segmentation:
     return Segmentation(labels, PLANE, tuple(ids))
 
 
-class Says:
+class GivenLogits:
     """A network whose logits are given by a function of its views (n, p, p, CHANNELS)."""
 
     def __init__(self, function: Any) -> None:
@@ -100,7 +100,7 @@ def test_pieces_are_joined_until_none_belong_together() -> None:
     rows, columns = np.indices(truth.shape)
     v, u = (np.median(each) for each in np.nonzero(truth))
     quarters = np.where(truth > 0, 1 + (rows > v) + 2 * (columns > u), 0).astype(np.int32)
-    network = Says(lambda views: np.full(views.shape[:3], 3.0))
+    network = GivenLogits(lambda views: np.full(views.shape[:3], 3.0))
     found = of(network, depth).improved(segmentation(quarters))
     np.testing.assert_array_equal(found.found.labels, truth)
     assert found.found.ids == (1,)
@@ -117,20 +117,20 @@ def test_one_sided_belonging_joins_nothing() -> None:
         claims = np.arange(len(views))[:, None, None] == 0
         return np.where(inside | claims, 3.0, -3.0)
 
-    found = of(Says(claims_of_the_first), depth).improved(segmentation(truth))
+    found = of(GivenLogits(claims_of_the_first), depth).improved(segmentation(truth))
     assert sorted(found.found.ids) == [1, 2]
 
 
 def test_a_segment_that_is_mostly_stray_keeps_its_pixels() -> None:
     depth, truth = seen([standing(0, 0, *CAN)])
-    found = of(Says(lambda views: np.full(views.shape[:3], -3.0)), depth).improved(segmentation(truth))
+    found = of(GivenLogits(lambda views: np.full(views.shape[:3], -3.0)), depth).improved(segmentation(truth))
     np.testing.assert_array_equal(found.found.labels, truth)
     assert not found.own
 
 
 def test_no_segments_ask_nothing() -> None:
     depth, truth = seen([standing(0, 0, *CAN)])
-    network = Says(lambda views: views)
+    network = GivenLogits(lambda views: views)
     assert of(network, depth).improved(segmentation(np.zeros_like(truth))).found.ids == ()
     assert network.asked == 0
 
