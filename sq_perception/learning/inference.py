@@ -177,3 +177,29 @@ def _need_torch(what: str) -> None:
         importlib.import_module("torch")
     except ModuleNotFoundError as error:
         raise checkpoint.CheckpointError(f"{what} {NEEDS_TORCH}") from error
+
+
+def checked_device(device: str) -> str:
+    """The name of a device that is there, as torch names it.
+
+    Raises
+    ------
+    ValueError
+        If it is not the cpu and there is no torch, or torch does not know the name or sees no such device.
+    """
+    if device == "cpu":
+        return device
+    try:
+        import torch
+    except ModuleNotFoundError as error:
+        raise ValueError(f"device: {device!r} {NEEDS_TORCH}") from error
+    try:
+        kind = torch.device(device).type
+    except RuntimeError as error:
+        raise ValueError(f"device: {error}") from error
+    if kind not in ("cpu", "cuda"):
+        raise ValueError(f"device: expected cpu, cuda or cuda:N, got {device!r}")
+    if kind == "cuda" and (torch.device(device).index or 0) >= torch.cuda.device_count():
+        count = torch.cuda.device_count()
+        raise ValueError(f"device: {device!r} was asked for, but torch sees {count} CUDA devices here")
+    return device

@@ -23,11 +23,11 @@ from rclpy.node import Node
 
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
-from sq_perception.learning import checkpoint
+from sq_perception.learning import checkpoint, inference
 from sq_perception.nodes.frame import Frame
 from sq_perception.nodes.parameters import RecoverParameters
 from sq_perception.recovery.options import NEEDS_NETWORK
-from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, checked_device
+from sq_perception.recovery.recoverer import FrameRecovery, Recoverer
 from sq_perception.segmentation.standing import Pose
 
 WARM_UP_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
@@ -110,7 +110,7 @@ class Engine:
     def check(self, parameters: RecoverParameters, changed: frozenset[str]) -> None:
         """Raise ValueError for parameters that :meth:`follow` could not follow, as far as that is known at once."""
         if "device" in changed:
-            checked_device(parameters.device)
+            inference.checked_device(parameters.device)
         reads = not changed.isdisjoint(_READ_BY)
         if self._built is not None and "method" in changed:
             reads = reads or not self._built.recoverer.has_weights

@@ -14,8 +14,9 @@ The network is asked once about a segment, and again about one that was joined.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 
@@ -62,6 +63,9 @@ class _Seen:
     logits: np.ndarray
 
 
+_AnswersLabels: TypeAlias = Callable[[Sequence[int]], list[_Seen]]
+
+
 @dataclass(frozen=True, eq=False)
 class SegmentNetwork:
     """The network of masks before one image of a pinhole camera.
@@ -72,12 +76,15 @@ class SegmentNetwork:
         Metres, not finite or 0 where nothing was measured; every segment has a reading.
     plane : (4,) or None
         Support plane.
+    mapped
+        Applies a function of some labels to all of them; it may do so in several threads.
     """
 
     network: CompactMasks
     depth: np.ndarray
     camera: Camera
     plane: np.ndarray | None
+    mapped: Callable[[_AnswersLabels, Sequence[int]], list[_Seen]]
 
     def improved(self, found: Segmentation) -> OwnSegments:
         """Segments joined and rid of strays; labels run from 1, largest segment first."""
@@ -117,12 +124,16 @@ class SegmentNetwork:
         for label in chosen:
             _, top, bottom, left, right = extents[label].tolist()
             windows[label] = slice(top, bottom), slice(left, right)
-        views = {
-            label: segment_view.from_segment(self.depth, labels, label, window, self.camera, self.plane)
-            for label, window in windows.items()
-        }
-        logits = self.network.logits(np.stack([view.image for view in views.values()]))
-        return {label: _Seen(windows[label], views[label], each) for label, each in zip(chosen, logits, strict=True)}
+
+        def of_some(some: Sequence[int]) -> list[_Seen]:
+            views = [
+                segment_view.from_segment(self.depth, labels, label, windows[label], self.camera, self.plane)
+                for label in some
+            ]
+            logits = self.network.logits(np.stack([view.image for view in views]))
+            return [_Seen(windows[label], view, each) for label, view, each in zip(some, views, logits, strict=True)]
+
+        return dict(zip(chosen, self.mapped(of_some, chosen), strict=True))
 
 
 def _mutual(labels: np.ndarray, seen: Mapping[int, _Seen]) -> np.ndarray:

@@ -39,7 +39,6 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
 from sq_perception.learning import checkpoint, inference
-from sq_perception.learning.choices import NEEDS_TORCH
 from sq_perception.learning.forward import CompactMasks
 from sq_perception.recovery import continuity, methods, prediction, seen_object, segment_split
 from sq_perception.recovery.options import FITTED, NEEDS_NETWORK, Method, RecoveryOptions
@@ -56,7 +55,6 @@ __all__ = [
     "Recoverer",
     "Recovery",
     "RecoveryOptions",
-    "checked_device",
     "render_recovery",
 ]
 
@@ -107,7 +105,7 @@ class Recoverer:
         self._threads = threads or len(os.sched_getaffinity(0))
         self._options = RecoveryOptions(method=method)
         self._path = model
-        self._device = checked_device(device)
+        self._device = inference.checked_device(device)
         self._loaded: dict[bool, Network] = {} if weights_of is None else weights_of._loaded
         self._masks: CompactMasks | None = None if weights_of is None else weights_of._masks
         self._lock = threading.Lock()
@@ -203,7 +201,7 @@ class Recoverer:
             own: Mapping[int, np.ndarray] = {}
             network_of_masks = None
             if labels is None and options.repair and isinstance(network, inference.ThingPredictor):
-                network_of_masks = SegmentNetwork(self._load_masks(), depth, camera, found.plane)
+                network_of_masks = SegmentNetwork(self._load_masks(), depth, camera, found.plane, self._shared)
                 improved = network_of_masks.improved(found)
                 found, own = improved.found, improved.own
             objects = seen_object.objects(depth, found, camera, options.depth_range)
@@ -252,13 +250,11 @@ class Recoverer:
         if not views:
             return list(objects)
         if isinstance(network, inference.ThingPredictor):
-            # The network computes on one thread: each thread asks it about its share of the objects.
-            parts = [part for part in np.array_split(np.arange(len(views)), self._threads) if part.size]
 
-            def of_part(part: np.ndarray) -> list[Prediction]:
-                return prediction.of_hulls([views[k] for k in part], [objects[k].plane for k in part], network)
+            def of_some(some: Sequence[int]) -> list[Prediction]:
+                return prediction.of_hulls([views[k] for k in some], [objects[k].plane for k in some], network)
 
-            found = [one for part in self._mapped(of_part, parts) for one in part]
+            found = self._shared(of_some, range(len(views)))
         else:
             submit = self._beside.submit if options.method == "auto" else prediction.at_once
             found = prediction.of_bodies(views, network, submit)
@@ -269,6 +265,12 @@ class Recoverer:
         if len(items) < 2 or self._threads < 2:
             return [function(one) for one in items]
         return list(self._pool.map(function, items))
+
+    def _shared(self, function: Callable[[Sequence[int]], list[_Answer]], items: Sequence[int]) -> list[_Answer]:
+        """The function's answers to items; each thread gets its share of them, as networks compute on one."""
+        share = -(-len(items) // self._threads)
+        parts = [items[first : first + share] for first in range(0, len(items), share)] if items else []
+        return [answer for part in self._mapped(function, parts) for answer in part]
 
     def _load_network(self, of_things: bool) -> Network:
         """The network that predicts hulls, or the one that predicts bodies; if a file was named, its network."""
@@ -303,32 +305,6 @@ def render_recovery(frame: FrameRecovery, camera: Camera) -> tuple[np.ndarray, n
     shown = [k for k, body in enumerate(frame.bodies) if body.status != Status.FAILED]
     depth, index = raycast.render(Superquadric.stack([frame.bodies[k].superquadric for k in shown]), camera)
     return depth, np.append(np.array(shown, dtype=np.int32), np.int32(-1))[index]
-
-
-def checked_device(device: str) -> str:
-    """The name of a device that is there, as torch names it.
-
-    Raises
-    ------
-    ValueError
-        If it is not the cpu and there is no torch, or torch does not know the name or sees no such device.
-    """
-    if device == "cpu":
-        return device
-    try:
-        import torch
-    except ModuleNotFoundError as error:
-        raise ValueError(f"device: {device!r} {NEEDS_TORCH}") from error
-    try:
-        kind = torch.device(device).type
-    except RuntimeError as error:
-        raise ValueError(f"device: {error}") from error
-    if kind not in ("cpu", "cuda"):
-        raise ValueError(f"device: expected cpu, cuda or cuda:N, got {device!r}")
-    if kind == "cuda" and (torch.device(device).index or 0) >= torch.cuda.device_count():
-        count = torch.cuda.device_count()
-        raise ValueError(f"device: {device!r} was asked for, but torch sees {count} CUDA devices here")
-    return device
 
 
 def _plausible(depth: np.ndarray, camera: Camera) -> np.ndarray:

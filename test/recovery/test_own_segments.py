@@ -58,7 +58,7 @@ class GivenLogits:
 
 
 def of(network: Any, depth: np.ndarray) -> SegmentNetwork:
-    return SegmentNetwork(network, depth, CAMERA, PLANE)
+    return SegmentNetwork(network, depth, CAMERA, PLANE, lambda function, labels: function(labels))
 
 
 @pytest.fixture(scope="module")
