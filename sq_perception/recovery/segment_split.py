@@ -112,10 +112,10 @@ def split(
     while waiting:
         label, deepest = waiting.pop()
         mask = labels == label
-        if deepest == 0 or fits_left == 0 or not image.is_badly_explained(mask, fits[label]):
+        if deepest == 0 or fits_left == 0 or _explains(fits[label]):
             continue
         parts = convex_parts.parts(mask, known, camera, sigma, _PARTS)
-        if len(parts) < 2 or (are_one is not None and are_one(labels, parts)):
+        if len(parts) < 2 or (are_one is not None and are_one(labels, parts)) or not image.may_pay(mask, fits[label]):
             continue
         found: list[Fit] = []
         for part in parts[:fits_left]:
@@ -147,10 +147,8 @@ class _Image:
     plane: np.ndarray | None
     sigma: float
 
-    def is_badly_explained(self, mask: np.ndarray, fit: Fit) -> bool:
+    def may_pay(self, mask: np.ndarray, fit: Fit) -> bool:
         """Whether the body of a mask leaves so much over that a second one might pay."""
-        if fit.status != Status.FAILED and fit.inlier_share > 1 - _LEAST_LEFT and not fit.as_hull:
-            return False
         evidence = Evidence.of(self.depth, mask, self.camera, self.sigma)
         return _left(evidence, [fit]) > scene_description.price(evidence) + _LEAST_GAIN
 
@@ -181,6 +179,11 @@ class _Image:
             if (seen > down[: _DROP_STEPS // 2][inside, 2] + level).any():
                 return True
         return False
+
+
+def _explains(fit: Fit) -> bool:
+    """Whether a body leaves so little of its segment over that no split is thought of."""
+    return fit.status != Status.FAILED and fit.inlier_share > 1 - _LEAST_LEFT and not fit.as_hull
 
 
 def _left(evidence: Evidence, fits: Sequence[Fit]) -> float:
