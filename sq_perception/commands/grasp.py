@@ -121,8 +121,8 @@ def _frame(
 
     recovery = recoverer.recover(frame.depth, frame.camera, frame.labels)
     found = recovery.recovered
-    bodies = Superquadric.stack([one.superquadric for one in found])
-    covariance = np.array([one.covariance for one in found]).reshape(-1, 11, 11)
+    bodies = Superquadric.stack([recovered.superquadric for recovered in found])
+    covariance = np.array([recovered.covariance for recovered in found]).reshape(-1, 11, 11)
     around = Surroundings.of_image(frame.depth, frame.camera, recovery.plane)
     plan = grasps(bodies, hand, covariance, around, friction)
     stem = Path(frame.name).stem
@@ -134,7 +134,7 @@ def _frame(
         "file": file,
         "bodies": [
             {
-                "label": int(one.label),
+                "label": int(recovered.label),
                 "reason": plan.reasons[k],
                 "grasps": [
                     {
@@ -148,7 +148,7 @@ def _frame(
                     for grasp in plan.of(k)
                 ],
             }
-            for k, one in enumerate(found)
+            for k, recovered in enumerate(found)
         ],
     }
 
@@ -159,7 +159,7 @@ def _draw(path: Path, frame: RecordedFrame, found: Sequence[Recovery], plan: Gra
 
     figure = plots.new_figure(9.6, 9.6 * frame.camera.height / frame.camera.width)
     ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    draw_grasps(ax, frame.depth, frame.camera, [one.superquadric for one in found], plan, hand)
+    draw_grasps(ax, frame.depth, frame.camera, [recovered.superquadric for recovered in found], plan, hand)
     with output_file.writing(path) as partial:
         plots.save(figure, partial)
 
@@ -171,14 +171,14 @@ def _write_mesh(path: Path, found: Sequence[Recovery], plan: GraspPlan, hand: Gr
     from sq_perception.geometry import mesh
     from sq_perception.geometry.superquadric import Superquadric
 
-    solids = [one.superquadric for one in found]
+    solids = [recovered.superquadric for recovered in found]
     names = [f"body_{k}" for k in range(len(found))]
     owner = list(range(len(found)))
     for k in range(len(found)):
         for grasp in plan.of(k)[:1]:
             boxes = hand.boxes(grasp.opening, reach=0.0)
-            for name, one in zip(("left", "right", "hand"), boxes, strict=True):
-                solids.append(Superquadric(one[3:], np.full(2, _SHARP), grasp.placed(one[None, :3])[0], grasp.rotation))
+            for name, box in zip(("left", "right", "hand"), boxes, strict=True):
+                solids.append(Superquadric(box[3:], np.full(2, _SHARP), grasp.placed(box[None, :3])[0], grasp.rotation))
                 names.append(f"grasp_{k}_{name}")
                 owner.append(k)
     with output_file.writing(path) as partial:

@@ -19,12 +19,12 @@ _ALIKE = 0.01
 """Half sizes that differ by less than this share are the same."""
 
 
-def alike(one: State, other: State) -> bool:
+def alike(state: State, other: State) -> bool:
     """Whether two searches ended in the same valley, in the same of the body's forms or with the same sizes."""
-    if abs(one.cost - other.cost) > SIGNIFICANT:
+    if abs(state.cost - other.cost) > SIGNIFICANT:
         return False
-    sizes = np.abs(np.sort(one.parameters[:3]) - np.sort(other.parameters[:3]))
-    return bool((sizes < _ALIKE * np.sort(one.parameters[:3])).all())
+    sizes = np.abs(np.sort(state.parameters[:3]) - np.sort(other.parameters[:3]))
+    return bool((sizes < _ALIKE * np.sort(state.parameters[:3])).all())
 
 
 def other_depths(state: State, axis: int) -> list[State]:

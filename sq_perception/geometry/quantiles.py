@@ -23,15 +23,15 @@ def ranked(numbers: np.ndarray, rank: int) -> float:
     bits = numbers.view(np.uint32)
     left, high = rank, np.uint32(0)
     counts = np.zeros(1 << 16, np.int32)
-    for one in bits:
-        counts[one >> 16] += 1
+    for number in bits:
+        counts[number >> 16] += 1
     while left >= counts[high]:
         left -= counts[high]
         high += 1
     counts[:] = 0
-    for one in bits:
-        if one >> 16 == high:
-            counts[one & 0xFFFF] += 1
+    for number in bits:
+        if number >> 16 == high:
+            counts[number & 0xFFFF] += 1
     low = np.uint32(0)
     while left >= counts[low]:
         left -= counts[low]

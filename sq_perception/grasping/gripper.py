@@ -170,7 +170,9 @@ ROBOTIQ_2F_140 = Gripper(
 """Robotiq 2F-140.  Stroke 140 mm, 10 to 125 N: its manual; the rest as for the 2F-85: pads of 27 x 65 mm; the TCP moves
 by -18 and +6 mm."""
 
-GRIPPERS: Mapping[str, Gripper] = MappingProxyType({one.name: one for one in (PANDA, ROBOTIQ_2F_85, ROBOTIQ_2F_140)})
+GRIPPERS: Mapping[str, Gripper] = MappingProxyType(
+    {gripper.name: gripper for gripper in (PANDA, ROBOTIQ_2F_85, ROBOTIQ_2F_140)}
+)
 
 
 def gripper(name: str) -> Gripper:

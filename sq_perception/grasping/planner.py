@@ -64,7 +64,7 @@ FRICTION = 0.5
 _AT_MOST = 2.0
 """Times the least friction."""
 PER_BODY = 8
-"""Grasps a body that are told at most."""
+"""Grasps a body that are returned at most."""
 PLACEMENT = 0.002
 """Metres, standard deviation along each axis of where the hand comes to be: a careful calibration of camera and arm."""
 _ABOVE_TABLE = 0.004
@@ -88,7 +88,7 @@ _CHECKED, _CHECKED_CLOSELY = 40, 16
 _CHECKED_IF_DOUBTFUL, _SURE = 200, 0.5
 """The same of bodies whose best grasp is then less probable than that."""
 _LEAST = 0.05
-"""Grasps less probable than that are not told."""
+"""Grasps less probable than that are not returned."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,7 +207,7 @@ def _trials(
     # From every side: z the approach, y the closing line, x the third.
     y = np.repeat(closings.along, len(_SWINGS), axis=0)
     owner = np.repeat(closings.owner, len(_SWINGS))
-    half, side = (np.repeat(one, len(_SWINGS), axis=0) for one in (closings.reach, closings.sigma))
+    half, side = (np.repeat(numbers, len(_SWINGS), axis=0) for numbers in (closings.reach, closings.sigma))
     down = around.down(bodies.translation[owner])
     steep = down - y * (y * down).sum(axis=1, keepdims=True)
     length = np.linalg.norm(steep, axis=1, keepdims=True)

@@ -55,11 +55,11 @@ def at_rims(
     bodies: Superquadric, which: np.ndarray, gripper: Gripper, around: Surroundings, friction: float, placement: float
 ) -> Trials:
     """Grasps of bodies ``which`` by their rims, with all margins but those that the surroundings decide."""
-    found = [] if around.plane is None else [one for k in which for one in _rims(bodies[k], int(k), gripper, around)]
-    owner = np.array([one[0] for one in found], dtype=int).repeat(len(_INSETS))
+    found = [] if around.plane is None else [rim for k in which for rim in _rims(bodies[k], int(k), gripper, around)]
+    owner = np.array([rim[0] for rim in found], dtype=int).repeat(len(_INSETS))
     inset = np.tile(_INSETS, len(found))
-    width = np.array([one[2] for one in found]).repeat(len(_INSETS))
-    frames = np.array([one[1] for one in found]).reshape(-1, 3, 4).repeat(len(_INSETS), axis=0)
+    width = np.array([rim[2] for rim in found]).repeat(len(_INSETS))
+    frames = np.array([rim[1] for rim in found]).reshape(-1, 3, 4).repeat(len(_INSETS), axis=0)
     frames[:, :, 3] += (inset - gripper.tip)[:, None] * frames[:, :, 2]
     sigma = np.hypot(POINT_SIGMA, placement)
     opening = np.minimum(width + 2 * (CLEARANCE + 2 * sigma), gripper.opening)

@@ -52,7 +52,9 @@ class Trials:
         return Trials(*(getattr(self, part.name)[which] for part in fields(self)))
 
     def and_(self, other: Trials) -> Trials:
-        return Trials(*(np.concatenate([getattr(one, part.name) for one in (self, other)]) for part in fields(self)))
+        return Trials(
+            *(np.concatenate([getattr(trials, part.name) for trials in (self, other)]) for part in fields(self))
+        )
 
     @property
     def weakest(self) -> np.ndarray:

@@ -138,8 +138,8 @@ def beside(jumps: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
     return found
 
 
-def _apart(one: np.ndarray, other: np.ndarray, focal: float) -> np.ndarray:
-    return np.abs(one - other) * np.float32(focal / _STEEPEST) > np.minimum(one, other)
+def _apart(first: np.ndarray, second: np.ndarray, focal: float) -> np.ndarray:
+    return np.abs(first - second) * np.float32(focal / _STEEPEST) > np.minimum(first, second)
 
 
 def _smaller_difference(w: np.ndarray, axis: int) -> np.ndarray:

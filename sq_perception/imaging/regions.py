@@ -54,11 +54,11 @@ def _extents(labels: np.ndarray, count: int) -> np.ndarray:
             while u < width and labels[v, u] == label:
                 u += 1
             if label > 0:
-                one = found[label]
-                if one[0] == 0:
-                    one[1], one[3] = v, first
-                one[0] += u - first
-                one[2] = v + 1
-                one[3] = min(one[3], first)
-                one[4] = max(one[4], u)
+                extent = found[label]
+                if extent[0] == 0:
+                    extent[1], extent[3] = v, first
+                extent[0] += u - first
+                extent[2] = v + 1
+                extent[3] = min(extent[3], first)
+                extent[4] = max(extent[4], u)
     return found

@@ -61,7 +61,7 @@ class ManagedNode(LifecycleNodeMixin, Node):
         LifecycleNodeMixin.__init__(self, callback_group=ReentrantCallbackGroup())
         # rclpy's own callback runs the transition in the executor's thread, where nothing else is served for the
         # seconds that a model takes to load, and raises RCLError for one that the state does not allow, which ends it.
-        (service,) = (one for one in self.services if one.srv_type is ChangeState)
+        (service,) = (each for each in self.services if each.srv_type is ChangeState)
         service.callback = self._on_change_state  # type: ignore[assignment]  # executors await it
         self.fault = ""
         """Why the last transition failed; empty once one has succeeded."""

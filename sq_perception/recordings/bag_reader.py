@@ -48,7 +48,7 @@ class BagReader:
 
     def connections(self, *kinds: str, topic: str | None = None) -> list[Any]:
         """rosbags' connections of these types, of one topic or of all."""
-        return [one for one in self._reader.connections if one.msgtype in kinds and topic in (None, one.topic)]
+        return [each for each in self._reader.connections if each.msgtype in kinds and topic in (None, each.topic)]
 
     def messages(
         self, connections: list[Any], every: int = 1, limit: int | None = None

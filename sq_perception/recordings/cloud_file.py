@@ -132,7 +132,7 @@ def _pcd(data: bytes) -> np.ndarray:
     count = width * height
     if not (0 < count <= MOST_PIXELS and width > 0):
         raise UnpackingError(f"expected 1 to {MOST_PIXELS} points, got {width} x {height}")
-    counts = [int(one) for one in head.get("COUNT", ["1"] * len(head["FIELDS"]))]
+    counts = [int(part) for part in head.get("COUNT", ["1"] * len(head["FIELDS"]))]
     kinds = [f"<{_NUMBERS[kind]}{size}" for kind, size in zip(head["TYPE"], head["SIZE"], strict=True)]
     where = [head["FIELDS"].index(axis) for axis in "xyz"]
     if head["DATA"] == ["ascii"]:

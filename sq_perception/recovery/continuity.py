@@ -113,14 +113,14 @@ def repeated(previous: FrameRecovery, depth: np.ndarray, camera: Camera, options
 
     due, windows = _due(previous.bodies), extents(labels)
     kept = {}
-    for one in previous.bodies:
-        if one is due or CUT_SHORT in one.message or one.label >= len(windows):
+    for body in previous.bodies:
+        if body is due or CUT_SHORT in body.message or body.label >= len(windows):
             continue
-        _, top, bottom, left, right = windows[one.label].tolist()
-        sums, square = _moments(change, old, new, smooth, labels, one.label, (top, bottom, left, right), level)
+        _, top, bottom, left, right = windows[body.label].tolist()
+        sums, square = _moments(change, old, new, smooth, labels, body.label, (top, bottom, left, right), level)
         square = share * square + 1e-6 * share * np.trace(square) * np.eye(len(square))
         if square.any() and sums @ np.linalg.solve(square, sums) < _CHANGED:
-            kept[one.label] = one
+            kept[body.label] = body
     return Repeated(kept, still and 0 < len(kept) == len(previous.bodies))
 
 
@@ -130,21 +130,21 @@ def matched(kept: Repeated, labels: np.ndarray, objects: Sequence[SeenObject]) -
     ``labels`` are those of the frame before; a body whose object is segmented otherwise now is left out.
     """
     same: dict[int, Recovery] = {}
-    for one in objects if kept.bodies else ():
-        inside = labels[one.window][one.mask_crop]
+    for obj in objects if kept.bodies else ():
+        inside = labels[obj.window][obj.mask_crop]
         counts = np.bincount(np.maximum(inside, 0))
         counts[0] = 0
         label = int(counts.argmax())
         body = kept.bodies.get(label)
-        if body is not None and counts[label] > _ALIKE * (body.pixels + one.pixels - counts[label]):
-            same[one.label] = replace(body, label=one.label, pixels=one.pixels, repeats=body.repeats + 1)
+        if body is not None and counts[label] > _ALIKE * (body.pixels + obj.pixels - counts[label]):
+            same[obj.label] = replace(body, label=obj.label, pixels=obj.pixels, repeats=body.repeats + 1)
     return same
 
 
 def _due(bodies: Sequence[Recovery]) -> Recovery | None:
     """The body whose turn it is to be recovered anew, if any."""
-    waiting = [one for one in bodies if one.repeats >= _ANEW[one.status]]
-    return max(waiting, key=lambda one: one.repeats - _ANEW[one.status], default=None)
+    waiting = [body for body in bodies if body.repeats >= _ANEW[body.status]]
+    return max(waiting, key=lambda body: body.repeats - _ANEW[body.status], default=None)
 
 
 @kernel

@@ -25,61 +25,61 @@ _HARD_IMAGE = (ValueError, ArithmeticError, np.linalg.LinAlgError)
 """What numerical code may raise on degenerate data: reported with the object, never raised."""
 
 
-def fitted(one: SeenObject, depth: np.ndarray, camera: Camera, options: RecoveryOptions, deadline: float) -> Fit:
+def fitted(obj: SeenObject, depth: np.ndarray, camera: Camera, options: RecoveryOptions, deadline: float) -> Fit:
     """The body of an object by the chosen method; FAILED with a reason instead of any exception on hard data."""
-    if one.pixels < MIN_PIXELS:
-        return _failed(one, f"{one.pixels} pixels with a depth are too few for a body")
+    if obj.pixels < MIN_PIXELS:
+        return _failed(obj, f"{obj.pixels} pixels with a depth are too few for a body")
     try:
-        fit = _body(one, depth, camera, options, deadline)
+        fit = _body(obj, depth, camera, options, deadline)
     except _HARD_IMAGE as error:
-        return _failed(one, f"{options.method}: {error}")
+        return _failed(obj, f"{options.method}: {error}")
     if not np.isfinite(fit.superquadric.to_flat()).all():
-        return _failed(one, f"{options.method}: the result is not finite")
+        return _failed(obj, f"{options.method}: the result is not finite")
     return fit
 
 
-def _body(one: SeenObject, depth: np.ndarray, camera: Camera, options: RecoveryOptions, deadline: float) -> Fit:
+def _body(obj: SeenObject, depth: np.ndarray, camera: Camera, options: RecoveryOptions, deadline: float) -> Fit:
     if options.method == "classic":
-        return solina_bajcsy.fit(one.points)
+        return solina_bajcsy.fit(obj.points)
     if options.method == "network":
-        return _unfitted(_predicted(one), one, "prediction of the network, not refined")
+        return _unfitted(_predicted(obj), obj, "prediction of the network, not refined")
     known = FitOptions(
-        plane=one.plane if options.use_plane else None,
+        plane=obj.plane if options.use_plane else None,
         time_budget=max(deadline - time.perf_counter(), _LEAST_BUDGET),
     )
     if not options.free_space:
-        depth = np.where(one.mask, depth, np.float32(np.nan))
+        depth = np.where(obj.mask, depth, np.float32(np.nan))
         known = replace(known, nan_is_empty=False, model_error=MODEL_ERROR_ON_PLANE)
-    return _surface_fit(one, depth, camera, known)
+    return _surface_fit(obj, depth, camera, known)
 
 
-def _surface_fit(one: SeenObject, depth: np.ndarray, camera: Camera, known: FitOptions) -> Fit:
+def _surface_fit(obj: SeenObject, depth: np.ndarray, camera: Camera, known: FitOptions) -> Fit:
     """From the network's prediction, which may still be computed; images without noise may not need it.
 
-    What the image leaves open after all, such as the depth of a box seen face-on, the prediction tells again.
+    What the image leaves open after all, such as the depth of a box seen face-on, the prediction settles.
     """
-    if one.prediction is None:
-        return surface_fit.fit(depth, one.mask, camera, options=known)
-    predicted = one.prediction.body
-    options = replace(known, expected=predicted, hull=one.prediction.hull)
-    return surface_fit.fit(depth, one.mask, camera, start=predicted, options=options)
+    if obj.prediction is None:
+        return surface_fit.fit(depth, obj.mask, camera, options=known)
+    predicted = obj.prediction.body
+    options = replace(known, expected=predicted, hull=obj.prediction.hull)
+    return surface_fit.fit(depth, obj.mask, camera, start=predicted, options=options)
 
 
-def _predicted(one: SeenObject) -> Superquadric:
-    if one.prediction is None:
+def _predicted(obj: SeenObject) -> Superquadric:
+    if obj.prediction is None:
         raise ValueError("no prediction")
-    return one.prediction.body()
+    return obj.prediction.body()
 
 
-def _unfitted(body: Superquadric, one: SeenObject, message: str) -> Fit:
+def _unfitted(body: Superquadric, obj: SeenObject, message: str) -> Fit:
     """The answer of a method that is no least squares fit: distances measured, nothing known about uncertainty."""
-    distance = body.sampson_distance(one.points)
+    distance = body.sampson_distance(obj.points)
     residual = float(np.sqrt(np.mean(distance**2)))
     return Fit(body, residual, Status.CONVERGED, message)
 
 
-def _failed(one: SeenObject, reason: str) -> Fit:
-    points = one.points
+def _failed(obj: SeenObject, reason: str) -> Fit:
+    points = obj.points
     low, high = points.min(axis=0), points.max(axis=0)
     size = np.maximum(0.5 * (high - low), 1e-3 * max(float((high - low).max()), 1e-3))
     body = Superquadric(size, np.ones(2), 0.5 * (low + high), np.array([0.0, 0.0, 0.0, 1.0]))

@@ -97,7 +97,7 @@ class SegmentNetwork:
             if not joined:
                 break
             seen |= self._seen(labels, joined)
-        own = {label: pixels for label, one in seen.items() if (pixels := _own(labels, label, one)) is not None}
+        own = {label: pixels for label, answer in seen.items() if (pixels := _own(labels, label, answer)) is not None}
         if len(seen) == len(found.ids):
             return OwnSegments(found, own)
         counts = regions.extents(labels)[:, 0]
@@ -142,13 +142,13 @@ def _mutual(labels: np.ndarray, seen: Mapping[int, _Seen]) -> np.ndarray:
     place[list(seen)] = np.arange(len(seen)) + 1
     means = np.zeros((len(seen), len(seen)))
     height, width = labels.shape
-    for i, one in enumerate(seen.values()):
-        if not one.view.image[..., segment_view.OTHERS].any():
+    for i, answer in enumerate(seen.values()):
+        if not answer.view.image[..., segment_view.OTHERS].any():
             continue
-        grid = np.ix_(np.clip(one.view.rows, 0, height - 1), np.clip(one.view.columns, 0, width - 1))
-        there = np.where(one.view.image[..., segment_view.IMAGE] > 0, place[labels[grid]], 0).ravel()
+        grid = np.ix_(np.clip(answer.view.rows, 0, height - 1), np.clip(answer.view.columns, 0, width - 1))
+        there = np.where(answer.view.image[..., segment_view.IMAGE] > 0, place[labels[grid]], 0).ravel()
         counts = np.bincount(there, minlength=len(seen) + 1)[1:]
-        sums = np.bincount(there, 1 / (1 + np.exp(-one.logits.ravel())), len(seen) + 1)[1:]
+        sums = np.bincount(there, 1 / (1 + np.exp(-answer.logits.ravel())), len(seen) + 1)[1:]
         means[i] = np.where(counts >= _LEAST_CELLS, sums / np.maximum(counts, 1), 0)
     return np.triu(np.minimum(means, means.T), 1)
 
@@ -170,9 +170,9 @@ def _join(labels: np.ndarray, seen: dict[int, _Seen]) -> list[int]:
     return remain
 
 
-def _own(labels: np.ndarray, label: int, one: _Seen) -> np.ndarray | None:
+def _own(labels: np.ndarray, label: int, answer: _Seen) -> np.ndarray | None:
     """The pixels of a segment's object in its window; None where there are no strays, or next to nothing else."""
-    inside = labels[one.window] == label
-    own = inside & (one.view.at_pixels(one.logits, one.window) >= 0)
+    inside = labels[answer.window] == label
+    own = inside & (answer.view.at_pixels(answer.logits, answer.window) >= 0)
     count, total = np.count_nonzero(own), np.count_nonzero(inside)
     return None if count == total or count < max(MIN_PIXELS, (1 - _MOST_STRAYS) * total) else own

@@ -66,10 +66,10 @@ def of_bodies(
     return _answered(views, submit(lambda: network.predict(shown)))
 
 
-def at_once(asked: Callable[[], Answers]) -> Future[Answers]:
+def at_once(computed: Callable[[], Answers]) -> Future[Answers]:
     """What need not be waited for any more."""
     found: Future[Answers] = Future()
-    found.set_result(asked())
+    found.set_result(computed())
     return found
 
 

@@ -191,7 +191,7 @@ class Recoverer:
                 kept = continuity.repeated(previous, cleaned, camera, options)
                 if kept.whole and (labels is None or np.array_equal(labels, previous.labels)):
                     milliseconds["segmentation"] = milliseconds["total"] = 1e3 * (time.perf_counter() - started)
-                    bodies = tuple(replace(one, repeats=one.repeats + 1) for one in previous.bodies)
+                    bodies = tuple(replace(body, repeats=body.repeats + 1) for body in previous.bodies)
                     return replace(previous, bodies=bodies, milliseconds=milliseconds)
             if labels is None:
                 found = segments.segment(depth, camera, options.segmentation_options())
@@ -208,20 +208,20 @@ class Recoverer:
             same = {} if previous is None else continuity.matched(kept, previous.labels, objects)
 
         with timed(milliseconds, "network"):
-            fresh = [one for one in objects if one.label not in same]
+            fresh = [obj for obj in objects if obj.label not in same]
             config = None if network is None else network.config
-            fresh = [one.only(own[one.label]) if one.label in own else one for one in fresh]
-            fresh = self._mapped(lambda one: seen_object.viewed(one, depth, camera, found, options, config), fresh)
+            fresh = [obj.only(own[obj.label]) if obj.label in own else obj for obj in fresh]
+            fresh = self._mapped(lambda obj: seen_object.viewed(obj, depth, camera, found, options, config), fresh)
             if network is not None:
                 fresh = self._predicted(fresh, network, options)
 
         with timed(milliseconds, "fit"):
             deadline = started + options.time_budget
-            fits = self._mapped(lambda one: methods.fitted(one, depth, camera, options, deadline), fresh)
-            fit_of = {one.label: fit for one, fit in zip(fresh, fits, strict=True)}
-            known = {one.label: one for one in fresh}
-            objects = [known.get(one.label, one) for one in objects]
-            fits = [same[one.label].fit if one.label in same else fit_of[one.label] for one in objects]
+            fits = self._mapped(lambda obj: methods.fitted(obj, depth, camera, options, deadline), fresh)
+            fit_of = {obj.label: fit for obj, fit in zip(fresh, fits, strict=True)}
+            known = {obj.label: obj for obj in fresh}
+            objects = [known.get(obj.label, obj) for obj in objects]
+            fits = [same[obj.label].fit if obj.label in same else fit_of[obj.label] for obj in objects]
         with timed(milliseconds, "repair"):
             if labels is None and options.repair and options.method in FITTED:
                 found, objects, fits = _split(found, objects, fits, depth, camera, options, network_of_masks, deadline)
@@ -229,16 +229,16 @@ class Recoverer:
             pairs = list(zip(objects, fits, strict=True))
 
             def recovery(pair: tuple[SeenObject, Fit]) -> Recovery:
-                one, fit = pair
-                if one.label in same and same[one.label].fit is fit:
-                    return same[one.label]
-                return Recovery(fit, methods.score(one.view, fit, options), one.label, one.pixels)
+                obj, fit = pair
+                if obj.label in same and same[obj.label].fit is fit:
+                    return same[obj.label]
+                return Recovery(fit, methods.score(obj.view, fit, options), obj.label, obj.pixels)
 
             bodies = tuple(self._mapped(recovery, pairs))
         reference = Reference.of(depth, camera, found.sigma, options)
         if previous is not None and previous.reference is not None and same:
             reference = reference.keeping(
-                previous.reference, found.labels, [one.label for one in bodies if one.repeats]
+                previous.reference, found.labels, [body.label for body in bodies if body.repeats]
             )
         milliseconds["total"] = 1e3 * (time.perf_counter() - started)
         message = "" if bodies else _why_empty(depth, found)
@@ -246,7 +246,7 @@ class Recoverer:
 
     def _predicted(self, objects: Sequence[SeenObject], network: Network, options: RecoveryOptions) -> list[SeenObject]:
         """The objects with their predictions; those of bodies may still be computed, beside fits that begin without."""
-        views = [one.shown for one in objects if one.shown is not None]
+        views = [obj.shown for obj in objects if obj.shown is not None]
         if not views:
             return list(objects)
         if isinstance(network, inference.ThingPredictor):
@@ -258,12 +258,12 @@ class Recoverer:
         else:
             submit = self._beside.submit if options.method == "auto" else prediction.at_once
             found = prediction.of_bodies(views, network, submit)
-        return [replace(one, prediction=said) for one, said in zip(objects, found, strict=True)]
+        return [replace(obj, prediction=predicted) for obj, predicted in zip(objects, found, strict=True)]
 
     def _mapped(self, function: Callable[[_Item], _Answer], items: Sequence[_Item]) -> list[_Answer]:
         """The function of each item; several at a time in threads that stay, as new ones cost memory and time."""
         if len(items) < 2 or self._threads < 2:
-            return [function(one) for one in items]
+            return [function(item) for item in items]
         return list(self._pool.map(function, items))
 
     def _shared(self, function: Callable[[Sequence[int]], list[_Answer]], items: Sequence[int]) -> list[_Answer]:
@@ -341,17 +341,17 @@ def _split(
     def prepared(mask: np.ndarray) -> SeenObject:
         label = int(found.labels.max()) + 1
         alone = replace(found, labels=np.where(mask, np.int32(label), found.labels), ids=(label,))
-        one = seen_object.objects(depth, alone, camera, options.depth_range)[0]
+        obj = seen_object.objects(depth, alone, camera, options.depth_range)[0]
         own = None if network is None else network.own(alone.labels, label)
-        one = one if own is None else one.only(own)
-        return seen_object.viewed(one, depth, camera, alone, options, None)
+        obj = obj if own is None else obj.only(own)
+        return seen_object.viewed(obj, depth, camera, alone, options, None)
 
     result = segment_split.split(
         depth,
         camera,
         found.labels,
         found.plane,
-        dict(zip((one.label for one in objects), fits, strict=True)),
+        dict(zip((obj.label for obj in objects), fits, strict=True)),
         lambda mask: methods.fitted(prepared(mask), depth, camera, options, deadline),
         found.sigma,
         deadline - time.perf_counter(),
@@ -360,10 +360,10 @@ def _split(
     if not result.parted:
         return found, objects, fits
     parted = {label for labels in result.parted for label in labels}
-    known = {one.label: one for one in objects if one.label not in parted}
+    known = {obj.label: obj for obj in objects if obj.label not in parted}
     known |= {label: replace(prepared(result.labels == label), label=label) for label in parted}
-    ordered = sorted(known.values(), key=lambda one: (-one.pixels, one.label))
-    ids = tuple(one.label for one in ordered)
+    ordered = sorted(known.values(), key=lambda obj: (-obj.pixels, obj.label))
+    ids = tuple(obj.label for obj in ordered)
     return replace(found, labels=result.labels, ids=ids), ordered, [result.fits[label] for label in ids]
 
 

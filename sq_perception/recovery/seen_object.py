@@ -116,7 +116,7 @@ def objects(
 
 
 def support(
-    one: SeenObject,
+    obj: SeenObject,
     depth: np.ndarray,
     camera: Camera,
     found: segments.Segmentation,
@@ -129,20 +129,20 @@ def support(
     """
     if found.plane is None:
         return None
-    low, median = one.levels(found.plane)
+    low, median = obj.levels(found.plane)
     behind = median <= 0
     if not behind and low < _HOVERING:
         return found.plane
-    other = segments.support_under(found, one.label, depth, camera, options)
+    other = segments.support_under(found, obj.label, depth, camera, options)
     if other is not None:
-        lowest, middle = one.levels(other)
+        lowest, middle = obj.levels(other)
         if abs(lowest) < _HOVERING < middle + _HOVERING:
             return other
     return None if behind or low > _HIGHEST_STACK else found.plane
 
 
 def viewed(
-    one: SeenObject,
+    obj: SeenObject,
     depth: np.ndarray,
     camera: Camera,
     found: segments.Segmentation,
@@ -150,31 +150,31 @@ def viewed(
     config: RegressorConfig | ThingConfig | None,
 ) -> SeenObject:
     """The object with what it stands on, what a network of this configuration is shown, and what its score takes."""
-    one = replace(one, plane=support(one, depth, camera, found, options.segmentation_options()))
-    inner = core(one, depth, camera)
-    shown = None if config is None else config.view_of(depth, inner, camera, one.plane)
+    obj = replace(obj, plane=support(obj, depth, camera, found, options.segmentation_options()))
+    inner = core(obj, depth, camera)
+    shown = None if config is None else config.view_of(depth, inner, camera, obj.plane)
     if shown is not None and not (isinstance(config, RegressorConfig) and config.framing == "full"):
-        return replace(one, shown=shown, view=shown)
-    view = canonical_view.from_mask(one.depth_crop, inner[one.window], one.camera_crop, _VIEW_PIXELS)
-    return replace(one, shown=shown, view=view)
+        return replace(obj, shown=shown, view=shown)
+    view = canonical_view.from_mask(obj.depth_crop, inner[obj.window], obj.camera_crop, _VIEW_PIXELS)
+    return replace(obj, shown=shown, view=view)
 
 
-def core(one: SeenObject, depth: np.ndarray, camera: Camera) -> np.ndarray:
+def core(obj: SeenObject, depth: np.ndarray, camera: Camera) -> np.ndarray:
     """The mask (height, width) without pixels that measured the table or the background: a view is framed by all.
 
     Sensors widen what is near, masks from colour what they like.  A thin thing on the table keeps its pixels.
     """
     if not camera.is_pinhole:
-        return one.mask
-    inner = one.mask_crop
-    if one.plane is not None:
-        above = one.heights(one.plane) > _ON_TABLE
-        inner = above if 2 * np.count_nonzero(above) > one.pixels else inner
-    footprint = quantile(one.depth_crop[one.mask_crop], 0.5) / np.sqrt(camera.fx * camera.fy)
-    whole = np.zeros_like(one.mask)
-    whole[one.window] = inner
+        return obj.mask
+    inner = obj.mask_crop
+    if obj.plane is not None:
+        above = obj.heights(obj.plane) > _ON_TABLE
+        inner = above if 2 * np.count_nonzero(above) > obj.pixels else inner
+    footprint = quantile(obj.depth_crop[obj.mask_crop], 0.5) / np.sqrt(camera.fx * camera.fy)
+    whole = np.zeros_like(obj.mask)
+    whole[obj.window] = inner
     # With a margin, as a part that goes on beyond the mask is something else.
-    down, across = one.window
+    down, across = obj.window
     around = slice(max(down.start - 1, 0), down.stop + 1), slice(max(across.start - 1, 0), across.stop + 1)
     whole[around] &= coherent(
         np.ascontiguousarray(depth[around]), np.ascontiguousarray(whole[around]), _JUMP_PIXELS * footprint + _JUMP

@@ -163,14 +163,14 @@ class _Image:
         if self.plane is None:
             return False
         normal, drop = self.plane[:3], np.linspace(0, 1, _DROP_STEPS)[:, None]
-        for one in fits:
-            body = one.superquadric
+        for fit in fits:
+            body = fit.superquadric
             height, reach = float(body.translation @ normal + self.plane[3]), float(body.support(normal[None])[0])
             level = max(_FOOT, _FOOT_NOISE * self.sigma * float(body.translation[2]) ** 2)
             if height - reach < level:
                 continue
             down = body.translation - (reach + drop * (height - reach)) * normal
-            if any((other.superquadric.gauge(down) < 1).any() for other in fits if other is not one):
+            if any((other.superquadric.gauge(down) < 1).any() for other in fits if other is not fit):
                 return True
             # Near the plane the line of sight grazes what is measured.
             columns, rows = np.rint(self.camera.project(down[: _DROP_STEPS // 2])).astype(int).T

@@ -2,7 +2,7 @@
 
 Each process has a Recoverer of its own, of one thread.  A few frames a process are under way, so that none waits while
 results are written, and that no more are read than that.  Where a process dies, killed or out of memory, new ones
-begin.  What had no answer then is asked again when its turn comes, so that a frame at which processes die takes no
+begin.  What had no answer then is begun again when its turn comes, so that a frame at which processes die takes no
 other with it; it is given up after some tries.  A cluster's scheduler does the same by itself.
 """
 
@@ -68,7 +68,7 @@ def recovered(
 
     An answer may be a :class:`WorkerLostError`.  The crew is dismissed in the end.
     """
-    asked: deque[tuple[_Key, Work | None, _Answer]] = deque()
+    under_way: deque[tuple[_Key, Work | None, _Answer]] = deque()
 
     def begun(work: Work | None) -> _Answer:
         if work is not None:
@@ -78,7 +78,7 @@ def recovered(
         return answer
 
     def first() -> tuple[_Key, FrameRecovery | Exception | None]:
-        key, work, answer = asked.popleft()
+        key, work, answer = under_way.popleft()
         deaths = 0
         while True:
             try:
@@ -88,15 +88,15 @@ def recovered(
                 if deaths == crew.tries:
                     return key, WorkerLostError("the process that recovered it died, again and again")
                 answer = begun(work)
-            except Exception as error:  # whatever it raised there is for the one that asked
+            except Exception as error:  # whatever it raised there is for the caller
                 return key, error
 
     try:
         for key, work in frames:
-            asked.append((key, work, begun(work)))
-            while asked and (len(asked) >= AHEAD * crew.size or asked[0][2].done()):
+            under_way.append((key, work, begun(work)))
+            while under_way and (len(under_way) >= AHEAD * crew.size or under_way[0][2].done()):
                 yield first()
-        while asked:
+        while under_way:
             yield first()
     finally:
         crew.end()

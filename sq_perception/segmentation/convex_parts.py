@@ -1,4 +1,4 @@
-"""Convex bodies among the segments of a depth image, told by lines of sight within them.
+"""Convex bodies among the segments of a depth image, found by lines of sight within them.
 
 Equation
 --------

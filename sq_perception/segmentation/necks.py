@@ -113,10 +113,10 @@ def joined(labels: np.ndarray, depth: np.ndarray, camera: Camera, plane: np.ndar
         profiles[label] = _Profile(points @ plane[:3] + plane[3], points @ sideways / slant, away)
     number = np.arange(len(extents), dtype=labels.dtype)
     # From below: a cap stands on a neck that stands on a bottle.
-    for label in sorted(profiles, key=lambda one: quantile(profiles[one].height, 0.5)):
-        below = [one for one in profiles if one != label and profiles[one].narrows_to(profiles[label])]
+    for label in sorted(profiles, key=lambda other: quantile(profiles[other].height, 0.5)):
+        below = [other for other in profiles if other != label and profiles[other].narrows_to(profiles[label])]
         if below:
-            nearest = min(below, key=lambda one: abs(profiles[one].away - profiles[label].away))
+            nearest = min(below, key=lambda other: abs(profiles[other].away - profiles[label].away))
             profiles[nearest] = profiles[nearest].with_(profiles.pop(label))
             number[number == label] = nearest
     return regions.renumbered(labels, number)

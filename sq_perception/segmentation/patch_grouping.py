@@ -2,7 +2,7 @@
 
 Every pair of patches that touch in the image gets a score, a sum over the samples of their common border, in samples:
 
-    convex edge  +1      concave edge  -1      depth step  0 to -1      flat  +0.3      not told  +0.1
+    convex edge  +1      concave edge  -1      depth step  0 to -1      flat  +0.3      unknown  +0.1
 
 Convex bodies never show a concave edge or a depth step of their own, so that these say two bodies; a step counts fully
 from twice the difference at which it is one, as noise makes small ones.  Two exceptions:
@@ -42,7 +42,7 @@ _HOLLOW_DEPTH = 0.3
 _FLAT = 0.3
 """What a border scores at which the surface goes on: less than an edge, as noise makes flat borders of folds."""
 _UNKNOWN = 0.1
-"""The same where nothing is told: patches that nothing parts are one body."""
+"""The same where nothing is known: patches that nothing parts are one body."""
 _SIGHT_SAMPLES = 24
 """Along a line between two patches; a nearer thing of a tenth of it is met by two or three."""
 _SEEN_THROUGH = 0.1
@@ -134,8 +134,8 @@ def _continued(patches: Patches, body: np.ndarray, camera: Camera) -> np.ndarray
         normals = patches.planes / length[:, None]
         z = 1 / np.einsum("ij,ij->i", rays, patches.planes)
         distance = np.abs(1 - z[None, :] * (patches.planes @ rays.T)) / length[:, None]
-        one = (normals @ normals.T > np.cos(_PLANE_ANGLE)) & (np.maximum(distance, distance.T) < _PLANE_DISTANCE)
-    a, b = np.nonzero(np.triu(one & (body[:, None] != body[None, :]), 1))
+        coplanar = (normals @ normals.T > np.cos(_PLANE_ANGLE)) & (np.maximum(distance, distance.T) < _PLANE_DISTANCE)
+    a, b = np.nonzero(np.triu(coplanar & (body[:, None] != body[None, :]), 1))
     weights = np.zeros((n, n))
     if a.size == 0:
         return weights

@@ -57,8 +57,8 @@ _TURNS = np.stack([np.cos(np.deg2rad(np.arange(0, 180, 10))), np.sin(np.deg2rad(
 """Directions (18, 2) in which edges are measured."""
 _UNDER, _BELOW = 3.0, 2.0
 """Tolerances below the support at which is looked for it, and from which on something seen lies below it."""
-_TOLD = 1 / 3
-"""Share of the feet that must be told to have the support, or something before it, under them.  Not of what reaches the
+_SUPPORTED = 1 / 3
+"""Share of the feet that must be seen to have the support, or something before it, under them.  Not of what reaches the
 nearest depth of the image: it goes on where the sensor measures nothing, and may itself hide its feet."""
 
 
@@ -212,8 +212,8 @@ def standing(
                 return False
         if not limits.hold(points, plane.equation[:3]):
             return False
-        told = _TOLD if points[:, 2].min() > nearest else 0.0
-        if not _stands(points, told, depth, relative, camera, plane):
+        least_share = _SUPPORTED if points[:, 2].min() > nearest else 0.0
+        if not _stands(points, least_share, depth, relative, camera, plane):
             return False
         around[rows, columns] = False
         return True
@@ -239,8 +239,8 @@ def _spread(relative: np.ndarray, around: np.ndarray, rows: np.ndarray, columns:
 def _stands(
     points: np.ndarray, least: float, depth: np.ndarray, relative: np.ndarray, camera: Camera, plane: Plane
 ) -> bool:
-    """Whether the support is under points (n, 3), as far as the camera tells, of a share of them at least; what the
-    image cuts off tells nothing."""
+    """Whether the support is under points (n, 3), as far as it is seen, of a share of them at least; what the
+    image cuts off counts as supported."""
     normal = plane.equation[:3]
     under = plane.height(points) + _UNDER * TOLERANCE * noise_growth(points[:, 2])
     feet = points - under[:, None] * normal
@@ -248,7 +248,7 @@ def _stands(
     at = np.rint(camera.project(feet))
     inside = (at >= 0).all(axis=1) & (at[:, 0] < camera.width) & (at[:, 1] < camera.height)
     columns, rows = at[inside].astype(int).T
-    told = depth[rows, columns] > 0
-    past = np.count_nonzero(told & (relative[rows, columns] < -_BELOW * TOLERANCE))
-    held = np.count_nonzero(told) - past
+    measured = depth[rows, columns] > 0
+    past = np.count_nonzero(measured & (relative[rows, columns] < -_BELOW * TOLERANCE))
+    held = np.count_nonzero(measured) - past
     return past <= held and held + np.count_nonzero(~inside) >= least * len(feet)

@@ -216,7 +216,7 @@ def _tops(parts: np.ndarray, reached: np.ndarray, height: np.ndarray, count: int
 
 
 def _shallow(height: np.ndarray, z: np.ndarray, known: np.ndarray, width: np.ndarray) -> np.ndarray:
-    """Samples whose surface is turned from the support by less than a ramp, told by chords along rows and columns.
+    """Samples whose surface is turned from the support by less than a ramp, by chords along rows and columns.
 
     With the chords' rises h_u, h_v and their inner products G, the squared sine of the slope is h^T G^-1 h.
     """

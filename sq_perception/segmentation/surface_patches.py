@@ -211,9 +211,9 @@ def _chord_noise(depth: np.ndarray, flat: np.ndarray | None, chord: _Chord, sigm
     if flat is not None:
         inverse, known = _mean(depth, flat, chord.half, chord.stride)
         both = (_bends(inverse, known, 0, chord.rho), _bends(inverse, known, chord.rho, 0))
-        told = [bends for bends in both if bends.size >= _FEWEST_CHORDS]
-        if told:
-            return 1.4826 * max(ranked(one, one.size // 2) for one in told)
+        enough = [bends for bends in both if bends.size >= _FEWEST_CHORDS]
+        if enough:
+            return 1.4826 * max(ranked(bends, bends.size // 2) for bends in enough)
     return _CHORD_NOISE * sigma / (2 * chord.half + 1)
 
 
@@ -291,10 +291,10 @@ def _fold(inverse: np.ndarray, known: np.ndarray, rho: int, pixel: float) -> np.
             for u in range(margin, columns - margin):
                 if not known[v, u]:
                     continue
-                told = True
+                is_known = True
                 for t in range(-reach, reach + 1):
-                    told &= known[v + t * down, u + t * right]
-                if told:
+                    is_known &= known[v + t * down, u + t * right]
+                if is_known:
                     a, b = inverse[v - reach * down, u - reach * right], inverse[v + reach * down, u + reach * right]
                     s = (np.float32(0.5) * (a + b) - inverse[v, u]) / (inverse[v, u] * length)
                     if not abs(s) <= abs(strongest[v, u]):
@@ -328,15 +328,15 @@ def _shapes(
     middle = np.array([camera.cx, camera.cy]) / stride
     centre, gram = _grams(seeds, inverse, scale, middle, count)
     curvature, planes = np.zeros(count + 1), np.full((count + 1, 3), np.nan)
-    told = np.flatnonzero(samples[1:] >= 2 * _SHAPE_TERMS) + 1
-    gram, centre = gram[told], centre[told]
+    large = np.flatnonzero(samples[1:] >= 2 * _SHAPE_TERMS) + 1
+    gram, centre = gram[large], centre[large]
     flat = _solved(gram, 3)
-    planes[told] = flat
-    planes[told, 2] -= np.einsum("ij,ij->i", flat[:, :2], centre)
+    planes[large] = flat
+    planes[large, 2] -= np.einsum("ij,ij->i", flat[:, :2], centre)
     bent = _solved(gram, _SHAPE_TERMS)
     # What the curvature explains, w - w_plane, may be noise if it is small beside that of single pixels.
     explained = np.einsum("ij,ij->i", bent, gram[:, :6, 6]) - np.einsum("ij,ij->i", flat, gram[:, :3, 6])
-    curvature[told] = np.where(explained > samples[told] * least_bend**2, 2 * (bent[:, 3] + bent[:, 5]), 0)
+    curvature[large] = np.where(explained > samples[large] * least_bend**2, 2 * (bent[:, 3] + bent[:, 5]), 0)
     return curvature, planes
 
 

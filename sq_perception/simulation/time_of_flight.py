@@ -73,9 +73,9 @@ class TimeOfFlight(SensorNoise):
         share, first, second = np.zeros((3, w.size), np.float32)
         for jump, step in zip(scene.jumps(), (1, width), strict=True):
             v, u = np.nonzero(jump)
-            one = v * width + u
-            edge = rng.random(one.size, dtype=np.float32)
-            for pixel, other, distance in ((one, one + step, edge), (one + step, one, 1 - edge)):
+            index = v * width + u
+            edge = rng.random(index.size, dtype=np.float32)
+            for pixel, other, distance in ((index, index + step, edge), (index + step, index, 1 - edge)):
                 reach = np.maximum(self.footprint / 2 - distance, 0) / self.footprint
                 # Within one kind of pair every pixel occurs once, so that plain indexing adds up.
                 share[pixel] += reach
