@@ -1,6 +1,6 @@
 """The command ``sq-perception``; ``sq-perception --help`` lists what it can do.
 
-Every command is a module with a ``main(arguments) -> exit code``.  None is imported before it is asked for, and each
+Every command is a function of a module, ``(arguments) -> exit code``.  None is imported before it is called, and each
 imports what computes only after its arguments were understood, so that every ``--help`` answers at once.
 
 Exit codes: 0 all went well, 1 something could not be read, written or found, 2 wrong usage, 130 interrupted.
@@ -19,26 +19,23 @@ from sq_perception.commands.console import FAILURE, INTERRUPTED, SUCCESS, USAGE,
 from sq_perception.learning.choices import NEEDS_TORCH
 
 COMMANDS = {
-    "recover": ("sq_perception.commands.recover", "depth images in, superquadrics out"),
-    "grasp": ("sq_perception.commands.grasp", "depth images in, grasps of a parallel gripper out"),
-    "render": ("sq_perception.commands.render", "draw a superquadric as a depth image"),
-    "demo": ("sq_perception.commands.demo", "live demonstration with real ROS 2 nodes (extra 'ros')"),
-    "view": ("sq_perception.commands.view", "a page in the browser: depth, bodies, parameters (extras 'ros', 'view')"),
-    "train": ("sq_perception.commands.train", "train a network"),
-    "thing-views": ("sq_perception.commands.thing_views", "draw views of household things to train on"),
-    "train-things": (
-        "sq_perception.commands.train_things",
-        "train the network that predicts the unseen side of things",
-    ),
-    "segment-views": ("sq_perception.commands.segment_views", "draw segments of simulated tables to train on"),
-    "train-masks": ("sq_perception.commands.train_masks", "train the network that finds strays in segments"),
-    "dataset": ("sq_perception.commands.dataset", "write a fixed set of training and test images"),
-    "evaluate": ("sq_perception.commands.evaluate", "the thesis' tables and plots, for networks and fits"),
-    "render-search": ("sq_perception.commands.render_search", "find the best s and tau of the soft renderer"),
-    "doctor": ("sq_perception.commands.doctor", "versions, extras, kernels, cores, and what is missing"),
-    "warm-up": ("sq_perception.commands.warm_up", "compile everything once, so that no first image waits"),
+    "recover": ("recover:main", "depth images in, superquadrics out"),
+    "grasp": ("grasp:main", "depth images in, grasps of a parallel gripper out"),
+    "render": ("render:main", "draw a superquadric as a depth image"),
+    "demo": ("demo:main", "live demonstration with real ROS 2 nodes (extra 'ros')"),
+    "view": ("view:main", "a page in the browser: depth, bodies, parameters (extras 'ros', 'view')"),
+    "train": ("train:main", "train a network"),
+    "thing-views": ("shard_views:things", "draw views of household things to train on"),
+    "train-things": ("shard_training:things", "train the network that predicts the unseen side of things"),
+    "segment-views": ("shard_views:segments", "draw segments of simulated tables to train on"),
+    "train-masks": ("shard_training:masks", "train the network that finds strays in segments"),
+    "dataset": ("dataset:main", "write a fixed set of training and test images"),
+    "evaluate": ("evaluate:main", "the thesis' tables and plots, for networks and fits"),
+    "render-search": ("render_search:main", "find the best s and tau of the soft renderer"),
+    "doctor": ("doctor:main", "versions, extras, kernels, cores, and what is missing"),
+    "warm-up": ("warm_up:main", "compile everything once, so that no first image waits"),
 }
-"""Name, module and summary."""
+"""Name, module of this folder and its function, and summary."""
 
 _EPILOG = """\
 examples:
@@ -49,7 +46,7 @@ examples:
   sq-perception evaluate --help
 """
 
-_VIEW_RECORDING = "sq_perception.commands.view_recording"
+_VIEW_RECORDING = "view_recording:main"
 """Of ``view FRAME ...``, which needs no ROS."""
 
 
@@ -93,8 +90,8 @@ def _parser() -> argparse.ArgumentParser:
 
 def _run(name: str, arguments: list[str]) -> int:
     is_recording = name == "view" and arguments and not arguments[0].startswith("-")
-    module = importlib.import_module(_VIEW_RECORDING if is_recording else COMMANDS[name][0])
-    code: int = module.main(arguments)
+    module, _, function = (_VIEW_RECORDING if is_recording else COMMANDS[name][0]).partition(":")
+    code: int = getattr(importlib.import_module(f"sq_perception.commands.{module}"), function)(arguments)
     return code
 
 

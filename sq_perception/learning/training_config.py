@@ -157,6 +157,35 @@ class TrainingConfig:
         return self.learning_rate * share
 
 
+@dataclass(frozen=True)
+class ShardTraining:
+    """A run on views that a folder holds (:mod:`sq_perception.learning.shard_training`)."""
+
+    minutes: float
+    """Training time, that of all parts of a stopped run together."""
+    rate: float
+    """The largest learning rate."""
+    weight_decay: float
+    batch: int = 64
+    seed: int = 0
+    threads: int = 0
+    """Of torch; 0 leaves its own choice."""
+    held: int = 2
+    """Shards that are kept for validation."""
+    validation: int = 200
+    """Steps between two validations."""
+    bfloat16: bool = False
+    """Layers before the heads in half the bits, their weights in all: 1.7 times as fast where processors have it."""
+    start: str = ""
+    """Weights to begin with: a file, or shipped ones."""
+
+
+THING_RUN = ShardTraining(minutes=120.0, rate=8e-4, weight_decay=1e-4)
+"""The network of things."""
+MASK_RUN = ShardTraining(minutes=60.0, rate=3e-3, weight_decay=1e-3)
+"""The network of masks."""
+
+
 def read(path: str | Path, **changes: Any) -> TrainingConfig:
     """The configuration of a YAML file, or of a shipped one by its name, with ``changes`` made to it.
 

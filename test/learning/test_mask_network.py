@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,11 +13,12 @@ from safetensors.numpy import save_file
 
 from sq_perception.commands import main
 from sq_perception.imaging.segment_view import CHANNELS, PIXELS, SEGMENT
-from sq_perception.learning import checkpoint, mask_training
+from sq_perception.learning import checkpoint, mask_training, shard_training
 from sq_perception.learning.checkpoint import CheckpointError
 from sq_perception.learning.mask_network import MaskNetwork
 from sq_perception.learning.network_config import MaskConfig
-from sq_perception.simulation.segment_views import NO, UNKNOWN, YES, draw_segment_views
+from sq_perception.learning.training_config import MASK_RUN
+from sq_perception.simulation.segment_views import NO, UNKNOWN, YES, SegmentViews, draw_segment_views
 
 SMALL = MaskConfig(widths=(4, 8))
 
@@ -58,13 +60,13 @@ def test_every_cell_has_a_logit(config: MaskConfig) -> None:
 
 def test_a_training_learns_goes_on_and_is_read_again(tmp_path: Path, rng: np.random.Generator) -> None:
     shards(tmp_path / "views", 3, rng)
-    config = mask_training.MaskTraining(minutes=0.1, batch=8, threads=1, held=1, validation=5)
-    first = mask_training.train(config, tmp_path / "views", tmp_path / "run", SMALL)
+    subject = replace(mask_training.MASKS, network=lambda _: MaskNetwork(SMALL))
+    config = replace(MASK_RUN, minutes=0.1, batch=8, threads=1, held=1, validation=5)
+    first = shard_training.train(subject, config, tmp_path / "views", tmp_path / "run")
     records = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
     assert records[-1]["strays"] == pytest.approx(1, abs=0.1)
     assert records[-1]["left"] < records[-1]["strays"]
-    longer = mask_training.MaskTraining(minutes=0.12, batch=8, threads=1, held=1, validation=5)
-    mask_training.train(longer, tmp_path / "views", tmp_path / "run", SMALL)
+    shard_training.train(subject, replace(config, minutes=0.12), tmp_path / "views", tmp_path / "run")
     more = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
     assert more[len(records)]["step"] > records[-1]["step"]
     again = checkpoint.load_masks(tmp_path / "run" / "masks.safetensors")
@@ -79,7 +81,7 @@ def test_a_folder_without_views_is_refused(tmp_path: Path, capsys: pytest.Captur
 
 def test_the_command_draws_what_the_training_reads(tmp_path: Path) -> None:
     assert main.main(["segment-views", str(tmp_path), "--shards", "1", "--scenes", "2"]) == 0
-    drawn = mask_training.read_views([tmp_path / "00000.safetensors"])
+    drawn = shard_training.read_views(SegmentViews, [tmp_path / "00000.safetensors"])
     again = draw_segment_views(2, np.random.default_rng([0, 0]))
     np.testing.assert_array_equal(drawn.images, again.images)
     np.testing.assert_array_equal(drawn.truth, again.truth)

@@ -16,10 +16,11 @@ from sq_perception.commands import main
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.support_directions import DIRECTIONS, mirrored
 from sq_perception.imaging.canonical_view import NEAREST
-from sq_perception.learning import checkpoint, thing_network, thing_training
+from sq_perception.learning import checkpoint, shard_training, thing_network, thing_training
 from sq_perception.learning.inference import ThingPredictor
 from sq_perception.learning.network_config import mirrored_planes
 from sq_perception.learning.thing_network import HullPrediction, ThingConfig, ThingNetwork
+from sq_perception.learning.training_config import THING_RUN
 from sq_perception.simulation.thing_views import ThingViews, draw_thing_views
 
 SMALL = ThingConfig(widths=(8, 16, 16, 16), blocks=1, hidden=16, factors=2)
@@ -148,12 +149,12 @@ def test_weights_of_another_kind_are_refused(tmp_path: Path) -> None:
 
 def test_a_run_that_was_stopped_goes_on(tmp_path: Path, rng: np.random.Generator) -> None:
     shards(tmp_path / "views", 3, rng)
-    config = thing_training.ThingTraining(minutes=0.02, batch=8, held=1, validation=1, threads=1)
-    thing_training.train(config, tmp_path / "views", tmp_path / "run", SMALL)
+    subject = replace(thing_training.THINGS, network=lambda _: ThingNetwork(SMALL))
+    config = replace(THING_RUN, minutes=0.02, batch=8, held=1, validation=1, threads=1)
+    shard_training.train(subject, config, tmp_path / "views", tmp_path / "run")
     first = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
     more = first[-1]["seconds"] / 60 + 0.02  # a busy machine may have taken longer than it was given
-    longer = thing_training.ThingTraining(minutes=more, batch=8, held=1, validation=1, threads=1)
-    thing_training.train(longer, tmp_path / "views", tmp_path / "run", SMALL)
+    shard_training.train(subject, replace(config, minutes=more), tmp_path / "views", tmp_path / "run")
     log = [json.loads(line) for line in (tmp_path / "run" / "log.jsonl").read_text().splitlines()]
     assert [row["step"] for row in log] == sorted(row["step"] for row in log)
     assert log[len(first)]["step"] > first[-1]["step"]

@@ -1,0 +1,166 @@
+"""Train a network on views that a folder holds: that of things, and that of masks.
+
+Making a view takes as long as learning from it, and each is worth being seen several times; so views are written into
+a folder first, shard by shard, or meanwhile by another process, and a training reads what it finds there, again and
+again.  What is particular to a network is a :class:`Subject`:
+:data:`sq_perception.learning.thing_training.THINGS`, :data:`sq_perception.learning.mask_training.MASKS`.
+
+The learning rate falls as a cosine over the time that the run is given, as on a CPU the time is what is known
+beforehand.  An exponential average of the weights is what is validated and kept.  A run that was stopped goes on where
+it was when the same command is given again.
+
+Views of the ``held`` first shards are never trained on; the log has the network's figures on them.
+"""
+
+from __future__ import annotations
+
+import copy
+import json
+import math
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+import torch
+from safetensors.numpy import load_file as load_arrays
+from safetensors.numpy import save as bytes_of
+
+from sq_perception.files import output_file, provenance
+from sq_perception.learning import checkpoint
+from sq_perception.learning.mask_network import MaskNetwork
+from sq_perception.learning.thing_network import ThingNetwork
+from sq_perception.learning.training_config import ShardTraining
+from sq_perception.learning.training_state import TrainingState
+
+_WARM_UP = 100
+"""Steps over which the learning rate rises."""
+_AVERAGE = 0.998
+"""The averaged weights remember some 500 steps."""
+Network = TypeVar("Network", ThingNetwork, MaskNetwork)
+Views = TypeVar("Views")
+"""A dataclass of arrays (n, ...), the views among them as ``images``."""
+
+
+@dataclass(frozen=True)
+class Subject(Generic[Network, Views]):
+    """What is particular to a network that is trained on shards."""
+
+    name: str
+    """Of its file of weights and of its command, ``train-NAME``."""
+    views: type[Views]
+    network: Callable[[str], Network]
+    """A network to begin with, from the weights that :attr:`ShardTraining.start` names."""
+    batch: Callable[[Views, np.ndarray, np.random.Generator], tuple[torch.Tensor, ...]]
+    """What the network takes of the views of these numbers, varied at random, and last the truth about them."""
+    loss: Callable[..., torch.Tensor]
+    """Of the network's output for a batch, and of that batch."""
+    validate: Callable[[Network, Views], dict[str, Any]]
+    """Figures of the network on views."""
+    finish: Callable[[Network, Views], None] | None = None
+    """Changes a network when its training ends, by views that it was trained on."""
+
+
+def write_views(folder: Path, shards: Iterable[int], draw: Callable[[np.random.Generator], Any], seed: int) -> None:
+    """Write shards of freshly drawn views that are not there yet; shard k follows from (seed, k) and ``draw`` alone."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for k in shards:
+        path = folder / f"{k:05d}.safetensors"
+        if path.exists():
+            continue
+        drawn = draw(np.random.default_rng([seed, k]))
+        output_file.write(path, bytes_of({**vars(drawn), "images": drawn.images.astype(np.float16)}))
+        print(f"{path}: {len(drawn.images)} views")
+
+
+def read_views(kind: type[Views], paths: list[Path]) -> Views:
+    """All views of some shards."""
+    shards = [load_arrays(str(path)) for path in paths]
+    names = [field.name for field in fields(kind)]  # type: ignore[arg-type]
+    return kind(**{name: np.concatenate([shard[name] for shard in shards]) for name in names})
+
+
+def train(subject: Subject[Network, Any], config: ShardTraining, views: Path, output: Path) -> Network:
+    """Run, or continue, a training; returns the averaged network, also kept in ``output``/NAME.safetensors.
+
+    Raises
+    ------
+    ValueError
+        If the folder holds no more shards than are kept for validation.
+    CheckpointError
+        If a file to begin or to go on with does not fit.
+    ArithmeticError
+        If the loss is no longer finite; the last state that was saved stays.
+    """
+    if config.threads:
+        torch.set_num_threads(config.threads)
+    torch.manual_seed(config.seed)
+    output.mkdir(parents=True, exist_ok=True)
+    network = subject.network(config.start).train()
+    optimizer = torch.optim.AdamW(network.parameters(), lr=config.rate, weight_decay=config.weight_decay)
+    state = TrainingState(network, copy.deepcopy(network), optimizer)
+    path = output / "state.safetensors"
+    if path.exists():
+        state.restore(path)
+    rng = np.random.default_rng([config.seed, state.step])
+    shards: list[Path] = []
+    pool = held = read_views(subject.views, _shards(views, config.held)[: config.held])
+    began, losses = time.monotonic() - state.seconds, []
+    while (progress := (time.monotonic() - began) / (60 * config.minutes)) < 1:
+        if state.step % config.validation == 0 or not shards:
+            found = _shards(views, config.held)[config.held :]
+            if len(found) > len(shards):
+                shards, pool = found, read_views(subject.views, found)
+        rate = falling_rate(config.rate, state.step, progress)
+        batch = subject.batch(pool, rng.integers(len(pool.images), size=config.batch), rng)
+        with torch.autocast("cpu", torch.bfloat16, enabled=config.bfloat16):
+            predicted = network(*batch[:-1])
+        loss = subject.loss(predicted, *batch)
+        state.descend(loss, rate)
+        if not bool(torch.isfinite(loss)):
+            raise ArithmeticError(f"step {state.step}: the loss is {loss.item()}; {path} is the last good state")
+        state.advance(_AVERAGE)
+        losses.append(loss.item())
+        if state.step % config.validation == 0:
+            state.seconds = time.monotonic() - began
+            record = {"loss": float(np.mean(losses)), "rate": rate, "views": len(pool.images)}
+            _keep(output, subject, config, state, {**record, **subject.validate(state.average, held)})
+            losses.clear()
+    state.seconds = time.monotonic() - began
+    if subject.finish is not None:
+        subject.finish(state.average, pool)
+    _keep(output, subject, config, state, subject.validate(state.average, held))
+    return state.average
+
+
+def falling_rate(rate: float, step: int, progress: float) -> float:
+    """The learning rate: it rises over some steps and falls as a cosine of the time that passed, 0 to 1."""
+    return rate * min(1.0, (step + 1) / _WARM_UP) * (0.5 * (1 + math.cos(math.pi * progress)) + 0.01)
+
+
+def _shards(folder: Path, held: int) -> list[Path]:
+    """The shards that a folder holds, in order; raises ValueError if there are none but those kept for validation."""
+    found = sorted(folder.glob("*.safetensors"))
+    if len(found) <= held:
+        raise ValueError(f"{folder}: expected more than {held} shards of views, found {len(found)}")
+    return found
+
+
+def _keep(
+    output: Path,
+    subject: Subject[Network, Any],
+    config: ShardTraining,
+    state: TrainingState[Network],
+    record: dict[str, Any],
+) -> None:
+    """Log, state and network of this moment."""
+    record = {"step": state.step, "seconds": state.seconds, **record}
+    with (output / "log.jsonl").open("a", encoding="utf-8") as file:
+        file.write(json.dumps(record) + "\n")
+    state.save(output / "state.safetensors")
+    training = {**asdict(config), "start": Path(config.start).name}
+    made = provenance.facts(f"sq-perception train-{subject.name}")
+    facts = {"training": training, "made": made, "validation": record}
+    checkpoint.save(output / f"{subject.name}.safetensors", state.average, facts)
