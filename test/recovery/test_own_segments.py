@@ -121,11 +121,41 @@ def test_one_sided_belonging_joins_nothing() -> None:
     assert sorted(found.found.ids) == [1, 2]
 
 
+def stray_in_rows(share: float) -> Any:
+    """A network that takes this share of a segment's rows, from the top, for strays."""
+
+    def logits(views: np.ndarray) -> np.ndarray:
+        inside = views[..., segment_view.SEGMENT] > 0
+        below = np.cumsum(inside.any(axis=2), axis=1) > share * inside.any(axis=2).sum(axis=1)[:, None]
+        return np.where(below[..., None], 3.0, -3.0) * np.ones(views.shape[:3])
+
+    return GivenLogits(logits)
+
+
 def test_a_segment_that_is_mostly_stray_keeps_its_pixels() -> None:
     depth, truth = seen([standing(0, 0, *CAN)])
-    found = of(GivenLogits(lambda views: np.full(views.shape[:3], -3.0)), depth).improved(segmentation(truth))
+    found = of(stray_in_rows(0.55), depth).improved(segmentation(truth))
     np.testing.assert_array_equal(found.found.labels, truth)
     assert not found.own
+
+
+def test_a_segment_that_shows_no_object_is_dropped() -> None:
+    depth, truth = seen([standing(0, 0, *CAN)])
+    found = of(stray_in_rows(0.8), depth).improved(segmentation(truth))
+    assert found.found.ids == ()
+    assert not found.found.labels.any()
+
+
+def test_the_floor_behind_a_table_is_no_object(shipped: Any) -> None:
+    """It is the larger of two segments; the can is the first one then."""
+    depth, truth = seen([standing(0, 0, *CAN)])
+    floor = plane_depth(PLANE + np.array([0.0, 0.0, 0.0, 0.7]), CAMERA)
+    behind = np.arange(CAMERA.height)[:, None] < np.nonzero(truth)[0].min() - 10
+    labels = np.where(behind, 1, 2 * truth).astype(np.int32)
+    assert np.count_nonzero(labels == 1) > np.count_nonzero(labels == 2)
+    found = of(shipped, np.where(behind, floor, depth).astype(np.float32)).improved(segmentation(labels)).found
+    assert found.ids == (1,)
+    np.testing.assert_array_equal(found.labels, truth)
 
 
 def test_no_segments_ask_nothing() -> None:
