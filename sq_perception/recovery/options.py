@@ -47,8 +47,8 @@ class RecoveryOptions:
         Whether a pixel beside an object shows that there is nothing before what it measured; not so where the image was
         made of a cloud.  Without it things are fitted by the tolerant course.
     repair
-        Join own segments, and leave strays in them out of fits, by a network (with the method ``auto`` alone); split
-        them where that describes the image more briefly.  Masks from outside stay as they are.
+        Join own segments, drop those of no object, and leave strays out of fits, by a network (with the method ``auto``
+        alone); split segments where that describes the image more briefly.  Masks from outside stay as they are.
 
     Raises
     ------
