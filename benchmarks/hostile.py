@@ -1,4 +1,4 @@
-"""Thousands of hostile messages against a running node: does it live, does it say why, is the next good frame right?
+"""Thousands of hostile messages against a running node: does it live, does it log why, is the next good frame right?
 
     python benchmarks/hostile.py [--messages 20000] [--seed 0] [--node recover_node]
 
@@ -136,7 +136,7 @@ def main() -> None:
             benchmark.run(options.messages // 2, options.seed + masked, masked)
         seconds = time.monotonic() - began
         result = benchmark.result()
-        said = benchmark.child.last_lines()
+        log = benchmark.child.last_lines()
     good, alone, counters = result["good_ms"], result["undisturbed_ms"], result["counters"]
     rows = [
         ["messages, minutes", f"{result['messages']}, {seconds / 60:.1f}"],
@@ -157,7 +157,7 @@ def main() -> None:
     lines = [[str(times), reason.replace("|", "/").replace("\n", " ")] for reason, times in result["reasons"]]
     reasons = report.table(["times", "reason, numbers and names as #"], lines)
     table = report.table(["", options.node], rows)
-    report.write(options.name, {"options": vars(options), **result, "said": said}, f"{table}\n\n{reasons}")
+    report.write(options.name, {"options": vars(options), **result, "log": log}, f"{table}\n\n{reasons}")
     right = result["good_frames_right"] == result["good_frames"] and result["balanced"]
     sys.exit(0 if right and not result["defects"] and not result["without_reason"] else 1)
 

@@ -5,7 +5,7 @@
 A supervisor starts the killed process again at once, as a launch file with ``respawn`` does.  The time goes from that
 start to the first result that needs the process: of an image that was taken after it.  Meanwhile the others must not
 fall silent: results where the viewer was killed, camera_infos where the node was, diagnoses where the camera was.
-A process that does not come back within 30 s counts as never back (test/respawned_nodes.py says why that may happen).
+A process that does not come back within 30 s counts as never back (the reasons: test/helpers/respawned_nodes.py).
 Shared-memory segments are counted after each kill, those of dead owners separately.  They are freed by the next start
 of one of this package's nodes, not by the viewer's, and not before they are ten seconds old.
 """
@@ -93,7 +93,7 @@ def main() -> None:
         "met",
     ]
     most = max(kill.orphans for kill in kills)
-    words = (
+    summary = (
         f"Processes left: {len(left)}. Segments of dead owners: {len(before)} before, at most {most} during, "
         f"{len(dead)} new ones after the end."
     )
@@ -104,7 +104,7 @@ def main() -> None:
         "orphans": {"before": len(before), "at_most": most, "after": len(dead)},
         "freed_before": len(freed),
     }
-    report.write(options.name, result, f"{report.table(header, rows)}\n\n{words}")
+    report.write(options.name, result, f"{report.table(header, rows)}\n\n{summary}")
     remove_orphans()
     sys.exit(0 if not left and all(row[-1] == "yes" for row in rows) else 1)
 

@@ -52,8 +52,8 @@ def of_one(works: list[workers.Work]) -> dict[str, float]:
 def of_many(works: list[workers.Work], jobs: int) -> dict[str, float]:
     """The same by so many processes."""
     spent, moments = processor_time(), []
-    crew = workers.Processes(workers.Setup(None, RecoveryOptions()), jobs)
-    for _ in workers.recovered(enumerate(works), crew):
+    executor = workers.Processes(workers.Setup(None, RecoveryOptions()), jobs)
+    for _ in workers.recovered(enumerate(works), executor):
         moments.append(time.perf_counter())
     for process in multiprocessing.active_children():
         process.join()

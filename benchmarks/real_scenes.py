@@ -82,11 +82,11 @@ def main() -> None:
     parser = arguments(__doc__, "real_scenes")
     parser.add_argument("--kinds", default="", help="of things, separated by semicolons")
     options = parser.parse_args()
-    words = [word.strip() for word in options.kinds.split(";") if word.strip()]
-    if not set(words) <= set(mesh_things.KINDS):
+    names = [name.strip() for name in options.kinds.split(";") if name.strip()]
+    if not set(names) <= set(mesh_things.KINDS):
         parser.error(f"--kinds: expected some of {', '.join(mesh_things.KINDS)}")
     least = min(filter(None, mesh_things.KINDS.values()))
-    kinds = {word: max(mesh_things.KINDS[word], least) for word in words} or None
+    kinds = {name: max(mesh_things.KINDS[name], least) for name in names} or None
     scans = report.shared_data("ycb_meshes")
     run(partial(scene_verdict.verdict, kinds=kinds, scans=scans, sensor=options.sensor), options, groups, GOALS)
 
@@ -116,8 +116,8 @@ def run(
         everything = [thing_facts(one) for each in verdicts for one in each.things]
         options.each.write_text(json.dumps(everything, indent=1) + "\n")
     result, text = tables(verdicts, groups, goals)
-    words = {name: str(value) if isinstance(value, Path) else value for name, value in vars(options).items()}
-    report.write(options.name, {**facts, "options": words, **result}, text)
+    given = {name: str(value) if isinstance(value, Path) else value for name, value in vars(options).items()}
+    report.write(options.name, {**facts, "options": given, **result}, text)
 
 
 def verdicts_of(evaluate: Callable[[int], SceneVerdict], seeds: range, jobs: int) -> Iterator[SceneVerdict]:

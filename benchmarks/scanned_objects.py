@@ -96,11 +96,11 @@ class FittedScan:
 
 
 def scans(folder: Path, wanted: str) -> list[Scan]:
-    """The scans whose names contain one of the wanted words, all without any."""
-    words = [word.strip() for word in wanted.split(";") if word.strip()]
+    """The scans whose names contain one of the wanted parts, all without any."""
+    parts = [part.strip() for part in wanted.split(";") if part.strip()]
     found = []
     for number, path in enumerate(sorted(path for path in folder.glob("*.ply") if ".hull" not in path.name)):
-        if words and not any(word in path.stem for word in words):
+        if parts and not any(part in path.stem for part in parts):
             continue
         mesh = trimesh.load_mesh(path, process=False)
         hull = trimesh.load_mesh(path.with_suffix(".hull.ply"), process=False)
@@ -212,7 +212,7 @@ def worst_line(setting: str, each: FittedScan, best: dict[str, float]) -> list[s
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
     parser.add_argument("--poses", type=int, default=20, help="images of every object in either setting")
-    parser.add_argument("--objects", default="", help="words in names of objects, separated by semicolons")
+    parser.add_argument("--objects", default="", help="parts of names of objects, separated by semicolons")
     parser.add_argument("--name", default="scanned_objects", help="name of the result files")
     options = parser.parse_args()
     data = report.shared_data("ycb_meshes")

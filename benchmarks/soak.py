@@ -325,7 +325,7 @@ def main() -> None:
         "phases": accounts,
         "verdicts": rows,
         "final": final.values,
-        "said": warnings,
+        "log": warnings,
         "course": seconds,
     }
     table = report.table(["what", "asked", "reached", "met"], rows)

@@ -60,7 +60,7 @@ class Child:
         return tail.decode(errors="replace").splitlines()[-count:]
 
     def interrupt(self) -> None:
-        """Ask it to stop, as Ctrl-C does."""
+        """Interrupt it, as Ctrl-C does."""
         self._signal(signal.SIGINT)
 
     def ends_within(self, seconds: float) -> bool:
@@ -89,7 +89,7 @@ class Children:
         self._interrupted = False
         self._before: Any = None
         self.killed: list[str] = []
-        """Names of those that did not stop when asked to."""
+        """Names of those that did not stop when interrupted."""
 
     def __enter__(self) -> Children:
         if threading.current_thread() is threading.main_thread():
@@ -121,7 +121,7 @@ class Children:
         return next((child for child in self._running if child.exit_code is not None), None)
 
     def stop(self) -> None:
-        """Interrupt all, wait, and kill those that do not listen.  A second Ctrl-C must not leave one behind."""
+        """Interrupt all, wait, and kill those that go on.  A second Ctrl-C must not leave one behind."""
         numbers = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
         previous = {number: signal.signal(number, signal.SIG_IGN) for number in numbers}
         try:

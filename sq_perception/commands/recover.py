@@ -227,19 +227,19 @@ def _run(options: argparse.Namespace) -> int:
         outputs = recover_outputs.Outputs(options)
         done.add(outputs.done)
         setup = workers.Setup(options.model, settings)
-        crew: Recoverer | workers.Processes | workers.Cluster
+        executor: Recoverer | workers.Processes | workers.Cluster
         if options.cluster:
-            crew = workers.Cluster(setup, options.cluster)
+            executor = workers.Cluster(setup, options.cluster)
         elif options.jobs > 1:
-            crew = workers.Processes(setup, options.jobs)
+            executor = workers.Processes(setup, options.jobs)
         else:
-            crew = Recoverer(options.model, method=options.method)
+            executor = Recoverer(options.model, method=options.method)
     except (FrameError, checkpoint.CheckpointError, OSError, ImportError) as error:
         return failed(str(error))
     except ValueError as error:
         return misused(str(error))
 
-    run = RecoverRun(options, settings, crew, outputs)
+    run = RecoverRun(options, settings, executor, outputs)
     code = run.over(recorded)
     for problem in outputs.finish(run.is_whole):
         complain(problem)

@@ -28,8 +28,8 @@ class RecoverRun:
         Of the command.
     settings
         Of the recovery, made of them.
-    crew
-        Who recovers.
+    executor
+        What recovers the frames, in this process or in others.
     outputs
         Where what was recovered goes.
 
@@ -43,11 +43,11 @@ class RecoverRun:
         self,
         options: argparse.Namespace,
         settings: RecoveryOptions,
-        crew: Recoverer | workers.Processes | workers.Cluster,
+        executor: Recoverer | workers.Processes | workers.Cluster,
         outputs: Outputs,
     ) -> None:
         self.is_whole = False
-        self._options, self._settings, self._crew, self._outputs = options, settings, crew, outputs
+        self._options, self._settings, self._executor, self._outputs = options, settings, executor, outputs
         self._tracks = RecordedTracks(lambda text: complain(f"warning: {text}")) if options.track else None
         self._unreadable = 0
         self._warm: set[Any] = set()
@@ -91,10 +91,10 @@ class RecoverRun:
 
     def _answered(self, pairs: Iterable[tuple[str, Any]]) -> Iterator[tuple[tuple[str, Any], Any]]:
         """The frames with what was recovered of each, or the error that it raised; None for what is no frame."""
-        crew = self._crew
-        if isinstance(crew, workers.Processes | workers.Cluster):
-            asked = ((pair, self._work(pair[1]) if isinstance(pair[1], RecordedFrame) else None) for pair in pairs)
-            yield from workers.recovered(asked, crew)
+        executor = self._executor
+        if isinstance(executor, workers.Processes | workers.Cluster):
+            works = ((pair, self._work(pair[1]) if isinstance(pair[1], RecordedFrame) else None) for pair in pairs)
+            yield from workers.recovered(works, executor)
             return
         previous: FrameRecovery | None = None
         for pair in pairs:
@@ -102,10 +102,10 @@ class RecoverRun:
             if isinstance(frame := pair[1], RecordedFrame):
                 try:
                     if frame.camera not in self._warm:
-                        crew.warm_up(frame.camera)
+                        executor.warm_up(frame.camera)
                         self._warm.add(frame.camera)
                     work = self._work(frame)
-                    answer = crew.recover(work.depth, work.camera, work.labels, work.options, previous)
+                    answer = executor.recover(work.depth, work.camera, work.labels, work.options, previous)
                     previous = answer if self._tracks else None
                 except (ValueError, ArithmeticError) as error:
                     answer = error

@@ -51,7 +51,7 @@ def main(arguments: Sequence[str]) -> int:
     page = Page(bound, [_SOURCE], parameters=False)
     try:
         print(f"http://{options.host}:{bound.getsockname()[1]}; Ctrl-C ends", flush=True)
-        _turn_over(page, first, frames)
+        _browse(page, first, frames)
     except KeyboardInterrupt:
         return SUCCESS
     finally:
@@ -81,23 +81,23 @@ def _recovered(options: argparse.Namespace) -> Iterator[tuple[RecordedFrame, Fra
         yield frame, recoverer.recover(frame.depth, frame.camera, labels, settings)
 
 
-def _turn_over(
+def _browse(
     page: Page,
     first: tuple[RecordedFrame, FrameRecovery],
     frames: Iterator[tuple[RecordedFrame, FrameRecovery]],
 ) -> NoReturn:
     """Show frames by the buttons of the page; never returns."""
-    wishes: queue.SimpleQueue[str] = queue.SimpleQueue()
+    clicks: queue.SimpleQueue[str] = queue.SimpleQueue()
     buttons = page.server.gui.add_button_group("Frame", (_PREVIOUS, _NEXT))
-    buttons.on_click(lambda _: wishes.put(buttons.value))
+    buttons.on_click(lambda _: clicks.put(buttons.value))
     shown, at = [first], 0
     while True:
         _show(page, *shown[at])
         try:
-            wish = wishes.get(timeout=_REDRAWN)
+            clicked = clicks.get(timeout=_REDRAWN)
         except queue.Empty:
             continue
-        if wish == _PREVIOUS:
+        if clicked == _PREVIOUS:
             at = max(at - 1, 0)
         elif at + 1 < len(shown):
             at += 1

@@ -1,4 +1,4 @@
-"""What an evaluation compares unless it is asked otherwise; importable at once, for the help of the command."""
+"""What an evaluation compares by default; importable at once, for the help of the command."""
 
 from typing import Literal
 

@@ -6,8 +6,8 @@ and by the soft renderer (equations 7.8 to 7.10) on a grid of r^3 voxels.  The s
     MAE(s, tau) = mean_bodies mean_pixels | X - T(s, tau) |
 
 and its least value.  The thesis found 0.0056 at s = 117.3, tau = 4.82 on its own range.  With images as exact as these
-the error falls with s as far as one looks, down to the half step of a voxel: nothing but the gradient, which a sharp
-boundary has in a thin layer only, speaks for a softer one.
+the error falls with s as far as one looks, down to the half step of a voxel: only the gradient, which a sharp
+boundary has in a thin layer only, is a reason for a softer one.
 """
 
 from __future__ import annotations

@@ -58,7 +58,7 @@ class OutputFile:
         self.path = Path(path)
         if self.path.is_dir():
             raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
-        self._target = self.path if is_passage(self.path) else Path(os.path.realpath(self.path))
+        self._target = self.path if is_stream(self.path) else Path(os.path.realpath(self.path))
         self._through = self._target is self.path
         if self._target.exists() and not os.access(self._target, os.W_OK):
             raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
@@ -95,8 +95,8 @@ class OutputFile:
                 return self._beside()
             if not self._through and self._replaced(old):
                 return self.path
-            passage = open_passage(self.path) if is_passage(self.path) else None
-            with self.partial.open("rb") as source, open(self.path if passage is None else passage, "wb") as sink:
+            stream = open_stream(self.path) if is_stream(self.path) else None
+            with self.partial.open("rb") as source, open(self.path if stream is None else stream, "wb") as sink:
                 shutil.copyfileobj(source, sink)
             return self.path
         finally:
@@ -204,7 +204,7 @@ def opened(path: Path, flags: int = 0) -> int:
     return descriptor
 
 
-def is_passage(path: Path) -> bool:
+def is_stream(path: Path) -> bool:
     """Whether what is written there goes elsewhere, so that a file of this name must not take its place."""
     status = _status(path)
     if status is None:
@@ -219,8 +219,8 @@ def unfinished(path: Path) -> Path:
     return path.with_name(f"{path.stem}.partial{path.suffix}")
 
 
-def open_passage(path: Path) -> int:
-    """Descriptor to write to where :func:`is_passage` is true: of this program's own ones a copy, with its place."""
+def open_stream(path: Path) -> int:
+    """Descriptor to write to where :func:`is_stream` is true: of this program's own ones a copy, with its place."""
     for link in _links(path):
         if os.path.realpath(link.parent) == f"{_DESCRIPTORS}{os.getpid()}/fd" and link.name.isdecimal():
             return os.dup(int(link.name))

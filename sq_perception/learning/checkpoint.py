@@ -46,11 +46,9 @@ _FORMATS: dict[type[Any], str] = {RegressorConfig: FORMAT, ThingConfig: THING_FO
 Config = TypeVar("Config", RegressorConfig, ThingConfig, MaskConfig)
 VERSION = "1"
 DEFAULT = "robust"
-"""Name of the weights that are used where none are named."""
-THINGS = "things"
-"""Name of the weights that predict the unseen side of things."""
-MASKS = "masks"
-"""Name of the weights that find the readings of a segment that are none of its object."""
+"""Name of the weights that predict a body where none are named; those for real cameras."""
+_SHIPPED: dict[type[Any], str] = {RegressorConfig: DEFAULT, ThingConfig: "things", MaskConfig: "masks"}
+"""Names of the weights that are used where none are named."""
 _MAX_PARAMETERS = 200_000_000
 _MAX_BYTES = 4 * _MAX_PARAMETERS + 2**20
 _MAX_HEADER_BYTES = 2**20
@@ -110,24 +108,21 @@ def load(path: Path | str | None = None, device: str | torch.device = "cpu") -> 
     """
     from sq_perception.learning.regressor import Regressor
 
-    config, weights = read(path)
-    return _module(Regressor, config, weights).to(device).eval()
+    return _module(Regressor, *read(RegressorConfig, path)).to(device).eval()
 
 
 def load_things(path: Path | str | None = None, device: str | torch.device = "cpu") -> ThingNetwork:
     """The network of things, None for the one that ships; otherwise as :func:`load`."""
     from sq_perception.learning.thing_network import ThingNetwork
 
-    config, weights = read_things(path)
-    return _module(ThingNetwork, config, weights).to(device).eval()
+    return _module(ThingNetwork, *read(ThingConfig, path)).to(device).eval()
 
 
-def load_masks(path: Path | str | None = None, device: str | torch.device = "cpu") -> MaskNetwork:
-    """The network of masks, None for the one that ships; otherwise as :func:`load`."""
+def load_masks(path: Path | str | None = None) -> MaskNetwork:
+    """The network of masks on the cpu, None for the one that ships; otherwise as :func:`load`."""
     from sq_perception.learning.mask_network import MaskNetwork
 
-    config, weights = read_masks(path)
-    return _module(MaskNetwork, config, weights).to(device).eval()
+    return _module(MaskNetwork, *read(MaskConfig, path)).eval()
 
 
 def _module(kind: Any, config: RegressorConfig | ThingConfig | MaskConfig, weights: Mapping[str, np.ndarray]) -> Any:
@@ -139,28 +134,17 @@ def _module(kind: Any, config: RegressorConfig | ThingConfig | MaskConfig, weigh
     return model
 
 
-def read(path: Path | str | None = None) -> tuple[RegressorConfig, dict[str, np.ndarray]]:
-    """The form of a network and its weights by name, in single precision; the path as :func:`resolve` takes it.
+def read(kind: type[Config], path: Path | str | None = None) -> tuple[Config, dict[str, np.ndarray]]:
+    """The form of a network of a kind and its weights by name, in single precision.
+
+    The path is as :func:`resolve` takes it, None for the weights of this kind that are used where none are named.
 
     Raises
     ------
     CheckpointError
         If the file is missing, no safetensors file, of another format or version, or does not fit its own config.
     """
-    return _read(resolve(path), RegressorConfig)
-
-
-def read_things(path: Path | str | None = None) -> tuple[ThingConfig, dict[str, np.ndarray]]:
-    """Those of a network of things, None for the one that ships; otherwise as :func:`read`."""
-    return _read(resolve(THINGS if path is None else path), ThingConfig)
-
-
-def read_masks(path: Path | str | None = None) -> tuple[MaskConfig, dict[str, np.ndarray]]:
-    """Those of a network of masks, None for the one that ships; otherwise as :func:`read`."""
-    return _read(resolve(MASKS if path is None else path), MaskConfig)
-
-
-def _read(path: Path, kind: type[Config]) -> tuple[Config, dict[str, np.ndarray]]:
+    path = resolve(_SHIPPED[kind] if path is None else path)
     data, _ = _bytes(path)
     config = _described(path, _strings(path, data, len(data)), kind)
     try:

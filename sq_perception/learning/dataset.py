@@ -58,7 +58,7 @@ def draw_views(
     """Views (count, p, p) of freshly drawn bodies, and the bodies (count,) in the views' frames.
 
     Occluders and framing are those of the source's disturbance, or the ones given; noise, holes and edges are left to
-    :meth:`Disturbance.worn`, which a view may undergo anew each time it is used.
+    :meth:`Disturbance.applied`, which may change a view anew each time it is used.
     """
     source = source or ViewSource()
     pinhole_share, disturbance = source.pinhole_share, source.disturbance
@@ -123,4 +123,4 @@ class ViewPool:
         chosen = self._rng.integers(len(self._images), size=count)
         bodies = Superquadric.from_flat(self._flat[chosen])
         views, bodies = dihedral.at_random(self._images[chosen], bodies, self._rng)
-        return self._source.disturbance.worn(views, self._rng), bodies
+        return self._source.disturbance.applied(views, self._rng), bodies

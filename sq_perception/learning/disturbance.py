@@ -58,14 +58,14 @@ class Disturbance:
             return None
         return np.where(rng.random((count, 1)) < self.noisy_share, _FRAMING * rng.standard_normal((count, 4)), 0.0)
 
-    def worn(self, views: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    def applied(self, views: np.ndarray, rng: np.random.Generator) -> np.ndarray:
         """Views (n, p, p), some of them with noise, steps, holes and wrong edges; the argument is left as it is."""
         if self.noisy_share == 0:
             return views
-        worn = views.copy()
+        disturbed = views.copy()
         chosen = np.flatnonzero(rng.random(len(views)) < self.noisy_share)
-        worn[chosen] = _holes(_steps(_noise(_edges(views[chosen], rng), rng), rng), rng)
-        return worn
+        disturbed[chosen] = _holes(_steps(_noise(_edges(views[chosen], rng), rng), rng), rng)
+        return disturbed
 
 
 def any_occluder(share: np.ndarray, rng: np.random.Generator) -> Occluder:

@@ -14,7 +14,7 @@ from __future__ import annotations
 import importlib
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -26,7 +26,16 @@ from sq_perception.geometry.support_directions import DIRECTIONS, mirrored
 from sq_perception.imaging.canonical_view import CanonicalView
 from sq_perception.learning import checkpoint, forward
 from sq_perception.learning.choices import NEEDS_TORCH
-from sq_perception.learning.network_config import RegressorConfig, ThingConfig, checked_views, mirrored_planes
+from sq_perception.learning.network_config import (
+    MaskConfig,
+    RegressorConfig,
+    ThingConfig,
+    checked_views,
+    mirrored_planes,
+)
+
+if TYPE_CHECKING:
+    from sq_perception.learning.thing_network import ThingNetwork
 
 
 class Predictor(Protocol):
@@ -42,17 +51,6 @@ class Predictor(Protocol):
         ValueError
             If the views are not (n, p, p) with p = ``config.pixels``, or not finite.
         """
-
-
-class Things(Protocol):
-    """A network of things, whatever computes it."""
-
-    config: ThingConfig
-
-    def predict(
-        self, views: np.ndarray, planes: np.ndarray, extents: np.ndarray
-    ) -> tuple[Superquadric, np.ndarray, np.ndarray]:
-        """Bodies (n,), support functions (n, J) and their S (n, J, J) of views (n, p, p), planes and extents."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,12 +81,12 @@ class HullPredictions:
 class ThingPredictor:
     """The network of things, made ready to predict.
 
-    It is asked about each view and its mirror image, whose answer is mirrored back: the mean of two support functions
+    It computes each view and its mirror image, whose prediction is mirrored back: the mean of two support functions
     errs less than one (by 3 to 6 % on recorded things); the mean of their covariances does not promise more.  The
     body is that of the view itself.
     """
 
-    def __init__(self, network: Things) -> None:
+    def __init__(self, network: forward.CompactThings | ThingNetwork) -> None:
         self.config = network.config
         self._network = network
 
@@ -129,7 +127,7 @@ def load(path: Path | str | None = None, device: str = "cpu") -> Predictor:
     CheckpointError
         As :func:`checkpoint.read`, and for a network that only torch computes where there is no torch.
     """
-    config, weights = checkpoint.read(path)
+    config, weights = checkpoint.read(RegressorConfig, path)
     if _is_cpu(device) and config.backbone == "compact":
         return forward.CompactRegressor(config, weights)
     _need_torch(f"a network of the backbone {config.backbone} on {device}")
@@ -140,7 +138,7 @@ def load(path: Path | str | None = None, device: str = "cpu") -> Predictor:
 def load_things(path: Path | str | None = None, device: str = "cpu") -> ThingPredictor:
     """A predictor of hulls, None for the network that ships; otherwise as :func:`load`."""
     if _is_cpu(device):
-        return ThingPredictor(forward.CompactThings(*checkpoint.read_things(path)))
+        return ThingPredictor(forward.CompactThings(*checkpoint.read(ThingConfig, path)))
     _need_torch(f"a network of things on {device}")
     return ThingPredictor(checkpoint.load_things(path, device))
 
@@ -151,9 +149,9 @@ def load_masks() -> forward.CompactMasks:
     Raises
     ------
     CheckpointError
-        As :func:`checkpoint.read_masks`.
+        As :func:`checkpoint.read`.
     """
-    return forward.CompactMasks(*checkpoint.read_masks())
+    return forward.CompactMasks(*checkpoint.read(MaskConfig))
 
 
 class _OnOneThread:

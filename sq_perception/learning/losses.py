@@ -17,7 +17,7 @@ Rotation only, and both together (6.9)
 
 L_OC(q) fits the predicted rotation to the true sizes, hence to the order in which the truth happens to list its axes.
 That order is no property of the body: a1 and a2 may be exchanged, and where e1 is about e2 any axis may pass for z.  A
-predictor that sees the body alone can only guess it; L_OC over all parameters does not ask.
+predictor that sees the body alone can only guess it; L_OC over all parameters does not depend on it.
 
 Bodies are torch batches (n,) in the frame of the canonical view, lengths in sides of the cube.
 """

@@ -1,4 +1,4 @@
-"""The network that knows which readings of a segment are of its object: a segment in its surroundings in, logits out.
+"""The network that predicts which readings of a segment are of its object: segment and surroundings in, logits out.
 
 Segments found in depth alone hold strays: pixels that a sensor widened an edge by, and parts of neighbours.  A fit
 takes them for surface.  For each cell of a view (:mod:`sq_perception.imaging.segment_view`) the network predicts

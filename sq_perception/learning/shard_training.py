@@ -15,7 +15,6 @@ Views of the ``held`` first shards are never trained on; the log has the network
 from __future__ import annotations
 
 import copy
-import json
 import math
 import time
 from collections.abc import Callable, Iterable
@@ -29,7 +28,7 @@ from safetensors.numpy import load_file as load_arrays
 from safetensors.numpy import save as bytes_of
 
 from sq_perception.files import output_file, provenance
-from sq_perception.learning import checkpoint
+from sq_perception.learning import checkpoint, training_log
 from sq_perception.learning.mask_network import MaskNetwork
 from sq_perception.learning.thing_network import ThingNetwork
 from sq_perception.learning.training_config import ShardTraining
@@ -157,8 +156,7 @@ def _keep(
 ) -> None:
     """Log, state and network of this moment."""
     record = {"step": state.step, "seconds": state.seconds, **record}
-    with (output / "log.jsonl").open("a", encoding="utf-8") as file:
-        file.write(json.dumps(record) + "\n")
+    training_log.append(output, record)
     state.save(output / "state.safetensors")
     training = {**asdict(config), "start": Path(config.start).name}
     made = provenance.facts(f"sq-perception train-{subject.name}")

@@ -2,7 +2,7 @@
 
 One linear script: take a batch, predict, compare, step.  Gradients are clipped; an exponential average of the weights
 is what is validated and saved.  Everything that changes lives in one state file, so that a run that was killed goes on
-where it stopped when the same command is given again.  An unsupervised loss is handed no labels.
+where it stopped when the same command is given again.  An unsupervised loss gets no labels.
 
 The output folder holds state.safetensors, log.jsonl, last.safetensors (the newest validated network) and
 model.safetensors (the best one so far).
@@ -29,7 +29,7 @@ from safetensors.torch import load_file
 from sq_perception.files import provenance
 from sq_perception.geometry.metrics import volume_iou
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.learning import checkpoint
+from sq_perception.learning import checkpoint, training_log
 from sq_perception.learning.backbone import ResNet18
 from sq_perception.learning.dataset import ViewPool, ViewSource, draw_views
 from sq_perception.learning.disturbance import Disturbance, any_occluder
@@ -37,7 +37,6 @@ from sq_perception.learning.fixed_set import FixedSet, ShuffledBatches
 from sq_perception.learning.objective import Objective
 from sq_perception.learning.regressor import Regressor, RegressorConfig
 from sq_perception.learning.training_config import TrainingConfig
-from sq_perception.learning.training_log import TrainingLog
 from sq_perception.learning.training_state import TrainingState, recalibrate
 
 _OF_A_RUN = ("loss", "backbone", "framing", "pixels", "canonical_labels", "optimizer")
@@ -141,9 +140,8 @@ def _train(
     notes = {"training": asdict(config), "made": provenance.facts("sq-perception train")}
     if device.type == "cuda":
         notes["made"]["device"] = torch.cuda.get_device_name(device)
-    log = TrainingLog(output, config.steps, state.step)
     started, saved, losses = time.monotonic() - state.seconds, time.monotonic(), []
-    try:
+    with training_log.bar(config.steps, state.step) as show:
         while state.step < config.steps and not (config.schedule == "plateau" and state.plateau.exhausted):
             progress, rate = state.step / config.steps, config.rate(state.step, state.plateau)
             images, bodies = batches.batch(config.batch)
@@ -164,7 +162,7 @@ def _train(
                 )
             state.advance(config.average)
             losses.append(loss.item())
-            log.step(state.step, losses[-1])
+            show(state.step, losses[-1])
 
             finished = state.step == config.steps
             stopping = stop_requested()
@@ -176,7 +174,8 @@ def _train(
                 record = {"step": state.step, "loss": float(np.mean(losses)), "rate": rate}
                 record |= {"sharpness": objective.sharpness(progress), "seconds": state.seconds}
                 record |= _validated(state.average, validation, objective)
-                log.record(record)
+                print(json.dumps(record), flush=True)
+                training_log.append(output, record)
                 _keep(output, state, record, notes)
                 state.plateau.validated(1 - record["iou"])
                 losses.clear()
@@ -186,8 +185,6 @@ def _train(
                 state.save(path)
             if stopping and not finished:
                 raise Stopped(f"stopped after step {state.step}; the same command goes on from {path}")
-    finally:
-        log.close()
     return state.average.eval()
 
 
@@ -250,7 +247,7 @@ def _validation_sets(config: TrainingConfig, network: RegressorConfig) -> dict[s
     if config.noisy_share > 0:
         rng = np.random.default_rng(0)
         near, bodies = draw_views(count, rng, ViewSource(pixels, config.pinhole_share))
-        sets["iou_worn"] = Disturbance(noisy_share=1.0).worn(near, rng), bodies
+        sets["iou_worn"] = Disturbance(noisy_share=1.0).applied(near, rng), bodies
     if config.occluded_share > 0:
         rng = np.random.default_rng(0)
         occluder = any_occluder(np.full(count, VALIDATION_HIDDEN), rng)
@@ -305,13 +302,13 @@ def _threads(count: int) -> Iterator[None]:
 @contextmanager
 def _stop_requests() -> Iterator[Callable[[], bool]]:
     """Within it SIGINT and SIGTERM only note that the run should stop after its step."""
-    asked: list[int] = []
+    received: list[int] = []
     previous = {}
     with suppress(ValueError):  # signals belong to the main thread; elsewhere nobody can send them
         for number in (signal.SIGINT, signal.SIGTERM):
-            previous[number] = signal.signal(number, lambda received, _: asked.append(received))
+            previous[number] = signal.signal(number, lambda signum, _: received.append(signum))
     try:
-        yield lambda: bool(asked)
+        yield lambda: bool(received)
     finally:
         for number, handler in previous.items():
             signal.signal(number, handler)

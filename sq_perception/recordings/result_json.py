@@ -97,8 +97,8 @@ class ResultLines:
         self._path = Path(path)
         self.done: list[dict[str, Any]] = []
         beginning = _line(head(options))
-        if output_file.is_passage(self._path):
-            self._can_go_back, self._descriptor = False, output_file.open_passage(self._path)
+        if output_file.is_stream(self._path):
+            self._can_go_back, self._descriptor = False, output_file.open_stream(self._path)
         else:
             self._can_go_back, self._descriptor = True, output_file.opened(self._path)
         try:
@@ -179,7 +179,7 @@ class ResultLines:
 
 
 class Recovered:
-    """Which frames are done: asked for each one before it is decoded; equal ones count one by one."""
+    """Which frames are done: called for each before it is decoded; equal ones are counted."""
 
     def __init__(self) -> None:
         self._left: Counter[str] = Counter()

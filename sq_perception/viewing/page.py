@@ -98,7 +98,7 @@ class Page:
         """viser's."""
         self._scene = Scene(self.server, has_one_node=len(nodes) == 1)
         self._nodes = {name: _NodePart(name) for name in nodes}
-        self._furnish(parameters)
+        self._add_widgets(parameters)
 
     @property
     def watched(self) -> bool:
@@ -208,7 +208,7 @@ class Page:
             if about is None or handle is None or name in part.pending:
                 continue
             with contextlib.suppress(TypeError, ValueError):
-                # A setter runs the callbacks of the control; they are not to take this for the user's wish.
+                # A setter runs the callbacks of the control; they are not to take this for a change by the user.
                 part.known[name] = about.shown(value)
                 handle.value = part.known[name]
 
@@ -216,9 +216,9 @@ class Page:
         """Show the answer of a node to a change."""
         self._nodes[node].answer.content = tables.answer(text, good)
 
-    # Furniture
+    # Widgets
 
-    def _furnish(self, parameters: bool) -> None:
+    def _add_widgets(self, parameters: bool) -> None:
         gui = self.server.gui
         gui.configure_theme(dark_mode=True, show_logo=False, show_share_button=False, brand_color=(64, 130, 200))
         gui.set_panel_label(TITLE)
@@ -244,12 +244,12 @@ class Page:
                 for label in ("configure", "activate", "deactivate", "cleanup"):
                     part.buttons[label] = self._add_button(part, label)
         with tabs.add_tab("View"):
-            self._furnish_view()
+            self._add_view_controls()
         with gui.add_folder("Depth image"):
             self._picture = gui.add_image(np.full((6, 8, 3), 38, np.uint8), jpeg_quality=85, format="jpeg")
             self._legend = gui.add_html("")
 
-    def _furnish_view(self) -> None:
+    def _add_view_controls(self) -> None:
         gui = self.server.gui
         places = gui.add_button_group("Look from", tuple(scene.PLACES), hint="Camera: as the depth camera sees it")
         self._point_colours = gui.add_dropdown("Point colours", (_MUTED, "depth"), initial_value=_MUTED)

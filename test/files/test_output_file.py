@@ -1,4 +1,4 @@
-"""Results never destroy: what was there stays until something better is whole, and passages are passed through."""
+"""Results never destroy: what was there stays until something better is whole, and streams are written through."""
 
 from __future__ import annotations
 

@@ -72,7 +72,7 @@ def test_frames_are_turned_over_and_recovered_once(shot):
         yield replace(frame, name="b"), recovery
 
     with pytest.raises(KeyboardInterrupt):
-        view_recording._turn_over(page, (frame, recovery), rest())
+        view_recording._browse(page, (frame, recovery), rest())
     assert shown == ["a", "b", "b", "a", "a", "b"]
     assert asked == ["b"]
 
