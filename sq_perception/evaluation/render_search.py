@@ -16,7 +16,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from sq_perception.evaluation import plots
@@ -69,8 +68,8 @@ def search(bodies: Superquadric, sharpness: np.ndarray, tau: np.ndarray, resolut
 
 def figure(found: RenderSearch) -> Figure:
     """The errors as a heat map on logarithmic scales, the optimum and the thesis' one marked."""
-    sheet = Figure(figsize=(6.4, 4.8), layout="constrained")
-    FigureCanvasAgg(sheet)
+    sheet = plots.new_figure(6.4, 4.8)
+    sheet.set_layout_engine("constrained")
     ax = sheet.add_subplot()
     mesh = ax.pcolormesh(found.tau, found.sharpness, np.log10(found.error), shading="nearest", cmap="viridis")
     bar = sheet.colorbar(mesh, ax=ax)

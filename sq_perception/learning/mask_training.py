@@ -59,9 +59,8 @@ def _batch(views: SegmentViews, chosen: np.ndarray, rng: np.random.Generator) ->
     """Images (b, CHANNELS, p, p) and their truth (b, p, p), varied as the module says."""
     images = views.images[chosen].astype(np.float32)
     without_plane, alone = rng.random((2, len(chosen))) < _KEPT_BACK
-    for channels, which in (((HEIGHT, PLANE), without_plane), ((OTHERS,), alone)):
-        for channel in channels:
-            images[which, :, :, channel] = 0
+    images[without_plane, :, :, HEIGHT] = images[without_plane, :, :, PLANE] = 0
+    images[alone, :, :, OTHERS] = 0
     truth = views.truth[chosen]
     if rng.random() < 0.5:
         images, truth = images[:, :, ::-1], truth[:, :, ::-1]

@@ -28,6 +28,7 @@ from sq_perception.learning.checkpoint import CheckpointError
 from sq_perception.learning.network_config import mirrored_planes
 from sq_perception.learning.shard_training import Subject
 from sq_perception.learning.thing_network import HullPrediction, ThingNetwork
+from sq_perception.learning.training_state import read_tensors
 from sq_perception.simulation.household import KINDS
 from sq_perception.simulation.thing_views import ThingViews
 
@@ -108,16 +109,9 @@ def begin_with(network: ThingNetwork, path: Path) -> None:
     CheckpointError
         If the file cannot be read, or nothing in it fits.
     """
-    from safetensors import SafetensorError
-    from safetensors.torch import load_file
-
-    try:
-        given = load_file(str(path))
-    except (OSError, SafetensorError) as error:
-        raise CheckpointError(f"{path}: not a readable safetensors file: {error}") from error
-    given = {name: tensor.float() for name, tensor in given.items()}
+    given = {name: tensor.float() for name, tensor in read_tensors(path).items()}
     if "mixer.0.weight" not in given:  # a Regressor flattens there, and has one channel in and no plane
-        given = {_mixer_without_flatten(name): tensor for name, tensor in given.items()}
+        given = {n.replace("mixer.1.", "mixer.0.").replace("mixer.3.", "mixer.2."): given[n] for n in given}
     taken = 0
     with torch.no_grad():
         for name, mine in network.state_dict().items():
@@ -138,13 +132,6 @@ def begin_with(network: ThingNetwork, path: Path) -> None:
                 mine.copy_(torch.cat([given[head] for head in heads]))
     if taken == 0:
         raise CheckpointError(f"{path}: none of its weights fits the network")
-
-
-def _mixer_without_flatten(name: str) -> str:
-    parts = name.split(".")
-    if parts[0] == "mixer":
-        parts[1] = str(int(parts[1]) - 1)
-    return ".".join(parts)
 
 
 def _new_network(start: str) -> ThingNetwork:

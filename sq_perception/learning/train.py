@@ -23,8 +23,6 @@ from typing import Any, Protocol
 import numba
 import numpy as np
 import torch
-from safetensors import SafetensorError
-from safetensors.torch import load_file
 
 from sq_perception.files import provenance
 from sq_perception.geometry.metrics import volume_iou
@@ -34,10 +32,11 @@ from sq_perception.learning.backbone import ResNet18
 from sq_perception.learning.dataset import ViewPool, ViewSource, draw_views
 from sq_perception.learning.disturbance import Disturbance, any_occluder
 from sq_perception.learning.fixed_set import FixedSet, ShuffledBatches
+from sq_perception.learning.inference import checked_device
 from sq_perception.learning.objective import Objective
 from sq_perception.learning.regressor import Regressor, RegressorConfig
 from sq_perception.learning.training_config import TrainingConfig
-from sq_perception.learning.training_state import TrainingState, recalibrate
+from sq_perception.learning.training_state import TrainingState, read_tensors, recalibrate
 
 _OF_A_RUN = ("loss", "backbone", "framing", "pixels", "canonical_labels", "optimizer")
 """Settings whose change makes another run; others may change when it goes on."""
@@ -87,19 +86,9 @@ def train(config: TrainingConfig, output: Path, network: RegressorConfig | None 
     ValueError
         For a device that this machine does not have, or data of another form.
     """
-    device = _device(config.device)
+    device = torch.device(checked_device(config.device))
     with _threads(config.threads), _stop_requests() as stop_requested:
         return _train(config, output, network, device, stop_requested)
-
-
-def _device(name: str) -> torch.device:
-    try:
-        device = torch.device(name)
-    except RuntimeError as error:
-        raise ValueError(f"device: {error}") from error
-    if device.type == "cuda" and not torch.cuda.is_available():
-        raise ValueError(f"device: {name!r} was asked for, but torch sees no CUDA device here")
-    return device
 
 
 def _check_same_run(config: TrainingConfig, output: Path) -> None:
@@ -205,18 +194,11 @@ def _new_network(config: TrainingConfig, form: RegressorConfig | None) -> Regres
         model = Regressor(form or config.regressor())
         if config.imagenet:
             assert isinstance(model.features, ResNet18)
-            model.features.load_imagenet(_state_dict(Path(config.imagenet)))
+            model.features.load_imagenet(read_tensors(Path(config.imagenet)))
         return model
     model = checkpoint.load(config.start)
     model.config = replace(model.config, marks_hidden=model.config.marks_hidden or config.marks_hidden)
     return model
-
-
-def _state_dict(path: Path) -> dict[str, torch.Tensor]:
-    try:
-        return load_file(str(path))
-    except (SafetensorError, OSError) as error:
-        raise checkpoint.CheckpointError(f"{path}: not a readable safetensors file: {error}") from error
 
 
 def _optimizer(config: TrainingConfig, model: Regressor) -> torch.optim.Optimizer:

@@ -165,17 +165,13 @@ def picture(depth: np.ndarray, span: tuple[float, float]) -> np.ndarray:
 
 def mesh_faces() -> np.ndarray:
     """Triangles (m, 3), uint32, outwards: the same for every mesh."""
-    columns = np.arange(COLUMNS)
-    following = (columns + 1) % COLUMNS
-    south, north = 0, 1 + (ROWS - 1) * COLUMNS
-    faces = [np.stack([np.full(COLUMNS, south), 1 + following, 1 + columns], axis=1)]
-    for row in range(ROWS - 2):
-        here, above = 1 + row * COLUMNS, 1 + (row + 1) * COLUMNS
-        faces.append(np.stack([here + columns, here + following, above + following], axis=1))
-        faces.append(np.stack([here + columns, above + following, above + columns], axis=1))
-    last = 1 + (ROWS - 2) * COLUMNS
-    faces.append(np.stack([last + columns, last + following, np.full(COLUMNS, north)], axis=1))
-    return np.concatenate(faces).astype(np.uint32)
+    rows = 1 + np.arange((ROWS - 1) * COLUMNS).reshape(ROWS - 1, COLUMNS)
+    grid = np.concatenate([np.zeros_like(rows[:1]), rows, np.full_like(rows[:1], 1 + rows.size)])
+    here, above = grid[:-1], grid[1:]
+    right, beyond = (np.roll(row, -1, axis=1) for row in (here, above))
+    # At the poles one of two triangles has two corners that are one.
+    faces = [np.stack([here, right, beyond], axis=-1)[1:], np.stack([here, beyond, above], axis=-1)[:-1]]
+    return np.concatenate(faces).reshape(-1, 3).astype(np.uint32)
 
 
 def mesh_vertices(body: Superquadric) -> np.ndarray:
@@ -202,18 +198,11 @@ def error_bars(body: Superquadric, sigma_size: np.ndarray) -> np.ndarray:
 
     Axes whose deviation is unknown have none; bars end where the shell does, and begin at the centre at the latest.
     """
-    segments = []
-    for axis in range(3):
-        half, sigma = float(body.size[axis]), float(sigma_size[axis])
-        if not sigma > 0:
-            continue
-        inner = max(half - SHELL_SIGMAS * sigma, 0.0)
-        outer = min(half + SHELL_SIGMAS * sigma, LARGEST_SHELL * half)
-        for side in (-1.0, 1.0):
-            ends = np.zeros((2, 3))
-            ends[:, axis] = side * inner, side * outer
-            segments.append(ends)
-    return np.array(segments, dtype=np.float32).reshape(-1, 2, 3)
+    size, sigma = np.asarray(body.size, dtype=float), np.asarray(sigma_size, dtype=float)
+    inner = np.maximum(size - SHELL_SIGMAS * sigma, 0.0)
+    outer = np.minimum(size + SHELL_SIGMAS * sigma, LARGEST_SHELL * size)
+    bars = (np.stack([inner, outer], axis=1)[:, :, None] * np.eye(3)[:, None])[sigma > 0]
+    return np.stack([-bars, bars], axis=1).reshape(-1, 2, 3).astype(np.float32)
 
 
 def label_position(body: Superquadric) -> np.ndarray:
