@@ -24,6 +24,7 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 import torch
+from safetensors import SafetensorError
 from safetensors.numpy import load_file as load_arrays
 from safetensors.numpy import save as bytes_of
 
@@ -75,10 +76,16 @@ def write_views(folder: Path, shards: Iterable[int], draw: Callable[[np.random.G
 
 
 def read_views(kind: type[Views], paths: list[Path]) -> Views:
-    """All views of some shards."""
-    shards = [load_arrays(str(path)) for path in paths]
+    """All views of some shards; raises ValueError if one is damaged, or of another kind."""
     names = [field.name for field in fields(kind)]  # type: ignore[arg-type]
-    return kind(**{name: np.concatenate([shard[name] for shard in shards]) for name in names})
+    shards = []
+    for path in paths:
+        try:
+            arrays = load_arrays(str(path))
+            shards.append([arrays[name] for name in names])
+        except (SafetensorError, KeyError) as error:
+            raise ValueError(f"{path}: not a readable shard of {kind.__name__}: {error}") from error
+    return kind(*(np.concatenate(parts) for parts in zip(*shards, strict=True)))
 
 
 def train(subject: Subject[Network, Any], config: ShardTraining, views: Path, output: Path) -> Network:
@@ -87,7 +94,7 @@ def train(subject: Subject[Network, Any], config: ShardTraining, views: Path, ou
     Raises
     ------
     ValueError
-        If the folder holds no more shards than are kept for validation.
+        If the folder holds no more shards than are kept for validation, or one that cannot be read.
     CheckpointError
         If a file to begin or to go on with does not fit.
     ArithmeticError

@@ -79,6 +79,18 @@ def test_a_folder_without_views_is_refused(tmp_path: Path, capsys: pytest.Captur
     assert "expected more than 2 shards" in capsys.readouterr().err
 
 
+def test_a_damaged_shard_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str], rng: np.random.Generator) -> None:
+    """One that was cut short, and one of another network's views."""
+    shards(tmp_path / "views", 3, rng)
+    arguments = ["train-masks", str(tmp_path / "views"), "--output", str(tmp_path / "run")]
+    whole = (tmp_path / "views" / "00001.safetensors").read_bytes()
+    (tmp_path / "views" / "00001.safetensors").write_bytes(whole[:-10])
+    assert main.main(arguments) == 1
+    save_file({"images": np.zeros((1, 64, 64))}, str(tmp_path / "views" / "00001.safetensors"))
+    assert main.main(arguments) == 1
+    assert capsys.readouterr().err.count("00001.safetensors: not a readable shard of SegmentViews") == 2
+
+
 def test_the_command_draws_what_the_training_reads(tmp_path: Path) -> None:
     assert main.main(["segment-views", str(tmp_path), "--shards", "1", "--scenes", "2"]) == 0
     drawn = shard_training.read_views(SegmentViews, [tmp_path / "00000.safetensors"])
