@@ -1,7 +1,8 @@
 """Segments of simulated tables, with which of their readings are of their object: training data.
 
-A scene of :mod:`~sq_perception.simulation.things_on_table` before a random camera is measured by one of the sensors;
-of many a smaller image is taken, whose borders cut things.  It is segmented as any image is, and each segment seen as a
+A scene of :mod:`~sq_perception.simulation.things_on_table` before a random camera, of many the table ends in sight
+(:mod:`~sq_perception.simulation.room`), is measured by one of the sensors; of many a smaller image is taken, whose
+borders cut things.  It is segmented as any image is, and each segment seen as a
 :class:`~sq_perception.imaging.segment_view.SegmentView`.  Its object is the thing that most of its pixels show; what
 shows the table or the room at half of its pixels, and no thing at 30 % of them, has none.  A reading is one of the
 object if its pixel shows the object and it is no more than 10 mm + 1 % off: what a sensor smears over an edge is not.
@@ -9,7 +10,7 @@ object if its pixel shows the object and it is no more than 10 mm + 1 % off: wha
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -17,7 +18,7 @@ import numpy as np
 from sq_perception.imaging import segment_view
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation import segments
-from sq_perception.simulation import sensor_noise
+from sq_perception.simulation import room, sensor_noise
 from sq_perception.simulation.things_on_table import TABLE_CAMERA, ThingsOnTable, things_on_table
 
 NO, YES, UNKNOWN = 0, 1, 2
@@ -26,6 +27,8 @@ _FOCALS, _LARGE_FOCALS = (430.0, 700.0), (800.0, 1000.0)
 """Pixels, at VGA and at 1280 x 720: depth cameras."""
 _LARGE = 0.15
 """Share of the scenes at 1280 x 720."""
+_WITH_ROOM = 0.6
+"""Share of the scenes whose table ends in sight, before a room."""
 _SMALLER, _SIDES = 0.6, (0.35, 0.9)
 """Share of the scenes of which a smaller image is taken, and its sides in those of the whole one."""
 _OFF, _OFF_SHARE = 0.01, 0.01
@@ -54,6 +57,8 @@ def draw_segment_views(scenes: int, rng: np.random.Generator) -> SegmentViews:
     images, truth = [], []
     for _ in range(scenes):
         drawn = things_on_table(rng, camera=_camera(rng))
+        if rng.random() < _WITH_ROOM:
+            drawn = replace(drawn, depth=room.behind(drawn, rng))
         depth = sensor_noise.preset(str(rng.choice(_SENSORS))).measured(drawn.depth, drawn.camera, rng)
         window = _cut(drawn, rng)
         depth, true_depth, labels = (np.ascontiguousarray(each[window]) for each in (depth, drawn.depth, drawn.labels))

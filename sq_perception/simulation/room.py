@@ -1,0 +1,67 @@
+"""The room behind a table: its edge, the floor below, and what stands on the floor.
+
+What a camera sees beyond a table stands there as well, and is no thing on it.  The table ends along a line behind the
+things, across a direction a that leads away from the camera, turned by up to 70 degrees.  Behind it lies a floor, or a
+lower table, 5 to 90 cm below; on it, where it is in sight, stand up to ten superquadrics, sharp or rounded, with edges
+of 4 cm to 1 m, that may reach above the table: boxes, bins, chairs and shelves.
+
+Metres, optical frame.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sq_perception.geometry import rotation as quaternions
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging import raycast
+from sq_perception.simulation.scenes import plane_depth
+from sq_perception.simulation.things_on_table import ThingsOnTable
+
+_TURN = float(np.deg2rad(70.0))
+_BEHIND = (0.03, 0.4)
+"""Of the edge, behind the farthest reading of a thing."""
+_BELOW = (0.05, 0.9)
+_MOST = 10
+_HALF_SIZES = (0.02, 0.5)
+"""Drawn by their logarithms."""
+_SHAPES = (0.1, 1.0)
+
+
+def behind(scene: ThingsOnTable, rng: np.random.Generator) -> np.ndarray:
+    """The depth (height, width) of a scene whose table ends; its things, and what hides them, stay as they are."""
+    camera, normal = scene.camera, scene.plane[:3]
+    angle = rng.uniform(-_TURN, _TURN)
+    away = scene.table @ np.array([np.sin(angle), np.cos(angle), 0.0])
+    rows, columns = np.nonzero(scene.labels)
+    if not rows.size:
+        return scene.depth
+    farthest = (camera.unproject(columns, rows, scene.depth[rows, columns]) @ away).max()
+    edge = farthest + rng.uniform(*_BEHIND)
+    table = plane_depth(scene.plane, camera)
+    v, u = np.indices(table.shape)
+    hit = np.isfinite(table)
+    on_table = np.zeros(table.shape, bool)
+    on_table[hit] = camera.unproject(u[hit], v[hit], table[hit]) @ away < edge
+    floor = np.append(normal, scene.plane[3] + rng.uniform(*_BELOW))
+    ground = plane_depth(floor, camera)
+    free = np.nonzero((scene.labels == 0) & ~on_table & np.isfinite(ground))
+    if not free[0].size:
+        return scene.depth
+    chosen = rng.integers(free[0].size, size=int(rng.integers(1, _MOST + 1)))
+    feet = camera.unproject(free[1][chosen], free[0][chosen], ground[free][chosen])
+    standing = Superquadric.stack([_standing_at(foot, edge, away, scene.table, rng) for foot in feet])
+    room = np.minimum(ground, raycast.render(standing, camera)[0])
+    wall = scene.depth[scene.labels == 0].max()
+    return np.where((scene.labels > 0) | on_table, scene.depth, np.minimum(room, wall))
+
+
+def _standing_at(
+    foot: np.ndarray, edge: float, away: np.ndarray, table: np.ndarray, rng: np.random.Generator
+) -> Superquadric:
+    """A body on the floor under a point of it, moved from the table where it would reach under its top."""
+    size, yaw = np.exp(rng.uniform(*np.log(_HALF_SIZES), 3)), rng.uniform(0, np.pi)
+    turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1.0]])
+    room = foot @ away - edge - np.hypot(*size[:2])
+    centre = foot - min(room, 0.0) * away + size[2] * table[:, 2]
+    return Superquadric(size, rng.uniform(*_SHAPES, 2), centre, quaternions.from_matrix(table @ turn))
