@@ -15,10 +15,12 @@ warm-up of each camera; those of stages are medians, so that they do not add up 
 as many threads as the libraries take by themselves, as for a user.  ``busy`` is how many cores other processes took
 meanwhile, from /proc/stat.
 
+``grasps`` is what follows for a gripper: what the image shows around the bodies, and the plan for all of them (Panda).
+
 IoU is that of volumes, mean over the true bodies that are at least half visible, a missed one counts as 0
 (synthetic_tabletop).
 
-Goals for 640 x 480 on two cores: 25 ms with 1 body, 50 with 5, 150 with 20.
+Goals for 640 x 480 on two cores: 15 ms with 1 body, 45 with 5, 140 with 20; 20 ms for the plan of 20 bodies.
 """
 
 from __future__ import annotations
@@ -38,14 +40,17 @@ from synthetic_tabletop import STAGES, SensedScene, scored
 
 from sq_perception.geometry import Superquadric
 from sq_perception.geometry import rotation as quaternions
+from sq_perception.grasping.gripper import PANDA
+from sq_perception.grasping.planner import grasps
+from sq_perception.grasping.surroundings import Surroundings
 from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
-from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
+from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, RecoveryOptions
 from sq_perception.simulation import sensor_noise
 from sq_perception.simulation.scenes import Scene
 
 SEED = 8100
-GOALS = {1: 25.0, 5: 50.0, 20: 150.0}
+GOALS = {1: 15.0, 5: 45.0, 20: 140.0}
 """Bodies and milliseconds, for the first of the images."""
 IMAGES = ((640, 480), (848, 480), (1280, 720))
 SENSORS = ("realsense_d435", "kinect_v1")
@@ -151,6 +156,7 @@ def measured(recoverer: Recoverer, frames: list[SensedScene], setting: str, repe
     masks, options = SETTINGS[setting]
     before = Busy.now()
     times: list[dict[str, float]] = []
+    planning: list[tuple[float, float]] = []
     ious: list[float] = []
     false, found = 0, 0
     for each in frames:
@@ -159,17 +165,31 @@ def measured(recoverer: Recoverer, frames: list[SensedScene], setting: str, repe
         for _ in range(repeats):
             recovered = recoverer.recover(each.depth, each.scene.camera, labels, options)
             times.append(recovered.milliseconds)
+            planning.append(planned(recovered, each))
         score = scored(each, recovered)
         ious += score.ious
         false += score.false
         found += len(recovered.recovered)
     return {
         "stages": {stage: report.spread(np.array([one.get(stage, 0.0) for one in times])) for stage in STAGES},
+        "surroundings": report.spread(np.array(planning)[:, 0]),
+        "plan": report.spread(np.array(planning)[:, 1]),
         "iou": report.spread(np.array(ious)),
         "recovered_per_frame": found / len(frames),
         "false_per_frame": false / len(frames),
         "busy": Busy.now().others_since(before),
     }
+
+
+def planned(recovered: FrameRecovery, seen: SensedScene) -> tuple[float, float]:
+    """Milliseconds that the surroundings and the plan of a frame's grasps take."""
+    bodies = Superquadric.stack([body.superquadric for body in recovered.recovered])
+    covariance = np.array([body.covariance for body in recovered.recovered]).reshape(-1, 11, 11)
+    started = time.perf_counter()
+    around = Surroundings.of_image(seen.depth, seen.scene.camera, recovered.plane)
+    between = time.perf_counter()
+    grasps(bodies, PANDA, covariance, around)
+    return 1e3 * (between - started), 1e3 * (time.perf_counter() - between)
 
 
 def _inside(body: Superquadric, seen_by: Camera) -> bool:
@@ -188,6 +208,7 @@ HEADER = [
     "ms median / p95",
     "goal",
     "of which " + " / ".join(stage for stage in STAGES if stage != "total"),
+    "grasps: surroundings / plan",
     "IoU %",
     "found",
     "false",
@@ -207,6 +228,7 @@ def line(sensor: str, image: tuple[int, int], count: int, setting: str, row: dic
         f"{stages['total']['median']:.0f} / {stages['total']['p95']:.0f}",
         "" if goal is None else f"{goal:.0f}",
         " / ".join(f"{stages[stage]['median']:.0f}" for stage in STAGES if stage != "total"),
+        f"{row['surroundings']['median']:.0f} / {row['plan']['median']:.0f}",
         f"{100 * row['iou']['mean']:.1f}",
         f"{row['recovered_per_frame']:.1f}",
         f"{row['false_per_frame']:.2f}",

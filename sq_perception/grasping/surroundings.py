@@ -76,10 +76,13 @@ class Surroundings:
         plane : (4,), optional
         """
         z = np.where(np.isfinite(depth) & (depth > 0), depth, np.nan)
-        rows, columns = np.nonzero(np.isfinite(z))
+        if plane is None:
+            rows, columns = np.nonzero(np.isfinite(z))
+        else:
+            across = plane[0] * (np.arange(camera.width) - camera.cx) / camera.fx
+            down = plane[1] * (np.arange(camera.height) - camera.cy) / camera.fy
+            rows, columns = np.nonzero(z * (across + down[:, None] + plane[2]) + plane[3] > _ABOVE)
         points = camera.unproject(columns, rows, z[rows, columns].astype(float))
-        if plane is not None:
-            points = points[points @ plane[:3] + plane[3] > _ABOVE]
         _, kept = np.unique(np.floor(points / _SPACING) @ [1.0, 1e4, 1e8], return_index=True)
         kept = kept[:: max(1, len(kept) // _MOST)]
         return cls(plane, points[kept], z, camera)
