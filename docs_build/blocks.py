@@ -148,12 +148,13 @@ def frame_time() -> str:
     rows = results("frame_time")["rows"]
     shown = [(count, rows[f"realsense_d435, 640 x 480, {count}, own"]) for count in (1, 5, 20)]
     return table(
-        ["bodies", "ms median / p95", "of which segmentation, fit"],
+        ["bodies", "ms median / p95", "of which segmentation, network, fit", "grasps after it, ms"],
         [
             [
                 str(count),
                 f"{row['stages']['total']['median']:.0f} / {row['stages']['total']['p95']:.0f}",
-                f"{row['stages']['segmentation']['median']:.0f}, {row['stages']['fit']['median']:.0f}",
+                ", ".join(f"{row['stages'][stage]['median']:.0f}" for stage in ("segmentation", "network", "fit")),
+                f"{row['surroundings']['median'] + row['plan']['median']:.0f}",
             ]
             for count, row in shown
         ],
