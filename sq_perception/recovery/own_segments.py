@@ -9,7 +9,7 @@ pixel x is of the object that most of a shows (:mod:`sq_perception.learning.mask
     strays    pixels of a with p_a < 1/2: what a sensor widened an edge by, and bits of neighbours.  They stay in the
               label image, as they are no background either, but no fit takes them for the object's surface
     nothing   a is dropped if less than ``_OF_AN_OBJECT`` of its pixels are of an object: a bump of the table, a wall,
-              the room behind
+              the room behind; not where there is no support plane, as all that is seen may be the object
 
 The network is asked once about a segment, and again about one that was joined.
 """
@@ -102,7 +102,7 @@ class SegmentNetwork:
                 break
             seen |= self._seen(labels, joined)
         shown = {label: _shown(labels, label, answer) for label, answer in seen.items()}
-        kept = [label for label, (_, share) in shown.items() if share >= _OF_AN_OBJECT]
+        kept = [label for label, (_, share) in shown.items() if share >= _OF_AN_OBJECT or self.plane is None]
         own = {label: pixels for label in kept if (pixels := _own(*shown[label])) is not None}
         if len(kept) == len(found.ids):
             return OwnSegments(found, own)

@@ -146,6 +146,14 @@ def test_a_segment_that_shows_no_object_is_dropped() -> None:
     assert not found.found.labels.any()
 
 
+def test_without_a_support_nothing_is_dropped() -> None:
+    """A body alone in an image, as a renderer makes it: all that is seen is the object."""
+    depth, truth = seen([standing(0, 0, *CAN)])
+    alone = np.where(truth > 0, depth, np.nan).astype(np.float32)
+    network = SegmentNetwork(stray_in_rows(0.8), alone, CAMERA, None, lambda function, labels: function(labels))
+    assert network.improved(segmentation(truth)).found.ids == (1,)
+
+
 def test_the_floor_behind_a_table_is_no_object(shipped: Any) -> None:
     """It is the larger of two segments; the can is the first one then."""
     depth, truth = seen([standing(0, 0, *CAN)])
