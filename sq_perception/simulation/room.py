@@ -39,10 +39,9 @@ def behind(scene: ThingsOnTable, rng: np.random.Generator) -> np.ndarray:
     farthest = (camera.unproject(columns, rows, scene.depth[rows, columns]) @ away).max()
     edge = farthest + rng.uniform(*_BEHIND)
     table = plane_depth(scene.plane, camera)
-    v, u = np.indices(table.shape)
-    hit = np.isfinite(table)
+    v, u = np.nonzero(np.isfinite(table))
     on_table = np.zeros(table.shape, bool)
-    on_table[hit] = camera.unproject(u[hit], v[hit], table[hit]) @ away < edge
+    on_table[v, u] = camera.unproject(u, v, table[v, u]) @ away < edge
     floor = np.append(normal, scene.plane[3] + rng.uniform(*_BELOW))
     ground = plane_depth(floor, camera)
     free = np.nonzero((scene.labels == 0) & ~on_table & np.isfinite(ground))
@@ -60,7 +59,8 @@ def _standing_at(
     foot: np.ndarray, edge: float, away: np.ndarray, table: np.ndarray, rng: np.random.Generator
 ) -> Superquadric:
     """A body on the floor under a point of it, moved from the table where it would reach under its top."""
-    size, yaw = np.exp(rng.uniform(*np.log(_HALF_SIZES), 3)), rng.uniform(0, np.pi)
+    least, most = np.log(_HALF_SIZES)
+    size, yaw = np.exp(rng.uniform(least, most, 3)), rng.uniform(0, np.pi)
     turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1.0]])
     room = foot @ away - edge - np.hypot(*size[:2])
     centre = foot - min(room, 0.0) * away + size[2] * table[:, 2]
