@@ -75,6 +75,7 @@ class Surroundings:
             A pinhole camera.
         plane : (4,), optional
         """
+        camera.check_image(depth)
         z = np.where(np.isfinite(depth) & (depth > 0), depth, np.nan)
         if plane is None:
             rows, columns = np.nonzero(np.isfinite(z))

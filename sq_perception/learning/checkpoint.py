@@ -46,7 +46,7 @@ _FORMATS: dict[type[Any], str] = {RegressorConfig: FORMAT, ThingConfig: THING_FO
 Config = TypeVar("Config", RegressorConfig, ThingConfig, MaskConfig)
 VERSION = "1"
 DEFAULT = "robust"
-"""Name of the weights that predict a body where none are named; those for real cameras."""
+"""Name of the weights that predict a body where none are named."""
 _SHIPPED: dict[type[Any], str] = {RegressorConfig: DEFAULT, ThingConfig: "things", MaskConfig: "masks"}
 """Names of the weights that are used where none are named."""
 _MAX_PARAMETERS = 200_000_000

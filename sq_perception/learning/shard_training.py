@@ -111,12 +111,13 @@ def train(subject: Subject[Network, Any], config: ShardTraining, views: Path, ou
     if path.exists():
         state.restore(path)
     rng = np.random.default_rng([config.seed, state.step])
-    shards: list[Path] = []
-    pool = held = read_views(subject.views, _shards(views, config.held)[: config.held])
+    found = _shards(views, config.held)
+    apart, shards = found[: config.held], found[config.held :]
+    held, pool = (read_views(subject.views, paths) for paths in (apart, shards))
     began, losses = time.monotonic() - state.seconds, []
     while (progress := (time.monotonic() - began) / (60 * config.minutes)) < 1:
-        if state.step % config.validation == 0 or not shards:
-            found = _shards(views, config.held)[config.held :]
+        if state.step % config.validation == 0:
+            found = [shard for shard in _shards(views, config.held) if shard not in apart]
             if len(found) > len(shards):
                 shards, pool = found, read_views(subject.views, found)
         rate = falling_rate(config.rate, state.step, progress)

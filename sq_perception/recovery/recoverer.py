@@ -2,8 +2,9 @@
 
     depth -> segmentation -> canonical view of each object -> network -> inverse of the view -> fit -> repair -> score
 
-Own segments are joined, and rid of strays, by a network (:mod:`sq_perception.recovery.own_segments`), and split where
-fitted bodies show it (:mod:`sq_perception.recovery.segment_split`).
+Own segments are joined, dropped where they show no object, and rid of strays by a network
+(:mod:`sq_perception.recovery.own_segments`), and split where fitted bodies show it
+(:mod:`sq_perception.recovery.segment_split`).
 
 | method | body |
 | --- | --- |

@@ -109,7 +109,7 @@ def split(
         known = np.where(np.isfinite(depth) & (depth > 0), depth, 0).astype(np.float32)
     image = _Image(depth, known, camera, plane, sigma)
     waiting = [(label, _DEEPEST) for label in sorted(fits, reverse=True)]
-    while waiting:
+    while waiting and time.perf_counter() < deadline:
         label, deepest = waiting.pop()
         mask = labels == label
         if deepest == 0 or fits_left == 0 or _explains(fits[label]):

@@ -62,17 +62,17 @@ class WorkerLostError(RuntimeError):
 
 
 def recovered(
-    frames: Iterable[tuple[_Key, Work | None]], crew: Processes | Cluster
+    frames: Iterable[tuple[_Key, Work | None]], executor: Processes | Cluster
 ) -> Iterator[tuple[_Key, FrameRecovery | Exception | None]]:
     """In the order of the frames, the recovery of each or what it raised, None for no work.
 
-    An answer may be a :class:`WorkerLostError`.  The crew is dismissed in the end.
+    An answer may be a :class:`WorkerLostError`.  The executor is shut down in the end.
     """
     under_way: deque[tuple[_Key, Work | None, _Answer]] = deque()
 
     def begun(work: Work | None) -> _Answer:
         if work is not None:
-            return crew.ask(work)
+            return executor.ask(work)
         answer: _Answer = Future()
         answer.set_result(None)
         return answer
@@ -83,9 +83,9 @@ def recovered(
         while True:
             try:
                 return key, answer.result()
-            except crew.lost:
+            except executor.lost:
                 deaths += 1
-                if deaths == crew.tries:
+                if deaths == executor.tries:
                     return key, WorkerLostError("the process that recovered it died, again and again")
                 answer = begun(work)
             except Exception as error:  # whatever it raised there is for the caller
@@ -94,12 +94,12 @@ def recovered(
     try:
         for key, work in frames:
             under_way.append((key, work, begun(work)))
-            while under_way and (len(under_way) >= AHEAD * crew.size or under_way[0][2].done()):
+            while under_way and (len(under_way) >= AHEAD * executor.size or under_way[0][2].done()):
                 yield first()
         while under_way:
             yield first()
     finally:
-        crew.end()
+        executor.end()
 
 
 class Processes:

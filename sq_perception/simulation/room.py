@@ -50,9 +50,8 @@ def behind(scene: ThingsOnTable, rng: np.random.Generator) -> np.ndarray:
     chosen = rng.integers(free[0].size, size=int(rng.integers(1, _MOST + 1)))
     feet = camera.unproject(free[1][chosen], free[0][chosen], ground[free][chosen])
     standing = Superquadric.stack([_standing_at(foot, edge, away, scene.table, rng) for foot in feet])
-    room = np.minimum(ground, raycast.render(standing, camera)[0])
-    wall = scene.depth[scene.labels == 0].max()
-    return np.where((scene.labels > 0) | on_table, scene.depth, np.minimum(room, wall))
+    seen = np.minimum(np.minimum(ground, raycast.render(standing, camera)[0]), scene.wall)
+    return np.where((scene.labels > 0) | on_table, scene.depth, seen)
 
 
 def _standing_at(
@@ -62,6 +61,6 @@ def _standing_at(
     least, most = np.log(_HALF_SIZES)
     size, yaw = np.exp(rng.uniform(least, most, 3)), rng.uniform(0, np.pi)
     turn = np.array([[np.cos(yaw), -np.sin(yaw), 0], [np.sin(yaw), np.cos(yaw), 0], [0, 0, 1.0]])
-    room = foot @ away - edge - np.hypot(*size[:2])
-    centre = foot - min(room, 0.0) * away + size[2] * table[:, 2]
+    clear = foot @ away - edge - np.hypot(*size[:2])
+    centre = foot - min(clear, 0.0) * away + size[2] * table[:, 2]
     return Superquadric(size, rng.uniform(*_SHAPES, 2), centre, quaternions.from_matrix(table @ turn))

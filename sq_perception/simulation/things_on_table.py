@@ -97,6 +97,8 @@ class ThingsOnTable:
         Height above the table = n.p + d.
     table : (3, 3)
         Optical from table frame.
+    wall
+        Depth of the wall behind all of it, metres.
     """
 
     camera: Camera
@@ -104,6 +106,7 @@ class ThingsOnTable:
     labels: np.ndarray
     plane: np.ndarray
     table: np.ndarray
+    wall: float
     placed: tuple[PlacedThing, ...]
 
 
@@ -246,7 +249,8 @@ def _seen(
     parts = [moved(body.thing.parts.to_flat(), *pose) for body, pose in zip(resting, poses, strict=True)]
     holes = [moved(body.thing.cavities.to_flat(), *pose) for body, pose in zip(resting, poses, strict=True)]
     everything, cavities = (Superquadric.from_flat(np.concatenate(flat)) for flat in (parts, holes))
-    depth, index = render_things(everything, owner, cavities, whose, camera, plane, rng.uniform(*_WALL))
+    wall = rng.uniform(*_WALL)
+    depth, index = render_things(everything, owner, cavities, whose, camera, plane, wall)
     placed = []
     for k, (body, (rotation, translation)) in enumerate(zip(resting, poses, strict=True)):
         none = np.zeros(len(parts[k]))
@@ -255,4 +259,4 @@ def _seen(
         )
         pixels, whole = int(np.count_nonzero(index == k)), int(np.count_nonzero(alone == 0))
         placed.append(PlacedThing(body.thing, body.rest, rotation, translation, k + 1, pixels, max(whole, 1)))
-    return ThingsOnTable(camera, depth, (index + 1).astype(np.int32), plane, table, tuple(placed))
+    return ThingsOnTable(camera, depth, (index + 1).astype(np.int32), plane, table, wall, tuple(placed))

@@ -134,8 +134,8 @@ def nearest(
     cost = state.mahalanobis(total, errors[row, some]) + np.linalg.slogdet(total)[1]
     cost = np.where(np.isfinite(rough[row, some]), cost, np.inf)
     best = np.argmin(cost, axis=1)
-    row = np.arange(count)
-    return Match(forms[row, some[row, best]], changed[row, best], cost[row, best])
+    each = np.arange(count)
+    return Match(forms[each, some[each, best]], changed[each, best], cost[each, best])
 
 
 def named(

@@ -161,6 +161,9 @@ def test_a_run_that_was_stopped_goes_on(tmp_path: Path, rng: np.random.Generator
     assert log[-1]["seconds"] > first[-1]["seconds"]
     kept = checkpoint.load_things(tmp_path / "run" / "things.safetensors").config
     assert replace(kept, spread=1.0) == SMALL
+    # A run that is over and asked for again does nothing, and is calibrated on what it was trained on.
+    over = shard_training.train(subject, config, tmp_path / "views", tmp_path / "run")
+    assert over.config == kept
 
 
 def test_the_spread_is_that_of_the_errors(rng: np.random.Generator) -> None:
