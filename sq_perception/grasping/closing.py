@@ -19,6 +19,7 @@ Metres, in the frame of the bodies.
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, replace
 from itertools import pairwise
 
 import numpy as np
@@ -48,29 +49,97 @@ def _directions() -> np.ndarray:
 DIRECTIONS = _directions()
 
 
-def known(bodies: Superquadric, covariance: np.ndarray | None) -> np.ndarray:
-    """Covariances (n, 9, 9) of sizes, centre and turn; what is not finite is replaced by a wide guess."""
-    wide = np.zeros((len(bodies), 9))
-    wide[:, :3] = UNKNOWN * bodies.size
-    wide[:, 3:6] = UNKNOWN * bodies.size.mean(axis=1, keepdims=True)
-    wide[:, 6:] = UNKNOWN
-    guess = wide[:, :, None] ** 2 * np.eye(9)
-    if covariance is None:
-        return guess
-    given = np.asarray(covariance, dtype=float)
-    if given.shape != (len(bodies), 11, 11):
-        raise ValueError(f"covariance: expected shape ({len(bodies)}, 11, 11), got {given.shape}")
-    given = given[:, _KEPT][:, :, _KEPT]
-    sound = np.isfinite(given).all(axis=(1, 2)) & (np.diagonal(given, axis1=1, axis2=2) >= 0).all(axis=1)
-    return np.where(sound[:, None, None], given, guess)
+@dataclass(frozen=True, eq=False)
+class KnownBodies:
+    """Bodies as far as they are known, n of them.
 
+    Attributes
+    ----------
+    flat, turns : (n, 12), (n, 3, 3)
+        Flat parameters and rotation matrices.
+    covariance : (n, 9, 9)
+        Of sizes, centre and turn.
+    """
 
-def reaches(
-    bodies: Superquadric, covariance: np.ndarray, owner: np.ndarray, directions: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """h(n) (k,) and the standard deviation (k,) of n.t + h(n), of body ``owner`` (k,) along ``directions`` (k, 3)."""
-    flat, turns = np.ascontiguousarray(bodies.to_flat(), dtype=float), np.ascontiguousarray(bodies.rotation_matrix)
-    return _reaches(flat, turns, covariance, owner, directions)
+    flat: np.ndarray
+    turns: np.ndarray
+    covariance: np.ndarray
+
+    @classmethod
+    def of(cls, bodies: Superquadric, covariance: np.ndarray | None) -> KnownBodies:
+        """A NumPy batch (n,) and covariances (n, 11, 11); what is not finite is replaced by a wide guess.
+
+        Raises
+        ------
+        ValueError
+            For covariances of another shape.
+        """
+        flat, turns = np.ascontiguousarray(bodies.to_flat(), dtype=float), np.ascontiguousarray(bodies.rotation_matrix)
+        wide = np.zeros((len(flat), 9))
+        wide[:, :3] = UNKNOWN * bodies.size
+        wide[:, 3:6] = UNKNOWN * bodies.size.mean(axis=1, keepdims=True)
+        wide[:, 6:] = UNKNOWN
+        guess = wide[:, :, None] ** 2 * np.eye(9)
+        if covariance is None:
+            return cls(flat, turns, guess)
+        given = np.asarray(covariance, dtype=float)
+        if given.shape != (len(flat), 11, 11):
+            raise ValueError(f"covariance: expected shape ({len(flat)}, 11, 11), got {given.shape}")
+        given = given[:, _KEPT][:, :, _KEPT]
+        sound = np.isfinite(given).all(axis=(1, 2)) & (np.diagonal(given, axis1=1, axis2=2) >= 0).all(axis=1)
+        return cls(flat, turns, np.where(sound[:, None, None], given, guess))
+
+    def __len__(self) -> int:
+        return len(self.flat)
+
+    @property
+    def middle(self) -> np.ndarray:
+        """Centres (n, 3)."""
+        return self.flat[:, 5:8]
+
+    def in_place(self) -> KnownBodies:
+        """The same with centres that are known for sure."""
+        covariance = self.covariance.copy()
+        covariance[:, 3:6] = covariance[:, :, 3:6] = 0.0
+        return replace(self, covariance=covariance)
+
+    def reaches(self, owner: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """h(n) (k,) and the standard deviation (k,) of n.t + h(n), for bodies ``owner`` (k,) and directions (k, 3)."""
+        return _reaches(self.flat, self.turns, self.covariance, owner, directions)
+
+    def middle_angles(self, owner: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Angle (k,) between directions (k, 3) and the normals where the lines through the centre along them leave.
+
+        The gradient of the gauge is the same all along such a line.
+        """
+        size, e1, e2 = self.flat[owner, :3], self.flat[owner, 3], self.flat[owner, 4]
+        q = np.abs((directions[:, None] @ self.turns[owner])[:, 0]) / size
+        value, slopes = nested_norm_and_slopes(q[:, 0], q[:, 1], q[:, 2], e1, e2)
+        steepness = np.linalg.norm(np.stack(slopes, axis=1) / size, axis=1)
+        return np.asarray(np.arccos(np.clip(value / steepness, -1.0, 1.0)))
+
+    def chords(
+        self, owner: np.ndarray, offset: np.ndarray, direction: np.ndarray, steepest: float = np.pi
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Where the line through t + offset (k, 3) along direction (k, 3) leaves body ``owner``, and how squarely.
+
+        Returns
+        -------
+        ends : (k, 2)
+            Along +direction and against it, metres from the offset; NaN where the line misses the body.
+        angle : (k,)
+            The larger one between direction and the normals at both ends, radians; NaN likewise and above ``steepest``.
+        """
+        ends, cosine = np.empty((2, len(owner))), np.empty((2, len(owner)))
+        least = np.cos(steepest)
+        starts = np.flatnonzero(np.diff(owner, prepend=-1, append=-1))
+        for first, last in pairwise(starts):
+            body, rows = owner[first], slice(first, last)
+            ends[:, rows], cosine[:, rows] = _chords(
+                self.flat[body], self.turns[body], offset[rows], direction[rows], least
+            )
+        lower = cosine.min(axis=0)
+        return ends.T, np.arccos(np.clip(np.where(lower >= least, lower, np.nan), -1.0, 1.0))
 
 
 @kernel
@@ -102,43 +171,6 @@ def _reaches(
             variance += 2 * half * gradient[i]
         sigma[k] = math.sqrt(max(variance, 0.0))
     return reach, sigma
-
-
-def middle_angles(bodies: Superquadric, owner: np.ndarray, directions: np.ndarray) -> np.ndarray:
-    """Angle (k,) between directions (k, 3) and the normals where the lines through the centre along them leave a body.
-
-    The gradient of the gauge is the same all along such a line.
-    """
-    turn = bodies.rotation_matrix[owner]
-    size, shape = bodies.size[owner], bodies.shape[owner]
-    m = (directions[:, None] @ turn)[:, 0]
-    q = np.abs(m) / size
-    value, slopes = nested_norm_and_slopes(q[:, 0], q[:, 1], q[:, 2], shape[:, 0], shape[:, 1])
-    steepness = np.linalg.norm(np.stack(slopes, axis=1) / size, axis=1)
-    return np.asarray(np.arccos(np.clip(value / steepness, -1.0, 1.0)))
-
-
-def chords(
-    bodies: Superquadric, owner: np.ndarray, offset: np.ndarray, direction: np.ndarray, steepest: float = np.pi
-) -> tuple[np.ndarray, np.ndarray]:
-    """Where the line through t + offset (k, 3) along direction (k, 3) leaves body ``owner``, and how squarely.
-
-    Returns
-    -------
-    ends : (k, 2)
-        Along +direction and against it, metres from the offset; NaN where the line misses the body.
-    angle : (k,)
-        The larger one between direction and the normals at both ends, radians; NaN likewise, and above ``steepest``.
-    """
-    flat, turns = np.ascontiguousarray(bodies.to_flat(), dtype=float), np.ascontiguousarray(bodies.rotation_matrix)
-    ends, cosine = np.empty((2, len(owner))), np.empty((2, len(owner)))
-    least = np.cos(steepest)
-    starts = np.flatnonzero(np.diff(owner, prepend=-1, append=-1))
-    for first, last in pairwise(starts):
-        body, rows = owner[first], slice(first, last)
-        ends[:, rows], cosine[:, rows] = _chords(flat[body], turns[body], offset[rows], direction[rows], least)
-    lower = cosine.min(axis=0)
-    return ends.T, np.arccos(np.clip(np.where(lower >= least, lower, np.nan), -1.0, 1.0))
 
 
 @kernel

@@ -37,8 +37,10 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sq_perception.geometry import rotation as quaternions
+from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.grasping import clearance, closing
+from sq_perception.grasping import clearance
+from sq_perception.grasping.closing import DIRECTIONS, KnownBodies
 from sq_perception.grasping.gripper import PANDA, Gripper
 from sq_perception.grasping.plan import Grasp, GraspPlan
 from sq_perception.grasping.rims import at_rims
@@ -142,21 +144,21 @@ def grasps(
     if not len(bodies):
         return GraspPlan()
     around = around or Surroundings()
-    spread = closing.known(bodies, covariance)
+    known = KnownBodies.of(bodies, covariance)
     reasons = np.array(
         [f"wider than the opening of {1e3 * gripper.opening:.0f} mm in every direction"] * len(bodies), dtype=object
     )
-    closings = _closings(bodies, spread, gripper, friction)
-    trials = _trials(bodies, spread, closings, gripper, around, friction, placement)
+    closings = _closings(known, gripper, friction)
+    trials = _trials(known, bodies.volume(), closings, gripper, around, friction, placement)
     reasons[np.unique(closings.owner)] = "no way for the fingers to come with the table and the palm in their way"
-    trials = _narrower(bodies, spread, trials.first(_CHECKED_IF_DOUBTFUL), gripper, placement)
+    trials = _narrower(known, trials.first(_CHECKED_IF_DOUBTFUL), gripper, placement)
     trials = _probable(trials, _CHECKED_IF_DOUBTFUL, reasons, "nothing holds")
-    looked_at = _among_others(bodies, spread, trials.first(_CHECKED), gripper, around, placement)
-    doubtful = np.setdiff1d(np.arange(len(bodies)), looked_at.owner[looked_at.logs.sum(axis=1) > np.log(_SURE)])
+    looked_at = _among_others(known, trials.first(_CHECKED), gripper, around, placement)
+    doubtful = np.setdiff1d(np.arange(len(bodies)), looked_at.owner[looked_at.total > np.log(_SURE)])
     if len(doubtful):
         more = trials.at(np.isin(trials.owner, doubtful)).after(_CHECKED)
         more = more.and_(at_rims(bodies, doubtful, gripper, around, friction, placement))
-        looked_at = looked_at.and_(_among_others(bodies, spread, more, gripper, around, placement))
+        looked_at = looked_at.and_(_among_others(known, more, gripper, around, placement))
     trials = _probable(looked_at, PER_BODY, reasons, "in the way")
     reasons[trials.owner] = ""
     return GraspPlan(tuple(_as_grasps(trials)), tuple(reasons))
@@ -179,24 +181,21 @@ def warm_up() -> None:
     grasps(bodies, PANDA, around=Surroundings(points=two + 0.3, depth=np.ones((2, 2)), camera=camera))
 
 
-def _closings(bodies: Superquadric, spread: np.ndarray, gripper: Gripper, friction: float) -> _Closings:
+def _closings(bodies: KnownBodies, gripper: Gripper, friction: float) -> _Closings:
     """Those of all bodies that are narrow enough and meet their surface squarely at its middle."""
-    owner = np.repeat(np.arange(len(bodies)), len(closing.DIRECTIONS))
-    local = np.tile(closing.DIRECTIONS, (len(bodies), 1))
-    along = (local[:, None] @ bodies.rotation_matrix[owner].transpose(0, 2, 1))[:, 0]
-    reach, there = closing.reaches(bodies, spread, owner, along)
-    _, here = closing.reaches(bodies, spread, owner, -along)
-    in_place = spread.copy()
-    in_place[:, 3:6] = in_place[:, :, 3:6] = 0.0
-    _, half = closing.reaches(bodies, in_place, owner, along)
+    owner = np.repeat(np.arange(len(bodies)), len(DIRECTIONS))
+    along = (DIRECTIONS @ bodies.turns.transpose(0, 2, 1)).reshape(-1, 3)
+    reach, there = bodies.reaches(owner, along)
+    _, here = bodies.reaches(owner, -along)
+    _, half = bodies.in_place().reaches(owner, along)
     fits = reach - _TOO_WIDE * half < 0.5 * gripper.opening
-    fits &= closing.middle_angles(bodies, owner, along) < np.arctan(friction)
+    fits &= bodies.middle_angles(owner, along) < np.arctan(friction)
     return _Closings(owner[fits], along[fits], reach[fits], np.stack([there, here], axis=1)[fits])
 
 
 def _trials(
-    bodies: Superquadric,
-    spread: np.ndarray,
+    bodies: KnownBodies,
+    volume: np.ndarray,
     closings: _Closings,
     gripper: Gripper,
     around: Surroundings,
@@ -208,7 +207,7 @@ def _trials(
     y = np.repeat(closings.along, len(_SWINGS), axis=0)
     owner = np.repeat(closings.owner, len(_SWINGS))
     half, side = (np.repeat(numbers, len(_SWINGS), axis=0) for numbers in (closings.reach, closings.sigma))
-    down = around.down(bodies.translation[owner])
+    down = around.down(bodies.middle[owner])
     steep = down - y * (y * down).sum(axis=1, keepdims=True)
     length = np.linalg.norm(steep, axis=1, keepdims=True)
     steep = steep / np.maximum(length, 1e-9)
@@ -217,8 +216,8 @@ def _trials(
     possible = (length[:, 0] > 0.3) & ((z * down).sum(axis=1) > -0.1)
     owner, y, z, half, side = owner[possible], y[possible], z[possible], half[possible], side[possible]
     x, tilting = np.cross(y, z), np.cross(down[possible], y)
-    near, near_sigma = closing.reaches(bodies, spread, owner, -z)
-    across, _ = closing.reaches(bodies, spread, owner, x)
+    near, near_sigma = bodies.reaches(owner, -z)
+    across, _ = bodies.reaches(owner, x)
 
     # At every depth: where the palm or the table stops the gripper or the middle is reached, shallow, and between.
     wanted = CLEARANCE + 2 * np.hypot(side, placement)
@@ -228,7 +227,7 @@ def _trials(
     shift = 0.5 * np.maximum(room, 0.0) * (wanted[:, 0] - wanted[:, 1]) / wanted.sum(axis=1)
     boxes = gripper.boxes_at(opening)
     deepest = np.minimum(gripper.palm - CLEARANCE - near, 0.0)
-    frames = np.stack([x, y, z, bodies.translation[owner]], axis=2)
+    frames = np.stack([x, y, z, bodies.middle[owner]], axis=2)
     height = np.full(len(owner), np.inf)
     if around.plane is not None:
         height = clearance.heights_above(around.plane, frames, boxes)
@@ -250,24 +249,22 @@ def _trials(
 
     # A pad touches where it overlaps the body, which may lie wholly beyond the TCP.
     touch = 0.5 * (np.maximum(u - gripper.tip, -near[at]) + np.minimum(u + gripper.tip, near[at]))
-    slid = v[:, None] * x[at]
     narrow, broad = np.arctan([friction, _AT_MOST * friction])
     cone, doubt = 0.5 * (narrow + broad), np.hypot(_SQUARE, (broad - narrow) / np.sqrt(12))
-    ends, angle = closing.chords(bodies, owner[at], slid + touch[:, None] * z[at], y[at], broad)
+    ends, angle = bodies.chords(owner[at], _ahead(frames, at, v, touch), y[at], broad)
     squarely = np.isfinite(angle)  # two in five; a body without any has that for a reason
     has_any = np.zeros(len(bodies), dtype=bool)
     has_any[owner[at[squarely]]] = True
     rows = np.flatnonzero(squarely | ~has_any[owner[at]])
-    u, at, slid, ends, angle = u[rows], at[rows], slid[rows], ends[rows], angle[rows]
+    u, v, at, ends, angle = u[rows], v[rows], at[rows], ends[rows], angle[rows]
+    offset = _ahead(frames, at, v, u)
 
     owner, half, side, opening, shift = owner[at], half[at], side[at], opening[at], shift[at]
     near, near_sigma, frames = near[at], near_sigma[at], frames[at]
-    y, z, position = (frames[:, :, k] for k in (1, 2, 3))
-    offset = u[:, None] * z + slid
     aside = np.nan_to_num(0.5 * (ends[:, 0] - ends[:, 1])) + shift
     lever = np.abs((offset * tilting[at]).sum(axis=1))
-    offset += aside[:, None] * y
-    position += offset
+    offset += aside[:, None] * frames[:, :, 1]
+    frames[:, :, 3] += offset
 
     deep = np.hypot(near_sigma, placement)
     room = 0.5 * opening - half
@@ -277,23 +274,33 @@ def _trials(
     logs[:, 1] = log_phi(u + gripper.tip + near - LEAST_ENGAGED, deep)
     logs[:, 2] = log_phi(gripper.palm - near - u, deep)
     logs[:, 3] = np.where(np.isfinite(angle), log_phi(cone - angle, doubt), -np.inf)
-    logs[:, 4] = weight(DENSITY * bodies.volume()[owner], lever, 2 * friction * gripper.force)
+    logs[:, 4] = weight(DENSITY * volume[owner], lever, 2 * friction * gripper.force)
     if around.plane is not None:  # moved without a turn, so that the lowest corner is the same
         logs[:, 5] = log_phi(height[at] + offset @ around.plane[:3], np.hypot(TABLE_SIGMA, placement))
     return Trials(owner, frames, opening, 2 * half, logs, sides)
 
 
-def _narrower(bodies: Superquadric, spread: np.ndarray, trials: Trials, gripper: Gripper, placement: float) -> Trials:
+@kernel
+def _ahead(frames: np.ndarray, at: np.ndarray, aside: np.ndarray, ahead: np.ndarray) -> np.ndarray:
+    """Offsets (k, 3) along the first and the third axis of frames ``at`` (k,)."""
+    offset = np.empty((len(at), 3))
+    for k in range(len(at)):
+        for i in range(3):
+            offset[k, i] = aside[k] * frames[at[k], i, 0] + ahead[k] * frames[at[k], i, 2]
+    return offset
+
+
+def _narrower(bodies: KnownBodies, trials: Trials, gripper: Gripper, placement: float) -> Trials:
     """The same, knowing that fingers which end above the middle do not come down to where a body is widest."""
     y, z = trials.frames[:, :, 1], trials.frames[:, :, 2]
-    beside = trials.frames[:, :, 3] + gripper.tip * z - bodies.translation[trials.owner]
+    beside = trials.frames[:, :, 3] + gripper.tip * z - bodies.middle[trials.owner]
     rows = np.flatnonzero((trials.logs[:, 0] < np.log(_CLEAR)) & ((beside * z).sum(axis=1) < 0))
     owner, y, beside = trials.owner[rows], y[rows], beside[rows]
     across = 0.5 * gripper.finger_width * trials.frames[rows, :, 0]
-    reached = np.fmax.reduce([closing.chords(bodies, owner, beside + k * across, y)[0] for k in (-1, 0, 1)])
+    reached = np.fmax.reduce([bodies.chords(owner, beside + k * across, y)[0] for k in (-1, 0, 1)])
     aside = (beside * y).sum(axis=1)
     for end, way in ((0, 1), (1, -1)):
-        reach, sigma = closing.reaches(bodies, spread, owner, way * y)
+        reach, sigma = bodies.reaches(owner, way * y)
         gap = 0.5 * trials.opening[rows] - np.fmin(reached[:, end], reach - way * aside)
         trials.sides[rows, end] = passing(gap, sigma, placement)
     trials.logs[rows, 0] = trials.sides[rows].sum(axis=1)
@@ -301,8 +308,7 @@ def _narrower(bodies: Superquadric, spread: np.ndarray, trials: Trials, gripper:
 
 
 def _among_others(
-    bodies: Superquadric,
-    spread: np.ndarray,
+    bodies: KnownBodies,
     trials: Trials,
     gripper: Gripper,
     around: Surroundings,
@@ -311,11 +317,10 @@ def _among_others(
     """The same with the margins that the surroundings decide."""
     if not len(trials.owner):
         return trials
-    flat, turns = np.ascontiguousarray(bodies.to_flat(), dtype=float), np.ascontiguousarray(bodies.rotation_matrix)
     boxes = gripper.boxes_at(trials.opening)
-    gap, other, way = clearance.gaps_to_bodies(trials.frames, boxes, trials.owner, flat, turns)
+    gap, other, way = clearance.gaps_to_bodies(trials.frames, boxes, trials.owner, bodies.flat, bodies.turns)
     near = np.flatnonzero(other >= 0)
-    _, sigma = closing.reaches(bodies, spread, other[near], -way[near])
+    _, sigma = bodies.reaches(other[near], -way[near])
     trials.logs[near, 6] = passing(gap[near], sigma, placement)
     trials = trials.first(_CHECKED_CLOSELY)
     boxes = gripper.boxes_at(trials.opening)
@@ -339,7 +344,7 @@ def _where_hidden(trials: Trials, gap: np.ndarray, gripper: Gripper, around: Sur
 
 def _as_grasps(trials: Trials) -> Iterator[Grasp]:
     """All of them, the most probable first."""
-    total = trials.logs.sum(axis=1)
+    total = trials.total
     order = np.argsort(-total, kind="stable")
     turns = quaternions.from_matrix(trials.frames[:, :, :3])
     scores, weakest = np.exp(total), trials.weakest

@@ -10,6 +10,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 from scipy.special import ndtr
 
+from sq_perception.geometry.kernels import kernel
+
 DENSITY = 500.0
 """kg/m^3, between empty and full packages; a mass is thought to be known to half of it."""
 CLEARANCE = 0.005
@@ -57,20 +59,43 @@ class Trials:
         )
 
     @property
+    def total(self) -> np.ndarray:
+        """Logarithm (k,) of the probability that all margins are kept."""
+        return np.asarray(np.einsum("ij->i", self.logs))
+
+    @property
     def weakest(self) -> np.ndarray:
         """Which margin takes most from each."""
         return np.asarray(np.argmin(self.logs, axis=1))
 
     def first(self, count: int, least: float = -np.inf) -> Trials:
         """The most probable ones of each body, each body's in order, of those whose logarithm is above ``least``."""
-        total = self.logs.sum(axis=1)
-        found = np.flatnonzero(total > least)
-        found = found[np.lexsort((-total[found], self.owner[found]))]
-        return self.at(found[_rank(self.owner[found]) < count])
+        return self.at(_first(self.owner, self.total, count, least))
 
     def after(self, count: int) -> Trials:
         """The others, of trials that are in order."""
         return self.at(np.flatnonzero(_rank(self.owner) >= count))
+
+
+@kernel
+def _first(owner: np.ndarray, total: np.ndarray, count: int, least: float) -> np.ndarray:
+    """Rows (j,) of the ``count`` greatest totals above ``least`` of each owner, owner by owner, the greatest first."""
+    candidates = np.flatnonzero(total > least)
+    of = np.zeros(owner.max() + 2 if len(owner) else 1, np.int64)
+    for row in candidates:
+        of[owner[row] + 1] += 1
+    of = np.cumsum(of)
+    filled, sorted_by_owner = of.copy(), np.empty(len(candidates), np.int64)
+    for row in candidates:
+        sorted_by_owner[filled[owner[row]]] = row
+        filled[owner[row]] += 1
+    kept, found = 0, np.empty(len(candidates), np.int64)
+    for k in range(len(of) - 1):
+        rows = sorted_by_owner[of[k] : of[k + 1]]
+        for j in np.argsort(-total[rows], kind="mergesort")[:count]:
+            found[kept] = rows[j]
+            kept += 1
+    return found[:kept]
 
 
 def _rank(owner: np.ndarray) -> np.ndarray:

@@ -7,7 +7,8 @@ import pytest
 
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.grasping import clearance, closing
+from sq_perception.grasping import clearance
+from sq_perception.grasping.closing import KnownBodies
 from sq_perception.grasping.gripper import GRIPPERS, PANDA, Gripper, gripper
 from sq_perception.grasping.planner import grasps
 from sq_perception.grasping.surroundings import Surroundings
@@ -47,10 +48,11 @@ def test_reach_and_chord_agree_with_the_body(size, shape):
     directions = np.random.default_rng(1).standard_normal((40, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     owner = np.zeros(40, dtype=int)
-    reach, _ = closing.reaches(body, closing.known(body, sure(1)), owner, directions)
+    known = KnownBodies.of(body, sure(1))
+    reach, _ = known.reaches(owner, directions)
     np.testing.assert_allclose(reach, body[0].support(directions), rtol=1e-9)
     offset = 0.2 * np.array(size).min() * directions[::-1]
-    ends, angle = closing.chords(body, owner, offset, directions)
+    ends, angle = known.chords(owner, offset, directions)
     for side, sign in ((0, 1), (1, -1)):
         points = body[0].translation + offset + sign * ends[:, side, None] * directions
         np.testing.assert_allclose(body[0].gauge(points), 1.0, atol=2e-2)
@@ -62,7 +64,7 @@ def test_the_sigma_of_a_reach_is_that_of_disturbed_bodies():
     body = Superquadric.stack([Superquadric([0.05, 0.03, 0.02], [0.4, 0.8], [0.1, 0.0, 0.5], [0.1, 0.4, 0.2, 0.8])])
     spread = np.diag(np.array([2, 1, 3, 0, 0, 2, 2, 4, 30, 20, 10]) ** 2 * 1e-6)[None]
     directions = quaternions.to_matrix(body.rotation)[0].T @ np.eye(3)
-    _, sigma = closing.reaches(body, closing.known(body, spread), np.zeros(3, dtype=int), directions)
+    _, sigma = KnownBodies.of(body, spread).reaches(np.zeros(3, dtype=int), directions)
     step = rng.standard_normal((20000, 11)) * np.sqrt(np.diag(spread[0]))
     turn = quaternions.multiply(body.rotation, quaternions.from_rotation_vector(step[:, 8:]))
     many = Superquadric(body.size + step[:, :3], body.shape, body.translation + step[:, 5:8], turn)
