@@ -26,7 +26,7 @@ from scipy.spatial import ConvexHull
 from sq_perception.fitting.bounds import Bounds
 from sq_perception.geometry import Superquadric
 from sq_perception.geometry import rotation as quaternions
-from sq_perception.geometry.kernels import kernel, ray_interval
+from sq_perception.geometry.kernels import in_object_frame, kernel, ray_interval
 
 COLUMNS = 128
 POLISH_COLUMNS = 64
@@ -94,25 +94,15 @@ def _common(
     body: np.ndarray, m: np.ndarray, corner: np.ndarray, step: np.ndarray, low: np.ndarray, high: np.ndarray
 ) -> float:
     """Summed length of what the columns share with the body."""
+    form = body[0], body[1], body[2], body[3], body[4]
     total = 0.0
     for i in range(low.shape[0]):
         for j in range(low.shape[1]):
             if low[i, j] >= high[i, j]:
                 continue
-            px, py, pz = corner[0] + i * step[0] - body[5], corner[1] + j * step[1] - body[6], -body[7]
-            hit, first, last = ray_interval(
-                m[0, 0] * px + m[1, 0] * py + m[2, 0] * pz,
-                m[0, 1] * px + m[1, 1] * py + m[2, 1] * pz,
-                m[0, 2] * px + m[1, 2] * py + m[2, 2] * pz,
-                m[2, 0],
-                m[2, 1],
-                m[2, 2],
-                body[0],
-                body[1],
-                body[2],
-                body[3],
-                body[4],
-            )
+            x, y = corner[0] + i * step[0] - body[5], corner[1] + j * step[1] - body[6]
+            origin = in_object_frame(m, x, y, -body[7])
+            hit, first, last = ray_interval(origin, (m[2, 0], m[2, 1], m[2, 2]), form)
             if hit:
                 total += max(0.0, min(last, high[i, j]) - max(first, low[i, j]))
     return total

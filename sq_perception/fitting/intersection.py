@@ -17,7 +17,7 @@ import numpy as np
 from sq_perception.fitting.normal_equations import LANES
 from sq_perception.fitting.rays import DEPTH, DIRECTION_X, DIRECTION_Y, LAST, ORIGIN_X, ORIGIN_Y, STIFFNESS, WEIGHT
 from sq_perception.fitting.terms import Terms
-from sq_perception.geometry.kernels import box_interval, gauge_derivatives, inline_kernel, kernel
+from sq_perception.geometry.kernels import box_interval, gauge_derivatives, in_object_frame, inline_kernel, kernel
 
 QX, QY, QZ, EX, EY, EZ, SHIFT = range(7)
 """A ray in the object frame, q + shift e;"""
@@ -139,7 +139,8 @@ def _meet_from_box(filled: int, tolerance: float, parameters: np.ndarray, lanes:
     for i in range(filled):
         qx, qy, qz = lanes[QX, i], lanes[QY, i], lanes[QZ, i]
         ex, ey, ez = lanes[EX, i], lanes[EY, i], lanes[EZ, i]
-        t_in, t_out = box_interval(qx, qy, qz, ex, ey, ez, parameters[0], parameters[1], parameters[2])
+        half = parameters[0], parameters[1], parameters[2]
+        t_in, t_out = box_interval((qx, qy, qz), (ex, ey, ez), half)
         inside = t_in <= t_out
         lanes[SHARE, i] = 1.0 if inside else 0.0
         lanes[SHIFT, i] = lanes[LOW, i] = t_in if inside else 0.0
@@ -172,21 +173,16 @@ def enter(
     ray: np.ndarray, terms: Terms, parameters: np.ndarray, rotation: np.ndarray, i: int, lanes: np.ndarray
 ) -> int:
     """Put a free ray into lane i if it crosses the bounding box in free space; 1 if so, 0 if not."""
-    m = rotation
     x, y, z = ray[ORIGIN_X] - parameters[5], ray[ORIGIN_Y] - parameters[6], -parameters[7]
-    dx, dy = ray[DIRECTION_X], ray[DIRECTION_Y]
-    ox = m[0, 0] * x + m[1, 0] * y + m[2, 0] * z
-    oy = m[0, 1] * x + m[1, 1] * y + m[2, 1] * z
-    oz = m[0, 2] * x + m[1, 2] * y + m[2, 2] * z
-    ex = m[0, 0] * dx + m[1, 0] * dy + m[2, 0]
-    ey = m[0, 1] * dx + m[1, 1] * dy + m[2, 1]
-    ez = m[0, 2] * dx + m[1, 2] * dy + m[2, 2]
-    t_in, t_out = box_interval(ox, oy, oz, ex, ey, ez, parameters[0], parameters[1], parameters[2])
+    origin = in_object_frame(rotation, x, y, z)
+    way = in_object_frame(rotation, ray[DIRECTION_X], ray[DIRECTION_Y], 1.0)
+    t_in, t_out = box_interval(origin, way, (parameters[0], parameters[1], parameters[2]))
     low = max(t_in, _NEAREST if terms.pinhole > 0.0 else -1e300)
     high = min(t_out, ray[DEPTH])
     if low >= high:
         return 0
-    lanes[QX, i], lanes[QY, i], lanes[QZ, i], lanes[EX, i], lanes[EY, i], lanes[EZ, i] = ox, oy, oz, ex, ey, ez
+    lanes[QX, i], lanes[QY, i], lanes[QZ, i] = origin
+    lanes[EX, i], lanes[EY, i], lanes[EZ, i] = way
     lanes[LOW, i], lanes[HIGH, i] = low, high
     lanes[PRECISION, i], lanes[SHARE, i] = ray[STIFFNESS], ray[WEIGHT]
     return 1

@@ -16,12 +16,18 @@ import re
 from collections.abc import Callable
 from functools import cache
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeAlias, TypeVar
+
+import numpy as np
 
 from sq_perception.geometry import kernel_cache
 from sq_perception.geometry.elementary import exp2, exp2_to_half, log2, log2_from_1_to_2
 
 _F = TypeVar("_F", bound=Callable[..., Any])
+Triple: TypeAlias = tuple[float, float, float]
+"""A point, a direction or half sizes."""
+Form: TypeAlias = tuple[float, float, float, float, float]
+"""a1 a2 a3 e1 e2."""
 
 _ROOT = Path(__file__).resolve().parents[1]
 _IMPORT = re.compile(rf"^ *from ({_ROOT.name}[.\w]*) import (\([^)]*\)|[^\n]*)", re.MULTILINE)
@@ -157,19 +163,21 @@ def support(nx: float, ny: float, nz: float, a1: float, a2: float, a3: float, e1
     return h
 
 
+@inline_kernel
+def in_object_frame(m: np.ndarray, x: float, y: float, z: float) -> Triple:
+    """R^T v: a vector of the parent frame in the frame of the object, whose rotation matrix (3, 3) is ``m``."""
+    return (
+        m[0, 0] * x + m[1, 0] * y + m[2, 0] * z,
+        m[0, 1] * x + m[1, 1] * y + m[2, 1] * z,
+        m[0, 2] * x + m[1, 2] * y + m[2, 2] * z,
+    )
+
+
 @kernel
-def box_interval(
-    ox: float, oy: float, oz: float, dx: float, dy: float, dz: float, a1: float, a2: float, a3: float
-) -> tuple[float, float]:
-    """Where the ray runs inside the box +-a: (t_in, t_out), with t_in > t_out when it misses."""
+def box_interval(origin: Triple, way: Triple, half: Triple) -> tuple[float, float]:
+    """Where the ray runs inside the box +-half: (t_in, t_out), with t_in > t_out when it misses."""
     t_in, t_out = -1e300, 1e300
-    for axis in range(3):
-        if axis == 0:
-            o, d, a = ox, dx, a1
-        elif axis == 1:
-            o, d, a = oy, dy, a2
-        else:
-            o, d, a = oz, dz, a3
+    for o, d, a in zip(origin, way, half):  # noqa: B905 - numba's has no ``strict``
         if abs(d) < 1e-300:
             if abs(o) > a:
                 return 1.0, -1.0
@@ -183,69 +191,35 @@ def box_interval(
 
 
 @kernel
-def ray_entry(
-    ox: float,
-    oy: float,
-    oz: float,
-    dx: float,
-    dy: float,
-    dz: float,
-    a1: float,
-    a2: float,
-    a3: float,
-    e1: float,
-    e2: float,
-) -> tuple[bool, float]:
+def ray_entry(origin: Triple, way: Triple, form: Form) -> tuple[bool, float]:
     """First intersection of the ray with the surface, over all t: (hit, t)."""
-    t_in, t_out = box_interval(ox, oy, oz, dx, dy, dz, a1, a2, a3)
+    t_in, t_out = box_interval(origin, way, form[:3])
     if t_in > t_out:
         return False, 0.0
-    return _newton(t_in, t_out, ox, oy, oz, dx, dy, dz, a1, a2, a3, e1, e2)
+    return _newton(t_in, t_out, origin, way, form)
 
 
 @kernel
-def ray_interval(
-    ox: float,
-    oy: float,
-    oz: float,
-    dx: float,
-    dy: float,
-    dz: float,
-    a1: float,
-    a2: float,
-    a3: float,
-    e1: float,
-    e2: float,
-) -> tuple[bool, float, float]:
+def ray_interval(origin: Triple, way: Triple, form: Form) -> tuple[bool, float, float]:
     """Both intersections of the ray with the surface: (hit, t_first, t_last)."""
-    t_in, t_out = box_interval(ox, oy, oz, dx, dy, dz, a1, a2, a3)
+    t_in, t_out = box_interval(origin, way, form[:3])
     if t_in > t_out:
         return False, 0.0, 0.0
-    hit, first = _newton(t_in, t_out, ox, oy, oz, dx, dy, dz, a1, a2, a3, e1, e2)
+    hit, first = _newton(t_in, t_out, origin, way, form)
     if not hit:
         return False, 0.0, 0.0
-    hit, last = _newton(-t_out, -t_in, ox, oy, oz, -dx, -dy, -dz, a1, a2, a3, e1, e2)
+    dx, dy, dz = way
+    hit, last = _newton(-t_out, -t_in, origin, (-dx, -dy, -dz), form)
     if not hit:
         return False, 0.0, 0.0
     return True, first, -last
 
 
 @kernel
-def _newton(
-    t_in: float,
-    t_out: float,
-    ox: float,
-    oy: float,
-    oz: float,
-    dx: float,
-    dy: float,
-    dz: float,
-    a1: float,
-    a2: float,
-    a3: float,
-    e1: float,
-    e2: float,
-) -> tuple[bool, float]:
+def _newton(t_in: float, t_out: float, origin: Triple, way: Triple, form: Form) -> tuple[bool, float]:
+    ox, oy, oz = origin
+    dx, dy, dz = way
+    a1, a2, a3, e1, e2 = form
     t = t_in
     enough = RAY_TOLERANCE * (t_out - t_in)
     for _ in range(MAX_NEWTON_STEPS):

@@ -12,7 +12,7 @@ import math
 import numba
 import numpy as np
 
-from sq_perception.geometry.kernels import kernel, parallel_kernel, ray_interval
+from sq_perception.geometry.kernels import in_object_frame, kernel, parallel_kernel, ray_interval
 from sq_perception.geometry.superquadric import Superquadric
 
 
@@ -69,20 +69,9 @@ def _iou(a: Superquadric, b: Superquadric, lower: np.ndarray, upper: np.ndarray,
 @kernel
 def _column(body: np.ndarray, m: np.ndarray, x: float, y: float, z0: float, step: float, count: int) -> tuple[int, int]:
     """First and last grid index inside the body on the column (x, y, z0 + k step)."""
-    px, py, pz = x - body[5], y - body[6], z0 - body[7]
-    hit, first, last = ray_interval(
-        m[0, 0] * px + m[1, 0] * py + m[2, 0] * pz,
-        m[0, 1] * px + m[1, 1] * py + m[2, 1] * pz,
-        m[0, 2] * px + m[1, 2] * py + m[2, 2] * pz,
-        m[2, 0],
-        m[2, 1],
-        m[2, 2],
-        body[0],
-        body[1],
-        body[2],
-        body[3],
-        body[4],
-    )
+    origin = in_object_frame(m, x - body[5], y - body[6], z0 - body[7])
+    form = body[0], body[1], body[2], body[3], body[4]
+    hit, first, last = ray_interval(origin, (m[2, 0], m[2, 1], m[2, 2]), form)
     if not hit:
         return 0, -1
     return max(0, math.ceil(first / step - 1e-9)), min(count - 1, math.floor(last / step + 1e-9))

@@ -8,7 +8,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from sq_perception.geometry.kernels import box_interval, kernel, parallel_kernel, ray_entry, support
+from sq_perception.geometry.kernels import box_interval, in_object_frame, kernel, parallel_kernel, ray_entry, support
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
 
@@ -100,17 +100,12 @@ def _render_bodies(
                     px, py, rx, ry = -t1, -t2, x, y
                 else:
                     px, py, rx, ry = x - t1, y - t2, 0.0, 0.0
-                ox = m[0, 0] * px + m[1, 0] * py - m[2, 0] * t3
-                oy = m[0, 1] * px + m[1, 1] * py - m[2, 1] * t3
-                oz = m[0, 2] * px + m[1, 2] * py - m[2, 2] * t3
-                dx = m[0, 0] * rx + m[1, 0] * ry + m[2, 0]
-                dy = m[0, 1] * rx + m[1, 1] * ry + m[2, 1]
-                dz = m[0, 2] * rx + m[1, 2] * ry + m[2, 2]
+                origin, way = in_object_frame(m, px, py, -t3), in_object_frame(m, rx, ry, 1.0)
                 # What begins behind something nearer needs no search.
-                t_in, _ = box_interval(ox, oy, oz, dx, dy, dz, a1, a2, a3)
+                t_in, _ = box_interval(origin, way, (a1, a2, a3))
                 if t_in >= depth[v, u]:
                     continue
-                hit, t = ray_entry(ox, oy, oz, dx, dy, dz, a1, a2, a3, e1, e2)
+                hit, t = ray_entry(origin, way, (a1, a2, a3, e1, e2))
                 if hit and t < depth[v, u] and (t > 0.0 or not pinhole):
                     depth[v, u] = t
                     index[v, u] = k

@@ -56,7 +56,7 @@ def agreement(
             ox = rotation[0, 0] * x + rotation[1, 0] * y - ez1 * t3
             oy = rotation[0, 1] * x + rotation[1, 1] * y - ez2 * t3
             oz = rotation[0, 2] * x + rotation[1, 2] * y - ez3 * t3
-            lowest, highest = box_interval(ox, oy, oz, ez1, ez2, ez3, reach * a1, reach * a2, reach * a3)
+            lowest, highest = box_interval((ox, oy, oz), (ez1, ez2, ez3), (reach * a1, reach * a2, reach * a3))
             # Voxel k = 0 .. n - 1 from the viewer has its centre at z = 1 - (k + 1/2) / n.
             k = math.ceil(max((1.0 - highest) * n - 0.5, 0.0)) if lowest <= highest else n
             last = math.floor(min((1.0 - lowest) * n - 0.5, n - 1.0)) if lowest <= highest else -1

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from sq_perception.geometry.kernels import gauge, kernel, parallel_kernel, ray_interval
+from sq_perception.geometry.kernels import gauge, in_object_frame, kernel, parallel_kernel, ray_interval
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.raycast import render
@@ -94,14 +94,10 @@ def _hollow_out(
                 a1, a2, a3, e1, e2, t1, t2, t3 = flat[k, :8]
                 m = matrices[k]
                 x, y = (u - cx) / fx, (v - cy) / fy
-                ox = -(m[0, 0] * t1 + m[1, 0] * t2 + m[2, 0] * t3)
-                oy = -(m[0, 1] * t1 + m[1, 1] * t2 + m[2, 1] * t3)
-                oz = -(m[0, 2] * t1 + m[1, 2] * t2 + m[2, 2] * t3)
-                dx = m[0, 0] * x + m[1, 0] * y + m[2, 0]
-                dy = m[0, 1] * x + m[1, 1] * y + m[2, 1]
-                dz = m[0, 2] * x + m[1, 2] * y + m[2, 2]
+                origin, way = in_object_frame(m, -t1, -t2, -t3), in_object_frame(m, x, y, 1.0)
+                (ox, oy, oz), (dx, dy, dz) = origin, way
                 z = depth[v, u]
                 if gauge(ox + z * dx, oy + z * dy, oz + z * dz, a1, a2, a3, e1, e2) < 1.0:
-                    hit, _, last = ray_interval(ox, oy, oz, dx, dy, dz, a1, a2, a3, e1, e2)
+                    hit, _, last = ray_interval(origin, way, (a1, a2, a3, e1, e2))
                     if hit and last > z:
                         depth[v, u] = last

@@ -156,7 +156,7 @@ def _render_views(
                     x -= t1
                     y -= t2
                     ox, oy, oz = m[0, 0] * x + m[1, 0] * y, m[0, 1] * x + m[1, 1] * y, m[0, 2] * x + m[1, 2] * y
-                    hit, t = ray_entry(ox, oy, oz, -m[2, 0], -m[2, 1], -m[2, 2], a1, a2, a3, e1, e2)
+                    hit, t = ray_entry((ox, oy, oz), (-m[2, 0], -m[2, 1], -m[2, 2]), (a1, a2, a3, e1, e2))
                     surface[i, j] = _NOTHING
                     if hit and pinhole[k]:
                         px, py, pz = ox - t * m[2, 0], oy - t * m[2, 1], oz - t * m[2, 2]
