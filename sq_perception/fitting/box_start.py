@@ -13,7 +13,7 @@ import numpy as np
 
 from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.observation import span
-from sq_perception.fitting.symmetry_start import ORDERS
+from sq_perception.fitting.symmetry_start import ORDERS, principal_axes
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 
@@ -56,10 +56,7 @@ def standing_axes(points: np.ndarray, normal: np.ndarray) -> np.ndarray:
 
 def _axes_of(points: np.ndarray) -> np.ndarray:
     centred = points - points.mean(axis=0)
-    _, axes = np.linalg.eigh(centred.T @ centred)
-    if np.linalg.det(axes) < 0:
-        axes[:, 0] *= -1
-    return axes
+    return principal_axes(centred.T @ centred)
 
 
 def _box_states(points: np.ndarray, axes: np.ndarray, deeper: bool, ground: float | None = None) -> list[State]:

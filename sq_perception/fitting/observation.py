@@ -57,8 +57,85 @@ _NO_NOISE = 1e-6
 
 
 @dataclass(frozen=True)
-class Observation:
-    """One object in one image, cropped to its surroundings.
+class Crop:
+    """An object and its surroundings in an image, as far as they do not depend on how far the object strays.
+
+    Attributes
+    ----------
+    depth, mask : (h, w)
+        NaN where nothing was measured; the caller's mask.  ``camera`` belongs to both.
+    band : int
+        Width, in pixels, of the band around the mask whose every pixel counts.
+    noise : DepthNoise
+        The depth noise.
+    distance : float
+        Mean depth of the object, metres.
+    footprint : float
+        Width of a pixel at that distance, metres.
+    """
+
+    depth: np.ndarray
+    mask: np.ndarray
+    camera: Camera
+    band: int
+    noise: DepthNoise
+    distance: float
+    footprint: float
+
+    @classmethod
+    def around(
+        cls, depth: np.ndarray, mask: np.ndarray, camera: Camera, noise: float | DepthNoise | None
+    ) -> Crop | None:
+        """The crop around a mask of an image; None if it holds no depth at all.  ``noise`` None estimates it."""
+        x, y, width, height = cv2.boundingRect(np.ascontiguousarray(mask).view(np.uint8))
+        extent = max(width, height)
+        band = max(BAND_PIXELS, math.ceil(_BAND_SHARE * extent))
+        margin = max(band, math.ceil(_WIDER * extent / 2))
+        top, left = max(y - margin, 0), max(x - margin, 0)
+        bottom, right = min(y + height + margin, camera.height), min(x + width + margin, camera.width)
+        crop = np.ascontiguousarray(depth[top:bottom, left:right], dtype=np.float32)
+        if camera.is_pinhole:
+            crop = np.where(crop > 0, crop, np.float32(np.nan))
+        inside = np.ascontiguousarray(mask[top:bottom, left:right])
+        distance = _mean_depth(crop, inside)
+        if not math.isfinite(distance):
+            return None
+        if noise is None:
+            noise = depth_noise.estimate(crop, inside, _NO_NOISE * max(abs(distance), 1e-3))
+        elif not isinstance(noise, DepthNoise):
+            noise = DepthNoise(noise)
+        footprint = (distance if camera.is_pinhole else 1.0) / math.sqrt(camera.fx * camera.fy)
+        view = camera.cropped(left, top, right - left, bottom - top)
+        return cls(crop, inside, view, band, noise, distance, footprint)
+
+    def observed(self, model_error: float, nan_is_empty: bool | None) -> Observation:
+        """Its pixels sorted; ``model_error`` in metres, ``nan_is_empty`` as in the options."""
+        sigma = math.hypot(self.noise.at(self.distance), model_error)
+        inside = coherent(self.depth, self.mask, _JUMP_PIXELS * self.footprint + _JUMP_NOISE * sigma)
+        filled = cv2.morphologyEx(inside.view(np.uint8), cv2.MORPH_CLOSE, np.ones((_HOLE, _HOLE), np.uint8))
+        claimed = cv2.bitwise_or(filled, self.mask.view(np.uint8))
+        near = cv2.dilate(filled, np.ones((2 * self.band + 1, 2 * self.band + 1), np.uint8))
+        if nan_is_empty is None:
+            beside = np.isfinite(self.depth[(near > 0) & (claimed == 0)])
+            nan_is_empty = beside.size == 0 or float(beside.mean()) < _BACKGROUND_SHARE
+        lost = _convex_hull(claimed) if nan_is_empty else np.ones_like(claimed)
+        pixels, areas, free, free_pixels = _sort(self.depth, inside, claimed, near, lost, self.footprint)
+        shown = _some(pixels, areas, _POINTS, 0.5)
+        v, u = np.divmod(shown, self.camera.width)
+        return Observation(
+            **{**vars(self), "mask": filled.view(bool)},
+            pixels=pixels,
+            areas=areas,
+            free=free,
+            free_pixels=free_pixels,
+            model_error=model_error,
+            points=np.asfortranarray(self.camera.unproject(u, v, self.depth.ravel()[shown])),
+        )
+
+
+@dataclass(frozen=True)
+class Observation(Crop):
+    """A crop whose pixels are sorted; the mask is that of the object, with its small holes closed.
 
     Attributes
     ----------
@@ -70,31 +147,19 @@ class Observation:
         The pixels beside the object that may bind it, likewise.
     free_pixels : int
         Number of pixels that these stand for.
-    noise : DepthNoise
-        The depth noise; ``model_error`` metres join it in squares.
-    distance : float
-        Mean depth of the object, metres.
-    footprint : float
-        Width of a pixel at that distance, metres.
+    model_error : float
+        How far the object may stray from a superquadric, metres; joins the noise in squares.
     points : (k, 3)
         Some 2000 measured points of the object in the optical frame, evenly over its surface; one contiguous column
         a coordinate, several times as fast to reduce.
-    depth, mask : (h, w)
-        The crop, the mask with its small holes closed; ``camera`` belongs to them.
     """
 
     pixels: np.ndarray
     areas: np.ndarray
     free: np.ndarray
     free_pixels: int
-    noise: DepthNoise
     model_error: float
-    distance: float
-    footprint: float
     points: np.ndarray
-    depth: np.ndarray
-    mask: np.ndarray
-    camera: Camera
 
     @cached_property
     def sigma(self) -> float:
@@ -152,78 +217,6 @@ class Observation:
         c, n = self.camera, self.noise
         noise = (n.constant, n.quadratic, self.model_error)
         return through(pixels, self.depth, (c.fx, c.fy, c.cx, c.cy), c.is_pinhole, noise, margin)
-
-
-@dataclass(frozen=True)
-class Crop:
-    """An object and its surroundings in an image, as far as they do not depend on how far the object strays.
-
-    ``depth`` (h, w), NaN where nothing was measured, the caller's ``mask`` (h, w), their ``camera``; ``band``: width,
-    in pixels, of the band around the mask whose every pixel counts; the others as in :class:`Observation`.
-    """
-
-    depth: np.ndarray
-    mask: np.ndarray
-    camera: Camera
-    band: int
-    noise: DepthNoise
-    distance: float
-    footprint: float
-
-    @classmethod
-    def around(
-        cls, depth: np.ndarray, mask: np.ndarray, camera: Camera, noise: float | DepthNoise | None
-    ) -> Crop | None:
-        """The crop around a mask of an image; None if it holds no depth at all.  ``noise`` None estimates it."""
-        x, y, width, height = cv2.boundingRect(np.ascontiguousarray(mask).view(np.uint8))
-        extent = max(width, height)
-        band = max(BAND_PIXELS, math.ceil(_BAND_SHARE * extent))
-        margin = max(band, math.ceil(_WIDER * extent / 2))
-        top, left = max(y - margin, 0), max(x - margin, 0)
-        bottom, right = min(y + height + margin, camera.height), min(x + width + margin, camera.width)
-        crop = np.ascontiguousarray(depth[top:bottom, left:right], dtype=np.float32)
-        if camera.is_pinhole:
-            crop = np.where(crop > 0, crop, np.float32(np.nan))
-        inside = np.ascontiguousarray(mask[top:bottom, left:right])
-        distance = _mean_depth(crop, inside)
-        if not math.isfinite(distance):
-            return None
-        if noise is None:
-            noise = depth_noise.estimate(crop, inside, _NO_NOISE * max(abs(distance), 1e-3))
-        elif not isinstance(noise, DepthNoise):
-            noise = DepthNoise(noise)
-        footprint = (distance if camera.is_pinhole else 1.0) / math.sqrt(camera.fx * camera.fy)
-        view = camera.cropped(left, top, right - left, bottom - top)
-        return cls(crop, inside, view, band, noise, distance, footprint)
-
-    def observed(self, model_error: float, nan_is_empty: bool | None) -> Observation:
-        """Its pixels sorted; ``model_error`` in metres, ``nan_is_empty`` as in the options."""
-        sigma = math.hypot(self.noise.at(self.distance), model_error)
-        inside = coherent(self.depth, self.mask, _JUMP_PIXELS * self.footprint + _JUMP_NOISE * sigma)
-        filled = cv2.morphologyEx(inside.view(np.uint8), cv2.MORPH_CLOSE, np.ones((_HOLE, _HOLE), np.uint8))
-        claimed = cv2.bitwise_or(filled, self.mask.view(np.uint8))
-        near = cv2.dilate(filled, np.ones((2 * self.band + 1, 2 * self.band + 1), np.uint8))
-        if nan_is_empty is None:
-            beside = np.isfinite(self.depth[(near > 0) & (claimed == 0)])
-            nan_is_empty = beside.size == 0 or float(beside.mean()) < _BACKGROUND_SHARE
-        lost = _convex_hull(claimed) if nan_is_empty else np.ones_like(claimed)
-        pixels, areas, free, free_pixels = _sort(self.depth, inside, claimed, near, lost, self.footprint)
-        shown = _some(pixels, areas, _POINTS, 0.5)
-        v, u = np.divmod(shown, self.camera.width)
-        return Observation(
-            pixels,
-            areas,
-            free,
-            free_pixels,
-            self.noise,
-            model_error,
-            self.distance,
-            self.footprint,
-            np.asfortranarray(self.camera.unproject(u, v, self.depth.ravel()[shown])),
-            self.depth,
-            filled.view(bool),
-            self.camera,
-        )
 
 
 def _some(pixels: np.ndarray, areas: np.ndarray, count: int, offset: float) -> np.ndarray:

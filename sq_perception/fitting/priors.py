@@ -70,14 +70,14 @@ def support_derivatives(
 @kernel
 def _support_cost(terms: Terms, parameters: np.ndarray, rotation: np.ndarray, sums: np.ndarray) -> float:
     a1, a2, a3, e1, e2, t1, t2, t3 = parameters
-    normal = np.array([terms.normal_x, terms.normal_y, terms.normal_z])
+    normal = terms.plane[:3]
     n = np.zeros(3)
     for k in range(3):
         n[k] = rotation[0, k] * normal[0] + rotation[1, k] * normal[1] + rotation[2, k] * normal[2]
     cost = 0.0
     row = np.zeros(STEP_LENGTH + 1)
     h, hx, hy, hz, h1, h2 = support_derivatives(n[0], n[1], n[2], a1, a2, a3, e1, e2)
-    lowest = normal[0] * t1 + normal[1] * t2 + normal[2] * t3 + terms.offset - h
+    lowest = normal[0] * t1 + normal[1] * t2 + normal[2] * t3 + terms.plane[3] - h
     s = terms.plane_stiffness if lowest < 0.0 else terms.gap_stiffness
     if s > 0.0:
         residual = s * lowest
@@ -170,11 +170,10 @@ def _proportion_cost(terms: Terms, parameters: np.ndarray, sums: np.ndarray) -> 
 
 @kernel
 def _expectation_cost(terms: Terms, parameters: np.ndarray, sums: np.ndarray) -> float:
-    expected = (terms.expected_1, terms.expected_2, terms.expected_3)
     cost = 0.0
     row = np.zeros(STEP_LENGTH + 1)
     for k in range(3):
-        residual = terms.expectation_stiffness * math.log(parameters[k] / expected[k])
+        residual = terms.expectation_stiffness * math.log(parameters[k] / terms.expected[k])
         scale = 1.0 / math.sqrt(1.0 + residual * residual)
         cost += math.log1p(residual * residual)
         row[:] = 0.0

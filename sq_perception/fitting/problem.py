@@ -113,11 +113,6 @@ class Problem:
         return time.perf_counter() > self.deadline
 
     @property
-    def is_predicted(self) -> bool:
-        """Whether a prediction of the thing's hull is known."""
-        return self.hull is not None
-
-    @property
     def outline(self) -> float:
         """Standard deviation of the outline where it is not known better, metres."""
         return outline_sigma(self.observation)
@@ -126,8 +121,7 @@ class Problem:
         """The terms with the predicted half sizes along the axes that a body has now."""
         if self.prior is None:
             return self.terms
-        x, y, z = (float(extent) for extent in self.prior.support(state.rotation.T))
-        return self.terms._replace(expected_1=x, expected_2=y, expected_3=z)
+        return self.terms._replace(expected=self.prior.support(state.rotation.T))
 
     def with_terms(self, **changed: float) -> Problem:
         """The problem with some terms changed."""
@@ -191,12 +185,8 @@ def terms_of(observation: Observation, options: FitOptions) -> Terms:
     )
     if options.plane is None:
         return terms
-    x, y, z, offset = (float(value) for value in options.plane)
     return terms._replace(
-        normal_x=x,
-        normal_y=y,
-        normal_z=z,
-        offset=offset,
+        plane=options.plane,
         plane_stiffness=1 / PLANE_SIGMA,
         gap_stiffness=1 / GAP_SIGMA,
         rest_stiffness=1 / REST_SIGMA,

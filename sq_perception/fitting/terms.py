@@ -13,8 +13,9 @@ class Terms(NamedTuple):
     Points that lie inside the body, behind its surface, count by Cauchy's loss of scale ``inner_cauchy`` if that is
     not 0, all others by Huber's.  A rendered depth is found by Newton's method until |g - 1| < ``hit_tolerance``,
     then in first order. Rendered residuals up to ``dead_zone`` noise levels count as 0: what rounding may do.
-    ``outline_stiffness`` is 1/sigma_o; the plane is n.x + d = height; a stiffness or price of 0 switches its term
-    off.  The rows of ``hull_directions`` are n_j, of ``hull_root`` those of W; no rows switch that term off.
+    ``outline_stiffness`` is 1/sigma_o; ``plane`` is n and d of n.x + d = height, ``expected`` three half sizes; a
+    stiffness or price of 0 switches its term off.  The rows of ``hull_directions`` are n_j, of ``hull_root`` those of
+    W; no rows switch that term off.
     """
 
     huber: float = 3.0
@@ -25,18 +26,13 @@ class Terms(NamedTuple):
     dead_zone: float = 0.0
     outline_stiffness: float = 1.0
     pinhole: float = 0.0
-    normal_x: float = 0.0
-    normal_y: float = 0.0
-    normal_z: float = 0.0
-    offset: float = 0.0
+    plane: np.ndarray = np.zeros(4)
     plane_stiffness: float = 0.0
     gap_stiffness: float = 0.0
     rest_stiffness: float = 0.0
     proportion_stiffness: float = 0.0
     roundness_stiffness: float = 0.0
-    expected_1: float = 1.0
-    expected_2: float = 1.0
-    expected_3: float = 1.0
+    expected: np.ndarray = np.ones(3)
     expectation_stiffness: float = 0.0
     volume_price: float = 0.0
     hull_directions: np.ndarray = np.empty((0, 3))

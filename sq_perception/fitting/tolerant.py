@@ -83,11 +83,11 @@ def solve(problem: Problem, given: Sequence[State]) -> Solution:
     problem = _with_priors(problem)
     points, plane = problem.observation.points, problem.options.plane
     # How far a box goes on behind what was seen is predicted.
-    deeper = not problem.is_predicted
+    deeper = problem.hull is None
     boxes = box_start.principal(points, deeper) if plane is None else box_start.on_plane(points, plane, deeper)
     starts = [*given, *boxes]
     solution = _best(problem, starts)
-    if problem.is_predicted:
+    if problem.hull is not None:
         if _mean_loss(problem, solution.state) > _typical_of_hollow(problem):
             return replace(solution, notes=_AS_HULL, as_hull=True)
         return solution
@@ -99,7 +99,7 @@ def solve(problem: Problem, given: Sequence[State]) -> Solution:
 def _best(problem: Problem, starts: Sequence[State]) -> Solution:
     few = draw(problem, COARSE_RAYS, 0.7)
     begun = _tried(problem, starts, few, FIRST_STEPS)
-    kept = _KEPT_OF_PREDICTED if problem.is_predicted else _KEPT
+    kept = _KEPT if problem.hull is None else _KEPT_OF_PREDICTED
     settled = _tried(problem, begun[:kept], few, BASIN_STEPS)
     if problem.hull is None or problem.late:
         return _refined(problem, settled)

@@ -180,16 +180,14 @@ def test_plane_rest_and_proportion(rng: np.random.Generator) -> None:
     normal /= np.linalg.norm(normal)
     plane = np.append(normal, -normal @ body.translation + 0.4 * body.size.min())
     target = torch.tensor(plane)
-    terms = PLAIN._replace(
-        normal_x=plane[0], normal_y=plane[1], normal_z=plane[2], offset=plane[3], plane_stiffness=200.0
-    )
+    terms = PLAIN._replace(plane=plane, plane_stiffness=200.0)
     expected = expected_sums(body, lambda moved: 200 * statement.lowest_height(moved, target)[None])
     assert_same(SAMPSON, NO_RAYS, NO_RAYS, terms, body, expected)
 
     lifted = plane + np.array([0, 0, 0, 3 * body.size.max()])
     height = float(statement.lowest_height(as_torch(body), torch.tensor(lifted))) * 40
     assert height > 0
-    gap = terms._replace(offset=lifted[3], gap_stiffness=40.0)
+    gap = terms._replace(plane=lifted, gap_stiffness=40.0)
     damped = 40 / np.sqrt(1 + height**2)
     _, matrix = expected_sums(body, lambda moved: damped * statement.lowest_height(moved, torch.tensor(lifted))[None])
     assert_same(SAMPSON, NO_RAYS, NO_RAYS, gap, body, (np.log1p(height**2), matrix))
@@ -211,7 +209,7 @@ def test_plane_rest_and_proportion(rng: np.random.Generator) -> None:
     )
 
     sizes = np.array([0.02, 0.05, 0.08])
-    expecting = PLAIN._replace(expected_1=0.02, expected_2=0.05, expected_3=0.08, expectation_stiffness=4.0)
+    expecting = PLAIN._replace(expected=sizes, expectation_stiffness=4.0)
     residual = 4 * np.log(body.size / sizes)
     scale = torch.tensor(4 / np.sqrt(1 + residual**2))
     _, matrix = expected_sums(body, lambda moved: scale * statement.surprise(moved, torch.tensor(sizes)))
@@ -220,7 +218,7 @@ def test_plane_rest_and_proportion(rng: np.random.Generator) -> None:
 
 def test_a_body_above_the_plane_pays_nothing(rng: np.random.Generator) -> None:
     body = random_body(rng)
-    terms = PLAIN._replace(normal_y=-1.0, offset=1.0, plane_stiffness=1000.0)
+    terms = PLAIN._replace(plane=np.array([0.0, -1.0, 0.0, 1.0]), plane_stiffness=1000.0)
     state = State.of(body)
     sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
     assert evaluate(SAMPSON, NO_RAYS, NO_RAYS, terms, state.parameters, state.rotation, sums) == 0
