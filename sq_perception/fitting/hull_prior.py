@@ -13,6 +13,7 @@ most errors, is what the fit takes.  With the tails the fit follows bodies that 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -55,7 +56,12 @@ class HullPrior:
         in all directions is left to S: the outline determines a thing's size.
         """
         count = len(self.support)
-        model, pull = MODEL_SHARE * self.extent, PULL_SHARE * self.extent
-        precision = np.linalg.inv(self.covariance + model**2 * np.eye(count))
-        precision += (misfit - 1.0) / pull**2 * (np.eye(count) - 1.0 / count)
+        pull = (misfit - 1.0) / (PULL_SHARE * self.extent) ** 2
+        precision = self._precision + pull * (np.eye(count) - 1.0 / count)
         return np.ascontiguousarray(np.linalg.cholesky(precision).T)
+
+    @cached_property
+    def _precision(self) -> np.ndarray:
+        """(S + model error)^-1."""
+        model = MODEL_SHARE * self.extent
+        return np.linalg.inv(self.covariance + model**2 * np.eye(len(self.support)))

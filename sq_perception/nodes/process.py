@@ -184,12 +184,13 @@ def _finish(nodes: Sequence[Stoppable], code: int) -> None:
 
     with ThreadPoolExecutor(max(len(nodes), 1)) as pool:  # each may wait for a transition
         closed = list(pool.map(lambda node: node.close(), nodes))
-    if not all(closed):
-        # A thread still compiles or loads, and nothing can interrupt it: to unload libraries under it would crash.
+    if all(closed):
+        for node in nodes:
+            node.destroy_node()
+    rclpy.try_shutdown()
+    if code or not all(closed):
+        # A node that could not be made is half there, and the interpreter would destroy it after its context.  A
+        # thread that still compiles or loads cannot be interrupted, and to unload libraries under it would crash.
         sys.stdout.flush()
         sys.stderr.flush()
-        rclpy.try_shutdown()
         os._exit(code)
-    for node in nodes:
-        node.destroy_node()
-    rclpy.try_shutdown()

@@ -215,7 +215,7 @@ def from_labels(
 def support_under(
     found: Segmentation, label: int, depth: np.ndarray, camera: Camera, options: SegmentationOptions | None = None
 ) -> np.ndarray | None:
-    """The plane (4,) that the surroundings of one object show below it; None where they show none.
+    """The plane (4,) that the surroundings of one object show below it; None where they show none but the known one.
 
     For objects that do not stand on the plane of the segmentation: a frame may show a table, a shelf and the floor.
     ``depth`` and ``camera`` are those of the segmentation.
@@ -224,7 +224,7 @@ def support_under(
     depth, valid = _checked(depth, camera, options.depth_range)
     if not camera.is_pinhole or not ((found.labels == label) & valid).any():
         return None
-    return support_plane.around(found.labels, (label,), depth, valid, camera)
+    return support_plane.around(found.labels, (label,), depth, valid, camera, found.plane)
 
 
 def warm_up() -> None:

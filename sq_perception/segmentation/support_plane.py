@@ -37,6 +37,8 @@ _PLANE_POINTS = 1500
 _REFINE_POINTS = 8000
 _HYPOTHESES = 200
 _PLANES = 3
+_APART = 2
+"""Pixels next to a body that are none of its surroundings, as they may show either."""
 COARSE_PIXELS = 120
 """Samples along the shorter side of the image that surfaces are searched on."""
 _ISLAND_SHARE = 0.25
@@ -82,9 +84,7 @@ def noise_growth(z: np.ndarray) -> np.ndarray:
 
 def planes(depth: np.ndarray, valid: np.ndarray, camera: Camera) -> list[Plane]:
     """Up to three planes, the one with most points first; each is taken away before the next is searched."""
-    pixels = np.flatnonzero(valid)
-    rows, columns = np.divmod(pixels[:: max(1, pixels.size // _REFINE_POINTS)], camera.width)
-    points = camera.unproject(columns, rows, depth[rows, columns])
+    points = _some_points(depth, valid, camera, _REFINE_POINTS)
     rng = np.random.default_rng(_SEED)
     total, found = len(points), []
     for _ in range(_PLANES):
@@ -123,9 +123,17 @@ def support(candidates: list[Plane], depth: np.ndarray, valid: np.ndarray, camer
 
 
 def around(
-    labels: np.ndarray, ids: tuple[int, ...], depth: np.ndarray, valid: np.ndarray, camera: Camera
+    labels: np.ndarray,
+    ids: tuple[int, ...],
+    depth: np.ndarray,
+    valid: np.ndarray,
+    camera: Camera,
+    known: np.ndarray | None = None,
 ) -> np.ndarray | None:
-    """The support plane (4,) from the unlabelled pixels near the bodies: below all of them, and touched."""
+    """The support plane (4,) from the unlabelled pixels near the bodies: below all of them, and touched.
+
+    None also where these pixels show no plane but a ``known`` one (4,).
+    """
     near = np.zeros(labels.shape, bool)
     bodies = []
     for label in ids:
@@ -137,10 +145,19 @@ def around(
         step = max(1, rows.size // 500)
         rows, columns = top + rows[::step], left + columns[::step]
         bodies.append(camera.unproject(columns, rows, depth[rows, columns]))
-    labelled = cv2.dilate((labels > 0).astype(np.uint8), np.ones((5, 5), np.uint8)) > 0
-    near &= valid & ~labelled
+    left, top, width, height = cv2.boundingRect(near.view(np.uint8))
+    left, top = max(left - _APART, 0), max(top - _APART, 0)
+    window = slice(top, top + height + 2 * _APART), slice(left, left + width + 2 * _APART)
+    labelled = cv2.dilate((labels[window] > 0).view(np.uint8), np.ones((2 * _APART + 1, 2 * _APART + 1), np.uint8)) > 0
+    depth, near = depth[window], near[window] & valid[window] & ~labelled
+    camera = camera.cropped(left, top, depth.shape[1], depth.shape[0])
     if np.count_nonzero(near) < 30:
         return None
+    if known is not None:
+        points = _some_points(depth, near, camera, _PLANE_POINTS)
+        off = np.abs(points @ known[:3] + known[3]) >= TOLERANCE * noise_growth(points[:, 2])
+        if np.count_nonzero(off) < _LEAST_SHARE * len(points):
+            return None
     best, best_vote = None, 0.0
     for plane in planes(depth, near, camera):
         contact = []
@@ -153,6 +170,13 @@ def around(
         if vote > best_vote:
             best, best_vote = plane.equation, vote
     return best
+
+
+def _some_points(depth: np.ndarray, wanted: np.ndarray, camera: Camera, count: int) -> np.ndarray:
+    """Points (k, 3) of the wanted pixels; about ``count``, evenly taken, where there are more."""
+    pixels = np.flatnonzero(wanted)
+    rows, columns = np.divmod(pixels[:: max(1, pixels.size // count)], camera.width)
+    return camera.unproject(columns, rows, depth[rows, columns])
 
 
 def _dominant_plane(points: np.ndarray, rng: np.random.Generator) -> tuple[np.ndarray | None, np.ndarray]:
