@@ -23,12 +23,8 @@ IoU is with the true convex hull, 0 where no body was found.  The difference to 
 
 from __future__ import annotations
 
-import argparse
-import os
-
-if __name__ == "__main__":  # as a script only: a process that imports this has threads already
-    for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
-        os.environ.setdefault(variable, "1")
+if __name__ == "__main__":
+    import one_thread  # noqa: F401
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
@@ -216,12 +212,11 @@ def table(result: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser = report.parser(__doc__, "ablation")
     parser.add_argument("--scenes", type=int, default=60, help="number of household scenes")
     parser.add_argument("--first", type=int, default=5000, help="seed of the first one")
     parser.add_argument("--frames", type=Path, help="recorded frames, as of known_frames")
     parser.add_argument("--hulls", type=Path, help="their true hulls")
-    parser.add_argument("--name", default="ablation", help="name of the result files")
     options = parser.parse_args()
     recoverer = Recoverer()
     sets = {"household": list(simulated(range(options.first, options.first + options.scenes), recoverer))}

@@ -1,6 +1,6 @@
 """The surface fit and the classic fit of the same object, and what each of them costs in milliseconds.
 
-The classic fit gets 1000 of the object's measured points, evenly in the order of the image, as its users would give it.
+The classic fit gets the object's measured points, of which it takes 1000, evenly in the order of the image.
 """
 
 from __future__ import annotations
@@ -13,8 +13,6 @@ import numpy as np
 from sq_perception.fitting import solina_bajcsy, surface_fit
 from sq_perception.fitting.fit import Fit, Status
 from sq_perception.imaging.camera import Camera
-
-CLASSIC_POINTS = 1000
 
 
 @dataclass(frozen=True)
@@ -39,10 +37,14 @@ def both(depth: np.ndarray, mask: np.ndarray, camera: Camera, options: surface_f
     """Fit one object of an image with both methods."""
     began = time.perf_counter()
     fit = surface_fit.fit(depth, mask, camera, options=options)
-    middle = time.perf_counter()
+    milliseconds = 1e3 * (time.perf_counter() - began)
+    points = measured_points(depth, mask, camera)
+    began = time.perf_counter()
+    classic = solina_bajcsy.fit(points)
+    return Both(fit, classic, milliseconds, 1e3 * (time.perf_counter() - began), points)
+
+
+def measured_points(depth: np.ndarray, mask: np.ndarray, camera: Camera) -> np.ndarray:
+    """What was measured within a mask: points (n, 3) of the optical frame, in the order of the image."""
     rows, columns = np.nonzero(mask & np.isfinite(depth))
-    points = camera.unproject(columns, rows, depth[rows, columns])
-    chosen = np.linspace(0, len(points) - 1, min(len(points), CLASSIC_POINTS)).astype(int)
-    classic = solina_bajcsy.fit(points[chosen])
-    ended = time.perf_counter()
-    return Both(fit, classic, 1e3 * (middle - began), 1e3 * (ended - middle), points)
+    return camera.unproject(columns, rows, depth[rows, columns])

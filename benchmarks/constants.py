@@ -23,12 +23,8 @@ numbers that are read when a module is loaded.  Results are written as they come
 
 from __future__ import annotations
 
-import argparse
-import os
-
-if __name__ == "__main__":  # as a script only: a process that imports this has threads already
-    for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
-        os.environ.setdefault(variable, "1")
+if __name__ == "__main__":
+    import one_thread  # noqa: F401
 
 import ast
 import dataclasses
@@ -412,10 +408,9 @@ def _is_idle(found: dict[str, Any]) -> bool:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser = report.parser(__doc__, "constants")
     parser.add_argument("--only", nargs="+", default=list(SETS), help="rooms, or modules as room.module")
     parser.add_argument("--kernels", action="store_true", help="those too that compiled code has frozen in (hours)")
-    parser.add_argument("--name", default="constants", help="name of the result files")
     options = parser.parse_args()
     torch.set_num_threads(1)
     scene_verdict.recoverer().warm_up(tables()[0].camera)

@@ -25,7 +25,6 @@ Goals for 640 x 480 on two cores: 15 ms with 1 body, 45 with 5, 140 with 20; 20 
 
 from __future__ import annotations
 
-import argparse
 import os
 import time
 from dataclasses import dataclass
@@ -36,18 +35,17 @@ import numba
 import numpy as np
 import report
 import torch
-from synthetic_tabletop import STAGES, SensedScene, scored
+from synthetic_tabletop import STAGES, SensedScene, scored, visible_shares
 
 from sq_perception.geometry import Superquadric
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.grasping.gripper import PANDA
 from sq_perception.grasping.planner import grasps
 from sq_perception.grasping.surroundings import Surroundings
-from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
 from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, RecoveryOptions
 from sq_perception.simulation import sensor_noise
-from sq_perception.simulation.scenes import Scene
+from sq_perception.simulation.scenes import Scene, inside_image
 
 SEED = 8100
 GOALS = {1: 15.0, 5: 45.0, 20: 140.0}
@@ -132,7 +130,7 @@ def bodies_on_a_table(count: int, number: int) -> tuple[Superquadric, np.ndarray
         circle = np.append(place, np.hypot(size[0], size[1]))
         apart = all(np.hypot(*(circle - other)[:2]) > circle[2] + other[2] + GAP for other in circles)
         body = Superquadric(size, shape, centre, turn)
-        if apart and _inside(body, lowest):
+        if apart and inside_image(body, lowest, _BORDER):
             bodies.append(body)
             circles.append(circle)
         if len(bodies) == count:
@@ -145,8 +143,7 @@ def frame(count: int, number: int, seen_by: Camera, sensor: str) -> SensedScene:
     bodies, plane = bodies_on_a_table(count, number)
     scene = Scene(bodies, seen_by, plane)
     depth, labels = scene.render()
-    alone = np.array([np.count_nonzero(raycast.render(body, seen_by)[1] >= 0) for body in bodies])
-    visible = np.bincount(labels.ravel(), minlength=count + 1)[1:] / np.maximum(alone, 1)
+    visible = visible_shares(scene, labels)
     depth = sensor_noise.preset(sensor).measured(depth, seen_by, np.random.default_rng([SEED, count, number, 1]))
     return SensedScene(scene, depth, np.where(np.isfinite(depth), labels, 0), visible)
 
@@ -192,14 +189,6 @@ def planned(recovered: FrameRecovery, seen: SensedScene) -> tuple[float, float]:
     return 1e3 * (between - started), 1e3 * (time.perf_counter() - between)
 
 
-def _inside(body: Superquadric, seen_by: Camera) -> bool:
-    low, high = body.bounding_box()
-    corners = np.stack(np.meshgrid(*np.stack([low, high], axis=-1), indexing="ij"), axis=-1).reshape(-1, 3)
-    pixels = seen_by.project(corners)
-    limit = np.array([seen_by.width, seen_by.height]) - 1 - _BORDER
-    return bool((pixels >= _BORDER).all() and (pixels <= limit).all())
-
-
 HEADER = [
     "sensor",
     "image",
@@ -237,10 +226,9 @@ def line(sensor: str, image: tuple[int, int], count: int, setting: str, row: dic
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser = report.parser(__doc__, "frame_time")
     parser.add_argument("--scenes", type=int, default=3)
     parser.add_argument("--repeats", type=int, default=5, help="of each scene")
-    parser.add_argument("--name", default="frame_time", help="name of the result files")
     options = parser.parse_args()
     facts: dict[str, Any] = {
         "options": vars(options),

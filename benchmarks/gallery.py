@@ -14,13 +14,10 @@ the sum of all IoU is largest.
 
 from __future__ import annotations
 
-import argparse
-import os
 import textwrap
 
-if __name__ == "__main__":  # as a script only: a process that imports this has threads already
-    for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
-        os.environ.setdefault(variable, "1")
+if __name__ == "__main__":
+    import one_thread  # noqa: F401
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -330,7 +327,7 @@ deviation; IoU is with the true convex hull.
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser = report.parser(__doc__)
     parser.add_argument("--only", nargs="+", choices=list(ENTRIES), help="draw these pictures, leave the page as it is")
     parser.add_argument("--docs", type=Path, default=Path(__file__).resolve().parents[1] / "docs")
     options = parser.parse_args()

@@ -18,7 +18,6 @@ from mesh_things import MeshThing
 
 from sq_perception.imaging.camera import Camera
 from sq_perception.simulation import sensor_noise
-from sq_perception.simulation.mesh_rendering import Mesh, render_mesh
 from sq_perception.simulation.scenes import plane_depth
 
 _CONTACT = 3e-4
@@ -81,11 +80,9 @@ def viewed(
     table = np.array([[1.0, 0, 0], [0, -np.sin(angle), -np.cos(angle)], [0, np.cos(angle), -np.sin(angle)]])
     origin = np.array([0.0, 0.0, distance])
     plane = np.append(table[:, 2], -table[:, 2] @ origin)
-    depth = plane_depth(plane, camera)
-    labels = np.zeros(depth.shape, np.int32)
-    poses, alone = [], []
+    poses: list[tuple[np.ndarray, np.ndarray]] = []
     outlines: list[np.ndarray] = []
-    for k, each in enumerate(things):
+    for each in things:
         c, s = np.cos(np.deg2rad(each.heading)), np.sin(np.deg2rad(each.heading))
         turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]]) @ each.turn
         corners = each.thing.hull @ turn.T
@@ -94,13 +91,11 @@ def viewed(
         outlines.append(tabletop.outline(corners + place))
         if any(tabletop.gap(outlines[-1], other) < -_CONTACT for other in outlines[:-1]):
             raise ValueError(f"{each.name}: stands where another thing is")
-        rotation, translation = table @ turn, table @ place + origin
-        vertices = each.thing.mesh.vertices @ rotation.T + translation
-        own = render_mesh(Mesh(vertices, np.asarray(each.thing.mesh.faces)), camera)
-        nearer = own < depth
-        depth, labels = np.where(nearer, own, depth), np.where(nearer, np.int32(k + 1), labels)
-        poses.append((rotation, translation))
-        alone.append(np.isfinite(own).sum())
+        poses.append((table @ turn, table @ place + origin))
+    depth, labels, alone = mesh_scene.render_meshes(
+        [each.thing.mesh for each in things], [turn for turn, _ in poses], [place for _, place in poses],
+        plane_depth(plane, camera),
+    )  # fmt: skip
     visible = np.bincount(labels.ravel(), minlength=len(things) + 1)[1:] / np.maximum(alone, 1)
     measured = sensor_noise.preset(sensor).measured(depth, camera, np.random.default_rng(seed))
     return ComposedView(camera, sensor, measured, labels, plane, tuple(things), tuple(poses), visible)

@@ -10,7 +10,6 @@ After every hundred a good frame follows, whose bodies are compared with those o
 
 from __future__ import annotations
 
-import argparse
 import os
 import re
 import sys
@@ -123,11 +122,10 @@ class Benchmark:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser = report.parser(__doc__, "hostile")
     parser.add_argument("--messages", type=int, default=20_000)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--node", choices=("recover_node", "fitter_node"), default="recover_node")
-    parser.add_argument("--name", default="hostile", help="of the results' files")
     options = parser.parse_args()
     with Peer("hostile") as peer, Children(environment()) as children:
         benchmark = Benchmark(options.node, peer, children)

@@ -15,11 +15,8 @@ the half sizes of each kind within two reported deviations.
 
 from __future__ import annotations
 
-import os
-
-if __name__ == "__main__":  # as a script only: a process that imports this has threads already
-    for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
-        os.environ.setdefault(variable, "1")
+if __name__ == "__main__":
+    import one_thread  # noqa: F401
 
 from functools import partial
 

@@ -12,7 +12,6 @@ of one of this package's nodes, not by the viewer's, and not before they are ten
 
 from __future__ import annotations
 
-import argparse
 import os
 import shlex
 import sys
@@ -41,14 +40,13 @@ _CALM = (0.5, 2.0)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser = report.parser(__doc__, "kills")
     parser.add_argument("--kills", type=int, default=50)
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--rate", type=float, default=30.0)
     parser.add_argument("--objects", type=int, default=1)
     parser.add_argument("--node", choices=("recover_node", "fitter_node"), default="recover_node")
     parser.add_argument("--viewer", default="", help="command that prints a line for each result; a plain subscriber")
-    parser.add_argument("--name", default="kills", help="of the results' files")
     options = parser.parse_args()
     rng = np.random.default_rng(options.seed)
     # An equal share of each, in a random order.

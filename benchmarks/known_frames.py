@@ -25,12 +25,8 @@ The FILE of another METHOD is a JSON list of objects with ``frame`` (the NPZ's s
 
 from __future__ import annotations
 
-import argparse
-import os
-
-if __name__ == "__main__":  # as a script only: a process that imports this has threads already
-    for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
-        os.environ.setdefault(variable, "1")
+if __name__ == "__main__":
+    import one_thread  # noqa: F401
 
 import json
 from dataclasses import dataclass
@@ -41,6 +37,7 @@ from typing import Any
 import numpy as np
 import report
 import trimesh
+from both_fits import measured_points
 from hull_oracle import Columns
 from scene_verdict import _oriented_box
 
@@ -116,8 +113,7 @@ def answers(name: str, frame: Any, hulls: Path, recoverer: Recoverer, others: Ot
             found.append(answer(frame, number, hulls, title, body, sigma, share))
     found += _own(frame, hulls, recoverer.recover(depth, camera))
     for number, label in enumerate(frame["ids"]):
-        rows, cols = np.nonzero((labels == label) & np.isfinite(depth) & (depth > 0))
-        points = camera.unproject(cols, rows, depth[rows, cols])
+        points = measured_points(depth, (labels == label) & (depth > 0), camera)
         found.append(answer(frame, number, hulls, METHODS[4], _oriented_box(points), np.full(3, np.nan), np.nan))
         for title, bodies in others.items():
             given = bodies.get((name, int(label)))
@@ -172,11 +168,10 @@ def summary(group: list[Answer]) -> dict[str, Any]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser = report.parser(__doc__, "known_frames")
     parser.add_argument("frames", type=Path, help="folder of NPZ files")
     parser.add_argument("hulls", type=Path, help="folder of <mesh>.hull.ply")
     parser.add_argument("--bodies", type=_bodies_of, action="append", default=[], help="METHOD=FILE of another program")
-    parser.add_argument("--name", default="known_frames", help="name of the result files")
     options = parser.parse_args()
     paths = sorted(options.frames.glob("*.npz"))
     if not paths:

@@ -11,13 +11,10 @@ axes are listed as they were in the training.
 
 from __future__ import annotations
 
-import argparse
-import os
 from pathlib import Path
 
-if __name__ == "__main__":  # as a script only: a process that imports this has threads already
-    for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
-        os.environ.setdefault(variable, "1")
+if __name__ == "__main__":
+    import one_thread  # noqa: F401
 
 import report
 import torch
@@ -36,7 +33,7 @@ THESIS = {
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser = report.parser(__doc__)
     parser.add_argument("runs", type=Path, nargs="*", default=sorted(path.parent for path in _found()))
     parser.add_argument("--bodies", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=2020)

@@ -11,12 +11,10 @@ something on an idle machine alone; that of processor time holds on a busy one.
 
 from __future__ import annotations
 
-import argparse
 import os
 
-if __name__ == "__main__":  # as a script only: a process that imports this has threads already
-    for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
-        os.environ.setdefault(variable, "1")
+if __name__ == "__main__":
+    import one_thread  # noqa: F401
 
 import multiprocessing
 import time
@@ -66,10 +64,9 @@ def _figures(frames: int, seconds: float, all_frames: int, processor: float) -> 
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser = report.parser(__doc__, "many_frames")
     parser.add_argument("--frames", type=int, default=1000)
     parser.add_argument("--jobs", type=int, default=2)
-    parser.add_argument("--name", default="many_frames", help="name of the result files")
     options = parser.parse_args()
     torch.set_num_threads(1)
     camera = frame_time.camera(*frame_time.IMAGES[0])

@@ -5,7 +5,7 @@ Metres; optical frame; p_camera = rotation p_mesh + translation.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -100,6 +100,22 @@ def view(mesh: trimesh.Trimesh, pose: Poser, rng: np.random.Generator) -> MeshVi
     if plane is not None:
         depth = np.where(mask, depth, plane_depth(plane, CAMERA))
     return MeshView(measured(depth, rng), mask, CAMERA, plane, turn, translation)
+
+
+def render_meshes(
+    meshes: Sequence[trimesh.Trimesh], turns: Sequence[np.ndarray], places: Sequence[np.ndarray], behind: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Depth and labels (height, width) of meshes in given poses before a background, and their pixels (n,) if alone.
+
+    Labels count from 1; 0 is the background.
+    """
+    depth, labels, alone = behind, np.zeros(behind.shape, np.int32), []
+    for k, (mesh, turn, place) in enumerate(zip(meshes, turns, places, strict=True)):
+        own = render_mesh(Mesh(mesh.vertices @ turn.T + place, np.asarray(mesh.faces)), CAMERA)
+        nearer = own < depth
+        depth, labels = np.where(nearer, own, depth), np.where(nearer, np.int32(k + 1), labels)
+        alone.append(np.count_nonzero(np.isfinite(own)))
+    return depth, labels, np.array(alone, dtype=int)
 
 
 def measured(depth: np.ndarray, rng: np.random.Generator) -> np.ndarray:

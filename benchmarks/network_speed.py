@@ -161,7 +161,7 @@ def tables(result: dict[str, Any]) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser = report.parser(__doc__)
     parser.add_argument("--rounds", type=int, default=200, help="calls of each engine for one view")
     parser.add_argument("--images", type=int, default=100, help="recovered by each method")
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])

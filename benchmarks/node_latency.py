@@ -13,7 +13,6 @@ shows whether a queue grows; the counters of /diagnostics show whether every fra
 
 from __future__ import annotations
 
-import argparse
 import os
 import signal
 import subprocess
@@ -143,7 +142,7 @@ def measure(camera: list[str], recovery: list[str], rate: float, seconds: float)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser = report.parser(__doc__)
     parser.add_argument("--seconds", type=float, default=60.0)
     parser.add_argument("--rate", type=float, default=30.0)
     options = parser.parse_args()

@@ -11,13 +11,10 @@ it), image by image, with twice its standard error.
 
 from __future__ import annotations
 
-import argparse
-import os
 from pathlib import Path
 
-if __name__ == "__main__":  # as a script only: a process that imports this has threads already
-    for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
-        os.environ.setdefault(variable, "1")
+if __name__ == "__main__":
+    import one_thread  # noqa: F401
 
 from typing import Any
 
@@ -70,7 +67,7 @@ def cell(figures: dict[str, np.ndarray]) -> str:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser = report.parser(__doc__)
     parser.add_argument("--bodies", type=int, default=500)
     shipped = list(checkpoint.shipped_regressors().values())
     parser.add_argument("--models", type=Path, nargs="*", default=shipped, help="default: all shipped weights")

@@ -47,15 +47,12 @@ Published for orientation only, other things and another simulator: GIGA (HR) 87
 
 from __future__ import annotations
 
-import argparse
-import os
 import shlex
 import subprocess
 import tempfile
 
-if __name__ == "__main__":  # as a script only: a process that imports this has threads already
-    for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
-        os.environ.setdefault(variable, "1")
+if __name__ == "__main__":
+    import one_thread  # noqa: F401
 
 import json
 import time
@@ -70,6 +67,7 @@ import numpy as np
 import picking_scenes
 import report
 import trimesh
+from both_fits import measured_points
 from picking_scenes import EYE, GRIPPER, KINDS, LOOK, TABLE_CAMERA, THINGS, Scene
 from picking_world import Pick, Thing, World
 
@@ -137,8 +135,7 @@ class Seen:
 
     def points(self, label: int) -> np.ndarray:
         """Measured points (n, 3) of one mask."""
-        rows, columns = np.nonzero((self.recovery.labels == label) & np.isfinite(self.depth))
-        return TABLE_CAMERA.unproject(columns, rows, self.depth[rows, columns].astype(float))
+        return measured_points(self.depth.astype(float), self.recovery.labels == label, TABLE_CAMERA)
 
     def planned(self, bodies: list[Superquadric], covariance: np.ndarray | None = None) -> tuple[Grasp, ...]:
         around = Surroundings.of_image(self.depth, TABLE_CAMERA, self.recovery.plane)
@@ -466,7 +463,7 @@ def _with_earlier(results: str, part: str, found: dict[str, Any]) -> dict[str, A
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = report.parser(__doc__)
     parser.add_argument("--scenes", type=int, default=20, help="of each kind")
     parser.add_argument("--kinds", default=",".join(KINDS))
     parser.add_argument("--contestants", default=",".join(CONTESTANTS))

@@ -10,7 +10,6 @@ saw, the body that was planned on, and the gripper where it was sent.  Scenes ar
 
 from __future__ import annotations
 
-import argparse
 import json
 from dataclasses import replace
 from itertools import islice
@@ -20,6 +19,7 @@ from typing import Any
 import numpy as np
 import picking
 import picking_scenes
+import report
 from picking_scenes import EYE, GRIPPER, KINDS, LOOK, TABLE_CAMERA
 from picking_world import STEP, World
 from PIL import Image
@@ -141,7 +141,7 @@ def _picture(world: World) -> np.ndarray:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = report.parser(__doc__)
     parser.add_argument("--scenes", type=Path, metavar="PNG")
     parser.add_argument("--film", type=Path, metavar="GIF")
     parser.add_argument("--failures", type=Path, metavar="PNG")

@@ -19,12 +19,8 @@ Millimetres; times are of one pinned thread, milliseconds.
 
 from __future__ import annotations
 
-import argparse
-import os
-
-if __name__ == "__main__":  # as a script only: a process that imports this has threads already
-    for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
-        os.environ.setdefault(variable, "1")
+if __name__ == "__main__":
+    import one_thread  # noqa: F401
 
 import sys
 from dataclasses import dataclass
@@ -289,16 +285,14 @@ def renders(folder: Path) -> tuple[dict[str, Any], str]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser = report.parser(__doc__, "real_frames")
     parser.add_argument("--frames", type=int, default=45, help="frames of every category of the table, at most")
-    parser.add_argument("--name", default="real_frames", help="name of the result files")
     options = parser.parse_args()
     folders = [report.shared_data(name) for name in ("frames", "mosd_learn", "author_renders")]
     if None in folders:
         sys.exit(0)
     frames, mosd, author = (folder for folder in folders if folder is not None)
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    report.pin()
     surface_fit.warm_up()
     parts = {"carton": carton(frames), "table": table(mosd, options.frames), "renders": renders(author)}
     report.write(

@@ -17,11 +17,9 @@ Millimetres; times are of one thread each, milliseconds.
 from __future__ import annotations
 
 import argparse
-import os
 
-if __name__ == "__main__":  # as a script only: a process that imports this has threads already
-    for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
-        os.environ.setdefault(variable, "1")
+if __name__ == "__main__":
+    import one_thread  # noqa: F401
 
 import json
 import multiprocessing
@@ -93,13 +91,12 @@ def main() -> None:
 
 def arguments(text: str | None, name: str) -> argparse.ArgumentParser:
     """Options of a benchmark of scenes that describes itself so."""
-    parser = argparse.ArgumentParser(description=(text or "").split("\n\n")[0])
+    parser = report.parser(text, name)
     parser.add_argument("--scenes", type=int, default=1000, help="number of scenes")
     parser.add_argument("--first", type=int, default=0, help="seed of the first scene")
     parser.add_argument("--sensor", choices=list(tabletop.SENSORS), help="one for all scenes; they alternate otherwise")
     parser.add_argument("--jobs", type=int, default=1, help="processes, each of one thread")
     parser.add_argument("--each", type=Path, help="write every thing's figures and bodies to this file, JSON")
-    parser.add_argument("--name", default=name, help="name of the result files")
     return parser
 
 
@@ -124,8 +121,7 @@ def verdicts_of(evaluate: Callable[[int], SceneVerdict], seeds: range, jobs: int
     """The verdicts of scenes in their order, with a line for each."""
     began = time.perf_counter()
     if jobs == 1:
-        if hasattr(os, "sched_setaffinity"):
-            os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+        report.pin()
         warm_up()
         yield from map(partial(_reported, began=began), map(evaluate, seeds))
         return

@@ -1,7 +1,8 @@
-"""What every benchmark shares: metadata, spread, recorded data, and files of JSON and Markdown beside each other."""
+"""What every benchmark shares: options, metadata, spread, recorded data, and files of JSON and Markdown."""
 
 from __future__ import annotations
 
+import argparse
 import json
 import os
 import sys
@@ -13,6 +14,20 @@ import numpy as np
 from sq_perception.files import provenance
 
 RESULTS = Path(__file__).resolve().parent / "results"
+
+
+def parser(documentation: str | None, name: str = "") -> argparse.ArgumentParser:
+    """The parser of a benchmark that its docstring describes; ``--name`` where its results have a name."""
+    made = argparse.ArgumentParser(description=(documentation or "").split("\n\n")[0])
+    if name:
+        made.add_argument("--name", default=name, help="of the files of results (%(default)s)")
+    return made
+
+
+def pin() -> None:
+    """Keep this process on one processor, where the system can."""
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
 
 
 def shared_data(folder: str) -> Path | None:

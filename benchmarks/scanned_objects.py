@@ -17,12 +17,8 @@ axis.  Times are of one pinned thread, milliseconds.
 
 from __future__ import annotations
 
-import argparse
-import os
-
-if __name__ == "__main__":  # as a script only: a process that imports this has threads already
-    for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
-        os.environ.setdefault(variable, "1")
+if __name__ == "__main__":
+    import one_thread  # noqa: F401
 
 import sys
 from collections.abc import Callable
@@ -210,16 +206,14 @@ def worst_line(setting: str, each: FittedScan, best: dict[str, float]) -> list[s
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser = report.parser(__doc__, "scanned_objects")
     parser.add_argument("--poses", type=int, default=20, help="images of every object in either setting")
     parser.add_argument("--objects", default="", help="parts of names of objects, separated by semicolons")
-    parser.add_argument("--name", default="scanned_objects", help="name of the result files")
     options = parser.parse_args()
     data = report.shared_data("ycb_meshes")
     if data is None:
         sys.exit(0)
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    report.pin()
     surface_fit.warm_up()
     objects = scans(data, options.objects)
     bodies = {scan.name: oracle(scan.hull) for scan in objects}

@@ -4,7 +4,7 @@
 | --- | --- | --- |
 | given | true | `Recoverer().recover(depth, camera, labels)` |
 | own | its own | `Recoverer().recover(depth, camera)`; the body of the mask that agrees, or none |
-| classic | true, eroded | Solina and Bajcsy's fit of 1000 of the measured points |
+| classic | true, eroded | Solina and Bajcsy's fit of the measured points |
 | oriented box | true, eroded | the smallest box around the measured points |
 | standing box | true, eroded | from the true table to the highest of them, over the smallest rectangle around all |
 
@@ -29,7 +29,7 @@ import cv2
 import numpy as np
 import tabletop
 import trimesh
-from both_fits import CLASSIC_POINTS
+from both_fits import measured_points
 from real_frames import below_table
 from tabletop import Placed, Tabletop
 
@@ -245,8 +245,7 @@ def matches(own: np.ndarray, true: np.ndarray) -> dict[int, int]:
 def _inner_points(label: int, scene: Tabletop) -> np.ndarray:
     """Measured points (n, 3) of a thing away from the edge of its mask."""
     mask = cv2.erode((scene.labels == label).astype(np.uint8), np.ones((2 * EROSION + 1,) * 2, np.uint8)) > 0
-    rows, columns = np.nonzero(mask & np.isfinite(scene.depth))
-    return scene.camera.unproject(columns, rows, scene.depth[rows, columns])
+    return measured_points(scene.depth, mask, scene.camera)
 
 
 def _simple(points: np.ndarray, placed: Placed, scene: Tabletop) -> dict[str, Answer]:
@@ -254,8 +253,7 @@ def _simple(points: np.ndarray, placed: Placed, scene: Tabletop) -> dict[str, An
     names = ("classic", "oriented box", "standing box")
     if len(points) < FEWEST_POINTS:
         return {name: Answer(status="failed", message="too few points") for name in names}
-    chosen = np.linspace(0, len(points) - 1, min(len(points), CLASSIC_POINTS)).astype(int)
-    classic = solina_bajcsy.fit(points[chosen])
+    classic = solina_bajcsy.fit(points)
     bodies = classic.superquadric, _oriented_box(points), _standing_box(points, scene)
     answers = {name: _answer(body, placed, scene) for name, body in zip(names, bodies, strict=True)}
     if classic.status == Status.FAILED:
@@ -285,9 +283,7 @@ def _box(edges: np.ndarray, centre: np.ndarray, turn: np.ndarray) -> Superquadri
 
 
 def _distances(frame: FrameRecovery, scene: Tabletop) -> np.ndarray:
-    rows, columns = np.nonzero((scene.labels > 0) & np.isfinite(scene.depth))
-    rows, columns = rows[::SAMPLED], columns[::SAMPLED]
-    points = scene.camera.unproject(columns, rows, scene.depth[rows, columns])
+    points = measured_points(scene.depth, scene.labels > 0, scene.camera)[::SAMPLED]
     nearest = np.full(len(points), np.inf)
     for body in frame.recovered:
         nearest = np.minimum(nearest, np.abs(body.superquadric.sampson_distance(points)))

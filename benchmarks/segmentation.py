@@ -20,12 +20,8 @@ one pinned thread.
 
 from __future__ import annotations
 
-import argparse
-import os
-
-if __name__ == "__main__":  # as a script only: a process that imports this has threads already
-    for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
-        os.environ.setdefault(variable, "1")
+if __name__ == "__main__":
+    import one_thread  # noqa: F401
 
 import sys
 import time
@@ -216,16 +212,14 @@ def summary(known: list[Instances], scores: list[Score]) -> tuple[dict[str, Any]
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser = report.parser(__doc__, "segmentation")
     parser.add_argument("--frames", type=int, default=1000, help="frames of each folder, at most")
     parser.add_argument("--repeats", type=int, default=5, help="the time is the shortest of so many")
-    parser.add_argument("--name", default="segmentation", help="name of the result files")
     options = parser.parse_args()
     folders = [folder for folder in map(report.shared_data, ("mosd_learn", "frames")) if folder is not None]
     if not folders:
         sys.exit(0)
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    report.pin()
     cv2.setNumThreads(1)
     known = frames(folders, options.frames)
     result, text = summary(known, [scored(each, options.repeats) for each in known])

@@ -5,10 +5,10 @@ python benchmarks/sensor_pictures.py docs/sensors.png
 
 from __future__ import annotations
 
-import argparse
 from pathlib import Path
 
 import numpy as np
+import report
 from matplotlib import colormaps
 from PIL import Image
 
@@ -24,7 +24,7 @@ SCALE = 6.0
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser = report.parser(__doc__)
     parser.add_argument("output", type=Path)
     output = parser.parse_args().output
     scene = table_scene(np.random.default_rng(SEED), BODIES)

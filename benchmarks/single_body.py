@@ -13,14 +13,9 @@ true half sizes within two reported standard deviations, each estimated axis com
 
 from __future__ import annotations
 
-import argparse
-import os
+if __name__ == "__main__":
+    import one_thread  # noqa: F401
 
-if __name__ == "__main__":  # as a script only: a process that imports this has threads already
-    for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
-        os.environ.setdefault(variable, "1")
-
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -28,10 +23,11 @@ from typing import Any
 import cv2
 import numpy as np
 import report
+from both_fits import Both, both
 from scipy.optimize import linear_sum_assignment
 
-from sq_perception.fitting import solina_bajcsy, surface_fit
-from sq_perception.fitting.fit import Fit, Status
+from sq_perception.fitting import surface_fit
+from sq_perception.fitting.fit import Status
 from sq_perception.geometry import Superquadric, metrics, rotation
 from sq_perception.imaging import raycast, unit_cube
 from sq_perception.imaging.camera import Camera
@@ -200,34 +196,26 @@ def run(name: str, row: Row, count: int) -> dict[str, Any]:
     """Fit every image of a row with both methods."""
     rng = np.random.default_rng(SEED + list(ROWS).index(name))
     truth = row.bodies(count, rng)
-    options = surface_fit.FitOptions() if row.pixels is None else surface_fit.FitOptions(pixels=row.pixels)
-    fits: list[Fit] = []
-    classic: list[Fit] = []
-    milliseconds = np.empty((count, 2))
-    for k, body in enumerate(truth):
+    options = surface_fit.FitOptions(pixels=row.pixels)
+    done: list[Both] = []
+    for body in truth:
         image = row.image(body) if row.image else sensor(body, rng)
         if row.damage:
             image = row.damage(image, rng)
-        began = time.perf_counter()
-        fits.append(surface_fit.fit(image.depth, image.mask, image.camera, options=options))
-        middle = time.perf_counter()
-        rows, columns = np.nonzero(image.mask & np.isfinite(image.depth))
-        chosen = np.linspace(0, len(rows) - 1, min(len(rows), 1000)).astype(int)
-        points = image.camera.unproject(columns[chosen], rows[chosen], image.depth[rows[chosen], columns[chosen]])
-        classic.append(solina_bajcsy.fit(points))
-        milliseconds[k] = 1e3 * (middle - began), 1e3 * (time.perf_counter() - middle)
+        done.append(both(image.depth, image.mask, image.camera, options))
+    fits = [each.fit for each in done]
     found = Superquadric.stack([fit.superquadric for fit in fits])
     iou = 100 * metrics.volume_iou(found, truth)
-    iou_classic = 100 * metrics.volume_iou(Superquadric.stack([fit.superquadric for fit in classic]), truth)
+    iou_classic = 100 * metrics.volume_iou(Superquadric.stack([each.classic.superquadric for each in done]), truth)
     errors = np.array([size_errors(f, t) for f, t in zip(found, truth, strict=True)])
     sigma = np.array([fit.sigma_size for fit in fits])
     covered = np.abs(errors) <= 2 * sigma
     poor = iou < 95
     return {
         "iou": report.spread(iou),
-        "milliseconds": report.spread(milliseconds[:, 0]),
+        "milliseconds": report.spread(np.array([each.milliseconds for each in done])),
         "classic_iou": report.spread(iou_classic),
-        "classic_milliseconds": report.spread(milliseconds[:, 1]),
+        "classic_milliseconds": report.spread(np.array([each.classic_milliseconds for each in done])),
         "within_2_sigma": float(covered.mean() * 100),
         "within_2_sigma_where_iou_below_95": float(covered[poor].all(axis=1).mean() * 100) if poor.any() else None,
         "below_95": float(poor.mean() * 100),
@@ -238,14 +226,12 @@ def run(name: str, row: Row, count: int) -> dict[str, Any]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser = report.parser(__doc__, "single_body")
     parser.add_argument("--bodies", type=int, default=2000)
     parser.add_argument("--rows", default="", help="names of rows, separated by semicolons; all by default")
-    parser.add_argument("--name", default="single_body", help="name of the result files")
     parser.add_argument("--update", action="store_true", help="keep the other rows of the files, with their commits")
     options = parser.parse_args()
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    report.pin()
     surface_fit.warm_up()
     names = [name.strip() for name in options.rows.split(";")] if options.rows else list(ROWS)
     result = report.previous(options.name, "rows") if options.update else {}

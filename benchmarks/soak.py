@@ -15,7 +15,6 @@ first minute.
 
 from __future__ import annotations
 
-import argparse
 import os
 import sys
 import tempfile
@@ -287,14 +286,13 @@ def verdicts(alone: dict[str, Any], asked: dict[str, Any], offered: dict[str, An
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser = report.parser(__doc__, "soak")
     parser.add_argument("--minutes", type=float, default=30.0)
     parser.add_argument("--rate", type=float, default=30.0)
     parser.add_argument("--objects", type=int, default=5)
     parser.add_argument("--offered", type=float, default=90.0, help="Hz of the last phase; 0 leaves it out")
     parser.add_argument("--node", choices=("recover_node", "fitter_node"), default="recover_node")
     parser.add_argument("--size", default="", metavar="WxH", help="of the image; 640x480 if not given")
-    parser.add_argument("--name", default="soak", help="of the results' files")
     options = parser.parse_args()
     with (
         Peer("soak") as peer,

@@ -21,12 +21,8 @@ faster; ``--record`` replaces them and keeps what they replace.  Under two minut
 
 from __future__ import annotations
 
-import argparse
-import os
-
-if __name__ == "__main__":  # as a script only: a process that imports this has threads already
-    for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
-        os.environ.setdefault(variable, "1")
+if __name__ == "__main__":
+    import one_thread  # noqa: F401
 
 import cProfile
 import pstats
@@ -179,7 +175,7 @@ def line(name: str, row: dict[str, Any], before: dict[str, Any]) -> list[str]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser = report.parser(__doc__)
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--record", action="store_true", help="keep the figures")
     options = parser.parse_args()

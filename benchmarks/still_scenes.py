@@ -15,12 +15,8 @@ what slows the machine slows both.
 
 from __future__ import annotations
 
-import argparse
-import os
-
-if __name__ == "__main__":  # as a script only: a process that imports this has threads already
-    for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
-        os.environ.setdefault(variable, "1")
+if __name__ == "__main__":
+    import one_thread  # noqa: F401
 
 import time
 from typing import Any
@@ -89,11 +85,10 @@ def line(count: int, row: dict[str, Any]) -> list[str]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser = report.parser(__doc__, "still_scenes")
     parser.add_argument("--scenes", type=int, default=4)
     parser.add_argument("--frames", type=int, default=16, help="of each scene")
     parser.add_argument("--sensor", choices=list(tabletop.SENSORS), default="stereo")
-    parser.add_argument("--name", default="still_scenes", help="name of the result files")
     options = parser.parse_args()
     torch.set_num_threads(1)
     recoverer = Recoverer(threads=1)

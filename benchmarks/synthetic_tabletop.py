@@ -19,12 +19,8 @@ medians of one pinned thread.
 
 from __future__ import annotations
 
-import argparse
-import os
-
-if __name__ == "__main__":  # as a script only: a process that imports this has threads already
-    for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
-        os.environ.setdefault(variable, "1")
+if __name__ == "__main__":
+    import one_thread  # noqa: F401
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -91,14 +87,19 @@ def frame(number: int, sensor: str) -> SensedScene:
     rng = np.random.default_rng([SEED, number])
     scene = crowded_scene(rng, int(rng.integers(BODIES[0], BODIES[1] + 1)))
     depth, labels = scene.render()
-    whole = [np.count_nonzero(raycast.render(body, scene.camera)[1] >= 0) for body in scene.bodies]
-    seen = np.bincount(labels.ravel(), minlength=len(whole) + 1)[1:]
+    visible = visible_shares(scene, labels)
     if sensor == PLAIN:
         depth = np.round(1e3 * (depth + 1.5e-3 * depth**2 * rng.standard_normal(depth.shape))) / 1e3
     else:
         depth = sensor_noise.preset(sensor).measured(depth, scene.camera, rng)
     depth = depth.astype(np.float32)
-    return SensedScene(scene, depth, np.where(np.isfinite(depth), labels, 0), seen / np.maximum(whole, 1))
+    return SensedScene(scene, depth, np.where(np.isfinite(depth), labels, 0), visible)
+
+
+def visible_shares(scene: Scene, labels: np.ndarray) -> np.ndarray:
+    """Share (n,) of each body's silhouette that nothing hides, by the labels (height, width) of the scene."""
+    whole = [np.count_nonzero(raycast.render(body, scene.camera)[1] >= 0) for body in scene.bodies]
+    return np.bincount(labels.ravel(), minlength=len(whole) + 1)[1:] / np.maximum(whole, 1)
 
 
 def scored(seen: SensedScene, found: FrameRecovery) -> FrameScore:
@@ -177,12 +178,11 @@ HEADER = [
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser = report.parser(__doc__, "synthetic_tabletop")
     parser.add_argument("--scenes", type=int, default=60)
     parser.add_argument("--first", type=int, default=0, help="number of the first scene")
     parser.add_argument("--sensors", nargs="*", default=["realsense_d435", PLAIN])
     parser.add_argument("--settings", nargs="*", default=list(SETTINGS), choices=list(SETTINGS))
-    parser.add_argument("--name", default="synthetic_tabletop", help="name of the result files")
     options = parser.parse_args()
     torch.set_num_threads(1)
     recoverer = Recoverer()

@@ -26,7 +26,6 @@ from scipy.spatial import ConvexHull
 
 from sq_perception.imaging.camera import Camera
 from sq_perception.simulation import sensor_noise
-from sq_perception.simulation.mesh_rendering import Mesh, render_mesh
 from sq_perception.simulation.scenes import plane_depth
 
 SENSORS = {"stereo": "realsense_d435", "structured light": "kinect_v1"}
@@ -248,18 +247,15 @@ def _seen(
     rng: np.random.Generator,
 ) -> Tabletop:
     camera = mesh_scene.CAMERA
-    depth = _background(stand, camera)
-    labels = np.zeros(depth.shape, np.int32)
-    alone, placed = [], []
     turns = [stand.table @ pose[:3, :3] for _, pose in poses]
     places = [stand.table @ pose[:3, 3] + stand.origin for _, pose in poses]
-    for k, (thing, turn, place) in enumerate(zip(things, turns, places, strict=True)):
-        own = render_mesh(Mesh(thing.mesh.vertices @ turn.T + place, np.asarray(thing.mesh.faces)), camera)
-        alone.append(int(np.isfinite(own).sum()))
-        nearer = own < depth
-        depth, labels = np.where(nearer, own, depth), np.where(nearer, np.int32(k + 1), labels)
-    for k, (thing, (rest, _), turn, place) in enumerate(zip(things, poses, turns, places, strict=True)):
-        placed.append(Placed(thing, rest, turn, place, k + 1, int((labels == k + 1).sum()), alone[k]))
+    meshes = [thing.mesh for thing in things]
+    depth, labels, alone = mesh_scene.render_meshes(meshes, turns, places, _background(stand, camera))
+    pixels = np.bincount(labels.ravel(), minlength=len(things) + 1)[1:]
+    placed = [
+        Placed(thing, rest, turn, place, k + 1, int(pixels[k]), int(alone[k]))
+        for k, (thing, (rest, _), turn, place) in enumerate(zip(things, poses, turns, places, strict=True))
+    ]
     measured = model.measured(depth, camera, rng)
     return Tabletop(seed, sensor, camera, measured, depth, labels, stand.plane, stand.table, tuple(placed))
 

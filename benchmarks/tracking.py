@@ -29,12 +29,8 @@ Goals: no switch, and after 30 frames at most half of the error of the first fra
 
 from __future__ import annotations
 
-import argparse
-import os
-
-if __name__ == "__main__":  # as a script only: a process that imports this has threads already
-    for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
-        os.environ.setdefault(variable, "1")
+if __name__ == "__main__":
+    import one_thread  # noqa: F401
 
 import time
 from collections.abc import Iterator
@@ -45,10 +41,10 @@ import cv2
 import numpy as np
 import report
 import torch
+from synthetic_tabletop import visible_shares
 
 from sq_perception.geometry import Superquadric
 from sq_perception.geometry import rotation as quaternions
-from sq_perception.imaging import raycast
 from sq_perception.recovery.recoverer import FrameRecovery, Recoverer
 from sq_perception.simulation.scenes import Scene, table_scene
 from sq_perception.simulation.sensor_model import Ideal
@@ -144,9 +140,7 @@ def views(shown: Scene, row: Row, frames: int, rng: np.random.Generator) -> Iter
     for k in range(frames):
         here, pose = moved(shown, row.arc * k / max(frames - 1, 1))
         depth, labels = here.render()
-        alone = [np.isfinite(raycast.render(here.bodies[j], here.camera)[0]).sum() for j in range(BODIES)]
-        visible = np.bincount(labels.ravel(), minlength=BODIES + 1)[1:] / np.maximum(alone, 1)
-        yield View(here, row.sensor.measured(depth, here.camera, rng), labels, visible, pose)
+        yield View(here, row.sensor.measured(depth, here.camera, rng), labels, visible_shares(here, labels), pose)
 
 
 def follow(session: TrackingSession, record: Record, k: int, view: View, found: FrameRecovery, ids: dict[int, int],
@@ -274,15 +268,13 @@ def owners(labels: np.ndarray, found: FrameRecovery) -> tuple[dict[int, int], se
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser = report.parser(__doc__, "tracking")
     parser.add_argument("--scenes", type=int, default=2)
     parser.add_argument("--frames", type=int, default=300)
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--rows", nargs="+", choices=tuple(ROWS), default=tuple(ROWS))
-    parser.add_argument("--name", default="tracking", help="name of the result files")
     options = parser.parse_args()
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+    report.pin()
     cv2.setNumThreads(1)
     torch.set_num_threads(1)
     known = report.previous(options.name, "rows") if len(options.rows) < len(ROWS) else {}

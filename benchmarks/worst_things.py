@@ -10,13 +10,13 @@ sees.
 
 from __future__ import annotations
 
-import argparse
 import json
 from pathlib import Path
 from typing import Any
 
 import household_things
 import numpy as np
+import report
 from gallery_figures import WIRE, write_picture
 from matplotlib.axes import Axes
 from scipy.spatial import ConvexHull
@@ -65,7 +65,7 @@ def draw(ax: Axes, row: dict[str, Any]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n\n")[0])
+    parser = report.parser(__doc__)
     parser.add_argument("each", type=Path, help="what household_things wrote with --each")
     parser.add_argument("picture", type=Path, help="PNG to write")
     options = parser.parse_args()

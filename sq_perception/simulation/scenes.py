@@ -160,10 +160,12 @@ def resting_body(
     return Superquadric(size, shape, centre, rotation), float(np.linalg.norm(size))
 
 
-def inside_image(body: Superquadric, camera: Camera) -> bool:
+def inside_image(body: Superquadric, camera: Camera, border: float = 0.0) -> bool:
+    """Whether the box around a body is seen whole, and no corner of it within a border of so many pixels."""
     lower, upper = body.bounding_box()
     if lower[2] <= 0:
         return False
     corners = np.stack(np.meshgrid(*np.stack([lower, upper], axis=-1), indexing="ij"), axis=-1).reshape(-1, 3)
     pixels = camera.project(corners)
-    return bool((pixels >= 0).all() and (pixels <= [camera.width - 1, camera.height - 1]).all())
+    limit = np.array([camera.width, camera.height]) - 1 - border
+    return bool((pixels >= border).all() and (pixels <= limit).all())
