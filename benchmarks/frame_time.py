@@ -189,40 +189,26 @@ def planned(recovered: FrameRecovery, seen: SensedScene) -> tuple[float, float]:
     return 1e3 * (between - started), 1e3 * (time.perf_counter() - between)
 
 
-HEADER = [
-    "sensor",
-    "image",
-    "bodies",
-    "masks, method",
-    "ms median / p95",
-    "goal",
-    "of which " + " / ".join(stage for stage in STAGES if stage != "total"),
-    "grasps: surroundings / plan",
-    "IoU %",
-    "found",
-    "false",
-    "busy",
-]
-
-
-def line(sensor: str, image: tuple[int, int], count: int, setting: str, row: dict[str, Any]) -> list[str]:
+def line(sensor: str, image: tuple[int, int], count: int, setting: str, row: dict[str, Any]) -> dict[str, str]:
     """A row of the table."""
     stages = row["stages"]
     goal = GOALS[count] if image == IMAGES[0] else None
-    return [
-        sensor,
-        f"{image[0]} x {image[1]}",
-        str(count),
-        setting,
-        f"{stages['total']['median']:.0f} / {stages['total']['p95']:.0f}",
-        "" if goal is None else f"{goal:.0f}",
-        " / ".join(f"{stages[stage]['median']:.0f}" for stage in STAGES if stage != "total"),
-        f"{row['surroundings']['median']:.0f} / {row['plan']['median']:.0f}",
-        f"{100 * row['iou']['mean']:.1f}",
-        f"{row['recovered_per_frame']:.1f}",
-        f"{row['false_per_frame']:.2f}",
-        f"{row['busy']:.2f}",
-    ]
+    return {
+        "sensor": sensor,
+        "image": f"{image[0]} x {image[1]}",
+        "bodies": str(count),
+        "masks, method": setting,
+        "ms median / p95": f"{stages['total']['median']:.0f} / {stages['total']['p95']:.0f}",
+        "goal": "" if goal is None else f"{goal:.0f}",
+        "of which " + " / ".join(stage for stage in STAGES if stage != "total"): " / ".join(
+            f"{stages[stage]['median']:.0f}" for stage in STAGES if stage != "total"
+        ),
+        "grasps: surroundings / plan": f"{row['surroundings']['median']:.0f} / {row['plan']['median']:.0f}",
+        "IoU %": f"{100 * row['iou']['mean']:.1f}",
+        "found": f"{row['recovered_per_frame']:.1f}",
+        "false": f"{row['false_per_frame']:.2f}",
+        "busy": f"{row['busy']:.2f}",
+    }
 
 
 def main() -> None:
@@ -248,9 +234,9 @@ def main() -> None:
                     row = measured(recoverer, frames, setting, options.repeats)
                     rows[f"{sensor}, {image[0]} x {image[1]}, {count}, {setting}"] = row
                     lines.append(line(sensor, image, count, setting, row))
-                    print(" | ".join(lines[-1]), flush=True)
+                    print(" | ".join(lines[-1].values()), flush=True)
     facts["load_after"] = os.getloadavg()
-    text = report.table(HEADER, lines)
+    text = report.table_of(lines)
     load = " to ".join(f"{facts[name][0]:.2f}" for name in ("load_before", "load_after"))
     text += (
         f"\n\n{facts['cores']} cores; threads: {facts['threads']}; load average of a minute {load}, this run included."

@@ -79,17 +79,15 @@ def main() -> None:
         back, silence = (np.array([getattr(kill, what) for kill in chosen]) for what in ("back", "silence"))
         good = back.max() < ASKED and silence.max() < _GAP[member]
         rows.append(
-            [member, str(len(chosen)), f"{np.median(back):.2f} / {back.max():.2f}", f"{np.median(silence):.2f} / "
-             f"{silence.max():.2f}", f"{_GAP[member]:g}", "yes" if good else "NO"]
-        )  # fmt: skip
-    header = [
-        "killed",
-        "times",
-        f"back after s, median / max (< {ASKED:g})",
-        "others silent s, median / max",
-        "<",
-        "met",
-    ]
+            {
+                "killed": member,
+                "times": str(len(chosen)),
+                f"back after s, median / max (< {ASKED:g})": f"{np.median(back):.2f} / {back.max():.2f}",
+                "others silent s, median / max": f"{np.median(silence):.2f} / {silence.max():.2f}",
+                "<": f"{_GAP[member]:g}",
+                "met": "yes" if good else "NO",
+            }
+        )
     most = max(kill.orphans for kill in kills)
     summary = (
         f"Processes left: {len(left)}. Segments of dead owners: {len(before)} before, at most {most} during, "
@@ -102,9 +100,9 @@ def main() -> None:
         "orphans": {"before": len(before), "at_most": most, "after": len(dead)},
         "freed_before": len(freed),
     }
-    report.write(options.name, result, f"{report.table(header, rows)}\n\n{summary}")
+    report.write(options.name, result, f"{report.table_of(rows)}\n\n{summary}")
     remove_orphans()
-    sys.exit(0 if not left and all(row[-1] == "yes" for row in rows) else 1)
+    sys.exit(0 if not left and all(row["met"] == "yes" for row in rows) else 1)
 
 
 if __name__ == "__main__":

@@ -14,8 +14,7 @@ shows whether a queue grows; the counters of /diagnostics show whether every fra
 from __future__ import annotations
 
 import os
-import signal
-import subprocess
+import sys
 import tempfile
 import time
 from collections import Counter
@@ -25,11 +24,21 @@ from typing import Any
 import numpy as np
 import report
 
-from sq_perception.commands import children
-from sq_perception.recordings import frame_source
-
 os.environ.setdefault("ROS_DOMAIN_ID", "77")
 os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
+sys.path.append(str(Path(__file__).resolve().parent.parent / "test" / "helpers"))
+
+from running_nodes import Peer, arguments, environment, until, usage
+
+from sq_perception.commands.children import Children
+from sq_perception.recordings import frame_source
+
+NODE = "/recover_node"
+QUIET = ["--log-level", "warn"]
+ONE_THREAD = {"NUMBA_NUM_THREADS": "1"}
+_PATIENCE = 120.0
+_LAST_DIAGNOSIS = 2.5
+"""Seconds after the last frame in which the node's account of it comes."""
 
 HOLD = 15
 """Frames that a scene stays."""
@@ -52,15 +61,6 @@ CASES: dict[str, dict[str, list[str]]] = {
 OFFERED = {"five objects, 3 times the rate": ("table 640 x 480, five objects", 3.0)}
 
 
-def node(name: str, parameters: list[str], *, background: bool = False) -> subprocess.Popen[bytes]:
-    """A node of this package in a process of its own; in the background: one thread, and last in the queue."""
-    arguments = [argument for parameter in parameters for argument in ("-p", parameter)]
-    command = children.command(name, ["--ros-args", "--log-level", "warn", *arguments])
-    if not background:
-        return subprocess.Popen(command)
-    return subprocess.Popen(["nice", "-n", "10", *command], env={**os.environ, "NUMBA_NUM_THREADS": "1"})
-
-
 def record(folder: Path) -> None:
     """Write what a simulated D435 measures of five objects on a table, ``HOLD`` frames of each of ``SCENES`` scenes."""
     made = frame_source.generated("table", 0, objects=5, calibration=None, with_labels=False)
@@ -71,64 +71,23 @@ def record(folder: Path) -> None:
         number += 1
 
 
-def megabytes(process: int) -> float:
-    """What a process holds in memory."""
-    return int(Path(f"/proc/{process}/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
-
-
 def measure(camera: list[str], recovery: list[str], rate: float, seconds: float) -> dict[str, Any]:
-    """Latencies (seconds since the start, milliseconds) and the recovery node's own counters."""
-    import rclpy
-    from diagnostic_msgs.msg import DiagnosticArray
-    from rclpy.time import Time
-    from sensor_msgs.msg import PointCloud2
-
-    rclpy.init()
-    listener = rclpy.create_node("latency")
-    latencies: list[tuple[float, float]] = []
-    counters: dict[str, str] = {}
-    bodies: Counter[int] = Counter()
-
-    def result(message: PointCloud2) -> None:
-        age = (listener.get_clock().now() - Time.from_msg(message.header.stamp)).nanoseconds * 1e-6
-        latencies.append((time.monotonic(), age))
-        bodies[message.width * message.height] += 1
-
-    def diagnosis(message: DiagnosticArray) -> None:
-        for status in message.status:
-            if "recover" in status.name:
-                counters.update({value.key: value.value for value in status.values})
-
-    listener.create_subscription(PointCloud2, "/recover_node/superquadrics", result, 100)
-    listener.create_subscription(DiagnosticArray, "/diagnostics", diagnosis, 10)
-    processes = [node("recover_node", recovery)]
-    try:
-        processes.append(node("synthetic_depth_node", [*camera, f"rate:={rate}"], background=True))
-        deadline = time.monotonic() + 120
-        while len(latencies) < 2 * rate and time.monotonic() < deadline:
-            rclpy.spin_once(listener, timeout_sec=0.1)
-        latencies.clear()
-        bodies.clear()
-        resident = [megabytes(processes[0].pid)]
-        began = time.monotonic()
-        while time.monotonic() < began + seconds:
-            rclpy.spin_once(listener, timeout_sec=0.1)
-        taken = list(latencies)
-        resident.append(megabytes(processes[0].pid))
-        end = time.monotonic() + 2.5
-        processes.pop().send_signal(signal.SIGINT)
-        while time.monotonic() < end:
-            rclpy.spin_once(listener, timeout_sec=0.1)
-    finally:
-        for process in processes:
-            process.send_signal(signal.SIGINT)
-        for process in processes:
-            process.wait(timeout=20)
-        listener.destroy_node()
-        rclpy.shutdown()
-    if not taken:
-        raise RuntimeError("no result arrived within two minutes")
-    when, age = np.array(taken).T
+    """Latencies and the recovery node's own counters, over some seconds from the first results on."""
+    with Peer("latency") as peer, Children(environment()) as nodes, Children(environment(**ONE_THREAD)) as cameras:
+        answers, diagnoses = peer.answers(NODE), peer.diagnoses(NODE)
+        node = nodes.start("recover_node", [*arguments(*recovery), *QUIET])
+        source = cameras.start("synthetic_depth_node", [*arguments(*camera, f"rate:={rate}"), *QUIET])
+        os.setpriority(os.PRIO_PROCESS, source.pid, 10)
+        until(lambda: len(answers) >= 2 * rate, (node, source), _PATIENCE)
+        first, resident = len(answers), [usage(node.pid).rss]
+        time.sleep(seconds)
+        taken = answers[first:]
+        resident.append(usage(node.pid).rss)
+        cameras.stop()
+        time.sleep(_LAST_DIAGNOSIS)
+        counters = diagnoses[-1].values
+    when, age = np.array([(answer.time, answer.age) for answer in taken]).T
+    bodies = Counter(answer.message.width * answer.message.height for answer in taken)
     third = len(age) // 3
     return {
         "milliseconds": report.spread(age),
@@ -157,17 +116,17 @@ def main() -> None:
             row = result[name] = measure(camera, recovery, times * options.rate, options.seconds)
             ms = row["milliseconds"]
             rows.append(
-                [
-                    name,
-                    f"{ms['median']:.1f} / {ms['p95']:.1f} / {ms['max']:.1f}",
-                    f"{row['results_per_second']:.1f}",
-                    f"{row['trend_ms']:+.1f}",
-                    f"{row['longest_gap_ms']:.0f}",
-                    f"{row['resident_megabytes'][0]:.0f} / {row['resident_megabytes'][1]:.0f}",
-                ]
+                {
+                    "frame": name,
+                    "ms median / p95 / max": f"{ms['median']:.1f} / {ms['p95']:.1f} / {ms['max']:.1f}",
+                    "results / s": f"{row['results_per_second']:.1f}",
+                    "trend ms": f"{row['trend_ms']:+.1f}",
+                    "longest gap ms": f"{row['longest_gap_ms']:.0f}",
+                    "node, MB at start / end": " / ".join(f"{rss:.0f}" for rss in row["resident_megabytes"]),
+                }
             )
-    header = ["frame", "ms median / p95 / max", "results / s", "trend ms", "longest gap ms", "node, MB at start / end"]
-    report.write("node_latency", {"options": vars(options), "cases": result}, report.table(header, rows))
+
+    report.write("node_latency", {"options": vars(options), "cases": result}, report.table_of(rows))
 
 
 if __name__ == "__main__":

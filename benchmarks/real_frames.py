@@ -168,7 +168,7 @@ def things(folder: Path, frames: int) -> list[MeasuredObject]:
     return found
 
 
-def table_line(title: str, chosen: list[MeasuredObject]) -> tuple[dict[str, Any], list[str]]:
+def table_line(title: str, chosen: list[MeasuredObject]) -> tuple[dict[str, Any], dict[str, str]]:
     """Figures of some objects."""
     figures: dict[str, Any] = {
         name: report.spread(np.array([getattr(each, name) for each in chosen]))
@@ -183,20 +183,21 @@ def table_line(title: str, chosen: list[MeasuredObject]) -> tuple[dict[str, Any]
         "status": {s.name.lower(): sum(each.found.fit.status == s for each in chosen) for s in Status},
     }
     distance, below, ms = figures["distance"], figures["below"], figures["milliseconds"]
-    classic, classic_below = figures["classic_distance"], figures["classic_below"]
-    row = [
-        title,
-        str(len(chosen)),
-        f"{distance['mean']:.2f} / {distance['max']:.1f}",
-        str(figures["too_far"]),
-        f"{below['mean']:.1f} / {below['max']:.1f}",
-        str(figures["too_low"]),
-        " / ".join(str(count) for count in figures["status"].values()),
-        f"{ms['median']:.1f} / {ms['p95']:.1f}",
-        f"{classic['mean']:.2f} / {classic['max']:.1f}",
-        f"{classic_below['mean']:.0f} / {classic_below['max']:.0f} ({figures['classic_too_low']})",
-        f"{figures['classic_milliseconds']['median']:.1f}",
-    ]
+    classic, low = figures["classic_distance"], figures["classic_below"]
+
+    row = {
+        "objects": title,
+        "count": str(len(chosen)),
+        "distance mm mean / worst": f"{distance['mean']:.2f} / {distance['max']:.1f}",
+        f"> {DISTANCE:.0f} mm (goal 0)": str(figures["too_far"]),
+        "below table mm mean / worst": f"{below['mean']:.1f} / {below['max']:.1f}",
+        f"> {BELOW:.0f} mm (goal 0)": str(figures["too_low"]),
+        "converged / weak / failed": " / ".join(str(count) for count in figures["status"].values()),
+        "ms median / p95": f"{ms['median']:.1f} / {ms['p95']:.1f}",
+        "classic distance mm": f"{classic['mean']:.2f} / {classic['max']:.1f}",
+        f"classic below mm (> {BELOW:.0f})": f"{low['mean']:.0f} / {low['max']:.0f} ({figures['classic_too_low']})",
+        "classic ms": f"{figures['classic_milliseconds']['median']:.1f}",
+    }
     return figures, row
 
 
@@ -213,38 +214,25 @@ def table(folder: Path, frames: int) -> tuple[dict[str, Any], str]:
         if chosen:
             result[name.strip("*")], row = table_line(name, chosen)
             rows.append(row)
-    header = [
-        "objects",
-        "count",
-        "distance mm mean / worst",
-        f"> {DISTANCE:.0f} mm (goal 0)",
-        "below table mm mean / worst",
-        f"> {BELOW:.0f} mm (goal 0)",
-        "converged / weak / failed",
-        "ms median / p95",
-        "classic distance mm",
-        f"classic below mm (> {BELOW:.0f})",
-        "classic ms",
-    ]
     far = sorted(counted, key=lambda each: -max(each.distance / DISTANCE, each.below / BELOW))[:WORST]
     worst = [
-        [
-            each.name,
-            f"{each.distance:.1f}",
-            f"{each.below:.1f}",
-            " ".join(f"{1e3 * a:.0f}" for a in each.found.fit.superquadric.size),
-            " ".join(f"{e:.2f}" for e in each.found.fit.superquadric.shape),
-            each.found.verdict,
-        ]
+        {
+            "object": each.name,
+            "distance mm": f"{each.distance:.1f}",
+            "below table mm": f"{each.below:.1f}",
+            "half sizes mm": " ".join(f"{1e3 * a:.0f}" for a in each.found.fit.superquadric.size),
+            "e1 e2": " ".join(f"{e:.2f}" for e in each.found.fit.superquadric.shape),
+            "verdict": each.found.verdict,
+        }
         for each in far
     ]
-    worst_header = ["object", "distance mm", "below table mm", "half sizes mm", "e1 e2", "verdict"]
-    result["worst"] = [dict(zip(worst_header, each, strict=True)) for each in worst]
+
+    result["worst"] = worst
     return result, (
         "Objects on a table, human masks\n\n"
-        + report.table(header, rows)
+        + report.table_of(rows)
         + "\n\nThe worst of them\n\n"
-        + report.table(worst_header, worst)
+        + report.table_of(worst)
     )
 
 
@@ -270,18 +258,18 @@ def renders(folder: Path) -> tuple[dict[str, Any], str]:
         "milliseconds": times,
         "classic_milliseconds": classic_times,
     }
-    header = ["images", "IoU %", "min", "goal: mean / min", "ms median", "classic IoU %", "classic min", "classic ms"]
-    row = [
-        str(len(names)),
-        f"{ours.mean():.2f}",
-        f"{ours.min():.2f} ({names[int(ours.argmin())]})",
-        f"{RENDERS[0]} / {RENDERS[1]}",
-        f"{times['median']:.1f}",
-        f"{classic.mean():.1f}",
-        f"{classic.min():.1f}",
-        f"{classic_times['median']:.1f}",
-    ]
-    return result, "Renders of the thesis' author\n\n" + report.table(header, [row])
+
+    row = {
+        "images": str(len(names)),
+        "IoU %": f"{ours.mean():.2f}",
+        "min": f"{ours.min():.2f} ({names[int(ours.argmin())]})",
+        "goal: mean / min": f"{RENDERS[0]} / {RENDERS[1]}",
+        "ms median": f"{times['median']:.1f}",
+        "classic IoU %": f"{classic.mean():.1f}",
+        "classic min": f"{classic.min():.1f}",
+        "classic ms": f"{classic_times['median']:.1f}",
+    }
+    return result, "Renders of the thesis' author\n\n" + report.table_of([row])
 
 
 def main() -> None:

@@ -49,31 +49,6 @@ TOO_FAR, TOO_LOW = 3.0, 10.0
 WORST = 15
 GOALS = {"given": "85", "own": "80"}
 SHARES = {"all visible (90 % and more)": (0.9, np.inf), "50 to 90 %": (0.5, 0.9), "under 50 %": (0.0, 0.5)}
-HEADER = [
-    "things",
-    "method",
-    "count",
-    "IoU % mean +- std",
-    "median",
-    "goal",
-    f"< {100 * POOR:.0f} % (%)",
-    "edge error mm median",
-    "mean",
-    "along: right, away, up: mean excess mm",
-    "weak / failed / missed %",
-    "2 sigma %",
-]
-WORST_HEADER = [
-    "seed, label",
-    "thing",
-    "sensor",
-    "visible %",
-    "IoU %",
-    "edges / true ones mm",
-    "excess right, away, up mm",
-    "e1 e2",
-    "verdict",
-]
 
 
 def main() -> None:
@@ -174,12 +149,11 @@ def tables(verdicts: list[SceneVerdict], groups: Groups, goals: dict[str, str]) 
                 result[f"{name.strip('*')}: {method}"] = figures = summary(chosen, method)
                 rows.append(line(name, method, figures, goals.get(method, "-") if name == ALL else ""))
     chain_result, chain_text = chain(verdicts)
-    text = [report.table(HEADER, rows), "Whole chain and times\n\n" + chain_text]
+    text = [report.table_of(rows), "Whole chain and times\n\n" + chain_text]
     for method in ("given", "own"):
         order = sorted(found[ALL], key=lambda one: one.answers[method].iou)[:WORST]
-        worst = [worst_line(one, method) for one in order]
-        result[f"worst: {method}"] = [dict(zip(WORST_HEADER, row, strict=True)) for row in worst]
-        text.append(f"The worst with masks {method}\n\n{report.table(WORST_HEADER, worst)}")
+        result[f"worst: {method}"] = worst = [worst_line(one, method) for one in order]
+        text.append(f"The worst with masks {method}\n\n{report.table_of(worst)}")
     return {**chain_result, **result}, "\n\n".join(text)
 
 
@@ -203,23 +177,23 @@ def summary(chosen: list[ThingVerdict], method: str) -> dict[str, Any]:
     }
 
 
-def line(name: str, method: str, figures: dict[str, Any], goal: str) -> list[str]:
+def line(name: str, method: str, figures: dict[str, Any], goal: str) -> dict[str, str]:
     """A row of the table."""
     iou, errors, status, covered = (figures[key] for key in ("iou", "edge_error", "status", "within_2_sigma"))
-    return [
-        name,
-        method,
-        f"{iou['count']:.0f}",
-        f"{iou['mean']:.1f} +- {iou['std']:.1f}",
-        f"{iou['median']:.1f}",
-        goal,
-        f"{figures['poor']:.0f}",
-        "" if errors is None else f"{errors['median']:.1f}",
-        "" if errors is None else f"{errors['mean']:.1f}",
-        "" if errors is None else " ".join(f"{x:+.1f}" for x in figures["excess"]),
-        " / ".join(f"{status[key]:.0f}" for key in ("weak", "failed", "none")),
-        "" if covered is None else f"{covered:.0f}",
-    ]
+    return {
+        "things": name,
+        "method": method,
+        "count": f"{iou['count']:.0f}",
+        "IoU % mean +- std": f"{iou['mean']:.1f} +- {iou['std']:.1f}",
+        "median": f"{iou['median']:.1f}",
+        "goal": goal,
+        f"< {100 * POOR:.0f} % (%)": f"{figures['poor']:.0f}",
+        "edge error mm median": "" if errors is None else f"{errors['median']:.1f}",
+        "mean": "" if errors is None else f"{errors['mean']:.1f}",
+        "along: right, away, up: mean excess mm": " ".join(f"{x:+.1f}" for x in figures["excess"] or ()),
+        "weak / failed / missed %": " / ".join(f"{status[key]:.0f}" for key in ("weak", "failed", "none")),
+        "2 sigma %": "" if covered is None else f"{covered:.0f}",
+    }
 
 
 def chain(verdicts: list[SceneVerdict]) -> tuple[dict[str, Any], str]:
@@ -254,52 +228,39 @@ def chain(verdicts: list[SceneVerdict]) -> tuple[dict[str, Any], str]:
         result[f"chain: {sensor}"] = figures
         times = figures["milliseconds"]
         rows.append(
-            [
-                sensor,
-                str(figures["scenes"]),
-                f"{bodies} + {figures['under_200_pixels']}",
-                str(figures["false_bodies"]),
-                f"{figures['median_distance']:.2f}",
-                str(figures["scenes_too_far"]),
-                f"{figures['explained']:.1f}",
-                f"{figures['below_worst']:.1f} ({figures['too_low']})",
-                f"{figures['plane_degrees_worst']:.1f} ({figures['no_plane']})",
-                f"{times['given']['median']:.0f} / {times['given']['p95']:.0f}",
-                f"{times['own']['median']:.0f} / {times['own']['p95']:.0f}",
-                f"{figures['milliseconds_per_thing']:.0f}",
-            ]
+            {
+                "sensor": sensor,
+                "scenes": str(figures["scenes"]),
+                "things + under 200 pixels": f"{bodies} + {figures['under_200_pixels']}",
+                "false bodies": str(figures["false_bodies"]),
+                f"median distance mm (goal {TOO_FAR:.0f})": f"{figures['median_distance']:.2f}",
+                "scenes above": str(figures["scenes_too_far"]),
+                "within 10 mm % (goal 95)": f"{figures['explained']:.1f}",
+                f"below table mm (> {TOO_LOW:.0f}; goal 0)": f"{figures['below_worst']:.1f} ({figures['too_low']})",
+                "table off by degrees (not found)": f"{figures['plane_degrees_worst']:.1f} ({figures['no_plane']})",
+                "ms a frame, given: median / p95": f"{times['given']['median']:.0f} / {times['given']['p95']:.0f}",
+                "ms a frame, own": f"{times['own']['median']:.0f} / {times['own']['p95']:.0f}",
+                "ms a thing, given": f"{figures['milliseconds_per_thing']:.0f}",
+            }
         )
-    header = [
-        "sensor",
-        "scenes",
-        "things + under 200 pixels",
-        "false bodies",
-        f"median distance mm (goal {TOO_FAR:.0f})",
-        "scenes above",
-        "within 10 mm % (goal 95)",
-        f"below table mm (> {TOO_LOW:.0f}; goal 0)",
-        "table off by degrees (not found)",
-        "ms a frame, given: median / p95",
-        "ms a frame, own",
-        "ms a thing, given",
-    ]
-    return result, report.table(header, rows)
+
+    return result, report.table_of(rows)
 
 
-def worst_line(one: ThingVerdict, method: str) -> list[str]:
+def worst_line(one: ThingVerdict, method: str) -> dict[str, str]:
     answer = one.answers[method]
     edges = 2e3 * np.sort(answer.body[:3])
-    return [
-        f"{one.seed}, {one.label}",
-        f"{one.name}, {one.rest}",
-        one.sensor,
-        f"{100 * one.visible_share:.0f}",
-        f"{100 * answer.iou:.0f}",
-        f"{_numbers(edges)} / {_numbers(1e3 * one.edges)}",
-        _numbers(1e3 * answer.excess, "+.0f"),
-        _numbers(answer.body[3:5], ".2f"),
-        f"{answer.status}: {answer.message}" if answer.message else answer.status,
-    ]
+    return {
+        "seed, label": f"{one.seed}, {one.label}",
+        "thing": f"{one.name}, {one.rest}",
+        "sensor": one.sensor,
+        "visible %": f"{100 * one.visible_share:.0f}",
+        "IoU %": f"{100 * answer.iou:.0f}",
+        "edges / true ones mm": f"{_numbers(edges)} / {_numbers(1e3 * one.edges)}",
+        "excess right, away, up mm": _numbers(1e3 * answer.excess, "+.0f"),
+        "e1 e2": _numbers(answer.body[3:5], ".2f"),
+        "verdict": f"{answer.status}: {answer.message}" if answer.message else answer.status,
+    }
 
 
 def _numbers(values: np.ndarray, form: str = ".0f") -> str:

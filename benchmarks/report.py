@@ -6,6 +6,7 @@ import argparse
 import json
 import os
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -76,6 +77,11 @@ def write(name: str, result: dict[str, Any], table: str, shown: bool = True) -> 
     (RESULTS / f"{name}.md").write_text(f"{head}\n\n{table}\n")
     if shown:
         print(table)
+
+
+def table_of(rows: Sequence[Mapping[str, str]]) -> str:
+    """A Markdown table of rows that give the cell of each column by its title, in the order of the first row."""
+    return table(list(rows[0]), [list(row.values()) for row in rows])
 
 
 def table(header: list[str], rows: list[list[str]]) -> str:

@@ -144,65 +144,38 @@ def summary(outcomes: list[FittedScan], best: dict[str, float]) -> dict[str, Any
     }
 
 
-def line(name: str, figures: dict[str, Any], goal: str, classic_goal: str) -> list[str]:
+def line(name: str, figures: dict[str, Any], goal: str, classic_goal: str) -> dict[str, str]:
     """A row of the table."""
     ms, classic_ms = figures["milliseconds"], figures["classic_milliseconds"]
-    return [
-        name,
-        f"{figures['oracle']:.1f}",
-        f"{figures['iou']['mean']:.1f} +- {figures['iou']['std']:.1f}",
-        f"{figures['iou']['min']:.0f}",
-        f"{figures['share']['mean']:.3f}",
-        goal,
-        f"{figures['poor']:.0f}",
-        f"{ms['median']:.1f} / {ms['p95']:.1f}",
-        f"{figures['within_2_sigma']:.0f}",
-        " / ".join(str(count) for count in figures["status"].values()),
-        f"{figures['classic_iou']['mean']:.1f}",
-        f"{figures['classic_share']['mean']:.3f}",
-        classic_goal,
-        f"{classic_ms['median']:.1f}",
-    ]
+    return {
+        "object": name,
+        "oracle IoU %": f"{figures['oracle']:.1f}",
+        "IoU %": f"{figures['iou']['mean']:.1f} +- {figures['iou']['std']:.1f}",
+        "min": f"{figures['iou']['min']:.0f}",
+        "share": f"{figures['share']['mean']:.3f}",
+        "goal": goal,
+        f"share < {POOR} (%)": f"{figures['poor']:.0f}",
+        "ms median / p95": f"{ms['median']:.1f} / {ms['p95']:.1f}",
+        "2 sigma %": f"{figures['within_2_sigma']:.0f}",
+        "converged / weak / failed": " / ".join(str(count) for count in figures["status"].values()),
+        "classic IoU %": f"{figures['classic_iou']['mean']:.1f}",
+        "classic share": f"{figures['classic_share']['mean']:.3f}",
+        "expected": classic_goal,
+        "classic ms": f"{classic_ms['median']:.1f}",
+    }
 
 
-HEADER = [
-    "object",
-    "oracle IoU %",
-    "IoU %",
-    "min",
-    "share",
-    "goal",
-    f"share < {POOR} (%)",
-    "ms median / p95",
-    "2 sigma %",
-    "converged / weak / failed",
-    "classic IoU %",
-    "classic share",
-    "expected",
-    "classic ms",
-]
-WORST_HEADER = [
-    "setting",
-    "object",
-    "pose",
-    "share",
-    "half sizes / those of the hull along them, mm",
-    "e1 e2",
-    "verdict",
-]
-
-
-def worst_line(setting: str, each: FittedScan, best: dict[str, float]) -> list[str]:
+def worst_line(setting: str, each: FittedScan, best: dict[str, float]) -> dict[str, str]:
     sizes = [" ".join(f"{1e3 * x:.0f}" for x in values) for values in (each.body.size, each.extent)]
-    return [
-        setting,
-        each.scan.name,
-        str(each.pose),
-        f"{each.iou / best[each.scan.name]:.2f}",
-        " / ".join(sizes),
-        " ".join(f"{e:.2f}" for e in each.body.shape),
-        each.found.verdict,
-    ]
+    return {
+        "setting": setting,
+        "object": each.scan.name,
+        "pose": str(each.pose),
+        "share": f"{each.iou / best[each.scan.name]:.2f}",
+        "half sizes / those of the hull along them, mm": " / ".join(sizes),
+        "e1 e2": " ".join(f"{e:.2f}" for e in each.body.shape),
+        "verdict": each.found.verdict,
+    }
 
 
 def main() -> None:
@@ -229,14 +202,14 @@ def main() -> None:
             figures = summary(found[-options.poses :], best)
             result[f"{setting}, {scan.name}"] = figures
             rows.append(line(scan.name, figures, "", ""))
-            print(setting, "|", " | ".join(rows[-1]), flush=True)
+            print(setting, "|", " | ".join(rows[-1].values()), flush=True)
         result[setting] = summary(found, best)
         rows.append(line("**all**", result[setting], how.goal, CLASSIC_GOAL))
-        tables.append(f"{setting}, {options.poses} poses of each object\n\n{report.table(HEADER, rows)}")
+        tables.append(f"{setting}, {options.poses} poses of each object\n\n{report.table_of(rows)}")
         found.sort(key=lambda each: each.iou / best[each.scan.name])
         worst += [worst_line(setting, each, best) for each in found[:WORST]]
-    result["worst"] = [dict(zip(WORST_HEADER, each, strict=True)) for each in worst]
-    tables.append(f"The worst of each setting\n\n{report.table(WORST_HEADER, worst)}")
+    result["worst"] = worst
+    tables.append(f"The worst of each setting\n\n{report.table_of(worst)}")
     report.write(options.name, {"options": vars(options), **result}, "\n\n".join(tables))
 
 

@@ -144,39 +144,23 @@ def figures(scores: list[Score]) -> dict[str, Any]:
     }
 
 
-def line(name: str, group: dict[str, Any], goal: float | None) -> list[str]:
+def line(name: str, group: dict[str, Any], goal: float | None) -> dict[str, str]:
     """A row of the table."""
     ms = group["milliseconds"]
-    return [
-        name,
-        str(group["frames"]),
-        str(group["objects"]),
-        f"{group['iou']:.3f}",
-        f"{group['iou_of_all']:.3f}",
-        f"{group['precision']:.3f}",
-        f"{group['recall']:.3f}",
-        f"{group['f1']:.3f}",
-        "" if goal is None else f"{goal:.2f}",
-        str(group["cut"]),
-        str(group["joined"]),
-        f"{ms['median']:.1f} / {ms['max']:.1f}",
-    ]
-
-
-HEADER = [
-    "frames of",
-    "frames",
-    "objects",
-    f"IoU (goal {IOU_GOAL})",
-    "of all",
-    "precision",
-    "recall",
-    "F1",
-    "goal",
-    "cut",
-    "joined",
-    "ms median / max",
-]
+    return {
+        "frames of": name,
+        "frames": str(group["frames"]),
+        "objects": str(group["objects"]),
+        f"IoU (goal {IOU_GOAL})": f"{group['iou']:.3f}",
+        "of all": f"{group['iou_of_all']:.3f}",
+        "precision": f"{group['precision']:.3f}",
+        "recall": f"{group['recall']:.3f}",
+        "F1": f"{group['f1']:.3f}",
+        "goal": "" if goal is None else f"{goal:.2f}",
+        "cut": str(group["cut"]),
+        "joined": str(group["joined"]),
+        "ms median / max": f"{ms['median']:.1f} / {ms['max']:.1f}",
+    }
 
 
 def summary(known: list[Instances], scores: list[Score]) -> tuple[dict[str, Any], str]:
@@ -204,7 +188,7 @@ def summary(known: list[Instances], scores: list[Score]) -> tuple[dict[str, Any]
         for each, s in both
         if s.hits < s.objects or (s.hits < s.segments and each.category != OTHER)
     ]
-    text = report.table(HEADER, rows)
+    text = report.table_of(rows)
     if worst:
         text += "\n\nFrames where something is missed or invented\n\n"
         text += report.table(["frame", "category", "IoU of each object", "segments", "cut", "joined"], worst)

@@ -237,40 +237,28 @@ def main() -> None:
     result = report.previous(options.name, "rows") if options.update else {}
     for name in names:
         result[name] = {**run(name, ROWS[name], options.bodies), "commit": report.commit()}
-        print(" | ".join(cells(name, result[name])), flush=True)
+        print(" | ".join(cells(name, result[name]).values()), flush=True)
     ordered = {name: result[name] for name in ROWS if name in result}
     rows = [cells(name, line) for name, line in ordered.items()]
-    report.write(options.name, {"options": vars(options), "rows": ordered}, report.table(HEADER, rows))
+    report.write(options.name, {"options": vars(options), "rows": ordered}, report.table_of(rows))
 
 
-def cells(name: str, line: dict[str, Any]) -> list[str]:
+def cells(name: str, line: dict[str, Any]) -> dict[str, str]:
     """A row of the table."""
-    ms, classic = line["milliseconds"], line["classic_milliseconds"]
+    ms, classic, old = line["milliseconds"], line["classic_milliseconds"], line["classic_iou"]
     covering = line["within_2_sigma_where_iou_below_95"]
-    return [
-        name,
-        f"{line['iou']['mean']:.2f} +- {line['iou']['std']:.2f}",
-        f"{line['iou']['min']:.1f}",
-        f"{ms['median']:.1f} / {ms['p95']:.1f}",
-        f"{ms['median'] / classic['median']:.1f}",
-        line["goal"],
-        f"{line['within_2_sigma']:.1f}",
-        f"{line['below_95']:.1f}" + ("" if covering is None else f" ({covering:.0f})"),
-        f"{line['classic_iou']['mean']:.1f} / {line['classic_iou']['min']:.0f} / {classic['median']:.1f} ms",
-    ]
-
-
-HEADER = [
-    "data",
-    "IoU %",
-    "min",
-    "ms median / p95",
-    "x classic",
-    "goal: mean / min / ms",
-    "2 sigma %",
-    "IoU < 95 % (of these, covered)",
-    "classic: mean / min / ms",
-]
+    return {
+        "data": name,
+        "IoU %": f"{line['iou']['mean']:.2f} +- {line['iou']['std']:.2f}",
+        "min": f"{line['iou']['min']:.1f}",
+        "ms median / p95": f"{ms['median']:.1f} / {ms['p95']:.1f}",
+        "x classic": f"{ms['median'] / classic['median']:.1f}",
+        "goal: mean / min / ms": line["goal"],
+        "2 sigma %": f"{line['within_2_sigma']:.1f}",
+        "IoU < 95 % (of these, covered)": f"{line['below_95']:.1f}"
+        + ("" if covering is None else f" ({covering:.0f})"),
+        "classic: mean / min / ms": f"{old['mean']:.1f} / {old['min']:.0f} / {classic['median']:.1f} ms",
+    }
 
 
 if __name__ == "__main__":

@@ -33,7 +33,6 @@ from sq_perception.recovery.recoverer import FrameRecovery, Recoverer
 from sq_perception.simulation import sensor_noise
 
 COUNTS = (1, 5, 8)
-HEADER = ["things", "alone ms", "following ms", "mean", "ratio", "repeated %", "IoU % alone", "following"]
 
 
 def ious(frame: FrameRecovery, scene: tabletop.Tabletop) -> list[float]:
@@ -75,13 +74,19 @@ def measured(recoverer: Recoverer, count: int, scenes: int, frames: int, sensor:
     }
 
 
-def line(count: int, row: dict[str, Any]) -> list[str]:
+def line(count: int, row: dict[str, Any]) -> dict[str, str]:
     """A row of the table."""
     alone, following, iou = row["alone"], row["following"], row["iou"]
-    spent = [f"{alone['median']:.0f}", f"{following['median']:.1f}", f"{following['mean']:.1f}"]
-    ratio = f"{following['mean'] / alone['mean']:.2f}"
-    quality = [f"{100 * iou[name]['mean']:.1f}" for name in ("alone", "following")]
-    return [str(count), *spent, ratio, f"{100 * row['repeated']:.0f}", *quality]
+    return {
+        "things": str(count),
+        "alone ms": f"{alone['median']:.0f}",
+        "following ms": f"{following['median']:.1f}",
+        "mean": f"{following['mean']:.1f}",
+        "ratio": f"{following['mean'] / alone['mean']:.2f}",
+        "repeated %": f"{100 * row['repeated']:.0f}",
+        "IoU % alone": f"{100 * iou['alone']['mean']:.1f}",
+        "following": f"{100 * iou['following']['mean']:.1f}",
+    }
 
 
 def main() -> None:
@@ -96,8 +101,8 @@ def main() -> None:
     rows = {}
     for count in COUNTS:
         rows[str(count)] = measured(recoverer, count, options.scenes, options.frames, options.sensor)
-        print(" | ".join(line(count, rows[str(count)])), flush=True)
-    table = report.table(HEADER, [line(int(count), row) for count, row in rows.items()])
+        print(" | ".join(line(count, rows[str(count)]).values()), flush=True)
+    table = report.table_of([line(int(count), row) for count, row in rows.items()])
     report.write(options.name, {"options": vars(options), "rows": rows}, table)
 
 

@@ -197,34 +197,20 @@ def figures(records: list[Record]) -> dict[str, Any]:
     return result
 
 
-def line(name: str, row: dict[str, Any]) -> list[str]:
+def line(name: str, row: dict[str, Any]) -> dict[str, str]:
     """A row of the table."""
-    errors = [f"{100 * row['error'][str(k)]:.2f}" if str(k) in row["error"] else "" for k in SHOWN]
-    ms = row["milliseconds"]
-    return [
-        name,
-        *errors,
-        f"{100 * row['single']:.2f}",
-        f"{100 * row['bias']:.2f}",
-        f"{100 * row['within_2_sigma']:.0f} / {100 * row['within_2_sigma_last']:.0f}",
-        f"{row['switches']} ({row['split']})",
-        str(row["births"]),
-        str(row["lost"]),
-        f"{ms['median']:.1f} / {ms['p95']:.1f}",
-    ]
-
-
-HEADER = [
-    "row",
-    *(f"frame {k}, %" for k in SHOWN),
-    "single, %",
-    "its bias, %",
-    "2 sigma, % all / last frame",
-    "switches (split)",
-    "births",
-    "lost",
-    "ms",
-]
+    errors, ms = row["error"], row["milliseconds"]
+    return {
+        "row": name,
+        **{f"frame {k}, %": f"{100 * errors[str(k)]:.2f}" if str(k) in errors else "" for k in SHOWN},
+        "single, %": f"{100 * row['single']:.2f}",
+        "its bias, %": f"{100 * row['bias']:.2f}",
+        "2 sigma, % all / last frame": f"{100 * row['within_2_sigma']:.0f} / {100 * row['within_2_sigma_last']:.0f}",
+        "switches (split)": f"{row['switches']} ({row['split']})",
+        "births": str(row["births"]),
+        "lost": str(row["lost"]),
+        "ms": f"{ms['median']:.1f} / {ms['p95']:.1f}",
+    }
 
 
 def run(row: Row, count: int, frames: int, seed: int) -> dict[str, list[Record]]:
@@ -281,10 +267,10 @@ def main() -> None:
     for name in options.rows:
         for masks, records in run(ROWS[name], options.scenes, options.frames, options.seed).items():
             known[f"{name}, {masks}"] = figures(records)
-            print(line(f"{name}, {masks}", known[f"{name}, {masks}"]), flush=True)
+            print(" | ".join(line(f"{name}, {masks}", known[f"{name}, {masks}"]).values()), flush=True)
     order = [f"{name}, {masks}" for name in ROWS for masks in MASKS]
     known = {name: known[name] for name in order if name in known}
-    table = report.table(HEADER, [line(name, row) for name, row in known.items()])
+    table = report.table_of([line(name, row) for name, row in known.items()])
     report.write(options.name, {"options": vars(options), "rows": known}, table)
 
 
