@@ -16,6 +16,8 @@ from pathlib import Path
 if __name__ == "__main__":
     import one_thread  # noqa: F401
 
+from dataclasses import asdict
+
 import report
 import torch
 
@@ -44,43 +46,27 @@ def main() -> None:
     torch.set_num_threads(1)
     networks = [Network.read(folder / "model.safetensors", folder.name) for folder in options.runs]
     result, rows = {}, []
-    for network, outcome in zip(
-        networks,
-        compare([(one, options.bodies) for one in networks], ThesisImages(options.bodies, options.seed)),
-        strict=True,
-    ):
-        figures, summary = outcome.figures, outcome.figures.summary()
-        iou = figures.volume_iou
+    outcomes = compare([(one, options.bodies) for one in networks], ThesisImages(options.bodies, options.seed))
+    for network, outcome in zip(networks, outcomes, strict=True):
+        iou, summary = outcome.figures.volume_iou, outcome.figures.summary()
         steps, minutes = network.metrics["step"], network.metrics["seconds"] / 60
-        result[network.name] = {
-            "loss": network.loss,
-            "steps": steps,
-            "minutes": minutes,
-            "training": network.training,
-            "iou": report.spread(iou),
-            "over_85": float((iou > 0.85).mean()),
-            "thesis_iou": report.spread(figures.iou),
-            "volume_error": summary.delta_a,
-            "shape_error": summary.delta_e,
-            "translation_error": list(summary.delta_t),
-            "quarter_turns": summary.quarter_turns,
-        }
+        trained = {"loss": network.loss, "steps": steps, "minutes": minutes, "training": network.training}
+        result[network.name] = {**trained, "iou": report.spread(iou), "summary": asdict(summary)}
         rows.append(
-            [
-                network.name,
-                f"{steps} / {minutes:.0f}",
-                f"{100 * iou.mean():.2f} +- {100 * iou.std():.2f}",
-                f"{100 * (iou > 0.85).mean():.1f}",
-                f"{100 * summary.iou_mean:.2f} +- {100 * summary.iou_std:.2f}",
-                f"{100 * summary.delta_a:+.1f}",
-                f"{100 * summary.delta_e:+.1f}",
-                ", ".join(f"{100 * value:+.2f}" for value in summary.delta_t),
-                f"{100 * summary.quarter_turns:.0f}",
-                THESIS.get(network.loss, ""),
-            ]
+            {
+                "run": network.name,
+                "steps / min": f"{steps} / {minutes:.0f}",
+                "IoU %": f"{100 * iou.mean():.2f} +- {100 * iou.std():.2f}",
+                "over 85 %": f"{100 * (iou > 0.85).mean():.1f}",
+                "thesis IoU %": f"{100 * summary.iou_mean:.2f} +- {100 * summary.iou_std:.2f}",
+                "dA %": f"{100 * summary.delta_a:+.1f}",
+                "dE %": f"{100 * summary.delta_e:+.1f}",
+                "dT %": ", ".join(f"{100 * value:+.2f}" for value in summary.delta_t),
+                "quarter turns %": f"{100 * summary.quarter_turns:.0f}",
+                "thesis: IoU %": THESIS.get(network.loss, ""),
+            }
         )
-    header = ["run", "steps / min", "IoU %", "over 85 %", "thesis IoU %", "dA %", "dE %", "dT %", "quarter turns %"]
-    report.write("losses", {"bodies": options.bodies, "runs": result}, report.table([*header, "thesis: IoU %"], rows))
+    report.write("losses", {"bodies": options.bodies, "runs": result}, report.table_of(rows))
 
 
 def _found() -> list[Path]:

@@ -70,6 +70,7 @@ import trimesh
 from both_fits import measured_points
 from picking_scenes import EYE, GRIPPER, KINDS, LOOK, TABLE_CAMERA, THINGS, Scene
 from picking_world import Pick, Thing, World
+from scipy.stats import binomtest
 
 from sq_perception.fitting import solina_bajcsy
 from sq_perception.fitting.options import MODEL_ERROR_ON_PLANE
@@ -340,10 +341,8 @@ def wilson(good: int, count: int) -> tuple[float, float, float]:
     """Share and its 95 % interval, percent."""
     if not count:
         return float("nan"), float("nan"), float("nan")
-    z, p = 1.96, good / count
-    middle = (p + z * z / (2 * count)) / (1 + z * z / count)
-    half = z / (1 + z * z / count) * np.sqrt(p * (1 - p) / count + z * z / (4 * count * count))
-    return 100 * p, 100 * (middle - half), 100 * (middle + half)
+    interval = binomtest(good, count).proportion_ci(method="wilson")
+    return 100 * good / count, 100 * interval.low, 100 * interval.high
 
 
 def summary(lines: list[dict[str, Any]]) -> dict[str, Any]:

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import os
 import sys
-import tempfile
 import time
 import zlib
 from collections.abc import Sequence
@@ -86,8 +85,8 @@ class Phase:
 class Soak:
     """A node that stays, a camera that is started anew for each phase, and the peer that watches them."""
 
-    def __init__(self, node: str, objects: int, size: str, peer: Peer, nodes: Children, cameras: Children) -> None:
-        self.name, self.objects, self.size = f"/{node}", objects, size
+    def __init__(self, node: str, objects: int, peer: Peer, nodes: Children, cameras: Children) -> None:
+        self.name, self.objects = f"/{node}", objects
         self.peer, self.cameras = peer, cameras
         self.scenes: dict[int, int] = {}
         peer.listen(PointCloud2, f"/{CAMERA_NODE}/truth", self._on_truth)
@@ -100,13 +99,10 @@ class Soak:
     def phase(self, rate: float, seconds: float, hold: int, *, services: bool = True) -> Phase:
         """Run the camera at a rate and watch."""
         parameters = [f"rate:={rate}", f"objects:={self.objects}", f"hold:={hold}", f"scenes:={SCENES}"]
-        with tempfile.TemporaryDirectory() as folder:
-            if self.size:
-                parameters.append(f"camera_info_file:={_camera_file(Path(folder), self.size)}")
-            camera = self.cameras.start(CAMERA_NODE, [*arguments(*parameters), "--log-level", "warn"])
-            os.setpriority(os.PRIO_PROCESS, camera.pid, 15)
-            seen = len(self.answers)
-            until(lambda: len(self.answers) >= seen + 3, (self.node, camera))
+        camera = self.cameras.start(CAMERA_NODE, [*arguments(*parameters), "--log-level", "warn"])
+        os.setpriority(os.PRIO_PROCESS, camera.pid, 15)
+        seen = len(self.answers)
+        until(lambda: len(self.answers) >= seen + 3, (self.node, camera))
         first, diagnosed = len(self.answers), len(self.diagnoses)
         phase = Phase(rate, time.monotonic())
         second = 0
@@ -147,17 +143,6 @@ class Soak:
             if answer.stamp in self.scenes:
                 found.setdefault(self.scenes[answer.stamp], []).append(answer.age)
         return {scene: np.array(ages) for scene, ages in found.items()}
-
-
-def _camera_file(folder: Path, size: str) -> Path:
-    width, height = (int(part) for part in size.split("x"))
-    focal = 525.0 * width / 640
-    path = folder / "camera.yaml"
-    path.write_text(
-        f"image_width: {width}\nimage_height: {height}\ncamera_name: soak\ncamera_matrix:\n  rows: 3\n  cols: 3\n"
-        f"  data: [{focal}, 0, {(width - 1) / 2}, 0, {focal}, {(height - 1) / 2}, 0, 0, 1]\n"
-    )
-    return path
 
 
 def line(phase: Phase, what: str, begin: float) -> dict[str, float]:
@@ -292,14 +277,13 @@ def main() -> None:
     parser.add_argument("--objects", type=int, default=5)
     parser.add_argument("--offered", type=float, default=90.0, help="Hz of the last phase; 0 leaves it out")
     parser.add_argument("--node", choices=("recover_node", "fitter_node"), default="recover_node")
-    parser.add_argument("--size", default="", metavar="WxH", help="of the image; 640x480 if not given")
     options = parser.parse_args()
     with (
         Peer("soak") as peer,
         Children(environment()) as nodes,
         Children(environment(NUMBA_NUM_THREADS="1")) as cameras,
     ):
-        soak = Soak(options.node, options.objects, options.size, peer, nodes, cameras)
+        soak = Soak(options.node, options.objects, peer, nodes, cameras)
         alone = soak.phase(_ALONE_RATE, SCENES * _ALONE_FRAMES / _ALONE_RATE, _ALONE_FRAMES, services=False)
         hold = round(SCENE_SECONDS * options.rate)
         asked = soak.phase(options.rate, 60 * options.minutes, hold)
