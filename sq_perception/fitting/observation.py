@@ -214,9 +214,8 @@ class Observation(Crop):
         return distance.ravel()[self.free]
 
     def _through(self, pixels: np.ndarray, margin: float) -> np.ndarray:
-        c, n = self.camera, self.noise
-        noise = (n.constant, n.quadratic, self.model_error)
-        return through(pixels, self.depth, (c.fx, c.fy, c.cx, c.cy), c.is_pinhole, noise, margin)
+        noise = self.noise.constant, self.noise.quadratic, self.model_error
+        return through(pixels, self.depth, self.camera.lens, noise, margin)
 
 
 def _some(pixels: np.ndarray, areas: np.ndarray, count: int, offset: float) -> np.ndarray:

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sq_perception.geometry.kernels import kernel
+from sq_perception.imaging.camera import Lens
 
 ORIGIN_X, ORIGIN_Y, DIRECTION_X, DIRECTION_Y, DEPTH, STIFFNESS, WEIGHT, LAST = range(8)
 """Columns of a ray.
@@ -74,17 +75,16 @@ def drawn(pixels: np.ndarray, areas: np.ndarray, count: int, offset: float) -> n
 def through(
     pixels: np.ndarray,
     depth: np.ndarray,
-    intrinsics: tuple[float, float, float, float],
-    pinhole: bool,
+    lens: Lens,
     noise: tuple[float, float, float],
     margin: float,
 ) -> np.ndarray:
     """Rays (n, 8) through pixels, indices into the depth image; object rays, or free ones that end a margin before.
 
-    ``intrinsics``: fx, fy, cx, cy; ``noise``: its constant and quadratic part and the model error, which join in
+    ``noise``: its constant and quadratic part and the model error, which join in
     squares; ``margin``: in such standard deviations, 0 for rays of the object.
     """
-    fx, fy, cx, cy = intrinsics
+    fx, fy, cx, cy, pinhole = lens
     constant, quadratic, model_error = noise
     width = depth.shape[1]
     rays = np.zeros((pixels.shape[0], RAY_COLUMNS))

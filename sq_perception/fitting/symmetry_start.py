@@ -24,6 +24,8 @@ import numpy as np
 from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.observation import Observation
 from sq_perception.geometry.kernels import kernel
+from sq_perception.imaging.camera import Lens
+from sq_perception.imaging.lens import point_at
 
 MOMENT_SHARE = 0.27
 START_EXPONENT = 0.5
@@ -40,9 +42,8 @@ ORDERS = ((1, 2, 0), (2, 0, 1), (0, 1, 2))
 def completed_moments(observation: Observation) -> tuple[np.ndarray, np.ndarray] | None:
     """Centre (3,) and second moments (3, 3) about it of the completed body; None if no pixel has an opposite."""
     camera = observation.camera
-    intrinsics = (camera.fx, camera.fy, camera.cx, camera.cy)
     stride = max(1, round(math.sqrt(len(observation.pixels) / _MOST_PAIRS)))
-    u, v, pairs = _opposite_pairs(observation.depth, observation.mask, intrinsics, camera.is_pinhole, stride)
+    u, v, pairs = _opposite_pairs(observation.depth, observation.mask, camera.lens, stride)
     if len(pairs) < 3:
         return None
     rank = len(pairs) - 1 - min(max(_RANK // stride**2, int(0.002 * len(pairs))), len(pairs) - 1)
@@ -74,15 +75,13 @@ def _moments(pairs: np.ndarray, centre: np.ndarray, shortest: float) -> np.ndarr
 def _opposite_pairs(
     depth: np.ndarray,
     inside: np.ndarray,
-    intrinsics: tuple[float, float, float, float],
-    pinhole: bool,
+    lens: Lens,
     stride: int,
 ) -> tuple[float, float, np.ndarray]:
     """Centre of the silhouette (u, v), and for each pixel with an opposite: half difference and mean of the points.
 
     Of the pairs, those of every ``stride``-th row and column.
     """
-    fx, fy, cx, cy = intrinsics
     height, width = depth.shape
     total_u, total_v, count = 0.0, 0.0, 0
     for v in range(height):
@@ -105,10 +104,8 @@ def _opposite_pairs(
                 continue
             if not inside[v2, u2] or not np.isfinite(depth[v2, u2]):
                 continue
-            z, z2 = np.float64(depth[v, u]), np.float64(depth[v2, u2])
-            s, s2 = (z, z2) if pinhole else (1.0, 1.0)
-            x, y = (u - cx) / fx * s, (v - cy) / fy * s
-            x2, y2 = (u2 - cx) / fx * s2, (v2 - cy) / fy * s2
+            x, y, z = point_at(u, v, np.float64(depth[v, u]), lens)
+            x2, y2, z2 = point_at(u2, v2, np.float64(depth[v2, u2]), lens)
             pairs[k, 0], pairs[k, 1], pairs[k, 2] = 0.5 * (x - x2), 0.5 * (y - y2), 0.5 * (z - z2)
             pairs[k, 3], pairs[k, 4], pairs[k, 5] = 0.5 * (x + x2), 0.5 * (y + y2), 0.5 * (z + z2)
             k += 1

@@ -18,11 +18,21 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 Projection = Literal["pinhole", "orthographic"]
+
+
+class Lens(NamedTuple):
+    """The numbers of a camera, as compiled code takes them."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    is_pinhole: bool
 
 
 @dataclass(frozen=True)
@@ -68,6 +78,11 @@ class Camera:
     def matrix(self) -> np.ndarray:
         """The 3 x 3 matrix K."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
+
+    @property
+    def lens(self) -> Lens:
+        """The numbers of the camera, for compiled code."""
+        return Lens(float(self.fx), float(self.fy), float(self.cx), float(self.cy), self.is_pinhole)
 
     @property
     def is_pinhole(self) -> bool:

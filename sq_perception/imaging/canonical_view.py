@@ -27,9 +27,10 @@ import cv2
 import numpy as np
 
 from sq_perception.geometry import rotation as quaternions
-from sq_perception.geometry.kernels import inline_kernel, kernel
+from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.imaging.camera import Camera
+from sq_perception.imaging.camera import Camera, Lens
+from sq_perception.imaging.lens import point_at
 
 MARGIN = 1.06
 """Side of the cube over the side of what is seen in it."""
@@ -149,10 +150,9 @@ def from_mask(
     camera = camera.cropped(left, top, width, height)
     window = np.s_[top : top + height, left : left + width]
     depth, mask = np.ascontiguousarray(depth[window], dtype=np.float32), np.ascontiguousarray(mask[window])
-    intrinsics = camera.fx, camera.fy, camera.cx, camera.cy
 
     matrix = _FLIP @ look
-    image, low, high, closest = _turned(depth, mask, intrinsics, camera.is_pinhole, matrix)
+    image, low, high, closest = _turned(depth, mask, camera.lens, matrix)
     z = image[np.isfinite(image)]
     outliers = int(z.size * OUTLIERS_PER_END)
     ordered = np.partition(z, [outliers, z.size // 2, z.size - 1 - outliers])
@@ -166,13 +166,9 @@ def from_mask(
     if find_hidden:
         lost = np.ones_like(mask) if missing_is_hidden else _within_hull(mask & np.isfinite(depth))
         ground = np.array([0.0, 0.0, 0.0, np.inf]) if plane is None else np.asarray(plane, dtype=float)
-        covered = _covered(
-            depth, mask, filled, lost, intrinsics, camera.is_pinhole, matrix, ground, _NEARER * float(extent)
-        )
+        covered = _covered(depth, mask, filled, lost, camera.lens, matrix, ground, _NEARER * float(extent))
     beyond = (-left, -top, whole.width - left, whole.height - top) if missing_is_hidden else (0, 0, 0, 0)
-    value, hidden = _resampled(
-        image, filled, covered, beyond, intrinsics, camera.is_pinhole, matrix, anchor, extent, middle, pixels
-    )
+    value, hidden = _resampled(image, filled, covered, beyond, camera.lens, matrix, anchor, extent, middle, pixels)
     return CanonicalView(value, hidden, quaternions.from_matrix(matrix), matrix.T @ anchor, float(extent))
 
 
@@ -231,21 +227,11 @@ def _within_hull(mask: np.ndarray) -> np.ndarray:
     return cv2.erode(hull, np.ones((3, 3), np.uint8)).view(bool)
 
 
-@inline_kernel
-def _point(
-    u: int, v: int, z: float, intrinsics: tuple[float, float, float, float], pinhole: bool
-) -> tuple[float, float, float]:
-    fx, fy, cx, cy = intrinsics
-    scale = z if pinhole else 1.0
-    return (u - cx) / fx * scale, (v - cy) / fy * scale, z
-
-
 @kernel
 def _turned(
     depth: np.ndarray,
     mask: np.ndarray,
-    intrinsics: tuple[float, float, float, float],
-    pinhole: bool,
+    lens: Lens,
     matrix: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Turned z (height, width) of the measured pixels of a mask, NaN elsewhere.
@@ -257,7 +243,7 @@ def _turned(
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):
             if mask[v, u] and np.isfinite(depth[v, u]):
-                x, y, z = _point(u, v, np.float64(depth[v, u]), intrinsics, pinhole)
+                x, y, z = point_at(u, v, np.float64(depth[v, u]), lens)
                 image[v, u] = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z
                 for k in range(2):
                     along = matrix[k, 0] * x + matrix[k, 1] * y + matrix[k, 2] * z
@@ -272,8 +258,7 @@ def _covered(
     mask: np.ndarray,
     filled: np.ndarray,
     lost: np.ndarray,
-    intrinsics: tuple[float, float, float, float],
-    pinhole: bool,
+    lens: Lens,
     matrix: np.ndarray,
     plane: np.ndarray,
     tolerance: float,
@@ -288,7 +273,7 @@ def _covered(
             if not np.isfinite(depth[v, u]):
                 covered[v, u] = lost[v, u]
             elif not mask[v, u]:
-                x, y, z = _point(u, v, np.float64(depth[v, u]), intrinsics, pinhole)
+                x, y, z = point_at(u, v, np.float64(depth[v, u]), lens)
                 nearer = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z > filled[v, u] + tolerance
                 height = plane[0] * x + plane[1] * y + plane[2] * z + plane[3]
                 covered[v, u] = nearer and abs(height) > tolerance
@@ -301,8 +286,7 @@ def _resampled(
     filled: np.ndarray,
     covered: np.ndarray,
     whole: tuple[int, int, int, int],
-    intrinsics: tuple[float, float, float, float],
-    pinhole: bool,
+    lens: Lens,
     matrix: np.ndarray,
     anchor: np.ndarray,
     extent: float,
@@ -317,7 +301,7 @@ def _resampled(
     The object may go on where ``covered`` is, and beyond ``whole``: left, top, right and bottom of the image, unless it
     is empty.
     """
-    fx, fy, cx, cy = intrinsics
+    fx, fy, cx, cy, pinhole = lens
     height, width = image.shape
     left, top, right, bottom = whole
     value, hidden = np.zeros((pixels, pixels), np.float32), np.zeros((pixels, pixels), np.bool_)

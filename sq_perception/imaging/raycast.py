@@ -10,7 +10,7 @@ import numpy as np
 
 from sq_perception.geometry.kernels import box_interval, in_object_frame, kernel, parallel_kernel, ray_entry, support
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.imaging.camera import Camera
+from sq_perception.imaging.camera import Camera, Lens
 
 
 def render(bodies: Superquadric, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
@@ -34,23 +34,20 @@ def render(bodies: Superquadric, camera: Camera) -> tuple[np.ndarray, np.ndarray
         bodies = Superquadric.from_flat(bodies.to_flat()[None])
     depth = np.full((camera.height, camera.width), np.inf)
     index = np.full((camera.height, camera.width), -1, dtype=np.int32)
-    intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     matrices = np.ascontiguousarray(bodies.rotation_matrix, dtype=float)
     flat = np.ascontiguousarray(bodies.to_flat(), dtype=float)
-    windows = _windows(flat, matrices, intrinsics, camera.is_pinhole, camera.width, camera.height)
-    _render_bodies(flat, matrices, windows, intrinsics, camera.is_pinhole, depth, index)
+    windows = _windows(flat, matrices, camera.lens, camera.width, camera.height)
+    _render_bodies(flat, matrices, windows, camera.lens, depth, index)
     return depth, index
 
 
 @kernel
-def _windows(
-    flat: np.ndarray, matrices: np.ndarray, intrinsics: np.ndarray, pinhole: bool, width: int, height: int
-) -> np.ndarray:
+def _windows(flat: np.ndarray, matrices: np.ndarray, lens: Lens, width: int, height: int) -> np.ndarray:
     """Pixels (n, 4): left, top, right, bottom, the last two exclusive, outside of which no part of a body is seen.
 
     Those of the corners of the box around each body.
     """
-    fx, fy, cx, cy = intrinsics
+    fx, fy, cx, cy, pinhole = lens
     windows = np.zeros((flat.shape[0], 4), np.int64)
     reach = np.empty(3)
     for k in range(flat.shape[0]):
@@ -81,12 +78,11 @@ def _render_bodies(
     flat: np.ndarray,
     matrices: np.ndarray,
     windows: np.ndarray,
-    intrinsics: np.ndarray,
-    pinhole: bool,
+    lens: Lens,
     depth: np.ndarray,
     index: np.ndarray,
 ) -> None:
-    fx, fy, cx, cy = intrinsics
+    fx, fy, cx, cy, pinhole = lens
     for v in numba.prange(depth.shape[0]):
         for k in range(flat.shape[0]):
             left, top, right, bottom = windows[k]

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sq_perception.geometry.kernels import kernel
-from sq_perception.imaging.camera import Camera
+from sq_perception.imaging.camera import Camera, Lens
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,13 +44,13 @@ def render_mesh(mesh: Mesh, camera: Camera) -> np.ndarray:
     windows = np.concatenate([np.ceil(pixels.min(axis=1) - 1e-6), np.floor(pixels.max(axis=1) + 1e-6) + 1], axis=1)
     limits = np.array([camera.width, camera.height, camera.width, camera.height])
     windows = np.clip(windows, 0, limits).astype(np.int64)
-    _rasterise(corners, windows, np.array([camera.fx, camera.fy, camera.cx, camera.cy]), depth)
+    _rasterise(corners, windows, camera.lens, depth)
     return depth
 
 
 @kernel
-def _rasterise(corners: np.ndarray, windows: np.ndarray, intrinsics: np.ndarray, depth: np.ndarray) -> None:
-    fx, fy, cx, cy = intrinsics
+def _rasterise(corners: np.ndarray, windows: np.ndarray, lens: Lens, depth: np.ndarray) -> None:
+    fx, fy, cx, cy, _ = lens
     for k in range(corners.shape[0]):
         a, b, c = corners[k]
         left, top, right, bottom = windows[k]

@@ -12,7 +12,7 @@ import numpy as np
 
 from sq_perception.geometry.kernels import gauge, in_object_frame, kernel, parallel_kernel, ray_interval
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.imaging.camera import Camera
+from sq_perception.imaging.camera import Camera, Lens
 from sq_perception.imaging.raycast import render
 
 
@@ -47,22 +47,19 @@ def render_things(
     """
     depth, index = render(parts, camera)
     thing = np.append(np.asarray(owner, dtype=np.int32), np.int32(-1))[index]
-    intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
     if len(cavities):
         matrices = np.ascontiguousarray(cavities.rotation_matrix, dtype=float)
         flat = np.ascontiguousarray(cavities.to_flat(), dtype=float)
-        _hollow_out(flat, matrices, np.asarray(cavity_owner, dtype=np.int32), intrinsics, depth, thing)
+        _hollow_out(flat, matrices, np.asarray(cavity_owner, dtype=np.int32), camera.lens, depth, thing)
     plane = np.array([0.0, 0.0, 0.0, 1.0]) if table is None else np.asarray(table, dtype=float)
-    _add_background(plane, float(behind), intrinsics, depth, thing)
+    _add_background(plane, float(behind), camera.lens, depth, thing)
     return depth, thing
 
 
 @kernel
-def _add_background(
-    plane: np.ndarray, behind: float, intrinsics: np.ndarray, depth: np.ndarray, thing: np.ndarray
-) -> None:
+def _add_background(plane: np.ndarray, behind: float, lens: Lens, depth: np.ndarray, thing: np.ndarray) -> None:
     """Table and wall where they are nearer than the things, in place."""
-    fx, fy, cx, cy = intrinsics
+    fx, fy, cx, cy, _ = lens
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):
             z = behind
@@ -79,11 +76,11 @@ def _hollow_out(
     flat: np.ndarray,
     matrices: np.ndarray,
     owner: np.ndarray,
-    intrinsics: np.ndarray,
+    lens: Lens,
     depth: np.ndarray,
     thing: np.ndarray,
 ) -> None:
-    fx, fy, cx, cy = intrinsics
+    fx, fy, cx, cy, _ = lens
     for v in numba.prange(depth.shape[0]):
         for u in range(depth.shape[1]):
             if thing[v, u] < 0:
