@@ -76,15 +76,13 @@ def viewed(
     ValueError
         If two things are in one place, as seen from above.
     """
-    camera, angle = mesh_scene.CAMERA, np.deg2rad(down)
-    table = np.array([[1.0, 0, 0], [0, -np.sin(angle), -np.cos(angle)], [0, np.cos(angle), -np.sin(angle)]])
+    camera, table = mesh_scene.CAMERA, mesh_scene.looked_down_on(np.deg2rad(down))
     origin = np.array([0.0, 0.0, distance])
     plane = np.append(table[:, 2], -table[:, 2] @ origin)
     poses: list[tuple[np.ndarray, np.ndarray]] = []
     outlines: list[np.ndarray] = []
     for each in things:
-        c, s = np.cos(np.deg2rad(each.heading)), np.sin(np.deg2rad(each.heading))
-        turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]]) @ each.turn
+        turn = mesh_scene.about_z(np.deg2rad(each.heading)) @ each.turn
         corners = each.thing.hull @ turn.T
         low, high = corners.min(axis=0), corners.max(axis=0)
         place = np.append(each.place, 0.0) - np.append((low + high)[:2] / 2, low[2])

@@ -74,9 +74,7 @@ def resting(hull: trimesh.Trimesh) -> Poser:
     def pose(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         rest = rests[rng.choice(len(rests), p=likely)]
         down, roll, yaw = np.deg2rad([rng.uniform(*ELEVATION), rng.uniform(-ROLL, ROLL), rng.uniform(0, 360)])
-        # Columns: the table's x, y and upward normal in the frame of a camera that looks along it, then down on it.
-        level = np.array([[1.0, 0, 0], [0, -np.sin(down), -np.cos(down)], [0, np.cos(down), -np.sin(down)]])
-        table = _about_z(roll) @ level @ _about_z(yaw)
+        table = about_z(roll) @ looked_down_on(down) @ about_z(yaw)
         turn = table @ rest[:3, :3]
         middle = trimesh.transform_points(hull.vertices, rest)
         middle = (middle.min(axis=0) + middle.max(axis=0)) / 2
@@ -130,6 +128,12 @@ def _place(rng: np.random.Generator) -> np.ndarray:
     return distance * np.append(rng.uniform(-OFF_AXIS, OFF_AXIS, 2), 1.0)
 
 
-def _about_z(angle: float) -> np.ndarray:
+def looked_down_on(down: float) -> np.ndarray:
+    """Columns: right, away and up on a table, in the optical frame of a camera that looks down by so many radians."""
+    return np.array([[1.0, 0, 0], [0, -np.sin(down), -np.cos(down)], [0, np.cos(down), -np.sin(down)]])
+
+
+def about_z(angle: float) -> np.ndarray:
+    """The rotation (3, 3) about z by so many radians."""
     c, s = np.cos(angle), np.sin(angle)
     return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])

@@ -30,6 +30,7 @@ import numpy as np
 import tabletop
 import trimesh
 from both_fits import measured_points
+from mesh_scene import about_z
 from real_frames import below_table
 from tabletop import Placed, Tabletop
 
@@ -271,10 +272,9 @@ def _standing_box(points: np.ndarray, scene: Tabletop) -> Superquadric:
     flat = points @ scene.table
     height = points @ scene.plane[:3] + scene.plane[3]
     middle, edges, degrees = cv2.minAreaRect(flat[:, :2].astype(np.float32))
-    c, s = np.cos(np.deg2rad(degrees)), np.sin(np.deg2rad(degrees))
     top = max(float(height.max()), _THINNEST)
     centre = scene.table @ np.array([*middle, top / 2 - scene.plane[3]])
-    return _box(np.array([*edges, top]), centre, scene.table @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]]))
+    return _box(np.array([*edges, top]), centre, scene.table @ about_z(np.deg2rad(degrees)))
 
 
 def _box(edges: np.ndarray, centre: np.ndarray, turn: np.ndarray) -> Superquadric:

@@ -21,6 +21,7 @@ from pathlib import Path
 import mesh_scene
 import mesh_things
 import numpy as np
+from mesh_scene import about_z, looked_down_on
 from mesh_things import MeshThing
 from scipy.spatial import ConvexHull
 
@@ -121,8 +122,7 @@ class _Stand:
 
     def holds(self, outline: np.ndarray) -> bool:
         """Whether points (n, 2) of the table's frame lie on the table."""
-        c, s = np.cos(self.yaw), np.sin(self.yaw)
-        along = outline @ np.array([[c, -s], [s, c]])
+        along = outline @ about_z(self.yaw)[:2, :2]
         return bool((np.abs(along) < self.sides / 2).all())
 
 
@@ -186,11 +186,9 @@ def gap(first: np.ndarray, second: np.ndarray) -> float:
 
 def _stand(rng: np.random.Generator, nearest: float) -> _Stand:
     down, roll = np.deg2rad([rng.uniform(*ELEVATION), rng.uniform(-ROLL, ROLL)])
-    level = np.array([[1.0, 0, 0], [0, -np.sin(down), -np.cos(down)], [0, np.cos(down), -np.sin(down)]])
-    tilt = np.array([[np.cos(roll), -np.sin(roll), 0], [np.sin(roll), np.cos(roll), 0], [0, 0, 1.0]])
     origin = np.array([0.0, 0.0, rng.uniform(*DISTANCE)])
     sides = np.array([rng.uniform(*side) for side in TABLE_SIDES])
-    return _Stand(tilt @ level, origin, rng.uniform(-0.5, 0.5), sides, nearest)
+    return _Stand(about_z(roll) @ looked_down_on(down), origin, rng.uniform(-0.5, 0.5), sides, nearest)
 
 
 def _arranged(things: list[MeshThing], stand: _Stand, rng: np.random.Generator) -> list[tuple[str, np.ndarray]] | None:
@@ -218,8 +216,7 @@ def _lying(thing: MeshThing, spread: float, rng: np.random.Generator) -> tuple[s
     """One of the rests of a thing, turned about the vertical, its middle at most ``spread`` from the origin."""
     rest = thing.rests[rng.choice(len(thing.rests), p=[each.likely for each in thing.rests])]
     yaw, bearing, radius = rng.uniform(0, 2 * np.pi), rng.uniform(0, 2 * np.pi), spread * np.sqrt(rng.random())
-    c, s = np.cos(yaw), np.sin(yaw)
-    turn = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]]) @ rest.turn
+    turn = about_z(yaw) @ rest.turn
     corners = thing.hull @ turn.T
     low, high = corners.min(axis=0), corners.max(axis=0)
     pose = np.eye(4)
@@ -265,7 +262,6 @@ def _background(stand: _Stand, camera: Camera) -> np.ndarray:
     plane = stand.plane
     table = plane_depth(plane, camera)
     points = camera.points(np.where(np.isfinite(table), table, 1e3)) - stand.origin
-    c, s = np.cos(stand.yaw), np.sin(stand.yaw)
-    along = (points @ stand.table[:, :2]) @ np.array([[c, -s], [s, c]])
+    along = (points @ stand.table[:, :2]) @ about_z(stand.yaw)[:2, :2]
     on_table = np.isfinite(table) & (np.abs(along) < stand.sides / 2).all(axis=-1)
     return np.where(on_table, table, plane_depth(plane + [0, 0, 0, FLOOR], camera))
