@@ -149,7 +149,7 @@ def falling_rate(rate: float, step: int, progress: float) -> float:
 
 def _shards(folder: Path, held: int) -> list[Path]:
     """The shards that a folder holds, in order; raises ValueError if there are none but those kept for validation."""
-    found = sorted(folder.glob("*.safetensors"))
+    found = sorted(folder.glob("[!.]*.safetensors"))  # one that is being written is hidden
     if len(found) <= held:
         raise ValueError(f"{folder}: expected more than {held} shards of views, found {len(found)}")
     return found

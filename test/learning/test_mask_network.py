@@ -12,6 +12,7 @@ import torch
 from safetensors.numpy import save_file
 
 from sq_perception.commands import main
+from sq_perception.files import output_file
 from sq_perception.imaging.segment_view import CHANNELS, PIXELS, SEGMENT
 from sq_perception.learning import checkpoint, mask_training, shard_training
 from sq_perception.learning.checkpoint import CheckpointError
@@ -77,6 +78,15 @@ def test_a_folder_without_views_is_refused(tmp_path: Path, capsys: pytest.Captur
     tmp_path.joinpath("empty").mkdir()
     assert main.main(["train-masks", str(tmp_path / "empty"), "--output", str(tmp_path / "run")]) == 1
     assert "expected more than 2 shards" in capsys.readouterr().err
+
+
+def test_a_shard_that_is_being_written_is_not_read(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], rng: np.random.Generator
+) -> None:
+    shards(tmp_path / "views", 2, rng)
+    with output_file.writing(tmp_path / "views" / "00002.safetensors"):
+        assert main.main(["train-masks", str(tmp_path / "views"), "--output", str(tmp_path / "run")]) == 1
+    assert "expected more than 2 shards of views, found 2" in capsys.readouterr().err
 
 
 def test_a_damaged_shard_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[str], rng: np.random.Generator) -> None:
