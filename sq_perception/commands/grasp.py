@@ -84,7 +84,9 @@ def _run(options: argparse.Namespace) -> int:
     from sq_perception.recordings.inputs import RecordedInput
     from sq_perception.recovery.recoverer import Recoverer
 
-    entries, code = [], SUCCESS
+    entries: list[dict[str, Any]] = []
+    stems: set[str] = set()
+    code = SUCCESS
     try:
         recorded, recoverer = RecordedInput(options.frames, options.camera_info), Recoverer()
     except (FrameError, CheckpointError) as error:
@@ -97,7 +99,10 @@ def _run(options: argparse.Namespace) -> int:
             complain(f"{file}: a view of the unit cube has no metres to grasp in")
             code = FAILURE
         else:
-            entries.append(_frame(file, frame, recoverer, hand, friction, options))
+            if frame.warning:
+                complain(f"warning: {frame.name}: {frame.warning}")
+            stem = output_file.free_name(frame.name if frame.topic else Path(frame.name).stem, stems)
+            entries.append(_frame(file, stem, frame, recoverer, hand, friction, options))
     chosen = {"gripper": hand.name, "friction": friction}
     document = {"format": FORMAT, "version": VERSION, "options": chosen, "frames": entries}
     text = json.dumps(document, indent=1, allow_nan=False)
@@ -111,21 +116,28 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _frame(
-    file: str, frame: RecordedFrame, recoverer: Recoverer, hand: Gripper, friction: float, options: argparse.Namespace
+    file: str,
+    stem: str,
+    frame: RecordedFrame,
+    recoverer: Recoverer,
+    hand: Gripper,
+    friction: float,
+    options: argparse.Namespace,
 ) -> dict[str, Any]:
     import numpy as np
 
     from sq_perception.geometry.superquadric import Superquadric
     from sq_perception.grasping.planner import grasps
     from sq_perception.grasping.surroundings import Surroundings
+    from sq_perception.recovery.options import RecoveryOptions
 
-    recovery = recoverer.recover(frame.depth, frame.camera, frame.labels)
+    settings = RecoveryOptions(free_space=frame.has_free_space)
+    recovery = recoverer.recover(frame.depth, frame.camera, frame.labels, settings)
     found = recovery.recovered
     bodies = Superquadric.stack([recovered.superquadric for recovered in found])
     covariance = np.array([recovered.covariance for recovered in found]).reshape(-1, 11, 11)
     around = Surroundings.of_image(frame.depth, frame.camera, recovery.plane)
     plan = grasps(bodies, hand, covariance, around, friction)
-    stem = Path(frame.name).stem
     if options.pictures:
         _draw(options.pictures / f"{stem}.png", frame, found, plan, hand)
     if options.meshes and found:

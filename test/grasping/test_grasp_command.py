@@ -51,6 +51,16 @@ def test_a_can_is_grasped_across_and_everything_is_written(frame, tmp_path, caps
     assert "mm open" in capsys.readouterr().out
 
 
+def test_frames_of_one_name_have_a_picture_each_and_their_warnings_are_told(frame, tmp_path, capsys):
+    other = tmp_path / "far" / frame.name
+    other.parent.mkdir()
+    recorded = dict(np.load(frame))
+    np.savez(other, **{**recorded, "depth": 1000 * recorded["depth"]})
+    assert main.main(["grasp", str(frame), str(other), "--pictures", str(tmp_path)]) == 0
+    assert sorted(path.name for path in tmp_path.glob("*.png")) == ["can.png", "can_2.png"]
+    assert "for millimetres the depth scale is 1000" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("wrong", [["--gripper", "claw"], ["--friction", "0"], ["--json", "nowhere/out.json"]])
 def test_wrong_usage_is_told(frame, wrong, capsys):
     assert main.main(["grasp", str(frame), *wrong]) == 2
