@@ -226,7 +226,7 @@ def _matrix(info: dict[Any, Any], names: tuple[str, ...], length: int | None) ->
         values = entry.get("data") if isinstance(entry, dict) else entry
         try:
             numbers = np.array(values, dtype=float).ravel()
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:  # the last of whole numbers that no float holds
             raise FrameError(f"{name}: expected numbers, got {reprlib.repr(values)}") from error
         if not np.isfinite(numbers).all() or (length is not None and numbers.size != length):
             wanted = "finite numbers" if length is None else f"{length} finite numbers"

@@ -65,6 +65,7 @@ def test_four_numbers_are_the_same_camera(tmp_path):
         ({"ppx": 1, "ppy": 2}, "expected width"),
         ({"width": 64, "height": 48, "fx": 1, "fy": 1, "ppx": 1, "ppy": 1, "model": "F-Theta"}, "F-Theta"),
         ({"width": 64, "height": 48, "intrinsic_matrix": [1, 2]}, "9 numbers"),
+        ({"width": 64, "height": 48, "fx": 10**400, "fy": 1, "ppx": 1, "ppy": 1}, "expected numbers"),
         ({"width": 64, "height": 48, "intrinsic_matrix": [60, 0, 31.5, 0, 61, 23.5, 0, 0, 1]}, "transposed"),
         ({"intrinsic_matrix": [60, 0, 0, 0, 61, 0, 31.5, 23.5, 1]}, "width"),
         ({}, "width"),
