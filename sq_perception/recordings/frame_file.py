@@ -329,7 +329,9 @@ def _read_npz(path: Path, projection: Projection, scale: float | None) -> Record
         if labels.shape != depth.shape or labels.dtype.kind not in "iub":
             expected = f"expected integers of the depth's shape {depth.shape}"
             raise ValueError(f"labels: {expected}, got {labels.dtype} {labels.shape}")
-        labels = labels.astype(np.int32)
+        if labels.max() > np.iinfo(np.int32).max:
+            raise ValueError(f"labels: expected numbers below 2^31, got {labels.max()}")
+        labels = np.maximum(labels, 0).astype(np.int32)
     height, width = depth.shape
     is_cube = str(fields.get("projection", "")) == "orthographic"
     if projection == "orthographic" or is_cube:

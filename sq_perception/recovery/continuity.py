@@ -96,6 +96,8 @@ def repeated(previous: FrameRecovery, depth: np.ndarray, camera: Camera, options
     before = previous.reference
     if before is None or before.camera != camera or before.options != options or not camera.is_pinhole:
         return NOTHING
+    if previous.labels.max(initial=0) > previous.labels.size:  # given ones, and tables by label would be huge
+        return NOTHING
     old, new = before.depth, Reference.of(depth, camera, before.sigma, options).depth
     labels = np.ascontiguousarray(previous.labels[:: before.stride, :: before.stride], dtype=np.int32)
     reach = _REACH * float(old[labels > 0].max(initial=0))

@@ -186,12 +186,14 @@ def from_labels(
     Raises
     ------
     ValueError
-        If either image does not fit the camera, or labels are no integers.
+        If either image does not fit the camera, or labels are no integers, or some are beyond 32 bits.
     """
     options = options or SegmentationOptions()
     labels = np.asarray(labels)
     if labels.dtype.kind not in "iub":
         raise ValueError(f"labels: expected an integer image, got {labels.dtype}")
+    if labels.max(initial=0) > np.iinfo(np.int32).max:
+        raise ValueError(f"labels: expected numbers below 2^31, got {labels.max()}")
     if labels.ndim != 2:
         raise ValueError(f"labels: expected shape (height, width), got {labels.shape}")
     camera.check_image(labels)

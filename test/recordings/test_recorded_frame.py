@@ -46,6 +46,12 @@ def save_npz(path, **fields):
     return path
 
 
+def test_npz_with_labels_that_would_become_others_is_refused(tmp_path):
+    labels = np.full((48, 64), 2**32 + 2)
+    with pytest.raises(FrameError, match="numbers below"):
+        read(save_npz(tmp_path / "frame.npz", labels=labels))
+
+
 def test_npz_with_labels_and_plane(tmp_path):
     labels = np.zeros((48, 64), np.int16)
     labels[10:20, 10:20] = 7

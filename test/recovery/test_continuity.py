@@ -168,6 +168,16 @@ def test_given_masks_that_stay_repeat_too(recoverer):
     assert [one.repeats for one in after.bodies] == [1, 1, 1]
 
 
+def test_masks_with_huge_labels_are_recovered_anew(recoverer):
+    """Tables by label would be larger than the memory."""
+    _, index = raycast.render(Superquadric.stack(list(STILL)), CAMERA)
+    labels = np.where(index >= 0, 2**31 - 1 - index, 0).astype(np.int32)
+    first = recoverer.recover(image(STILL, 0), CAMERA, labels)
+    again = recoverer.recover(image(STILL, 1), CAMERA, labels, previous=first)
+    assert sorted(body.label for body in again.bodies) == [2**31 - 3, 2**31 - 2, 2**31 - 1]
+    assert not any(body.repeats for body in again.bodies)
+
+
 @pytest.mark.parametrize("status", [Status.CONVERGED, Status.WEAK])
 def test_each_body_has_its_turn_one_at_a_time_and_a_weak_one_sooner(first, status):
     limit = {Status.CONVERGED: 30, Status.WEAK: 10}[status]

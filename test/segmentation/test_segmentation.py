@@ -131,6 +131,12 @@ def test_nothing_to_find(depth):
     np.testing.assert_array_equal(from_labels(np.zeros(depth.shape, int), depth, CAMERA).ids, ())
 
 
+def test_labels_that_would_become_others_are_refused():
+    labels = np.full((CAMERA.height, CAMERA.width), 2**32 + 2)
+    with pytest.raises(ValueError, match="numbers below"):
+        from_labels(labels, np.ones(labels.shape), CAMERA)
+
+
 def test_noisy_empty_table_stays_empty():
     for seed in range(5):
         depth, _ = scene([standing(5.0, 5.0, (0.01, 0.01, 0.01))], noise=0.003, seed=seed)
