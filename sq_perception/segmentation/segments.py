@@ -33,7 +33,6 @@ from sq_perception.imaging import depth_steps, regions
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation import (
     convex_parts,
-    necks,
     patch_grouping,
     standing,
     support_plane,
@@ -296,8 +295,7 @@ def _above(
     holds = partial(limits.is_small, up=support.plane.equation[:3])
     inside = _bodies(known, clear[window], seen, support.sigma, holds, flat)
     foot = above[window] & (inside == 0)
-    grown = depth_steps.grown(inside, foot, known, _FOOT_PIXELS, depth_steps.STEP)
-    labels[window] = necks.joined(grown, known, seen, support.plane.equation)
+    labels[window] = depth_steps.grown(inside, foot, known, _FOOT_PIXELS, depth_steps.STEP)
     return labels
 
 
