@@ -251,13 +251,13 @@ def _trials(
     touch = 0.5 * (np.maximum(u - gripper.tip, -near[at]) + np.minimum(u + gripper.tip, near[at]))
     narrow, broad = np.arctan([friction, _AT_MOST * friction])
     cone, doubt = 0.5 * (narrow + broad), np.hypot(_SQUARE, (broad - narrow) / np.sqrt(12))
-    ends, angle = bodies.chords(owner[at], _ahead(frames, at, v, touch), y[at], broad)
+    ends, angle = bodies.chords(owner[at], _offsets(frames, at, v, touch), y[at], broad)
     squarely = np.isfinite(angle)  # two in five; a body without any has that for a reason
     has_any = np.zeros(len(bodies), dtype=bool)
     has_any[owner[at[squarely]]] = True
     rows = np.flatnonzero(squarely | ~has_any[owner[at]])
     u, v, at, ends, angle = u[rows], v[rows], at[rows], ends[rows], angle[rows]
-    offset = _ahead(frames, at, v, u)
+    offset = _offsets(frames, at, v, u)
 
     owner, half, side, opening, shift = owner[at], half[at], side[at], opening[at], shift[at]
     near, near_sigma, frames = near[at], near_sigma[at], frames[at]
@@ -281,7 +281,7 @@ def _trials(
 
 
 @kernel
-def _ahead(frames: np.ndarray, at: np.ndarray, aside: np.ndarray, ahead: np.ndarray) -> np.ndarray:
+def _offsets(frames: np.ndarray, at: np.ndarray, aside: np.ndarray, ahead: np.ndarray) -> np.ndarray:
     """Offsets (k, 3) along the first and the third axis of frames ``at`` (k,)."""
     offset = np.empty((len(at), 3))
     for k in range(len(at)):

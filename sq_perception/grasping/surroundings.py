@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from sq_perception.geometry.kernels import kernel
-from sq_perception.imaging.camera import Camera
+from sq_perception.imaging.camera import Camera, Lens
 
 _BEHIND = 0.015
 """A place so many metres behind what a pixel measured was not seen."""
@@ -111,20 +111,19 @@ class Surroundings:
         if self.depth is None or self.camera is None:
             return np.full(places.shape[:-1], np.nan)
         camera, flat = self.camera, np.ascontiguousarray(places, dtype=float).reshape(-1, 3)
-        at = _pixels_at(flat, camera.width, camera.height, np.array([camera.fx, camera.fy, camera.cx, camera.cy]))
+        at = _pixels_at(flat, camera.width, camera.height, camera.lens)
         found = np.where(at >= 0, self.depth.ravel()[at] - flat[:, 2], np.nan)
         return np.asarray(found.reshape(places.shape[:-1]))
 
 
 @kernel
-def _pixels_at(places: np.ndarray, width: int, height: int, intrinsics: np.ndarray) -> np.ndarray:
+def _pixels_at(places: np.ndarray, width: int, height: int, lens: Lens) -> np.ndarray:
     """Position (k,) in a flat image of the pixels that show places (k, 3); -1 beyond the image or not before it."""
-    fx, fy, cx, cy = intrinsics
     found = np.full(len(places), -1)
     for k in range(len(places)):
         z = places[k, 2]
         if z > _NEAREST:
-            column, row = np.rint(fx * places[k, 0] / z + cx), np.rint(fy * places[k, 1] / z + cy)
+            column, row = np.rint(lens.fx * places[k, 0] / z + lens.cx), np.rint(lens.fy * places[k, 1] / z + lens.cy)
             if 0 <= column < width and 0 <= row < height:
                 found[k] = int(row) * width + int(column)
     return found

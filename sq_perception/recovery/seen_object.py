@@ -14,9 +14,10 @@ import numpy as np
 from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.quantiles import quantile
 from sq_perception.imaging import canonical_view
-from sq_perception.imaging.camera import Camera
+from sq_perception.imaging.camera import Camera, Lens
 from sq_perception.imaging.canonical_view import CanonicalView
 from sq_perception.imaging.coherence import coherent
+from sq_perception.imaging.lens import point_at
 from sq_perception.learning.network_config import RegressorConfig, ThingConfig
 from sq_perception.recovery.options import RecoveryOptions
 from sq_perception.recovery.prediction import Prediction
@@ -79,8 +80,7 @@ class SeenObject:
 
     def heights(self, plane: np.ndarray) -> np.ndarray:
         """Metres above a plane (4,): of the pixels of ``mask_crop``, NaN elsewhere."""
-        c = self.camera_crop
-        return _heights(self.depth_crop, self.mask_crop, (c.fx, c.fy, c.cx, c.cy), c.is_pinhole, plane)
+        return _heights(self.depth_crop, self.mask_crop, self.camera_crop.lens, plane)
 
     def levels(self, plane: np.ndarray) -> tuple[float, float]:
         """The height of its lowest pixels above a plane, and the median of all, metres; of some thousand pixels."""
@@ -183,20 +183,11 @@ def core(obj: SeenObject, depth: np.ndarray, camera: Camera) -> np.ndarray:
 
 
 @kernel
-def _heights(
-    depth: np.ndarray,
-    mask: np.ndarray,
-    intrinsics: tuple[float, float, float, float],
-    pinhole: bool,
-    plane: np.ndarray,
-) -> np.ndarray:
-    fx, fy, cx, cy = intrinsics
+def _heights(depth: np.ndarray, mask: np.ndarray, lens: Lens, plane: np.ndarray) -> np.ndarray:
     heights = np.full(depth.shape, np.nan)
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):
             if mask[v, u]:
-                z = np.float64(depth[v, u])
-                scale = z if pinhole else 1.0
-                x, y = (u - cx) / fx * scale, (v - cy) / fy * scale
+                x, y, z = point_at(u, v, np.float64(depth[v, u]), lens)
                 heights[v, u] = plane[0] * x + plane[1] * y + plane[2] * z + plane[3]
     return heights

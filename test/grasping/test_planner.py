@@ -12,6 +12,7 @@ from sq_perception.grasping.closing import KnownBodies
 from sq_perception.grasping.gripper import GRIPPERS, PANDA, Gripper, gripper
 from sq_perception.grasping.planner import grasps
 from sq_perception.grasping.surroundings import Surroundings
+from sq_perception.grasping.trials import Trials
 from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
 
@@ -317,3 +318,18 @@ def test_misuse_is_told(wrong, what):
 def test_every_gripper_takes_a_can(hand):
     assert plan(standing(*CAN), hand=hand).grasps[0].score > 0.9
     assert np.linalg.norm(hand.link_from_tcp[1]) == pytest.approx(1.0)
+
+
+def test_the_first_of_each_body_are_its_most_probable_ones():
+    rng = np.random.default_rng(5)
+    owner, logs = rng.integers(0, 4, 60), rng.integers(-9, 1, (60, 9)).astype(float)  # whole numbers: many are alike
+    numbers = np.arange(60.0)
+    trials = Trials(owner, np.zeros((60, 3, 4)), numbers, numbers, logs, np.zeros((60, 2)))
+    total = logs.sum(axis=1)
+    expected = [
+        row
+        for k in range(4)
+        for row in sorted(np.flatnonzero((owner == k) & (total > -45)), key=lambda row: -total[row])[:5]
+    ]
+    np.testing.assert_array_equal(trials.first(5, -45.0).opening, expected)
+    assert not len(trials.at(np.empty(0, int)).first(5).owner)

@@ -10,7 +10,7 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast, unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.recordings.frame_file import read
-from sq_perception.segmentation.segments import SegmentationOptions, from_labels, segment
+from sq_perception.segmentation.segments import Segmentation, SegmentationOptions, from_labels, segment, support_under
 
 CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)
 TILT = 0.7
@@ -231,3 +231,17 @@ def test_separate_objects_on_recorded_tables(shared_data):
         for label in np.unique(frame.labels[frame.labels > 0]):
             ious.append(best_iou((frame.labels == label) & measured, np.where(measured, found.labels, 0)))
     assert np.mean(ious) > 0.95
+
+
+def test_another_support_is_sought_where_the_surroundings_show_one():
+    """A body on a shelf 10 cm above the table, to the right of the image's middle, and one that the table alone is
+    around."""
+    shelf = PLANE - np.array([0, 0, 0, 0.1])
+    depth, labels = scene([standing(-0.25, 0.0, (0.06, 0.04, 0.09)), standing(0.2, 0.0, (0.05, 0.05, 0.12))])
+    on_shelf = (np.arange(CAMERA.width) > CAMERA.width // 2) & ~(labels == 1)
+    depth = np.where(on_shelf, np.fmin(depth, table_depth(plane=shelf)), depth).astype(np.float32)
+    labels[(labels == 2) & (depth < table_depth(plane=shelf) - 1e-3)] = 3
+    labels[labels == 2] = 0
+    found = Segmentation(labels, PLANE, (1, 3))
+    np.testing.assert_allclose(support_under(found, 3, depth, CAMERA), shelf, atol=2e-3)
+    assert support_under(found, 1, depth, CAMERA) is None
