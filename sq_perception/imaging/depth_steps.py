@@ -31,12 +31,11 @@ def components(mask: np.ndarray) -> np.ndarray:
     return labels
 
 
-def separated(depth: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+def separated(depth: np.ndarray, wanted: np.ndarray, step: float = STEP) -> np.ndarray:
     """Components of the wanted pixels, cut where neighbouring depths jump; the cut pixels are given back."""
     filled = np.where(wanted, depth, np.float32(0))
-    kept = wanted & ~edges(filled, wanted, STEP)
-    labels = components(cv2.morphologyEx(kept.astype(np.uint8), cv2.MORPH_OPEN, CROSS))
-    return grown(labels, wanted & (labels == 0), depth, 2, STEP)
+    labels = components(wanted & ~edges(filled, wanted, step))
+    return grown(labels, wanted & (labels == 0), depth, 2, step)
 
 
 def grown(labels: np.ndarray, free: np.ndarray, depth: np.ndarray, rounds: int, step: float) -> np.ndarray:

@@ -160,7 +160,7 @@ def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | No
     everything = cv2.copyTo(everything, measured.view(np.uint8))
     relative = support.image_relative(everything, camera)
     labels = _above(known, relative * valid, valid, camera, support, walls, limits)
-    test = standing.standing(everything, relative, camera, support, walls, limits)
+    test = standing.standing(everything, relative, labels, camera, support, walls, limits)
     labels, ids = _ordered(labels, least, options.max_objects, test)
     return Segmentation(labels, plane.equation, ids, max(support.sigma, _LEAST_SIGMA))
 

@@ -167,6 +167,7 @@ def alone(depth: np.ndarray, camera: Camera, limits: Limits) -> ObjectTest:
 def standing(
     depth: np.ndarray,
     relative: np.ndarray,
+    labels: np.ndarray,
     camera: Camera,
     support: SupportSurface,
     walls: list[Plane],
@@ -178,6 +179,8 @@ def standing(
     ----------
     depth, relative : (height, width)
         Metres, 0 where nothing was measured, and the heights above the support as at one metre of depth.
+    labels : int32 (height, width)
+        The segments.
     camera
         A pinhole camera.
     support
@@ -186,8 +189,8 @@ def standing(
         Other planes of the image.
     """
     last_row, last_column = camera.height - 1, camera.width - 1
-    around = depth > 0
-    measured = np.count_nonzero(around)
+    measured = np.count_nonzero(depth)
+    around = (depth > 0) & ~_tall(labels, relative)
     coarse = depth[::_SPARSE, ::_SPARSE]
     nearest = quantile(coarse[coarse > 0], _STRAY) * (1 + depth_steps.STEP) if coarse.any() else 0.0
     plane = support.plane
@@ -219,6 +222,14 @@ def standing(
         return True
 
     return is_thing
+
+
+def _tall(labels: np.ndarray, relative: np.ndarray) -> np.ndarray:
+    """Pixels, bool (height, width), of segments that are higher than any noise, on average: things or the room."""
+    at = np.flatnonzero(labels)
+    of, count = labels.ravel()[at], int(labels.max(initial=0)) + 1
+    means = np.bincount(of, relative.ravel()[at], count) / np.maximum(np.bincount(of, minlength=count), 1)
+    return np.asarray((means > HIGHEST * TOLERANCE)[labels])
 
 
 def _spread(relative: np.ndarray, around: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> float:

@@ -65,6 +65,9 @@ _MOST_PATCHES = 150
 """Bounds the time of frames that are noise alone; those of things have some 30."""
 _CONCAVE_BAND = 0.3
 """Of a fold's threshold, from which on patches grow into what is concave last."""
+_GAP = 0.1
+"""Share of the depth by which samples of what is left over differ at most: a side that is seen at a grazing angle has
+steps, what lies behind a fringe is farther."""
 _NEAREST, _FARTHEST = np.float32(1e-3), np.float32(1e3)
 """Metres between which depths are inverted."""
 _FAR_RADII = 2.0
@@ -167,7 +170,8 @@ def find(
         fold /= limit
         smooth = known & ~stepped & (np.abs(fold) < 1)
     least = max(6, round(_LEAST_AREA * (focal / middle / stride) ** 2))
-    seeds = _large(cv2.morphologyEx(smooth.astype(np.uint8), cv2.MORPH_OPEN, depth_steps.CROSS), least)
+    opened = cv2.morphologyEx(smooth.astype(np.uint8), cv2.MORPH_OPEN, depth_steps.CROSS)
+    seeds = _large(depth_steps.components(opened), least)
     free = (coarse > 0) & (seeds == 0)
     # Concave bands come last, so that two patches meet in the middle of theirs, even if the other edge of a narrow
     # ledge lies within the chord.
@@ -175,7 +179,8 @@ def find(
         concave = fold > _CONCAVE_BAND
     labels = depth_steps.grown(seeds, free & ~concave, coarse, 2 * rho, step)
     labels = depth_steps.grown(labels, free & (labels == 0), coarse, 2 * rho, step)
-    left = _large((coarse > 0) & (labels == 0), least)
+    # A fringe of something near touches what is seen beside it, however far.
+    left = _large(depth_steps.separated(coarse, (coarse > 0) & (labels == 0), _GAP), least)
     count = int(seeds.max())
     labels = np.where(left > 0, left + count, labels)
     count += int(left.max())
@@ -302,9 +307,8 @@ def _fold(inverse: np.ndarray, known: np.ndarray, rho: int, pixel: float) -> np.
     return strongest
 
 
-def _large(mask: np.ndarray, least: int) -> np.ndarray:
-    """Components of a mask with at least so many samples, the largest ones if there are very many; labels from 1."""
-    labels = depth_steps.components(mask)
+def _large(labels: np.ndarray, least: int) -> np.ndarray:
+    """Those with at least so many samples, the largest ones if there are very many; labels from 1."""
     counts = regions.extents(labels)[:, 0]
     kept = counts >= least
     if np.count_nonzero(kept) > _MOST_PATCHES:

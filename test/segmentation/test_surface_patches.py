@@ -125,3 +125,14 @@ def test_a_wall_behind_does_not_make_the_chords_of_things_longer_or_shorter(wall
 
 def test_nothing_wanted():
     assert patches(np.full((240, 320), np.nan)) is None
+
+
+def test_a_fringe_of_something_near_is_no_patch_with_what_is_far_behind_it():
+    """Two strips too narrow to be smooth, side by side: a thing's fringe, and what is seen past it."""
+    depth = np.zeros((CAMERA.height, CAMERA.width))
+    depth[40:200, 150:154], depth[40:200, 154:158] = 0.7, 2.3
+    found = patches(depth)
+    assert found.count >= 2
+    for label in range(1, found.count + 1):
+        of_one = found.depth[found.labels == label]
+        assert of_one.max() < 1.1 * of_one.min()
