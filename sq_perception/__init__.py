@@ -9,6 +9,8 @@ from __future__ import annotations
 import importlib
 from typing import TYPE_CHECKING, Any
 
+from sq_perception.files.version import __version__
+
 if TYPE_CHECKING:
     from sq_perception.evaluation.recovery_figure import recovery_figure
     from sq_perception.fitting.fit import Fit, Status
@@ -21,8 +23,6 @@ if TYPE_CHECKING:
     from sq_perception.recordings.frame_file import RecordedFrame
     from sq_perception.recordings.frame_file import read as read_frame
     from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, Recovery, RecoveryOptions
-
-__version__ = "0.2.0"
 
 __all__ = [
     "Camera",

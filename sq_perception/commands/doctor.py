@@ -11,8 +11,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from sq_perception import __version__
 from sq_perception.commands.console import FAILURE, SUCCESS, parser
+from sq_perception.files.version import __version__
 
 _HELP = "Show what is installed, what is missing, and how to get it; the exit code is 1 where the core cannot work."
 _PACKAGE = Path(__file__).parents[1]

@@ -14,8 +14,8 @@ import os
 import sys
 from collections.abc import Sequence
 
-from sq_perception import __version__
 from sq_perception.commands.console import FAILURE, INTERRUPTED, SUCCESS, USAGE, complain
+from sq_perception.files.version import __version__
 from sq_perception.learning.choices import NEEDS_TORCH
 
 COMMANDS = {

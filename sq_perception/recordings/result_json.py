@@ -19,8 +19,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from sq_perception import __version__
 from sq_perception.files import output_file
+from sq_perception.files.version import __version__
 from sq_perception.recordings.frame_file import Stamp
 
 FORMAT, VERSION = "sq_perception.recovery", 1
