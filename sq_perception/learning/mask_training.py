@@ -18,7 +18,7 @@ from sq_perception.imaging.segment_view import HEIGHT, OTHERS, PLANE, SEGMENT
 from sq_perception.learning import checkpoint
 from sq_perception.learning.mask_network import MaskNetwork
 from sq_perception.learning.shard_training import Subject
-from sq_perception.simulation.segment_views import UNKNOWN, YES, SegmentViews
+from sq_perception.simulation.segment_views import UNKNOWN, YES, SegmentViews, draw_segment_views
 
 AROUND = 0.5
 _KEPT_BACK = 0.1
@@ -69,4 +69,4 @@ def _batch(views: SegmentViews, chosen: np.ndarray, rng: np.random.Generator) ->
     return torch.from_numpy(np.ascontiguousarray(images.transpose(0, 3, 1, 2))), torch.from_numpy(truth.copy())
 
 
-MASKS = Subject("masks", SegmentViews, _new_network, _batch, mask_loss, validate)
+MASKS = Subject("masks", draw_segment_views(0, np.random.default_rng()), _new_network, _batch, mask_loss, validate)

@@ -9,7 +9,8 @@ The learning rate falls as a cosine over the time that the run is given, as on a
 beforehand.  An exponential average of the weights is what is validated and kept.  A run that was stopped goes on where
 it was when the same command is given again.
 
-Views of the ``held`` first shards are never trained on; the log has the network's figures on them.
+Views of the ``held`` first shards that a run finds are never trained on; the log has the network's figures on them.
+The state of the run names them: shards that come later change nothing in that.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import copy
 import math
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -50,7 +51,8 @@ class Subject(Generic[Network, Views]):
 
     name: str
     """Of its file of weights and of its command, ``train-NAME``."""
-    views: type[Views]
+    none: Views
+    """No views at all, in the form of all."""
     network: Callable[[str], Network]
     """A network to begin with, from the weights that :attr:`ShardTraining.start` names."""
     batch: Callable[[Views, np.ndarray, np.random.Generator], tuple[torch.Tensor, ...]]
@@ -71,21 +73,29 @@ def write_views(folder: Path, shards: Iterable[int], draw: Callable[[np.random.G
         if path.exists():
             continue
         drawn = draw(np.random.default_rng([seed, k]))
-        output_file.write(path, bytes_of({**vars(drawn), "images": drawn.images.astype(np.float16)}))
+        output_file.write(path, bytes_of(_stored(drawn)))
         print(f"{path}: {len(drawn.images)} views")
 
 
-def read_views(kind: type[Views], paths: list[Path]) -> Views:
-    """All views of some shards; raises ValueError if one is damaged, or of another kind."""
-    names = [field.name for field in fields(kind)]  # type: ignore[arg-type]
-    shards = []
+def read_views(none: Views, paths: list[Path]) -> Views:
+    """All views of some shards, in the form of ``none``; raises ValueError if one is damaged, or of another form."""
+    kind, shards = type(none), []
     for path in paths:
         try:
             arrays = load_arrays(str(path))
-            shards.append([arrays[name] for name in names])
-        except (SafetensorError, KeyError) as error:
+            shards.append([arrays[name] for name in vars(none)])
+            for (name, wanted), array in zip(_stored(none).items(), shards[-1], strict=True):
+                shape = len(shards[-1][0]), *wanted.shape[1:]
+                if array.shape != shape or array.dtype != wanted.dtype:
+                    raise ValueError(f"{name}: expected {wanted.dtype} {shape}, got {array.dtype} {array.shape}")
+        except (SafetensorError, KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{path}: not a readable shard of {kind.__name__}: {error}") from error
     return kind(*(np.concatenate(parts) for parts in zip(*shards, strict=True)))
+
+
+def _stored(views: Any) -> dict[str, np.ndarray]:
+    """Views as a shard holds them."""
+    return {**vars(views), "images": views.images.astype(np.float16)}
 
 
 def train(subject: Subject[Network, Any], config: ShardTraining, views: Path, output: Path) -> Network:
@@ -95,6 +105,8 @@ def train(subject: Subject[Network, Any], config: ShardTraining, views: Path, ou
     ------
     ValueError
         If the folder holds no more shards than are kept for validation, or one that cannot be read.
+    OSError
+        If a shard that is kept for validation is gone.
     CheckpointError
         If a file to begin or to go on with does not fit.
     ArithmeticError
@@ -111,15 +123,16 @@ def train(subject: Subject[Network, Any], config: ShardTraining, views: Path, ou
     if path.exists():
         state.restore(path)
     rng = np.random.default_rng([config.seed, state.step])
-    found = _shards(views, config.held)
-    apart, shards = found[: config.held], found[config.held :]
-    held, pool = (read_views(subject.views, paths) for paths in (apart, shards))
+    found = _shards(views, len(state.held) or config.held)
+    state.held = state.held or [shard.name for shard in found[: config.held]]
+    shards = [shard for shard in found if shard.name not in state.held]
+    held, pool = (read_views(subject.none, paths) for paths in ([views / name for name in state.held], shards))
     began, losses = time.monotonic() - state.seconds, []
     while (progress := (time.monotonic() - began) / (60 * config.minutes)) < 1:
         if state.step % config.validation == 0:
-            found = [shard for shard in _shards(views, config.held) if shard not in apart]
+            found = [shard for shard in _shards(views, len(state.held)) if shard.name not in state.held]
             if len(found) > len(shards):
-                shards, pool = found, read_views(subject.views, found)
+                shards, pool = found, read_views(subject.none, found)
         rate = falling_rate(config.rate, state.step, progress)
         batch = subject.batch(pool, rng.integers(len(pool.images), size=config.batch), rng)
         with torch.autocast("cpu", torch.bfloat16, enabled=config.bfloat16):

@@ -30,7 +30,7 @@ from sq_perception.learning.shard_training import Subject
 from sq_perception.learning.thing_network import HullPrediction, ThingNetwork
 from sq_perception.learning.training_state import read_tensors
 from sq_perception.simulation.household import KINDS
-from sq_perception.simulation.thing_views import ThingViews
+from sq_perception.simulation.thing_views import ThingViews, draw_thing_views
 
 BODY, CENTRE = 2.0, 1.0
 """Weights of the losses beside the likelihood, which is of order 1 where they are of order 0.05."""
@@ -162,4 +162,6 @@ def _calibrate(network: ThingNetwork, views: ThingViews) -> None:
     network.config = replace(network.config, spread=likeliest_spread(network, sample))
 
 
-THINGS = Subject("things", ThingViews, _new_network, _batch, hull_loss, validate, _calibrate)
+THINGS = Subject(
+    "things", draw_thing_views(0, np.random.default_rng()), _new_network, _batch, hull_loss, validate, _calibrate
+)

@@ -40,6 +40,8 @@ class TrainingState(Generic[Network]):
     """Time spent, in all parts of the run."""
     best: float = -math.inf
     """Best validation so far."""
+    held: list[str] = field(default_factory=list)
+    """Names of the files of views that are kept for validation, where a run has such."""
 
     def save(self, path: Path) -> None:
         """Write everything to ``path``."""
@@ -47,6 +49,7 @@ class TrainingState(Generic[Network]):
             "step": torch.tensor(self.step),
             "seconds": torch.tensor(self.seconds, dtype=torch.float64),
             "best": torch.tensor(self.best, dtype=torch.float64),
+            "held": torch.tensor([*"\n".join(self.held).encode()], dtype=torch.uint8),
             "schedule": torch.tensor(astuple(self.plateau), dtype=torch.float64),
         }
         for prefix, network in (("model", self.model), ("average", self.average)):
@@ -78,6 +81,8 @@ class TrainingState(Generic[Network]):
             self.plateau = Plateau(best, int(without_progress), int(reductions))
             self.step, self.seconds = int(tensors["step"]), float(tensors["seconds"])
             self.best = float(tensors["best"])
+            if "held" in tensors:  # not in the states of 0.2.0
+                self.held = bytes(tensors["held"].tolist()).decode().splitlines()
         except (SafetensorError, OSError, KeyError, IndexError, RuntimeError, ValueError) as error:
             raise CheckpointError(f"{path}: not the state of such a run: {error}") from error
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from safetensors.numpy import save_file
+from safetensors.numpy import load_file, save_file
 
 from sq_perception.commands import main
 from sq_perception.files import output_file
@@ -101,9 +101,50 @@ def test_a_damaged_shard_is_named(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert capsys.readouterr().err.count("00001.safetensors: not a readable shard of SegmentViews") == 2
 
 
+@pytest.mark.parametrize(
+    ("name", "wrong"),
+    [
+        ("images", np.zeros((24, PIXELS, PIXELS, CHANNELS - 1), np.float16)),
+        ("images", np.zeros((24, PIXELS, PIXELS, CHANNELS), np.float64)),
+        ("truth", np.zeros((23, PIXELS, PIXELS), np.uint8)),
+        ("truth", np.zeros((), np.uint8)),
+    ],
+)
+def test_a_shard_of_another_form_is_named(
+    tmp_path: Path, rng: np.random.Generator, name: str, wrong: np.ndarray
+) -> None:
+    shards(tmp_path / "views", 3, rng)
+    path = tmp_path / "views" / "00001.safetensors"
+    save_file({**load_file(str(path)), name: wrong}, str(path))
+    with pytest.raises(ValueError, match=rf"00001\.safetensors: .*{name}: expected .* got {wrong.dtype}"):
+        shard_training.read_views(mask_training.MASKS.none, sorted((tmp_path / "views").iterdir()))
+
+
+def test_a_shard_that_comes_before_those_held_is_trained_on(tmp_path: Path, rng: np.random.Generator) -> None:
+    """Between two parts of a run one of a lower number appears: what the first part learnt is not validated on."""
+    shards(tmp_path / "views", 3, rng)
+    (tmp_path / "views" / "00000.safetensors").rename(tmp_path / "later")
+    validated = []
+
+    def validate(network: MaskNetwork, views: SegmentViews) -> dict[str, float]:
+        validated.append(views.truth)
+        return {}
+
+    subject = replace(mask_training.MASKS, network=lambda _: MaskNetwork(SMALL), validate=validate)
+    config = replace(MASK_RUN, minutes=0.001, batch=2, threads=1, held=1)
+    shard_training.train(subject, config, tmp_path / "views", tmp_path / "run")
+    (tmp_path / "later").rename(tmp_path / "views" / "00000.safetensors")
+    shard_training.train(subject, config, tmp_path / "views", tmp_path / "run")
+    first, again = validated[0], validated[-1]
+    np.testing.assert_array_equal(first, again)
+    (tmp_path / "views" / "00001.safetensors").unlink()
+    with pytest.raises(OSError, match=r"00001\.safetensors"):
+        shard_training.train(subject, config, tmp_path / "views", tmp_path / "run")
+
+
 def test_the_command_draws_what_the_training_reads(tmp_path: Path) -> None:
     assert main.main(["segment-views", str(tmp_path), "--shards", "1", "--scenes", "2"]) == 0
-    drawn = shard_training.read_views(SegmentViews, [tmp_path / "00000.safetensors"])
+    drawn = shard_training.read_views(mask_training.MASKS.none, [tmp_path / "00000.safetensors"])
     again = draw_segment_views(2, np.random.default_rng([0, 0]))
     np.testing.assert_array_equal(drawn.images, again.images)
     np.testing.assert_array_equal(drawn.truth, again.truth)

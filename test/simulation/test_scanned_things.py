@@ -15,10 +15,11 @@ from sq_perception.geometry.support_directions import DIRECTIONS
 from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
 from sq_perception.learning.shard_training import read_views, write_views
+from sq_perception.learning.thing_training import THINGS
 from sq_perception.simulation.mesh_rendering import Mesh, render_mesh
 from sq_perception.simulation.scanned_things import read_things
 from sq_perception.simulation.thing_setting import draw_setting
-from sq_perception.simulation.thing_views import ThingViews, draw_thing_views, support_in_view
+from sq_perception.simulation.thing_views import draw_thing_views, support_in_view
 
 CAMERA = Camera(640, 480, 554.0, 554.0, 319.5, 239.5)
 BODY = Superquadric([0.06, 0.04, 0.03], [0.3, 0.7], [0.05, -0.03, 0.7], [0.3, -0.2, 0.5, 0.8])
@@ -98,7 +99,7 @@ def test_half_of_the_views_show_ones_own_things(
 ) -> None:
     own = read_things(folder)
     write_views(tmp_path / "views", range(1), lambda rng: draw_thing_views(40, rng, own=own), 5)
-    views = read_views(ThingViews, [tmp_path / "views" / "00000.safetensors"])
+    views = read_views(THINGS.none, [tmp_path / "views" / "00000.safetensors"])
     drawn = draw_thing_views(40, np.random.default_rng([5, 0]), own=own)
     np.testing.assert_array_equal(views.support, drawn.support)
     of_mesh = views.kinds == 6
