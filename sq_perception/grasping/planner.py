@@ -151,6 +151,7 @@ def grasps(
     closings = _closings(known, gripper, friction)
     trials = _trials(known, bodies.volume(), closings, gripper, around, friction, placement)
     reasons[np.unique(closings.owner)] = "no way for the fingers to come with the table and the palm in their way"
+    reasons[_behind(known, around.plane)] = "behind the plane that bodies stand on"
     trials = _narrower(known, trials.first(_CHECKED_IF_DOUBTFUL), gripper, placement)
     trials = _probable(trials, _CHECKED_IF_DOUBTFUL, reasons, "nothing holds")
     looked_at = _among_others(known, trials.first(_CHECKED), gripper, around, placement)
@@ -162,6 +163,14 @@ def grasps(
     trials = _probable(looked_at, PER_BODY, reasons, "in the way")
     reasons[trials.owner] = ""
     return GraspPlan(tuple(_as_grasps(trials)), tuple(reasons))
+
+
+def _behind(bodies: KnownBodies, plane: np.ndarray | None) -> np.ndarray:
+    """Which bodies (n,) do not even reach the plane from behind."""
+    if plane is None:
+        return np.zeros(len(bodies), dtype=bool)
+    top, _ = bodies.reaches(np.arange(len(bodies)), np.tile(plane[:3], (len(bodies), 1)))
+    return np.asarray(bodies.middle @ plane[:3] + top + plane[3] < 0)
 
 
 def _probable(trials: Trials, count: int, reasons: np.ndarray, why: str) -> Trials:

@@ -18,6 +18,7 @@ _NEAREST = 1e-3
 _SPACING = 0.005
 """Metres between the points that are kept."""
 _MOST = 6000
+"""Points that are kept."""
 _ABOVE = 0.008
 """Metres; lower points are the table's."""
 
@@ -85,7 +86,8 @@ class Surroundings:
             rows, columns = np.nonzero(z * (across + down[:, None] + plane[2]) + plane[3] > _ABOVE)
         points = camera.unproject(columns, rows, z[rows, columns].astype(float))
         _, kept = np.unique(np.floor(points / _SPACING) @ [1.0, 1e4, 1e8], return_index=True)
-        kept = kept[:: max(1, len(kept) // _MOST)]
+        if len(kept) > _MOST:
+            kept = kept[np.linspace(0, len(kept) - 1, _MOST).astype(int)]
         return cls(plane, points[kept], z, camera)
 
     def down(self, places: np.ndarray) -> np.ndarray:

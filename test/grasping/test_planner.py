@@ -7,7 +7,7 @@ import pytest
 
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.grasping import clearance
+from sq_perception.grasping import clearance, surroundings
 from sq_perception.grasping.closing import KnownBodies
 from sq_perception.grasping.gripper import GRIPPERS, PANDA, Gripper, gripper
 from sq_perception.grasping.planner import grasps
@@ -118,6 +118,27 @@ def test_what_is_wider_than_the_opening_is_never_tried():
     assert "wider than the opening of 80 mm" in found.reasons[0]
     assert found.of(1)
     assert found.reasons[1] == ""
+
+
+def test_what_lies_behind_the_support_has_that_for_a_reason():
+    """Also where it is too wide; what looks out of the plane only in part is in the table's way."""
+    sunk = Superquadric(*CAN, [0.5, 0.0, -0.055], UPRIGHT)
+    behind, wide = (
+        Superquadric(*CAN, [0.0, 0.0, -0.07], UPRIGHT),
+        Superquadric([0.1] * 3, [1, 1], [1, 0, -0.2], UPRIGHT),
+    )
+    reasons = plan(behind, wide, sunk, standing(*CAN, y=0.5)).reasons
+    assert reasons[:2] == ("behind the plane that bodies stand on",) * 2
+    assert reasons[2].startswith("no way for the fingers")
+    assert reasons[3] == ""
+
+
+def test_no_more_points_are_kept_than_are_promised_and_from_everywhere():
+    camera = Camera(100, 100, 100.0, 100.0, 49.5, 49.5)
+    points = Surroundings.of_image(np.full((100, 100), 2.0), camera, None).points
+    assert len(points) == surroundings._MOST
+    for quarter in (points[:, 0] < 0, points[:, 1] < 0):
+        assert quarter.mean() == pytest.approx(0.5, abs=0.01)
 
 
 def test_an_uncertain_width_is_given_room_and_believed_less():
