@@ -7,6 +7,7 @@ the command ``sq-perception grasp`` does.  Correlations of a body's numbers are 
 
 from __future__ import annotations
 
+import threading
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from visualization_msgs.msg import MarkerArray
 
 from sq_msgs_py import answers
 from sq_msgs_py import grasps as messages
-from sq_msgs_py.markers import markers
+from sq_msgs_py.markers import Mesh, markers
 from sq_msgs_py.poses import plane_of
 from sq_msgs_py.superquadrics import SuperquadricArray, from_message
 from sq_perception.grasping.gripper import Gripper, gripper
@@ -28,6 +29,7 @@ from sq_perception.grasping.planner import grasps, warm_up
 from sq_perception.grasping.surroundings import Surroundings
 from sq_perception.nodes.live_parameters import LiveParameters
 from sq_perception.nodes.managed_node import ManagedNode
+from sq_perception.nodes.outputs import ARRIVAL
 from sq_perception.nodes.parameters import GraspParameters
 from sq_perception.nodes.statistics import THROTTLE
 from sq_perception.recordings.publication import covariances, superquadrics
@@ -45,6 +47,8 @@ class GraspNode(ManagedNode):
         self._plane: PoseStamped | None = None
         self._shown: tuple[int, ...] = ()
         self._publishers: list[Publisher] = []
+        self._publishing = threading.Lock()
+        """Held while something is published, or nothing is any more."""
         self._subscriptions: list[Any] = []
         self._service = self.create_service(Trigger, "~/plan", self._on_plan)
         if self._settings.current.autostart:
@@ -70,9 +74,14 @@ class GraspNode(ManagedNode):
         for subscription in self._subscriptions:
             self.destroy_subscription(subscription)
         self._subscriptions = []
-        for publisher in self._publishers:
-            self.destroy_publisher(publisher)
-        self._publishers, self._shown = [], ()
+        with self._publishing:
+            if self._shown and self._last is not None and self.context.ok():
+                shown = self._publishers[-1]
+                shown.publish(self._markers([], [], self._last.header))
+                shown.wait_for_all_acked(ARRIVAL)
+            for publisher in self._publishers:
+                self.destroy_publisher(publisher)
+            self._publishers = []
 
     def _cleanup(self) -> None:
         self._deactivate()
@@ -103,7 +112,10 @@ class GraspNode(ManagedNode):
             if self._plane is not None and self._plane.header.frame_id == message.header.frame_id:
                 plane = plane_of(self._plane)
             plan = planned(bodies, self._settings.current, plane)
-            found = self._published(message.header, bodies, plan, gripper(self._settings.current.gripper))
+            with self._publishing:
+                if not self._publishers:  # deactivated while it was planned
+                    return None, f"the node is {self.state}"
+                found = self._published(message.header, bodies, plan, gripper(self._settings.current.gripper))
         except Exception as error:
             reason = f"refused superquadrics: {type(error).__name__}: {error}"
             self.get_logger().warning(reason, throttle_duration_sec=THROTTLE)
@@ -128,9 +140,13 @@ class GraspNode(ManagedNode):
         for grasp in best.values():
             vertices, faces, edges = hand.mesh(grasp.opening)
             meshes.append((grasp.placed(vertices), faces, grasp.placed(edges)))
-        shown.publish(markers(meshes, list(best), header, namespace="grasps", previous_ids=self._shown))
-        self._shown = tuple(best)
+        shown.publish(self._markers(meshes, list(best), header))
         return found
+
+    def _markers(self, meshes: list[Mesh], ids: list[int], header: Any) -> MarkerArray:
+        """Those of grasps of some bodies, which take the place of those before."""
+        before, self._shown = self._shown, tuple(ids)
+        return markers(meshes, ids, header, namespace="grasps", previous_ids=before)
 
 
 def planned(bodies: SuperquadricArray, parameters: GraspParameters, plane: np.ndarray | None = None) -> GraspPlan:

@@ -46,7 +46,7 @@ from sq_perception.recovery.recovery import timed
 _OVERRIDABLE = tuple(getattr(QoSPolicyKind, name) for name in ("HISTORY", "DEPTH", "RELIABILITY", "DURABILITY"))
 _LATCHED = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 """Late comers get the last one: a table that is hidden by an arm is still there."""
-_ARRIVAL = Duration(seconds=0.5)
+ARRIVAL = Duration(seconds=0.5)
 """How long the last markers may take to arrive before their publisher goes."""
 
 
@@ -75,7 +75,7 @@ class Outputs:
         """Destroy the publishers; what planners know stays with them, markers go."""
         if self._publishers:
             self.hide()
-            self.markers.wait_for_all_acked(_ARRIVAL)
+            self.markers.wait_for_all_acked(ARRIVAL)
         for publisher in self._publishers:
             self._node.destroy_publisher(publisher)
         self._publishers = ()

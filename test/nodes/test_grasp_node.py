@@ -21,6 +21,7 @@ from sq_msgs_py import grasps as messages
 from sq_msgs_py.poses import plane_message
 from sq_msgs_py.superquadrics import SuperquadricArray, to_message
 from sq_perception.grasping.planner import warm_up
+from sq_perception.nodes import grasp_node
 from sq_perception.nodes.grasp_node import GraspNode
 
 BOX, CAN, WALL = 4, 7, 9
@@ -134,6 +135,35 @@ def test_a_cloud_of_something_else_is_refused_and_the_next_one_answered(bench):
     bench.cloud.publish(PointCloud2(width=3, height=1))
     assert len(bench.answer(to_message(bodies(), Header()))["grasps"].poses) > 0
     assert len(bench.answer(to_message(SuperquadricArray.empty(), Header()))["grasps"].poses) == 0
+
+
+def test_markers_go_with_the_node_that_shows_them(bench):
+    bench.answer(to_message(bodies(), HEADER))
+    bench.heard.clear()
+    assert bench.node._change("deactivate")
+    bench.until(lambda: "markers" in bench.heard)
+    gone = bench.heard["markers"].markers
+    assert {(marker.action, marker.id) for marker in gone} == {(Marker.DELETE, BOX), (Marker.DELETE, CAN)}
+    assert {marker.ns for marker in gone} == {"grasps/surface", "grasps/outline"}
+
+
+def test_a_cloud_that_is_planned_while_the_node_is_deactivated_is_dropped(bench, monkeypatch):
+    """Deactivated between the plan and its publication: no refusal, no grasps, and the next activation answers."""
+    planned, said = grasp_node.planned, []
+
+    def deactivated(*given):
+        assert bench.node._change("deactivate")
+        return planned(*given)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(grasp_node, "planned", deactivated)
+        patched.setattr(bench.node.get_logger(), "warning", lambda text, **_: said.append(text))
+        assert bench.node._answered(to_message(bodies(), HEADER)) == (None, "the node is inactive")
+    assert not said
+    assert bench.node._change("activate")
+    bench.until(lambda: all(one.get_subscription_count() for one in bench.node._publishers))
+    bench.until(bench.cloud.get_subscription_count)
+    assert len(bench.answer(to_message(bodies(), HEADER))["grasps"].poses) > 0
 
 
 def test_grasps_survive_the_way_through_a_message():
