@@ -1,9 +1,12 @@
 """Frames recovered by several processes at a time, of this machine or of a Dask cluster, answered in their order.
 
 Each process has a Recoverer of its own, of one thread.  A few frames a process are under way, so that none waits while
-results are written, and that no more are read than that.  Where a process dies, killed or out of memory, new ones
-begin.  What had no answer then is begun again when its turn comes, so that a frame at which processes die takes no
-other with it; it is given up after some tries.  A cluster's scheduler does the same by itself.
+results are written, and that no more are read than that.  Where a process dies, killed or out of memory, a new one
+begins, and its frame is begun again when its turn comes; it is given up after some tries.  A cluster's scheduler does
+the same by itself.
+
+Each process has a pipe of its own.  Those of :class:`concurrent.futures.ProcessPoolExecutor` share one: killed while it
+writes an answer, a process leaves all others, and who asked them, waiting for ever.
 """
 
 from __future__ import annotations
@@ -13,10 +16,11 @@ import signal
 import threading
 from collections import deque
 from collections.abc import Iterable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import cache
+from multiprocessing.connection import Connection
+from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeAlias, TypeVar, cast
 
@@ -55,6 +59,10 @@ class Setup:
 
     model: Path | str | None
     options: RecoveryOptions
+
+
+class _LostError(RuntimeError):
+    """A process died before it answered."""
 
 
 class WorkerLostError(RuntimeError):
@@ -103,25 +111,47 @@ def recovered(
 
 
 class Processes:
-    """A pool of ``size`` processes that is made anew where it broke."""
+    """``size`` processes, each asked by a thread of its own; another one begins where one died."""
 
-    lost: type[Exception] = BrokenProcessPool
+    lost: type[Exception] = _LostError
     tries = TRIES
 
     def __init__(self, setup: Setup, size: int) -> None:
         self._setup, self.size = setup, size
-        self._pool = _pool(setup, size)
+        self._threads, self._lock = ThreadPoolExecutor(size), threading.Lock()
+        self._of_thread: dict[int, tuple[BaseProcess, Connection]] = {}
+        self._ended = False
 
     def ask(self, work: Work) -> _Answer:
-        try:
-            return self._pool.submit(_recover, self._setup, work)
-        except BrokenProcessPool:
-            self.end()
-            self._pool = _pool(self._setup, self.size)
-            return self._pool.submit(_recover, self._setup, work)
+        return self._threads.submit(self._answer, work)
 
     def end(self) -> None:
-        self._pool.shutdown(wait=False, cancel_futures=True)
+        with self._lock:
+            self._ended = True
+            for process, _ in self._of_thread.values():
+                process.terminate()
+        self._threads.shutdown(cancel_futures=True)
+
+    def _answer(self, work: Work) -> FrameRecovery:
+        thread = threading.get_ident()
+        with self._lock:
+            if self._ended:
+                raise _LostError
+            if thread not in self._of_thread:
+                self._of_thread[thread] = _started(self._setup)
+            process, pipe = self._of_thread[thread]
+        try:
+            pipe.send(work)
+            answer = pipe.recv()
+        except (EOFError, OSError) as error:
+            with self._lock:
+                del self._of_thread[thread]
+            pipe.close()
+            process.join()
+            raise _LostError from error
+        if isinstance(answer, Exception):
+            raise answer
+        return cast(FrameRecovery, answer)
 
 
 class Cluster:
@@ -159,16 +189,30 @@ class Cluster:
         self._client.close()
 
 
-def _pool(setup: Setup, jobs: int) -> ProcessPoolExecutor:
+def _started(setup: Setup) -> tuple[BaseProcess, Connection]:
+    """A process, and this end of its pipe."""
     # Not forked: a process that has threads of BLAS and numba cannot be copied.
     context = multiprocessing.get_context("spawn")
-    return ProcessPoolExecutor(jobs, context, initializer=_begin, initargs=(setup,))
+    here, there = context.Pipe()
+    process = context.Process(target=_serve, args=(setup, there), daemon=True)
+    process.start()
+    there.close()  # so that its end is that of the pipe
+    return process, here
 
 
-def _begin(setup: Setup) -> None:
-    """Of a new process; Ctrl-C is for the one that asks."""
+def _serve(setup: Setup, pipe: Connection) -> None:
+    """What a process does until the other end of its pipe is closed; Ctrl-C is for the one that asks."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    _recoverer(setup)
+    while True:
+        try:
+            work = pipe.recv()
+        except EOFError:
+            return
+        try:
+            answer: FrameRecovery | Exception = _recover(setup, work)
+        except Exception as error:  # the answer to this frame; who asked raises it
+            answer = error
+        pipe.send(answer)
 
 
 @cache

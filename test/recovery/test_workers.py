@@ -6,6 +6,7 @@ import os
 import signal
 import threading
 import time
+from multiprocessing.connection import Connection
 from pathlib import Path
 
 import numpy as np
@@ -65,6 +66,19 @@ def test_a_killed_process_costs_no_frame_and_answers_none_twice() -> None:
         if key == 5:
             os.kill(_children()[-1], signal.SIGKILL)
     assert seen == list(range(24))
+
+
+def _dies_while_it_answers(_: Setup, pipe: Connection) -> None:
+    pipe.recv()
+    os.write(pipe.fileno(), (1000).to_bytes(4, "big") + b"the first bytes of a thousand")
+    os._exit(1)
+
+
+def test_processes_that_die_while_they_answer_are_missed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(workers, "_serve", _dies_while_it_answers)
+    answers = list(workers.recovered(_frames(2), workers.Processes(_SETUP, 2)))
+    assert [key for key, _ in answers] == [0, 1]
+    assert all(isinstance(answer, workers.WorkerLostError) for _, answer in answers)
 
 
 def test_a_frame_at_which_processes_die_takes_no_other_with_it(monkeypatch: pytest.MonkeyPatch) -> None:
