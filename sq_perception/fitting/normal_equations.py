@@ -12,11 +12,13 @@ import math
 
 import numpy as np
 
+from sq_perception.geometry.elementary import log2
 from sq_perception.geometry.kernels import inline_kernel, kernel
 
 STEP_LENGTH = 11
 LANES = 64
 _SMALL = 1e-300
+_LN_2 = math.log(2.0)
 
 
 @inline_kernel
@@ -34,8 +36,8 @@ def huber_loss(residual: float, huber: float, weight: float) -> tuple[float, flo
 @inline_kernel
 def cauchy_loss(residual: float, scale: float, weight: float) -> tuple[float, float]:
     """Cauchy's loss, which almost stops growing beyond ``scale``, and the square root of its weight; no branch."""
-    square = residual * residual / (scale * scale)
-    return weight * scale * scale * math.log1p(square), math.sqrt(weight / (1.0 + square))
+    above = 1.0 + residual * residual / (scale * scale)
+    return _LN_2 * weight * scale * scale * log2(above), math.sqrt(weight / above)
 
 
 @kernel

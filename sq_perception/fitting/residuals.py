@@ -66,7 +66,7 @@ from sq_perception.fitting.normal_equations import LANES, STEP_LENGTH, add_block
 from sq_perception.fitting.priors import prior_cost
 from sq_perception.fitting.rays import LAST, STIFFNESS
 from sq_perception.fitting.terms import Terms
-from sq_perception.geometry.kernels import kernel
+from sq_perception.geometry.kernels import inline_kernel, kernel
 
 CLASSIC, SAMPSON, RENDERED = 0, 1, 2
 
@@ -122,6 +122,16 @@ def evaluate(
     return cost + prior_cost(terms, parameters, rotation, sums)
 
 
+@inline_kernel
+def _loss(residual: float, huber: float, terms: Terms, weight: float) -> tuple[float, float]:
+    """The loss of an object's ray and the square root of its weight: Cauchy's behind the surface if asked for."""
+    loss, scale = huber_loss(residual, huber, weight)
+    if terms.inner_cauchy > 0.0:
+        inner_loss, inner_scale = cauchy_loss(residual, terms.inner_cauchy, weight)
+        return (inner_loss, inner_scale) if residual < 0.0 else (loss, scale)
+    return loss, scale
+
+
 @kernel
 def _rendered_rows(
     filled: int, part: np.ndarray, terms: Terms, lanes: np.ndarray, missed: np.ndarray, block: np.ndarray
@@ -142,9 +152,7 @@ def _rendered_rows(
             excess = max(abs(residual) - terms.dead_zone, 0.0)
             factor = factor if excess > 0.0 else 0.0
             residual = math.copysign(excess, residual)
-        loss, scale = huber_loss(residual, terms.outline_huber if missed[i] else terms.huber, lanes[SHARE, i])
-        if terms.inner_cauchy > 0.0 and residual < 0.0:
-            loss, scale = cauchy_loss(residual, terms.inner_cauchy, lanes[SHARE, i])
+        loss, scale = _loss(residual, terms.outline_huber if missed[i] else terms.huber, terms, lanes[SHARE, i])
         cost += loss
         block[0, i] = scale * factor
         block[STEP_LENGTH, i] = scale * residual
@@ -167,9 +175,7 @@ def _measured_rows(
         classic = (g + 1.0) * root_of_volume * lanes[PRECISION, i]
         residual = (g - 1.0) * (classic if stage == CLASSIC else sampson)
         factor = 2.0 * g * root_of_volume * lanes[PRECISION, i] if stage == CLASSIC else sampson
-        loss, scale = huber_loss(residual, terms.huber, lanes[SHARE, i])
-        if terms.inner_cauchy > 0.0 and residual < 0.0:
-            loss, scale = cauchy_loss(residual, terms.inner_cauchy, lanes[SHARE, i])
+        loss, scale = _loss(residual, terms.huber, terms, lanes[SHARE, i])
         cost += loss
         block[0, i] = scale * factor
         block[STEP_LENGTH, i] = scale * residual
