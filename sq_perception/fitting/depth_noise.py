@@ -12,6 +12,7 @@ adds q^2 / 12 at least; q is the smallest depth difference that occurs.  It hold
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,7 +46,7 @@ class DepthNoise:
 
     def __post_init__(self) -> None:
         parts = (self.constant, self.quadratic, self.quantum)
-        if not (np.isfinite(parts).all() and min(parts) >= 0 and max(parts[:2]) > 0):
+        if not (all(map(math.isfinite, parts)) and min(parts) >= 0 and max(parts[:2]) > 0):
             raise ValueError(f"noise: expected positive metres, got {self.constant}, {self.quadratic}, {self.quantum}")
 
     def at(self, z: float) -> float:
@@ -55,27 +56,35 @@ class DepthNoise:
 
 def estimate(depth: np.ndarray, inside: np.ndarray, least: float) -> DepthNoise:
     """The noise of the depth image within a mask (h, w); ``least`` metres if it is smaller or cannot be estimated."""
-    step = max(1, int(2 * np.count_nonzero(inside) / _SAMPLES))
-    third, first = _differences(depth, inside, step)
+    typical, quantum = _typical(depth, inside)
+    spread = typical * MEDIAN_TO_SIGMA / math.sqrt(20.0)
+    if spread < 0.5 * quantum:
+        return DepthNoise(max(quantum / math.sqrt(12.0), least), quantum=quantum)
+    return DepthNoise(max(spread, least))
+
+
+@kernel
+def _typical(depth: np.ndarray, inside: np.ndarray) -> tuple[float, float]:
+    """The median of the absolute third differences, and the quantum of the first ones; 0 for what is not known."""
+    third, first = _differences(depth, inside, max(1, int(2 * np.count_nonzero(inside) / _SAMPLES)))
     if third.size < _FEWEST:
-        return DepthNoise(least)
+        return 0.0, 0.0
     moved = first[first > 0]
     quantum = 0.0
     if moved.size >= _FEWEST:
         rank = moved.size // 50
-        smallest = float(np.partition(moved, rank)[rank])
-        if np.mean(np.abs(moved / smallest - np.rint(moved / smallest)) < 0.02) > 0.8:
+        smallest = np.partition(moved, rank)[rank]
+        steps = moved / smallest
+        if np.count_nonzero(np.abs(steps - np.rint(steps)) < 0.02) > 0.8 * moved.size:
             quantum = smallest
-    spread = _median(third, quantum) * MEDIAN_TO_SIGMA / np.sqrt(20.0)
-    if spread < 0.5 * quantum:
-        return DepthNoise(max(quantum / float(np.sqrt(12.0)), least), quantum=quantum)
-    return DepthNoise(max(float(spread), least))
+    return _median(third, quantum), quantum
 
 
+@kernel
 def _median(values: np.ndarray, quantum: float) -> float:
     """The median of positive values (n,); of multiples of a quantum as if each were spread evenly over its interval."""
     middle = values.size // 2
-    median = float(np.partition(values, middle)[middle])
+    median = np.partition(values, middle)[middle]
     if quantum == 0.0:
         return median
     below = np.count_nonzero(values < median - quantum / 2)
