@@ -21,14 +21,13 @@ from sq_perception.fitting.normal_equations import STEP_LENGTH
 from sq_perception.fitting.rays import SAMPLE, WEIGHT, Rays
 from sq_perception.fitting.residuals import RENDERED, evaluate
 from sq_perception.fitting.terms import Terms
+from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.superquadric import Superquadric
 
 WEAK_SHARE = 0.15
 """A half size whose standard deviation exceeds this share of it is called undetermined."""
 _PRIOR_LOG_SIZE, _PRIOR_SHAPE, _PRIOR_ANGLE = 1.0, 0.5, 1.0
 """Standard deviations of the prior: a factor e, half of the range of an exponent, a radian."""
-
-_IS_LOWER = np.tri(STEP_LENGTH, dtype=bool)
 
 
 def covariance_at(state: State, rays: Rays, terms: Terms, outline: float) -> np.ndarray:
@@ -37,19 +36,32 @@ def covariance_at(state: State, rays: Rays, terms: Terms, outline: float) -> np.
     ``outline`` is the standard deviation of the outline, metres.
     """
     stride = max(1, len(rays.hits) // SAMPLE)
-    hits, free = rays.every(stride).weighing(stride)
-    sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
     terms = terms._replace(outline_stiffness=1 / outline)
-    cost = evaluate(RENDERED, hits, free, terms, state.parameters, state.rotation, sums)
-    variance = max(1.0, cost / float(hits[:, WEIGHT].sum()))
-    lower = sums[:STEP_LENGTH, :STEP_LENGTH]
-    full = np.where(_IS_LOWER, lower, lower.T)
     length = float(state.parameters[:3].sum()) / 3
-    prior = np.array([1 / _PRIOR_LOG_SIZE] * 3 + [1 / _PRIOR_SHAPE] * 2 + [1 / length] * 3 + [1 / _PRIOR_ANGLE] * 3)
-    covariance = _inverse(full / variance + np.diag(prior**2), float(prior.min() ** 2))
+    prior = (
+        np.array([1 / _PRIOR_LOG_SIZE] * 3 + [1 / _PRIOR_SHAPE] * 2 + [1 / length] * 3 + [1 / _PRIOR_ANGLE] * 3) ** 2
+    )
+    information = _information(*rays.every(stride).weighing(stride), terms, state.parameters, state.rotation, prior)
+    covariance = _inverse(information, float(prior.min()))
     units = np.concatenate([state.parameters[:3], np.ones(STEP_LENGTH - 3)])
     covariance = units[:, None] * covariance * units
     return (covariance + covariance.T) / 2
+
+
+@kernel
+def _information(
+    hits: np.ndarray, free: np.ndarray, terms: Terms, parameters: np.ndarray, rotation: np.ndarray, prior: np.ndarray
+) -> np.ndarray:
+    """J^T J / s^2 + P (11, 11), of which ``prior`` (11,) is the diagonal of P."""
+    sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
+    cost = evaluate(RENDERED, hits, free, terms, parameters, rotation, sums)
+    variance = max(1.0, cost / hits[:, WEIGHT].sum())
+    information = np.diag(prior)
+    for j in range(STEP_LENGTH):
+        for k in range(j + 1):
+            information[j, k] += sums[j, k] / variance
+            information[k, j] = information[j, k]
+    return information
 
 
 def _inverse(information: np.ndarray, least: float) -> np.ndarray:
