@@ -15,6 +15,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -23,8 +24,8 @@ from sq_perception.fitting.hull_prior import HullPrior
 from sq_perception.fitting.levenberg_marquardt import State, minimize
 from sq_perception.fitting.observation import Observation
 from sq_perception.fitting.options import FitOptions
-from sq_perception.fitting.rays import WEIGHT, Rays
-from sq_perception.fitting.residuals import RENDERED, SAMPSON
+from sq_perception.fitting.rays import SAMPLE, WEIGHT, Rays
+from sq_perception.fitting.residuals import RENDERED, SAMPSON, surface_distance
 from sq_perception.fitting.terms import Terms
 from sq_perception.geometry.superquadric import Superquadric
 
@@ -163,6 +164,12 @@ class Solution:
     notes: tuple[str, ...] = ()
     spread_factor: float = 1.0
     as_hull: bool = False
+
+    @cached_property
+    def distances(self) -> np.ndarray:
+        """Sampson distances (n,) of a sample of the object's points to the body, metres, positive outside."""
+        rays = self.problem.observation.object_rays(SAMPLE)
+        return surface_distance(rays, self.state.parameters, self.state.rotation)
 
     def covariance(self) -> np.ndarray:
         """(11, 11) of the valley of the cost that the body lies in."""

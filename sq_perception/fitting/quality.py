@@ -10,8 +10,6 @@ from sq_perception.fitting.covariance import carried_over, spread, undetermined
 from sq_perception.fitting.fit import CUT_SHORT, FAILED_SHARE, INLIER, Fit, Status
 from sq_perception.fitting.observation import OUTLIER_SHARE, Observation, span
 from sq_perception.fitting.problem import Solution
-from sq_perception.fitting.rays import SAMPLE
-from sq_perception.fitting.residuals import surface_distance
 from sq_perception.geometry.quantiles import quantile
 from sq_perception.geometry.superquadric import Superquadric
 
@@ -30,16 +28,14 @@ def assessed(solution: Solution, began: float) -> Fit:
     covariance = solution.covariance() + spread(state, solution.alternatives)
     canonical = body.canonical_form()
     covariance = carried_over(covariance, body, canonical)
-    everything = observation.object_rays(SAMPLE)
-    outside = surface_distance(everything, state.parameters, state.rotation)
-    distance = np.abs(outside)
+    distance = np.abs(solution.distances)
     inlying = distance < INLIER * observation.sigma
     typical = quantile(distance, 0.5)
     kept = distance < max(INLIER * observation.sigma, INLIER * typical)
     residual = float(np.sqrt(np.mean(distance[kept] ** 2))) if kept.any() else typical
     if solution.as_hull:
         # A hollow thing lies inside its hull: only what sticks out speaks against the body.
-        typical = quantile(np.maximum(outside, 0.0), _REACHED)
+        typical = quantile(np.maximum(solution.distances, 0.0), _REACHED)
     reached, message = status(canonical, covariance, typical, observation.sigma, solution.as_hull)
     cut = (CUT_SHORT,) if solution.problem.late else ()
     return Fit(

@@ -28,8 +28,6 @@ from sq_perception.fitting.observation import Crop, Observation
 from sq_perception.fitting.options import MIN_PIXELS, MODEL_ERROR_ON_PLANE, FitOptions
 from sq_perception.fitting.problem import Problem, Solution
 from sq_perception.fitting.quality import assessed, failed
-from sq_perception.fitting.rays import SAMPLE
-from sq_perception.fitting.residuals import surface_distance
 from sq_perception.geometry.quantiles import quantile
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.support_directions import DIRECTIONS
@@ -117,9 +115,7 @@ def _exactly(
 
 def _is_explained(solution: Solution, noise: float) -> bool:
     """Whether a body of the tolerant course leaves no more than the noise, so that an exact one may be there."""
-    rays = solution.problem.observation.object_rays(SAMPLE)
-    distance = np.abs(surface_distance(rays, solution.state.parameters, solution.state.rotation))
-    return MEDIAN_TO_SIGMA * quantile(distance, 0.5) < noise
+    return MEDIAN_TO_SIGMA * quantile(np.abs(solution.distances), 0.5) < noise
 
 
 def warm_up() -> None:
