@@ -19,6 +19,7 @@ from sq_perception.geometry.superquadric import Superquadric
 
 _START_EXPONENT = 0.3
 """Nearer to a box than to an ellipsoid; a few steps find the rest."""
+_ORDERS = np.array(ORDERS)
 
 
 def enclosing_box(points: np.ndarray, footprint: float) -> Superquadric:
@@ -64,25 +65,24 @@ def _box_states(points: np.ndarray, axes: np.ndarray, deeper: bool, ground: floa
     low, high = span(points, axes.T).T
     if ground is not None:
         low[2] = min(ground, high[2] - 1e-4)
-    boxes = [(low, high)]
-    thin = int(np.argmin((high - low)[:2] if ground is not None else high - low))
-    view = points.mean(axis=0) @ axes
-    longest = float((high - low).max())
-    for share in (0.5, 1.0) if deeper else ():
-        deeper_low, deeper_high = low.copy(), high.copy()
-        extra = share * longest - (high - low)[thin]
-        if extra <= 0:
-            continue
-        if view[thin] > 0:
-            deeper_high[thin] += extra
-        else:
-            deeper_low[thin] -= extra
-        boxes.append((deeper_low, deeper_high))
-    found = []
-    for lower, upper in boxes:
-        half = np.maximum((upper - lower) / 2, 1e-6)
-        centre = axes @ ((lower + upper) / 2)
-        for order in ORDERS:
-            parameters = np.concatenate([half[list(order)], [_START_EXPONENT, _START_EXPONENT], centre])
-            found.append(State(parameters, np.ascontiguousarray(axes[:, order]), math.inf, 0))
+    found = _ordered(low, high, axes)
+    if not deeper:
+        return found
+    extents = high - low
+    thin = int(np.argmin(extents[:2] if ground is not None else extents))
+    seen_from_below = points.mean(axis=0) @ axes[:, thin] > 0
+    for share in (0.5, 1.0):
+        extra = share * float(extents.max()) - extents[thin]
+        if extra > 0:
+            more = np.where(np.arange(3) == thin, extra, 0.0)
+            found += _ordered(low, high + more, axes) if seen_from_below else _ordered(low - more, high, axes)
     return found
+
+
+def _ordered(low: np.ndarray, high: np.ndarray, axes: np.ndarray) -> list[State]:
+    """The box from ``low`` to ``high`` along the axes (columns), for each choice of z."""
+    parameters = np.full((len(ORDERS), 8), _START_EXPONENT)
+    parameters[:, :3] = np.maximum((high - low) / 2, 1e-6)[_ORDERS]
+    parameters[:, 5:] = axes @ ((low + high) / 2)
+    rotations = np.ascontiguousarray(axes[:, _ORDERS].swapaxes(0, 1))
+    return [State(numbers, rotation, math.inf, 0) for numbers, rotation in zip(parameters, rotations, strict=True)]
