@@ -116,8 +116,7 @@ class Crop:
         claimed = cv2.bitwise_or(filled, self.mask.view(np.uint8))
         near = cv2.dilate(filled, np.ones((2 * self.band + 1, 2 * self.band + 1), np.uint8))
         if nan_is_empty is None:
-            beside = np.isfinite(self.depth[(near > 0) & (claimed == 0)])
-            nan_is_empty = beside.size == 0 or float(beside.mean()) < _BACKGROUND_SHARE
+            nan_is_empty = _measured_beside(self.depth, near, claimed) < _BACKGROUND_SHARE
         lost = _convex_hull(claimed) if nan_is_empty else np.ones_like(claimed)
         pixels, areas, free, free_pixels = _sort(self.depth, inside, claimed, near, lost, self.footprint)
         shown = _some(pixels, areas, _POINTS, 0.5)
@@ -228,7 +227,7 @@ def span(points: np.ndarray, directions: np.ndarray) -> np.ndarray:
     place = (len(points) - 1) * np.array([OUTLIER_SHARE, 1 - OUTLIER_SHARE])
     before = place.astype(int)
     after = np.minimum(before + 1, len(points) - 1)
-    along = np.partition(directions @ points.T, np.unique([before, after]), axis=1)
+    along = np.partition(directions @ points.T, (*before, *after), axis=1)
     lower, upper = along[:, before], along[:, after]
     return np.asarray(lower + (upper - lower) * (place - before))
 
@@ -252,6 +251,18 @@ def _mean_depth(depth: np.ndarray, inside: np.ndarray) -> float:
     if count == 0:
         return np.nan
     return total / count
+
+
+@kernel
+def _measured_beside(depth: np.ndarray, near: np.ndarray, claimed: np.ndarray) -> float:
+    """The share of the pixels near the object, but not its own, that were measured; 0 without any."""
+    measured, count = 0, 0
+    for v in range(depth.shape[0]):
+        for u in range(depth.shape[1]):
+            beside = (near[v, u] > 0) & (claimed[v, u] == 0)
+            count += beside
+            measured += beside & np.isfinite(depth[v, u])
+    return measured / max(count, 1)
 
 
 @kernel
