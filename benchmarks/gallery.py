@@ -50,7 +50,7 @@ from sq_perception.evaluation.plots import (
     new_figure,
 )
 from sq_perception.fitting.fit import Status
-from sq_perception.recovery.recoverer import FrameRecovery, Recovery
+from sq_perception.recovery.recoverer import FrameRecovery
 from sq_perception.simulation import sensor_noise
 from sq_perception.tracking.session import Followed, TrackingSession
 
@@ -59,19 +59,6 @@ TRACKED_SCENE = 2
 TRACKED_WINDOW = (70.0, 550.0, 40.0, 440.0)
 """Left, right, top, bottom of what is shown of these frames, pixels."""
 WRAPPED: dict[str, Any] = {"break_long_words": False, "break_on_hyphens": False}
-
-
-# Figures of a scene
-
-
-def _surplus(found: Sequence[MatchedThing], frame: FrameRecovery) -> list[Recovery]:
-    taken = {one.body.label for one in found if one.body is not None}
-    return [body for body in frame.recovered if body.label not in taken]
-
-
-def mean_iou(found: Sequence[MatchedThing]) -> float:
-    """Per cent."""
-    return 100 * float(np.mean([one.iou for one in found]))
 
 
 # The page
@@ -88,111 +75,56 @@ class Entry:
 def of_scene(
     title: str,
     things: Sequence[Stood],
-    text: Callable[[list[MatchedThing], FrameRecovery], str],
+    text: str,
     sensor: str = "realsense_d435",
     azimuth: float = 35.0,
+    edges_of: str = "",
     **where: float,
 ) -> Callable[[Path], Entry]:
-    """A picture of three panels."""
+    """A picture of three panels, and how good the bodies are; of one thing every edge."""
 
     def draw(path: Path) -> Entry:
         view = viewed(things, sensor, **where)
         frame = recoverer().recover(view.depth, view.camera)
         found = matched(view, frame)
         write_picture(scene_figure(view, frame, azimuth), path)
-        return Entry(title, text(found, frame))
+        detail = [edges(one) for one in found if one.placed.thing.name == edges_of]
+        return Entry(title, " ".join([text, measured(found, frame), *detail]))
 
     return draw
 
 
-def _can(found: list[MatchedThing], frame: FrameRecovery) -> str:
-    (one,) = found
+def measured(found: Sequence[MatchedThing], frame: FrameRecovery) -> str:
+    """What was found of the things, and how far off it is."""
+    bodies = {one.placed.thing.name: one.body for one in found}
+    errors = [
+        2e3 * np.sort(one.body.superquadric.size) - 1e3 * one.placed.thing.edges
+        for one in found
+        if one.body is not None
+    ]
+    missed = ", ".join(name for name, body in bodies.items() if body is None)
     return (
-        f"A can of {_edges(one)} mm. Its back comes from the silhouette and the curvature of the front, its foot from "
-        f"the table. IoU {100 * one.iou:.0f} %."
+        f"{len(errors)} of {len(found)} things found{f' (missed: {missed})' * bool(missed)}, "
+        f"{len(frame.recovered) - len(errors)} bodies too many. Mean IoU "
+        f"{100 * np.mean([one.iou for one in found]):.0f} %, edges off by {np.mean(errors):+.1f} mm in the mean."
     )
 
 
-def _kitchen(found: list[MatchedThing], frame: FrameRecovery) -> str:
-    hidden = min(found, key=lambda one: one.visible)
-    return (
-        f"Six things that stand before each other, the {hidden.stood.name} {100 * hidden.visible:.0f} % visible. "
-        f"{_count(found, frame)} Mean IoU {mean_iou(found):.0f} %. Stereo widens what is near by some pixels: edges "
-        f"are off by {_bias(found):+.1f} mm in the mean."
-    )
-
-
-def _kitchen_light(found: list[MatchedThing], frame: FrameRecovery) -> str:
-    light, stereo = (1e3 * float(sensor_noise.preset(name).sigma(0.85)) for name in ("kinect_v1", "realsense_d435"))
-    return (
-        f"Noise of {light:.1f} mm at 0.85 m where stereo has {stereo:.1f}. {_count(found, frame)} Mean IoU "
-        f"{mean_iou(found):.0f} %, edges off by {_bias(found):+.1f} mm in the mean."
-    )
-
-
-def _touching(found: list[MatchedThing], frame: FrameRecovery) -> str:
-    return (
-        f"Three boxes and a can, parted at folds in the depth and by lines of sight between them. "
-        f"{_count(found, frame)} Mean IoU {mean_iou(found):.0f} %."
-    )
-
-
-def _bottles(found: list[MatchedThing], frame: FrameRecovery) -> str:
-    worst = min(found, key=lambda one: one.iou)
-    return (
-        f"No superquadric has a shoulder and a neck: one body leaves out the neck, or bottle and neck become two. "
-        f"{_count(found, frame)} Mean IoU {mean_iou(found):.0f} %, the worst {100 * worst.iou:.0f} % "
-        f"({worst.stood.name})."
-    )
-
-
-def _hidden(found: list[MatchedThing], frame: FrameRecovery) -> str:
-    one = next(each for each in found if each.stood.name == "hidden box")
+def edges(one: MatchedThing) -> str:
+    """Those of a thing and of its body, and how sure they are."""
+    name = f"The {one.placed.thing.name}, {100 * one.placed.visible_share:.0f} % visible"
     if one.body is None:
-        return "A box behind another one. Nothing was recovered of the hidden one."
+        return f"{name}: no body."
     order = np.argsort(-one.body.superquadric.size)
     seen, sigma = 100 * one.body.seen[order], 2e3 * one.body.sigma_size[order]
-    edges, true = 2e3 * one.body.superquadric.size[order], 1e3 * one.stood.thing.edges[::-1]
+    sizes, true = 2e3 * one.body.superquadric.size[order], 1e3 * one.placed.thing.edges[::-1]
     parts = [
-        f"{name} edge {seen[k]:.0f} % measured, {edges[k]:.0f} ± {sigma[k]:.0f} mm, truly {true[k]:.0f}"
-        for k, name in enumerate(("longest", "middle", "shortest"))
+        f"edge {seen[k]:.0f} % measured, {sizes[k]:.0f} ± {sigma[k]:.0f} mm, truly {true[k]:.0f}" for k in range(3)
     ]
     return (
-        f"A box of which another one hides {100 * (1 - one.visible):.0f} %: {'; '.join(parts)} (`seen`, `sigma_size`). "
-        f"Status `{Status(one.body.status).name}`, message: {one.body.message}."
+        f"{name}: {'; '.join(parts)} (`seen`, `sigma_size`). Status `{Status(one.body.status).name}`, message: "
+        f"{one.body.message}."
     )
-
-
-def _edges(one: MatchedThing) -> str:
-    return " x ".join(f"{1e3 * edge:.0f}" for edge in one.stood.thing.edges)
-
-
-def _count(found: list[MatchedThing], frame: FrameRecovery) -> str:
-    missed = [one.stood.name for one in found if one.body is None]
-    matched_bodies = sum(one.body is not None for one in found)
-    extra = len(frame.recovered) - matched_bodies
-    text = f"{matched_bodies} of {len(found)} things found"
-    text += f" (missed: {', '.join(missed)})" if missed else ""
-    if not extra:
-        return text + ", no body too many."
-    return text + f", {extra} {'body' if extra == 1 else 'bodies'} too many{_where(found, frame)}."
-
-
-def _where(found: list[MatchedThing], frame: FrameRecovery) -> str:
-    """What the surplus bodies are pieces of."""
-    names = set()
-    for body in _surplus(found, frame):
-        pixels = np.bincount(found[0].labels[frame.labels == body.label], minlength=len(found) + 1)
-        names.add(found[int(pixels[1:].argmax())].stood.name if pixels[1:].any() else "table")
-    return f", pieces of {' and '.join(sorted(names))}" if names else ""
-
-
-def _bias(found: list[MatchedThing]) -> float:
-    """Recovered minus true edges, mean, millimetres."""
-    errors = [
-        2e3 * np.sort(one.body.superquadric.size) - 1e3 * one.stood.thing.edges for one in found if one.body is not None
-    ]
-    return float(np.mean(errors))
 
 
 def empty(path: Path) -> Entry:
@@ -274,10 +206,24 @@ def _draw_course(ax: Axes, error: np.ndarray, sigma: np.ndarray, single: np.ndar
 
 
 ENTRIES: dict[str, Callable[[Path], Entry]] = {
-    "can": of_scene("One can", (Stood("can", can(75, 110), (0.0, 0.0)),), _can, distance=0.6),
-    "household_stereo": of_scene("A table by stereo", kitchen(), _kitchen, distance=0.85),
+    "can": of_scene(
+        "One can",
+        (Stood("can", can(75, 110), (0.0, 0.0)),),
+        "Its back comes from the silhouette and the curvature of the front, its foot from the table.",
+        distance=0.6,
+    ),
+    "household_stereo": of_scene(
+        "A table by stereo",
+        kitchen(),
+        "Six things that stand before each other. Stereo widens what is near by some pixels.",
+        distance=0.85,
+    ),
     "household_structured_light": of_scene(
-        "The same table by structured light", kitchen(), _kitchen_light, sensor="kinect_v1", distance=0.85
+        "The same table by structured light",
+        kitchen(),
+        "Less noise than stereo has.",
+        sensor="kinect_v1",
+        distance=0.85,
     ),
     "touching": of_scene(
         "Things that touch",
@@ -287,7 +233,7 @@ ENTRIES: dict[str, Callable[[Path], Entry]] = {
             Stood("flat box", carton(90, 60, 35), (-0.045, -0.0562), 8),
             Stood("can", can(66, 100), (0.1035, 0.02)),
         ),
-        _touching,
+        "Three boxes and a can, parted at folds in the depth and by lines of sight between them.",
         distance=0.65,
     ),
     "bottles": of_scene(
@@ -297,7 +243,7 @@ ENTRIES: dict[str, Callable[[Path], Entry]] = {
             Stood("bottle 2", bottle(4), (0.0, 0.08)),
             Stood("bottle 3", bottle(9), (0.1, -0.06), 35, mesh_things.ON_X),
         ),
-        _bottles,
+        "No superquadric has a shoulder and a neck: one body leaves out the neck, or bottle and neck become two.",
         down=32.0,
         distance=0.75,
     ),
@@ -307,7 +253,8 @@ ENTRIES: dict[str, Callable[[Path], Entry]] = {
             Stood("box in front", carton(150, 50, 160), (-0.06, -0.04), 4),
             Stood("hidden box", carton(190, 70, 90), (0.02, 0.08), 8),
         ),
-        _hidden,
+        "A box behind another one.",
+        edges_of="hidden box",
         azimuth=50.0,
         down=30.0,
         distance=0.65,

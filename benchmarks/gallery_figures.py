@@ -13,13 +13,13 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
-from gallery_scenes import ComposedView, Stood
 from hull_oracle import Columns
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from PIL import Image
 from scipy.optimize import linear_sum_assignment
+from tabletop import Placed, Tabletop
 
 from sq_perception.evaluation.body_pictures import draw_bodies_3d, picture_axes
 from sq_perception.evaluation.plots import (
@@ -43,17 +43,17 @@ ASPECT = 1.28
 """Width over height of a panel with an image."""
 FAINT = "#6b7885"
 _MARGIN = 30
+_ELEVATION = 24.0
+"""Degrees, of the pictures of bodies."""
 _BEFORE, _BEHIND = 0.05, 0.08
 _SEGMENTS = 64
 
 
 @dataclass(frozen=True, eq=False)
 class MatchedThing:
-    """A thing and its body; None where nothing was recovered of it.  ``labels`` is the frame's true label image."""
+    """A thing and its body; None where nothing was recovered of it."""
 
-    stood: Stood
-    labels: np.ndarray
-    visible: float
+    placed: Placed
     body: Recovery | None
     iou: float
 
@@ -63,27 +63,23 @@ def recoverer() -> Recoverer:
     return Recoverer()
 
 
-def matched(view: ComposedView, frame: FrameRecovery) -> list[MatchedThing]:
+def matched(view: Tabletop, frame: FrameRecovery) -> list[MatchedThing]:
     """Each thing with its body."""
-    iou = np.zeros((len(view.things), len(frame.recovered)))
-    for k in range(len(view.things)):
-        columns = Columns.of(view.hull(k))
+    iou = np.zeros((len(view.placed), len(frame.recovered)))
+    for k, placed in enumerate(view.placed):
+        columns = Columns.of(placed.hull)
         iou[k] = [columns.iou(body.superquadric) for body in frame.recovered]
     rows, chosen = linear_sum_assignment(-iou)
     pairs = {k: j for k, j in zip(rows, chosen, strict=True) if iou[k, j] > 0}
     return [
-        MatchedThing(
-            stood,
-            view.labels,
-            float(view.visible[k]),
-            frame.recovered[pairs[k]] if k in pairs else None,
-            float(iou[k, pairs[k]]) if k in pairs else 0.0,
-        )
-        for k, stood in enumerate(view.things)
+        MatchedThing(placed, frame.recovered[pairs[k]], float(iou[k, pairs[k]]))
+        if k in pairs
+        else MatchedThing(placed, None, 0.0)
+        for k, placed in enumerate(view.placed)
     ]
 
 
-def scene_figure(view: ComposedView, frame: FrameRecovery, azimuth: float = 35.0, elevation: float = 24.0) -> Figure:
+def scene_figure(view: Tabletop, frame: FrameRecovery, azimuth: float) -> Figure:
     """The three panels of one scene."""
     figure = new_figure(11.8, 3.55)
     axes = figure.subplots(1, 3, gridspec_kw={"wspace": 0.028, "width_ratios": [ASPECT, ASPECT, 1.0]})
@@ -101,17 +97,17 @@ def scene_figure(view: ComposedView, frame: FrameRecovery, azimuth: float = 35.0
         ax.set_ylim(window[3], window[2])
     panel_title(axes[0], "Depth", SENSORS[view.sensor])
     panel_title(axes[1], "Own masks, recovered outlines", f"{len(bodies)} bodies" if len(bodies) != 1 else "1 body")
-    cages = [line for k in range(len(view.things)) for line in _cage(view, k)]
-    around = [_box_around(view, k) for k in range(len(view.things))]
+    cages = [line for placed in view.placed for line in _cage(placed)]
+    around = [_box_around(placed) for placed in view.placed]
     draw_bodies_3d(
-        axes[2], bodies, plane=view.plane, colours=shades, elevation=elevation, azimuth=azimuth, enclosed=around
+        axes[2], bodies, plane=view.plane, colours=shades, elevation=_ELEVATION, azimuth=azimuth, enclosed=around
     )
-    _draw_lines(axes[2], cages, picture_axes(elevation, azimuth, view.plane))
+    _draw_lines(axes[2], cages, picture_axes(_ELEVATION, azimuth, view.plane))
     panel_title(axes[2], "From the right", "thin lines: the true things")
     return figure
 
 
-def empty_figure(views: Sequence[ComposedView]) -> Figure:
+def empty_figure(views: Sequence[Tabletop]) -> Figure:
     """What each sensor makes of a table with nothing on it."""
     figure = new_figure(11.62, 2.42)
     axes = figure.subplots(1, len(views), gridspec_kw={"wspace": 0.025})
@@ -125,7 +121,7 @@ def empty_figure(views: Sequence[ComposedView]) -> Figure:
     return figure
 
 
-def _window(view: ComposedView) -> tuple[float, float, float, float]:
+def _window(view: Tabletop) -> tuple[float, float, float, float]:
     """Left, right, top, bottom of the part of the image with the things, in the proportions of a panel."""
     rows, columns = np.nonzero(view.labels)
     low = np.array([columns.min(), rows.min()], dtype=float) - _MARGIN
@@ -137,7 +133,7 @@ def _window(view: ComposedView) -> tuple[float, float, float, float]:
     return middle[0] - half[0], middle[0] + half[0], middle[1] - half[1], middle[1] + half[1]
 
 
-def _limits(view: ComposedView) -> tuple[float, float]:
+def _limits(view: Tabletop) -> tuple[float, float]:
     """Nearest and farthest depth of the scale: those of the things, and a little behind them."""
     near, far = np.nanquantile(view.depth[view.labels > 0], (0.005, 0.995))
     return float(near) - _BEFORE, float(far) + _BEHIND
@@ -148,18 +144,16 @@ def panel_title(ax: Axes, text: str, detail: str) -> None:
     ax.set_title(detail, loc="right", fontsize=8.5, color=FAINT, pad=4)
 
 
-def _box_around(view: ComposedView, k: int) -> Superquadric:
+def _box_around(placed: Placed) -> Superquadric:
     """A thing's box in its own frame."""
-    hull, (rotation, translation) = view.things[k].thing.hull, view.poses[k]
-    low, high = hull.min(axis=0), hull.max(axis=0)
-    middle = rotation @ ((low + high) / 2) + translation
-    return Superquadric((high - low) / 2, np.full(2, 0.1), middle, quaternions.from_matrix(rotation))
+    low, high = placed.thing.hull.min(axis=0), placed.thing.hull.max(axis=0)
+    middle = placed.rotation @ ((low + high) / 2) + placed.translation
+    return Superquadric((high - low) / 2, np.full(2, 0.1), middle, quaternions.from_matrix(placed.rotation))
 
 
-def _cage(view: ComposedView, k: int) -> list[np.ndarray]:
+def _cage(placed: Placed) -> list[np.ndarray]:
     """Lines (n, 3) in the optical frame that show a thing: edges of a box, rims and sides of a body of revolution."""
-    thing = view.things[k].thing
-    rotation, translation = view.poses[k]
+    thing = placed.thing
     lines: list[np.ndarray] = []
     low, high = thing.hull.min(axis=0), thing.hull.max(axis=0)
     if thing.kind == "box":
@@ -176,7 +170,7 @@ def _cage(view: ComposedView, k: int) -> list[np.ndarray]:
             lines.append(np.column_stack([r * ring, np.full(len(ring), z)]))
         for direction in ring[: -1 : _SEGMENTS // 4]:
             lines.append(np.column_stack([order[:, 1:] * direction, order[:, 0]]))
-    return [line @ rotation.T + translation for line in lines]
+    return [line @ placed.rotation.T + placed.translation for line in lines]
 
 
 def _rims(profile: np.ndarray) -> list[tuple[float, float]]:

@@ -8,15 +8,15 @@ these are composed to show something.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import mesh_scene
 import mesh_things
 import numpy as np
 import tabletop
 from mesh_things import MeshThing
+from tabletop import Tabletop
 
-from sq_perception.imaging.camera import Camera
 from sq_perception.simulation import sensor_noise
 from sq_perception.simulation.scenes import plane_depth
 
@@ -34,41 +34,7 @@ class Stood:
     turn: np.ndarray = field(default_factory=lambda: mesh_things.UPRIGHT)
 
 
-@dataclass(frozen=True, eq=False)
-class ComposedView:
-    """A composed scene through a sensor.
-
-    Attributes
-    ----------
-    depth, labels : (height, width)
-        As measured; true things from 1, 0 elsewhere.
-    plane : (4,)
-        The true table.
-    things
-        Name and thing, in the order of labels.
-    poses
-        Rotation (3, 3) and translation (3,), camera from thing.
-    visible
-        Share of each thing's pixels that nothing hides.
-    """
-
-    camera: Camera
-    sensor: str
-    depth: np.ndarray
-    labels: np.ndarray
-    plane: np.ndarray
-    things: tuple[Stood, ...]
-    poses: tuple[tuple[np.ndarray, np.ndarray], ...]
-    visible: np.ndarray
-
-    def hull(self, k: int) -> np.ndarray:
-        rotation, translation = self.poses[k]
-        return self.things[k].thing.hull @ rotation.T + translation
-
-
-def viewed(
-    things: Sequence[Stood], sensor: str, down: float = 40.0, distance: float = 0.75, seed: int = 0
-) -> ComposedView:
+def viewed(things: Sequence[Stood], sensor: str, down: float = 40.0, distance: float = 0.75) -> Tabletop:
     """Things on a table whose middle is ``distance`` metres away, looked down on by ``down`` degrees.
 
     Raises
@@ -79,7 +45,7 @@ def viewed(
     camera, table = mesh_scene.CAMERA, mesh_scene.looked_down_on(np.deg2rad(down))
     origin = np.array([0.0, 0.0, distance])
     plane = np.append(table[:, 2], -table[:, 2] @ origin)
-    poses: list[tuple[np.ndarray, np.ndarray]] = []
+    placed: list[tuple[MeshThing, str, np.ndarray, np.ndarray]] = []
     outlines: list[np.ndarray] = []
     for each in things:
         turn = mesh_scene.about_z(np.deg2rad(each.heading)) @ each.turn
@@ -89,14 +55,10 @@ def viewed(
         outlines.append(tabletop.outline(corners + place))
         if any(tabletop.gap(outlines[-1], other) < -_CONTACT for other in outlines[:-1]):
             raise ValueError(f"{each.name}: stands where another thing is")
-        poses.append((table @ turn, table @ place + origin))
-    depth, labels, alone = mesh_scene.render_meshes(
-        [each.thing.mesh for each in things], [turn for turn, _ in poses], [place for _, place in poses],
-        plane_depth(plane, camera),
-    )  # fmt: skip
-    visible = np.bincount(labels.ravel(), minlength=len(things) + 1)[1:] / np.maximum(alone, 1)
-    measured = sensor_noise.preset(sensor).measured(depth, camera, np.random.default_rng(seed))
-    return ComposedView(camera, sensor, measured, labels, plane, tuple(things), tuple(poses), visible)
+        placed.append((replace(each.thing, name=each.name), "", table @ turn, table @ place + origin))
+    true, labels, known = tabletop.rendered(placed, plane_depth(plane, camera))
+    depth = sensor_noise.preset(sensor).measured(true, camera, np.random.default_rng(0))
+    return Tabletop(0, sensor, camera, depth, true, labels, plane, table, known)
 
 
 def carton(width: float, depth: float, height: float) -> MeshThing:

@@ -5,7 +5,6 @@
 | box | cartons, edges rounded by 0.5 to 4 mm | 6 to 30 cm, 45 to 100 and 15 to 70 % of that, at least 2 cm |
 | can | cylinders, rims rounded by 1 to 3 mm | diameter 5 to 11 cm, height 4 to 20 cm |
 | bottle | body of 50 to 68 % of the height, shoulder, neck of 2.2 to 4 cm | diameter 6 to 9 cm, height 15 to 28 cm |
-| vessel | bowls and cups, open at the top | diameter 7 to 16 cm, height 4 to 11 cm |
 | scan | YCB objects (../shared/data/ycb_meshes) | as they are |
 
 A thing's own frame has its base, or its middle, anywhere; z is the axis of revolution.  Its true edges are those of the
@@ -27,8 +26,8 @@ import trimesh
 from hull_oracle import Columns
 from scipy.spatial import ConvexHull
 
-KINDS = {"box": 0.35, "can": 0.25, "bottle": 0.2, "scan": 0.2, "vessel": 0.0}
-"""How often each comes; a vessel only where it is asked for."""
+KINDS = {"box": 0.35, "can": 0.25, "bottle": 0.2, "scan": 0.2}
+"""How often each comes."""
 SECTIONS = 96
 ROUNDING_STEPS = 5
 
@@ -122,24 +121,6 @@ def bottle(rng: np.random.Generator) -> MeshThing:
     return _revolved("bottle", "bottle", np.array(profile), lying=0.2)
 
 
-def vessel(rng: np.random.Generator) -> MeshThing:
-    """A bowl that widens upwards, or a straight cup without a handle."""
-    wall = 0.004
-    if rng.random() < 0.5:
-        name, rim, height = "bowl", rng.uniform(0.06, 0.08), rng.uniform(0.04, 0.07)
-        along = np.linspace(0, np.pi / 2, 12)
-        foot = 0.5 * rim
-        outside = np.stack([foot + (rim - foot) * np.sin(along), height * (1 - np.cos(along))], 1)
-    else:
-        name, rim, height = "cup", rng.uniform(0.035, 0.045), rng.uniform(0.08, 0.11)
-        outside = np.array([[rim, 0.0], [rim, height]])
-    inside = outside[::-1] - [wall, 0]
-    inside[-1, 1] = wall
-    inside = inside[(inside[:, 1] >= wall)]
-    profile = np.concatenate([[[0, 0]], outside, inside, [[0, wall]]])
-    return _revolved("vessel", name, profile, lying=0.0)
-
-
 def scans(folder: Path | None) -> tuple[MeshThing, ...]:
     """The YCB objects of a folder; none without one."""
     return () if folder is None else _scans(folder)
@@ -162,18 +143,13 @@ def _scans(folder: Path) -> tuple[MeshThing, ...]:
     return tuple(found)
 
 
-MAKERS: dict[str, Callable[[np.random.Generator], MeshThing]] = {
-    "box": box,
-    "can": can,
-    "bottle": bottle,
-    "vessel": vessel,
-}
+MAKERS: dict[str, Callable[[np.random.Generator], MeshThing]] = {"box": box, "can": can, "bottle": bottle}
 
 
-def draw(rng: np.random.Generator, kinds: dict[str, float], scanned: tuple[MeshThing, ...]) -> MeshThing:
+def draw(rng: np.random.Generator, scanned: tuple[MeshThing, ...]) -> MeshThing:
     """A random thing of one of the kinds, by their weights."""
-    names = [name for name, weight in kinds.items() if weight > 0 and (name != "scan" or scanned)]
-    weights = np.array([kinds[name] for name in names])
+    names = [name for name in KINDS if name != "scan" or scanned]
+    weights = np.array([KINDS[name] for name in names])
     kind = names[rng.choice(len(names), p=weights / weights.sum())]
     return scanned[rng.integers(len(scanned))] if kind == "scan" else MAKERS[kind](rng)
 

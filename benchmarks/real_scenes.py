@@ -1,10 +1,10 @@
 """Household things on a table through a depth sensor: how close the recovered bodies come to the true hulls.
 
-    python benchmarks/real_scenes.py [--scenes 1000] [--first 0] [--jobs 1] [--kinds "box; can"] [--sensor stereo]
+    python benchmarks/real_scenes.py [--scenes 1000] [--first 0] [--jobs 1] [--sensor stereo]
                                      [--each FILE] [--name real_scenes]
 
 Scenes are those of :mod:`tabletop`, methods and measures those of :mod:`scene_verdict`.  Counted are things at least
-half visible; things with under 200 pixels are left out and numbered, vessels (--kinds) are apart from all others.
+half visible; things with under 200 pixels are left out and numbered.
 
 Goals, things at least half visible: IoU 85 % with masks given, 80 % with the program's own; error of full edges, mean
 of three: median 5 mm, mean 9 mm.  Whole chain, own masks: median distance from the things' measured pixels to the
@@ -42,8 +42,6 @@ Groups = Callable[[list[ThingVerdict]], dict[str, list[ThingVerdict]]]
 """Makes the rows of a table of all things; the first one, ALL, is what goals are for."""
 ALL = "**all, at least half visible**"
 HALF = 0.5
-APART = "vessel"
-"""Counted by themselves."""
 POOR = 0.7
 TOO_FAR, TOO_LOW = 3.0, 10.0
 WORST = 15
@@ -52,16 +50,9 @@ SHARES = {"all visible (90 % and more)": (0.9, np.inf), "50 to 90 %": (0.5, 0.9)
 
 
 def main() -> None:
-    parser = arguments(__doc__, "real_scenes")
-    parser.add_argument("--kinds", default="", help="of things, separated by semicolons")
-    options = parser.parse_args()
-    names = [name.strip() for name in options.kinds.split(";") if name.strip()]
-    if not set(names) <= set(mesh_things.KINDS):
-        parser.error(f"--kinds: expected some of {', '.join(mesh_things.KINDS)}")
-    least = min(filter(None, mesh_things.KINDS.values()))
-    kinds = {name: max(mesh_things.KINDS[name], least) for name in names} or None
+    options = arguments(__doc__, "real_scenes").parse_args()
     scans = report.shared_data("ycb_meshes")
-    run(partial(scene_verdict.verdict, kinds=kinds, scans=scans, sensor=options.sensor), options, groups, GOALS)
+    run(partial(scene_verdict.verdict, scans=scans, sensor=options.sensor), options, groups, GOALS)
 
 
 def arguments(text: str | None, name: str) -> argparse.ArgumentParser:
@@ -120,14 +111,12 @@ def _reported(each: SceneVerdict, began: float) -> SceneVerdict:
 
 def groups(everything: list[ThingVerdict]) -> dict[str, list[ThingVerdict]]:
     """The rows of the table, all first."""
-    counted = [one for one in everything if one.kind != APART]
-    half = [one for one in counted if one.visible_share >= HALF]
+    half = [one for one in everything if one.visible_share >= HALF]
     rows: dict[str, list[ThingVerdict]] = {ALL: half}
     for kind in mesh_things.KINDS:
-        chosen = [one for one in everything if one.kind == kind and one.visible_share >= HALF]
-        rows[kind] = chosen
+        rows[kind] = chosen = [one for one in half if one.kind == kind]
         rows |= {f"{kind}, {rest}": [one for one in chosen if one.rest == rest] for rest in ("upright", "lying")}
-    return rows | by_sensor_and_share(half, counted)
+    return rows | by_sensor_and_share(half, everything)
 
 
 def by_sensor_and_share(half: list[ThingVerdict], counted: list[ThingVerdict]) -> dict[str, list[ThingVerdict]]:

@@ -142,9 +142,9 @@ def recoverer() -> Recoverer:
     return Recoverer()
 
 
-def verdict(seed: int, kinds: dict[str, float] | None, scans: Path | None, sensor: str | None) -> SceneVerdict:
+def verdict(seed: int, scans: Path | None, sensor: str | None) -> SceneVerdict:
     """Make the scene of a seed and evaluate every method on it."""
-    return evaluated(tabletop.scene(seed, kinds, scans, sensor))
+    return evaluated(tabletop.scene(seed, scans, sensor))
 
 
 def evaluated(scene: Tabletop) -> SceneVerdict:

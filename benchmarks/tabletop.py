@@ -15,6 +15,7 @@ Metres; optical frame; heights above the table = n.p + d.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -126,17 +127,13 @@ class _Stand:
         return bool((np.abs(along) < self.sides / 2).all())
 
 
-def scene(
-    seed: int, kinds: dict[str, float] | None = None, scans: Path | None = None, sensor: str | None = None
-) -> Tabletop:
+def scene(seed: int, scans: Path | None = None, sensor: str | None = None) -> Tabletop:
     """The scene of a seed.
 
     Parameters
     ----------
     seed
         The same one, with the same other arguments, gives the same scene and the same noise.
-    kinds
-        Weights of the kinds of things; those of :mod:`mesh_things` by default.
     scans
         The folder of scanned objects; without it there are none of them.
     sensor
@@ -145,21 +142,18 @@ def scene(
     Raises
     ------
     ValueError
-        For an unknown sensor or kind.
+        For an unknown sensor.
     """
     sensor = sensor or list(SENSORS)[seed % len(SENSORS)]
     if sensor not in SENSORS:
         raise ValueError(f"sensor: expected one of {', '.join(SENSORS)}, got {sensor!r}")
-    kinds = mesh_things.KINDS if kinds is None else kinds
-    if not set(kinds) <= set(mesh_things.KINDS):
-        raise ValueError(f"kinds: expected some of {', '.join(mesh_things.KINDS)}, got {', '.join(kinds)}")
     rng = np.random.default_rng([_STREAM, seed])
     model = sensor_noise.preset(SENSORS[sensor])
     nearest = max(NEAREST, getattr(model, "near", 0.0) + 0.01)
     scanned = mesh_things.scans(scans)
     count = int(rng.integers(1, MOST + 1))
     while True:
-        things = [mesh_things.draw(rng, kinds, scanned) for _ in range(count)]
+        things = [mesh_things.draw(rng, scanned) for _ in range(count)]
         for _ in range(_TRIES):
             stand = _stand(rng, nearest)
             poses = _arranged(things, stand, rng)
@@ -234,6 +228,20 @@ def _in_view(corners: np.ndarray, nearest: float) -> bool:
     return bool((pixels > _MARGIN).all() and (pixels < limit).all())
 
 
+def rendered(
+    things: Sequence[tuple[MeshThing, str, np.ndarray, np.ndarray]], behind: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, tuple[Placed, ...]]:
+    """Depth and labels (height, width) of things before a background, and these as they are placed.
+
+    Each comes with its rest, rotation (3, 3) and translation (3,), camera from thing.
+    """
+    meshes, turns, places = ([each[k] for each in things] for k in (0, 2, 3))
+    depth, labels, alone = mesh_scene.render_meshes([thing.mesh for thing in meshes], turns, places, behind)
+    pixels = np.bincount(labels.ravel(), minlength=len(things) + 1)[1:]
+    placed = [Placed(*each, k + 1, int(pixels[k]), int(alone[k])) for k, each in enumerate(things)]
+    return depth, labels, tuple(placed)
+
+
 def _seen(
     seed: int,
     sensor: str,
@@ -244,17 +252,13 @@ def _seen(
     rng: np.random.Generator,
 ) -> Tabletop:
     camera = mesh_scene.CAMERA
-    turns = [stand.table @ pose[:3, :3] for _, pose in poses]
-    places = [stand.table @ pose[:3, 3] + stand.origin for _, pose in poses]
-    meshes = [thing.mesh for thing in things]
-    depth, labels, alone = mesh_scene.render_meshes(meshes, turns, places, _background(stand, camera))
-    pixels = np.bincount(labels.ravel(), minlength=len(things) + 1)[1:]
-    placed = [
-        Placed(thing, rest, turn, place, k + 1, int(pixels[k]), int(alone[k]))
-        for k, (thing, (rest, _), turn, place) in enumerate(zip(things, poses, turns, places, strict=True))
+    lying = [
+        (thing, rest, stand.table @ pose[:3, :3], stand.table @ pose[:3, 3] + stand.origin)
+        for thing, (rest, pose) in zip(things, poses, strict=True)
     ]
+    depth, labels, placed = rendered(lying, _background(stand, camera))
     measured = model.measured(depth, camera, rng)
-    return Tabletop(seed, sensor, camera, measured, depth, labels, stand.plane, stand.table, tuple(placed))
+    return Tabletop(seed, sensor, camera, measured, depth, labels, stand.plane, stand.table, placed)
 
 
 def _background(stand: _Stand, camera: Camera) -> np.ndarray:
