@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.imaging.camera import Camera
 from sq_perception.simulation.scenes import TABLE_CAMERA, Scene, inside_image, resting_body, table_plane
 
 MOST = 12
@@ -28,33 +27,31 @@ _CONTACT = 2e-4
 _SURFACE_SAMPLES = 1500
 
 
-def crowded_scene(rng: np.random.Generator, count: int = 6, camera: Camera = TABLE_CAMERA) -> Scene:
+def crowded_scene(rng: np.random.Generator, count: int) -> Scene:
     """``count`` random bodies on a table seen from 0.5 to 1.2 m, most touching another one, wholly inside the image.
 
     Raises
     ------
     ValueError
-        If ``count`` is not 1 to 12, the camera is no pinhole, or the bodies find no room in its image.
+        If ``count`` is not 1 to 12, or the bodies find no room in the image.
     """
     if not 1 <= count <= MOST:
         raise ValueError(f"count: expected 1 to {MOST} bodies, got {count}")
-    if not camera.is_pinhole:
-        raise ValueError("camera: expected a pinhole camera, got an orthographic one")
     for _ in range(_VIEWS):
         plane = table_plane(rng, DISTANCE, PITCH)
         bodies: list[_Placed] = []
         for _ in range(_ATTEMPTS):
             drawn = resting_body(rng, plane, RADIUS)[0]
-            if not inside_image(drawn, camera):
+            if not inside_image(drawn, TABLE_CAMERA):
                 continue
             body = _Placed.of(drawn, rng)
             if bodies and rng.random() < PUSHED:
                 body = _pushed(body, bodies[rng.integers(len(bodies))], plane[:3])
-            if not any(map(body.overlaps, bodies)) and inside_image(body.body, camera):
+            if not any(map(body.overlaps, bodies)) and inside_image(body.body, TABLE_CAMERA):
                 bodies.append(body)
             if len(bodies) == count:
-                return Scene(Superquadric.stack([placed.body for placed in bodies]), camera, plane)
-    raise ValueError(f"no room for {count} bodies in an image of {camera.width} x {camera.height} pixels")
+                return Scene(Superquadric.stack([placed.body for placed in bodies]), TABLE_CAMERA, plane)
+    raise ValueError(f"no room for {count} bodies in an image of {TABLE_CAMERA.width} x {TABLE_CAMERA.height} pixels")
 
 
 @dataclass(frozen=True)

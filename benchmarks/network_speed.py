@@ -49,10 +49,8 @@ def engines(model: Any) -> dict[str, Callable[[np.ndarray], Any]]:
         weights = {name: tensor.numpy() for name, tensor in model.state_dict().items()}
         ways["forward"] = CompactRegressor(model.config, weights).predict
     ways[RIVAL] = model.for_inference().predict
-    ways["torch, folded, bfloat16"] = model.for_inference(torch.bfloat16).predict
     if torch.cuda.is_available():
-        for dtype in (torch.float32, torch.bfloat16, torch.float16):
-            ways[f"GPU, folded, {str(dtype).removeprefix('torch.')}"] = model.for_inference(dtype).to("cuda").predict
+        ways["GPU, folded"] = model.for_inference().to("cuda").predict
     return ways
 
 

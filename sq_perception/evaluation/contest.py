@@ -9,7 +9,7 @@ import numpy as np
 
 from sq_perception.evaluation.contestants import Contestant
 from sq_perception.evaluation.figures_of_merit import FiguresOfMerit
-from sq_perception.evaluation.thesis_images import CHUNK, ThesisImages
+from sq_perception.evaluation.thesis_images import ThesisImages
 from sq_perception.geometry.superquadric import Superquadric
 
 Advance = Callable[[str, int], None]
@@ -29,7 +29,6 @@ class Outcome:
 def compare(
     contestants: Sequence[tuple[Contestant, int]],
     images: ThesisImages,
-    chunk: int = CHUNK,
     advance: Advance | None = None,
 ) -> list[Outcome]:
     """Let every contestant recover the first so many bodies of the test set.
@@ -39,8 +38,6 @@ def compare(
     contestants
         Each with the number of its bodies, at most those of the test set.
     images : ThesisImages
-    chunk : int
-        Images in memory at a time; changes no result.
     advance
         Called with the progress.
 
@@ -54,7 +51,7 @@ def compare(
             raise ValueError(f"{contestant.name}: expected 1 to {images.count} bodies, got {count}")
     parts: list[list[tuple[FiguresOfMerit, np.ndarray, np.ndarray]]] = [[] for _ in contestants]
     most = max((count for _, count in contestants), default=0)
-    for piece in images.chunks(chunk):
+    for piece in images.chunks():
         if piece.first >= most:
             break
         for (contestant, count), part in zip(contestants, parts, strict=True):

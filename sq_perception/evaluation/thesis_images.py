@@ -28,6 +28,7 @@ from sq_perception.segmentation import segments
 from sq_perception.simulation.scenes import thesis_bodies
 
 CHUNK = 200
+"""Images in memory at a time; changes no result."""
 _BLOCK = 500
 _SPAWN_KEY = 6
 
@@ -117,11 +118,9 @@ class ThesisImages:
         depth, _ = raycast.render(unit_cube.optical_from_cube(self.truth[number]), self.camera)
         return unit_cube.depth_from_grey(unit_cube.grey_from_depth(depth))
 
-    def chunks(self, size: int = CHUNK) -> Iterator[ImageChunk]:
-        """All bodies with their images, ``size`` at a time."""
-        if size < 1:
-            raise ValueError(f"size: expected at least 1, got {size}")
-        for first in range(0, self.count, size):
-            numbers = range(first, min(first + size, self.count))
+    def chunks(self) -> Iterator[ImageChunk]:
+        """All bodies with their images, some at a time."""
+        for first in range(0, self.count, CHUNK):
+            numbers = range(first, min(first + CHUNK, self.count))
             depth = np.stack([self.image(number) for number in numbers])
             yield ImageChunk(first, self.truth[first : numbers.stop], depth, self.camera)

@@ -25,8 +25,6 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.learning.backbone import ResNet18, compact_backbone, fold
 from sq_perception.learning.network_config import RegressorConfig, checked_views
 
-INFERENCE_DTYPES = (torch.float32, torch.bfloat16, torch.float16)
-
 
 class Regressor(nn.Module):
     """See the module."""
@@ -60,7 +58,7 @@ class Regressor(nn.Module):
 
     def raw(self, views: torch.Tensor) -> torch.Tensor:
         """Outputs (n, 14) of the heads: size 3, shape 2, translation 3, rotation 6, all unbounded."""
-        h = self.mixer(self.features(views.to(self._dtype))).float()
+        h = self.mixer(self.features(views)).float()
         with torch.autocast(views.device.type, enabled=False):  # eight bits of mantissa are too few for a size
             heads = (self.size_head, self.shape_head, self.translation_head, self.rotation_head)
             return torch.cat([head(h) for head in heads], dim=-1)
@@ -80,29 +78,9 @@ class Regressor(nn.Module):
             raw = self.raw(batch.to(device, memory_format=torch.channels_last))
         return self.config.decode(raw.cpu().numpy().astype(float))
 
-    def for_inference(self, dtype: torch.dtype = torch.float32) -> Regressor:
-        """A copy that predicts the same, faster: normalisations folded into their convolutions, channels last.
-
-        Parameters
-        ----------
-        dtype
-            Of everything but the heads, which stay in single precision.  bfloat16 pays on processors that multiply it
-            (AVX512-BF16, AMX), float16 on graphics cards; elsewhere they work and are slower.
-
-        Raises
-        ------
-        ValueError
-            For a type other than float32, bfloat16 and float16.
-        """
-        if dtype not in INFERENCE_DTYPES:
-            raise ValueError(f"dtype: expected one of {', '.join(map(str, INFERENCE_DTYPES))}, got {dtype}")
+    def for_inference(self) -> Regressor:
+        """A copy that predicts the same, faster: normalisations folded into their convolutions, channels last."""
         copied = copy.deepcopy(self).eval()
         fold(copied.features)
-        copied.features.to(dtype)
-        copied.mixer.to(dtype)
         copied.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         return copied
-
-    @property
-    def _dtype(self) -> torch.dtype:
-        return next(self.features.parameters()).dtype

@@ -43,10 +43,7 @@ def _body(obj: SeenObject, depth: np.ndarray, camera: Camera, options: RecoveryO
         return solina_bajcsy.fit(obj.points)
     if options.method == "network":
         return _unfitted(_predicted(obj), obj, "prediction of the network, not refined")
-    known = FitOptions(
-        plane=obj.plane if options.use_plane else None,
-        time_budget=max(deadline - time.perf_counter(), _LEAST_BUDGET),
-    )
+    known = FitOptions(plane=obj.plane, time_budget=max(deadline - time.perf_counter(), _LEAST_BUDGET))
     if not options.free_space:
         depth = np.where(obj.mask, depth, np.float32(np.nan))
         known = replace(known, nan_is_empty=False, model_error=MODEL_ERROR_ON_PLANE)

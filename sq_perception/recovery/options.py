@@ -29,10 +29,6 @@ class RecoveryOptions:
         Nearest and farthest depth of an object, metres.
     max_objects
         The largest ones are recovered.
-    min_pixels
-        Smaller objects are ignored; None: 0.05 % of the image for own masks, any size for masks from outside.
-    use_plane
-        Let the fit know the support plane.
     time_budget
         Seconds per frame after which the surface fit tries no further start for any object, and no segment is split any
         more.  The objects with most pixels, large or near, come first.
@@ -61,8 +57,6 @@ class RecoveryOptions:
     tau: float = soft_agreement.THESIS_TAU
     depth_range: tuple[float, float] = (0.0, np.inf)
     max_objects: int = 20
-    min_pixels: int | None = None
-    use_plane: bool = True
     time_budget: float = np.inf
     max_size: float = 0.6
     workspace: standing.Box | None = None
@@ -78,15 +72,12 @@ class RecoveryOptions:
                 raise ValueError(f"{name}: expected a positive number, got {number}")
         if not self.time_budget > 0:
             raise ValueError(f"time_budget: expected a positive number of seconds, got {self.time_budget}")
-        if self.min_pixels is not None and self.min_pixels < 1:
-            raise ValueError(f"min_pixels: expected at least 1, got {self.min_pixels}")
         self.segmentation_options()
 
     def segmentation_options(self) -> segments.SegmentationOptions:
         return segments.SegmentationOptions(
             depth_range=self.depth_range,
             max_objects=self.max_objects,
-            min_pixels=self.min_pixels,
             max_size=self.max_size,
             workspace=self.workspace,
             workspace_pose=self.workspace_pose,

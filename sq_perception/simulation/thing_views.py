@@ -40,6 +40,8 @@ PLANE_GIVEN = 0.8
 PLANE_TILT, PLANE_SHIFT = float(np.deg2rad(0.7)), 0.002
 """Standard deviations of the given plane: of its tilt in both directions, and of its distance from the thing."""
 
+_PIXELS = 64
+"""Side of the views: what the network of things takes."""
 _LEAST_SEEN = 40
 _LARGEST_SUPPORT, _LEAST_WIDTH = 3.0, 0.6
 _OPPOSITE = np.argmin(DIRECTIONS @ DIRECTIONS.T, axis=1)
@@ -73,22 +75,13 @@ class ThingViews:
     kinds: np.ndarray
 
 
-def draw_thing_views(
-    count: int,
-    rng: np.random.Generator,
-    pixels: int = 64,
-    kinds: Sequence[str] | None = None,
-    own: Sequence[Thing] = (),
-) -> ThingViews:
-    """Views of ``count`` random things, half of them one's ``own`` where there are such.
-
-    ``kinds`` as of :func:`household.draw_thing`, for the others.
-    """
-    images = np.empty((count, pixels, pixels), dtype=np.float32)
+def draw_thing_views(count: int, rng: np.random.Generator, own: Sequence[Thing] = ()) -> ThingViews:
+    """Views of ``count`` random things, half of them one's ``own`` where there are such."""
+    images = np.empty((count, _PIXELS, _PIXELS), dtype=np.float32)
     planes, extents = np.zeros((count, 4), np.float32), np.empty(count, np.float32)
     support, numbers = np.empty((count, len(DIRECTIONS)), np.float32), np.empty(count, dtype=np.int64)
     for k in range(count):
-        thing, view, plane, reach = _draw_one(rng, pixels, kinds, own)
+        thing, view, plane, reach = _draw_one(rng, own)
         images[k], planes[k], extents[k], support[k] = view.marked, plane, view.extent, reach
         numbers[k] = KINDS.index(thing.kind)
     return ThingViews(images, planes, extents, support, numbers)
@@ -100,12 +93,10 @@ def support_in_view(parts: Superquadric, view: CanonicalView) -> np.ndarray:
     return (support_of_union(parts, directions) - directions @ view.anchor) / view.extent
 
 
-def _draw_one(
-    rng: np.random.Generator, pixels: int, kinds: Sequence[str] | None, own: Sequence[Thing]
-) -> tuple[Thing, CanonicalView, np.ndarray, np.ndarray]:
+def _draw_one(rng: np.random.Generator, own: Sequence[Thing]) -> tuple[Thing, CanonicalView, np.ndarray, np.ndarray]:
     """A thing, its view, the plane in the view's frame and its support function."""
     for _ in range(_ATTEMPTS):
-        thing = own[int(rng.integers(len(own)))] if len(own) and rng.random() < OWN else draw_thing(rng, kinds)
+        thing = own[int(rng.integers(len(own)))] if len(own) and rng.random() < OWN else draw_thing(rng)
         setting = draw_setting(thing, rng)
         depth, seen = setting.render()
         depth, seen = _something_before(depth, seen, rng)
@@ -121,7 +112,7 @@ def _draw_one(
         measured, mask, camera = _cut(measured, mask, setting.camera, rng)
         if np.count_nonzero(mask & np.isfinite(measured)) < _LEAST_SEEN:
             continue
-        view = canonical_view.from_mask(measured, mask, camera, pixels, plane=plane, missing_is_hidden=True)
+        view = canonical_view.from_mask(measured, mask, camera, _PIXELS, plane=plane, missing_is_hidden=True)
         reach = support_in_view(setting.parts, view)
         if np.abs(reach).max() > _LARGEST_SUPPORT or (reach + reach[_OPPOSITE]).max() < _LEAST_WIDTH:
             continue

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from sq_perception.commands import main
-from sq_perception.evaluation import contest, evaluation_pictures, thesis_tables
+from sq_perception.evaluation import contest, evaluation_pictures, thesis_images, thesis_tables
 from sq_perception.evaluation.contestants import Answers, FittingMethod, Network, unique_names
 from sq_perception.evaluation.figures_of_merit import FiguresOfMerit, Summary, shortest_arc
 from sq_perception.evaluation.thesis_images import ImageChunk, ThesisImages
@@ -128,9 +128,10 @@ class TestImages:
         for seed in (0, 2020, [2020, 0], [1, 0], [11, 0]):
             assert not np.isin(thesis_bodies(1000, np.random.default_rng(seed)).size, sizes).any()
 
-    def test_chunks_hold_every_image_once_in_8_bits(self) -> None:
+    def test_chunks_hold_every_image_once_in_8_bits(self, monkeypatch: pytest.MonkeyPatch) -> None:
         images = ThesisImages(5)
-        chunks = list(images.chunks(2))
+        monkeypatch.setattr(thesis_images, "CHUNK", 2)
+        chunks = list(images.chunks())
         assert [(chunk.first, len(chunk)) for chunk in chunks] == [(0, 2), (2, 2), (4, 1)]
         np.testing.assert_array_equal(chunks[1].depth[1], images.image(3))
         grey = (1 - images.image(3)) * 255 - 0.5
@@ -148,9 +149,12 @@ class TestImages:
 
 
 class TestContest:
-    def test_chunks_do_not_change_the_result(self) -> None:
+    def test_chunks_do_not_change_the_result(self, monkeypatch: pytest.MonkeyPatch) -> None:
         network, fit = Network.read(checkpoint.resolve()), FittingMethod.of("classic")
-        results = [contest.compare([(network, 7), (fit, 4)], ThesisImages(7), chunk) for chunk in (2, 7)]
+        results = []
+        for chunk in (2, 7):
+            monkeypatch.setattr(thesis_images, "CHUNK", chunk)
+            results.append(contest.compare([(network, 7), (fit, 4)], ThesisImages(7)))
         for small, large in zip(*results, strict=True):
             np.testing.assert_allclose(small.bodies.to_flat(), large.bodies.to_flat(), atol=1e-4)
             np.testing.assert_allclose(small.figures.iou, large.figures.iou, atol=1e-3)

@@ -13,10 +13,8 @@ import torch
 from safetensors.torch import load_file, save_file
 from torch.nn import functional
 
-from sq_perception.geometry.metrics import volume_iou
 from sq_perception.learning import checkpoint
 from sq_perception.learning.backbone import ResNet18
-from sq_perception.learning.dataset import draw_views
 from sq_perception.learning.regressor import Regressor, RegressorConfig
 from sq_perception.learning.training_config import TrainingConfig
 
@@ -193,22 +191,6 @@ class TestPrecision:
         assert any(isinstance(module, torch.nn.BatchNorm2d) for module in model.modules())
         np.testing.assert_allclose(folded.predict(views[:, 0].numpy()).to_flat(), expected, atol=2e-4)
         np.testing.assert_allclose(model.predict(views[:, 0].numpy()).to_flat(), expected, atol=1e-5)
-
-    @pytest.mark.parametrize(("dtype", "mean", "worst"), [(torch.bfloat16, 0.97, 0.9), (torch.float16, 0.99, 0.97)])
-    def test_lower_precision_means_the_same_bodies(self, dtype: torch.dtype, mean: float, worst: float) -> None:
-        model = checkpoint.load()
-        views, _ = draw_views(64, np.random.default_rng(11))
-        lower = model.for_inference(dtype)
-        assert {parameter.dtype for parameter in lower.features.parameters()} == {dtype}
-        assert lower.rotation_head.weight.dtype == torch.float32
-        iou = volume_iou(lower.predict(views), model.for_inference().predict(views))
-        assert iou.mean() > mean
-        assert iou.min() > worst
-
-    @pytest.mark.parametrize("dtype", [torch.float64, torch.int8])
-    def test_refuses_other_types(self, dtype: torch.dtype) -> None:
-        with pytest.raises(ValueError, match="dtype: expected one of"):
-            Regressor(COMPACT).for_inference(dtype)
 
 
 class TestCheckpoint:

@@ -12,6 +12,7 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.recordings.cloud_file import UNORGANISED
 from sq_perception.recordings.frame_file import FrameError, Reading, read
 from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
+from sq_perception.segmentation import support_plane
 
 CAMERA = Camera(160, 120, 210.0, 200.0, 80.5, 58.25)
 BODY = Superquadric([0.06, 0.04, 0.05], [0.2, 0.2], [0.01, 0.02, 0.7], [0.4, 0.2, 0.1, 0.8])
@@ -87,15 +88,16 @@ def test_a_cloud_in_any_order_is_seen_again(tmp_path):
     assert (error < np.maximum(0.006, 3 * np.sort(found.sigma_size))).all()
 
 
-def test_no_free_space_means_that_what_is_beside_says_nothing():
+def test_no_free_space_means_that_what_is_beside_says_nothing(monkeypatch):
     """The same body before a near wall and a far one: without free space both give the same fit."""
     depth, index = raycast.render(BODY, CAMERA)
     mask = (index >= 0).astype(np.int32)
     recoverer = Recoverer(method="symmetry")
     sizes = []
+    monkeypatch.setattr(support_plane, "around", lambda *_: None)  # a wall is no support
     for behind in (0.9, 3.0):
         image = np.where(np.isfinite(depth), depth, behind).astype(np.float32)
-        options = RecoveryOptions(method="symmetry", free_space=False, use_plane=False)
+        options = RecoveryOptions(method="symmetry", free_space=False)
         sizes.append(recoverer.recover(image, CAMERA, mask, options).bodies[0].superquadric.size)
     np.testing.assert_array_equal(*sizes)
 

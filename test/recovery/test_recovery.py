@@ -232,7 +232,6 @@ def test_misuse_is_refused(symmetry):
         ("sharpness", np.nan),
         ("tau", -1.0),
         ("max_objects", 0),
-        ("min_pixels", 0),
         ("depth_range", (1.0, 1.0)),
         ("time_budget", 0.0),
     ):
