@@ -118,15 +118,6 @@ def test_several_cameras_are_one_process_with_names_of_their_own(repository: Pat
     ]
 
 
-@pytest.mark.parametrize(("scene", "projection"), [("table", "pinhole"), ("thesis", "orthographic")])
-def test_the_synthetic_camera_and_its_readers_agree(
-    scene: str, projection: str, repository: Path, launch: dict[str, type]
-) -> None:
-    nodes = nodes_of(repository / "launch_scripts" / "synthetic.launch.py", launch, scene=scene)
-    assert {node.named["executable"] for node in nodes} == {"recover_node", "fitter_node", "synthetic_depth_node"}
-    assert {node.named["parameters"][0]["projection"] for node in nodes} == {projection}
-
-
 def rviz_of(nodes: list[Any]) -> Any:
     """The one RViz2 among nodes; its configuration is looked up where the package installs it."""
     (rviz,) = (node for node in nodes if node.named["package"] == "rviz2")
@@ -144,11 +135,3 @@ def test_rviz_looks_at_the_topics_of_the_camera(repository: Path, launch: dict[s
     assert [node.named["executable"] for node in nodes] == ["recover_node", "rviz2"]
     assert dict(rviz.named["remappings"]) == {"/depth/image": "/zed/depth", "/depth/camera_info": "/zed/info"}
     assert rviz.named["arguments"][-1] == "zed_optical"
-
-
-@pytest.mark.parametrize(("scene", "frame"), [("table", "camera_depth_optical_frame"), ("thesis", "unit_cube")])
-def test_rviz_is_fixed_to_the_frame_of_the_synthetic_camera(
-    scene: str, frame: str, repository: Path, launch: dict[str, type]
-) -> None:
-    nodes = nodes_of(repository / "launch_scripts" / "synthetic.launch.py", launch, scene=scene, rviz="true")
-    assert rviz_of(nodes).named["arguments"][-1] == frame

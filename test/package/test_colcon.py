@@ -82,7 +82,6 @@ def test_share_is_complete(install: Path) -> None:
     for name in (
         "package.xml",
         "launch/recover.launch.py",
-        "launch/synthetic.launch.py",
         "config/fast_dds.xml",
         "config/superquadrics.rviz",
     ):

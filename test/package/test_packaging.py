@@ -60,7 +60,6 @@ def test_the_wheel_carries_everything(wheel: Path) -> None:
         f"{data}/share/{PACKAGE}/config/fast_dds.xml",
         f"{data}/share/{PACKAGE}/config/superquadrics.rviz",
         f"{data}/share/{PACKAGE}/launch/recover.launch.py",
-        f"{data}/share/{PACKAGE}/launch/synthetic.launch.py",
         f"{PACKAGE}/config/fast_dds.xml",
         "sq_msgs_py/superquadrics.py",
         *(f"{data}/lib/{PACKAGE}/{node}" for node in NODES),
