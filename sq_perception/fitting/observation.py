@@ -28,6 +28,7 @@ from sq_perception.fitting import depth_noise
 from sq_perception.fitting.depth_noise import DepthNoise
 from sq_perception.fitting.rays import drawn, through
 from sq_perception.geometry.kernels import kernel
+from sq_perception.imaging import regions
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.coherence import coherent
 
@@ -87,7 +88,7 @@ class Crop:
         cls, depth: np.ndarray, mask: np.ndarray, camera: Camera, noise: float | DepthNoise | None
     ) -> Crop | None:
         """The crop around a mask of an image; None if it holds no depth at all.  ``noise`` None estimates it."""
-        x, y, width, height = cv2.boundingRect(np.ascontiguousarray(mask).view(np.uint8))
+        x, y, width, height = regions.box(np.ascontiguousarray(mask))
         extent = max(width, height)
         band = max(BAND_PIXELS, math.ceil(_BAND_SHARE * extent))
         margin = max(band, math.ceil(_WIDER * extent / 2))

@@ -29,6 +29,7 @@ import numpy as np
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging import regions
 from sq_perception.imaging.camera import Camera, Lens
 from sq_perception.imaging.lens import point_at
 
@@ -212,9 +213,9 @@ def _with_surroundings(left: int, top: int, width: int, height: int, camera: Cam
 
 def _box(depth: np.ndarray, mask: np.ndarray) -> tuple[int, int, int, int]:
     """Left, top, width and height of the pixels of a mask that have a depth; widths of 0 where there are none."""
-    left, top, width, height = cv2.boundingRect(np.ascontiguousarray(mask).view(np.uint8))
+    left, top, width, height = regions.box(np.ascontiguousarray(mask))
     window = np.s_[top : top + height, left : left + width]
-    inner_left, inner_top, width, height = cv2.boundingRect((mask[window] & np.isfinite(depth[window])).view(np.uint8))
+    inner_left, inner_top, width, height = regions.box(mask[window] & np.isfinite(depth[window]))
     return left + inner_left, top + inner_top, width, height
 
 

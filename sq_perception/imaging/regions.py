@@ -1,4 +1,4 @@
-"""Regions of a label image: int32 (height, width), 0 for nothing, labels from 1."""
+"""Regions of a label image: int32 (height, width), 0 for nothing, labels from 1; and of a mask."""
 
 from __future__ import annotations
 
@@ -18,6 +18,24 @@ def pixels(labels: np.ndarray, label: int, extent: np.ndarray) -> tuple[np.ndarr
     """Rows and columns of a label's pixels, by its extent."""
     rows, columns = _pixels(np.ascontiguousarray(labels, dtype=np.int32), int(label), *extent.tolist())
     return rows, columns
+
+
+@kernel
+def box(mask: np.ndarray) -> tuple[int, int, int, int]:
+    """Left, top, width and height of the set pixels of a mask, bool (height, width); all 0 where none is set."""
+    columns = np.zeros(mask.shape[1], np.bool_)
+    top, bottom = mask.shape[0], 0
+    for v in range(mask.shape[0]):
+        some = False
+        for u in range(mask.shape[1]):  # without an end before the last: vector code
+            some |= mask[v, u]
+        if some:
+            top, bottom = min(top, v), v + 1
+            columns |= mask[v]
+    found = np.flatnonzero(columns)
+    if found.size == 0:
+        return 0, 0, 0, 0
+    return found[0], top, found[-1] + 1 - found[0], bottom - top
 
 
 @kernel

@@ -28,11 +28,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
 
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.imaging import raycast
+from sq_perception.imaging import raycast, regions
 from sq_perception.imaging.camera import Camera
 
 PARAMETERS = 11
@@ -90,7 +89,7 @@ class Evidence:
         camera.check_image(objects)
         if not camera.is_pinhole:
             raise ValueError("camera: expected a pinhole camera, got an orthographic one")
-        left, top, width, height = cv2.boundingRect(np.ascontiguousarray(objects).view(np.uint8))
+        left, top, width, height = regions.box(np.ascontiguousarray(objects))
         margin = int(np.ceil(_MARGIN * max(width, height)))
         right, bottom = min(left + width + margin, camera.width), min(top + height + margin, camera.height)
         left, top = max(left - margin, 0), max(top - margin, 0)

@@ -8,12 +8,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
-import cv2
 import numpy as np
 
 from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.quantiles import quantile
-from sq_perception.imaging import canonical_view
+from sq_perception.imaging import canonical_view, regions
 from sq_perception.imaging.camera import Camera, Lens
 from sq_perception.imaging.canonical_view import CanonicalView
 from sq_perception.imaging.coherence import coherent
@@ -106,7 +105,7 @@ def objects(
     seen = []
     for label in found.ids:
         mask = (found.labels == label) & measured
-        left, top, width, height = cv2.boundingRect(mask.view(np.uint8))
+        left, top, width, height = regions.box(mask)
         window = slice(top, top + height), slice(left, left + width)
         crop = mask[window]
         camera_crop = camera.cropped(left, top, width, height)
