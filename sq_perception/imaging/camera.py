@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -79,7 +80,7 @@ class Camera:
         """The 3 x 3 matrix K."""
         return np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1.0]])
 
-    @property
+    @cached_property
     def lens(self) -> Lens:
         """The numbers of the camera, for compiled code."""
         return Lens(float(self.fx), float(self.fy), float(self.cx), float(self.cy), self.is_pinhole)
