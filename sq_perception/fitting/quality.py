@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 
 import numpy as np
@@ -10,6 +11,7 @@ from sq_perception.fitting.covariance import carried_over, spread, undetermined
 from sq_perception.fitting.fit import CUT_SHORT, FAILED_SHARE, INLIER, Fit, Status
 from sq_perception.fitting.observation import OUTLIER_SHARE, Observation, span
 from sq_perception.fitting.problem import Solution
+from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.quantiles import quantile
 from sq_perception.geometry.superquadric import Superquadric
 
@@ -28,11 +30,8 @@ def assessed(solution: Solution, began: float) -> Fit:
     covariance = solution.covariance() + spread(state, solution.alternatives)
     canonical = body.canonical_form()
     covariance = carried_over(covariance, body, canonical)
-    distance = np.abs(solution.distances)
-    inlying = distance < INLIER * observation.sigma
-    typical = quantile(distance, 0.5)
-    kept = distance < max(INLIER * observation.sigma, INLIER * typical)
-    residual = float(np.sqrt(np.mean(distance[kept] ** 2))) if kept.any() else typical
+    typical = quantile(np.abs(solution.distances), 0.5)
+    residual, inlier_share = _within(solution.distances, INLIER * observation.sigma, INLIER * typical)
     if solution.as_hull:
         # A hollow thing lies inside its hull: only what sticks out speaks against the body.
         typical = quantile(np.maximum(solution.distances, 0.0), _REACHED)
@@ -44,13 +43,26 @@ def assessed(solution: Solution, began: float) -> Fit:
         status=reached,
         message="; ".join([message, *solution.notes, *cut]),
         noise=observation.sigma,
-        inlier_share=float(inlying.mean()),
+        inlier_share=inlier_share,
         seen=seen_extents(canonical, observation.points),
         covariance=covariance,
         iterations=state.iterations,
         milliseconds=(time.perf_counter() - began) * 1e3,
         as_hull=solution.as_hull,
     )
+
+
+@kernel
+def _within(distances: np.ndarray, noise: float, typical: float) -> tuple[float, float]:
+    """Root mean square of the distances (n,) within either bound, and the share of those within the first one."""
+    square, kept, inlying = 0.0, 0, 0
+    for distance in distances:
+        size = abs(distance)
+        is_kept = size < max(noise, typical)
+        square += size * size if is_kept else 0.0
+        kept += is_kept
+        inlying += size < noise
+    return math.sqrt(square / max(kept, 1)), inlying / distances.shape[0]
 
 
 def seen_extents(body: Superquadric, points: np.ndarray) -> np.ndarray:
