@@ -51,6 +51,7 @@ class Bounds:
         extent = max(float(np.linalg.norm(high - low)), 1e-9)
         size = self.size if self.size is not None else (SMALLEST_SIZE * extent / 2, LARGEST_SIZE * extent / 2)
         reach = math.sqrt(3.0) * max(extent, size[1])  # no point of a body is farther from its centre
-        lower = np.concatenate([np.full(3, size[0]), np.full(2, self.shape[0]), low - reach])
-        upper = np.concatenate([np.full(3, size[1]), np.full(2, self.shape[1]), high + reach])
+        (smallest, largest), (sharpest, bluntest) = size, self.shape
+        lower = np.array([*[smallest] * 3, *[sharpest] * 2, *(low - reach)])
+        upper = np.array([*[largest] * 3, *[bluntest] * 2, *(high + reach)])
         return lower, upper

@@ -49,8 +49,9 @@ def standing_axes(points: np.ndarray, normal: np.ndarray) -> np.ndarray:
     first = np.array([y, -x, 0.0] if abs(z) < 0.9 else [0.0, z, -y])  # across z, or across x
     first /= np.linalg.norm(first)
     second = quaternions.cross(normal, first)
-    flat = np.stack([points @ first, points @ second], axis=1)
-    (_, _), (_, _), angle = cv2.minAreaRect(flat.astype(np.float32))
+    flat = np.empty((len(points), 2), np.float32)
+    flat[:, 0], flat[:, 1] = points @ first, points @ second
+    (_, _), (_, _), angle = cv2.minAreaRect(flat)
     c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
     return np.stack([c * first + s * second, -s * first + c * second, normal], axis=1)
 

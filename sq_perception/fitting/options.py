@@ -68,9 +68,11 @@ class FitOptions:
             raise ValueError(f"model_error: expected metres, 0 or more, got {self.model_error}")
         if self.plane is not None:
             plane = np.asarray(self.plane, dtype=float)
-            if plane.shape != (4,) or not np.isfinite(plane).all() or not np.linalg.norm(plane[:3]) > 0:
+            normal = plane[:3] if plane.shape == (4,) and np.isfinite(plane).all() else np.zeros(3)
+            length = np.linalg.norm(normal)
+            if not length > 0:
                 raise ValueError(f"plane: expected 4 finite numbers n d with a normal, got {self.plane}")
-            object.__setattr__(self, "plane", plane / np.linalg.norm(plane[:3]))
+            object.__setattr__(self, "plane", plane / length)
         if self.pixels is not None and self.pixels < MIN_PIXELS:
             raise ValueError(f"pixels: expected {MIN_PIXELS} or more, got {self.pixels}")
         if not self.time_budget > 0:

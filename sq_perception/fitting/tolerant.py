@@ -104,7 +104,7 @@ def _best(problem: Problem, starts: Sequence[State]) -> Solution:
     if problem.hull is None or problem.late:
         return _refined(problem, settled)
     misfit = max(1.0, _mean_loss(problem, settled[0]) / EXPLAINED)
-    terms = problem.terms._replace(hull_root=problem.hull.root(misfit))
+    terms = problem.terms if misfit == 1.0 else problem.terms._replace(hull_root=problem.hull.root(misfit))
     drawn = replace(problem, independent=INDEPENDENT_OF_PREDICTED / misfit, terms=terms)
     settled = _tried(drawn, settled[:2], draw(drawn, COARSE_RAYS, 0.7), BASIN_STEPS)
     solution = _refined(drawn, settled)
