@@ -55,13 +55,16 @@ class HullPrior:
         that is known of the thing's form, and the body shall be near to it in each direction, however unsure.  Growth
         in all directions is left to S: the outline determines a thing's size.
         """
-        count = len(self.support)
-        pull = (misfit - 1.0) / (PULL_SHARE * self.extent) ** 2
-        precision = self._precision + pull * (np.eye(count) - 1.0 / count)
+        precision = self._precision
+        if misfit > 1.0:
+            count = len(self.support)
+            pull = (misfit - 1.0) / (PULL_SHARE * self.extent) ** 2
+            precision = precision + pull * (np.eye(count) - 1.0 / count)
         return np.ascontiguousarray(np.linalg.cholesky(precision).T)
 
     @cached_property
     def _precision(self) -> np.ndarray:
         """(S + model error)^-1."""
-        model = MODEL_SHARE * self.extent
-        return np.linalg.inv(self.covariance + model**2 * np.eye(len(self.support)))
+        covariance = self.covariance.copy()
+        np.fill_diagonal(covariance, covariance.diagonal() + (MODEL_SHARE * self.extent) ** 2)
+        return np.linalg.inv(covariance)
