@@ -23,8 +23,9 @@ def one_body(parts: list[Any]) -> np.ndarray | None:
 
     So few numbers are checked ten times as fast in Python.  None for all else, what is no body included.
     """
-    if not all(type(part) is np.ndarray and part.ndim == 1 and part.dtype == np.float64 for part in parts):
-        return None
+    for part in parts:
+        if not (type(part) is np.ndarray and part.ndim == 1 and part.dtype == np.float64):
+            return None
     size, shape, translation, rotation = (part.tolist() for part in parts)
     if (len(size), len(shape), len(translation), len(rotation)) != (3, 2, 3, 4):
         return None

@@ -17,7 +17,7 @@ Every pixel is a ray p = o + z d with d_z = 1 and o_z = 0, so that the ray param
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, NamedTuple
 
@@ -127,7 +127,7 @@ class Camera:
 
     def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
         """The camera of an image cut out at column ``left`` and row ``top``."""
-        return replace(self, width=width, height=height, cx=self.cx - left, cy=self.cy - top)
+        return Camera(width, height, self.fx, self.fy, self.cx - left, self.cy - top, self.projection)
 
     def check_image(self, image: np.ndarray) -> None:
         """Raise ValueError unless the image has this camera's size."""
