@@ -264,7 +264,7 @@ def test_kept_machine_code_is_bound_to_all_kernel_sources(tmp_path: Path) -> Non
     """A kernel compiled into another module's function: after an edit of its file alone, the new code must run."""
     package = tmp_path / "sq_perception"
     source = Path(kernels.__file__).parents[1]
-    for name in ("__init__.py", "geometry"):
+    for name in ("__init__.py", "files", "geometry"):
         target = package / name
         if (source / name).is_dir():
             shutil.copytree(source / name, target, ignore=shutil.ignore_patterns("__pycache__"))
