@@ -71,7 +71,7 @@ def _inverse(information: np.ndarray, least: float) -> np.ndarray:
     eigenvalues, and an inverse may have variances below 0 or far above the prior's: the eigenvalues are then held.
     """
     inverse = np.linalg.inv(information)
-    variances = inverse.diagonal()
+    variances = np.diag(inverse)
     if (variances > 0).all() and (variances < 2 / least).all():
         return inverse
     values, axes = np.linalg.eigh(information)
@@ -102,9 +102,9 @@ def spread(state: State, alternatives: Iterable[Alternative]) -> np.ndarray:
     return moments
 
 
-def carried_over(covariance: np.ndarray, state: State, form: Superquadric) -> np.ndarray:
+def carried_over(covariance: np.ndarray, body: Superquadric, form: Superquadric) -> np.ndarray:
     """The covariance in another of the body's 8 forms: axes exchange and reverse."""
-    turn = np.round(state.rotation.T @ form.rotation_matrix)
+    turn = np.round(body.rotation_matrix.T @ form.rotation_matrix)
     change = np.eye(STEP_LENGTH)
     change[0:3, 0:3] = np.abs(turn).T
     change[8:11, 8:11] = turn.T
@@ -113,4 +113,4 @@ def carried_over(covariance: np.ndarray, state: State, form: Superquadric) -> np
 
 def undetermined(covariance: np.ndarray, size: np.ndarray) -> np.ndarray:
     """Which half sizes (3,) the image leaves open."""
-    return np.sqrt(covariance.diagonal()[:3]) > WEAK_SHARE * size
+    return np.sqrt(np.diag(covariance)[:3]) > WEAK_SHARE * size

@@ -55,16 +55,13 @@ class HullPrior:
         that is known of the thing's form, and the body shall be near to it in each direction, however unsure.  Growth
         in all directions is left to S: the outline determines a thing's size.
         """
-        precision = self._precision
-        if misfit > 1.0:
-            count = len(self.support)
-            pull = (misfit - 1.0) / (PULL_SHARE * self.extent) ** 2
-            precision = precision + pull * (np.eye(count) - 1.0 / count)
+        count = len(self.support)
+        pull = (misfit - 1.0) / (PULL_SHARE * self.extent) ** 2
+        precision = self._precision + pull * (np.eye(count) - 1.0 / count)
         return np.ascontiguousarray(np.linalg.cholesky(precision).T)
 
     @cached_property
     def _precision(self) -> np.ndarray:
         """(S + model error)^-1."""
-        covariance = self.covariance.copy()
-        np.fill_diagonal(covariance, covariance.diagonal() + (MODEL_SHARE * self.extent) ** 2)
-        return np.linalg.inv(covariance)
+        model = MODEL_SHARE * self.extent
+        return np.linalg.inv(self.covariance + model**2 * np.eye(len(self.support)))

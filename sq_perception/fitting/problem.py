@@ -27,7 +27,6 @@ from sq_perception.fitting.options import FitOptions
 from sq_perception.fitting.rays import SAMPLE, WEIGHT, Rays
 from sq_perception.fitting.residuals import RENDERED, SAMPSON, surface_distance
 from sq_perception.fitting.terms import Terms
-from sq_perception.geometry.quantiles import quantile
 from sq_perception.geometry.superquadric import Superquadric
 
 # Rays and steps of the stages: chosen on benchmarks/single_body.
@@ -172,11 +171,6 @@ class Solution:
         rays = self.problem.observation.object_rays(SAMPLE)
         return surface_distance(rays, self.state.parameters, self.state.rotation)
 
-    @cached_property
-    def typical_distance(self) -> float:
-        """Their median, on either side of the body alike."""
-        return quantile(np.abs(self.distances), 0.5)
-
     def covariance(self) -> np.ndarray:
         """(11, 11) of the valley of the cost that the body lies in."""
         problem, state = self.problem, self.state
@@ -184,7 +178,7 @@ class Solution:
 
     def unsure(self) -> np.ndarray:
         """Standard deviations (3,) of the half sizes, as shares of them."""
-        deviations = np.sqrt(self.covariance().diagonal()[:3])
+        deviations = np.sqrt(np.diag(self.covariance())[:3])
         return np.asarray(deviations / self.state.parameters[:3])
 
 

@@ -26,9 +26,11 @@ _AXES = "xyz"
 def assessed(solution: Solution, began: float) -> Fit:
     """The result of a fit, with its residual, inliers, covariance and status."""
     observation, state = solution.problem.observation, solution.state
-    canonical = state.body.canonical_form()
-    covariance = carried_over(solution.covariance() + spread(state, solution.alternatives), state, canonical)
-    typical = solution.typical_distance
+    body = state.body
+    covariance = solution.covariance() + spread(state, solution.alternatives)
+    canonical = body.canonical_form()
+    covariance = carried_over(covariance, body, canonical)
+    typical = quantile(np.abs(solution.distances), 0.5)
     residual, inlier_share = _within(solution.distances, INLIER * observation.sigma, INLIER * typical)
     if solution.as_hull:
         # A hollow thing lies inside its hull: only what sticks out speaks against the body.

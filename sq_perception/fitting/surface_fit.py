@@ -29,6 +29,7 @@ from sq_perception.fitting.options import MIN_PIXELS, MODEL_ERROR_ON_PLANE, FitO
 from sq_perception.fitting.problem import Problem, Solution
 from sq_perception.fitting.quality import assessed, failed
 from sq_perception.geometry.kernels import kernel
+from sq_perception.geometry.quantiles import quantile
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.support_directions import DIRECTIONS
 from sq_perception.imaging import raycast
@@ -115,7 +116,7 @@ def _exactly(
 
 def _is_explained(solution: Solution, noise: float) -> bool:
     """Whether a body of the tolerant course leaves no more than the noise, so that an exact one may be there."""
-    return MEDIAN_TO_SIGMA * solution.typical_distance < noise
+    return MEDIAN_TO_SIGMA * quantile(np.abs(solution.distances), 0.5) < noise
 
 
 def warm_up() -> None:
