@@ -128,9 +128,13 @@ class Processes:
     def end(self) -> None:
         with self._lock:
             self._ended = True
-            for process, _ in self._of_thread.values():
+            asked = list(self._of_thread.values())
+            for process, _ in asked:
                 process.terminate()
         self._threads.shutdown(cancel_futures=True)
+        for process, pipe in asked:
+            process.join()
+            pipe.close()
 
     def _answer(self, work: Work) -> FrameRecovery:
         thread = threading.get_ident()

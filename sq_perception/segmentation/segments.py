@@ -42,6 +42,8 @@ from sq_perception.segmentation import (
 from sq_perception.segmentation.support_plane import Plane
 from sq_perception.segmentation.support_surface import SupportSurface
 
+_LEAST_PIXELS, _LEAST_SHARE = 30, 5e-4
+"""Of an object: pixels, and share of the image; at VGA a square of 2 cm at 0.8 m.  Smaller ones are bits of noise."""
 _FOOT_PIXELS = 3
 """Up to which the foot of a thing reaches below what is clearly above the support."""
 _AROUND = 40
@@ -62,8 +64,6 @@ class SegmentationOptions:
         Nearest and farthest depth that is looked at, metres.
     max_objects
         The largest ones are kept.
-    min_pixels
-        Smaller components are dropped; None: 0.05 % of the image, at least 30.
     max_size
         Largest edge of an object, metres; what is larger is furniture.  Not asked of labels from outside.
     workspace
@@ -75,7 +75,6 @@ class SegmentationOptions:
 
     depth_range: tuple[float, float] = (0.0, np.inf)
     max_objects: int = 20
-    min_pixels: int | None = None
     max_size: float = 0.6
     workspace: standing.Box | None = None
     workspace_pose: standing.Pose | None = None
@@ -139,7 +138,7 @@ def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | No
     """
     options = options or SegmentationOptions()
     depth, valid = _checked(depth, camera, options.depth_range)
-    least = _least_pixels(options, depth)
+    least = max(_LEAST_PIXELS, round(_LEAST_SHARE * depth.size))
     if not camera.is_pinhole:
         labels, ids = _ordered(depth_steps.components(valid), least, options.max_objects)
         return Segmentation(labels, None, ids)
@@ -180,7 +179,7 @@ def from_labels(
     Returns
     -------
     Segmentation
-        Labels without a valid depth pixel, or with fewer than ``min_pixels`` where that is given, are left out.
+        Labels without a valid depth pixel are left out.
 
     Raises
     ------
@@ -201,8 +200,7 @@ def from_labels(
     given = labels[valid & (labels > 0)]  # of a table with few things, few pixels: these are sorted
     values, counts = np.unique(given, return_counts=True)
     order = np.argsort(-counts, kind="stable")
-    least = options.min_pixels or 1
-    ids = tuple(int(values[k]) for k in order if counts[k] >= least)
+    ids = tuple(int(values[k]) for k in order)
     if options.workspace is not None:
         box, pose = options.workspace, options.workspace_pose
         ids = tuple(k for k in ids if standing.within(box, _points(labels == k, depth, valid, camera), pose))
@@ -255,12 +253,6 @@ def _checked(depth: np.ndarray, camera: Camera, limits: tuple[float, float]) -> 
     if near > 0 or not camera.is_pinhole:
         valid &= depth >= near
     return depth, valid
-
-
-def _least_pixels(options: SegmentationOptions, depth: np.ndarray) -> int:
-    if options.min_pixels is not None:
-        return max(1, options.min_pixels)
-    return max(30, round(5e-4 * depth.size))
 
 
 # The objects on it

@@ -21,7 +21,7 @@ import numpy as np
 
 from sq_perception.geometry import rotation
 from sq_perception.geometry.quantiles import quantile
-from sq_perception.imaging import depth_steps
+from sq_perception.imaging import depth_steps, regions
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation import support_plane
 from sq_perception.segmentation.support_plane import COARSE_PIXELS, TOLERANCE, Plane, noise_growth
@@ -229,7 +229,7 @@ def _tall(labels: np.ndarray, relative: np.ndarray) -> np.ndarray:
     at = np.flatnonzero(labels)
     of, count = labels.ravel()[at], int(labels.max(initial=0)) + 1
     means = np.bincount(of, relative.ravel()[at], count) / np.maximum(np.bincount(of, minlength=count), 1)
-    return np.asarray((means > HIGHEST * TOLERANCE)[labels])
+    return regions.renumbered(labels, (means > HIGHEST * TOLERANCE).astype(np.int32)) > 0
 
 
 def _spread(relative: np.ndarray, around: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> float:

@@ -101,10 +101,15 @@ def test_the_same_image_gives_the_same_objects():
     np.testing.assert_array_equal(first.plane, second.plane)
 
 
+def test_a_speck_is_no_object():
+    speck = np.full((CAMERA.height, CAMERA.width), np.nan, np.float32)
+    speck[100:105, 100:105] = 1.0
+    assert segment(speck, CAMERA).ids == ()
+
+
 def test_options_choose():
     depth, _ = scene(THREE)
     assert segment(depth, CAMERA, SegmentationOptions(max_objects=2)).ids == (1, 2)
-    assert segment(depth, CAMERA, SegmentationOptions(min_pixels=10**6)).ids == ()
     assert segment(depth, CAMERA, SegmentationOptions(depth_range=(5.0, 6.0))).ids == ()
     near = segment(depth, CAMERA, SegmentationOptions(depth_range=(0.0, 1.0)))
     assert near.ids
