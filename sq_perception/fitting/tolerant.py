@@ -155,7 +155,7 @@ def _with_priors(problem: Problem) -> Problem:
         inner_cauchy=_INNER_CAUCHY,
         proportion_stiffness=0.0,
         volume_price=0.0,
-        hull_directions=np.ascontiguousarray(hull.directions),
+        hull_directions=np.array(hull.directions, order="C"),  # not read only: another form to compile
         hull_support=np.ascontiguousarray(hull.support),
         hull_root=hull.root(),
     )

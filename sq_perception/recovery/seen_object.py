@@ -79,7 +79,8 @@ class SeenObject:
 
     def heights(self, plane: np.ndarray) -> np.ndarray:
         """Metres above a plane (4,): of the pixels of ``mask_crop``, NaN elsewhere."""
-        return _heights(self.depth_crop, self.mask_crop, self.camera_crop.lens, plane)
+        depth, mask = np.ascontiguousarray(self.depth_crop), np.ascontiguousarray(self.mask_crop)
+        return _heights(depth, mask, self.camera_crop.lens, plane)
 
     def levels(self, plane: np.ndarray) -> tuple[float, float]:
         """The height of its lowest pixels above a plane, and the median of all, metres; of some thousand pixels."""

@@ -281,11 +281,12 @@ def _above(
         return labels
     top, left = max(top - _AROUND, 0), max(left - _AROUND, 0)
     window = slice(top, top + height + 2 * _AROUND), slice(left, left + width + 2 * _AROUND)
-    flat = (valid & (np.abs(relative) < support_plane.TOLERANCE))[window]
-    known = known[window]
+    # Contiguous, as kernels are compiled for arrays of a kind.
+    flat = np.ascontiguousarray((valid & (np.abs(relative) < support_plane.TOLERANCE))[window])
+    known, clear = np.ascontiguousarray(known[window]), np.ascontiguousarray(clear[window])
     seen = camera.cropped(left, top, known.shape[1], known.shape[0])
     holds = partial(limits.is_small, up=support.plane.equation[:3])
-    inside = _bodies(known, clear[window], seen, support.sigma, holds, flat)
+    inside = _bodies(known, clear, seen, support.sigma, holds, flat)
     foot = above[window] & (inside == 0)
     labels[window] = depth_steps.grown(inside, foot, known, _FOOT_PIXELS, depth_steps.STEP)
     return labels
