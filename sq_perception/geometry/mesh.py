@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-from scipy.spatial import ConvexHull
 
 from sq_perception.geometry.superquadric import Superquadric
 
@@ -64,6 +63,8 @@ def triangles(body: Superquadric, resolution: int = 32) -> tuple[np.ndarray, np.
     faces : (m, 3)
         Indices of vertices; watertight and convex, faces outwards.
     """
+    from scipy.spatial import ConvexHull  # here: a node that recovers does without
+
     _check_single(body)
     if resolution < 8 or resolution % 8:
         raise ValueError(f"resolution: expected a positive multiple of 8, got {resolution}")

@@ -32,7 +32,6 @@ from typing import Any
 
 import numpy as np
 from array_api_compat import array_namespace, is_torch_array
-from scipy.special import beta
 
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.body_numbers import LENGTHS, checked_turn, floating, one_body
@@ -264,6 +263,8 @@ class Superquadric:
 
     def volume(self) -> np.ndarray:
         """Volume (...), cubic metres: 2 a1 a2 a3 e1 e2 B(e1/2 + 1, e1) B(e2/2, e2/2)."""
+        from scipy.special import beta  # here: a node that recovers does without
+
         a, e1, e2 = self._numpy()
         return 2 * np.prod(a, axis=-1) * e1 * e2 * beta(e1 / 2 + 1, e1) * beta(e2 / 2, e2 / 2)
 

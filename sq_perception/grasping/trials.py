@@ -8,7 +8,6 @@ from __future__ import annotations
 from dataclasses import dataclass, fields
 
 import numpy as np
-from scipy.special import ndtr
 
 from sq_perception.geometry.kernels import kernel
 
@@ -110,6 +109,8 @@ def passing(gap: np.ndarray, sigma: np.ndarray, placement: float) -> np.ndarray:
 
 def log_phi(margin: np.ndarray, sigma: np.ndarray | float) -> np.ndarray:
     """log Phi(m / sigma), never below log(1e-12); nothing is known to less than a micrometre."""
+    from scipy.special import ndtr  # here: a node that recovers does without
+
     return np.asarray(np.log(np.maximum(ndtr(margin / np.maximum(sigma, 1e-6)), 1e-12)))
 
 

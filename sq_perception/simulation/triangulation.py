@@ -20,7 +20,6 @@ from typing import Any
 
 import cv2
 import numpy as np
-from scipy.special import ndtri
 
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.inverse_depth import InverseDepth, beside
@@ -125,6 +124,8 @@ class Triangulation(SensorNoise):
 
     def _thin_out(self, lost: np.ndarray, cosine: np.ndarray, rng: np.random.Generator) -> None:
         """Lose readings of grazing surfaces, window-sized patches of them together."""
+        from scipy.special import ndtri  # here: a node that recovers does without
+
         v, u = np.nonzero(~lost & (cosine < np.cos(np.radians(self.grazing))))
         if v.size:
             share = self.dropout(self.near, cosine[v, u])

@@ -40,7 +40,7 @@ class Agreement(NamedTuple):
 
 def compared(size: np.ndarray, total: np.ndarray, error: np.ndarray) -> Agreement:
     """The agreement of errors (n, 11) with their covariances (n, 11, 11); bodies with half sizes (n, 3)."""
-    limit, limit_five, limit_three = state.chi2_limit(GATE, np.array([LENGTH, 5, 3]))
+    limit, limit_five, limit_three = (state.chi2_limit(GATE, freedom) for freedom in (LENGTH, 5, 3))
 
     def outside(part: slice, bound: float) -> np.ndarray:
         return state.mahalanobis(total[:, part, part], error[:, part]) > bound

@@ -28,7 +28,6 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import linear_sum_assignment
 
 from sq_perception.geometry.kernels import inline_kernel, kernel, support
 from sq_perception.tracking import agreement, forms, state
@@ -127,6 +126,7 @@ def elsewhere(
 def warm_up() -> None:
     """Load what is compiled, or compile it."""
     _apart(np.ones((1, 12)), np.ones((1, 12)))
+    cheapest(np.ones((1, 1)))
 
 
 @kernel
@@ -185,8 +185,47 @@ def _alone(covariance: np.ndarray, error: np.ndarray) -> float:
 def _assigned(pairs: Pairs, cost: np.ndarray, alone: float, shape: tuple[int, int]) -> Pairs:
     table = np.full(shape, alone)
     table[pairs.track, pairs.observed] = cost
-    rows, columns = linear_sum_assignment(table)
-    kept = np.zeros(shape, dtype=bool)
-    kept[rows, columns] = True
+    kept = cheapest(table) if len(table) <= len(table.T) else cheapest(table.T.copy()).T
     chosen = kept[pairs.track, pairs.observed]
     return Pairs(*(part[chosen] for part in pairs))
+
+
+@kernel
+def cheapest(cost: np.ndarray) -> np.ndarray:
+    """The pairs of rows and columns with the least sum of costs (n, m), n <= m, each row in one: (n, m), bool.
+
+    Rows are added one by one, each by the shortest path that changes earlier pairs, in costs less the prices of rows
+    and columns (Crouse, On implementing 2D rectangular assignment algorithms, 2016).
+    """
+    rows, columns = cost.shape
+    of_row, of_column = np.full(rows, -1), np.full(columns, -1)
+    of_rows, of_columns = np.zeros(rows), np.zeros(columns)  # prices
+    for new in range(rows):
+        length, before = np.full(columns, np.inf), np.full(columns, -1)
+        done = np.zeros(columns, dtype=np.bool_)
+        row, end, so_far = new, -1, 0.0
+        while row >= 0:
+            end = -1
+            for j in range(columns):
+                if not done[j]:
+                    through = so_far + cost[row, j] - of_rows[row] - of_columns[j]
+                    if through < length[j]:
+                        length[j], before[j] = through, row
+                    if end < 0 or length[j] < length[end]:
+                        end = j
+            done[end] = True
+            row, so_far = of_column[end], length[end]
+        of_rows[new] += so_far
+        for j in range(columns):
+            if done[j]:
+                of_columns[j] -= so_far - length[j]
+                if j != end:
+                    of_rows[of_column[j]] += so_far - length[j]
+        while end >= 0:  # the row before takes the end, and its own column is the next end; the new one had none
+            row = before[end]
+            of_column[end] = row
+            of_row[row], end = end, of_row[row]
+    pairs = np.zeros((rows, columns), dtype=np.bool_)
+    for i in range(rows):
+        pairs[i, of_row[i]] = True
+    return pairs

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.optimize import linear_sum_assignment
 from scipy.stats import chi2
 from tracked_bodies import (
     CAMERA,
@@ -28,7 +29,7 @@ from sq_perception.imaging.raycast import render
 from sq_perception.recovery.recoverer import Recoverer
 from sq_perception.simulation import scenes
 from sq_perception.simulation.sensor_model import Ideal
-from sq_perception.tracking import sight, state
+from sq_perception.tracking import association, sight, state
 from sq_perception.tracking import tracker as tracker_module
 from sq_perception.tracking.tracker import FORGET_AFTER, Tracker, TrackState
 
@@ -340,3 +341,22 @@ def test_boxes_whose_fits_choose_their_z_axis_anew(rng):
             last[track.id] = track.superquadric
     assert set(last) == {1, 2}
     assert len(named) > 2
+
+
+# What a node does without SciPy
+
+
+@pytest.mark.parametrize("freedom", [1, 3, 5, 11])
+def test_the_limits_of_chi_squared_are_scipys(freedom):
+    for probability in (0.001, 0.5, 0.999, 1 - 1e-9):
+        assert state.chi2_limit(probability, freedom) == pytest.approx(chi2.ppf(probability, freedom), rel=1e-8)
+
+
+def test_the_cheapest_pairs_are_scipys_also_where_many_cost_the_same(rng):
+    for _ in range(300):
+        cost = rng.normal(size=np.sort(rng.integers(1, 9, 2)))
+        cost[rng.random(cost.shape) < 0.5] = 2.0
+        pairs = association.cheapest(cost)
+        assert (pairs.sum(axis=1) == 1).all()
+        assert (pairs.sum(axis=0) <= 1).all()
+        assert cost[pairs].sum() == pytest.approx(cost[linear_sum_assignment(cost)].sum())
