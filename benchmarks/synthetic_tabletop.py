@@ -12,7 +12,7 @@ pixel by itself, then millimetres.
     seen IoU      the same for masks: true pixels against labels of the matched body
     false         recovered bodies a frame that are left over, or whose IoU with every true body is below ``FALSE``
 
-``own`` are the program's masks, ``own, no repair`` those before segments are joined and split, ``true``
+``own`` are the program's masks, ``own, no repair`` those before segments are parted and joined, ``true``
 those of the renderer: the difference is what the segmentation costs.  Failed bodies count as not recovered.  Times are
 medians of one pinned thread.
 """
@@ -43,7 +43,7 @@ IOU_GOAL, FALSE_GOAL = 0.92, 0.1
 HALF = 0.5
 FALSE = 0.2
 PLAIN = "plain"
-STAGES = ("segmentation", "network", "fit", "repair", "score", "total")
+STAGES = ("segmentation", "network", "fit", "score", "total")
 SETTINGS: dict[str, tuple[bool, RecoveryOptions]] = {
     "own": (False, RecoveryOptions()),
     "own, no repair": (False, RecoveryOptions(repair=False)),

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from sq_perception.commands.console import SUCCESS, at_least, failed, parser
@@ -46,13 +47,15 @@ def segments(arguments: Sequence[str]) -> int:
     what = "segments of simulated tables, and which of their readings are of their object,"
     command = _parser("segment-views", what, example, shards=40)
     command.add_argument("--scenes", type=at_least(1), default=200, help="a shard, of some four segments each (200)")
+    command.add_argument("--pieces", action="store_true", help="and compact pieces of segments")
     given = command.parse_args(arguments)
 
     from sq_perception.learning.shard_training import write_views
     from sq_perception.simulation.segment_views import draw_segment_views
 
     try:
-        write_views(given.folder, _shards(given), lambda rng: draw_segment_views(given.scenes, rng), given.seed)
+        drawn = partial(draw_segment_views, given.scenes, with_pieces=given.pieces)
+        write_views(given.folder, _shards(given), drawn, given.seed)
     except OSError as error:
         return failed(f"segment-views: {given.folder}: {error}")
     return SUCCESS

@@ -59,6 +59,14 @@ class SegmentView:
     top: float
     side: float
 
+    def of_part(self, cells: np.ndarray) -> np.ndarray:
+        """The image as it would be if the segment had these cells alone, bool (PIXELS, PIXELS), and the rest of them
+        were of other segments; what it is measured by stays."""
+        image = self.image.copy()
+        image[..., SEGMENT] = cells
+        image[..., OTHERS] += self.image[..., SEGMENT] * ~cells
+        return image
+
     def at_pixels(self, values: np.ndarray, window: tuple[slice, slice]) -> np.ndarray:
         """Values (PIXELS, PIXELS) of the cells, between them interpolated, at the pixels of a window of the image."""
         down, across = window

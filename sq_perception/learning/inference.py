@@ -143,15 +143,15 @@ def load_things(path: Path | str | None = None, device: str = "cpu") -> ThingPre
     return ThingPredictor(checkpoint.load_things(path, device))
 
 
-def load_masks() -> forward.CompactMasks:
-    """The network of masks that ships, computed without torch.
+def load_masks(path: Path | str | None = None) -> forward.CompactMasks:
+    """A network of masks, None for the one of segments that ships, computed without torch.
 
     Raises
     ------
     CheckpointError
         As :func:`checkpoint.read`.
     """
-    return forward.CompactMasks(*checkpoint.read(MaskConfig))
+    return forward.CompactMasks(*checkpoint.read(MaskConfig, path))
 
 
 class _OnOneThread:

@@ -135,7 +135,7 @@ class RecoverParameters(Parameters):
         "Where the fit starts: network, symmetry, or auto (the best of them); classic is Solina and Bajcsy's method.",
         choices=get_args(Method),
     )
-    repair: bool = setting(True, "Join, drop and split own segments; leave readings of neighbours out of fits.")
+    repair: bool = setting(True, "Part, join and drop own segments; leave readings of neighbours out of fits.")
 
     @property
     def box(self) -> Box | None:

@@ -12,7 +12,6 @@ from sq_perception.segmentation import segments, standing
 
 Method = Literal["auto", "network", "symmetry", "classic"]
 NEEDS_NETWORK = ("auto", "network")
-FITTED = ("auto", "symmetry")
 
 
 @dataclass(frozen=True)
@@ -43,8 +42,8 @@ class RecoveryOptions:
         Whether a pixel beside an object shows that there is nothing before what it measured; not so where the image was
         made of a cloud.  Without it things are fitted by the tolerant course.
     repair
-        Join own segments, drop those of no object, and leave strays out of fits, by a network (with the method ``auto``
-        alone); split segments where that describes the image more briefly.  Masks from outside stay as they are.
+        Part and join own segments, drop those of no object, and leave strays out of fits, by a network; with the method
+        ``auto`` alone.  Masks from outside stay as they are.
 
     Raises
     ------

@@ -4,6 +4,11 @@ Rules of geometry take an image apart (:mod:`sq_perception.segmentation.segments
 segments knows better what belongs together.  For a segment a it predicts p_a(x), the probability that the reading of a
 pixel x is of the object that most of a shows (:mod:`sq_perception.learning.mask_network`).
 
+    parted    if the mean of p_a over one of four compact pieces of a (:mod:`sq_perception.segmentation.pieces`) is
+              below ``_SURE``, another network is asked about that piece as if it were a segment, and then about pieces
+              that no object claims.  A piece shows another object if it claims itself, and if it and the objects found
+              so far do not claim each other: if the means of p are below ``_APART``.  A pixel is of the object that
+              claims it most
     joined    a and b are one if each is the other's object: if the smaller of the means of p_a over b and of p_b over a
               is more than ``_ONE``; the surest pairs first, until there is none
     strays    pixels of a with p_a < 1/2: what a sensor widened an edge by, and bits of neighbours.  They stay in the
@@ -11,14 +16,14 @@ pixel x is of the object that most of a shows (:mod:`sq_perception.learning.mask
     nothing   a is dropped if less than ``_OF_AN_OBJECT`` of its pixels are of an object: a bump of the table, a wall,
               the room behind; not where there is no support plane, as all that is seen may be the object
 
-The network is asked once about a segment, and again about one that was joined.
+The network is asked once about a segment, and again about one that was parted or joined.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from typing import Protocol, TypeVar
 
 import numpy as np
 
@@ -27,11 +32,23 @@ from sq_perception.imaging import regions, segment_view
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.segment_view import SegmentView
 from sq_perception.learning.forward import CompactMasks
+from sq_perception.segmentation import pieces
 from sq_perception.segmentation.segments import Segmentation
 
 _ONE = 0.4
 """Less than 1/2, as the smaller mean errs downwards.  At 0.3 to 0.5 no two things of recorded frames were joined, and
 the IoU of simulated masks changed by 0.1 %."""
+_PIECES = 4
+"""Of a segment.  Each should show one thing, and enough of it to tell things apart."""
+_SURE = 0.93
+"""Asks 3.8 more questions an image of household things; 0.8 asks 2.0, finds as much there, and one thing less of 29 on
+recorded frames."""
+_APART = 0.3
+"""Of simulated things (884) 0.2, 0.3 and 0.4 miss 8.7, 8.6 and 8.4 %, and cut 42, 44 and 52 pieces off others."""
+_ITSELF = 0.5
+"""A piece that claims less of itself shows no object: what a sensor smeared, or several things."""
+_LEAST_TO_PART = 60
+"""Cells of a segment: of 15 in a piece."""
 _LEAST_CELLS = 4
 """Of another segment in a view, for a mean."""
 _OF_AN_OBJECT = 1 / 3
@@ -68,15 +85,23 @@ class _Seen:
     logits: np.ndarray
 
 
-_AnswersLabels: TypeAlias = Callable[[Sequence[int]], list[_Seen]]
+_Answer = TypeVar("_Answer")
+
+
+class _Mapped(Protocol):
+    def __call__(
+        self, function: Callable[[Sequence[int]], list[_Answer]], labels: Sequence[int], /
+    ) -> list[_Answer]: ...
 
 
 @dataclass(frozen=True, eq=False)
 class SegmentNetwork:
-    """The network of masks before one image of a pinhole camera.
+    """The networks of masks before one image of a pinhole camera.
 
     Attributes
     ----------
+    network, of_pieces
+        For segments, and for compact pieces of segments.
     depth : float (height, width)
         Metres, not finite or 0 where nothing was measured; every segment has a reading.
     plane : (4,) or None
@@ -86,17 +111,21 @@ class SegmentNetwork:
     """
 
     network: CompactMasks
+    of_pieces: CompactMasks
     depth: np.ndarray
     camera: Camera
     plane: np.ndarray | None
-    mapped: Callable[[_AnswersLabels, Sequence[int]], list[_Seen]]
+    mapped: _Mapped
 
     def improved(self, found: Segmentation) -> OwnSegments:
-        """Segments joined, rid of strays, and without those of nothing; labels run from 1, largest segment first."""
+        """Segments parted, joined, rid of strays, without those of nothing; labels from 1, the largest first."""
         if not found.ids:
             return OwnSegments(found, {})
         labels = found.labels.copy()
         seen = self._seen(labels, found.ids)
+        parts = self._parted(labels, seen)
+        if parts:
+            seen |= self._seen(labels, parts)
         for _ in range(_ROUNDS if len(seen) > 1 else 0):
             joined = _join(labels, seen)
             if not joined:
@@ -105,7 +134,7 @@ class SegmentNetwork:
         shown = {label: _shown(labels, label, answer) for label, answer in seen.items()}
         kept = [label for label, (_, share) in shown.items() if share >= _OF_AN_OBJECT or self.plane is None]
         own = {label: pixels for label in kept if (pixels := _own(*shown[label])) is not None}
-        if len(kept) == len(found.ids):
+        if not parts and len(kept) == len(found.ids):
             return OwnSegments(found, own)
         counts = regions.extents(labels)[:, 0]
         order = sorted(kept, key=lambda label: (-counts[label], label))
@@ -114,17 +143,33 @@ class SegmentNetwork:
         renumbered = replace(found, labels=regions.renumbered(labels, number), ids=tuple(range(1, len(order) + 1)))
         return OwnSegments(renumbered, {int(number[label]): own[label] for label in own})
 
-    def are_one(self, labels: np.ndarray, parts: Sequence[np.ndarray]) -> bool:
-        """Whether two of some parts, bool (height, width), among other segments are each other's object."""
-        labels, first = labels.copy(), int(labels.max()) + 1
-        for k, part in enumerate(parts):
-            labels[part] = first + k
-        seen = self._seen(labels, range(first, first + len(parts)))
-        return bool(_mutual(labels, seen).max() > _ONE)
+    def _parted(self, labels: np.ndarray, seen: Mapping[int, _Seen]) -> list[int]:
+        """Part segments that are several objects; the labels of all the parts."""
+        doubtful = [label for label, answer in seen.items() if _is_doubtful(answer)]
+        if not doubtful:
+            return []
+        objects = self.mapped(lambda some: [self._objects(seen[each]) for each in some], doubtful)
+        parts = [_cut(labels, label, seen[label], each) for label, each in zip(doubtful, objects, strict=True)]
+        return [label for some in parts for label in some]
 
-    def own(self, labels: np.ndarray, label: int) -> np.ndarray | None:
-        """Pixels of a segment's object in its window; None where there are no strays."""
-        return _own(*_shown(labels, label, self._seen(labels, (label,))[label]))
+    def _objects(self, answer: _Seen) -> list[np.ndarray]:
+        """The logits (p, p) of each object that pieces of a segment show, in the cells of its view.
+
+        The least sure piece is asked about first, then what no object claims.
+        """
+        some = _pieces(answer.view)
+        sure = _means(answer.logits, some)
+        objects: dict[int, np.ndarray] = {}
+        claimed = np.zeros(len(some))
+        while claimed.min() < _APART:
+            piece = int(np.lexsort((sure, claimed))[0])
+            logits = self.of_pieces.logits(answer.view.of_part(some[piece])[None])[0]
+            claims = _means(logits, some)
+            if claims[piece] >= _ITSELF and (claims[list(objects)] < _APART).all():
+                objects[piece] = logits
+                claimed = np.maximum(claimed, claims)
+            claimed[piece] = 1.0
+        return list(objects.values())
 
     def _seen(self, labels: np.ndarray, chosen: Sequence[int]) -> dict[int, _Seen]:
         extents, windows = regions.extents(labels), {}
@@ -141,6 +186,48 @@ class SegmentNetwork:
             return [_Seen(windows[label], view, each) for label, view, each in zip(some, views, logits, strict=True)]
 
         return dict(zip(chosen, self.mapped(of_some, chosen), strict=True))
+
+
+def _probability(logits: np.ndarray) -> np.ndarray:
+    return 1 / (1 + np.exp(-logits))
+
+
+def _own_cells(view: SegmentView) -> np.ndarray:
+    """Cells (p, p) in which a reading of the segment is."""
+    return (view.image[..., segment_view.SEGMENT] > 0) & (view.image[..., segment_view.MEASURED] > 0)
+
+
+def _is_doubtful(answer: _Seen) -> bool:
+    """Whether a piece of a segment may be of something else than most of it."""
+    if np.count_nonzero(_own_cells(answer.view)) < _LEAST_TO_PART:
+        return False
+    return bool(_means(answer.logits, _pieces(answer.view)).min() < _SURE)
+
+
+def _means(logits: np.ndarray, some: Sequence[np.ndarray]) -> np.ndarray:
+    """The mean of p over each of some pieces."""
+    p = _probability(logits)
+    return np.array([p[piece].mean() for piece in some])
+
+
+def _pieces(view: SegmentView) -> list[np.ndarray]:
+    cells = _own_cells(view)
+    return pieces.compact(cells, _PIECES, np.argwhere(cells).mean(axis=0))
+
+
+def _cut(labels: np.ndarray, label: int, answer: _Seen, objects: Sequence[np.ndarray]) -> list[int]:
+    """Give pixels of a segment to the object that claims them most; the labels of the parts, none if it stays whole."""
+    if len(objects) < 2:
+        return []
+    rows, columns = np.nonzero(labels[answer.window] == label)
+    logits = np.stack([answer.view.at_pixels(each, answer.window)[rows, columns] for each in objects])
+    is_large = np.bincount(logits.argmax(axis=0), minlength=len(objects)) >= MIN_PIXELS
+    more = np.count_nonzero(is_large) - 1
+    if more < 1:
+        return []
+    names = np.array([label, *(int(labels.max()) + 1 + np.arange(more))])
+    labels[answer.window][rows, columns] = names[logits[is_large].argmax(axis=0)]
+    return [int(name) for name in names]
 
 
 def _mutual(labels: np.ndarray, seen: Mapping[int, _Seen]) -> np.ndarray:

@@ -1,10 +1,9 @@
 """Depth image and camera in, superquadrics out: the one place that chains the stages.
 
-    depth -> segmentation -> canonical view of each object -> network -> inverse of the view -> fit -> repair -> score
+    depth -> segmentation -> canonical view of each object -> network -> inverse of the view -> fit -> score
 
-Own segments are joined, dropped where they show no object, and rid of strays by a network
-(:mod:`sq_perception.recovery.own_segments`), and split where fitted bodies show it
-(:mod:`sq_perception.recovery.segment_split`).
+With ``auto``, own segments are parted, joined, dropped where they show no object, and rid of strays by a network
+(:mod:`sq_perception.recovery.own_segments`).
 
 | method | body |
 | --- | --- |
@@ -41,8 +40,8 @@ from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
 from sq_perception.learning import checkpoint, inference
 from sq_perception.learning.forward import CompactMasks
-from sq_perception.recovery import continuity, methods, prediction, seen_object, segment_split
-from sq_perception.recovery.options import FITTED, NEEDS_NETWORK, Method, RecoveryOptions
+from sq_perception.recovery import continuity, methods, prediction, seen_object
+from sq_perception.recovery.options import NEEDS_NETWORK, Method, RecoveryOptions
 from sq_perception.recovery.own_segments import SegmentNetwork
 from sq_perception.recovery.prediction import Prediction
 from sq_perception.recovery.recovery import FrameRecovery, Recovery, timed
@@ -108,7 +107,7 @@ class Recoverer:
         self._path = model
         self._device = inference.checked_device(device)
         self._loaded: dict[bool, Network] = {} if weights_of is None else weights_of._loaded
-        self._masks: CompactMasks | None = None if weights_of is None else weights_of._masks
+        self._masks: tuple[CompactMasks, CompactMasks] | None = None if weights_of is None else weights_of._masks
         self._lock = threading.Lock()
         self._beside = ThreadPoolExecutor(1, thread_name_prefix="network")
         self._pool = ThreadPoolExecutor(self._threads, thread_name_prefix="fit")
@@ -179,7 +178,7 @@ class Recoverer:
         previous: FrameRecovery | None,
     ) -> FrameRecovery:
         started = time.perf_counter()
-        milliseconds = dict.fromkeys(("segmentation", "network", "fit", "repair", "score", "total"), 0.0)
+        milliseconds = dict.fromkeys(("segmentation", "network", "fit", "score", "total"), 0.0)
         network = None
         if options.method in NEEDS_NETWORK:
             network = self._load_network(camera.is_pinhole and options.method == "auto")
@@ -200,10 +199,8 @@ class Recoverer:
                 found = segments.from_labels(labels, depth, camera, options.segmentation_options())
             depth = cleaned
             own: Mapping[int, np.ndarray] = {}
-            network_of_masks = None
             if labels is None and options.repair and isinstance(network, inference.ThingPredictor):
-                network_of_masks = SegmentNetwork(self._load_masks(), depth, camera, found.plane, self._shared)
-                improved = network_of_masks.improved(found)
+                improved = SegmentNetwork(*self._load_masks(), depth, camera, found.plane, self._shared).improved(found)
                 found, own = improved.found, improved.own
             objects = seen_object.objects(depth, found, camera, options.depth_range)
             same = {} if previous is None else continuity.matched(kept, previous.labels, objects)
@@ -223,9 +220,6 @@ class Recoverer:
             known = {obj.label: obj for obj in fresh}
             objects = [known.get(obj.label, obj) for obj in objects]
             fits = [same[obj.label].fit if obj.label in same else fit_of[obj.label] for obj in objects]
-        with timed(milliseconds, "repair"):
-            if labels is None and options.repair and options.method in FITTED:
-                found, objects, fits = _split(found, objects, fits, depth, camera, options, network_of_masks, deadline)
         with timed(milliseconds, "score"):
             pairs = list(zip(objects, fits, strict=True))
 
@@ -281,10 +275,11 @@ class Recoverer:
                 self._loaded.update(dict.fromkeys(kinds, self._read_network(of_things)))
             return self._loaded[of_things]
 
-    def _load_masks(self) -> CompactMasks:
+    def _load_masks(self) -> tuple[CompactMasks, CompactMasks]:
+        """Of segments, and of pieces of them."""
         with self._lock:
             if self._masks is None:
-                self._masks = inference.load_masks()
+                self._masks = inference.load_masks(), inference.load_masks(checkpoint.PIECES)
             return self._masks
 
     def _read_network(self, of_things: bool) -> Network:
@@ -325,47 +320,6 @@ def _cleaned(depth: np.ndarray, camera: Camera) -> np.ndarray:
     if camera.is_pinhole:
         bad |= depth <= 0
     return np.where(bad, np.float32(np.nan), depth)
-
-
-def _split(
-    found: segments.Segmentation,
-    objects: list[SeenObject],
-    fits: list[Fit],
-    depth: np.ndarray,
-    camera: Camera,
-    options: RecoveryOptions,
-    network: SegmentNetwork | None,
-    deadline: float,
-) -> tuple[segments.Segmentation, list[SeenObject], list[Fit]]:
-    """Segments, objects and bodies after splitting; new segments are fitted without the network of things."""
-
-    def prepared(mask: np.ndarray) -> SeenObject:
-        label = int(found.labels.max()) + 1
-        alone = replace(found, labels=np.where(mask, np.int32(label), found.labels), ids=(label,))
-        obj = seen_object.objects(depth, alone, camera, options.depth_range)[0]
-        own = None if network is None else network.own(alone.labels, label)
-        obj = obj if own is None else obj.only(own)
-        return seen_object.viewed(obj, depth, camera, alone, options, None)
-
-    result = segment_split.split(
-        depth,
-        camera,
-        found.labels,
-        found.plane,
-        dict(zip((obj.label for obj in objects), fits, strict=True)),
-        lambda mask: methods.fitted(prepared(mask), depth, camera, options, deadline),
-        found.sigma,
-        deadline - time.perf_counter(),
-        None if network is None else network.are_one,
-    )
-    if not result.parted:
-        return found, objects, fits
-    parted = {label for labels in result.parted for label in labels}
-    known = {obj.label: obj for obj in objects if obj.label not in parted}
-    known |= {label: replace(prepared(result.labels == label), label=label) for label in parted}
-    ordered = sorted(known.values(), key=lambda obj: (-obj.pixels, obj.label))
-    ids = tuple(obj.label for obj in ordered)
-    return replace(found, labels=result.labels, ids=ids), ordered, [result.fits[label] for label in ids]
 
 
 def _why_empty(depth: np.ndarray, found: segments.Segmentation) -> str:

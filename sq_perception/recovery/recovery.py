@@ -84,7 +84,7 @@ class FrameRecovery:
     bodies
         One entry per object, the one with most pixels first, failed ones among them.
     milliseconds
-        By stage: segmentation, network, fit, repair, score, total.
+        By stage: segmentation, network, fit, score, total.
     labels : int32 (height, width)
         The masks that were used.
     plane : (4,) or None

@@ -42,6 +42,10 @@ from sq_perception.segmentation import crossings
 _FEW, _MANY = 30, 160
 """Samples of a segment: to see whether its lines are crossed, 435 pairs, and to take it apart.  90 instead of 160 find
 0.4 % less of household things (80 scenes, IoU of all), 60 instead of 30 as much."""
+_SUSPICIOUS = 0.12
+"""Share of crossed pairs from which on a segment may be several bodies."""
+_APART = 0.55
+"""Share of crossed pairs, on average, between parts of a segment: more than half, as between bodies that touch."""
 _LEAST_SAMPLES = 4
 """Of a part: six pairs."""
 _METRIC = 0.3
@@ -59,30 +63,6 @@ _LEAST_AREA = 8e-4
 """Of a part, square metres across the line of sight.  Twice as much joins 8 more of 335 household things."""
 _NEAR = 0.03
 """Neighbouring segments are no farther apart, metres, beyond the distance of their samples."""
-
-
-@dataclass(frozen=True)
-class SightOptions:
-    """When a segment is taken apart.
-
-    Attributes
-    ----------
-    suspicious
-        Share of crossed pairs from which on a segment may be several bodies.
-    apart
-        Share of crossed pairs, on average, between parts of a segment: more than half, as between bodies that touch.
-    """
-
-    suspicious: float = 0.12
-    apart: float = 0.55
-
-    def __post_init__(self) -> None:
-        for name in ("suspicious", "apart"):
-            if not 0 < getattr(self, name) < 1:
-                raise ValueError(f"{name}: expected a share between 0 and 1, got {getattr(self, name)}")
-
-
-_USUAL = SightOptions()
 
 
 def corrected(
@@ -120,7 +100,7 @@ def corrected(
         part = image.sampled(label, extents[label], _FEW)
         if part is None:
             continue
-        pieces = image.pieces(part, extents[label], _USUAL)
+        pieces = image.pieces(part, extents[label])
         if not pieces:
             parts.append(part)
         for number, pixels in enumerate(pieces):
@@ -142,24 +122,6 @@ def corrected(
         first = np.unique(group, return_index=True)[1]
         number_of[names] = names[first[group]]
     return regions.renumbered(result, number_of)
-
-
-def parts(
-    mask: np.ndarray, depth: np.ndarray, camera: Camera, sigma: float, options: SightOptions = _USUAL
-) -> list[np.ndarray]:
-    """Masks (height, width) of the convex parts of a mask; none where it is one, or has no such parts.
-
-    ``depth``, ``camera`` and ``sigma`` as in :func:`corrected`.
-    """
-    depth = _plain(depth)
-    image = _Image(depth, (mask & (depth > 0)).astype(np.int32), camera, sigma)
-    extents = regions.extents(image.labels)
-    whole = image.sampled(1, extents[1], _FEW) if len(extents) > 1 else None
-    found = []
-    for pixels in [] if whole is None else image.pieces(whole, extents[1], options):
-        found.append(np.zeros(mask.shape, bool))
-        found[-1][pixels] = True
-    return found
 
 
 def warm_up() -> None:
@@ -238,17 +200,17 @@ class _Image:
         reach = near / 2 + 0.7 * np.array([part.spacing for part in parts])
         return crossings.between(pixels, points, ends, reach, self.depth, *self.limits)
 
-    def pieces(self, part: _Part, extent: np.ndarray, options: SightOptions) -> list[tuple[np.ndarray, np.ndarray]]:
+    def pieces(self, part: _Part, extent: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
         """Rows and columns of each convex part of a segment; nothing where it has no such parts."""
         crossed = crossings.within(part.pixels, self.points(part), self.depth, self.labels, *self.limits)[0]
-        if crossed.mean() < options.suspicious:
+        if crossed.mean() < _SUSPICIOUS:
             return []
         whole = self.sampled(part.label, extent, _MANY)
         if whole is None:
             return []
         crossed, gap, far = crossings.within(whole.pixels, self.points(whole), self.depth, self.labels, *self.limits)
         n = len(whole.z)
-        group = _linked(crossed + _METRIC * far / max(far.max(), 1e-9), np.ones(n), options.apart)
+        group = _linked(crossed + _METRIC * far / max(far.max(), 1e-9), np.ones(n), _APART)
         size = np.bincount(group)
         large = size >= max(_LEAST_SAMPLES, _LEAST_AREA / whole.spacing**2)
         if np.count_nonzero(large) < 2:

@@ -6,18 +6,24 @@ borders cut things.  It is segmented as any image is, and each segment seen as a
 :class:`~sq_perception.imaging.segment_view.SegmentView`.  Its object is the thing that most of its pixels show; what
 shows the table or the room at half of its pixels, and no thing at 30 % of them, has none.  A reading is one of the
 object if its pixel shows the object and it is no more than 10 mm + 1 % off: what a sensor smears over an edge is not.
+
+The network that tells whether a segment is one thing also sees compact pieces of segments
+(:mod:`~sq_perception.segmentation.pieces`), and of two neighbours as if they were one, each with the thing that it
+shows; the rest of the segment is other segments.  Of a segment that shows several things it sees each one's part.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
-from sq_perception.imaging import segment_view
+from sq_perception.imaging import regions, segment_view
 from sq_perception.imaging.camera import Camera
-from sq_perception.segmentation import segments
+from sq_perception.imaging.segment_view import SegmentView
+from sq_perception.segmentation import pieces, segments
 from sq_perception.simulation import room, sensor_noise
 from sq_perception.simulation.things_on_table import TABLE_CAMERA, ThingsOnTable, things_on_table
 
@@ -29,11 +35,22 @@ _LARGE = 0.15
 """Share of the scenes at 1280 x 720."""
 _WITH_ROOM = 0.6
 """Share of the scenes whose table ends in sight, before a room."""
+_LARGER, _TIMES = 0.35, (1.0, 2.5)
+"""Share of the scenes that are as if all of it were so many times as large and as far: the largest thing that is
+recovered is 0.6 m long, and what is none is not told by its size."""
 _SMALLER, _SIDES = 0.6, (0.35, 0.9)
 """Share of the scenes of which a smaller image is taken, and its sides in those of the whole one."""
 _OFF, _OFF_SHARE = 0.01, 0.01
 _MOSTLY_NOTHING, _SOME_THING = 0.5, 0.3
 _LEAST_CELLS = 8
+_PIECES = (3, 7)
+"""Pieces that a segment is cut into: from, and below."""
+_PURE = 0.7
+"""Share of a piece's readings that show one thing: others have no object."""
+_PART = 0.1
+"""Share of a segment from which on what shows one of several things is seen by itself as well."""
+_TWO_AS_ONE, _BESIDE = 0.3, np.ones((7, 7), np.uint8)
+"""Share of the segments that are seen as one with a neighbour within three pixels."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,32 +69,102 @@ class SegmentViews:
     truth: np.ndarray
 
 
-def draw_segment_views(scenes: int, rng: np.random.Generator) -> SegmentViews:
-    """Views of all segments of some random scenes."""
+def draw_segment_views(scenes: int, rng: np.random.Generator, with_pieces: bool = False) -> SegmentViews:
+    """Views of all segments of some random scenes, and perhaps of pieces of them."""
     images, truth = [], []
     for _ in range(scenes):
-        drawn = things_on_table(rng, camera=_camera(rng))
-        if rng.random() < _WITH_ROOM:
-            drawn = replace(drawn, depth=room.behind(drawn, rng))
-        depth = sensor_noise.preset(str(rng.choice(_SENSORS))).measured(drawn.depth, drawn.camera, rng)
-        window = _cut(drawn, rng)
-        depth, true_depth, labels = (np.ascontiguousarray(each[window]) for each in (depth, drawn.depth, drawn.labels))
-        camera = drawn.camera.cropped(window[1].start, window[0].start, depth.shape[1], depth.shape[0])
-        found = segments.segment(depth, camera)
-        for label in found.ids:
-            mask = found.labels == label
-            left, top, width, height = cv2.boundingRect(mask.view(np.uint8))
-            extent = slice(top, top + height), slice(left, left + width)
-            view = segment_view.from_segment(depth, found.labels, label, extent, camera, found.plane)
-            shown = view.image[..., segment_view.MEASURED] * view.image[..., segment_view.SEGMENT]
-            if np.count_nonzero(shown) >= _LEAST_CELLS:
-                images.append(view.image.astype(np.float16))
-                truth.append(_truth(view, depth, mask, labels, true_depth))
+        for image, own in _views(_measured(rng), rng, with_pieces):
+            if np.count_nonzero(image[..., segment_view.MEASURED] * image[..., segment_view.SEGMENT]) >= _LEAST_CELLS:
+                images.append(image.astype(np.float16))
+                truth.append(own)
     size = segment_view.PIXELS
     shape = (len(images), size, size)
     return SegmentViews(
         np.array(images, np.float16).reshape(*shape, segment_view.CHANNELS), np.array(truth, np.uint8).reshape(shape)
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _Measured:
+    """An image (height, width) that a sensor took of things; ``shown`` are their labels, 0 for none."""
+
+    depth: np.ndarray
+    true_depth: np.ndarray
+    shown: np.ndarray
+    camera: Camera
+
+    def view(self, labels: np.ndarray, label: int, plane: np.ndarray | None) -> SegmentView:
+        _, top, bottom, left, right = regions.extents(labels)[label].tolist()
+        window = slice(top, bottom), slice(left, right)
+        return segment_view.from_segment(self.depth, labels, label, window, self.camera, plane)
+
+    def in_cells(self, view: SegmentView) -> tuple[np.ndarray, np.ndarray]:
+        """What the cells of a view show: labels, -1 for what a sensor smeared; and whether something was measured."""
+        height, width = self.depth.shape
+        grid = np.ix_(np.clip(view.rows, 0, height - 1), np.clip(view.columns, 0, width - 1))
+        near = np.abs(self.depth[grid] - self.true_depth[grid]) < _OFF + _OFF_SHARE * self.depth[grid]
+        return np.where(near, self.shown[grid], -1), view.image[..., segment_view.MEASURED] > 0
+
+
+def _measured(rng: np.random.Generator) -> _Measured:
+    """A random image."""
+    drawn = things_on_table(rng, camera=_camera(rng))
+    if rng.random() < _WITH_ROOM:
+        drawn = replace(drawn, depth=room.behind(drawn, rng))
+    if rng.random() < _LARGER:
+        drawn = replace(drawn, depth=rng.uniform(*_TIMES) * drawn.depth)
+    depth = sensor_noise.preset(str(rng.choice(_SENSORS))).measured(drawn.depth, drawn.camera, rng)
+    window = _cut(drawn, rng)
+    depth, true_depth, shown = (np.ascontiguousarray(each[window]) for each in (depth, drawn.depth, drawn.labels))
+    camera = drawn.camera.cropped(window[1].start, window[0].start, depth.shape[1], depth.shape[0])
+    return _Measured(depth, true_depth, shown, camera)
+
+
+def _views(measured: _Measured, rng: np.random.Generator, with_pieces: bool) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Images and truth of segments, and of pieces of them."""
+    found = segments.segment(measured.depth, measured.camera)
+    for label in found.ids:
+        view = measured.view(found.labels, label, found.plane)
+        shown = measured.shown[found.labels == label]
+        yield view.image, _truth(*measured.in_cells(view), _object(shown))
+        if with_pieces:
+            yield from _of_pieces(view, measured, rng)
+            yield from _of_merged(label, found, measured, rng)
+
+
+def _of_merged(
+    label: int, found: segments.Segmentation, measured: _Measured, rng: np.random.Generator
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Images and truth of each thing that a segment shows, if several, and of pieces of it and a neighbour as one."""
+    mask = found.labels == label
+    counts = np.bincount(measured.shown[mask], minlength=1)
+    things = np.flatnonzero(counts[1:] > _PART * counts.sum()) + 1
+    for thing in things if len(things) > 1 else ():
+        free = int(found.labels.max()) + 1
+        parts = np.where(mask & (measured.shown == thing), np.int32(free), found.labels)
+        view = measured.view(parts, free, found.plane)
+        yield view.image, _truth(*measured.in_cells(view), int(thing))
+    others = np.unique(found.labels[cv2.dilate(mask.view(np.uint8), _BESIDE) > 0])
+    others = others[others > label]
+    if len(others) and rng.random() < _TWO_AS_ONE:
+        both = np.where(found.labels == rng.choice(others), np.int32(label), found.labels)
+        yield from _of_pieces(measured.view(both, label, found.plane), measured, rng)
+
+
+def _of_pieces(
+    view: SegmentView, measured: _Measured, rng: np.random.Generator
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Images and truth of pieces of a segment that show one thing: of one of them, or if they show several, of all."""
+    cells, known = measured.in_cells(view)
+    segment = view.image[..., segment_view.SEGMENT] > 0
+    some, of = [], []
+    for piece in pieces.compact(segment, int(rng.integers(*_PIECES)), rng.uniform(0, segment_view.PIXELS, 2)):
+        counts = np.bincount(cells[piece & known & (cells >= 0)], minlength=1)
+        if counts.max() >= max(1, _PURE * np.count_nonzero(piece & known)):
+            some.append(piece)
+            of.append(int(counts.argmax()))
+    for k in range(len(some)) if len(set(of)) > 1 else rng.permutation(len(some))[:1]:
+        yield view.of_part(some[k]), _truth(cells, known, of[k] or -2)
 
 
 def _camera(rng: np.random.Generator) -> Camera:
@@ -101,15 +188,13 @@ def _cut(scene: ThingsOnTable, rng: np.random.Generator) -> tuple[slice, slice]:
     return slice(int(top), int(top + size[0])), slice(int(left), int(left + size[1]))
 
 
-def _truth(
-    view: segment_view.SegmentView, depth: np.ndarray, mask: np.ndarray, labels: np.ndarray, true_depth: np.ndarray
-) -> np.ndarray:
+def _object(shown: np.ndarray) -> int:
+    """The thing that most of a segment's pixels show, -2 if they show none."""
+    counts = np.bincount(shown, minlength=2)
+    most, total = int(counts[1:].argmax()) + 1, counts.sum()
+    return -2 if counts[0] >= _MOSTLY_NOTHING * total and counts[most] <= _SOME_THING * total else most
+
+
+def _truth(cells: np.ndarray, known: np.ndarray, thing: int) -> np.ndarray:
     """NO, YES or UNKNOWN (p, p)."""
-    shown = np.bincount(labels[mask], minlength=2)
-    most, total = int(shown[1:].argmax()) + 1, shown.sum()
-    if shown[0] >= _MOSTLY_NOTHING * total and shown[most] <= _SOME_THING * total:
-        most = -1
-    grid = np.ix_(np.clip(view.rows, 0, depth.shape[0] - 1), np.clip(view.columns, 0, depth.shape[1] - 1))
-    near = np.abs(depth[grid] - true_depth[grid]) < _OFF + _OFF_SHARE * depth[grid]
-    truth = np.where((labels[grid] == most) & near, YES, NO)
-    return np.where(view.image[..., segment_view.MEASURED] > 0, truth, UNKNOWN).astype(np.uint8)
+    return np.where(known, np.where(cells == thing, YES, NO), UNKNOWN).astype(np.uint8)

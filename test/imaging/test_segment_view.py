@@ -79,3 +79,15 @@ def test_values_of_cells_come_back_to_their_pixels() -> None:
     back = shown.at_pixels(ramp.astype(np.float32), WINDOW)
     assert back.shape == (40, 60)
     np.testing.assert_allclose(back, np.arange(60, 120)[None, :].repeat(40, axis=0) + 0.5, atol=0.05)
+
+
+def test_the_rest_of_a_segment_is_other_segments_to_a_part() -> None:
+    shown = view()
+    cells = shown.image[..., SEGMENT] > 0
+    left = cells & (np.arange(PIXELS) < PIXELS // 2)
+    part = shown.of_part(left)
+    np.testing.assert_array_equal(part[..., SEGMENT], left)
+    np.testing.assert_array_equal(part[..., OTHERS] > 0, (shown.image[..., OTHERS] > 0) | (cells & ~left))
+    same = [channel for channel in range(CHANNELS) if channel not in (SEGMENT, OTHERS)]
+    np.testing.assert_array_equal(part[..., same], shown.image[..., same])
+    np.testing.assert_array_equal(shown.of_part(cells), shown.image)

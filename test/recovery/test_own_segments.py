@@ -13,7 +13,7 @@ from sq_perception.geometry import rotation
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast, segment_view
 from sq_perception.imaging.camera import Camera
-from sq_perception.learning import inference
+from sq_perception.learning import checkpoint, inference
 from sq_perception.recovery.own_segments import SegmentNetwork
 from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
 from sq_perception.segmentation.segments import Segmentation
@@ -57,13 +57,15 @@ class GivenLogits:
         return np.asarray(self._function(views), np.float32)
 
 
-def of(network: Any, depth: np.ndarray) -> SegmentNetwork:
-    return SegmentNetwork(network, depth, CAMERA, PLANE, lambda function, labels: function(labels))
+def of(networks: Any, depth: np.ndarray) -> SegmentNetwork:
+    """Before an image: of a network for segments and for pieces, or of one of each."""
+    of_segments, of_pieces = networks if isinstance(networks, tuple) else (networks, networks)
+    return SegmentNetwork(of_segments, of_pieces, depth, CAMERA, PLANE, lambda function, labels: function(labels))
 
 
 @pytest.fixture(scope="module")
 def shipped() -> Any:
-    return inference.load_masks()
+    return inference.load_masks(), inference.load_masks(checkpoint.PIECES)
 
 
 def test_the_rim_that_a_sensor_adds_is_stray(shipped: Any) -> None:
@@ -90,8 +92,61 @@ def test_two_halves_of_a_can_are_joined_and_two_cans_are_not(shipped: Any) -> No
     assert len(found.ids) == 2
     for can in (1, 2):
         assert len(np.unique(found.labels[truth == can])) == 1
-    assert of(shipped, depth).are_one(truth, [halves == 1, halves == 3])
-    assert not of(shipped, depth).are_one(np.zeros_like(truth), [truth == 1, truth == 2])
+
+
+def test_two_boxes_under_one_label_become_two(shipped: Any) -> None:
+    boxes = standing(-0.055, 0, (0.05, 0.04, 0.03), (0.1, 0.1)), standing(0.035, 0.01, (0.04, 0.03, 0.06), (0.1, 0.1))
+    depth, truth = seen(list(boxes))
+    found = of(shipped, depth).improved(segmentation((truth > 0).astype(np.int32))).found
+    assert found.ids == (1, 2)
+    for box in (1, 2):
+        mine = found.labels == np.bincount(found.labels[truth == box]).argmax()
+        assert np.count_nonzero(mine & (truth == box)) > 0.9 * np.count_nonzero(mine | (truth == box))
+
+
+def halves_of(views: np.ndarray) -> np.ndarray:
+    """Whether cells (n, p, p) are in the left half of what a segment and its neighbours fill."""
+    filled = (views[..., [segment_view.SEGMENT, segment_view.OTHERS]] > 0).any(axis=(1, 3))
+    middle = [np.median(np.flatnonzero(each)) for each in filled]
+    return np.arange(views.shape[2])[None, None, :] < np.array(middle)[:, None, None]
+
+
+def claims_of_halves(views: np.ndarray) -> np.ndarray:
+    """A network that sees an object in either half of the columns, and shows the one that most of a segment is in."""
+    left, mine = halves_of(views), views[..., segment_view.SEGMENT] > 0
+    of_left = (mine & left).sum(axis=(1, 2)) >= (mine & ~left).sum(axis=(1, 2))
+    return np.where(left == of_left[:, None, None], 3.0, -3.0) * np.ones(views.shape[:3])
+
+
+def test_a_doubtful_segment_is_parted_where_its_pieces_say() -> None:
+    depth, truth = seen([standing(0, 0, *CAN)])
+    found = of(GivenLogits(claims_of_halves), depth).improved(segmentation(truth)).found
+    assert found.ids == (1, 2)
+    np.testing.assert_array_equal(found.labels > 0, truth > 0)
+    columns = [np.nonzero(found.labels == label)[1] for label in found.ids]
+    first, second = sorted(columns, key=lambda each: float(each.mean()))
+    assert first.max() < second.min()
+    assert abs(len(first) - len(second)) < 0.2 * len(first)
+
+
+def test_pieces_that_are_of_nothing_are_no_objects() -> None:
+    """The network sees an object in the right half, and none in the left one, as where a sensor smeared an edge."""
+
+    def right_alone(views: np.ndarray) -> np.ndarray:
+        return np.where(halves_of(views), -3.0, 3.0) * np.ones(views.shape[:3])
+
+    depth, truth = seen([standing(0, 0, *CAN)])
+    network = GivenLogits(right_alone)
+    found = of(network, depth).improved(segmentation(truth))
+    np.testing.assert_array_equal(found.found.labels, truth)
+    assert network.asked > 1
+
+
+def test_a_segment_that_is_surely_one_is_asked_about_once() -> None:
+    depth, truth = seen([standing(0, 0, *CAN)])
+    network = GivenLogits(lambda views: np.full(views.shape[:3], 3.0))
+    np.testing.assert_array_equal(of(network, depth).improved(segmentation(truth)).found.labels, truth)
+    assert network.asked == 1
 
 
 def test_pieces_are_joined_until_none_belong_together() -> None:
@@ -125,7 +180,7 @@ def stray_in_rows(share: float) -> Any:
     """A network that takes this share of a segment's rows, from the top, for strays."""
 
     def logits(views: np.ndarray) -> np.ndarray:
-        inside = views[..., segment_view.SEGMENT] > 0
+        inside = (views[..., [segment_view.SEGMENT, segment_view.OTHERS]] > 0).any(axis=3)
         below = np.cumsum(inside.any(axis=2), axis=1) > share * inside.any(axis=2).sum(axis=1)[:, None]
         return np.where(below[..., None], 3.0, -3.0) * np.ones(views.shape[:3])
 
@@ -150,7 +205,8 @@ def test_without_a_support_nothing_is_dropped() -> None:
     """A body alone in an image, as a renderer makes it: all that is seen is the object."""
     depth, truth = seen([standing(0, 0, *CAN)])
     alone = np.where(truth > 0, depth, np.nan).astype(np.float32)
-    network = SegmentNetwork(stray_in_rows(0.8), alone, CAMERA, None, lambda function, labels: function(labels))
+    mostly = stray_in_rows(0.8)
+    network = SegmentNetwork(mostly, mostly, alone, CAMERA, None, lambda function, labels: function(labels))
     assert network.improved(segmentation(truth)).found.ids == (1,)
 
 

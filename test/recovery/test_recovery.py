@@ -22,7 +22,7 @@ from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, RecoveryO
 from sq_perception.simulation.scenes import table_scene
 
 CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)
-STAGES = {"segmentation", "network", "fit", "repair", "score", "total"}
+STAGES = {"segmentation", "network", "fit", "score", "total"}
 
 
 def seen(bodies, camera, background=np.nan):

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 
 from sq_perception.imaging.segment_view import IMAGE, MEASURED, SEGMENT
+from sq_perception.segmentation.segments import Segmentation
 from sq_perception.simulation import segment_views
 from sq_perception.simulation.segment_views import NO, UNKNOWN, YES, SegmentViews, draw_segment_views
 
@@ -46,3 +50,19 @@ def test_scenes_without_segments_give_an_empty_batch(monkeypatch: pytest.MonkeyP
     nothing = segment_views.segments.Segmentation(np.zeros((1, 1), np.int32), None, ())
     monkeypatch.setattr(segment_views.segments, "segment", lambda *_: nothing)
     assert draw_segment_views(1, np.random.default_rng(1)).truth.shape == (0, 64, 64)
+
+
+def test_pieces_of_merged_things_show_one_thing_each_or_none(monkeypatch: pytest.MonkeyPatch) -> None:
+    find = segment_views.segments.segment
+
+    def merged(*image: Any) -> Segmentation:
+        found = find(*image)
+        return replace(found, labels=(found.labels > 0).astype(np.int32), ids=(1,) if found.ids else ())
+
+    monkeypatch.setattr(segment_views.segments, "segment", merged)
+    scenes = 3
+    drawn = draw_segment_views(scenes, np.random.default_rng(2), with_pieces=True)
+    inside = (drawn.images[..., SEGMENT] > 0) & (drawn.truth != UNKNOWN)
+    pure = (inside & (drawn.truth == YES)).sum(axis=(1, 2)) / inside.sum(axis=(1, 2))
+    assert np.count_nonzero((pure > 0) & (pure < 0.7)) <= scenes
+    assert np.count_nonzero(pure >= 0.7) > 2 * scenes

@@ -1,0 +1,36 @@
+"""Compact pieces of a set of cells: all of it, none twice, of about one size."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sq_perception.segmentation import pieces
+
+
+def square(side: int) -> np.ndarray:
+    cells = np.zeros((40, 40), bool)
+    cells[4 : 4 + side, 7 : 7 + side] = True
+    return cells
+
+
+@pytest.mark.parametrize("count", [1, 3, 4, 6])
+def test_they_are_a_partition(count: int) -> None:
+    cells = square(24)
+    found = pieces.compact(cells, count, np.array([0.0, 0.0]))
+    assert len(found) == count
+    np.testing.assert_array_equal(np.sum(found, axis=0), cells.astype(int))
+    assert min(np.count_nonzero(each) for each in found) > 0.5 * np.count_nonzero(cells) / count
+
+
+def test_four_of_a_square_are_its_quarters() -> None:
+    found = pieces.compact(square(24), 4, np.array([0.0, 0.0]))
+    assert sorted(np.count_nonzero(each) for each in found) == [144] * 4
+    for each in found:
+        rows, columns = np.nonzero(each)
+        assert np.ptp(rows) == np.ptp(columns) == 11
+
+
+def test_no_more_pieces_than_cells() -> None:
+    cells = square(1)
+    assert len(pieces.compact(cells, 4, np.array([20.0, 20.0]))) == 1
