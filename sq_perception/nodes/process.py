@@ -11,6 +11,7 @@ middle of some frame.  So there is none while a node starts, and afterwards none
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import os
 import signal
@@ -33,6 +34,9 @@ _THREADS = {"OMP_WAIT_POLICY": "PASSIVE", "OPENBLAS_NUM_THREADS": "1"}
 with these settings and 50 to 150 ms without.  Small solves gain nothing from a second thread."""
 _SWITCH = 0.001
 """Seconds after which Python lets another thread go on.  With its 5 ms, services waited behind the threads that fit."""
+_M_ARENA_MAX, _HEAPS = -8, 2
+"""The option of glibc's malloc.h, and how many heaps a process gets: with one, threads waited for each other, and a
+frame took 10 % more processor time; with two, it took what it takes with one for each thread."""
 _LOOK = 0.1
 """Seconds between two looks at whether a signal has arrived."""
 
@@ -69,6 +73,7 @@ def run(name: str, create: Callable[[], Iterable[Stoppable]], arguments: Sequenc
             for variable, value in {**_THREADS, **fast_dds.additions()}.items():
                 os.environ.setdefault(variable, value)
             sys.setswitchinterval(_SWITCH)
+            share_heaps()
             with garbage_postponed():
                 import rclpy
                 from rclpy.executors import SingleThreadedExecutor
@@ -102,6 +107,15 @@ def run(name: str, create: Callable[[], Iterable[Stoppable]], arguments: Sequenc
             signal.signal(number, signal.SIG_IGN)
         _finish(nodes, code)
     return code
+
+
+def share_heaps() -> None:
+    """Let threads allocate from the same heaps: in those of their own each keeps what a frame has freed, 25 MB in all.
+
+    Changes nothing without glibc.  For the start of a process: heaps that are there already stay.
+    """
+    with suppress(AttributeError):
+        ctypes.CDLL(None).mallopt(_M_ARENA_MAX, _HEAPS)
 
 
 @contextmanager

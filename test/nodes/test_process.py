@@ -1,8 +1,11 @@
-"""The start of a node is not searched for garbage, neither while it lasts nor afterwards."""
+"""The start of a node is not searched for garbage, neither while it lasts nor afterwards; its threads share heaps."""
 
 from __future__ import annotations
 
 import gc
+import platform
+import subprocess
+import sys
 import weakref
 from collections.abc import Iterator
 
@@ -64,3 +67,34 @@ def test_what_is_kept_is_not_looked_at_until_it_is_released():
     assert ghost() is not None
     process.release_objects()
     assert ghost() is None
+
+
+HEAPS = """
+import ctypes, threading
+from sq_perception.nodes import process
+{first}
+together = threading.Barrier(8)
+def work():
+    kept = []
+    for _ in range(20):
+        together.wait()
+        kept.append(bytearray(50_000))
+threads = [threading.Thread(target=work) for _ in range(8)]
+for one in threads: one.start()
+for one in threads: one.join()
+c = ctypes.CDLL(None)
+c.fdopen.restype = ctypes.c_void_p
+out = ctypes.c_void_p(c.fdopen(1, b"w"))
+c.malloc_info(0, out)
+c.fflush(out)
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="other libraries have other heaps")
+def test_threads_share_heaps():
+    def heaps(first: str) -> int:
+        command = [sys.executable, "-c", HEAPS.format(first=first)]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.count("<heap nr=")
+
+    assert heaps("") > 2
+    assert heaps("process.share_heaps()") == 2
