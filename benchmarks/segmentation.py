@@ -35,7 +35,7 @@ import report
 from scipy.optimize import linear_sum_assignment
 
 from sq_perception.recordings import frame_file
-from sq_perception.segmentation.segments import SegmentationOptions, segment
+from sq_perception.segmentation.segments import segment
 
 IOU_GOAL = 0.85
 F1_GOAL = {"boxes": 0.9, "stacked_boxes": 0.9, "cylindric": 0.9, "occluded": 0.8}
@@ -114,12 +114,12 @@ def frames(folders: list[Path], most: int) -> list[Instances]:
     return found
 
 
-def scored(each: Instances, repeats: int, options: SegmentationOptions | None = None) -> Score:
+def scored(each: Instances, repeats: int) -> Score:
     """Segment one frame; the time is the shortest of some repeats."""
     times = []
     for _ in range(repeats):
         started = time.process_time()
-        found = segment(each.frame.depth, each.frame.camera, options)
+        found = segment(each.frame.depth, each.frame.camera)
         times.append(1e3 * (time.process_time() - started))
     labels = np.where(np.isfinite(each.frame.depth), found.labels, 0)
     return score(each.truth, labels, min(times))

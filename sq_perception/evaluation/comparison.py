@@ -35,7 +35,7 @@ class Pair:
     iou: float | None = None
 
 
-def pair(truth: Superquadric, recovered: Superquadric, resolution: int = 48) -> list[Pair]:
+def pair(truth: Superquadric, recovered: Superquadric) -> list[Pair]:
     """Pairs of two batches (n,) and (m,): every true body in order, then what was recovered without being there."""
     distance = np.linalg.norm(truth.translation[:, None] - recovered.translation[None], axis=-1)
     partner: dict[int, int] = {}
@@ -45,7 +45,7 @@ def pair(truth: Superquadric, recovered: Superquadric, resolution: int = 48) -> 
     overlap: dict[int, float] = {}
     if partner:
         both = recovered[np.array(list(partner.values()))], truth[np.array(list(partner))]
-        overlap = dict(zip(partner, volume_iou(*both, resolution).tolist(), strict=True))
+        overlap = dict(zip(partner, volume_iou(*both).tolist(), strict=True))
     pairs = [Pair(i, partner.get(i), overlap.get(i)) for i in range(len(truth))]
     found = set(partner.values())
     return pairs + [Pair(None, k) for k in range(len(recovered)) if k not in found]

@@ -69,4 +69,4 @@ def _batch(views: SegmentViews, chosen: np.ndarray, rng: np.random.Generator) ->
     return torch.from_numpy(np.ascontiguousarray(images.transpose(0, 3, 1, 2))), torch.from_numpy(truth.copy())
 
 
-MASKS = Subject("masks", draw_segment_views(0, np.random.default_rng()), _new_network, _batch, mask_loss, validate)
+MASKS = Subject("masks", draw_segment_views(0, np.random.default_rng(0)), _new_network, _batch, mask_loss, validate)

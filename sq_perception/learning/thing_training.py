@@ -163,5 +163,5 @@ def _calibrate(network: ThingNetwork, views: ThingViews) -> None:
 
 
 THINGS = Subject(
-    "things", draw_thing_views(0, np.random.default_rng()), _new_network, _batch, hull_loss, validate, _calibrate
+    "things", draw_thing_views(0, np.random.default_rng(0)), _new_network, _batch, hull_loss, validate, _calibrate
 )
