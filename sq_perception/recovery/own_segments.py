@@ -85,6 +85,15 @@ class _Seen:
     logits: np.ndarray
 
 
+@dataclass(frozen=True, eq=False)
+class _Doubt:
+    """A segment that may be several objects: the pieces (p, p) of its view, and the mean of p over each of them."""
+
+    view: SegmentView
+    pieces: np.ndarray
+    sure: np.ndarray
+
+
 _Answer = TypeVar("_Answer")
 
 
@@ -145,31 +154,36 @@ class SegmentNetwork:
 
     def _parted(self, labels: np.ndarray, seen: Mapping[int, _Seen]) -> list[int]:
         """Part segments that are several objects; the labels of all the parts."""
-        doubtful = [label for label, answer in seen.items() if _is_doubtful(answer)]
-        if not doubtful:
+        doubts = {label: doubt for label, answer in seen.items() if (doubt := _doubt(answer)) is not None}
+        if not doubts:
             return []
-        objects = self.mapped(lambda some: [self._objects(seen[each]) for each in some], doubtful)
-        parts = [_cut(labels, label, seen[label], each) for label, each in zip(doubtful, objects, strict=True)]
+        objects = self.mapped(lambda some: self._objects([doubts[label] for label in some]), list(doubts))
+        parts = [_cut(labels, label, seen[label], each) for label, each in zip(doubts, objects, strict=True)]
         return [label for some in parts for label in some]
 
-    def _objects(self, answer: _Seen) -> list[np.ndarray]:
-        """The logits (p, p) of each object that pieces of a segment show, in the cells of its view.
+    def _objects(self, doubts: Sequence[_Doubt]) -> list[list[np.ndarray]]:
+        """Of each segment, the logits (p, p) of the objects that pieces of it show, in the cells of its view.
 
         The least sure piece is asked about first, then what no object claims.
         """
-        some = _pieces(answer.view)
-        sure = _means(answer.logits, some)
+        first = [doubt.view.of_part(doubt.pieces == doubt.sure.argmin()) for doubt in doubts]
+        answers = self.of_pieces.logits(np.stack(first))
+        return [self._objects_of(doubt, answer) for doubt, answer in zip(doubts, answers, strict=True)]
+
+    def _objects_of(self, doubt: _Doubt, logits: np.ndarray) -> list[np.ndarray]:
+        piece = int(doubt.sure.argmin())
         objects: dict[int, np.ndarray] = {}
-        claimed = np.zeros(len(some))
-        while claimed.min() < _APART:
-            piece = int(np.lexsort((sure, claimed))[0])
-            logits = self.of_pieces.logits(answer.view.of_part(some[piece])[None])[0]
-            claims = _means(logits, some)
+        claimed = np.zeros(len(doubt.sure))
+        while True:
+            claims = _means(logits, doubt.pieces)
             if claims[piece] >= _ITSELF and (claims[list(objects)] < _APART).all():
                 objects[piece] = logits
                 claimed = np.maximum(claimed, claims)
             claimed[piece] = 1.0
-        return list(objects.values())
+            if claimed.min() >= _APART:
+                return list(objects.values())
+            piece = int(np.lexsort((doubt.sure, claimed))[0])
+            logits = self.of_pieces.logits(doubt.view.of_part(doubt.pieces == piece)[None])[0]
 
     def _seen(self, labels: np.ndarray, chosen: Sequence[int]) -> dict[int, _Seen]:
         extents, windows = regions.extents(labels), {}
@@ -192,27 +206,22 @@ def _probability(logits: np.ndarray) -> np.ndarray:
     return 1 / (1 + np.exp(-logits))
 
 
-def _own_cells(view: SegmentView) -> np.ndarray:
-    """Cells (p, p) in which a reading of the segment is."""
-    return (view.image[..., segment_view.SEGMENT] > 0) & (view.image[..., segment_view.MEASURED] > 0)
+def _doubt(answer: _Seen) -> _Doubt | None:
+    """A segment of which a piece may be of something else than most of it; None for others."""
+    cells = (answer.view.image[..., segment_view.SEGMENT] > 0) & (answer.view.image[..., segment_view.MEASURED] > 0)
+    rows, columns = np.nonzero(cells)
+    if len(rows) < _LEAST_TO_PART:
+        return None
+    some = pieces.compact(cells, _PIECES, (rows.mean(), columns.mean()))
+    sure = _means(answer.logits, some)
+    return _Doubt(answer.view, some, sure) if sure.min() < _SURE else None
 
 
-def _is_doubtful(answer: _Seen) -> bool:
-    """Whether a piece of a segment may be of something else than most of it."""
-    if np.count_nonzero(_own_cells(answer.view)) < _LEAST_TO_PART:
-        return False
-    return bool(_means(answer.logits, _pieces(answer.view)).min() < _SURE)
-
-
-def _means(logits: np.ndarray, some: Sequence[np.ndarray]) -> np.ndarray:
-    """The mean of p over each of some pieces."""
-    p = _probability(logits)
-    return np.array([p[piece].mean() for piece in some])
-
-
-def _pieces(view: SegmentView) -> list[np.ndarray]:
-    cells = _own_cells(view)
-    return pieces.compact(cells, _PIECES, np.argwhere(cells).mean(axis=0))
+def _means(logits: np.ndarray, some: np.ndarray) -> np.ndarray:
+    """The mean of p over each of some pieces, numbers (p, p)."""
+    where = some >= 0
+    number = some[where]
+    return np.bincount(number, _probability(logits[where])) / np.bincount(number)
 
 
 def _cut(labels: np.ndarray, label: int, answer: _Seen, objects: Sequence[np.ndarray]) -> list[int]:

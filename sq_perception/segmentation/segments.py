@@ -34,6 +34,7 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation import (
     convex_parts,
     patch_grouping,
+    pieces,
     standing,
     support_plane,
     support_surface,
@@ -229,6 +230,7 @@ def support_under(
 def warm_up() -> None:
     """Compile, or load from disk, every kernel by a ball on a table and by two that touch."""
     convex_parts.warm_up()
+    pieces.warm_up()
     camera = Camera(96, 72, 180.0, 180.0, 47.5, 35.5)
     v, u = np.indices((camera.height, camera.width))
     radius = np.hypot(u - camera.cx, v - camera.cy) / 20

@@ -158,7 +158,10 @@ def _of_pieces(
     cells, known = measured.in_cells(view)
     segment = view.image[..., segment_view.SEGMENT] > 0
     some, of = [], []
-    for piece in pieces.compact(segment, int(rng.integers(*_PIECES)), rng.uniform(0, segment_view.PIXELS, 2)):
+    count, (row, column) = int(rng.integers(*_PIECES)), rng.uniform(0, segment_view.PIXELS, 2)
+    numbers = pieces.compact(segment, count, (row, column))
+    for number in range(numbers.max() + 1):
+        piece = numbers == number
         counts = np.bincount(cells[piece & known & (cells >= 0)], minlength=1)
         if counts.max() >= max(1, _PURE * np.count_nonzero(piece & known)):
             some.append(piece)
