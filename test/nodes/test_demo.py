@@ -65,7 +65,7 @@ def test_what_is_missing_and_what_is_too_much_is_said() -> None:
 def test_two_blocks_that_overlap_by_half_have_an_iou_of_a_third() -> None:
     block = Superquadric(np.full((1, 3), 0.1), np.full((1, 2), 0.02), np.zeros((1, 3)), IDENTITY[None])
     moved = Superquadric(block.size, block.shape, np.array([[0.1, 0.0, 0.0]]), block.rotation)
-    assert pair(block, moved, 96)[0].iou == pytest.approx(1 / 3, abs=0.02)
+    assert pair(block, moved)[0].iou == pytest.approx(1 / 3, abs=0.02)
 
 
 def test_of_the_eight_forms_the_one_like_the_truth_is_shown(rng: np.random.Generator) -> None:
