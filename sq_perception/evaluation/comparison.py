@@ -17,6 +17,9 @@ from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.metrics import volume_iou
 from sq_perception.geometry.superquadric import Superquadric
 
+_POINTS = 48
+"""Points along each edge of the box in which an overlap is counted: fewer than for figures, as every frame is shown."""
+
 
 @dataclass(frozen=True, eq=False)
 class Pair:
@@ -45,7 +48,7 @@ def pair(truth: Superquadric, recovered: Superquadric) -> list[Pair]:
     overlap: dict[int, float] = {}
     if partner:
         both = recovered[np.array(list(partner.values()))], truth[np.array(list(partner))]
-        overlap = dict(zip(partner, volume_iou(*both).tolist(), strict=True))
+        overlap = dict(zip(partner, volume_iou(*both, _POINTS).tolist(), strict=True))
     pairs = [Pair(i, partner.get(i), overlap.get(i)) for i in range(len(truth))]
     found = set(partner.values())
     return pairs + [Pair(None, k) for k in range(len(recovered)) if k not in found]
