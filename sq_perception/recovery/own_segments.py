@@ -171,6 +171,7 @@ class SegmentNetwork:
         return [self._objects_of(doubt, answer) for doubt, answer in zip(doubts, answers, strict=True)]
 
     def _objects_of(self, doubt: _Doubt, logits: np.ndarray) -> list[np.ndarray]:
+        """The same of one segment, from the logits (p, p) that the least sure piece has."""
         piece = int(doubt.sure.argmin())
         objects: dict[int, np.ndarray] = {}
         claimed = np.zeros(len(doubt.sure))

@@ -17,8 +17,7 @@ _STEPS = 2
 def compact(cells: np.ndarray, count: int, place: tuple[float, float]) -> np.ndarray:
     """The piece, from 0, of each of some cells, bool (rows, columns); int32 (rows, columns), -1 elsewhere.
 
-    There are at most ``count`` of them.  ``place`` is the row and column that the first centre is far
-    from.
+    There are at most ``count`` of them.  ``place`` is the row and column that the first centre is far from.
     """
     return _compact(np.ascontiguousarray(cells), count, float(place[0]), float(place[1]))
 

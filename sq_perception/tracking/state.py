@@ -111,7 +111,14 @@ def chi2_limit(probability: float, freedom: int) -> float:
     Half of it, y, is found by halving from what it stays above with the probability Q(freedom / 2, y),
     Q(1/2, y) = erfc(sqrt(y)), Q(a + 1, y) = Q(a, y) + y^a exp(-y) / Gamma(a + 1).
     SciPy has it too, and the assignment of :mod:`sq_perception.tracking.association`: 15 MB that a node does without.
+
+    Raises
+    ------
+    ValueError
+        For another number of dimensions, which takes another first term.
     """
+    if freedom < 1 or freedom % 2 == 0:
+        raise ValueError(f"freedom: expected an odd number of dimensions, got {freedom}")
     low, high = 0.0, 500.0
     while low < (y := (low + high) / 2) < high:
         above, term = math.erfc(math.sqrt(y)), 2 * math.sqrt(y / math.pi) * math.exp(-y)

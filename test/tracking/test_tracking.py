@@ -352,6 +352,12 @@ def test_the_limits_of_chi_squared_are_scipys(freedom):
         assert state.chi2_limit(probability, freedom) == pytest.approx(chi2.ppf(probability, freedom), rel=1e-8)
 
 
+@pytest.mark.parametrize("freedom", [0, 2, -1])
+def test_limits_of_other_dimensions_are_refused(freedom):
+    with pytest.raises(ValueError, match=f"freedom: expected an odd number of dimensions, got {freedom}"):
+        state.chi2_limit(0.5, freedom)
+
+
 def test_the_cheapest_pairs_are_scipys_also_where_many_cost_the_same(rng):
     for _ in range(300):
         cost = rng.normal(size=np.sort(rng.integers(1, 9, 2)))
