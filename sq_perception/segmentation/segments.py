@@ -358,13 +358,19 @@ def _fine(
 def _ordered(
     labels: np.ndarray, least: int, most: int, accept: standing.ObjectTest | None = None
 ) -> tuple[np.ndarray, tuple[int, ...]]:
-    """Components with at least ``least`` pixels, renumbered from 1 by falling size, at most ``most`` of them."""
+    """Components with at least ``least`` pixels, renumbered from 1 by falling size, at most ``most`` of them.
+
+    Those that are not accepted are asked about once more: the test knows the things beside them then.
+    """
     extents = regions.extents(labels)
-    number, kept = np.zeros(len(extents), np.int32), 0
-    for label in np.argsort(-extents[:, 0], kind="stable"):
-        if kept == most or extents[label, 0] < least:
+    order = np.argsort(-extents[:, 0], kind="stable")
+    order = order[extents[order, 0] >= least]
+    kept: set[int] = set()
+    for label in np.tile(order, 1 if accept is None else 2).tolist():
+        if len(kept) == most:
             break
-        if accept is None or accept(*regions.pixels(labels, label, extents[label])):
-            kept += 1
-            number[label] = kept
-    return regions.renumbered(labels, number), tuple(range(1, kept + 1))
+        if label not in kept and (accept is None or accept(*regions.pixels(labels, label, extents[label]))):
+            kept.add(label)
+    number = np.zeros(len(extents), np.int32)
+    number[[label for label in order.tolist() if label in kept]] = np.arange(len(kept)) + 1
+    return regions.renumbered(labels, number), tuple(range(1, len(kept) + 1))

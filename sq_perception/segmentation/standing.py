@@ -175,6 +175,8 @@ def standing(
 ) -> ObjectTest:
     """The test of whether a segment is a thing that stands on the support, to be asked of the largest ones first.
 
+    What beside a thing is taken for the noise of the support grows less with every other thing that was accepted.
+
     Parameters
     ----------
     depth, relative : (height, width)

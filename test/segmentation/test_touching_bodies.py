@@ -185,6 +185,14 @@ def test_tilted_tables(pitch, roll):
     assert np.degrees(np.arccos(min(1.0, found.plane[:3] @ table.plane[:3]))) < 0.5
 
 
+def test_the_largest_of_many_is_found_among_low_ones():
+    """They are no noise of the table, though they are smaller, so that they are not known when it is asked about."""
+    steep = Table(pitch=1.2)
+    around = [steep.body(0.087 * np.cos(a), 0.087 * np.sin(a), (0.025, 0.025, 0.014), CAN) for a in np.arange(9) * 0.7]
+    depth, truth = steep.see([steep.body(0, 0, (0.06, 0.06, 0.024), CAN), *around], 5e-4)
+    assert ious(truth, segment(depth, VGA).labels)[0] > 0.9
+
+
 def test_touching_bodies_without_a_table():
     bodies = PARTED["can before a box"]
     depth, truth = TABLE.see(bodies, 0.001, table=False)
