@@ -33,7 +33,7 @@ from typing import TypeAlias, TypeVar
 import numpy as np
 
 from sq_perception.fitting import surface_fit
-from sq_perception.fitting.fit import Fit, Status
+from sq_perception.fitting.fit import Status
 from sq_perception.geometry.one_thread import one_blas_thread
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
@@ -216,20 +216,12 @@ class Recoverer:
         with timed(milliseconds, "fit"):
             deadline = started + options.time_budget
             fits = self._mapped(lambda obj: methods.fitted(obj, depth, camera, options, deadline), fresh)
-            fit_of = {obj.label: fit for obj, fit in zip(fresh, fits, strict=True)}
-            known = {obj.label: obj for obj in fresh}
-            objects = [known.get(obj.label, obj) for obj in objects]
-            fits = [same[obj.label].fit if obj.label in same else fit_of[obj.label] for obj in objects]
         with timed(milliseconds, "score"):
-            pairs = list(zip(objects, fits, strict=True))
-
-            def recovery(pair: tuple[SeenObject, Fit]) -> Recovery:
-                obj, fit = pair
-                if obj.label in same and same[obj.label].fit is fit:
-                    return same[obj.label]
-                return Recovery(fit, methods.score(obj.view, fit, options), obj.label, obj.pixels)
-
-            bodies = tuple(self._mapped(recovery, pairs))
+            scores = self._mapped(lambda k: methods.score(fresh[k].view, fits[k], options), range(len(fresh)))
+            of_label = dict(same)
+            for obj, fit, score in zip(fresh, fits, scores, strict=True):
+                of_label[obj.label] = Recovery(fit, score, obj.label, obj.pixels)
+            bodies = tuple(of_label[obj.label] for obj in objects)
         reference = Reference.of(depth, camera, found.sigma, options)
         if previous is not None and previous.reference is not None and same:
             reference = reference.keeping(
