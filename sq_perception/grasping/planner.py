@@ -32,21 +32,19 @@ of the bodies.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 
 import numpy as np
 
 from sq_perception.geometry import rotation as quaternions
-from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.grasping import clearance
-from sq_perception.grasping.closing import DIRECTIONS, KnownBodies
+from sq_perception.grasping import approaches, clearance
+from sq_perception.grasping.approaches import Closings
+from sq_perception.grasping.closing import KnownBodies
 from sq_perception.grasping.gripper import PANDA, Gripper
 from sq_perception.grasping.plan import Grasp, GraspPlan
 from sq_perception.grasping.rims import at_rims
 from sq_perception.grasping.surroundings import Surroundings
 from sq_perception.grasping.trials import (
-    CLEARANCE,
     DENSITY,
     LEAST_ENGAGED,
     MARGINS,
@@ -69,41 +67,18 @@ PER_BODY = 8
 """Grasps a body that are returned at most."""
 PLACEMENT = 0.002
 """Metres, standard deviation along each axis of where the hand comes to be: a careful calibration of camera and arm."""
-_ABOVE_TABLE = 0.004
-"""Metres."""
-_ENGAGED = 0.012
-"""Metres of finger beyond the near end that a shallow grasp has."""
 _SQUARE = np.deg2rad(8.0)
 """How sure normals are."""
 _HIDDEN = 0.15
 """Probability that space which nobody has seen beside a body is taken."""
-_SWINGS = np.deg2rad([0.0, 25.0, -25.0, 50.0, -50.0, 80.0, -80.0])
-"""Of the approach about the closing line, away from the steepest one."""
-_SLIDES = np.array([0.0, 0.4, -0.4, 0.8, -0.8])
-"""Along the third axis, shares of the way to where the finger's width is no more wholly on the body."""
 _CLEAR = 0.95
 """Grasps that pass a body with that probability where it is widest need not be looked at more closely."""
-_TOO_WIDE = 0.8
-"""A body that is wider than the opening by so many sigmas of its width is not tried: once in five it would fit."""
 _CHECKED, _CHECKED_CLOSELY = 40, 16
 """Grasps a body whose distance to the other bodies is looked at, and of the best of these that to measured points."""
 _CHECKED_IF_DOUBTFUL, _SURE = 200, 0.5
 """The same of bodies whose best grasp is then less probable than that."""
 _LEAST = 0.05
 """Grasps less probable than that are not returned."""
-
-
-@dataclass(frozen=True, eq=False)
-class _Closings:
-    """Directions (k, 3) in which a body ``owner`` may be closed upon, reaches (k,), and sigmas (k, 2) of both sides.
-
-    The direction points to the first side.
-    """
-
-    owner: np.ndarray
-    along: np.ndarray
-    reach: np.ndarray
-    sigma: np.ndarray = field(repr=False)
 
 
 def grasps(
@@ -148,7 +123,7 @@ def grasps(
     reasons = np.array(
         [f"wider than the opening of {1e3 * gripper.opening:.0f} mm in every direction"] * len(bodies), dtype=object
     )
-    closings = _closings(known, gripper, friction)
+    closings = approaches.closings(known, gripper, friction)
     trials = _trials(known, bodies.volume(), closings, gripper, around, friction, placement)
     reasons[np.unique(closings.owner)] = "no way for the fingers to come with the table and the palm in their way"
     reasons[_behind(known, around.plane)] = "behind the plane that bodies stand on"
@@ -190,113 +165,39 @@ def warm_up() -> None:
     grasps(bodies, PANDA, around=Surroundings(points=two + 0.3, depth=np.ones((2, 2)), camera=camera))
 
 
-def _closings(bodies: KnownBodies, gripper: Gripper, friction: float) -> _Closings:
-    """Those of all bodies that are narrow enough and meet their surface squarely at its middle."""
-    owner = np.repeat(np.arange(len(bodies)), len(DIRECTIONS))
-    along = (DIRECTIONS @ bodies.turns.transpose(0, 2, 1)).reshape(-1, 3)
-    reach, there = bodies.reaches(owner, along)
-    _, here = bodies.reaches(owner, -along)
-    _, half = bodies.in_place().reaches(owner, along)
-    fits = reach - _TOO_WIDE * half < 0.5 * gripper.opening
-    fits &= bodies.middle_angles(owner, along) < np.arctan(friction)
-    return _Closings(owner[fits], along[fits], reach[fits], np.stack([there, here], axis=1)[fits])
-
-
 def _trials(
     bodies: KnownBodies,
     volume: np.ndarray,
-    closings: _Closings,
+    found: Closings,
     gripper: Gripper,
     around: Surroundings,
     friction: float,
     placement: float,
 ) -> Trials:
     """Every closing from every side, at every depth and slide, with the margins that the body alone decides."""
-    # From every side: z the approach, y the closing line, x the third.
-    y = np.repeat(closings.along, len(_SWINGS), axis=0)
-    owner = np.repeat(closings.owner, len(_SWINGS))
-    half, side = (np.repeat(numbers, len(_SWINGS), axis=0) for numbers in (closings.reach, closings.sigma))
-    down = around.down(bodies.middle[owner])
-    steep = down - y * (y * down).sum(axis=1, keepdims=True)
-    length = np.linalg.norm(steep, axis=1, keepdims=True)
-    steep = steep / np.maximum(length, 1e-9)
-    swing = np.tile(_SWINGS, len(closings.owner))[:, None]
-    z = np.cos(swing) * steep + np.sin(swing) * np.cross(y, steep)
-    possible = (length[:, 0] > 0.3) & ((z * down).sum(axis=1) > -0.1)
-    owner, y, z, half, side = owner[possible], y[possible], z[possible], half[possible], side[possible]
-    x, tilting = np.cross(y, z), np.cross(down[possible], y)
-    near, near_sigma = bodies.reaches(owner, -z)
-    across, _ = bodies.reaches(owner, x)
-
-    # At every depth: where the palm or the table stops the gripper or the middle is reached, shallow, and between.
-    wanted = CLEARANCE + 2 * np.hypot(side, placement)
-    room = np.minimum(gripper.opening - 2 * half, wanted.sum(axis=1))
-    opening = 2 * half + room
-    # Of the room each side has its share: the hand is moved towards the side that is less sure.
-    shift = 0.5 * np.maximum(room, 0.0) * (wanted[:, 0] - wanted[:, 1]) / wanted.sum(axis=1)
-    boxes = gripper.boxes_at(opening)
-    deepest = np.minimum(gripper.palm - CLEARANCE - near, 0.0)
-    frames = np.stack([x, y, z, bodies.middle[owner]], axis=2)
-    height = np.full(len(owner), np.inf)
-    if around.plane is not None:
-        height = clearance.heights_above(around.plane, frames, boxes)
-        sink = -(z @ around.plane[:3])
-        low = np.where(sink > 1e-3, (height - _ABOVE_TABLE) / np.maximum(sink, 1e-3), np.inf)
-        deepest = np.minimum(deepest, low)
-    shallow = np.minimum(_ENGAGED - near - gripper.tip, deepest)
-    reachable = deepest > LEAST_ENGAGED - near - gripper.tip
-    rows = np.flatnonzero(reachable)
-    depth = np.stack([deepest, 0.5 * (deepest + shallow), shallow], axis=1)[rows]
-    free = np.maximum(across[rows] - 0.5 * gripper.finger_width, 0.0)
-    slide = free[:, None] * _SLIDES
-    places = len(_SLIDES) * depth.shape[1]
-    u = np.repeat(depth, len(_SLIDES), axis=1).ravel()
-    v = np.tile(slide, (1, depth.shape[1])).ravel()
-    at = np.repeat(rows, places)
-    distinct = (np.abs(v) > 1e-3) | (np.tile(np.arange(places) % len(_SLIDES), len(rows)) == 0)
-    u, v, at = u[distinct], v[distinct], at[distinct]
-
-    # A pad touches where it overlaps the body, which may lie wholly beyond the TCP.
-    touch = 0.5 * (np.maximum(u - gripper.tip, -near[at]) + np.minimum(u + gripper.tip, near[at]))
     narrow, broad = np.arctan([friction, _AT_MOST * friction])
     cone, doubt = 0.5 * (narrow + broad), np.hypot(_SQUARE, (broad - narrow) / np.sqrt(12))
-    ends, angle = bodies.chords(owner[at], _offsets(frames, at, v, touch), y[at], broad)
-    squarely = np.isfinite(angle)  # two in five; a body without any has that for a reason
-    has_any = np.zeros(len(bodies), dtype=bool)
-    has_any[owner[at[squarely]]] = True
-    rows = np.flatnonzero(squarely | ~has_any[owner[at]])
-    u, v, at, ends, angle = u[rows], v[rows], at[rows], ends[rows], angle[rows]
-    offset = _offsets(frames, at, v, u)
+    every = approaches.from_every_side(bodies, found, gripper, around, placement)
+    places = approaches.places(bodies, every, gripper, broad)
+    ways, u, angle = every.at(places.of), places.ahead, places.angle
+    owner, (turn, centre) = ways.owner, np.split(ways.frames, [3], axis=2)
+    aside = np.nan_to_num(0.5 * (places.ends[:, 0] - places.ends[:, 1])) + ways.shift
+    lever = np.abs((places.offset * ways.tilting).sum(axis=1))
+    offset = places.offset + aside[:, None] * turn[:, :, 1]
+    frames = np.concatenate([turn, centre + offset[:, :, None]], axis=2)
 
-    owner, half, side, opening, shift = owner[at], half[at], side[at], opening[at], shift[at]
-    near, near_sigma, frames = near[at], near_sigma[at], frames[at]
-    aside = np.nan_to_num(0.5 * (ends[:, 0] - ends[:, 1])) + shift
-    lever = np.abs((offset * tilting[at]).sum(axis=1))
-    offset += aside[:, None] * frames[:, :, 1]
-    frames[:, :, 3] += offset
-
-    deep = np.hypot(near_sigma, placement)
-    room = 0.5 * opening - half
+    deep = np.hypot(ways.near_sigma, placement)
+    room = 0.5 * ways.opening - ways.reach
     logs = np.zeros((len(owner), len(MARGINS)))
-    sides = np.stack([passing(room + way * aside, side[:, k], placement) for k, way in ((0, 1), (1, -1))], axis=1)
+    sides = np.stack([passing(room + way * aside, ways.sigma[:, k], placement) for k, way in ((0, 1), (1, -1))], axis=1)
     logs[:, 0] = sides[:, 0] + sides[:, 1]
-    logs[:, 1] = log_phi(u + gripper.tip + near - LEAST_ENGAGED, deep)
-    logs[:, 2] = log_phi(gripper.palm - near - u, deep)
+    logs[:, 1] = log_phi(u + gripper.tip + ways.near - LEAST_ENGAGED, deep)
+    logs[:, 2] = log_phi(gripper.palm - ways.near - u, deep)
     logs[:, 3] = np.where(np.isfinite(angle), log_phi(cone - angle, doubt), -np.inf)
     logs[:, 4] = weight(DENSITY * volume[owner], lever, 2 * friction * gripper.force)
     if around.plane is not None:  # moved without a turn, so that the lowest corner is the same
-        logs[:, 5] = log_phi(height[at] + offset @ around.plane[:3], np.hypot(TABLE_SIGMA, placement))
-    return Trials(owner, frames, opening, 2 * half, logs, sides)
-
-
-@kernel
-def _offsets(frames: np.ndarray, at: np.ndarray, aside: np.ndarray, ahead: np.ndarray) -> np.ndarray:
-    """Offsets (k, 3) along the first and the third axis of frames ``at`` (k,)."""
-    offset = np.empty((len(at), 3))
-    for k in range(len(at)):
-        for i in range(3):
-            offset[k, i] = aside[k] * frames[at[k], i, 0] + ahead[k] * frames[at[k], i, 2]
-    return offset
+        logs[:, 5] = log_phi(ways.height + offset @ around.plane[:3], np.hypot(TABLE_SIGMA, placement))
+    return Trials(owner, frames, ways.opening, 2 * ways.reach, logs, sides)
 
 
 def _narrower(bodies: KnownBodies, trials: Trials, gripper: Gripper, placement: float) -> Trials:

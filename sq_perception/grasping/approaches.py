@@ -1,0 +1,201 @@
+"""From where a parallel gripper may come to a body, and where along it its pads may be.
+
+A closing is a direction y of a body along which it is narrow enough and whose opposite surfaces are met squarely.  The
+hand comes to it along z, across y: as steeply as possible, or swung about y.  With x = y x z the TCP is at
+
+    t + u z + v x,    t the body's centre, u how far ahead of it (deepest, shallow, between), v how far along it.
+
+Metres, in the frame of the bodies.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+
+from sq_perception.geometry.kernels import kernel
+from sq_perception.grasping import clearance
+from sq_perception.grasping.closing import DIRECTIONS, KnownBodies
+from sq_perception.grasping.gripper import Gripper
+from sq_perception.grasping.surroundings import Surroundings
+from sq_perception.grasping.trials import CLEARANCE, LEAST_ENGAGED
+
+_TOO_WIDE = 0.8
+"""A body that is wider than the opening by so many sigmas of its width is not tried: once in five it would fit."""
+_SWINGS = np.deg2rad([0.0, 25.0, -25.0, 50.0, -50.0, 80.0, -80.0])
+"""Of the approach about the closing line, away from the steepest one."""
+_STEEP, _FROM_BELOW = 0.3, -0.1
+"""Sines: a closing line is at least so far off the vertical, and no hand comes more upwards than that."""
+_SLIDES = np.array([0.0, 0.4, -0.4, 0.8, -0.8])
+"""Along the third axis, shares of the way to where the finger's width is no more wholly on the body."""
+_SAME = 1e-3
+"""Metres: slides of less are the one in the middle."""
+_ABOVE_TABLE = 0.004
+"""Metres."""
+_ENGAGED = 0.012
+"""Metres of finger beyond the near end that a shallow grasp has."""
+
+
+@dataclass(frozen=True, eq=False)
+class Closings:
+    """Directions (k, 3) in which a body ``owner`` may be closed upon, reaches (k,), and sigmas (k, 2) of both sides.
+
+    The direction points to the first side.
+    """
+
+    owner: np.ndarray
+    along: np.ndarray
+    reach: np.ndarray
+    sigma: np.ndarray = field(repr=False)
+
+
+@dataclass(frozen=True, eq=False)
+class Approaches:
+    """Closings and the sides to come to them from, k of them.
+
+    Attributes
+    ----------
+    owner, reach, sigma
+        As of the closings.
+    frames : (k, 3, 4)
+        The TCP's axes as columns, and the body's centre.
+    tilting : (k, 3)
+        Horizontal, across the closing line: what lies off the centre along it turns the body in the hand.
+    near, near_sigma, across : (k,)
+        From the centre to the near end, the sigma of that, and to the end along x.
+    opening, shift : (k,)
+        Of the fingers, and of the hand towards the side that is less sure.
+    deepest : (k,)
+        u at which the palm or the table stops the hand, or the centre is reached.
+    height : (k,)
+        Of the lowest corner above the table with the TCP in the centre; inf without a table.
+    """
+
+    owner: np.ndarray
+    reach: np.ndarray
+    sigma: np.ndarray
+    frames: np.ndarray
+    tilting: np.ndarray
+    near: np.ndarray
+    near_sigma: np.ndarray
+    across: np.ndarray
+    opening: np.ndarray
+    shift: np.ndarray
+    deepest: np.ndarray
+    height: np.ndarray
+
+    def at(self, which: np.ndarray) -> Approaches:
+        return Approaches(*(getattr(self, part.name)[which] for part in fields(self)))
+
+
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Where the TCP may be, k of them.
+
+    Attributes
+    ----------
+    of : int (k,)
+        Their approaches.
+    ahead : (k,)
+        u.
+    offset : (k, 3)
+        From the body's centre.
+    ends : (k, 2)
+        Of the closing line, from the offset to the body's surface on either side; NaN where it misses the body.
+    angle : (k,)
+        The larger one between that line and the normals there; NaN likewise, and where it is too large to hold.
+    """
+
+    of: np.ndarray
+    ahead: np.ndarray
+    offset: np.ndarray
+    ends: np.ndarray
+    angle: np.ndarray
+
+
+def closings(bodies: KnownBodies, gripper: Gripper, friction: float) -> Closings:
+    """Those of all bodies that are narrow enough and meet their surface squarely at its middle."""
+    owner = np.repeat(np.arange(len(bodies)), len(DIRECTIONS))
+    along = (DIRECTIONS @ bodies.turns.transpose(0, 2, 1)).reshape(-1, 3)
+    reach, there = bodies.reaches(owner, along)
+    _, here = bodies.reaches(owner, -along)
+    _, half = bodies.in_place().reaches(owner, along)
+    fits = reach - _TOO_WIDE * half < 0.5 * gripper.opening
+    fits &= bodies.middle_angles(owner, along) < np.arctan(friction)
+    return Closings(owner[fits], along[fits], reach[fits], np.stack([there, here], axis=1)[fits])
+
+
+def from_every_side(
+    bodies: KnownBodies, found: Closings, gripper: Gripper, around: Surroundings, placement: float
+) -> Approaches:
+    """Every closing from every side, but from below."""
+    y = np.repeat(found.along, len(_SWINGS), axis=0)
+    owner = np.repeat(found.owner, len(_SWINGS))
+    half, side = (np.repeat(numbers, len(_SWINGS), axis=0) for numbers in (found.reach, found.sigma))
+    down = around.down(bodies.middle[owner])
+    steep = down - y * (y * down).sum(axis=1, keepdims=True)
+    length = np.linalg.norm(steep, axis=1, keepdims=True)
+    steep = steep / np.maximum(length, 1e-9)
+    swing = np.tile(_SWINGS, len(found.owner))[:, None]
+    z = np.cos(swing) * steep + np.sin(swing) * np.cross(y, steep)
+    possible = (length[:, 0] > _STEEP) & ((z * down).sum(axis=1) > _FROM_BELOW)
+    owner, y, z, half, side = owner[possible], y[possible], z[possible], half[possible], side[possible]
+    x, tilting = np.cross(y, z), np.cross(down[possible], y)
+    near, near_sigma = bodies.reaches(owner, -z)
+    across, _ = bodies.reaches(owner, x)
+
+    wanted = CLEARANCE + 2 * np.hypot(side, placement)
+    room = np.minimum(gripper.opening - 2 * half, wanted.sum(axis=1))
+    # Of the room each side has its share: the hand is moved towards the side that is less sure.
+    shift = 0.5 * np.maximum(room, 0.0) * (wanted[:, 0] - wanted[:, 1]) / wanted.sum(axis=1)
+    opening = 2 * half + room
+    frames = np.stack([x, y, z, bodies.middle[owner]], axis=2)
+    deepest = np.minimum(gripper.palm - CLEARANCE - near, 0.0)
+    height = np.full(len(owner), np.inf)
+    if around.plane is not None:
+        height = clearance.heights_above(around.plane, frames, gripper.boxes_at(opening))
+        sink = -(z @ around.plane[:3])
+        low = np.where(sink > 1e-3, (height - _ABOVE_TABLE) / np.maximum(sink, 1e-3), np.inf)
+        deepest = np.minimum(deepest, low)
+    return Approaches(owner, half, side, frames, tilting, near, near_sigma, across, opening, shift, deepest, height)
+
+
+def places(bodies: KnownBodies, every: Approaches, gripper: Gripper, steepest: float) -> Places:
+    """Of each approach those at which the pads meet the body squarely, in all depths and slides.
+
+    Of bodies that have none, those where they do not, too.  ``steepest`` is the angle to the normals up to which a pad
+    may hold.
+    """
+    shallow = np.minimum(_ENGAGED - every.near - gripper.tip, every.deepest)
+    rows = np.flatnonzero(every.deepest > LEAST_ENGAGED - every.near - gripper.tip)
+    depth = np.stack([every.deepest, 0.5 * (every.deepest + shallow), shallow], axis=1)[rows]
+    slide = np.maximum(every.across[rows] - 0.5 * gripper.finger_width, 0.0)[:, None] * _SLIDES
+    count = len(_SLIDES) * depth.shape[1]
+    u = np.repeat(depth, len(_SLIDES), axis=1).ravel()
+    v = np.tile(slide, (1, depth.shape[1])).ravel()
+    of = np.repeat(rows, count)
+    distinct = (np.abs(v) > _SAME) | (np.tile(np.arange(count) % len(_SLIDES), len(rows)) == 0)
+    u, v, of = u[distinct], v[distinct], of[distinct]
+
+    # A pad touches where it overlaps the body, which may lie wholly beyond the TCP.
+    near, owner = every.near[of], every.owner[of]
+    touch = 0.5 * (np.maximum(u - gripper.tip, -near) + np.minimum(u + gripper.tip, near))
+    along = np.ascontiguousarray(every.frames[of, :, 1])  # kernels are compiled for arrays of a kind
+    ends, angle = bodies.chords(owner, _offsets(every.frames, of, v, touch), along, steepest)
+    squarely = np.isfinite(angle)  # two in five
+    has_any = np.zeros(len(bodies), dtype=bool)
+    has_any[owner[squarely]] = True
+    rows = np.flatnonzero(squarely | ~has_any[owner])
+    u, v, of = u[rows], v[rows], of[rows]
+    return Places(of, u, _offsets(every.frames, of, v, u), ends[rows], angle[rows])
+
+
+@kernel
+def _offsets(frames: np.ndarray, at: np.ndarray, aside: np.ndarray, ahead: np.ndarray) -> np.ndarray:
+    """Offsets (k, 3) along the first and the third axis of frames ``at`` (k,)."""
+    offset = np.empty((len(at), 3))
+    for k in range(len(at)):
+        for i in range(3):
+            offset[k, i] = aside[k] * frames[at[k], i, 0] + ahead[k] * frames[at[k], i, 2]
+    return offset
