@@ -7,6 +7,7 @@ view's own grid, the view fitted to what of the body is visible.  Frames and val
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TypeAlias
 
 import numba
 import numpy as np
@@ -19,6 +20,10 @@ _NOTHING = -1e300
 _BEHIND = -2e300
 _MOST_ROUNDS = 4
 _SAME_EXTENT = 0.005
+_Sensed: TypeAlias = tuple[bool, float, float]
+"""Whether a pinhole camera sees, its eye's z, and the step of depths, 0 for none."""
+_Curtain: TypeAlias = tuple[float, float, float, float]
+"""Middle x, y and side of the view that an occluder is given in, and how far in its direction it begins."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,85 +131,122 @@ def _render_views(
     misses: np.ndarray,
     images: np.ndarray,
 ) -> None:
-    """Render, read off what is visible, and render again until the extent is that of the visible part."""
-    pixels = images.shape[1]
+    """All images; ``anchor`` and ``side`` become those of the views."""
     for k in numba.prange(flat.shape[0]):
-        a1, a2, a3, e1, e2, t1, t2, t3 = flat[k, :8]
-        m = matrices[k]
-        eye_1, eye_2, eye_3 = m[2, 0] * (eye[k] - t3), m[2, 1] * (eye[k] - t3), m[2, 2] * (eye[k] - t3)
-        middle_x, middle_y, unit = anchor[k, 0], anchor[k, 1], side[k]
-        occluded = fronts[k, 5] > 0.0
-        measured = pinhole[k] or occluded
-        missed = misses[k, 0] != 0.0 or misses[k, 1] != 0.0 or misses[k, 2] != 0.0 or misses[k, 3] != 0.0
-        front = np.inf
-        surface = np.empty((pixels, pixels))
-        seen = np.empty(pixels * pixels)
-        reach = np.empty(pixels * pixels)
-        last_round = _MOST_ROUNDS - 1
-        for turn in range(_MOST_ROUNDS + 1):
-            hits = 0
-            first_row, last_row, first_column, last_column = pixels, -1, pixels, -1
-            for i in range(pixels):
-                for j in range(pixels):
-                    x = anchor[k, 0] + ((j + 0.5) / pixels - 0.5) * side[k]
-                    y = anchor[k, 1] - ((i + 0.5) / pixels - 0.5) * side[k]
-                    if occluded:
-                        distance = _front_distance((x - middle_x) / unit, (y - middle_y) / unit, fronts[k])
-                        if front < distance < front + fronts[k, 4]:
-                            surface[i, j] = _BEHIND
-                            continue
-                    x -= t1
-                    y -= t2
-                    ox, oy, oz = m[0, 0] * x + m[1, 0] * y, m[0, 1] * x + m[1, 1] * y, m[0, 2] * x + m[1, 2] * y
-                    hit, t = ray_entry((ox, oy, oz), (-m[2, 0], -m[2, 1], -m[2, 2]), (a1, a2, a3, e1, e2))
-                    surface[i, j] = _NOTHING
-                    if hit and pinhole[k]:
-                        px, py, pz = ox - t * m[2, 0], oy - t * m[2, 1], oz - t * m[2, 2]
-                        _, nx, ny, nz, _, _ = gauge_derivatives(px, py, pz, a1, a2, a3, e1, e2)
-                        hit = nx * (eye_1 - px) + ny * (eye_2 - py) + nz * (eye_3 - pz) > 0.0
-                    if hit:
-                        z = t3 - t
-                        if quantum[k] > 0.0:
-                            z = (np.floor(z / quantum[k]) + 0.5) * quantum[k]
-                        surface[i, j] = z
-                        seen[hits] = z
-                        if occluded:
-                            reach[hits] = distance
-                        hits += 1
-                        first_row, last_row = min(first_row, i), max(last_row, i)
-                        first_column, last_column = min(first_column, j), max(last_column, j)
-            if hits == 0 or turn > last_round:
-                break
-            if occluded and turn == 0:
-                front = np.sort(reach[:hits])[int((1.0 - fronts[k, 5]) * (hits - 1))]
-                continue
-            ordered = np.sort(seen[:hits])
-            outliers = int(hits * OUTLIERS_PER_END)
-            anchor[k, 2] = ordered[hits - 1 - outliers]
-            extent = ordered[hits - 1 - outliers] - ordered[outliers]
-            if measured:
-                extent = max(extent, max(last_row - first_row, last_column - first_column) * side[k] / pixels)
-            else:
-                extent = max(extent, side[k] / MARGIN)
-            done = abs(extent * MARGIN - side[k]) <= (_SAME_EXTENT + 1.5 * measured / pixels) * side[k]
-            if done and not missed:
-                break
-            if measured:
-                anchor[k, 0] += (0.5 * (first_column + last_column + 1) / pixels - 0.5) * side[k]
-                anchor[k, 1] -= (0.5 * (first_row + last_row + 1) / pixels - 0.5) * side[k]
-            side[k] = extent * MARGIN
-            if missed and (done or turn == last_round):
-                for axis in range(3):
-                    anchor[k, axis] += misses[k, axis] * side[k]
-                side[k] *= np.exp(misses[k, 3])
-                last_round = turn
-        for i in range(pixels):
-            for j in range(pixels):
-                if surface[i, j] > _NOTHING:
-                    value = (surface[i, j] - anchor[k, 2]) / side[k] + NEAREST
-                    images[k, i, j] = min(max(value, 1 / 255), 1.0)
-                elif surface[i, j] == _BEHIND:
-                    images[k, i, j] = HIDDEN
+        sensed = pinhole[k], eye[k], quantum[k]
+        side[k] = _render_view(flat[k], matrices[k], anchor[k], side[k], sensed, fronts[k], misses[k], images[k])
+
+
+@kernel
+def _render_view(
+    body: np.ndarray,
+    turn: np.ndarray,
+    anchor: np.ndarray,
+    side: float,
+    sensed: _Sensed,
+    front: np.ndarray,
+    miss: np.ndarray,
+    image: np.ndarray,
+) -> float:
+    """Render, read off what is visible, and render again until the extent is that of the visible part: the side."""
+    pixels = image.shape[0]
+    surface, reach = np.empty((pixels, pixels)), np.empty((pixels, pixels))
+    is_occluded, is_missed = front[5] > 0.0, np.any(miss != 0.0)
+    is_fitted = sensed[0] or is_occluded  # else all of the body's extent is seen, which is known
+    rounds, curtain = _MOST_ROUNDS, (anchor[0], anchor[1], side, np.inf)
+    if is_occluded:
+        _cast(body, turn, anchor, side, sensed, front, curtain, surface, reach)
+        curtain = (anchor[0], anchor[1], side, _begins(surface, reach, front[5]))
+        rounds -= 1
+    while True:
+        _cast(body, turn, anchor, side, sensed, front, curtain, surface, reach)
+        rounds -= 1
+        seen = np.sort(surface.ravel()[surface.ravel() > _NOTHING])
+        if len(seen) == 0 or rounds < 0:
+            break
+        outliers = int(len(seen) * OUTLIERS_PER_END)
+        anchor[2] = seen[len(seen) - 1 - outliers]
+        extent = anchor[2] - seen[outliers]
+        top, bottom, left, right = _limits(surface)
+        extent = max(extent, max(bottom - top, right - left) * side / pixels if is_fitted else side / MARGIN)
+        done = abs(extent * MARGIN - side) <= (_SAME_EXTENT + 1.5 * is_fitted / pixels) * side
+        if done and not is_missed:
+            break
+        if is_fitted:
+            anchor[0] += (0.5 * (left + right + 1) / pixels - 0.5) * side
+            anchor[1] -= (0.5 * (top + bottom + 1) / pixels - 0.5) * side
+        side = extent * MARGIN
+        if is_missed and (done or rounds == 0):
+            anchor += miss[:3] * side
+            side *= np.exp(miss[3])
+            rounds = 0
+    for i in range(pixels):
+        for j in range(pixels):
+            if surface[i, j] > _NOTHING:
+                image[i, j] = min(max((surface[i, j] - anchor[2]) / side + NEAREST, 1 / 255), 1.0)
+            elif surface[i, j] == _BEHIND:
+                image[i, j] = HIDDEN
+    return side
+
+
+@kernel
+def _cast(
+    body: np.ndarray,
+    turn: np.ndarray,
+    anchor: np.ndarray,
+    side: float,
+    sensed: _Sensed,
+    front: np.ndarray,
+    curtain: _Curtain,
+    surface: np.ndarray,
+    reach: np.ndarray,
+) -> None:
+    """What the rays of a view meet: z of the body, :data:`_NOTHING`, or :data:`_BEHIND` an occluder.
+
+    ``reach`` becomes how far in the occluder's direction they are, if there is one.
+    """
+    pixels = surface.shape[0]
+    a1, a2, a3, e1, e2, t1, t2, t3 = body[:8]
+    is_pinhole, eye, quantum = sensed
+    middle_x, middle_y, unit, begins = curtain
+    eye_1, eye_2, eye_3 = turn[2, 0] * (eye - t3), turn[2, 1] * (eye - t3), turn[2, 2] * (eye - t3)
+    for i in range(pixels):
+        for j in range(pixels):
+            surface[i, j] = _NOTHING
+            x = anchor[0] + ((j + 0.5) / pixels - 0.5) * side
+            y = anchor[1] - ((i + 0.5) / pixels - 0.5) * side
+            if front[5] > 0.0:
+                reach[i, j] = _front_distance((x - middle_x) / unit, (y - middle_y) / unit, front)
+                if begins < reach[i, j] < begins + front[4]:
+                    surface[i, j] = _BEHIND
+                    continue
+            x, y = x - t1, y - t2
+            ox, oy, oz = (
+                turn[0, 0] * x + turn[1, 0] * y,
+                turn[0, 1] * x + turn[1, 1] * y,
+                turn[0, 2] * x + turn[1, 2] * y,
+            )
+            hit, t = ray_entry((ox, oy, oz), (-turn[2, 0], -turn[2, 1], -turn[2, 2]), (a1, a2, a3, e1, e2))
+            if hit and is_pinhole:
+                px, py, pz = ox - t * turn[2, 0], oy - t * turn[2, 1], oz - t * turn[2, 2]
+                _, nx, ny, nz, _, _ = gauge_derivatives(px, py, pz, a1, a2, a3, e1, e2)
+                hit = nx * (eye_1 - px) + ny * (eye_2 - py) + nz * (eye_3 - pz) > 0.0
+            if hit:
+                surface[i, j] = (np.floor((t3 - t) / quantum) + 0.5) * quantum if quantum > 0.0 else t3 - t
+
+
+@kernel
+def _limits(surface: np.ndarray) -> tuple[int, int, int, int]:
+    """First and last row, first and last column in which something is seen."""
+    rows, columns = np.nonzero(surface > _NOTHING)
+    return rows.min(), rows.max(), columns.min(), columns.max()
+
+
+@kernel
+def _begins(surface: np.ndarray, reach: np.ndarray, share: float) -> float:
+    """How far in its direction an occluder begins, so that this share of what is seen lies beyond."""
+    seen = np.sort(reach.ravel()[surface.ravel() > _NOTHING])
+    return seen[int((1.0 - share) * (len(seen) - 1))] if len(seen) else np.inf
 
 
 @kernel
