@@ -384,6 +384,13 @@ PICKERS = {
 }
 """Contestants of the picking benchmark; those that tried both kinds of scenes are shown."""
 FAILURES = ("collision", "wrong size", "missed", "slipped")
+GAINS = {
+    "ours without sigma": "covariance over 10 % of the size",
+    "ours without the hull": "predicted hull over release 0.2.0's predicted body",
+    "classic": "our fit over the classic one",
+    "cgn in masks": "over Contact-GraspNet in our masks",
+}
+"""Whom the picking benchmark compares ours with."""
 
 
 def picking() -> str:
@@ -397,6 +404,32 @@ def picking() -> str:
         *failed, unreachable = (sum(one["causes"][cause] for one in kinds) for cause in (*FAILURES, "unreachable"))
         rows.append([PICKERS[who], *cells, f"{tried}: {' / '.join(map(str, failed))}", str(unreachable)])
     heads = ["planned on", "packed, scenes: GSR / DR %", "pile", f"tried: {' / '.join(FAILURES)}", "unreachable"]
+    return table(heads, rows)
+
+
+def picking_share() -> str:
+    """How much of what true bodies reach recovered ones reach."""
+    found = results("picking")["rows"]
+    rows = []
+    for kind in ("packed", "pile"):
+        ours, true = found[f"{kind}: ours"], found[f"{kind}: true bodies"]
+        if ours["scenes"] != true["scenes"]:
+            raise ValueError(f"{kind}: expected as many scenes of true bodies as of recovered ones")
+        shares = [f"{100 * ours[rate][0] / true[rate][0]:.0f}" for rate in ("gsr", "dr")]
+        rows.append([kind, str(ours["scenes"]), *shares])
+    return table(["of what true bodies reach", "scenes", "GSR %", "DR %"], rows)
+
+
+def picking_gains() -> str:
+    """What parts of the recovery are worth to grasps, and by how much others are behind."""
+    gains = results("picking")["gains"]
+    heads = ["on the same scenes, points (95 % interval)"]
+    heads += [f"{kind}, {rate}" for kind in ("packed", "pile") for rate in ("GSR", "DR")]
+    rows = []
+    for other, name in GAINS.items():
+        kinds = [gains[f"{kind}: ours over {other}"] for kind in ("packed", "pile")]
+        values = ["{:+.0f} ({:+.0f} to {:+.0f})".format(*kind[rate]) for kind in kinds for rate in ("gsr", "dr")]
+        rows.append([f"{name}, {kinds[0]['scenes'][0]:.0f}", *values])
     return table(heads, rows)
 
 
@@ -433,6 +466,8 @@ BLOCKS: dict[str, Callable[[], str]] = {
         latency,
         still,
         picking,
+        picking_share,
+        picking_gains,
         picking_scores,
         tracks,
         layers,
