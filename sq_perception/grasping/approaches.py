@@ -1,7 +1,8 @@
 """From where a parallel gripper may come to a body, and where along it its pads may be.
 
 A closing is a direction y of a body along which it is narrow enough and whose opposite surfaces are met squarely.  The
-hand comes to it along z, across y: as steeply as possible, or swung about y.  With x = y x z the TCP is at
+hand comes to it along z, across y: as steeply as possible, or swung about y.  With x the cross product of y and z the
+TCP is at
 
     t + u z + v x,    t the body's centre, u how far ahead of it (deepest, shallow, between), v how far along it.
 
@@ -10,7 +11,7 @@ Metres, in the frame of the bodies.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -47,7 +48,7 @@ class Closings:
     owner: np.ndarray
     along: np.ndarray
     reach: np.ndarray
-    sigma: np.ndarray = field(repr=False)
+    sigma: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,7 +116,7 @@ class Places:
 
 
 def closings(bodies: KnownBodies, gripper: Gripper, friction: float) -> Closings:
-    """Those of all bodies that are narrow enough and meet their surface squarely at its middle."""
+    """Those of all bodies that are narrow enough and, for a friction mu, meet their surface squarely at its middle."""
     owner = np.repeat(np.arange(len(bodies)), len(DIRECTIONS))
     along = (DIRECTIONS @ bodies.turns.transpose(0, 2, 1)).reshape(-1, 3)
     reach, there = bodies.reaches(owner, along)
@@ -129,7 +130,7 @@ def closings(bodies: KnownBodies, gripper: Gripper, friction: float) -> Closings
 def from_every_side(
     bodies: KnownBodies, found: Closings, gripper: Gripper, around: Surroundings, placement: float
 ) -> Approaches:
-    """Every closing from every side, but from below."""
+    """Every closing from every side, but from below; ``placement`` is how sure the hand's place is, metres."""
     y = np.repeat(found.along, len(_SWINGS), axis=0)
     owner = np.repeat(found.owner, len(_SWINGS))
     half, side = (np.repeat(numbers, len(_SWINGS), axis=0) for numbers in (found.reach, found.sigma))
@@ -165,7 +166,7 @@ def places(bodies: KnownBodies, every: Approaches, gripper: Gripper, steepest: f
     """Of each approach those at which the pads meet the body squarely, in all depths and slides.
 
     Of bodies that have none, those where they do not, too.  ``steepest`` is the angle to the normals up to which a pad
-    may hold.
+    may hold, radians.
     """
     shallow = np.minimum(_ENGAGED - every.near - gripper.tip, every.deepest)
     rows = np.flatnonzero(every.deepest > LEAST_ENGAGED - every.near - gripper.tip)

@@ -19,6 +19,7 @@ from sq_perception.imaging.canonical_view import HIDDEN, MARGIN, NEAREST, OUTLIE
 _NOTHING = -1e300
 _BEHIND = -2e300
 _MOST_ROUNDS = 4
+"""Of fitting a view to what it shows; where there is an occluder, the first one finds where that begins."""
 _SAME_EXTENT = 0.005
 _Sensed: TypeAlias = tuple[bool, float, float]
 """Whether a pinhole camera sees, its eye's z, and the step of depths, 0 for none."""
