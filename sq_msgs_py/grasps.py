@@ -101,7 +101,7 @@ def moveit_grasps(
     header: Any,
     link: str,
     link_from_tcp: tuple[Sequence[float], Sequence[float]],
-    up: Sequence[float],
+    up: Sequence[float] | None,
     prefix: str,
     joints: Sequence[str] = (),
     types: MessageTypes = installed,
@@ -116,7 +116,7 @@ def moveit_grasps(
         The parent link of the end effector and position and quaternion of the TCP in it; of
         :class:`sq_perception.grasping.gripper.Gripper` where that link is the gripper's.
     up : (3,)
-        Away from the table in the frame of the header, of length 1: the way of the retreat.
+        Away from the table in the frame of the header, of length 1: the way of the retreat.  None: back as it came.
     prefix
         Of the ids of collision objects, which the fingers may touch: :data:`sq_msgs_py.transforms.PREFIX`.
     joints
@@ -148,6 +148,9 @@ def moveit_grasps(
     turns = product(unit_quaternions(grasps.rotation), back)
     places = grasps.position - matrices(turns) @ shift
     placed = GraspArray(places, turns, grasps.opening, grasps.width, grasps.score, grasps.id)
+    approach = matrices(unit_quaternions(turn))[:, 2]
+    own = empty(frame_id=link)
+    retreat = straight(own, (-approach).tolist()) if up is None else straight(header, up)
     found = []
     for k, pose in enumerate(poses(placed, header, types).poses):
         found.append(
@@ -157,8 +160,8 @@ def moveit_grasps(
                 grasp_posture=posture(float(grasps.width[k])),
                 grasp_pose=pose_stamped(header=header, pose=pose),
                 grasp_quality=float(grasps.score[k]),
-                pre_grasp_approach=straight(empty(frame_id=link), matrices(unit_quaternions(turn))[:, 2].tolist()),
-                post_grasp_retreat=straight(header, up),
+                pre_grasp_approach=straight(own, approach.tolist()),
+                post_grasp_retreat=retreat,
                 allowed_touch_objects=[f"{prefix}{int(grasps.id[k])}"],
             )
         )

@@ -3,11 +3,15 @@
 All outputs have the header of the cloud.  The last plane in its frame counts; without one, grippers come from the side
 of the frame's origin, that of the camera.  What no message holds, measured points and unseen space, is not looked at;
 the command ``sq-perception grasp`` does.  Correlations of a body's numbers are not in the cloud either.
+
+Where moveit_msgs is installed, ``~/plan_grasps`` is its service GraspPlanning: moveit_msgs/Grasp of the body that the
+target's id names as a collision object, of all bodies without one.  Its other requests are not looked at.
 """
 
 from __future__ import annotations
 
 import threading
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -18,9 +22,10 @@ from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
 
-from sq_msgs_py import answers
+from sq_msgs_py import answers, transforms
 from sq_msgs_py import grasps as messages
 from sq_msgs_py.markers import Mesh, markers
+from sq_msgs_py.message_types import installed
 from sq_msgs_py.poses import plane_of
 from sq_msgs_py.superquadrics import SuperquadricArray, from_message
 from sq_perception.grasping.gripper import Gripper, gripper
@@ -50,7 +55,9 @@ class GraspNode(ManagedNode):
         self._publishing = threading.Lock()
         """Held while something is published, or nothing is any more."""
         self._subscriptions: list[Any] = []
-        self._service = self.create_service(Trigger, "~/plan", self._on_plan)
+        self.create_service(Trigger, "~/plan", self._on_plan)
+        with suppress(ImportError):
+            self.create_service(installed("moveit_msgs/srv/GraspPlanning"), "~/plan_grasps", self._on_plan_grasps)
         if self._settings.current.autostart:
             self.start()
 
@@ -95,23 +102,49 @@ class GraspNode(ManagedNode):
         self._answered(message)
 
     def _on_plan(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        if not self.is_active or self._last is None:
-            response.message = "no superquadrics have come yet" if self.is_active else f"the node is {self.state}"
-            return response
-        found, response.message = self._answered(self._last)
-        if found:
+        cloud = self._last
+        found, response.message = self._planned_again(cloud)
+        if found and cloud:
             response.success = True
-            response.message = answers.text_of(found, self._last.header, response.message)
+            response.message = answers.text_of(found, cloud.header, response.message)
         return response
+
+    def _on_plan_grasps(self, request: Any, response: Any) -> Any:
+        code, target, cloud = response.error_code, request.target.id, self._last
+        code.source = self.get_fully_qualified_name()
+        found, code.message = self._planned_again(cloud)
+        if found is None or cloud is None:
+            code.val = code.FAILURE
+            return response
+        known = [transforms.name(number) for number in from_message(cloud).recovered.id]
+        if target and target not in known:
+            code.val = code.INVALID_OBJECT_NAME
+            code.message = f"target: expected an id among {', '.join(known) or 'none'}, got {target!r}"
+            return response
+        hand, plane = gripper(self._settings.current.gripper), self._plane_in(cloud.header)
+        up = None if plane is None else plane[:3].tolist()
+        each = messages.moveit_grasps(
+            found, cloud.header, hand.link, hand.link_from_tcp, up, transforms.PREFIX, hand.joints
+        )
+        response.grasps = [one for one in each if not target or target in one.allowed_touch_objects]
+        code.val = code.SUCCESS if response.grasps else code.PLANNING_FAILED
+        return response
+
+    def _planned_again(self, cloud: PointCloud2 | None) -> tuple[messages.GraspArray | None, str]:
+        if not self.is_active or cloud is None:
+            return None, "no superquadrics have come yet" if self.is_active else f"the node is {self.state}"
+        return self._answered(cloud)
+
+    def _plane_in(self, header: Any) -> np.ndarray | None:
+        """The last plane, where it is in the frame of that header."""
+        plane = self._plane
+        return plane_of(plane) if plane is not None and plane.header.frame_id == header.frame_id else None
 
     def _answered(self, message: PointCloud2) -> tuple[messages.GraspArray | None, str]:
         """Plan and publish; the grasps, and of how many bodies, and why others have none.  No message ends the node."""
         try:
             bodies = from_message(message).recovered
-            plane = None
-            if self._plane is not None and self._plane.header.frame_id == message.header.frame_id:
-                plane = plane_of(self._plane)
-            plan = planned(bodies, self._settings.current, plane)
+            plan = planned(bodies, self._settings.current, self._plane_in(message.header))
             with self._publishing:
                 if not self._publishers:  # deactivated while it was planned
                     return None, f"the node is {self.state}"

@@ -53,10 +53,9 @@ def test_the_link_holds_the_tcp_where_it_was_planned(hand):
 
 def test_fingers_open_by_half_each_and_close_on_the_width():
     hand = GRIPPERS["panda"]
-    joints = ("panda_finger_joint1", "panda_finger_joint2")
     given = (grasps(), "header", hand.link, hand.link_from_tcp, UP, "thing_")
-    first = moveit_grasps(*given, joints, types=by_hand)[0]
-    assert first.pre_grasp_posture.joint_names == list(joints)
+    first = moveit_grasps(*given, hand.joints, types=by_hand)[0]
+    assert first.pre_grasp_posture.joint_names == ["panda_finger_joint1", "panda_finger_joint2"]
     assert first.pre_grasp_posture.points[0].positions == pytest.approx([0.04, 0.04])
     assert first.grasp_posture.points[0].positions == pytest.approx([0.035, 0.035])
     assert not hasattr(moveit_grasps(*given, types=by_hand)[0].grasp_posture, "points")
