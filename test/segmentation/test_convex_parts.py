@@ -93,6 +93,22 @@ def test_a_bowl_has_no_convex_parts():
     np.testing.assert_array_equal(convex_parts.corrected(labels, depth, CAMERA, NOISE), labels)
 
 
+def test_a_cup_between_two_balls_is_parted_from_them_and_keeps_its_inside():
+    """A cup seen from the side, its front wall and above it a strip of the inside, before the balls in the image."""
+    depth, truth = seen([body(-0.1, (0.07, 0.07, 0.07)), body(0.1, (0.07, 0.07, 0.07))], noise=0.0)
+    v, u = np.indices(depth.shape)
+    x, y = (u - CAMERA.cx) / CAMERA.fx * 0.7, (v - CAMERA.cy) / CAMERA.fy * 0.7
+    bulge = np.sqrt(np.maximum(0.045**2 - x**2, 0))
+    cup = np.abs(x) < 0.044
+    wall, inside = cup & (y > -0.03) & (y < 0.06), cup & (y > -0.05) & (y <= -0.03)
+    depth[wall], depth[inside] = (0.68 - bulge)[wall], (0.68 + bulge)[inside]
+    truth[wall | inside] = 3
+    depth += NOISE * depth**2 * np.random.default_rng(0).standard_normal(depth.shape).astype(np.float32)
+    found = convex_parts.corrected((truth > 0).astype(np.int32), depth, CAMERA, NOISE)
+    assert len(names(found)) == 3
+    assert min(ious(found, truth)) > 0.7
+
+
 def test_what_is_no_thing_together_stays_apart():
     """A strip that goes far back beside a box may be its side, as far as lines of sight tell."""
     depth = np.full((CAMERA.height, CAMERA.width), 2.0, np.float32)
