@@ -68,12 +68,12 @@ class OwnSegments:
     Attributes
     ----------
     found : Segmentation
-    own : mapping of int to bool (h, w)
-        By label, in the least window that holds the segment; a label without strays is not among them.
+    strays : bool (height, width) or None
+        Pixels of segments that did not; None: not a single one.
     """
 
     found: Segmentation
-    own: Mapping[int, np.ndarray]
+    strays: np.ndarray | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,7 +129,7 @@ class SegmentNetwork:
     def improved(self, found: Segmentation) -> OwnSegments:
         """Segments parted, joined, rid of strays, without those of nothing; labels from 1, the largest first."""
         if not found.ids:
-            return OwnSegments(found, {})
+            return OwnSegments(found)
         labels = found.labels.copy()
         seen = self._seen(labels, found.ids)
         parts = self._parted(labels, seen)
@@ -142,15 +142,18 @@ class SegmentNetwork:
             seen |= self._seen(labels, joined)
         shown = {label: _shown(labels, label, answer) for label, answer in seen.items()}
         kept = [label for label, (_, share) in shown.items() if share >= _OF_AN_OBJECT or self.plane is None]
-        own = {label: pixels for label in kept if (pixels := _own(*shown[label])) is not None}
+        strays = np.zeros(labels.shape, bool)
+        for label in kept:
+            window = seen[label].window
+            strays[window] |= _strays(labels[window] == label, *shown[label])
         if not parts and len(kept) == len(found.ids):
-            return OwnSegments(found, own)
+            return OwnSegments(found, strays)
         counts = regions.extents(labels)[:, 0]
         order = sorted(kept, key=lambda label: (-counts[label], label))
         number = np.zeros(len(counts), np.int32)
         number[order] = np.arange(len(order)) + 1
         renumbered = replace(found, labels=regions.renumbered(labels, number), ids=tuple(range(1, len(order) + 1)))
-        return OwnSegments(renumbered, {int(number[label]): own[label] for label in own})
+        return OwnSegments(renumbered, strays)
 
     def _parted(self, labels: np.ndarray, seen: Mapping[int, _Seen]) -> list[int]:
         """Part segments that are several objects; the labels of all the parts."""
@@ -281,7 +284,7 @@ def _shown(labels: np.ndarray, label: int, answer: _Seen) -> tuple[np.ndarray, f
     return pixels, np.count_nonzero(pixels) / np.count_nonzero(inside)
 
 
-def _own(pixels: np.ndarray, share: float) -> np.ndarray | None:
-    """These pixels; None where there are no strays, or next to nothing else."""
-    is_whole = share == 1 or share < 1 - _MOST_STRAYS or np.count_nonzero(pixels) < MIN_PIXELS
-    return None if is_whole else pixels
+def _strays(inside: np.ndarray, own: np.ndarray, share: float) -> np.ndarray:
+    """The pixels of a segment that are not its object's own; none of one that has next to no other pixels."""
+    contradicts = share < 1 - _MOST_STRAYS or np.count_nonzero(own) < MIN_PIXELS
+    return np.zeros_like(inside) if contradicts else inside & ~own

@@ -24,7 +24,7 @@ from __future__ import annotations
 import os
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -42,7 +42,7 @@ from sq_perception.learning import checkpoint, inference
 from sq_perception.learning.forward import CompactMasks
 from sq_perception.recovery import continuity, methods, prediction, seen_object
 from sq_perception.recovery.options import NEEDS_NETWORK, Method, RecoveryOptions
-from sq_perception.recovery.own_segments import SegmentNetwork
+from sq_perception.recovery.own_segments import OwnSegments, SegmentNetwork
 from sq_perception.recovery.prediction import Prediction
 from sq_perception.recovery.recovery import FrameRecovery, Recovery, timed
 from sq_perception.recovery.reference import Reference
@@ -186,29 +186,27 @@ class Recoverer:
         with timed(milliseconds, "segmentation"):
             depth = _plausible(np.asarray(depth), camera)
             camera.check_image(depth)
-            cleaned, kept = _cleaned(depth, camera), continuity.NOTHING
-            if previous is not None:
+            cleaned, kept, age, segmented = _cleaned(depth, camera), continuity.NOTHING, 0, None
+            before = None if previous is None else previous.reference
+            if previous is not None and before is not None:
                 kept = continuity.repeated(previous, cleaned, camera, options)
-                if kept.whole and (labels is None or np.array_equal(labels, previous.labels)):
-                    milliseconds["segmentation"] = milliseconds["total"] = 1e3 * (time.perf_counter() - started)
-                    bodies = tuple(replace(body, repeats=body.repeats + 1) for body in previous.bodies)
-                    return replace(previous, bodies=bodies, milliseconds=milliseconds)
-            if labels is None:
-                found = segments.segment(depth, camera, options.segmentation_options())
-            else:
-                found = segments.from_labels(labels, depth, camera, options.segmentation_options())
-            depth = cleaned
-            own: Mapping[int, np.ndarray] = {}
-            if labels is None and options.repair and isinstance(network, inference.ThingPredictor):
-                improved = SegmentNetwork(*self._load_masks(), depth, camera, found.plane, self._shared).improved(found)
-                found, own = improved.found, improved.own
+                if kept.segments and (labels is None or np.array_equal(labels, previous.labels)):
+                    segmented, age = before.segments, before.age + 1
+                    if len(kept.bodies) == len(previous.bodies):
+                        milliseconds["segmentation"] = milliseconds["total"] = 1e3 * (time.perf_counter() - started)
+                        bodies = tuple(replace(body, repeats=body.repeats + 1) for body in previous.bodies)
+                        reference = replace(before, age=age)
+                        return replace(previous, bodies=bodies, milliseconds=milliseconds, reference=reference)
+            if segmented is None:
+                segmented = self._segmented(depth, cleaned, camera, labels, options, network)
+            depth, found, strays = cleaned, segmented.found, segmented.strays
             objects = seen_object.objects(depth, found, camera, options.depth_range)
             same = {} if previous is None else continuity.matched(kept, previous.labels, objects)
 
         with timed(milliseconds, "network"):
             fresh = [obj for obj in objects if obj.label not in same]
             config = None if network is None else network.config
-            fresh = [obj.only(own[obj.label]) if obj.label in own else obj for obj in fresh]
+            fresh = fresh if strays is None else [obj.without(strays) for obj in fresh]
             fresh = self._mapped(lambda obj: seen_object.viewed(obj, depth, camera, found, options, config), fresh)
             if network is not None:
                 fresh = self._predicted(fresh, network, options)
@@ -222,14 +220,29 @@ class Recoverer:
             for obj, fit, score in zip(fresh, fits, scores, strict=True):
                 of_label[obj.label] = Recovery(fit, score, obj.label, obj.pixels)
             bodies = tuple(of_label[obj.label] for obj in objects)
-        reference = Reference.of(depth, camera, found.sigma, options)
-        if previous is not None and previous.reference is not None and same:
-            reference = reference.keeping(
-                previous.reference, found.labels, [body.label for body in bodies if body.repeats]
-            )
+        reference = Reference.of(depth, camera, options, segmented, age)
+        if before is not None and same:
+            reference = reference.keeping(before, found.labels, [body.label for body in bodies if body.repeats])
         milliseconds["total"] = 1e3 * (time.perf_counter() - started)
         message = "" if bodies else _why_empty(depth, found)
         return FrameRecovery(bodies, milliseconds, found.labels, found.plane, message, reference)
+
+    def _segmented(
+        self,
+        depth: np.ndarray,
+        cleaned: np.ndarray,
+        camera: Camera,
+        labels: np.ndarray | None,
+        options: RecoveryOptions,
+        network: Network | None,
+    ) -> OwnSegments:
+        """The objects of an image: those given, or its own, which a network mends where one predicts hulls."""
+        if labels is not None:
+            return OwnSegments(segments.from_labels(labels, depth, camera, options.segmentation_options()))
+        found = segments.segment(depth, camera, options.segmentation_options())
+        if not (options.repair and isinstance(network, inference.ThingPredictor)):
+            return OwnSegments(found)
+        return SegmentNetwork(*self._load_masks(), cleaned, camera, found.plane, self._shared).improved(found)
 
     def _predicted(self, objects: Sequence[SeenObject], network: Network, options: RecoveryOptions) -> list[SeenObject]:
         """The objects with their predictions; those of bodies may still be computed, beside fits that begin without."""

@@ -1,4 +1,4 @@
-"""The readings that the bodies of a frame were recovered from: what the next frame is compared with."""
+"""The readings and segments that the bodies of a frame were recovered from: what the next frame is compared with."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from sq_perception.imaging.camera import Camera
 from sq_perception.recovery.options import RecoveryOptions
+from sq_perception.recovery.own_segments import OwnSegments
 
 _WIDTH = 320
 """Columns that are compared: noise of neighbouring pixels is alike in all sensors of sensor_noise.preset."""
@@ -19,28 +20,30 @@ BAND = 2
 
 @dataclass(frozen=True, eq=False)
 class Reference:
-    """The readings that a frame's bodies were recovered from.
+    """What a frame's bodies were recovered from.
 
     Attributes
     ----------
     depth : float32 (rows, columns)
         Every ``stride``-th pixel of the image; 0 where nothing was measured.
-    sigma
-        Noise of the depth at one metre, metres.
+    segments
+        The objects, of all pixels, found ``age`` frames ago.
     """
 
     depth: np.ndarray
     stride: int
-    sigma: float
     camera: Camera
     options: RecoveryOptions
+    segments: OwnSegments
+    age: int = 0
 
     @classmethod
-    def of(cls, depth: np.ndarray, camera: Camera, sigma: float, options: RecoveryOptions) -> Reference:
+    def of(
+        cls, depth: np.ndarray, camera: Camera, options: RecoveryOptions, segments: OwnSegments, age: int = 0
+    ) -> Reference:
         """Of an image (height, width) that is NaN where nothing was measured."""
         stride = max(1, round(camera.width / _WIDTH))
-        seen = np.asarray(depth[::stride, ::stride], dtype=np.float32)
-        return cls(np.where(np.isnan(seen), np.float32(0), seen), stride, sigma, camera, options)
+        return cls(sampled(depth, stride), stride, camera, options, segments, age)
 
     def keeping(self, other: Reference, labels: np.ndarray, kept: Sequence[int]) -> Reference:
         """These readings, but those of another reference around the labels that were recovered from it."""
@@ -48,6 +51,12 @@ class Reference:
         for label in kept:
             taken |= around(labels[:: self.stride, :: self.stride] == label) > 0
         return replace(self, depth=np.where(taken, other.depth, self.depth))
+
+
+def sampled(depth: np.ndarray, stride: int) -> np.ndarray:
+    """Every so many-th pixel, float32, of an image that is NaN where nothing was measured; 0 there."""
+    seen = np.asarray(depth[::stride, ::stride], dtype=np.float32)
+    return np.where(np.isnan(seen), np.float32(0), seen)
 
 
 def around(mask: np.ndarray) -> np.ndarray:

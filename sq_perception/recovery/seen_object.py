@@ -88,10 +88,10 @@ class SeenObject:
         heights = heights[:: max(1, heights.size // _POINTS)]
         return quantile(heights, _LOWEST), quantile(heights, 0.5)
 
-    def only(self, pixels: np.ndarray) -> SeenObject:
-        """The object as those of its pixels show it that are set in ``pixels``, of the form of ``mask_crop``."""
+    def without(self, strays: np.ndarray) -> SeenObject:
+        """The object as its pixels show it but for those that are set in ``strays``, bool (height, width)."""
         mask = np.zeros_like(self.mask)
-        mask[self.window] = kept = self.mask_crop & pixels
+        mask[self.window] = kept = self.mask_crop & ~strays[self.window]
         return replace(self, mask=mask, mask_crop=kept)
 
 

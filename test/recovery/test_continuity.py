@@ -121,6 +121,20 @@ def test_what_is_put_down_or_taken_away_is_noticed_at_once(recoverer, first):
     assert [one.repeats for one in frame.bodies] == [2, 2]
 
 
+def test_readings_that_come_and_go_at_a_hole_are_nothing_new_but_a_thing_in_it_is(recoverer):
+    """A hole in the table beside the things, of which a part is measured in the next frame."""
+    hole = slice(190, 220), slice(40, 70)
+    with_hole = image(STILL, 0)
+    with_hole[hole] = np.nan
+    first = recoverer.recover(with_hole, CAMERA)
+    smaller = image(STILL, 1)
+    smaller[194:216, 44:66] = np.nan
+    assert continuity.repeated(first, smaller, CAMERA, first.reference.options).segments
+    thing = image(STILL, 1)
+    thing[hole] -= np.float32(0.03)
+    assert not continuity.repeated(first, thing, CAMERA, first.reference.options).segments
+
+
 def test_slow_motion_adds_up_until_it_is_noticed(recoverer, first):
     frame, x = first, PLACES[1][0]
     for step in range(1, 16):
@@ -149,7 +163,7 @@ def test_a_camera_that_moved_repeats_nothing(recoverer, first):
 def test_other_options_cameras_and_segments_repeat_nothing(recoverer, first):
     depth = image(STILL, 5)
     options = RecoveryOptions(method="symmetry")
-    assert continuity.repeated(first, depth, CAMERA, options).whole
+    assert continuity.repeated(first, depth, CAMERA, options).segments
     other = replace(options, max_size=0.5)
     assert not continuity.repeated(first, depth, CAMERA, other).bodies
     assert not continuity.repeated(first, depth, replace(CAMERA, cx=150.0), options).bodies
@@ -187,9 +201,52 @@ def test_each_body_has_its_turn_one_at_a_time_and_a_weak_one_sooner(first, statu
     ]
     kept = continuity.repeated(replace(first, bodies=tuple(bodies)), image(STILL, 1), CAMERA, options)
     assert set(kept.bodies) == {one.label for one in bodies[:-1]}
-    assert not kept.whole
     young = tuple(replace(one, repeats=limit - 1) for one in bodies)
-    assert continuity.repeated(replace(first, bodies=young), image(STILL, 1), CAMERA, options).whole
+    assert continuity.repeated(replace(first, bodies=young), image(STILL, 1), CAMERA, options).segments
+
+
+def test_a_turn_takes_the_old_segments_until_they_are_old(recoverer, first):
+    """The body is fitted to the new readings of the same pixels, unless something moved or the segments are old."""
+    waiting = replace(first, bodies=(replace(first.bodies[0], repeats=30), *first.bodies[1:]))
+    frame = recoverer.recover(image(STILL, 1), CAMERA, previous=waiting)
+    assert [one.repeats for one in frame.bodies] == [0, 1, 1]
+    assert frame.labels is first.labels
+    assert frame.reference.age == 1
+    here = frame.labels[:: frame.reference.stride, :: frame.reference.stride]
+    assert (frame.reference.depth != first.reference.depth)[here == frame.bodies[0].label].all()
+    assert (frame.reference.depth == first.reference.depth)[here == frame.bodies[1].label].all()
+    alone = recoverer.recover(image(STILL, 1), CAMERA, first.labels)
+    np.testing.assert_allclose(
+        frame.bodies[0].superquadric.to_flat(), alone.bodies[0].superquadric.to_flat(), atol=2e-3
+    )
+
+    still = recoverer.recover(image(STILL, 2), CAMERA, previous=first)
+    assert still.reference.age == 1
+    old = replace(waiting, reference=replace(first.reference, age=30))
+    frame = recoverer.recover(image(STILL, 1), CAMERA, previous=old)
+    assert frame.labels is not first.labels
+    assert frame.reference.age == 0
+    moved = recoverer.recover(image(changed(1, standing(0.02, 0.0)), 3), CAMERA, previous=waiting)
+    assert moved.labels is not first.labels, "another one was pushed while it was this one's turn"
+
+
+def test_strays_of_a_segment_are_none_of_its_body_when_its_turn_comes():
+    """With the network of masks: the pixels that it took from a segment stay taken."""
+    recoverer = Recoverer()
+    first = recoverer.recover(image(STILL, 0), CAMERA)
+    segments = first.reference.segments
+    mask = first.labels == first.bodies[0].label
+    half = replace(segments, strays=mask & (np.arange(CAMERA.width) > np.median(np.nonzero(mask)[1])))
+    waiting = replace(
+        first,
+        bodies=(replace(first.bodies[0], repeats=30), *first.bodies[1:]),
+        reference=replace(first.reference, segments=half),
+    )
+    frame = recoverer.recover(image(STILL, 1), CAMERA, previous=waiting)
+    assert frame.bodies[0].repeats == 0
+    assert frame.reference.segments is half
+    whole = recoverer.recover(image(STILL, 1), CAMERA, first.labels)
+    assert np.linalg.norm(frame.bodies[0].superquadric.to_flat() - whole.bodies[0].superquadric.to_flat()) > 1e-3
 
 
 def test_a_tracker_counts_the_error_of_a_repeated_answer_once(recoverer, first):

@@ -76,9 +76,8 @@ def test_the_rim_that_a_sensor_adds_is_stray(shipped: Any) -> None:
     depth = np.where(wider & (truth == 0), cv2.erode(np.where(truth > 0, depth, np.inf), brush), depth)
     found = of(shipped, depth.astype(np.float32)).improved(segmentation(wider.astype(np.int32)))
     np.testing.assert_array_equal(found.found.labels, wider)
-    own = np.zeros_like(wider)
-    rows, columns = np.nonzero(wider)
-    own[rows.min() : rows.max() + 1, columns.min() : columns.max() + 1] = found.own[1]
+    assert not (found.strays & ~wider).any()
+    own = wider & ~found.strays
     rim = wider & (truth == 0)
     assert np.count_nonzero(own & rim) < 0.6 * np.count_nonzero(rim)
     assert np.count_nonzero(own & (truth > 0)) > 0.95 * np.count_nonzero(truth)
@@ -159,7 +158,7 @@ def test_pieces_are_joined_until_none_belong_together() -> None:
     found = of(network, depth).improved(segmentation(quarters))
     np.testing.assert_array_equal(found.found.labels, truth)
     assert found.found.ids == (1,)
-    assert not found.own
+    assert not found.strays.any()
     assert network.asked == 4 + 2 + 1
 
 
@@ -191,7 +190,7 @@ def test_a_segment_that_is_mostly_stray_keeps_its_pixels() -> None:
     depth, truth = seen([standing(0, 0, *CAN)])
     found = of(stray_in_rows(0.55), depth).improved(segmentation(truth))
     np.testing.assert_array_equal(found.found.labels, truth)
-    assert not found.own
+    assert not found.strays.any()
 
 
 def test_a_segment_that_shows_no_object_is_dropped() -> None:
