@@ -70,9 +70,9 @@ lint: $(VENV)/.package
 quick: $(VENV)/.package
 	$(VENV)/bin/pytest $(addprefix test/,$(CORE)) -m "not process"
 
-# Both halves at once: tests that start processes mostly wait for them.
-test: lint
-	$(MAKE) --no-print-directory --jobs 2 --output-sync=target test-computing test-processes
+# Two at once: tests that start processes, and come after the short lint, mostly wait for them.
+test: $(VENV)/.package
+	$(MAKE) --no-print-directory --jobs 2 --output-sync=target lint test-computing test-processes
 
 # The executable, not `python -m pytest`: that would put the source tree before the installed package.
 test-computing test-processes: $(VENV)/.package
