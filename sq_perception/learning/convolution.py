@@ -113,7 +113,10 @@ class _Tiled:
         kernels, bias = _folded(weights, name, norm)
         inputs = kernels.shape[1]
         g = _G[4 if inputs >= _WIDE else 6]
-        return cls(contiguous(np.einsum("ai,bj,kcij->abck", g, g, kernels).reshape(len(g) ** 2, inputs, -1)), bias)
+        # g w g^T of all kernels as one product: a sum over four indices takes thirty times as long, at every start.
+        taps = kernels.transpose(2, 3, 1, 0).reshape(g.shape[1] ** 2, -1)
+        tiles = np.kron(g, g) @ taps
+        return cls(contiguous(tiles.reshape(len(tiles), inputs, -1)), bias)
 
     def computed(
         self, x: np.ndarray, side: int, memory: Memory, name: str, skip: np.ndarray | None = None, margin: int = 0
