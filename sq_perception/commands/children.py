@@ -25,6 +25,8 @@ from typing import Any
 
 _PATIENCE = 8.0
 """Seconds for all children together to end after an interrupt: a lifecycle node waits 4 s for its transition."""
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+"""What ends the parent, and has to end the children first."""
 _TAIL = 2**14
 """Bytes of a node's output that are looked at."""
 _ROOT = str(Path(__file__).resolve().parent.parent.parent)
@@ -86,29 +88,36 @@ class Children:
     def __init__(self, environment: Mapping[str, str] | None = None) -> None:
         self._environment = environment
         self._running: list[Child] = []
-        self._interrupted = False
-        self._before: Any = None
+        self._interrupted = self._starting = False
+        self._before: dict[signal.Signals, Any] = {}
         self.killed: list[str] = []
         """Names of those that did not stop when interrupted."""
 
     def __enter__(self) -> Children:
         if threading.current_thread() is threading.main_thread():
-            self._before = signal.signal(signal.SIGINT, self._interrupt)
+            self._before = {number: signal.signal(number, self._interrupt) for number in _SIGNALS}
         return self
 
     def __exit__(self, *_: object) -> None:
         self.stop()
-        if self._before is not None:
-            signal.signal(signal.SIGINT, self._before)
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
 
     def _interrupt(self, *_: object) -> None:
         self._interrupted = True
-        raise KeyboardInterrupt
+        if not self._starting:
+            raise KeyboardInterrupt
 
     def start(self, node: str, arguments: Sequence[str] = ()) -> Child:
-        """Start one node."""
-        child = Child(node, arguments, self._environment)
-        self._running.append(child)
+        """Start one node; a Ctrl-C meanwhile waits until it is known, as nobody would stop it otherwise."""
+        self._starting = True
+        try:
+            child = Child(node, arguments, self._environment)
+            self._running.append(child)
+        finally:
+            self._starting = False
+        if self._interrupted:
+            raise KeyboardInterrupt
         return child
 
     def dead(self) -> Child | None:
@@ -122,7 +131,7 @@ class Children:
 
     def stop(self) -> None:
         """Interrupt all, wait, and kill those that go on.  A second Ctrl-C must not leave one behind."""
-        numbers = (signal.SIGINT, signal.SIGTERM) if threading.current_thread() is threading.main_thread() else ()
+        numbers = _SIGNALS if threading.current_thread() is threading.main_thread() else ()
         previous = {number: signal.signal(number, signal.SIG_IGN) for number in numbers}
         try:
             for child in self._running:

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import signal
 import sys
 import time
 from contextlib import nullcontext
@@ -62,8 +61,6 @@ def show(options: argparse.Namespace) -> int:
     except (FrameError, OSError) as error:
         print(error, file=sys.stderr)
         return 2
-    for number in (signal.SIGTERM, signal.SIGHUP):
-        signal.signal(number, signal.default_int_handler)  # as Ctrl-C: no child may outlive its parent
     try:
         return run(camera, options.seconds, options.output_dir)
     except DemoError as error:

@@ -22,7 +22,7 @@ pytest.importorskip("rclpy", reason="rclpy missing: install the extra 'ros' or s
 
 import sq_perception
 from sq_perception.commands import children as children_module
-from sq_perception.commands.children import Children, parameter_arguments
+from sq_perception.commands.children import Child, Children, parameter_arguments
 from sq_perception.evaluation.comparison import alike, pair
 from sq_perception.evaluation.demo_figure import demo_figure
 from sq_perception.evaluation.demo_table import demo_table
@@ -219,6 +219,23 @@ def test_a_ctrl_c_that_got_lost_is_noticed() -> None:
         with pytest.raises(KeyboardInterrupt):
             children.dead()
     assert signal.getsignal(signal.SIGINT) is before
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_a_signal_while_a_node_is_started_leaves_none_behind(monkeypatch: pytest.MonkeyPatch, number: int) -> None:
+    """It comes when the process exists and nobody knows it yet."""
+    started: list[Child] = []
+
+    class Interrupted(Child):
+        def __init__(self, *given: object) -> None:
+            super().__init__(*given)  # type: ignore[arg-type]
+            started.append(self)
+            signal.raise_signal(number)
+
+    monkeypatch.setattr(children_module, "Child", Interrupted)
+    with pytest.raises(KeyboardInterrupt), Children(environment()[0]) as children:
+        children.start("synthetic_depth_node")
+    assert [child.exit_code is None for child in started] == [False]
 
 
 def test_a_node_that_dies_is_named_and_ends_the_demonstration(tmp_path: Path) -> None:

@@ -217,7 +217,7 @@ def test_the_table_says_what_the_message_says(bench: Bench) -> None:
     # What others say is text, never a part of the page.
     assert "<b>no & camera</b>" in browser.text()
     assert "4 dropped" in browser.text()
-    assert "160 × 120" in browser.text()
+    browser.until(lambda: "160 × 120" in browser.text())  # the image comes on its own
 
 
 def test_bodies_are_drawn_where_and_as_they_are(bench: Bench) -> None:
