@@ -171,7 +171,7 @@ def _hopeless(observation: Observation) -> str:
     count = len(observation.pixels)
     if count < MIN_PIXELS:
         return f"{count} pixels with a depth; a fit needs {MIN_PIXELS}"
-    return "the measured points lie on one line" if _on_one_line(observation.points[::4]) else ""
+    return "the measured points lie on one line" if _on_one_line(observation.points) else ""
 
 
 @kernel

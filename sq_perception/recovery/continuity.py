@@ -9,7 +9,7 @@ Equation
 --------
 q = (d - r) / (s z^2) compares a pixel's depth d with its depth r when its body was recovered; s is the noise of the
 difference at one metre, measured on the frame itself, where most pixels are taken to show what they did.  An object
-repeats if the eight sums of q over its surroundings, weighted by
+repeats if most of its pixels are still measured and the eight sums of q over its surroundings, weighted by
 
     1, x, y, x^2, x y, y^2 (the place in the image), dr/dx, dr/dy (what a shift by a pixel makes of r, edges included)
 
@@ -51,6 +51,9 @@ _CLIP, _FAR = 3.0, 6.0
 """Noise levels: more is an edge that wandered, in an object's sums and in a patch."""
 _CHANGED = 30.0
 """T of an object that does not repeat: 1 in 5000 by chance; 1 in 50 at the edges of simulated sensors."""
+_MOST = 0.5
+"""Share of an object's pixels that are measured in both frames.  What is taken away where nothing is behind it, or
+comes too near, has none."""
 _PATCH, _NEW = 7, 3.5
 """Compared pixels across, and mean of q in noise levels, of a patch that shows something new.  An edge that wanders
 fills half of it."""
@@ -126,6 +129,10 @@ def repeated(previous: FrameRecovery, depth: np.ndarray, camera: Camera, options
         if body.label >= len(windows):
             continue
         _, top, bottom, left, right = windows[body.label].tolist()
+        window = slice(top, bottom), slice(left, right)
+        had = (labels[window] == body.label) & (old[window] > 0)
+        if np.count_nonzero(had & (new[window] > 0)) <= _MOST * np.count_nonzero(had):
+            continue
         sums, square = _moments(change, old, new, smooth, labels, body.label, (top, bottom, left, right), level)
         square = share * square + 1e-6 * share * np.trace(square) * np.eye(len(square))
         if square.any() and sums @ np.linalg.solve(square, sums) < _CHANGED:

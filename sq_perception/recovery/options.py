@@ -72,6 +72,8 @@ class RecoveryOptions:
         if not self.time_budget > 0:
             raise ValueError(f"time_budget: expected a positive number of seconds, got {self.time_budget}")
         self.segmentation_options()
+        if self.workspace is not None:  # options are compared from frame to frame: of an array no one truth
+            object.__setattr__(self, "workspace", tuple(float(side) for side in self.workspace))
 
     def segmentation_options(self) -> segments.SegmentationOptions:
         return segments.SegmentationOptions(

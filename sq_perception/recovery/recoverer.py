@@ -149,7 +149,7 @@ class Recoverer:
         Parameters
         ----------
         depth : float (height, width)
-            Metres in the optical frame; NaN, inf, and for a pinhole camera 0 and less: nothing measured.
+            Metres in the optical frame; NaN, inf, less than 0, of a pinhole camera 0 too: nothing measured.
         camera : Camera
         labels : integer (height, width), optional
             Instance masks, 0 for background; without them the image is segmented.
@@ -190,7 +190,8 @@ class Recoverer:
             before = None if previous is None else previous.reference
             if previous is not None and before is not None:
                 kept = continuity.repeated(previous, cleaned, camera, options)
-                if kept.segments and (labels is None or np.array_equal(labels, previous.labels)):
+                is_same = not before.given if labels is None else np.array_equal(labels, previous.labels)
+                if kept.segments and is_same:
                     segmented, age = before.segments, before.age + 1
                     if len(kept.bodies) == len(previous.bodies):
                         milliseconds["segmentation"] = milliseconds["total"] = 1e3 * (time.perf_counter() - started)
@@ -199,7 +200,8 @@ class Recoverer:
                         return replace(previous, bodies=bodies, milliseconds=milliseconds, reference=reference)
             if segmented is None:
                 segmented = self._segmented(depth, cleaned, camera, labels, options, network)
-            depth, found, strays = cleaned, segmented.found, segmented.strays
+            found, strays = segmented.found, segmented.strays
+            depth = _in_range(cleaned, found.labels, options.depth_range)
             objects = seen_object.objects(depth, found, camera, options.depth_range)
             same = {} if previous is None else continuity.matched(kept, previous.labels, objects)
 
@@ -220,7 +222,7 @@ class Recoverer:
             for obj, fit, score in zip(fresh, fits, scores, strict=True):
                 of_label[obj.label] = Recovery(fit, score, obj.label, obj.pixels)
             bodies = tuple(of_label[obj.label] for obj in objects)
-        reference = Reference.of(depth, camera, options, segmented, age)
+        reference = Reference.of(cleaned, camera, options, segmented, age=age, given=labels is not None)
         if before is not None and same:
             reference = reference.keeping(before, found.labels, [body.label for body in bodies if body.repeats])
         milliseconds["total"] = 1e3 * (time.perf_counter() - started)
@@ -325,6 +327,15 @@ def _cleaned(depth: np.ndarray, camera: Camera) -> np.ndarray:
     if camera.is_pinhole:
         bad |= depth <= 0
     return np.where(bad, np.float32(np.nan), depth)
+
+
+def _in_range(depth: np.ndarray, labels: np.ndarray, depth_range: tuple[float, float]) -> np.ndarray:
+    """The image without what lies out of range of the labelled objects: it is theirs, and none of the free space."""
+    near, far = depth_range
+    if near <= 0 and np.isinf(far):
+        return depth
+    out = (labels > 0) & ((depth < near) | (depth > far))
+    return np.where(out, np.float32(np.nan), depth)
 
 
 def _why_empty(depth: np.ndarray, found: segments.Segmentation) -> str:

@@ -27,7 +27,7 @@ class Reference:
     depth : float32 (rows, columns)
         Every ``stride``-th pixel of the image; 0 where nothing was measured.
     segments
-        The objects, of all pixels, found ``age`` frames ago.
+        The objects, of all pixels, found ``age`` frames ago, or ``given``.
     """
 
     depth: np.ndarray
@@ -35,15 +35,23 @@ class Reference:
     camera: Camera
     options: RecoveryOptions
     segments: OwnSegments
-    age: int = 0
+    age: int
+    given: bool
 
     @classmethod
     def of(
-        cls, depth: np.ndarray, camera: Camera, options: RecoveryOptions, segments: OwnSegments, age: int = 0
+        cls,
+        depth: np.ndarray,
+        camera: Camera,
+        options: RecoveryOptions,
+        segments: OwnSegments,
+        *,
+        age: int,
+        given: bool,
     ) -> Reference:
         """Of an image (height, width) that is NaN where nothing was measured."""
         stride = max(1, round(camera.width / _WIDTH))
-        return cls(sampled(depth, stride), stride, camera, options, segments, age)
+        return cls(sampled(depth, stride), stride, camera, options, segments, age, given)
 
     def keeping(self, other: Reference, labels: np.ndarray, kept: Sequence[int]) -> Reference:
         """These readings, but those of another reference around the labels that were recovered from it."""

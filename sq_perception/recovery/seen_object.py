@@ -98,7 +98,8 @@ class SeenObject:
 def objects(
     depth: np.ndarray, found: segments.Segmentation, camera: Camera, depth_range: tuple[float, float]
 ) -> list[SeenObject]:
-    """The objects of a segmentation, in its order, as far as they were measured within the range of depth."""
+    """The objects of a segmentation, in its order, as far as they were measured within the range of depth; those that
+    were not at all are left out."""
     measured = np.isfinite(depth)
     near, far = depth_range
     if near > 0 or np.isfinite(far):
@@ -107,6 +108,8 @@ def objects(
     for label in found.ids:
         mask = (found.labels == label) & measured
         left, top, width, height = regions.box(mask)
+        if width == 0:
+            continue
         window = slice(top, top + height), slice(left, left + width)
         crop = mask[window]
         camera_crop = camera.cropped(left, top, width, height)

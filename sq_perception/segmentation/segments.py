@@ -84,13 +84,19 @@ class SegmentationOptions:
         near, far = self.depth_range
         if not (0 <= near < far):
             raise ValueError(f"depth_range: expected 0 <= nearest < farthest, got {self.depth_range}")
-        if self.max_objects < 1:
-            raise ValueError(f"max_objects: expected at least 1, got {self.max_objects}")
+        if not (self.max_objects >= 1 and self.max_objects == int(self.max_objects)):
+            raise ValueError(f"max_objects: expected a whole number, at least 1, got {self.max_objects}")
         if self.workspace is not None:
             box = tuple(self.workspace)
             if len(box) != 6 or not all(low < high for low, high in zip(box[:3], box[3:], strict=True)):
                 raise ValueError(
                     f"workspace: expected least x, y, z and greater x, y, z in metres, got {self.workspace}"
+                )
+        if self.workspace_pose is not None:
+            turn, place = (np.asarray(part, dtype=float) for part in self.workspace_pose)
+            if turn.shape != (4,) or place.shape != (3,) or not np.isfinite([*turn, *place]).all() or not turn.any():
+                raise ValueError(
+                    f"workspace_pose: expected a quaternion and a translation in metres, got {self.workspace_pose}"
                 )
         if not self.max_size > 0:
             raise ValueError(f"max_size: expected a positive number, got {self.max_size}")

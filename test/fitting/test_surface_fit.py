@@ -355,6 +355,16 @@ def test_a_strip_of_a_wall_has_a_covariance(width: int, height: int, model_error
         assert (fit.sigma_size > 0).all()
 
 
+@pytest.mark.parametrize("width", [2, 3, 4, 5])
+def test_a_narrow_mask_is_no_line(width: int) -> None:
+    """A ledge that faces the camera: every so many-th of its pixels may lie in one column."""
+    camera = Camera(64, 140, 200.0, 200.0, 31.5, 69.5)
+    depth, mask = np.full((140, 64), 1.0, np.float32), np.zeros((140, 64), bool)
+    mask[20:120, 30 : 30 + width] = True
+    depth[mask] = 0.5
+    assert surface_fit.fit(depth, mask, camera).status != Status.FAILED
+
+
 def test_an_inverse_of_information_is_a_covariance(rng: np.random.Generator) -> None:
     """One direction known 10^10 times as well as another that is known from the prior alone."""
     axes, _ = np.linalg.qr(rng.normal(size=(11, 11)))

@@ -135,6 +135,29 @@ def test_readings_that_come_and_go_at_a_hole_are_nothing_new_but_a_thing_in_it_i
     assert not continuity.repeated(first, thing, CAMERA, first.reference.options).segments
 
 
+def test_a_thing_without_readings_is_gone_at_once_and_no_frame_after_it_fails(recoverer, first):
+    """Taken away where nothing is measured behind it, or covered: the band around it reads as before."""
+    label = first.bodies[0].label
+    frame = first
+    for seed in range(1, 13):  # longer than the turn of a weak body takes
+        lost = image(STILL, seed)
+        lost[first.labels == label] = np.nan
+        frame = recoverer.recover(lost, CAMERA, previous=frame)
+        assert len(frame.bodies) == len(STILL) - 1
+        if seed == 1:
+            assert [one.repeats for one in frame.bodies] == [1, 1]
+    back = recoverer.recover(image(STILL, 20), CAMERA, previous=frame)
+    assert len(back.bodies) == len(STILL)
+
+
+def test_given_segments_are_not_taken_for_own_ones(recoverer, first):
+    labels = np.where(first.labels == first.bodies[0].label, 5, 0).astype(np.int32)
+    given = recoverer.recover(image(STILL, 1), CAMERA, labels)
+    assert [one.label for one in given.bodies] == [5]
+    own = recoverer.recover(image(STILL, 2), CAMERA, previous=given)
+    assert len(own.bodies) == len(STILL)
+
+
 def test_slow_motion_adds_up_until_it_is_noticed(recoverer, first):
     frame, x = first, PLACES[1][0]
     for step in range(1, 16):

@@ -173,6 +173,18 @@ def test_no_depth_value_raises(method, projection, weights):
                     assert 0 <= body.score <= 1
 
 
+def test_what_is_out_of_range_of_an_object_is_not_measured(symmetry):
+    """Its near edge is cut off by the range: as if the sensor had lost it, and no free space before the rest."""
+    scene = table_scene(np.random.default_rng(3), 1, CAMERA)
+    depth, labels = scene.render()
+    depth = depth.astype(np.float32)
+    cut = float(np.quantile(depth[labels > 0], 0.3))
+    lost = np.where((labels > 0) & (depth < cut), np.float32(np.nan), depth)
+    cropped = symmetry.recover(depth, CAMERA, labels, RecoveryOptions(method="symmetry", depth_range=(cut, 9.0)))
+    without = symmetry.recover(lost, CAMERA, labels, RecoveryOptions(method="symmetry", depth_range=(cut, 9.0)))
+    np.testing.assert_array_equal(cropped.bodies[0].superquadric.to_flat(), without.bodies[0].superquadric.to_flat())
+
+
 def test_methods_do_what_they_say(weights):
     truth = random_bodies(1, 11)
     depth, labels = seen(truth, CAMERA, background=1.4)

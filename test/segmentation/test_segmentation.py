@@ -218,7 +218,17 @@ def test_misuse_is_refused():
         from_labels(truth.astype(float), depth, CAMERA)
     with pytest.raises(ValueError, match="float image"):
         segment((1000 * np.nan_to_num(depth)).astype(np.uint16), CAMERA)
-    for wrong in ({"depth_range": (2.0, 1.0)}, {"max_objects": 0}, {"max_size": 0.0}):
+    box, nowhere = (-1.0, -1.0, -1.0, 1.0, 1.0, 1.0), (0.0, 0.0, 0.0, np.nan)
+    for wrong in (
+        {"depth_range": (2.0, 1.0)},
+        {"max_objects": 0},
+        {"max_objects": 2.5},
+        {"max_objects": np.nan},
+        {"max_size": 0.0},
+        {"workspace": box, "workspace_pose": ((0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))},
+        {"workspace": box, "workspace_pose": ((0.0, 0.0, 0.0, 1.0), nowhere[1:])},
+        {"workspace": box, "workspace_pose": (nowhere[1:], nowhere)},
+    ):
         with pytest.raises(ValueError, match=next(iter(wrong))):
             SegmentationOptions(**wrong)
 
