@@ -303,3 +303,17 @@ def test_tall_neighbours_are_not_taken_for_each_other_s_noise():
     relative = support.image_relative(depth, camera)
     is_thing = standing.standing(depth, relative, labels, camera, support, [], standing.Limits(0.6, None, None))
     assert all(is_thing(*np.nonzero(labels == k)) for k in range(1, 5))
+
+
+def test_a_narrower_frame_shows_the_same_table(shared_data):
+    """A shelf of which the table is an eighth: which triples are drawn hangs on every pixel at the border."""
+    with np.load(shared_data / "frames" / "felix_9.npz") as content:
+        depth, matrix = content["depth"].astype(np.float32), content["K"]
+    height, width = depth.shape
+    camera = Camera.from_matrix(matrix, width, height)
+    up = np.array([-0.09, -0.99, 0.13]) / np.linalg.norm([-0.09, -0.99, 0.13])
+    for top, left in np.ndindex(4, 4):
+        window = depth[top : height - top, left : width - left].copy()
+        plane = segment(window, camera.cropped(left, top, width - 2 * left, height - 2 * top)).plane
+        assert plane is not None
+        assert plane[:3] @ up > np.cos(np.deg2rad(3))
