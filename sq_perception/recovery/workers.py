@@ -17,7 +17,7 @@ import threading
 from collections import deque
 from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
@@ -228,4 +228,5 @@ def _recoverer(setup: Setup) -> Recoverer:
 
 def _recover(setup: Setup, work: Work) -> FrameRecovery:
     with _one_at_a_time:  # workers of a cluster may have several threads
-        return _recoverer(setup).recover(work.depth, work.camera, work.labels, work.options)
+        found = _recoverer(setup).recover(work.depth, work.camera, work.labels, work.options)
+    return replace(found, reference=None)  # no frame follows it, and it is as large as the image
