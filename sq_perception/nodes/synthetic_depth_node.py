@@ -20,6 +20,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rclpy.node import Node
 from rclpy.qos import QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
@@ -38,6 +39,7 @@ from sq_perception.imaging.calibration import intrinsics
 from sq_perception.nodes.frame import image_topic, packed
 from sq_perception.nodes.live_parameters import LiveParameters
 from sq_perception.nodes.parameters import RAW, SyntheticParameters
+from sq_perception.nodes.statistics import THROTTLE
 from sq_perception.recordings import camera_file
 from sq_perception.recordings.frame_source import FrameSource, SourceFrame, generated, recorded, recordings
 from sq_perception.recordings.publication import CAMERA_FRAME, CUBE_FRAME, depth_message, truth_array
@@ -84,7 +86,7 @@ class SyntheticDepthNode(Node):
     def __init__(self, name: str, context: Any = None) -> None:
         super().__init__(name, context=context)
         self.start_failure = ""
-        self._settings = LiveParameters(self, SyntheticParameters)
+        self._settings = LiveParameters(self, SyntheticParameters, check=self._check)
         self._source = frame_source(self._settings.current)
         replay = self._settings.current.scene == "replay"
         self._image = self._output(Image, "depth/image")
@@ -103,6 +105,9 @@ class SyntheticDepthNode(Node):
         """There is nothing to wait for."""
         return True
 
+    def _check(self, parameters: SyntheticParameters, _: frozenset[str]) -> None:
+        parameters.check(self._source.clean.is_cube, self._source.clean.name)
+
     def _output(self, kind: type[Any], topic: str) -> Any:
         profile = QoSProfile(depth=2, history=QoSHistoryPolicy.KEEP_LAST, reliability=QoSReliabilityPolicy.RELIABLE)
         options = QoSOverridingOptions.with_default_policies()
@@ -115,14 +120,14 @@ class SyntheticDepthNode(Node):
             self._ticks.timer_period_ns = int(1e9 / self._rate)
         try:
             frame = self._source.next(settings.noise, settings.sensor)
+            if frame is not None:
+                self._publish(frame, settings)
         except ValueError as error:
-            self.get_logger().warning(f"left out: {error}")
+            self.get_logger().warning(f"left out: {error}", throttle_duration_sec=THROTTLE)
             return
         if frame is None:
             self.get_logger().info("that was the last frame (loop is false)")
             self._ticks.cancel()
-            return
-        self._publish(frame, settings)
 
     def _publish(self, frame: SourceFrame, settings: SyntheticParameters) -> None:
         frame_id = settings.frame_id or (CUBE_FRAME if frame.is_cube else CAMERA_FRAME)
@@ -131,7 +136,9 @@ class SyntheticDepthNode(Node):
         encoding = settings.encoding if settings.encoding in fitting else fitting[0]
         if self._truth is not None and frame.truth is not None:
             self._truth.publish(to_message(truth_array(frame.truth), header))
-        if self._info is not None and not frame.is_cube:
+        if not frame.is_cube:
+            if self._info is None:
+                self._info = self._output(CameraInfo, "depth/camera_info")
             self._info.publish(_camera_info(frame, header))
         depth, labels = frame.depth, frame.labels
         if frame.calibration is not None:
@@ -140,7 +147,8 @@ class SyntheticDepthNode(Node):
         if labels is not None:
             if self._mask is None:
                 self._mask = self._output(Image, "mask/image")
-            self._mask.publish(labels_to_message(labels, header))
+            wide = labels.max(initial=0) > np.iinfo(np.uint16).max
+            self._mask.publish(labels_to_message(labels, header, "32SC1" if wide else "16UC1"))
         if self._packed is not None and not frame.is_cube and self._packed.get_subscription_count():
             self._packed.publish(packed(depth, header, encoding))
         self._image.publish(depth_message(depth, header, encoding))

@@ -19,6 +19,7 @@ from typing import Any, NamedTuple
 
 from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import ParameterEvent
+from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.qos import QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
 from rclpy.subscription import Subscription
@@ -98,7 +99,8 @@ class ViewNode(Node):
         self._remote = {name: RemoteNode(self, name) for name in nodes}
         self.create_subscription(DiagnosticArray, "/diagnostics", self._on_diagnostics, 10)
         self.create_subscription(ParameterEvent, "/parameter_events", self._on_parameter_event, 1000)
-        self.create_timer(_SERVICE_PERIOD, self._on_tick)
+        # Steady: a simulator that is paused stops the node's own clock.
+        self.create_timer(_SERVICE_PERIOD, self._on_tick, clock=Clock(clock_type=ClockType.STEADY_TIME))
         self._closed = threading.Event()
         self._news = threading.Event()
         self._drawer = threading.Thread(target=self._draw_on, name="drawer", daemon=True)

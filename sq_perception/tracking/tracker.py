@@ -247,17 +247,29 @@ class Tracker:
         return here + there, missing
 
     def _without_repeats(self, pairs: Pairs, recoveries: Sequence[Observed], stamp: float) -> Pairs:
-        """The pairs that are to be fused.  A moving body's pose is not what was fused before, even in an old answer."""
+        """The pairs that are to be fused: an old answer is where it does not say what was fused before.
+
+        It does not for a body that moves, nor where the camera's pose was corrected or the first one was never seen.
+        """
+        if not len(pairs.track):
+            return pairs
         new = np.ones(len(pairs.track), dtype=bool)
+        agrees = self._compared(pairs)[2].agrees
         for k, (track, index) in enumerate(zip(pairs.track, pairs.observed, strict=True)):
             body = self._bodies[track]
-            if recoveries[index].repeats == 0 or body.is_moving:
+            if recoveries[index].repeats == 0 or body.is_moving or body.jumps > 0 or not agrees[k]:
                 continue
             new[k] = False
             body.seen, body.missed, body.last, body.observation = body.seen + 1, 0, stamp, int(index)
             if body.follows:
                 body.agreed = stamp
         return Pairs(*(part[new] for part in pairs))
+
+    def _compared(self, pairs: Pairs) -> tuple[np.ndarray, np.ndarray, agreement.Agreement]:
+        """Covariances (n, 11, 11) and errors (n, 11) of what was observed beside the tracks, and whether they agree."""
+        states, covariances = self._stacked([self._bodies[k] for k in pairs.track])
+        total, error = covariances + pairs.covariance + LEAST, state.difference(states, pairs.state)
+        return total, error, agreement.compared(states[:, 0:3], total, error)
 
     def _fuse(self, pairs: Pairs, to_camera: np.ndarray, stamp: float) -> None:
         if not len(pairs.track):
@@ -267,8 +279,7 @@ class Tracker:
         common = COMMON_SHARE * pairs.covariance + LEAST
         white = (1 - COMMON_SHARE - LASTING_SHARE) * pairs.covariance
         whole = pairs.covariance + LEAST
-        total, error = covariances + whole, state.difference(states, pairs.state)
-        verdict = agreement.compared(states[:, 0:3], total, error)
+        total, error, verdict = self._compared(pairs)
         turning = np.zeros(len(some), dtype=bool)
         for k, body in enumerate(some):
             agrees, slid, turned = verdict.agrees[k], verdict.slid[k], verdict.turned[k]

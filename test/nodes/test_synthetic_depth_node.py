@@ -9,10 +9,14 @@ import pytest
 pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
 
+from rclpy.parameter import Parameter
+from sensor_msgs.msg import CameraInfo, Image
+from spun_nodes import SpunNodes
+
 from sq_perception.imaging import unit_cube
 from sq_perception.nodes.live_parameters import ParameterError
 from sq_perception.nodes.parameters import SyntheticParameters
-from sq_perception.nodes.synthetic_depth_node import frame_source
+from sq_perception.nodes.synthetic_depth_node import SyntheticDepthNode, frame_source
 from sq_perception.recordings.frame_file import FrameError
 from sq_perception.recordings.frame_source import FrameSource
 
@@ -134,3 +138,35 @@ def test_misuse_is_named(recordings, tmp_path):
         replay(path=str(recordings))
     with pytest.raises(FrameError, match="camera_info"):
         replay(path=str(recordings / "1.npz"), camera_info_file=str(tmp_path / "no.yaml"))
+
+
+def test_a_node_replays_what_a_folder_holds(tmp_path):
+    """First an orthographic frame, then a pinhole one with large labels: camera_info and masks come with these."""
+    depth = np.full((8, 8), 0.5, np.float32)
+    np.savez(tmp_path / "0.npz", depth=depth, projection="orthographic")
+    matrix = np.array([[5.0, 0, 3.5], [0, 5.0, 3.5], [0, 0, 1]])
+    np.savez(tmp_path / "1.npz", depth=depth, K=matrix, labels=np.full(depth.shape, 70000, np.int32))
+    bench = SpunNodes("-p", "scene:=replay", "-p", f"path:={tmp_path}", "-p", "hold:=1", "-p", "rate:=20.0")
+    heard = {"depth/camera_info": [], "mask/image": [], "depth/image": []}
+    for topic, kind in (("depth/camera_info", CameraInfo), ("mask/image", Image), ("depth/image", Image)):
+        bench.peer.create_subscription(kind, f"/{topic}", heard[topic].append, 10)
+    node = SyntheticDepthNode("synthetic_depth_node", context=bench.context)
+    bench.spin([node])
+    try:
+        bench.until(lambda: all(len(messages) > 2 for messages in heard.values()))
+        assert {message.encoding for message in heard["mask/image"]} == {"32SC1"}
+    finally:
+        bench.finish()
+
+
+def test_a_sensor_that_cannot_measure_the_scene_is_refused_while_the_node_runs(tmp_path):
+    np.savez(tmp_path / "0.npz", depth=np.full((8, 8), 0.5, np.float32), projection="orthographic")
+    bench = SpunNodes("-p", "scene:=replay", "-p", f"path:={tmp_path}")
+    node = SyntheticDepthNode("synthetic_depth_node", context=bench.context)
+    bench.spin([node])
+    try:
+        (refused,) = node.set_parameters([Parameter("sensor", value="zed")])
+        assert not refused.successful
+        assert "sensor" in refused.reason
+    finally:
+        bench.finish()

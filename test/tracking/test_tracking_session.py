@@ -55,6 +55,18 @@ def test_a_body_moved_by_a_hand_is_never_published_where_it_was(rng):
             np.testing.assert_allclose(found.superquadric.gauge(points), seen.superquadric.gauge(points), rtol=1e-9)
 
 
+def test_an_old_answer_counts_where_the_camera_was_corrected(rng):
+    """Still frames repeat an answer; then the map moves the camera by 4 cm: no body stays where the old pose had it."""
+    one, truth = TrackingSession(), body()
+    seen = draw(truth, noise(), rng)
+    for k in range(14):
+        pose = np.array([0.0, 0.0, 0.0, 1.0]), np.array([0.04 * (k >= 8), 0.0, 0.0])
+        (found,) = one.follow([seen._replace(repeats=k)], 0.2 * k, pose)
+        off = found.superquadric.translation - seen.superquadric.translation
+        assert np.linalg.norm(off) < 0.004, f"frame {k}"
+    assert found.id == 1
+
+
 def test_a_body_exchanged_for_another_is_published_late_by_one_frame_at_most(rng):
     """The same place and pose, other sizes: one such frame may be an error, the second one is believed."""
     one, old, new = TrackingSession(), body((0.05, 0.04, 0.03)), body((0.05, 0.04, 0.06))
