@@ -39,6 +39,8 @@ _REFINE_POINTS = 8000
 _HYPOTHESES, _MOST_HYPOTHESES, _MISSED = 200, 2000, 0.01
 """Draws at first, and at most until a plane is missed with that probability.  200 alone missed a table of 10 to 15 % of
 the points seven times of 20."""
+_LAYER = 0.7
+"""Share of the points within two tolerances that lie within one: of a plane nearly all, of noise half."""
 _FEW_POINTS, _FINALISTS = 300, 100
 """On so many points more draws are counted, and the best of them on all."""
 _PLANES = 3
@@ -204,7 +206,10 @@ def _dominant_plane(points: np.ndarray, least: float, rng: np.random.Generator) 
         fewer = np.ascontiguousarray(weighted[:, :: max(1, len(few) // _FEW_POINTS)])
         more = more[np.argsort(-_votes(more, fewer), kind="stable")[:_FINALISTS]]
         votes = _votes(more, weighted)
-        best = more[votes.argmax()] if len(more) and votes.max() > most else best
+        top = more[votes.argmax()][None] if len(more) else more
+        # Of points all over the room a tenth may lie in a layer as thick, but as many beside it.
+        if len(top) and votes.max() > max(most, _LAYER * _votes(top, weighted / 2)[0]):
+            best = top[0]
     plane = best.astype(float)
     growth = noise_growth(points[:, 2])
     reach, weights, rows = TOLERANCE * growth, growth**-2, np.ascontiguousarray(points.T)
