@@ -428,14 +428,14 @@ def gains_table(gains: dict[str, Any]) -> str:
 def gain(lines: list[dict[str, Any]], kind: str, name: str, other: str) -> dict[str, list[float]]:
     """By how many percent GSR and DR of one contestant are above another's on the same scenes, and 95 % intervals.
 
-    ``kind`` is one, or "both".
+    ``kind`` is one, or "both", of which nothing is said where scenes of one were not tried.
     """
     asked = [run for run in lines if kind in (run["kind"], BOTH)]
     runs = {
         who: {(run["kind"], run["seed"]): run for run in asked if run["contestant"] == who} for who in (name, other)
     }
     seeds = sorted(set(runs[name]) & set(runs[other]))
-    if not seeds:
+    if {seed[0] for seed in seeds} != (set(KINDS) if kind == BOTH else {kind}):
         return {}
     counts = np.array(
         [[(runs[who][seed]["taken"], len(runs[who][seed]["picks"])) for seed in seeds] for who in (name, other)]

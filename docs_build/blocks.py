@@ -429,7 +429,8 @@ def picking_gains() -> str:
     for other, name in GAINS.items():
         kinds = [gains[f"{kind}: ours over {other}"] for kind in ("packed", "pile")]
         values = ["{:+.0f} ({:+.0f} to {:+.0f})".format(*kind[rate]) for kind in kinds for rate in ("gsr", "dr")]
-        rows.append([f"{name}, {kinds[0]['scenes'][0]:.0f}", *values])
+        scenes = " / ".join(dict.fromkeys(f"{kind['scenes'][0]:.0f}" for kind in kinds))
+        rows.append([f"{name}, {scenes}", *values])
     return table(heads, rows)
 
 
