@@ -22,6 +22,7 @@ Metres, radians, seconds.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import deepcopy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -93,6 +94,8 @@ class TrackingSession:
 
     def __init__(self) -> None:
         self._tracker = Tracker()
+        self._without_pose: Tracker | None = None
+        """What follows frames without a pose, by the last one known: a copy, as where their bodies are is a guess."""
         self._stamp = -np.inf
         self._pose: tuple[np.ndarray, np.ndarray] = state.as_pose(None)
         self.tally = Tally()
@@ -102,8 +105,8 @@ class TrackingSession:
 
     def reset(self) -> None:
         """Forget every body; ids go on."""
-        self._tracker.reset()
-        self._stamp = -np.inf
+        self._posed().reset()
+        self._stamp, self._pose = -np.inf, state.as_pose(None)
         self.tally = replace(self.tally, tracks=0)
         self.hidden = ()
 
@@ -138,10 +141,13 @@ class TrackingSession:
             As :meth:`Tracker.update`; nothing has changed then.
         """
         rotation, position = state.as_pose(camera_pose) if is_pose_known else self._pose
-        tracks = self._tracker.update(observed, stamp, (rotation, position), camera=camera, depth=depth)
+        if not is_pose_known and self._without_pose is None:
+            self._without_pose = deepcopy(self._tracker)
+        tracker = self._posed() if is_pose_known else self._without_pose or self._tracker
+        tracks = tracker.update(observed, stamp, (rotation, position), camera=camera, depth=depth)
         self.tally = Tally(
             tracks=len(tracks),
-            births=self._tracker.births,
+            births=tracker.births,
             resets=self.tally.resets + (stamp < self._stamp),
             without_pose=self.tally.without_pose + (not is_pose_known),
         )
@@ -166,6 +172,13 @@ class TrackingSession:
                 covariance = np.full((LENGTH, LENGTH), np.nan)
             found.append(Followed(track.id, track.seen, is_fused, body, covariance))
         return tuple(found)
+
+    def _posed(self) -> Tracker:
+        """The tracker of frames with a pose, as it was before those without one; the ids that these gave are taken."""
+        if self._without_pose is not None:
+            self._tracker.skip_ids(self._without_pose.births)
+            self._without_pose = None
+        return self._tracker
 
 
 def _in_form_of(body: Superquadric, covariance: np.ndarray, observation: Observed) -> tuple[Superquadric, np.ndarray]:

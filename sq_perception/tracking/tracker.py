@@ -118,6 +118,10 @@ class Tracker:
         """Forget every body; ids go on."""
         self._bodies, self._stamp = [], None
 
+    def skip_ids(self, births: int) -> None:
+        """Give none of so many first ids any more: another tracker, begun as a copy, has."""
+        self._next_id = max(self._next_id, births + 1)
+
     def update(
         self,
         recoveries: Sequence[Observed],

@@ -79,6 +79,31 @@ def test_a_body_exchanged_for_another_is_published_late_by_one_frame_at_most(rng
     assert found.is_fused
 
 
+def test_frames_without_a_pose_leave_the_tracks_as_they_are(rng):
+    """The camera goes 15 cm while its pose is lost, from one of two equal bodies to where the other one was."""
+    one, truths = TrackingSession(), [body(centre=(x, 0.0, 1.0)) for x in (0.0, 0.15)]
+    for k in range(60):
+        position = np.array([min(0.15, 0.005 * max(k - 5, 0)), 0.0, 0.0])
+        pose, is_known = (np.array([0.0, 0.0, 0.0, 1.0]), position), not 5 <= k < 40
+        followed = one.follow(
+            [from_camera(draw(t, noise(), rng), *pose) for t in truths], 0.033 * k, pose, is_pose_known=is_known
+        )
+        if is_known:
+            assert [found.id for found in followed] == [1, 2], f"frame {k}"
+            for found, truth in zip(followed, truths, strict=True):
+                assert np.linalg.norm(found.superquadric.translation + position - truth.translation) < 0.006
+
+
+def test_what_was_seen_before_the_first_pose_is_no_second_body(rng):
+    one, truth = TrackingSession(), body()
+    pose = np.array([0.0, 0.0, 0.0, 1.0]), np.array([0.5, 0.0, 0.0])
+    before = [one.follow([draw(truth, noise(), rng)], 0.1 * k, pose, is_pose_known=False)[0].id for k in range(4)]
+    after = [one.follow([draw(truth, noise(), rng)], 0.1 * k, pose)[0].id for k in range(4, 8)]
+    assert before == [1] * 4
+    assert after == [2] * 4, "an id is never used again"
+    assert one.hidden == ()
+
+
 def test_without_a_pose_there_are_ids_and_forms_but_no_fusion(rng):
     truth, one = body(), TrackingSession()
     last = None
