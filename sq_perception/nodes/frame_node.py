@@ -200,6 +200,7 @@ class FrameNode(ManagedNode):
                 outcome = Outcome(False, str(error))
             except Exception as error:
                 if not self.context.ok() or self._input is not source:
+                    self._statistics.count("dropped", int(arrival is not None))
                     return
                 outcome = Outcome(False, f"{type(error).__name__}: {error}")
                 self._note_defect(outcome.text)
@@ -303,6 +304,8 @@ class FrameNode(ManagedNode):
         outcome: Outcome | None = await caller
         self.destroy_timer(late)
         del self._triggers[caller]
+        if outcome is None and source.silence < TRIGGER_TIMEOUT:
+            return Outcome(False, f"of the images on {source.topic} none was recovered within {TRIGGER_TIMEOUT:g} s")
         return outcome or Outcome(False, f"no frame on {source.topic} within {TRIGGER_TIMEOUT:g} s: {source.heard}")
 
     def _on_second(self) -> None:

@@ -96,6 +96,10 @@ class Input:
         self._infos: deque[_Info] = deque(maxlen=_INFOS)
         self._masks: OrderedDict[int, Image] = OrderedDict()
         self._is_closed = False
+        # Of a subscription that another thread destroys meanwhile not even the name can be asked.
+        self._info_topic, self._mask_topic = (
+            str(node.resolve_topic_name(name)) for name in ("depth/camera_info", "mask/image")
+        )
         # Subscriptions are served in this order: what an image needs is there before the image.
         self._info: Subscription | None = None
         if settings.current.projection == "pinhole" and transport != POINTS:
@@ -112,11 +116,11 @@ class Input:
         """
         if self._info is None or self._latched is not None or self._is_closed:
             return
-        offered = self._node.get_publishers_info_by_topic(self._info.topic_name)
+        offered = self._node.get_publishers_info_by_topic(self._info_topic)
         if any(publisher.qos_profile.durability == QoSDurabilityPolicy.TRANSIENT_LOCAL for publisher in offered):
             self._latched = self._node.create_subscription(
                 CameraInfo,
-                self._info.topic_name,
+                self._info_topic,
                 self._on_info,
                 QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL),
                 # Others on the topic may keep nothing; the plain subscription hears them.
@@ -181,7 +185,7 @@ class Input:
             self._node.get_logger().warning(f"{self.topic}: {UNORGANISED}", throttle_duration_sec=THROTTLE)
         if use == "always" and arrival.mask is None:
             expected = "expected one with the stamp of the image (use_masks is always)"
-            raise ValueError(f"mask: {expected}, none came on {self._mask.topic_name}")
+            raise ValueError(f"mask: {expected}, none came on {self._mask_topic}")
         return frame if arrival.mask is None or use == "never" else frame.with_mask(arrival.mask)
 
     def _calibration_of(self, image: DepthMessage, source: Subscription) -> Calibration:
@@ -215,7 +219,7 @@ class Input:
         except ValueError:
             size = None
         use, deadline = parameters.use_masks, now + parameters.patience
-        needs_mask = use == "always" or (use == "auto" and self._node.count_publishers(self._mask.topic_name) > 0)
+        needs_mask = use == "always" or (use == "auto" and self._node.count_publishers(self._mask_topic) > 0)
         with self._changed:
             if self._is_closed:
                 self._statistics.count("dropped")
