@@ -1,4 +1,4 @@
-"""Whether a body should have been seen where it is thought to be.
+"""Whether a body should have been seen where it is thought to be, and from where it is seen.
 
 26 points of the surface, in the directions of a cube's faces, edges and corners, speak for a body; those on the far
 side are left out.  A point is evidence of absence only where the image measured something farther: beyond the image,
@@ -67,3 +67,11 @@ def _near_side(bodies: Superquadric, camera: Camera) -> tuple[np.ndarray, np.nda
     normals = bodies.gauge_gradient(points)
     sight = points if camera.is_pinhole else np.array([0.0, 0.0, 1.0])
     return points, (normals * sight).sum(axis=-1) < 0
+
+
+def towards(centres: np.ndarray, rotation: np.ndarray, position: np.ndarray, orthographic: bool) -> np.ndarray:
+    """Unit vectors (m, 3) from centres (m, 3) to the camera; an orthographic one looks along its z from everywhere."""
+    if orthographic:
+        return np.broadcast_to(-quaternions.to_matrix(rotation)[:, 2], centres.shape)
+    way = position - centres
+    return way / np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-12)

@@ -170,7 +170,7 @@ class Tracker:
 
         expected = partial(sight.expected, camera=camera, depth=depth, rotation=rotation, position=position)
         pairs, missing = self._pairs(observed, covariance, stamp, expected)
-        to_camera = _towards(observed[:, 5:8], rotation, position, orthographic)
+        to_camera = sight.towards(observed[:, 5:8], rotation, position, orthographic)
         taken = set(pairs.observed.tolist())
         self._fuse(self._without_repeats(pairs, recoveries, stamp), to_camera, stamp)
         for j in range(len(observed)):
@@ -251,10 +251,8 @@ class Tracker:
         return here + there, missing
 
     def _without_repeats(self, pairs: Pairs, recoveries: Sequence[Observed], stamp: float) -> Pairs:
-        """The pairs that are to be fused: an old answer is where it does not say what was fused before.
-
-        It does not for a body that moves, nor where the camera's pose was corrected or the first one was never seen.
-        """
+        """The pairs that are to be fused: those of old answers only where these do not say what was fused before, of a
+        body that moves, or where the camera's pose was corrected or the first one was never seen."""
         if not len(pairs.track):
             return pairs
         new = np.ones(len(pairs.track), dtype=bool)
@@ -399,11 +397,3 @@ def _published(body: _Body) -> Track:
         observation=body.observation,
         follows=body.follows and body.observation is not None,
     )
-
-
-def _towards(centres: np.ndarray, rotation: np.ndarray, position: np.ndarray, orthographic: bool) -> np.ndarray:
-    """Unit vectors (m, 3) from centres (m, 3) to the camera; an orthographic one looks along its z from everywhere."""
-    if orthographic:
-        return np.broadcast_to(-quaternions.to_matrix(rotation)[:, 2], centres.shape)
-    way = position - centres
-    return way / np.maximum(np.linalg.norm(way, axis=-1, keepdims=True), 1e-12)
