@@ -43,7 +43,7 @@ def main(arguments: Sequence[str]) -> int:
     except Stopped as stopped:
         print(stopped, file=sys.stderr)
         return INTERRUPTED
-    except (DivergedError, CheckpointError, ValueError) as error:
+    except (DivergedError, CheckpointError, ValueError, OSError) as error:
         return failed(f"train: {error}")
     return SUCCESS
 

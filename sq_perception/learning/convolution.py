@@ -221,7 +221,8 @@ def _write_tiles(x: np.ndarray, side: int, size: int, tiles: np.ndarray) -> None
     """B^T d B of every tile of framed images: (tiles, size^2, channels)."""
     channels, step = x.shape[3], size - 2
     count = (side + step - 1) // step
-    half = np.empty((size, (count * step + 2) * channels), np.float32)  # B^T d of a row of tiles
+    # B^T d of a row of tiles; images are framed for the larger tiles, and as wide as these need.
+    half = np.empty((size, x.shape[2] * channels), np.float32)
     tile = 0
     for image in range(x.shape[0]):
         rows = x[image].reshape(x.shape[1], x.shape[2] * channels)
@@ -229,7 +230,7 @@ def _write_tiles(x: np.ndarray, side: int, size: int, tiles: np.ndarray) -> None
             _forward(rows[step * i : step * i + size], half)
             for j in range(count):
                 for k in range(size):
-                    row = half[k].reshape(count * step + 2, channels)
+                    row = half[k].reshape(x.shape[2], channels)
                     _forward(row[step * j : step * j + size], tiles[tile, size * k : size * (k + 1)])
                 tile += 1
 

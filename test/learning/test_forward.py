@@ -61,7 +61,7 @@ def test_the_layout_is_that_of_the_modules(config: RegressorConfig | ThingConfig
     assert layout.shapes(config) == {name: shape for name, shape in held.items() if not name.endswith(layout.COUNTER)}
 
 
-@pytest.mark.parametrize("config", FORMS, ids=str)
+@pytest.mark.parametrize("config", [*FORMS, *(RegressorConfig(pixels=pixels) for pixels in (32, 96))], ids=str)
 def test_a_random_regressor(config: RegressorConfig, rng: np.random.Generator) -> None:
     torch.manual_seed(1)
     model = lively(Regressor(config))
