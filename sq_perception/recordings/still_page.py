@@ -101,6 +101,8 @@ def _scene(frame: RecordedFrame, recovery: FrameRecovery) -> trimesh.Scene:
     if len(cloud.points):
         middle = np.median(cloud.points, axis=0).astype(float)
         whole.add_geometry(trimesh.PointCloud(cloud.points, cloud.colours), node_name="points")
+    else:  # of a covered lens one black point, as no GLB is empty
+        whole.add_geometry(trimesh.PointCloud(middle[None], np.array([[0, 0, 0, 255]], np.uint8)), node_name="points")
     for k, body in enumerate(recovery.bodies):
         if body.status == Status.FAILED:
             continue

@@ -67,6 +67,15 @@ def test_nothing_is_loaded_and_no_name_ends_the_script(page):
     assert not re.search(r"<(script|link|img|iframe)[^>]*\s(src|href)=", text)
 
 
+def test_a_covered_lens_is_a_frame_like_others(tmp_path):
+    """Its GLB has a point, as none may be empty."""
+    depth = np.full((60, 80), np.nan, np.float32)
+    page = StillPage(tmp_path / "out.html")
+    page.add(RecordedFrame(depth, CAMERA, None, "dark"), Recoverer(method="symmetry").recover(depth, CAMERA))
+    assert page.close() == tmp_path / "out.html"
+    assert "frames.push(" in (tmp_path / "out.html").read_text()
+
+
 def test_no_page_without_a_frame(tmp_path):
     page = StillPage(tmp_path / "out.html")
     assert page.close() is None
