@@ -150,7 +150,7 @@ def moveit_grasps(
     placed = GraspArray(places, turns, grasps.opening, grasps.width, grasps.score, grasps.id)
     approach = matrices(unit_quaternions(turn))[:, 2]
     own = empty(frame_id=link)
-    retreat = straight(own, (-approach).tolist()) if up is None else straight(header, up)
+    retreat = (own, (-approach).tolist()) if up is None else (header, up)
     found = []
     for k, pose in enumerate(poses(placed, header, types).poses):
         found.append(
@@ -161,7 +161,7 @@ def moveit_grasps(
                 grasp_pose=pose_stamped(header=header, pose=pose),
                 grasp_quality=float(grasps.score[k]),
                 pre_grasp_approach=straight(own, approach.tolist()),
-                post_grasp_retreat=retreat,
+                post_grasp_retreat=straight(*retreat),
                 allowed_touch_objects=[f"{prefix}{int(grasps.id[k])}"],
             )
         )

@@ -44,7 +44,7 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.regions import extents
 from sq_perception.recovery.options import RecoveryOptions
 from sq_perception.recovery.recovery import FrameRecovery, Recovery
-from sq_perception.recovery.reference import BAND, sampled
+from sq_perception.recovery.reference import BAND, Reference, sampled
 from sq_perception.recovery.seen_object import SeenObject
 
 _CLIP, _FAR = 3.0, 6.0
@@ -84,24 +84,32 @@ class Repeated:
     ----------
     bodies
         By their label in the frame before.
-    segments
-        Whether there is nothing else to see than the objects of the frame before.
+    reference
+        That of the frame before, a frame older, where its segments repeat; None where they have to be found.
     """
 
     bodies: Mapping[int, Recovery]
-    segments: bool
+    reference: Reference | None
 
 
-NOTHING = Repeated({}, False)
+NOTHING = Repeated({}, None)
 
 
-def repeated(previous: FrameRecovery, depth: np.ndarray, camera: Camera, options: RecoveryOptions) -> Repeated:
+def repeated(
+    previous: FrameRecovery,
+    depth: np.ndarray,
+    camera: Camera,
+    options: RecoveryOptions,
+    labels: np.ndarray | None = None,
+) -> Repeated:
     """What an image repeats of the frame before it.
 
     Parameters
     ----------
     depth : float (height, width)
         Metres, NaN where nothing was measured.
+    labels : integer (height, width), optional
+        Masks that were given for the image: segments repeat only where these do, or where none were given to either.
     """
     before = previous.reference
     if before is None or before.camera != camera or before.options != options or not camera.is_pinhole:
@@ -109,8 +117,8 @@ def repeated(previous: FrameRecovery, depth: np.ndarray, camera: Camera, options
     if previous.labels.max(initial=0) > previous.labels.size:  # given ones, and tables by label would be huge
         return NOTHING
     old, new, sigma = before.depth, sampled(depth, before.stride), before.segments.found.sigma
-    labels = np.ascontiguousarray(previous.labels[:: before.stride, :: before.stride], dtype=np.int32)
-    reach = _REACH * float(old[labels > 0].max(initial=0))
+    shown = np.ascontiguousarray(previous.labels[:: before.stride, :: before.stride], dtype=np.int32)
+    reach = _REACH * float(old[shown > 0].max(initial=0))
     change, near = _changed(old, new, reach)
     spread = ranked(near, 3 * near.size // 4) / _QUARTILE if near.size else np.inf
     if spread > _NOISIER * sigma:
@@ -123,24 +131,27 @@ def repeated(previous: FrameRecovery, depth: np.ndarray, camera: Camera, options
     still = float(np.abs(cv2.blur(patches, (_PATCH, _PATCH))).max()) < _NEW
     smooth = cv2.blur(old, (3, 3))
 
-    due, windows = _due(previous.bodies), extents(labels)
+    due, windows = _due(previous.bodies), extents(shown)
     kept, repeating = {}, 0
     for body in previous.bodies:
         if body.label >= len(windows):
             continue
         _, top, bottom, left, right = windows[body.label].tolist()
         window = slice(top, bottom), slice(left, right)
-        had = (labels[window] == body.label) & (old[window] > 0)
+        had = (shown[window] == body.label) & (old[window] > 0)
         if np.count_nonzero(had & (new[window] > 0)) <= _MOST * np.count_nonzero(had):
             continue
-        sums, square = _moments(change, old, new, smooth, labels, body.label, (top, bottom, left, right), level)
+        sums, square = _moments(change, old, new, smooth, shown, body.label, (top, bottom, left, right), level)
         square = share * square + 1e-6 * share * np.trace(square) * np.eye(len(square))
         if square.any() and sums @ np.linalg.solve(square, sums) < _CHANGED:
             repeating += 1
             if body is not due and CUT_SHORT not in body.message:
                 kept[body.label] = body
     count = len(previous.bodies)
-    return Repeated(kept, still and 0 < count == repeating and (len(kept) == count or before.age < _OLD))
+    is_same = not before.given if labels is None else np.array_equal(labels, previous.labels)
+    is_fresh = len(kept) == count or before.age < _OLD
+    repeats = is_same and still and 0 < count == repeating and is_fresh
+    return Repeated(kept, replace(before, age=before.age + 1) if repeats else None)
 
 
 def matched(kept: Repeated, labels: np.ndarray, objects: Sequence[SeenObject]) -> dict[int, Recovery]:

@@ -186,20 +186,17 @@ class Recoverer:
         with timed(milliseconds, "segmentation"):
             depth = _plausible(np.asarray(depth), camera)
             camera.check_image(depth)
-            cleaned, kept, age, segmented = _cleaned(depth, camera), continuity.NOTHING, 0, None
-            before = None if previous is None else previous.reference
-            if previous is not None and before is not None:
-                kept = continuity.repeated(previous, cleaned, camera, options)
-                is_same = not before.given if labels is None else np.array_equal(labels, previous.labels)
-                if kept.segments and is_same:
-                    segmented, age = before.segments, before.age + 1
-                    if len(kept.bodies) == len(previous.bodies):
-                        milliseconds["segmentation"] = milliseconds["total"] = 1e3 * (time.perf_counter() - started)
-                        bodies = tuple(replace(body, repeats=body.repeats + 1) for body in previous.bodies)
-                        reference = replace(before, age=age)
-                        return replace(previous, bodies=bodies, milliseconds=milliseconds, reference=reference)
-            if segmented is None:
-                segmented = self._segmented(depth, cleaned, camera, labels, options, network)
+            cleaned, kept = _cleaned(depth, camera), continuity.NOTHING
+            if previous is not None:
+                kept = continuity.repeated(previous, cleaned, camera, options, labels)
+            if previous is not None and kept.reference and len(kept.bodies) == len(previous.bodies):
+                milliseconds["segmentation"] = milliseconds["total"] = 1e3 * (time.perf_counter() - started)
+                bodies = tuple(replace(body, repeats=body.repeats + 1) for body in previous.bodies)
+                return replace(previous, bodies=bodies, milliseconds=milliseconds, reference=kept.reference)
+            if kept.reference:
+                segmented, age = kept.reference.segments, kept.reference.age
+            else:
+                segmented, age = self._segmented(depth, cleaned, camera, labels, options, network), 0
             found, strays = segmented.found, segmented.strays
             depth = _in_range(cleaned, found.labels, options.depth_range)
             objects = seen_object.objects(depth, found, camera, options.depth_range)
@@ -223,8 +220,10 @@ class Recoverer:
                 of_label[obj.label] = Recovery(fit, score, obj.label, obj.pixels)
             bodies = tuple(of_label[obj.label] for obj in objects)
         reference = Reference.of(cleaned, camera, options, segmented, age=age, given=labels is not None)
-        if before is not None and same:
-            reference = reference.keeping(before, found.labels, [body.label for body in bodies if body.repeats])
+        if previous is not None and previous.reference is not None and same:
+            reference = reference.keeping(
+                previous.reference, found.labels, [body.label for body in bodies if body.repeats]
+            )
         milliseconds["total"] = 1e3 * (time.perf_counter() - started)
         message = "" if bodies else _why_empty(depth, found)
         return FrameRecovery(bodies, milliseconds, found.labels, found.plane, message, reference)

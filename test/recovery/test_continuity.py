@@ -129,10 +129,10 @@ def test_readings_that_come_and_go_at_a_hole_are_nothing_new_but_a_thing_in_it_i
     first = recoverer.recover(with_hole, CAMERA)
     smaller = image(STILL, 1)
     smaller[194:216, 44:66] = np.nan
-    assert continuity.repeated(first, smaller, CAMERA, first.reference.options).segments
+    assert continuity.repeated(first, smaller, CAMERA, first.reference.options).reference is not None
     thing = image(STILL, 1)
     thing[hole] -= np.float32(0.03)
-    assert not continuity.repeated(first, thing, CAMERA, first.reference.options).segments
+    assert continuity.repeated(first, thing, CAMERA, first.reference.options).reference is None
 
 
 def test_a_thing_without_readings_is_gone_at_once_and_no_frame_after_it_fails(recoverer, first):
@@ -186,7 +186,7 @@ def test_a_camera_that_moved_repeats_nothing(recoverer, first):
 def test_other_options_cameras_and_segments_repeat_nothing(recoverer, first):
     depth = image(STILL, 5)
     options = RecoveryOptions(method="symmetry")
-    assert continuity.repeated(first, depth, CAMERA, options).segments
+    assert continuity.repeated(first, depth, CAMERA, options).reference is not None
     other = replace(options, max_size=0.5)
     assert not continuity.repeated(first, depth, CAMERA, other).bodies
     assert not continuity.repeated(first, depth, replace(CAMERA, cx=150.0), options).bodies
@@ -224,8 +224,9 @@ def test_each_body_has_its_turn_one_at_a_time_and_a_weak_one_sooner(first, statu
     ]
     kept = continuity.repeated(replace(first, bodies=tuple(bodies)), image(STILL, 1), CAMERA, options)
     assert set(kept.bodies) == {one.label for one in bodies[:-1]}
+    assert kept.reference.segments is first.reference.segments
     young = tuple(replace(one, repeats=limit - 1) for one in bodies)
-    assert continuity.repeated(replace(first, bodies=young), image(STILL, 1), CAMERA, options).segments
+    assert continuity.repeated(replace(first, bodies=young), image(STILL, 1), CAMERA, options).reference is not None
 
 
 def test_a_turn_takes_the_old_segments_until_they_are_old(recoverer, first):
