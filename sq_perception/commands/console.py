@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -95,6 +95,29 @@ def folder(text: str) -> Path:
     except OSError as error:
         raise argparse.ArgumentTypeError(str(error)) from error
     return Path(text)
+
+
+def replaced_input(
+    inputs: Sequence[Path],
+    files: Mapping[str, str | Path | None],
+    folders: Mapping[str, tuple[Path | None, str]] | None = None,
+) -> str:
+    """Which output would take the place of an input, as a sentence; empty if none.
+
+    Parameters
+    ----------
+    files, folders
+        By the option that names them: files, and folders with the suffix of what is written there; None is not asked
+        for.
+    """
+    for name, file in files.items():
+        path = Path(file or STANDARD_OUTPUT)
+        if path.exists() and any(given.exists() and path.samefile(given) for given in inputs):
+            return f"--{name}: {path}: this is an input"
+    for name, (folder, suffix) in (folders or {}).items():
+        if folder and any(given.suffix.lower() == suffix and given.parent.samefile(folder) for given in inputs):
+            return f"--{name}: {folder}: the {suffix} files in this folder are inputs; choose another one"
+    return ""
 
 
 def add_frames(command: argparse.ArgumentParser) -> None:

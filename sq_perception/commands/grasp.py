@@ -22,6 +22,7 @@ from sq_perception.commands.console import (
     misused,
     parser,
     positive,
+    replaced_input,
     text_target,
 )
 from sq_perception.files import output_file
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
     from sq_perception.grasping.gripper import Gripper
     from sq_perception.grasping.plan import GraspPlan
     from sq_perception.recordings.frame_file import RecordedFrame
+    from sq_perception.recordings.inputs import RecordedInput
     from sq_perception.recovery.recoverer import Recoverer, Recovery
 
 HELP = """\
@@ -84,13 +86,23 @@ def _run(options: argparse.Namespace) -> int:
     from sq_perception.recordings.inputs import RecordedInput
     from sq_perception.recovery.recoverer import Recoverer
 
+    try:
+        recorded = RecordedInput(options.frames, options.camera_info)
+        if problem := replaced_input(recorded.files, {"json": options.json}, {"pictures": (options.pictures, ".png")}):
+            return misused(problem)
+        return _planned(recorded, Recoverer(), hand, friction, options)
+    except (FrameError, CheckpointError, OSError) as error:
+        return failed(str(error))
+
+
+def _planned(
+    recorded: RecordedInput, recoverer: Recoverer, hand: Gripper, friction: float, options: argparse.Namespace
+) -> int:
+    from sq_perception.recordings.frame_file import FrameError
+
     entries: list[dict[str, Any]] = []
     stems: set[str] = set()
     code = SUCCESS
-    try:
-        recorded, recoverer = RecordedInput(options.frames, options.camera_info), Recoverer()
-    except (FrameError, CheckpointError) as error:
-        return failed(str(error))
     for file, frame in recorded:
         if isinstance(frame, FrameError):
             complain(str(frame))

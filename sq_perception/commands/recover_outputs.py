@@ -12,6 +12,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from sq_perception.commands import console
 from sq_perception.commands.console import STANDARD_OUTPUT
 from sq_perception.files import output_file
 
@@ -48,15 +49,9 @@ _DECISIVE = (
 
 def replaced_input(options: argparse.Namespace, inputs: Sequence[Path]) -> str:
     """Which output would take the place of an input; empty if none."""
-    for name in _FILES:
-        path = Path(getattr(options, name) or STANDARD_OUTPUT)
-        if path.exists() and any(given.exists() and path.samefile(given) for given in inputs):
-            return f"--{name}: {path}: this is an input"
-    for name, suffix in (("pictures", ".png"), ("meshes", f".{options.mesh_format}")):
-        folder = getattr(options, name)
-        if folder and any(given.suffix.lower() == suffix and given.parent.samefile(folder) for given in inputs):
-            return f"--{name}: {folder}: the {suffix} files in this folder are inputs; choose another one"
-    return ""
+    files = {name: getattr(options, name) for name in _FILES}
+    folders = {"pictures": (options.pictures, ".png"), "meshes": (options.meshes, f".{options.mesh_format}")}
+    return console.replaced_input(inputs, files, folders)
 
 
 def _decisive(options: argparse.Namespace) -> dict[str, Any]:

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sq_perception.commands.console import SUCCESS, complain, failed, misused, parser, target
+from sq_perception.commands.console import SUCCESS, complain, failed, misused, parser, replaced_input, target
 from sq_perception.files import output_file
 
 if TYPE_CHECKING:
@@ -68,6 +68,10 @@ def _render(options: argparse.Namespace) -> int:
     if suffix not in ((".png", ".npz") if pinhole else (".png", ".bmp", ".npz")):
         kinds = ".png or .npz" if pinhole else ".png, .bmp or .npz"
         return misused(f"--output: {output.name}: an image of this projection is a {kinds}")
+    given = [Path(options.camera_info)] if options.camera_info else []
+    beside = output.with_suffix(".yaml") if pinhole and suffix == ".png" else None
+    if problem := replaced_input(given, {"output": beside}):
+        return misused(problem)
     if options.bits == 16 and (pinhole or suffix != ".png"):
         return misused("--bits: only orthographic PNGs have a choice")
 

@@ -71,6 +71,17 @@ def test_rendered_cube_images_come_back(tmp_path, suffix):
     assert entry["track"] is None
 
 
+def test_the_camera_that_is_given_is_not_replaced(tmp_path, capsys):
+    """A rendered PNG has its camera beside it, by the same name."""
+    path = tmp_path / "can.png"
+    assert main.main(["render", *CAN, "--projection", "pinhole", "-o", str(path)]) == 0
+    before = (tmp_path / "can.yaml").read_text()
+    given = ["--camera-info", str(tmp_path / "can.yaml")]
+    assert main.main(["render", *CAN, "--projection", "pinhole", *given, "-o", str(path)]) == 2
+    assert "this is an input" in capsys.readouterr().err
+    assert (tmp_path / "can.yaml").read_text() == before
+
+
 def test_pinhole_round_trips(tmp_path):
     for name in ("can.png", "can.npz"):
         path, out = tmp_path / name, tmp_path / "out.json"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+import cv2
 import numpy as np
 import pytest
 import trimesh
@@ -49,6 +50,24 @@ def test_a_can_is_grasped_across_and_everything_is_written(frame, tmp_path, caps
     names = set(trimesh.load_scene(tmp_path / "can.glb").geometry)
     assert names == {"body_0", "grasp_0_left", "grasp_0_right", "grasp_0_hand"}
     assert "mm open" in capsys.readouterr().out
+
+
+def test_no_input_is_replaced(frame, tmp_path, capsys):
+    """A depth image in the folder of the pictures, or named for the JSON."""
+    depth = np.load(frame)["depth"]
+    image = tmp_path / "depth.png"
+    cv2.imwrite(str(image), np.nan_to_num(1000 * depth).astype(np.uint16))
+    before = image.read_bytes()
+    camera = ["--camera-info", "200,200,79.5,59.5"]
+    for option, value in (("--pictures", tmp_path), ("--json", image)):
+        assert main.main(["grasp", str(image), *camera, option, str(value)]) == 2
+        assert f"{option}: " in capsys.readouterr().err
+        assert image.read_bytes() == before
+
+
+def test_a_full_disk_is_a_sentence(frame, capsys):
+    assert main.main(["grasp", str(frame), "--json", "/dev/full"]) == 1
+    assert "No space left" in capsys.readouterr().err
 
 
 def test_frames_of_one_name_have_a_picture_each_and_their_warnings_are_told(frame, tmp_path, capsys):
