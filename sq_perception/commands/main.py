@@ -46,9 +46,6 @@ examples:
   sq-perception evaluate --help
 """
 
-_VIEW_RECORDING = "view_recording:main"
-"""Of ``view FRAME ...``, which needs no ROS."""
-
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
@@ -89,8 +86,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _run(name: str, arguments: list[str]) -> int:
-    is_recording = name == "view" and arguments and not arguments[0].startswith("-")
-    module, _, function = (_VIEW_RECORDING if is_recording else COMMANDS[name][0]).partition(":")
+    module, _, function = COMMANDS[name][0].partition(":")
     code: int = getattr(importlib.import_module(f"sq_perception.commands.{module}"), function)(arguments)
     return code
 

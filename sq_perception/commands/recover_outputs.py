@@ -8,7 +8,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -91,7 +91,13 @@ class Outputs:
             from sq_perception.recordings.still_page import StillPage
 
             self._page = StillPage(options.html)
-        self._stems = {Path(entry["file"]).stem for entry in self.done if not entry.get("topic")}
+        self._stems: set[str] = set()
+        given = [output_file.free_name(_stem(entry), self._stems) for entry in self.done]
+        if options.pictures and (lost := sum(not (options.pictures / f"{stem}.png").is_file() for stem in given)):
+            console.complain(
+                f"warning: --jsonl: {options.jsonl} has {len(given)} frames already, which are not drawn again: "
+                f"{lost} of them without a picture in {options.pictures}"
+            )
 
     def add(
         self,
@@ -103,7 +109,7 @@ class Outputs:
         """Write a frame, what was recovered from it, and its element of ``frames``; raises OSError if that fails."""
         options = self._options
         self.results.append(entry)
-        stem = output_file.free_name(frame.name if frame.topic else Path(frame.name).stem, self._stems)
+        stem = output_file.free_name(_stem(entry), self._stems)
         if options.pictures:
             _draw(options.pictures / f"{stem}.png", frame, recovery)
         if options.meshes:
@@ -146,6 +152,15 @@ class Outputs:
                         yield from _elsewhere(name, path, output_file.write(path, text().encode(), whole))
                 except OSError as error:
                     yield f"--{name}: {error}"
+
+
+def _stem(entry: Mapping[str, Any]) -> str:
+    """What the picture and the meshes of a frame are called, unless another frame has that name, by its element."""
+    from sq_perception.recordings import bag_file
+    from sq_perception.recordings.frame_file import Stamp
+
+    path = Path(entry["file"])
+    return bag_file.frame_name(path, Stamp(**entry["stamp"])) if entry.get("topic") else path.stem
 
 
 def _lines(options: argparse.Namespace) -> ResultLines | None:

@@ -68,9 +68,9 @@ def _render(options: argparse.Namespace) -> int:
     if suffix not in ((".png", ".npz") if pinhole else (".png", ".bmp", ".npz")):
         kinds = ".png or .npz" if pinhole else ".png, .bmp or .npz"
         return misused(f"--output: {output.name}: an image of this projection is a {kinds}")
-    given = [Path(options.camera_info)] if options.camera_info else []
+    cameras = [Path(options.camera_info)] if options.camera_info else []
     beside = output.with_suffix(".yaml") if pinhole and suffix == ".png" else None
-    if problem := replaced_input(given, {"output": beside}):
+    if problem := replaced_input(cameras, {"output": beside}):
         return misused(problem)
     if options.bits == 16 and (pinhole or suffix != ".png"):
         return misused("--bits: only orthographic PNGs have a choice")
@@ -83,7 +83,10 @@ def _render(options: argparse.Namespace) -> int:
     from sq_perception.recordings.camera_file import read_calibration
 
     try:
-        body = Superquadric.from_flat(np.array([getattr(options, name) for name in PARAMETERS]))
+        given = np.array([getattr(options, name) for name in PARAMETERS])
+        if not np.isfinite(given).all():
+            return misused(f"expected finite parameters, got {' '.join(f'{value:g}' for value in given)}")
+        body = Superquadric.from_flat(given)
         if not pinhole:
             width = options.width or unit_cube.THESIS_PIXELS
             camera = unit_cube.camera(width, options.height)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from sq_perception.commands.console import SUCCESS, at_least, parser, target
+from sq_perception.commands.console import SUCCESS, at_least, misused, parser, target
 
 _HELP = "The best s and tau of the soft renderer: the grid search of the thesis' figure 7.6."
+_PICTURES = (".png", ".pdf", ".svg")
 _EPILOG = "example:\n  sq-perception render-search --picture render_search.png"
 
 
@@ -20,6 +21,8 @@ def main(arguments: Sequence[str]) -> int:
     add("--seed", type=int, default=2020, help="default %(default)s")
     add("--picture", type=target, metavar="FILE", help="draw the heat map there")
     options = command.parse_args(arguments)
+    if options.picture and options.picture.suffix.lower() not in _PICTURES:
+        return misused(f"--picture: {options.picture}: expected a name that ends in {', '.join(_PICTURES)}")
 
     import numpy as np
 

@@ -49,6 +49,10 @@ def main(given: Sequence[str]) -> int:
     """Entry point of ``sq-perception view``; the exit code."""
     cut = given.index(_ROS) if _ROS in given else len(given)
     parser = _parser()
+    if _names_frames(parser, given[:cut]):
+        from sq_perception.commands import view_recording
+
+        return view_recording.main(given)
     options = parser.parse_args(given[:cut])
     nodes = list(dict.fromkeys(f"/{name.strip('/')}" for name in options.node or [DEFAULT_NODE]))
     for name in nodes:
@@ -78,6 +82,14 @@ def main(given: Sequence[str]) -> int:
         )
     finally:
         bound.close()
+
+
+def _names_frames(parser: argparse.ArgumentParser, given: Sequence[str]) -> bool:
+    """Whether recorded frames are to be shown: something was given that is no option of the live page."""
+    others = given[:1]
+    if not others or others[0].startswith("-"):  # of `FRAME --help` the help is the recordings' own
+        _, others = parser.parse_known_args(given)
+    return any(not other.startswith("-") for other in others)
 
 
 def camera_info_beside(depth: str) -> str:

@@ -40,7 +40,8 @@ from sq_perception.recordings.bag_reader import CAMERA_INFO, COMPRESSED, IMAGE, 
 from sq_perception.recordings.frame_file import MILLIMETRES, FrameError, Reading, RecordedFrame, Stamp
 
 SUFFIXES = (".mcap", ".db3")
-_MASKS = "/mask/image"
+_MASKS, _RENDERED = "/mask/image", "/rendered_depth"
+"""Ends of the topics of labels, and of what was recovered: the latter is read where nothing else shows depth."""
 _PEEKED = 10
 """Messages of a topic after which it shows no depth: the first ones may be damaged."""
 
@@ -49,6 +50,11 @@ def is_bag(path: str | Path) -> bool:
     """Whether a path looks like a recording, from the outside."""
     path = Path(path)
     return (path / "metadata.yaml").is_file() if path.is_dir() else path.suffix.lower() in SUFFIXES
+
+
+def frame_name(path: Path, stamp: Stamp) -> str:
+    """What the frame of a bag with this stamp is called."""
+    return f"{path.resolve().name if path.is_dir() else path.stem}_{stamp}"
 
 
 def raw_topic(topic: str) -> str:
@@ -108,7 +114,6 @@ class RecordedBag:
         if every < 1 or (limit is not None and limit < 1):
             raise ValueError(f"every, limit: expected at least 1, got {every} and {limit}")
         self._path = Path(path)
-        self._name = self._path.resolve().name if self._path.is_dir() else self._path.stem
         self._camera_info = camera_info
         self._distortion: Treatment = distortion
         self._orthographic = projection == "orthographic"
@@ -193,6 +198,7 @@ class RecordedBag:
             return wanted
         known = depth_image.GREY_ENCODINGS if self._orthographic else depth_image.DEPTH_ENCODINGS
         found = [topic for topic in images if encodings[topic] in known and not topic.endswith(_MASKS)]
+        found = [topic for topic in found if not raw_topic(topic).endswith(_RENDERED)] or found
         packed = f"/{compressed_depth.TRANSPORT}"
         found = [topic for topic in found if not (topic.endswith(packed) and topic.removesuffix(packed) in found)]
         if not found and damage is not None:
@@ -252,7 +258,7 @@ class RecordedBag:
 
     def _decoded(self, message: Message, info: Message | None) -> RecordedFrame:
         depth, encoding = publication.depth_of(message.content, self._orthographic)
-        name, warning = f"{self._name}_{message.stamp}", ""
+        name, warning = frame_name(self._path, message.stamp), ""
         labels = self._labels(message.stamp, name, depth)
         if self._orthographic:
             camera = unit_cube.camera(depth.shape[1], depth.shape[0])

@@ -188,6 +188,8 @@ def test_a_missing_model_is_one_clear_line(tmp_path, view, capsys):
         ["render", *CUBE_BODY[:8], "0", "0", "0", "0", "--output", "x.png"],
         ["render", *CUBE_BODY, "--output", "x.png", "--width", "1"],
         ["render", *CUBE_BODY, "--output", "no/such/folder/x.png"],
+        ["render", "nan", *CUBE_BODY[1:], "--output", "x.png"],
+        ["render-search", "--picture", "x.txt"],
     ],
 )
 def test_wrong_usage_is_code_two_and_no_traceback(arguments, capsys, tmp_path, monkeypatch):

@@ -10,7 +10,7 @@ import pytest
 import trimesh
 import yaml
 
-from sq_perception.commands import main
+from sq_perception.commands import main, recover_outputs
 from sq_perception.commands.console import complain
 from sq_perception.commands.recover_lines import lines
 from sq_perception.fitting.fit import CUT_SHORT
@@ -414,3 +414,25 @@ def test_a_folder_is_resumed_where_it_ended(tmp_path, monkeypatch):
     assert run(folder, "--jsonl", lines, "--max-objects", "3") == 2
     assert run(folder, "--jsonl", lines, "--workspace", *"001112") == 2
     assert run(folder, "--jsonl", lines, "--mcap", tmp_path / "out.mcap") == 2
+
+
+def test_pictures_of_a_resumed_run_keep_their_names(tmp_path, monkeypatch, capsys):
+    """Three frames of one name; after the first there are two left, and they do not take its picture's place."""
+    monkeypatch.setattr(recover_outputs, "_draw", lambda path, *_: path.write_bytes(b""))
+    frames = [tmp_path / name / "f.npz" for name in "abc"]
+    for frame in frames:
+        frame.parent.mkdir()
+        save_npz(frame)
+    lines, pictures = tmp_path / "out.jsonl", tmp_path / "pictures"
+    with monkeypatch.context() as context:
+        interrupt_after(1, context)
+        assert run(*frames, "--jsonl", lines, "--pictures", pictures) == 130
+    assert [path.name for path in pictures.iterdir()] == ["f.png"]
+    first = (pictures / "f.png").stat().st_mtime_ns
+    assert run(*frames[:2], "--jsonl", lines, "--pictures", pictures) == 0
+    assert run(*frames, "--jsonl", lines, "--pictures", pictures) == 0
+    assert sorted(path.name for path in pictures.iterdir()) == ["f.png", "f_2.png", "f_3.png"]
+    assert (pictures / "f.png").stat().st_mtime_ns == first
+    assert "not drawn again" not in capsys.readouterr().err
+    assert run(*frames, "--jsonl", lines, "--pictures", tmp_path / "others") == 0
+    assert "has 3 frames already, which are not drawn again: 3 of them" in capsys.readouterr().err

@@ -261,6 +261,11 @@ def test_the_topic_is_found_by_encoding_and_several_must_be_chosen_from(tmp_path
     (frame,) = frames(tmp_path / "one", topic=TOPIC + "/compressedDepth")
     assert frame.topic == TOPIC + "/compressedDepth"
     two = write(tmp_path / "two", [*contents, (other, 1, image(metres(grey) + 1, 1, "32FC1"))])
+    rendered = ("/recover_node/rendered_depth", 1, image(metres(grey), 1, "32FC1"))  # of a bag of results
+    (frame,) = frames(write(tmp_path / "results", [*contents, rendered]))
+    assert frame.topic == TOPIC
+    (frame,) = frames(write(tmp_path / "rendered", [("/recover_node/camera_info", 1, info(1)), rendered]))
+    assert frame.topic == rendered[0], "nothing else shows depth"
     with pytest.raises(FrameError, match=f"several depth topics.*{other}, {TOPIC}"):
         RecordedBag(two)
     (frame,) = frames(two, topic=other.lstrip("/"))

@@ -92,3 +92,13 @@ def test_nothing_to_show_ends_at_once(tmp_path, capsys):
     pytest.importorskip("viser", reason="needs the extra 'view'")
     assert main.main(["view", str(tmp_path / "none.npz"), "--method", "symmetry"]) == 1
     assert "no such file" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "given", [["none.npz", "--port", "0"], ["--port", "0", "none.npz"], ["--projection", "orthographic", "none.npz"]]
+)
+def test_frames_may_come_after_the_options(given, monkeypatch):
+    seen = []
+    monkeypatch.setattr(view_recording, "main", lambda arguments: seen.append(arguments) or 0)
+    assert main.main(["view", *given]) == 0
+    assert seen == [given]
