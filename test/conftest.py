@@ -9,13 +9,14 @@ import shutil
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
+from types import CodeType
 from typing import Any
 
 import numpy as np
 import pytest
 
 REPOSITORY = Path(__file__).resolve().parent.parent
-_STARTING = {"subprocess", "browser", "running_nodes", "respawned_nodes", "hostile_messages"}
+_STARTING = {"subprocess", "browser", "running_nodes", "respawned_nodes", "hostile_messages", "sealed_network"}
 """Modules by which tests start processes."""
 
 
@@ -31,7 +32,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Mark the tests that start processes, themselves, by their fixtures, or by a helper."""
     for item in items:
         if isinstance(item, pytest.Function):
-            names = [*inspect.unwrap(item.function).__code__.co_names, *item.fixturenames]
+            names = [*_names(inspect.unwrap(item.function).__code__), *item.fixturenames]
             if _starts_processes(names, vars(item.module), set()):
                 item.add_marker(pytest.mark.process)
 
@@ -43,10 +44,17 @@ def _starts_processes(names: Iterable[str], module: dict[str, Any], seen: set[st
         value = inspect.unwrap(module[name]) if callable(module[name]) else module[name]
         if {getattr(value, "__name__", ""), getattr(value, "__module__", "")} & _STARTING:
             return True
-        code = getattr(value, "__code__", None)
-        if code is not None and _starts_processes(code.co_names, module, seen):
+        methods = vars(value).values() if inspect.isclass(value) else [value]
+        codes = [method.__code__ for method in methods if hasattr(method, "__code__")]
+        if any(_starts_processes(_names(code), module, seen) for code in codes):
             return True
     return False
+
+
+def _names(code: CodeType) -> list[str]:
+    """All names of a function that are not its own, with those of the functions in it."""
+    inner = [name for each in code.co_consts if isinstance(each, CodeType) for name in _names(each)]
+    return [*code.co_names, *inner]
 
 
 @pytest.fixture(scope="session")

@@ -27,6 +27,7 @@ _OPTIONS = (
     *("--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update"),
     *("--disable-sync", "--disable-extensions", "--disable-default-apps", "--disable-domain-reliability"),
     *("--no-proxy-server", "--host-resolver-rules=MAP * ~NOTFOUND , EXCLUDE localhost , EXCLUDE 127.0.0.1"),
+    "--disable-features=BackForwardCache",  # a page that was left would keep its connection for 40 s
     *("--remote-debugging-port=0", "--remote-allow-origins=*", "--force-device-scale-factor=1"),
 )
 _START = 20.0
