@@ -49,7 +49,8 @@ _OLDEST = 3600.0
 _DEFECTS = 10
 """Frames in a row that end in a defect of ours or of the device, after which the node starts anew."""
 TRIGGER_TIMEOUT = 5.0
-"""Seconds without a frame after which ~/trigger and ~/recover fail: five periods of the slowest camera in use."""
+"""Seconds without a frame after which ~/trigger and ~/recover fail, beyond what an image waits for its camera_info: five
+periods of the slowest camera in use."""
 _STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 """For timers: simulated time may stand still, and the node still has to report it."""
 
@@ -300,13 +301,14 @@ class FrameNode(ManagedNode):
         self._triggers[caller] = monotonic()
         # In a group of its own: rclpy's remember for good what was destroyed.
         alone = ReentrantCallbackGroup()
-        late = self.create_timer(TRIGGER_TIMEOUT, caller.cancel, callback_group=alone, clock=_STEADY)
+        waited = TRIGGER_TIMEOUT + self._settings.current.patience
+        late = self.create_timer(waited, caller.cancel, callback_group=alone, clock=_STEADY)
         outcome: Outcome | None = await caller
         self.destroy_timer(late)
         del self._triggers[caller]
-        if outcome is None and source.silence < TRIGGER_TIMEOUT:
-            return Outcome(False, f"of the images on {source.topic} none was recovered within {TRIGGER_TIMEOUT:g} s")
-        return outcome or Outcome(False, f"no frame on {source.topic} within {TRIGGER_TIMEOUT:g} s: {source.heard}")
+        if outcome is None and source.silence < waited:
+            return Outcome(False, f"of the images on {source.topic} none was recovered within {waited:g} s")
+        return outcome or Outcome(False, f"no frame on {source.topic} within {waited:g} s: {source.heard}")
 
     def _on_second(self) -> None:
         source, parameters = self._input, self._settings.current
