@@ -22,7 +22,7 @@ Metres, radians, seconds.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from copy import deepcopy
+from copy import copy
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -142,7 +142,7 @@ class TrackingSession:
         """
         rotation, position = state.as_pose(camera_pose) if is_pose_known else self._pose
         if not is_pose_known and self._without_pose is None:
-            self._without_pose = deepcopy(self._tracker)
+            self._without_pose = copy(self._tracker)
         tracker = self._posed() if is_pose_known else self._without_pose or self._tracker
         tracks = tracker.update(observed, stamp, (rotation, position), camera=camera, depth=depth)
         self.tally = Tally(

@@ -12,6 +12,7 @@ from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
 from sq_perception.tracking import agreement, forms, state, tracker
+from sq_perception.tracking import body as track_body
 
 CAMERA = Camera(160, 120, 140.0, 140.0, 79.5, 59.5)
 NOTHING = np.full((CAMERA.height, CAMERA.width), np.nan)
@@ -29,7 +30,7 @@ def nothing_but_the_covariances(patch, common, lasting):
     nought = np.zeros_like(tracker.LEAST)
     for module, name, value in (
         (tracker, "LEAST", nought),
-        (tracker, "DRIFT", nought),
+        (track_body, "DRIFT", nought),
         (tracker, "COMMON_SHARE", common),
         (tracker, "LASTING_SHARE", lasting),
         (agreement, "GATE", 1 - 1e-9),

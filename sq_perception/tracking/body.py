@@ -1,0 +1,120 @@
+"""What is kept of one track from frame to frame, how it is predicted, and what of it is published.
+
+Metres, radians, seconds; world frame; state and covariance as in :mod:`~sq_perception.tracking.state`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.tracking import state as states
+from sq_perception.tracking.fusion import Views
+from sq_perception.tracking.state import CENTRE, LENGTH, POSE, TURN
+from sq_perception.tracking.track import Track, TrackState
+
+DRIFT = states.diagonal(0.0, 0.0, 0.001, 0.01)
+"""Random walk of a body at rest in a second: a millimetre, and 0.6 degrees.  Chosen."""
+CONFIRM_AFTER = 3
+"""Observations until a track is confirmed: one more than may disagree by chance.  Chosen."""
+FORGET_POSE_AFTER = 5.0
+"""Seconds without observation until a body may be anywhere within reach.  Chosen."""
+_MOTION_SHARE = 0.5
+"""Standard deviation of a predicted motion, as a share of it: hands speed up and stop.  Chosen."""
+_MOVING_TURN = 0.3
+"""Radians in a second that a moving body may turn, standard deviation.  Chosen."""
+_COASTING = 1.0
+"""Seconds: so long an unseen body is taken to go on as it was seen to move.  Chosen."""
+_UNPLACED = 1.0
+"""Metres and radians: deviation of a pose that is forgotten, farther than things are carried."""
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """One track.
+
+    Attributes
+    ----------
+    id
+        Of the track.
+    state : (12,)
+    covariance : (11, 11)
+        P, without ``lasting``.
+    lasting : (11, 11)
+        M: of the error that all views have in common.
+    views : Views
+    last
+        Stamp of the last observation.
+    agreed
+        Stamp of the last one that the centre follows.
+    velocity : (3,)
+    seen, missed
+        Number of observations, and of frames in a row since that should have shown it.
+    disagreed, strayed : (11,)
+        Observations in a row that disagreed, and the error of the last one if it did.
+    jumps
+        Observations in a row that were found elsewhere.
+    observation
+        Index of this frame's observation, None if there is none.
+    follows
+        Whether the state is as the last observation has it.
+    """
+
+    id: int
+    state: np.ndarray
+    covariance: np.ndarray
+    lasting: np.ndarray
+    views: Views
+    last: float
+    agreed: float
+    velocity: np.ndarray = field(default_factory=lambda: np.zeros(3))
+    seen: int = 1
+    missed: int = 0
+    disagreed: int = 0
+    strayed: np.ndarray = field(default_factory=lambda: np.zeros(LENGTH))
+    jumps: int = 0
+    observation: int | None = None
+    follows: bool = False
+
+    @property
+    def is_moving(self) -> bool:
+        return bool(self.velocity.any())
+
+    def predicted(self, elapsed: float, stamp: float) -> Body:
+        """The body at a stamp, so many seconds after the frame before; not observed."""
+        variance, after = np.diag(DRIFT) * elapsed, self.state
+        velocity = np.zeros(3) if stamp - self.last > _COASTING else self.velocity
+        if velocity.any():
+            step = velocity * elapsed
+            after = after.copy()
+            after[5:8] += step
+            variance[CENTRE] += _MOTION_SHARE**2 * (step @ step)
+            variance[TURN] += _MOVING_TURN**2 * min(elapsed, 1.0)
+        if stamp - self.last > FORGET_POSE_AFTER:
+            variance[POSE] += _UNPLACED**2
+        covariance = self.covariance + np.diag(variance)
+        return replace(self, state=after, covariance=covariance, velocity=velocity, observation=None)
+
+    def published(self) -> Track:
+        """What a consumer gets."""
+        covariance = states.from_log(self.covariance + self.lasting @ self.lasting.T, self.state[0:3])
+        known = TrackState.CONFIRMED if self.seen >= CONFIRM_AFTER else TrackState.TENTATIVE
+        return Track(
+            id=self.id,
+            superquadric=Superquadric.from_flat(self.state.copy()),
+            sigma_size=np.sqrt(np.diag(covariance)[0:3]),
+            covariance=covariance,
+            velocity=self.velocity.copy(),
+            seen=self.seen,
+            state=known if self.observation is not None else TrackState.LOST,
+            observation=self.observation,
+            follows=self.follows and self.observation is not None,
+        )
+
+
+def stacked(some: Sequence[Body]) -> tuple[np.ndarray, np.ndarray]:
+    """States (n, 12) and covariances (n, 11, 11)."""
+    return np.array([body.state for body in some]), np.array([body.covariance for body in some])
