@@ -52,7 +52,7 @@ VIEWS = 16
 """Directions that are remembered for each body: two thirds of a circle at ``VIEW_ANGLE``.  Each costs time."""
 
 
-@dataclass
+@dataclass(frozen=True, eq=False)
 class Views:
     """The directions that bodies were seen from; batch dimensions first, then one entry per kept view.
 
@@ -74,10 +74,11 @@ class Views:
     used: np.ndarray
 
     @classmethod
-    def none(cls) -> Views:
-        """No view yet."""
-        square = np.zeros((VIEWS, LENGTH, LENGTH))
-        return cls(np.zeros((VIEWS, 3)), square, square.copy(), np.full(VIEWS, -1))
+    def first(cls, direction: np.ndarray, bias: np.ndarray) -> Views:
+        """One view, whose common error is that of the estimate."""
+        directions, biases, used = np.zeros((VIEWS, 3)), np.zeros((VIEWS, LENGTH, LENGTH)), np.full(VIEWS, -1)
+        directions[0], biases[0], used[0] = direction, bias, 0
+        return cls(directions, biases, biases, used)
 
     @classmethod
     def stack(cls, several: list[Views]) -> Views:
@@ -116,7 +117,7 @@ def fused(
     lasting : (n, 11, 11)
         M.
     views : Views
-        A batch (n,); changed in place and returned.
+        A batch (n,).
     white, common : (n, 11, 11)
         W, and B for a view from a new direction.
     shared : (n, 11, 11)
@@ -137,16 +138,19 @@ def fused(
     local = np.einsum("nji,nj->ni", quaternions.to_matrix(seen_as), direction)
 
     row = np.arange(count)
-    likeness = np.einsum("nmi,ni->nm", views.direction, local)
+    directions, biases, correlations, used = (
+        part.copy() for part in (views.direction, views.bias, views.correlation, views.used)
+    )
+    likeness = np.einsum("nmi,ni->nm", directions, local)
     place = np.argmax(likeness, axis=1)
     fresh = likeness[row, place] < np.cos(VIEW_ANGLE)
-    place = np.where(fresh, np.argmin(views.used, axis=1), place)
-    views.direction[row[fresh], place[fresh]] = local[fresh]
-    views.bias[row[fresh], place[fresh]] = common[fresh]
-    views.correlation[row[fresh], place[fresh]] = 0.0
-    views.used[row, place] = views.used.max(axis=1) + 1
+    place = np.where(fresh, np.argmin(used, axis=1), place)
+    directions[row[fresh], place[fresh]] = local[fresh]
+    biases[row[fresh], place[fresh]] = common[fresh]
+    correlations[row[fresh], place[fresh]] = 0.0
+    used[row, place] = used.max(axis=1) + 1
 
-    bias, correlation = views.bias[row, place], views.correlation[row, place]
+    bias, correlation = biases[row, place], correlations[row, place]
     noise = bias + white
     total = covariance - correlation - correlation.swapaxes(1, 2) + noise
     gain = np.linalg.solve(total, (covariance - correlation).swapaxes(1, 2)).swapaxes(1, 2)
@@ -155,16 +159,16 @@ def fused(
     kept = np.eye(LENGTH) - gain
     cross = kept @ correlation @ gain.swapaxes(1, 2)
     after = kept @ covariance @ kept.swapaxes(1, 2) + cross + cross.swapaxes(1, 2) + gain @ noise @ gain.swapaxes(1, 2)
-    views.correlation[:] = kept[:, None] @ views.correlation
-    views.correlation[row, place] += gain @ bias
+    correlations = kept[:, None] @ correlations
+    correlations[row, place] += gain @ bias
 
     correction = step[:, TURN]
     if turning.any():
         correction = np.where(determined & turning[:, None], 0.0, correction)
     back = quaternions.to_matrix(quaternions.from_rotation_vector(correction))
-    views.direction[:] = views.direction @ back
     after = 0.5 * (after + after.swapaxes(1, 2))
-    return state.moved(track, step), after, kept @ lasting + gain @ shared, views
+    seen = Views(directions @ back, biases, correlations, used)
+    return state.moved(track, step), after, kept @ lasting + gain @ shared, seen
 
 
 def root(covariance: np.ndarray) -> np.ndarray:

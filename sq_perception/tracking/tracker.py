@@ -316,12 +316,18 @@ def _velocity(body: Body, error: np.ndarray, slid: bool, stamp: float, covarianc
 def _born(
     number: int, index: int, observed: np.ndarray, covariance: np.ndarray, view: np.ndarray, stamp: float
 ) -> Body:
-    whole, views = (1 - LASTING_SHARE) * covariance + LEAST, Views.none()
-    lasting = fusion.root(LASTING_SHARE * covariance)
-    views.direction[0] = quaternions.to_matrix(observed[8:12]).T @ view
-    views.bias[0] = views.correlation[0] = COMMON_SHARE * covariance + LEAST
-    views.used[0] = 0
-    return Body(number, observed, whole, lasting, views, stamp, stamp, observation=index, follows=True)
+    direction = quaternions.to_matrix(observed[8:12]).T @ view
+    return Body(
+        number,
+        observed,
+        (1 - LASTING_SHARE) * covariance + LEAST,
+        fusion.root(LASTING_SHARE * covariance),
+        Views.first(direction, COMMON_SHARE * covariance + LEAST),
+        last=stamp,
+        agreed=stamp,
+        observation=index,
+        follows=True,
+    )
 
 
 def _survivors(bodies: _Bodies, missing: set[int], stamp: float) -> _Bodies:
