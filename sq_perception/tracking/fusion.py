@@ -38,6 +38,7 @@ Reference: S. F. Schmidt, Application of State-Space Methods to Navigation Probl
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -80,16 +81,6 @@ class Views:
         directions[0], biases[0], used[0] = direction, bias, 0
         return cls(directions, biases, biases, used)
 
-    @classmethod
-    def stack(cls, several: list[Views]) -> Views:
-        """A batch (n, ...)."""
-        return cls(
-            np.stack([views.direction for views in several]),
-            np.stack([views.bias for views in several]),
-            np.stack([views.correlation for views in several]),
-            np.stack([views.used for views in several]),
-        )
-
     def __getitem__(self, index: int) -> Views:
         return Views(self.direction[index], self.bias[index], self.correlation[index], self.used[index])
 
@@ -98,7 +89,7 @@ def fused(
     track: np.ndarray,
     covariance: np.ndarray,
     lasting: np.ndarray,
-    views: Views,
+    views: Sequence[Views],
     observed: np.ndarray,
     white: np.ndarray,
     common: np.ndarray,
@@ -116,8 +107,8 @@ def fused(
         P.
     lasting : (n, 11, 11)
         M.
-    views : Views
-        A batch (n,).
+    views
+        Of each track; those after the observation are returned as a batch (n,).
     white, common : (n, 11, 11)
         W, and B for a view from a new direction.
     shared : (n, 11, 11)
@@ -138,9 +129,8 @@ def fused(
     local = np.einsum("nji,nj->ni", quaternions.to_matrix(seen_as), direction)
 
     row = np.arange(count)
-    directions, biases, correlations, used = (
-        part.copy() for part in (views.direction, views.bias, views.correlation, views.used)
-    )
+    directions, biases = np.stack([each.direction for each in views]), np.stack([each.bias for each in views])
+    correlations, used = np.stack([each.correlation for each in views]), np.stack([each.used for each in views])
     likeness = np.einsum("nmi,ni->nm", directions, local)
     place = np.argmax(likeness, axis=1)
     fresh = likeness[row, place] < np.cos(VIEW_ANGLE)

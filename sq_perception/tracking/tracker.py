@@ -194,7 +194,8 @@ def _placed(bodies: _Bodies, here: Pairs, there: Pairs) -> _Bodies:
     """The bodies, which know whether they were found where they were."""
     after = list(bodies)
     for k in here.track:
-        after[k] = replace(after[k], jumps=0)
+        if after[k].jumps:
+            after[k] = replace(after[k], jumps=0)
     for k in there.track:
         # Its sizes and exponents were found elsewhere: nothing more has to be waited for.
         after[k] = replace(after[k], jumps=after[k].jumps + 1, disagreed=max(after[k].disagreed, PATIENCE))
@@ -270,7 +271,7 @@ def _fused(bodies: _Bodies, pairs: Pairs, to_camera: np.ndarray, stamp: float) -
         states,
         covariances,
         np.array([body.lasting for body in some]),
-        Views.stack([body.views for body in some]),
+        [body.views for body in some],
         pairs.state,
         white,
         common,
