@@ -57,7 +57,8 @@ class Columns:
                 raise ValueError(f"{column}: expected shape {shape}, got {values.shape}")
             if is_unsigned:
                 _check_unsigned(column, values)
-            values = values.astype(np.uint32 if is_unsigned else np.float32)
+            with np.errstate(over="ignore"):  # of a stranger's doubles: infinite
+                values = values.astype(np.uint32 if is_unsigned else np.float32)
             if column in self.FINITE and not np.isfinite(values).all():
                 raise ValueError(f"{column}: expected finite numbers, got {values.tolist()}")
             object.__setattr__(self, column, values)
@@ -145,10 +146,10 @@ def cloud_points(message: PointCloud2, described: Fields, needed: Sequence[str])
         raise MessageError(f"row_step: expected at least {width * message.point_step} bytes, got {row_step}")
     if len(message.data) != height * row_step:
         raise MessageError(f"data: expected height x row_step = {height * row_step} bytes, got {len(message.data)}")
+    if height * width == 0:  # whose step may be any number
+        return np.empty(0, np.dtype(list(zip(names, formats, strict=True))))
     offsets, step = [present[name].offset for name in names], int(message.point_step)
     layout = np.dtype({"names": names, "formats": formats, "offsets": offsets, "itemsize": step})
-    if height * width == 0:
-        return np.empty(0, layout)
     rows = np.ndarray((height, width), layout, buffer=memoryview(message.data), strides=(row_step, step))
     return rows.reshape(-1)
 

@@ -22,6 +22,7 @@ def points_from_message(message: PointCloud2) -> np.ndarray:
     """
     found = cloud_points(message, [(name, FLOAT32) for name in "xyz"], "xyz")
     points = np.empty((len(found), 3), np.float32)
-    for k, name in enumerate("xyz"):
-        points[:, k] = found[name]
+    with np.errstate(over="ignore"):  # doubles that no camera measures: infinite
+        for k, name in enumerate("xyz"):
+            points[:, k] = found[name]
     return points.reshape(int(message.height), int(message.width), 3)

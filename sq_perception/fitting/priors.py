@@ -23,7 +23,7 @@ import numpy as np
 
 from sq_perception.fitting.normal_equations import STEP_LENGTH, add_block, add_row
 from sq_perception.fitting.terms import Terms
-from sq_perception.geometry.kernels import inline_kernel, kernel, p_norm
+from sq_perception.geometry.kernels import conjugate, inline_kernel, kernel, p_norm
 
 Derivatives = tuple[float, float, float, float, float, float]
 """h and its derivatives by x, y, z, e1 and e2."""
@@ -55,8 +55,8 @@ def support_derivatives(
     nx: float, ny: float, nz: float, a1: float, a2: float, a3: float, e1: float, e2: float
 ) -> Derivatives:
     """Support function h at an object-frame direction and its derivatives: h, h_nx, h_ny, h_nz, h_e1, h_e2."""
-    inner, inner_x, inner_y, inner_e = p_norm(a1 * abs(nx), a2 * abs(ny), max(2.0 - e2, 1e-3))
-    h, h_inner, h_z, h_e = p_norm(inner, a3 * abs(nz), max(2.0 - e1, 1e-3))
+    inner, inner_x, inner_y, inner_e = p_norm(a1 * abs(nx), a2 * abs(ny), conjugate(e2))
+    h, h_inner, h_z, h_e = p_norm(inner, a3 * abs(nz), conjugate(e1))
     return (
         h,
         math.copysign(h_inner * inner_x * a1, nx),

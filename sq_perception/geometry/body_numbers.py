@@ -8,6 +8,9 @@ from typing import Any
 import numpy as np
 
 LENGTHS = {"size": 3, "shape": 2, "translation": 3, "rotation": 4}
+LEAST_CONJUGATE = 1e-3
+"""Of 2 - e, the exponent of the dual norm: 0 would be the maximum of an octahedron, from which this differs by at most
+0.04 % for each norm, and without a division by 0."""
 _LEAST_SQUARE = 1e-18
 """Of the length of a quaternion."""
 

@@ -21,6 +21,7 @@ from typing import Any, TypeAlias, TypeVar
 import numpy as np
 
 from sq_perception.geometry import kernel_cache
+from sq_perception.geometry.body_numbers import LEAST_CONJUGATE
 from sq_perception.geometry.elementary import exp2, exp2_to_half, log2, log2_from_1_to_2
 
 _F = TypeVar("_F", bound=Callable[..., Any])
@@ -155,11 +156,17 @@ def gauge_slope(
     return g, slope
 
 
+@inline_kernel
+def conjugate(e: float) -> float:
+    """The exponent of the dual norm."""
+    return max(2.0 - e, LEAST_CONJUGATE)
+
+
 @kernel
 def support(nx: float, ny: float, nz: float, a1: float, a2: float, a3: float, e1: float, e2: float) -> float:
     """max n.p over the body, for a direction of any length: the dual norm, see :meth:`Superquadric.support`."""
-    h, _, _, _ = p_norm(a1 * abs(nx), a2 * abs(ny), max(2.0 - e2, 1e-3))
-    h, _, _, _ = p_norm(h, a3 * abs(nz), max(2.0 - e1, 1e-3))
+    h, _, _, _ = p_norm(a1 * abs(nx), a2 * abs(ny), conjugate(e2))
+    h, _, _, _ = p_norm(h, a3 * abs(nz), conjugate(e1))
     return h
 
 

@@ -34,7 +34,7 @@ import numpy as np
 from array_api_compat import array_namespace, is_torch_array
 
 from sq_perception.geometry import rotation as quaternions
-from sq_perception.geometry.body_numbers import LENGTHS, checked_turn, floating, one_body
+from sq_perception.geometry.body_numbers import LEAST_CONJUGATE, LENGTHS, checked_turn, floating, one_body
 
 Array = Any
 """A NumPy array or a torch tensor."""
@@ -272,13 +272,13 @@ class Superquadric:
         """Support function: max of n.p over the body, minus n.t, for unit directions n (..., N, 3), shape (..., N).
 
         The dual of the gauge: the same nested norm of a * |R^T n| with each exponent p = 2/e replaced by its conjugate
-        2/(2 - e), that is e by 2 - e.  The body touches the plane n.p = n.t + support.
+        2/(2 - e), that is e by 2 - e, but for octahedra.  The body touches the plane n.p = n.t + support.
         """
         n = directions @ self.rotation_matrix
         xp = array_namespace(n)
         q = xp.abs(n) * self.size[..., None, :]
-        e1, e2 = 2 - self.shape[..., None, 0], 2 - self.shape[..., None, 1]
-        return nested_norm(q[..., 0], q[..., 1], q[..., 2], e1, e2)
+        conjugate = xp.clip(2 - self.shape, min=LEAST_CONJUGATE)[..., None, :]
+        return nested_norm(q[..., 0], q[..., 1], q[..., 2], conjugate[..., 0], conjugate[..., 1])
 
     def bounding_box(self) -> tuple[Array, Array]:
         """Lower and upper corner (..., 3) of the axis-aligned box in the parent frame."""

@@ -24,7 +24,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from sq_perception.geometry.kernels import gauge_derivatives, kernel, p_norm
+from sq_perception.geometry.kernels import conjugate, gauge_derivatives, kernel, p_norm
 from sq_perception.geometry.superquadric import Superquadric, nested_norm_and_slopes
 
 UNKNOWN = 0.1
@@ -153,8 +153,8 @@ def _reaches(
         for i in range(3):
             m[i] = n[0] * turns[owner[k], 0, i] + n[1] * turns[owner[k], 1, i] + n[2] * turns[owner[k], 2, i]
             q[i] = body[i] * abs(m[i])
-        h, h_x, h_y, _ = p_norm(q[0], q[1], max(2.0 - body[4], 1e-3))
-        reach[k], by_h, by_z, _ = p_norm(h, q[2], max(2.0 - body[3], 1e-3))
+        h, h_x, h_y, _ = p_norm(q[0], q[1], conjugate(body[4]))
+        reach[k], by_h, by_z, _ = p_norm(h, q[2], conjugate(body[3]))
         gradient[0], gradient[1], gradient[2] = by_h * h_x, by_h * h_y, by_z
         for i in range(3):
             farthest[i] = gradient[i] * body[i] * np.sign(m[i])

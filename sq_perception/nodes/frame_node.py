@@ -49,8 +49,8 @@ _OLDEST = 3600.0
 _DEFECTS = 10
 """Frames in a row that end in a defect of ours or of the device, after which the node starts anew."""
 TRIGGER_TIMEOUT = 5.0
-"""Seconds without a frame after which ~/trigger and ~/recover fail, beyond what an image waits for its camera_info: five
-periods of the slowest camera in use."""
+"""Seconds without a frame after which ~/trigger and ~/recover fail, beyond those that an image waits for its
+camera_info: five periods of the slowest camera in use."""
 _STEADY = Clock(clock_type=ClockType.STEADY_TIME)
 """For timers: simulated time may stand still, and the node still has to report it."""
 

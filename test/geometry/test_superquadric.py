@@ -131,6 +131,18 @@ class TestClosedForms:
         assert (farthest <= support + 1e-12).all()
         np.testing.assert_allclose(farthest, support, rtol=0.01)
 
+    def test_octahedra_have_the_support_of_their_corners(self) -> None:
+        """The dual norm of e = 2 is a maximum; in NumPy, in torch and in kernels."""
+        octahedron = local([0.2, 0.3, 0.5], [2.0, 2.0])
+        directions = np.array([[1.0, 0, 0], [3, 2, 0], [15, 10, 6], [1, 2, 3]])
+        corners = (np.abs(directions) * octahedron.size).max(axis=1)
+        found = octahedron.support(directions)
+        np.testing.assert_allclose(found, corners, rtol=1e-3)
+        tensors = Superquadric.from_flat(torch.from_numpy(octahedron.to_flat().copy()))
+        np.testing.assert_allclose(tensors.support(torch.from_numpy(directions)).numpy(), found, rtol=1e-12)
+        in_kernels = [kernels.support(*direction, 0.2, 0.3, 0.5, 2.0, 2.0) for direction in directions]
+        np.testing.assert_allclose(in_kernels, found, rtol=1e-6)
+
     def test_bounding_box_holds_the_samples(self) -> None:
         bodies = random_bodies(10, 15)
         points = bodies.sample_surface(2000, np.random.default_rng(16))

@@ -58,3 +58,8 @@ def test_what_is_no_cloud_of_points_is_named():
     empty = message()
     vars(empty).update(height=0, data=b"")
     assert points_from_message(empty).shape == (0, 4, 3)
+    vars(empty).update(width=0, point_step=2**32 - 1, row_step=0)
+    assert points_from_message(empty).shape == (0, 0, 3), "the step of no point may be any number"
+    far = message("f8")
+    far.data = np.full(len(far.data) // 8, 1e300).tobytes()
+    assert np.isinf(points_from_message(far)).all()
