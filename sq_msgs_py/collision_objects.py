@@ -100,13 +100,16 @@ def _has_changed(known: SuperquadricArray | None, shown: SuperquadricArray, k: i
     """Whether a point of a body may have moved by more than a step since planners were sent it."""
     if known is None:
         return True
-    largest = float(known.size.max())
+    largest, reach = float(known.size.max()), float(np.linalg.norm(known.size[0]))
     turn = 2 * np.arccos(
         min(1.0, abs(float(np.vdot(unit_quaternions(known.rotation[0]), unit_quaternions(shown.rotation[k])))))
     )
-    moves = np.linalg.norm(known.translation[0] - shown.translation[k]), np.abs(known.size[0] - shown.size[k]).max()
+    moves = (
+        np.linalg.norm(part[0] - new[k])
+        for part, new in ((known.translation, shown.translation), (known.size, shown.size))
+    )
     rounds = largest * np.abs(known.shape[0] - shown.shape[k]).max()
-    return bool(sum(moves) + rounds + largest * turn > _STEP)
+    return bool(sum(moves) + rounds + reach * turn > _STEP)
 
 
 def collision_objects(

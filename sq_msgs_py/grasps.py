@@ -157,7 +157,7 @@ def moveit_grasps(
             grasp(
                 id=f"{k}",
                 pre_grasp_posture=posture(float(grasps.opening[k])),
-                grasp_posture=posture(float(grasps.width[k])),
+                grasp_posture=posture(float(min(grasps.width[k], grasps.opening[k]))),  # it may be wider than both say
                 grasp_pose=pose_stamped(header=header, pose=pose),
                 grasp_quality=float(grasps.score[k]),
                 pre_grasp_approach=straight(own, approach.tolist()),

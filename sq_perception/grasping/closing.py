@@ -67,7 +67,7 @@ class KnownBodies:
 
     @classmethod
     def of(cls, bodies: Superquadric, covariance: np.ndarray | None) -> KnownBodies:
-        """A NumPy batch (n,) and covariances (n, 11, 11); what is not finite is replaced by a wide guess.
+        """A NumPy batch (n,) and covariances (n, 11, 11); of numbers whose variance is unknown a wide guess is taken.
 
         Raises
         ------
@@ -86,7 +86,10 @@ class KnownBodies:
         if given.shape != (len(flat), 11, 11):
             raise ValueError(f"covariance: expected shape ({len(flat)}, 11, 11), got {given.shape}")
         given = given[:, _KEPT][:, :, _KEPT]
-        sound = np.isfinite(given).all(axis=(1, 2)) & (np.diagonal(given, axis1=1, axis2=2) >= 0).all(axis=1)
+        variance = np.diagonal(given, axis1=1, axis2=2)
+        known = np.isfinite(variance) & (variance >= 0)
+        given = np.where(known[:, :, None] & known[:, None, :], given, guess)
+        sound = np.isfinite(given).all(axis=(1, 2))
         return cls(flat, turns, np.where(sound[:, None, None], given, guess))
 
     def __len__(self) -> int:

@@ -96,7 +96,7 @@ def grasps(
     bodies : Superquadric
         A NumPy batch (n,), all in one frame.
     covariance : (n, 11, 11), optional
-        As in :class:`sq_perception.fitting.fit.Fit`; a body whose covariance is not finite is taken for one of 10 %.
+        As in :class:`sq_perception.fitting.fit.Fit`; what is not finite in it is taken for known to 10 %.
     around
         Table, measured points and what was seen; nothing but the bodies if not given.
     friction

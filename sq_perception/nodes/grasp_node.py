@@ -154,6 +154,8 @@ class GraspNode(ManagedNode):
             self.get_logger().warning(reason, throttle_duration_sec=THROTTLE)
             return None, reason
         reasons = [f"{number}: {why}" for number, why in zip(bodies.id, plan.reasons, strict=True) if why]
+        if len(bodies) and not (reasons or len(found)):
+            reasons = ["only_id and region leave none"]
         return found, "; ".join([f"{len(found)} grasps of {len(bodies)} bodies", *reasons])
 
     def _published(self, header: Any, bodies: SuperquadricArray, plan: GraspPlan, hand: Gripper) -> messages.GraspArray:

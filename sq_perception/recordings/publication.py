@@ -264,12 +264,13 @@ def covariances(array: SuperquadricArray) -> np.ndarray:
     """(n, 11, 11) of the bodies of a message, from the deviations of sizes, centre and turn; NaN where unknown."""
     found = np.zeros((len(array), 11, 11))
     size, centre, turn = (
-        np.asarray(sigma, dtype=float) ** 2 for sigma in (array.sigma_size, array.sigma_centre, array.sigma_turn)
+        np.where(np.isfinite(sigma), np.asarray(sigma, dtype=float) ** 2, np.nan)
+        for sigma in (array.sigma_size, array.sigma_centre, array.sigma_turn)
     )
     axes = superquadrics(array).rotation_matrix
-    found[:, :3, :3] = size[:, :, None] * np.eye(3)
+    found[:, range(3), range(3)] = size
     found[:, _CENTRE, _CENTRE] = (axes * centre[:, None]) @ axes.transpose(0, 2, 1)
-    found[:, _TURN, _TURN] = turn[:, :, None] * np.eye(3)
+    found[:, range(8, 11), range(8, 11)] = turn
     return found
 
 

@@ -205,6 +205,22 @@ def test_a_body_of_unknown_depth_is_taken_by_its_known_sides():
     assert all(abs(closing_line(grasp)[1]) > 0.9 for grasp in found)
 
 
+def test_what_is_known_of_a_body_counts_though_not_all_is():
+    """A cloud of an older version has no deviations of the turn: those of the sizes are believed all the same."""
+    body, vague = standing(*BOX), sure(1, sigma=0.03)
+    for unknown in ([8, 9, 10], [2], range(5, 8)):
+        part = vague.copy()
+        part[:, unknown] = part[:, :, unknown] = np.nan
+        assert (
+            plan(body, covariance=part).grasps[0].score
+            < plan(body, covariance=np.full_like(vague, np.nan)).grasps[0].score
+        )
+    np.testing.assert_array_equal(
+        KnownBodies.of(Superquadric.stack([body]), np.full((1, 11, 11), np.nan)).covariance,
+        KnownBodies.of(Superquadric.stack([body]), None).covariance,
+    )
+
+
 def test_the_score_falls_with_the_friction():
     scores = [plan(standing(*CAN), friction=mu).grasps[0].score for mu in (0.2, 0.4, 0.8)]
     assert scores == sorted(scores)

@@ -131,7 +131,7 @@ def test_a_region_may_be_asked_for_and_the_answer_has_its_grasps(bench):
     bench.node.set_parameters([Parameter("only_id", value=BOX)])
     answer = bench.call(Trigger, "/grasp_node/plan", Trigger.Request())
     assert not answer.success
-    assert answer.message == "0 grasps of 3 bodies"
+    assert answer.message == "0 grasps of 3 bodies; only_id and region leave none"
 
 
 def test_a_cloud_of_something_else_is_refused_and_the_next_one_answered(bench):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -58,4 +59,7 @@ def test_fingers_open_by_half_each_and_close_on_the_width():
     assert first.pre_grasp_posture.joint_names == ["panda_finger_joint1", "panda_finger_joint2"]
     assert first.pre_grasp_posture.points[0].positions == pytest.approx([0.04, 0.04])
     assert first.grasp_posture.points[0].positions == pytest.approx([0.035, 0.035])
+    wide = replace(grasps(), width=[0.12, 0.05, 0.04])  # a side that is so unsure that it may be narrower
+    first = moveit_grasps(wide, *given[1:], hand.joints, types=by_hand)[0]
+    assert first.grasp_posture.points[0].positions == first.pre_grasp_posture.points[0].positions
     assert not hasattr(moveit_grasps(*given, types=by_hand)[0].grasp_posture, "points")

@@ -229,6 +229,10 @@ def test_a_scene_tells_what_changes():
     assert said(array, HEADER) == []
     moved = replace(array, translation=array.translation + [[0.001, 0, 0], [0, 0, 0], [0.01, 0, 0]])
     assert said(moved, HEADER) == [("6", False)], "a millimetre is no change"
+    larger = replace(array, size=array.size + [[0.0015] * 3, [0] * 3, [0] * 3])
+    assert ("4", False) in said(larger, HEADER), "its corners have moved by 2.6 mm"
+    assert said(array, HEADER)
+    assert said(moved, HEADER) == [("6", False)]
     only = moved.where(moved.id == 4)
     assert said(only, HEADER, hidden=[6]) == [], "what is hidden is still there"
     assert said(only, HEADER) == [("6", True)]
