@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 import picking
+import picking_contestants
 import picking_scenes
 import report
 from picking_scenes import EYE, GRIPPER, KINDS, LOOK, TABLE_CAMERA
@@ -69,7 +70,7 @@ def scenes(path: Path, seed: int, recoverer: Recoverer) -> None:
 
 def failures(path: Path, lines: list[dict[str, Any]]) -> dict[str, str]:
     """A panel for each cause that occurs; says which scene each is of."""
-    order = [name for name in picking.CONTESTANTS if name not in picking.PEERS]
+    order = [name for name in picking_contestants.CONTESTANTS if name not in picking_contestants.PEERS]
     lines = sorted((line for line in lines if line["contestant"] in order), key=lambda x: order.index(x["contestant"]))
     first: dict[str, tuple[dict[str, Any], int]] = {}
     for line in lines:
@@ -79,11 +80,11 @@ def failures(path: Path, lines: list[dict[str, Any]]) -> dict[str, str]:
     figure = plots.new_figure(5.2 * len(panels), 4.6)
     for column, (cause, line, number) in enumerate(panels):
         scene, name = picking_scenes.scene(line["kind"], line["seed"]), line["contestant"]
-        recoverer = picking.recoverer_of(name)
+        recoverer = picking_contestants.recoverer_of(name)
         one = next(islice(picking.rounds(scene, name, recoverer), number, None))
         bodies = [found.superquadric for found in one.seen.recovery.recovered]
         ax = figure.add_axes((column / len(panels) + 0.002, 0.0, 1 / len(panels) - 0.004, 1.0))
-        planned = [bodies[one.grasp.body]] if name in picking.ON_RECOVERED else []
+        planned = [bodies[one.grasp.body]] if name in picking_contestants.ON_RECOVERED else []
         _draw(ax, one.seen.depth, planned, GraspPlan((replace(one.grasp, body=0),)), f"{CAUSES[cause]}\n{name}")
     plots.save(figure, path, dots_per_inch=80)
     return {cause: f"{line['contestant']}: {line['kind']} {line['seed']}" for cause, line, _ in panels}

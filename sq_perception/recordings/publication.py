@@ -263,10 +263,8 @@ def drawn(array: SuperquadricArray, bodies: Superquadric) -> Bodies:
 def covariances(array: SuperquadricArray) -> np.ndarray:
     """(n, 11, 11) of the bodies of a message, from the deviations of sizes, centre and turn; NaN where unknown."""
     found = np.zeros((len(array), 11, 11))
-    size, centre, turn = (
-        np.where(np.isfinite(sigma), np.asarray(sigma, dtype=float) ** 2, np.nan)
-        for sigma in (array.sigma_size, array.sigma_centre, array.sigma_turn)
-    )
+    deviations = [np.asarray(each, float) for each in (array.sigma_size, array.sigma_centre, array.sigma_turn)]
+    size, centre, turn = (np.where(np.isfinite(each), each**2, np.nan) for each in deviations)
     axes = superquadrics(array).rotation_matrix
     found[:, range(3), range(3)] = size
     found[:, _CENTRE, _CENTRE] = (axes * centre[:, None]) @ axes.transpose(0, 2, 1)
