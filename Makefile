@@ -63,15 +63,17 @@ demo: $(VENV)/.package
 	$(VENV)/bin/sq-perception demo --seconds $(SECONDS_SHOWN) $(if $(FRAME),--frame "$(FRAME)") \
 		$(if $(CAMERA_INFO),--camera-info "$(CAMERA_INFO)")
 
-lint: $(VENV)/.package
+# Of the sources, so that it need not wait for the package.
+lint: $(VENV)/.dependencies
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/mypy
 
 quick: $(VENV)/.package
 	$(VENV)/bin/pytest $(addprefix test/,$(CORE)) -m "not process"
 
-# Two at once: tests that start processes, and come after the short lint, mostly wait for them.
-test: $(VENV)/.package
+# Two at once: the lint beside the installation, then tests that start processes, and mostly wait for them, beside those
+# that compute.
+test:
 	$(MAKE) --no-print-directory --jobs 2 --output-sync=target lint test-computing test-processes
 
 # The executable, not `python -m pytest`: that would put the source tree before the installed package.

@@ -41,12 +41,12 @@ POINTS, CONTACTS = 20000, 2048
 
 def farthest_points(x: torch.Tensor, batch: torch.Tensor | None = None, ratio: float = 0.5, **_: Any) -> torch.Tensor:
     """Indices of points (n, 3), each the farthest from those before it."""
-    count = int(np.ceil(float(ratio) * len(x)))
-    chosen = [0]
-    distance = ((x - x[0]) ** 2).sum(1)
-    for _step in range(count - 1):
+    coordinates = np.ascontiguousarray(x.detach().numpy().T)
+    chosen, distance = [0], np.full(len(x), np.inf, np.float32)
+    for _step in range(int(np.ceil(float(ratio) * len(x))) - 1):
+        away = coordinates - coordinates[:, chosen[-1], None]
+        np.minimum(distance, (away * away).sum(axis=0), out=distance)
         chosen.append(int(distance.argmax()))
-        distance = torch.minimum(distance, ((x - x[chosen[-1]]) ** 2).sum(1))
     return torch.tensor(chosen)
 
 

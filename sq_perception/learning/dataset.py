@@ -23,6 +23,9 @@ CAMERA_DISTANCE = (1.5, 12.0)
 """Nearest and farthest pinhole camera, in lengths of the body."""
 _PROPORTION = 6.0
 
+POOL = 4096
+"""Views of a pool: a gigabyte of those of the thesis' size."""
+
 
 @dataclass(frozen=True)
 class ViewSource:
@@ -106,7 +109,7 @@ class ViewPool:
     """
 
     def __init__(
-        self, rng: np.random.Generator, source: ViewSource | None = None, capacity: int = 4096, reuse: int = 4
+        self, rng: np.random.Generator, source: ViewSource | None = None, capacity: int = POOL, reuse: int = 4
     ) -> None:
         self._rng, self._reuse = rng, reuse
         self._source = source or ViewSource()

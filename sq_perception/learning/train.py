@@ -29,7 +29,7 @@ from sq_perception.geometry.metrics import volume_iou
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.learning import checkpoint, training_log
 from sq_perception.learning.backbone import ResNet18
-from sq_perception.learning.dataset import ViewPool, ViewSource, draw_views
+from sq_perception.learning.dataset import POOL, ViewPool, ViewSource, draw_views
 from sq_perception.learning.disturbance import Disturbance, any_occluder
 from sq_perception.learning.fixed_set import FixedSet, ShuffledBatches
 from sq_perception.learning.inference import checked_device
@@ -209,7 +209,9 @@ def _optimizer(config: TrainingConfig, model: Regressor) -> torch.optim.Optimize
 
 def _batches(config: TrainingConfig, network: RegressorConfig, rng: np.random.Generator) -> Batches:
     if not config.data:
-        return ViewPool(rng, config.views(network), reuse=config.reuse)
+        # A short run holds no more views than it takes.
+        taken = max(config.steps * config.batch, CALIBRATION_VIEWS if config.average > 0 else 0)
+        return ViewPool(rng, config.views(network), min(POOL, taken), config.reuse)
     fixed = FixedSet(Path(config.data), "train")
     theirs = fixed.settings
     if (theirs.pixels, theirs.framing) != (network.pixels, network.framing):

@@ -212,10 +212,10 @@ class TestTraining:
         objective = Objective("least_squares_free")
         before = validate(model, views, truth).mean()
         optimizer = torch.optim.AdamW(model.parameters(), 3e-3)
-        for step in range(200):
+        for step in range(100):
             model.train()
             optimizer.zero_grad()
-            objective.loss(model(batch), batch, None, step / 200, generator).mean().backward()
+            objective.loss(model(batch), batch, None, step / 100, generator).mean().backward()
             optimizer.step()
         recalibrate(model, batch, 8)
         assert validate(model, views, truth).mean() > max(before + 0.2, 0.7)
