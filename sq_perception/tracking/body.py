@@ -61,6 +61,8 @@ class Body:
         Index of this frame's observation, None if there is none.
     follows
         Whether the state is as the last observation has it.
+    answer : (12,) or None
+        What the last observation was, if it is an old one and shows no more than that the body is still there.
     """
 
     id: int
@@ -78,6 +80,7 @@ class Body:
     jumps: int = 0
     observation: int | None = None
     follows: bool = False
+    answer: np.ndarray | None = None
 
     @property
     def is_moving(self) -> bool:
@@ -96,7 +99,13 @@ class Body:
         if stamp - self.last > FORGET_POSE_AFTER:
             variance[POSE] += _UNPLACED**2
         covariance = self.covariance + np.diag(variance)
-        return replace(self, state=after, covariance=covariance, velocity=velocity, observation=None)
+        answer = self.answer if self.observation is not None else None
+        return replace(self, state=after, covariance=covariance, velocity=velocity, observation=None, answer=answer)
+
+    def still_there(self, index: int, answer: np.ndarray, stamp: float) -> Body:
+        """The body after an old observation, one of this index in its frame."""
+        agreed = stamp if self.follows else self.agreed
+        return replace(self, seen=self.seen + 1, missed=0, last=stamp, agreed=agreed, observation=index, answer=answer)
 
     def published(self) -> Track:
         """What a consumer gets."""

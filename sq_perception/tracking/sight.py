@@ -52,7 +52,7 @@ def open_share(bodies: Superquadric, camera: Camera, depth: np.ndarray) -> np.nd
     pixels = camera.project(points)
     inside = near & (pixels >= 0).all(axis=-1) & (pixels <= [camera.width - 1, camera.height - 1]).all(axis=-1)
     column, row = np.where(inside[..., None], np.rint(np.nan_to_num(pixels)), 0).astype(int).transpose(2, 0, 1)
-    measured = np.asarray(depth, dtype=float)[row, column]
+    measured = np.asarray(depth)[row, column].astype(float)
     valid = np.isfinite(measured) & ((measured > 0) | (not camera.is_pinhole))
     tolerance = _TOLERANCE * bodies.size.min(axis=-1)[:, None]
     clear = inside & valid & (np.where(valid, measured, 0) > points[..., 2] + tolerance)

@@ -60,6 +60,8 @@ MOST = 100
 _RESTART = 3.0
 """A restarted pose is unsure by this many times the displacement.  Chosen."""
 _Bodies = tuple[Body, ...]
+_Expected = Callable[[np.ndarray], np.ndarray]
+"""Of states (n, 12), whether they should be seen (n,)."""
 
 
 class Tracker:
@@ -129,11 +131,16 @@ class Tracker:
             self.reset()
         elapsed = 0.0 if self._stamp is None else stamp - self._stamp
         bodies = tuple(body.predicted(elapsed, stamp) for body in self._bodies)
-        here, there, missing = _pairs(bodies, observed, covariance, stamp, expected)
-        bodies, pairs = _placed(bodies, here, there), here + there
-        bodies, fresh = _still_there(bodies, pairs, [body.repeats > 0 for body in recoveries], stamp)
-        bodies = _fused(bodies, fresh, to_camera[fresh.observed], stamp)
-        new = np.setdiff1d(np.arange(len(observed)), pairs.observed).tolist()
+        repeats = [body.repeats > 0 for body in recoveries]
+        if all(repeats) and (tracks := _repeated(bodies, observed)) is not None:
+            bodies, missing = _unchanged(bodies, tracks, observed, stamp, expected)
+            new: list[int] = []
+        else:
+            here, there, missing = _pairs(bodies, observed, covariance, stamp, expected)
+            bodies, pairs = _placed(bodies, here, there), here + there
+            bodies, fresh = _still_there(bodies, pairs, observed, repeats, stamp)
+            bodies = _fused(bodies, fresh, to_camera[fresh.observed], stamp)
+            new = np.setdiff1d(np.arange(len(observed)), pairs.observed).tolist()
         bodies += tuple(
             _born(self.births + n, k, observed[k], covariance[k], to_camera[k], stamp) for n, k in enumerate(new, 1)
         )
@@ -165,12 +172,32 @@ def _in_world(
     return flat, state.turned(covariance, matrix)
 
 
+def _repeated(bodies: _Bodies, observed: np.ndarray) -> list[int] | None:
+    """The track of each observation, where all of them are to the bit what showed bodies to be there the frame before.
+
+    Nothing has to be compared then: a table at which nothing happens costs next to nothing.
+    """
+    by_answer = {body.answer.tobytes(): k for k, body in enumerate(bodies) if body.answer is not None}
+    tracks = [by_answer.get(each.tobytes(), -1) for each in observed]
+    return tracks if tracks and min(tracks) >= 0 and len(set(tracks)) == len(tracks) else None
+
+
+def _unchanged(
+    bodies: _Bodies, tracks: Sequence[int], observed: np.ndarray, stamp: float, expected: _Expected
+) -> tuple[_Bodies, set[int]]:
+    """The bodies after such a frame, and the ids of those that should have been in it."""
+    after, left = list(bodies), [k for k in range(len(bodies)) if k not in tracks]
+    for index, k in enumerate(tracks):
+        after[k] = after[k].still_there(index, observed[index], stamp)
+    return tuple(after), {bodies[k].id for k in left if expected(bodies[k].state[None])[0]}
+
+
 def _pairs(
     bodies: _Bodies,
     observed: np.ndarray,
     covariance: np.ndarray,
     stamp: float,
-    expected: Callable[[np.ndarray], np.ndarray],
+    expected: _Expected,
 ) -> tuple[Pairs, Pairs, set[int]]:
     """What was observed in place, and what was moved; and the ids of tracks that should have been in place."""
     if not bodies:
@@ -202,7 +229,9 @@ def _placed(bodies: _Bodies, here: Pairs, there: Pairs) -> _Bodies:
     return tuple(after)
 
 
-def _still_there(bodies: _Bodies, pairs: Pairs, repeats: Sequence[bool], stamp: float) -> tuple[_Bodies, Pairs]:
+def _still_there(
+    bodies: _Bodies, pairs: Pairs, observed: np.ndarray, repeats: Sequence[bool], stamp: float
+) -> tuple[_Bodies, Pairs]:
     """The bodies after old answers about them, and the pairs that are to be fused.
 
     Old answers are only where these do not say what was fused before, of a body that moves, or where the camera's pose
@@ -217,8 +246,7 @@ def _still_there(bodies: _Bodies, pairs: Pairs, repeats: Sequence[bool], stamp: 
         if not repeats[index] or body.is_moving or body.jumps > 0 or not agrees[k]:
             continue
         new[k] = False
-        agreed = stamp if body.follows else body.agreed
-        after[track] = replace(body, seen=body.seen + 1, missed=0, last=stamp, agreed=agreed, observation=int(index))
+        after[track] = body.still_there(int(index), observed[index], stamp)
     return tuple(after), Pairs(*(part[new] for part in pairs))
 
 
@@ -294,6 +322,7 @@ def _fused(bodies: _Bodies, pairs: Pairs, to_camera: np.ndarray, stamp: float) -
             last=stamp,
             observation=int(pairs.observed[k]),
             follows=not (strays.slid[k] or strays.turned[k] or insists),
+            answer=None,
         )
     return tuple(after)
 
