@@ -12,7 +12,7 @@ that their work empties the caches.
     classic   the same / that of the classic fits of its objects
     stages    shares of the frame, the network's under ``fit`` where it computes beside the fit
     compiled  share in kernels, in libraries (NumPy, OpenCV, torch), in the interpreter, as the profiler sees it: it
-              slows the interpreter alone
+              slows the interpreter alone, and counts operators on arrays as its work
     IoU       of volumes, mean over the true bodies at least half visible
 
 Printed beside the ratios in ``results/speed.json``, those last recorded: at a release, or where something was made
