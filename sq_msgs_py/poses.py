@@ -78,7 +78,7 @@ def plane_message(plane: np.ndarray, header: Any) -> PoseStamped:
     from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
 
     normal, offset = np.asarray(plane[:3], dtype=float), float(plane[3])
-    length = np.linalg.norm(normal)
+    length = float(np.linalg.norm(normal))
     normal, offset = normal / length, offset / length
     axis = np.eye(3)[0 if abs(normal[0]) < _ACROSS else 1]
     along = np.cross(np.cross(normal, axis), normal)

@@ -342,7 +342,7 @@ def _filled(image: np.ndarray) -> np.ndarray:
     empty = np.isnan(image).astype(np.uint8)
     _, nearest = cv2.distanceTransformWithLabels(empty, cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
     known = image[empty == 0]
-    by_label = np.zeros(nearest.max() + 1, dtype=np.float32)
+    by_label = np.zeros(int(nearest.max()) + 1, dtype=np.float32)
     by_label[nearest[empty == 0]] = known
     return by_label[nearest]
 

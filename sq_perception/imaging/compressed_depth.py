@@ -82,7 +82,7 @@ def decode(image_format: str, data: bytes | np.ndarray) -> np.ndarray:
         grey = _grey(message)
     _, a, b = _HEADER.unpack_from(message)
     if packed == "16UC1":
-        depth = grey / _MILLIMETRES
+        depth: np.ndarray = grey / _MILLIMETRES
     else:
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
             depth = np.float32(a) / (grey.astype(np.float32) - np.float32(b))

@@ -200,7 +200,7 @@ class _Lookup:
             inverse = cv2.copyTo(closed, (inverse == 0).view(np.uint8), inverse)
             # Of each pixel and its neighbours to the right, below, and across.
             least, most = (find(inverse, _SQUARE, anchor=(0, 0)) for find in (cv2.erode, cv2.dilate))
-            smooth = (least > np.float32(1 - self.step) * most).view(np.uint8)
+            smooth: np.ndarray = (least > np.float32(1 - self.step) * most).view(np.uint8)
             smooth[-1], smooth[:, -1] = 0, 0
             smooth = cv2.remap(smooth, self.left, self.top, cv2.INTER_NEAREST, borderValue=0)
             smooth = cv2.bitwise_and(smooth, (nearest < np.inf).view(np.uint8))

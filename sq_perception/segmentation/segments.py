@@ -338,7 +338,7 @@ def _fine(
     depth: np.ndarray,
     wanted: np.ndarray,
     stride: int,
-    step: float,
+    step: np.float32,
 ) -> np.ndarray:
     """The same; ``known`` are the depths of labelled samples in a frame of one sample, inf for others."""
     labels = np.zeros(depth.shape, np.int32)

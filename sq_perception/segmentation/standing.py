@@ -264,4 +264,4 @@ def _stands(
     measured = depth[rows, columns] > 0
     past = np.count_nonzero(measured & (relative[rows, columns] < -_BELOW * TOLERANCE))
     held = np.count_nonzero(measured) - past
-    return past <= held and held + np.count_nonzero(~inside) >= least * len(feet)
+    return bool(past <= held and held + np.count_nonzero(~inside) >= least * len(feet))

@@ -102,7 +102,7 @@ def _soap(rng: np.random.Generator) -> Thing:
 
 def _tin(rng: np.random.Generator) -> Thing:
     """Drink and food cans, flat tins, drums of powder: the makers' diameters, any height."""
-    radius = rng.choice([0.052, 0.053, 0.058, 0.066, 0.073, 0.083, 0.099]) / 2 * rng.uniform(0.9, 1.1)
+    radius = float(rng.choice([0.052, 0.053, 0.058, 0.066, 0.073, 0.083, 0.099])) / 2 * rng.uniform(0.9, 1.1)
     if rng.random() < 0.35:
         radius = log_uniform(rng, 0.045, 0.13) / 2
     height = 2 * radius * log_uniform(rng, 0.35, 2.6)

@@ -151,7 +151,7 @@ def _masked(
     measured: np.ndarray, seen: np.ndarray, camera: Camera, table: np.ndarray | None, rng: np.random.Generator
 ) -> np.ndarray:
     """The mask that a segmentation or a person draws, less what measured the table, as the views of images have it."""
-    error = rng.choice((-2, -1, -1, -1, 0, 0, 0, 1, 1, 2))
+    error = int(rng.choice((-2, -1, -1, -1, 0, 0, 0, 1, 1, 2)))
     mask: np.ndarray = seen.astype(np.uint8)
     if error:
         brush = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * abs(error) + 1, 2 * abs(error) + 1))

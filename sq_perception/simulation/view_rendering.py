@@ -240,7 +240,7 @@ def _cast(
 def _limits(surface: np.ndarray) -> tuple[int, int, int, int]:
     """First and last row, first and last column in which something is seen."""
     rows, columns = np.nonzero(surface > _NOTHING)
-    return rows.min(), rows.max(), columns.min(), columns.max()
+    return int(rows.min()), int(rows.max()), int(columns.min()), int(columns.max())
 
 
 @kernel
