@@ -71,9 +71,9 @@ lint: $(VENV)/.dependencies
 quick: $(VENV)/.package
 	$(VENV)/bin/pytest $(addprefix test/,$(CORE)) -m "not process"
 
-# Two at once: the lint beside the installation, then tests that start processes, and mostly wait for them, beside those
-# that compute.
-test:
+# Two at once: the lint while kernels are compiled, then tests that start processes, and mostly wait for them, beside
+# those that compute.
+test: $(VENV)/.dependencies
 	$(MAKE) --no-print-directory --jobs 2 --output-sync=target lint test-computing test-processes
 
 # The executable, not `python -m pytest`: that would put the source tree before the installed package.

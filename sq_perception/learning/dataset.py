@@ -22,7 +22,6 @@ GREY_LEVELS = 255.0
 CAMERA_DISTANCE = (1.5, 12.0)
 """Nearest and farthest pinhole camera, in lengths of the body."""
 _PROPORTION = 6.0
-
 POOL = 4096
 """Views of a pool: a gigabyte of those of the thesis' size."""
 
