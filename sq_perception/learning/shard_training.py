@@ -34,7 +34,7 @@ from sq_perception.learning import checkpoint, training_log
 from sq_perception.learning.mask_network import MaskNetwork
 from sq_perception.learning.thing_network import ThingNetwork
 from sq_perception.learning.training_config import ShardTraining
-from sq_perception.learning.training_state import TrainingState
+from sq_perception.learning.training_state import TrainingState, mixed_precision
 
 _WARM_UP = 100
 """Steps over which the learning rate rises."""
@@ -135,7 +135,7 @@ def train(subject: Subject[Network, Any], config: ShardTraining, views: Path, ou
                 shards, pool = found, read_views(subject.none, found)
         rate = falling_rate(config.rate, state.step, progress)
         batch = subject.batch(pool, rng.integers(len(pool.images), size=config.batch), rng)
-        with torch.autocast("cpu", torch.bfloat16, enabled=config.bfloat16):
+        with mixed_precision("cpu", config.bfloat16):
             predicted = network(*batch[:-1])
         loss = subject.loss(predicted, *batch)
         state.descend(loss, rate)

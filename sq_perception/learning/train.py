@@ -36,7 +36,7 @@ from sq_perception.learning.inference import checked_device
 from sq_perception.learning.objective import Objective
 from sq_perception.learning.regressor import Regressor, RegressorConfig
 from sq_perception.learning.training_config import TrainingConfig
-from sq_perception.learning.training_state import TrainingState, read_tensors, recalibrate
+from sq_perception.learning.training_state import TrainingState, mixed_precision, read_tensors, recalibrate
 
 _OF_A_RUN = ("loss", "backbone", "framing", "pixels", "canonical_labels", "optimizer")
 """Settings whose change makes another run; others may change when it goes on."""
@@ -140,7 +140,7 @@ def _train(
                 labels = bodies.canonical_form() if config.canonical_labels else bodies
                 truth = Superquadric.from_flat(torch.from_numpy(labels.to_flat()).float().to(device))
             model.train()
-            with torch.autocast(device.type, torch.bfloat16, enabled=config.bfloat16):
+            with mixed_precision(device.type, config.bfloat16):
                 prediction = model(views)
             loss = objective.loss(prediction, views, truth, progress, generator).mean()
             norm = state.descend(loss, rate)

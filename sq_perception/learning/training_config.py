@@ -92,7 +92,7 @@ class TrainingConfig:
     average: float = 0.999
     """The averaged weights keep this much of themselves at each step; they are what is validated and saved."""
     bfloat16: bool = True
-    """Compute the network in bfloat16 where it is safe (automatic mixed precision)."""
+    """Compute the network in bfloat16 where it is safe and the device has it (automatic mixed precision)."""
     validation: int = 1000
     """Bodies in each validation set, and steps between validations."""
     seed: int = 1

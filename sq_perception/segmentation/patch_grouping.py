@@ -25,6 +25,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from sq_perception.geometry.kernels import kernel
+from sq_perception.geometry.quantiles import quantile
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation.surface_patches import Patches
 
@@ -66,7 +68,7 @@ def bodies(patches: Patches, camera: Camera) -> np.ndarray:
 
 def _sample_area(patches: Patches, camera: Camera) -> float:
     """Square metres of a sample in the image plane at the bodies' depth."""
-    z = float(np.median(patches.depth[patches.labels > 0]))
+    z = quantile(patches.depth[patches.labels > 0], 0.5)
     return (z * patches.stride) ** 2 / (camera.fx * camera.fy)
 
 
@@ -77,57 +79,76 @@ def _borders(patches: Patches) -> tuple[np.ndarray, ...]:
     Samples without a depth count to the nearest one that has some, as a body throws a shadow beside itself in which a
     triangulating camera measures nothing.
     """
-    n = patches.count + 1
     labels, depth, gap = _bridged(patches)
     known = np.nan_to_num(patches.fold)
     square = np.ones((5, 5), np.uint8)
     concave, convex = cv2.dilate(known, square), -cv2.erode(known, square)
     fold = np.where(concave > convex, concave, -convex)
-    weights, dents, over, joint = np.zeros((4, n * n))
-    for here, there in (
-        ((slice(None), slice(None, -1)), (slice(None), slice(1, None))),
-        ((slice(None, -1), slice(None)), (slice(1, None), slice(None))),
-    ):
-        rows, columns = np.nonzero((labels[here] != labels[there]) & (labels[here] > 0) & (labels[there] > 0))
-        a, b = labels[here][rows, columns], labels[there][rows, columns]
-        za, zb = depth[here][rows, columns], depth[there][rows, columns]
-        far = gap[here][rows, columns] | gap[there][rows, columns]
-        beyond = np.abs(za - zb) / (patches.depth_step * np.minimum(za, zb)) - 1
-        step = beyond > 0
-        s = fold[here][rows, columns]
-        score = np.where(s != 0, np.clip(_FLAT - s, -1, 1), _UNKNOWN)
-        score = np.where(step, -np.minimum(beyond, 1), np.where(far, 0.0, score))
-        weights += np.bincount(a * n + b, score, n * n)
-        dents += np.bincount(a * n + b, np.where(step, 0.0, np.maximum(-score, 0)), n * n)
-        joint += np.bincount((a * n + b)[np.abs(za - zb) < _ATTACHED], minlength=n * n)
-        behind = np.where(za > zb, a * n + b, b * n + a)
-        over += np.bincount(behind[step & (np.abs(za - zb) < _HOLLOW_DEPTH)], minlength=n * n)
-    scores, bent, behind_of, attached = (each.reshape(n, n) for each in (weights, dents, over, joint))
-    return scores + scores.T, bent + bent.T, behind_of, attached + attached.T
+    scores, dents, over, joint = _border_sums(labels, depth, gap, fold, patches.count + 1, patches.depth_step)
+    return scores + scores.T, dents + dents.T, over, joint + joint.T
+
+
+@kernel
+def _border_sums(
+    labels: np.ndarray, depth: np.ndarray, gap: np.ndarray, fold: np.ndarray, n: int, depth_step: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The same from labels and depths with holes filled; scores, dents and joint count half of the border each way."""
+    scores, dents, over, joint = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n))
+    rows, columns = labels.shape
+    for v in range(rows):
+        for u in range(columns):
+            for v2, u2 in ((v, u + 1), (v + 1, u)):
+                if v2 == rows or u2 == columns:
+                    continue
+                a, b = labels[v, u], labels[v2, u2]
+                if a == b or a == 0 or b == 0:
+                    continue
+                za, zb, s = depth[v, u], depth[v2, u2], fold[v, u]
+                apart = abs(za - zb)
+                beyond = apart / (depth_step * min(za, zb)) - 1
+                if beyond > 0:
+                    scores[a, b] -= min(beyond, 1.0)
+                    if apart < _HOLLOW_DEPTH:
+                        over[(a, b) if za > zb else (b, a)] += 1
+                elif not (gap[v, u] or gap[v2, u2]):
+                    score = min(max(_FLAT - s, -1.0), 1.0) if s != 0 else _UNKNOWN
+                    scores[a, b] += score
+                    dents[a, b] += max(-score, 0.0)
+                if apart < _ATTACHED:
+                    joint[a, b] += 1
+    return scores, dents, over, joint
 
 
 def _bridged(patches: Patches) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Labels and depth with holes filled by the nearest measured sample, and where the holes are."""
     gap = patches.depth == 0
-    if not gap.any() or gap.all():
-        return patches.labels, patches.depth, gap
-    _, nearest = cv2.distanceTransformWithLabels(gap.view(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
-    measured = np.flatnonzero(~gap)
-    source = np.zeros(int(nearest.max()) + 1, np.int64)
-    source[nearest.ravel()[measured]] = measured
     labels, depth = patches.labels.copy(), patches.depth.copy()
-    labels[gap], depth[gap] = labels.ravel()[source[nearest[gap]]], depth.ravel()[source[nearest[gap]]]
+    if gap.any() and not gap.all():
+        _, nearest = cv2.distanceTransformWithLabels(gap.view(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
+        _fill(labels, depth, gap, nearest)
     return labels, depth, gap
+
+
+@kernel
+def _fill(labels: np.ndarray, depth: np.ndarray, gap: np.ndarray, nearest: np.ndarray) -> None:
+    """Give holes the label and the depth of the measured sample that has the same number as the nearest one."""
+    rows, columns = labels.shape
+    source = np.zeros((nearest.max() + 1, 2), np.int64)
+    for v in range(rows):
+        for u in range(columns):
+            if not gap[v, u]:
+                source[nearest[v, u]] = v, u
+    for v in range(rows):
+        for u in range(columns):
+            if gap[v, u]:
+                from_v, from_u = source[nearest[v, u]]
+                labels[v, u], depth[v, u] = labels[from_v, from_u], depth[from_v, from_u]
 
 
 def _continued(patches: Patches, body: np.ndarray, camera: Camera) -> np.ndarray:
     """Scores (n, n) of patches in one plane between which only nearer things, or nothing at all, were measured."""
     n = patches.count + 1
-    rows, columns = np.nonzero(patches.labels)
-    numbers = patches.labels[rows, columns]
-    counts = np.bincount(numbers, minlength=n)
-    total = np.stack([np.bincount(numbers, rows, n), np.bincount(numbers, columns, n)], -1)
-    middle = total / np.maximum(counts, 1)[:, None]
+    counts, middle = _middles(patches.labels, n)
     rays = _rays(middle, patches.stride, camera)
     length = np.linalg.norm(patches.planes, axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -153,6 +174,22 @@ def _continued(patches: Patches, body: np.ndarray, camera: Camera) -> np.ndarray
     goes_on = (farther < _SEEN_THROUGH) & (hidden > _SEEN_THROUGH)
     weights[a, b] = goes_on * np.sqrt(np.minimum(counts[a], counts[b]))
     return weights + weights.T
+
+
+@kernel
+def _middles(labels: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
+    """Number of samples (n,) of each patch and their middle (n, 2), row and column; 0 for nothing."""
+    counts, middle = np.zeros(n), np.zeros((n, 2))
+    for v in range(labels.shape[0]):
+        for u in range(labels.shape[1]):
+            label = labels[v, u]
+            if label > 0:
+                counts[label] += 1
+                middle[label, 0] += v
+                middle[label, 1] += u
+    for label in range(n):
+        middle[label] /= max(counts[label], 1.0)
+    return counts, middle
 
 
 def _rays(grid: np.ndarray, stride: int, camera: Camera) -> np.ndarray:

@@ -20,14 +20,16 @@ Metres and pixels.  Reference: P. J. Besl, R. C. Jain, Segmentation through vari
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
 from sq_perception.geometry.kernels import kernel
+from sq_perception.geometry.quantiles import quantile
 from sq_perception.imaging import depth_steps, regions
-from sq_perception.imaging.camera import Camera
+from sq_perception.imaging.camera import Camera, Lens
 from sq_perception.segmentation.support_plane import COARSE_PIXELS, LEAST_GROWTH, TOLERANCE, Plane, noise_growth
 
 _ROUNDS = 6
@@ -95,31 +97,29 @@ def measured(plane: Plane, depth: np.ndarray, valid: np.ndarray, camera: Camera)
         A pinhole camera.
     """
     k = _stride(depth.shape)
-    rows, columns = np.nonzero(valid[::k, ::k])
-    z = depth[::k, ::k][rows, columns].astype(float)
+    x, y, z = _seen(depth, valid, k, camera.lens)
     growth = noise_growth(z)
-    terms = _terms((k * columns - camera.cx) / camera.fx, (k * rows - camera.cy) / camera.fy)
-    height = (z * (plane.equation[[2, 0, 1]] @ terms[:3]) + plane.equation[3]) / growth
+    a, b, c, d = plane.equation
+    height = (z * (a * x + b * y + c) + d) / growth
     flat = SupportSurface(plane, np.zeros(_TERMS), 0.0, plane.sigma)
     on = np.abs(height) < TOLERANCE
     if not on.any():
         return flat
-    limit = _DISTORTION * float(np.median(z[on] / growth[on]))
+    limit = _DISTORTION * quantile(z[on] / growth[on], 0.5)
     bend, off = flat.bend, height
     for _ in range(_ROUNDS):
-        if np.count_nonzero(on) < 10 * _TERMS:
+        gram, right = _normal_equations(x, y, height, off)
+        if gram[0, 0] < 10 * _TERMS:
             return flat
-        some = terms * on
-        bend = np.linalg.lstsq(some @ terms.T, some @ height, rcond=None)[0]
-        off = height - np.clip(bend @ terms, -limit, limit)
-        grown = np.abs(off) < TOLERANCE
-        if np.array_equal(grown, on):
+        bend = np.linalg.lstsq(gram, right, rcond=None)[0]
+        off, is_settled = _off(x, y, height, bend, limit, off)
+        if is_settled:
             break
-        on = grown
-    gained = np.count_nonzero(np.abs(off) < 0.5 * TOLERANCE)
+    within = np.abs(off)
+    gained = np.count_nonzero(within < 0.5 * TOLERANCE)
     if gained < _GAIN * np.count_nonzero(np.abs(height) < 0.5 * TOLERANCE):
         return flat
-    return SupportSurface(plane, bend, limit, float(1.4826 * np.median(np.abs(off[on]))))
+    return SupportSurface(plane, bend, limit, 1.4826 * quantile(within[within < TOLERANCE], 0.5))
 
 
 def risen(relative: np.ndarray, depth: np.ndarray, valid: np.ndarray, camera: Camera) -> np.ndarray:
@@ -148,20 +148,8 @@ def risen(relative: np.ndarray, depth: np.ndarray, valid: np.ndarray, camera: Ca
     if not reached.any():
         return np.zeros(depth.shape, bool)
     passable = known & (height < HIGHEST * TOLERANCE) & _shallow(height * noise_growth(z), z, known, width)
-    joined = [
-        (here, there, np.abs(z[here] - z[there]) < k * depth_steps.STEP * z[here])
-        for here, there in (
-            ((slice(1, None), slice(None)), (slice(None, -1), slice(None))),
-            ((slice(None), slice(1, None)), (slice(None), slice(None, -1))),
-        )
-    ]
-    for _ in range(int(np.ceil(_RAMP_LENGTH / max(float(np.median(width[reached])), 1e-4)))):
-        before = np.count_nonzero(reached)
-        for here, there, near in joined:
-            reached[here] |= reached[there] & near & passable[here]
-            reached[there] |= reached[here] & near & passable[there]
-        if np.count_nonzero(reached) == before:
-            break
+    rounds = math.ceil(_RAMP_LENGTH / max(quantile(width[reached], 0.5), 1e-4))
+    _spread_over(reached, passable & ~reached, z, rounds, np.float32(k * depth_steps.STEP))
     reached &= ~_low_things(height, known, reached)
     full = cv2.resize(reached.view(np.uint8), None, fx=k, fy=k, interpolation=cv2.INTER_NEAREST)
     return full[: depth.shape[0], : depth.shape[1]] > 0
@@ -185,8 +173,7 @@ def _low_things(height: np.ndarray, known: np.ndarray, reached: np.ndarray) -> n
     own = _level(height, reached)
     for level in _LEVELS:
         parts = depth_steps.components(known & (height > level * TOLERANCE))
-        tops = _tops(parts, reached, height, int(parts.max()))
-        own |= (tops[1] > tops[0] - 0.5 * TOLERANCE)[parts] & (parts > 0)
+        _add_reached_tops(parts, reached, height, int(parts.max()), own)
     return own
 
 
@@ -204,15 +191,85 @@ def _level(height: np.ndarray, reached: np.ndarray) -> np.ndarray:
 
 
 @kernel
-def _tops(parts: np.ndarray, reached: np.ndarray, height: np.ndarray, count: int) -> np.ndarray:
-    """Greatest height (2, count + 1) in each part of what was not reached, and of what was."""
+def _add_reached_tops(parts: np.ndarray, reached: np.ndarray, height: np.ndarray, count: int, own: np.ndarray) -> None:
+    """Add to ``own`` the parts whose highest samples, but for half a tolerance, were reached."""
     tops = np.zeros((2, count + 1), np.float32)
     for v in range(parts.shape[0]):
         for u in range(parts.shape[1]):
             if parts[v, u] > 0:
                 side = 1 if reached[v, u] else 0
                 tops[side, parts[v, u]] = max(tops[side, parts[v, u]], height[v, u])
-    return tops
+    for v in range(parts.shape[0]):
+        for u in range(parts.shape[1]):
+            part = parts[v, u]
+            own[v, u] |= part > 0 and tops[1, part] > tops[0, part] - 0.5 * TOLERANCE
+
+
+@kernel
+def _spread_over(reached: np.ndarray, free: np.ndarray, z: np.ndarray, rounds: int, step: np.float32) -> None:
+    """Add to what is reached the free samples beside it, a row and a column a round, not across a depth step."""
+    rows, columns = reached.shape
+    left = np.argwhere(free)
+    for _ in range(rounds):
+        for down, right in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+            is_back = down + right < 0
+            for n in range(len(left)):
+                # Against the direction, so that a sample added now adds no other one.
+                v, u = left[len(left) - 1 - n if is_back else n]
+                v2, u2 = v + down, u + right
+                if 0 <= v2 < rows and 0 <= u2 < columns and reached[v2, u2]:
+                    limit = step * (z[v, u] if is_back else z[v2, u2])
+                    reached[v, u] |= abs(z[v2, u2] - z[v, u]) < limit
+        kept = 0
+        for v, u in left:
+            if not reached[v, u]:
+                left[kept] = v, u
+                kept += 1
+        if kept == len(left):
+            return
+        left = left[:kept]
+
+
+@kernel
+def _seen(depth: np.ndarray, valid: np.ndarray, k: int, lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """x, y and depth (n,) of every k-th valid pixel."""
+    x, y, z = np.empty((3, (depth.shape[0] // k + 1) * (depth.shape[1] // k + 1)))
+    n = 0
+    for v in range(0, depth.shape[0], k):
+        for u in range(0, depth.shape[1], k):
+            if valid[v, u]:
+                x[n], y[n], z[n] = (u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy, depth[v, u]
+                n += 1
+    return x[:n], y[:n], z[:n]
+
+
+@kernel
+def _normal_equations(
+    x: np.ndarray, y: np.ndarray, height: np.ndarray, off: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Of the least squares fit of b to the heights of samples that are within the tolerance of the last one."""
+    gram, right = np.zeros((_TERMS, _TERMS)), np.zeros(_TERMS)
+    for i in range(len(x)):
+        if abs(off[i]) < TOLERANCE:
+            term = (1.0, x[i], y[i], x[i] * x[i], x[i] * y[i], y[i] * y[i])
+            for j in range(_TERMS):
+                right[j] += term[j] * height[i]
+                for k in range(_TERMS):
+                    gram[j, k] += term[j] * term[k]
+    return gram, right
+
+
+@kernel
+def _off(
+    x: np.ndarray, y: np.ndarray, height: np.ndarray, bend: np.ndarray, limit: float, last: np.ndarray
+) -> tuple[np.ndarray, bool]:
+    """Heights above a bent support, and whether those within the tolerance are the same as last time."""
+    off, is_same = np.empty_like(height), True
+    for i in range(len(x)):
+        b = bend[0] + x[i] * (bend[1] + bend[3] * x[i] + bend[4] * y[i]) + y[i] * (bend[2] + bend[5] * y[i])
+        off[i] = height[i] - min(max(b, -limit), limit)
+        is_same &= (abs(off[i]) < TOLERANCE) == (abs(last[i]) < TOLERANCE)
+    return off, is_same
 
 
 def _shallow(height: np.ndarray, z: np.ndarray, known: np.ndarray, width: np.ndarray) -> np.ndarray:
@@ -248,10 +305,6 @@ def _relative(
             relative = above / max(z * z, LEAST_GROWTH) - min(max(off, -limit), limit)
             height[v, u] = relative if z > 0 else 0.0
     return height
-
-
-def _terms(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y])
 
 
 def _stride(shape: tuple[int, ...]) -> int:
