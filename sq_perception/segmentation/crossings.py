@@ -113,39 +113,34 @@ def assigned(
 ) -> np.ndarray:
     """The part (n,) of each pixel: that of the nearest sample, or, of those almost as near, of the one to whose
     samples most lines are free."""
+    # Samples part by part, in rows: to look for the nearest one of a part is vector code.
+    order = np.argsort(part, kind="mergesort")
+    down, right, away = samples[order, 0].astype(np.float64), samples[order, 1].astype(np.float64), z[order]
+    ends = np.searchsorted(part[order], np.arange(parts + 1))
     chosen = np.zeros(rows.size, np.int64)
     nearest = np.empty(parts)
-    over, count = np.empty(parts), np.empty(parts)
     for i in range(rows.size):
         v, u = rows[i], columns[i]
         here = np.float64(depth[v, u])
         width = here / focal
-        nearest[:] = np.inf
-        for j in range(samples.shape[0]):
-            down, right = (samples[j, 0] - v) * width, (samples[j, 1] - u) * width
-            square = down * down + right * right + (z[j] - here) ** 2
-            if square < nearest[part[j]]:
-                nearest[part[j]] = square
+        for k in range(parts):
+            least_square = np.inf
+            for j in range(ends[k], ends[k + 1]):
+                vertical, across, along = (down[j] - v) * width, (right[j] - u) * width, away[j] - here
+                least_square = min(least_square, vertical * vertical + across * across + along * along)
+            nearest[k] = least_square
         best = int(np.argmin(nearest))
         chosen[i] = best
         limit = (math.sqrt(nearest[best]) + spacing) ** 2
-        rivals = 0
-        for k in range(parts):
-            rivals += 1 if nearest[k] <= limit else 0
-        if rivals < 2:
+        if np.count_nonzero(nearest <= limit) < 2:
             continue
-        over[:] = 0.0
-        count[:] = 0.0
-        for j in range(samples.shape[0]):
-            k = part[j]
-            if nearest[k] > limit:
-                continue
-            count[k] += 1
-            if _crossed(v, u, here, samples[j, 0], samples[j, 1], z[j], depth, noise, least):
-                over[k] += 1
-        least_share = over[best] / count[best] - _HOME
+        least_share = np.inf
         for k in range(parts):
-            if nearest[k] <= limit and over[k] / count[k] < least_share:
-                least_share = over[k] / count[k]
-                chosen[i] = k
+            if nearest[k] <= limit:
+                over = 0
+                for j in range(ends[k], ends[k + 1]):
+                    over += _crossed(v, u, here, down[j], right[j], away[j], depth, noise, least)
+                share = over / (ends[k + 1] - ends[k]) + (0.0 if k == best else _HOME)
+                if share < least_share or (share == least_share and k == best):
+                    least_share, chosen[i] = share, k
     return chosen

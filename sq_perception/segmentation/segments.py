@@ -43,6 +43,8 @@ from sq_perception.segmentation import (
 from sq_perception.segmentation.support_plane import Plane
 from sq_perception.segmentation.support_surface import SupportSurface
 
+EVERYTHING = (0.0, np.inf)
+"""Range of all depths, metres."""
 _LEAST_PIXELS, _LEAST_SHARE = 30, 5e-4
 """Of an object: pixels, and share of the image; at VGA a square of 2 cm at 0.8 m.  Smaller ones are bits of noise."""
 _FOOT_PIXELS = 3
@@ -74,7 +76,7 @@ class SegmentationOptions:
         Quaternion x y z w and translation of the optical frame in the frame of the box; None: they are the same.
     """
 
-    depth_range: tuple[float, float] = (0.0, np.inf)
+    depth_range: tuple[float, float] = EVERYTHING
     max_objects: int = 20
     max_size: float = 0.6
     workspace: standing.Box | None = None
@@ -161,9 +163,11 @@ def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | No
         return Segmentation(labels, None, ids)
     support = support_surface.measured(plane, known, valid, camera)
     walls = [other for other in planes if other is not plane]
-    # What is out of range holds things up and hides them all the same.
-    everything, measured = _checked(depth, camera, (0.0, np.inf))
-    everything = cv2.copyTo(everything, measured.view(np.uint8))
+    everything = known
+    if options.depth_range != EVERYTHING:
+        # What is out of range holds things up and hides them all the same.
+        everything, measured = _checked(depth, camera, EVERYTHING)
+        everything = cv2.copyTo(everything, measured.view(np.uint8))
     relative = support.image_relative(everything, camera)
     labels = _above(known, relative * valid, valid, camera, support, walls, limits)
     test = standing.standing(everything, relative, labels, camera, support, walls, limits)
@@ -290,7 +294,7 @@ def _above(
     top, left = max(top - _AROUND, 0), max(left - _AROUND, 0)
     window = slice(top, top + height + 2 * _AROUND), slice(left, left + width + 2 * _AROUND)
     # Contiguous, as kernels are compiled for arrays of a kind.
-    flat = np.ascontiguousarray((valid & (np.abs(relative) < support_plane.TOLERANCE))[window])
+    flat = valid[window] & (np.abs(relative[window]) < support_plane.TOLERANCE)
     known, clear = np.ascontiguousarray(known[window]), np.ascontiguousarray(clear[window])
     seen = camera.cropped(left, top, known.shape[1], known.shape[0])
     holds = partial(limits.is_small, up=support.plane.equation[:3])
@@ -318,6 +322,8 @@ def _bodies(
     labels = convex_parts.corrected(labels, depth, camera, sigma, holds)
     # What is too small for a patch stays what the steps made of it.
     rest = cv2.morphologyEx((wanted & (labels == 0)).view(np.uint8), cv2.MORPH_OPEN, depth_steps.CROSS)
+    if not rest.any():
+        return labels
     rest = depth_steps.components(rest)
     rest[rest > 0] += labels.max()
     return labels + rest

@@ -20,8 +20,9 @@ import cv2
 import numpy as np
 
 from sq_perception.geometry import rotation
+from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.quantiles import quantile
-from sq_perception.imaging import depth_steps, regions
+from sq_perception.imaging import depth_steps
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation import support_plane
 from sq_perception.segmentation.support_plane import COARSE_PIXELS, TOLERANCE, Plane, noise_growth
@@ -228,10 +229,23 @@ def standing(
 
 def _tall(labels: np.ndarray, relative: np.ndarray) -> np.ndarray:
     """Pixels, bool (height, width), of segments that are higher than any noise, on average: things or the room."""
-    at = np.flatnonzero(labels)
-    of, count = labels.ravel()[at], int(labels.max(initial=0)) + 1
-    means = np.bincount(of, relative.ravel()[at], count) / np.maximum(np.bincount(of, minlength=count), 1)
-    return regions.renumbered(labels, (means > HIGHEST * TOLERANCE).astype(np.int32)) > 0
+    return np.asarray(_higher(labels, relative, int(labels.max(initial=0)) + 1))
+
+
+@kernel
+def _higher(labels: np.ndarray, relative: np.ndarray, count: int) -> np.ndarray:
+    sums, pixels = np.zeros(count), np.zeros(count)
+    for v in range(labels.shape[0]):
+        for u in range(labels.shape[1]):
+            if labels[v, u] > 0:
+                sums[labels[v, u]] += relative[v, u]
+                pixels[labels[v, u]] += 1
+    is_high = sums > HIGHEST * TOLERANCE * pixels
+    found = np.empty(labels.shape, np.bool_)
+    for v in range(labels.shape[0]):
+        for u in range(labels.shape[1]):
+            found[v, u] = is_high[labels[v, u]]
+    return found
 
 
 def _spread(relative: np.ndarray, around: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> float:
@@ -241,12 +255,25 @@ def _spread(relative: np.ndarray, around: np.ndarray, rows: np.ndarray, columns:
     """
     top, left = max(int(rows.min()) - _BESIDE, 0), max(int(columns.min()) - _BESIDE, 0)
     window = slice(top, int(rows.max()) + _BESIDE + 1), slice(left, int(columns.max()) + _BESIDE + 1)
-    heights = np.abs(relative[window])
-    mask = np.zeros(heights.shape, np.uint8)
+    mask = np.zeros(relative[window].shape, np.uint8)
     mask[rows - top, columns - left] = 1
     near, ring = (cv2.dilate(mask, np.ones((2 * k + 1, 2 * k + 1), np.uint8)) for k in (_SMEARED, _BESIDE))
-    heights = heights[(ring > near) & around[window] & (heights < HIGHEST * TOLERANCE)]
+    heights = _heights_where(relative, around, ring - near, top, left)
     return 1.4826 * quantile(heights, 0.5) if heights.size >= _FEWEST else 0.0
+
+
+@kernel
+def _heights_where(relative: np.ndarray, around: np.ndarray, mask: np.ndarray, top: int, left: int) -> np.ndarray:
+    """|heights| (n,) of the pixels around a thing in a mask, whose corner lies there, but for what is too high."""
+    found, n = np.empty(mask.size, np.float32), 0
+    for v in range(mask.shape[0]):
+        for u in range(mask.shape[1]):
+            if mask[v, u] > 0 and around[top + v, left + u]:
+                height = abs(relative[top + v, left + u])
+                if height < HIGHEST * TOLERANCE:
+                    found[n] = height
+                    n += 1
+    return found[:n]
 
 
 def _stands(

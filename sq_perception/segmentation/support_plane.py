@@ -26,8 +26,7 @@ import numpy as np
 
 from sq_perception.geometry.kernels import kernel
 from sq_perception.imaging import depth_steps, regions
-from sq_perception.imaging.camera import Camera, Lens
-from sq_perception.imaging.lens import point_at
+from sq_perception.imaging.camera import Camera
 
 TOLERANCE = 0.008
 """Half thickness of a plane while it is searched, metres at a depth of one metre."""
@@ -182,22 +181,9 @@ def around(
 
 def _some_points(depth: np.ndarray, wanted: np.ndarray, camera: Camera, count: int) -> np.ndarray:
     """Points (k, 3) of the wanted pixels; about ``count``, evenly taken, where there are more."""
-    step = max(1, np.count_nonzero(wanted) // count)
-    return np.asarray(_every(np.ascontiguousarray(depth), np.ascontiguousarray(wanted), step, camera.lens))
-
-
-@kernel
-def _every(depth: np.ndarray, wanted: np.ndarray, step: int, lens: Lens) -> np.ndarray:
-    """Points (k, 3) of every so many of the wanted pixels."""
-    points = np.empty((np.count_nonzero(wanted) // step + 1, 3))
-    n = 0
-    for v in range(depth.shape[0]):
-        for u in range(depth.shape[1]):
-            if wanted[v, u]:
-                if n % step == 0:
-                    points[n // step] = point_at(u, v, np.float64(depth[v, u]), lens)
-                n += 1
-    return points[: (n + step - 1) // step]
+    pixels = np.flatnonzero(wanted)
+    rows, columns = np.divmod(pixels[:: max(1, pixels.size // count)], camera.width)
+    return camera.unproject(columns, rows, depth[rows, columns])
 
 
 def _dominant_plane(points: np.ndarray, least: float, rng: np.random.Generator) -> tuple[np.ndarray | None, np.ndarray]:
@@ -225,37 +211,14 @@ def _dominant_plane(points: np.ndarray, least: float, rng: np.random.Generator) 
         if len(top) and votes.max() > max(most, _LAYER * _votes(top, weighted / 2)[0]):
             best = top[0]
     plane = best.astype(float)
+    growth = noise_growth(points[:, 2])
+    reach, weights, rows = TOLERANCE * growth, growth**-2, np.ascontiguousarray(points.T)
     for share in (1.0, 1.0, 0.5):
-        count, middle, moments = _near(points, plane, share * TOLERANCE)
-        if count < 12:
-            return None, np.zeros(len(points), bool)
-        normal = np.linalg.eigh(moments)[1][:, 0]
-        offset = -normal @ middle
-        plane = np.append(normal, offset) * (1.0 if offset > 0 else -1.0)
-    return plane, np.abs(points @ plane[:3] + plane[3]) < TOLERANCE * noise_growth(points[:, 2])
-
-
-@kernel
-def _near(points: np.ndarray, plane: np.ndarray, reach: float) -> tuple[int, np.ndarray, np.ndarray]:
-    """How many points (n, 3) lie within so many metres of a plane at one metre of depth, and their weighted middle (3,)
-    and moments (3, 3) about it."""
-    weights, middle, moments = np.zeros(len(points)), np.zeros(3), np.zeros((3, 3))
-    count = 0
-    for i in range(len(points)):
-        x, y, z = points[i]
-        growth = max(z * z, LEAST_GROWTH)
-        if abs(plane[0] * x + plane[1] * y + plane[2] * z + plane[3]) < reach * growth:
-            weights[i] = 1 / (growth * growth)
-            count += 1
-    total = max(weights.sum(), 1e-300)
-    for i in range(len(points)):
-        for j in range(3):
-            middle[j] += weights[i] / total * points[i, j]
-    for i in range(len(points)):
-        for j in range(3):
-            for k in range(3):
-                moments[j, k] += weights[i] * (points[i, j] - middle[j]) * (points[i, k] - middle[k])
-    return count, middle, moments
+        inside = np.abs(plane[:3] @ rows + plane[3]) < share * reach
+        if np.count_nonzero(inside) < 12:
+            return None, inside
+        plane = _least_squares_plane(rows, weights * inside)
+    return plane, np.abs(plane[:3] @ rows + plane[3]) < reach
 
 
 def _through_three(points: np.ndarray, count: int, rng: np.random.Generator) -> np.ndarray:
@@ -278,6 +241,16 @@ def _votes(planes: np.ndarray, points: np.ndarray) -> np.ndarray:
         for i in range(points.shape[1]):
             votes[k] += abs(a * points[0, i] + b * points[1, i] + c * points[2, i] + d * points[3, i]) < 1
     return votes
+
+
+def _least_squares_plane(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """The plane (4,) through weighted points (3, n), normal towards the camera."""
+    middle = points @ weights / weights.sum()
+    centred = points - middle[:, None]
+    _, axes = np.linalg.eigh((weights * centred) @ centred.T)
+    normal = axes[:, 0]
+    offset = -normal @ middle
+    return np.append(normal, offset) * (1.0 if offset > 0 else -1.0)
 
 
 def _is_face(plane: Plane, surfaces: list[_Surface]) -> bool:

@@ -148,8 +148,20 @@ def risen(relative: np.ndarray, depth: np.ndarray, valid: np.ndarray, camera: Ca
     if not reached.any():
         return np.zeros(depth.shape, bool)
     passable = known & (height < HIGHEST * TOLERANCE) & _shallow(height * noise_growth(z), z, known, width)
-    rounds = math.ceil(_RAMP_LENGTH / max(quantile(width[reached], 0.5), 1e-4))
-    _spread_over(reached, passable & ~reached, z, rounds, np.float32(k * depth_steps.STEP))
+    joined = [
+        (here, there, np.abs(z[here] - z[there]) < k * depth_steps.STEP * z[here])
+        for here, there in (
+            ((slice(1, None), slice(None)), (slice(None, -1), slice(None))),
+            ((slice(None), slice(1, None)), (slice(None), slice(None, -1))),
+        )
+    ]
+    for _ in range(math.ceil(_RAMP_LENGTH / max(quantile(width[reached], 0.5), 1e-4))):
+        before = np.count_nonzero(reached)
+        for here, there, near in joined:
+            reached[here] |= reached[there] & near & passable[here]
+            reached[there] |= reached[here] & near & passable[there]
+        if np.count_nonzero(reached) == before:
+            break
     reached &= ~_low_things(height, known, reached)
     full = cv2.resize(reached.view(np.uint8), None, fx=k, fy=k, interpolation=cv2.INTER_NEAREST)
     return full[: depth.shape[0], : depth.shape[1]] > 0
@@ -203,31 +215,6 @@ def _add_reached_tops(parts: np.ndarray, reached: np.ndarray, height: np.ndarray
         for u in range(parts.shape[1]):
             part = parts[v, u]
             own[v, u] |= part > 0 and tops[1, part] > tops[0, part] - 0.5 * TOLERANCE
-
-
-@kernel
-def _spread_over(reached: np.ndarray, free: np.ndarray, z: np.ndarray, rounds: int, step: np.float32) -> None:
-    """Add to what is reached the free samples beside it, a row and a column a round, not across a depth step."""
-    rows, columns = reached.shape
-    left = np.argwhere(free)
-    for _ in range(rounds):
-        for down, right in ((-1, 0), (1, 0), (0, -1), (0, 1)):
-            is_back = down + right < 0
-            for n in range(len(left)):
-                # Against the direction, so that a sample added now adds no other one.
-                v, u = left[len(left) - 1 - n if is_back else n]
-                v2, u2 = v + down, u + right
-                if 0 <= v2 < rows and 0 <= u2 < columns and reached[v2, u2]:
-                    limit = step * (z[v, u] if is_back else z[v2, u2])
-                    reached[v, u] |= abs(z[v2, u2] - z[v, u]) < limit
-        kept = 0
-        for v, u in left:
-            if not reached[v, u]:
-                left[kept] = v, u
-                kept += 1
-        if kept == len(left):
-            return
-        left = left[:kept]
 
 
 @kernel
