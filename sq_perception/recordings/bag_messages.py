@@ -35,9 +35,7 @@ def types(name: str) -> Callable[..., Any]:
     KeyError
         For a type that ROS 2 Jazzy's common interfaces do not have.
     """
-    kind = _store().types[name]
-    # Shared between messages: they are written and never changed.
-    defaults = {field: _default(description) for field, description in _fields(name)} | _DECLARED.get(name, {})
+    kind, defaults = _store().types[name], _defaults(name)
 
     def make(**given: Any) -> Any:
         return kind(**{**defaults, **given})
@@ -54,26 +52,17 @@ def definition(name: str) -> str:
 def as_cdr(message: Any) -> bytes:
     """A message's bytes, little endian, with their encapsulation header."""
     name = message.__msgtype__
-    for field, dtype in _numbers(name):
-        setattr(message, field, np.asarray(getattr(message, field), dtype))
+    for field, default in _defaults(name).items():
+        if isinstance(default, np.ndarray):
+            setattr(message, field, np.asarray(getattr(message, field), default.dtype))
     return bytes(_store().serialize_cdr(message, name))
 
 
 @cache
-def _numbers(name: str) -> tuple[tuple[str, np.dtype[Any]], ...]:
-    """Fields of a message that are arrays of numbers."""
-    found = []
-    for field, (node, detail) in _fields(name):
-        if node in (Nodetype.ARRAY, Nodetype.SEQUENCE) and detail[0][0] == Nodetype.BASE:
-            base = detail[0][1][0]
-            if base != "string":
-                found.append((field, _dtype(base)))
-    return tuple(found)
-
-
-def _fields(name: str) -> list[tuple[str, Any]]:
-    fields: list[tuple[str, Any]] = _store().fielddefs[name][1]
-    return fields
+def _defaults(name: str) -> dict[str, Any]:
+    """Fields of an empty message, shared between messages: they are written and never changed."""
+    fields = _store().fielddefs[name][1]
+    return {field: _default(description) for field, description in fields} | _DECLARED.get(name, {})
 
 
 def _default(description: Any) -> Any:
