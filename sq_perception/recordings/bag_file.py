@@ -37,6 +37,7 @@ from sq_perception.imaging.calibration import Calibration, Treatment
 from sq_perception.imaging.camera import Projection
 from sq_perception.recordings import publication
 from sq_perception.recordings.bag_reader import CAMERA_INFO, COMPRESSED, IMAGE, BagReader, Message, described
+from sq_perception.recordings.camera_file import camera_info_of
 from sq_perception.recordings.frame_file import MILLIMETRES, FrameError, Reading, RecordedFrame, Stamp
 
 SUFFIXES = (".mcap", ".db3")
@@ -80,8 +81,7 @@ class RecordedBag:
     topic
         Of the images; needed where several show depth.
     camera_info
-        Anything with the fields of sensor_msgs/CameraInfo, or a function of an image's width and height that gives it;
-        goes before those in the bag.
+        Intrinsics as :func:`frame_file.read` takes them; go before those in the bag.
     projection
         "orthographic" looks for grey images of the unit cube.
     every, limit
@@ -103,7 +103,7 @@ class RecordedBag:
         self,
         path: str | Path,
         topic: str | None = None,
-        camera_info: Any = None,
+        camera_info: str | Path | None = None,
         projection: Projection = "pinhole",
         every: int = 1,
         limit: int | None = None,
@@ -147,8 +147,9 @@ class RecordedBag:
 
     def __iter__(self) -> Iterator[RecordedFrame | FrameError]:
         needs_info = self._camera_info is None and not self._orthographic
+        latest: Message | None = None
+        waiting: Message | None = None
         try:
-            latest: Message | None = None
             connections = self._reader.connections(IMAGE, COMPRESSED, topic=self.topic)
             if needs_info:
                 infos = self._reader.connections(CAMERA_INFO, topic=self._info_topic)
@@ -156,23 +157,20 @@ class RecordedBag:
                     (message for message in self._reader.messages(infos) if isinstance(message, Message)), None
                 )
                 connections += infos
-            waiting: Message | None = None
             for message in self._reader.messages(connections, self._every, self._limit):
                 if isinstance(message, FrameError):
                     yield message
-                elif message.is_info:
-                    if waiting is not None and waiting.stamp <= message.stamp:
-                        yield from self._frame(waiting, message if waiting.stamp == message.stamp else latest)
-                        waiting = None
+                    continue
+                if waiting is not None and not (message.is_info and message.stamp < waiting.stamp):
+                    is_its_own = message.is_info and message.stamp == waiting.stamp
+                    yield from self._frame(waiting, message if is_its_own else latest)
+                    waiting = None
+                if message.is_info:
                     latest = message
+                elif needs_info and (latest is None or latest.stamp != message.stamp):
+                    waiting = message  # the camera_info of its stamp may come right after it
                 else:
-                    if waiting is not None:
-                        yield from self._frame(waiting, latest)
-                        waiting = None
-                    if not needs_info or (latest is not None and latest.stamp == message.stamp):
-                        yield from self._frame(message, latest)
-                    else:  # the camera_info of its stamp may come right after it
-                        waiting = message
+                    yield from self._frame(message, latest)
             if waiting is not None:
                 yield from self._frame(waiting, latest)
         except FrameError as error:
@@ -285,10 +283,9 @@ class RecordedBag:
         )
 
     def _calibration(self, info: Message | None, depth: np.ndarray) -> Calibration:
+        known: Any = None if info is None else info.content
         if self._camera_info is not None:
-            given = self._camera_info
-            known = given(depth.shape[1], depth.shape[0]) if callable(given) else given
-            return Calibration.of(known, self.topic, self._distortion)
-        if info is None:
+            known = camera_info_of(self._camera_info, depth.shape[1], depth.shape[0])
+        if known is None:
             raise ValueError(f"no camera_info on {self._info_topic}: name the camera with --camera-info")
-        return Calibration.of(info.content, self.topic, self._distortion)
+        return Calibration.of(known, self.topic, self._distortion)

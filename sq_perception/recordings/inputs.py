@@ -139,13 +139,11 @@ class RecordedInput:
             return FrameError(f"{path}: {error}")
 
     def _bag(self, path: Path) -> Iterator[tuple[str, RecordedFrame | FrameError]]:
-        source = self._camera_info
-        info = None if source is None else lambda width, height: camera_file.camera_info_of(source, width, height)
         try:
             bag = RecordedBag(
                 path,
                 self._topic,
-                info,
+                self._camera_info,
                 self._projection,
                 self._every,
                 self._limit,

@@ -222,7 +222,7 @@ def test_a_missing_camera_info_is_named_and_can_be_given(tmp_path, grey):
     assert TOPIC in str(error)
     assert "1.000000000" in str(error)
     assert f"no camera_info on {INFO}" in str(error)
-    (frame,) = frames(bag, camera_info=info(0))
+    (frame,) = frames(bag, camera_info="200,200,79.5,59.5")
     assert frame.camera == CAMERA
 
 
