@@ -14,19 +14,10 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 
+from sq_perception.evaluation import plots
 from sq_perception.evaluation.body_pictures import draw_bodies_3d
 from sq_perception.evaluation.contest import Outcome
 from sq_perception.evaluation.figures_of_merit import GOOD_IOU
-from sq_perception.evaluation.plots import (
-    FAINT,
-    INK,
-    WIRE,
-    draw_depth,
-    heading_of,
-    new_figure,
-    span_within,
-    window_of,
-)
 from sq_perception.evaluation.thesis_images import ThesisImages
 from sq_perception.imaging import raycast, unit_cube
 
@@ -42,36 +33,36 @@ _CLOSE_IOU_BINS = np.linspace(95, 100, 101)
 
 def distributions(outcome: Outcome) -> Figure:
     """IoU (as figures 6.6, 7.3, 7.7), shortest arc (figure 6.3) and the angle that is a property of the bodies."""
-    figure = new_figure(14.0, 3.5)
+    figure = plots.new_figure(14.0, 3.5)
     grid = figure.add_gridspec(1, 3, left=0.045, right=0.985, bottom=0.15, top=0.88, wspace=0.17)
     figures, summary = outcome.figures, outcome.figures.summary()
 
     ax = figure.add_subplot(grid[0])
     _histogram(ax, 100 * figures.iou, _CLOSE_IOU_BINS if summary.iou_min > 0.01 * _CLOSE_IOU_BINS[0] else _IOU_BINS)
-    ax.axvline(100 * summary.iou_mean, color=WIRE, lw=1.2)
+    ax.axvline(100 * summary.iou_mean, color=plots.WIRE, lw=1.2)
     low, high = (100 * (summary.iou_mean + side * summary.iou_std) for side in (-1, 1))
     ax.axvspan(max(low, 0.0), min(high, 100.0), color="#fbeaf3", lw=0, zorder=0)
-    ax.set_xlabel("IoU, per cent", fontsize=9, color=INK)
-    ax.set_ylabel("bodies", fontsize=9, color=INK)
-    heading_of(ax, "IoU", f"{100 * summary.over_85:.1f} % over {100 * GOOD_IOU:.0f} %; line, band: mean ± std")
+    ax.set_xlabel("IoU, per cent", fontsize=9, color=plots.INK)
+    ax.set_ylabel("bodies", fontsize=9, color=plots.INK)
+    plots.heading_of(ax, "IoU", f"{100 * summary.over_85:.1f} % over {100 * GOOD_IOU:.0f} %; line, band: mean ± std")
 
     ax = figure.add_subplot(grid[1])
     _histogram(ax, np.rad2deg(figures.shortest_arc), _ARC_BINS)
     ax.set_xticks(np.arange(0, 361, 90), ["0", "π/2", "π", "3π/2", "2π"])
-    ax.set_xlabel("radians", fontsize=9, color=INK)
-    heading_of(ax, "Shortest arc to the label (figure 6.3)", f"{100 * summary.quarter_turns:.0f} % quarter turns")
+    ax.set_xlabel("radians", fontsize=9, color=plots.INK)
+    plots.heading_of(ax, "Shortest arc to the label (figure 6.3)", f"{100 * summary.quarter_turns:.0f} % quarter turns")
 
     ax = figure.add_subplot(grid[2])
     _histogram(ax, np.rad2deg(figures.symmetric_angle), _ANGLE_BINS)
     free = np.rad2deg(figures.any_order_angle)
-    ax.hist(free[np.isfinite(free)], bins=_ANGLE_BINS.tolist(), color=WIRE, lw=1.1, histtype="step")
-    ax.set_xlabel("degrees", fontsize=9, color=INK)
+    ax.hist(free[np.isfinite(free)], bins=_ANGLE_BINS.tolist(), color=plots.WIRE, lw=1.1, histtype="step")
+    ax.set_xlabel("degrees", fontsize=9, color=plots.INK)
     if summary.recovered:
         medians = np.rad2deg([summary.symmetric_angle_median, summary.any_order_angle_median])
         names = (f"8 parameter vectors, median {medians[0]:.1f}", f"any order of axes, median {medians[1]:.1f}")
-        keys = [Patch(color=_BAR), Line2D([], [], color=WIRE, lw=1.1)]
-        ax.legend(keys, names, frameon=False, fontsize=8.5, labelcolor=INK, loc="upper center")
-    heading_of(ax, "Angle, symmetries aside", "" if summary.recovered else "no body recovered")
+        keys = [Patch(color=_BAR), Line2D([], [], color=plots.WIRE, lw=1.1)]
+        ax.legend(keys, names, frameon=False, fontsize=8.5, labelcolor=plots.INK, loc="upper center")
+    plots.heading_of(ax, "Angle, symmetries aside", "" if summary.recovered else "no body recovered")
     return figure
 
 
@@ -80,29 +71,29 @@ def ranked(outcome: Outcome) -> dict[str, list[int]]:
     order = np.argsort(-outcome.figures.iou, kind="stable")
     each = min(_EACH, max(1, len(order) // 3))
     middle = max(each, len(order) // 2 - each // 2)
-    groups = {"best": order[:each], "median": order[middle : middle + each], "worst": order[each:][-each:]}
-    taken: set[int] = set()
-    chosen: dict[str, list[int]] = {}
-    for name, numbers in groups.items():
-        chosen[name] = [int(number) for number in numbers if int(number) not in taken]
-        taken.update(chosen[name])
-    return chosen
+    after = middle + each
+    return {
+        "best": order[:each].tolist(),
+        "median": order[middle:after].tolist(),
+        "worst": order[after:][-each:].tolist(),
+    }
 
 
 def examples(outcome: Outcome, images: ThesisImages) -> Figure:
     """Best, median and worst bodies: what was seen, what the prediction looks like from there, and both from aside."""
     groups = ranked(outcome)
-    figure = new_figure(15.0, 6.1)
+    figure = plots.new_figure(15.0, 6.1)
     rows = figure.add_gridspec(3, _EACH, left=0.045, right=0.995, bottom=0.01, top=0.955, wspace=0.05, hspace=0.14)
     for row, (name, numbers) in enumerate(groups.items()):
-        figure.text(0.012, 0.83 - 0.325 * row, name, fontsize=12, weight="bold", color=INK, rotation=90, va="center")
+        look = {"fontsize": 12, "weight": "bold", "color": plots.INK, "rotation": 90, "va": "center"}
+        figure.text(0.012, 0.83 - 0.325 * row, name, look)
         for column, number in enumerate(numbers):
             tiles = rows[row, column].subgridspec(1, 3, wspace=0.03)
             axes = [figure.add_subplot(tiles[k]) for k in range(3)]
             _draw_example(axes, outcome, images, number)
             if row == 0:
                 for ax, text in zip(axes[1:], ("predicted", "wires: true"), strict=True):
-                    ax.set_title(text, loc="right", fontsize=8.5, color=FAINT, pad=3)
+                    ax.set_title(text, loc="right", fontsize=8.5, color=plots.FAINT, pad=3)
     return figure
 
 
@@ -112,18 +103,18 @@ def _draw_example(axes: Sequence[Axes], outcome: Outcome, images: ThesisImages, 
     predicted = unit_cube.optical_from_cube(outcome.bodies[number])
     rendered = raycast.render(predicted, images.camera)[0] if is_recovered else np.full_like(depth, np.nan)
     shown = np.argwhere(np.isfinite(depth) | np.isfinite(rendered))[:, ::-1].astype(float)
-    window = window_of([], images.camera, shown)
-    limits = span_within(depth, window)
+    window = plots.window_of([], images.camera, shown)
+    limits = plots.span_within(depth, window)
     for ax, image in zip(axes, (depth, rendered), strict=False):
-        draw_depth(ax, image, limits, window)
-    axes[0].set_title(f"{100 * outcome.figures.iou[number]:.1f} %", loc="left", fontsize=10, color=INK, pad=3)
-    axes[0].set_title(f"body {number}", loc="right", fontsize=8.5, color=FAINT, pad=3)
+        plots.draw_depth(ax, image, limits, window)
+    axes[0].set_title(f"{100 * outcome.figures.iou[number]:.1f} %", loc="left", fontsize=10, color=plots.INK, pad=3)
+    axes[0].set_title(f"body {number}", loc="right", fontsize=8.5, color=plots.FAINT, pad=3)
     if is_recovered:
         true = unit_cube.optical_from_cube(outcome.labels[number])
         draw_bodies_3d(axes[2], [predicted], wires=[true], elevation=22.0, azimuth=55.0, unit="", pixels=300)
     else:
         axes[2].set_axis_off()
-        axes[2].text(0.5, 0.5, "no body", transform=axes[2].transAxes, ha="center", fontsize=9, color=FAINT)
+        axes[2].text(0.5, 0.5, "no body", transform=axes[2].transAxes, ha="center", fontsize=9, color=plots.FAINT)
 
 
 def _histogram(ax: Axes, values: np.ndarray, bins: np.ndarray) -> None:
@@ -133,4 +124,4 @@ def _histogram(ax: Axes, values: np.ndarray, bins: np.ndarray) -> None:
     ax.grid(axis="x", color=_GRID, lw=0.8)
     ax.spines[["top", "right"]].set_visible(False)
     ax.spines[["left", "bottom"]].set_color(_GRID)
-    ax.tick_params(which="both", labelsize=8.5, colors=FAINT, length=0)
+    ax.tick_params(which="both", labelsize=8.5, colors=plots.FAINT, length=0)
