@@ -15,7 +15,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.patches import Polygon
 from scipy.spatial import ConvexHull
 
-from sq_perception.evaluation.plots import INK, MOST_POINTS, WIRE, colour
+from sq_perception.evaluation.plots import INK, WIRE, colour
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.mesh import mesh, outline
 from sq_perception.geometry.superquadric import Superquadric
@@ -24,6 +24,8 @@ from sq_perception.imaging.camera import Camera
 
 _LIGHT = np.array([-0.48, -0.72, -0.5]) / np.linalg.norm([-0.48, -0.72, -0.5])
 """Towards the light, in the frame of the picture: from the upper left, in front."""
+_MOST_POINTS = 1500
+"""Of the cloud of one body."""
 
 
 def draw_bodies_3d(
@@ -49,7 +51,7 @@ def draw_bodies_3d(
     bodies
         Single bodies.
     points
-        Measured points (n, 3) per body, drawn as dots where no body hides them.
+        Measured points (n, 3) per body, some of which are drawn as dots where no body hides them.
     plane : (4,), optional
         Support plane: up is along its normal, and it is drawn as a grid with the bodies' footprints.
     colours
@@ -71,26 +73,19 @@ def draw_bodies_3d(
     upright = _upright(plane)
     view = picture_axes(elevation, azimuth, plane)
     turn = quaternions.from_matrix(view)
-    turned = [body.transformed(turn, np.zeros(3)) for body in bodies]
+    turned, cages, unseen = (
+        [body.transformed(turn, np.zeros(3)) for body in group] for group in (bodies, wires, enclosed)
+    )
     shades = [np.asarray(colour(k) if colours is None else colours[k % len(colours)]) for k in range(len(bodies))]
     clouds = [np.asarray(cloud) @ view.T for cloud in points or []]
-    cages = [body.transformed(turn, np.zeros(3)) for body in wires]
-    shown = turned + cages + [body.transformed(turn, np.zeros(3)) for body in enclosed]
-    low, high = (np.array(corner) for corner in zip(*(body.bounding_box() for body in shown), strict=True))
+    boxes = [body.bounding_box() for body in turned + cages + unseen]
+    low, high = (np.array(corner) for corner in zip(*boxes, strict=True))
     middle = 0.5 * (low.min(axis=0) + high.max(axis=0))
     half = 0.62 * float((high.max(axis=0) - low.min(axis=0))[:2].max())
-    finer = 2
-    scale = finer * pixels / (2 * half)
-    centre = finer * pixels / 2 - 0.5
-    camera = Camera(
-        finer * pixels,
-        finer * pixels,
-        scale,
-        scale,
-        centre - scale * middle[0],
-        centre - scale * middle[1],
-        "orthographic",
-    )
+    side = 2 * pixels  # twice as fine as the picture
+    scale = side / (2 * half)
+    cx, cy = side / 2 - 0.5 - scale * middle[:2]
+    camera = Camera(side, side, scale, scale, cx, cy, "orthographic")
     depth, index = raycast.render(Superquadric.stack(turned), camera)
     extent = (middle[0] - half, middle[0] + half, middle[1] + half, middle[1] - half)
     picture = _shaded(depth, index, turned, shades, camera)
@@ -107,7 +102,7 @@ def draw_bodies_3d(
         lines = LineCollection(segments[seen][..., :2], colors=[0.35 * shade], linewidths=0.9, zorder=3)
         ax.add_collection(lines, autolim=False)
     for cloud, shade in zip(clouds, shades, strict=False):
-        cloud = cloud[:: max(1, len(cloud) // MOST_POINTS)]
+        cloud = cloud[:: max(1, len(cloud) // _MOST_POINTS)]
         cloud = cloud[~_hidden(cloud, depth, camera, 0.02 * half)]
         ax.scatter(cloud[:, 0], cloud[:, 1], s=1.6, color=[0.25 * shade], alpha=0.55, linewidths=0, zorder=4)
     for cage in cages:
@@ -180,11 +175,8 @@ def _draw_ground(
         raised = np.concatenate([corners, np.full((*corners.shape[:-1], 1), level)], axis=-1)
         return (raised @ (view @ upright.T).T)[..., :2]
 
-    lines = []
-    for x in np.arange(low[0], high[0] + 0.5 * step, step):
-        lines.append([(x, low[1]), (x, high[1])])
-    for y in np.arange(low[1], high[1] + 0.5 * step, step):
-        lines.append([(low[0], y), (high[0], y)])
+    lines = [[(x, low[1]), (x, high[1])] for x in np.arange(low[0], high[0] + 0.5 * step, step)]
+    lines += [[(low[0], y), (high[0], y)] for y in np.arange(low[1], high[1] + 0.5 * step, step)]
     frame = np.array([(low[0], low[1]), (high[0], low[1]), (high[0], high[1]), (low[0], high[1])])
     ax.add_patch(Polygon(drawn(frame), closed=True, facecolor="#eef1f4", edgecolor="none", zorder=0))
     grid = LineCollection(list(drawn(np.array(lines))), colors="#cfd7de", linewidths=0.8, zorder=0.5)

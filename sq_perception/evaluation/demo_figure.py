@@ -12,19 +12,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from sq_perception.evaluation import plots
 from sq_perception.evaluation.body_pictures import draw_bodies_3d
-from sq_perception.evaluation.plots import (
-    FAINT,
-    INK,
-    WIRE,
-    colour,
-    draw_depth,
-    draw_outlines,
-    heading_of,
-    new_figure,
-    span_within,
-    window_of,
-)
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
 
@@ -53,30 +42,30 @@ def demo_figure(
     plane : (4,), optional
         Support plane n.p + d = height.
     """
-    figure = new_figure(15.0, 8.5)
-    figure.text(0.02, 0.958, heading, fontsize=15, weight="bold", color=INK)
+    figure = plots.new_figure(15.0, 8.5)
+    figure.text(0.02, 0.958, heading, fontsize=15, weight="bold", color=plots.INK)
     if truth:
-        figure.text(0.98, 0.958, "wires: the true bodies", fontsize=11, color=WIRE, ha="right")
+        figure.text(0.98, 0.958, "wires: the true bodies", fontsize=11, color=plots.WIRE, ha="right")
     rows = figure.add_gridspec(2, 1, left=0.02, right=0.98, top=0.905, bottom=0.02, hspace=0.12)
     above, below = rows[0].subgridspec(1, 3, wspace=0.03), rows[1].subgridspec(1, 4, wspace=0.02)
 
-    window = window_of([body for _, bodies, _ in methods for body in bodies], camera)
-    limits = span_within(depth, window)
+    window = plots.window_of([body for _, bodies, _ in methods for body in bodies], camera)
+    limits = plots.span_within(depth, window)
     ax = figure.add_subplot(above[0])
-    draw_depth(ax, depth, limits)
+    plots.draw_depth(ax, depth, limits)
     left, right, top, bottom = window
-    ax.add_patch(Rectangle((left, top), right - left, bottom - top, fill=False, edgecolor=FAINT, lw=1.0, ls="--"))
-    heading_of(ax, "Depth image", f"{camera.width} x {camera.height}, {limits[0]:.2f} to {limits[1]:.2f} {unit}")
+    ax.add_patch(Rectangle((left, top), right - left, bottom - top, fill=False, edgecolor=plots.FAINT, lw=1.0, ls="--"))
+    plots.heading_of(ax, "Depth image", f"{camera.width} x {camera.height}, {limits[0]:.2f} to {limits[1]:.2f} {unit}")
     for k, (name, bodies, remark) in enumerate(methods):
         ax = figure.add_subplot(above[1 + k])
-        draw_depth(ax, depth, limits, window)
-        draw_outlines(ax, bodies, camera, [colour(i) for i in range(len(bodies))], width=1.8)
-        heading_of(ax, name, remark)
+        plots.draw_depth(ax, depth, limits, window)
+        plots.draw_outlines(ax, bodies, camera, [plots.colour(i) for i in range(len(bodies))], width=1.8)
+        plots.heading_of(ax, name, remark)
     for k, (name, bodies, _) in enumerate(methods):
         for i, (elevation, azimuth, direction) in enumerate(_VIEWS):
             ax = figure.add_subplot(below[2 * k + i])
             draw_bodies_3d(
                 ax, list(bodies), plane=plane, elevation=elevation, azimuth=azimuth, unit=unit, wires=list(truth)
             )
-            heading_of(ax, name if i == 0 else "", direction)
+            plots.heading_of(ax, name if i == 0 else "", direction)
     return figure

@@ -54,12 +54,12 @@ def demo_table(
             partner, overlap = pairs[name][i].recovered, pairs[name][i].iou
             if partner is None:
                 cells += ["[red]not found[/]", "", ""]
-            elif has_truth and overlap is not None:
+                continue
+            quality = f"{_length(residuals[partner], unit, 1)} {unit}".strip()
+            if has_truth and overlap is not None:
                 colour = "green" if overlap >= _GOOD_OVERLAP else "red"
-                cells += [*_numbers(alike(found[partner], model[i]), unit), f"[{colour}]{100 * overlap:.1f} %[/]"]
-            else:
-                residual = _length(residuals[partner], unit, 1)
-                cells += [*_numbers(alike(found[partner], model[i]), unit), f"{residual} {unit}".strip()]
+                quality = f"[{colour}]{100 * overlap:.1f} %[/]"
+            cells += [*_numbers(alike(found[partner], model[i]), unit), quality]
         table.add_row(str(i + 1), *cells)
     for k, (name, (found, _)) in enumerate(results.items()):
         for extra in pairs[name][len(model) :]:

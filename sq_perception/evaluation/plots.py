@@ -33,8 +33,6 @@ NOTHING = "#1b2129"
 FAINT = "#8a97a3"
 DEPTH_MAP = LinearSegmentedColormap.from_list("depth", ["#f4f6f7", "#c3ced6", "#8b9dab", "#566a7b", "#36475a"])
 _CONTOUR_PIXELS = 1280
-MOST_POINTS = 1500
-"""Of the cloud of one body."""
 Window = tuple[float, float, float, float]
 """Left, right, top, bottom of a part of an image."""
 
@@ -105,15 +103,8 @@ def draw_outlines(
 def silhouettes(body: Superquadric, camera: Camera) -> list[np.ndarray]:
     """Closed outlines (n, 2) of a body in the image, in pixels; cut at the image's border, empty if out of sight."""
     k = max(1, _CONTOUR_PIXELS // max(camera.width, camera.height))
-    fine = Camera(
-        camera.width * k,
-        camera.height * k,
-        camera.fx * k,
-        camera.fy * k,
-        (camera.cx + 0.5) * k - 0.5,
-        (camera.cy + 0.5) * k - 0.5,
-        camera.projection,
-    )
+    cx, cy = (camera.cx + 0.5) * k - 0.5, (camera.cy + 0.5) * k - 0.5
+    fine = Camera(camera.width * k, camera.height * k, camera.fx * k, camera.fy * k, cx, cy, camera.projection)
     _, index = raycast.render(body, fine)
     contours, _ = cv2.findContours((index >= 0).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
     return [(contour[:, 0, :] + 0.5) / k - 0.5 for contour in contours if len(contour) > 2]

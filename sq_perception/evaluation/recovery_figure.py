@@ -10,22 +10,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
+from sq_perception.evaluation import plots
 from sq_perception.evaluation.body_pictures import draw_bodies_3d
-from sq_perception.evaluation.plots import (
-    DEPTH_MAP,
-    FAINT,
-    INK,
-    MOST_POINTS,
-    WIRE,
-    colour,
-    draw_depth,
-    draw_masks,
-    draw_outlines,
-    heading_of,
-    new_figure,
-    span_within,
-    window_of,
-)
 from sq_perception.fitting.covariance import undetermined
 from sq_perception.fitting.fit import Status
 from sq_perception.imaging.camera import Camera
@@ -46,35 +32,36 @@ def recovery_figure(
     """
     shown = [(k, body) for k, body in enumerate(recovery.bodies) if body.status != Status.FAILED]
     bodies = [body.superquadric for _, body in shown]
-    shades = [colour(k) for k, _ in shown]
-    figure = new_figure(14.4, 10.4)
+    shades = [plots.colour(k) for k, _ in shown]
+    figure = plots.new_figure(14.4, 10.4)
     edges = {"left": 0.02, "right": 0.985, "top": 0.925, "bottom": 0.03}
     rows = figure.add_gridspec(2, 1, height_ratios=(1.25, 1), hspace=0.16, **edges)
     top = rows[0].subgridspec(1, 2, wspace=0.04)
     bottom = rows[1].subgridspec(1, 3, wspace=0.02, width_ratios=(1, 1, 1.05))
-    figure.text(0.02, 0.968, title or "Recovered superquadrics", fontsize=15, weight="bold", color=INK)
+    figure.text(0.02, 0.968, title or "Recovered superquadrics", fontsize=15, weight="bold", color=plots.INK)
 
     pixels = np.argwhere(np.isin(recovery.labels, [body.label for body in recovery.bodies]))[:, ::-1].astype(float)
-    window = window_of(bodies, camera, pixels)
-    limits = span_within(depth, window)
+    window = plots.window_of(bodies, camera, pixels)
+    limits = plots.span_within(depth, window)
     left = figure.add_subplot(top[0])
-    draw_depth(left, depth, limits)
+    plots.draw_depth(left, depth, limits)
     _depth_bar(left, limits, unit)
-    draw_masks(left, recovery.labels, [body.label for body in recovery.bodies])
-    heading_of(left, "Depth and masks", f"{camera.width} x {camera.height}")
+    plots.draw_masks(left, recovery.labels, [body.label for body in recovery.bodies])
+    plots.heading_of(left, "Depth and masks", f"{camera.width} x {camera.height}")
     right = figure.add_subplot(top[1])
-    draw_depth(right, depth, limits, window)
-    draw_outlines(right, bodies, camera, shades)
+    plots.draw_depth(right, depth, limits, window)
+    plots.draw_outlines(right, bodies, camera, shades)
     for k, body in shown:
         _draw_open_axes(right, body, camera)
         _number(right, camera.project(body.superquadric.translation), k)
-    heading_of(right, "Recovered outlines", "faint: hidden edges; axes: what the view leaves open")
+    plots.heading_of(right, "Recovered outlines", "faint: hidden edges; axes: what the view leaves open")
 
-    clouds = [_cloud(depth, recovery.labels == body.label, camera) for _, body in shown]
+    points = camera.points(depth)
+    clouds = [points[(recovery.labels == body.label) & np.isfinite(depth)] for _, body in shown]
     for k, (elevation, azimuth, name) in enumerate(((24, 28, "From the camera's side"), (12, 90, "From the right"))):
         ax = figure.add_subplot(bottom[k])
         draw_bodies_3d(ax, bodies, clouds, recovery.plane, shades, elevation=elevation, azimuth=azimuth, unit=unit)
-        heading_of(ax, name, "")
+        plots.heading_of(ax, name, "")
     _draw_numbers(figure.add_subplot(bottom[2]), recovery, unit)
     return figure
 
@@ -85,34 +72,35 @@ def _draw_numbers(ax: Axes, recovery: FrameRecovery, unit: str) -> None:
     ax.set_xlim(0, 1)
     ax.set_ylim(0, 1)
     total = recovery.milliseconds.get("total", float("nan"))
-    ax.text(0, 0.95, "Full edges, exponents, score", fontsize=10.5, color=INK)
-    ax.text(1, 0.95, f"{total:.0f} ms", fontsize=9.5, color=FAINT, ha="right")
+    ax.text(0, 0.95, "Full edges, exponents, score", fontsize=10.5, color=plots.INK)
+    ax.text(1, 0.95, f"{total:.0f} ms", fontsize=9.5, color=plots.FAINT, ha="right")
     if not recovery.bodies:
-        ax.text(0, 0.86, recovery.message or "no object", fontsize=9.5, color=FAINT)
+        ax.text(0, 0.86, recovery.message or "no object", fontsize=9.5, color=plots.FAINT)
     for k, body in enumerate(recovery.bodies[:_MOST_LISTED]):
         y = 0.85 - 0.108 * k
-        ax.add_patch(Rectangle((0.0, y - 0.032), 0.035, 0.064, color=colour(k), lw=0))
+        ax.add_patch(Rectangle((0.0, y - 0.032), 0.035, 0.064, color=plots.colour(k), lw=0))
         _number(ax, (0.0175, y), k)
         if body.status == Status.FAILED:
-            ax.text(0.06, y, shorten(f"failed: {body.message}", _LONGEST), fontsize=9, color=FAINT, va="center")
+            ax.text(0.06, y, shorten(f"failed: {body.message}", _LONGEST), fontsize=9, color=plots.FAINT, va="center")
             continue
         e1, e2 = body.superquadric.shape
         text = wording.edges(body.superquadric.size, body.sigma_size, unit != "m")
-        ax.text(0.06, y + 0.018, text, fontsize=9, color=INK, va="center")
-        ax.text(1, y + 0.018, f"e {e1:.2f} {e2:.2f}  {body.score:.2f}", fontsize=9, color=INK, ha="right", va="center")
+        look = {"fontsize": 9, "color": plots.INK, "va": "center"}
+        ax.text(0.06, y + 0.018, text, look)
+        ax.text(1, y + 0.018, f"e {e1:.2f} {e2:.2f}  {body.score:.2f}", look, ha="right")
         verdict = f"{body.status.name.lower()}: {body.message}" if body.status == Status.WEAK else body.message
-        ax.text(0.06, y - 0.032, shorten(verdict, _LONGEST), fontsize=8, color=FAINT, va="center")
+        ax.text(0.06, y - 0.032, shorten(verdict, _LONGEST), fontsize=8, color=plots.FAINT, va="center")
     if len(recovery.bodies) > _MOST_LISTED:
-        ax.text(0, 0.0, f"and {len(recovery.bodies) - _MOST_LISTED} more", fontsize=9, color=FAINT)
+        ax.text(0, 0.0, f"and {len(recovery.bodies) - _MOST_LISTED} more", fontsize=9, color=plots.FAINT)
 
 
 def _depth_bar(ax: Axes, limits: tuple[float, float], unit: str) -> None:
     """The scale of the depth picture, under it."""
     bar = ax.inset_axes((0.0, -0.055, 1.0, 0.025))
-    bar.imshow(np.linspace(0.0, 1.0, 256)[None], cmap=DEPTH_MAP, aspect="auto", extent=(*limits, 0.0, 1.0))
+    bar.imshow(np.linspace(0.0, 1.0, 256)[None], cmap=plots.DEPTH_MAP, aspect="auto", extent=(*limits, 0.0, 1.0))
     bar.set_yticks([])
     bar.set_xticks(limits, [f"{limit:.2f} {unit}" for limit in limits])
-    bar.tick_params(length=0, labelsize=8.5, labelcolor=FAINT, pad=2)
+    bar.tick_params(length=0, labelsize=8.5, labelcolor=plots.FAINT, pad=2)
     near, far = bar.get_xticklabels()
     near.set_horizontalalignment("left")
     far.set_horizontalalignment("right")
@@ -121,8 +109,9 @@ def _depth_bar(ax: Axes, limits: tuple[float, float], unit: str) -> None:
 
 def _number(ax: Axes, at: Sequence[float] | np.ndarray, k: int) -> None:
     """The number of the k-th body, dark on a light disc."""
-    disc = {"boxstyle": "circle,pad=0.2", "facecolor": "white", "edgecolor": colour(k), "linewidth": 1.5}
-    ax.text(at[0], at[1], str(k), fontsize=8.5, color=INK, ha="center", va="center", bbox=disc, zorder=6, clip_on=True)
+    disc = {"boxstyle": "circle,pad=0.2", "facecolor": "white", "edgecolor": plots.colour(k), "linewidth": 1.5}
+    look = {"fontsize": 8.5, "color": plots.INK, "ha": "center", "va": "center", "bbox": disc}
+    ax.text(at[0], at[1], str(k), look, zorder=6, clip_on=True)
 
 
 def _draw_open_axes(ax: Axes, body: Recovery, camera: Camera) -> None:
@@ -134,12 +123,6 @@ def _draw_open_axes(ax: Axes, body: Recovery, camera: Camera) -> None:
         reach = shape.size[k] * shape.rotation_matrix[:, k]
         ends = camera.project(shape.translation + np.array([-1.0, 1.0])[:, None] * reach)
         if np.isfinite(ends).all():
-            ax.plot(*ends.T, color=WIRE, lw=1.4, solid_capstyle="round", zorder=5)
-            ax.text(ends[1, 0], ends[1, 1], "xyz"[k], fontsize=9, color=WIRE, weight="bold", zorder=6, clip_on=True)
-
-
-def _cloud(depth: np.ndarray, mask: np.ndarray, camera: Camera) -> np.ndarray:
-    rows, columns = np.nonzero(mask & np.isfinite(depth))
-    step = max(1, rows.size // MOST_POINTS)
-    rows, columns = rows[::step], columns[::step]
-    return camera.unproject(columns, rows, depth[rows, columns])
+            ax.plot(*ends.T, color=plots.WIRE, lw=1.4, solid_capstyle="round", zorder=5)
+            look = {"fontsize": 9, "color": plots.WIRE, "weight": "bold"}
+            ax.text(ends[1, 0], ends[1, 1], "xyz"[k], look, zorder=6, clip_on=True)
