@@ -24,8 +24,7 @@ from rich.live import Live
 from rich.text import Text
 
 from sq_perception.commands.children import Children, parameter_arguments
-from sq_perception.evaluation.comparison import pair
-from sq_perception.evaluation.demo_table import TITLES, delays, demo_table
+from sq_perception.evaluation.demo_table import TITLES, delays, demo_table, pair
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Projection

@@ -23,9 +23,8 @@ pytest.importorskip("rclpy", reason="rclpy missing: install the extra 'ros' or s
 import sq_perception
 from sq_perception.commands import children as children_module
 from sq_perception.commands.children import Child, Children, parameter_arguments
-from sq_perception.evaluation.comparison import alike, pair
 from sq_perception.evaluation.demo_figure import demo_figure
-from sq_perception.evaluation.demo_table import demo_table
+from sq_perception.evaluation.demo_table import alike, demo_table, pair
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast, unit_cube
 from sq_perception.imaging.camera import Camera
