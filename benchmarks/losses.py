@@ -16,13 +16,11 @@ from pathlib import Path
 if __name__ == "__main__":
     import one_thread  # noqa: F401
 
-from dataclasses import asdict
 
 import report
 import torch
 
-from sq_perception.evaluation.contest import compare
-from sq_perception.evaluation.contestants import Network
+from sq_perception.evaluation.contest import compare, network
 from sq_perception.evaluation.thesis_images import ThesisImages
 
 THESIS = {
@@ -44,26 +42,27 @@ def main() -> None:
         print("runs/ holds no trained network; see sq-perception train --help")
         return
     torch.set_num_threads(1)
-    networks = [Network.read(folder / "model.safetensors", folder.name) for folder in options.runs]
+    networks = [network(folder / "model.safetensors", folder.name) for folder in options.runs]
     result, rows = {}, []
     outcomes = compare([(one, options.bodies) for one in networks], ThesisImages(options.bodies, options.seed))
-    for network, outcome in zip(networks, outcomes, strict=True):
+    for outcome in outcomes:
+        one, metrics = outcome.contestant, outcome.contestant.notes["metrics"]
         iou, summary = outcome.figures.volume_iou, outcome.figures.summary()
-        steps, minutes = network.metrics["step"], network.metrics["seconds"] / 60
-        trained = {"loss": network.loss, "steps": steps, "minutes": minutes, "training": network.training}
-        result[network.name] = {**trained, "iou": report.spread(iou), "summary": asdict(summary)}
+        steps, minutes = metrics["step"], metrics["seconds"] / 60
+        trained = {"loss": one.loss, "steps": steps, "minutes": minutes, "training": one.notes["training"]}
+        result[one.name] = {**trained, "iou": report.spread(iou), "summary": summary}
         rows.append(
             {
-                "run": network.name,
+                "run": one.name,
                 "steps / min": f"{steps} / {minutes:.0f}",
                 "IoU %": f"{100 * iou.mean():.2f} +- {100 * iou.std():.2f}",
                 "over 85 %": f"{100 * (iou > 0.85).mean():.1f}",
-                "thesis IoU %": f"{100 * summary.iou_mean:.2f} +- {100 * summary.iou_std:.2f}",
-                "dA %": f"{100 * summary.delta_a:+.1f}",
-                "dE %": f"{100 * summary.delta_e:+.1f}",
-                "dT %": ", ".join(f"{100 * value:+.2f}" for value in summary.delta_t),
-                "quarter turns %": f"{100 * summary.quarter_turns:.0f}",
-                "thesis: IoU %": THESIS.get(network.loss, ""),
+                "thesis IoU %": f"{100 * summary['iou_mean']:.2f} +- {100 * summary['iou_std']:.2f}",
+                "dA %": f"{100 * summary['delta_a']:+.1f}",
+                "dE %": f"{100 * summary['delta_e']:+.1f}",
+                "dT %": ", ".join(f"{100 * value:+.2f}" for value in summary["delta_t"]),
+                "quarter turns %": f"{100 * summary['quarter_turns']:.0f}",
+                "thesis: IoU %": THESIS.get(one.loss, ""),
             }
         )
     report.write("losses", {"bodies": options.bodies, "runs": result}, report.table_of(rows))

@@ -12,7 +12,7 @@ from sq_perception.commands.console import FAILURE, SUCCESS, at_least, complain,
 from sq_perception.evaluation.protocol import BODIES, DEFAULT_SEED, FIT_BODIES, FITS
 
 if TYPE_CHECKING:
-    from sq_perception.evaluation.contestants import Contestant
+    from sq_perception.evaluation.contest import Contestant
     from sq_perception.recovery.recoverer import Method
 
 _HELP = """\
@@ -82,7 +82,7 @@ def _evaluate(options: argparse.Namespace, methods: list[Method], command: list[
 
 def _contestants(options: argparse.Namespace, methods: list[Method]) -> tuple[list[tuple[Contestant, int]], list[str]]:
     """Who takes part, with the number of bodies, and what is wrong with those who cannot."""
-    from sq_perception.evaluation.contestants import FittingMethod, Network, unique_names
+    from sq_perception.evaluation.contest import fit, network, unique_names
     from sq_perception.learning.checkpoint import CheckpointError, shipped_regressors
 
     contestants: list[tuple[Contestant, int]] = []
@@ -90,12 +90,12 @@ def _contestants(options: argparse.Namespace, methods: list[Method]) -> tuple[li
     paths = list(shipped_regressors().values()) if options.models is None else options.models
     for path, name in zip(paths, unique_names(paths), strict=True):
         try:
-            contestants.append((Network.read(path, name), options.bodies))
+            contestants.append((network(path, name), options.bodies))
         except CheckpointError as error:
             failures.append(str(error))
     for method in methods:
         try:
-            contestants.append((FittingMethod.of(method), min(options.fit_bodies, options.bodies)))
+            contestants.append((fit(method), min(options.fit_bodies, options.bodies)))
         except CheckpointError as error:
             failures.append(f"{method}: {error}")
     return contestants, failures

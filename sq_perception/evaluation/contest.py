@@ -1,19 +1,171 @@
-"""All contestants on the same images, chunk by chunk, and what each of them made of them."""
+"""Networks alone and the fits on the same images, each from the 256 x 256 image to a body of the cube frame.
+
+A network sees the canonical view of the image's largest object; its prediction is carried back and not refined.
+Predictions are made in batches, which changes no body.  Times are those of :meth:`Recoverer.recover`, image by image:
+segmentation, view, network or fit, and score, everything that a user waits for.  Networks are timed on the first 300
+images, fits on every image they get.
+
+The loss that a network was trained by, from its file's header, decides its row of the thesis' tables and what
+was given to it: under occupancy_rotation, size, shape and place are those of the label.  Labels list their axes as a
+training listed them, with a1 >= a2 for ``canonical_labels`` and for the fits, whose results are in canonical form.
+"""
 
 from __future__ import annotations
 
+import json
+import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
-from sq_perception.evaluation.contestants import Contestant
 from sq_perception.evaluation.figures_of_merit import FiguresOfMerit
-from sq_perception.evaluation.thesis_images import ThesisImages
+from sq_perception.evaluation.protocol import FITS
+from sq_perception.evaluation.thesis_images import ImageChunk, ThesisImages
+from sq_perception.files.output_file import free_name
+from sq_perception.fitting.fit import Status
 from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging import unit_cube
+from sq_perception.learning import checkpoint, inference
+from sq_perception.learning.choices import LOSSES
+from sq_perception.learning.inference import Predictor
+from sq_perception.learning.objective import Objective
+from sq_perception.recovery.recoverer import Method, Recoverer, RecoveryOptions
 
-Advance = Callable[[str, int], None]
-"""Called with a contestant's name and the number of bodies done."""
+TIMED_IMAGES = 300
+_IDENTITY = (0.0, 0.0, 0.0, 1.0)
+_NOBODY = np.array([1e-3, 1e-3, 1e-3, 1.0, 1.0, -1.0, -1.0, -1.0, *_IDENTITY])
+"""Stands where nothing was recovered: outside of the cube."""
+
+
+@dataclass(frozen=True, eq=False)
+class Answers:
+    """What was made of n images.
+
+    Attributes
+    ----------
+    bodies : Superquadric
+        Batch (n,) in the cube frame.
+    recovered : bool (n,)
+        False where there is no body; the one in ``bodies`` then means nothing.
+    milliseconds : (n,)
+        Execution time of each image, NaN where it was not measured.
+    """
+
+    bodies: Superquadric
+    recovered: np.ndarray
+    milliseconds: np.ndarray
+
+    @classmethod
+    def of(cls, bodies: Sequence[Superquadric | None], milliseconds: np.ndarray) -> Answers:
+        """Answers of single bodies, None where nothing was recovered."""
+        flat = np.array([_NOBODY if body is None else body.to_flat() for body in bodies])
+        return cls(Superquadric.from_flat(flat), np.array([body is not None for body in bodies]), milliseconds)
+
+
+@dataclass(frozen=True, eq=False)
+class Contestant:
+    """A network alone, or a method of the recovery with a fit.
+
+    Attributes
+    ----------
+    name : str
+        Short, unique within a comparison; also names files.
+    description : str
+        One line for the reader.
+    loss : str
+        What a network was trained by; empty where its file does not name it, and for fits.
+    recover
+        One body an image; the truth in the chunk is not looked at.
+    has_canonical_labels : bool
+        Whether labels are in canonical form.
+    notes : dict
+        JSON values: of a network its file, and the notes of its header.
+    """
+
+    name: str
+    description: str
+    loss: str
+    recover: Callable[[ImageChunk], Answers]
+    has_canonical_labels: bool = True
+    notes: dict[str, Any] = field(default_factory=dict)
+
+    def labels(self, truth: Superquadric) -> Superquadric:
+        """The true bodies, each in the parameter vector with which rotations are to be compared."""
+        return truth.canonical_form() if self.has_canonical_labels else truth
+
+    def with_given(self, prediction: Superquadric, labels: Superquadric) -> Superquadric:
+        """What is compared with the labels: the prediction, with whatever was given to the contestant."""
+        return Objective(self.loss).with_given(prediction, labels) if self.loss else prediction
+
+
+def network(path: Path, name: str | None = None) -> Contestant:
+    """The network of a weights file.
+
+    Raises
+    ------
+    CheckpointError
+        If the file is missing, damaged or of another kind, or its header names a loss that is not known.
+    """
+    model = inference.load(path)
+    header = checkpoint.read_header(path)
+    training, metrics = (_note(header, key, path) for key in ("training", "metrics"))
+    if training.get("loss", LOSSES[0]) not in LOSSES:
+        raise checkpoint.CheckpointError(f"{path}: the header names an unknown loss: {training['loss']!r}")
+    # Headers without a loss are of the time when there was one only.
+    loss = str(training.get("loss", "occupancy")) if training else ""
+    parts = [f"network alone, loss {loss or 'not in the file'}"]
+    parts.append(f"views of {model.config.pixels} x {model.config.pixels}")
+    if "step" in metrics:
+        parts.append(f"{metrics['step']} steps in its last training")
+    if training.get("start"):
+        parts.append("started from another network")
+    if loss == "occupancy_rotation":
+        parts.append("size, shape and place given")
+    return Contestant(
+        name or default_name(path),
+        ", ".join(parts),
+        loss,
+        partial(_predicted, model, Recoverer(path, method="network")),
+        training.get("canonical_labels", False),
+        {"model": str(path), "training": training, "metrics": metrics},
+    )
+
+
+def fit(method: Method) -> Contestant:
+    """A method of the recovery with a fit; raises CheckpointError if its network is needed and cannot be read."""
+    return Contestant(method, FITS[method], "", partial(_fitted, method, Recoverer(method=method)))
+
+
+def _predicted(model: Predictor, recoverer: Recoverer, images: ImageChunk) -> Answers:
+    bodies: list[Superquadric | None] = [None] * len(images)
+    views = {k: view for k, view in enumerate(images.views(model.config)) if view is not None}
+    if views:
+        predicted = model.predict(np.stack([view.marked for view in views.values()]))
+        for (k, view), body in zip(views.items(), predicted, strict=True):
+            bodies[k] = unit_cube.cube_from_optical(view.from_canonical(body))
+    if images.first == 0:
+        recoverer.warm_up(images.camera)
+    milliseconds = np.full(len(images), np.nan)
+    for k in range(min(len(images), TIMED_IMAGES - images.first)):
+        milliseconds[k] = recoverer.recover(images.depth[k], images.camera).milliseconds["total"]
+    return Answers.of(bodies, milliseconds)
+
+
+def _fitted(method: Method, recoverer: Recoverer, images: ImageChunk) -> Answers:
+    if images.first == 0:
+        recoverer.warm_up(images.camera)
+    bodies: list[Superquadric | None] = [None] * len(images)
+    milliseconds = np.empty(len(images))
+    for k, depth in enumerate(images.depth):
+        frame = recoverer.recover(depth, images.camera, options=RecoveryOptions(method=method))
+        milliseconds[k] = frame.milliseconds["total"]
+        if frame.bodies and frame.bodies[0].status != Status.FAILED:
+            bodies[k] = unit_cube.cube_from_optical(frame.bodies[0].superquadric).canonical_form()
+    return Answers.of(bodies, milliseconds)
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +181,7 @@ class Outcome:
 def compare(
     contestants: Sequence[tuple[Contestant, int]],
     images: ThesisImages,
-    advance: Advance | None = None,
+    advance: Callable[[str, int], None] | None = None,
 ) -> list[Outcome]:
     """Let every contestant recover the first so many bodies of the test set.
 
@@ -39,7 +191,7 @@ def compare(
         Each with the number of its bodies, at most those of the test set.
     images : ThesisImages
     advance
-        Called with the progress.
+        Called with a contestant's name and the number of bodies done.
 
     Raises
     ------
@@ -50,10 +202,7 @@ def compare(
         if not 1 <= count <= images.count:
             raise ValueError(f"{contestant.name}: expected 1 to {images.count} bodies, got {count}")
     parts: list[list[tuple[FiguresOfMerit, np.ndarray, np.ndarray]]] = [[] for _ in contestants]
-    most = max((count for _, count in contestants), default=0)
     for piece in images.chunks():
-        if piece.first >= most:
-            break
         for (contestant, count), part in zip(contestants, parts, strict=True):
             mine = piece.head(count - piece.first)
             if len(mine) == 0:
@@ -70,3 +219,25 @@ def compare(
         bodies, labels = (Superquadric.from_flat(np.concatenate(flat)) for flat in (flats, labels_flat))
         outcomes.append(Outcome(contestant, FiguresOfMerit.concatenated(figures), bodies, labels))
     return outcomes
+
+
+def default_name(path: Path) -> str:
+    """A file's own name, or that of its folder where all are called model.safetensors."""
+    name = path.resolve().parent.name if path.stem == "model" else path.stem
+    return re.sub(r"[^\w.+-]+", "_", name) or "network"
+
+
+def unique_names(paths: Sequence[Path]) -> list[str]:
+    """A name for each file, none of them twice and none of a fit."""
+    taken = set[str](FITS)
+    return [free_name(default_name(path), taken) for path in paths]
+
+
+def _note(header: dict[str, str], key: str, path: Path) -> dict[str, Any]:
+    try:
+        note = json.loads(header.get(key, "{}"))
+    except json.JSONDecodeError as error:
+        raise checkpoint.CheckpointError(f"{path}: the header's {key!r} is no JSON: {error}") from error
+    if not isinstance(note, dict):
+        raise checkpoint.CheckpointError(f"{path}: expected an object as the header's {key!r}, got {note!r}")
+    return note

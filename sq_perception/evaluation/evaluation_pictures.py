@@ -38,31 +38,33 @@ def distributions(outcome: Outcome) -> Figure:
     figures, summary = outcome.figures, outcome.figures.summary()
 
     ax = figure.add_subplot(grid[0])
-    _histogram(ax, 100 * figures.iou, _CLOSE_IOU_BINS if summary.iou_min > 0.01 * _CLOSE_IOU_BINS[0] else _IOU_BINS)
-    ax.axvline(100 * summary.iou_mean, color=plots.WIRE, lw=1.2)
-    low, high = (100 * (summary.iou_mean + side * summary.iou_std) for side in (-1, 1))
+    _histogram(ax, 100 * figures.iou, _CLOSE_IOU_BINS if summary["iou_min"] > 0.01 * _CLOSE_IOU_BINS[0] else _IOU_BINS)
+    ax.axvline(100 * summary["iou_mean"], color=plots.WIRE, lw=1.2)
+    low, high = (100 * (summary["iou_mean"] + side * summary["iou_std"]) for side in (-1, 1))
     ax.axvspan(max(low, 0.0), min(high, 100.0), color="#fbeaf3", lw=0, zorder=0)
     ax.set_xlabel("IoU, per cent", fontsize=9, color=plots.INK)
     ax.set_ylabel("bodies", fontsize=9, color=plots.INK)
-    plots.heading_of(ax, "IoU", f"{100 * summary.over_85:.1f} % over {100 * GOOD_IOU:.0f} %; line, band: mean ± std")
+    plots.heading_of(ax, "IoU", f"{100 * summary['over_85']:.1f} % over {100 * GOOD_IOU:.0f} %; line, band: mean ± std")
 
     ax = figure.add_subplot(grid[1])
     _histogram(ax, np.rad2deg(figures.shortest_arc), _ARC_BINS)
     ax.set_xticks(np.arange(0, 361, 90), ["0", "π/2", "π", "3π/2", "2π"])
     ax.set_xlabel("radians", fontsize=9, color=plots.INK)
-    plots.heading_of(ax, "Shortest arc to the label (figure 6.3)", f"{100 * summary.quarter_turns:.0f} % quarter turns")
+    plots.heading_of(
+        ax, "Shortest arc to the label (figure 6.3)", f"{100 * summary['quarter_turns']:.0f} % quarter turns"
+    )
 
     ax = figure.add_subplot(grid[2])
     _histogram(ax, np.rad2deg(figures.symmetric_angle), _ANGLE_BINS)
     free = np.rad2deg(figures.any_order_angle)
     ax.hist(free[np.isfinite(free)], bins=_ANGLE_BINS.tolist(), color=plots.WIRE, lw=1.1, histtype="step")
     ax.set_xlabel("degrees", fontsize=9, color=plots.INK)
-    if summary.recovered:
-        medians = np.rad2deg([summary.symmetric_angle_median, summary.any_order_angle_median])
+    if summary["recovered"]:
+        medians = np.rad2deg([summary["symmetric_angle_median"], summary["any_order_angle_median"]])
         names = (f"8 parameter vectors, median {medians[0]:.1f}", f"any order of axes, median {medians[1]:.1f}")
         keys = [Patch(color=_BAR), Line2D([], [], color=plots.WIRE, lw=1.1)]
         ax.legend(keys, names, frameon=False, fontsize=8.5, labelcolor=plots.INK, loc="upper center")
-    plots.heading_of(ax, "Angle, symmetries aside", "" if summary.recovered else "no body recovered")
+    plots.heading_of(ax, "Angle, symmetries aside", "" if summary["recovered"] else "no body recovered")
     return figure
 
 

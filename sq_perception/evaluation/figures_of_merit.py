@@ -28,8 +28,9 @@ A body that was not recovered has IoU 0, and NaN in everything that compares par
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 
@@ -41,36 +42,6 @@ GOOD_IOU = 0.85
 _QUARTER_TURN = np.deg2rad([70.0, 110.0])
 _CYCLES = np.array([[0.5, 0.5, 0.5, 0.5], [-0.5, -0.5, -0.5, 0.5]])
 """x to y to z to x, and back."""
-
-
-@dataclass(frozen=True)
-class Summary:
-    """Means over a test set, as the thesis defines them: shares and relative errors as fractions, angles in radians.
-
-    Numbers about parameters are over the ``recovered`` bodies, times over the ``timed`` ones; NaN where there is none.
-    """
-
-    bodies: int
-    recovered: int
-    iou_mean: float
-    iou_std: float
-    iou_median: float
-    iou_min: float
-    iou_max: float
-    over_85: float
-    volume_iou_mean: float
-    volume_iou_std: float
-    delta_a: float
-    delta_e: float
-    delta_t: tuple[float, float, float]
-    quarter_turns: float
-    symmetric_angle_median: float
-    any_order_angle_median: float
-    timed: int
-    milliseconds_mean: float
-    milliseconds_std: float
-    milliseconds_median: float
-    milliseconds_p95: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,36 +120,39 @@ class FiguresOfMerit:
         """The figures of several batches, one after the other."""
         return cls(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(cls)))
 
-    def summary(self) -> Summary:
-        """Means as in the thesis' tables."""
+    def summary(self) -> dict[str, Any]:
+        """Means over a test set, as in the thesis' tables: JSON values by name.
+
+        Shares and relative errors are fractions, angles radians.  Numbers about parameters are over the ``recovered``
+        bodies, times over the ``timed`` ones; NaN where there is none.
+        """
         recovered = np.isfinite(self.delta_a)
         times = self.milliseconds[np.isfinite(self.milliseconds)]
         axes = self.axes_angle[recovered]
         low, high = _QUARTER_TURN
-        delta_t = self.delta_t[recovered]
-        return Summary(
-            bodies=len(self),
-            recovered=int(recovered.sum()),
-            iou_mean=_mean(self.iou),
-            iou_std=float(self.iou.std()),
-            iou_median=float(np.median(self.iou)),
-            iou_min=float(self.iou.min()),
-            iou_max=float(self.iou.max()),
-            over_85=_mean(self.iou > GOOD_IOU),
-            volume_iou_mean=_mean(self.volume_iou),
-            volume_iou_std=float(self.volume_iou.std()),
-            delta_a=_mean(self.delta_a[recovered]),
-            delta_e=_mean(self.delta_e[recovered]),
-            delta_t=(_mean(delta_t[:, 0]), _mean(delta_t[:, 1]), _mean(delta_t[:, 2])),
-            quarter_turns=_mean((axes > low) & (axes < high)),
-            symmetric_angle_median=_median(self.symmetric_angle[recovered]),
-            any_order_angle_median=_median(self.any_order_angle[recovered]),
-            timed=times.size,
-            milliseconds_mean=_mean(times),
-            milliseconds_std=float(times.std()) if times.size else np.nan,
-            milliseconds_median=_median(times),
-            milliseconds_p95=float(np.percentile(times, 95)) if times.size else np.nan,
-        )
+        return {
+            "bodies": len(self),
+            "recovered": int(recovered.sum()),
+            "iou_mean": _of(np.mean, self.iou),
+            "iou_std": _of(np.std, self.iou),
+            "iou_median": _of(np.median, self.iou),
+            "iou_min": _of(np.min, self.iou),
+            "iou_max": _of(np.max, self.iou),
+            "over_85": _of(np.mean, self.iou > GOOD_IOU),
+            "volume_iou_mean": _of(np.mean, self.volume_iou),
+            "volume_iou_std": _of(np.std, self.volume_iou),
+            "delta_a": _of(np.mean, self.delta_a[recovered]),
+            "delta_e": _of(np.mean, self.delta_e[recovered]),
+            "delta_t": [_of(np.mean, coordinate) for coordinate in self.delta_t[recovered].T],
+            "quarter_turns": _of(np.mean, (axes > low) & (axes < high)),
+            "symmetric_angle_median": _of(np.median, self.symmetric_angle[recovered]),
+            "any_order_angle_median": _of(np.median, self.any_order_angle[recovered]),
+            "timed": times.size,
+            "milliseconds_mean": _of(np.mean, times),
+            "milliseconds_std": _of(np.std, times),
+            "milliseconds_median": _of(np.median, times),
+            "milliseconds_p95": _of(lambda values: np.percentile(values, 95), times),
+        }
 
 
 def shortest_arc(predicted: np.ndarray, true: np.ndarray) -> np.ndarray:
@@ -187,9 +161,5 @@ def shortest_arc(predicted: np.ndarray, true: np.ndarray) -> np.ndarray:
     return 2 * np.arctan2(np.linalg.norm(between[..., :3], axis=-1), between[..., 3])
 
 
-def _mean(values: np.ndarray) -> float:
-    return float(np.mean(values)) if len(values) else float("nan")
-
-
-def _median(values: np.ndarray) -> float:
-    return float(np.median(values)) if len(values) else float("nan")
+def _of(statistic: Callable[[np.ndarray], np.floating], values: np.ndarray) -> float:
+    return float(statistic(values)) if len(values) else float("nan")

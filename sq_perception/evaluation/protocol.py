@@ -1,9 +1,17 @@
 """What an evaluation compares by default; importable at once, for the help of the command."""
 
-from typing import Literal
+from __future__ import annotations
 
-FITS: tuple[Literal["auto", "symmetry", "classic"], ...] = ("auto", "symmetry", "classic")
-"""Network and surface fit, the surface fit alone, and the fit of Solina and Bajcsy."""
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from sq_perception.recovery.options import Method
+
+FITS: dict[Method, str] = {
+    "auto": "surface fit, started by central symmetry and the shipped network",
+    "symmetry": "surface fit, started by central symmetry alone",
+    "classic": "Solina and Bajcsy's iterative fit to the points",
+}
 BODIES = 20_000
 """Bodies for networks, as many as the thesis tested on."""
 FIT_BODIES = 2000

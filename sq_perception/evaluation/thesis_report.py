@@ -5,16 +5,14 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
 from sq_perception.evaluation import evaluation_pictures as pictures
 from sq_perception.evaluation import plots, thesis_tables
 from sq_perception.evaluation.contest import Outcome
-from sq_perception.evaluation.contestants import Network
 from sq_perception.evaluation.thesis_images import ThesisImages
-from sq_perception.evaluation.thesis_tables import Table, TableEntry
+from sq_perception.evaluation.thesis_tables import Entry, Table
 
 FORMAT, VERSION = "sq_perception.evaluation", 1
 _CAPTIONS = {
@@ -48,29 +46,24 @@ def write(
     for outcome in outcomes:
         plots.save(pictures.distributions(outcome), folder / _file(outcome, "distributions"))
         plots.save(pictures.examples(outcome, images), folder / _file(outcome, "examples"))
+    entries = [_entry(outcome) for outcome in outcomes]
     document = {
         "format": FORMAT,
         "version": VERSION,
         "facts": facts,
         "failures": list(failures),
-        "contestants": [_entry(outcome) for outcome in outcomes],
+        "contestants": entries,
     }
     text = json.dumps(_finite(document), indent=1, allow_nan=False, ensure_ascii=False)
     (folder / "results.json").write_text(text + "\n", encoding="utf-8")
     path = folder / "report.md"
-    path.write_text(_markdown(outcomes, facts, failures), encoding="utf-8")
+    path.write_text(_markdown(outcomes, entries, facts, failures), encoding="utf-8")
     return path
 
 
 def overview(outcomes: Sequence[Outcome]) -> list[Table]:
     """All contestants, in everything that is one number."""
-    return thesis_tables.overview(_results(outcomes))
-
-
-def _results(outcomes: Sequence[Outcome]) -> list[TableEntry]:
-    return [
-        TableEntry(outcome.contestant.name, outcome.contestant.loss, outcome.figures.summary()) for outcome in outcomes
-    ]
+    return thesis_tables.overview([_entry(outcome) for outcome in outcomes])
 
 
 def _file(outcome: Outcome, kind: str) -> str:
@@ -79,17 +72,15 @@ def _file(outcome: Outcome, kind: str) -> str:
 
 def _entry(outcome: Outcome) -> dict[str, Any]:
     contestant = outcome.contestant
-    entry: dict[str, Any] = {
+    return {
         "name": contestant.name,
         "description": contestant.description,
         "loss": contestant.loss or None,
-        "summary": asdict(outcome.figures.summary()),
+        "summary": outcome.figures.summary(),
         "examples": pictures.ranked(outcome),
         "pictures": [_file(outcome, kind) for kind in _CAPTIONS],
+        **contestant.notes,
     }
-    if isinstance(contestant, Network):
-        entry.update(model=str(contestant.path), training=contestant.training, metrics=contestant.metrics)
-    return entry
 
 
 def _finite(value: Any) -> Any:
@@ -123,11 +114,13 @@ def _protocol(outcomes: Sequence[Outcome]) -> str:
     )
 
 
-def _markdown(outcomes: Sequence[Outcome], facts: dict[str, Any], failures: Sequence[str]) -> str:
+def _markdown(
+    outcomes: Sequence[Outcome], entries: Sequence[Entry], facts: dict[str, Any], failures: Sequence[str]
+) -> str:
     lines = ["# Evaluation", "", f"`{facts.get('command')}`", "", _facts_line(facts), "", _protocol(outcomes), ""]
     lines += [f"Left out: {failure}\n" for failure in failures]
     lines += [f"- {outcome.contestant.name}: {outcome.contestant.description}" for outcome in outcomes]
-    for table in (*overview(outcomes), *thesis_tables.thesis_tables(_results(outcomes))):
+    for table in (*thesis_tables.overview(entries), *thesis_tables.thesis_tables(entries)):
         lines += ["", f"## {table.title}", "", table.markdown()]
         if table.note:
             lines += ["", table.note]

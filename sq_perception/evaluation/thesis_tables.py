@@ -10,9 +10,10 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
-from sq_perception.evaluation.figures_of_merit import Summary
-
+Entry = Mapping[str, Any]
+"""A contestant as results.json has it: name, loss (None for fits), and the summary of its figures."""
 NOTHING = "none given"
 """In the cells of a row of the thesis that no contestant answers."""
 NOT_IN_THESIS = "not in the thesis"
@@ -35,15 +36,6 @@ class Table:
 
 
 @dataclass(frozen=True)
-class TableEntry:
-    """What a table needs to know of a contestant; ``loss`` is empty for fits."""
-
-    name: str
-    loss: str
-    summary: Summary
-
-
-@dataclass(frozen=True)
 class _Row:
     """A row of the thesis: its label, the loss of the networks that answer it, and the thesis' cells by column."""
 
@@ -51,8 +43,8 @@ class _Row:
     loss: str
     thesis: Mapping[str, str]
 
-    def is_answered_by(self, result: TableEntry) -> bool:
-        return result.loss == self.loss if self.loss else not result.loss and result.name == "classic"
+    def is_answered_by(self, result: Entry) -> bool:
+        return result["loss"] == self.loss if self.loss else not result["loss"] and result["name"] == "classic"
 
 
 _IOU, _TIME = "IoU", "Execution time [ms]"
@@ -104,28 +96,30 @@ _OCCUPANCY_6_1 = replace(_OCCUPANCY, label="Model 2, L_OC")
 _ROTATION = _Row("rotation alone, L_OC(q)", "occupancy_rotation", {_IOU: "75.02 %"})
 _UNSUPERVISED = (_LEAST_SQUARES, _RENDER, _FREE_SPACE)
 
-_COLUMNS: Mapping[str, Callable[[Summary], str]] = {
-    _IOU: lambda s: spread(s.iou_mean, s.iou_std),
-    "min": lambda s: percent(s.iou_min),
-    "median": lambda s: percent(s.iou_median),
-    "max": lambda s: percent(s.iou_max),
-    "over 85 %": lambda s: percent(s.over_85),
-    "volume IoU": lambda s: spread(s.volume_iou_mean, s.volume_iou_std),
-    "recovered": lambda s: f"{s.recovered} of {s.bodies}",
-    "ΔA": lambda s: signed(s.delta_a),
-    "ΔE": lambda s: signed(s.delta_e),
-    "ΔT": lambda s: f"({', '.join(signed(value) for value in s.delta_t)})",
-    "quarter turns": lambda s: percent(s.quarter_turns, 1),
-    "angle": lambda s: _degrees(s.symmetric_angle_median),
-    "axes in any order": lambda s: _degrees(s.any_order_angle_median),
-    "ms median / p95": lambda s: f"{s.milliseconds_median:.1f} / {s.milliseconds_p95:.1f}" if s.timed else "not timed",
-    _TIME: lambda s: f"{s.milliseconds_mean:.2f} ± {s.milliseconds_std:.2f}" if s.timed else "not timed",
-    "timed": lambda s: str(s.timed),
+_COLUMNS: Mapping[str, Callable[[Mapping[str, Any]], str]] = {
+    _IOU: lambda s: spread(s["iou_mean"], s["iou_std"]),
+    "min": lambda s: percent(s["iou_min"]),
+    "median": lambda s: percent(s["iou_median"]),
+    "max": lambda s: percent(s["iou_max"]),
+    "over 85 %": lambda s: percent(s["over_85"]),
+    "volume IoU": lambda s: spread(s["volume_iou_mean"], s["volume_iou_std"]),
+    "recovered": lambda s: f"{s['recovered']} of {s['bodies']}",
+    "ΔA": lambda s: signed(s["delta_a"]),
+    "ΔE": lambda s: signed(s["delta_e"]),
+    "ΔT": lambda s: f"({', '.join(signed(value) for value in s['delta_t'])})",
+    "quarter turns": lambda s: percent(s["quarter_turns"], 1),
+    "angle": lambda s: _degrees(s["symmetric_angle_median"]),
+    "axes in any order": lambda s: _degrees(s["any_order_angle_median"]),
+    "ms median / p95": lambda s: (
+        f"{s['milliseconds_median']:.1f} / {s['milliseconds_p95']:.1f}" if s["timed"] else "not timed"
+    ),
+    _TIME: lambda s: f"{s['milliseconds_mean']:.2f} ± {s['milliseconds_std']:.2f}" if s["timed"] else "not timed",
+    "timed": lambda s: str(s["timed"]),
 }
 """The cell of a contestant in each column, by the column's title."""
 
 
-def thesis_tables(results: Sequence[TableEntry]) -> list[Table]:
+def thesis_tables(results: Sequence[Entry]) -> list[Table]:
     """All tables of chapters 6 and 7, in order."""
     own = "Rows that the thesis does not have stand last."
     time = (
@@ -148,11 +142,11 @@ def thesis_tables(results: Sequence[TableEntry]) -> list[Table]:
     ]  # fmt: skip
 
 
-def overview(results: Sequence[TableEntry]) -> list[Table]:
+def overview(results: Sequence[Entry]) -> list[Table]:
     """Every contestant: how well the bodies overlap, and what is wrong about them, with the time it took."""
 
     def listed(title: str, columns: Sequence[str], note: str = "") -> Table:
-        rows = tuple((entry.name, *(_COLUMNS[name](entry.summary) for name in columns)) for entry in results)
+        rows = tuple((entry["name"], *(_COLUMNS[name](entry["summary"]) for name in columns)) for entry in results)
         return Table(title, ("Contestant", *columns), rows, note)
 
     return [
@@ -180,20 +174,18 @@ def spread(mean: float, deviation: float) -> str:
     return f"{100 * mean:.2f} ± {100 * deviation:.2f} %" if math.isfinite(mean) else "unknown"
 
 
-def _table(
-    title: str, rows: Sequence[_Row], results: Sequence[TableEntry], columns: Sequence[str], note: str = ""
-) -> Table:
+def _table(title: str, rows: Sequence[_Row], results: Sequence[Entry], columns: Sequence[str], note: str = "") -> Table:
     """Our cells beside the thesis'."""
     header = ["Method", "Contestant"]
     for name in columns:
         header += [name, f"{name}, thesis"]
     lines = []
     for row in rows:
-        answers: list[TableEntry | None] = [result for result in results if row.is_answered_by(result)]
+        answers: list[Entry | None] = [result for result in results if row.is_answered_by(result)]
         for result in answers or [None]:
-            cells = [row.label, result.name if result else NOTHING]
+            cells = [row.label, result["name"] if result else NOTHING]
             for name in columns:
-                ours = _COLUMNS[name](result.summary) if result else NOTHING
+                ours = _COLUMNS[name](result["summary"]) if result else NOTHING
                 cells += [ours, row.thesis.get(name, NOT_IN_THESIS)]
             lines.append(tuple(cells))
     return Table(title, tuple(header), tuple(lines), note)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -13,10 +14,10 @@ import torch
 
 from sq_perception.commands import main
 from sq_perception.evaluation import contest, evaluation_pictures, thesis_images, thesis_tables
-from sq_perception.evaluation.contestants import Answers, FittingMethod, Network, unique_names
-from sq_perception.evaluation.figures_of_merit import FiguresOfMerit, Summary, shortest_arc
+from sq_perception.evaluation.contest import Answers, fit, network, unique_names
+from sq_perception.evaluation.figures_of_merit import FiguresOfMerit, shortest_arc
 from sq_perception.evaluation.thesis_images import ImageChunk, ThesisImages
-from sq_perception.evaluation.thesis_tables import NOT_IN_THESIS, NOTHING, Table, TableEntry
+from sq_perception.evaluation.thesis_tables import NOT_IN_THESIS, NOTHING, Table
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
@@ -53,9 +54,9 @@ def small_network(path: Path, **training: object) -> Path:
     return path
 
 
-def summary(**changed: float) -> Summary:
-    values = FiguresOfMerit.of(LABELS, LABELS).summary()
-    return Summary(**{**values.__dict__, **changed})
+def entry(name: str, loss: str | None, **changed: float) -> dict[str, Any]:
+    """A contestant of results.json."""
+    return {"name": name, "loss": loss, "summary": {**FiguresOfMerit.of(LABELS, LABELS).summary(), **changed}}
 
 
 class TestFigures:
@@ -70,10 +71,10 @@ class TestFigures:
         shift = np.array([0.01, -0.02, 0.03])
         changed = Superquadric(1.1 * LABELS.size, 0.9 * LABELS.shape, LABELS.translation + shift, LABELS.rotation)
         found = FiguresOfMerit.of(changed, LABELS).summary()
-        assert found.delta_a == pytest.approx(1.1**3 - 1)
-        assert found.delta_e == pytest.approx(-0.1)
-        assert found.delta_t == pytest.approx(tuple(shift))
-        assert 0.4 < found.iou_mean < 1 / 1.1**3
+        assert found["delta_a"] == pytest.approx(1.1**3 - 1)
+        assert found["delta_e"] == pytest.approx(-0.1)
+        assert found["delta_t"] == pytest.approx(tuple(shift))
+        assert 0.4 < found["iou_mean"] < 1 / 1.1**3
 
     def test_a_concentric_body_of_k_times_the_size_has_iou_k_cubed(self) -> None:
         smaller = Superquadric(0.8 * LABELS.size, LABELS.shape, LABELS.translation, LABELS.rotation)
@@ -98,7 +99,7 @@ class TestFigures:
             assert np.rad2deg(figures.axes_angle) == pytest.approx(axes, abs=1e-4)
             assert np.rad2deg(figures.symmetric_angle) == pytest.approx(symmetric, abs=1e-4)
             assert np.rad2deg(figures.any_order_angle) == pytest.approx(any_order, abs=1e-4)
-            assert figures.summary().quarter_turns == (axes == 90)
+            assert figures.summary()["quarter_turns"] == (axes == 90)
 
     @pytest.mark.parametrize("degrees", [0.0, 30.0, 90.0, 180.0, 270.0, 359.0])
     def test_the_shortest_arc_runs_to_two_pi_as_in_figure_6_3(self, degrees: float) -> None:
@@ -111,11 +112,11 @@ class TestFigures:
     def test_what_was_not_recovered_has_iou_0_and_no_errors(self) -> None:
         recovered = np.arange(40) % 4 > 0
         found = FiguresOfMerit.of(LABELS, LABELS, recovered)
-        assert found.summary().iou_mean == pytest.approx(0.75)
-        assert (found.summary().recovered, found.summary().delta_a) == (30, 0)
+        assert found.summary()["iou_mean"] == pytest.approx(0.75)
+        assert (found.summary()["recovered"], found.summary()["delta_a"]) == (30, 0)
         nothing = FiguresOfMerit.of(LABELS, LABELS, np.zeros(40, bool)).summary()
-        assert (nothing.recovered, nothing.timed, nothing.iou_mean) == (0, 0, 0)
-        assert np.isnan(nothing.delta_a)
+        assert (nothing["recovered"], nothing["timed"], nothing["iou_mean"]) == (0, 0, 0)
+        assert np.isnan(nothing["delta_a"])
 
 
 class TestImages:
@@ -150,11 +151,11 @@ class TestImages:
 
 class TestContest:
     def test_chunks_do_not_change_the_result(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        network, fit = Network.read(checkpoint.resolve()), FittingMethod.of("classic")
+        alone, classic = network(checkpoint.resolve()), fit("classic")
         results = []
         for chunk in (2, 7):
             monkeypatch.setattr(thesis_images, "CHUNK", chunk)
-            results.append(contest.compare([(network, 7), (fit, 4)], ThesisImages(7)))
+            results.append(contest.compare([(alone, 7), (classic, 4)], ThesisImages(7)))
         for small, large in zip(*results, strict=True):
             np.testing.assert_allclose(small.bodies.to_flat(), large.bodies.to_flat(), atol=1e-4)
             np.testing.assert_allclose(small.figures.iou, large.figures.iou, atol=1e-3)
@@ -164,7 +165,7 @@ class TestContest:
         """In batches and one by one: two ways to the same bodies."""
         images = ThesisImages(6)
         (chunk,) = images.chunks()
-        answers = Network.read(checkpoint.resolve()).recover(chunk)
+        answers = network(checkpoint.resolve()).recover(chunk)
         recoverer = Recoverer(method="network")
         for k, depth in enumerate(chunk.depth):
             (found,) = recoverer.recover(depth, images.camera).bodies
@@ -177,7 +178,7 @@ class TestContest:
         images = ThesisImages(2)
         (chunk,) = images.chunks()
         chunk.depth[1] = np.nan
-        for contestant in (Network.read(checkpoint.resolve()), FittingMethod.of("symmetry")):
+        for contestant in (network(checkpoint.resolve()), fit("symmetry")):
             assert contestant.recover(chunk).recovered.tolist() == [True, False]
 
     @pytest.mark.parametrize("canonical", [False, True])
@@ -185,9 +186,9 @@ class TestContest:
         self, tmp_path: Path, canonical: bool
     ) -> None:
         path = small_network(tmp_path / "a.safetensors", loss="occupancy_rotation", canonical_labels=canonical)
-        network = Network.read(path)
-        labels = network.labels(LABELS)
-        compared = network.with_given(Superquadric.from_flat(LABELS.to_flat()[::-1]), labels)
+        alone = network(path)
+        labels = alone.labels(LABELS)
+        compared = alone.with_given(Superquadric.from_flat(LABELS.to_flat()[::-1]), labels)
         np.testing.assert_array_equal(compared.size, labels.size)
         np.testing.assert_allclose(compared.rotation, LABELS.rotation[::-1], atol=1e-12)
         assert (labels.size[:, 0] >= labels.size[:, 1]).all() == canonical
@@ -215,10 +216,10 @@ class TestTables:
 
     def test_losses_answer_the_rows_of_the_thesis(self) -> None:
         results = [
-            TableEntry("shipped", "occupancy", summary(iou_mean=0.9)),
-            TableEntry("free", "least_squares_free", summary(iou_mean=0.8)),
-            TableEntry("classic", "", summary(iou_mean=0.7)),
-            TableEntry("auto", "", summary(iou_mean=0.99)),
+            entry("shipped", "occupancy", iou_mean=0.9),
+            entry("free", "least_squares_free", iou_mean=0.8),
+            entry("classic", None, iou_mean=0.7),
+            entry("auto", None, iou_mean=0.99),
         ]
         tables = {table.title.split(":")[0]: table for table in thesis_tables.thesis_tables(results)}
         rows = {row[0]: row for row in tables["Table 7.4"].rows}
@@ -231,7 +232,7 @@ class TestTables:
         assert [len(table.rows) for table in thesis_tables.overview(results)] == [4, 4]
 
     def test_two_networks_of_one_loss_are_two_rows(self) -> None:
-        results = [TableEntry(name, "render", summary()) for name in ("first", "second")]
+        results = [entry(name, "render") for name in ("first", "second")]
         (table,) = (one for one in thesis_tables.thesis_tables(results) if one.title.startswith("Table 7.2"))
         assert [row[1] for row in table.rows if row[0].endswith("L_DR")] == ["first", "second"]
 
