@@ -12,8 +12,7 @@ from __future__ import annotations
 import ast
 import json
 import re
-from collections.abc import Callable, Iterator
-from functools import cache
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -262,25 +261,6 @@ def purpose(package: str) -> str:
     """The beginning of a package's docstring, up to a colon or the end of the sentence."""
     docstring = ast.get_docstring(ast.parse((PACKAGE / package / "__init__.py").read_text(encoding="utf-8"))) or ""
     return re.split(r"[:.]\s|[:.]$", " ".join(docstring.split()), maxsplit=1)[0]
-
-
-@cache
-def imported(package: str) -> frozenset[str]:
-    """Other packages that modules of one import, wherever in them."""
-    return frozenset({there for path in (PACKAGE / package).rglob("*.py") for there in _packages_of(path)}) - {package}
-
-
-def _packages_of(path: Path) -> Iterator[str]:
-    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-        names: list[str] = []
-        if isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
-            names = [f"{node.module}.{alias.name}" for alias in node.names]
-        for name in names:
-            root, _, rest = name.partition(".")
-            if root == "sq_perception" and (PACKAGE / rest.partition(".")[0]).is_dir():
-                yield rest.partition(".")[0]
 
 
 def speed() -> str:
