@@ -208,7 +208,7 @@ def _write_mesh(path: Path, frame: RecordedFrame, recovery: FrameRecovery) -> No
     """The bodies of a frame; no file where there is none."""
     from sq_perception.fitting.fit import Status
     from sq_perception.geometry import mesh
-    from sq_perception.recordings.frame_entry import in_result_frame
+    from sq_perception.recordings.result_json import in_result_frame
 
     shown = [k for k, body in enumerate(recovery.bodies) if body.status != Status.FAILED]
     if not shown:

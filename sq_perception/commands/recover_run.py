@@ -11,7 +11,7 @@ from typing import Any
 from sq_perception.commands.console import FAILURE, INTERRUPTED, SUCCESS, complain, progress
 from sq_perception.commands.recover_outputs import Outputs
 from sq_perception.fitting.fit import Status
-from sq_perception.recordings import frame_entry
+from sq_perception.recordings import result_json
 from sq_perception.recordings.frame_file import FrameError, RecordedFrame
 from sq_perception.recordings.inputs import RecordedInput
 from sq_perception.recordings.tracks import RecordedTracks
@@ -124,7 +124,7 @@ class RecoverRun:
         recovery = replace(answer, bodies=wanted)
         tracks = self._tracks.follow(file, frame, recovery) if self._tracks else None
         has_masks = not self._options.ignore_masks and frame.labels is not None
-        entry = frame_entry.frame_entry(file, frame, recovery, tracks, has_masks)
+        entry = result_json.frame_entry(file, frame, recovery, tracks, has_masks)
         self._outputs.add(frame, recovery, tracks, entry)
 
 

@@ -1,9 +1,9 @@
 """Results of recorded frames: JSON and CSV when all is done, or a line of JSON a frame as it goes, to be resumed.
 
-``result.schema.json`` beside this file describes the document, and every field in it.  A file of JSON lines has its
-head without ``frames`` in its first line, and in each line that follows an element of ``frames``
-(:mod:`sq_perception.recordings.frame_entry`).  Such a file grows; a line that an end of the program cut short is taken
-away when it is opened again, and nothing is added to what other options have found.
+``result.schema.json`` beside this file describes the document, and every field in it.  Coordinates are metres in the
+optical frame, or those of the unit cube.  A file of JSON lines has its head without ``frames`` in its first line, and
+in each line that follows an element of ``frames``.  Such a file grows; a line that an end of the program cut short is
+taken away when it is opened again, and nothing is added to what other options have found.
 """
 
 from __future__ import annotations
@@ -12,16 +12,22 @@ import csv
 import errno
 import io
 import json
+import math
 import os
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 from sq_perception.files import output_file
 from sq_perception.files.version import __version__
-from sq_perception.recordings.frame_file import Stamp
+from sq_perception.fitting.fit import Status
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging import unit_cube
+from sq_perception.recordings.frame_file import RecordedFrame, Stamp
+from sq_perception.recovery.recoverer import FrameRecovery
+from sq_perception.tracking.session import Followed
 
 FORMAT, VERSION = "sq_perception.recovery", 1
 UNITS = {"optical": "m", "cube": "1"}
@@ -38,6 +44,86 @@ def head(options: Mapping[str, Any]) -> dict[str, Any]:
     """What both forms begin with; ``options`` are those that decide what is found."""
     program = f"sq_perception {__version__}"
     return {"format": FORMAT, "version": VERSION, "program": program, "units": UNITS, "options": dict(options)}
+
+
+def frame_entry(
+    file: str,
+    frame: RecordedFrame,
+    recovery: FrameRecovery,
+    tracks: Sequence[Followed] | None,
+    has_masks: bool,
+) -> dict[str, Any]:
+    """The element of ``frames``; ``tracks`` are those of the bodies that did not fail, None without tracking.
+
+    ``has_masks``: whether labels are those of masks that came with the frame.
+    """
+    bodies, left = [], iter(tracks or ())
+    for body in recovery.bodies:
+        track = None if body.status == Status.FAILED else next(left, None)
+        superquadric = in_result_frame(body.superquadric, frame.is_cube)
+        bodies.append(
+            {
+                **_parameters(superquadric),
+                "score": _number(body.score),
+                "residual": _number(body.residual),
+                "sigma_size": _numbers(body.sigma_size),
+                "seen": _numbers(body.seen),
+                "status": body.status.name.lower(),
+                "message": body.message,
+                "label": int(body.label) if has_masks else None,
+                "pixels": int(body.pixels),
+                "track": None if track is None else _track_entry(track, frame.is_cube),
+            }
+        )
+    return {
+        "file": file,
+        "ms": _number(recovery.milliseconds["total"]),
+        "superquadrics": bodies,
+        "coordinates": "cube" if frame.is_cube else "optical",
+        "camera": {
+            "projection": frame.camera.projection,
+            "width": frame.camera.width,
+            "height": frame.camera.height,
+            "K": _numbers(frame.camera.matrix.ravel()),
+        },
+        "message": recovery.message,
+        "ms_by_stage": {stage: _number(value) for stage, value in recovery.milliseconds.items()},
+        "plane": None if recovery.plane is None else _numbers(recovery.plane),
+        "stamp": None if frame.stamp is None else frame.stamp._asdict(),
+        "topic": frame.topic or None,
+        "frame_id": frame.frame_id or None,
+    }
+
+
+def _track_entry(track: Followed, is_cube: bool) -> dict[str, Any]:
+    body = track.superquadric
+    if is_cube:
+        body = unit_cube.cube_from_optical(body)  # not its canonical form: the track keeps its own
+    return {
+        "id": track.id,
+        "seen": track.seen,
+        "fused": track.is_fused,
+        **_parameters(body),
+        "sigma_size": _numbers(track.sigma_size),
+    }
+
+
+def in_result_frame(body: Superquadric, is_cube: bool) -> Superquadric:
+    """A body in the coordinates that results are given in."""
+    return unit_cube.cube_from_optical(body).canonical_form() if is_cube else body
+
+
+def _parameters(body: Superquadric) -> dict[str, list[float | None]]:
+    return {name: _numbers(getattr(body, name)) for name in ("size", "shape", "translation", "rotation")}
+
+
+def _numbers(values: Iterable[float]) -> list[float | None]:
+    return [_number(value) for value in values]
+
+
+def _number(value: float) -> float | None:
+    """JSON knows neither NaN nor infinity."""
+    return float(value) if math.isfinite(value) else None
 
 
 def document(options: Mapping[str, Any], frames: Sequence[Mapping[str, Any]]) -> str:

@@ -21,8 +21,8 @@ from trimesh.visual.material import PBRMaterial
 from sq_perception.files.output_file import OutputFile
 from sq_perception.fitting.fit import Status
 from sq_perception.geometry.mesh import COLOURS, triangles
-from sq_perception.recordings.frame_entry import in_result_frame
 from sq_perception.recordings.frame_file import RecordedFrame
+from sq_perception.recordings.result_json import in_result_frame
 from sq_perception.recovery import wording
 from sq_perception.recovery.recovery import FrameRecovery
 from sq_perception.viewing import drawings
@@ -97,12 +97,11 @@ def _scene(frame: RecordedFrame, recovery: FrameRecovery) -> trimesh.Scene:
     span = drawings.depth_span(frame.depth) or (0.0, 1.0)
     cloud = drawings.cloud(frame.depth, frame.camera, span, _MOST_POINTS, is_muted=True)
     whole = trimesh.Scene()
-    middle = np.array([0.0, 0.0, span[0]])
-    if len(cloud.points):
-        middle = np.median(cloud.points, axis=0).astype(float)
-        whole.add_geometry(trimesh.PointCloud(cloud.points, cloud.colours), node_name="points")
-    else:  # of a covered lens one black point, as no GLB is empty
-        whole.add_geometry(trimesh.PointCloud(middle[None], np.array([[0, 0, 0, 255]], np.uint8)), node_name="points")
+    points, colours = cloud.points, cloud.colours
+    if not len(points):  # of a covered lens one black point, as no GLB is empty
+        points, colours = np.array([[0.0, 0.0, span[0]]]), np.array([[0, 0, 0, 255]], np.uint8)
+    middle = np.median(points, axis=0).astype(float)
+    whole.add_geometry(trimesh.PointCloud(points, colours), node_name="points")
     for k, body in enumerate(recovery.bodies):
         if body.status == Status.FAILED:
             continue

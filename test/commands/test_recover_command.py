@@ -326,7 +326,7 @@ def run(*arguments):
 
 def interrupt_after(frames, monkeypatch):
     """Ctrl-C while the frame after so many is worked on."""
-    from sq_perception.recordings import frame_entry as module
+    from sq_perception.recordings import result_json as module
 
     entry, calls = module.frame_entry, []
 
