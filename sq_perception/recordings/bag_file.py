@@ -37,7 +37,7 @@ from sq_perception.imaging.calibration import Calibration, Treatment
 from sq_perception.imaging.camera import Projection
 from sq_perception.recordings import publication
 from sq_perception.recordings.bag_reader import CAMERA_INFO, COMPRESSED, IMAGE, BagReader, Message, described
-from sq_perception.recordings.camera_file import camera_info_of
+from sq_perception.recordings.camera_file import read_camera_info
 from sq_perception.recordings.frame_file import MILLIMETRES, FrameError, Reading, RecordedFrame, Stamp
 
 SUFFIXES = (".mcap", ".db3")
@@ -161,11 +161,12 @@ class RecordedBag:
                 if isinstance(message, FrameError):
                     yield message
                     continue
-                if waiting is not None and not (message.is_info and message.stamp < waiting.stamp):
-                    is_its_own = message.is_info and message.stamp == waiting.stamp
+                is_info = message.kind == CAMERA_INFO
+                if waiting is not None and not (is_info and message.stamp < waiting.stamp):
+                    is_its_own = is_info and message.stamp == waiting.stamp
                     yield from self._frame(waiting, message if is_its_own else latest)
                     waiting = None
-                if message.is_info:
+                if is_info:
                     latest = message
                 elif needs_info and (latest is None or latest.stamp != message.stamp):
                     waiting = message  # the camera_info of its stamp may come right after it
@@ -212,7 +213,7 @@ class RecordedBag:
         for message in islice(self._reader.messages(self._reader.connections(IMAGE, COMPRESSED, topic=topic)), _PEEKED):
             if isinstance(message, FrameError):
                 continue
-            if message.is_packed:
+            if message.kind == COMPRESSED:
                 return compressed_depth.encoding(message.content.format) or message.content.format
             return str(message.content.encoding)
         return None
@@ -285,7 +286,7 @@ class RecordedBag:
     def _calibration(self, info: Message | None, depth: np.ndarray) -> Calibration:
         known: Any = None if info is None else info.content
         if self._camera_info is not None:
-            known = camera_info_of(self._camera_info, depth.shape[1], depth.shape[0])
+            known = read_camera_info(self._camera_info, (depth.shape[1], depth.shape[0]))
         if known is None:
             raise ValueError(f"no camera_info on {self._info_topic}: name the camera with --camera-info")
         return Calibration.of(known, self.topic, self._distortion)

@@ -29,10 +29,9 @@ class Message:
     """A message that could be read as what it claims to be; its fields may still hold anything."""
 
     content: Any
+    kind: str
     stamp: Stamp
     received: int
-    is_info: bool
-    is_packed: bool
 
 
 class BagReader:
@@ -57,7 +56,7 @@ class BagReader:
         if not connections:  # which rosbags would take for all
             return
         stored = self._reader.messages(connections)
-        seen = taken = 0
+        seen = 0
         while True:
             try:
                 connection, nanoseconds, data = next(stored)
@@ -65,14 +64,12 @@ class BagReader:
                 return
             except Exception as error:  # whatever damaged indices, chunks and pages lead to
                 raise FrameError(f"{self.path}: cannot be read any further: {described(error)}") from error
-            is_info = connection.msgtype == CAMERA_INFO
-            if not is_info:
-                seen += 1
-                if (seen - 1) % every:
+            if connection.msgtype != CAMERA_INFO:
+                before, seen = seen, seen + 1
+                if before % every:
                     continue
-                if limit is not None and taken == limit:
+                if limit is not None and before // every == limit:
                     return
-                taken += 1
             try:
                 content: Any = self._types.deserialize_cdr(_plain(data), connection.msgtype)
                 stamp = Stamp(int(content.header.stamp.sec), int(content.header.stamp.nanosec))
@@ -83,7 +80,7 @@ class BagReader:
                     f"{described(error)}"
                 )
                 continue
-            yield Message(content, stamp, nanoseconds, is_info, is_packed=connection.msgtype == COMPRESSED)
+            yield Message(content, connection.msgtype, stamp, nanoseconds)
 
 
 def _open(path: Path) -> tuple[Any, Any]:

@@ -61,48 +61,41 @@ class CameraInfo:
     roi: Region
 
 
-def calibrated(where: str | Path, info: Any, name: str, distortion: Treatment) -> Calibration:
-    """:meth:`Calibration.of <sq_perception.imaging.calibration.Calibration.of>` whose fault is a FrameError."""
-    try:
-        return Calibration.of(info, name, distortion)
-    except ValueError as error:
-        raise FrameError(f"{where}: {error}") from error
-
-
-def camera_info_of(source: str | Path, width: int, height: int) -> CameraInfo:
-    """That of a YAML, JSON or four numbers, for images of this size; raises FrameError as :func:`read_camera_info`."""
-    numbers = None if Path(source).exists() else four_numbers(str(source))
-    if numbers is None:
-        return read_camera_info(source)
-    fx, fy, cx, cy = numbers
-    none = (0.0,) * 12
-    return CameraInfo(width, height, "plumb_bob", (), (fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0), none, 0, 0, Region())
-
-
-def read_calibration(path: str | Path, distortion: Treatment = "auto") -> Calibration:
-    """The calibration that a YAML file describes.
+def read_calibration(
+    source: str | Path, distortion: Treatment = "auto", name: str = "", size: tuple[int, int] | None = None
+) -> Calibration:
+    """The calibration of images called ``name``, as :func:`read_camera_info` has it.
 
     Raises
     ------
     FrameError
         As :func:`read_camera_info`, or if the camera is not calibrated or its distortion not known.
     """
-    return calibrated(path, read_camera_info(path), "", distortion)
+    info = read_camera_info(source, size)
+    try:
+        return Calibration.of(info, name, distortion)
+    except ValueError as error:
+        raise FrameError(f"{source}: {error}") from error
 
 
-def read_camera_info(path: str | Path) -> CameraInfo:
+def read_camera_info(source: str | Path, size: tuple[int, int] | None = None) -> CameraInfo:
     """A YAML file in the layout of camera_calibration, or of a printed camera_info message; or JSON, see the module.
 
-    A file that does not name its distortion model means plumb_bob; what else it does not name is zero.
+    A file that does not name its distortion model means plumb_bob; what else it does not name is zero.  Where the
+    ``size`` of the images is given, width and height, four numbers do for a file.
 
     Raises
     ------
     FrameError
     """
+    if size is not None and not Path(source).exists() and (numbers := _four_numbers(str(source))) is not None:
+        fx, fy, cx, cy = numbers
+        matrix = (fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0)
+        return CameraInfo(*size, "plumb_bob", (), matrix, (0.0,) * 12, 0, 0, Region())
     try:
-        return _camera_info(Path(path))
+        return _camera_info(Path(source))
     except (plain_yaml.YamlError, FrameError) as error:
-        raise FrameError(f"{path}: cannot read the camera_info: {error}") from error
+        raise FrameError(f"{source}: cannot read the camera_info: {error}") from error
 
 
 def _camera_info(path: Path) -> CameraInfo:
@@ -143,14 +136,13 @@ def is_transposed(matrix: np.ndarray) -> bool:
     return bool((matrix[6:8] != 0).any() and not (matrix[[2, 5]] != 0).any())
 
 
-def four_numbers(text: str) -> tuple[float, float, float, float] | None:
+def _four_numbers(text: str) -> list[float] | None:
     """fx, fy, cx, cy of a text such as ``525,525,319.5,239.5``; None if it is another text, such as a path."""
-    parts = text.split(",")
     try:
-        numbers = [float(part) for part in parts]
+        numbers = [float(part) for part in text.split(",")]
     except ValueError:
         return None
-    return (numbers[0], numbers[1], numbers[2], numbers[3]) if len(numbers) == 4 else None
+    return numbers if len(numbers) == 4 else None
 
 
 def _read_json(path: Path) -> dict[str, Any]:

@@ -38,7 +38,7 @@ from sq_perception.imaging import unit_cube
 from sq_perception.imaging.calibration import Treatment
 from sq_perception.imaging.camera import Camera, Projection
 from sq_perception.recordings import cloud_file
-from sq_perception.recordings.camera_file import FrameError, calibrated, camera_info_of, is_transposed
+from sq_perception.recordings.camera_file import FrameError, is_transposed, read_calibration
 
 SUFFIXES = (".npz", ".npy", ".png", ".bmp", ".tif", ".tiff", ".exr", *cloud_file.SUFFIXES)
 MILLIMETRES = 1000.0
@@ -269,8 +269,8 @@ def _read(
         )
     if camera_info is None:
         raise ValueError("a depth image needs a camera_info file with the camera's intrinsics")
-    info = camera_info_of(camera_info, image.shape[1], image.shape[0])
-    calibration = calibrated(camera_info, info, path.with_suffix("").as_posix(), distortion)
+    size = image.shape[1], image.shape[0]
+    calibration = read_calibration(camera_info, distortion, path.with_suffix("").as_posix(), size)
     scale, warnings = 1.0 if is_metric else MILLIMETRES, [f"{camera_info}: {calibration.note}"] * bool(calibration.note)
     if reading.scale is not None:
         scale = reading.scale

@@ -81,9 +81,9 @@ class RecordedInput:
         self._distortion: Treatment = distortion
         self._reading = reading
         if camera_info is not None:
-            info = camera_file.camera_info_of(camera_info, *_ANY_SIZE)
             # Auto depends on what the images are called.
-            camera_file.calibrated(camera_info, info, "", "ignore" if distortion == "auto" else distortion)
+            treatment = "ignore" if distortion == "auto" else distortion
+            camera_file.read_calibration(camera_info, treatment, size=_ANY_SIZE)
         self._projection: Projection = projection
         self._topic, self._every, self._limit = topic, every, limit
         self._is_done = is_done
