@@ -54,11 +54,6 @@ class Bodies:
         Red, green, blue in [0, 1].
     failed : n of int
         Ids of the objects of which no body is known.
-
-    Raises
-    ------
-    ValueError
-        If the lengths differ.
     """
 
     superquadrics: Superquadric
@@ -68,12 +63,6 @@ class Bodies:
     is_weak: Sequence[bool]
     colours: np.ndarray
     failed: Sequence[int] = ()
-
-    def __post_init__(self) -> None:
-        count = len(self.superquadrics)
-        for name in ("sigma_size", "score", "ids", "is_weak", "colours"):
-            if len(getattr(self, name)) != count:
-                raise ValueError(f"{name}: expected one for each of {count} bodies, got {len(getattr(self, name))}")
 
     def __len__(self) -> int:
         return len(self.superquadrics)

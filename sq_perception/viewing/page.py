@@ -59,14 +59,6 @@ class Transition:
 Request = Change | Transition
 
 
-@dataclass(eq=False)
-class _Pending:
-    """A value that waits for the user to stop typing."""
-
-    value: Any
-    due: float
-
-
 class Page:
     """Serves the page of some nodes on a bound socket.
 
@@ -118,11 +110,12 @@ class Page:
         changes: list[Request] = list(ready)
         for part in self._nodes.values():
             for name, pending in list(part.pending.items()):
-                if now >= pending.due:
+                value, due = pending
+                if now >= due:
                     # A newer value that comes this instant has replaced the entry and stays.
                     if part.pending.get(name) is pending:
                         del part.pending[name]
-                    changes.append(Change(part.name, name, pending.value))
+                    changes.append(Change(part.name, name, value))
         return changes
 
     # The scene
@@ -299,7 +292,7 @@ class Page:
             def _(_: viser.GuiEvent) -> None:
                 wanted = about.wanted(handle.value)
                 if wanted is not None and wanted != part.known.get(about.name):
-                    part.pending[about.name] = _Pending(wanted, monotonic() + about.patience)
+                    part.pending[about.name] = wanted, monotonic() + about.patience
 
         return handle
 
@@ -319,7 +312,8 @@ class _NodePart:
     controls: dict[str, Control] = field(default_factory=dict)
     handles: dict[str, Any] = field(default_factory=dict)
     known: dict[str, Any] = field(default_factory=dict)
-    pending: dict[str, _Pending] = field(default_factory=dict)
+    pending: dict[str, tuple[Any, float]] = field(default_factory=dict)
+    """Values that wait for the user to stop typing, and when they are sent."""
 
 
 _TRANSITIONS: dict[str, tuple[str, ...]] = {

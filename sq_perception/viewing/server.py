@@ -133,7 +133,7 @@ def refusal(headers: Mapping[str, str], own_names: frozenset[str]) -> str:
     host = headers.get("Host", "")
     found = _HOST.fullmatch(host)
     name = "" if found is None else found["name"].strip("[]").lower()
-    if not (name == "localhost" or name in own_names or _is_address(name)):
+    if not (name == "localhost" or name in own_names or _address(name)):
         return f"Host {host!r} is no name of this machine"
     origin = headers.get("Origin")
     if origin is not None and urlsplit(origin).netloc.lower() != host.lower():
@@ -143,10 +143,8 @@ def refusal(headers: Mapping[str, str], own_names: frozenset[str]) -> str:
 
 def is_local(host: str) -> bool:
     """Whether an address to bind to can only be reached from this machine."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
+    address = _address(host)
+    return host == "localhost" if address is None else address.is_loopback
 
 
 def own_names() -> frozenset[str]:
@@ -198,9 +196,9 @@ def _guarding(bound: socket.socket) -> Iterator[tuple[Callable[[], bool], weakre
             websockets.asyncio.server.serve = original  # type: ignore[misc]
 
 
-def _is_address(name: str) -> bool:
+def _address(name: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
+    """The address that is written so; None for a name."""
     try:
-        ipaddress.ip_address(name)
+        return ipaddress.ip_address(name)
     except ValueError:
-        return False
-    return True
+        return None

@@ -127,8 +127,6 @@ def test_misuse_is_refused() -> None:
         drawings.cloud(np.ones((48, 64), np.float32), CAMERA, (0, 1), 0)
     with pytest.raises(ValueError, match="does not fit"):
         drawings.cloud(np.ones((4, 6), np.float32), CAMERA, (0, 1), 9)
-    with pytest.raises(ValueError, match="ids: expected one for each of 1"):
-        Bodies(Superquadric.stack([body()]), np.ones((1, 3)), np.ones(1), [], [False], np.ones((1, 3)))
 
 
 # Controls
