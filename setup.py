@@ -85,7 +85,7 @@ setup(
     package_data={
         "sq_perception.config": ["*.rviz", "*.xml", "*.yaml"],
         "sq_perception.learning": ["configurations/*.yaml"],
-        "sq_perception.recordings": ["*.json"],
+        "sq_perception.recordings": ["*.html", "*.json"],
         "sq_perception.weights": ["*.safetensors", "*.json", "*.md"],
         "sq_perception": ["py.typed"],
         "sq_msgs_py": ["py.typed"],

@@ -30,29 +30,7 @@ from sq_perception.viewing import drawings
 _MOST_POINTS = 30000
 _HALF_TURN_ABOUT_X = np.diag([1.0, -1.0, -1.0, 1.0])
 _SCENE = "$SCENE"
-_BEGINNING = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><title>sq_perception: superquadrics from depth</title><style>
-body { margin: 0; font: 14px sans-serif; color: #22303c; display: flex; flex-direction: column; height: 100vh }
-iframe { flex: 1; border: 0; min-height: 40vh } table { border-collapse: collapse } td, th { text-align: left }
-td, th { padding: 2px 10px; vertical-align: top } td:not(:last-child) { white-space: nowrap }
-#numbers { max-height: 45vh; overflow: auto } select { margin: 6px }
-.chip { display: inline-block; width: 1em; height: 1em; margin-right: .4em; vertical-align: middle }
-</style></head><body><select id="choice" aria-label="Frame"></select><iframe id="scene" title="Scene"></iframe>
-<div id="numbers"></div>
-<script>const frames = [], viewer = %s;</script>
-"""
-_END = """<script>
-const choice = document.getElementById("choice");
-frames.forEach((frame, k) => choice.add(new Option(frame.name, k)));
-function show() {
-  const frame = frames[choice.value];
-  document.getElementById("scene").srcdoc = viewer.replace("$SCENE", () => frame.glb);
-  document.getElementById("numbers").innerHTML = frame.numbers;
-}
-choice.onchange = show;
-if (frames.length) show();
-</script></body></html>
-"""
+_TEMPLATE = Path(__file__).with_name("still_page.html")
 
 
 class StillPage:
@@ -65,7 +43,8 @@ class StillPage:
         nothing = trimesh.Scene(trimesh.creation.box())
         scene_to = scene_to_html(nothing)
         there = base64.b64encode(nothing.export(file_type="glb")).decode()
-        self._file.write(_BEGINNING % _as_script(scene_to.replace(there, _SCENE)))
+        beginning, self._end = _TEMPLATE.read_text(encoding="utf-8").split("<!-- frames -->\n")
+        self._file.write(beginning.replace("$VIEWER", _as_script(scene_to.replace(there, _SCENE))))
 
     def add(self, frame: RecordedFrame, recovery: FrameRecovery) -> None:
         """Write a frame and what was recovered from it."""
@@ -80,7 +59,7 @@ class StillPage:
         if self._file.closed:
             return None
         with self._file:
-            self._file.write(_END)
+            self._file.write(self._end)
         if not self._count:
             self._output.discard()
             return None
