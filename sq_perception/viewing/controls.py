@@ -51,7 +51,7 @@ class Control:
     value: Any
     hint: str
     group: Group
-    is_float: bool = False
+    type: type[bool] | type[int] | type[float] | type[str] = str
     low: float | None = None
     high: float | None = None
     step: float | None = None
@@ -64,24 +64,16 @@ class Control:
 
     def shown(self, value: Any) -> Any:
         """A value of the node in the type of the control."""
-        if self.kind == "fixed":
-            return plain(value)
-        if self.kind == "bool":
-            return bool(value)
-        if self.kind in ("slider", "number"):
-            return float(value) if self.is_float else int(value)
-        return str(value)
+        return plain(value) if self.kind == "fixed" else self.type(value)
 
     def wanted(self, value: Any) -> Any:
         """A value of the page in the type of the parameter; None for what is no value, such as half a number."""
-        if self.kind == "bool":
-            return bool(value)
-        if self.kind in ("slider", "number"):
-            number = float(value)
-            if not math.isfinite(number):
-                return None
-            return number if self.is_float else round(number)
-        return str(value)
+        if self.kind not in ("slider", "number"):
+            return self.type(value)
+        number = float(value)
+        if not math.isfinite(number):
+            return None
+        return round(number) if self.type is int else number
 
 
 def control(about: Any, value: Any) -> Control:
@@ -95,7 +87,7 @@ def control(about: Any, value: Any) -> Control:
     if about.read_only or group == "other":
         return made
     if isinstance(value, bool):
-        return replace(made, kind="bool", value=value)
+        return replace(made, kind="bool", type=bool, value=value)
     if isinstance(value, str):
         choices = _choices(constraints)
         if choices:
@@ -114,16 +106,15 @@ def arranged(parameters: Iterable[tuple[Any, Any]]) -> list[Control]:
 
 
 def _number(about: Any, value: float, made: Control) -> Control:
-    is_float = bool(about.floating_point_range) or isinstance(value, float)
-    kind = float if is_float else int
-    made = replace(made, kind="number", value=kind(value), is_float=is_float, patience=TYPED)
+    kind = float if about.floating_point_range or isinstance(value, float) else int
+    made = replace(made, kind="number", type=kind, value=kind(value), patience=TYPED)
     ranges = [*about.floating_point_range, *about.integer_range]
     if not ranges or not ranges[0].from_value < ranges[0].to_value:
         return made
     # What the node holds is shown, even where its descriptor rules it out.
     low, high = kind(min(ranges[0].from_value, value)), kind(max(ranges[0].to_value, value))
-    short = high - low <= (_SLIDER_SPAN if is_float else _SLIDER_STEPS)
-    step = float(ranges[0].step) or (10.0 ** (math.floor(math.log10(high - low)) - 2) if is_float else 1)
+    short = high - low <= (_SLIDER_SPAN if kind is float else _SLIDER_STEPS)
+    step = float(ranges[0].step) or (10.0 ** (math.floor(math.log10(high - low)) - 2) if kind is float else 1)
     if short and step <= high - low:
         return replace(made, kind="slider", low=low, high=high, step=step, patience=0.15)
     return replace(made, low=low, high=high)

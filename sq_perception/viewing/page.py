@@ -103,11 +103,8 @@ class Page:
 
     def requests(self) -> list[Request]:
         """What users have asked for since the last call, in order; of several values of a parameter the last."""
-        now, ready = monotonic(), []
-        with contextlib.suppress(queue.Empty):
-            while True:
-                ready.append(self._requests.get_nowait())
-        changes: list[Request] = list(ready)
+        now = monotonic()
+        changes = [self._requests.get_nowait() for _ in range(self._requests.qsize())]
         for part in self._nodes.values():
             for name, pending in list(part.pending.items()):
                 value, due = pending
@@ -149,9 +146,9 @@ class Page:
         drawn = bodies if bodies is not None and not state.remark and is_wanted else None
         with self.server.atomic():
             kept: set[str] = set()
-            for k in range(len(drawn) if drawn is not None else 0):
-                assert drawn is not None
-                kept |= self._scene.draw_body(node, drawn, k, state.is_silent, self._is_wanted)
+            if drawn is not None:
+                for k in range(len(drawn)):
+                    kept |= self._scene.draw_body(node, drawn, k, state.is_silent, self._is_wanted)
             self._scene.keep(node, kept)
         is_cube = self._scene.camera is not None and not self._scene.camera.is_pinhole
         part.table.content = tables.bodies_table(node, bodies, stamp, state, is_cube=is_cube)

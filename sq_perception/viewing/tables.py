@@ -59,7 +59,7 @@ class NodeState:
 def bodies_table(name: str, bodies: Bodies | None, stamp: float, state: NodeState, *, is_cube: bool = False) -> str:
     """The bodies of a node; ``stamp`` is that of their image, seconds; ``is_cube`` if it shows the unit cube."""
     if bodies is None:
-        return _note("No result has come yet.")
+        return f'<div style="padding:4px 17px;font-size:12.5px;color:{_DIM}">No result has come yet.</div>'
     faded = ";opacity:0.45" if state.is_silent else ""
     rows = []
     for k, body in enumerate(bodies.superquadrics):
@@ -164,10 +164,6 @@ def answer(text: str, good: bool) -> str:
         f'<div style="margin:2px 12px 6px 12px;padding:6px 9px;border-left:3px solid {colour};'
         f'background:rgba(128,128,128,0.12);font-size:12.5px;overflow-wrap:anywhere">{html.escape(text)}</div>'
     )
-
-
-def _note(text: str) -> str:
-    return f'<div style="padding:4px 17px;font-size:12.5px;color:{_DIM}">{html.escape(text)}</div>'
 
 
 def _size(half: float, sigma: float) -> str:
