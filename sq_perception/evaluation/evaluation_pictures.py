@@ -37,28 +37,22 @@ def distributions(outcome: Outcome) -> Figure:
     grid = figure.add_gridspec(1, 3, left=0.045, right=0.985, bottom=0.15, top=0.88, wspace=0.17)
     figures, summary = outcome.figures, outcome.figures.summary()
 
-    ax = figure.add_subplot(grid[0])
-    _histogram(ax, 100 * figures.iou, _CLOSE_IOU_BINS if summary["iou_min"] > 0.01 * _CLOSE_IOU_BINS[0] else _IOU_BINS)
+    bins = _CLOSE_IOU_BINS if summary["iou_min"] > 0.01 * _CLOSE_IOU_BINS[0] else _IOU_BINS
+    ax = _histogram(figure.add_subplot(grid[0]), 100 * figures.iou, bins, "IoU, per cent")
     ax.axvline(100 * summary["iou_mean"], color=plots.WIRE, lw=1.2)
     low, high = (100 * (summary["iou_mean"] + side * summary["iou_std"]) for side in (-1, 1))
     ax.axvspan(max(low, 0.0), min(high, 100.0), color="#fbeaf3", lw=0, zorder=0)
-    ax.set_xlabel("IoU, per cent", fontsize=9, color=plots.INK)
     ax.set_ylabel("bodies", fontsize=9, color=plots.INK)
     plots.heading_of(ax, "IoU", f"{100 * summary['over_85']:.1f} % over {100 * GOOD_IOU:.0f} %; line, band: mean ± std")
 
-    ax = figure.add_subplot(grid[1])
-    _histogram(ax, np.rad2deg(figures.shortest_arc), _ARC_BINS)
+    ax = _histogram(figure.add_subplot(grid[1]), np.rad2deg(figures.shortest_arc), _ARC_BINS, "radians")
     ax.set_xticks(np.arange(0, 361, 90), ["0", "π/2", "π", "3π/2", "2π"])
-    ax.set_xlabel("radians", fontsize=9, color=plots.INK)
-    plots.heading_of(
-        ax, "Shortest arc to the label (figure 6.3)", f"{100 * summary['quarter_turns']:.0f} % quarter turns"
-    )
+    turned = f"{100 * summary['quarter_turns']:.0f} % quarter turns"
+    plots.heading_of(ax, "Shortest arc to the label (figure 6.3)", turned)
 
-    ax = figure.add_subplot(grid[2])
-    _histogram(ax, np.rad2deg(figures.symmetric_angle), _ANGLE_BINS)
+    ax = _histogram(figure.add_subplot(grid[2]), np.rad2deg(figures.symmetric_angle), _ANGLE_BINS, "degrees")
     free = np.rad2deg(figures.any_order_angle)
     ax.hist(free[np.isfinite(free)], bins=_ANGLE_BINS.tolist(), color=plots.WIRE, lw=1.1, histtype="step")
-    ax.set_xlabel("degrees", fontsize=9, color=plots.INK)
     if summary["recovered"]:
         medians = np.rad2deg([summary["symmetric_angle_median"], summary["any_order_angle_median"]])
         names = (f"8 parameter vectors, median {medians[0]:.1f}", f"any order of axes, median {medians[1]:.1f}")
@@ -119,11 +113,13 @@ def _draw_example(axes: Sequence[Axes], outcome: Outcome, images: ThesisImages, 
         axes[2].text(0.5, 0.5, "no body", transform=axes[2].transAxes, ha="center", fontsize=9, color=plots.FAINT)
 
 
-def _histogram(ax: Axes, values: np.ndarray, bins: np.ndarray) -> None:
+def _histogram(ax: Axes, values: np.ndarray, bins: np.ndarray, unit: str) -> Axes:
     ax.hist(values[np.isfinite(values)], bins=bins.tolist(), color=_BAR, lw=0)
     ax.set_xlim(bins[0], bins[-1])
+    ax.set_xlabel(unit, fontsize=9, color=plots.INK)
     ax.set_axisbelow(True)
     ax.grid(axis="x", color=_GRID, lw=0.8)
     ax.spines[["top", "right"]].set_visible(False)
     ax.spines[["left", "bottom"]].set_color(_GRID)
     ax.tick_params(which="both", labelsize=8.5, colors=plots.FAINT, length=0)
+    return ax
