@@ -12,7 +12,7 @@ from __future__ import annotations
 import ast
 import json
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 
@@ -31,12 +31,16 @@ def renewed(text: str) -> str:
     return _BLOCK.sub(lambda match: f"{match[1]}{BLOCKS[match[2]]().rstrip()}\n{match[3]}", text)
 
 
-def table(heads: list[str], rows: list[list[str]]) -> str:
-    head, *body = (f"| {' | '.join(line)} |\n" for line in (heads, *rows))
-    return "".join([head, f"|{'---|' * len(heads)}\n", *body])
+def table(head: str, rows: Iterable[str]) -> str:
+    """A table of Markdown; cells are divided by ``|``."""
+    lines = [f"| {head} |", f"|{'---|' * (head.count('|') + 1)}", *(f"| {row} |" for row in rows)]
+    return "\n".join(lines) + "\n"
 
 
 # Figures
+
+HULL, EDGES, SIGMAS = "IoU with the true convex hull %", "error of full edges mm", "within 2 sigma %"
+BOTH_IOU = "IoU %, masks given / own"
 
 
 def results(name: str) -> Any:
@@ -46,36 +50,23 @@ def results(name: str) -> Any:
 def accuracy() -> str:
     """Images of the thesis' protocol: IoU from the evaluation, times of whole recoveries from the occlusion bench."""
     summaries = {one["name"]: one["summary"] for one in results("evaluation")["contestants"]}
-    times = {
-        name: row["milliseconds"]["median"] for name, row in results("occlusion")["rows"]["thesis, 0 % hidden"].items()
-    }
-    rows = [
-        ("`auto`: network + surface fit", summaries["auto"], "auto", ""),
-        ("`symmetry`: surface fit without the network", summaries["symmetry"], "symmetry", ""),
-        (
-            "`network` alone, weights `supervised`",
-            summaries["supervised"],
-            "network supervised",
-            "94.62 +- 3.18, 99.06 over 85, 2.88 ms on a GPU",
-        ),
-        ("`network` alone, weights `robust` (default)", summaries["robust"], "network robust", ""),
-        ("`classic`: Solina and Bajcsy", summaries["classic"], "classic", "84.51 +- 8.89, 690 ms"),
+    timed = results("occlusion")["rows"]["thesis, 0 % hidden"]
+    supervised = "94.62 +- 3.18, 99.06 over 85, 2.88 ms on a GPU"
+    shown = [
+        ("`auto`: network + surface fit", "auto", "auto", ""),
+        ("`symmetry`: surface fit without the network", "symmetry", "symmetry", ""),
+        ("`network` alone, weights `supervised`", "supervised", "network supervised", supervised),
+        ("`network` alone, weights `robust` (default)", "robust", "network robust", ""),
+        ("`classic`: Solina and Bajcsy", "classic", "classic", "84.51 +- 8.89, 690 ms"),
     ]
-    return table(
-        ["method", "bodies", "IoU mean +- std", "min", "> 85 %", "ms", "the thesis reports"],
-        [
-            [
-                name,
-                str(of["bodies"]),
-                f"{100 * of['iou_mean']:.2f} +- {100 * of['iou_std']:.2f}",
-                f"{100 * of['iou_min']:.1f}",
-                f"{100 * of['over_85']:.1f}",
-                f"{times[timed]:.1f}",
-                thesis,
-            ]
-            for name, of, timed, thesis in rows
-        ],
-    )
+    rows = []
+    for title, name, clock, thesis in shown:
+        of = summaries[name]
+        mean, std, least, over = (100 * of[part] for part in ("iou_mean", "iou_std", "iou_min", "over_85"))
+        time = timed[clock]["milliseconds"]["median"]
+        iou = f"{mean:.2f} +- {std:.2f} | {least:.1f} | {over:.1f}"
+        rows.append(f"{title} | {of['bodies']} | {iou} | {time:.1f} | {thesis}")
+    return table("method | bodies | IoU mean +- std | min | > 85 % | ms | the thesis reports", rows)
 
 
 def household() -> str:
@@ -87,19 +78,13 @@ def household() -> str:
         "classic": "`classic`, masks given",
         "oriented box": "smallest box of the seen points, masks given",
     }
-    rows = [(text, found[f"all, at least half visible: {name}"]) for name, text in names.items()]
-    return table(
-        ["method", "IoU with the true convex hull %", "error of full edges mm, median / mean", "within 2 sigma %"],
-        [
-            [
-                text,
-                f"{row['iou']['mean']:.1f}",
-                f"{row['edge_error']['median']:.1f} / {row['edge_error']['mean']:.1f}",
-                "" if row["within_2_sigma"] is None else f"{row['within_2_sigma']:.0f}",
-            ]
-            for text, row in rows
-        ],
-    )
+    rows = []
+    for name, text in names.items():
+        row = found[f"all, at least half visible: {name}"]
+        error, within = row["edge_error"], row["within_2_sigma"]
+        sigma = "" if within is None else f"{within:.0f}"
+        rows.append(f"{text} | {row['iou']['mean']:.1f} | {error['median']:.1f} / {error['mean']:.1f} | {sigma}")
+    return table(f"method | {HULL} | {EDGES}, median / mean | {SIGMAS}", rows)
 
 
 def kinds() -> str:
@@ -110,22 +95,15 @@ def kinds() -> str:
         "50 to 90 % visible": "visible: 50 to 90 %",
         "under 50 % visible": "visible: under 50 %",
     }
-    rows = [(title, scenes[f"{name}: given"], scenes[f"{name}: own"]) for title, name in names.items()]
+    shown = [(title, scenes[f"{name}: given"], scenes[f"{name}: own"]) for title, name in names.items()]
     every = "all, at least half visible"
-    rows.append(("harder things", harder[f"{every}: given"], harder[f"{every}: own"]))
-    return table(
-        ["things", "number", "IoU %, masks given / own", "error of edges mm, median", "within 2 sigma %, masks given"],
-        [
-            [
-                name,
-                f"{given['iou']['count']:.0f}",
-                f"{given['iou']['mean']:.1f} / {own['iou']['mean']:.1f}",
-                f"{given['edge_error']['median']:.1f} / {own['edge_error']['median']:.1f}",
-                f"{given['within_2_sigma']:.0f}",
-            ]
-            for name, given, own in rows
-        ],
-    )
+    shown.append(("harder things", harder[f"{every}: given"], harder[f"{every}: own"]))
+    rows = []
+    for title, given, own in shown:
+        iou = f"{given['iou']['mean']:.1f} / {own['iou']['mean']:.1f}"
+        error = f"{given['edge_error']['median']:.1f} / {own['edge_error']['median']:.1f}"
+        rows.append(f"{title} | {given['iou']['count']:.0f} | {iou} | {error} | {given['within_2_sigma']:.0f}")
+    return table(f"things | number | {BOTH_IOU} | error of edges mm, median | {SIGMAS}, masks given", rows)
 
 
 def prediction() -> str:
@@ -144,20 +122,15 @@ def prediction() -> str:
 
 def frame_time() -> str:
     """Whole frames of a simulated RealSense, VGA, own masks."""
-    rows = results("frame_time")["rows"]
-    shown = [(count, rows[f"realsense_d435, 640 x 480, {count}, own"]) for count in (1, 5, 20)]
-    return table(
-        ["bodies", "ms median / p95", "of which segmentation, network, fit", "grasps after it, ms"],
-        [
-            [
-                str(count),
-                f"{row['stages']['total']['median']:.0f} / {row['stages']['total']['p95']:.0f}",
-                ", ".join(f"{row['stages'][stage]['median']:.0f}" for stage in ("segmentation", "network", "fit")),
-                f"{row['surroundings']['median'] + row['plan']['median']:.0f}",
-            ]
-            for count, row in shown
-        ],
-    )
+    found = results("frame_time")["rows"]
+    rows = []
+    for count in (1, 5, 20):
+        row = found[f"realsense_d435, 640 x 480, {count}, own"]
+        total = row["stages"]["total"]
+        parts = ", ".join(f"{row['stages'][stage]['median']:.0f}" for stage in ("segmentation", "network", "fit"))
+        grasps = row["surroundings"]["median"] + row["plan"]["median"]
+        rows.append(f"{count} | {total['median']:.0f} / {total['p95']:.0f} | {parts} | {grasps:.0f}")
+    return table("bodies | ms median / p95 | of which segmentation, network, fit | grasps after it, ms", rows)
 
 
 def latency() -> str:
@@ -168,60 +141,34 @@ def latency() -> str:
         "table 640 x 480, five objects": "640 x 480, table-top, five bodies, simulated D435",
         "five objects, 3 times the rate": "the same, 90 Hz offered",
     }
-    cases = results("node_latency")["cases"]
-    return table(
-        ["frame", "ms median / p95 / max", "results / s", "trend"],
-        [
-            [
-                text,
-                " / ".join(f"{cases[name]['milliseconds'][part]:.1f}" for part in ("median", "p95", "max")),
-                f"{cases[name]['results_per_second']:.1f}",
-                f"{cases[name]['trend_ms']:+.1f} ms",
-            ]
-            for name, text in names.items()
-        ],
-    )
+    rows = []
+    for name, text in names.items():
+        case = results("node_latency")["cases"][name]
+        times = " / ".join(f"{case['milliseconds'][part]:.1f}" for part in ("median", "p95", "max"))
+        rows.append(f"{text} | {times} | {case['results_per_second']:.1f} | {case['trend_ms']:+.1f} ms")
+    return table("frame | ms median / p95 / max | results / s | trend", rows)
 
 
 def still() -> str:
     """What a frame of things that stand still costs after another one."""
-    return table(
-        [
-            "things",
-            "processor ms alone",
-            "after another, median / mean",
-            "taken from it %",
-            "IoU % alone",
-            "after another",
-        ],
-        [
-            [
-                count,
-                f"{row['alone']['median']:.0f}",
-                f"{row['following']['median']:.1f} / {row['following']['mean']:.1f}",
-                f"{100 * row['repeated']:.0f}",
-                *(f"{100 * row['iou'][name]['mean']:.1f}" for name in ("alone", "following")),
-            ]
-            for count, row in results("still_scenes")["rows"].items()
-        ],
-    )
+    rows = []
+    for count, row in results("still_scenes")["rows"].items():
+        after = f"{row['following']['median']:.1f} / {row['following']['mean']:.1f}"
+        iou = " | ".join(f"{100 * row['iou'][name]['mean']:.1f}" for name in ("alone", "following"))
+        rows.append(f"{count} | {row['alone']['median']:.0f} | {after} | {100 * row['repeated']:.0f} | {iou}")
+    heads = "things | processor ms alone | after another, median / mean | taken from it % | IoU % alone | after another"
+    return table(heads, rows)
 
 
 def tracks() -> str:
     """Errors of sizes of tracked bodies by frame, per cent."""
     frames = ("1", "10", "30", "300")
-    return table(
-        ["camera, masks", *(f"after {frame}" for frame in frames), "common to all views", "within 2 sigma %"],
-        [
-            [
-                name,
-                *(f"{100 * row['error'][frame]:.2f}" for frame in frames),
-                f"{100 * row['bias']:.2f}",
-                f"{100 * row['within_2_sigma']:.0f}",
-            ]
-            for name, row in results("tracking")["rows"].items()
-        ],
-    )
+    rows = []
+    for name, row in results("tracking")["rows"].items():
+        errors = " | ".join(f"{100 * row['error'][frame]:.2f}" for frame in frames)
+        rows.append(f"{name} | {errors} | {100 * row['bias']:.2f} | {100 * row['within_2_sigma']:.0f}")
+    after = " | ".join(f"after {frame}" for frame in frames)
+    return table(f"camera, masks | {after} | common to all views | {SIGMAS}", rows)
 
 
 # The packages
@@ -247,14 +194,9 @@ def layers() -> str:
 
 def packages() -> str:
     """What each subpackage holds, by its docstring."""
-    return table(
-        ["package", "holds"],
-        [
-            [f"[`{name}/`](../sq_perception/{name}/__init__.py)", purpose(name)]
-            for layer in reversed(package_layers())
-            for name in layer
-        ],
-    )
+    names = [name for layer in reversed(package_layers()) for name in layer]
+    rows = (f"[`{name}/`](../sq_perception/{name}/__init__.py) | {purpose(name)}" for name in names)
+    return table("package | holds", rows)
 
 
 def purpose(package: str) -> str:
@@ -265,19 +207,17 @@ def purpose(package: str) -> str:
 
 def speed() -> str:
     """What a frame costs, and where."""
-    found = results("speed")["rows"]
-    rows = [
-        [
-            name.removesuffix(", own"),
-            f"{row['loops']:.1f}",
-            f"{row['classic']:.1f}",
-            *(" / ".join(f"{100 * share:.0f}" for share in row[part].values()) for part in ("stages", "kinds")),
-        ]
-        for name, row in found.items()
-        if name == "thesis, auto" or name.endswith("own")
-    ]
-    shares = [f"{' / '.join(next(iter(found.values()))[part])} %" for part in ("stages", "kinds")]
-    return table(["frame", "times a loop", "times classic fits", *shares], rows)
+    found = {
+        name: row for name, row in results("speed")["rows"].items() if name == "thesis, auto" or name.endswith("own")
+    }
+    rows = []
+    for name, row in found.items():
+        shares = " | ".join(
+            " / ".join(f"{100 * one:.0f}" for one in row[part].values()) for part in ("stages", "kinds")
+        )
+        rows.append(f"{name.removesuffix(', own')} | {row['loops']:.1f} | {row['classic']:.1f} | {shares}")
+    shares = " | ".join(f"{' / '.join(next(iter(found.values()))[part])} %" for part in ("stages", "kinds"))
+    return table(f"frame | times a loop | times classic fits | {shares}", rows)
 
 
 def known() -> str:
@@ -288,18 +228,11 @@ def known() -> str:
         pair = (groups[kind][f"auto, {masks}"][key] for masks in ("given", "own"))
         return " / ".join("-" if one is None else f"{scale * one:.{digits}f}" for one in pair)
 
-    rows = [
-        [
-            kind,
-            str(groups[kind]["auto, given"]["things"]),
-            both(kind, "iou", 100),
-            both(kind, "error_median", 1e3),
-            both(kind, "two_sigma", 100, 0),
-        ]
-        for kind in ("box", "cylinder", "bottle", "vessel", "other")
-    ]
-    heads = ["things", "number", "IoU %, masks given / own", "error of edges mm, median", "within 2 sigma %"]
-    return table(heads, rows)
+    rows = []
+    for kind in ("box", "cylinder", "bottle", "vessel", "other"):
+        errors = f"{both(kind, 'iou', 100)} | {both(kind, 'error_median', 1e3)} | {both(kind, 'two_sigma', 100, 0)}"
+        rows.append(f"{kind} | {groups[kind]['auto, given']['things']} | {errors}")
+    return table(f"things | number | {BOTH_IOU} | error of edges mm, median | {SIGMAS}", rows)
 
 
 ABLATIONS = {
@@ -316,39 +249,26 @@ ABLATIONS = {
 
 def ablation() -> str:
     """The fit without one source of knowledge at a time."""
-    found = results("ablation")
-    sets = ("household", "recorded")
-    rows = [
-        [text, *(f"{found[one][name]['iou']:.1f} ({found[one][name]['difference']:+.1f})" for one in sets)]
-        for name, text in ABLATIONS.items()
-    ]
-    heads = ["fit", *(f"{one}, {found[one]['whole']['count']} things" for one in sets)]
-    return table(heads, rows)
+    found = [results("ablation")[name] for name in ("household", "recorded")]
+    rows = []
+    for name, text in ABLATIONS.items():
+        cells = " | ".join(f"{one[name]['iou']:.1f} ({one[name]['difference']:+.1f})" for one in found)
+        rows.append(f"{text} | {cells}")
+    household, recorded = (one["whole"]["count"] for one in found)
+    return table(f"fit | household, {household} things | recorded, {recorded} things", rows)
 
 
 def recorded() -> str:
     """The fair kinds of the recorded frames, by method."""
-    heads = [
-        "method, masks",
-        "IoU with the true convex hull %",
-        "error of full edges mm, median / mean",
-        "within 2 sigma %",
-    ]
     rows = []
-    for method, one in results("known_frames")["groups"]["fair"].items():
-        if method == "EMS":  # the better of the two is shown
+    for title, one in results("known_frames")["groups"]["fair"].items():
+        if title == "EMS":  # the better of the two is shown
             continue
+        method, comma, masks = title.partition(",")
         sigma = "" if one["two_sigma"] is None else f"{100 * one['two_sigma']:.0f}"
         errors = f"{1e3 * one['error_median']:.1f} / {1e3 * one['error_mean']:.1f}"
-        rows.append(
-            [
-                f"`{method.split(',')[0]}`{method.partition(',')[2] and ','}{method.partition(',')[2]}",
-                f"{100 * one['iou']:.1f}",
-                errors,
-                sigma,
-            ]
-        )
-    return table(heads, rows)
+        rows.append(f"`{method}`{comma}{masks} | {100 * one['iou']:.1f} | {errors} | {sigma}")
+    return table(f"method, masks | {HULL} | {EDGES}, median / mean | {SIGMAS}", rows)
 
 
 PICKERS = {
@@ -382,8 +302,9 @@ def picking() -> str:
         cells = [f"{one['scenes']}: {_rate(one['gsr'])} / {_rate(one['dr'])}" for one in kinds]
         tried = sum(one["tried"] for one in kinds)
         *failed, unreachable = (sum(one["causes"][cause] for one in kinds) for cause in (*FAILURES, "unreachable"))
-        rows.append([PICKERS[who], *cells, f"{tried}: {' / '.join(map(str, failed))}", str(unreachable)])
-    heads = ["planned on", "packed, scenes: GSR / DR %", "pile", f"tried: {' / '.join(FAILURES)}", "unreachable"]
+        causes = f"{tried}: {' / '.join(map(str, failed))}"
+        rows.append(f"{PICKERS[who]} | {' | '.join(cells)} | {causes} | {unreachable}")
+    heads = f"planned on | packed, scenes: GSR / DR % | pile | tried: {' / '.join(FAILURES)} | unreachable"
     return table(heads, rows)
 
 
@@ -395,22 +316,21 @@ def picking_share() -> str:
         ours, true = found[f"{kind}: ours"], found[f"{kind}: true bodies"]
         if ours["scenes"] != true["scenes"]:
             raise ValueError(f"{kind}: expected as many scenes of true bodies as of recovered ones")
-        shares = [f"{100 * ours[rate][0] / true[rate][0]:.0f}" for rate in ("gsr", "dr")]
-        rows.append([kind, str(ours["scenes"]), *shares])
-    return table(["of what true bodies reach", "scenes", "GSR %", "DR %"], rows)
+        gsr, dr = (100 * ours[rate][0] / true[rate][0] for rate in ("gsr", "dr"))
+        rows.append(f"{kind} | {ours['scenes']} | {gsr:.0f} | {dr:.0f}")
+    return table("of what true bodies reach | scenes | GSR % | DR %", rows)
 
 
 def picking_gains() -> str:
     """What parts of the recovery are worth to grasps, and by how much others are behind."""
     gains = results("picking")["gains"]
-    heads = ["on the same scenes, points (95 % interval)"]
-    heads += [f"{kind}, {rate}" for kind in ("packed", "pile") for rate in ("GSR", "DR")]
     rows = []
     for other, name in GAINS.items():
         kinds = [gains[f"{kind}: ours over {other}"] for kind in ("packed", "pile")]
         values = ["{:+.0f} ({:+.0f} to {:+.0f})".format(*kind[rate]) for kind in kinds for rate in ("gsr", "dr")]
         scenes = " / ".join(dict.fromkeys(f"{kind['scenes'][0]:.0f}" for kind in kinds))
-        rows.append([f"{name}, {scenes}", *values])
+        rows.append(" | ".join([f"{name}, {scenes}", *values]))
+    heads = "on the same scenes, points (95 % interval) | packed, GSR | packed, DR | pile, GSR | pile, DR"
     return table(heads, rows)
 
 
@@ -424,7 +344,8 @@ def picking_scores() -> str:
         means.append([f"{100 * sum(one[0] * one[of] for one in bins) / count:.0f}" for of in (1, 2)] + [str(count)])
     heads = ["score", *(f"{0.2 * k:.1f} to {0.2 * k + 0.2:.1f}" for k in range(5))]
     names = ("mean score %", "held %", "tried")
-    return table(heads, [[name, *values] for name, values in zip(names, zip(*means, strict=True), strict=True)])
+    rows = (" | ".join([name, *values]) for name, values in zip(names, zip(*means, strict=True), strict=True))
+    return table(" | ".join(heads), rows)
 
 
 def _rate(one: list[float]) -> str:
