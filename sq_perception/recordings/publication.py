@@ -36,6 +36,8 @@ CAMERA_FRAME, CUBE_FRAME = "camera_depth_optical_frame", "unit_cube"
 _GREY_TYPES: dict[str, type[np.unsignedinteger]] = {"mono8": np.uint8, "mono16": np.uint16}
 _SHAPE, _CENTRE, _TURN, _CENTRE_AND_TURN = slice(3, 5), slice(5, 8), slice(8, 11), slice(5, 11)
 """Of a body's covariance: its exponents, its centre in the optical frame and its rotation vector in its own."""
+_OF_EACH_BODY = ("score", "residual", "sigma_size", "status", "label")
+"""Columns of a message that are attributes of a recovery of the same name."""
 _WORST, _BEST = np.array([0.80, 0.20, 0.15]), np.array([0.20, 0.65, 0.30])
 
 
@@ -220,20 +222,15 @@ def superquadric_array(found: Identified, is_cube: bool) -> SuperquadricArray:
     turns = np.stack([body.superquadric.rotation_matrix for body in recovery.bodies])
     centres = np.swapaxes(turns, 1, 2) @ covariances[:, _CENTRE, _CENTRE] @ turns
     deviations = np.sqrt(np.einsum("nii->ni", covariances))
+    counted = {"seen": found.seen, "fused": found.fused, "reason": found.reasons}
     return SuperquadricArray(
         size=bodies.size,
         shape=bodies.shape,
         translation=bodies.translation,
         rotation=bodies.rotation,
-        score=np.array([body.score for body in recovery.bodies]),
-        residual=np.array([body.residual for body in recovery.bodies]),
-        sigma_size=np.stack([body.sigma_size for body in recovery.bodies]),
-        id=np.array(found.ids, dtype=np.uint32),
-        status=np.array([body.status for body in recovery.bodies], dtype=np.uint32),
-        label=np.array([body.label for body in recovery.bodies], dtype=np.uint32),
-        seen=np.array(found.seen, dtype=np.uint32) if found.seen else None,
-        fused=np.array(found.fused, dtype=np.uint32) if found.fused else None,
-        reason=np.array(found.reasons, dtype=np.uint32) if found.reasons else None,
+        id=np.array(found.ids),
+        **{name: np.array([getattr(body, name) for body in recovery.bodies]) for name in _OF_EACH_BODY},
+        **{name: np.array(values, np.uint32) for name, values in counted.items() if values},
         sigma_shape=deviations[:, _SHAPE],
         sigma_centre=np.sqrt(np.einsum("nii->ni", centres)),
         sigma_turn=deviations[:, _TURN],
