@@ -82,12 +82,13 @@ def _run(options: argparse.Namespace) -> int:
     friction = options.friction or planner.FRICTION
 
     from sq_perception.learning.checkpoint import CheckpointError
+    from sq_perception.recordings.bag_file import InputOptions
     from sq_perception.recordings.frame_file import FrameError
     from sq_perception.recordings.inputs import RecordedInput
     from sq_perception.recovery.recoverer import Recoverer
 
     try:
-        recorded = RecordedInput(options.frames, options.camera_info)
+        recorded = RecordedInput(options.frames, InputOptions(options.camera_info))
         if problem := replaced_input(recorded.files, {"json": options.json}, {"pictures": (options.pictures, ".png")}):
             return misused(problem)
         return _planned(recorded, Recoverer(), hand, friction, options)

@@ -193,6 +193,7 @@ def _run(options: argparse.Namespace) -> int:
     from sq_perception.commands.recover_lines import lines
     from sq_perception.commands.recover_run import RecoverRun
     from sq_perception.learning import checkpoint
+    from sq_perception.recordings.bag_file import InputOptions
     from sq_perception.recordings.frame_file import FrameError, Reading
     from sq_perception.recordings.inputs import RecordedInput
     from sq_perception.recordings.result_json import Recovered
@@ -209,8 +210,7 @@ def _run(options: argparse.Namespace) -> int:
             max_size=options.max_size,
             workspace=None if options.workspace is None else tuple(options.workspace),
         )
-        recorded = RecordedInput(
-            options.frames,
+        wanted = InputOptions(
             options.camera_info,
             options.projection,
             options.topic,
@@ -218,8 +218,8 @@ def _run(options: argparse.Namespace) -> int:
             options.limit,
             options.distortion,
             Reading(options.depth_scale, options.depth_min, options.depth_max, options.roi, options.masks),
-            done,
         )
+        recorded = RecordedInput(options.frames, wanted, done)
         if problem := recover_outputs.replaced_input(options, recorded.files):
             return misused(problem)
         if options.method in NEEDS_NETWORK:

@@ -61,13 +61,13 @@ def main(arguments: Sequence[str]) -> int:
 
 def _recovered(options: argparse.Namespace) -> Iterator[tuple[RecordedFrame, FrameRecovery]]:
     """The frames that can be read, one by one as they are asked for."""
+    from sq_perception.recordings.bag_file import InputOptions
     from sq_perception.recordings.frame_file import FrameError
     from sq_perception.recordings.inputs import RecordedInput
     from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
 
-    recorded = RecordedInput(
-        options.frames, options.camera_info, options.projection, topic=options.topic, every=options.every
-    )
+    wanted = InputOptions(options.camera_info, options.projection, options.topic, options.every)
+    recorded = RecordedInput(options.frames, wanted)
     recoverer = Recoverer(method=options.method)
     for _, frame in recorded:
         if isinstance(frame, FrameError):

@@ -24,9 +24,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterator
 from contextlib import ExitStack, closing
+from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -68,6 +68,44 @@ def camera_info_topic(topic: str) -> str:
     return raw_topic(topic).rpartition("/")[0] + "/camera_info"
 
 
+@dataclass(frozen=True)
+class InputOptions:
+    """What is read of files, folders and bags, and how.
+
+    Attributes
+    ----------
+    camera_info
+        Intrinsics of images and bags, as :func:`frame_file.read` takes them; go before what a folder or bag brings.
+    projection
+        "pinhole" or "orthographic", which looks for grey images of the unit cube in bags.
+    topic
+        Of the images in bags; needed where several show depth.
+    every, limit
+        Of each folder and bag: every n-th frame only, and at most so many.
+    distortion
+        Of images and bags: "auto", "apply" or "ignore", see :mod:`sq_perception.imaging.calibration`.
+    reading
+        What is taken of each image; masks are files called as the frames are.
+
+    Raises
+    ------
+    ValueError
+        If ``every`` or ``limit`` is below 1.
+    """
+
+    camera_info: str | Path | None = None
+    projection: Projection = "pinhole"
+    topic: str | None = None
+    every: int = 1
+    limit: int | None = None
+    distortion: Treatment = "auto"
+    reading: Reading = field(default_factory=Reading)
+
+    def __post_init__(self) -> None:
+        if self.every < 1 or (self.limit is not None and self.limit < 1):
+            raise ValueError(f"every, limit: expected at least 1, got {self.every} and {self.limit}")
+
+
 class RecordedBag:
     """One depth topic of a bag; iterating gives its frames once, in the order they were recorded.
 
@@ -78,18 +116,8 @@ class RecordedBag:
     ----------
     path
         Of the folder or file.
-    topic
-        Of the images; needed where several show depth.
-    camera_info
-        Intrinsics as :func:`frame_file.read` takes them; go before those in the bag.
-    projection
-        "orthographic" looks for grey images of the unit cube.
-    every, limit
-        Every n-th image only, and at most so many.
-    distortion
-        "auto", "apply" or "ignore", see :mod:`sq_perception.imaging.calibration`.
-    reading
-        What is taken of each image; masks are files called as the frames are.
+    options
+        All of its images by default.
     is_done
         Called with the stamp of each image that counts; where it is true, the image is neither decoded nor given.
 
@@ -102,26 +130,15 @@ class RecordedBag:
     def __init__(
         self,
         path: str | Path,
-        topic: str | None = None,
-        camera_info: str | Path | None = None,
-        projection: Projection = "pinhole",
-        every: int = 1,
-        limit: int | None = None,
-        distortion: Treatment = "auto",
-        reading: Reading | None = None,
+        options: InputOptions | None = None,
         is_done: Callable[[Stamp], bool] = lambda stamp: False,
     ) -> None:
-        if every < 1 or (limit is not None and limit < 1):
-            raise ValueError(f"every, limit: expected at least 1, got {every} and {limit}")
         self._path = Path(path)
-        self._camera_info = camera_info
-        self._distortion: Treatment = distortion
-        self._orthographic = projection == "orthographic"
-        self._every, self._limit = every, limit
-        self._reading, self._is_done = reading or Reading(), is_done
+        self._options, self._is_done = options or InputOptions(), is_done
+        self._orthographic = self._options.projection == "orthographic"
         with ExitStack() as opened:
             self._reader = opened.enter_context(closing(BagReader(self._path)))
-            self.topic = self._chosen(topic)
+            self.topic = self._chosen(self._options.topic)
             self._info_topic = camera_info_topic(self.topic)
             self._masks = opened.enter_context(closing(self._recorded_masks()))
             self._mask = next(self._masks, None)
@@ -130,7 +147,7 @@ class RecordedBag:
     def __enter__(self) -> RecordedBag:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
     def close(self) -> None:
@@ -142,11 +159,11 @@ class RecordedBag:
         count = sum(
             max(0, connection.msgcount) for connection in self._reader.connections(IMAGE, COMPRESSED, topic=self.topic)
         )
-        count = -(-count // self._every)
-        return count if self._limit is None else min(count, self._limit)
+        count = -(-count // self._options.every)
+        return count if self._options.limit is None else min(count, self._options.limit)
 
     def __iter__(self) -> Iterator[RecordedFrame | FrameError]:
-        needs_info = self._camera_info is None and not self._orthographic
+        needs_info = self._options.camera_info is None and not self._orthographic
         latest: Message | None = None
         waiting: Message | None = None
         try:
@@ -157,7 +174,7 @@ class RecordedBag:
                     (message for message in self._reader.messages(infos) if isinstance(message, Message)), None
                 )
                 connections += infos
-            for message in self._reader.messages(connections, self._every, self._limit):
+            for message in self._reader.messages(connections, self._options.every, self._options.limit):
                 if isinstance(message, FrameError):
                     yield message
                     continue
@@ -234,7 +251,7 @@ class RecordedBag:
 
     def _labels(self, stamp: Stamp, name: str, image: np.ndarray) -> np.ndarray | None:
         """The masks of an image: from files if there is a folder of them, else from the bag."""
-        labels = self._reading.labels(name, image)
+        labels = self._options.reading.labels(name, image)
         if labels is not None:
             return labels
         while self._mask is not None and self._mask.stamp < stamp:
@@ -257,18 +274,18 @@ class RecordedBag:
 
     def _decoded(self, message: Message, info: Message | None) -> RecordedFrame:
         depth, encoding = publication.depth_of(message.content, self._orthographic)
-        name, warning = frame_name(self._path, message.stamp), ""
+        name, warning, reading = frame_name(self._path, message.stamp), "", self._options.reading
         labels = self._labels(message.stamp, name, depth)
         if self._orthographic:
             camera = unit_cube.camera(depth.shape[1], depth.shape[0])
         else:
-            if self._reading.scale is not None:
-                depth = depth * np.float32((MILLIMETRES if encoding.startswith("16UC1") else 1.0) / self._reading.scale)
+            if reading.scale is not None:
+                depth = depth * np.float32((MILLIMETRES if encoding.startswith("16UC1") else 1.0) / reading.scale)
             calibration = self._calibration(info, depth)
             labels = None if labels is None else calibration.rectified_labels(labels)
             depth, camera = calibration.rectified(depth), calibration.camera
             warning = f"{self._path}: {self.topic}: {calibration.note}" if calibration.note else ""
-        return self._reading.of(
+        return reading.of(
             RecordedFrame(
                 depth,
                 camera,
@@ -285,8 +302,8 @@ class RecordedBag:
 
     def _calibration(self, info: Message | None, depth: np.ndarray) -> Calibration:
         known: Any = None if info is None else info.content
-        if self._camera_info is not None:
-            known = read_camera_info(self._camera_info, (depth.shape[1], depth.shape[0]))
+        if self._options.camera_info is not None:
+            known = read_camera_info(self._options.camera_info, (depth.shape[1], depth.shape[0]))
         if known is None:
             raise ValueError(f"no camera_info on {self._info_topic}: name the camera with --camera-info")
-        return Calibration.of(known, self.topic, self._distortion)
+        return Calibration.of(known, self.topic, self._options.distortion)

@@ -14,11 +14,9 @@ import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from sq_perception.imaging.calibration import Treatment
-from sq_perception.imaging.camera import Projection
 from sq_perception.recordings import bag_file, camera_file, frame_file
-from sq_perception.recordings.bag_file import RecordedBag
-from sq_perception.recordings.frame_file import FrameError, Reading, RecordedFrame, Stamp
+from sq_perception.recordings.bag_file import InputOptions, RecordedBag
+from sq_perception.recordings.frame_file import FrameError, RecordedFrame, Stamp
 
 CAMERA_FILES = (
     "camera_info.yaml",
@@ -43,18 +41,8 @@ class RecordedInput:
     ----------
     names
         As the user gave them.
-    camera_info
-        Intrinsics of images and bags, as :func:`frame_file.read` takes them; goes before what a folder or bag brings.
-    projection
-        "pinhole" or "orthographic".
-    topic
-        Of the images in bags.
-    every, limit
-        Of each folder and bag: every n-th frame only, and at most so many.
-    distortion
-        Of PNGs and bags: "auto", "apply" or "ignore", see :mod:`sq_perception.imaging.calibration`.
-    reading
-        What is taken of each image; all of it by default.
+    options
+        All of their images by default.
     is_done
         Called with file, topic and stamp of each frame that counts; where it is true, the frame is neither read nor
         given.
@@ -68,25 +56,14 @@ class RecordedInput:
     def __init__(
         self,
         names: Sequence[str],
-        camera_info: str | Path | None = None,
-        projection: Projection = "pinhole",
-        topic: str | None = None,
-        every: int = 1,
-        limit: int | None = None,
-        distortion: Treatment = "auto",
-        reading: Reading | None = None,
+        options: InputOptions | None = None,
         is_done: Callable[[str, str, Stamp | None], bool] = lambda file, topic, stamp: False,
     ) -> None:
-        self._camera_info = camera_info
-        self._distortion: Treatment = distortion
-        self._reading = reading
-        if camera_info is not None:
+        self._options, self._is_done = options or InputOptions(), is_done
+        if self._options.camera_info is not None:
             # Auto depends on what the images are called.
-            treatment = "ignore" if distortion == "auto" else distortion
-            camera_file.read_calibration(camera_info, treatment, size=_ANY_SIZE)
-        self._projection: Projection = projection
-        self._topic, self._every, self._limit = topic, every, limit
-        self._is_done = is_done
+            treatment = "ignore" if self._options.distortion == "auto" else self._options.distortion
+            camera_file.read_calibration(self._options.camera_info, treatment, size=_ANY_SIZE)
         self._sources: list[tuple[Path, str | Path | None] | tuple[Path, FrameError]] = []
         for name in names:
             self._add(Path(name))
@@ -96,7 +73,8 @@ class RecordedInput:
     @property
     def files(self) -> list[Path]:
         """Files and bags that are read."""
-        given = [] if self._camera_info is None or not Path(self._camera_info).exists() else [Path(self._camera_info)]
+        named = self._options.camera_info
+        given = [] if named is None or not Path(named).exists() else [Path(named)]
         return given + [path for path, rest in self._sources if not isinstance(rest, FrameError)]
 
     def __iter__(self) -> Iterator[tuple[str, RecordedFrame | FrameError]]:
@@ -112,7 +90,7 @@ class RecordedInput:
 
     def _add(self, path: Path) -> None:
         if not path.is_dir() or bag_file.is_bag(path):
-            self._sources.append((path, self._camera_info or _camera_file(path.parent)))
+            self._sources.append((path, self._options.camera_info or _camera_file(path.parent)))
             return
         try:
             found = self._in_folders(path, None)
@@ -123,16 +101,17 @@ class RecordedInput:
 
     def _in_folders(self, folder: Path, above: str | Path | None) -> list[tuple[Path, str | Path | None]]:
         """The frames of a folder, or of those in it, with their camera, which may be that of the folder ``above``."""
-        camera_info = self._camera_info or _camera_file(folder) or above
+        camera_info = self._options.camera_info or _camera_file(folder) or above
         if found := in_folder(folder):
             _log.info("%s: %d frames, camera %s", folder, len(found), camera_info or "of the files")
-            return [(path, camera_info) for path in found[:: self._every][: self._limit]]
+            return [(path, camera_info) for path in found[:: self._options.every][: self._options.limit]]
         folders = [inner for inner in folder.iterdir() if inner.is_dir() and not inner.is_symlink()]
         return [pair for inner in sorted(folders, key=_natural) for pair in self._in_folders(inner, camera_info)]
 
     def _file(self, path: Path, camera_info: str | Path | None) -> RecordedFrame | FrameError:
         try:
-            return frame_file.read(path, camera_info, self._projection, self._distortion, self._reading)
+            options = self._options
+            return frame_file.read(path, camera_info, options.projection, options.distortion, options.reading)
         except FrameError as error:
             return error
         except (OSError, MemoryError) as error:
@@ -140,17 +119,7 @@ class RecordedInput:
 
     def _bag(self, path: Path) -> Iterator[tuple[str, RecordedFrame | FrameError]]:
         try:
-            bag = RecordedBag(
-                path,
-                self._topic,
-                self._camera_info,
-                self._projection,
-                self._every,
-                self._limit,
-                self._distortion,
-                self._reading,
-                lambda stamp: self._is_done(str(path), bag.topic, stamp),
-            )
+            bag = RecordedBag(path, self._options, lambda stamp: self._is_done(str(path), bag.topic, stamp))
         except FrameError as error:
             yield str(path), error
             return

@@ -26,7 +26,6 @@ import re
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -104,8 +103,8 @@ class ResultBag:
     def __enter__(self) -> ResultBag:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
-        self.close(whole=error is None)
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        self.close(whole=kind is None)
 
     def add(self, frame: RecordedFrame, recovery: FrameRecovery, tracks: Sequence[Followed] | None) -> None:
         """Write a frame and what was recovered from it.

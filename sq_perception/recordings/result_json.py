@@ -183,10 +183,8 @@ class ResultLines:
         self._path = Path(path)
         self.done: list[dict[str, Any]] = []
         beginning = _line(head(options))
-        if output_file.is_stream(self._path):
-            self._can_go_back, self._descriptor = False, output_file.open_stream(self._path)
-        else:
-            self._can_go_back, self._descriptor = True, output_file.opened(self._path)
+        self._can_go_back = not output_file.is_stream(self._path)
+        self._descriptor = (output_file.opened if self._can_go_back else output_file.open_stream)(self._path)
         try:
             self._end = self._found(json.loads(beginning)) if self._can_go_back else 0
             if not self._end:

@@ -18,6 +18,7 @@ from sq_perception.geometry.mesh import COLOURS
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
+from sq_perception.recordings.bag_file import InputOptions
 from sq_perception.recordings.frame_file import FrameError
 from sq_perception.recordings.inputs import RecordedInput, in_folder
 
@@ -78,10 +79,11 @@ def test_a_folder_gives_its_frames_in_natural_order_with_its_camera(tmp_path):
     assert [file for file, _ in found] == [str(tmp_path / name) for name in order]
     assert [frame.camera.fx for _, frame in found] == [200, 300, 300, 300, 300]
     camera_yaml(tmp_path / "camera_info.yaml", 400.0)
-    assert next(iter(RecordedInput([str(tmp_path / ".")], every=2, limit=2)))[1].name == "f1.npz"
-    assert [frame.camera.fx for _, frame in RecordedInput([str(tmp_path)], every=2, limit=2)] == [200, 400]
+    some = InputOptions(every=2, limit=2)
+    assert next(iter(RecordedInput([str(tmp_path / ".")], some)))[1].name == "f1.npz"
+    assert [frame.camera.fx for _, frame in RecordedInput([str(tmp_path)], some)] == [200, 400]
     given = camera_yaml(tmp_path / "mine.yaml", 500.0)
-    assert [frame.camera.fx for _, frame in RecordedInput([str(tmp_path)], given)] == [200] + 4 * [500]
+    assert [frame.camera.fx for _, frame in RecordedInput([str(tmp_path)], InputOptions(given))] == [200] + 4 * [500]
 
 
 def test_bad_inputs_come_as_errors_in_their_place(tmp_path):
@@ -94,7 +96,7 @@ def test_bad_inputs_come_as_errors_in_their_place(tmp_path):
     assert [isinstance(frame, FrameError) for frame in found] == [True, True, False, True, True]
     assert "no frames in it" in str(found[0])
     with pytest.raises(FrameError, match=r"none\.yaml"):
-        RecordedInput(names, tmp_path / "none.yaml")
+        RecordedInput(names, InputOptions(tmp_path / "none.yaml"))
 
 
 @pytest.mark.parametrize(

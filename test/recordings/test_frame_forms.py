@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from sq_perception.imaging.camera import Camera
+from sq_perception.recordings.bag_file import InputOptions
 from sq_perception.recordings.frame_file import FrameError, Reading, read
 from sq_perception.recordings.inputs import RecordedInput
 
@@ -54,7 +55,7 @@ def test_a_transposed_matrix_is_named(tmp_path):
 
 def test_four_numbers_are_the_same_camera(tmp_path):
     assert read(save(tmp_path / "a.png"), NUMBERS).camera == CAMERA
-    ((_, frame),) = RecordedInput([str(tmp_path / "a.png")], NUMBERS)
+    ((_, frame),) = RecordedInput([str(tmp_path / "a.png")], InputOptions(NUMBERS))
     assert frame.camera == CAMERA
 
 
@@ -220,9 +221,9 @@ def test_an_image_finds_the_camera_beside_it(tmp_path):
 def test_matrices_beside_frames_are_no_frames(tmp_path):
     save(tmp_path / "a.png")
     save(tmp_path / "K.npy")
-    assert [file for file, _ in RecordedInput([str(tmp_path)], NUMBERS)] == [str(tmp_path / "a.png")]
+    assert [file for file, _ in RecordedInput([str(tmp_path)], InputOptions(NUMBERS))] == [str(tmp_path / "a.png")]
     (tmp_path / "a.png").unlink()
-    assert [file for file, _ in RecordedInput([str(tmp_path)], NUMBERS)] == [str(tmp_path / "K.npy")]
+    assert [file for file, _ in RecordedInput([str(tmp_path)], InputOptions(NUMBERS))] == [str(tmp_path / "K.npy")]
 
 
 @pytest.mark.parametrize(("value", "dtype"), [(0.8, np.float32), (800, np.uint16)])

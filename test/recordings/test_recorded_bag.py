@@ -28,7 +28,7 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.distortion import Distortion
 from sq_perception.imaging.rectification import Rectification
 from sq_perception.recordings import bag_file, bag_reader
-from sq_perception.recordings.bag_file import RecordedBag
+from sq_perception.recordings.bag_file import InputOptions, RecordedBag
 from sq_perception.recordings.frame_file import FrameError, RecordedFrame, Stamp
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)
@@ -115,8 +115,8 @@ def metres(grey):
     return np.where(grey > 0, grey / np.float32(1000), np.float32(np.nan)).astype(np.float32)
 
 
-def frames(path, *arguments, **options):
-    with RecordedBag(path, *arguments, **options) as bag:
+def frames(path, **options):
+    with RecordedBag(path, InputOptions(**options)) as bag:
         return list(bag)
 
 
@@ -271,7 +271,7 @@ def test_the_topic_is_found_by_encoding_and_several_must_be_chosen_from(tmp_path
     (frame,) = frames(two, topic=other.lstrip("/"))
     np.testing.assert_array_equal(frame.depth, metres(grey) + 1)
     with pytest.raises(FrameError, match=f"no images on /nowhere.*{TOPIC}"):
-        RecordedBag(two, topic="/nowhere")
+        RecordedBag(two, InputOptions(topic="/nowhere"))
     none = write(tmp_path / "none", contents[:3])
     with pytest.raises(FrameError, match=r"no topic with 16UC1 or 32FC1.*/infra/image \(mono8\)"):
         RecordedBag(none)
@@ -290,11 +290,11 @@ def test_orthographic_images(tmp_path):
 def test_every_and_limit(tmp_path, grey, every, limit, wanted):
     contents = [(INFO, 0, info(0))] + [(TOPIC, second, image(grey, second, "16UC1")) for second in range(1, 8)]
     write(tmp_path / "bag", contents)
-    with RecordedBag(tmp_path / "bag", every=every, limit=limit) as bag:
+    with RecordedBag(tmp_path / "bag", InputOptions(every=every, limit=limit)) as bag:
         assert len(bag) == wanted
         assert [frame.stamp.sec for frame in bag] == list(range(1, 8, every))[:limit]
     with pytest.raises(ValueError, match="at least 1"):
-        RecordedBag(tmp_path / "bag", every=0)
+        InputOptions(every=0)
 
 
 def hostile(grey):
