@@ -19,7 +19,7 @@ from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.task import Future
 
-from sq_perception.viewing.controls import Control, arranged, plain
+from sq_perception.viewing.controls import Control, control, plain
 from sq_perception.viewing.page import Page
 
 _PATIENCE = 3.0
@@ -137,7 +137,7 @@ class RemoteNode:
         self._known = set(names)
         read = [parameter_value_to_python(value) for value in got.values]
         with self._lock:
-            self._new_controls = arranged(zip(described.descriptors, read, strict=True))
+            self._new_controls = [control(*both) for both in zip(described.descriptors, read, strict=True)]
             self._new_values.clear()
 
     async def _answer(self, call: Future, patience: float = _PATIENCE) -> Any:

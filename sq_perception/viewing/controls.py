@@ -17,7 +17,6 @@ it.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -97,12 +96,6 @@ def control(about: Any, value: Any) -> Control:
     if isinstance(value, (int, float)) and math.isfinite(value):
         return _number(about, value, made)
     return made
-
-
-def arranged(parameters: Iterable[tuple[Any, Any]]) -> list[Control]:
-    """Controls of descriptors and values by group, in the order of GROUPS, and in the given order within each."""
-    controls = [control(about, value) for about, value in parameters]
-    return [one for group in GROUPS for one in controls if one.group == group]
 
 
 def _number(about: Any, value: float, made: Control) -> Control:
