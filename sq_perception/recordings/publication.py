@@ -9,8 +9,8 @@ Metres in the optical frame; for frames of the unit cube (``is_cube``) the cube 
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
 
@@ -55,20 +55,16 @@ class Identified:
         Of each object.
     hidden
         Ids of tracks that the frame does not show.
-    seen
-        Frames that showed each object so far; empty where nobody counted.
-    fused
-        Whether the numbers of each object are those of its track; empty for none.
-    reasons
-        :class:`~sq_msgs_py.superquadrics.Reason` of each object, by the frame's fit and the axes that are published.
+    columns
+        What a message says of each object besides, by its column: ``seen``, frames that showed it so far; ``fused``,
+        whether its numbers are those of its track; ``reason``, :class:`~sq_msgs_py.superquadrics.Reason` by the frame's
+        fit and the axes that are published.
     """
 
     recovery: FrameRecovery
     ids: tuple[int, ...]
     hidden: tuple[int, ...] = ()
-    seen: tuple[int, ...] = ()
-    fused: tuple[bool, ...] = ()
-    reasons: tuple[int, ...] = ()
+    columns: Mapping[str, tuple[int, ...]] = field(default_factory=dict)
 
     @property
     def summary(self) -> str:
@@ -100,7 +96,7 @@ def identified(
     """
     if tracks is None:
         reasons = tuple(_reason(body.fit, body.superquadric) for body in recovery.bodies)
-        return Identified(recovery, tuple(body.label for body in recovery.bodies), reasons=reasons)
+        return Identified(recovery, tuple(body.label for body in recovery.bodies), columns={"reason": reasons})
     left = iter(tracks)
     bodies, known = [], []
     for body in recovery.bodies:
@@ -113,8 +109,9 @@ def identified(
             replace(body, fit=replace(body.fit, superquadric=track.superquadric, covariance=track.covariance))
         )
         known.append((track.id, track.seen, track.is_fused, _reason(body.fit, track.superquadric)))
-    ids, seen, fused, reasons = zip(*known, strict=True) if known else ((), (), (), ())
-    return Identified(replace(recovery, bodies=tuple(bodies)), ids, hidden, seen, fused, reasons)
+    ids, *columns = zip(*known, strict=True) if known else ((), (), (), ())
+    names = ("seen", "fused", "reason")
+    return Identified(replace(recovery, bodies=tuple(bodies)), ids, hidden, dict(zip(names, columns, strict=True)))
 
 
 def _reason(fit: Fit, shown: Superquadric) -> int:
@@ -222,7 +219,6 @@ def superquadric_array(found: Identified, is_cube: bool) -> SuperquadricArray:
     turns = np.stack([body.superquadric.rotation_matrix for body in recovery.bodies])
     centres = np.swapaxes(turns, 1, 2) @ covariances[:, _CENTRE, _CENTRE] @ turns
     deviations = np.sqrt(np.einsum("nii->ni", covariances))
-    counted = {"seen": found.seen, "fused": found.fused, "reason": found.reasons}
     return SuperquadricArray(
         size=bodies.size,
         shape=bodies.shape,
@@ -230,7 +226,7 @@ def superquadric_array(found: Identified, is_cube: bool) -> SuperquadricArray:
         rotation=bodies.rotation,
         id=np.array(found.ids),
         **{name: np.array([getattr(body, name) for body in recovery.bodies]) for name in _OF_EACH_BODY},
-        **{name: np.array(values, np.uint32) for name, values in counted.items() if values},
+        **{name: np.array(values, np.uint32) for name, values in found.columns.items()},
         sigma_shape=deviations[:, _SHAPE],
         sigma_centre=np.sqrt(np.einsum("nii->ni", centres)),
         sigma_turn=deviations[:, _TURN],
