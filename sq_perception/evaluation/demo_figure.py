@@ -59,7 +59,7 @@ def demo_figure(
     for k, (name, bodies, remark) in enumerate(methods):
         ax = figure.add_subplot(above[1 + k])
         plots.draw_depth(ax, depth, limits, window)
-        plots.draw_outlines(ax, bodies, camera, [plots.colour(i) for i in range(len(bodies))], width=1.8)
+        plots.draw_outlines(ax, bodies, camera, width=1.8)
         plots.heading_of(ax, name, remark)
     for k, (name, bodies, _) in enumerate(methods):
         for i, (elevation, azimuth, direction) in enumerate(_VIEWS):

@@ -8,7 +8,7 @@
 | a file in a folder that takes no new ones, or one that is mounted by itself | likewise, into the file as it is |
 
 A result that is not whole, because its making was interrupted, does not replace a file that holds something: it is
-kept beside it, see :func:`unfinished`.  Two programs do not write the same file at the same time: the second is refused
+kept beside it, as name.partial.suffix.  Two programs do not write the same file at the same time: the second is refused
 when it begins.
 """
 
@@ -118,7 +118,7 @@ class OutputFile:
     def _beside(self) -> Path:
         if self._through:  # no place there, or none that is not passed on
             return self.keep()
-        beside = unfinished(self._target)
+        beside = self._target.with_name(f"{self._target.stem}.partial{self._target.suffix}")
         self.partial.replace(beside)
         self.keep()
         return beside
@@ -212,11 +212,6 @@ def is_stream(path: Path) -> bool:
     return not stat.S_ISREG(status.st_mode) or any(
         os.path.realpath(link.parent).startswith(_DESCRIPTORS) for link in _links(path)
     )
-
-
-def unfinished(path: Path) -> Path:
-    """Where an unfinished result is kept for the sake of a good one: beside it, as name.partial.suffix."""
-    return path.with_name(f"{path.stem}.partial{path.suffix}")
 
 
 def open_stream(path: Path) -> int:

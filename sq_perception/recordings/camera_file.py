@@ -194,13 +194,13 @@ def _of_open3d(found: dict[str, Any]) -> dict[str, Any]:
 
 
 def _size(info: dict[Any, Any], names: tuple[str, ...]) -> int:
-    for name in names:
-        if name in info:
-            value = _count(info, name)
-            if value < 1:
-                raise FrameError(f"{name}: expected a positive integer, got {value!r}")
-            return value
-    raise FrameError(f"expected {names[0]} (or {names[1]})")
+    name = next((name for name in names if name in info), None)
+    if name is None:
+        raise FrameError(f"expected {names[0]} (or {names[1]})")
+    value = _count(info, name)
+    if value < 1:
+        raise FrameError(f"{name}: expected a positive integer, got {value!r}")
+    return value
 
 
 def _count(info: dict[Any, Any], name: str) -> int:
