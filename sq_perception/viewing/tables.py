@@ -99,36 +99,29 @@ def node_status(state: NodeState) -> str:
     """One node in a few lines: is it there, how fast, how late, what was lost, what went wrong last."""
     colour, text = _verdict(state)
     values = state.diagnostics
-    facts = []
-    if values.get("rate [Hz]"):
-        facts.append(("rate", f"{_rounded(values['rate [Hz]'], 1)} Hz"))
+    rate = values.get("rate [Hz]")
     median, high = values.get("stamp to result: median [ms]"), values.get("stamp to result: p95 [ms]")
+    delay = "" if state.latency is None else f"{state.latency:.0f} ms"
     if median:
-        facts.append(("stamp to result", f"{_rounded(median)} ms, p95 {_rounded(high or '-')} ms"))
-    elif state.latency is not None:
-        facts.append(("stamp to result", f"{state.latency:.0f} ms"))
-    counts = [
-        f"{html.escape(values[key])} {key}"
-        for key in ("received", "answered", "dropped", "refused", "lost")
-        if key in values
-    ]
-    if counts:
-        facts.append(("frames", ", ".join(counts)))
-    if values.get("tracks"):
-        facts.append(("tracks", html.escape(values["tracks"])))
-    if values.get("last error"):
-        facts.append(("last error", f'<span style="color:{_OPEN}">{html.escape(values["last error"])}</span>'))
-    if state.remark:
-        facts.append(("not drawn", f'<span style="color:{_BAD}">{html.escape(state.remark)}</span>'))
+        delay = f"{_rounded(median)} ms, p95 {_rounded(high or '-')} ms"
+    counts = (key for key in ("received", "answered", "dropped", "refused", "lost") if key in values)
+    facts = {
+        "rate": f"{_rounded(rate, 1)} Hz" if rate else "",
+        "stamp to result": delay,
+        "frames": ", ".join(f"{html.escape(values[key])} {key}" for key in counts),
+        "tracks": html.escape(values.get("tracks", "")),
+        "last error": _coloured(_OPEN, values.get("last error", "")),
+        "not drawn": _coloured(_BAD, state.remark),
+    }
     rows = "".join(
         f'<tr><td style="color:{_DIM};padding:1px 10px 1px 0;vertical-align:top;white-space:nowrap">{key}</td>'
         f'<td style="padding:1px 0;overflow-wrap:anywhere">{value}</td></tr>'
-        for key, value in facts
+        for key, value in facts.items()
+        if value
     )
-    dot = f'<span style="color:{colour}">●</span>'
     return (
-        f'<div style="padding:4px 12px"><div>{dot} <b>{html.escape(state.name)}</b> '
-        f'<span style="color:{colour}">{html.escape(text)}</span></div>'
+        f'<div style="padding:4px 12px"><div>{_coloured(colour, "●")} <b>{html.escape(state.name)}</b> '
+        f"{_coloured(colour, text)}</div>"
         f'<table style="font-size:12.5px;line-height:1.35;margin-left:14px">{rows}</table></div>'
     )
 
@@ -138,7 +131,7 @@ def source_status(topic: str, size: tuple[int, int] | None, rate: float, frame: 
     text = f"{size[0]} × {size[1]}, {rate:.1f} Hz, {frame or 'no frame_id'}" if size and not remark else remark
     colour = _GOOD if size and not remark else _OPEN
     return (
-        f'<div style="padding:4px 12px"><span style="color:{colour}">●</span> <b>{html.escape(topic)}</b><br>'
+        f'<div style="padding:4px 12px">{_coloured(colour, "●")} <b>{html.escape(topic)}</b><br>'
         f'<span style="font-size:12.5px;margin-left:14px;color:{_DIM}">{html.escape(text)}</span></div>'
     )
 
@@ -164,6 +157,10 @@ def answer(text: str, good: bool) -> str:
         f'<div style="margin:2px 12px 6px 12px;padding:6px 9px;border-left:3px solid {colour};'
         f'background:rgba(128,128,128,0.12);font-size:12.5px;overflow-wrap:anywhere">{html.escape(text)}</div>'
     )
+
+
+def _coloured(colour: str, text: str) -> str:
+    return f'<span style="color:{colour}">{html.escape(text)}</span>' if text else ""
 
 
 def _size(half: float, sigma: float) -> str:
