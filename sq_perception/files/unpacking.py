@@ -84,14 +84,12 @@ def grey_image(path: Path) -> np.ndarray:
     if image is None:
         raise UnpackingError("not a readable image")
     if image.ndim == 3:
-        colours = image[..., :3]
-        if not np.array_equal(
-            colours, np.broadcast_to(colours[..., :1], colours.shape), equal_nan=colours.dtype.kind == "f"
-        ):
+        first, *others = np.moveaxis(image[..., :3], -1, 0)
+        if not all(np.array_equal(first, other, equal_nan=True) for other in others):
             raise UnpackingError(
                 "expected a grey image, got a colour image: is it the camera's picture, or depth drawn in colours?"
             )
-        image = np.ascontiguousarray(colours[..., 0])
+        image = np.ascontiguousarray(first)
     if image.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
         raise UnpackingError(f"expected 8 or 16 bit or floats, got {image.dtype}")
     return image
