@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import errno
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from io import BufferedWriter
 
@@ -37,6 +37,13 @@ _PACKED = 1.01
 class McapFile:
     """Writes to ``file``, which stays open.
 
+    Parameters
+    ----------
+    file, library
+        Where to write, and who does.
+    definition
+        Gives the text that defines a type ``package/msg/Name``.
+
     Attributes
     ----------
     groups : int
@@ -48,28 +55,20 @@ class McapFile:
         From :meth:`add`, if there is no room; what was added before can still be finished.
     """
 
-    def __init__(self, file: BufferedWriter, library: str) -> None:
+    def __init__(self, file: BufferedWriter, library: str, definition: Callable[[str], str]) -> None:
         self.groups = 0
-        self._file = file
+        self._file, self._definition = file, definition
         self._writer = Writer(file, CHUNK_BYTES)
         self._writer.start("ros2", library)
         self._schemas: dict[str, int] = {}
+        self._channels: dict[tuple[str, str], int] = {}
         self._fixed = _CHUNK
         """Bytes of schemas and channels, which stand in the file twice."""
-        self._channels = self._chunks = self._waiting = 0
+        self._chunks = self._waiting = 0
         self._thread = ThreadPoolExecutor(1, thread_name_prefix="mcap")
 
-    def channel(self, topic: str, type_name: str, definition: str) -> int:
-        """The id of a new channel: a topic, the name of its type ``package/msg/Name``, and the text that defines it."""
-        if type_name not in self._schemas:
-            self._schemas[type_name] = self._writer.register_schema(type_name, "ros2msg", definition.encode())
-            self._fixed += 2 * (len(definition.encode()) + _CHANNEL)
-        self._channels += 1
-        self._fixed += 2 * (len(topic.encode()) + _CHANNEL)
-        return self._writer.register_channel(topic, "cdr", self._schemas[type_name])
-
-    def add(self, messages: Sequence[tuple[int, bytes]], time: int) -> None:
-        """Add a group: pairs of a channel's id and a message as CDR, all received at ``time``, 0 to LATEST."""
+    def add(self, messages: Sequence[tuple[str, str, bytes]], time: int) -> None:
+        """Add a group: topic, type ``package/msg/Name`` and CDR of messages, all received at ``time``, 0 to LATEST."""
         if not messages or not 0 <= time <= LATEST:
             raise ValueError(f"expected messages and a time from 0 to {LATEST}, got {len(messages)} at {time}")
         self._thread.submit(self._add, messages, time).result()
@@ -79,17 +78,29 @@ class McapFile:
         with self._thread:
             self._thread.submit(self._finish).result()
 
-    def _add(self, messages: Sequence[tuple[int, bytes]], time: int) -> None:
-        size = self._waiting + sum(len(data) + _MESSAGE for _, data in messages)
-        index = self._fixed + (self._chunks + 2) * (_CHUNK + 10 * self._channels)
+    def _add(self, messages: Sequence[tuple[str, str, bytes]], time: int) -> None:
+        group = [(self._channel(topic, kind), data) for topic, kind, data in messages]
+        size = self._waiting + sum(len(data) + _MESSAGE for _, data in group)
+        index = self._fixed + (self._chunks + 2) * (_CHUNK + 10 * len(self._channels))
         self._set_aside(int(_PACKED * size) + index)
-        for channel, data in messages:
+        for channel, data in group:
             end = self._file.tell()
             self._writer.add_message(channel, time, data, time)
             self._waiting += len(data) + _MESSAGE
             if self._file.tell() != end:  # a chunk was full
                 self._waiting, self._chunks = 0, self._chunks + 1
         self.groups += 1
+
+    def _channel(self, topic: str, kind: str) -> int:
+        """The number of the channel of a topic and a type."""
+        if kind not in self._schemas:
+            definition = self._definition(kind).encode()
+            self._schemas[kind] = self._writer.register_schema(kind, "ros2msg", definition)
+            self._fixed += 2 * (len(definition) + _CHANNEL)
+        if (topic, kind) not in self._channels:
+            self._channels[topic, kind] = self._writer.register_channel(topic, "cdr", self._schemas[kind])
+            self._fixed += 2 * (len(topic.encode()) + _CHANNEL)
+        return self._channels[topic, kind]
 
     def _finish(self) -> None:
         self._writer.finish()

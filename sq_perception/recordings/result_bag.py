@@ -89,13 +89,12 @@ class ResultBag:
             raise ValueError(f"{path}: expected the name of a file that ends in {SUFFIX}")
         self._images = set(images)
         self._frames = 0
-        self._channels: dict[tuple[str, str], int] = {}
         self._shown_ids: list[int] = []
         self._last = Stamp(0, 0)
         self._output = OutputFile(self._path, f"{self._path.name}.partial")
         self._raw = self._output.partial.open("wb")
         try:
-            self._file = McapFile(self._raw, "sq_perception")
+            self._file = McapFile(self._raw, "sq_perception", bag_messages.definition)
         except BaseException:
             self._discard()
             raise
@@ -128,9 +127,7 @@ class ResultBag:
         received = frame.received if frame.received is not None else stamp.sec * _SECOND + stamp.nanosec
         shown = publication.findings(found, self._header(frame, stamp), frame.is_cube)
         messages = self._messages(frame, found, shown)
-        group = [
-            (self._channel(topic, message.__msgtype__), bag_messages.as_cdr(message)) for topic, message in messages
-        ]
+        group = [(topic, message.__msgtype__, bag_messages.as_cdr(message)) for topic, message in messages]
         self._frames += 1
         self._shown_ids, self._last = shown.shown_ids, stamp
         try:
@@ -194,11 +191,6 @@ class ResultBag:
             return frame.stamp
         last = self._last.sec * _SECOND + self._last.nanosec
         return Stamp(*divmod(min(last + round(INTERVAL * _SECOND), _LAST_SECOND * _SECOND), _SECOND))
-
-    def _channel(self, topic: str, kind: str) -> int:
-        if (topic, kind) not in self._channels:
-            self._channels[topic, kind] = self._file.channel(topic, kind, bag_messages.definition(kind))
-        return self._channels[topic, kind]
 
     # the end
 

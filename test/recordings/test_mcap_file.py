@@ -15,19 +15,28 @@ from mcap.reader import NonSeekingReader, make_reader
 from sq_perception.recordings import mcap_file
 from sq_perception.recordings.mcap_file import LATEST, McapFile
 
-STRING = ("std_msgs/msg/String", "string data\n")
+STRING = "std_msgs/msg/String"
+TOPICS = ("/topic_0", "/topic_1")
 GROUP = 9000
 """Bytes."""
 
 
+def empty(file):
+    return McapFile(file, "test", {STRING: "string data\n"}.__getitem__)
+
+
+def pair(data):
+    """A message on each of two topics."""
+    return [(topic, STRING, one) for topic, one in zip(TOPICS, data, strict=True)]
+
+
 def filled(file, groups, rng, size=3000):
     """A file with groups of two messages on two topics; the groups that were added."""
-    mcap = McapFile(file, "test")
-    channels = [mcap.channel(f"/topic_{k}", *STRING) for k in range(2)]
+    mcap = empty(file)
     added = []
     for k in range(groups):
-        data = [rng.bytes(size) for _ in channels]
-        mcap.add(list(zip(channels, data, strict=True)), 100 + k)
+        data = [rng.bytes(size) for _ in TOPICS]
+        mcap.add(pair(data), 100 + k)
         added.append((100 + k, data))
     return mcap, added
 
@@ -62,7 +71,7 @@ def test_an_independent_reader_finds_everything(file, rng, monkeypatch):
     assert statistics.channel_message_counts == {1: 5, 2: 5}
     assert (statistics.message_start_time, statistics.message_end_time) == (100, 104)
     assert (statistics.schema_count, statistics.channel_count) == (1, 2)
-    assert {one.topic for one in summary.channels.values()} == {"/topic_0", "/topic_1"}
+    assert {one.topic for one in summary.channels.values()} == set(TOPICS)
     assert {(one.name, one.encoding, one.data) for one in summary.schemas.values()} == {
         ("std_msgs/msg/String", "ros2msg", b"string data\n")
     }
@@ -78,7 +87,7 @@ def test_an_independent_reader_finds_everything(file, rng, monkeypatch):
 
 
 def test_a_file_without_messages_is_whole(file):
-    mcap = McapFile(file, "test")
+    mcap = empty(file)
     mcap.finish()
     summary, found = read(file)
     assert found == []
@@ -86,11 +95,10 @@ def test_a_file_without_messages_is_whole(file):
 
 
 def test_times_that_a_bag_cannot_hold_are_refused(file):
-    mcap = McapFile(file, "test")
-    channel = mcap.channel("/topic", *STRING)
+    mcap = empty(file)
     for bad in (-1, LATEST + 1):
         with pytest.raises(ValueError, match="time"):
-            mcap.add([(channel, b"")], bad)
+            mcap.add([("/topic", STRING, b"")], bad)
     with pytest.raises(ValueError, match="messages"):
         mcap.add([], 0)
 
@@ -102,20 +110,19 @@ def test_at_whatever_size_the_disk_ends_there_is_room_for_the_index(tmp_path, rn
     path = tmp_path / "limited.mcap"
     for limit in range(30_000, 48_000, 1900):
         with path.open("wb") as file:
-            mcap = McapFile(file, "test")
-            channel = mcap.channel("/topic", *STRING)
+            mcap = empty(file)
             with file_size_limit(limit):
-                added = as_many_as_fit(mcap, channel, rng)
+                added = as_many_as_fit(mcap, rng)
                 mcap.finish()
         with path.open("rb") as file:
             assert len(read(file)[1]) == mcap.groups == added >= 2
         assert limit - GROUP - 4000 < path.stat().st_size <= limit
 
 
-def as_many_as_fit(mcap, channel, rng):
+def as_many_as_fit(mcap, rng):
     for k in range(20):
         try:
-            mcap.add([(channel, rng.bytes(GROUP))], k)
+            mcap.add([("/topic", STRING, rng.bytes(GROUP))], k)
         except OSError:
             return k
     return 20
@@ -143,7 +150,7 @@ def test_an_interrupt_finds_no_half_group(file, rng, monkeypatch):
     with monkeypatch.context() as patched:
         patched.setattr("concurrent.futures.Future.result", interrupted)
         with pytest.raises(KeyboardInterrupt):
-            mcap.add([(1, more[0]), (2, more[1])], 200)
+            mcap.add(pair(more), 200)
     mcap.finish()
     assert read(file)[1] == expected([*added, (200, more)])
     assert mcap.groups == 2
