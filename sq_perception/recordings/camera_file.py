@@ -27,6 +27,7 @@ LARGEST = 2**20
 """Bytes of a file."""
 _SKEW = 1e-6
 """Of fx; no depth camera in use has any."""
+_MATRIX, _PROJECTION = ("camera_matrix", "k", "K"), ("projection_matrix", "p", "P")
 _NO_DISTORTION = ("none", "")
 _BROWN_CONRADY = ("brown conrady", "inverse brown conrady", "modified brown conrady")
 """Names of librealsense.  Of depth images the coefficients are zero; others are taken for plumb_bob's."""
@@ -106,14 +107,14 @@ def _camera_info(path: Path) -> CameraInfo:
     if not isinstance(info, dict):
         raise FrameError("expected a camera_info as a YAML mapping")
     width, height = (_size(info, names) for names in (("image_width", "width"), ("image_height", "height")))
-    matrix = _matrix(info, ("camera_matrix", "k", "K"), 9)
+    matrix = _matrix(info, _MATRIX, 9)
     distortion = _matrix(info, ("distortion_coefficients", "d", "D"), None)
-    projection = _matrix(info, ("projection_matrix", "p", "P"), 12)
-    if matrix is None and projection is None:
+    projection = _matrix(info, _PROJECTION, 12)
+    if not info.keys() & {*_MATRIX, *_PROJECTION}:
         raise FrameError("expected a camera_matrix (or k) of 9 numbers, or a projection_matrix (or p) of 12")
-    if matrix is not None and is_transposed(matrix):
+    if is_transposed(matrix):
         raise FrameError("camera matrix: expected 0 0 1 in its last row; it seems to be transposed")
-    if matrix is not None and abs(matrix[1]) > _SKEW * abs(matrix[0]):
+    if abs(matrix[1]) > _SKEW * abs(matrix[0]):
         raise FrameError(f"camera matrix: expected no skew, got {matrix[1]:g}")
     region = info.get("roi", {})
     if not isinstance(region, dict):
@@ -122,9 +123,9 @@ def _camera_info(path: Path) -> CameraInfo:
         width,
         height,
         str(info.get("distortion_model", info.get("camera_model", "plumb_bob"))),
-        () if distortion is None else tuple(distortion.tolist()),
-        (0.0,) * 9 if matrix is None else tuple(matrix.tolist()),
-        (0.0,) * 12 if projection is None else tuple(projection.tolist()),
+        tuple(distortion.tolist()),
+        tuple(matrix.tolist()),
+        tuple(projection.tolist()),
         _count(info, "binning_x"),
         _count(info, "binning_y"),
         Region(*(_count(region, name) for name in ("x_offset", "y_offset", "width", "height"))),
@@ -210,7 +211,8 @@ def _count(info: dict[Any, Any], name: str) -> int:
     return value
 
 
-def _matrix(info: dict[Any, Any], names: tuple[str, ...], length: int | None) -> np.ndarray | None:
+def _matrix(info: dict[Any, Any], names: tuple[str, ...], length: int | None) -> np.ndarray:
+    """The numbers of the first of the names that is there; zeros, or none, where none is."""
     for name in names:
         if name not in info:
             continue
@@ -224,4 +226,4 @@ def _matrix(info: dict[Any, Any], names: tuple[str, ...], length: int | None) ->
             wanted = "finite numbers" if length is None else f"{length} finite numbers"
             raise FrameError(f"{name}: expected {wanted}, got {reprlib.repr(values)}")
         return numbers
-    return None
+    return np.zeros(length or 0)
