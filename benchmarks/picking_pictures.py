@@ -26,7 +26,6 @@ from picking_world import STEP, World
 from PIL import Image
 
 from sq_perception.evaluation import plots
-from sq_perception.evaluation.grasp_figure import draw_grasps
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.grasping.plan import GraspPlan
@@ -91,7 +90,7 @@ def failures(path: Path, lines: list[dict[str, Any]]) -> dict[str, str]:
 
 
 def _draw(ax: Any, depth: np.ndarray, bodies: list[Superquadric], plan: GraspPlan, text: str) -> None:
-    draw_grasps(ax, depth, TABLE_CAMERA, bodies, plan, GRIPPER)
+    plots.draw_grasps(ax, depth, TABLE_CAMERA, bodies, plan, GRIPPER)
     ax.set_xlim(*SHOWN[0])
     ax.set_ylim(*SHOWN[1])
     ax.text(0.02, 0.04, text, transform=ax.transAxes, color=plots.INK, weight="bold")

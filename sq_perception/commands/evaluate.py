@@ -53,7 +53,7 @@ def _evaluate(options: argparse.Namespace, methods: list[Method], command: list[
     import numba
     import torch
 
-    from sq_perception.evaluation import thesis_report
+    from sq_perception.evaluation import thesis_report, thesis_tables
     from sq_perception.evaluation.contest import compare
     from sq_perception.evaluation.thesis_images import ThesisImages
     from sq_perception.files import provenance
@@ -74,8 +74,9 @@ def _evaluate(options: argparse.Namespace, methods: list[Method], command: list[
         "seed": options.seed,
         "spawn_key": "(6, block), blocks of 500 bodies",
     }
-    written = thesis_report.write(options.output, outcomes, images, facts, failures)
-    print("\n\n".join(table.markdown() for table in thesis_report.overview(outcomes)))
+    found = thesis_report.document(outcomes, facts, failures)
+    written = thesis_report.write(options.output, found, outcomes, images)
+    print("\n\n".join(table.markdown() for table in thesis_tables.overview(found["contestants"])))
     print(f"written: {written}")
     return FAILURE if failures else SUCCESS
 

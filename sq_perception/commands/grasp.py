@@ -180,11 +180,10 @@ def _frame(
 
 def _draw(path: Path, frame: RecordedFrame, found: Sequence[Recovery], plan: GraspPlan, hand: Gripper) -> None:
     from sq_perception.evaluation import plots
-    from sq_perception.evaluation.grasp_figure import draw_grasps
 
     figure = plots.new_figure(9.6, 9.6 * frame.camera.height / frame.camera.width)
     ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    draw_grasps(ax, frame.depth, frame.camera, [recovered.superquadric for recovered in found], plan, hand)
+    plots.draw_grasps(ax, frame.depth, frame.camera, [recovered.superquadric for recovered in found], plan, hand)
     with output_file.writing(path) as partial:
         plots.save(figure, partial)
 

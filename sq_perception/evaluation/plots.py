@@ -1,4 +1,4 @@
-"""What all pictures have: figures and colours, the depth image, masks, reprojected outlines.
+"""What all pictures have: figures and colours, the depth image, masks, reprojected outlines, grasps.
 
 Drawing functions take a Matplotlib axes; figures are made with the object interface and the Agg canvas, so that
 nothing here touches a display or a global state.  Images are in pixels with centres at integers, bodies in the optical
@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -26,6 +26,10 @@ from sq_perception.geometry.mesh import COLOURS, outline
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
+
+if TYPE_CHECKING:
+    from sq_perception.grasping.gripper import Gripper
+    from sq_perception.grasping.plan import GraspPlan
 
 INK = "#22303c"
 WIRE = "#d1006c"
@@ -98,6 +102,22 @@ def draw_outlines(
         faint = LineCollection(pixels[inside & ~seen][::2], colors=[shade], linewidths=0.4 * width, alpha=0.6)
         for lines in (solid, faint):
             ax.add_collection(lines, autolim=False)
+
+
+def draw_grasps(
+    ax: Axes, depth: np.ndarray, camera: Camera, bodies: list[Superquadric], plan: GraspPlan, hand: Gripper
+) -> None:
+    """A depth image, the outlines of its bodies and, at the best grasp of each, the gripper with its probability."""
+    draw_depth(ax, depth)
+    draw_outlines(ax, bodies, camera, edges=False, width=1.4)
+    for k in range(len(bodies)):
+        for grasp in plan.of(k)[:1]:
+            for line in hand.wires(grasp.opening):
+                pixels = camera.project(grasp.placed(line))
+                ax.plot(*pixels.T, color="white", lw=5.0, solid_capstyle="round")
+                ax.plot(*pixels.T, color=colour(k), lw=2.6, solid_capstyle="round")
+            where = float(pixels[-1, 0]), float(pixels[-1, 1])
+            ax.text(*where, f" {grasp.score:.2f}", color=INK, fontsize=11, weight="bold", clip_on=True)
 
 
 def silhouettes(body: Superquadric, camera: Camera) -> list[np.ndarray]:

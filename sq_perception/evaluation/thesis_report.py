@@ -12,7 +12,7 @@ from sq_perception.evaluation import evaluation_pictures as pictures
 from sq_perception.evaluation import plots, thesis_tables
 from sq_perception.evaluation.contest import Outcome
 from sq_perception.evaluation.thesis_images import ThesisImages
-from sq_perception.evaluation.thesis_tables import Entry, Table
+from sq_perception.evaluation.thesis_tables import Entry
 
 FORMAT, VERSION = "sq_perception.evaluation", 1
 _CAPTIONS = {
@@ -27,10 +27,8 @@ _CAPTIONS = {
 }
 
 
-def write(
-    folder: Path, outcomes: Sequence[Outcome], images: ThesisImages, facts: dict[str, Any], failures: Sequence[str] = ()
-) -> Path:
-    """Write report.md, results.json and the PNGs into an existing folder; returns report.md.
+def document(outcomes: Sequence[Outcome], facts: dict[str, Any], failures: Sequence[str] = ()) -> dict[str, Any]:
+    """Everything that was found, as results.json has it but for numbers that JSON does not know.
 
     Parameters
     ----------
@@ -41,46 +39,35 @@ def write(
     failures
         Why some contestants are missing; shown at the top.
     """
-    if not outcomes:
-        raise ValueError("outcomes: expected at least one")
+    entries = [
+        {
+            "name": outcome.contestant.name,
+            "description": outcome.contestant.description,
+            "loss": outcome.contestant.loss or None,
+            "summary": outcome.figures.summary(),
+            "examples": pictures.ranked(outcome),
+            "pictures": [_file(outcome.contestant.name, kind) for kind in _CAPTIONS],
+            **outcome.contestant.notes,
+        }
+        for outcome in outcomes
+    ]
+    return {"format": FORMAT, "version": VERSION, "facts": facts, "failures": list(failures), "contestants": entries}
+
+
+def write(folder: Path, found: dict[str, Any], outcomes: Sequence[Outcome], images: ThesisImages) -> Path:
+    """Write report.md, results.json and the PNGs of a :func:`document` into an existing folder; returns report.md."""
     for outcome in outcomes:
-        plots.save(pictures.distributions(outcome), folder / _file(outcome, "distributions"))
-        plots.save(pictures.examples(outcome, images), folder / _file(outcome, "examples"))
-    entries = [_entry(outcome) for outcome in outcomes]
-    document = {
-        "format": FORMAT,
-        "version": VERSION,
-        "facts": facts,
-        "failures": list(failures),
-        "contestants": entries,
-    }
-    text = json.dumps(_finite(document), indent=1, allow_nan=False, ensure_ascii=False)
+        plots.save(pictures.distributions(outcome), folder / _file(outcome.contestant.name, "distributions"))
+        plots.save(pictures.examples(outcome, images), folder / _file(outcome.contestant.name, "examples"))
+    text = json.dumps(_finite(found), indent=1, allow_nan=False, ensure_ascii=False)
     (folder / "results.json").write_text(text + "\n", encoding="utf-8")
     path = folder / "report.md"
-    path.write_text(_markdown(outcomes, entries, facts, failures), encoding="utf-8")
+    path.write_text(_markdown(found), encoding="utf-8")
     return path
 
 
-def overview(outcomes: Sequence[Outcome]) -> list[Table]:
-    """All contestants, in everything that is one number."""
-    return thesis_tables.overview([_entry(outcome) for outcome in outcomes])
-
-
-def _file(outcome: Outcome, kind: str) -> str:
-    return f"{outcome.contestant.name}_{kind}.png"
-
-
-def _entry(outcome: Outcome) -> dict[str, Any]:
-    contestant = outcome.contestant
-    return {
-        "name": contestant.name,
-        "description": contestant.description,
-        "loss": contestant.loss or None,
-        "summary": outcome.figures.summary(),
-        "examples": pictures.ranked(outcome),
-        "pictures": [_file(outcome, kind) for kind in _CAPTIONS],
-        **contestant.notes,
-    }
+def _file(name: str, kind: str) -> str:
+    return f"{name}_{kind}.png"
 
 
 def _finite(value: Any) -> Any:
@@ -105,27 +92,25 @@ def _facts_line(facts: dict[str, Any]) -> str:
     )
 
 
-def _protocol(outcomes: Sequence[Outcome]) -> str:
-    counts = sorted({len(outcome.figures) for outcome in outcomes})
-    bodies = " and ".join(str(count) for count in counts)
+def _protocol(entries: Sequence[Entry]) -> str:
+    bodies = " and ".join(str(count) for count in sorted({entry["summary"]["bodies"] for entry in entries}))
     return (
         f"Bodies of the thesis' protocol that no training has seen, clean 8 bit images of 256 x 256 pixels, {bodies} "
         "of them (the table says who had how many, always the first ones). ΔT is in per cent of the cube's side."
     )
 
 
-def _markdown(
-    outcomes: Sequence[Outcome], entries: Sequence[Entry], facts: dict[str, Any], failures: Sequence[str]
-) -> str:
-    lines = ["# Evaluation", "", f"`{facts.get('command')}`", "", _facts_line(facts), "", _protocol(outcomes), ""]
-    lines += [f"Left out: {failure}\n" for failure in failures]
-    lines += [f"- {outcome.contestant.name}: {outcome.contestant.description}" for outcome in outcomes]
+def _markdown(found: dict[str, Any]) -> str:
+    entries, facts = found["contestants"], found["facts"]
+    lines = ["# Evaluation", "", f"`{facts.get('command')}`", "", _facts_line(facts), "", _protocol(entries), ""]
+    lines += [f"Left out: {failure}\n" for failure in found["failures"]]
+    lines += [f"- {entry['name']}: {entry['description']}" for entry in entries]
     for table in (*thesis_tables.overview(entries), *thesis_tables.thesis_tables(entries)):
         lines += ["", f"## {table.title}", "", table.markdown()]
         if table.note:
             lines += ["", table.note]
     for kind, caption in _CAPTIONS.items():
         lines += ["", f"## {kind.capitalize()}", "", caption]
-        for outcome in outcomes:
-            lines += ["", f"{outcome.contestant.name}:", "", f"![{kind}](<{_file(outcome, kind)}>)"]
+        for entry in entries:
+            lines += ["", f"{entry['name']}:", "", f"![{kind}](<{_file(entry['name'], kind)}>)"]
     return "\n".join(lines) + "\n"
