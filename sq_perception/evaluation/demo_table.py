@@ -49,17 +49,14 @@ class Pair:
 def pair(truth: Superquadric, recovered: Superquadric) -> list[Pair]:
     """Pairs of two batches (n,) and (m,): every true body in order, then what was recovered without being there."""
     distance = np.linalg.norm(truth.translation[:, None] - recovered.translation[None], axis=-1)
-    partner: dict[int, int] = {}
-    for i, k in zip(*linear_sum_assignment(distance), strict=True):
-        if distance[i, k] <= truth.size[i].max() + recovered.size[k].max():
-            partner[int(i)] = int(k)
-    overlap: dict[int, float] = {}
-    if partner:
-        both = recovered[np.array(list(partner.values()))], truth[np.array(list(partner))]
-        overlap = dict(zip(partner, volume_iou(*both, _POINTS).tolist(), strict=True))
-    pairs = [Pair(i, partner.get(i), overlap.get(i)) for i in range(len(truth))]
-    found = set(partner.values())
-    return pairs + [Pair(None, k) for k in range(len(recovered)) if k not in found]
+    i, k = linear_sum_assignment(distance)
+    is_near = distance[i, k] <= truth.size[i].max(axis=1) + recovered.size[k].max(axis=1)
+    i, k = i[is_near], k[is_near]
+    overlap = volume_iou(recovered[k], truth[i], _POINTS) if len(i) else np.empty(0)
+    near = (Pair(*one) for one in zip(i.tolist(), k.tolist(), overlap.tolist(), strict=True))
+    partners = {one.truth: one for one in near}
+    pairs = [partners.get(number, Pair(number, None)) for number in range(len(truth))]
+    return pairs + [Pair(None, number) for number in range(len(recovered)) if number not in k]
 
 
 def alike(body: Superquadric, model: Superquadric) -> Superquadric:
