@@ -41,6 +41,8 @@ class Control:
 
     Attributes
     ----------
+    type : type
+        Of the parameter's values, where they may be changed.
     patience : float
         Seconds to wait for further changes before the value is sent.
     """
