@@ -84,6 +84,8 @@ class Engine:
         self._node = node
         self._lock = threading.Lock()
         self._built: _Built | None = None
+        self._last: dict[Hashable, FrameRecovery] = {}
+        """The last frame's bodies, by its frame_id and their origin."""
         self._request = 0
         self._is_to_read = False
         """Whether weights that were asked for have not been read yet."""
@@ -95,11 +97,14 @@ class Engine:
     def build(self, parameters: RecoverParameters) -> None:
         """Make the recoverer and warm it up.  Raises ValueError if the model or the device cannot be used."""
         self.release()
-        self._replace(_made(parameters, None, lambda: True))
+        self._built = _made(parameters, None, lambda: True)
 
     def release(self) -> None:
         """Let go of the recoverer, and of one that is being made."""
-        self._replace(None)
+        with self._lock:
+            self._request += 1
+            self._built, self._last, self._is_to_read = None, {}, False
+            self.is_making, self.fault = False, ""
 
     def discard(self) -> None:
         """Let nobody else share the recoverer from now on: it has failed again and again."""
@@ -134,22 +139,22 @@ class Engine:
             work = self._request, parameters, None if self._is_to_read else self._built
         threading.Thread(target=self._swap, args=work, name="recoverer in the making", daemon=True).start()
 
-    def recover(
-        self, frame: Frame, parameters: RecoverParameters, pose: Pose | None = None, previous: Answer | None = None
-    ) -> Answer:
+    def recover(self, frame: Frame, parameters: RecoverParameters, pose: Pose | None = None) -> Answer:
         """The bodies of a frame by the parameters in force, and a value that is equal for equal origins.
 
-        ``pose`` is that of the frame in ``target_frame``, if there is one.  What did not change since the ``previous``
-        frame of the same camera is taken from its answer, if its origin is the same.
+        ``pose`` is that of the frame in ``target_frame``, if there is one.  With ``tracking``, what did not change
+        since the last frame is taken from its answer, if camera and origin are the same.
         """
         built = self._built
         if built is None:
             raise RuntimeError("the recoverer has been released")
         method = built.parameters.method  # others may be set already, and still in the making
         origin = built.weights, method
-        known = previous[0] if previous is not None and previous[1] == origin else None
+        key = frame.header.frame_id, origin
+        previous = self._last.get(key) if parameters.tracking else None
         options = replace(parameters.recovery_options(pose, frame.has_free_space), method=method)
-        recovery = built.recoverer.recover(frame.depth, frame.camera, frame.labels, options, known)
+        recovery = built.recoverer.recover(frame.depth, frame.camera, frame.labels, options, previous)
+        self._last = {key: recovery}
         return recovery, origin
 
     @property
@@ -159,27 +164,23 @@ class Engine:
             return "none"
         return _described(built.parameters) + (", another one is being made" if self.is_making else "")
 
-    def _replace(self, built: _Built | None, request: int | None = None, fault: str = "") -> bool:
-        """End all requests, or one of them; False if it is the last one no more, and nothing has changed then."""
-        with self._lock:
-            if request not in (None, self._request):
-                return False
-            self._request += 1
-            self.is_making, self.fault = False, fault
-            if not fault:
-                self._built, self._is_to_read = built, False
-            return True
-
     def _swap(self, request: int, parameters: RecoverParameters, kept: _Built | None) -> None:
         started, log = perf_counter(), self._node.get_logger()
+        built, fault = None, ""
         try:
             built = _made(parameters, kept, lambda: request == self._request)
-            if built is not None and self._replace(built, request):
-                log.info(f"changed to {_described(parameters)} within {perf_counter() - started:.1f} s")
         except Exception as error:  # whatever it is: the old one goes on
             fault = f"cannot change to {_described(parameters)}: {' '.join(str(error).split())}"
-            if self._replace(None, request, fault):
-                log.error(f"{fault}; what was there before goes on")
+        with self._lock:
+            if request != self._request:  # another one is wanted by now
+                return
+            self.is_making, self.fault = False, fault
+            if built is not None:
+                self._built, self._is_to_read = built, False
+        if fault:
+            log.error(f"{fault}; what was there before goes on")
+        else:
+            log.info(f"changed to {_described(parameters)} within {perf_counter() - started:.1f} s")
 
 
 def _made(parameters: RecoverParameters, kept: _Built | None, is_wanted: Callable[[], bool]) -> _Built | None:

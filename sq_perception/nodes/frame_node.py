@@ -90,8 +90,6 @@ class FrameNode(ManagedNode):
         self._poses = CameraPoses(self)
         self._tracking = Tracking(self, self._poses)
         self._outputs = Outputs(self, self._poses)
-        self._before: dict[str, Answer] = {}
-        """The answer to the last frame, by its frame_id."""
         self._input: Input | None = None
         self._worker: threading.Thread | None = None
         self._enabled = True
@@ -151,7 +149,6 @@ class FrameNode(ManagedNode):
             self._outputs.close()
         self._poses.close()
         self._engine.release()
-        self._before = {}
         process.release_objects()  # nothing of a network may hang on in a cycle of references
 
     def _stop(self) -> None:
@@ -233,9 +230,7 @@ class FrameNode(ManagedNode):
         if parameters.target_frame and parameters.box is not None:
             turn, shift = pose_in(self._poses, frame.header, parameters.target_frame, parameters.tf_tolerance)
             pose = tuple(turn.tolist()), tuple(shift.tolist())
-        before = self._before.get(frame.header.frame_id) if parameters.tracking else None
-        answer = self._engine.recover(frame, parameters, pose, before)
-        self._before = {frame.header.frame_id: answer}
+        answer = self._engine.recover(frame, parameters, pose)
         stages |= {f"recovery: {name}": took for name, took in answer[0].milliseconds.items()}
         return frame, answer, stages
 
