@@ -16,7 +16,6 @@ import signal
 import subprocess
 import sys
 import tempfile
-import threading
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -33,13 +32,13 @@ _ROOT = str(Path(__file__).resolve().parent.parent.parent)
 _CODE = "import sys; sys.path[:1] = [{root!r}]; from sq_perception.nodes import executables as e; sys.exit(e.{node}())"
 
 
-class Child:
+class Child(subprocess.Popen[bytes]):
     """One running node of :mod:`sq_perception.nodes.executables`; the environment is this process's if not given."""
 
     def __init__(self, node: str, arguments: Sequence[str], environment: Mapping[str, str] | None = None) -> None:
         self.name = node
         self._output = tempfile.TemporaryFile()  # noqa: SIM115 - as long as the child
-        self._process = subprocess.Popen(
+        super().__init__(
             command(node, arguments),
             env={**(os.environ if environment is None else environment), "PYTHONUNBUFFERED": "1"},
             stdin=subprocess.DEVNULL,
@@ -47,13 +46,11 @@ class Child:
             stderr=subprocess.STDOUT,
             start_new_session=True,
         )
-        self.pid = self._process.pid
-        """Its process id, and that of its group."""
 
     @property
     def exit_code(self) -> int | None:
         """None while it runs."""
-        return self._process.poll()
+        return self.poll()
 
     def last_lines(self, count: int = 15) -> list[str]:
         """Its last output, standard output and error together."""
@@ -62,28 +59,23 @@ class Child:
         return tail.decode(errors="replace").splitlines()[-count:]
 
     def interrupt(self) -> None:
-        """Interrupt it, as Ctrl-C does."""
-        self._signal(signal.SIGINT)
-
-    def ends_within(self, seconds: float) -> bool:
-        """Whether it has ended within some seconds."""
-        with suppress(subprocess.TimeoutExpired):
-            self._process.wait(timeout=max(seconds, 0.0))
-        return self.exit_code is not None
+        """Interrupt it and all that it started, as Ctrl-C does."""
+        self.send_signal(signal.SIGINT)
 
     def kill(self) -> None:
         """End it and all that it started."""
-        self._signal(signal.SIGKILL)
-        self._process.wait()
+        self.send_signal(signal.SIGKILL)
+        self.wait()
 
-    def _signal(self, number: int) -> None:
+    def send_signal(self, sig: int) -> None:
+        """To the group that it leads."""
         if self.exit_code is None:
             with suppress(ProcessLookupError):
-                os.killpg(self.pid, number)
+                os.killpg(self.pid, sig)
 
 
 class Children:
-    """Nodes that live as long as a ``with`` block."""
+    """Nodes that live as long as a ``with`` block of the main thread."""
 
     def __init__(self, environment: Mapping[str, str] | None = None) -> None:
         self._environment = environment
@@ -94,8 +86,7 @@ class Children:
         """Names of those that did not stop when interrupted."""
 
     def __enter__(self) -> Children:
-        if threading.current_thread() is threading.main_thread():
-            self._before = {number: signal.signal(number, self._interrupt) for number in _SIGNALS}
+        self._before = {number: signal.signal(number, self._interrupt) for number in _SIGNALS}
         return self
 
     def __exit__(self, *_: object) -> None:
@@ -131,14 +122,15 @@ class Children:
 
     def stop(self) -> None:
         """Interrupt all, wait, and kill those that go on.  A second Ctrl-C must not leave one behind."""
-        numbers = _SIGNALS if threading.current_thread() is threading.main_thread() else ()
-        previous = {number: signal.signal(number, signal.SIG_IGN) for number in numbers}
+        previous = {number: signal.signal(number, signal.SIG_IGN) for number in _SIGNALS}
         try:
             for child in self._running:
                 child.interrupt()
             deadline = time.monotonic() + _PATIENCE
             for child in self._running:
-                if not child.ends_within(deadline - time.monotonic()):
+                try:
+                    child.wait(max(deadline - time.monotonic(), 0.0))
+                except subprocess.TimeoutExpired:
                     child.kill()
                     self.killed.append(child.name)
             self._running.clear()
