@@ -1,33 +1,17 @@
 """``sq-perception recover``: recorded frames in; JSON, meshes, pictures, a bag and a table out.
 
 Whether everything can be written is known before the first frame is read, and what was there before is kept until there
-is something better (:mod:`sq_perception.commands.recover_outputs`).  Heavy imports happen inside, so that ``--help``
-answers at once.
+is something better (:mod:`sq_perception.commands.recover_outputs`).
 """
 
 from __future__ import annotations
 
 import argparse
-import logging
 import math
 from collections.abc import Sequence
 from pathlib import Path
 
-from sq_perception.commands import recover_outputs
-from sq_perception.commands.console import (
-    FAILURE,
-    STANDARD_OUTPUT,
-    add_frames,
-    at_least,
-    complain,
-    failed,
-    folder,
-    misused,
-    parser,
-    positive,
-    target,
-    text_target,
-)
+from sq_perception.commands.console import add_frames, at_least, folder, parser, positive, target, text_target
 
 HELP = """\
 Recover superquadrics from recorded depth images.
@@ -99,13 +83,8 @@ meshes:
 def main(arguments: Sequence[str]) -> int:
     """Entry of ``sq-perception recover``; the exit code."""
     command = parser("recover", HELP, EPILOG)
-    _add_arguments(command)
-    return _run(command.parse_args(arguments))
-
-
-def _add_arguments(parser: argparse.ArgumentParser) -> None:
-    add_frames(parser)
-    add = parser.add_argument
+    add_frames(command)
+    add = command.add_argument
     add("--json", type=text_target, metavar="OUT", help="write the results there; - is the standard output")
     add("--jsonl", type=text_target, metavar="OUT", help="a line for each frame; those it has are skipped, see below")
     add("--csv", type=text_target, metavar="OUT", help="write the bodies there as a table; - is the standard output")
@@ -166,6 +145,11 @@ def _add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
         help="box of the optical frame, metres, that the middle of an object lies in",
     )
+    options = command.parse_args(arguments)
+
+    from sq_perception.commands import recover_run
+
+    return recover_run.run(options)
 
 
 def _region(text: str) -> tuple[int, int, int, int]:
@@ -180,73 +164,3 @@ def _existing(text: str) -> Path:
     if not Path(text).is_dir():
         raise argparse.ArgumentTypeError(f"{text}: expected a folder")
     return Path(text)
-
-
-def _run(options: argparse.Namespace) -> int:
-    if options.cluster and options.jobs > 1:
-        return misused("--jobs, --cluster: one of them; a cluster has as many processes as it has")
-    if [options.json, options.jsonl, options.csv].count(STANDARD_OUTPUT) > 1:
-        return misused("--json, --jsonl, --csv: only one of them can be the standard output")
-    if options.verbose:
-        logging.basicConfig(level=logging.INFO, format="sq-perception: %(message)s")
-
-    from sq_perception.commands.recover_lines import lines
-    from sq_perception.commands.recover_run import RecoverRun
-    from sq_perception.learning import checkpoint
-    from sq_perception.recordings.bag_file import InputOptions
-    from sq_perception.recordings.frame_file import FrameError, Reading
-    from sq_perception.recordings.inputs import RecordedInput
-    from sq_perception.recordings.result_json import Recovered
-    from sq_perception.recovery import workers
-    from sq_perception.recovery.options import NEEDS_NETWORK
-    from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
-
-    done = Recovered()
-    try:
-        settings = RecoveryOptions(
-            method=options.method,
-            max_objects=options.max_objects,
-            time_budget=options.time_budget,
-            max_size=options.max_size,
-            workspace=None if options.workspace is None else tuple(options.workspace),
-        )
-        wanted = InputOptions(
-            options.camera_info,
-            options.projection,
-            options.topic,
-            options.every,
-            options.limit,
-            options.distortion,
-            Reading(options.depth_scale, options.depth_min, options.depth_max, options.roi, options.masks),
-        )
-        recorded = RecordedInput(options.frames, wanted, done)
-        if problem := recover_outputs.replaced_input(options, recorded.files):
-            return misused(problem)
-        if options.method in NEEDS_NETWORK:
-            checkpoint.check(options.model)
-        outputs = recover_outputs.Outputs(options)
-        done.add(outputs.done)
-        setup = workers.Setup(options.model, settings)
-        executor: Recoverer | workers.Processes | workers.Cluster
-        if options.cluster:
-            executor = workers.Cluster(setup, options.cluster)
-        elif options.jobs > 1:
-            executor = workers.Processes(setup, options.jobs)
-        else:
-            executor = Recoverer(options.model, method=options.method)
-    except (FrameError, checkpoint.CheckpointError, OSError, ImportError) as error:
-        return failed(str(error))
-    except ValueError as error:
-        return misused(str(error))
-
-    run = RecoverRun(options, settings, executor, outputs)
-    code = run.over(recorded)
-    for problem in outputs.finish(run.is_whole):
-        complain(problem)
-        code = code or FAILURE
-    if STANDARD_OUTPUT not in (options.json, options.jsonl, options.csv) and not options.quiet:
-        for line in lines(outputs.results, options.verbose):
-            print(line)
-    if not options.quiet:
-        complain(run.summary())
-    return code

@@ -15,13 +15,17 @@ from typing import TYPE_CHECKING, Any
 from sq_perception.commands import console
 from sq_perception.commands.console import STANDARD_OUTPUT
 from sq_perception.files import output_file
+from sq_perception.fitting.fit import Status
+from sq_perception.geometry import mesh
+from sq_perception.recordings import bag_file, result_json
+from sq_perception.recordings.frame_entry import in_result_frame
+from sq_perception.recordings.frame_file import RecordedFrame, Stamp
+from sq_perception.recordings.result_json import ResultLines
+from sq_perception.recovery.recovery import FrameRecovery
+from sq_perception.tracking.session import Followed
 
 if TYPE_CHECKING:
-    from sq_perception.recordings.frame_file import RecordedFrame
     from sq_perception.recordings.result_bag import ResultBag
-    from sq_perception.recordings.result_json import ResultLines
-    from sq_perception.recovery.recoverer import FrameRecovery
-    from sq_perception.tracking.session import Followed
 
 _FILES = ("json", "jsonl", "csv", "mcap", "html")
 _DECISIVE = (
@@ -126,8 +130,6 @@ class Outputs:
 
         ``whole``: whether all frames were tried.
         """
-        from sq_perception.recordings import result_json
-
         if self._lines is not None:
             self._lines.close()
         for name, output in (("mcap", self._bag), ("html", self._page)):
@@ -156,9 +158,6 @@ class Outputs:
 
 def _stem(entry: Mapping[str, Any]) -> str:
     """What the picture and the meshes of a frame are called, unless another frame has that name, by its element."""
-    from sq_perception.recordings import bag_file
-    from sq_perception.recordings.frame_file import Stamp
-
     path = Path(entry["file"])
     return bag_file.frame_name(path, Stamp(**entry["stamp"])) if entry.get("topic") else path.stem
 
@@ -166,8 +165,6 @@ def _stem(entry: Mapping[str, Any]) -> str:
 def _lines(options: argparse.Namespace) -> ResultLines | None:
     if not options.jsonl:
         return None
-    from sq_perception.recordings.result_json import ResultLines
-
     path = "/dev/stdout" if options.jsonl == STANDARD_OUTPUT else options.jsonl
     lines = ResultLines(path, _decisive(options))
     needing = [name for name in ("track", "mcap", "html") if getattr(options, name)]
@@ -206,10 +203,6 @@ def _draw(path: Path, frame: RecordedFrame, recovery: FrameRecovery) -> None:
 
 def _write_mesh(path: Path, frame: RecordedFrame, recovery: FrameRecovery) -> None:
     """The bodies of a frame; no file where there is none."""
-    from sq_perception.fitting.fit import Status
-    from sq_perception.geometry import mesh
-    from sq_perception.recordings.result_json import in_result_frame
-
     shown = [k for k, body in enumerate(recovery.bodies) if body.status != Status.FAILED]
     if not shown:
         return

@@ -3,20 +3,87 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import statistics
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 from typing import Any
 
-from sq_perception.commands.console import FAILURE, INTERRUPTED, SUCCESS, complain, progress
-from sq_perception.commands.recover_outputs import Outputs
+from sq_perception.commands import console
+from sq_perception.commands.console import FAILURE, STANDARD_OUTPUT, complain, failed, misused
+from sq_perception.commands.recover_lines import lines
+from sq_perception.commands.recover_outputs import Outputs, replaced_input
 from sq_perception.fitting.fit import Status
-from sq_perception.recordings import result_json
-from sq_perception.recordings.frame_file import FrameError, RecordedFrame
+from sq_perception.learning import checkpoint
+from sq_perception.recordings import frame_entry
+from sq_perception.recordings.frame_file import FrameError, Reading, RecordedFrame
 from sq_perception.recordings.inputs import RecordedInput
+from sq_perception.recordings.result_json import Recovered
 from sq_perception.recordings.tracks import RecordedTracks
 from sq_perception.recovery import workers
+from sq_perception.recovery.options import NEEDS_NETWORK
 from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, RecoveryOptions
+
+
+def run(options: argparse.Namespace) -> int:
+    """What ``sq-perception recover`` does with these options; the exit code."""
+    if options.cluster and options.jobs > 1:
+        return misused("--jobs, --cluster: one of them; a cluster has as many processes as it has")
+    if [options.json, options.jsonl, options.csv].count(STANDARD_OUTPUT) > 1:
+        return misused("--json, --jsonl, --csv: only one of them can be the standard output")
+    if options.verbose:
+        logging.basicConfig(level=logging.INFO, format="sq-perception: %(message)s")
+
+    done = Recovered()
+    try:
+        settings = RecoveryOptions(
+            method=options.method,
+            max_objects=options.max_objects,
+            time_budget=options.time_budget,
+            max_size=options.max_size,
+            workspace=None if options.workspace is None else tuple(options.workspace),
+        )
+        recorded = RecordedInput(
+            options.frames,
+            options.camera_info,
+            options.projection,
+            options.topic,
+            options.every,
+            options.limit,
+            options.distortion,
+            Reading(options.depth_scale, options.depth_min, options.depth_max, options.roi, options.masks),
+            done,
+        )
+        if problem := replaced_input(options, recorded.files):
+            return misused(problem)
+        if options.method in NEEDS_NETWORK:
+            checkpoint.check(options.model)
+        outputs = Outputs(options)
+        done.add(outputs.done)
+        setup = workers.Setup(options.model, settings)
+        executor: Recoverer | workers.Processes | workers.Cluster
+        if options.cluster:
+            executor = workers.Cluster(setup, options.cluster)
+        elif options.jobs > 1:
+            executor = workers.Processes(setup, options.jobs)
+        else:
+            executor = Recoverer(options.model, method=options.method)
+    except (FrameError, checkpoint.CheckpointError, OSError, ImportError) as error:
+        return failed(str(error))
+    except ValueError as error:
+        return misused(str(error))
+
+    run = RecoverRun(options, settings, executor, outputs)
+    code = run.over(recorded)
+    for problem in outputs.finish(run.is_whole):
+        complain(problem)
+        code = code or FAILURE
+    if STANDARD_OUTPUT not in (options.json, options.jsonl, options.csv) and not options.quiet:
+        for line in lines(outputs.results, options.verbose):
+            print(line)
+    if not options.quiet:
+        complain(run.summary())
+    return code
 
 
 class RecoverRun:
@@ -69,9 +136,9 @@ class RecoverRun:
                     return FAILURE
         except KeyboardInterrupt:
             complain("interrupted; what is done so far is kept")
-            return INTERRUPTED
+            return console.INTERRUPTED
         self.is_whole = True
-        return FAILURE if self._unreadable else SUCCESS
+        return FAILURE if self._unreadable else console.SUCCESS
 
     def summary(self) -> str:
         """The run in one line."""
@@ -134,7 +201,7 @@ def _count(number: int, singular: str, many: str | None = None) -> str:
 
 def _progress(recorded: RecordedInput) -> Iterator[tuple[str, Any]]:
     """The frames, with a bar on a terminal where there are several."""
-    with progress() as bar:
+    with console.progress() as bar:
         task = bar.add_task("recovering", total=recorded.total, visible=recorded.total > 1)
         for pair in recorded:
             bar.update(task, total=recorded.total, visible=recorded.total > 1)

@@ -1,0 +1,145 @@
+"""What ``sq-perception grasp`` does with its frames: recover, plan, and write JSON, pictures and meshes."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from sq_perception.commands import console
+from sq_perception.commands.console import STANDARD_OUTPUT, complain, failed, misused
+from sq_perception.files import output_file
+from sq_perception.geometry import mesh
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.grasping import planner
+from sq_perception.grasping.gripper import Gripper, gripper
+from sq_perception.grasping.plan import GraspPlan
+from sq_perception.grasping.surroundings import Surroundings
+from sq_perception.learning.checkpoint import CheckpointError
+from sq_perception.recordings.frame_file import FrameError, RecordedFrame
+from sq_perception.recordings.inputs import RecordedInput
+from sq_perception.recovery.options import RecoveryOptions
+from sq_perception.recovery.recoverer import Recoverer, Recovery
+
+FORMAT, VERSION = "sq_perception.grasps", 1
+_SHARP = 0.02
+"""Exponents of a gripper's boxes in a mesh."""
+
+
+def run(options: argparse.Namespace) -> int:
+    """What the command does with these options; the exit code."""
+    try:
+        hand = gripper(options.gripper)
+    except ValueError as error:
+        return misused(str(error))
+    friction = options.friction or planner.FRICTION
+    try:
+        recorded = RecordedInput(options.frames, options.camera_info)
+        pictures = {"pictures": (options.pictures, ".png")}
+        if problem := console.replaced_input(recorded.files, {"json": options.json}, pictures):
+            return misused(problem)
+        recoverer = Recoverer()
+        entries: list[dict[str, Any]] = []
+        stems: set[str] = set()
+        code = console.SUCCESS
+        for file, frame in recorded:
+            if isinstance(frame, FrameError):
+                code = failed(str(frame))
+            elif frame.is_cube:
+                code = failed(f"{file}: a view of the unit cube has no metres to grasp in")
+            else:
+                if frame.warning:
+                    complain(f"warning: {frame.name}: {frame.warning}")
+                stem = output_file.free_name(frame.name if frame.topic else Path(frame.name).stem, stems)
+                entries.append({"file": file, "bodies": _bodies(stem, frame, recoverer, hand, friction, options)})
+        chosen = {"gripper": hand.name, "friction": friction}
+        document = {"format": FORMAT, "version": VERSION, "options": chosen, "frames": entries}
+        text = json.dumps(document, indent=1, allow_nan=False)
+        if options.json == STANDARD_OUTPUT:
+            sys.stdout.write(f"{text}\n")
+            return code
+        if options.json and entries:
+            output_file.write(options.json, f"{text}\n".encode())
+        _print_table(entries)
+        return code
+    except (FrameError, CheckpointError, OSError) as error:
+        return failed(str(error))
+
+
+def _bodies(
+    stem: str, frame: RecordedFrame, recoverer: Recoverer, hand: Gripper, friction: float, options: argparse.Namespace
+) -> list[dict[str, Any]]:
+    """Draw the grasps of a frame where that is asked for; its ``bodies``."""
+    settings = RecoveryOptions(free_space=frame.has_free_space)
+    recovery = recoverer.recover(frame.depth, frame.camera, frame.labels, settings)
+    found = recovery.recovered
+    bodies = Superquadric.stack([recovered.superquadric for recovered in found])
+    covariance = np.array([recovered.covariance for recovered in found]).reshape(-1, 11, 11)
+    around = Surroundings.of_image(frame.depth, frame.camera, recovery.plane)
+    plan = planner.grasps(bodies, hand, covariance, around, friction)
+    if options.pictures:
+        _draw(options.pictures / f"{stem}.png", frame, found, plan, hand)
+    if options.meshes and found:
+        _write_mesh(options.meshes / f"{stem}.glb", found, plan, hand)
+    return [
+        {
+            "label": int(recovered.label),
+            "reason": plan.reasons[k],
+            "grasps": [
+                {
+                    "position": grasp.position.tolist(),
+                    "rotation": grasp.rotation.tolist(),
+                    "opening": grasp.opening,
+                    "width": grasp.width,
+                    "score": grasp.score,
+                    "weakest": grasp.weakest,
+                }
+                for grasp in plan.of(k)
+            ],
+        }
+        for k, recovered in enumerate(found)
+    ]
+
+
+def _draw(path: Path, frame: RecordedFrame, found: Sequence[Recovery], plan: GraspPlan, hand: Gripper) -> None:
+    from sq_perception.evaluation import plots
+    from sq_perception.evaluation.grasp_figure import draw_grasps
+
+    figure = plots.new_figure(9.6, 9.6 * frame.camera.height / frame.camera.width)
+    ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
+    draw_grasps(ax, frame.depth, frame.camera, [recovered.superquadric for recovered in found], plan, hand)
+    with output_file.writing(path) as partial:
+        plots.save(figure, partial)
+
+
+def _write_mesh(path: Path, found: Sequence[Recovery], plan: GraspPlan, hand: Gripper) -> None:
+    """Bodies and, as sharp superquadrics, the boxes of each body's best gripper."""
+    solids = [recovered.superquadric for recovered in found]
+    names = [f"body_{k}" for k in range(len(found))]
+    owner = list(range(len(found)))
+    for k in range(len(found)):
+        for grasp in plan.of(k)[:1]:
+            boxes = hand.boxes(grasp.opening, reach=0.0)
+            for name, box in zip(("left", "right", "hand"), boxes, strict=True):
+                solids.append(Superquadric(box[3:], np.full(2, _SHARP), grasp.placed(box[None, :3])[0], grasp.rotation))
+                names.append(f"grasp_{k}_{name}")
+                owner.append(k)
+    with output_file.writing(path) as partial:
+        mesh.export(solids, partial, names=names, colours=mesh.COLOURS[np.array(owner) % len(mesh.COLOURS)])
+
+
+def _print_table(entries: Sequence[dict[str, Any]]) -> None:
+    for entry in entries:
+        print(entry["file"])
+        for body in entry["bodies"]:
+            text = body["reason"]
+            if body["grasps"]:
+                best = body["grasps"][0]
+                at = " ".join(f"{value:.3f}" for value in best["position"])
+                text = f"{best['score']:.2f}  at {at} m, {1e3 * best['opening']:.0f} mm open"
+            print(f"  {body['label']:4d}  {text}")
