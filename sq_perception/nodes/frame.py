@@ -12,6 +12,7 @@ from typing import Any, TypeAlias, cast
 
 import numpy as np
 from rclpy.node import Node
+from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
 from sq_msgs_py.depth_image import DEPTH_ENCODINGS, GREY_ENCODINGS, labels_from_message, size_mismatch
@@ -25,6 +26,16 @@ from sq_perception.recordings import cloud_file, publication
 DepthMessage: TypeAlias = Image | CompressedImage | PointCloud2
 _DIGITS = 3
 """Of the pixels that the camera of a cloud is rounded to: the same camera for each frame, whatever its noise."""
+
+
+def newest() -> QoSProfile:
+    """For images: a slow subscriber with a queue answers old ones.  Made anew, as rclpy writes overrides into it."""
+    return QoSProfile(depth=1, reliability=QoSReliabilityPolicy.BEST_EFFORT)
+
+
+def latched() -> QoSProfile:
+    """Late comers get the last one: a table that is hidden by an arm is still there.  Made anew, likewise."""
+    return QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 from geometry_msgs.msg import PoseArray, PoseStamped
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSDurabilityPolicy, QoSProfile
 from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import Trigger
 from visualization_msgs.msg import MarkerArray
@@ -32,14 +31,13 @@ from sq_perception.grasping.gripper import Gripper, gripper
 from sq_perception.grasping.plan import GraspPlan
 from sq_perception.grasping.planner import grasps, warm_up
 from sq_perception.grasping.surroundings import Surroundings
+from sq_perception.nodes.frame import latched
 from sq_perception.nodes.live_parameters import LiveParameters
 from sq_perception.nodes.managed_node import ManagedNode
 from sq_perception.nodes.outputs import ARRIVAL
 from sq_perception.nodes.parameters import GraspParameters
 from sq_perception.nodes.statistics import THROTTLE
 from sq_perception.recordings.publication import covariances, superquadrics
-
-_LATCHED = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
 
 
 class GraspNode(ManagedNode):
@@ -73,7 +71,7 @@ class GraspNode(ManagedNode):
         )
         self._publishers = [self.create_publisher(kind, topic, 10) for kind, topic in kinds]
         self._subscriptions = [
-            self.create_subscription(PoseStamped, "support_plane", self._on_plane, _LATCHED),
+            self.create_subscription(PoseStamped, "support_plane", self._on_plane, latched()),
             self.create_subscription(PointCloud2, "superquadrics", self._on_cloud, 1),
         ]
 

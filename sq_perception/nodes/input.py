@@ -18,14 +18,7 @@ from typing import Any
 
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
-from rclpy.qos import (
-    QoSCompatibility,
-    QoSDurabilityPolicy,
-    QoSHistoryPolicy,
-    QoSProfile,
-    QoSReliabilityPolicy,
-    qos_check_compatible,
-)
+from rclpy.qos import QoSCompatibility, QoSDurabilityPolicy, QoSReliabilityPolicy, qos_check_compatible
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
@@ -33,7 +26,7 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 from sq_msgs_py.depth_image import size_mismatch
 from sq_perception.imaging.calibration import Calibration
 from sq_perception.nodes import fast_dds
-from sq_perception.nodes.frame import DepthMessage, Frame, decode, image_topic, size_of, stamp_of
+from sq_perception.nodes.frame import DepthMessage, Frame, decode, image_topic, latched, newest, size_of, stamp_of
 from sq_perception.nodes.live_parameters import LiveParameters
 from sq_perception.nodes.parameters import POINTS, RAW, RecoverParameters
 from sq_perception.nodes.statistics import THROTTLE, Statistics
@@ -72,8 +65,8 @@ class _Info:
 class Input:
     """The subscriptions of an active node, and what came.
 
-    Inputs are best effort, keep last 1: a slow subscriber with a queue answers old images.  An image that comes while
-    none ``is_wanted`` is dropped at once.
+    Inputs are best effort, keep last 1, unless overridden.  An image that comes while none ``is_wanted`` is dropped at
+    once.
     """
 
     def __init__(
@@ -122,7 +115,7 @@ class Input:
                 CameraInfo,
                 self._info_topic,
                 self._on_info,
-                QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL),
+                latched(),
                 # Others on the topic may keep nothing; the plain subscription hears them.
                 event_callbacks=SubscriptionEventCallbacks(incompatible_qos=lambda _: None),
             )
@@ -285,7 +278,7 @@ class Input:
             kind,
             topic,
             callback,
-            QoSProfile(depth=1, history=QoSHistoryPolicy.KEEP_LAST, reliability=QoSReliabilityPolicy.BEST_EFFORT),
+            newest(),
             event_callbacks=SubscriptionEventCallbacks(message_lost=lambda event: self._on_lost(made, event)),
             qos_overriding_options=QoSOverridingOptions.with_default_policies(),
         )

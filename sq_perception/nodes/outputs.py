@@ -14,7 +14,6 @@ outlives a restart after a fault, so that an object that is gone is still remove
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Collection
 from functools import partial
 from typing import Any
@@ -23,7 +22,7 @@ from geometry_msgs.msg import PoseStamped
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.publisher import Publisher
-from rclpy.qos import QoSDurabilityPolicy, QoSPolicyKind, QoSProfile
+from rclpy.qos import QoSPolicyKind
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import Image, PointCloud2
 from visualization_msgs.msg import MarkerArray
@@ -31,10 +30,11 @@ from visualization_msgs.msg import MarkerArray
 from sq_msgs_py import collision_objects
 from sq_msgs_py.detections import detections
 from sq_msgs_py.markers import markers
+from sq_msgs_py.message_types import installed
 from sq_msgs_py.poses import plane_message
 from sq_msgs_py.superquadrics import to_message
 from sq_msgs_py.transforms import transforms
-from sq_perception.nodes.frame import Frame
+from sq_perception.nodes.frame import Frame, latched
 from sq_perception.nodes.parameters import RecoverParameters
 from sq_perception.nodes.statistics import THROTTLE
 from sq_perception.nodes.tracking import CameraPoses, Pose, PoseError
@@ -44,8 +44,6 @@ from sq_perception.recovery.recoverer import render_recovery
 from sq_perception.recovery.recovery import timed
 
 _OVERRIDABLE = tuple(getattr(QoSPolicyKind, name) for name in ("HISTORY", "DEPTH", "RELIABILITY", "DURABILITY"))
-_LATCHED = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
-"""Late comers get the last one: a table that is hidden by an arm is still there."""
 ARRIVAL = Duration(seconds=0.5)
 """How long the last markers may take to arrive before their publisher goes."""
 
@@ -67,7 +65,7 @@ class Outputs:
         self.superquadrics = create(PointCloud2, "~/superquadrics", 10)
         self.markers = create(MarkerArray, "~/markers", 1)
         self.rendered_depth = create(Image, "~/rendered_depth", 1)
-        self.support_plane = create(PoseStamped, "~/support_plane", _LATCHED)
+        self.support_plane = create(PoseStamped, "~/support_plane", latched())
         self._publishers = self.superquadrics, self.markers, self.rendered_depth, self.support_plane
         self.optional.follow(parameters)
 
@@ -110,13 +108,8 @@ class Outputs:
             with timed(stages, "pictures"):
                 if self.markers.get_subscription_count():
                     before = self._shown.shown_ids if self._shown is not None else ()
-                    self.markers.publish(
-                        findings.markers(
-                            before,
-                            parameters.marker_colours == "score",
-                            alpha=parameters.marker_alpha,
-                        )
-                    )
+                    by_score = parameters.marker_colours == "score"
+                    self.markers.publish(findings.markers(before, by_score, parameters.marker_alpha))
                     self._shown = findings
                 if self.rendered_depth.get_subscription_count():
                     self.rendered_depth.publish(frame.encode(render_recovery(found.recovery, frame.camera)[0]))
@@ -165,17 +158,15 @@ class OptionalOutputs:
 
     def follow(self, parameters: RecoverParameters) -> None:
         """Create the publishers that are asked for, and destroy the others."""
-        self.absent = {
-            parameter: package for parameter, package in self.absent.items() if getattr(parameters, parameter)
-        }
-        for parameter in _KINDS:
-            if getattr(parameters, parameter):
-                if parameter not in self._publishers and parameter not in self.absent:
-                    self._create(parameter)
-            elif parameter in self._publishers:
-                if parameter == "publish_collision_objects" and self.withdraw():
-                    continue  # the publisher lasts until the next call, so that its last message arrives
-                self._node.destroy_publisher(self._publishers.pop(parameter))
+        asked = [parameter for parameter in _KINDS if getattr(parameters, parameter)]
+        self.absent = {parameter: package for parameter, package in self.absent.items() if parameter in asked}
+        for parameter in asked:
+            if parameter not in self._publishers and parameter not in self.absent:
+                self._create(parameter)
+        for parameter in self._publishers.keys() - set(asked):
+            if parameter == "publish_collision_objects" and self.withdraw():
+                continue  # the publisher lasts until the next call, so that its last message arrives
+            self._node.destroy_publisher(self._publishers.pop(parameter))
 
     def publish(self, found: Findings, parameters: RecoverParameters, hidden: Collection[int] = ()) -> None:
         """Publish what a frame showed, where it is asked for and somebody listens.
@@ -190,10 +181,10 @@ class OptionalOutputs:
         if not has_frame and (parameters.publish_tf or parameters.publish_collision_objects):
             text = "expected images with a frame_id, got none: no transforms, no objects"
             self._node.get_logger().warning(text, once=True)
-        if has_frame and (heard := self._heard("publish_tf")):
+        heard = self._heard("publish_tf")
+        if has_frame and heard and len(found.array.recovered):
             message: Any = heard.msg_type
-            if frames := transforms(found.array, found.header, prefix=parameters.tf_prefix):
-                heard.publish(message(transforms=frames))
+            heard.publish(message(transforms=transforms(found.array, found.header, prefix=parameters.tf_prefix)))
         if heard := self._heard("publish_detections"):
             heard.publish(
                 detections(found.array, found.header, covariances=found.covariances, prefix=parameters.tf_prefix)
@@ -225,7 +216,7 @@ class OptionalOutputs:
     def _create(self, parameter: str) -> None:
         package, kind, topic, queue = _KINDS[parameter]
         try:
-            message_type = getattr(importlib.import_module(f"{package}.msg"), kind)
+            message_type: Any = installed(f"{package}/msg/{kind}")
             self._publishers[parameter] = self._node.create_publisher(message_type, topic, queue)
         except Exception as error:  # a package that is there in part fails in other ways than ImportError
             self.absent = {**self.absent, parameter: package}

@@ -1,12 +1,13 @@
 """Another node as the page sees it: its parameters, its lifecycle state, whether it is there.
 
 Services are called by tasks of the executor; a call without an answer is given up after a while, as the node may have
-died.  What is to be shown waits, and the drawing thread takes it with :meth:`RemoteNode.show`.
+died.  What is to be shown waits in its order, and the drawing thread takes it with :meth:`RemoteNode.show`.
 """
 
 from __future__ import annotations
 
-import threading
+from collections import deque
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from time import monotonic
 from typing import Any
@@ -19,7 +20,7 @@ from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.task import Future
 
-from sq_perception.viewing.controls import Control, control, plain
+from sq_perception.viewing.controls import arranged, plain
 from sq_perception.viewing.page import Page
 
 _PATIENCE = 3.0
@@ -47,10 +48,7 @@ class RemoteNode:
         self._known: set[str] = set()
         self._look_due = 0.0
         self._load_due: float | None = None
-        self._lock = threading.Lock()
-        self._new_controls: list[Control] | None = None
-        self._new_values: dict[str, Any] = {}
-        self._new_answer: tuple[str, bool] | None = None
+        self._news: deque[Callable[[Page], None]] = deque()
 
     # In the executor's thread
 
@@ -73,8 +71,7 @@ class RemoteNode:
         if any(value.name not in self._known for value in event.new_parameters) or event.deleted_parameters:
             self._load_due = monotonic() + _SETTLED
         values = [*event.new_parameters, *event.changed_parameters]
-        with self._lock:
-            self._new_values.update({value.name: parameter_value_to_python(value.value) for value in values})
+        self._note_values({value.name: parameter_value_to_python(value.value) for value in values})
 
     async def change(self, name: str, value: Any) -> None:
         """Ask for another value of a parameter; the node's answer is shown, and what it holds then."""
@@ -92,8 +89,8 @@ class RemoteNode:
         self._note(f"{name} is now {plain(value)}" if result.successful else reason, result.successful)
         with suppress(TimeoutError):
             response = await self._answer(self._parameters.get_parameters([name]))
-            with self._lock:
-                self._new_values.update((name, parameter_value_to_python(value)) for value in response.values)
+            for value in response.values:  # none where there is no such parameter
+                self._note_values({name: parameter_value_to_python(value)})
 
     async def transit(self, label: str) -> None:
         """Ask for a lifecycle transition."""
@@ -136,9 +133,8 @@ class RemoteNode:
             return
         self._known = set(names)
         read = [parameter_value_to_python(value) for value in got.values]
-        with self._lock:
-            self._new_controls = [control(*both) for both in zip(described.descriptors, read, strict=True)]
-            self._new_values.clear()
+        controls = arranged(zip(described.descriptors, read, strict=True))
+        self._news.append(lambda page: page.show_controls(self.name, controls))
 
     async def _answer(self, call: Future, patience: float = _PATIENCE) -> Any:
         """The answer of a service.  Raises TimeoutError if there is none."""
@@ -152,20 +148,14 @@ class RemoteNode:
         return answer
 
     def _note(self, text: str, good: bool) -> None:
-        with self._lock:
-            self._new_answer = text, good
+        self._news.append(lambda page: page.show_answer(self.name, text, good))
+
+    def _note_values(self, values: Mapping[str, Any]) -> None:
+        self._news.append(lambda page: page.show_values(self.name, values))
 
     # In the drawing thread
 
     def show(self, page: Page) -> None:
         """Put what is new into the page."""
-        with self._lock:
-            controls, self._new_controls = self._new_controls, None
-            values, self._new_values = self._new_values, {}
-            answer, self._new_answer = self._new_answer, None
-        if controls is not None:
-            page.show_controls(self.name, controls)
-        if values:
-            page.show_values(self.name, values)
-        if answer is not None:
-            page.show_answer(self.name, *answer)
+        while self._news:
+            self._news.popleft()(page)

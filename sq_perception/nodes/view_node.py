@@ -13,6 +13,7 @@ import threading
 import traceback
 from collections import OrderedDict, deque
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import partial
 from time import monotonic
 from typing import Any, NamedTuple
@@ -21,7 +22,6 @@ from diagnostic_msgs.msg import DiagnosticArray
 from rcl_interfaces.msg import ParameterEvent
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from rclpy.qos import QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 
@@ -29,7 +29,7 @@ from sq_msgs_py.depth_image import GREY_ENCODINGS
 from sq_msgs_py.superquadrics import from_message
 from sq_perception.geometry import rotation
 from sq_perception.imaging import unit_cube
-from sq_perception.nodes.frame import decode_by, size_of, stamp_of
+from sq_perception.nodes.frame import decode_by, newest, size_of, stamp_of
 from sq_perception.nodes.remote_node import RemoteNode
 from sq_perception.nodes.statistics import THROTTLE
 from sq_perception.nodes.tracking import CameraPoses, PoseError
@@ -137,15 +137,14 @@ class ViewNode(Node):
             remote.tick()
 
     def _listen(self) -> None:
-        newest = QoSProfile(depth=1, history=QoSHistoryPolicy.KEEP_LAST, reliability=QoSReliabilityPolicy.BEST_EFFORT)
         depth, camera_info = self._topics
         self._inputs = [
-            self.create_subscription(CameraInfo, camera_info, self._on_info, newest),
-            self.create_subscription(Image, depth, self._on_image, newest),
+            self.create_subscription(CameraInfo, camera_info, self._on_info, newest()),
+            self.create_subscription(Image, depth, self._on_image, newest()),
         ]
         for name in self._remote:
             topic = f"{name}/superquadrics"
-            self._inputs.append(self.create_subscription(PointCloud2, topic, partial(self._on_result, name), newest))
+            self._inputs.append(self.create_subscription(PointCloud2, topic, partial(self._on_result, name), newest()))
 
     def _on_info(self, message: CameraInfo) -> None:
         self._info = message
@@ -194,11 +193,11 @@ class ViewNode(Node):
                     self.get_logger().error(traceback.format_exc(), throttle_duration_sec=THROTTLE)
 
     def _draw(self) -> None:
+        for remote in self._remote.values():
+            remote.show(self._page)
         if not self._page.watched:
             self._status_due = 0.0  # controls may have changed when somebody looks again
             return
-        for remote in self._remote.values():
-            remote.show(self._page)
         now = monotonic()
         status_due = now >= self._status_due
         results = dict(self._results)
@@ -238,18 +237,14 @@ class ViewNode(Node):
         if result is self._shown.get(name) and not status_due:
             return
         self._shown[name] = result
-        bodies, remark = (None, "") if result is None else self._converted(result.message, header)
         remote = self._remote[name]
-        state = NodeState(
-            name,
-            None if result is None else monotonic() - result.time,
-            None if result is None else result.latency,
-            remote.lifecycle,
-            self._diagnosed.get(name, {}) if remote.is_there else {},
-            remote.is_there,
-            remark,
-        )
-        stamp = 0.0 if result is None else 1e-9 * stamp_of(result.message)
+        diagnostics = self._diagnosed.get(name, {}) if remote.is_there else {}
+        state = NodeState(name, lifecycle=remote.lifecycle, diagnostics=diagnostics, is_there=remote.is_there)
+        bodies, stamp = None, 0.0
+        if result is not None:
+            bodies, remark = self._converted(result.message, header)
+            stamp = 1e-9 * stamp_of(result.message)
+            state = replace(state, age=monotonic() - result.time, latency=result.latency, remark=remark)
         self._page.show_bodies(name, bodies, stamp, state)
         if status_due:
             self._page.show_state(state)
