@@ -6,6 +6,7 @@ Readers find fields by name, whatever their order, offset, type and byte order, 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
 
 import numpy as np
@@ -27,10 +28,16 @@ class MessageError(ValueError):
     """A message that does not hold what it should; its text names what was expected and what arrived."""
 
 
-class Columns:
-    """n rows of numbers: what frozen dataclasses of columns (n,) or (n, k) derive from.
+def column(*names: str, is_finite: bool = False) -> Mapping[str, Any]:
+    """Metadata of a dataclass field: which fields of the message it holds, and whether it has no NaN."""
+    return {"names": names, "is_finite": is_finite}
 
-    ``NAMES`` are the fields of each column, ``FINITE`` the columns without NaN.  A column that is None is 0 or NaN.
+
+@dataclass(frozen=True, eq=False)
+class Columns:
+    """n rows of numbers: the base of frozen dataclasses whose fields are columns (n,) or (n, k), by :func:`column`.
+
+    ``FIELDS`` are those of the message.  A column that is None is 0 or NaN.
 
     Raises
     ------
@@ -40,13 +47,12 @@ class Columns:
     """
 
     FIELDS: ClassVar[Fields]
-    NAMES: ClassVar[Mapping[str, tuple[str, ...]]]
-    FINITE: ClassVar[tuple[str, ...]]
 
     def __post_init__(self) -> None:
         kinds, count = dict(self.FIELDS), len(self)
-        for column, names in self.NAMES.items():
-            given, is_unsigned = getattr(self, column), kinds[names[0]] == UINT32
+        for each in fields(self):
+            name, names, given = each.name, each.metadata["names"], getattr(self, each.name)
+            is_unsigned = kinds[names[0]] == UINT32
             shape = (count,) if len(names) == 1 else (count, len(names))
             if given is None:
                 given = np.zeros(shape, np.uint32) if is_unsigned else np.full(shape, np.nan)
@@ -54,17 +60,17 @@ class Columns:
             if values.size == 0 and count == 0:
                 values = values.reshape(shape)
             if values.shape != shape:
-                raise ValueError(f"{column}: expected shape {shape}, got {values.shape}")
+                raise ValueError(f"{name}: expected shape {shape}, got {values.shape}")
             if is_unsigned:
-                _check_unsigned(column, values)
+                _check_unsigned(name, values)
             with np.errstate(over="ignore"):  # of a stranger's doubles: infinite
                 values = values.astype(np.uint32 if is_unsigned else np.float32)
-            if column in self.FINITE and not np.isfinite(values).all():
-                raise ValueError(f"{column}: expected finite numbers, got {values.tolist()}")
-            object.__setattr__(self, column, values)
+            if each.metadata["is_finite"] and not np.isfinite(values).all():
+                raise ValueError(f"{name}: expected finite numbers, got {values.tolist()}")
+            object.__setattr__(self, name, values)
 
     def __len__(self) -> int:
-        return len(np.atleast_1d(getattr(self, next(iter(self.NAMES)))))
+        return len(np.atleast_1d(getattr(self, fields(self)[0].name)))
 
 
 Rows = TypeVar("Rows", bound=Columns)
@@ -74,8 +80,9 @@ def to_message(rows: Columns, header: Any, types: MessageTypes = installed) -> P
     """The message of n rows (n may be 0) with the given std_msgs/Header, of the classes in ``types``."""
     layout = np.dtype([(name, "<" + _NUMPY_TYPES[datatype]) for name, datatype in rows.FIELDS])
     points = np.zeros(len(rows), layout)
-    for column, names in rows.NAMES.items():
-        values = getattr(rows, column).reshape(len(rows), len(names))
+    for each in fields(rows):
+        names = each.metadata["names"]
+        values = getattr(rows, each.name).reshape(len(rows), len(names))
         for k, name in enumerate(names):
             points[name] = values[:, k]
     field = types("sensor_msgs/msg/PointField")
@@ -106,10 +113,11 @@ def from_message(kind: type[Rows], message: PointCloud2, needed: Sequence[str]) 
     """
     points = cloud_points(message, kind.FIELDS, needed)
     columns: dict[str, np.ndarray] = {}
-    for column, names in kind.NAMES.items():
+    for each in fields(kind):
+        names = each.metadata["names"]
         if set(names) <= set(points.dtype.names or ()):
             values = np.stack([points[name] for name in names], axis=-1)
-            columns[column] = values[:, 0] if len(names) == 1 else values
+            columns[each.name] = values[:, 0] if len(names) == 1 else values
     try:
         return kind(**columns)
     except ValueError as error:

@@ -13,13 +13,13 @@ id              of the body, as in the cloud of the superquadrics (uint32; the o
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sq_msgs_py import columns
-from sq_msgs_py.columns import FLOAT32, UINT32, Columns
+from sq_msgs_py.columns import FLOAT32, UINT32, Columns, column
 from sq_msgs_py.message_types import MessageTypes, installed
 from sq_msgs_py.poses import matrices, poses_at, product, unit_quaternions
 
@@ -33,14 +33,6 @@ FIELDS: tuple[tuple[str, int], ...] = (
     ("id", UINT32),
 )
 """Name and PointField datatype of every field, in the order of the message."""
-_COLUMNS = {
-    "position": ("x", "y", "z"),
-    "rotation": ("qx", "qy", "qz", "qw"),
-    "opening": ("opening",),
-    "width": ("width",),
-    "score": ("score",),
-    "id": ("id",),
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,15 +50,13 @@ class GraspArray(Columns):
     """
 
     FIELDS = FIELDS
-    NAMES = _COLUMNS
-    FINITE = ("position", "rotation")
 
-    position: np.ndarray
-    rotation: np.ndarray
-    opening: np.ndarray
-    width: np.ndarray
-    score: np.ndarray
-    id: np.ndarray
+    position: np.ndarray = field(metadata=column("x", "y", "z", is_finite=True))
+    rotation: np.ndarray = field(metadata=column("qx", "qy", "qz", "qw", is_finite=True))
+    opening: np.ndarray = field(metadata=column("opening"))
+    width: np.ndarray = field(metadata=column("width"))
+    score: np.ndarray = field(metadata=column("score"))
+    id: np.ndarray = field(metadata=column("id"))
 
 
 def to_message(grasps: GraspArray, header: Any, types: MessageTypes = installed) -> PointCloud2:

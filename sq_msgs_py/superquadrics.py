@@ -34,14 +34,14 @@ equally right: compare bodies, never raw parameters.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from enum import IntFlag
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from sq_msgs_py import columns
-from sq_msgs_py.columns import FLOAT32, UINT32, Columns
+from sq_msgs_py.columns import FLOAT32, UINT32, Columns, column
 from sq_msgs_py.columns import MessageError as MessageError
 from sq_msgs_py.message_types import MessageTypes, installed
 
@@ -74,21 +74,6 @@ FIELDS: tuple[tuple[str, int], ...] = tuple(
 FIELDS += tuple((f"sigma_{name}", FLOAT32) for name in ("e1", "e2", "c1", "c2", "c3", "r1", "r2", "r3"))
 """Name and PointField datatype of every field, in the order of the message."""
 
-_COLUMNS = {
-    "size": ("a1", "a2", "a3"),
-    "shape": ("e1", "e2"),
-    "translation": ("x", "y", "z"),
-    "rotation": ("qx", "qy", "qz", "qw"),
-    "score": ("score",),
-    "residual": ("residual",),
-    "sigma_size": ("sigma_a1", "sigma_a2", "sigma_a3"),
-    "id": ("id",),
-    "status": ("status",),
-    **{name: (name,) for name in ("label", "seen", "fused", "reason")},
-    "sigma_shape": ("sigma_e1", "sigma_e2"),
-    "sigma_centre": ("sigma_c1", "sigma_c2", "sigma_c3"),
-    "sigma_turn": ("sigma_r1", "sigma_r2", "sigma_r3"),
-}
 _NEEDED = tuple(name for name, _ in FIELDS[: [name for name, _ in FIELDS].index("label")])
 """Fields that every cloud has."""
 
@@ -116,25 +101,23 @@ class SuperquadricArray(Columns):
     """
 
     FIELDS = FIELDS
-    NAMES = _COLUMNS
-    FINITE = ("size", "shape", "translation", "rotation")
 
-    size: np.ndarray
-    shape: np.ndarray
-    translation: np.ndarray
-    rotation: np.ndarray
-    score: np.ndarray
-    residual: np.ndarray
-    sigma_size: np.ndarray
-    id: np.ndarray
-    status: np.ndarray
-    label: np.ndarray | None = None
-    seen: np.ndarray | None = None
-    fused: np.ndarray | None = None
-    reason: np.ndarray | None = None
-    sigma_shape: np.ndarray | None = None
-    sigma_centre: np.ndarray | None = None
-    sigma_turn: np.ndarray | None = None
+    size: np.ndarray = field(metadata=column("a1", "a2", "a3", is_finite=True))
+    shape: np.ndarray = field(metadata=column("e1", "e2", is_finite=True))
+    translation: np.ndarray = field(metadata=column("x", "y", "z", is_finite=True))
+    rotation: np.ndarray = field(metadata=column("qx", "qy", "qz", "qw", is_finite=True))
+    score: np.ndarray = field(metadata=column("score"))
+    residual: np.ndarray = field(metadata=column("residual"))
+    sigma_size: np.ndarray = field(metadata=column("sigma_a1", "sigma_a2", "sigma_a3"))
+    id: np.ndarray = field(metadata=column("id"))
+    status: np.ndarray = field(metadata=column("status"))
+    label: np.ndarray | None = field(default=None, metadata=column("label"))
+    seen: np.ndarray | None = field(default=None, metadata=column("seen"))
+    fused: np.ndarray | None = field(default=None, metadata=column("fused"))
+    reason: np.ndarray | None = field(default=None, metadata=column("reason"))
+    sigma_shape: np.ndarray | None = field(default=None, metadata=column("sigma_e1", "sigma_e2"))
+    sigma_centre: np.ndarray | None = field(default=None, metadata=column("sigma_c1", "sigma_c2", "sigma_c3"))
+    sigma_turn: np.ndarray | None = field(default=None, metadata=column("sigma_r1", "sigma_r2", "sigma_r3"))
 
     @property
     def recovered(self) -> SuperquadricArray:
@@ -143,12 +126,12 @@ class SuperquadricArray(Columns):
 
     def where(self, kept: np.ndarray) -> SuperquadricArray:
         """Those of a mask (n,), in their order."""
-        return replace(self, **{column.name: getattr(self, column.name)[kept] for column in fields(self)})
+        return replace(self, **{each.name: getattr(self, each.name)[kept] for each in fields(self)})
 
     @classmethod
     def empty(cls) -> SuperquadricArray:
         """No superquadric at all."""
-        return cls(**{name: np.empty(0, np.uint32) for name in _COLUMNS})
+        return cls(**{each.name: np.empty(0, np.uint32) for each in fields(cls)})
 
 
 def to_message(superquadrics: SuperquadricArray, header: Any, types: MessageTypes = installed) -> PointCloud2:
