@@ -98,7 +98,8 @@ def grey_from_message(message: Image) -> np.ndarray:
     ImageError
         As :func:`pixels_from_message`.
     """
-    return _native(pixels_from_message(message, GREY_ENCODINGS))
+    pixels = pixels_from_message(message, GREY_ENCODINGS)
+    return pixels.astype(pixels.dtype.newbyteorder("="))
 
 
 def labels_from_message(message: Image) -> np.ndarray:
@@ -334,7 +335,3 @@ def _to_message(pixels: np.ndarray, header: Any, encoding: str, types: MessageTy
     )
     message.data = byte_array(little)  # the constructor of rclpy's class would copy it twice
     return message
-
-
-def _native(pixels: np.ndarray) -> np.ndarray:
-    return pixels.astype(pixels.dtype.newbyteorder("="))

@@ -109,12 +109,12 @@ def markers(
 
     as_it_is, as_wide = make_scale(x=1.0, y=1.0, z=1.0), make_scale(x=float(line_width))
     found = []
-    for number, mesh, colour in zip(ids, meshes, paint, strict=True):
-        vertices, faces, outline = _checked(mesh)
+    for number, (surface_vertices, surface_faces, outline), colour in zip(ids, meshes, paint, strict=True):
+        vertices, faces = checked_mesh(surface_vertices, surface_faces)
         corners = [point(x=x, y=y, z=z) for x, y, z in vertices.tolist()]
         surface = [corners[index] for index in faces.reshape(-1).tolist()]
         found.append(marker("surface", number, _TRIANGLE_LIST, colour, as_it_is, surface))
-        lines = [point(x=x, y=y, z=z) for x, y, z in outline.reshape(-1, 3).tolist()]
+        lines = [point(x=x, y=y, z=z) for x, y, z in _checked_outline(outline).tolist()]
         found.append(marker("outline", number, _LINE_LIST, _OUTLINE_COLOUR, as_wide, lines))
     for number in sorted({int(previous) for previous in previous_ids} - set(ids)):
         for kind in ("surface", "outline"):
@@ -123,15 +123,18 @@ def markers(
     return array
 
 
-def _checked(mesh: Mesh) -> Mesh:
-    vertices, faces, outline = (np.asarray(part) for part in mesh)
-    vertices, outline = vertices.astype(float), outline.astype(float)
+def checked_mesh(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (k, 3), float64, and faces (m, 3) of their indices; ValueError for anything else."""
+    vertices, faces = np.asarray(vertices, dtype=float), np.asarray(faces)
     if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
         raise ValueError(f"mesh: expected vertices (k, 3) and faces (m, 3), got {vertices.shape} and {faces.shape}")
-    if outline.size == 0:
-        outline = outline.reshape(0, 2, 3)
-    if outline.ndim != 3 or outline.shape[1:] != (2, 3):
-        raise ValueError(f"outline: expected segments (j, 2, 3), got {outline.shape}")
     if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
         raise ValueError(f"faces: expected indices 0 to {len(vertices) - 1}, got {faces.min()} to {faces.max()}")
-    return vertices, faces, outline
+    return vertices, faces
+
+
+def _checked_outline(outline: np.ndarray) -> np.ndarray:
+    outline = np.asarray(outline, dtype=float)
+    if outline.size and (outline.ndim != 3 or outline.shape[1:] != (2, 3)):
+        raise ValueError(f"outline: expected segments (j, 2, 3), got {outline.shape}")
+    return outline.reshape(-1, 3)

@@ -10,8 +10,8 @@ Sequences of numbers are given as lists or array.array, whatever the class at ha
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Callable
+from pkgutil import resolve_name
 from typing import Any
 
 MessageTypes = Callable[[str], Callable[..., Any]]
@@ -26,5 +26,5 @@ def installed(name: str) -> Callable[..., Any]:
         Where that package is not installed.
     """
     package, folder, short = name.split("/")
-    found: Callable[..., Any] = getattr(importlib.import_module(f"{package}.{folder}"), short)
+    found: Callable[..., Any] = resolve_name(f"{package}.{folder}:{short}")
     return found

@@ -75,7 +75,7 @@ def plane_message(plane: np.ndarray, header: Any) -> PoseStamped:
 
     The x axis is that of the header's frame laid into the plane, or its y axis where the plane is across x.
     """
-    from geometry_msgs.msg import Point, Pose, PoseStamped, Quaternion
+    from geometry_msgs.msg import PoseStamped
 
     normal, offset = np.asarray(plane[:3], dtype=float), float(plane[3])
     length = float(np.linalg.norm(normal))
@@ -83,9 +83,8 @@ def plane_message(plane: np.ndarray, header: Any) -> PoseStamped:
     axis = np.eye(3)[0 if abs(normal[0]) < _ACROSS else 1]
     along = np.cross(np.cross(normal, axis), normal)
     along /= np.linalg.norm(along)
-    x, y, z, w = _quaternion(np.column_stack([along, np.cross(normal, along), normal])).tolist()
-    centre = (-offset * normal).tolist()
-    pose = Pose(position=Point(x=centre[0], y=centre[1], z=centre[2]), orientation=Quaternion(x=x, y=y, z=z, w=w))
+    turn = _quaternion(np.column_stack([along, np.cross(normal, along), normal]))
+    (pose,) = poses_at((-offset * normal)[None], turn[None])
     return PoseStamped(header=header, pose=pose)
 
 

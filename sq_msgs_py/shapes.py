@@ -25,6 +25,7 @@ import numpy as np
 from geometry_msgs.msg import Point
 from shape_msgs.msg import Mesh, MeshTriangle, SolidPrimitive
 
+from sq_msgs_py.markers import checked_mesh
 from sq_msgs_py.superquadrics import SuperquadricArray
 
 BOX, CYLINDER, SPHERE = "box", "cylinder", "sphere"
@@ -194,11 +195,7 @@ def _checked(size: np.ndarray, shape: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 def _checked_mesh(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    vertices, faces = np.asarray(vertices, dtype=float), np.asarray(faces)
-    if vertices.ndim != 2 or vertices.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
-        raise ValueError(f"mesh: expected vertices (k, 3) and faces (m, 3), got {vertices.shape} and {faces.shape}")
+    vertices, faces = checked_mesh(vertices, faces)
     if not np.isfinite(vertices).all():
         raise ValueError("mesh: expected finite vertices")
-    if faces.size and (faces.min() < 0 or faces.max() >= len(vertices)):
-        raise ValueError(f"faces: expected indices 0 to {len(vertices) - 1}, got {faces.min()} to {faces.max()}")
     return vertices, faces

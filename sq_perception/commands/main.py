@@ -9,10 +9,10 @@ Exit codes: 0 all went well, 1 something could not be read, written or found, 2 
 from __future__ import annotations
 
 import argparse
-import importlib
 import os
 import sys
 from collections.abc import Sequence
+from pkgutil import resolve_name
 
 from sq_perception.commands.console import FAILURE, INTERRUPTED, SUCCESS, USAGE, complain
 from sq_perception.files.version import __version__
@@ -53,7 +53,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         if not given or given[0] not in COMMANDS:
             _parser().parse_args(given)
-        return _run(given[0], given[1:])
+        code: int = resolve_name(f"sq_perception.commands.{COMMANDS[given[0]][0]}")(given[1:])
+        return code
     except SystemExit as stop:  # argparse: help was shown, or the usage was wrong
         if isinstance(stop.code, int):
             return stop.code
@@ -83,12 +84,6 @@ def _parser() -> argparse.ArgumentParser:
     for name, (_, summary) in COMMANDS.items():
         commands.add_parser(name, help=summary, add_help=False)
     return parser
-
-
-def _run(name: str, arguments: list[str]) -> int:
-    module, _, function = COMMANDS[name][0].partition(":")
-    code: int = getattr(importlib.import_module(f"sq_perception.commands.{module}"), function)(arguments)
-    return code
 
 
 if __name__ == "__main__":
