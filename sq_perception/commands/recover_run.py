@@ -33,17 +33,54 @@ def run(options: argparse.Namespace) -> int:
         return misused("--json, --jsonl, --csv: only one of them can be the standard output")
     if options.verbose:
         logging.basicConfig(level=logging.INFO, format="sq-perception: %(message)s")
-
-    done = Recovered()
     try:
-        settings = RecoveryOptions(
+        one = RecoverRun(options)
+    except (FrameError, checkpoint.CheckpointError, OSError, ImportError) as error:
+        return failed(str(error))
+    except ValueError as error:
+        return misused(str(error))
+    code = one.over_all_frames()
+    for problem in one.outputs.finish(one.is_whole):
+        complain(problem)
+        code = code or FAILURE
+    if STANDARD_OUTPUT not in (options.json, options.jsonl, options.csv) and not options.quiet:
+        for line in lines(one.outputs.results, options.verbose):
+            print(line)
+    if not options.quiet:
+        complain(one.summary())
+    return code
+
+
+class RecoverRun:
+    """One pass, with these options of the command.
+
+    Attributes
+    ----------
+    outputs : Outputs
+        Where what was recovered goes.
+    is_whole : bool
+        Whether all frames were tried.
+
+    Raises
+    ------
+    FrameError, CheckpointError, OSError, ImportError
+        If something cannot be read or written, or is missing.
+    ValueError
+        If the options cannot be meant so.
+    """
+
+    def __init__(self, options: argparse.Namespace) -> None:
+        self.is_whole = False
+        self._options = options
+        self._settings = RecoveryOptions(
             method=options.method,
             max_objects=options.max_objects,
             time_budget=options.time_budget,
             max_size=options.max_size,
             workspace=None if options.workspace is None else tuple(options.workspace),
         )
-        recorded = RecordedInput(
+        done = Recovered()
+        self._recorded = RecordedInput(
             options.frames,
             options.camera_info,
             options.projection,
@@ -54,76 +91,29 @@ def run(options: argparse.Namespace) -> int:
             Reading(options.depth_scale, options.depth_min, options.depth_max, options.roi, options.masks),
             done,
         )
-        if problem := replaced_input(options, recorded.files):
-            return misused(problem)
+        if problem := replaced_input(options, self._recorded.files):
+            raise ValueError(problem)
         if options.method in NEEDS_NETWORK:
             checkpoint.check(options.model)
-        outputs = Outputs(options)
-        done.add(outputs.done)
-        setup = workers.Setup(options.model, settings)
-        executor: Recoverer | workers.Processes | workers.Cluster
+        self.outputs = Outputs(options)
+        done.add(self.outputs.done)
+        setup = workers.Setup(options.model, self._settings)
+        self._executor: Recoverer | workers.Processes | workers.Cluster
         if options.cluster:
-            executor = workers.Cluster(setup, options.cluster)
+            self._executor = workers.Cluster(setup, options.cluster)
         elif options.jobs > 1:
-            executor = workers.Processes(setup, options.jobs)
+            self._executor = workers.Processes(setup, options.jobs)
         else:
-            executor = Recoverer(options.model, method=options.method)
-    except (FrameError, checkpoint.CheckpointError, OSError, ImportError) as error:
-        return failed(str(error))
-    except ValueError as error:
-        return misused(str(error))
-
-    run = RecoverRun(options, settings, executor, outputs)
-    code = run.over(recorded)
-    for problem in outputs.finish(run.is_whole):
-        complain(problem)
-        code = code or FAILURE
-    if STANDARD_OUTPUT not in (options.json, options.jsonl, options.csv) and not options.quiet:
-        for line in lines(outputs.results, options.verbose):
-            print(line)
-    if not options.quiet:
-        complain(run.summary())
-    return code
-
-
-class RecoverRun:
-    """One pass.
-
-    Parameters
-    ----------
-    options
-        Of the command.
-    settings
-        Of the recovery, made of them.
-    executor
-        What recovers the frames, in this process or in others.
-    outputs
-        Where what was recovered goes.
-
-    Attributes
-    ----------
-    is_whole : bool
-        Whether all frames were tried.
-    """
-
-    def __init__(
-        self,
-        options: argparse.Namespace,
-        settings: RecoveryOptions,
-        executor: Recoverer | workers.Processes | workers.Cluster,
-        outputs: Outputs,
-    ) -> None:
-        self.is_whole = False
-        self._options, self._settings, self._executor, self._outputs = options, settings, executor, outputs
+            self._executor = Recoverer(options.model, method=options.method)
         self._tracks = RecordedTracks(lambda text: complain(f"warning: {text}")) if options.track else None
         self._unreadable = 0
         self._warm: set[Any] = set()
         self._warnings: set[str] = set()
 
-    def over(self, recorded: RecordedInput) -> int:
-        """All frames; the exit code."""
+    def over_all_frames(self) -> int:
+        """Recover them; the exit code."""
         try:
-            for (file, frame), answer in self._answered(_progress(recorded)):
+            for (file, frame), answer in self._answered(_progress(self._recorded)):
                 try:
                     if isinstance(frame, FrameError):
                         raise frame
@@ -142,7 +132,7 @@ class RecoverRun:
 
     def summary(self) -> str:
         """The run in one line."""
-        entries = self._outputs.results
+        entries = self.outputs.results
         bodies = [body for entry in entries for body in entry["superquadrics"]]
         failed = sum(body["status"] == "failed" for body in bodies)
         parts = [_count(len(entries), "frame"), f"{_count(len(bodies), 'object')} ({failed} failed)"]
@@ -191,8 +181,8 @@ class RecoverRun:
         recovery = replace(answer, bodies=wanted)
         tracks = self._tracks.follow(file, frame, recovery) if self._tracks else None
         has_masks = not self._options.ignore_masks and frame.labels is not None
-        entry = result_json.frame_entry(file, frame, recovery, tracks, has_masks)
-        self._outputs.add(frame, recovery, tracks, entry)
+        entry = frame_entry.frame_entry(file, frame, recovery, tracks, has_masks)
+        self.outputs.add(frame, recovery, tracks, entry)
 
 
 def _count(number: int, singular: str, many: str | None = None) -> str:
