@@ -86,7 +86,7 @@ def to_message(rows: Columns, header: Any, types: MessageTypes = installed) -> P
         for k, name in enumerate(names):
             points[name] = values[:, k]
     field = types("sensor_msgs/msg/PointField")
-    message: PointCloud2 = types("sensor_msgs/msg/PointCloud2")(
+    return types("sensor_msgs/msg/PointCloud2")(
         header=header,
         height=1,
         width=len(points),
@@ -100,7 +100,6 @@ def to_message(rows: Columns, header: Any, types: MessageTypes = installed) -> P
         data=byte_array(points),
         is_dense=all(bool(np.isfinite(points[name]).all()) for name, _ in rows.FIELDS),
     )
-    return message
 
 
 def from_message(kind: type[Rows], message: PointCloud2, needed: Sequence[str]) -> Rows:

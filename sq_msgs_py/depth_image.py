@@ -292,7 +292,7 @@ def _of_part(message: CameraInfo, fx: float, fy: float, cx: float, cy: float) ->
 def intrinsics_to_message(intrinsics: Intrinsics, header: Any, types: MessageTypes = installed) -> CameraInfo:
     """A camera_info without distortion: K, R = I and P of the intrinsics."""
     fx, fy, cx, cy = (float(x) for x in (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy))
-    message: CameraInfo = types("sensor_msgs/msg/CameraInfo")(
+    return types("sensor_msgs/msg/CameraInfo")(
         header=header,
         width=intrinsics.width,
         height=intrinsics.height,
@@ -302,7 +302,6 @@ def intrinsics_to_message(intrinsics: Intrinsics, header: Any, types: MessageTyp
         r=[1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0],
         p=[fx, 0.0, cx, 0.0, 0.0, fy, cy, 0.0, 0.0, 0.0, 1.0, 0.0],
     )
-    return message
 
 
 def raw_intrinsics_to_message(raw: RawIntrinsics, header: Any) -> CameraInfo:

@@ -78,8 +78,7 @@ def from_message(message: PointCloud2) -> GraspArray:
 def poses(grasps: GraspArray, header: Any, types: MessageTypes = installed) -> PoseArray:
     """The poses alone as a geometry_msgs/PoseArray, in the same order."""
     found = poses_at(grasps.position, grasps.rotation, types)
-    array: PoseArray = types("geometry_msgs/msg/PoseArray")(header=header, poses=found)
-    return array
+    return types("geometry_msgs/msg/PoseArray")(header=header, poses=found)
 
 
 APPROACH, LEAST_APPROACH = 0.1, 0.05

@@ -119,8 +119,7 @@ def markers(
     for number in sorted({int(previous) for previous in previous_ids} - set(ids)):
         for kind in ("surface", "outline"):
             found.append(make_marker(header=header, ns=f"{namespace}/{kind}", id=number, action=_DELETE))
-    array: MarkerArray = types("visualization_msgs/msg/MarkerArray")(markers=found)
-    return array
+    return types("visualization_msgs/msg/MarkerArray")(markers=found)
 
 
 def checked_mesh(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -26,5 +26,4 @@ def installed(name: str) -> Callable[..., Any]:
         Where that package is not installed.
     """
     package, folder, short = name.split("/")
-    found: Callable[..., Any] = resolve_name(f"{package}.{folder}:{short}")
-    return found
+    return resolve_name(f"{package}.{folder}:{short}")

@@ -53,8 +53,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         if not given or given[0] not in COMMANDS:
             _parser().parse_args(given)
-        code: int = resolve_name(f"sq_perception.commands.{COMMANDS[given[0]][0]}")(given[1:])
-        return code
+        return resolve_name(f"sq_perception.commands.{COMMANDS[given[0]][0]}")(given[1:])
     except SystemExit as stop:  # argparse: help was shown, or the usage was wrong
         if isinstance(stop.code, int):
             return stop.code

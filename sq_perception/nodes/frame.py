@@ -8,7 +8,7 @@ from __future__ import annotations
 import array
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, TypeAlias, cast
+from typing import Any, TypeAlias
 
 import numpy as np
 from rclpy.node import Node
@@ -74,8 +74,7 @@ class Frame:
 
     def encode(self, depth: np.ndarray) -> Image:
         """A message like the frame's own with another depth (height, width), NaN or inf for nothing."""
-        sent = self.calibration.as_sent(depth)
-        return cast(Image, publication.depth_message(sent, self.header, self.encoding))
+        return publication.depth_message(self.calibration.as_sent(depth), self.header, self.encoding)
 
 
 def decode(message: DepthMessage, calibration_of: Callable[[], Calibration] | None) -> Frame:

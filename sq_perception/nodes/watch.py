@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import rclpy
-from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, QoSReliabilityPolicy
 from rclpy.signals import SignalHandlerOptions
@@ -64,9 +63,7 @@ class Watch:
 
     def __enter__(self) -> Watch:
         rclpy.init(args=[], signal_handler_options=SignalHandlerOptions.NO)
-        node = Node("demo")
-        self._executor = SingleThreadedExecutor()
-        self._executor.add_node(node)
+        self._node = node = Node("demo")
         self._image_topic = node.resolve_topic_name("depth/image")
         fast = QoSProfile(depth=5, reliability=QoSReliabilityPolicy.BEST_EFFORT)
         node.create_subscription(CameraInfo, "depth/camera_info", self._on_info, fast)
@@ -81,7 +78,7 @@ class Watch:
 
     def listen(self, seconds: float) -> None:
         """Take what comes, for some seconds at most."""
-        self._executor.spin_once(timeout_sec=seconds)
+        rclpy.spin_once(self._node, timeout_sec=seconds)
 
     def frame(self, shot: Shot) -> Frame:
         """The decoded depth image of a complete shot.
