@@ -9,7 +9,8 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
+from functools import partial
 
 from sq_perception.nodes import process
 
@@ -27,17 +28,14 @@ _NAMESPACE = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
 """Checked here as well as by rclpy, which has begun to make a node by then and complains of its rest."""
 
 
-def _program(name: str) -> Callable[..., int]:
-    def program(arguments: Sequence[str] | None = None) -> int:
-        return process.run(name, lambda: [_node(name)], arguments)
-
-    return program
+def _run(name: str, arguments: Sequence[str] | None = None) -> int:
+    return process.run(name, lambda: [_node(name)], arguments)
 
 
-recover_node = _program("recover_node")
-fitter_node = _program("fitter_node")
-grasp_node = _program("grasp_node")
-synthetic_depth_node = _program("synthetic_depth_node")
+recover_node = partial(_run, "recover_node")
+fitter_node = partial(_run, "fitter_node")
+grasp_node = partial(_run, "grasp_node")
+synthetic_depth_node = partial(_run, "synthetic_depth_node")
 
 
 def recover_cameras(arguments: Sequence[str] | None = None) -> int:

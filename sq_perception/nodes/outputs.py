@@ -38,8 +38,7 @@ from sq_perception.nodes.frame import Frame, latched
 from sq_perception.nodes.parameters import RecoverParameters
 from sq_perception.nodes.statistics import THROTTLE
 from sq_perception.nodes.tracking import CameraPoses, Pose, PoseError
-from sq_perception.recordings import publication
-from sq_perception.recordings.publication import Findings, Identified
+from sq_perception.recordings.publication import Findings, Identified, findings
 from sq_perception.recovery.recoverer import render_recovery
 from sq_perception.recovery.recovery import timed
 
@@ -90,27 +89,27 @@ class Outputs:
 
         Raises ValueError if the transform to that frame is not known: nothing may be published in a wrong frame.
         """
-        findings = publication.findings(found, frame.header, frame.is_cube)
-        findings = in_frame(findings, self._poses, parameters.target_frame, parameters.tf_tolerance)
-        self.superquadrics.publish(to_message(findings.array, findings.header))
-        if findings.plane is not None:
-            self.support_plane.publish(plane_message(findings.plane, findings.header))
-        return findings
+        here = findings(found, frame.header, frame.is_cube)
+        there = in_frame(here, self._poses, parameters.target_frame, parameters.tf_tolerance)
+        self.superquadrics.publish(to_message(there.array, there.header))
+        if there.plane is not None:
+            self.support_plane.publish(plane_message(there.plane, there.header))
+        return there
 
     def accompany(
-        self, found: Identified, findings: Findings, frame: Frame, parameters: RecoverParameters
+        self, found: Identified, shown: Findings, frame: Frame, parameters: RecoverParameters
     ) -> dict[str, float]:
         """Publish what goes with the answer; milliseconds by stage.  What goes wrong here is logged, and no more."""
         stages: dict[str, float] = {}
         try:
             with timed(stages, "outputs"):
-                self.optional.publish(findings, parameters, found.hidden)
+                self.optional.publish(shown, parameters, found.hidden)
             with timed(stages, "pictures"):
                 if self.markers.get_subscription_count():
                     before = self._shown.shown_ids if self._shown is not None else ()
                     by_score = parameters.marker_colours == "score"
-                    self.markers.publish(findings.markers(before, by_score, parameters.marker_alpha))
-                    self._shown = findings
+                    self.markers.publish(shown.markers(before, by_score, parameters.marker_alpha))
+                    self._shown = shown
                 if self.rendered_depth.get_subscription_count():
                     self.rendered_depth.publish(frame.encode(render_recovery(found.recovery, frame.camera)[0]))
         except Exception as error:

@@ -18,8 +18,7 @@ from rclpy.time import Time
 from sq_perception.nodes.frame import Frame, stamp_of
 from sq_perception.nodes.parameters import RecoverParameters
 from sq_perception.nodes.statistics import THROTTLE
-from sq_perception.recordings import publication
-from sq_perception.recordings.publication import Identified
+from sq_perception.recordings.publication import Identified, identified
 from sq_perception.recovery.recoverer import FrameRecovery
 from sq_perception.tracking.session import Tally, TrackingSession
 
@@ -128,7 +127,7 @@ class Tracking:
             if stamp < self._untracked_stamp:
                 self._poses.clear()  # a recording begins again
             self._untracked_stamp = stamp
-            return publication.identified(recovery)
+            return identified(recovery)
         if self._origin not in (None, origin):
             self._forget("bodies come from another method or model from now on")
         self._origin = origin
@@ -159,7 +158,7 @@ class Tracking:
         if self._session.tally.resets > resets:
             self._node.get_logger().info(f"the stamps jumped back to {stamp:.3f} s: tracks are forgotten, ids go on")
             self._poses.clear()
-        return publication.identified(recovery, tracks, self._session.hidden)
+        return identified(recovery, tracks, self._session.hidden)
 
     def _forget(self, why: str) -> None:
         self._session.reset()

@@ -1,0 +1,145 @@
+"""``thing-views`` and ``segment-views`` draw views into a folder; ``train-things`` and ``train-masks`` train on them."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from sq_perception.commands.console import SUCCESS, at_least, failed, parser, positive
+from sq_perception.learning.training_config import MASK_RUN, THING_RUN, ShardTraining
+
+_DRAW = """\
+Draw {what} into a folder, shard by shard.
+
+Shard k follows from the seed and k alone; those that are there already stay.  Several processes may fill one folder
+with other --first; a training reads what it finds.
+"""
+_TRAIN = """\
+Train the network that {what}, on {views} (or still writes).
+
+The same command goes on with a run that was stopped.  The output folder holds the state, a log, and the newest network,
+{weights}.
+"""
+
+
+def thing_views(arguments: Sequence[str]) -> int:
+    """Entry of ``sq-perception thing-views``; the exit code."""
+    example = "sq-perception thing-views sets/things --shards 200 && sq-perception train-things sets/things"
+    command = _drawing("thing-views", "canonical views of simulated household things", example, shards=100)
+    command.add_argument("--views", type=at_least(1), default=512, help="views a shard (512)")
+    command.add_argument(
+        "--meshes", type=Path, metavar="FOLDER", help="your own things, in metres, for half of the views"
+    )
+    given = command.parse_args(arguments)
+
+    from sq_perception.simulation.scanned_things import read_things
+    from sq_perception.simulation.thing_views import draw_thing_views
+
+    def drawing() -> Callable[[Any], Any]:
+        own = read_things(given.meshes) if given.meshes is not None else ()
+        return partial(draw_thing_views, given.views, own=own)
+
+    return _draw("thing-views", given, drawing)
+
+
+def segment_views(arguments: Sequence[str]) -> int:
+    """Entry of ``sq-perception segment-views``; the exit code."""
+    example = "sq-perception segment-views sets/segments && sq-perception train-masks sets/segments"
+    what = "segments of simulated tables, and which of their readings are of their object,"
+    command = _drawing("segment-views", what, example, shards=40)
+    command.add_argument("--scenes", type=at_least(1), default=200, help="a shard, of some four segments each (200)")
+    command.add_argument("--pieces", action="store_true", help="and compact pieces of segments")
+    given = command.parse_args(arguments)
+
+    from sq_perception.simulation.segment_views import draw_segment_views
+
+    return _draw("segment-views", given, lambda: partial(draw_segment_views, given.scenes, with_pieces=given.pieces))
+
+
+def train_things(arguments: Sequence[str]) -> int:
+    """Entry of ``sq-perception train-things``; the exit code."""
+    text = _TRAIN.format(
+        what="predicts the unseen side of things",
+        views="views that `thing-views` wrote",
+        weights="things.safetensors, which `recover --model` takes",
+    )
+    example = "sq-perception train-things sets/things --output runs/things --minutes 120 --start robust"
+    command = _training("things", text, example, THING_RUN)
+    command.add_argument("--bfloat16", action="store_true", help="half the bits, faster on processors that have them")
+    options = vars(command.parse_args(arguments))
+
+    from sq_perception.learning.thing_training import THINGS
+
+    return _train(THINGS, THING_RUN, options)
+
+
+def train_masks(arguments: Sequence[str]) -> int:
+    """Entry of ``sq-perception train-masks``; the exit code."""
+    text = _TRAIN.format(
+        what="finds strays in segments", views="those that `segment-views` wrote", weights="masks.safetensors"
+    )
+    example = "sq-perception train-masks sets/segments --output runs/masks --minutes 60"
+    options = vars(_training("masks", text, example, MASK_RUN).parse_args(arguments))
+
+    from sq_perception.learning.mask_training import MASKS
+
+    return _train(MASKS, MASK_RUN, options)
+
+
+def _drawing(name: str, what: str, example: str, shards: int) -> argparse.ArgumentParser:
+    """What both commands that draw take."""
+    command = parser(name, _DRAW.format(what=what), f"example:\n  {example}")
+    add = command.add_argument
+    add("folder", type=Path, help="of the shards")
+    add("--shards", type=at_least(1), default=shards, help="how many there shall be (%(default)s)")
+    add("--first", type=at_least(0), default=0, help="number of the first one (0)")
+    add("--seed", type=at_least(0), default=0, help="default 0")
+    return command
+
+
+def _draw(name: str, given: argparse.Namespace, drawing: Callable[[], Callable[[Any], Any]]) -> int:
+    """Write the shards with what ``drawing`` gives, which may have to read something first."""
+    from sq_perception.learning.shard_training import write_views
+
+    try:
+        write_views(given.folder, range(given.first, given.first + given.shards), drawing(), given.seed)
+    except ValueError as error:
+        return failed(f"{name}: {error}")
+    except OSError as error:
+        return failed(f"{name}: {given.folder}: {error}")
+    return SUCCESS
+
+
+def _training(subject: str, text: str, example: str, run: ShardTraining) -> argparse.ArgumentParser:
+    """What both commands that train take."""
+    command = parser(f"train-{subject}", text, f"example:\n  {example}")
+    command.set_defaults(**asdict(run))
+    add = command.add_argument
+    add("views", type=Path, metavar="FOLDER", help="of the shards of views")
+    add("--output", "-o", type=Path, default=Path(f"runs/{subject}"), help="folder (%(default)s)")
+    add("--minutes", type=positive, help="training time, over which the rate falls (%(default)s)")
+    add("--batch", type=at_least(1), help="views a step (%(default)s)")
+    add("--rate", type=positive, help="largest learning rate (%(default)s)")
+    add("--threads", type=at_least(0), help="of torch; 0: its own choice")
+    add("--held", type=at_least(1), help="shards that are kept for validation (%(default)s)")
+    add("--seed", type=at_least(0), help="default %(default)s")
+    add("--start", metavar="MODEL", help="weights to begin with: a file, or shipped ones")
+    return command
+
+
+def _train(subject: Any, run: ShardTraining, options: dict[str, Any]) -> int:
+    from sq_perception.learning.checkpoint import CheckpointError
+    from sq_perception.learning.shard_training import train
+
+    views, output = options.pop("views"), options.pop("output")
+    try:
+        train(subject, replace(run, **options), views, output)
+    except (CheckpointError, ValueError, ArithmeticError, OSError) as error:
+        return failed(f"train-{subject.name}: {error}")
+    except KeyboardInterrupt:
+        return failed(f"train-{subject.name}: stopped; the same command goes on from the last validation")
+    return SUCCESS
