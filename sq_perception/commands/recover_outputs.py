@@ -13,14 +13,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from sq_perception.commands import console
-from sq_perception.commands.console import STANDARD_OUTPUT
 from sq_perception.files import output_file
 from sq_perception.fitting.fit import Status
 from sq_perception.geometry import mesh
 from sq_perception.recordings import bag_file, result_json
 from sq_perception.recordings.frame_entry import in_result_frame
 from sq_perception.recordings.frame_file import RecordedFrame, Stamp
-from sq_perception.recordings.result_json import ResultLines
 from sq_perception.recovery.recovery import FrameRecovery
 from sq_perception.tracking.session import Followed
 
@@ -143,7 +141,7 @@ class Outputs:
             ("json", lambda: result_json.document(_decisive(self._options), entries)),
             ("csv", lambda: result_json.table(entries)),
         ):
-            if getattr(self._options, name) == STANDARD_OUTPUT:
+            if getattr(self._options, name) == console.STANDARD_OUTPUT:
                 sys.stdout.write(text())
             elif getattr(self._options, name):
                 path = Path(getattr(self._options, name))
@@ -162,11 +160,11 @@ def _stem(entry: Mapping[str, Any]) -> str:
     return bag_file.frame_name(path, Stamp(**entry["stamp"])) if entry.get("topic") else path.stem
 
 
-def _lines(options: argparse.Namespace) -> ResultLines | None:
+def _lines(options: argparse.Namespace) -> result_json.ResultLines | None:
     if not options.jsonl:
         return None
-    path = "/dev/stdout" if options.jsonl == STANDARD_OUTPUT else options.jsonl
-    lines = ResultLines(path, _decisive(options))
+    path = "/dev/stdout" if options.jsonl == console.STANDARD_OUTPUT else options.jsonl
+    lines = result_json.ResultLines(path, _decisive(options))
     needing = [name for name in ("track", "mcap", "html") if getattr(options, name)]
     if lines.done and needing:
         lines.close()

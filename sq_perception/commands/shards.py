@@ -1,4 +1,4 @@
-"""``thing-views`` and ``segment-views`` draw views into a folder; ``train-things`` and ``train-masks`` train on them."""
+"""``thing-views`` and ``segment-views`` draw views into a folder, ``train-things`` and ``train-masks`` train on it."""
 
 from __future__ import annotations
 

@@ -14,7 +14,6 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from sq_perception.commands import console
-from sq_perception.commands.console import at_least, failed
 from sq_perception.nodes import process
 
 if TYPE_CHECKING:
@@ -64,15 +63,15 @@ def main(given: Sequence[str]) -> int:
         parser.error(f"--port: expected 0 to 65535, got {options.port}")
     for module, remedy in _NEEDED:
         if importlib.util.find_spec(module) is None:
-            return failed(f"view needs {remedy}")
+            return console.failed(f"view needs {remedy}")
     try:
         from sq_perception.viewing import server
     except ImportError as error:
-        return failed(f"view: viser cannot be imported, {error}: pip install '.[view]' in a checkout")
+        return console.failed(f"view: viser cannot be imported, {error}: pip install '.[view]' in a checkout")
     try:
         bound = server.listening_socket(options.host, options.port)
     except server.ServerError as error:
-        return failed(str(error))
+        return console.failed(str(error))
     camera_info = options.camera_info or camera_info_beside(options.depth)
     try:
         return process.run(
@@ -128,6 +127,6 @@ def _parser() -> argparse.ArgumentParser:
     add("--depth", default=DEFAULT_DEPTH, metavar="TOPIC", help="depth image (%(default)s)")
     add("--camera-info", metavar="TOPIC", help="its camera_info (the one in its name space)")
     console.add_address(parser)
-    add("--max-points", type=at_least(1), default=40000, metavar="N", help="points of the cloud (%(default)s)")
+    add("--max-points", type=console.at_least(1), default=40000, metavar="N", help="points of the cloud (%(default)s)")
     add("--rate", type=float, default=10.0, metavar="HZ", help="pictures per second (%(default)g)")
     return parser

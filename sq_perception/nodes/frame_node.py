@@ -307,14 +307,13 @@ class FrameNode(ManagedNode):
 
     def _on_second(self) -> None:
         source, parameters = self._input, self._settings.current
-        silent = source is not None and 0 < parameters.no_frame_warning < source.silence
-        if silent and source is not None:
-            self.get_logger().warning(
-                f"no depth image on {source.topic} for {source.silence:.0f} s: {source.heard}",
-                throttle_duration_sec=THROTTLE,
-            )
+        silent = False
         if source is not None:
             source.look_for_latched()
+            silent = 0 < parameters.no_frame_warning < source.silence
+            if silent:
+                text = f"no depth image on {source.topic} for {source.silence:.0f} s: {source.heard}"
+                self.get_logger().warning(text, throttle_duration_sec=THROTTLE)
         more = {"state": self.state, "enabled": str(self._enabled).lower(), "engine": self._engine.description}
         if absent := self._outputs.optional.absent:
             more["missing packages"] = " ".join(absent.values())
