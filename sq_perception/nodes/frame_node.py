@@ -244,8 +244,8 @@ class FrameNode(ManagedNode):
         age = 1e-9 * (self.get_clock().now().nanoseconds - stamp_of(frame))
         if abs(age) < _OLDEST:
             stages["stamp to result"] = 1e3 * age
+        self._outputs.accompany(found, findings, frame, parameters, stages)
         self._statistics.answer(stages, found.summary)
-        self._statistics.note(self._outputs.accompany(found, findings, frame, parameters))
         return Outcome(True, found.summary, findings)
 
     def _resolve(self, outcome: Outcome, arrived: float = math.inf) -> None:

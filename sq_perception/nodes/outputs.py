@@ -97,10 +97,9 @@ class Outputs:
         return there
 
     def accompany(
-        self, found: Identified, shown: Findings, frame: Frame, parameters: RecoverParameters
-    ) -> dict[str, float]:
-        """Publish what goes with the answer; milliseconds by stage.  What goes wrong here is logged, and no more."""
-        stages: dict[str, float] = {}
+        self, found: Identified, shown: Findings, frame: Frame, parameters: RecoverParameters, stages: dict[str, float]
+    ) -> None:
+        """Publish what goes with the answer, and note the time of each stage.  What goes wrong is logged, no more."""
         try:
             with timed(stages, "outputs"):
                 self.optional.publish(shown, parameters, found.hidden)
@@ -118,7 +117,6 @@ class Outputs:
                     f"a result was published without all that goes with it: {type(error).__name__}: {error}",
                     throttle_duration_sec=THROTTLE,
                 )
-        return stages
 
 
 def pose_in(poses: CameraPoses, header: Any, frame_id: str, patience: float) -> Pose:

@@ -61,13 +61,9 @@ class Statistics:
     def answer(self, milliseconds: Mapping[str, float], summary: str = "") -> None:
         """Count an answered frame with the duration of its stages; ``summary`` explains also a lack of bodies."""
         self._last_answer = summary
-        self.count("answered")
-        self.note(milliseconds)
-
-    def note(self, milliseconds: Mapping[str, float]) -> None:
-        """Keep the duration of stages that follow the answer."""
         with self._lock:
             self._stages.append((self._clock(), milliseconds))
+        self.count("answered")
 
     def status(self, name: str, standing: Standing | None, more: Mapping[str, str]) -> DiagnosticStatus:
         """The diagnostics of a node, and ``more`` that there is to know beside the frames.
