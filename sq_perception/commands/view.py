@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
-import math
 import re
 import socket
 from collections.abc import Sequence
@@ -38,10 +37,6 @@ examples:
 """
 _NODE_NAME = re.compile(r"(/[A-Za-z_][A-Za-z0-9_]*)+")
 _ROS = "--ros-args"
-_NEEDED = (
-    ("rclpy", "ROS 2 in Python: pip install 'sq_perception[ros]', or source a ROS 2 Jazzy installation"),
-    ("viser", "the viewer's library: pip install '.[view]' in a checkout"),
-)
 
 
 def main(given: Sequence[str]) -> int:
@@ -57,13 +52,13 @@ def main(given: Sequence[str]) -> int:
     for name in nodes:
         if not _NODE_NAME.fullmatch(name):
             parser.error(f"--node: expected a name like {DEFAULT_NODE}, got {name!r}")
-    if not (math.isfinite(options.rate) and 0 < options.rate <= 60):
+    if not 0 < options.rate <= 60:
         parser.error(f"--rate: expected a number above 0, at most 60, got {options.rate:g}")
     if options.port is not None and not 0 <= options.port <= 65535:
         parser.error(f"--port: expected 0 to 65535, got {options.port}")
-    for module, remedy in _NEEDED:
-        if importlib.util.find_spec(module) is None:
-            return console.failed(f"view needs {remedy}")
+    if importlib.util.find_spec("rclpy") is None:
+        remedy = "pip install 'sq_perception[ros]', or source a ROS 2 Jazzy installation"
+        return console.failed(f"view needs ROS 2 in Python: {remedy}")
     try:
         from sq_perception.viewing import server
     except ImportError as error:
@@ -72,13 +67,8 @@ def main(given: Sequence[str]) -> int:
         bound = server.listening_socket(options.host, options.port)
     except server.ServerError as error:
         return console.failed(str(error))
-    camera_info = options.camera_info or camera_info_beside(options.depth)
     try:
-        return process.run(
-            NAME,
-            lambda: [_node(bound, options.depth, camera_info, nodes, options.max_points, options.rate)],
-            given[cut:],
-        )
+        return process.run(NAME, lambda: [_node(bound, nodes, options)], given[cut:])
     finally:
         bound.close()
 
@@ -96,17 +86,16 @@ def camera_info_beside(depth: str) -> str:
     return f"{depth.rpartition('/')[0]}/camera_info" if "/" in depth else "camera_info"
 
 
-def _node(
-    bound: socket.socket, depth: str, camera_info: str, nodes: Sequence[str], most_points: int, rate: float
-) -> ViewNode:
+def _node(bound: socket.socket, nodes: Sequence[str], options: argparse.Namespace) -> ViewNode:
     from sq_perception.nodes.view_node import ViewNode
     from sq_perception.viewing.page import Page
     from sq_perception.viewing.server import is_local
 
     host, port = bound.getsockname()[:2]
-    page = Page(bound, nodes, most_points)
+    page = Page(bound, nodes, options.max_points)
+    camera_info = options.camera_info or camera_info_beside(options.depth)
     try:
-        node = ViewNode(NAME, page, depth, camera_info, nodes, rate)
+        node = ViewNode(NAME, page, options.depth, camera_info, nodes, options.rate)
     except BaseException:
         page.close()
         raise

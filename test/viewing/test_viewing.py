@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import importlib.util
 import re
 import socket
+import subprocess
+import sys
 from collections.abc import Iterator
 from types import SimpleNamespace
 
@@ -376,9 +379,20 @@ def test_the_command_says_what_is_wrong(taken: int, capsys: pytest.CaptureFixtur
     said = capsys.readouterr().err
     assert said.startswith("sq-perception: --port: ")
     assert said.count("\n") == 1
-    monkeypatch.setattr(view, "_NEEDED", (("no_such_module", "this: pip install 'sq_perception[view]'"),))
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     assert view.main([]) == 1
-    assert capsys.readouterr().err == "sq-perception: view needs this: pip install 'sq_perception[view]'\n"
+    remedy = "pip install 'sq_perception[ros]', or source a ROS 2 Jazzy installation"
+    assert capsys.readouterr().err == f"sq-perception: view needs ROS 2 in Python: {remedy}\n"
+
+
+def test_without_the_viewer_s_library_the_command_says_how_to_get_it() -> None:
+    pytest.importorskip("rclpy", reason="needs the extra 'ros'")
+    code = "import sys; sys.modules['viser'] = None; from sq_perception.commands import view; sys.exit(view.main([]))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600)
+    assert done.returncode == 1
+    assert done.stderr.startswith("sq-perception: view: viser cannot be imported, ")
+    assert "pip install '.[view]'" in done.stderr
+    assert done.stderr.count("\n") == 1
 
 
 def test_the_camera_info_is_beside_the_image() -> None:
