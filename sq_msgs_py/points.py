@@ -21,8 +21,6 @@ def points_from_message(message: PointCloud2) -> np.ndarray:
         As :func:`~sq_msgs_py.superquadrics.from_message`, for the fields x, y, z.
     """
     found = cloud_points(message, [(name, FLOAT32) for name in "xyz"], "xyz")
-    points = np.empty((len(found), 3), np.float32)
     with np.errstate(over="ignore"):  # doubles that no camera measures: infinite
-        for k, name in enumerate("xyz"):
-            points[:, k] = found[name]
+        points = np.stack([found[name].astype(np.float32) for name in "xyz"], axis=-1)
     return points.reshape(int(message.height), int(message.width), 3)
