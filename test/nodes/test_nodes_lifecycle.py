@@ -434,6 +434,20 @@ class TestSeveralCameras:
         assert recoverer.most_at_work == 1
         assert min(answered.values()) >= 12, answered
 
+    def test_an_override_of_one_camera_leaves_the_other_alone(self, make_bench):
+        """rclpy writes overrides into the profile that it is given."""
+        override = "qos_overrides./front/recover_node/support_plane.publisher.durability:=volatile"
+        bench = make_bench("-p", override, "-p", "autostart:=false", namespaces=("front", "wrist"))
+        for node in bench.nodes:
+            node.start()
+            bench.until(lambda node=node: node.is_active)
+        bench.active()
+        kept = {}
+        for space in ("front", "wrist"):
+            (found,) = bench.peer.get_publishers_info_by_topic(f"/{space}/recover_node/support_plane")
+            kept[space] = found.qos_profile.durability.name
+        assert kept == {"front": "VOLATILE", "wrist": "TRANSIENT_LOCAL"}
+
     def test_a_swap_on_one_camera_leaves_the_other_alone(self, make_bench):
         bench = make_bench(namespaces=("front", "wrist")).active()
         assert bench.nodes[1].set_parameters([Parameter("model", value="7")])[0].successful
