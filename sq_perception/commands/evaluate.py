@@ -41,7 +41,14 @@ examples:
 
 def main(arguments: Sequence[str]) -> int:
     """Entry of ``sq-perception evaluate``; the exit code, which is that of a failure if a model could not be read."""
-    command = _parser()
+    command = parser("evaluate", _HELP, _EPILOG)
+    add = command.add_argument
+    add("--models", type=Path, nargs="*", metavar="FILE", help="weights to compare (default: all that are shipped)")
+    add("--methods", nargs="*", choices=FITS, metavar="FIT", help=f"fits to compare (default: {' '.join(FITS)})")
+    add("--bodies", type=at_least(1), default=BODIES, metavar="N", help=f"bodies for networks ({BODIES})")
+    add("--fit-bodies", type=at_least(1), default=FIT_BODIES, metavar="N", help=f"the first N for fits ({FIT_BODIES})")
+    add("--seed", type=at_least(0), default=DEFAULT_SEED, help=f"of the test set ({DEFAULT_SEED})")
+    add("--output", type=folder, default="runs/evaluation", metavar="DIR", help="folder (runs/evaluation)")
     options = command.parse_args(arguments)
     methods: list[Method] = list(dict.fromkeys(FITS if options.methods is None else options.methods))
     if options.models == [] and not methods:
@@ -100,15 +107,3 @@ def _contestants(options: argparse.Namespace, methods: list[Method]) -> tuple[li
         except CheckpointError as error:
             failures.append(f"{method}: {error}")
     return contestants, failures
-
-
-def _parser() -> argparse.ArgumentParser:
-    command = parser("evaluate", _HELP, _EPILOG)
-    add = command.add_argument
-    add("--models", type=Path, nargs="*", metavar="FILE", help="weights to compare (default: all that are shipped)")
-    add("--methods", nargs="*", choices=FITS, metavar="FIT", help=f"fits to compare (default: {' '.join(FITS)})")
-    add("--bodies", type=at_least(1), default=BODIES, metavar="N", help=f"bodies for networks ({BODIES})")
-    add("--fit-bodies", type=at_least(1), default=FIT_BODIES, metavar="N", help=f"the first N for fits ({FIT_BODIES})")
-    add("--seed", type=at_least(0), default=DEFAULT_SEED, help=f"of the test set ({DEFAULT_SEED})")
-    add("--output", type=folder, default="runs/evaluation", metavar="DIR", help="folder (runs/evaluation)")
-    return command

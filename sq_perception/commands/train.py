@@ -27,7 +27,18 @@ examples:
 
 def main(arguments: Sequence[str]) -> int:
     """Entry of ``sq-perception train``; the exit code."""
-    command = _parser()
+    command = parser("train", _HELP, _EPILOG)
+    command.add_argument("--output", type=Path, default=Path("runs/compact"), help="folder of the run (runs/compact)")
+    shipped = ", ".join(training_config.shipped())
+    command.add_argument("--config", metavar="FILE", help=f"YAML file, or one of {shipped}")
+    for field in fields(TrainingConfig):
+        name = "--" + field.name.replace("_", "-")
+        default, text = argparse.SUPPRESS, f"default {field.default!r}"
+        if isinstance(field.default, bool):
+            command.add_argument(name, action=argparse.BooleanOptionalAction, default=default, help=text)
+        else:
+            choices = CHOICES.get(field.name)
+            command.add_argument(name, type=type(field.default), choices=choices, default=default, help=text)
     options = vars(command.parse_args(arguments))
     output, file = options.pop("output"), options.pop("config")
     try:
@@ -46,20 +57,3 @@ def main(arguments: Sequence[str]) -> int:
     except (DivergedError, CheckpointError, ValueError, OSError) as error:
         return failed(f"train: {error}")
     return SUCCESS
-
-
-def _parser() -> argparse.ArgumentParser:
-    """``--output``, ``--config`` and one option for each field of the configuration."""
-    command = parser("train", _HELP, _EPILOG)
-    command.add_argument("--output", type=Path, default=Path("runs/compact"), help="folder of the run (runs/compact)")
-    shipped = ", ".join(training_config.shipped())
-    command.add_argument("--config", metavar="FILE", help=f"YAML file, or one of {shipped}")
-    for field in fields(TrainingConfig):
-        name = "--" + field.name.replace("_", "-")
-        default, text = argparse.SUPPRESS, f"default {field.default!r}"
-        if isinstance(field.default, bool):
-            command.add_argument(name, action=argparse.BooleanOptionalAction, default=default, help=text)
-        else:
-            choices = CHOICES.get(field.name)
-            command.add_argument(name, type=type(field.default), choices=choices, default=default, help=text)
-    return command
