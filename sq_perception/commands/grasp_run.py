@@ -21,6 +21,7 @@ from sq_perception.grasping.gripper import Gripper, gripper
 from sq_perception.grasping.plan import GraspPlan
 from sq_perception.grasping.surroundings import Surroundings
 from sq_perception.learning.checkpoint import CheckpointError
+from sq_perception.recordings.bag_file import InputOptions
 from sq_perception.recordings.frame_file import FrameError, RecordedFrame
 from sq_perception.recordings.inputs import RecordedInput
 from sq_perception.recovery.options import RecoveryOptions
@@ -39,7 +40,7 @@ def run(options: argparse.Namespace) -> int:
         return misused(str(error))
     friction = options.friction or planner.FRICTION
     try:
-        recorded = RecordedInput(options.frames, options.camera_info)
+        recorded = RecordedInput(options.frames, InputOptions(options.camera_info))
         pictures = {"pictures": (options.pictures, ".png")}
         if problem := console.replaced_input(recorded.files, {"json": options.json}, pictures):
             return misused(problem)
@@ -108,11 +109,10 @@ def _bodies(
 
 def _draw(path: Path, frame: RecordedFrame, found: Sequence[Recovery], plan: GraspPlan, hand: Gripper) -> None:
     from sq_perception.evaluation import plots
-    from sq_perception.evaluation.grasp_figure import draw_grasps
 
     figure = plots.new_figure(9.6, 9.6 * frame.camera.height / frame.camera.width)
     ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
-    draw_grasps(ax, frame.depth, frame.camera, [recovered.superquadric for recovered in found], plan, hand)
+    plots.draw_grasps(ax, frame.depth, frame.camera, [recovered.superquadric for recovered in found], plan, hand)
     with output_file.writing(path) as partial:
         plots.save(figure, partial)
 

@@ -17,8 +17,8 @@ from sq_perception.files import output_file
 from sq_perception.fitting.fit import Status
 from sq_perception.geometry import mesh
 from sq_perception.recordings import bag_file, result_json
-from sq_perception.recordings.frame_entry import in_result_frame
 from sq_perception.recordings.frame_file import RecordedFrame, Stamp
+from sq_perception.recordings.result_json import in_result_frame
 from sq_perception.recovery.recovery import FrameRecovery
 from sq_perception.tracking.session import Followed
 

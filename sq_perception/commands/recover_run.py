@@ -15,10 +15,10 @@ from sq_perception.commands.recover_lines import lines
 from sq_perception.commands.recover_outputs import Outputs, replaced_input
 from sq_perception.fitting.fit import Status
 from sq_perception.learning import checkpoint
-from sq_perception.recordings import frame_entry
+from sq_perception.recordings import result_json
+from sq_perception.recordings.bag_file import InputOptions
 from sq_perception.recordings.frame_file import FrameError, Reading, RecordedFrame
 from sq_perception.recordings.inputs import RecordedInput
-from sq_perception.recordings.result_json import Recovered
 from sq_perception.recordings.tracks import RecordedTracks
 from sq_perception.recovery import workers
 from sq_perception.recovery.options import NEEDS_NETWORK
@@ -34,20 +34,20 @@ def run(options: argparse.Namespace) -> int:
     if options.verbose:
         logging.basicConfig(level=logging.INFO, format="sq-perception: %(message)s")
     try:
-        one = RecoverRun(options)
+        this = RecoverRun(options)
     except (FrameError, checkpoint.CheckpointError, OSError, ImportError) as error:
         return failed(str(error))
     except ValueError as error:
         return misused(str(error))
-    code = one.over_all_frames()
-    for problem in one.outputs.finish(one.is_whole):
+    code = this.over_all_frames()
+    for problem in this.outputs.finish(this.is_whole):
         complain(problem)
         code = code or FAILURE
     if STANDARD_OUTPUT not in (options.json, options.jsonl, options.csv) and not options.quiet:
-        for line in lines(one.outputs.results, options.verbose):
+        for line in lines(this.outputs.results, options.verbose):
             print(line)
     if not options.quiet:
-        complain(one.summary())
+        complain(this.summary())
     return code
 
 
@@ -79,9 +79,8 @@ class RecoverRun:
             max_size=options.max_size,
             workspace=None if options.workspace is None else tuple(options.workspace),
         )
-        done = Recovered()
-        self._recorded = RecordedInput(
-            options.frames,
+        done = result_json.Recovered()
+        wanted = InputOptions(
             options.camera_info,
             options.projection,
             options.topic,
@@ -89,8 +88,8 @@ class RecoverRun:
             options.limit,
             options.distortion,
             Reading(options.depth_scale, options.depth_min, options.depth_max, options.roi, options.masks),
-            done,
         )
+        self._recorded = RecordedInput(options.frames, wanted, done)
         if problem := replaced_input(options, self._recorded.files):
             raise ValueError(problem)
         if options.method in NEEDS_NETWORK:
@@ -181,7 +180,7 @@ class RecoverRun:
         recovery = replace(answer, bodies=wanted)
         tracks = self._tracks.follow(file, frame, recovery) if self._tracks else None
         has_masks = not self._options.ignore_masks and frame.labels is not None
-        entry = frame_entry.frame_entry(file, frame, recovery, tracks, has_masks)
+        entry = result_json.frame_entry(file, frame, recovery, tracks, has_masks)
         self.outputs.add(frame, recovery, tracks, entry)
 
 

@@ -20,7 +20,7 @@ from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.task import Future
 
-from sq_perception.viewing.controls import arranged, plain
+from sq_perception.viewing.controls import control, plain
 from sq_perception.viewing.page import Page
 
 _PATIENCE = 3.0
@@ -133,7 +133,7 @@ class RemoteNode:
             return
         self._known = set(names)
         read = [parameter_value_to_python(value) for value in got.values]
-        controls = arranged(zip(described.descriptors, read, strict=True))
+        controls = [control(*both) for both in zip(described.descriptors, read, strict=True)]
         self._news.append(lambda page: page.show_controls(self.name, controls))
 
     async def _answer(self, call: Future, patience: float = _PATIENCE) -> Any:
