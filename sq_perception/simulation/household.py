@@ -1,6 +1,6 @@
 """Household things as they are: unions of superquadrics of household proportions.
 
-A :class:`~sq_perception.simulation.thing.Thing` is drawn by its kind; bottles and vessels have modules of their own.
+A :class:`~sq_perception.simulation.thing.Thing` is drawn by its kind; bottles and vessels have a module of their own.
 
 Families and their measures (ranges are wider than the sources: things differ)
 ------------------------------------------------------------------------------
@@ -27,7 +27,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from sq_perception.geometry import rotation as quaternions
-from sq_perception.simulation.bottles import bottle, tube
+from sq_perception.simulation.containers import bottle, bowl, cup, tub, tube
 from sq_perception.simulation.thing import (
     CARTON_RESTS,
     ON_X,
@@ -41,7 +41,6 @@ from sq_perception.simulation.thing import (
     one_of,
     part,
 )
-from sq_perception.simulation.vessels import bowl, cup, tub
 
 KINDS = ("box", "can", "bottle", "vessel", "round", "tool", "union", "soft")
 LIKELY = {
