@@ -13,7 +13,7 @@ import trimesh
 
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.imaging.camera import Camera
-from sq_perception.simulation.mesh_rendering import Mesh, render_mesh
+from sq_perception.simulation.rendering import Mesh, render_mesh
 from sq_perception.simulation.scenes import plane_depth
 
 CAMERA = Camera(640, 480, 320 / np.tan(np.deg2rad(30)), 320 / np.tan(np.deg2rad(30)), 319.5, 239.5)

@@ -33,7 +33,7 @@ from sq_perception.grasping.planner import grasps
 from sq_perception.grasping.surroundings import Surroundings
 from sq_perception.imaging.camera import Camera
 from sq_perception.recovery.recoverer import Recoverer
-from sq_perception.simulation.thing_rendering import render_things
+from sq_perception.simulation.rendering import render_things
 
 SHOWN = (150, 490), (335, 65)
 """Columns and rows of a picture."""

@@ -28,8 +28,8 @@ from sq_perception.geometry.union import flat_support, moved
 from sq_perception.grasping.gripper import PANDA
 from sq_perception.simulation import sensor_noise
 from sq_perception.simulation.household import draw_thing
+from sq_perception.simulation.rendering import render_things
 from sq_perception.simulation.thing import ON_X, ON_Y, UPRIGHT
-from sq_perception.simulation.thing_rendering import render_things
 from sq_perception.simulation.thing_setting import looking_down
 from sq_perception.simulation.things_on_table import TABLE_CAMERA
 

@@ -15,7 +15,7 @@ import numpy as np
 
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.simulation.mesh_rendering import Mesh
+from sq_perception.simulation.rendering import Mesh
 from sq_perception.simulation.thing import NO_CAVITY, Rest, Thing
 
 SUFFIXES = (".ply", ".obj", ".stl", ".glb", ".off")

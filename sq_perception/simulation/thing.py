@@ -20,7 +20,7 @@ import numpy as np
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.union import flat_support, support_of_union
-from sq_perception.simulation.mesh_rendering import Mesh
+from sq_perception.simulation.rendering import Mesh
 
 _STRAIGHT = (0.0, 0.0, 0.0, 1.0)
 _LEAN = (np.deg2rad(4.0), np.deg2rad(35.0))

@@ -16,9 +16,8 @@ from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.union import flat_support, moved
 from sq_perception.imaging.camera import Camera
-from sq_perception.simulation.mesh_rendering import Mesh, render_mesh
+from sq_perception.simulation.rendering import Mesh, render_mesh, render_things
 from sq_perception.simulation.thing import NO_CAVITY, SIX_WAYS, Thing
-from sq_perception.simulation.thing_rendering import render_things
 
 ON_TOP, FREE = 0.10, 0.05
 """Shares of the views in which the thing stands on something on the table, and in which there is no table."""

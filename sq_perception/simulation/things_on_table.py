@@ -17,7 +17,7 @@ Metres; depth is the z coordinate, +inf where nothing is.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -26,8 +26,8 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.union import flat_support, moved
 from sq_perception.imaging.camera import Camera
 from sq_perception.simulation.household import draw_thing
-from sq_perception.simulation.thing import SIX_WAYS, Thing
-from sq_perception.simulation.thing_rendering import render_things
+from sq_perception.simulation.rendering import render_things
+from sq_perception.simulation.thing import NO_CAVITY, SIX_WAYS, Thing
 from sq_perception.simulation.thing_setting import looking_down
 
 MOST_THINGS = 8
@@ -122,11 +122,8 @@ class _Resting:
     carries: bool
 
     def at(self, shift: np.ndarray) -> _Resting:
-        by = np.asarray(shift) - self.shift
-        return _Resting(self.thing, self.rest, self.turn, self.shift + by, self.reach + _WAYS @ by, self.carries)
-
-    def named(self, rest: str) -> _Resting:
-        return _Resting(self.thing, rest, self.turn, self.shift, self.reach, self.carries)
+        by = shift - self.shift
+        return replace(self, shift=self.shift + by, reach=self.reach + _WAYS @ by)
 
     def apart(self, other: _Resting, gap: float) -> bool:
         """Whether a tried plane lies between both, ``gap`` wide; level ones need none."""
@@ -210,7 +207,7 @@ def _drawn(thing: Thing, how: str, others: list[_Resting], spread: float, rng: n
     if how == "stacked":
         face = 0.5 * np.array([other.reach[0] + other.reach[16], other.reach[8] + other.reach[24]])
         at = middle[:2] + rng.uniform(-0.25, 0.25, 2) * face.min()
-        return body.at(np.array([*at, other.reach[_UP] + floor])).named(f"stacked, {rest}")
+        return replace(body.at(np.array([*at, other.reach[_UP] + floor])), rest=f"stacked, {rest}")
     if other.reach[_DOWN] < -1e-3:  # itself not on the table
         return None
     reach = flat_support(turned, way[None])[0]
@@ -223,7 +220,7 @@ def _drawn(thing: Thing, how: str, others: list[_Resting], spread: float, rng: n
     if how == "leaning":
         if placed.reach[_UP] > other.reach[_UP] + 0.01 or thing.kind in ("round", "soft", "union"):
             return None
-        return placed.named(f"leaning, {rest}")
+        return replace(placed, rest=f"leaning, {rest}")
     return placed
 
 
@@ -254,9 +251,7 @@ def _seen(
     placed = []
     for k, (body, (rotation, translation)) in enumerate(zip(resting, poses, strict=True)):
         none = np.zeros(len(parts[k]))
-        _, alone = render_things(
-            Superquadric.from_flat(parts[k]), none, Superquadric.stack([]), none[:0], camera, plane
-        )
+        _, alone = render_things(Superquadric.from_flat(parts[k]), none, NO_CAVITY, none[:0], camera, plane)
         pixels, whole = int(np.count_nonzero(index == k)), int(np.count_nonzero(alone == 0))
         placed.append(PlacedThing(body.thing, body.rest, rotation, translation, k + 1, pixels, max(whole, 1)))
     return ThingsOnTable(camera, depth, (index + 1).astype(np.int32), plane, table, wall, tuple(placed))

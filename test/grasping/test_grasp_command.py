@@ -12,7 +12,7 @@ import trimesh
 from sq_perception.commands import main
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
-from sq_perception.simulation.thing_rendering import render_things
+from sq_perception.simulation.rendering import render_things
 from sq_perception.simulation.thing_setting import looking_down
 
 CAMERA = Camera(160, 120, 200.0, 200.0, 79.5, 59.5)

@@ -14,7 +14,7 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.canonical_view import HIDDEN, NEAREST
 from sq_perception.imaging.raycast import render
 from sq_perception.simulation.household import KINDS, draw_thing
-from sq_perception.simulation.thing_rendering import render_things
+from sq_perception.simulation.rendering import render_things
 from sq_perception.simulation.thing_sensing import draw_sensor
 from sq_perception.simulation.thing_setting import Setting, draw_setting
 from sq_perception.simulation.thing_views import draw_thing_views, support_in_view
