@@ -6,8 +6,7 @@ view's own grid, the view fitted to what of the body is visible.  Frames and val
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TypeAlias
+from typing import NamedTuple, TypeAlias
 
 import numba
 import numpy as np
@@ -27,8 +26,7 @@ _Curtain: TypeAlias = tuple[float, float, float, float]
 """Middle x, y and side of the view that an occluder is given in, and how far in its direction it begins."""
 
 
-@dataclass(frozen=True, eq=False)
-class Occluder:
+class Occluder(NamedTuple):
     """Something opaque before each body (n,): all that lies beyond a front that came in from one side.
 
     In the plane of the view, in units of its side and from its middle, (u, v) are coordinates along and across the
@@ -106,12 +104,9 @@ def render_views(
         raise ValueError("distance: expected positive distances of the camera")
     pinhole = np.isfinite(away)
     eye = upper[:, 2] + np.where(pinhole, away, 0.0)
-    fronts = np.zeros((len(bodies), 6))
-    if occluder is not None:
-        if not ((occluder.share >= 0) & (occluder.share < 1)).all():
-            raise ValueError("occluder: expected shares of at least 0 and below 1")
-        columns = (occluder.direction, occluder.bow, occluder.offset, occluder.power, occluder.thickness)
-        fronts[:] = np.stack([*columns, occluder.share], axis=-1)
+    fronts = np.zeros((len(bodies), 6)) if occluder is None else np.stack(occluder, axis=-1)
+    if not ((fronts[:, 5] >= 0) & (fronts[:, 5] < 1)).all():
+        raise ValueError("occluder: expected shares of at least 0 and below 1")
     misses = np.zeros((len(bodies), 4)) if miss is None else np.array(miss, dtype=float)
     _render_views(flat, matrices, anchor, side, steps, pinhole, eye, fronts, misses, images)
     identity = np.array([0.0, 0.0, 0.0, 1.0])
