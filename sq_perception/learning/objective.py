@@ -26,7 +26,7 @@ import torch
 
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import sight_lines
-from sq_perception.learning import depth_losses, losses
+from sq_perception.learning import losses
 from sq_perception.learning.choices import LOSSES, UNSUPERVISED
 
 _SHARPNESS = {"render": (6.0, 100.0)}
@@ -95,12 +95,12 @@ class Objective:
         row, column = torch.randint(self.stride, (2,), generator=generator, device=views.device).tolist()
         lines, depth = sight_lines.of_view(views[:, 0], self.stride, row, column)
         if self.name == "render":
-            return depth_losses.render_loss(prediction, lines, depth, s, _DENSITY * s)
+            return losses.render_loss(prediction, lines, depth, s, _DENSITY * s)
         smallness = max(0.0, 1 - progress / _CURRICULUM)
-        loss = depth_losses.least_squares_loss(prediction, lines, depth)
+        loss = losses.least_squares_loss(prediction, lines, depth)
         loss = loss * (prediction.size.prod(dim=-1) / _TYPICAL_VOLUME) ** smallness
         if self.name == "least_squares_free":
-            loss = loss + _FREE_SPACE * depth_losses.free_space_loss(prediction, lines, depth)
+            loss = loss + _FREE_SPACE * losses.free_space_loss(prediction, lines, depth)
             # The same optimum, but a few badly seen bodies, whose squares are a hundred times those of the others, do
             # not make the whole gradient.
             loss = torch.sqrt(loss + _ROOT_FLOOR)

@@ -13,7 +13,7 @@ from sq_perception.geometry import Superquadric
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.metrics import volume_iou
 from sq_perception.imaging import sight_lines
-from sq_perception.learning import depth_losses, losses
+from sq_perception.learning import losses
 from sq_perception.learning.objective import LOSSES, UNSUPERVISED, Objective
 from sq_perception.simulation.scenes import thesis_bodies
 from sq_perception.simulation.view_rendering import render_views
@@ -103,12 +103,12 @@ class TestLeastSquares:
         sphere = body(0.2, 0.2, 0.2, 1, 1, 0.5, 0.5, 0.5, *IDENTITY)
         lines = torch.tensor([[0.5, 0.5], [0.8, 0.5], [0.1, 0.1]], dtype=DOUBLE)
         depth = torch.tensor([[0.7, 0.5, 0.0]], dtype=DOUBLE)
-        found = depth_losses.least_squares_loss(sphere, lines, depth).item()
+        found = losses.least_squares_loss(sphere, lines, depth).item()
         assert found == pytest.approx(np.sqrt(0.2**3) * 1.25**2 / 2)
 
     def test_an_empty_view_has_no_residual(self) -> None:
         sphere = body(0.2, 0.2, 0.2, 1, 1, 0.5, 0.5, 0.5, *IDENTITY)
-        assert depth_losses.least_squares_loss(sphere, torch.rand(5, 2).double(), torch.zeros(1, 5)).item() == 0
+        assert losses.least_squares_loss(sphere, torch.rand(5, 2).double(), torch.zeros(1, 5)).item() == 0
 
     def test_only_free_space_minds_what_lies_behind_the_points(self) -> None:
         """One face of a box, and the same face on a box twice as wide: the points lie on both."""
@@ -118,9 +118,9 @@ class TestLeastSquares:
         seen = (lines - 0.5).abs().amax(dim=-1) < 0.18
         depth = torch.where(seen, 0.7, 0.0)[None].double()
         for box in (narrow, wide):
-            assert depth_losses.least_squares_loss(box, lines, depth).item() < 2e-4
-        assert depth_losses.free_space_loss(narrow, lines, depth).item() < 1e-6
-        assert depth_losses.free_space_loss(wide, lines, depth).item() > 0.01
+            assert losses.least_squares_loss(box, lines, depth).item() < 2e-4
+        assert losses.free_space_loss(narrow, lines, depth).item() < 1e-6
+        assert losses.free_space_loss(wide, lines, depth).item() > 0.01
 
 
 class TestRenderLoss:
@@ -128,7 +128,7 @@ class TestRenderLoss:
         """A body that no line meets renders to 0, and the loss is the mean of the image."""
         aside = body(0.05, 0.05, 0.05, 1, 1, 0.1, 0.1, 0.5, *IDENTITY)
         lines, depth = torch.tensor([[0.8, 0.8], [0.9, 0.5]], dtype=DOUBLE), torch.tensor([[0.6, 0.0]], dtype=DOUBLE)
-        assert depth_losses.render_loss(aside, lines, depth, 100.0, 200.0).item() == pytest.approx(0.3)
+        assert losses.render_loss(aside, lines, depth, 100.0, 200.0).item() == pytest.approx(0.3)
 
     def test_the_voxels_of_the_thesis_agree_with_their_limit(self) -> None:
         images, bodies = render_views(thesis_bodies(4, np.random.default_rng(4)), 48)
@@ -136,7 +136,7 @@ class TestRenderLoss:
         guess = tensors(Superquadric(bodies.size * 1.2, bodies.shape, bodies.translation, bodies.rotation))
         lines, depth = sight_lines.of_view(view)
         voxels = voxel_loss(guess, view, 20.0, 40 / 48)
-        limit = depth_losses.render_loss(guess, lines, depth, 20.0, 40.0)
+        limit = losses.render_loss(guess, lines, depth, 20.0, 40.0)
         torch.testing.assert_close(voxels, limit, rtol=0.05, atol=0)
 
 
