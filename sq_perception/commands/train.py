@@ -47,13 +47,13 @@ def main(arguments: Sequence[str]) -> int:
         command.error(str(error))
 
     from sq_perception.learning.checkpoint import CheckpointError
-    from sq_perception.learning.train import DivergedError, Stopped, train
+    from sq_perception.learning.train import Stopped, train
 
     try:
         train(config, output)
     except Stopped as stopped:
         print(stopped, file=sys.stderr)
         return INTERRUPTED
-    except (DivergedError, CheckpointError, ValueError, OSError) as error:
+    except (CheckpointError, ValueError, ArithmeticError, OSError) as error:
         return failed(f"train: {error}")
     return SUCCESS

@@ -40,11 +40,6 @@ class Disturbance:
     noisy_share: float = 0.0
     """Share of the views with noise, steps, holes and wrong edges, each of them in some of those."""
 
-    def __post_init__(self) -> None:
-        for name in ("occluded_share", "noisy_share"):
-            if not 0 <= getattr(self, name) <= 1:
-                raise ValueError(f"{name}: expected a share from 0 to 1, got {getattr(self, name)}")
-
     def occluder(self, count: int, rng: np.random.Generator) -> Occluder | None:
         """Occluders for ``count`` bodies, some of which hide nothing; None where no view is to have one."""
         if self.occluded_share == 0:

@@ -15,7 +15,6 @@ The state of the run names them: shards that come later change nothing in that.
 
 from __future__ import annotations
 
-import copy
 import math
 import time
 from collections.abc import Callable, Iterable
@@ -30,7 +29,7 @@ from safetensors.numpy import load_file as load_arrays
 from safetensors.numpy import save as bytes_of
 
 from sq_perception.files import output_file, provenance
-from sq_perception.learning import checkpoint, training_log
+from sq_perception.learning import checkpoint
 from sq_perception.learning.mask_network import MaskNetwork
 from sq_perception.learning.thing_network import ThingNetwork
 from sq_perception.learning.training_config import ShardTraining
@@ -110,7 +109,7 @@ def train(subject: Subject[Network, Any], config: ShardTraining, views: Path, ou
     CheckpointError
         If a file to begin or to go on with does not fit.
     ArithmeticError
-        If the loss is no longer finite; the last state that was saved stays.
+        If the loss or a gradient is no longer finite; the last state that was saved stays.
     """
     if config.threads:
         torch.set_num_threads(config.threads)
@@ -118,10 +117,7 @@ def train(subject: Subject[Network, Any], config: ShardTraining, views: Path, ou
     output.mkdir(parents=True, exist_ok=True)
     network = subject.network(config.start).train()
     optimizer = torch.optim.AdamW(network.parameters(), lr=config.rate, weight_decay=config.weight_decay)
-    state = TrainingState(network, copy.deepcopy(network), optimizer)
-    path = output / "state.safetensors"
-    if path.exists():
-        state.restore(path)
+    state = TrainingState(output / "state.safetensors", network, optimizer)
     rng = np.random.default_rng([config.seed, state.step])
     found = _shards(views, len(state.held) or config.held)
     state.held = state.held or [shard.name for shard in found[: config.held]]
@@ -138,10 +134,7 @@ def train(subject: Subject[Network, Any], config: ShardTraining, views: Path, ou
         with mixed_precision("cpu", config.bfloat16):
             predicted = network(*batch[:-1])
         loss = subject.loss(predicted, *batch)
-        state.descend(loss, rate)
-        if not bool(torch.isfinite(loss)):
-            raise ArithmeticError(f"step {state.step}: the loss is {loss.item()}; {path} is the last good state")
-        state.advance(_AVERAGE)
+        state.descend(loss, rate, _AVERAGE)
         losses.append(loss.item())
         if state.step % config.validation == 0:
             state.seconds = time.monotonic() - began
@@ -177,8 +170,8 @@ def _keep(
 ) -> None:
     """Log, state and network of this moment."""
     record = {"step": state.step, "seconds": state.seconds, **record}
-    training_log.append(output, record)
-    state.save(output / "state.safetensors")
+    state.log(record)
+    state.save()
     training = {**asdict(config), "start": Path(config.start).name}
     made = provenance.facts(f"sq-perception train-{subject.name}")
     facts = {"training": training, "made": made, "validation": record}

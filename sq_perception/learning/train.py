@@ -10,24 +10,26 @@ model.safetensors (the best one so far).
 
 from __future__ import annotations
 
-import copy
 import json
 import signal
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numba
 import numpy as np
 import torch
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from sq_perception.files import provenance
 from sq_perception.geometry.metrics import volume_iou
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.learning import checkpoint, training_log
+from sq_perception.learning import checkpoint
 from sq_perception.learning.backbone import ResNet18
 from sq_perception.learning.dataset import POOL, ViewPool, ViewSource, draw_views
 from sq_perception.learning.disturbance import Disturbance, any_occluder
@@ -52,18 +54,8 @@ VALIDATION_HIDDEN = 0.3
 """Share of each body that is hidden in the validation set ``hidden``."""
 
 
-class DivergedError(ArithmeticError):
-    """A run whose loss or gradient is no longer finite; the last saved state stays as it was."""
-
-
 class Stopped(Exception):  # noqa: N818 - nothing is wrong
     """A run that was asked to stop; its state is saved."""
-
-
-class Batches(Protocol):
-    """Where views come from."""
-
-    def batch(self, count: int) -> tuple[np.ndarray, Superquadric]: ...
 
 
 def train(config: TrainingConfig, output: Path, network: RegressorConfig | None = None) -> Regressor:
@@ -80,8 +72,8 @@ def train(config: TrainingConfig, output: Path, network: RegressorConfig | None 
 
     Raises
     ------
-    DivergedError
-        When the loss or a gradient is no longer finite.
+    ArithmeticError
+        When the loss or a gradient is no longer finite; the last saved state stays as it was.
     Stopped
         After SIGINT or SIGTERM; the state is saved first.
     CheckpointError
@@ -115,17 +107,14 @@ def _train(
     device: torch.device,
     stop_requested: Callable[[], bool],
 ) -> Regressor:
-    objective = config.objective()
+    objective = Objective(config.loss, config.points, config.sharpness_start, config.sharpness_end)
     output.mkdir(parents=True, exist_ok=True)
     _check_same_run(config, output)
     torch.manual_seed(config.seed)
     model = _new_network(config, network).to(device)
     layout = torch.channels_last if model.config.widths[0] >= _FEWEST_CHANNELS_LAST else torch.contiguous_format
     model.to(memory_format=layout)  # type: ignore[call-overload]
-    state = TrainingState(model, copy.deepcopy(model), _optimizer(config, model))
-    path = output / "state.safetensors"
-    if path.exists():
-        state.restore(path)
+    state = TrainingState(output / "state.safetensors", model, _optimizer(config, model))
     seed = np.random.SeedSequence([config.seed, state.step])
     generator = torch.Generator(device=device).manual_seed(int(seed.generate_state(1)[0]))
     batches = _batches(config, model.config, np.random.default_rng(seed))
@@ -134,7 +123,7 @@ def _train(
     if device.type == "cuda":
         notes["made"]["device"] = torch.cuda.get_device_name(device)
     started, saved, losses = time.monotonic() - state.seconds, time.monotonic(), []
-    with training_log.bar(config.steps, state.step) as show:
+    with _bar(config.steps, state.step) as show:
         while state.step < config.steps and not (config.schedule == "plateau" and state.plateau.exhausted):
             progress, rate = state.step / config.steps, config.rate(state.step, state.plateau)
             images, bodies = batches.batch(config.batch)
@@ -147,13 +136,7 @@ def _train(
             with mixed_precision(device.type, config.bfloat16):
                 prediction = model(views)
             loss = objective.loss(prediction, views, truth, progress, generator).mean()
-            norm = state.descend(loss, rate)
-            if not torch.isfinite(loss) & torch.isfinite(norm):
-                raise DivergedError(
-                    f"step {state.step}: loss {loss.item():.4g}, norm of the gradient {norm.item():.4g}; "
-                    f"{path if path.exists() else 'no state'} is the last good one. A smaller learning rate may help."
-                )
-            state.advance(config.average)
+            state.descend(loss, rate, config.average)
             losses.append(loss.item())
             show(state.step, losses[-1])
 
@@ -168,16 +151,16 @@ def _train(
                 record |= {"sharpness": objective.sharpness(progress), "seconds": state.seconds}
                 record |= _validated(state.average, validation, objective)
                 print(json.dumps(record), flush=True)
-                training_log.append(output, record)
+                state.log(record)
                 _keep(output, state, record, notes)
                 state.plateau.validated(1 - record["iou"])
                 losses.clear()
             due = time.monotonic() - saved > _SAVE_SECONDS
             if state.step % config.validation == 0 or finished or stopping or due:
                 state.seconds, saved = time.monotonic() - started, time.monotonic()
-                state.save(path)
+                state.save()
             if stopping and not finished:
-                raise Stopped(f"stopped after step {state.step}; the same command goes on from {path}")
+                raise Stopped(f"stopped after step {state.step}; the same command goes on from {state.path}")
     return state.average.eval()
 
 
@@ -211,11 +194,13 @@ def _optimizer(config: TrainingConfig, model: Regressor) -> torch.optim.Optimize
     return torch.optim.AdamW(model.parameters(), config.learning_rate, weight_decay=config.weight_decay)
 
 
-def _batches(config: TrainingConfig, network: RegressorConfig, rng: np.random.Generator) -> Batches:
+def _batches(config: TrainingConfig, network: RegressorConfig, rng: np.random.Generator) -> ViewPool | ShuffledBatches:
     if not config.data:
         # A short run holds no more views than it takes.
         taken = max(config.steps * config.batch, CALIBRATION_VIEWS if config.average > 0 else 0)
-        return ViewPool(rng, config.views(network), min(POOL, taken), config.reuse)
+        disturbance = Disturbance(config.occluded_share, config.noisy_share)
+        source = ViewSource(network.pixels, config.pinhole_share, config.wide_share, disturbance, network.framing)
+        return ViewPool(rng, source, min(POOL, taken), config.reuse)
     fixed = FixedSet(Path(config.data), "train")
     theirs = fixed.settings
     if (theirs.pixels, theirs.framing) != (network.pixels, network.framing):
@@ -266,6 +251,16 @@ def _keep(output: Path, state: TrainingState, record: dict[str, Any], notes: dic
         names.append("model.safetensors")
     for name in names:
         checkpoint.save(output / name, state.average, {**notes, "metrics": record})
+
+
+@contextmanager
+def _bar(steps: int, first: int) -> Iterator[Callable[[int, float], None]]:
+    """A bar on a terminal, for a run of ``steps`` of which ``first`` are done; called with steps done and a loss."""
+    columns = (TextColumn("step"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[note]}"))
+    quiet = not sys.stderr.isatty()
+    with Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True), disable=quiet) as progress:
+        task = progress.add_task("training", total=steps, completed=first, note="")
+        yield lambda done, loss: progress.update(task, completed=done, note=f"loss {loss:.4f}")
 
 
 @contextmanager

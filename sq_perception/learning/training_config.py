@@ -17,10 +17,7 @@ from sq_perception.learning.choices import LOSSES, UNSUPERVISED, Backbone, Frami
 from sq_perception.learning.schedule import Plateau, cosine
 
 if TYPE_CHECKING:
-    from sq_perception.learning.dataset import ViewSource
-    from sq_perception.learning.disturbance import Disturbance
     from sq_perception.learning.network_config import RegressorConfig
-    from sq_perception.learning.objective import Objective
 
 Optimizer = Literal["adamw", "adam"]
 _SHIPPED = Path(__file__).with_name("configurations")
@@ -108,6 +105,9 @@ class TrainingConfig:
         for name in ("steps", "batch", "points", "validation", "reuse"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}: expected at least 1, got {getattr(self, name)}")
+        for name in ("pinhole_share", "wide_share", "occluded_share", "noisy_share"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise ValueError(f"{name}: expected a share from 0 to 1, got {getattr(self, name)}")
         if not self.learning_rate > 0:
             raise ValueError(f"learning_rate: expected a positive number, got {self.learning_rate}")
         if not 0 <= self.average < 1:
@@ -118,19 +118,6 @@ class TrainingConfig:
             raise ValueError("full frames are the thesis' images: orthographic, whole and clean")
         if self.imagenet and self.backbone != "resnet18":
             raise ValueError("imagenet: only resnet18 has the form of those weights")
-        self.disturbance()
-
-    def disturbance(self) -> Disturbance:
-        """What happens to the views."""
-        from sq_perception.learning.disturbance import Disturbance
-
-        return Disturbance(self.occluded_share, self.noisy_share)
-
-    def objective(self) -> Objective:
-        """What is minimised."""
-        from sq_perception.learning.objective import Objective
-
-        return Objective(self.loss, self.points, self.sharpness_start, self.sharpness_end)
 
     @property
     def marks_hidden(self) -> bool:
@@ -144,12 +131,6 @@ class TrainingConfig:
         form = RegressorConfig() if self.framing == "cropped" else RegressorConfig.thesis()
         changes = {"backbone": self.backbone, "pixels": self.pixels, "marks_hidden": self.marks_hidden}
         return replace(form, **changes)  # type: ignore[arg-type]
-
-    def views(self, network: RegressorConfig) -> ViewSource:
-        """What is drawn for a network."""
-        from sq_perception.learning.dataset import ViewSource
-
-        return ViewSource(network.pixels, self.pinhole_share, self.wide_share, self.disturbance(), network.framing)
 
     def rate(self, step: int, plateau: Plateau) -> float:
         """The learning rate of a step, by what the validations so far have shown."""

@@ -1,15 +1,19 @@
 """All of a run that changes, in one file: weights, their average, the optimiser's moments, schedule, step and time.
 
+Beside it lies the run's log, a line of JSON at each validation.
+
 A state is written beside the old one and takes its place at once, so that a run killed at any moment finds the last
 whole state again.  Like every file of weights it is safetensors and can carry no code.
 """
 
 from __future__ import annotations
 
+import copy
+import json
 import math
 from dataclasses import astuple, dataclass, field
 from pathlib import Path
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import torch
 from safetensors import SafetensorError
@@ -37,11 +41,18 @@ def mixed_precision(device: str, wanted: bool) -> torch.autocast:
 
 @dataclass(eq=False)
 class TrainingState(Generic[Network]):
-    """What a training holds between two steps."""
+    """What a training holds between two steps; goes on from the file where there is one.
 
+    Raises
+    ------
+    CheckpointError
+        If the file is damaged, or of a run with another network.
+    """
+
+    path: Path
     model: Network
-    average: Network
     optimizer: torch.optim.Optimizer
+    average: Network = field(init=False)
     plateau: Plateau = field(default_factory=Plateau)
     step: int = 0
     """Steps done."""
@@ -52,8 +63,13 @@ class TrainingState(Generic[Network]):
     held: list[str] = field(default_factory=list)
     """Names of the files of views that are kept for validation, where a run has such."""
 
-    def save(self, path: Path) -> None:
-        """Write everything to ``path``."""
+    def __post_init__(self) -> None:
+        self.average = copy.deepcopy(self.model)
+        if self.path.exists():
+            self._restore()
+
+    def save(self) -> None:
+        """Write everything to the file."""
         tensors = {
             "step": torch.tensor(self.step),
             "seconds": torch.tensor(self.seconds, dtype=torch.float64),
@@ -65,18 +81,11 @@ class TrainingState(Generic[Network]):
             tensors.update({f"{prefix}.{k}": v.contiguous() for k, v in network.state_dict().items()})
         for index, slots in self.optimizer.state_dict()["state"].items():
             tensors.update({f"optimizer.{index}.{k}": torch.as_tensor(v).contiguous() for k, v in slots.items()})
-        output_file.write(path, bytes_of(tensors))
+        output_file.write(self.path, bytes_of(tensors))
 
-    def restore(self, path: Path) -> None:
-        """Go on from :meth:`save`.
-
-        Raises
-        ------
-        CheckpointError
-            If the file is damaged, or of a run with another network.
-        """
+    def _restore(self) -> None:
         try:
-            tensors = load_file(str(path), device=str(next(self.model.parameters()).device))
+            tensors = load_file(str(self.path), device=str(next(self.model.parameters()).device))
             for prefix, network in (("model.", self.model), ("average.", self.average)):
                 own = {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
                 network.load_state_dict(own)
@@ -93,26 +102,42 @@ class TrainingState(Generic[Network]):
             if "held" in tensors:  # not in the states of 0.2.0
                 self.held = bytes(tensors["held"].tolist()).decode().splitlines()
         except (SafetensorError, OSError, KeyError, IndexError, RuntimeError, ValueError) as error:
-            raise CheckpointError(f"{path}: not the state of such a run: {error}") from error
+            raise CheckpointError(f"{self.path}: not the state of such a run: {error}") from error
 
-    def descend(self, loss: torch.Tensor, rate: float) -> torch.Tensor:
-        """Prepare a step down the gradient of a loss at this rate; the norm of the gradient before it is clipped."""
+    def log(self, record: dict[str, Any]) -> None:
+        """Add the numbers of a validation, by name, to the ``log.jsonl`` beside the file."""
+        with self.path.with_name("log.jsonl").open("a", encoding="utf-8") as file:
+            file.write(json.dumps(record) + "\n")
+
+    def descend(self, loss: torch.Tensor, rate: float, keep: float) -> None:
+        """Make a step down the gradient of a loss at this rate, and let the averaged weights follow.
+
+        Early in a run they keep less than ``keep`` of themselves.
+
+        Raises
+        ------
+        ArithmeticError
+            If the loss or its gradient is not finite; nothing is changed then.
+        """
         for group in self.optimizer.param_groups:
             group["lr"] = rate
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        return torch.nn.utils.clip_grad_norm_(self.model.parameters(), _CLIP)
-
-    @torch.no_grad()
-    def advance(self, keep: float) -> None:
-        """Make the step, and let the averaged weights follow; early in a run they keep less than ``keep``."""
+        norm = torch.nn.utils.clip_grad_norm_(self.model.parameters(), _CLIP)
+        if not torch.isfinite(loss) & torch.isfinite(norm):
+            raise ArithmeticError(
+                f"step {self.step}: loss {loss.item():.4g}, norm of the gradient {norm.item():.4g}; "
+                f"{self.path if self.path.exists() else 'no state'} is the last good one. "
+                "A smaller learning rate may help."
+            )
         self.optimizer.step()
         keep = min(keep, (self.step + 1) / (self.step + 10))
-        for mine, theirs in zip(self.average.state_dict().values(), self.model.state_dict().values(), strict=True):
-            if mine.is_floating_point():
-                mine.lerp_(theirs, 1 - keep)
-            else:
-                mine.copy_(theirs)
+        with torch.no_grad():
+            for mine, theirs in zip(self.average.state_dict().values(), self.model.state_dict().values(), strict=True):
+                if mine.is_floating_point():
+                    mine.lerp_(theirs, 1 - keep)
+                else:
+                    mine.copy_(theirs)
         self.step += 1
 
 
