@@ -38,7 +38,6 @@ import numpy as np
 import report
 import scene_verdict
 import single_body
-import torch
 import tracking
 from package_constants import Constant, constants, forget, frozen_in, reason_to_pass, varied
 from tabletop import Tabletop
@@ -231,7 +230,6 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", default=list(SETS), help="rooms, or modules as room.module")
     parser.add_argument("--kernels", action="store_true", help="those too that compiled code has frozen in (hours)")
     options = parser.parse_args()
-    torch.set_num_threads(1)
     scene_verdict.recoverer().warm_up(tables()[0].camera)
     for module in pkgutil.walk_packages(sq_perception.__path__, "sq_perception."):
         if module.name.split(".")[1] in SETS:

@@ -35,12 +35,12 @@ from gallery_figures import (
     empty_figure,
     matched,
     panel_title,
-    recoverer,
     scene_figure,
     write_picture,
 )
 from gallery_scenes import Stood, bottle, can, carton, kitchen, viewed
 from matplotlib.axes import Axes
+from scene_verdict import recoverer
 
 from sq_perception.evaluation.plots import (
     WIRE,

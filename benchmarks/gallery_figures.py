@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 from itertools import product
 from pathlib import Path
 
@@ -18,6 +17,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from PIL import Image
+from scene_verdict import recoverer
 from scipy.optimize import linear_sum_assignment
 from tabletop import Placed, Tabletop
 
@@ -34,7 +34,7 @@ from sq_perception.evaluation.plots import (
 )
 from sq_perception.geometry import Superquadric
 from sq_perception.geometry import rotation as quaternions
-from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, Recovery
+from sq_perception.recovery.recoverer import FrameRecovery, Recovery
 
 SENSORS = {"realsense_d435": "stereo, RealSense D435", "kinect_v1": "structured light, Kinect v1"}
 DOTS = 100
@@ -56,11 +56,6 @@ class MatchedThing:
     placed: Placed
     body: Recovery | None
     iou: float
-
-
-@cache
-def recoverer() -> Recoverer:
-    return Recoverer()
 
 
 def matched(view: Tabletop, frame: FrameRecovery) -> list[MatchedThing]:

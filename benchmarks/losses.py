@@ -18,7 +18,6 @@ if __name__ == "__main__":
 
 
 import report
-import torch
 
 from sq_perception.evaluation.contest import compare, network
 from sq_perception.evaluation.thesis_images import ThesisImages
@@ -41,7 +40,6 @@ def main() -> None:
     if not options.runs:
         print("runs/ holds no trained network; see sq-perception train --help")
         return
-    torch.set_num_threads(1)
     networks = [network(folder / "model.safetensors", folder.name) for folder in options.runs]
     result, rows = {}, []
     outcomes = compare([(one, options.bodies) for one in networks], ThesisImages(options.bodies, options.seed))

@@ -21,7 +21,6 @@ from typing import Any
 import numpy as np
 import report
 import single_body
-import torch
 
 from sq_perception.fitting.fit import Status
 from sq_perception.geometry import Superquadric, metrics
@@ -72,7 +71,6 @@ def main() -> None:
     shipped = list(checkpoint.shipped_regressors().values())
     parser.add_argument("--models", type=Path, nargs="*", default=shipped, help="default: all shipped weights")
     options = parser.parse_args()
-    torch.set_num_threads(1)
     networks = {path.stem: Recoverer(path, method="network") for path in options.models}
     default = Recoverer(method="auto")
     result: dict[str, Any] = {}

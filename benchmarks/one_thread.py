@@ -1,4 +1,4 @@
-"""Imported before NumPy: this process computes in one thread.
+"""Imported before NumPy and torch: this process computes in one thread.
 
 Only a script does so, for itself: a process that imports a benchmark has threads already, and numba refuses to compile
 once they run and their number is named anew.
@@ -9,4 +9,4 @@ from __future__ import annotations
 import os
 
 for variable in ("OMP_NUM_THREADS", "NUMBA_NUM_THREADS"):
-    os.environ.setdefault(variable, "1")
+    os.environ[variable] = "1"

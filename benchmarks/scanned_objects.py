@@ -32,6 +32,7 @@ import report
 import trimesh
 from both_fits import Both, both
 from hull_oracle import Columns, oracle
+from mesh_things import scanned_meshes
 
 from sq_perception.fitting import surface_fit
 from sq_perception.fitting.fit import Status
@@ -93,16 +94,12 @@ class FittedScan:
 
 def scans(folder: Path, wanted: str) -> list[Scan]:
     """The scans whose names contain one of the wanted parts, all without any."""
-    parts = [part.strip() for part in wanted.split(";") if part.strip()]
-    found = []
-    for number, path in enumerate(sorted(path for path in folder.glob("*.ply") if ".hull" not in path.name)):
-        if parts and not any(part in path.stem for part in parts):
-            continue
-        mesh = trimesh.load_mesh(path, process=False)
-        hull = trimesh.load_mesh(path.with_suffix(".hull.ply"), process=False)
-        name = path.stem.split("_", 1)[-1].replace("_", " ")
-        found.append(Scan(name, number, mesh, hull, Columns.of(hull.vertices)))
-    return found
+    parts = [part.strip().replace("_", " ") for part in wanted.split(";") if part.strip()]
+    return [
+        Scan(name, number, mesh, hull, Columns.of(hull.vertices))
+        for number, (name, mesh, hull) in enumerate(scanned_meshes(folder))
+        if not parts or any(part in name for part in parts)
+    ]
 
 
 def image(scan: Scan, setting: Placement, pose: int, poser: mesh_scene.Poser) -> mesh_scene.MeshView:

@@ -38,7 +38,6 @@ import frame_time
 import numpy as np
 import report
 import single_body
-import torch
 from synthetic_tabletop import STAGES, scored
 
 from sq_perception.fitting import solina_bajcsy
@@ -179,7 +178,6 @@ def main() -> None:
     parser.add_argument("--repeats", type=int, default=5)
     parser.add_argument("--record", action="store_true", help="keep the figures")
     options = parser.parse_args()
-    torch.set_num_threads(1)
     before = report.previous("speed", "rows")
     rows: dict[str, dict[str, Any]] = {}
     chain = recoverer.Recoverer(threads=1)

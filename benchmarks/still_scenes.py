@@ -27,7 +27,6 @@ import real_scenes
 import report
 import scene_verdict
 import tabletop
-import torch
 
 from sq_perception.recovery.recoverer import FrameRecovery, Recoverer
 from sq_perception.simulation import sensor_noise
@@ -95,7 +94,6 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=16, help="of each scene")
     parser.add_argument("--sensor", choices=list(tabletop.SENSORS), default="stereo")
     options = parser.parse_args()
-    torch.set_num_threads(1)
     recoverer = Recoverer(threads=1)
     recoverer.warm_up(household_things.scene(0, options.sensor, 1).camera)
     rows = {}

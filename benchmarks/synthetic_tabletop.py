@@ -27,7 +27,6 @@ from typing import Any
 
 import numpy as np
 import report
-import torch
 from crowds import crowded_scene
 from scipy.optimize import linear_sum_assignment
 
@@ -170,7 +169,6 @@ def main() -> None:
     parser.add_argument("--sensors", nargs="*", default=["realsense_d435", PLAIN])
     parser.add_argument("--settings", nargs="*", default=list(SETTINGS), choices=list(SETTINGS))
     options = parser.parse_args()
-    torch.set_num_threads(1)
     recoverer = Recoverer()
     result: dict[str, Any] = {}
     rows = []

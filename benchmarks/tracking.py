@@ -40,7 +40,6 @@ from typing import Any
 import cv2
 import numpy as np
 import report
-import torch
 from synthetic_tabletop import visible_shares
 
 from sq_perception.geometry import Superquadric
@@ -262,7 +261,6 @@ def main() -> None:
     options = parser.parse_args()
     report.pin()
     cv2.setNumThreads(1)
-    torch.set_num_threads(1)
     known = report.previous(options.name, "rows") if len(options.rows) < len(ROWS) else {}
     for name in options.rows:
         for masks, records in run(ROWS[name], options.scenes, options.frames, options.seed).items():
