@@ -155,18 +155,13 @@ def read(kind: type[Config], path: Path | str | None = None) -> tuple[Config, di
         raise CheckpointError(f"{path}: not a readable safetensors file: {error}") from error
     expected = layout.shapes(config)
     found = {name: array for name, array in stored.items() if not name.endswith(layout.COUNTER)}
-    for what, names in (("misses", expected.keys() - found.keys()), ("has no", found.keys() - expected.keys())):
-        if names:
-            shown = ", ".join(sorted(names)[:3]) + (", ..." if len(names) > 3 else "")
-            subject = "the file" if what == "misses" else "the network"
-            raise CheckpointError(f"{path}: the weights do not fit the config: {subject} {what} {shown}")
     weights = {}
-    for name, array in found.items():
-        if array.shape != expected[name] or array.dtype.kind != "f":
-            raise CheckpointError(
-                f"{path}: the weights do not fit the config: {name}: expected numbers of shape {expected[name]}, "
-                f"got {array.dtype} {array.shape}"
-            )
+    for name in sorted(expected.keys() | found.keys()):
+        array = found.get(name)
+        if array is None or array.shape != expected.get(name) or array.dtype.kind != "f":
+            wanted = f"numbers of shape {expected[name]}" if name in expected else "no such weights"
+            given = "none" if array is None else f"{array.dtype} {array.shape}"
+            raise CheckpointError(f"{path}: the weights do not fit the config: {name}: expected {wanted}, got {given}")
         weights[name] = array.astype(np.float32)
         if not np.isfinite(weights[name]).all():
             raise CheckpointError(f"{path}: the weights are not all finite")
