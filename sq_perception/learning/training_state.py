@@ -20,6 +20,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 from safetensors.torch import save as bytes_of
 from torch import nn
+from torch.optim.swa_utils import update_bn
 
 from sq_perception.files import output_file
 from sq_perception.learning.checkpoint import CheckpointError
@@ -149,21 +150,11 @@ def read_tensors(path: Path) -> dict[str, torch.Tensor]:
         raise CheckpointError(f"{path}: not a readable safetensors file: {error}") from error
 
 
-@torch.no_grad()
 def recalibrate(model: nn.Module, views: torch.Tensor, batch: int) -> None:
     """Measure the means and variances of all normalisations anew, on ``views`` (n, 1, p, p).
 
     An average of weights has activations of its own: those recorded while the moving weights trained do not fit it.
     """
-    norms = [module for module in model.modules() if isinstance(module, torch.nn.BatchNorm2d)]
-    momenta = [norm.momentum for norm in norms]
-    for norm in norms:
-        norm.reset_running_stats()
-        norm.momentum = None
     device = next(model.parameters()).device
-    model.train()
-    for i in range(0, len(views) - batch + 1, batch):
-        model(views[i : i + batch].to(device, memory_format=torch.channels_last))
-    model.eval()
-    for norm, momentum in zip(norms, momenta, strict=True):
-        norm.momentum = momentum
+    whole = views[: len(views) // batch * batch].split(batch)
+    update_bn((part.to(device, memory_format=torch.channels_last) for part in whole), model)
