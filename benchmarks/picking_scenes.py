@@ -19,7 +19,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from picking_world import NO_CAVITY, Thing, World
+from picking_world import Thing, World
 
 from sq_perception.geometry import mesh
 from sq_perception.geometry import rotation as quaternions
@@ -29,7 +29,7 @@ from sq_perception.grasping.gripper import PANDA
 from sq_perception.simulation import sensor_noise
 from sq_perception.simulation.household import draw_thing
 from sq_perception.simulation.rendering import render_things
-from sq_perception.simulation.thing import ON_X, ON_Y, UPRIGHT
+from sq_perception.simulation.thing import NO_CAVITY, ON_X, ON_Y, UPRIGHT
 from sq_perception.simulation.thing_setting import looking_down
 from sq_perception.simulation.things_on_table import TABLE_CAMERA
 

@@ -27,8 +27,8 @@ from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.grasping.gripper import Gripper
 from sq_perception.grasping.trials import DENSITY
+from sq_perception.simulation.thing import NO_CAVITY
 
-NO_CAVITY = Superquadric.stack([])
 STEP = 0.002
 APPROACH, LIFT = 0.10, 0.10
 SHAKE, SHAKES = 0.03, 2.0

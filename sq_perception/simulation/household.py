@@ -43,17 +43,6 @@ from sq_perception.simulation.thing import (
 )
 
 KINDS = ("box", "can", "bottle", "vessel", "round", "tool", "union", "soft")
-LIKELY = {
-    "box": 0.29,
-    "can": 0.18,
-    "bottle": 0.24,
-    "vessel": 0.10,
-    "round": 0.06,
-    "tool": 0.05,
-    "union": 0.04,
-    "soft": 0.04,
-}
-"""How often each comes where nothing else is asked for."""
 
 
 def draw_thing(rng: np.random.Generator, kinds: Sequence[str] | None = None) -> Thing:
@@ -67,7 +56,7 @@ def draw_thing(rng: np.random.Generator, kinds: Sequence[str] | None = None) -> 
     names = list(KINDS if kinds is None else kinds)
     if not names or not set(names) <= set(KINDS):
         raise ValueError(f"kinds: expected some of {', '.join(KINDS)}, got {names}")
-    makers = _MAKERS[names[one_of([LIKELY[name] for name in names], rng)]]
+    _, makers = _MAKERS[names[one_of([_MAKERS[name][0] for name in names], rng)]]
     return makers[one_of([likely for _, likely in makers], rng)][0](rng)
 
 
@@ -257,13 +246,14 @@ def _bag(rng: np.random.Generator) -> Thing:
     return assembled("soft", "bag", rows, (("lying", ON_X, 0.5), ("standing", UPRIGHT, 0.5)))
 
 
-_MAKERS: dict[str, tuple[tuple[Callable[[np.random.Generator], Thing], float], ...]] = {
-    "box": ((_carton, 0.78), (_book, 0.1), (_soap, 0.12)),
-    "can": ((_tin, 0.55), (_jar, 0.2), (_spray_can, 0.13), (_roll, 0.12)),
-    "bottle": ((bottle, 0.92), (tube, 0.08)),
-    "vessel": ((cup, 0.45), (bowl, 0.3), (tub, 0.25)),
-    "round": ((_fruit, 0.75), (_bent, 0.25)),
-    "tool": ((_pen, 0.35), (_handled, 0.4), (_gun, 0.25)),
-    "union": ((_toy, 1.0),),
-    "soft": ((_bag, 1.0),),
+_MAKERS: dict[str, tuple[float, tuple[tuple[Callable[[np.random.Generator], Thing], float], ...]]] = {
+    "box": (0.29, ((_carton, 0.78), (_book, 0.1), (_soap, 0.12))),
+    "can": (0.18, ((_tin, 0.55), (_jar, 0.2), (_spray_can, 0.13), (_roll, 0.12))),
+    "bottle": (0.24, ((bottle, 0.92), (tube, 0.08))),
+    "vessel": (0.10, ((cup, 0.45), (bowl, 0.3), (tub, 0.25))),
+    "round": (0.06, ((_fruit, 0.75), (_bent, 0.25))),
+    "tool": (0.05, ((_pen, 0.35), (_handled, 0.4), (_gun, 0.25))),
+    "union": (0.04, ((_toy, 1.0),)),
+    "soft": (0.04, ((_bag, 1.0),)),
 }
+"""How often each kind comes where nothing else is asked for, and its families with how often each of these comes."""
