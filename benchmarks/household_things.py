@@ -29,15 +29,17 @@ import trimesh
 from scene_verdict import SceneVerdict, ThingVerdict
 from scipy.spatial import ConvexHull
 
+from sq_perception.geometry import Superquadric
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.simulation import sensor_noise
 from sq_perception.simulation.household import KINDS
-from sq_perception.simulation.things_on_table import PlacedThing, hull_points, things_on_table
+from sq_perception.simulation.things_on_table import PlacedThing, things_on_table
 
 SEED = 7801
 GOALS = {"given": "88", "own": "85"}
 NAMES = ("round bottle", "oval bottle")
 WAYS = ("standing", "lying", "leaning", "stacked")
+_GRID = (33, 64)
 
 
 def scene(seed: int, sensor: str | None, count: int | None = None) -> tabletop.Tabletop:
@@ -60,6 +62,16 @@ def _known(placed: PlacedThing) -> tabletop.Placed:
     known = mesh_things.MeshThing(thing.kind, thing.name, trimesh.convex.convex_hull(hull), hull, edges, ())
     matrix = quaternions.to_matrix(placed.rotation)
     return tabletop.Placed(known, placed.rest, matrix, placed.translation, placed.label, placed.pixels, placed.alone)
+
+
+def hull_points(parts: Superquadric) -> np.ndarray:
+    """Points (n, 3) whose convex hull is that of a union, to some thousandths of its size.
+
+    Angles at even distances crowd where a sharp body has its edges.
+    """
+    eta, omega = np.linspace(-np.pi / 2, np.pi / 2, _GRID[0]), np.linspace(-np.pi, np.pi, _GRID[1], endpoint=False)
+    grid = np.stack(np.meshgrid(eta, omega, indexing="ij"), axis=-1).reshape(-1, 2)
+    return np.asarray(parts.parametric_points(grid[:, 0], grid[:, 1])).reshape(-1, 3)
 
 
 def verdict(seed: int, sensor: str | None) -> SceneVerdict:

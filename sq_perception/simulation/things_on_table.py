@@ -46,7 +46,6 @@ _NEAREST = 0.35
 _TRIES = 60
 _SCENES = 15
 _MARGIN = 2.0
-_GRID = (33, 64)
 _BEARINGS = np.linspace(0, 2 * np.pi, 32, endpoint=False)
 _WAYS = np.concatenate([np.stack([np.cos(_BEARINGS), np.sin(_BEARINGS), 0 * _BEARINGS], axis=1), SIX_WAYS[[2, 5]]])
 _BACK = np.argmin(_WAYS @ _WAYS.T, axis=1)
@@ -129,16 +128,6 @@ class _Resting:
         """Whether a tried plane lies between both, ``gap`` wide; level ones need none."""
         free = -(self.reach + other.reach[_BACK])
         return bool((free[:_UP] >= gap).any() or (free[_UP:] >= -1e-9).any())
-
-
-def hull_points(parts: Superquadric) -> np.ndarray:
-    """Points (n, 3) whose convex hull is that of a union, to some thousandths of its size.
-
-    Angles at even distances crowd where a sharp body has its edges.
-    """
-    eta, omega = np.linspace(-np.pi / 2, np.pi / 2, _GRID[0]), np.linspace(-np.pi, np.pi, _GRID[1], endpoint=False)
-    grid = np.stack(np.meshgrid(eta, omega, indexing="ij"), axis=-1).reshape(-1, 2)
-    return np.asarray(parts.parametric_points(grid[:, 0], grid[:, 1])).reshape(-1, 3)
 
 
 def things_on_table(rng: np.random.Generator, count: int | None = None, camera: Camera = TABLE_CAMERA) -> ThingsOnTable:

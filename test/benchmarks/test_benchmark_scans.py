@@ -1,4 +1,4 @@
-"""What the benchmark of scanned objects builds on: its rasteriser, its poses and its IoU, against the package's own."""
+"""What benchmarks of scans and things build on: rasteriser, poses, IoU and hulls, against the package's own."""
 
 from __future__ import annotations
 
@@ -11,9 +11,12 @@ from types import ModuleType
 import numpy as np
 import pytest
 import trimesh
+from scipy.spatial import ConvexHull
 
 from sq_perception.geometry import Superquadric, metrics, rotation
 from sq_perception.geometry.mesh import mesh
+from sq_perception.geometry.support_directions import DIRECTIONS
+from sq_perception.simulation.things_on_table import TABLE_CAMERA, things_on_table
 
 BODY = Superquadric([0.06, 0.04, 0.03], [0.3, 0.7], [0.05, -0.03, 0.7], [0.3, -0.2, 0.5, 0.8])
 
@@ -61,3 +64,16 @@ def test_iou_with_a_hull_is_the_iou_of_the_bodies(hulls: ModuleType, rng: np.ran
         turn, shift = rotation.from_rotation_vector(rng.normal(0, 0.2, 3)), rng.normal(0, 0.01, 3)
         moved = BODY.transformed(turn, BODY.translation - rotation.to_matrix(turn) @ BODY.translation + shift)
         assert columns.iou(moved) == pytest.approx(float(metrics.volume_iou(moved, BODY, 128)), abs=3e-3)
+
+
+def test_hull_points_span_the_hull(repository: Path) -> None:
+    with benchmarks_on_path(repository):
+        hull_points = importlib.import_module("household_things").hull_points
+    scene = things_on_table(np.random.default_rng(3), 4)
+    assert scene.camera == TABLE_CAMERA
+    for placed in scene.placed:
+        points = hull_points(placed.thing.parts)
+        reach = placed.thing.support(DIRECTIONS)
+        spanned = (points[ConvexHull(points).vertices] @ DIRECTIONS.T).max(axis=0)
+        assert (spanned <= reach + 1e-9).all()
+        assert (reach - spanned).max() < 0.02 * np.linalg.norm(placed.thing.box[1] - placed.thing.box[0])

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from scipy.spatial import ConvexHull
 
 from sq_perception.geometry.support_directions import DIRECTIONS
 from sq_perception.geometry.union import support_of_union
 from sq_perception.imaging.camera import Camera
-from sq_perception.simulation.things_on_table import TABLE_CAMERA, ThingsOnTable, hull_points, things_on_table
+from sq_perception.simulation.things_on_table import ThingsOnTable, things_on_table
 
 SMALL = Camera(160, 120, 138.6, 138.6, 79.5, 59.5)
 
@@ -55,17 +54,6 @@ def test_labels_are_those_of_things_in_the_image(scenes: list[ThingsOnTable]) ->
             if len(points):
                 reach = support_of_union(placed.parts, DIRECTIONS)
                 assert ((points @ DIRECTIONS.T).max(axis=0) < reach + 1e-6).all()
-
-
-def test_hull_points_span_the_hull() -> None:
-    scene = things_on_table(np.random.default_rng(3), 4)
-    assert scene.camera == TABLE_CAMERA
-    for placed in scene.placed:
-        points = hull_points(placed.thing.parts)
-        reach = placed.thing.support(DIRECTIONS)
-        spanned = (points[ConvexHull(points).vertices] @ DIRECTIONS.T).max(axis=0)
-        assert (spanned <= reach + 1e-9).all()
-        assert (reach - spanned).max() < 0.02 * np.linalg.norm(placed.thing.box[1] - placed.thing.box[0])
 
 
 def test_a_seed_is_a_scene_and_misuse_is_told() -> None:
