@@ -26,6 +26,7 @@ import multiprocessing
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -76,11 +77,16 @@ def run(
     """Evaluate the scenes that were asked for, and write the results."""
     verdicts = list(verdicts_of(evaluate, range(options.first, options.first + options.scenes), options.jobs))
     if options.each is not None:
-        everything = [thing_facts(one) for each in verdicts for one in each.things]
-        options.each.write_text(json.dumps(everything, indent=1) + "\n")
+        everything = [asdict(one) for each in verdicts for one in each.things]
+        options.each.write_text(json.dumps(everything, indent=1, default=_or_none) + "\n")
     result, text = tables(verdicts, groups, goals)
     given = {name: str(value) if isinstance(value, Path) else value for name, value in vars(options).items()}
     report.write(options.name, {**facts, "options": given, **result}, text)
+
+
+def _or_none(values: np.ndarray) -> list[Any]:
+    """An array for JSON, None for what is not known."""
+    return list(np.where(np.isfinite(values), values, None))
 
 
 def verdicts_of(evaluate: Callable[[int], SceneVerdict], seeds: range, jobs: int) -> Iterator[SceneVerdict]:
@@ -254,33 +260,6 @@ def worst_line(one: ThingVerdict, method: str) -> dict[str, str]:
 
 def _numbers(values: np.ndarray, form: str = ".0f") -> str:
     return " ".join(f"{x:{form}}" for x in values) if np.isfinite(values).all() else "-"
-
-
-def thing_facts(one: ThingVerdict) -> dict[str, Any]:
-    """One thing, for whoever wants other figures."""
-    return {
-        "seed": one.seed,
-        "label": one.label,
-        "sensor": one.sensor,
-        "thing": one.name,
-        "kind": one.kind,
-        "rest": one.rest,
-        "pixels": one.pixels,
-        "measured": one.measured,
-        "visible_share": round(one.visible_share, 4),
-        "edges": np.round(one.edges, 5).tolist(),
-        "answers": {
-            name: {
-                "iou": round(answer.iou, 4),
-                "size_error": None if np.isnan(answer.size_error) else round(answer.size_error, 5),
-                "excess": None if np.isnan(answer.excess).any() else np.round(answer.excess, 5).tolist(),
-                "status": answer.status,
-                "message": answer.message,
-                "body": None if np.isnan(answer.body).any() else np.round(answer.body, 6).tolist(),
-            }
-            for name, answer in one.answers.items()
-        },
-    }
 
 
 if __name__ == "__main__":

@@ -52,7 +52,7 @@ def draw(ax: Axes, row: dict[str, Any]) -> None:
     answer = row["answers"][METHOD]
     edges = " x ".join(f"{1e3 * edge:.0f}" for edge in sorted(row["edges"]))
     text = "no body"
-    if answer["body"] is not None:
+    if None not in answer["body"]:
         body = Superquadric.from_flat(np.array(answer["body"]))
         draw_outlines(ax, [body], scene.camera, [colour(0)], width=1.6)
         text = " x ".join(f"{2e3 * size:.0f}" for size in sorted(body.size))
@@ -60,7 +60,7 @@ def draw(ax: Axes, row: dict[str, Any]) -> None:
     ax.set_ylim(middle[1] + reach, middle[1] - reach)
     ax.set_xticks([])
     ax.set_yticks([])
-    heading_of(ax, row["thing"], f"IoU {100 * answer['iou']:.0f} %, {answer['status'].lower()}")
+    heading_of(ax, row["name"], f"IoU {100 * answer['iou']:.0f} %, {answer['status'].lower()}")
     ax.set_xlabel(f"{text}, true {edges} mm", fontsize=8)
 
 
