@@ -10,21 +10,15 @@ After every hundred a good frame follows, whose bodies are compared with those o
 
 from __future__ import annotations
 
-import os
 import re
 import sys
 import time
 from collections import Counter
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+import own_domain  # noqa: F401
 import report
-
-os.environ.setdefault("ROS_DOMAIN_ID", "79")
-os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-sys.path.append(str(Path(__file__).resolve().parent.parent / "test" / "helpers"))
-
 from hostile_messages import HostileFrame, Siege, Verdict, difference, frames
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from running_nodes import Peer, arguments, environment, until, usage

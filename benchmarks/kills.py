@@ -12,20 +12,14 @@ of one of this package's nodes, not by the viewer's, and not before they are ten
 
 from __future__ import annotations
 
-import os
 import shlex
 import sys
 import time
 from dataclasses import asdict
-from pathlib import Path
 
 import numpy as np
+import own_domain  # noqa: F401
 import report
-
-os.environ.setdefault("ROS_DOMAIN_ID", "80")
-os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-sys.path.append(str(Path(__file__).resolve().parent.parent / "test" / "helpers"))
-
 from respawned_nodes import CAMERA, MEMBERS, NODE, VIEWER, Kill, Robot, orphans
 from running_nodes import Peer
 

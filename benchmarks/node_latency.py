@@ -14,7 +14,6 @@ shows whether a queue grows; the counters of /diagnostics show whether every fra
 from __future__ import annotations
 
 import os
-import sys
 import tempfile
 import time
 from collections import Counter
@@ -22,12 +21,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import own_domain  # noqa: F401
 import report
-
-os.environ.setdefault("ROS_DOMAIN_ID", "77")
-os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-sys.path.append(str(Path(__file__).resolve().parent.parent / "test" / "helpers"))
-
 from running_nodes import Peer, arguments, environment, until, usage
 
 from sq_perception.commands.children import Children

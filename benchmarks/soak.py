@@ -21,16 +21,11 @@ import time
 import zlib
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
-from pathlib import Path
 from typing import Any
 
 import numpy as np
+import own_domain  # noqa: F401
 import report
-
-os.environ.setdefault("ROS_DOMAIN_ID", "78")
-os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-sys.path.append(str(Path(__file__).resolve().parent.parent / "test" / "helpers"))
-
 from rcl_interfaces.srv import GetParameters
 from running_nodes import (
     Answer,
