@@ -2,6 +2,15 @@
 
 The protocol itself is in :mod:`sq_perception.simulation.scenes`; depth comes in 255 integer steps a unit, as in its
 images.
+
+Positions
+---------
+A view has 8 positions, quarter turns and reflections.  Position (k, mirror) is a reflection of x, where ``mirror``, and
+then k quarter turns counter-clockwise in x and y, all about the middle (1/2, 1/2) of the view.  The image of the moved
+body is the moved image, for cropped views and for full frames alike.
+
+A mirrored image is the image of the mirrored body, which is a superquadric again: with M = diag(-1, 1, 1), M R M is a
+rotation, and the body's own symmetry takes up the second M.
 """
 
 from __future__ import annotations
@@ -12,7 +21,6 @@ import numpy as np
 
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast, unit_cube
-from sq_perception.learning import dihedral
 from sq_perception.learning.choices import Framing
 from sq_perception.learning.disturbance import Disturbance
 from sq_perception.simulation.scenes import THESIS_SIZE, thesis_bodies
@@ -99,8 +107,37 @@ def full_frames(bodies: Superquadric, pixels: int = unit_cube.THESIS_PIXELS) -> 
     return np.where(grey > 0, (grey + np.float32(0.5)) / np.float32(GREY_LEVELS), np.float32(0))
 
 
+def moved_images(images: np.ndarray, turns: np.ndarray, mirror: np.ndarray) -> np.ndarray:
+    """Images (n, p, p) in positions (n,)."""
+    images = np.where(mirror[:, None, None], images[:, :, ::-1], images)
+    out = np.empty_like(images)
+    for k in range(4):
+        chosen = turns == k
+        out[chosen] = np.rot90(images[chosen], k, axes=(1, 2))
+    return out
+
+
+def moved_bodies(bodies: Superquadric, turns: np.ndarray, mirror: np.ndarray) -> Superquadric:
+    """The bodies (n,) of those images."""
+    sign = np.where(mirror, -1.0, 1.0)
+    centred = bodies.translation - 0.5
+    centred = np.stack([sign * centred[:, 0], centred[:, 1], centred[:, 2]], axis=-1)
+    rotation = bodies.rotation * np.stack([np.ones_like(sign), sign, sign, np.ones_like(sign)], axis=-1)
+    angle = 0.5 * np.pi * turns
+    turn = np.stack([np.zeros_like(angle), np.zeros_like(angle), np.sin(angle / 2), np.cos(angle / 2)], axis=-1)
+    return Superquadric(bodies.size, bodies.shape, centred, rotation).transformed(turn, np.full(3, 0.5))
+
+
+def turned_at_random(
+    images: np.ndarray, bodies: Superquadric, rng: np.random.Generator
+) -> tuple[np.ndarray, Superquadric]:
+    """Images (n, p, p) and their bodies (n,), each in any of the 8 positions."""
+    turns, mirror = rng.integers(4, size=len(images)), rng.random(len(images)) < 0.5
+    return moved_images(images, turns, mirror), moved_bodies(bodies, turns, mirror)
+
+
 class ViewPool:
-    """A pool of rendered views from which batches are drawn, each time in another of the 8 dihedral positions.
+    """A pool of rendered views from which batches are drawn, each time in another of the 8 positions.
 
     Rendering costs as much as a training step.  Each batch renders only ``batch / reuse`` new views, which replace the
     oldest of the pool; a view is so seen about ``reuse`` times, rarely twice in the same position, and with new noise
@@ -124,5 +161,5 @@ class ViewPool:
         self._next = int(slots[-1] + 1) % len(self._images)
         chosen = self._rng.integers(len(self._images), size=count)
         bodies = Superquadric.from_flat(self._flat[chosen])
-        views, bodies = dihedral.at_random(self._images[chosen], bodies, self._rng)
+        views, bodies = turned_at_random(self._images[chosen], bodies, self._rng)
         return self._source.disturbance.applied(views, self._rng), bodies

@@ -46,7 +46,7 @@ from safetensors.numpy import save
 
 from sq_perception.files import output_file
 from sq_perception.geometry.superquadric import FLAT_LENGTH, Superquadric
-from sq_perception.learning import dataset, dihedral
+from sq_perception.learning import dataset
 from sq_perception.learning.choices import Framing
 from sq_perception.simulation.scenes import thesis_bodies
 
@@ -214,7 +214,7 @@ class FixedSet:
 class ShuffledBatches:
     """Batches of a fixed set, every image once a round, in a new order each round; stands where a ViewPool stands.
 
-    Each image comes in a random one of its 8 positions (:mod:`sq_perception.learning.dihedral`).
+    Each image comes in a random one of its 8 positions (:mod:`sq_perception.learning.dataset`).
     """
 
     def __init__(self, fixed_set: FixedSet, rng: np.random.Generator) -> None:
@@ -228,7 +228,7 @@ class ShuffledBatches:
         while len(self._order) < count:
             self._order = np.concatenate([self._order, self._rng.permutation(len(self._set))])
         chosen, self._order = self._order[:count], self._order[count:]
-        return dihedral.at_random(*self._set.batch(chosen), self._rng)
+        return dataset.turned_at_random(*self._set.batch(chosen), self._rng)
 
 
 def _write_manifest(folder: Path, settings: Settings, done: dict[str, str]) -> None:

@@ -24,7 +24,7 @@ from torch.optim.swa_utils import update_bn
 
 from sq_perception.files import output_file
 from sq_perception.learning.checkpoint import CheckpointError
-from sq_perception.learning.schedule import Plateau
+from sq_perception.learning.training_config import Plateau
 
 Network = TypeVar("Network", bound=nn.Module)
 _CLIP = 1.0

@@ -16,8 +16,7 @@ from sq_perception.commands import main
 from sq_perception.geometry import Superquadric
 from sq_perception.imaging import raycast, unit_cube
 from sq_perception.learning import fixed_set
-from sq_perception.learning.dataset import ViewSource, draw_views
-from sq_perception.learning.dihedral import moved_bodies, moved_images
+from sq_perception.learning.dataset import ViewSource, draw_views, moved_bodies, moved_images
 from sq_perception.learning.fixed_set import FixedSet, FixedSetError, Settings, ShuffledBatches, draw, generate
 from sq_perception.simulation import view_rendering
 

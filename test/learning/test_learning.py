@@ -15,8 +15,7 @@ from unit_axis import grid
 
 from sq_perception.geometry import Superquadric
 from sq_perception.learning import checkpoint, losses
-from sq_perception.learning.dataset import ViewPool, ViewSource, draw_views
-from sq_perception.learning.dihedral import moved_bodies, moved_images
+from sq_perception.learning.dataset import ViewPool, ViewSource, draw_views, moved_bodies, moved_images
 from sq_perception.learning.disturbance import any_occluder
 from sq_perception.learning.objective import UNSUPERVISED, Objective
 from sq_perception.learning.regressor import Regressor, RegressorConfig

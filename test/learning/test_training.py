@@ -24,8 +24,7 @@ from sq_perception.learning import checkpoint, train, training_config
 from sq_perception.learning.dataset import full_frames
 from sq_perception.learning.fixed_set import Settings, generate
 from sq_perception.learning.regressor import Regressor, RegressorConfig
-from sq_perception.learning.schedule import Plateau, cosine
-from sq_perception.learning.training_config import TrainingConfig
+from sq_perception.learning.training_config import Plateau, TrainingConfig, cosine
 from sq_perception.learning.training_state import mixed_precision
 from sq_perception.recovery.recoverer import Recoverer
 from sq_perception.simulation.scenes import thesis_bodies
