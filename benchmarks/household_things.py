@@ -33,7 +33,9 @@ from sq_perception.geometry import Superquadric
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.simulation import sensor_noise
 from sq_perception.simulation.household import KINDS
-from sq_perception.simulation.things_on_table import PlacedThing, things_on_table
+from sq_perception.simulation.rendering import render_things
+from sq_perception.simulation.thing import NO_CAVITY
+from sq_perception.simulation.things_on_table import PlacedThing, ThingsOnTable, things_on_table
 
 SEED = 7801
 GOALS = {"given": "88", "own": "85"}
@@ -48,20 +50,23 @@ def scene(seed: int, sensor: str | None, count: int | None = None) -> tabletop.T
     rng = np.random.default_rng([SEED, seed])
     truth = things_on_table(rng, count)
     depth = sensor_noise.preset(tabletop.SENSORS[sensor]).measured(truth.depth, truth.camera, rng)
-    placed = tuple(_known(each) for each in truth.placed)
+    placed = tuple(_known(each, truth) for each in truth.placed)
     return tabletop.Tabletop(
         seed, sensor, truth.camera, depth, truth.depth, truth.labels, truth.plane, truth.table, placed
     )
 
 
-def _known(placed: PlacedThing) -> tabletop.Placed:
+def _known(placed: PlacedThing, truth: ThingsOnTable) -> tabletop.Placed:
     thing = placed.thing
     points = hull_points(thing.parts)
     hull = points[ConvexHull(points).vertices]
     edges = np.sort(thing.box[1] - thing.box[0])
     known = mesh_things.MeshThing(thing.kind, thing.name, trimesh.convex.convex_hull(hull), hull, edges, ())
     matrix = quaternions.to_matrix(placed.rotation)
-    return tabletop.Placed(known, placed.rest, matrix, placed.translation, placed.label, placed.pixels, placed.alone)
+    owner = np.zeros(len(placed.parts))
+    _, shown = render_things(placed.parts, owner, NO_CAVITY, owner[:0], truth.camera, truth.plane)
+    alone = max(1, int(np.count_nonzero(shown == 0)))
+    return tabletop.Placed(known, placed.rest, matrix, placed.translation, placed.label, placed.pixels, alone)
 
 
 def hull_points(parts: Superquadric) -> np.ndarray:

@@ -27,7 +27,7 @@ from sq_perception.geometry.union import flat_support, moved
 from sq_perception.imaging.camera import Camera
 from sq_perception.simulation.household import draw_thing
 from sq_perception.simulation.rendering import render_things
-from sq_perception.simulation.thing import NO_CAVITY, SIX_WAYS, Thing
+from sq_perception.simulation.thing import SIX_WAYS, Thing
 from sq_perception.simulation.thing_setting import looking_down
 
 MOST_THINGS = 8
@@ -64,8 +64,8 @@ class PlacedThing:
         Optical from the thing's frame.
     label
         Its value in the label image.
-    pixels, alone
-        How many pixels show it, and would if it were alone.
+    pixels
+        How many pixels show it.
     """
 
     thing: Thing
@@ -74,7 +74,6 @@ class PlacedThing:
     translation: np.ndarray
     label: int
     pixels: int
-    alone: int
 
     @property
     def parts(self) -> Superquadric:
@@ -237,10 +236,8 @@ def _seen(
     everything, cavities = (Superquadric.from_flat(np.concatenate(flat)) for flat in (parts, holes))
     wall = rng.uniform(*_WALL)
     depth, index = render_things(everything, owner, cavities, whose, camera, plane, wall)
-    placed = []
-    for k, (body, (rotation, translation)) in enumerate(zip(resting, poses, strict=True)):
-        none = np.zeros(len(parts[k]))
-        _, alone = render_things(Superquadric.from_flat(parts[k]), none, NO_CAVITY, none[:0], camera, plane)
-        pixels, whole = int(np.count_nonzero(index == k)), int(np.count_nonzero(alone == 0))
-        placed.append(PlacedThing(body.thing, body.rest, rotation, translation, k + 1, pixels, max(whole, 1)))
-    return ThingsOnTable(camera, depth, (index + 1).astype(np.int32), plane, table, wall, tuple(placed))
+    placed = tuple(
+        PlacedThing(body.thing, body.rest, *pose, k + 1, int(np.count_nonzero(index == k)))
+        for k, (body, pose) in enumerate(zip(resting, poses, strict=True))
+    )
+    return ThingsOnTable(camera, depth, (index + 1).astype(np.int32), plane, table, wall, placed)

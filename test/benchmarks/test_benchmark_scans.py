@@ -77,3 +77,12 @@ def test_hull_points_span_the_hull(repository: Path) -> None:
         spanned = (points[ConvexHull(points).vertices] @ DIRECTIONS.T).max(axis=0)
         assert (spanned <= reach + 1e-9).all()
         assert (reach - spanned).max() < 0.02 * np.linalg.norm(placed.thing.box[1] - placed.thing.box[0])
+
+
+def test_a_thing_shows_no_more_than_it_would_alone(repository: Path) -> None:
+    with benchmarks_on_path(repository):
+        scene = importlib.import_module("household_things").scene(0, None, 5)
+    shares = [placed.visible_share for placed in scene.placed]
+    assert len(shares) == 5
+    assert 0 <= min(shares) < 1
+    assert max(shares) <= 1
