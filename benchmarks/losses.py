@@ -32,8 +32,9 @@ THESIS = {
 
 
 def main() -> None:
+    found = sorted(path.parent for path in Path("runs").glob("*/model.safetensors"))
     parser = report.parser(__doc__)
-    parser.add_argument("runs", type=Path, nargs="*", default=sorted(path.parent for path in _found()))
+    parser.add_argument("runs", type=Path, nargs="*", default=found)
     parser.add_argument("--bodies", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=2020)
     options = parser.parse_args()
@@ -64,10 +65,6 @@ def main() -> None:
             }
         )
     report.write("losses", {"bodies": options.bodies, "runs": result}, report.table_of(rows))
-
-
-def _found() -> list[Path]:
-    return list(Path("runs").glob("*/model.safetensors"))
 
 
 if __name__ == "__main__":

@@ -126,11 +126,6 @@ def _nearest(thing: Thing) -> Superquadric:
     return solina_bajcsy.fit(points, escapes=3).superquadric
 
 
-def classic(seen: Seen) -> tuple[Grasp, ...]:
-    """The recovery was made by that method."""
-    return seen.planned([one.superquadric for one in seen.recovery.recovered])
-
-
 def box(seen: Seen) -> tuple[Grasp, ...]:
     bodies = []
     for one in seen.recovery.bodies:
@@ -187,13 +182,14 @@ def cgn_in_masks(seen: Seen) -> tuple[Grasp, ...]:
     return tuple(grasp for grasp, row, column in seen.peer.found(seen.depth) if labels[row, column] > 0)
 
 
+# What "ours without the hull" and "classic" have of their own is their recovery: recoverer_of.
 CONTESTANTS: dict[str, Callable[[Seen], tuple[Grasp, ...]]] = {
     "ours": ours,
     "ours without sigma": without_sigma,
     "ours without the hull": ours,
     "ours at any score": at_any_score,
     "true bodies": true_bodies,
-    "classic": classic,
+    "classic": without_sigma,
     "box": box,
     "centroid": centroid,
     "cgn in masks": cgn_in_masks,

@@ -118,7 +118,7 @@ class TrainingState(Generic[Network]):
         Raises
         ------
         ArithmeticError
-            If the loss or its gradient is not finite; nothing is changed then.
+            If the loss or its gradient is not finite; the weights are left as they are.
         """
         for group in self.optimizer.param_groups:
             group["lr"] = rate
