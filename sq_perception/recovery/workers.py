@@ -221,8 +221,11 @@ def _serve(setup: Setup, pipe: Connection) -> None:
 
 @cache
 def _recoverer(setup: Setup) -> Recoverer:
+    import cv2
+
     from sq_perception.recovery.recoverer import Recoverer
 
+    cv2.setNumThreads(1)  # its threads spin while they wait, on the cores of the other processes
     return Recoverer(setup.model, method=setup.options.method, threads=1)
 
 
