@@ -29,7 +29,7 @@ from sq_perception.imaging.camera import Camera
 
 PIXELS = 64
 CHANNELS = 9
-MEASURED, HEIGHT, SEGMENT, OTHERS, IMAGE, PLANE = 0, 2, 3, 4, 5, 8
+MEASURED, HEIGHT, SEGMENT, OTHERS, IMAGE, SCALE, PLANE = 0, 2, 3, 4, 5, 6, 8
 """Channels that others than the network look at."""
 USUAL_SIDE = 0.2
 """Metres; that the channel of the scale is 0 for it."""
