@@ -56,8 +56,6 @@ class Calibration:
     ----------
     camera : Camera
         The pinhole camera of the rectified images.
-    size : (int, int)
-        Width and height of the images as they are sent.
     rectification : Rectification or None
         Between the two; None where an image is rectified as it comes.
     note : str
@@ -66,7 +64,6 @@ class Calibration:
     """
 
     camera: Camera
-    size: tuple[int, int]
     rectification: Rectification | None = None
     note: str = ""
 
@@ -98,18 +95,23 @@ class Calibration:
             raw = not is_rectified_name(name)
             note = _note(info, raw)
         if not raw:
-            camera = _camera(intrinsics_from_message(info))
-            return cls(camera, (camera.width, camera.height), note=note)
+            return cls(_camera(intrinsics_from_message(info)), note=note)
         try:
             known = raw_intrinsics_from_message(info)
             camera = _camera(known.intrinsics)
             lens = _lens(known.distortion_model, known.distortion)
             if lens.is_identity:
-                return cls(camera, (camera.width, camera.height), note=note)
+                return cls(camera, note=note)
             found = rectification(camera, lens)
         except ValueError as error:
             raise ValueError(f"{error} (of a raw image; distortion = ignore takes it for rectified)") from error
-        return cls(found.camera, (camera.width, camera.height), found, note)
+        return cls(found.camera, found, note)
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Width and height of the images as they are sent."""
+        sent = self.camera if self.rectification is None else self.rectification.raw
+        return sent.width, sent.height
 
     def rectified(self, depth: np.ndarray) -> np.ndarray:
         """The depth image (height, width) of ``camera`` from one as it was sent; metres, NaN for nothing.
@@ -120,12 +122,12 @@ class Calibration:
             If the image has not the size of ``size``; the message names the likely reason.
         """
         self.check(depth)
-        return depth if self.rectification is None else self.rectification.rectified(depth)
+        return depth if self.rectification is None else self.rectification.there.depth(depth)
 
     def rectified_labels(self, labels: np.ndarray) -> np.ndarray:
         """The label image of ``camera`` from one of the depth image as it was sent; raises as :meth:`rectified`."""
         self.check(labels)
-        return labels if self.rectification is None else self.rectification.rectified_labels(labels)
+        return labels if self.rectification is None else self.rectification.there.labels(labels)
 
     def as_sent(self, depth: np.ndarray) -> np.ndarray:
         """A depth image of ``camera`` with the pixels of the images as they are sent; metres, NaN or inf for nothing.
@@ -136,12 +138,12 @@ class Calibration:
             If the image has not the size of ``camera``.
         """
         self.camera.check_image(depth)
-        return depth if self.rectification is None else self.rectification.distorted(depth)
+        return depth if self.rectification is None else self.rectification.back.depth(depth)
 
     def labels_as_sent(self, labels: np.ndarray) -> np.ndarray:
         """The same for a label image."""
         self.camera.check_image(labels)
-        return labels if self.rectification is None else self.rectification.distorted_labels(labels)
+        return labels if self.rectification is None else self.rectification.back.labels(labels)
 
     def check(self, image: np.ndarray) -> None:
         """Raise ValueError unless the image (height, width) has the size of those that are sent."""

@@ -94,53 +94,20 @@ class Rectification:
     @cached_property
     def seen(self) -> float:
         """Share of the raw pixels that the rectified image shows."""
-        u, v = self._back.u, self._back.v
+        u, v = self.back.u, self.back.v
         return float(((u > -0.5) & (v > -0.5) & (u < self.camera.width - 0.5) & (v < self.camera.height - 0.5)).mean())
 
-    def rectified(self, depth: np.ndarray) -> np.ndarray:
-        """The depth image of :attr:`camera` from a raw one.
-
-        Depth is in metres, positive, NaN or +inf where there is nothing; the result is float32, NaN also where the raw
-        image does not see.
-
-        Raises
-        ------
-        ValueError
-            If the image has not the size of the raw camera.
-        """
-        self.raw.check_image(depth)
-        return self._there.depth(depth)
-
-    def rectified_labels(self, labels: np.ndarray) -> np.ndarray:
-        """The label image of :attr:`camera` from a raw one, int32; 0 where the raw image did not see."""
-        self.raw.check_image(labels)
-        return self._there.labels(labels)
-
-    def distorted(self, depth: np.ndarray) -> np.ndarray:
-        """The raw depth image from one of :attr:`camera`; as :meth:`rectified`.
-
-        Raises
-        ------
-        ValueError
-            If the image has not the size of :attr:`camera`.
-        """
-        self.camera.check_image(depth)
-        return self._back.depth(depth)
-
-    def distorted_labels(self, labels: np.ndarray) -> np.ndarray:
-        """The raw label image from one of :attr:`camera`, int32; 0 where there is nothing."""
-        self.camera.check_image(labels)
-        return self._back.labels(labels)
-
     @cached_property
-    def _there(self) -> _Lookup:
+    def there(self) -> Lookup:
+        """Images of :attr:`camera` from raw ones."""
         rays = _rays(self.camera, *_grid(self.camera))
-        return _Lookup.of(_pixels(self.raw, self.distortion.forward(rays)), self.raw)
+        return Lookup.of(_pixels(self.raw, self.distortion.forward(rays)), self.raw)
 
     @cached_property
-    def _back(self) -> _Lookup:
+    def back(self) -> Lookup:
+        """Raw images from those of :attr:`camera`."""
         images = _rays(self.raw, *_grid(self.raw))
-        return _Lookup.of(_pixels(self.camera, self.distortion.inverse(images)), self.camera)
+        return Lookup.of(_pixels(self.camera, self.distortion.inverse(images)), self.camera)
 
 
 @lru_cache(maxsize=_KEPT)
@@ -156,11 +123,13 @@ def rectification(raw: Camera, distortion: Distortion) -> Rectification:
 
 
 @dataclass(frozen=True, eq=False)
-class _Lookup:
+class Lookup:
     """Where the pixels (height, width) of one image lie in another, the source.
 
     Attributes
     ----------
+    source : Camera
+        Of the images that are looked up in; others raise ValueError.
     u, v : float32 (height, width)
         Column and row in the source, far outside of it where it does not see the pixel.
     left, top : float32 (height, width)
@@ -171,6 +140,7 @@ class _Lookup:
         Relative difference of depths beyond which neighbours show different surfaces.
     """
 
+    source: Camera
     u: np.ndarray
     v: np.ndarray
     left: np.ndarray
@@ -179,7 +149,7 @@ class _Lookup:
     step: float
 
     @classmethod
-    def of(cls, places: np.ndarray, source: Camera) -> _Lookup:
+    def of(cls, places: np.ndarray, source: Camera) -> Lookup:
         """From places (height, width, 2) in the image of ``source``, NaN where it sees nothing."""
         places = np.nan_to_num(places, nan=_OUTSIDE, posinf=_OUTSIDE, neginf=_OUTSIDE)
         places = np.clip(places, _OUTSIDE, LARGEST_SIDE + 1).astype(np.float32)
@@ -187,15 +157,18 @@ class _Lookup:
         left, top = np.floor(u), np.floor(v)
         off = np.maximum(np.abs(u - np.rint(u)), np.abs(v - np.rint(v)))
         step = math.sqrt(2.0) * _STEEPEST / min(source.fx, source.fy)
-        return cls(u, v, left, top, (off <= _CLOSE).view(np.uint8), min(step, 0.5))
+        return cls(source, u, v, left, top, (off <= _CLOSE).view(np.uint8), min(step, 0.5))
 
-    def depth(self, source: np.ndarray) -> np.ndarray:
-        """Depth (height, width), NaN where there is none."""
-        source = np.ascontiguousarray(source, dtype=np.float32)
-        nearest = self._nearest(source, np.nan)
+    def depth(self, image: np.ndarray) -> np.ndarray:
+        """The depth image, float32 in metres, of one of the source: positive, NaN or +inf where there is nothing.
+
+        NaN where there is none, also where the source does not see.
+        """
+        image = np.ascontiguousarray(image, dtype=np.float32)
+        nearest = self._nearest(image, np.nan)
         # Warnings for pixels without depth only.
         with np.errstate(divide="ignore", invalid="ignore"):
-            inverse = cv2.patchNaNs(1 / source, 0)
+            inverse = cv2.patchNaNs(1 / image, 0)
             closed = cv2.morphologyEx(inverse, cv2.MORPH_CLOSE, _CROSS)
             inverse = cv2.copyTo(closed, (inverse == 0).view(np.uint8), inverse)
             # Of each pixel and its neighbours to the right, below, and across.
@@ -208,13 +181,14 @@ class _Lookup:
         result = np.full(nearest.shape, np.nan, np.float32)
         return cv2.copyTo(nearest, self.close, cv2.copyTo(between, smooth, result))
 
-    def labels(self, source: np.ndarray) -> np.ndarray:
-        """Labels, int32 (height, width), 0 where there are none."""
+    def labels(self, image: np.ndarray) -> np.ndarray:
+        """The label image, int32, of one of the source; 0 where there are none, also where the source does not see."""
         # OpenCV looks up no int32; bits are moved as they are.
-        return self._nearest(np.ascontiguousarray(source, dtype=np.int32).view(np.float32), 0.0).view(np.int32)
+        return self._nearest(np.ascontiguousarray(image, dtype=np.int32).view(np.float32), 0.0).view(np.int32)
 
-    def _nearest(self, source: np.ndarray, nothing: float) -> np.ndarray:
-        return cv2.remap(source, self.u, self.v, cv2.INTER_NEAREST, borderValue=nothing)
+    def _nearest(self, image: np.ndarray, nothing: float) -> np.ndarray:
+        self.source.check_image(image)
+        return cv2.remap(image, self.u, self.v, cv2.INTER_NEAREST, borderValue=nothing)
 
 
 def _grid(camera: Camera) -> tuple[np.ndarray, np.ndarray]:

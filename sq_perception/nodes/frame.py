@@ -93,7 +93,7 @@ def decode(message: DepthMessage, calibration_of: Callable[[], Calibration] | No
     if isinstance(message, PointCloud2):
         depth, seen, is_image = cloud_file.as_image(points_from_message(message))
         numbers = {name: round(getattr(seen, name), _DIGITS) for name in ("fx", "fy", "cx", "cy")}
-        calibration = Calibration(replace(seen, **numbers), (seen.width, seen.height))
+        calibration = Calibration(replace(seen, **numbers))
         return Frame(message.header, "32FC1", depth, calibration, has_free_space=is_image)
     if calibration_of is None:
         if message.encoding in DEPTH_ENCODINGS:
@@ -103,7 +103,7 @@ def decode(message: DepthMessage, calibration_of: Callable[[], Calibration] | No
             )
         depth, encoding = publication.depth_of(message, is_cube=True)
         height, width = depth.shape
-        return Frame(message.header, encoding, depth, Calibration(unit_cube.camera(width, height), (width, height)))
+        return Frame(message.header, encoding, depth, Calibration(unit_cube.camera(width, height)))
     if isinstance(message, Image) and message.encoding in GREY_ENCODINGS:
         raise ValueError(
             f"encoding: expected 16UC1 or 32FC1 for projection = pinhole, got {message.encoding!r}; "

@@ -97,8 +97,8 @@ def test_which_image_it_is(changes, name, distortion, raw, camera, rng):
     undone = Rectification(camera, Distortion(info.distortion_model, info.d))
     assert calibration.rectification == undone
     assert calibration.camera == undone.camera != camera
-    np.testing.assert_array_equal(calibration.rectified(depth), undone.rectified(depth))
-    np.testing.assert_array_equal(calibration.rectified_labels(labels), undone.rectified_labels(labels))
+    np.testing.assert_array_equal(calibration.rectified(depth), undone.there.depth(depth))
+    np.testing.assert_array_equal(calibration.rectified_labels(labels), undone.there.labels(labels))
     seen = np.ones((undone.camera.height, undone.camera.width), np.float32)
     assert calibration.as_sent(seen).shape == depth.shape
     assert calibration.labels_as_sent(seen.astype(np.int32)).shape == depth.shape

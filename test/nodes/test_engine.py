@@ -44,7 +44,7 @@ def engine() -> Engine:
 def frame() -> Frame:
     depth, _ = raycast.render(BODY, CAMERA)
     image = np.where(np.isfinite(depth), depth, np.nan).astype(np.float32)
-    return Frame(Header(), "32FC1", image, Calibration(CAMERA, (64, 48)), np.isfinite(image).astype(np.int32))
+    return Frame(Header(), "32FC1", image, Calibration(CAMERA), np.isfinite(image).astype(np.int32))
 
 
 def set_to(engine: Engine, before: RecoverParameters, **values: Any) -> RecoverParameters:

@@ -51,7 +51,7 @@ def frame(header: Header = HEADER, camera: Camera = CAMERA) -> Frame:
         header,
         "32FC1",
         np.full((camera.height, camera.width), np.nan, np.float32),
-        Calibration(camera, (camera.width, camera.height)),
+        Calibration(camera),
     )
 
 

@@ -66,7 +66,7 @@ def test_packed_and_plain_are_read_alike(rng):
     depth[3, 4] = np.nan
     header = Header(frame_id="camera")
     for message in (depth_to_message(depth, header, "16UC1"), packed(depth, header, "16UC1")):
-        frame = decode(message, lambda: Calibration(Camera(16, 12, 15.0, 15.0, 7.5, 5.5), (16, 12)))
+        frame = decode(message, lambda: Calibration(Camera(16, 12, 15.0, 15.0, 7.5, 5.5)))
         np.testing.assert_array_equal(frame.depth, depth)
         assert frame.depth.dtype == np.float32
         assert frame.encoding == "16UC1"

@@ -239,7 +239,7 @@ def test_distortion_is_undone_unless_the_topic_is_a_rectified_one(tmp_path, grey
         (frame,) = frames(bag, topic=topic, distortion=treatment)
         undone = Rectification(CAMERA, Distortion("plumb_bob", (0.1, 0, 0, 0, 0)))
         assert frame.camera == (undone.camera if applied else CAMERA)
-        expected = undone.rectified(metres(grey)) if applied else metres(grey)
+        expected = undone.there.depth(metres(grey)) if applied else metres(grey)
         np.testing.assert_array_equal(frame.depth, expected)
         assert frame.warning == "" if treatment != "auto" else "0.1 0 0 0 0" in frame.warning
         assert ("not undone" in frame.warning) == (treatment == "auto" and not applied)

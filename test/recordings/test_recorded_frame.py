@@ -99,7 +99,7 @@ def test_a_distorted_image_is_rectified_unless_a_name_says_that_it_is(tmp_path, 
     undone = Rectification(Camera(64, 48, 60.0, 61.0, 31.5, 23.5), Distortion("plumb_bob", (0.1, 0, 0, 0, 0)))
     for frame in (read(tmp_path / "1.png", info), read(tmp_path / "depth_rect" / "1.png", info, distortion="apply")):
         assert frame.camera == undone.camera
-        np.testing.assert_array_equal(frame.depth, undone.rectified(image / np.float32(1000)))
+        np.testing.assert_array_equal(frame.depth, undone.there.depth(image / np.float32(1000)))
     for frame in (read(tmp_path / "depth_rect" / "1.png", info), read(tmp_path / "1.png", info, distortion="ignore")):
         assert frame.camera == Camera(64, 48, 55.0, 55.0, 30.0, 22.0)
         np.testing.assert_array_equal(frame.depth, image / np.float32(1000))

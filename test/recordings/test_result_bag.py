@@ -462,7 +462,7 @@ def test_the_file_holds_what_the_node_publishes(tmp_path, scene):
     from sq_perception.recovery.recoverer import render_recovery
 
     frame, recovery = scene
-    calibration = Calibration(frame.camera, (frame.camera.width, frame.camera.height))
+    calibration = Calibration(frame.camera)
     live = Frame(Header(stamp=Time(sec=3, nanosec=4), frame_id="optical"), "32FC1", frame.depth, calibration)
     ids, defaults = tuple(one.label for one in recovery.bodies), RecoverParameters()
     shown = publication.findings(publication.Identified(recovery, ids), live.header, is_cube=False)
