@@ -14,29 +14,9 @@ from typing import Any
 
 from threadpoolctl import ThreadpoolController
 
-
-class _Limit:
-    """How many blocks want one thread, and what undoes the setting."""
-
-    def __init__(self) -> None:
-        self._lock = threading.Lock()
-        self._blocks = 0
-        self._undone: Any = None
-
-    def begin(self) -> None:
-        with self._lock:
-            if not self._blocks:
-                self._undone = _libraries().limit(limits=1, user_api="blas")
-            self._blocks += 1
-
-    def end(self) -> None:
-        with self._lock:
-            self._blocks -= 1
-            if not self._blocks:
-                self._undone.restore_original_limits()
-
-
-_limit = _Limit()
+_lock = threading.Lock()
+_blocks: list[Any] = []
+"""For each block that wants one thread what undoes the setting: the same for all."""
 
 
 @cache
@@ -47,11 +27,15 @@ def _libraries() -> ThreadpoolController:
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
     """Within the block, and as long as any other such block lasts, BLAS computes on the thread that calls it."""
-    _limit.begin()
+    with _lock:
+        _blocks.append(_blocks[0] if _blocks else _libraries().limit(limits=1, user_api="blas"))
     try:
         yield
     finally:
-        _limit.end()
+        with _lock:
+            setting = _blocks.pop()
+            if not _blocks:
+                setting.restore_original_limits()
 
 
 @contextmanager
