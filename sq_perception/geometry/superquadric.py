@@ -265,8 +265,11 @@ class Superquadric:
         """Volume (...), cubic metres: 2 a1 a2 a3 e1 e2 B(e1/2 + 1, e1) B(e2/2, e2/2)."""
         from scipy.special import beta  # here: a node that recovers does without
 
-        a, e1, e2 = self._numpy()
-        return 2 * np.prod(a, axis=-1) * e1 * e2 * beta(e1 / 2 + 1, e1) * beta(e2 / 2, e2 / 2)
+        size, shape = self.size, self.shape
+        if is_torch_array(size):
+            size, shape = size.detach().cpu().numpy(), shape.detach().cpu().numpy()
+        e1, e2 = shape[..., 0], shape[..., 1]
+        return 2 * np.prod(size, axis=-1) * e1 * e2 * beta(e1 / 2 + 1, e1) * beta(e2 / 2, e2 / 2)
 
     def support(self, directions: Array) -> Array:
         """Support function: max of n.p over the body, minus n.t, for unit directions n (..., N, 3), shape (..., N).
@@ -325,12 +328,6 @@ class Superquadric:
         q = quaternions.multiply(q, _HALF_TURNS[largest])
         q = q * np.where(q[..., 3:] < 0, -1.0, 1.0)
         return Superquadric(size, self.shape, self.translation, q)
-
-    def _numpy(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        size, shape = self.size, self.shape
-        if is_torch_array(size):
-            size, shape = size.detach().cpu().numpy(), shape.detach().cpu().numpy()
-        return size, shape[..., 0], shape[..., 1]
 
 
 def nested_norm(x: Array, y: Array, z: Array, e1: Array, e2: Array) -> Array:

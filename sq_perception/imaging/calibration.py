@@ -95,10 +95,10 @@ class Calibration:
             raw = not is_rectified_name(name)
             note = _note(info, raw)
         if not raw:
-            return cls(_camera(intrinsics_from_message(info)), note=note)
+            return cls(Camera(**vars(intrinsics_from_message(info))), note=note)
         try:
             known = raw_intrinsics_from_message(info)
-            camera = _camera(known.intrinsics)
+            camera = Camera(**vars(known.intrinsics))
             lens = _lens(known.distortion_model, known.distortion)
             if lens.is_identity:
                 return cls(camera, note=note)
@@ -166,10 +166,6 @@ def is_distorted(coefficients: Sequence[float]) -> bool:
 def intrinsics(camera: Camera) -> Intrinsics:
     """The intrinsics of a camera, as :class:`Calibration` compares them."""
     return Intrinsics(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
-
-
-def _camera(known: Intrinsics) -> Camera:
-    return Camera(known.width, known.height, known.fx, known.fy, known.cx, known.cy)
 
 
 def _lens(model: str, coefficients: tuple[float, ...]) -> Distortion:

@@ -92,12 +92,10 @@ class Camera:
     def rays(self, u: np.ndarray | float, v: np.ndarray | float) -> tuple[np.ndarray, np.ndarray]:
         """Origins and directions (..., 3) of pixels (...): p = origin + depth * direction."""
         u, v = np.broadcast_arrays(np.asarray(u, dtype=float), np.asarray(v, dtype=float))
-        lateral = np.stack([(u - self.cx) / self.fx, (v - self.cy) / self.fy], axis=-1)
-        zero, one = np.zeros(u.shape + (1,)), np.ones(u.shape + (1,))
-        flat, forward = np.concatenate([lateral, zero], -1), np.concatenate([lateral, one], -1)
+        x, y, zero, one = (u - self.cx) / self.fx, (v - self.cy) / self.fy, np.zeros(u.shape), np.ones(u.shape)
         if self.is_pinhole:
-            return np.zeros_like(flat), forward
-        return flat, np.concatenate([np.zeros_like(lateral), one], -1)
+            return np.stack([zero, zero, zero], axis=-1), np.stack([x, y, one], axis=-1)
+        return np.stack([x, y, zero], axis=-1), np.stack([zero, zero, one], axis=-1)
 
     def unproject(self, u: np.ndarray, v: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """Points (..., 3) in the optical frame of pixels (...) at the given depths (...)."""
