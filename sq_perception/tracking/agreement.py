@@ -1,10 +1,10 @@
 """Whether an observation agrees with its track, and in what it does not.
 
-With the error e = z - x^, its covariance S and the probability p (``GATE``), an observation agrees if
+With the error e = z - x^ and its covariance S an observation agrees if
 
-    e^T S^-1 e < chi2_11(p)
+    e^T S^-1 e < chi2_11(0.999)
 
-and neither its centre nor its rotation alone is outside of chi2_3(p).  A centre or a rotation that is, by more than
+and neither its centre nor its rotation alone is outside of chi2_3(0.999).  A centre or a rotation that is, by more than
 errors of no importance, has strayed.
 """
 
@@ -17,8 +17,9 @@ import numpy as np
 from sq_perception.tracking import state
 from sq_perception.tracking.state import CENTRE, LENGTH, SIZE_AND_SHAPE, TURN
 
-GATE = 0.999
-"""Probability that an observation of the tracked body is taken for one.  Chosen: one good one in 1000 is doubted."""
+LIMITS = {3: 16.266236196238125, 5: 20.515005652432876, LENGTH: 31.26413362023999}
+"""What a chi-squared number of so many dimensions stays below with probability 0.999.  Chosen: one good observation in
+1000 is doubted."""
 STILL_SHARE = 0.05
 """Displacements below this share of the mean half size, and turns below so many radians, are no motion.
 Chosen: a millimetre or two of a household thing, and 3 degrees."""
@@ -40,16 +41,15 @@ class Agreement(NamedTuple):
 
 def compared(size: np.ndarray, total: np.ndarray, error: np.ndarray) -> Agreement:
     """The agreement of errors (n, 11) with their covariances (n, 11, 11); bodies with half sizes (n, 3)."""
-    limit, limit_five, limit_three = (state.chi2_limit(GATE, freedom) for freedom in (LENGTH, 5, 3))
 
-    def outside(part: slice, bound: float) -> np.ndarray:
-        return state.mahalanobis(total[:, part, part], error[:, part]) > bound
+    def outside(part: slice) -> np.ndarray:
+        return state.mahalanobis(total[:, part, part], error[:, part]) > LIMITS[part.stop - part.start]
 
-    slid = outside(CENTRE, limit_three) & (np.linalg.norm(error[:, CENTRE], axis=-1) > STILL_SHARE * size.mean(axis=-1))
-    turned = outside(TURN, limit_three) & (np.linalg.norm(error[:, TURN], axis=-1) > STILL_SHARE)
-    excess = state.mahalanobis(total, error) / limit
+    slid = outside(CENTRE) & (np.linalg.norm(error[:, CENTRE], axis=-1) > STILL_SHARE * size.mean(axis=-1))
+    turned = outside(TURN) & (np.linalg.norm(error[:, TURN], axis=-1) > STILL_SHARE)
+    excess = state.mahalanobis(total, error) / LIMITS[LENGTH]
     agrees = (excess <= 1) & ~slid & ~turned
-    return Agreement(agrees, ~outside(SIZE_AND_SHAPE, limit_five), slid, turned, np.maximum(excess, 1))
+    return Agreement(agrees, ~outside(SIZE_AND_SHAPE), slid, turned, np.maximum(excess, 1))
 
 
 def same_side(before: np.ndarray, now: np.ndarray) -> bool:

@@ -56,6 +56,9 @@ class Pairs(NamedTuple):
         nothing = np.zeros(0, dtype=int)
         return cls(nothing, nothing, np.zeros((0, 12)), np.zeros((0, LENGTH, LENGTH)))
 
+    def at(self, which: np.ndarray) -> Pairs:
+        return Pairs(*(part[which] for part in self))
+
     def __add__(self, other: Pairs) -> Pairs:  # type: ignore[override]
         return Pairs(*(np.concatenate(both) for both in zip(self, other, strict=True)))
 
@@ -71,25 +74,22 @@ def in_place(
     Covariances are (n, 11, 11) and (m, 11, 11); what observations have in addition to theirs, such as a least error,
     is part of the tracks'.
     """
-    if not len(track) or not len(observed):
-        return Pairs.none()
     apart = _apart(track, observed)
     between = observed[None, :, 5:8] - track[:, None, 5:8]
     centres = track_covariance[:, None, CENTRE, CENTRE] + covariance[None, :, CENTRE, CENTRE]
-    agree = state.mahalanobis(centres, between) < state.chi2_limit(agreement.GATE, 3)
+    agree = state.mahalanobis(centres, between) < agreement.LIMITS[3]
     deep = apart < _DEEP
     i, j = np.nonzero(deep | ((apart < 1) & agree))
     if not len(i):
         return Pairs.none()
-    match = forms.nearest(track[i], track_covariance[i], observed[j], covariance[j], forms.EXCHANGE)
-    total = track_covariance[i] + match.covariance
-    error = state.difference(track[i], match.state)
+    pairs = Pairs(i, j, *forms.nearest(track[i], track_covariance[i], observed[j], covariance[j], forms.EXCHANGE))
+    total = track_covariance[i] + pairs.covariance
+    error = state.difference(track[i], pairs.state)
     cost = _student(total, error)
     younger, later = np.any(twins(track), axis=1), np.greater(np.cumsum(deep, axis=1), deep)
     unlike = younger[i] != later[i, j]
     cost = cost + _TWIN * unlike
-    alone = _alone(total, error)
-    return _assigned(Pairs(i, j, match.state, match.covariance), cost, alone, (len(track), len(observed)))
+    return _assigned(pairs, cost, _alone(total, error), (len(track), len(observed)))
 
 
 def twins(states: np.ndarray) -> np.ndarray:
@@ -105,22 +105,20 @@ def elsewhere(
     covariance: np.ndarray,
 ) -> Pairs:
     """Pairs that agree in sizes and exponents, with centres within ``reach`` (n,) metres."""
-    if not len(track) or not len(observed):
-        return Pairs.none()
     distance = np.linalg.norm(observed[None, :, 5:8] - track[:, None, 5:8], axis=-1)
     i, j = np.nonzero(distance < reach[:, None])
     if not len(i):
         return Pairs.none()
     free = _unplaced(track_covariance[i], distance[i, j])
-    match = forms.nearest(track[i], free, observed[j], covariance[j], forms.EXCHANGE)
-    total = (track_covariance[i] + match.covariance)[:, SIZE_AND_SHAPE, SIZE_AND_SHAPE]
-    error = state.difference(track[i], match.state)[:, SIZE_AND_SHAPE]
-    alike = state.mahalanobis(total, error) < state.chi2_limit(agreement.GATE, 5)
-    pairs = Pairs(i[alike], j[alike], match.state[alike], match.covariance[alike])
+    pairs = Pairs(i, j, *forms.nearest(track[i], free, observed[j], covariance[j], forms.EXCHANGE))
+    total = (track_covariance[i] + pairs.covariance)[:, SIZE_AND_SHAPE, SIZE_AND_SHAPE]
+    error = state.difference(track[i], pairs.state)[:, SIZE_AND_SHAPE]
+    alike = state.mahalanobis(total, error) < agreement.LIMITS[5]
     if not alike.any():
         return Pairs.none()
-    cost = _student(total[alike], error[alike]) + (distance[i, j] / reach[i])[alike]
-    return _assigned(pairs, cost, _alone(total[alike], error[alike]), (len(track), len(observed)))
+    pairs, total, error = pairs.at(alike), total[alike], error[alike]
+    cost = _student(total, error) + (distance[i, j] / reach[i])[alike]
+    return _assigned(pairs, cost, _alone(total, error), (len(track), len(observed)))
 
 
 def warm_up() -> None:
@@ -186,8 +184,7 @@ def _assigned(pairs: Pairs, cost: np.ndarray, alone: float, shape: tuple[int, in
     table = np.full(shape, alone)
     table[pairs.track, pairs.observed] = cost
     kept = cheapest(table) if len(table) <= len(table.T) else cheapest(table.T.copy()).T
-    chosen = kept[pairs.track, pairs.observed]
-    return Pairs(*(part[chosen] for part in pairs))
+    return pairs.at(kept[pairs.track, pairs.observed])
 
 
 @kernel

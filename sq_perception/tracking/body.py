@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
+from enum import Enum
 
 import numpy as np
 
@@ -14,7 +15,6 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.tracking import state as states
 from sq_perception.tracking.fusion import Views
 from sq_perception.tracking.state import CENTRE, LENGTH, POSE, TURN
-from sq_perception.tracking.track import Track, TrackState
 
 DRIFT = states.diagonal(0.0, 0.0, 0.001, 0.01)
 """Random walk of a body at rest in a second: a millimetre, and 0.6 degrees.  Chosen."""
@@ -30,6 +30,55 @@ _COASTING = 1.0
 """Seconds: so long an unseen body is taken to go on as it was seen to move.  Chosen."""
 _UNPLACED = 1.0
 """Metres and radians: deviation of a pose that is forgotten, farther than things are carried."""
+
+
+class TrackState(Enum):
+    """How far a track is known."""
+
+    TENTATIVE = "tentative"
+    """Observed in this frame, not often yet."""
+    CONFIRMED = "confirmed"
+    """Observed in this frame, and often enough."""
+    LOST = "lost"
+    """Not observed in this frame: hidden, missed or gone."""
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """One body as known after a frame.
+
+    Attributes
+    ----------
+    id
+        Never used for another body.
+    superquadric : Superquadric
+        A single body in the world frame, in the same one of its forms as long as the track lives.
+    sigma_size : (3,)
+        Standard deviations of the half sizes, metres.
+    covariance : (11, 11)
+        Of a1 a2 a3 e1 e2 t1 t2 t3 (world frame) and the rotation vector in the object frame, metres and radians.
+    velocity : (3,)
+        Metres per second in the world frame; zero for bodies at rest.
+    seen
+        Number of observations.
+    state : TrackState
+    observation
+        Index of this frame's observation; None if there is none.
+    follows
+        Whether the body is as this frame observed it.  False where there is none, for one whose centre or
+        rotation is elsewhere and which the track does not believe yet, and for one of other sizes or exponents if it is
+        not the first in a row.
+    """
+
+    id: int
+    superquadric: Superquadric
+    sigma_size: np.ndarray
+    covariance: np.ndarray
+    velocity: np.ndarray
+    seen: int
+    state: TrackState
+    observation: int | None
+    follows: bool
 
 
 @dataclass(frozen=True, eq=False)

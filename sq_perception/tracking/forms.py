@@ -20,8 +20,6 @@ earn its wider covariance.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from sq_perception.geometry import rotation as quaternions
@@ -70,14 +68,6 @@ def _changes() -> np.ndarray:
 _CHANGES = _changes()
 
 
-class Match(NamedTuple):
-    """Observations in the forms nearest to their tracks; ``cost`` is d^2 + log det S, lower is better."""
-
-    state: np.ndarray
-    covariance: np.ndarray
-    cost: np.ndarray
-
-
 def candidates(observed: np.ndarray) -> np.ndarray:
     """All 24 forms (..., 24, 12) of states (..., 12)."""
     shape = np.broadcast_to(observed[..., None, 3:5], (*observed.shape[:-1], len(TURNS), 2))
@@ -103,8 +93,8 @@ def _added(observed: np.ndarray) -> np.ndarray:
 
 def nearest(
     track: np.ndarray, track_covariance: np.ndarray, observed: np.ndarray, covariance: np.ndarray, exchange: float
-) -> Match:
-    """Each of n observations in the form that continues its track.
+) -> tuple[np.ndarray, np.ndarray]:
+    """Each of n observations in the form that continues its track: states (n, 12) and covariances (n, 11, 11).
 
     Parameters
     ----------
@@ -135,7 +125,7 @@ def nearest(
     cost = np.where(np.isfinite(rough[row, some]), cost, np.inf)
     best = np.argmin(cost, axis=1)
     each = np.arange(count)
-    return Match(forms[each, some[each, best]], changed[each, best], cost[each, best])
+    return forms[each, some[each, best]], changed[each, best]
 
 
 def named(
@@ -158,9 +148,9 @@ def _form(
     track: np.ndarray, track_covariance: np.ndarray, observed: np.ndarray, covariance: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """The result of :func:`named`, before open turns."""
-    exact = nearest(track[None], track_covariance[None], observed[None], covariance[None], exchange=0.0)
-    if np.linalg.norm(state.difference(track, exact.state[0])[TURN]) <= _SAME_NAME:
-        return exact.state[0], exact.covariance[0]
+    (exact,), (known,) = nearest(track[None], track_covariance[None], observed[None], covariance[None], exchange=0.0)
+    if np.linalg.norm(state.difference(track, exact)[TURN]) <= _SAME_NAME:
+        return exact, known
     forms = candidates(observed)
     errors = state.difference(track, forms)
     changed = _CHANGES @ covariance @ _CHANGES.swapaxes(-1, -2)
@@ -171,5 +161,5 @@ def _form(
     keeps[:EXACT] = False
     best = int(np.argmin(np.where(keeps, cost, np.inf)))
     if not keeps[best] or cost[best] > cost[:EXACT].min() + _SELDOM_TURNED:
-        return exact.state[0], exact.covariance[0]
+        return exact, known
     return forms[best], changed[best]

@@ -14,7 +14,6 @@ import numpy as np
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
-from sq_perception.tracking import state
 
 _DIRECTIONS = np.array([d for d in np.ndindex(3, 3, 3) if d != (1, 1, 1)], dtype=float) - 1
 _TOLERANCE = 0.25
@@ -34,7 +33,7 @@ def expected(
         return np.ones(len(states), dtype=bool)
     back = quaternions.conjugate(rotation)
     home = -quaternions.to_matrix(back) @ position
-    return open_share(state.bodies(states).transformed(back, home), camera, depth) >= 0.5
+    return open_share(Superquadric.from_flat(states).transformed(back, home), camera, depth) >= 0.5
 
 
 def open_share(bodies: Superquadric, camera: Camera, depth: np.ndarray) -> np.ndarray:

@@ -15,14 +15,12 @@ Fits speak of metres instead of logarithms: :func:`to_log` and :func:`from_log` 
 
 from __future__ import annotations
 
-import math
-from functools import cache
 from typing import Protocol
 
 import numpy as np
 
 from sq_perception.geometry import rotation as quaternions
-from sq_perception.geometry.superquadric import FLAT_LENGTH, Superquadric
+from sq_perception.geometry.superquadric import Superquadric
 
 LENGTH = 11
 SIZE, SHAPE, CENTRE, TURN = slice(0, 3), slice(3, 5), slice(5, 8), slice(8, 11)
@@ -104,31 +102,6 @@ def mahalanobis(covariance: np.ndarray, error: np.ndarray) -> np.ndarray:
     return np.einsum("...i,...i->...", error, solved)
 
 
-@cache
-def chi2_limit(probability: float, freedom: int) -> float:
-    """What a chi-squared number of ``freedom`` dimensions, an odd number, stays below with this probability.
-
-    Half of it, y, is found by halving from what it stays above with the probability Q(freedom / 2, y),
-    Q(1/2, y) = erfc(sqrt(y)), Q(a + 1, y) = Q(a, y) + y^a exp(-y) / Gamma(a + 1).
-    SciPy has it too, and the assignment of :mod:`sq_perception.tracking.association`: 15 MB that a node does without.
-
-    Raises
-    ------
-    ValueError
-        For another number of dimensions, which takes another first term.
-    """
-    if freedom < 1 or freedom % 2 == 0:
-        raise ValueError(f"freedom: expected an odd number of dimensions, got {freedom}")
-    low, high = 0.0, 500.0
-    while low < (y := (low + high) / 2) < high:
-        above, term = math.erfc(math.sqrt(y)), 2 * math.sqrt(y / math.pi) * math.exp(-y)
-        for k in range(3, freedom + 1, 2):
-            above += term
-            term *= 2 * y / k
-        low, high = (y, high) if above > 1 - probability else (low, y)
-    return 2 * y
-
-
 def diagonal(log_size: float, shape: float, centre: float, turn: float) -> np.ndarray:
     """(11, 11) covariance of independent errors with these standard deviations."""
     return np.diag(np.square([log_size] * 3 + [shape] * 2 + [centre] * 3 + [turn] * 3))
@@ -161,8 +134,3 @@ def as_pose(pose: object) -> tuple[np.ndarray, np.ndarray]:
     if not rigid or np.linalg.det(rotation) < 0 or not np.allclose(matrix[3], [0, 0, 0, 1], atol=1e-9):
         raise ValueError(f"camera_pose: expected a rigid motion, got {matrix.tolist()}")
     return quaternions.from_matrix(rotation), matrix[:3, 3]
-
-
-def bodies(states: np.ndarray) -> Superquadric:
-    """States (..., 12) as superquadrics."""
-    return Superquadric.from_flat(np.reshape(states, (*np.shape(states)[:-1], FLAT_LENGTH)))

@@ -31,10 +31,9 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.tracking import agreement, association, fusion, sight, state
 from sq_perception.tracking.agreement import STILL_SHARE
 from sq_perception.tracking.association import Pairs
-from sq_perception.tracking.body import CONFIRM_AFTER, Body, stacked
+from sq_perception.tracking.body import CONFIRM_AFTER, Body, Track, TrackState, stacked
 from sq_perception.tracking.fusion import Views
 from sq_perception.tracking.state import CENTRE, LENGTH, TURN, Observed
-from sq_perception.tracking.track import Track, TrackState
 
 __all__ = ["Track", "TrackState", "Tracker"]
 
@@ -247,7 +246,7 @@ def _still_there(
             continue
         new[k] = False
         after[track] = body.still_there(int(index), observed[index], stamp)
-    return tuple(after), Pairs(*(part[new] for part in pairs))
+    return tuple(after), pairs.at(new)
 
 
 def _compared(bodies: _Bodies, pairs: Pairs) -> tuple[np.ndarray, np.ndarray, agreement.Agreement]:

@@ -33,7 +33,7 @@ def nothing_but_the_covariances(patch, common, lasting):
         (track_body, "DRIFT", nought),
         (tracker, "COMMON_SHARE", common),
         (tracker, "LASTING_SHARE", lasting),
-        (agreement, "GATE", 1 - 1e-9),
+        (agreement, "LIMITS", {freedom: chi2.ppf(1 - 1e-9, freedom) for freedom in agreement.LIMITS}),
     ):
         patch.setattr(module, name, value)
     return tracker.Tracker()
@@ -106,10 +106,10 @@ def looking_at(target, direction, distance):
 def error_of(track, truth):
     """Error of a track in the truth's nearest form, and its covariance, in logarithms."""
     covariance = state.to_log(track.covariance, track.superquadric.size)
-    match = forms.nearest(
+    (seen,), (known,) = forms.nearest(
         truth.to_flat()[None], 1e-9 * np.eye(11)[None], track.superquadric.to_flat()[None], covariance[None], 0.0
     )
-    return state.difference(truth.to_flat(), match.state[0]), match.covariance[0]
+    return state.difference(truth.to_flat(), seen), known
 
 
 def nees(track, truth):

@@ -51,15 +51,15 @@ def test_the_nearest_form_undoes_any_exact_one_with_its_covariance(rng):
     truth, covariance = body(), correlated(rng)
     for form in range(8):
         seen = draw(truth, covariance, rng, form, np.zeros(11))
-        match = forms.nearest(
+        states, covariances = forms.nearest(
             truth.to_flat()[None],
             noise()[None],
             seen.superquadric.to_flat()[None],
             state.to_log(seen.covariance, seen.superquadric.size)[None],
             0.3,
         )
-        np.testing.assert_allclose(state.difference(truth.to_flat(), match.state[0]), 0, atol=1e-9)
-        np.testing.assert_allclose(match.covariance[0], covariance, atol=1e-12)
+        np.testing.assert_allclose(state.difference(truth.to_flat(), states[0]), 0, atol=1e-9)
+        np.testing.assert_allclose(covariances[0], covariance, atol=1e-12)
 
 
 def test_z_changes_places_only_where_the_exponents_are_alike(rng):
@@ -69,14 +69,14 @@ def test_z_changes_places_only_where_the_exponents_are_alike(rng):
         flat = forms.candidates(truth.to_flat())
         flat[:, 3:5] = shape
         count = len(flat)
-        match = forms.nearest(
+        states, _ = forms.nearest(
             np.tile(truth.to_flat(), (count, 1)),
             np.tile(noise(), (count, 1, 1)),
             flat,
             np.tile(noise(), (count, 1, 1)),
             0.3,
         )
-        turn = quaternions.geodesic_angle(match.state[:, 8:12], truth.rotation)
+        turn = quaternions.geodesic_angle(states[:, 8:12], truth.rotation)
         assert (turn[: forms.EXACT] < 1e-6).all()
         assert (turn[forms.EXACT :] < 1e-6).all() == allowed
 

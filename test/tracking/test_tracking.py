@@ -29,7 +29,7 @@ from sq_perception.imaging.raycast import render
 from sq_perception.recovery.recoverer import Recoverer
 from sq_perception.simulation import scenes
 from sq_perception.simulation.sensor_model import Ideal
-from sq_perception.tracking import association, sight, state
+from sq_perception.tracking import agreement, association, sight, state
 from sq_perception.tracking import tracker as tracker_module
 from sq_perception.tracking.tracker import FORGET_AFTER, Tracker, TrackState
 
@@ -378,16 +378,9 @@ def test_boxes_whose_fits_choose_their_z_axis_anew(rng):
 # What a node does without SciPy
 
 
-@pytest.mark.parametrize("freedom", [1, 3, 5, 11])
-def test_the_limits_of_chi_squared_are_scipys(freedom):
-    for probability in (0.001, 0.5, 0.999, 1 - 1e-9):
-        assert state.chi2_limit(probability, freedom) == pytest.approx(chi2.ppf(probability, freedom), rel=1e-8)
-
-
-@pytest.mark.parametrize("freedom", [0, 2, -1])
-def test_limits_of_other_dimensions_are_refused(freedom):
-    with pytest.raises(ValueError, match=f"freedom: expected an odd number of dimensions, got {freedom}"):
-        state.chi2_limit(0.5, freedom)
+def test_the_limits_of_chi_squared_are_scipys():
+    for freedom, limit in agreement.LIMITS.items():
+        assert limit == pytest.approx(chi2.ppf(0.999, freedom), rel=1e-12)
 
 
 def test_the_cheapest_pairs_are_scipys_also_where_many_cost_the_same(rng):
