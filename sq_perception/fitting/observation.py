@@ -117,10 +117,12 @@ class Crop:
         claimed = cv2.bitwise_or(filled, self.mask.view(np.uint8))
         near = cv2.dilate(filled, np.ones((2 * self.band + 1, 2 * self.band + 1), np.uint8))
         if nan_is_empty is None:
-            nan_is_empty = _measured_beside(self.depth, near, claimed) < _BACKGROUND_SHARE
+            beside = cv2.subtract(near, claimed)
+            measured = cv2.bitwise_and(beside, np.isfinite(self.depth).view(np.uint8))
+            nan_is_empty = cv2.countNonZero(measured) / max(cv2.countNonZero(beside), 1) < _BACKGROUND_SHARE
         lost = _convex_hull(claimed) if nan_is_empty else np.ones_like(claimed)
         pixels, areas, free, free_pixels = _sort(self.depth, inside, claimed, near, lost, self.footprint)
-        shown = _some(pixels, areas, _POINTS, 0.5)
+        shown = drawn(pixels, areas, _POINTS, 0.5)
         v, u = np.divmod(shown, self.camera.width)
         return Observation(
             **{**vars(self), "mask": filled.view(bool)},
@@ -166,12 +168,17 @@ class Observation(Crop):
         """Noise and model error together at the object's distance, metres."""
         return float(np.hypot(self.noise.at(self.distance), self.model_error))
 
+    @property
+    def outline(self) -> float:
+        """Standard deviation of an outline whose misfit was not measured yet, metres: the noise, or a whole pixel."""
+        return max(self.sigma, self.footprint)
+
     def object_rays(self, count: int, offset: float = 0.5) -> np.ndarray:
         """About ``count`` rays (k, 8) of the object, systematically by area; each weighs 1.
 
         Draws with other offsets (0 to 1) take other pixels.
         """
-        return self._through(_some(self.pixels, self.areas, count, offset), 0.0)
+        return self._through(drawn(self.pixels, self.areas, count, offset), 0.0)
 
     def free_rays(self, count: int, offset: float = 0.5) -> np.ndarray:
         """At most ``count`` rays (k, 8) through free space, likewise; z is where free space ends."""
@@ -184,13 +191,8 @@ class Observation(Crop):
         """The rays through some of the free pixels."""
         return self._through(pixels, _FREE_MARGIN)
 
-    def rim(self) -> np.ndarray:
-        """The free pixels that touch the mask."""
-        touching = cv2.dilate(self.mask.view(np.uint8), np.ones((3, 3), np.uint8)).ravel()
-        return self.free[touching[self.free] > 0]
-
     def ring(self, radius: float) -> np.ndarray:
-        """The free pixels at this distance from the mask, to half a pixel."""
+        """The free pixels at this distance from the mask, to half a pixel: at 1, those that touch it."""
         return self.free[np.abs(self._distance_to_mask - radius) < 0.5]
 
     def beyond(self, band: float) -> Observation:
@@ -216,11 +218,6 @@ class Observation(Crop):
     def _through(self, pixels: np.ndarray, margin: float) -> np.ndarray:
         noise = self.noise.constant, self.noise.quadratic, self.model_error
         return through(pixels, self.depth, self.camera.lens, noise, margin)
-
-
-def _some(pixels: np.ndarray, areas: np.ndarray, count: int, offset: float) -> np.ndarray:
-    """All pixels, or about ``count`` of them, evenly by area."""
-    return pixels if len(pixels) <= count else drawn(pixels, areas, count, offset)
 
 
 def span(points: np.ndarray, directions: np.ndarray) -> np.ndarray:
@@ -252,18 +249,6 @@ def _mean_depth(depth: np.ndarray, inside: np.ndarray) -> float:
     if count == 0:
         return np.nan
     return total / count
-
-
-@kernel
-def _measured_beside(depth: np.ndarray, near: np.ndarray, claimed: np.ndarray) -> float:
-    """The share of the pixels near the object, but not its own, that were measured; 0 without any."""
-    measured, count = 0, 0
-    for v in range(depth.shape[0]):
-        for u in range(depth.shape[1]):
-            beside = (near[v, u] > 0) & (claimed[v, u] == 0)
-            count += beside
-            measured += beside & np.isfinite(depth[v, u])
-    return measured / max(count, 1)
 
 
 @kernel

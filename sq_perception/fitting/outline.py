@@ -31,7 +31,7 @@ _SHARPER = 0.7
 def without_shrunk_edge(problem: Problem, state: State) -> tuple[Problem, State]:
     """Forget the free rays next to the mask if the mask turns out to be smaller than the body."""
     full = problem.observation
-    if _depth_inside(problem, state, full.rim()) < _SHRUNK:
+    if _depth_inside(problem, state, full.ring(1)) < _SHRUNK:
         return problem, state
     problem = replace(problem, observation=full.beyond(BAND_PIXELS))
     state = refine(problem, state, draw(problem, FINAL_RAYS, 0.6), BASIN_STEPS)

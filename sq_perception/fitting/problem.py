@@ -113,11 +113,6 @@ class Problem:
         """Whether the time is up."""
         return time.perf_counter() > self.deadline
 
-    @property
-    def outline(self) -> float:
-        """Standard deviation of the outline where it is not known better, metres."""
-        return outline_sigma(self.observation)
-
     def terms_at(self, state: State) -> Terms:
         """The terms with the predicted half sizes along the axes that a body has now."""
         if self.prior is None:
@@ -173,8 +168,8 @@ class Solution:
 
     def covariance(self) -> np.ndarray:
         """(11, 11) of the valley of the cost that the body lies in."""
-        problem, state = self.problem, self.state
-        return covariance_at(state, self.rays, problem.terms_at(state), problem.outline) * self.spread_factor
+        terms, outline = self.problem.terms_at(self.state), self.problem.observation.outline
+        return covariance_at(self.state, self.rays, terms, outline) * self.spread_factor
 
     def unsure(self) -> np.ndarray:
         """Standard deviations (3,) of the half sizes, as shares of them."""
@@ -187,7 +182,7 @@ def terms_of(observation: Observation, options: FitOptions) -> Terms:
     terms = Terms(
         hit_tolerance=HIT_TOLERANCE,
         pinhole=1.0 if observation.camera.is_pinhole else 0.0,
-        outline_stiffness=1 / outline_sigma(observation),
+        outline_stiffness=1 / observation.outline,
         proportion_stiffness=1 / PROPORTION_SIGMA,
     )
     if options.plane is None:
@@ -199,11 +194,6 @@ def terms_of(observation: Observation, options: FitOptions) -> Terms:
         rest_stiffness=1 / REST_SIGMA,
         volume_price=VOLUME_PRICE,
     )
-
-
-def outline_sigma(observation: Observation) -> float:
-    """Standard deviation of an outline whose misfit was not measured yet, metres: the noise, or a whole pixel."""
-    return max(observation.sigma, observation.footprint)
 
 
 def draw(problem: Problem, count: int, offset: float) -> Rays:
@@ -219,10 +209,14 @@ def draw(problem: Problem, count: int, offset: float) -> Rays:
 
 def coarse(problem: Problem, starts: Iterable[State]) -> list[State]:
     """Where a few steps lead from each start, in their order; from the first one at least."""
-    rays = draw(problem, COARSE_RAYS, 0.5)
+    return tried(problem, SAMPSON, starts, draw(problem, COARSE_RAYS, 0.5), COARSE_STEPS)
+
+
+def tried(problem: Problem, stage: int, starts: Iterable[State], rays: Rays, steps: int) -> list[State]:
+    """The same with any stage's residual, on rays at hand."""
     found: list[State] = []
     for start in starts:
-        found.append(_minimized(problem, SAMPSON, start, rays, COARSE_STEPS, TOLERANCE))
+        found.append(_minimized(problem, stage, start, rays, steps, TOLERANCE))
         if problem.late:
             break
     return found

@@ -52,7 +52,12 @@ class Rays(NamedTuple):
 
 @kernel
 def drawn(pixels: np.ndarray, areas: np.ndarray, count: int, offset: float) -> np.ndarray:
-    """About ``count`` of the pixels (n,), systematically by their areas; other offsets (0 to 1) take other pixels."""
+    """All of the pixels (n,), or about ``count`` of them, systematically by their areas.
+
+    Other offsets (0 to 1) take other pixels.
+    """
+    if pixels.shape[0] <= count:
+        return pixels
     total = 0.0
     for i in range(areas.shape[0]):
         total += areas[i]
