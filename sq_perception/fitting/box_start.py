@@ -13,13 +13,13 @@ import numpy as np
 
 from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.observation import span
-from sq_perception.fitting.symmetry_start import ORDERS, principal_axes
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 
 _START_EXPONENT = 0.3
 """Nearer to a box than to an ellipsoid; a few steps find the rest."""
-_ORDERS = np.array(ORDERS)
+ORDERS = np.array([[1, 2, 0], [2, 0, 1], [0, 1, 2]])
+"""Which of three right-handed axes are x, y and z, so that each is z once."""
 
 
 def enclosing_box(points: np.ndarray, footprint: float) -> Superquadric:
@@ -30,6 +30,13 @@ def enclosing_box(points: np.ndarray, footprint: float) -> Superquadric:
     low, high = local.min(axis=0), local.max(axis=0)
     size = np.maximum((high - low) / 2, max(footprint, 1e-6))
     return Superquadric(size, np.array([0.2, 0.2]), centre + axes @ ((low + high) / 2), quaternions.from_matrix(axes))
+
+
+def on_one_line(points: np.ndarray) -> bool:
+    """Whether points (n >= 1, 3) spread along one direction only."""
+    centred = points - points.mean(axis=0)
+    spread = np.linalg.eigvalsh(centred.T @ centred)
+    return bool(spread[1] <= 1e-6 * spread[2])
 
 
 def principal(points: np.ndarray, deeper: bool = True) -> list[State]:
@@ -54,6 +61,19 @@ def standing_axes(points: np.ndarray, normal: np.ndarray) -> np.ndarray:
     (_, _), (_, _), angle = cv2.minAreaRect(flat)
     c, s = math.cos(math.radians(angle)), math.sin(math.radians(angle))
     return np.stack([c * first + s * second, -s * first + c * second, normal], axis=1)
+
+
+def three_orders(axes: np.ndarray) -> list[np.ndarray]:
+    """The rotations (3, 3) with these axes (columns, right-handed) whose z axis is each of them in turn."""
+    return [np.ascontiguousarray(axes[:, order]) for order in ORDERS]
+
+
+def principal_axes(moments: np.ndarray) -> np.ndarray:
+    """Right-handed eigenvectors (3, 3), as columns."""
+    _, axes = np.linalg.eigh(moments)
+    if np.linalg.det(axes) < 0:
+        axes[:, 0] *= -1
+    return axes
 
 
 def _axes_of(points: np.ndarray) -> np.ndarray:
@@ -83,7 +103,6 @@ def _box_states(points: np.ndarray, axes: np.ndarray, deeper: bool, ground: floa
 def _ordered(low: np.ndarray, high: np.ndarray, axes: np.ndarray) -> list[State]:
     """The box from ``low`` to ``high`` along the axes (columns), for each choice of z."""
     parameters = np.full((len(ORDERS), 8), _START_EXPONENT)
-    parameters[:, :3] = np.maximum((high - low) / 2, 1e-6)[_ORDERS]
+    parameters[:, :3] = np.maximum((high - low) / 2, 1e-6)[ORDERS]
     parameters[:, 5:] = axes @ ((low + high) / 2)
-    rotations = np.ascontiguousarray(axes[:, _ORDERS].swapaxes(0, 1))
-    return [State(numbers, rotation, math.inf, 0) for numbers, rotation in zip(parameters, rotations, strict=True)]
+    return [State(*each, math.inf, 0) for each in zip(parameters, three_orders(axes), strict=True)]

@@ -23,7 +23,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sq_perception.fitting import rounding, starts, tolerant, unseen
+from sq_perception.fitting import rounding, symmetry_start, tolerant, unseen
 from sq_perception.fitting.covariance import Alternative
 from sq_perception.fitting.depth_noise import MEDIAN_TO_SIGMA
 from sq_perception.fitting.levenberg_marquardt import State
@@ -62,6 +62,9 @@ million.  Kept, they look like something left to explain, and rivals are sought 
 _SETTLED, _UNSURE = 1.03, 0.01
 """A last mean squared residual above the one, or a half size less certain than the other, as a share of it, make other
 valleys of the cost worth a look; chosen on benchmarks/single_body."""
+_GATE = 3.6
+"""Mean squared residual after the few steps from a start, above which the next group is tried; chosen on
+benchmarks/single_body."""
 _PROMISING = 2.0
 """Mean squared residual after the few steps from a cheap start, above which it is not followed.  Of 42 images that a
 body explains, none left more than 0.8; of 80 that none explains, nine in ten left more than this."""
@@ -76,11 +79,11 @@ def solve(problem: Problem, given: Sequence[State]) -> Solution:
     tried = coarse(problem, given)
     finalists = select(problem, tried) if given else []
     if not given or _goes_on(problem, finalists):
-        found = starts.automatic(problem)
+        found = _automatic(problem)
         tried += found
         finalists = select(problem, found, finalists)
         if _goes_on(problem, finalists):
-            found = coarse(problem, starts.everything(problem.observation))
+            found = coarse(problem, symmetry_start.everything(problem.observation))
             tried += found
             finalists = select(problem, found, finalists)
         if _goes_on(problem, finalists):
@@ -94,7 +97,8 @@ def solve_cheaply(problem: Problem, given: Sequence[State], later: Callable[[], 
     ``later`` returns further starts that cost time: it is called only if those before do not suffice.
     """
     finalists: list[State] = []
-    groups: list[Callable[[], Sequence[State]]] = [lambda: given, lambda: next(starts.symmetric(problem.observation))]
+    symmetric = symmetry_start.groups(problem.observation)
+    groups: list[Callable[[], Sequence[State]]] = [lambda: given, lambda: next(symmetric)]
     for group in groups if later is None else [*groups, later]:
         candidates = group()
         tried = coarse(problem, candidates) if candidates else []
@@ -103,6 +107,16 @@ def solve_cheaply(problem: Problem, given: Sequence[State], later: Callable[[], 
         if problem.explained_by(finalists):
             return _decide(problem, finalists)
     return None
+
+
+def _automatic(problem: Problem) -> list[State]:
+    """Where the first groups of starts lead, as many as it takes to come near the noise."""
+    found: list[State] = []
+    for group in symmetry_start.groups(problem.observation):
+        found += coarse(problem, group)
+        if least(found).cost < _GATE * problem.floor(COARSE_RAYS) or problem.late:
+            break
+    return found
 
 
 def _goes_on(problem: Problem, finalists: list[State]) -> bool:

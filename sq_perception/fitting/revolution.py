@@ -23,7 +23,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sq_perception.fitting.box_start import standing_axes
+from sq_perception.fitting.box_start import ORDERS, standing_axes
 from sq_perception.fitting.covariance import Alternative
 from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.observation import span
@@ -37,7 +37,6 @@ from sq_perception.fitting.problem import (
     settle,
 )
 from sq_perception.fitting.rivals import resized
-from sq_perception.fitting.symmetry_start import ORDERS
 from sq_perception.geometry import rotation as quaternions
 
 SPARED = 3
@@ -90,7 +89,7 @@ def from_body(state: State) -> list[State]:
     for order in ORDERS:
         rotation = np.ascontiguousarray(state.rotation[:, order])
         parameters = state.parameters.copy()
-        parameters[:3] = parameters[list(order)]
+        parameters[:3] = parameters[order]
         parameters[3] = state.parameters[3] if order[2] == 2 else _START_EXPONENT
         parameters[4] = 1.0
         turned = State(parameters, rotation, math.inf, state.iterations)

@@ -11,6 +11,7 @@ import math
 import numpy as np
 
 from sq_perception.fitting import symmetry_start
+from sq_perception.fitting.box_start import three_orders
 from sq_perception.fitting.levenberg_marquardt import State
 
 SIGNIFICANT = 0.5
@@ -45,7 +46,7 @@ def _turned(state: State) -> State:
 def other_orders(state: State) -> list[State]:
     """The same box with each of its other axes as z."""
     found = []
-    for order in symmetry_start.three_orders(np.eye(3))[:2]:
+    for order in three_orders(np.eye(3))[:2]:
         parameters = state.parameters.copy()
         parameters[:3] = order.T @ parameters[:3]
         parameters[3:5] = symmetry_start.START_EXPONENT

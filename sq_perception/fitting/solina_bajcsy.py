@@ -28,6 +28,7 @@ import time
 import numpy as np
 
 from sq_perception.fitting.bounds import Bounds
+from sq_perception.fitting.box_start import on_one_line
 from sq_perception.fitting.fit import FAILED_SHARE, INLIER, Fit, Status
 from sq_perception.fitting.levenberg_marquardt import State, minimize
 from sq_perception.fitting.options import MIN_PIXELS
@@ -81,11 +82,10 @@ def fit(points: np.ndarray, *, escapes: int = 0) -> Fit:
         points = points[np.linspace(0, len(points) - 1, _MOST_POINTS).astype(int)]
     start = moment_start(points)
     extent = float(np.linalg.norm(np.ptp(points, axis=0)))
-    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
     reason = ""
     if len(points) < MIN_PIXELS:
         reason = f"{len(points)} points; a fit needs {MIN_PIXELS}"
-    elif spread[1] < 1e-3 * spread[0] or spread[1] == 0:
+    elif on_one_line(points):
         reason = "the points lie on one line"
     state = start
     if not reason:

@@ -28,7 +28,6 @@ from sq_perception.fitting.observation import Crop, Observation
 from sq_perception.fitting.options import MIN_PIXELS, MODEL_ERROR_ON_PLANE, FitOptions
 from sq_perception.fitting.problem import Problem, Solution
 from sq_perception.fitting.quality import assessed, failed
-from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.quantiles import quantile
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.support_directions import DIRECTIONS
@@ -171,19 +170,4 @@ def _hopeless(observation: Observation) -> str:
     count = len(observation.pixels)
     if count < MIN_PIXELS:
         return f"{count} pixels with a depth; a fit needs {MIN_PIXELS}"
-    return "the measured points lie on one line" if _on_one_line(observation.points) else ""
-
-
-@kernel
-def _on_one_line(points: np.ndarray) -> bool:
-    """Whether points (n, 3) spread along one direction only."""
-    middle, moments = np.zeros(3), np.zeros((3, 3))
-    for i in range(points.shape[0]):
-        for j in range(3):
-            middle[j] += points[i, j] / points.shape[0]
-    for i in range(points.shape[0]):
-        for j in range(3):
-            for k in range(3):
-                moments[j, k] += (points[i, j] - middle[j]) * (points[i, k] - middle[k])
-    spread = np.linalg.eigvalsh(moments)
-    return spread[1] <= 1e-6 * spread[2]
+    return "the measured points lie on one line" if box_start.on_one_line(observation.points) else ""

@@ -18,9 +18,12 @@ approximately, the better the smaller the body against its distance; it starts a
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 
 import numpy as np
 
+from sq_perception.fitting import box_start
+from sq_perception.fitting.box_start import principal_axes, three_orders
 from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.observation import Observation
 from sq_perception.geometry.kernels import kernel
@@ -35,8 +38,36 @@ _RANK = 4
 _MOST_PAIRS = 2500
 """Enough for second moments to 2 %."""
 _EIGHTH_TURN = math.pi / 4
-ORDERS = ((1, 2, 0), (2, 0, 1), (0, 1, 2))
-"""Which of three right-handed axes are x, y and z, so that each is z once."""
+_EXPONENTS = (0.3, 0.8)
+"""Of the last starts of all: between box and ellipsoid, nearer to either."""
+
+
+def groups(observation: Observation) -> Iterator[list[State]]:
+    """Starts in the order in which to try them; the points' box where nothing shows the symmetry."""
+    completed = completed_moments(observation)
+    if completed is None:
+        yield box_start.principal(observation.points)
+        return
+    centre, moments = completed
+    axes = principal_axes(moments)
+    for turned in [axes, *eighth_turns(axes)]:
+        yield states(centre, moments, turned)
+
+
+def everything(observation: Observation) -> list[State]:
+    """All starts at once, for images on which the first ones failed: boxes, and deeper and turned twice."""
+    found = box_start.principal(observation.points)
+    completed = completed_moments(observation)
+    if completed is None:
+        return found
+    centre, moments = completed
+    axes = principal_axes(moments)
+    deeper = centre + np.array([0.0, 0.0, 0.5 * math.sqrt(float(np.trace(moments)) / 3)])
+    for middle in (centre, deeper):
+        for exponent in _EXPONENTS:
+            for turned in [axes, *eighth_turns(axes), *double_turns(axes)]:
+                found += states(middle, moments, turned, exponent)
+    return found
 
 
 def completed_moments(observation: Observation) -> tuple[np.ndarray, np.ndarray] | None:
@@ -112,11 +143,6 @@ def _opposite_pairs(
     return centre_u, centre_v, pairs[:k]
 
 
-def three_orders(axes: np.ndarray) -> list[np.ndarray]:
-    """The rotations (3, 3) with these axes (columns, right-handed) whose z axis is each of them in turn."""
-    return [np.ascontiguousarray(axes[:, order]) for order in ORDERS]
-
-
 def eighth_turns(axes: np.ndarray) -> list[np.ndarray]:
     """The axes turned by 45 degrees about each of themselves: where two moments are alike, their axes are arbitrary."""
     turned = []
@@ -137,14 +163,6 @@ def double_turns(axes: np.ndarray) -> list[np.ndarray]:
             if j != k:
                 twice.append(both)
     return twice
-
-
-def principal_axes(moments: np.ndarray) -> np.ndarray:
-    """Right-handed eigenvectors (3, 3), as columns."""
-    _, axes = np.linalg.eigh(moments)
-    if np.linalg.det(axes) < 0:
-        axes[:, 0] *= -1
-    return axes
 
 
 def states(centre: np.ndarray, moments: np.ndarray, axes: np.ndarray, exponent: float = START_EXPONENT) -> list[State]:

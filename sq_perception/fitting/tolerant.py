@@ -55,11 +55,11 @@ from sq_perception.fitting.problem import (
     by_cost,
     draw,
     refined_best,
-    settle,
     terms_of,
+    tried,
 )
-from sq_perception.fitting.rays import SAMPLE, Rays
-from sq_perception.fitting.residuals import mean_loss, surface_distance
+from sq_perception.fitting.rays import SAMPLE
+from sq_perception.fitting.residuals import RENDERED, mean_loss, surface_distance
 from sq_perception.geometry.quantiles import quantile
 
 INDEPENDENT_OF_PREDICTED, EXPLAINED = 100.0, 0.5
@@ -98,15 +98,15 @@ def solve(problem: Problem, given: Sequence[State]) -> Solution:
 
 def _best(problem: Problem, starts: Sequence[State]) -> Solution:
     few = draw(problem, COARSE_RAYS, 0.7)
-    begun = _tried(problem, starts, few, FIRST_STEPS)
+    begun = by_cost(tried(problem, RENDERED, starts, few, FIRST_STEPS))
     kept = _KEPT if problem.hull is None else _KEPT_OF_PREDICTED
-    settled = _tried(problem, begun[:kept], few, BASIN_STEPS)
+    settled = by_cost(tried(problem, RENDERED, begun[:kept], few, BASIN_STEPS))
     if problem.hull is None or problem.late:
         return _refined(problem, settled)
     misfit = max(1.0, _mean_loss(problem, settled[0]) / EXPLAINED)
     terms = problem.terms if misfit == 1.0 else problem.terms._replace(hull_root=problem.hull.root(misfit))
     drawn = replace(problem, independent=INDEPENDENT_OF_PREDICTED / misfit, terms=terms)
-    settled = _tried(drawn, settled[:2], draw(drawn, COARSE_RAYS, 0.7), BASIN_STEPS)
+    settled = by_cost(tried(drawn, RENDERED, settled[:2], draw(drawn, COARSE_RAYS, 0.7), BASIN_STEPS))
     solution = _refined(drawn, settled)
     return replace(solution, problem=problem, rays=solution.rays.weighing(1 / misfit))
 
@@ -161,13 +161,3 @@ def _with_priors(problem: Problem) -> Problem:
     )
     observation = problem.observation.of_hull()
     return replace(problem, terms=terms, observation=observation, independent=INDEPENDENT_OF_PREDICTED, hull=hull)
-
-
-def _tried(problem: Problem, starts: Sequence[State], rays: Rays, steps: int) -> list[State]:
-    """Where some steps lead from each start, the best first; from the first one at least."""
-    found: list[State] = []
-    for start in starts:
-        found.append(settle(problem, start, rays, steps))
-        if problem.late:
-            break
-    return by_cost(found)
