@@ -11,7 +11,7 @@ Metres, in the frame of the bodies.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import numpy as np
 
@@ -38,8 +38,7 @@ _ENGAGED = 0.012
 """Metres of finger beyond the near end that a shallow grasp has."""
 
 
-@dataclass(frozen=True, eq=False)
-class Closings:
+class Closings(NamedTuple):
     """Directions (k, 3) in which a body ``owner`` may be closed upon, reaches (k,), and sigmas (k, 2) of both sides.
 
     The direction points to the first side.
@@ -51,8 +50,7 @@ class Closings:
     sigma: np.ndarray
 
 
-@dataclass(frozen=True, eq=False)
-class Approaches:
+class Approaches(NamedTuple):
     """Closings and the sides to come to them from, k of them.
 
     Attributes
@@ -87,11 +85,10 @@ class Approaches:
     height: np.ndarray
 
     def at(self, which: np.ndarray) -> Approaches:
-        return Approaches(*(getattr(self, part.name)[which] for part in fields(self)))
+        return Approaches(*(part[which] for part in self))
 
 
-@dataclass(frozen=True, eq=False)
-class Places:
+class Places(NamedTuple):
     """Where the TCP may be, k of them.
 
     Attributes

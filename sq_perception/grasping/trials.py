@@ -5,7 +5,7 @@ Metres, newtons, kilograms.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from typing import NamedTuple
 
 import numpy as np
 
@@ -35,8 +35,7 @@ _PAD_RADIUS = 0.006
 """Mean arm of the friction of a pad of some 18 mm, metres."""
 
 
-@dataclass(frozen=True, eq=False)
-class Trials:
+class Trials(NamedTuple):
     """Grasps under trial, k of them, and the logarithm of the probability of each margin so far.
 
     ``sides`` (k, 2) are those of the two sides that the fingers pass, whose sum is the margin of the opening.
@@ -50,12 +49,10 @@ class Trials:
     sides: np.ndarray
 
     def at(self, which: np.ndarray) -> Trials:
-        return Trials(*(getattr(self, part.name)[which] for part in fields(self)))
+        return Trials(*(part[which] for part in self))
 
     def and_(self, other: Trials) -> Trials:
-        return Trials(
-            *(np.concatenate([getattr(trials, part.name) for trials in (self, other)]) for part in fields(self))
-        )
+        return Trials(*map(np.concatenate, zip(self, other, strict=True)))
 
     @property
     def total(self) -> np.ndarray:

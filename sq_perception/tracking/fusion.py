@@ -39,7 +39,7 @@ Reference: S. F. Schmidt, Application of State-Space Methods to Navigation Probl
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -53,8 +53,7 @@ VIEWS = 16
 """Directions that are remembered for each body: two thirds of a circle at ``VIEW_ANGLE``.  Each costs time."""
 
 
-@dataclass(frozen=True, eq=False)
-class Views:
+class Views(NamedTuple):
     """The directions that bodies were seen from; batch dimensions first, then one entry per kept view.
 
     Attributes
@@ -81,8 +80,8 @@ class Views:
         directions[0], biases[0], used[0] = direction, bias, 0
         return cls(directions, biases, biases, used)
 
-    def __getitem__(self, index: int) -> Views:
-        return Views(self.direction[index], self.bias[index], self.correlation[index], self.used[index])
+    def of(self, index: int) -> Views:
+        return Views(*(part[index] for part in self))
 
 
 def fused(
@@ -129,8 +128,7 @@ def fused(
     local = np.einsum("nji,nj->ni", quaternions.to_matrix(seen_as), direction)
 
     row = np.arange(count)
-    directions, biases = np.stack([each.direction for each in views]), np.stack([each.bias for each in views])
-    correlations, used = np.stack([each.correlation for each in views]), np.stack([each.used for each in views])
+    directions, biases, correlations, used = (np.stack(parts) for parts in zip(*views, strict=True))
     likeness = np.einsum("nmi,ni->nm", directions, local)
     place = np.argmax(likeness, axis=1)
     fresh = likeness[row, place] < np.cos(VIEW_ANGLE)

@@ -315,7 +315,7 @@ def _fused(bodies: _Bodies, pairs: Pairs, to_camera: np.ndarray, stamp: float) -
             state=states[k],
             covariance=covariances[k],
             lasting=lasting[k],
-            views=views[k],
+            views=views.of(k),
             seen=body.seen + 1,
             missed=0,
             last=stamp,
