@@ -49,28 +49,20 @@ def _elementary(function: _F) -> _F:
     return kernel_cache.compiled(function, _OPTIONS)
 
 
-def _bits_of(_typing: Any, number: Any) -> Any:
-    """The bits of a float64 as int64."""
-    del number
+def _bitcast(source: Any, target: Any) -> Any:
+    """A function of compiled code that takes the bits of a number of one type for one of another type."""
 
-    def generate(context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
-        return builder.bitcast(arguments[0], context.get_value_type(types.int64))
+    def typed(_context: Any, _number: Any) -> Any:
+        def generate(context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+            return builder.bitcast(arguments[0], context.get_value_type(target))
 
-    return types.int64(types.float64), generate
+        return target(source), generate
 
-
-def _number_of(_typing: Any, bits: Any) -> Any:
-    """The float64 of these bits."""
-    del bits
-
-    def generate(context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
-        return builder.bitcast(arguments[0], context.get_value_type(types.float64))
-
-    return types.float64(types.int64), generate
+    return intrinsic(typed)
 
 
-_bits: Any = intrinsic(_bits_of)
-_number: Any = intrinsic(_number_of)
+_bits = _bitcast(types.float64, types.int64)
+_number = _bitcast(types.int64, types.float64)
 
 
 @_elementary
