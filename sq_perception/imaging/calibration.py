@@ -37,7 +37,7 @@ import numpy as np
 from sq_msgs_py.depth_image import Intrinsics, intrinsics_from_message, raw_intrinsics_from_message, size_mismatch
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.compressed_depth import TRANSPORT
-from sq_perception.imaging.distortion import FISHEYE, MODELS, NONE, Distortion
+from sq_perception.imaging.distortion import FISHEYE, MODELS, Distortion
 from sq_perception.imaging.rectification import Rectification, rectification
 
 Treatment = Literal["auto", "apply", "ignore"]
@@ -100,7 +100,7 @@ class Calibration:
             known = raw_intrinsics_from_message(info)
             camera = Camera(**vars(known.intrinsics))
             lens = _lens(known.distortion_model, known.distortion)
-            if lens.is_identity:
+            if lens is None:
                 return cls(camera, note=note)
             found = rectification(camera, lens)
         except ValueError as error:
@@ -168,12 +168,12 @@ def intrinsics(camera: Camera) -> Intrinsics:
     return Intrinsics(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
 
 
-def _lens(model: str, coefficients: tuple[float, ...]) -> Distortion:
+def _lens(model: str, coefficients: tuple[float, ...]) -> Distortion | None:
+    """None for one that moves nothing; a fisheye lens always moves."""
     if model != FISHEYE and not is_distorted(coefficients):
-        return Distortion()
-    if model not in MODELS or model == NONE:
-        expected = ", ".join(model for model in MODELS if model != NONE)
-        raise ValueError(f"camera_info: distortion_model: expected {expected}, got {model!r}")
+        return None
+    if model not in MODELS:
+        raise ValueError(f"camera_info: distortion_model: expected {', '.join(MODELS)}, got {model!r}")
     try:
         return Distortion(model, coefficients)
     except ValueError as error:

@@ -32,12 +32,11 @@ from functools import cached_property
 
 import numpy as np
 
-NONE = "none"
 FISHEYE = "equidistant"
 POLYNOMIAL = ("plumb_bob", "rational_polynomial")
-MODELS = (*POLYNOMIAL, FISHEYE, NONE)
+MODELS = (*POLYNOMIAL, FISHEYE)
 
-_LENGTHS = {**dict.fromkeys(POLYNOMIAL, (4, 5, 8, 12, 14)), FISHEYE: (4,), NONE: (0,)}
+_LENGTHS = {**dict.fromkeys(POLYNOMIAL, (4, 5, 8, 12, 14)), FISHEYE: (4,)}
 _LARGEST = 1e6
 """Of a coefficient; whatever is larger is no lens."""
 _WIDEST = math.pi / 2 - 1e-3
@@ -68,8 +67,8 @@ class Distortion:
         prism or tilt.
     """
 
-    model: str = NONE
-    coefficients: tuple[float, ...] = ()
+    model: str
+    coefficients: tuple[float, ...]
 
     def __post_init__(self) -> None:
         if self.model not in MODELS:
@@ -87,11 +86,6 @@ class Distortion:
             raise ValueError(f"distortion {self.model}: thin prism and tilt (coefficients 9 to 14) are not supported")
         object.__setattr__(self, "coefficients", coefficients)
 
-    @property
-    def is_identity(self) -> bool:
-        """Whether nothing is moved; a fisheye lens always moves."""
-        return self.model != FISHEYE and not any(self.coefficients)
-
     def __str__(self) -> str:
         return " ".join([self.model, *(f"{value:g}" for value in self.coefficients)])
 
@@ -108,8 +102,6 @@ class Distortion:
         """Rays (..., 2) of images at (..., 2); NaN where no ray has its image."""
         images = np.asarray(images, dtype=float)
         flat = images.reshape(-1, 2)
-        if self.is_identity:
-            return self.forward(images)
         table, reached = self._table
         with np.errstate(all="ignore"):
             radius = np.hypot(flat[:, 0], flat[:, 1])
@@ -145,8 +137,6 @@ class Distortion:
 
     def _radial(self, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """q and dq/ds at squared radii."""
-        if self.model == NONE:
-            return np.ones_like(s), np.zeros_like(s)
         if self.model in POLYNOMIAL:
             k1, k2, _, _, k3, k4, k5, k6 = (*self.coefficients, 0.0, 0.0, 0.0, 0.0)[:8]
             over, over_slope = 1 + s * (k1 + s * (k2 + s * k3)), k1 + s * (2 * k2 + 3 * k3 * s)

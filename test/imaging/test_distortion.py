@@ -46,7 +46,6 @@ def test_an_ideal_fisheye_sees_angles():
     lens = Distortion("equidistant", (0, 0, 0, 0))
     angle = np.linspace(0, 1.5, 50)
     np.testing.assert_allclose(lens.forward(np.stack([np.tan(angle), 0 * angle], -1))[:, 0], angle, atol=1e-12)
-    assert not lens.is_identity
 
 
 @pytest.mark.parametrize("lens", [BARREL, PINCUSHION, RATIONAL, FISHEYE, Distortion("plumb_bob", (-0.2, 0, 0, 0))])
@@ -93,19 +92,17 @@ def test_what_the_lens_cannot_show_is_nan():
 
 
 def test_nothing_moves_where_there_is_no_distortion(points):
-    for lens in (Distortion(), Distortion("plumb_bob", (0,) * 5), Distortion("rational_polynomial", (0,) * 8)):
-        assert lens.is_identity
+    for lens in (Distortion("plumb_bob", (0,) * 5), Distortion("rational_polynomial", (0,) * 8)):
         np.testing.assert_array_equal(lens.forward(points), points)
-        np.testing.assert_array_equal(lens.inverse(points), points)
+        np.testing.assert_allclose(lens.inverse(points), points, rtol=1e-12)
 
 
 @pytest.mark.parametrize(
     ("model", "coefficients", "words"),
     [
-        ("unified", (1, 2, 3, 4), "plumb_bob, rational_polynomial, equidistant, none, got 'unified'"),
+        ("unified", (1, 2, 3, 4), "plumb_bob, rational_polynomial, equidistant, got 'unified'"),
         ("plumb_bob", (1, 2, 3), "4 or 5 or 8 or 12 or 14 coefficients, got 3"),
         ("equidistant", (0,) * 5, "expected 4 coefficients, got 5"),
-        ("none", (0.1,), "expected 0 coefficients, got 1"),
         ("plumb_bob", (np.nan, 0, 0, 0), "finite"),
         ("plumb_bob", (np.inf, 0, 0, 0), "finite"),
         ("plumb_bob", (1e9, 0, 0, 0), "up to 1e"),

@@ -70,7 +70,7 @@ def test_nothing_is_invented_at_edges(name):
 def test_without_distortion_an_image_is_itself(rng):
     depth = rng.uniform(0.5, 4, (RAW.height, RAW.width)).astype(np.float32)
     depth[rng.random(depth.shape) < 0.2] = np.nan
-    undone = Rectification(RAW, Distortion())
+    undone = Rectification(RAW, Distortion("plumb_bob", (0,) * 4))
     assert undone.camera == RAW
     assert undone.seen == 1
     np.testing.assert_array_equal(undone.there.depth(depth), depth)
