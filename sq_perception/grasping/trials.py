@@ -9,8 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sq_perception.geometry.kernels import kernel
-
 DENSITY = 500.0
 """kg/m^3, between empty and full packages; a mass is thought to be known to half of it."""
 CLEARANCE = 0.005
@@ -66,32 +64,14 @@ class Trials(NamedTuple):
 
     def first(self, count: int, least: float = -np.inf) -> Trials:
         """The most probable ones of each body, each body's in order, of those whose logarithm is above ``least``."""
-        return self.at(_first(self.owner, self.total, count, least))
+        total = self.total
+        rows = np.flatnonzero(total > least)
+        rows = rows[np.lexsort((-total[rows], self.owner[rows]))]
+        return self.at(rows[_rank(self.owner[rows]) < count])
 
     def after(self, count: int) -> Trials:
         """The others, of trials that are in order."""
         return self.at(np.flatnonzero(_rank(self.owner) >= count))
-
-
-@kernel
-def _first(owner: np.ndarray, total: np.ndarray, count: int, least: float) -> np.ndarray:
-    """Rows (j,) of the ``count`` greatest totals above ``least`` of each owner, owner by owner, the greatest first."""
-    candidates = np.flatnonzero(total > least)
-    of = np.zeros(owner.max() + 2 if len(owner) else 1, np.int64)
-    for row in candidates:
-        of[owner[row] + 1] += 1
-    of = np.cumsum(of)
-    filled, sorted_by_owner = of.copy(), np.empty(len(candidates), np.int64)
-    for row in candidates:
-        sorted_by_owner[filled[owner[row]]] = row
-        filled[owner[row]] += 1
-    kept, found = 0, np.empty(len(candidates), np.int64)
-    for k in range(len(of) - 1):
-        rows = sorted_by_owner[of[k] : of[k + 1]]
-        for j in np.argsort(-total[rows], kind="mergesort")[:count]:
-            found[kept] = rows[j]
-            kept += 1
-    return found[:kept]
 
 
 def _rank(owner: np.ndarray) -> np.ndarray:
