@@ -23,7 +23,7 @@ import trimesh
 from scipy.optimize import least_squares, minimize
 from scipy.spatial import ConvexHull
 
-from sq_perception.fitting.bounds import Bounds
+from sq_perception.fitting.options import Bounds
 from sq_perception.geometry import Superquadric
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.kernels import in_object_frame, kernel, ray_interval

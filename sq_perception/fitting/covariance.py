@@ -16,11 +16,10 @@ from typing import NamedTuple
 
 import numpy as np
 
+from sq_perception.fitting.cost import STEP_LENGTH, Terms
 from sq_perception.fitting.levenberg_marquardt import State
-from sq_perception.fitting.normal_equations import STEP_LENGTH
 from sq_perception.fitting.rays import SAMPLE, WEIGHT, Rays
 from sq_perception.fitting.residuals import RENDERED, evaluate
-from sq_perception.fitting.terms import Terms
 from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.superquadric import Superquadric
 

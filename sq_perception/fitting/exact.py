@@ -23,7 +23,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sq_perception.fitting import rounding, symmetry_start, tolerant, unseen
+from sq_perception.fitting import rounding, starts, tolerant, unseen
 from sq_perception.fitting.covariance import Alternative
 from sq_perception.fitting.depth_noise import MEDIAN_TO_SIGMA
 from sq_perception.fitting.levenberg_marquardt import State
@@ -42,12 +42,12 @@ from sq_perception.fitting.problem import (
     by_cost,
     coarse,
     draw,
+    in_time,
     least,
     refine,
     select,
     settle,
 )
-from sq_perception.fitting.rays import Rays
 from sq_perception.fitting.residuals import surface_distance
 from sq_perception.fitting.rivals import SIGNIFICANT, alike, other_axes, other_depths
 from sq_perception.geometry.quantiles import quantile
@@ -83,7 +83,7 @@ def solve(problem: Problem, given: Sequence[State]) -> Solution:
         tried += found
         finalists = select(problem, found, finalists)
         if _goes_on(problem, finalists):
-            found = coarse(problem, symmetry_start.everything(problem.observation))
+            found = coarse(problem, starts.everything(problem.observation))
             tried += found
             finalists = select(problem, found, finalists)
         if _goes_on(problem, finalists):
@@ -97,7 +97,7 @@ def solve_cheaply(problem: Problem, given: Sequence[State], later: Callable[[], 
     ``later`` returns further starts that cost time: it is called only if those before do not suffice.
     """
     finalists: list[State] = []
-    symmetric = symmetry_start.groups(problem.observation)
+    symmetric = starts.groups(problem.observation)
     groups: list[Callable[[], Sequence[State]]] = [lambda: given, lambda: next(symmetric)]
     for group in groups if later is None else [*groups, later]:
         candidates = group()
@@ -112,7 +112,7 @@ def solve_cheaply(problem: Problem, given: Sequence[State], later: Callable[[], 
 def _automatic(problem: Problem) -> list[State]:
     """Where the first groups of starts lead, as many as it takes to come near the noise."""
     found: list[State] = []
-    for group in symmetry_start.groups(problem.observation):
+    for group in starts.groups(problem.observation):
         found += coarse(problem, group)
         if least(found).cost < _GATE * problem.floor(COARSE_RAYS) or problem.late:
             break
@@ -138,11 +138,7 @@ def _decide(problem: Problem, finalists: list[State]) -> Solution:
         more = draw(problem, _MORE_RAYS, 0.3)
         settled = by_cost(settle(problem, state, more) for state in [favourite, *others])
         favourite, *others = _distinct(settled, settled[0].cost + RIVAL_SLACK)
-    best = refine(problem, favourite, rays)
-    for rival in others:
-        if problem.late:
-            break
-        best = least([best, refine(problem, rival, rays)])
+    best = least(in_time(problem, [favourite, *others], lambda state: refine(problem, state, rays)))
 
     solution = _varied(Solution(problem, best, rays))
     if not problem.late:
@@ -208,32 +204,22 @@ def _better(solution: Solution, rivals: list[State]) -> tuple[State, list[State]
     problem, best = solution.problem, solution.state
     few = draw(problem, BASIN_RAYS, 0.2)
     reference = settle(problem, best, few)
+    hopeless = _HOPELESS * reference.cost
+
+    def followed(rival: State) -> State:
+        state = settle(problem, rival, few, FIRST_STEPS)
+        return settle(problem, state, few, BASIN_STEPS - FIRST_STEPS) if state.cost < hopeless else state
+
     # On other rays the body may already find its way out of a shallow valley.
-    settled = [reference, *_promising(problem, rivals, few, reference.cost)]
+    settled = [reference, *(state for state in in_time(problem, rivals, followed) if state.cost < hopeless)]
     chosen = _distinct(settled, reference.cost + RIVAL_SLACK, [best._replace(cost=reference.cost)])
     if not chosen:
         return best, []
-    found: list[State] = []
-    for rival in by_cost(chosen)[:FINALISTS]:
-        if problem.late:
-            break
-        state = refine(problem, rival, solution.rays)
-        found.append(state)
+    found = in_time(problem, by_cost(chosen)[:FINALISTS], lambda rival: refine(problem, rival, solution.rays))
+    for state in found:
         if state.cost < best.cost - SIGNIFICANT:
             best = state
     return best, found
-
-
-def _promising(problem: Problem, rivals: list[State], rays: Rays, cost: float) -> list[State]:
-    """Rivals on few rays, some steps at a time: those that stay far behind are given up."""
-    found: list[State] = []
-    for rival in rivals:
-        if problem.late:
-            break
-        state = settle(problem, rival, rays, FIRST_STEPS)
-        if state.cost < _HOPELESS * cost:
-            found.append(settle(problem, state, rays, BASIN_STEPS - FIRST_STEPS))
-    return found
 
 
 def _alternatives(best: State, found: list[State]) -> tuple[Alternative, ...]:

@@ -14,9 +14,8 @@ import math
 
 import numpy as np
 
-from sq_perception.fitting.normal_equations import LANES
+from sq_perception.fitting.cost import LANES, Terms
 from sq_perception.fitting.rays import DEPTH, DIRECTION_X, DIRECTION_Y, LAST, ORIGIN_X, ORIGIN_Y, STIFFNESS, WEIGHT
-from sq_perception.fitting.terms import Terms
 from sq_perception.geometry.kernels import box_interval, gauge_derivatives, in_object_frame, inline_kernel, kernel
 
 QX, QY, QZ, EX, EY, EZ, SHIFT = range(7)

@@ -15,9 +15,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sq_perception.fitting.normal_equations import STEP_LENGTH
+from sq_perception.fitting.cost import STEP_LENGTH, Terms
 from sq_perception.fitting.residuals import evaluate
-from sq_perception.fitting.terms import Terms
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.superquadric import Superquadric
@@ -57,6 +56,7 @@ class State(NamedTuple):
         return Superquadric(p[0:3], p[3:5], p[5:8], quaternions.from_matrix(self.rotation))
 
 
+@kernel
 def minimize(
     stage: int,
     rays: np.ndarray,
@@ -71,27 +71,9 @@ def minimize(
 
     Stops when a step lowers the cost by less than ``tolerance`` of it, or when no step lowers it.
     """
-    parameters, rotation, cost, iterations = _minimize(
-        stage, rays, free, terms, start.parameters, start.rotation, limits[0], limits[1], max_iterations, tolerance
-    )
-    return State(parameters, rotation, cost, start.iterations + iterations)
-
-
-@kernel
-def _minimize(
-    stage: int,
-    rays: np.ndarray,
-    free: np.ndarray,
-    terms: Terms,
-    parameters: np.ndarray,
-    rotation: np.ndarray,
-    lower: np.ndarray,
-    upper: np.ndarray,
-    max_iterations: int,
-    tolerance: float,
-) -> tuple[np.ndarray, np.ndarray, float, int]:
-    parameters = np.minimum(np.maximum(parameters, lower), upper)
-    rotation = rotation.copy()
+    lower, upper = limits
+    parameters = np.minimum(np.maximum(start.parameters, lower), upper)
+    rotation = start.rotation.copy()
     sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
     next_sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
     factor = np.zeros((STEP_LENGTH, STEP_LENGTH))
@@ -124,7 +106,7 @@ def _minimize(
         damping = max(damping * _BETTER, 1e-9)
         if gain <= tolerance * max(abs(cost), 1e-12):
             break
-    return parameters, rotation, cost, iterations
+    return State(parameters, rotation, cost, start.iterations + iterations)
 
 
 @kernel

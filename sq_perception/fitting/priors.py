@@ -12,7 +12,7 @@ hull        W (n_j.t + h(R^T n_j) - b_j): the support function in J directions b
 volume      a linear price on log(a1 a2 a3), for the smaller of two bodies that explain the image alike.
 
 Each function returns its share of the cost and adds its derivatives to the normal equations ``sums``; the unknowns are
-those of :mod:`sq_perception.fitting.residuals`, the sizes of the terms in :class:`~sq_perception.fitting.terms.Terms`.
+those of :mod:`sq_perception.fitting.residuals`, the sizes of the terms in :class:`~sq_perception.fitting.cost.Terms`.
 """
 
 from __future__ import annotations
@@ -21,8 +21,7 @@ import math
 
 import numpy as np
 
-from sq_perception.fitting.normal_equations import STEP_LENGTH, add_block, add_row
-from sq_perception.fitting.terms import Terms
+from sq_perception.fitting.cost import STEP_LENGTH, Terms, add_block, add_row
 from sq_perception.geometry.kernels import conjugate, inline_kernel, kernel, p_norm
 
 Derivatives = tuple[float, float, float, float, float, float]

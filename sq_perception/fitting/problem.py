@@ -13,12 +13,13 @@ the noise times the rays' weight, so that a body that leaves nothing but noise c
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
 
+from sq_perception.fitting.cost import Terms
 from sq_perception.fitting.covariance import Alternative, covariance_at
 from sq_perception.fitting.hull_prior import HullPrior
 from sq_perception.fitting.levenberg_marquardt import State, minimize
@@ -26,7 +27,6 @@ from sq_perception.fitting.observation import Observation
 from sq_perception.fitting.options import FitOptions
 from sq_perception.fitting.rays import SAMPLE, WEIGHT, Rays
 from sq_perception.fitting.residuals import RENDERED, SAMPSON, surface_distance
-from sq_perception.fitting.terms import Terms
 from sq_perception.geometry.superquadric import Superquadric
 
 # Rays and steps of the stages: chosen on benchmarks/single_body.
@@ -209,14 +209,15 @@ def draw(problem: Problem, count: int, offset: float) -> Rays:
 
 def coarse(problem: Problem, starts: Iterable[State]) -> list[State]:
     """Where a few steps lead from each start, in their order; from the first one at least."""
-    return tried(problem, SAMPSON, starts, draw(problem, COARSE_RAYS, 0.5), COARSE_STEPS)
+    rays = draw(problem, COARSE_RAYS, 0.5)
+    return in_time(problem, starts, lambda start: _minimized(problem, SAMPSON, start, rays, COARSE_STEPS, TOLERANCE))
 
 
-def tried(problem: Problem, stage: int, starts: Iterable[State], rays: Rays, steps: int) -> list[State]:
-    """The same with any stage's residual, on rays at hand."""
+def in_time(problem: Problem, states: Iterable[State], search: Callable[[State], State]) -> list[State]:
+    """Where a search leads from each state, in their order, as long as there is time; from the first one at least."""
     found: list[State] = []
-    for start in starts:
-        found.append(_minimized(problem, stage, start, rays, steps, TOLERANCE))
+    for state in states:
+        found.append(search(state))
         if problem.late:
             break
     return found

@@ -34,6 +34,7 @@ import math
 
 import numpy as np
 
+from sq_perception.fitting.cost import LANES, STEP_LENGTH, Terms, add_block, cauchy_loss, huber_loss
 from sq_perception.fitting.intersection import (
     EX,
     EY,
@@ -62,10 +63,8 @@ from sq_perception.fitting.intersection import (
     padded,
     place,
 )
-from sq_perception.fitting.normal_equations import LANES, STEP_LENGTH, add_block, cauchy_loss, huber_loss
 from sq_perception.fitting.priors import prior_cost
 from sq_perception.fitting.rays import LAST, STIFFNESS
-from sq_perception.fitting.terms import Terms
 from sq_perception.geometry.kernels import inline_kernel, kernel
 
 CLASSIC, SAMPSON, RENDERED = 0, 1, 2

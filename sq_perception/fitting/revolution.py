@@ -23,7 +23,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from sq_perception.fitting.box_start import ORDERS, standing_axes
 from sq_perception.fitting.covariance import Alternative
 from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.observation import span
@@ -37,6 +36,7 @@ from sq_perception.fitting.problem import (
     settle,
 )
 from sq_perception.fitting.rivals import resized
+from sq_perception.fitting.starts import ORDERS, standing_axes
 from sq_perception.geometry import rotation as quaternions
 
 SPARED = 3

@@ -10,8 +10,7 @@ import math
 
 import numpy as np
 
-from sq_perception.fitting import symmetry_start
-from sq_perception.fitting.box_start import three_orders
+from sq_perception.fitting import starts
 from sq_perception.fitting.levenberg_marquardt import State
 
 SIGNIFICANT = 0.5
@@ -38,28 +37,28 @@ def _turned(state: State) -> State:
     """The body turned by 45 degrees about its z: a square cross-section and a round one are hard to distinguish."""
     parameters = state.parameters.copy()
     parameters[:2] = math.sqrt(0.5 * (parameters[0] ** 2 + parameters[1] ** 2))
-    parameters[4] = symmetry_start.START_EXPONENT
-    turned = symmetry_start.eighth_turns(state.rotation)[2]
+    parameters[4] = starts.START_EXPONENT
+    turned = starts.eighth_turns(state.rotation)[2]
     return State(parameters, np.ascontiguousarray(turned), math.inf, state.iterations)
 
 
 def other_orders(state: State) -> list[State]:
     """The same box with each of its other axes as z."""
     found = []
-    for order in three_orders(np.eye(3))[:2]:
+    for order in starts.three_orders(np.eye(3))[:2]:
         parameters = state.parameters.copy()
         parameters[:3] = order.T @ parameters[:3]
-        parameters[3:5] = symmetry_start.START_EXPONENT
+        parameters[3:5] = starts.START_EXPONENT
         found.append(State(parameters, np.ascontiguousarray(state.rotation @ order), math.inf, state.iterations))
     return found
 
 
 def other_axes(state: State) -> list[State]:
     """The same box of axes with each z, and turned by 45 degrees about each axis."""
-    moments = state.rotation @ np.diag(state.parameters[:3] ** 2 * symmetry_start.MOMENT_SHARE) @ state.rotation.T
+    moments = state.rotation @ np.diag(state.parameters[:3] ** 2 * starts.MOMENT_SHARE) @ state.rotation.T
     found: list[State] = []
-    for axes in [state.rotation, *symmetry_start.eighth_turns(state.rotation)]:
-        found += symmetry_start.states(state.parameters[5:8], moments, axes)
+    for axes in [state.rotation, *starts.eighth_turns(state.rotation)]:
+        found += starts.states(state.parameters[5:8], moments, axes)
     return found
 
 

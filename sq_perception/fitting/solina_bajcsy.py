@@ -27,14 +27,13 @@ import time
 
 import numpy as np
 
-from sq_perception.fitting.bounds import Bounds
-from sq_perception.fitting.box_start import on_one_line
+from sq_perception.fitting.cost import Terms
 from sq_perception.fitting.fit import FAILED_SHARE, INLIER, Fit, Status
 from sq_perception.fitting.levenberg_marquardt import State, minimize
-from sq_perception.fitting.options import MIN_PIXELS
+from sq_perception.fitting.options import MIN_PIXELS, Bounds
 from sq_perception.fitting.rays import DEPTH, LAST, ORIGIN_X, ORIGIN_Y, RAY_COLUMNS, STIFFNESS, WEIGHT
 from sq_perception.fitting.residuals import CLASSIC
-from sq_perception.fitting.terms import Terms
+from sq_perception.fitting.starts import on_one_line
 from sq_perception.geometry import rotation as quaternions
 
 _NO_FREE_SPACE = np.empty((0, RAY_COLUMNS))

@@ -19,7 +19,7 @@ from typing import Literal
 
 import numpy as np
 
-from sq_perception.fitting import box_start, exact, tolerant
+from sq_perception.fitting import exact, starts, tolerant
 from sq_perception.fitting.depth_noise import MEDIAN_TO_SIGMA
 from sq_perception.fitting.fit import Fit
 from sq_perception.fitting.hull_prior import HullPrior
@@ -93,7 +93,7 @@ def fit(
     observation = crop.observed(options.tolerated, options.nan_is_empty)
     reason = _hopeless(observation)
     if reason:
-        body = box_start.enclosing_box(observation.points, observation.footprint)
+        body = starts.enclosing_box(observation.points, observation.footprint)
         return failed(body, observation, reason, began)
     course = tolerant if options.tolerated > 0 else exact
     given = given if later is None else later()
@@ -170,4 +170,4 @@ def _hopeless(observation: Observation) -> str:
     count = len(observation.pixels)
     if count < MIN_PIXELS:
         return f"{count} pixels with a depth; a fit needs {MIN_PIXELS}"
-    return "the measured points lie on one line" if box_start.on_one_line(observation.points) else ""
+    return "the measured points lie on one line" if starts.on_one_line(observation.points) else ""

@@ -38,12 +38,11 @@ from dataclasses import replace
 
 import numpy as np
 
-from sq_perception.fitting import box_start, revolution, unseen
+from sq_perception.fitting import revolution, unseen
 from sq_perception.fitting.depth_noise import MEDIAN_TO_SIGMA
 from sq_perception.fitting.fit import INLIER
 from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.problem import (
-    BASIN_STEPS,
     COARSE_RAYS,
     FINAL_RAYS,
     FIRST_STEPS,
@@ -54,12 +53,14 @@ from sq_perception.fitting.problem import (
     Solution,
     by_cost,
     draw,
+    in_time,
     refined_best,
+    settle,
     terms_of,
-    tried,
 )
 from sq_perception.fitting.rays import SAMPLE
-from sq_perception.fitting.residuals import RENDERED, mean_loss, surface_distance
+from sq_perception.fitting.residuals import mean_loss, surface_distance
+from sq_perception.fitting.starts import on_plane, principal
 from sq_perception.geometry.quantiles import quantile
 
 INDEPENDENT_OF_PREDICTED, EXPLAINED = 100.0, 0.5
@@ -84,7 +85,7 @@ def solve(problem: Problem, given: Sequence[State]) -> Solution:
     points, plane = problem.observation.points, problem.options.plane
     # How far a box goes on behind what was seen is predicted.
     deeper = problem.hull is None
-    boxes = box_start.principal(points, deeper) if plane is None else box_start.on_plane(points, plane, deeper)
+    boxes = principal(points, deeper) if plane is None else on_plane(points, plane, deeper)
     starts = [*given, *boxes]
     solution = _best(problem, starts)
     if problem.hull is not None:
@@ -98,15 +99,16 @@ def solve(problem: Problem, given: Sequence[State]) -> Solution:
 
 def _best(problem: Problem, starts: Sequence[State]) -> Solution:
     few = draw(problem, COARSE_RAYS, 0.7)
-    begun = by_cost(tried(problem, RENDERED, starts, few, FIRST_STEPS))
+    begun = by_cost(in_time(problem, starts, lambda start: settle(problem, start, few, FIRST_STEPS)))
     kept = _KEPT if problem.hull is None else _KEPT_OF_PREDICTED
-    settled = by_cost(tried(problem, RENDERED, begun[:kept], few, BASIN_STEPS))
+    settled = by_cost(in_time(problem, begun[:kept], lambda state: settle(problem, state, few)))
     if problem.hull is None or problem.late:
         return _refined(problem, settled)
     misfit = max(1.0, _mean_loss(problem, settled[0]) / EXPLAINED)
     terms = problem.terms if misfit == 1.0 else problem.terms._replace(hull_root=problem.hull.root(misfit))
     drawn = replace(problem, independent=INDEPENDENT_OF_PREDICTED / misfit, terms=terms)
-    settled = by_cost(tried(drawn, RENDERED, settled[:2], draw(drawn, COARSE_RAYS, 0.7), BASIN_STEPS))
+    few = draw(drawn, COARSE_RAYS, 0.7)
+    settled = by_cost(in_time(drawn, settled[:2], lambda state: settle(drawn, state, few)))
     solution = _refined(drawn, settled)
     return replace(solution, problem=problem, rays=solution.rays.weighing(1 / misfit))
 

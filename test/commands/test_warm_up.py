@@ -38,4 +38,4 @@ def test_frames_call_no_kernel_that_the_warm_up_did_not_compile() -> None:
         assert recoverer.recover(depth.astype(np.float32), camera).bodies
     assert {name: new for name, of in compiled().items() if (new := of - known.get(name, set()))} == {}
     # One form of arguments, whatever array a hull's directions came in: a second one takes 18 s and 13 MB.
-    assert len(levenberg_marquardt._minimize.signatures) == 1
+    assert len(levenberg_marquardt.minimize.signatures) == 1

@@ -10,8 +10,8 @@ import pytest
 import residual_statement as statement
 import torch
 
+from sq_perception.fitting.cost import STEP_LENGTH, Terms
 from sq_perception.fitting.levenberg_marquardt import State, minimize
-from sq_perception.fitting.normal_equations import STEP_LENGTH
 from sq_perception.fitting.rays import (
     DEPTH,
     DIRECTION_X,
@@ -24,7 +24,6 @@ from sq_perception.fitting.rays import (
     WEIGHT,
 )
 from sq_perception.fitting.residuals import CLASSIC, RENDERED, SAMPSON, evaluate, penetration, surface_distance
-from sq_perception.fitting.terms import Terms
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 

@@ -8,12 +8,11 @@ import numpy as np
 import pytest
 
 from sq_perception.fitting import surface_fit
+from sq_perception.fitting.cost import STEP_LENGTH, Terms
 from sq_perception.fitting.hull_prior import MODEL_SHARE, PULL_SHARE, HullPrior
 from sq_perception.fitting.levenberg_marquardt import State, move
-from sq_perception.fitting.normal_equations import STEP_LENGTH
 from sq_perception.fitting.priors import prior_cost
 from sq_perception.fitting.surface_fit import FitOptions
-from sq_perception.fitting.terms import Terms
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.support_directions import DIRECTIONS
 from sq_perception.imaging import raycast

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from sq_perception.fitting import covariance, quality, surface_fit
-from sq_perception.fitting.bounds import Bounds
 from sq_perception.fitting.fit import CUT_SHORT, Fit, Status
+from sq_perception.fitting.options import Bounds
 from sq_perception.fitting.surface_fit import FitOptions
 from sq_perception.geometry import metrics
 from sq_perception.geometry import rotation as quaternions
