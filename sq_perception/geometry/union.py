@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from sq_perception.geometry.kernels import kernel, support
+from sq_perception.geometry.kernels import in_object_frame, kernel, support
 from sq_perception.geometry.superquadric import Superquadric
 
 
@@ -25,9 +25,7 @@ def flat_support(flat: np.ndarray, directions: np.ndarray) -> np.ndarray:
         m = _matrix(flat[k, 8:])
         for j in range(directions.shape[0]):
             x, y, z = directions[j]
-            nx = m[0, 0] * x + m[1, 0] * y + m[2, 0] * z
-            ny = m[0, 1] * x + m[1, 1] * y + m[2, 1] * z
-            nz = m[0, 2] * x + m[1, 2] * y + m[2, 2] * z
+            nx, ny, nz = in_object_frame(m, x, y, z)
             far = x * flat[k, 5] + y * flat[k, 6] + z * flat[k, 7]
             far += support(nx, ny, nz, flat[k, 0], flat[k, 1], flat[k, 2], flat[k, 3], flat[k, 4])
             reach[j] = max(reach[j], far)
