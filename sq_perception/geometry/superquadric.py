@@ -314,16 +314,17 @@ class Superquadric:
         NumPy bodies only.  A half turn about an axis moves that axis' component of the quaternion to qw, up to sign, so
         that the largest component names the half turn of the smallest angle; among equals qw, then x, y, z wins.
         """
-        if not self.batch_shape:  # numbers of a single body: a tenth of the time
-            size, q = self.size, self.rotation
+        size, q = self.size, self.rotation
+        if not self.batch_shape:  # numbers of a single body: a fourth of the time
             if size[0] < size[1]:
                 size, q = size[[1, 0, 2]], quaternions.multiply(q, _QUARTER_TURN)
             x, y, z, w = (round(abs(part), 12) for part in q.tolist())
-            q = quaternions.multiply(q, _HALF_TURNS[(w, x, y, z).index(max(w, x, y, z))])
+            parts = w, x, y, z
+            q = quaternions.multiply(q, _HALF_TURNS[parts.index(max(parts))])
             return Superquadric(size, self.shape, self.translation, -q if q[3] < 0 else q)
-        swapped = self.size[..., :1] < self.size[..., 1:2]
-        size = np.where(swapped, self.size[..., [1, 0, 2]], self.size)
-        q: Any = np.where(swapped, quaternions.multiply(self.rotation, _QUARTER_TURN), self.rotation)
+        swapped = size[..., :1] < size[..., 1:2]
+        size = np.where(swapped, size[..., [1, 0, 2]], size)
+        q = quaternions.multiply(q, np.where(swapped, _QUARTER_TURN, _HALF_TURNS[0]))
         largest = np.argmax(np.round(np.abs(q[..., [3, 0, 1, 2]]), 12), axis=-1)
         q = quaternions.multiply(q, _HALF_TURNS[largest])
         q = q * np.where(q[..., 3:] < 0, -1.0, 1.0)
