@@ -206,13 +206,14 @@ class _Image:
 
     def pieces(self, part: _Part, extent: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
         """Rows and columns of each convex part of a segment; nothing where it has no such parts."""
-        crossed = crossings.within(part.pixels, self.points(part), self.depth, self.labels, *self.limits)[0]
+        crossed, _ = crossings.within(part.pixels, self.points(part), self.depth, *self.limits)
         if crossed.mean() < _SUSPICIOUS:
             return []
         whole = self.sampled(part.label, extent, _MANY)
         if whole is None:
             return []
-        crossed, gap, far = crossings.within(whole.pixels, self.points(whole), self.depth, self.labels, *self.limits)
+        points = self.points(whole)
+        crossed, far = crossings.within(whole.pixels, points, self.depth, *self.limits)
         n = len(whole.z)
         group = _linked(crossed + _METRIC * far / max(far.max(), 1e-9), np.ones(n), _APART)
         size = np.bincount(group)
@@ -222,6 +223,7 @@ class _Image:
         # What is too small for a part joins the one that it is nearest to.
         keep = np.flatnonzero(large[group])
         group = np.unique(group[keep[np.argmin(far[:, keep], axis=1)]], return_inverse=True)[1]
+        gap = crossings.gaps(whole.pixels, points, self.depth, self.labels)
         group = _with_whole_vessels(group, gap, far, _HOLLOW * self.sigma * float(np.median(whole.z)) ** 2)
         count = int(group.max()) + 1
         if count < 2:

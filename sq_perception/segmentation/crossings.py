@@ -67,34 +67,40 @@ def between(
 
 @kernel
 def within(
-    pixels: np.ndarray, points: np.ndarray, depth: np.ndarray, labels: np.ndarray, noise: float, least: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Of each pair of samples (n, n): 1 where the line is crossed, the mean gap behind it over its own segment, and the
-    distance, metres."""
+    pixels: np.ndarray, points: np.ndarray, depth: np.ndarray, noise: float, least: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Of each pair of samples (n, n): 1 where the line is crossed, and the distance, metres."""
     n = pixels.shape[0]
-    crossed, gaps, far = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n))
+    crossed, far = np.zeros((n, n)), np.zeros((n, n))
+    for i in range(n):
+        for j in range(i):
+            p, q = pixels[i], pixels[j]
+            if _crossed(p[0], p[1], points[i, 2], q[0], q[1], points[j, 2], depth, noise, least):
+                crossed[i, j] = crossed[j, i] = 1.0
+            x, y, z = points[i, 0] - points[j, 0], points[i, 1] - points[j, 1], points[i, 2] - points[j, 2]
+            far[i, j] = far[j, i] = math.sqrt(x * x + y * y + z * z)
+    return crossed, far
+
+
+@kernel
+def gaps(pixels: np.ndarray, points: np.ndarray, depth: np.ndarray, labels: np.ndarray) -> np.ndarray:
+    """Mean gap (n, n) behind the line of each pair of samples over its own segment, metres; 0 without any of that."""
+    n = pixels.shape[0]
+    found = np.zeros((n, n))
     for i in range(n):
         own = labels[pixels[i, 0], pixels[i, 1]]
         for j in range(i):
-            total, count, over = 0.0, 0, 0.0
+            total, count = 0.0, 0
             for k in range(1, _STEPS):
                 t = k / _STEPS
                 v = int((1 - t) * pixels[i, 0] + t * pixels[j, 0] + 0.5)
                 u = int((1 - t) * pixels[i, 1] + t * pixels[j, 1] + 0.5)
-                seen = np.float64(depth[v, u])
-                line = 1.0 / ((1 - t) / points[i, 2] + t / points[j, 2])
-                gap = seen - line
-                if gap > max(noise * line * line, least):
-                    over = 1.0
-                if seen > 0.0 and labels[v, u] == own:
-                    total += gap
+                if labels[v, u] == own and depth[v, u] > 0.0:
+                    total += np.float64(depth[v, u]) - 1.0 / ((1 - t) / points[i, 2] + t / points[j, 2])
                     count += 1
-            crossed[i, j] = crossed[j, i] = over
             if count > 0:
-                gaps[i, j] = gaps[j, i] = total / count
-            x, y, z = points[i, 0] - points[j, 0], points[i, 1] - points[j, 1], points[i, 2] - points[j, 2]
-            far[i, j] = far[j, i] = math.sqrt(x * x + y * y + z * z)
-    return crossed, gaps, far
+                found[i, j] = found[j, i] = total / count
+    return found
 
 
 @kernel
