@@ -142,6 +142,12 @@ def _plain(depth: np.ndarray) -> np.ndarray:
     return np.ascontiguousarray(depth, dtype=np.float32)
 
 
+def _stride(pixels: int, count: int) -> int:
+    """Of a grid that takes some ``count`` of so many pixels, twice as many at most."""
+    stride = max(1, math.isqrt(pixels // count))
+    return stride + 1 if pixels > 2 * count * stride**2 else stride
+
+
 def _by_size(extents: np.ndarray) -> list[int]:
     """Labels that have pixels, the largest first."""
     order = np.argsort(-extents[:, 0], kind="stable")
@@ -178,7 +184,7 @@ class _Image:
     def sampled(self, label: int, extent: np.ndarray, count: int) -> _Part | None:
         """Some ``count`` samples of a segment on a grid; None where they are too few to say anything."""
         pixels, top, bottom, left, right = extent
-        stride = max(1, int(np.sqrt(pixels / count)))
+        stride = _stride(int(pixels), count)
         top, left = (first + (stride // 2 - first) % stride for first in (int(top), int(left)))
         window = slice(top, int(bottom), stride), slice(left, int(right), stride)
         rows, columns = np.nonzero((self.labels[window] == label) & (self.depth[window] > 0))
@@ -186,7 +192,7 @@ class _Image:
 
     def of_pixels(self, label: int, rows: np.ndarray, columns: np.ndarray, count: int) -> _Part | None:
         """The same of pixels that have a depth."""
-        stride = max(1, int(np.sqrt(len(rows) / count)))
+        stride = _stride(len(rows), count)
         chosen = (rows % stride == stride // 2) & (columns % stride == stride // 2)
         return self._part(label, rows[chosen], columns[chosen], stride)
 
