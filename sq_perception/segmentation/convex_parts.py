@@ -63,6 +63,9 @@ _INSIDE = 0.15
 """Share of a segment's samples that are insides, beyond which the segment is one vessel: of recorded bowls and mugs
 seen from above they are a third and more, of one from the side among other things 0.07.  0.08 to 0.25 find the same
 things in 240 simulated scenes."""
+_BLOCKS = 4
+"""Blocks of pixels, which go to a part together, from a sample to the next one.  A cluttered frame takes 40 % less
+time; 920 things in 210 simulated and 45 recorded frames have the same IoU, 0.812, as pixel by pixel."""
 _LEAST_AREA = 8e-4
 """Of a part, square metres across the line of sight.  Twice as much joins 8 more of 335 household things."""
 _NEAR = 0.03
@@ -235,9 +238,8 @@ class _Image:
         if count < 2:
             return []
         rows, columns = regions.pixels(self.labels, part.label, extent)
-        chosen = crossings.assigned(
-            rows, columns, whole.pixels, whole.z, group, count, self.depth, self.focal, whole.spacing, *self.limits
-        )
+        seen = self.depth, self.focal, whole.spacing, max(1, _stride(len(rows), _MANY) // _BLOCKS), *self.limits
+        chosen = crossings.assigned(rows, columns, whole.pixels, whole.z, group, count, *seen)
         return [(rows[chosen == k], columns[chosen == k]) for k in range(count) if (chosen == k).any()]
 
     def points(self, part: _Part) -> np.ndarray:

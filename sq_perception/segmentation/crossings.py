@@ -11,6 +11,7 @@ import math
 import numpy as np
 
 from sq_perception.geometry.kernels import inline_kernel, kernel
+from sq_perception.imaging.depth_steps import STEP
 
 _STEPS = 8
 """In which a line is walked."""
@@ -114,20 +115,28 @@ def assigned(
     depth: np.ndarray,
     focal: float,
     spacing: float,
+    block: int,
     noise: float,
     least: float,
 ) -> np.ndarray:
     """The part (n,) of each pixel: that of the nearest sample, or, of those almost as near, of the one to whose
-    samples most lines are free."""
+    samples most lines are free.  The first pixel of each block that is so many pixels wide speaks for those at its
+    depth."""
     # Samples part by part, in rows: to look for the nearest one of a part is vector code.
     order = np.argsort(part, kind="mergesort")
     down, right, away = samples[order, 0].astype(np.float64), samples[order, 1].astype(np.float64), z[order]
     ends = np.searchsorted(part[order], np.arange(parts + 1))
     chosen = np.zeros(rows.size, np.int64)
     nearest = np.empty(parts)
+    first = np.full((depth.shape[0] // block + 1, depth.shape[1] // block + 1), -1)
     for i in range(rows.size):
         v, u = rows[i], columns[i]
         here = np.float64(depth[v, u])
+        other = first[v // block, u // block]
+        if other >= 0 and abs(depth[rows[other], columns[other]] - here) < STEP * here:
+            chosen[i] = chosen[other]
+            continue
+        first[v // block, u // block] = i
         width = here / focal
         for k in range(parts):
             least_square = np.inf
