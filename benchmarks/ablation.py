@@ -106,7 +106,7 @@ def rows() -> tuple[Row, ...]:
         row("twice as sure", hull=lambda h, _: replace(h, covariance=h.covariance / 4)),
         row("every ray counts", program=rays(1000.0)),
         row("as a body", program=lambda: patch.multiple(Observation, of_hull=lambda self: self)),
-        row("no plane", plane=None, model_error=methods.MODEL_ERROR_ON_PLANE),
+        row("no plane", plane=None, model_error=methods.MODEL_ERROR),
         row("no free space", nan_is_empty=False),
         row("missing is empty", nan_is_empty=True),
         row("hull alone", program=rays(3.0)),

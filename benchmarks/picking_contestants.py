@@ -36,7 +36,7 @@ from picking_scenes import EYE, GRIPPER, LOOK, TABLE_CAMERA
 from picking_world import Thing, World
 
 from sq_perception.fitting import solina_bajcsy
-from sq_perception.fitting.options import MODEL_ERROR_ON_PLANE
+from sq_perception.fitting.options import MODEL_ERROR
 from sq_perception.geometry import mesh
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
@@ -113,7 +113,7 @@ def true_bodies(seen: Seen) -> tuple[Grasp, ...]:
     for k in seen.world.left:
         position, rotation = seen.world.pose(k)
         bodies.append(_nearest(seen.world.things[k]).transformed(rotation, position).transformed(LOOK, EYE))
-    covariance = np.diag([MODEL_ERROR_ON_PLANE**2] * 3 + [0.0] * 8)
+    covariance = np.diag([MODEL_ERROR**2] * 3 + [0.0] * 8)
     return seen.planned(bodies, np.repeat(covariance[None], len(bodies), axis=0))
 
 

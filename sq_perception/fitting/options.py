@@ -20,7 +20,7 @@ WIDEST_EXPONENT = 2.0
 """Beyond, a superquadric is not convex and its gauge no norm."""
 MIN_PIXELS = 12
 """A body has 11 parameters."""
-MODEL_ERROR_ON_PLANE = 0.0025
+MODEL_ERROR = 0.0025
 """Real objects are no superquadrics; on tables of everyday things this is how far they stray, metres."""
 
 
@@ -78,7 +78,7 @@ class FitOptions:
         Standard deviation of the depth noise, metres, or how it grows with depth; None estimates it from the image.
     model_error
         How far the object may stray from a superquadric, metres.  None: 0 if a superquadric explains the image down
-        to its noise, else 2.5 mm for objects on a plane and what is left over for others.
+        to its noise, else 2.5 mm for objects on a plane or with a predicted hull, what is left over for others.
     plane
         (4,) support plane n.x + d = height in the optical frame, n pointing away from the support; None if the object
         floats.  A body does not reach below it, and is expected to lie on one of its faces.
@@ -125,9 +125,6 @@ class FitOptions:
         if not self.time_budget > 0:
             raise ValueError(f"time_budget: expected positive seconds, got {self.time_budget}")
 
-    @property
-    def tolerated(self) -> float:
-        """The model error that holds, metres."""
-        if self.model_error is not None:
-            return self.model_error
-        return 0.0 if self.plane is None else MODEL_ERROR_ON_PLANE
+    def predicted_hull(self) -> HullPrior | None:
+        """What :attr:`hull` holds, or returns."""
+        return self.hull() if callable(self.hull) else self.hull

@@ -25,7 +25,7 @@ from sq_perception.fitting.fit import Fit
 from sq_perception.fitting.hull_prior import HullPrior
 from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.observation import Crop, Observation
-from sq_perception.fitting.options import MIN_PIXELS, MODEL_ERROR_ON_PLANE, FitOptions
+from sq_perception.fitting.options import MIN_PIXELS, MODEL_ERROR, FitOptions
 from sq_perception.fitting.problem import Problem, Solution
 from sq_perception.fitting.quality import assessed, failed
 from sq_perception.geometry.quantiles import quantile
@@ -37,9 +37,9 @@ from sq_perception.imaging.camera import Camera
 __all__ = ["FitOptions", "fit", "warm_up"]
 
 _FINE_NOISE = 0.1
-"""Of what things on a plane stray from superquadrics: under less noise the exact course goes first, as what the
-tolerant one leaves of a true superquadric may then be more than the noise.  Under more, true superquadrics were left
-0.5 to 0.8 of it, and things of benchmarks/household_things 1.2 and more."""
+"""Of what things stray from superquadrics: under less noise the exact course goes first, as what the tolerant one
+leaves of a true superquadric may then be more than the noise.  Under more, true superquadrics were left 0.5 to 0.8 of
+it, and things of benchmarks/household_things 1.2 and more."""
 
 
 def fit(
@@ -85,20 +85,26 @@ def fit(
     if crop is None:
         raise ValueError("the mask holds no pixel with a depth: there is nothing to fit")
     undecided = options.model_error is None
-    fine = crop.noise.at(crop.distance) < _FINE_NOISE * MODEL_ERROR_ON_PLANE
+    fine = crop.noise.at(crop.distance) < _FINE_NOISE * MODEL_ERROR
     if undecided and (later is not None if options.plane is None else fine):
         exactly = _exactly(crop, options, given, later, began)
         if exactly is not None:
             return assessed(exactly, began)
-    observation = crop.observed(options.tolerated, options.nan_is_empty)
+    is_thing = undecided and (options.plane is not None or options.predicted_hull() is not None)
+    if is_thing:
+        # Also without a plane: to look for a superquadric from everywhere took 86 ms a body, not 14, and had 0.8 % less
+        # IoU on 226 household things whose plane was kept back, though 0.3 % more on 750 noisy superquadrics.
+        options = replace(options, model_error=MODEL_ERROR)
+    observation = crop.observed(options.model_error or 0.0, options.nan_is_empty)
     reason = _hopeless(observation)
     if reason:
         body = starts.enclosing_box(observation.points, observation.footprint)
         return failed(body, observation, reason, began)
-    course = tolerant if options.tolerated > 0 else exact
+    course = tolerant if options.model_error else exact
     given = given if later is None else later()
     solution = course.solve(Problem.of(observation, options, began), given)
-    if undecided and options.plane is not None and not fine and _is_explained(solution, crop.noise.at(crop.distance)):
+    untried = options.plane is None or not fine
+    if is_thing and untried and _is_explained(solution, crop.noise.at(crop.distance)):
         solution = _exactly(crop, options, [solution.state, *given], None, began) or solution
     return assessed(solution, began)
 

@@ -148,7 +148,7 @@ def take_over(problem: Problem, best: State, given: Sequence[State]) -> Solution
 
 
 def _with_priors(problem: Problem) -> Problem:
-    hull = problem.options.hull() if callable(problem.options.hull) else problem.options.hull
+    hull = problem.options.predicted_hull()
     if hull is None:
         terms = problem.terms._replace(huber=_HUBER, inner_cauchy=_INNER_CAUCHY, volume_price=VOLUME_PRICE)
         return replace(problem, terms=terms, independent=INDEPENDENT_RAYS)

@@ -9,7 +9,7 @@ import numpy as np
 
 from sq_perception.fitting import solina_bajcsy, surface_fit
 from sq_perception.fitting.fit import Fit, Status
-from sq_perception.fitting.options import MIN_PIXELS, MODEL_ERROR_ON_PLANE, FitOptions
+from sq_perception.fitting.options import MIN_PIXELS, MODEL_ERROR, FitOptions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import soft_agreement
 from sq_perception.imaging.camera import Camera
@@ -46,7 +46,7 @@ def _body(obj: SeenObject, depth: np.ndarray, camera: Camera, options: RecoveryO
     known = FitOptions(plane=obj.plane, time_budget=max(deadline - time.perf_counter(), _LEAST_BUDGET))
     if not options.free_space:
         depth = np.where(obj.mask, depth, np.float32(np.nan))
-        known = replace(known, nan_is_empty=False, model_error=MODEL_ERROR_ON_PLANE)
+        known = replace(known, nan_is_empty=False, model_error=MODEL_ERROR)
     return _surface_fit(obj, depth, camera, known)
 
 

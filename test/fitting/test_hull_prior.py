@@ -126,3 +126,19 @@ def test_a_vague_prediction_leaves_the_size_open(
         options = FitOptions(plane=plane, model_error=0.0025, hull=told(body, sigma))
         widest.append(surface_fit.fit(depth, mask, CAMERA, options=options).sigma_size.max())
     assert widest[1] > 1.5 * widest[0]
+
+
+def test_a_thing_that_floats_is_fitted_as_one_on_a_plane_is(
+    box_from_the_front: tuple[np.ndarray, np.ndarray, Superquadric, np.ndarray], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No superquadric explains it: none is sought from everywhere, and its far side is the predicted one."""
+    _, mask, body, _ = box_from_the_front
+    shown, _ = raycast.render(body, CAMERA)
+    dents = 0.004 * np.sin(np.linspace(0, 40, shown.shape[1]))[None]
+    depth = np.where(mask, shown + dents, 1.5).astype(np.float32)
+    monkeypatch.setattr(surface_fit.exact, "solve", None)
+    found = surface_fit.fit(depth, mask, CAMERA, options=FitOptions(hull=told(body, 0.004)))
+    ahead = np.array([[0.0, 0.0, 1.0]])
+    far = found.superquadric.translation[2] + found.superquadric.support(ahead)[0]
+    assert far == pytest.approx(body.translation[2] + body.support(ahead)[0], abs=0.007)
+    assert found.superquadric.size.max() == pytest.approx(0.06, abs=0.01)
