@@ -101,6 +101,8 @@ class Distortion:
     def inverse(self, images: np.ndarray) -> np.ndarray:
         """Rays (..., 2) of images at (..., 2); NaN where no ray has its image."""
         images = np.asarray(images, dtype=float)
+        if self.model != "equidistant" and not any(self.coefficients):
+            return images.copy()
         flat = images.reshape(-1, 2)
         table, reached = self._table
         with np.errstate(all="ignore"):

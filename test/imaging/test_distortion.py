@@ -94,7 +94,7 @@ def test_what_the_lens_cannot_show_is_nan():
 def test_nothing_moves_where_there_is_no_distortion(points):
     for lens in (Distortion("plumb_bob", (0,) * 5), Distortion("rational_polynomial", (0,) * 8)):
         np.testing.assert_array_equal(lens.forward(points), points)
-        np.testing.assert_allclose(lens.inverse(points), points, rtol=1e-12)
+        np.testing.assert_array_equal(lens.inverse(points), points)
 
 
 @pytest.mark.parametrize(
