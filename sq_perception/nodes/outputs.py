@@ -151,7 +151,8 @@ class OptionalOutputs:
         self.absent: dict[str, str] = {}
         """Packages that are missing, by what asks for them; replaced as a whole, for other threads."""
         self._scene = collision_objects.Scene()
-        self._listeners = 0
+        self._listeners: tuple[int, frozenset[bytes]] = 0, frozenset()
+        """How many planners there were, and which."""
 
     def follow(self, parameters: RecoverParameters) -> None:
         """Create the publishers that are asked for, and destroy the others."""
@@ -187,8 +188,7 @@ class OptionalOutputs:
                 detections(found.array, found.header, covariances=found.covariances, prefix=parameters.tf_prefix)
             )
         heard = self._heard("publish_collision_objects")
-        before, self._listeners = self._listeners, heard.get_subscription_count() if heard is not None else 0
-        if self._listeners > before:
+        if self._has_another_listener(heard):
             self._scene.forget()
         if heard is not None and parameters.publish_collision_objects and has_frame:
             meshes = (lambda: found.meshes) if parameters.collision_shapes == "mesh" else None
@@ -221,6 +221,20 @@ class OptionalOutputs:
                 f"{parameter}: expected {package}, which cannot be used ({error}): {topic} is not published; Debian "
                 f"package ros-$ROS_DISTRO-{package.replace('_', '-')}"
             )
+
+    def _has_another_listener(self, heard: Publisher | None) -> bool:
+        """Whether there is a planner that was not there at the last frame.
+
+        Their number alone misses one that has started again meanwhile; who they are alone one that is known and cannot
+        be reached yet.
+        """
+        number, names = self._listeners
+        if heard is None:
+            self._listeners = 0, frozenset()
+            return False
+        those = self._node.get_subscriptions_info_by_topic(heard.topic_name)
+        self._listeners = heard.get_subscription_count(), frozenset(bytes(one.endpoint_gid) for one in those)
+        return self._listeners[0] > number or not self._listeners[1] <= names
 
     def _heard(self, parameter: str) -> Publisher | None:
         """The publisher of what is asked for, if somebody listens."""

@@ -71,6 +71,7 @@ class Publisher:
 
     def __init__(self, kind: type[Any], topic: str, queue: int) -> None:
         self.msg_type, self.topic, self.queue, self.listeners = kind, topic, queue, 1
+        self.topic_name, self.restarts = topic, 0
         self.sent: list[Any] = []
 
     def get_subscription_count(self) -> int:
@@ -98,6 +99,10 @@ class Node:
 
     def destroy_publisher(self, publisher: Publisher) -> None:
         assert self.publishers.pop(publisher.topic) is publisher
+
+    def get_subscriptions_info_by_topic(self, topic: str) -> list[Any]:
+        publisher = self.publishers[topic]
+        return [SimpleNamespace(endpoint_gid=[publisher.restarts, k]) for k in range(publisher.listeners)]
 
     def get_logger(self) -> Any:
         def warning(text: str, once: bool = False, **_: Any) -> None:
@@ -234,6 +239,9 @@ def test_planners_are_told_of_changes_alone_and_a_new_planner_of_everything(node
     show(BOX, CAN, collision_shapes="mesh")
     scene.listeners = 1
     assert show(BOX, CAN, collision_shapes="mesh") == 2, "a planner that has started again knows nothing"
+    scene.restarts += 1
+    assert show(BOX, CAN, collision_shapes="mesh") == 2, "between two frames, too"
+    assert show(BOX, CAN, collision_shapes="mesh") == 0
 
 
 def test_switching_off_removes_and_ending_does_not(node):
