@@ -50,16 +50,31 @@ class Turns:
     @contextmanager
     def turn(self) -> Iterator[None]:
         """Wait for one's turn, and keep it for the block."""
+        self._take()
+        try:
+            yield
+        finally:
+            self._give()
+
+    @contextmanager
+    def pause(self) -> Iterator[None]:
+        """Within one's turn: others have theirs during the block, and the next one is waited for at its end."""
+        self._give()
+        try:
+            yield
+        finally:
+            self._take()
+
+    def _take(self) -> None:
         ticket = object()
         with self._changed:
             self._waiting.append(ticket)
             self._changed.wait_for(lambda: self._waiting[0] is ticket)
-        try:
-            yield
-        finally:
-            with self._changed:
-                self._waiting.popleft()
-                self._changed.notify_all()
+
+    def _give(self) -> None:
+        with self._changed:
+            self._waiting.popleft()
+            self._changed.notify_all()
 
 
 TURNS = Turns()

@@ -40,6 +40,7 @@ from sq_perception.nodes.statistics import THROTTLE, Standing, Statistics
 from sq_perception.nodes.tracking import CameraPoses, Tracking
 from sq_perception.recordings.publication import Findings
 from sq_perception.recovery.recovery import timed
+from sq_perception.segmentation.standing import Pose
 from sq_perception.tracking import association
 
 _WORKER_END = 3.0
@@ -226,13 +227,24 @@ class FrameNode(ManagedNode):
         stages = {"wait": 1e3 * (monotonic() - arrival.time)}
         with timed(stages, "decode"):
             frame = source.frame(arrival, parameters)
-        pose = None
-        if parameters.target_frame and parameters.box is not None:
-            turn, shift = pose_in(self._poses, frame.header, parameters.target_frame, parameters.tf_tolerance)
-            pose = tuple(turn.tolist()), tuple(shift.tolist())
-        answer = self._engine.recover(frame, parameters, pose)
+        answer = self._engine.recover(frame, parameters, self._pose_of(frame, parameters))
         stages |= {f"recovery: {name}": took for name, took in answer[0].milliseconds.items()}
         return frame, answer, stages
+
+    def _pose_of(self, frame: Frame, parameters: RecoverParameters) -> Pose | None:
+        """Where the frame is in ``target_frame``, if its workspace is there; ValueError if that is not known.
+
+        A transform that has not come yet is waited for while other cameras compute.
+        """
+        if not parameters.target_frame or parameters.box is None:
+            return None
+        asked = self._poses, frame.header, parameters.target_frame
+        try:
+            turn, shift = pose_in(*asked, 0.0)
+        except ValueError:
+            with TURNS.pause():
+                turn, shift = pose_in(*asked, parameters.tf_tolerance)
+        return tuple(turn.tolist()), tuple(shift.tolist())
 
     def _published(self, arrival: Arrival, frame: Frame, answer: Answer, stages: dict[str, float]) -> Outcome:
         """Name the bodies and publish them."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gc
+import sys
 import threading
 import time
 import weakref
@@ -433,6 +434,32 @@ class TestSeveralCameras:
             answered = {space: len(bench.answers[space]) - counted[space] for space in bench.answers}
         assert recoverer.most_at_work == 1
         assert min(answered.values()) >= 12, answered
+
+    def test_a_camera_that_waits_for_its_transform_lets_the_other_compute(self, make_bench, monkeypatch):
+        waits, over = threading.Event(), threading.Event()
+        given_up: list[bool] = []
+
+        def lookup_transform(target: str, source: str, stamp: Any, patience: Any) -> None:
+            if patience.nanoseconds:
+                waits.set()
+                given_up.append(not over.wait(PATIENCE / 3))
+            raise LookupError("it does not come")
+
+        buffer = SimpleNamespace(lookup_transform=lookup_transform, clear=lambda: None)
+        listener = SimpleNamespace(unregister=lambda: None)
+        stand_in = SimpleNamespace(Buffer=lambda: buffer, TransformListener=lambda *_: listener)
+        monkeypatch.setitem(sys.modules, "tf2_ros", stand_in)
+        bench = make_bench(namespaces=("front", "wrist")).active()
+        bench.answer("wrist")
+        box = [-1.0, -1.0, 0.0, 1.0, 1.0, 2.0]
+        assert bench.nodes[1].set_parameters([Parameter("target_frame", value="base")])[0].successful
+        assert bench.nodes[1].set_parameters([Parameter("workspace", value=box)])[0].successful
+        bench.publish("wrist")
+        bench.until(waits.is_set)
+        assert bench.answer("front") == 1.0
+        assert not given_up, "it was answered meanwhile"
+        over.set()
+        bench.until(lambda: "it does not come" in counts_of(bench.nodes[1]).last_error)
 
     def test_an_override_of_one_camera_leaves_the_other_alone(self, make_bench):
         """rclpy writes overrides into the profile that it is given."""
