@@ -227,6 +227,7 @@ class FrameNode(ManagedNode):
         stages = {"wait": 1e3 * (monotonic() - arrival.time)}
         with timed(stages, "decode"):
             frame = source.frame(arrival, parameters)
+        self._poses.follow(stamp_of(frame))
         answer = self._engine.recover(frame, parameters, self._pose_of(frame, parameters))
         stages |= {f"recovery: {name}": took for name, took in answer[0].milliseconds.items()}
         return frame, answer, stages

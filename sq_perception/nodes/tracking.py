@@ -39,6 +39,7 @@ class CameraPoses:
         self._buffer: Any = None
         self._listener: Any = None
         self._missing = ""
+        self._stamp = 0
 
     def listen(self) -> None:
         """Begin to listen to /tf, if that was not done yet; a buffer knows only what it has heard."""
@@ -77,10 +78,15 @@ class CameraPoses:
             raise PoseError(f"the transform from {header.frame_id} to {frame} is no rigid motion")
         return quaternion / length, translation
 
-    def clear(self) -> None:
-        """Forget what was heard: after a jump back in time, transforms of the old time would shadow the new ones."""
-        if self._buffer is not None:
+    def follow(self, stamp: int) -> None:
+        """Note the stamp of the next image, nanoseconds, before its pose is asked for.
+
+        After a jump back, as where a recording begins again, what was heard is forgotten: transforms of the old time
+        would shadow the new ones, and tf2 takes none that is 10 s older than its newest.
+        """
+        if stamp < self._stamp and self._buffer is not None:
             self._buffer.clear()
+        self._stamp = stamp
 
     def close(self) -> None:
         """Listen no more, until a frame is asked for again."""
@@ -101,7 +107,6 @@ class Tracking:
         self._frame_id = ""
         self._fixed_frame: str | None = None
         self._origin: Hashable = None
-        self._untracked_stamp = 0.0
 
     @property
     def tally(self) -> Tally:
@@ -121,12 +126,8 @@ class Tracking:
         Numbers of another ``origin``, method or model, are not fused with these: a change ends the tracks.  ``arrival``
         is the time, seconds, of an image without stamp.  Raises ValueError if the tracker cannot go on; it begins anew.
         """
-        stamp = 1e-9 * stamp_of(frame)
         if not parameters.tracking:
             self._session.reset()
-            if stamp < self._untracked_stamp:
-                self._poses.clear()  # a recording begins again
-            self._untracked_stamp = stamp
             return identified(recovery)
         if self._origin not in (None, origin):
             self._forget("bodies come from another method or model from now on")
@@ -137,7 +138,7 @@ class Tracking:
         if not self._fixed_frame and frame.header.frame_id != self._frame_id:
             self._session.reset()  # another camera: its world is another one
             self._frame_id = frame.header.frame_id
-        stamp, resets = stamp or arrival, self._session.tally.resets
+        stamp, resets = 1e-9 * stamp_of(frame) or arrival, self._session.tally.resets
         pose: Pose | None = None
         is_known = True
         if self._fixed_frame:
@@ -157,7 +158,6 @@ class Tracking:
             raise ValueError(f"tracking: {error}") from error
         if self._session.tally.resets > resets:
             self._node.get_logger().info(f"the stamps jumped back to {stamp:.3f} s: tracks are forgotten, ids go on")
-            self._poses.clear()
         return identified(recovery, tracks, self._session.hidden)
 
     def _forget(self, why: str) -> None:

@@ -224,6 +224,20 @@ def test_a_camera_that_moves_is_looked_up(make_bench, monkeypatch, capfd):
     assert tf2.cleared == 1
 
 
+@pytest.mark.parametrize("tracking", ["true", "false"])
+@pytest.mark.parametrize("box", [(), ("-p", "workspace:=[-1.0, -1.0, 0.0, 1.0, 1.0, 2.0]")])
+def test_a_bag_that_begins_again_is_seen_in_the_target_frame_again(make_bench, monkeypatch, box, tracking):
+    """tf2 takes no transforms of the beginning while it remembers the end."""
+    tf2 = Tf2()
+    stands = np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3)
+    tf2.poses[60.0] = stands
+    tf2.clear = lambda: tf2.poses.update({3.1: stands})
+    monkeypatch.setitem(sys.modules, "tf2_ros", tf2.module)
+    bench = make_bench("-p", "target_frame:=base", "-p", "tf_tolerance:=0.0", "-p", f"tracking:={tracking}", *box)
+    counts = [bench.send(image(sec)) for sec in (60.0, 3.0, 3.1)]
+    assert [(one.answered, one.refused) for one in counts] == [(1, 0), (1, 1), (2, 1)], counts[-1].last_error
+
+
 def test_without_tf2_ids_remain(make_bench, monkeypatch, capfd):
     monkeypatch.setitem(sys.modules, "tf2_ros", None)
     bench = make_bench("-p", "fixed_frame:=map")
