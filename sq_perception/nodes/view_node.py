@@ -150,6 +150,7 @@ class ViewNode(Node):
         self._info = message
 
     def _on_image(self, message: Image) -> None:
+        self._poses.follow(stamp_of(message))
         with self._lock:
             self._arrivals.append(monotonic())
             self._images[stamp_of(message)] = message

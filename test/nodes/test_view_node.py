@@ -1,0 +1,59 @@
+"""The viewer's node without a browser: in which frame bodies are drawn, whatever the clock does."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("rclpy", reason="needs the extra 'ros'")
+pytest.importorskip("viser", reason="needs the extra 'view'")
+
+from builtin_interfaces.msg import Time
+from geometry_msgs.msg import TransformStamped
+from rclpy.context import Context
+from std_msgs.msg import Header
+
+from sq_msgs_py.depth_image import depth_to_message
+from sq_msgs_py.superquadrics import SuperquadricArray, to_message
+from sq_perception.nodes.view_node import ViewNode
+
+
+@pytest.fixture
+def view() -> Iterator[ViewNode]:
+    page: Any = SimpleNamespace(watched=False, requests=list, close=lambda: None)
+    context = Context()
+    context.init(args=["--ros-args"])
+    node = ViewNode("sq_view", page, "depth/image", "depth/camera_info", ["/recover_node"], 10.0, context)
+    yield node
+    node.close()
+    node.destroy_node()
+    context.try_shutdown()
+
+
+def test_bodies_in_another_frame_are_drawn_though_a_bag_begins_again(view, monkeypatch):
+    """tf2 takes no transforms of the beginning while it remembers the end."""
+    known = {60}
+
+    def lookup_transform(target: str, source: str, stamp: Any, patience: Any) -> TransformStamped:
+        if stamp.nanoseconds // 10**9 not in known:
+            raise LookupError("would require extrapolation into the past")
+        answer = TransformStamped()
+        answer.transform.rotation.w = 1.0
+        return answer
+
+    buffer = SimpleNamespace(lookup_transform=lookup_transform, clear=lambda: known.add(4))
+    stand_in = SimpleNamespace(Buffer=lambda: buffer, TransformListener=lambda *_: None)
+    monkeypatch.setitem(sys.modules, "tf2_ros", stand_in)
+    drawn = []
+    for sec in (60, 3, 4):
+        stamp = Time(sec=sec)
+        image = depth_to_message(np.ones((2, 2)), Header(stamp=stamp, frame_id="camera"))
+        view._on_image(image)
+        cloud = to_message(SuperquadricArray.empty(), Header(stamp=stamp, frame_id="base"))
+        drawn.append(view._converted(cloud, image.header)[1] == "")
+    assert drawn == [True, False, True]
