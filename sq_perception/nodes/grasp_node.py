@@ -34,7 +34,7 @@ from sq_perception.grasping.surroundings import Surroundings
 from sq_perception.nodes.frame import latched
 from sq_perception.nodes.live_parameters import LiveParameters
 from sq_perception.nodes.managed_node import ManagedNode
-from sq_perception.nodes.outputs import ARRIVAL
+from sq_perception.nodes.outputs import ARRIVAL, MarkerIds
 from sq_perception.nodes.parameters import GraspParameters
 from sq_perception.nodes.statistics import THROTTLE
 from sq_perception.recordings.publication import covariances, superquadrics
@@ -48,7 +48,7 @@ class GraspNode(ManagedNode):
         self._settings = LiveParameters(self, GraspParameters)
         self._last: PointCloud2 | None = None
         self._plane: PoseStamped | None = None
-        self._shown: tuple[int, ...] = ()
+        self._marker_ids = MarkerIds()
         self._publishers: list[Publisher] = []
         self._publishing = threading.Lock()
         """Held while something is published, or nothing is any more."""
@@ -80,7 +80,7 @@ class GraspNode(ManagedNode):
             self.destroy_subscription(subscription)
         self._subscriptions = []
         with self._publishing:
-            if self._shown and self._last is not None and self.context.ok():
+            if self._publishers and self._last is not None and self.context.ok():
                 shown = self._publishers[-1]
                 shown.publish(self._markers([], [], self._last.header))
                 shown.wait_for_all_acked(ARRIVAL)
@@ -178,8 +178,7 @@ class GraspNode(ManagedNode):
 
     def _markers(self, meshes: list[Mesh], ids: list[int], header: Any) -> MarkerArray:
         """Those of grasps of some bodies, which take the place of those before."""
-        before, self._shown = self._shown, tuple(ids)
-        return markers(meshes, ids, header, namespace="grasps", previous_ids=before)
+        return markers(meshes, ids, header, namespace="grasps", previous_ids=self._marker_ids.replaced(ids))
 
 
 def planned(bodies: SuperquadricArray, parameters: GraspParameters, plane: np.ndarray | None = None) -> GraspPlan:

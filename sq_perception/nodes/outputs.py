@@ -14,8 +14,10 @@ outlives a restart after a fault, so that an object that is gone is still remove
 
 from __future__ import annotations
 
-from collections.abc import Collection
+import math
+from collections.abc import Collection, Sequence
 from functools import partial
+from time import monotonic
 from typing import Any
 
 from geometry_msgs.msg import PoseStamped
@@ -45,6 +47,30 @@ from sq_perception.recovery.recovery import timed
 _OVERRIDABLE = tuple(getattr(QoSPolicyKind, name) for name in ("HISTORY", "DEPTH", "RELIABILITY", "DURABILITY"))
 ARRIVAL = Duration(seconds=0.5)
 """How long the last markers may take to arrive before their publisher goes."""
+_REPEATED = 10.0
+"""Seconds for which a marker is deleted again and again: longer than RViz is busy with something else."""
+_MOST_AGAIN = 32
+"""Ids of which that is done, those that went last: each costs a message 0.1 ms."""
+
+
+class MarkerIds:
+    """Ids of the markers that a listener may still show: those of the last message, and for a while those before.
+
+    A listener that is busy loses messages, and a marker whose deletion was in a lost one would stay for good.
+    """
+
+    def __init__(self) -> None:
+        self._until: dict[int, float] = {}
+        """Until when they are deleted, in the order in which they went; endless while they are shown."""
+
+    def replaced(self, ids: Sequence[int]) -> list[int]:
+        """Those that the next message has to delete, which shows ``ids``."""
+        now, shown = monotonic(), dict.fromkeys(ids, math.inf)
+        gone = {number: until for number, until in self._until.items() if until >= now and number not in shown}
+        again = dict([one for one in gone.items() if one[1] < math.inf][-_MOST_AGAIN:])
+        fresh = dict.fromkeys((number for number in gone if gone[number] == math.inf), now + _REPEATED)
+        self._until = again | fresh | shown
+        return [*again, *fresh]
 
 
 class Outputs:
@@ -54,7 +80,9 @@ class Outputs:
         self._node, self._poses = node, poses
         self.optional = OptionalOutputs(node)
         self._publishers: tuple[Publisher, ...] = ()
-        self._shown: Findings | None = None
+        self._marker_ids = MarkerIds()
+        self._header: Any = None
+        """That of the markers that are shown, if there are any."""
 
     def open(self, parameters: RecoverParameters) -> None:
         """Create what is published."""
@@ -80,9 +108,9 @@ class Outputs:
 
     def hide(self) -> None:
         """Delete the markers: nobody moves them from now on."""
-        if self._shown is not None and self._node.context.ok():
-            gone, self._shown = self._shown, None
-            self.markers.publish(markers([], [], gone.header, previous_ids=gone.shown_ids))
+        if self._header is not None and self._node.context.ok():
+            header, self._header = self._header, None
+            self.markers.publish(markers([], [], header, previous_ids=self._marker_ids.replaced(())))
 
     def answer(self, found: Identified, frame: Frame, parameters: RecoverParameters) -> Findings:
         """Publish the point cloud, in ``target_frame`` if there is one; what was found as every output shows it.
@@ -105,10 +133,9 @@ class Outputs:
                 self.optional.publish(shown, parameters, found.hidden)
             with timed(stages, "pictures"):
                 if self.markers.get_subscription_count():
-                    before = self._shown.shown_ids if self._shown is not None else ()
-                    by_score = parameters.marker_colours == "score"
-                    self.markers.publish(shown.markers(before, by_score, parameters.marker_alpha))
-                    self._shown = shown
+                    gone, by_score = self._marker_ids.replaced(shown.shown_ids), parameters.marker_colours == "score"
+                    self.markers.publish(shown.markers(gone, by_score, parameters.marker_alpha))
+                    self._header = shown.header
                 if self.rendered_depth.get_subscription_count():
                     self.rendered_depth.publish(frame.encode(render_recovery(found.recovery, frame.camera)[0]))
         except Exception as error:

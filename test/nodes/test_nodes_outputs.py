@@ -24,9 +24,10 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.calibration import Calibration
 from sq_perception.imaging.camera import Camera
+from sq_perception.nodes import outputs as outputs_module
 from sq_perception.nodes.frame import Frame
 from sq_perception.nodes.live_parameters import ParameterError
-from sq_perception.nodes.outputs import OptionalOutputs, in_frame
+from sq_perception.nodes.outputs import MarkerIds, OptionalOutputs, in_frame
 from sq_perception.nodes.parameters import RecoverParameters
 from sq_perception.nodes.tracking import CameraPoses, PoseError, Tracking
 from sq_perception.recordings import publication
@@ -372,6 +373,21 @@ def test_markers_follow_the_frame(node, tf2):
     for k in range(4):
         near, far = (np.array([[p.x, p.y, p.z] for p in array.markers[k].points]) for array in (one, other))
         np.testing.assert_allclose(near @ quaternions.to_matrix(turn).T + shift, far, atol=1e-6)
+
+
+def test_markers_that_are_gone_are_deleted_for_a_while_and_all_of_them_at_once(monkeypatch):
+    now = [100.0]
+    monkeypatch.setattr(outputs_module, "monotonic", lambda: now[0])
+    ids = MarkerIds()
+    assert ids.replaced([1, 2]) == []
+    now[0] += 60
+    assert [ids.replaced([1]), ids.replaced([1])] == [[2], [2]], "however long they were shown"
+    assert [ids.replaced([2]), ids.replaced([2])] == [[1], [1]], "2 is back"
+    now[0] += 10.5
+    assert ids.replaced([2]) == []
+    ids.replaced(range(50))
+    assert sorted(ids.replaced([])) == list(range(50))
+    assert 0 < len(ids.replaced([])) < 50
 
 
 def test_markers_lie_on_the_bodies(node):

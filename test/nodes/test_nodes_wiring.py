@@ -14,6 +14,8 @@ pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
 from frame_node_bench import CAMERA, FRAME_ID, Bench, ball
 from geometry_msgs.msg import PoseStamped
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
@@ -418,6 +420,30 @@ def test_pictures_are_made_while_somebody_listens_and_stale_markers_go(bench):
     bench.until(lambda: len(shown) == 2)
     actions = {(marker.id, marker.action) for marker in shown[1].markers}
     assert actions == {(5, Marker.ADD), (1, Marker.DELETE)}
+
+
+def test_a_marker_goes_though_its_listener_was_too_busy_to_hear_of_it(bench):
+    """RViz has a queue of 5 messages: the one that deletes a marker falls out of it while RViz draws something else."""
+    assert bench.node.set_parameters([Parameter("tracking", value=False)])[0].successful
+    busy, shown = Node("busy", context=bench.context), set()
+
+    def draw(message: MarkerArray) -> None:
+        for marker in message.markers:
+            (shown.add if marker.action == Marker.ADD else shown.discard)(marker.id)
+
+    busy.create_subscription(MarkerArray, "recover_node/markers", draw, 5)
+    executor = SingleThreadedExecutor(context=bench.context)
+    executor.add_node(busy)
+    bench.until(lambda: bench.node._outputs.markers.get_subscription_count())
+    bench.recoverer.bodies = (ball(1), ball(5))
+    bench.answer(bench.depth())
+    bench.until(lambda: executor.spin_once(0.05) or shown == {1, 5})
+    bench.recoverer.bodies = (ball(5),)
+    for _ in range(8):
+        bench.answer(bench.depth())
+    bench.until(lambda: executor.spin_once(0.05) or shown == {5})
+    executor.remove_node(busy)
+    busy.destroy_node()
 
 
 @pytest.mark.parametrize("end", ["disabled", "deactivated", "ended"])
