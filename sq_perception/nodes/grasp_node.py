@@ -64,6 +64,7 @@ class GraspNode(ManagedNode):
         warm_up()
 
     def _activate(self) -> None:
+        self._last = self._plane = None  # of another time: what was there then may be gone
         kinds: tuple[tuple[type[Any], str], ...] = (
             (PoseArray, "~/grasps"),
             (PointCloud2, "~/grasp_details"),
@@ -90,7 +91,6 @@ class GraspNode(ManagedNode):
 
     def _cleanup(self) -> None:
         self._deactivate()
-        self._last = self._plane = None
 
     def _on_plane(self, message: PoseStamped) -> None:
         self._plane = message

@@ -169,6 +169,15 @@ def test_a_cloud_that_is_planned_while_the_node_is_deactivated_is_dropped(bench,
     assert len(bench.answer(to_message(bodies(), HEADER))["grasps"].poses) > 0
 
 
+def test_what_was_there_before_a_pause_is_not_planned_for_after_it(bench):
+    bench.answer(to_message(bodies(), HEADER))
+    assert bench.call(Trigger, "/grasp_node/plan", Trigger.Request()).success
+    assert bench.node._change("deactivate")
+    assert bench.node._change("activate")
+    answer = bench.call(Trigger, "/grasp_node/plan", Trigger.Request())
+    assert (answer.success, answer.message) == (False, "no superquadrics have come yet")
+
+
 def asked_for(bench, target):
     """What MoveIt's service answers: its handler, as classes of a service exist only where they are built."""
     from moveit_msgs.msg import MoveItErrorCodes
