@@ -32,8 +32,8 @@ ARGUMENTS = {
     "use_sim_time": ("", "true: time is that of /clock"),
     "log_level": ("", "of the nodes: debug, info, warn, error or fatal"),
     "respawn": ("true", "start a node again that has ended by itself"),
-    "fitter": ("false", "also start fitter_node, the classic method"),
-    "rviz": ("false", "also start RViz2 with share/sq_perception/config/superquadrics.rviz"),
+    "fitter": ("false", "also start fitter_node, the classic method, on the first camera"),
+    "rviz": ("false", "also start RViz2 with share/sq_perception/config/superquadrics.rviz, on the first camera"),
     "rviz_frame": ("camera_depth_optical_frame", "RViz2's fixed frame: the frame_id of the depth images"),
 }
 _YES = ("true", "1", "yes")
@@ -53,7 +53,8 @@ def generate_launch_description() -> LaunchDescription:
 
 def _nodes(context: LaunchContext) -> list[Node]:
     given = {name: LaunchConfiguration(name).perform(context) for name in ARGUMENTS}
-    cameras = given["cameras"].split()
+    cameras = [_within(given["namespace"], camera).strip("/") for camera in given["cameras"].split()]
+    first = cameras[0] if cameras else given["namespace"]
     executables = ["recover_cameras" if cameras else "recover_node"]
     executables += ["fitter_node"] * (given["fitter"].lower() in _YES)
     parameters: list[str | dict[str, bool | str]] = [given["params_file"]] if given["params_file"] else []
@@ -68,13 +69,13 @@ def _nodes(context: LaunchContext) -> list[Node]:
             package="sq_perception",
             executable=executable,
             # Those of recover_cameras have names of their own: one for the process would be one for all of them.
-            **({} if executable == "recover_cameras" else {"name": executable, "namespace": given["namespace"]}),
+            **({} if executable == "recover_cameras" else {"name": executable, "namespace": first}),
             output="screen",
             respawn=given["respawn"].lower() in _YES,
             respawn_delay=_RESPAWN_DELAY,
             parameters=parameters,
             arguments=[
-                *([_within(given["namespace"], one).strip("/") for one in cameras] * (executable == "recover_cameras")),
+                *(cameras * (executable == "recover_cameras")),
                 *(["--ros-args", "--log-level", given["log_level"]] if given["log_level"] else []),
             ],
             remappings=[
@@ -86,24 +87,24 @@ def _nodes(context: LaunchContext) -> list[Node]:
         )
         for executable in executables
     ]
-    return nodes + [_rviz(given)] * (given["rviz"].lower() in _YES)
+    return nodes + [_rviz(given, first)] * (given["rviz"].lower() in _YES)
 
 
-def _rviz(given: dict[str, str]) -> Node:
-    """RViz2 on the camera's topics: its configuration names those of the demonstration."""
+def _rviz(given: dict[str, str], namespace: str) -> Node:
+    """RViz2 on the topics of the camera in a namespace: its configuration names those of the demonstration."""
     share = PathJoinSubstitution([FindPackageShare("sq_perception"), "config", "superquadrics.rviz"])
     return Node(
         package="rviz2",
         executable="rviz2",
         arguments=["-d", share, "-f", given["rviz_frame"]],
         remappings=[
-            ("/depth/image", _within(given["namespace"], given["depth"])),
-            ("/depth/camera_info", _within(given["namespace"], given["camera_info"])),
+            ("/depth/image", _within(namespace, given["depth"])),
+            ("/depth/camera_info", _within(namespace, given["camera_info"])),
             *(
-                (f"/{node}/{name}", _within(given["namespace"], f"{node}/{name}"))
+                (f"/{node}/{name}", _within(namespace, f"{node}/{name}"))
                 for node in ("recover_node", "fitter_node")
                 for name in ("markers", "rendered_depth")
-                if given["namespace"]
+                if namespace
             ),
         ],
     )

@@ -135,3 +135,17 @@ def test_rviz_looks_at_the_topics_of_the_camera(repository: Path, launch: dict[s
     assert [node.named["executable"] for node in nodes] == ["recover_node", "rviz2"]
     assert dict(rviz.named["remappings"]) == {"/depth/image": "/zed/depth", "/depth/camera_info": "/zed/info"}
     assert rviz.named["arguments"][-1] == "zed_optical"
+
+
+def test_of_several_cameras_rviz_and_the_classic_method_see_the_first(
+    repository: Path, launch: dict[str, type]
+) -> None:
+    path = repository / "launch_scripts" / "recover.launch.py"
+    given = {"cameras": "front wrist", "depth": "depth/raw", "rviz": "true", "fitter": "true", "namespace": "robot"}
+    nodes = nodes_of(path, launch, **given)
+    assert nodes[1].named["namespace"] == "robot/front"
+    remapped = dict(rviz_of(nodes).named["remappings"])
+    assert remapped["/depth/image"] == "/robot/front/depth/raw"
+    assert remapped["/depth/camera_info"] == "/robot/front/depth/camera_info"
+    assert remapped["/recover_node/markers"] == "/robot/front/recover_node/markers"
+    assert remapped["/fitter_node/markers"] == "/robot/front/fitter_node/markers"
