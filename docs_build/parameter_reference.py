@@ -39,7 +39,9 @@ After a change of `model`, `device`, `method` or `threads` frames go on as befor
 if it cannot be made the old one stays, and `/diagnostics` says why. Another `method` or model ends the tracks.
 
 Quality of service is a parameter too, at the start only: `qos_overrides.<topic>.subscription.reliability`, `.depth`,
-`.history`, or `.publisher.` and also `.durability`, with the topic as it is after remapping.
+`.history`, or `.publisher.` and also `.durability`, with the topic as it is after remapping. recover_node takes it for
+its inputs and for `~/superquadrics`, `~/markers`, `~/rendered_depth` and `~/support_plane`, synthetic_depth_node for
+all its topics, grasp_node for none.
 """
 
 
