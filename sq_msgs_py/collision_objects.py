@@ -35,6 +35,8 @@ Mesh = tuple[np.ndarray, np.ndarray]
 """Vertices (k, 3) and faces (m, 3)."""
 _STEP = 0.002
 """Metres: a body of which no point has moved farther is not sent again to planners, whose paddings are larger."""
+_AGAIN, _MOST_GONE = 2, 100
+"""Repetitions that remove a body that is gone, as a planner may be busy when the first one comes, and of how many."""
 
 
 class Scene:
@@ -48,12 +50,22 @@ class Scene:
     def __init__(self) -> None:
         self._known: dict[str, SuperquadricArray | None] = {}
         """By name; None for those that have to be sent again."""
+        self._gone: dict[str, int] = {}
+        """How many repetitions remove a name once more, in the order in which they went."""
+        self._gone_again: frozenset[str] = frozenset()
+        """Those that the next frame removes once more."""
         self._known_as = "", False
         self._header: Any = None
 
     def forget(self) -> None:
         """Let the next frame send every object again: another planner listens."""
         self._known = dict.fromkeys(self._known)
+
+    def repeat(self) -> None:
+        """Let the next frame send every object and every late removal again: a planner may have lost messages."""
+        self.forget()
+        self._gone_again = frozenset(self._gone)
+        self._gone = {key: left - 1 for key, left in self._gone.items() if left > 1}
 
     def changes(
         self,
@@ -85,7 +97,10 @@ class Scene:
             surfaces = list(compress(meshes(), new)) if new.any() else []
         objects = collision_objects(shown.where(new), header, meshes=surfaces, prefix=prefix)
         kept = {*names, *(name(number, prefix) for number in hidden)}
-        objects += removals(self._known.keys() - kept, header)
+        gone = self._known.keys() - kept
+        objects += removals((gone | self._gone_again) - kept, header)
+        late = [*((key, left) for key, left in self._gone.items() if key not in gone), *((key, _AGAIN) for key in gone)]
+        self._gone, self._gone_again = dict(late[-_MOST_GONE:]), frozenset()
         self._known = {key: state for key, state in self._known.items() if key in kept}
         self._known.update({names[k]: shown.where(np.arange(len(shown)) == k) for k in np.flatnonzero(new)})
         return objects

@@ -7,9 +7,9 @@ output is asked for, and one that is missing is named once in the log and stays 
 /tf is published as tf2_ros.TransformBroadcaster does it, with the same queue of 100; a publisher of our own needs
 tf2_msgs alone, knows whether anybody listens, and can be taken down again.
 
-The planning scene is sent again when another planner listens.  Switching it off removes all objects that were added.  A
-node that ends removes nothing: a planner must not lose its obstacles because a camera fails; and what planners know
-outlives a restart after a fault, so that an object that is gone is still removed.
+The planning scene is sent again when another planner listens, and from time to time.  Switching it off removes all
+objects that were added.  A node that ends removes nothing: a planner must not lose its obstacles because a camera
+fails; and what planners know outlives a restart after a fault, so that an object that is gone is still removed.
 """
 
 from __future__ import annotations
@@ -47,6 +47,9 @@ from sq_perception.recovery.recovery import timed
 _OVERRIDABLE = tuple(getattr(QoSPolicyKind, name) for name in ("HISTORY", "DEPTH", "RELIABILITY", "DURABILITY"))
 ARRIVAL = Duration(seconds=0.5)
 """How long the last markers may take to arrive before their publisher goes."""
+_ALL_AGAIN = 5.0
+"""Seconds between two messages of the whole planning scene: a planner takes none while it plans, its queue holds ten,
+and what fell out of it would stay for good in its world as it was."""
 _REPEATED = 10.0
 """Seconds for which a marker is deleted again and again: longer than RViz is busy with something else."""
 _MOST_AGAIN = 32
@@ -180,6 +183,7 @@ class OptionalOutputs:
         self._scene = collision_objects.Scene()
         self._listeners: tuple[int, frozenset[bytes]] = 0, frozenset()
         """How many planners there were, and which."""
+        self._all_due = 0.0
 
     def follow(self, parameters: RecoverParameters) -> None:
         """Create the publishers that are asked for, and destroy the others."""
@@ -217,6 +221,9 @@ class OptionalOutputs:
         heard = self._heard("publish_collision_objects")
         if self._has_another_listener(heard):
             self._scene.forget()
+        if heard is not None and monotonic() >= self._all_due:
+            self._scene.repeat()
+            self._all_due = monotonic() + _ALL_AGAIN
         if heard is not None and parameters.publish_collision_objects and has_frame:
             meshes = (lambda: found.meshes) if parameters.collision_shapes == "mesh" else None
             objects = self._scene.changes(found.array, found.header, hidden, meshes=meshes, prefix=parameters.tf_prefix)

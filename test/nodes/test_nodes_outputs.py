@@ -91,6 +91,7 @@ class Node:
         self.all: list[Publisher] = []
         self.warnings: list[str] = []
         self.said: list[str] = []
+        self.time = 100.0
 
     def create_publisher(self, kind: type[Any], topic: str, queue: int) -> Publisher:
         assert topic not in self.publishers
@@ -116,7 +117,9 @@ class Node:
 @pytest.fixture
 def node(monkeypatch: pytest.MonkeyPatch) -> Node:
     soft_messages.install(monkeypatch)
-    return Node()
+    made = Node()
+    monkeypatch.setattr(outputs_module, "monotonic", lambda: made.time)
+    return made
 
 
 def objects(publisher: Publisher, which: int = -1) -> dict[str, bytes]:
@@ -243,6 +246,48 @@ def test_planners_are_told_of_changes_alone_and_a_new_planner_of_everything(node
     scene.restarts += 1
     assert show(BOX, CAN, collision_shapes="mesh") == 2, "between two frames, too"
     assert show(BOX, CAN, collision_shapes="mesh") == 0
+
+
+def test_a_planner_that_was_busy_knows_in_the_end_what_is_there(node):
+    """It plans while one body goes and another one moves, and gets the last ten messages of that time."""
+    outputs = OptionalOutputs(node)
+    outputs.follow(ALL)
+    known: dict[str, Any] = {}
+
+    def heard(bodies: dict[int, Superquadric]) -> None:
+        identified = Identified(recovery(*(one(body, k) for k, body in bodies.items())), tuple(bodies))
+        outputs.publish(publication.findings(identified, HEADER, is_cube=False), ALL)
+
+    def take() -> None:
+        scene = node.publishers[SCENE]
+        for message in scene.sent[-10:]:
+            for thing in message.world.collision_objects:
+                known.pop(thing.id, None)
+                if thing.operation == soft("moveit_msgs").CollisionObject.ADD:
+                    known[thing.id] = thing.pose.position.x
+        scene.sent.clear()
+
+    def beside(body: Superquadric, x: float) -> Superquadric:
+        return Superquadric(body.size, body.shape, body.translation + [x, 0, 0], body.rotation)
+
+    heard({1: BOX, 2: CAN, 3: BOX})
+    take()
+    for k in range(1, 20):
+        heard({2: beside(CAN, 0.01 * k), 3: beside(BOX, 0.1)})
+    take()
+    assert set(known) == {"superquadric_1", "superquadric_2", "superquadric_3"}, "the removal was lost"
+    node.time += 6
+    for _ in range(3):
+        heard({2: beside(CAN, 0.2), 3: beside(BOX, 0.1)})
+    assert len(node.publishers[SCENE].sent) == 1
+    take()
+    assert known == {"superquadric_2": pytest.approx(0.05), "superquadric_3": pytest.approx(0.11)}
+    told = []
+    for _ in range(2):
+        node.time += 6
+        heard({2: beside(CAN, 0.2), 3: beside(BOX, 0.1)})
+        told.append(len(objects(node.publishers[SCENE])))
+    assert told == [3, 2], "removed by two repetitions, as a planner may miss the first, and no more"
 
 
 def test_switching_off_removes_and_ending_does_not(node):
