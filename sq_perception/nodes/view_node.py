@@ -154,6 +154,7 @@ class ViewNode(Node):
         with self._lock:
             self._arrivals.append(monotonic())
             self._images[stamp_of(message)] = message
+            self._images.move_to_end(stamp_of(message))  # where a short bag begins again the stamp is there already
             while len(self._images) > _IMAGES:
                 self._images.popitem(last=False)
         # The image waits for its result, where results come at all.

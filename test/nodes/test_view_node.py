@@ -57,3 +57,11 @@ def test_bodies_in_another_frame_are_drawn_though_a_bag_begins_again(view, monke
         cloud = to_message(SuperquadricArray.empty(), Header(stamp=stamp, frame_id="base"))
         drawn.append(view._converted(cloud, image.header)[1] == "")
     assert drawn == [True, False, True]
+
+
+def test_the_newest_image_is_the_last_one_where_a_short_bag_is_in_a_loop(view):
+    newest = []
+    for sec in (1, 2, 3, 1, 2):
+        view._on_image(depth_to_message(np.ones((2, 2)), Header(stamp=Time(sec=sec), frame_id="camera")))
+        newest.append(next(reversed(view._images.values())).header.stamp.sec)
+    assert newest == [1, 2, 3, 1, 2]
