@@ -14,6 +14,7 @@ Things of household scenes (:mod:`household_things`), at least half visible, and
 | every ray counts | as 1000 independent rays instead of 100 |
 | as a body | points within count in full, space within the outline's hull must be empty |
 | no plane, no free space | without either |
+| no plane, exactly | without one, and a superquadric that explains the image to its noise is sought first |
 | missing is empty | pixels without a reading belong to no part of the body |
 | hull alone | hardly any ray counts: what the network knows |
 | true hull | the true support function in place of the predicted one, 1 % of the view exact |
@@ -106,7 +107,8 @@ def rows() -> tuple[Row, ...]:
         row("twice as sure", hull=lambda h, _: replace(h, covariance=h.covariance / 4)),
         row("every ray counts", program=rays(1000.0)),
         row("as a body", program=lambda: patch.multiple(Observation, of_hull=lambda self: self)),
-        row("no plane", plane=None, model_error=methods.MODEL_ERROR),
+        row("no plane", plane=None),
+        row("no plane, exactly", program=lambda: patch.object(surface_fit, "_fills", lambda _: True), plane=None),
         row("no free space", nan_is_empty=False),
         row("missing is empty", nan_is_empty=True),
         row("hull alone", program=rays(3.0)),
