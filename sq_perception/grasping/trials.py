@@ -63,9 +63,9 @@ class Trials(NamedTuple):
         return np.asarray(np.argmin(self.logs, axis=1))
 
     def first(self, count: int, least: float = -np.inf) -> Trials:
-        """The most probable ones of each body, each body's in order, of those whose logarithm is above ``least``."""
+        """The most probable ones of each body, each body's in order, without those below the logarithm ``least``."""
         total = self.total
-        rows = np.flatnonzero(total > least)
+        rows = np.flatnonzero(total >= least)  # also what cannot hold, -inf: why it does not is a reason
         rows = rows[np.lexsort((-total[rows], self.owner[rows]))]
         return self.at(rows[_rank(self.owner[rows]) < count])
 

@@ -133,6 +133,12 @@ def test_what_lies_behind_the_support_has_that_for_a_reason():
     assert reasons[3] == ""
 
 
+def test_what_no_pad_meets_squarely_has_friction_for_a_reason():
+    """A low pebble, 6 cm long and 2.4 cm high: the fingers can come, and would slip off its slopes."""
+    pebble = standing([0.023, 0.031, 0.012], [1.7, 0.7])
+    assert plan(pebble, friction=0.4).reasons == ("nothing holds: friction",)
+
+
 def test_no_more_points_are_kept_than_are_promised_and_from_everywhere():
     camera = Camera(100, 100, 100.0, 100.0, 49.5, 49.5)
     points = Surroundings.of_image(np.full((100, 100), 2.0), camera, None).points
