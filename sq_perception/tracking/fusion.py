@@ -31,7 +31,8 @@ Equal views are averaged with equal weights and P falls to B, not to zero; views
 = gamma = 0 and F = 0 it is the Kalman filter of a constant.
 
 A view beyond the kept number takes the place of the one used longest ago: P keeps its error, only that a later look
-from there counts as new.
+from there counts as new.  So does, in those numbers, a look that knows some of them far better than the view's common
+error: a hand was in front, say, and is no more.
 
 Reference: S. F. Schmidt, Application of State-Space Methods to Navigation Problems, Adv. in Control Systems 3, 1966.
 """
@@ -51,6 +52,9 @@ VIEW_ANGLE = 0.25
 """Radians: views closer than this share their systematic error.  Chosen: outlines change little within 14 degrees."""
 VIEWS = 16
 """Directions that are remembered for each body: two thirds of a circle at ``VIEW_ANGLE``.  Each costs time."""
+_BETTER = 4.0
+"""Of variances: a look is far better that halves a deviation.  Chosen: of 224 looks at eight simulated bodies that
+nothing hid, the least sure first look had 2.1 times a later one's."""
 
 
 class Views(NamedTuple):
@@ -134,11 +138,14 @@ def fused(
     fresh = likeness[row, place] < np.cos(VIEW_ANGLE)
     place = np.where(fresh, np.argmin(used, axis=1), place)
     directions[row[fresh], place[fresh]] = local[fresh]
-    biases[row[fresh], place[fresh]] = common[fresh]
-    correlations[row[fresh], place[fresh]] = 0.0
     used[row, place] = used.max(axis=1) + 1
 
     bias, correlation = biases[row, place], correlations[row, place]
+    better = fresh[:, None] | (np.einsum("nii->ni", bias) > _BETTER * np.einsum("nii->ni", common))
+    same = ~better[:, :, None] & ~better[:, None, :]
+    bias = np.where(same, bias, np.where(better[:, :, None] & better[:, None, :], common, 0.0))
+    correlation = np.where(better[:, None, :], 0.0, correlation)
+    biases[row, place], correlations[row, place] = bias, correlation
     noise = bias + white
     total = covariance - correlation - correlation.swapaxes(1, 2) + noise
     gain = np.linalg.solve(total, (covariance - correlation).swapaxes(1, 2)).swapaxes(1, 2)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scipy.stats import chi2
 from tracked_bodies import (
     Seen,
     angle_between,
@@ -238,6 +239,21 @@ def test_deviations_three_times_too_small_break_nothing(rng):
     assert moving < 0.1 * 6 * 40
     errors = [np.abs(error_of(t, truth)[0][:3]).mean() for t, truth in zip(tracks, truths, strict=True)]
     assert np.mean(errors) < 0.04 * np.sqrt(2 / np.pi)
+
+
+@pytest.mark.parametrize("loose", [noise(0.5, 0.3, 0.02, 0.3), state.diagonal(0.01, 0.02, 0.001, 0.02)])
+def test_a_first_look_past_a_hand_leaves_no_doubt_in_those_that_follow(loose, rng):
+    """A still camera; of the second body the first frame leaves one size open alone.  All is known soon after."""
+    truth, tracker, sure = body(), Tracker(), noise(0.01, 0.02, 0.001, 0.02)
+    loose[0, 0] = 0.5**2
+    for k in range(20):
+        (track,) = tracker.update([draw(truth, loose if k == 0 else sure, rng, form=0)], 0.1 * k)
+        assert track.id == 1
+        assert np.linalg.eigvalsh(track.covariance).min() > 0
+    relative = track.sigma_size / truth.size
+    assert relative.max() < 0.02
+    assert relative.min() > 0.5 * 0.01, "a still camera averages no more out than before"
+    assert nees(track, truth) < chi2.ppf(0.999, 11)
 
 
 def test_an_unknown_covariance_has_a_default():
