@@ -146,7 +146,8 @@ class Body:
             variance[CENTRE] += _MOTION_SHARE**2 * (step @ step)
             variance[TURN] += _MOVING_TURN**2 * min(elapsed, 1.0)
         if stamp - self.last > FORGET_POSE_AFTER:
-            variance[POSE] += _UNPLACED**2
+            # Once: however many frames pass meanwhile, it cannot be forgotten more.
+            variance[POSE] += np.maximum(_UNPLACED**2 - np.diag(self.covariance)[POSE], 0.0)
         covariance = self.covariance + np.diag(variance)
         answer = self.answer if self.observation is not None else None
         return replace(self, state=after, covariance=covariance, velocity=velocity, observation=None, answer=answer)

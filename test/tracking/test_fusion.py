@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from scipy.stats import chi2
 from tracked_bodies import (
+    CAMERA,
+    NOTHING,
     Seen,
     angle_between,
     assert_chi_square,
@@ -254,6 +256,15 @@ def test_a_first_look_past_a_hand_leaves_no_doubt_in_those_that_follow(loose, rn
     assert relative.max() < 0.02
     assert relative.min() > 0.5 * 0.01, "a still camera averages no more out than before"
     assert nees(track, truth) < chi2.ppf(0.999, 11)
+
+
+@pytest.mark.parametrize("rate", [2, 30])
+def test_a_hidden_pose_is_forgotten_once_at_any_frame_rate(rate, rng):
+    tracker = Tracker()
+    tracker.update([draw(body(), noise(), rng)], 0.0)
+    for k in range(1, 20 * rate):
+        (track,) = tracker.update([], k / rate, camera=CAMERA, depth=NOTHING)
+    np.testing.assert_allclose(np.sqrt(np.diag(track.covariance)[5:]), 1.0, rtol=0.01)
 
 
 def test_an_unknown_covariance_has_a_default():
