@@ -138,9 +138,11 @@ class TrackingSession:
         Raises
         ------
         ValueError
-            As :meth:`Tracker.update`; nothing has changed then.
+            As :meth:`Tracker.update`; nothing has changed then, unless the stamp is before the last one.
         """
         rotation, position = state.as_pose(camera_pose) if is_pose_known else self._pose
+        if stamp < self._stamp:
+            self._posed().reset()  # its own last frame, one with a pose, may be older
         if not is_pose_known and self._without_pose is None:
             self._without_pose = copy(self._tracker)
         tracker = self._posed() if is_pose_known else self._without_pose or self._tracker

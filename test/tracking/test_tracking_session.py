@@ -178,6 +178,18 @@ def test_a_can_that_is_tipped_over_stays_a_can(height, rng):
     np.testing.assert_allclose(found.superquadric.gauge(points), seen.superquadric.gauge(points), rtol=1e-9)
 
 
+@pytest.mark.parametrize("is_pose_known", [True, False])
+def test_time_that_goes_back_to_between_frames_with_and_without_a_pose_resets(is_pose_known, rng):
+    """A pose at 10 s, none at 20 s, and then 15 s: before the last frame, though not before the last pose."""
+    one, seen = TrackingSession(), draw(body(), noise(), rng)
+    one.follow([seen], 10.0)
+    one.follow([seen], 20.0, is_pose_known=False)
+    (found,) = one.follow([seen], 15.0, is_pose_known=is_pose_known)
+    (later,) = one.follow([seen], 16.0)
+    assert (found.id, found.seen, one.tally.resets) == (2, 1, 1)
+    assert (later.id, later.seen) == ((2, 2) if is_pose_known else (3, 1))
+
+
 def test_time_that_goes_back_resets_and_ids_go_on(rng):
     one = TrackingSession()
     assert [one.follow([draw(body(), noise(), rng)], stamp)[0].id for stamp in (5.0, 5.1, 5.1, 2.0, 2.1)] == [
