@@ -42,6 +42,8 @@ COMMON_SHARE, LASTING_SHARE = 0.25, 0.25
 common.  Chosen; benchmarks/tracking.py finds half of a view's error to be the same over all frames."""
 LEAST = state.diagonal(0.01, 0.02, 0.001, 0.01)
 """F, the least common error of a view.  Chosen: 1 % in size, a millimetre, half a degree."""
+_LEAST_WHITE = 1e-6
+"""Share of F that is new in every observation at least: of exact ones, such as a simulator's, S has no inverse else."""
 UNKNOWN = 0.15, 0.2, 0.15, 0.2
 """Deviations (log sizes, exponents, centre as a share of the mean half size, turn) of observations without covariance.
 Chosen: errors of the classic fit and of the network alone on household things are of this order."""
@@ -263,7 +265,7 @@ def _fused(bodies: _Bodies, pairs: Pairs, to_camera: np.ndarray, stamp: float) -
     some = [bodies[k] for k in pairs.track]
     states, covariances = stacked(some)
     common = COMMON_SHARE * pairs.covariance + LEAST
-    white = (1 - COMMON_SHARE - LASTING_SHARE) * pairs.covariance
+    white = (1 - COMMON_SHARE - LASTING_SHARE) * pairs.covariance + _LEAST_WHITE * LEAST
     whole = pairs.covariance + LEAST
     total, error, verdict = _compared(bodies, pairs)
     turning = np.zeros(len(some), dtype=bool)

@@ -267,6 +267,15 @@ def test_a_hidden_pose_is_forgotten_once_at_any_frame_rate(rate, rng):
     np.testing.assert_allclose(np.sqrt(np.diag(track.covariance)[5:]), 1.0, rtol=0.01)
 
 
+def test_exact_bodies_are_fused_to_themselves():
+    truth, tracker = body(), Tracker()
+    for k in range(5):
+        (track,) = tracker.update([Seen(truth, np.zeros((11, 11)))], 0.1 * k)
+    assert (track.id, track.seen) == (1, 5)
+    np.testing.assert_allclose(track.superquadric.to_flat(), truth.to_flat(), atol=1e-12)
+    assert np.linalg.eigvalsh(track.covariance).min() > 0
+
+
 def test_an_unknown_covariance_has_a_default():
     seen = Seen(body(), np.full((11, 11), np.nan))
     (track,) = Tracker().update([seen], 0.0)
