@@ -54,6 +54,8 @@ class Scene:
     def __init__(self, server: PageServer, has_one_node: bool) -> None:
         self._server, self._has_one_node = server, has_one_node
         self.camera: Camera | None = None
+        self._length = 0.0
+        """Of the view volume that is drawn."""
         self._target: np.ndarray | None = None
         self._faces = drawings.mesh_faces()
         self._handles: dict[tuple[str, str], Any] = {}
@@ -96,8 +98,8 @@ class Scene:
         """Draw what a camera sees up to the nearest depths."""
         length = max(_NEAR_SHARE * span[0] if camera.is_pinhole else 1.0, 1e-3)
         state: dict[str, Any] = {"visible": is_wanted}
-        if camera != self.camera:
-            self.camera, state["points"] = camera, drawings.view_volume(camera, length)
+        if (camera, length) != (self.camera, self._length):
+            self.camera, self._length, state["points"] = camera, length, drawings.view_volume(camera, length)
         self._put("", "/camera", partial(self._add_lines, _FRUSTUM, 1.5), **state)
 
     def _add_lines(self, colour: tuple[int, int, int], width: float, path: str, **state: Any) -> Any:

@@ -335,9 +335,12 @@ def test_the_page_draws_what_is_there_and_takes_away_what_is_not() -> None:
     with listening_socket("127.0.0.1", 0) as bound:
         page = Page(bound, ["/a", "/a/b"])
         try:
-            for camera, lines in ((CAMERA, 8), (unit_cube.camera(64, 48), 12)):
-                page.show_depth(np.full((48, 64), 0.8, np.float32), camera)
-                assert page._scene._handles["", "/camera"].points.shape == (lines, 2, 3)
+            cube = unit_cube.camera(64, 48)
+            for camera, depth, lines, far in ((CAMERA, np.nan, 8, 1e-3), (CAMERA, 0.8, 8, 0.32), (cube, 0.8, 12, 1.0)):
+                page.show_depth(np.full((48, 64), depth, np.float32), camera)
+                volume = page._scene._handles["", "/camera"].points
+                assert volume.shape == (lines, 2, 3)
+                assert volume[..., 2].max() == pytest.approx(far)
             page.show_bodies("/a/b", bodies(), 0.0, NodeState("/a/b", age=99.0))
             for found, parts in (
                 (bodies(), {"surface", "id", "shell", "bars"}),
