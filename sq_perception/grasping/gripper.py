@@ -51,7 +51,7 @@ class Gripper:
     Raises
     ------
     ValueError
-        For a length or force that is not positive and finite.
+        For a length or force that is not one positive and finite number, or a hand that is not three.
     """
 
     name: str
@@ -70,9 +70,10 @@ class Gripper:
         for field in fields(self):
             value = getattr(self, field.name)
             if field.name not in ("name", "link", "link_from_tcp", "joints"):
-                numbers = np.asarray(value, dtype=float)
-                if not (np.isfinite(numbers) & (numbers > 0)).all():
-                    raise ValueError(f"{field.name}: expected positive numbers, got {value}")
+                numbers, count = np.asarray(value, dtype=float), (3,) if field.name == "hand" else ()
+                if numbers.shape != count or not (np.isfinite(numbers) & (numbers > 0)).all():
+                    expected = "three positive numbers" if count else "a positive number"
+                    raise ValueError(f"{field.name}: expected {expected}, got {value}")
 
     def boxes(self, opening: float, reach: float = _REACH) -> np.ndarray:
         """Centre and half sizes (3, 6) of both fingers and the hand in the TCP's frame, at an opening.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -355,6 +357,21 @@ def test_misuse_is_told(wrong, what):
         Surroundings(plane=np.ones(4))
     with pytest.raises(ValueError, match="gripper"):
         gripper("claw")
+
+
+@pytest.mark.parametrize(
+    ("wrong", "what"),
+    [
+        ({"opening": 0.0}, "opening: expected a positive number, got 0.0"),
+        ({"tip": np.nan}, "tip"),
+        ({"palm": (0.03, 0.03)}, "palm: expected a positive number"),
+        ({"hand": (0.06, 0.2)}, "hand: expected three positive numbers"),
+        ({"hand": (0.06, 0.2, -0.1)}, "hand"),
+    ],
+)
+def test_a_gripper_of_other_numbers_is_refused_before_it_plans(wrong, what):
+    with pytest.raises(ValueError, match=what):
+        replace(PANDA, **wrong)
 
 
 @pytest.mark.parametrize("hand", GRIPPERS.values(), ids=lambda hand: hand.name)
