@@ -72,10 +72,13 @@ class RecordedInput:
 
     @property
     def files(self) -> list[Path]:
-        """Files and bags that are read."""
-        named = self._options.camera_info
-        given = [] if named is None or not Path(named).exists() else [Path(named)]
-        return given + [path for path, rest in self._sources if not isinstance(rest, FrameError)]
+        """Files that are read: frames, bags and what is in them, cameras, and masks."""
+        sources = [(path, rest) for path, rest in self._sources if not isinstance(rest, FrameError)]
+        cameras = dict.fromkeys(Path(rest) for _, rest in sources if rest is not None)
+        within = [inner for path, _ in sources if path.is_dir() for inner in sorted(path.iterdir())]
+        masks = self._options.reading.masks
+        found = [*cameras, *(path for path, _ in sources), *within, *([] if masks is None else sorted(masks.iterdir()))]
+        return [path for path in found if path.exists()]
 
     def __iter__(self) -> Iterator[tuple[str, RecordedFrame | FrameError]]:
         for path, rest in self._sources:
