@@ -85,6 +85,8 @@ def target(text: str) -> Path:
 
 def text_target(text: str) -> str:
     """As :func:`target`, or - for the standard output."""
+    if text == STANDARD_OUTPUT and sys.stdout is None:
+        raise argparse.ArgumentTypeError("the standard output is closed")
     return text if text == STANDARD_OUTPUT else str(target(text))
 
 

@@ -49,7 +49,20 @@ examples:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
-    given = list(sys.argv[1:] if arguments is None else arguments)
+    code = _run(list(sys.argv[1:] if arguments is None else arguments))
+    try:
+        # Here and not at the interpreter's end, which prints a failure as an exception and has an exit code of its own.
+        if sys.stdout is not None:
+            sys.stdout.flush()
+    except OSError as error:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if not isinstance(error, BrokenPipeError):
+            complain(f"the standard output: {error.strerror}")
+        return code or FAILURE
+    return code
+
+
+def _run(given: list[str]) -> int:
     try:
         if not given or given[0] not in COMMANDS:
             _parser().parse_args(given)
@@ -67,7 +80,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         complain(f"{given[0]} {NEEDS_TORCH}")
         return FAILURE
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return FAILURE
+    except OSError as error:
+        complain(f"{given[0]}: {error}")
         return FAILURE
 
 

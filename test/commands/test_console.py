@@ -2,8 +2,13 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+
 import cv2
 import numpy as np
+import pytest
 import yaml
 
 from sq_perception.commands import main
@@ -35,3 +40,24 @@ def test_neither_masks_nor_cameras_nor_the_files_of_a_bag_are_replaced(tmp_path,
         assert recover(*arguments) == 2
         assert "input" in capsys.readouterr().err
     assert [path.read_bytes() for path in kept] == before
+
+
+@pytest.mark.parametrize(
+    ("output", "words"),
+    [("/dev/full", "sq-perception: the standard output: No space left on device\n"), ("a closed pipe", "")],
+)
+def test_what_cannot_be_printed_is_code_one_and_no_exception(output, words):
+    """Buffered, as in a user's shell, so that it fails when all is done."""
+    into, of = os.pipe()
+    os.close(into)
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONUNBUFFERED"}
+    with os.fdopen(of, "wb") if output == "a closed pipe" else open(output, "wb") as sink:
+        command = [sys.executable, "-m", "sq_perception", "--version"]
+        done = subprocess.run(command, stdout=sink, stderr=subprocess.PIPE, text=True, env=environment, check=False)
+    assert (done.returncode, done.stderr) == (1, words)
+
+
+def test_json_on_a_closed_standard_output_is_wrong_usage(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "stdout", None)
+    assert recover(tmp_path / "a.npz", "--json", "-") == 2
+    assert "--json: the standard output is closed" in capsys.readouterr().err
