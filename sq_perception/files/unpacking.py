@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import io
 import math
+import tokenize
 import warnings
 import zipfile
 import zlib
@@ -132,7 +133,10 @@ def _numbers(file: IO[bytes], file_size: int, where: str = "") -> np.ndarray:
     """The array of an open NPY file of so many bytes."""
     version = np.lib.format.read_magic(file)
     header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
-    shape, is_fortran, dtype = header(file)
+    try:
+        shape, is_fortran, dtype = header(file)
+    except (SyntaxError, tokenize.TokenError) as error:  # NumPy reads a damaged header as Python of old
+        raise UnpackingError(f"{where}not a readable header: {error}") from error
     if dtype.hasobject:
         raise UnpackingError(f"{where}expected numbers, got objects")
     count = math.prod(shape)

@@ -93,6 +93,17 @@ def test_arrays_that_are_not_what_they_claim_are_refused(tmp_path, member, words
         read(path)
 
 
+@pytest.mark.parametrize(("there", "damaged"), [(b"}", b"("), (b"'<f8'", b"'<,48")])
+def test_a_damaged_header_is_refused_as_one(tmp_path, there, damaged):
+    """What NumPy raises about it is no ValueError, and one such frame ended a run over many."""
+    data = header((4,)).replace(there, damaged) + bytes(32)
+    (tmp_path / "a.npy").write_bytes(data)
+    with pytest.raises(UnpackingError, match="not a readable"):
+        unpacking.npy_array(tmp_path / "a.npy")
+    with pytest.raises(UnpackingError, match="not a readable"):
+        npz_arrays(archive(tmp_path, depth=data), ["depth"])
+
+
 def test_an_archive_that_unpacks_to_far_more_than_it_weighs_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(unpacking, "MOST_PIXELS", 2**16)
     path = archive(tmp_path, depth=npy(np.zeros((2**9, 2**9))))
