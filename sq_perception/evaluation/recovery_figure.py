@@ -38,7 +38,8 @@ def recovery_figure(
     rows = figure.add_gridspec(2, 1, height_ratios=(1.25, 1), hspace=0.16, **edges)
     top = rows[0].subgridspec(1, 2, wspace=0.04)
     bottom = rows[1].subgridspec(1, 3, wspace=0.02, width_ratios=(1, 1, 1.05))
-    figure.text(0.02, 0.968, title or "Recovered superquadrics", fontsize=15, weight="bold", color=plots.INK)
+    look = {"fontsize": 15, "weight": "bold", "color": plots.INK}
+    figure.text(0.02, 0.968, title or "Recovered superquadrics", look, parse_math=False)  # a file may be called $1$
 
     pixels = np.argwhere(np.isin(recovery.labels, [body.label for body in recovery.bodies]))[:, ::-1].astype(float)
     window = plots.window_of(bodies, camera, pixels)

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -61,3 +63,18 @@ def test_json_on_a_closed_standard_output_is_wrong_usage(tmp_path, monkeypatch, 
     monkeypatch.setattr(sys, "stdout", None)
     assert recover(tmp_path / "a.npz", "--json", "-") == 2
     assert "--json: the standard output is closed" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", [b"$1$_$2_$.npz"])
+def test_a_frame_may_be_called_anything(tmp_path, name, monkeypatch):
+    """What Matplotlib takes for a formula, in pictures, meshes, tables and on the terminal."""
+    path = Path(os.fsdecode(os.path.join(os.fsencode(tmp_path), name)))
+    depth = np.full((30, 40), 1.0, np.float32)
+    depth[8:22, 10:30] = 0.8
+    np.savez(path, depth=depth, K=[[50, 0, 19.5], [0, 50, 14.5], [0, 0, 1]], labels=(depth < 0.9).astype(int))
+    monkeypatch.setattr(sys, "stdout", io.TextIOWrapper(io.BytesIO(), encoding="utf-8"))
+    outputs = ("--pictures", tmp_path, "--meshes", tmp_path, "--csv", tmp_path / "out.csv")
+    assert recover(path, *outputs) == 0
+    assert sys.stdout.buffer.getvalue()
+    assert {found.suffix for found in tmp_path.iterdir()} == {".npz", ".png", ".glb", ".csv"}
+    assert "weak" in (tmp_path / "out.csv").read_text(encoding="utf-8")
