@@ -20,8 +20,12 @@ STANDARD_OUTPUT = "-"
 
 def complain(message: str) -> None:
     """One line on the standard error; text of a recording must not steer the terminal."""
-    line = "".join(c if c.isprintable() else "?" for c in " ".join(message.split()))
-    print(f"sq-perception: {line}", file=sys.stderr)
+    print(f"sq-perception: {printable(' '.join(message.split()))}", file=sys.stderr)
+
+
+def printable(text: str) -> str:
+    """With a question mark for what cannot be shown, such as bytes of a file's name that are no UTF-8."""
+    return "".join(c if c.isprintable() else "?" for c in text)
 
 
 def failed(message: str) -> int:

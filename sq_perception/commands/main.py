@@ -9,6 +9,7 @@ Exit codes: 0 all went well, 1 something could not be read, written or found, 2 
 from __future__ import annotations
 
 import argparse
+import io
 import os
 import sys
 from collections.abc import Sequence
@@ -49,6 +50,8 @@ examples:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run one command; returns the exit code."""
+    if isinstance(sys.stdout, io.TextIOWrapper):
+        sys.stdout.reconfigure(errors="backslashreplace")  # the name of a file need not be UTF-8, nor the terminal
     code = _run(list(sys.argv[1:] if arguments is None else arguments))
     try:
         # Here and not at the interpreter's end, which prints a failure as an exception and has an exit code of its own.

@@ -149,7 +149,8 @@ class Outputs:
                     if not entries and path.is_file() and path.stat().st_size:
                         yield f"--{name}: no frame was read, so {path} stays as it is"
                     else:
-                        yield from _elsewhere(name, path, output_file.write(path, text().encode(), whole))
+                        data = text().encode(errors="backslashreplace")  # a file's name may be no UTF-8
+                        yield from _elsewhere(name, path, output_file.write(path, data, whole))
                 except OSError as error:
                     yield f"--{name}: {error}"
 
@@ -196,7 +197,7 @@ def _draw(path: Path, frame: RecordedFrame, recovery: FrameRecovery) -> None:
 
     unit = "of the cube" if frame.is_cube else "m"
     with output_file.writing(path) as partial:
-        save(recovery_figure(frame.depth, frame.camera, recovery, frame.name, unit), partial)
+        save(recovery_figure(frame.depth, frame.camera, recovery, console.printable(frame.name), unit), partial)
 
 
 def _write_mesh(path: Path, frame: RecordedFrame, recovery: FrameRecovery) -> None:

@@ -240,5 +240,7 @@ def _status(path: Path) -> os.stat_result | None:
 
 def _partial_name(target: Path) -> str:
     """Hidden, and no longer than a name may be."""
-    most = 255 - len(f"..partial{target.suffix}".encode())
-    return f".{target.name.encode()[:most].decode(errors='ignore')}.partial{target.suffix}"
+    most = 255 - len(os.fsencode(f"..partial{target.suffix}"))
+    name = os.fsencode(target.name)
+    cut = name[:most].decode(errors="ignore") if len(name) > most else target.name
+    return f".{cut}.partial{target.suffix}"

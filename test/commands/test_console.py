@@ -65,9 +65,9 @@ def test_json_on_a_closed_standard_output_is_wrong_usage(tmp_path, monkeypatch, 
     assert "--json: the standard output is closed" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("name", [b"$1$_$2_$.npz"])
+@pytest.mark.parametrize("name", [b"$1$_$2_$.npz", b"caf\xe9.npz"])
 def test_a_frame_may_be_called_anything(tmp_path, name, monkeypatch):
-    """What Matplotlib takes for a formula, in pictures, meshes, tables and on the terminal."""
+    """What Matplotlib takes for a formula, and what is no UTF-8, in pictures, meshes, tables and on the terminal."""
     path = Path(os.fsdecode(os.path.join(os.fsencode(tmp_path), name)))
     depth = np.full((30, 40), 1.0, np.float32)
     depth[8:22, 10:30] = 0.8
