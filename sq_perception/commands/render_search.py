@@ -18,7 +18,7 @@ def main(arguments: Sequence[str]) -> int:
     add("--bodies", type=at_least(2), default=20, help="random bodies (default %(default)s)")
     add("--resolution", type=at_least(2), default=64, help="pixels and voxels a side (%(default)s)")
     add("--steps", type=at_least(2), default=21, help="values of s and of tau (default %(default)s)")
-    add("--seed", type=int, default=2020, help="default %(default)s")
+    add("--seed", type=at_least(0), default=2020, help="default %(default)s")
     add("--picture", type=target, metavar="FILE", help="draw the heat map there")
     options = command.parse_args(arguments)
     if options.picture and options.picture.suffix.lower() not in _PICTURES:

@@ -190,6 +190,9 @@ def test_a_missing_model_is_one_clear_line(tmp_path, view, capsys):
         ["render", *CUBE_BODY, "--output", "no/such/folder/x.png"],
         ["render", "nan", *CUBE_BODY[1:], "--output", "x.png"],
         ["render-search", "--picture", "x.txt"],
+        ["render-search", "--seed", "-1"],
+        ["train", "--seed", "-1"],
+        ["train", "--threads", "-1"],
     ],
 )
 def test_wrong_usage_is_code_two_and_no_traceback(arguments, capsys, tmp_path, monkeypatch):
