@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from sq_perception.commands.console import SUCCESS, at_least, failed, parser, positive
+from sq_perception.commands.console import INTERRUPTED, SUCCESS, at_least, complain, failed, parser, positive
 from sq_perception.learning.training_config import MASK_RUN, THING_RUN, ShardTraining
 
 _DRAW = """\
@@ -141,5 +141,6 @@ def _train(subject: Any, run: ShardTraining, options: dict[str, Any]) -> int:
     except (CheckpointError, ValueError, ArithmeticError, OSError) as error:
         return failed(f"train-{subject.name}: {error}")
     except KeyboardInterrupt:
-        return failed(f"train-{subject.name}: stopped; the same command goes on from the last validation")
+        complain(f"train-{subject.name}: stopped; the same command goes on from the last validation")
+        return INTERRUPTED
     return SUCCESS

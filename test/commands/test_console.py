@@ -78,3 +78,16 @@ def test_a_frame_may_be_called_anything(tmp_path, name, monkeypatch):
     assert sys.stdout.buffer.getvalue()
     assert {found.suffix for found in tmp_path.iterdir()} == {".npz", ".png", ".glb", ".csv"}
     assert "weak" in (tmp_path / "out.csv").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("command", ["train-things", "train-masks"])
+def test_a_training_that_is_interrupted_says_so_by_its_code(tmp_path, command, monkeypatch, capsys):
+    pytest.importorskip("torch", reason="needs the extra 'train'")
+    from sq_perception.learning import shard_training
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(shard_training, "train", interrupted)
+    assert main.main([command, str(tmp_path), "--output", str(tmp_path)]) == 130
+    assert "the same command goes on" in capsys.readouterr().err
