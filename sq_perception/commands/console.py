@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 
 SUCCESS, FAILURE, USAGE, INTERRUPTED = 0, 1, 2, 130
 STANDARD_OUTPUT = "-"
+LAST_PORT = 65535
 
 
 def complain(message: str) -> None:
@@ -152,7 +153,15 @@ def add_address(command: argparse.ArgumentParser) -> None:
         metavar="ADDRESS",
         help="%(default)s, this machine; 0.0.0.0 is open to the network, no password",
     )
-    add("--port", type=int, help="port to serve on, 0 for any free one (8080, or the next free one)")
+    add("--port", type=_port, help="port to serve on, 0 for any free one (8080, or the next free one)")
+
+
+def _port(text: str) -> int:
+    """Checked here, as the system counts larger numbers from 0 again."""
+    port = at_least(0)(text)
+    if port > LAST_PORT:
+        raise argparse.ArgumentTypeError(f"expected 0 to {LAST_PORT}, got {port}")
+    return port
 
 
 def progress() -> Progress:

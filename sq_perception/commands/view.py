@@ -54,8 +54,6 @@ def main(given: Sequence[str]) -> int:
             parser.error(f"--node: expected a name like {DEFAULT_NODE}, got {name!r}")
     if not 0 < options.rate <= 60:
         parser.error(f"--rate: expected a number above 0, at most 60, got {options.rate:g}")
-    if options.port is not None and not 0 <= options.port <= 65535:
-        parser.error(f"--port: expected 0 to 65535, got {options.port}")
     if importlib.util.find_spec("rclpy") is None:
         remedy = "pip install 'sq_perception[ros]', or source a ROS 2 Jazzy installation"
         return console.failed(f"view needs ROS 2 in Python: {remedy}")
@@ -89,7 +87,7 @@ def camera_info_beside(depth: str) -> str:
 def _node(bound: socket.socket, nodes: Sequence[str], options: argparse.Namespace) -> ViewNode:
     from sq_perception.nodes.view_node import ViewNode
     from sq_perception.viewing.page import Page
-    from sq_perception.viewing.server import is_local
+    from sq_perception.viewing.server import is_local, url
 
     host, port = bound.getsockname()[:2]
     page = Page(bound, nodes, options.max_points)
@@ -104,8 +102,7 @@ def _node(bound: socket.socket, nodes: Sequence[str], options: argparse.Namespac
             f"warning: there is no password: whoever reaches port {port} of this machine sees the page and changes "
             "parameters; without --host, `ssh -L` brings the page to another machine"
         )
-    shown = "localhost" if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host  # noqa: S104
-    print(f"http://{shown}:{port}  shows {', '.join(nodes)}; Ctrl-C ends", flush=True)
+    print(f"{url(bound)}  shows {', '.join(nodes)}; Ctrl-C ends", flush=True)
     return node
 
 

@@ -50,7 +50,7 @@ def main(arguments: Sequence[str]) -> int:
         return failed(str(error))
     page = Page(bound, [_SOURCE], parameters=False)
     try:
-        print(f"http://{options.host}:{bound.getsockname()[1]}; Ctrl-C ends", flush=True)
+        print(f"{server.url(bound)}; Ctrl-C ends", flush=True)
         _browse(page, first, frames)
     except KeyboardInterrupt:
         return SUCCESS

@@ -147,6 +147,13 @@ def is_local(host: str) -> bool:
     return host == "localhost" if address is None else address.is_loopback
 
 
+def url(bound: socket.socket) -> str:
+    """Where a browser of this machine finds what is served on a bound socket."""
+    host, port = bound.getsockname()[:2]
+    shown = "localhost" if host in ("0.0.0.0", "::") else f"[{host}]" if ":" in host else host  # noqa: S104
+    return f"http://{shown}:{port}"
+
+
 def own_names() -> frozenset[str]:
     """Names that this machine gives itself, with and without .local."""
     name = socket.gethostname().lower()

@@ -94,6 +94,23 @@ def test_nothing_to_show_ends_at_once(tmp_path, capsys):
     assert "no such file" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("given", [["none.npz"], []])
+def test_no_other_port_is_taken_than_the_one_that_was_asked_for(given, capsys):
+    """The system takes 65537 for 1."""
+    assert main.main(["view", *given, "--port", "65537"]) == 2
+    assert "--port: expected 0 to 65535, got 65537" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("host", "shown"), [("127.0.0.1", "127.0.0.1"), ("192.0.2.1", "192.0.2.1"), ("::1", "[::1]"), ("::", "localhost")]
+)
+def test_the_address_that_is_printed_can_be_opened(host, shown):
+    pytest.importorskip("viser", reason="needs the extra 'view'")
+    from sq_perception.viewing import server
+
+    assert server.url(SimpleNamespace(getsockname=lambda: (host, 8080))) == f"http://{shown}:8080"
+
+
 @pytest.mark.parametrize(
     "given", [["none.npz", "--port", "0"], ["--port", "0", "none.npz"], ["--projection", "orthographic", "none.npz"]]
 )
