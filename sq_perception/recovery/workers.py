@@ -19,6 +19,7 @@ from collections.abc import Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cache
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.process import BaseProcess
 from pathlib import Path
@@ -194,19 +195,23 @@ class Cluster:
 
 
 def _started(setup: Setup) -> tuple[BaseProcess, Connection]:
-    """A process, and this end of its pipe."""
+    """A process, and this end of its pipe; Ctrl-C is for the one that asks."""
     # Not forked: a process that has threads of BLAS and numba cannot be copied.
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe()
     process = context.Process(target=_serve, args=(setup, there), daemon=True)
-    process.start()
+    resource_tracker.ensure_running()  # whose start would let the signal through again
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # the process inherits it, and has it at once
+    try:
+        process.start()
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
     there.close()  # so that its end is that of the pipe
     return process, here
 
 
 def _serve(setup: Setup, pipe: Connection) -> None:
-    """What a process does until the other end of its pipe is closed; Ctrl-C is for the one that asks."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """What a process does until the other end of its pipe is closed."""
     while True:
         try:
             work = pipe.recv()

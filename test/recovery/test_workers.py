@@ -50,6 +50,17 @@ def test_two_processes_answer_as_one_and_in_order() -> None:
         np.testing.assert_allclose(mine.to_flat(), theirs.to_flat(), rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.parametrize("seconds", [0.0, 0.1, 0.3])
+def test_a_ctrl_c_while_a_process_begins_is_not_for_it(seconds: float) -> None:
+    """Its imports take longer than that; what they were interrupted in was printed."""
+    process, pipe = workers._started(_SETUP)
+    time.sleep(seconds)
+    os.kill(process.pid, signal.SIGINT)
+    pipe.close()
+    process.join(60)
+    assert process.exitcode == 0
+
+
 def test_what_a_frame_raises_is_its_answer() -> None:
     (_, work), *_ = _frames(1)
     wrong = Work(work.depth[:10], work.camera, None, work.options)
