@@ -73,6 +73,10 @@ class Child(subprocess.Popen[bytes]):
             with suppress(ProcessLookupError):
                 os.killpg(self.pid, sig)
 
+    def close(self) -> None:
+        """Forget what it said; for one that has ended."""
+        self._output.close()
+
 
 class Children:
     """Nodes that live as long as a ``with`` block of the main thread."""
@@ -133,6 +137,7 @@ class Children:
                 except subprocess.TimeoutExpired:
                     child.kill()
                     self.killed.append(child.name)
+                child.close()
             self._running.clear()
         finally:
             for number, handler in previous.items():

@@ -293,6 +293,15 @@ def test_a_child_that_does_not_listen_is_killed_and_named(monkeypatch: pytest.Mo
     assert child.exit_code == -signal.SIGKILL
 
 
+def test_what_children_said_is_forgotten_when_they_have_stopped() -> None:
+    """Not when they are collected, which is a ResourceWarning."""
+    children = Children()
+    child = children.start("synthetic_depth_node")
+    children.stop()
+    with pytest.raises(ValueError, match="closed file"):
+        child.last_lines()
+
+
 def test_the_profile_is_only_set_where_the_user_has_not_chosen_one(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv(fast_dds.VARIABLE, raising=False)
     assert fast_dds.profile_path().is_file()
