@@ -20,6 +20,7 @@ _EXTRAS = {
     "bags": ("rosbags", "mcap"),
     "view": ("viser",),
     "exr": ("OpenEXR",),
+    "cluster": ("distributed",),
     "train": ("torch",),
     "ros": ("rclpy", "sensor_msgs", "visualization_msgs"),
 }
