@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import math
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -22,6 +23,21 @@ LAST_PORT = 65535
 def complain(message: str) -> None:
     """One line on the standard error; text of a recording must not steer the terminal."""
     print(f"sq-perception: {printable(' '.join(message.split()))}", file=sys.stderr)
+
+
+class _Complaints(logging.Handler):
+    """What the package logs, as complaints."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        complain(record.getMessage())
+
+
+def show_log() -> None:
+    """Print the package's warnings from now on, and that it has to compile, which takes minutes."""
+    log = logging.getLogger("sq_perception")
+    log.getChild("geometry.kernel_cache").setLevel(logging.INFO)
+    if not log.handlers:
+        log.addHandler(_Complaints())
 
 
 def printable(text: str) -> str:

@@ -15,7 +15,7 @@ import sys
 from collections.abc import Sequence
 from pkgutil import resolve_name
 
-from sq_perception.commands.console import FAILURE, INTERRUPTED, SUCCESS, USAGE, complain
+from sq_perception.commands.console import FAILURE, INTERRUPTED, SUCCESS, USAGE, complain, show_log
 from sq_perception.files.version import __version__
 from sq_perception.learning.choices import NEEDS_TORCH
 
@@ -69,6 +69,8 @@ def _run(given: list[str]) -> int:
     try:
         if not given or given[0] not in COMMANDS:
             _parser().parse_args(given)
+        if given[0] != "warm-up":  # which says how far it is
+            show_log()
         return resolve_name(f"sq_perception.commands.{COMMANDS[given[0]][0]}")(given[1:])
     except SystemExit as stop:  # argparse: help was shown, or the usage was wrong
         if isinstance(stop.code, int):

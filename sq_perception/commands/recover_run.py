@@ -32,7 +32,7 @@ def run(options: argparse.Namespace) -> int:
     if [options.json, options.jsonl, options.csv].count(STANDARD_OUTPUT) > 1:
         return misused("--json, --jsonl, --csv: only one of them can be the standard output")
     if options.verbose:
-        logging.basicConfig(level=logging.INFO, format="sq-perception: %(message)s")
+        logging.getLogger("sq_perception").setLevel(logging.INFO)
     try:
         this = RecoverRun(options)
     except (FrameError, checkpoint.CheckpointError, OSError, ImportError) as error:

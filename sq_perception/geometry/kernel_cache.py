@@ -3,6 +3,8 @@
 numba keeps machine code in ``NUMBA_CACHE_DIR``, beside the modules, or in the user's cache folder, and
 otherwise refuses to compile at all.  Service users and containers often have none of these.  For them there is a folder
 of the user's own among the temporary files: numba reads machine code with pickle, so that nobody else may write there.
+
+The first kernel that a process has to compile is announced in the log: a first start takes minutes.
 """
 
 from __future__ import annotations
@@ -17,6 +19,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+from numba.core import event
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 _log = logging.getLogger(__name__)
@@ -37,6 +40,24 @@ def compiled(function: _F, options: dict[str, Any]) -> _F:
         return cast(_F, numba.njit(cache=True, **options)(function))
     finally:
         settings.CACHE_DIR = before
+
+
+class _Announcement(event.Listener):
+    """Says once that kernels of this package are being compiled, and not found."""
+
+    def on_start(self, event: event.Event) -> None:
+        if event.data["dispatcher"].py_func.__module__.startswith(__package__.partition(".")[0]):
+            self._announce()
+
+    def on_end(self, event: event.Event) -> None:
+        pass
+
+    @cache  # noqa: B019 - there is one of them
+    def _announce(self) -> None:
+        _log.info("compiling, once for this installation: all kernels take about two minutes")
+
+
+event.register("numba:compile", _Announcement())
 
 
 @cache

@@ -19,6 +19,9 @@ from sq_perception.recovery.seen_object import SeenObject
 
 _SCORE_STRIDE = 3
 """22 x 22 lines of sight of 64 voxels settle a score to a hundredth."""
+_LEAST_MEASURED = 0.02
+"""Share of a mask: a sensor that sees nothing of a thing smears its outline.  Of 3582 things of
+benchmarks/household_things 63 showed less; 16 had a body all the same, of 20 % IoU at most."""
 _LEAST_BUDGET = 1e-6
 """Seconds; an object whose turn comes too late is still fitted, from one start."""
 _HARD_IMAGE = (ValueError, ArithmeticError, np.linalg.LinAlgError)
@@ -27,8 +30,9 @@ _HARD_IMAGE = (ValueError, ArithmeticError, np.linalg.LinAlgError)
 
 def fitted(obj: SeenObject, depth: np.ndarray, camera: Camera, options: RecoveryOptions, deadline: float) -> Fit:
     """The body of an object by the chosen method; FAILED with a reason instead of any exception on hard data."""
-    if obj.pixels < MIN_PIXELS:
-        return _failed(obj, f"{obj.pixels} pixels with a depth are too few for a body")
+    if obj.pixels < max(MIN_PIXELS, _LEAST_MEASURED * obj.masked):
+        of_all = f" of {obj.masked}" if obj.pixels >= MIN_PIXELS else ""
+        return _failed(obj, f"{obj.pixels}{of_all} pixels with a depth are too few for a body")
     try:
         fit = _body(obj, depth, camera, options, deadline)
     except _HARD_IMAGE as error:

@@ -43,8 +43,8 @@ class SeenObject:
     ----------
     label
         Its value in the label image.
-    pixels
-        Number of its measured pixels.
+    pixels, masked
+        Number of its measured pixels, and of the pixels of its label around them.
     mask : bool (height, width)
         These pixels; ``mask_crop``, ``depth_crop`` and ``camera_crop`` are their ``window`` of mask, depth and camera.
     plane : (4,) or None
@@ -59,6 +59,7 @@ class SeenObject:
 
     label: int
     pixels: int
+    masked: int
     mask: np.ndarray
     depth_crop: np.ndarray
     mask_crop: np.ndarray
@@ -114,7 +115,8 @@ def objects(
         crop = mask[window]
         camera_crop = camera.cropped(left, top, width, height)
         pixels = int(np.count_nonzero(crop))
-        seen.append(SeenObject(label, pixels, mask, depth[window], crop, camera_crop, window))
+        masked = int(np.count_nonzero(found.labels[window] == label))
+        seen.append(SeenObject(label, pixels, masked, mask, depth[window], crop, camera_crop, window))
     return seen
 
 

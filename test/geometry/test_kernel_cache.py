@@ -68,6 +68,24 @@ def test_it_starts_and_starts_again_with_what_it_compiled(installation: Path, tm
     assert folder.stat().st_mode & 0o777 == 0o700
 
 
+def test_a_command_that_has_to_compile_says_so_once(tmp_path: Path) -> None:
+    """A first start takes minutes; a second one has nothing to compile."""
+    body = "0.25 0.15 0.1 0.2 0.8 0.5 0.5 0.5 0 0 0 1"
+    render = ["render", *body.split(" "), "--output", str(tmp_path / "view.png")]
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "kernels")}
+    for times in (1, 0):
+        done = subprocess.run(
+            [sys.executable, "-m", "sq_perception", *render],
+            env=environment,
+            capture_output=True,
+            text=True,
+            timeout=PATIENCE,
+            check=True,
+            cwd=tmp_path,
+        )
+        assert done.stderr.count("compiling") == done.stderr.count("\n") == times
+
+
 def test_a_folder_that_others_can_write_is_not_read(installation: Path, tmp_path: Path) -> None:
     """Whoever may write there can run code."""
     uid = 0  # unshare -r

@@ -139,6 +139,20 @@ def test_failed_bodies_are_listed_and_not_rendered(symmetry):
 
 
 @pytest.mark.parametrize("method", ["symmetry", "classic"])
+def test_a_mask_of_which_next_to_nothing_was_measured_shows_no_body(method):
+    """A thing too near for the sensor, whose outline alone has readings, halfway to what is behind."""
+    depth, labels = seen(random_bodies(1, 2), CAMERA, background=1.2)
+    rows, columns = np.nonzero(labels)
+    some = slice(0, len(rows), 60)
+    near = depth[rows[some], columns[some]]
+    depth[labels > 0] = np.nan
+    depth[rows[some], columns[some]] = (near + 1.2) / 2
+    body = Recoverer(method=method).recover(depth, CAMERA, labels).bodies[0]
+    assert body.status == Status.FAILED
+    assert f"{len(near)} of " in body.message
+
+
+@pytest.mark.parametrize("method", ["symmetry", "classic"])
 @pytest.mark.parametrize(
     ("image", "why"),
     [
