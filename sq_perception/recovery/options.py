@@ -72,8 +72,13 @@ class RecoveryOptions:
         if not self.time_budget > 0:
             raise ValueError(f"time_budget: expected a positive number of seconds, got {self.time_budget}")
         self.segmentation_options()
-        if self.workspace is not None:  # options are compared from frame to frame: of an array no one truth
+        # Options are compared from frame to frame: of an array no one truth.
+        object.__setattr__(self, "depth_range", tuple(float(end) for end in self.depth_range))
+        if self.workspace is not None:
             object.__setattr__(self, "workspace", tuple(float(side) for side in self.workspace))
+        if self.workspace_pose is not None:
+            pose = tuple(tuple(float(number) for number in part) for part in self.workspace_pose)
+            object.__setattr__(self, "workspace_pose", pose)
 
     def segmentation_options(self) -> segments.SegmentationOptions:
         return segments.SegmentationOptions(

@@ -197,6 +197,22 @@ def test_other_options_cameras_and_segments_repeat_nothing(recoverer, first):
     assert {one.label: one.repeats for one in frame.bodies} == {2: 1, 3: 1, 7: 0, 8: 0}
 
 
+def test_options_are_compared_whatever_sequences_they_are_given_as(recoverer):
+    box, turn, nowhere = (-5.0, -5.0, -5.0, 5.0, 5.0, 5.0), (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0)
+    as_tuples = RecoveryOptions(
+        method="symmetry", depth_range=(0.0, 5.0), workspace=box, workspace_pose=(turn, nowhere)
+    )
+    as_arrays = RecoveryOptions(
+        method="symmetry",
+        depth_range=np.array([0.0, 5.0]),
+        workspace=np.array(box),
+        workspace_pose=(np.array(turn), np.array(nowhere)),
+    )
+    frame = recoverer.recover(image(STILL, 0), CAMERA, options=as_tuples)
+    frame = recoverer.recover(image(STILL, 5), CAMERA, options=as_arrays, previous=frame)
+    assert [one.repeats for one in frame.bodies] == [1, 1, 1]
+
+
 def test_given_masks_that_stay_repeat_too(recoverer):
     _, index = raycast.render(Superquadric.stack(list(STILL)), CAMERA)
     labels = (index + 1).astype(np.int32)
