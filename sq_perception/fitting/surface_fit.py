@@ -95,7 +95,7 @@ def fit(
         # Also without a plane: to look for a superquadric from everywhere first takes six times as long, and gains none
         # (benchmarks/ablation, "no plane, exactly") but 0.3 % of IoU where things are noisy superquadrics.
         options = replace(options, model_error=MODEL_ERROR)
-    observation = crop.observed(options.model_error or 0.0, options.nan_is_empty)
+    observation = crop.observed(options.model_error or 0.0, options.nan_is_empty, options.plane)
     reason = _hopeless(observation)
     if reason:
         body = starts.enclosing_box(observation.points, observation.footprint)
@@ -118,7 +118,7 @@ def _exactly(
     crop: Crop, options: FitOptions, given: list[State], later: Callable[[], list[State]] | None, began: float
 ) -> Solution | None:
     """The body that explains the image down to its noise, if one is cheaply found."""
-    trusted = crop.observed(0.0, options.nan_is_empty)
+    trusted = crop.observed(0.0, options.nan_is_empty, options.plane)
     if _hopeless(trusted):
         return None
     return exact.solve_cheaply(Problem.of(trusted, replace(options, model_error=0.0), began), given, later)

@@ -1,0 +1,66 @@
+"""Which pixels of a mask are taken for the object."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from sq_perception.fitting import surface_fit
+from sq_perception.fitting.fit import Status
+from sq_perception.fitting.observation import Crop
+from sq_perception.fitting.options import FitOptions
+from sq_perception.geometry import rotation as quaternions
+from sq_perception.geometry.metrics import volume_iou
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging.camera import Camera
+from sq_perception.simulation.rendering import render_things
+from sq_perception.simulation.thing import NO_CAVITY
+
+CAMERA = Camera(640, 480, 554.0, 554.0, 319.5, 239.5)
+PITCH = np.deg2rad(35)
+NORMAL = -np.array([0.0, np.cos(PITCH), np.sin(PITCH)])
+TABLE = np.append(NORMAL, 0.8 * np.sin(PITCH))
+RIGHT = np.array([1.0, 0.0, 0.0])
+UPRIGHT = quaternions.from_matrix(np.stack([RIGHT, np.cross(NORMAL, RIGHT), NORMAL], axis=1))
+HALF = 0.12
+BOX = Superquadric([0.04, 0.035, HALF], [0.2, 0.2], np.array([0.0, 0.0, 0.8]) + HALF * NORMAL, UPRIGHT)
+CAN = Superquadric([0.035, 0.035, HALF], [0.1, 1.0], BOX.translation, UPRIGHT)
+
+
+def image(body: Superquadric, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
+    """The body on its table, a wall behind, with little noise; and its mask."""
+    depth, thing = render_things(Superquadric.stack([body]), np.zeros(1), NO_CAVITY, np.zeros(0), CAMERA, TABLE, 1.5)
+    return (depth + 0.001 * depth**2 * rng.standard_normal(depth.shape)).astype(np.float32), thing == 0
+
+
+def grown(mask: np.ndarray, pixels: int) -> np.ndarray:
+    return cv2.dilate(mask.astype(np.uint8), np.ones((2 * pixels + 1, 2 * pixels + 1), np.uint8)) > 0
+
+
+@pytest.mark.parametrize("pixels", [2, 3])
+@pytest.mark.parametrize("truth", [BOX, CAN], ids=["box", "can"])
+def test_a_mask_too_large_by_pixels_makes_neither_table_nor_wall_a_part(
+    truth: Superquadric, pixels: int, rng: np.random.Generator
+) -> None:
+    """What is behind a thing goes on from its foot by way of the table, without a step."""
+    depth, mask = image(truth, rng)
+    fit = surface_fit.fit(depth, grown(mask, pixels), CAMERA, options=FitOptions(plane=TABLE))
+    assert fit.status == Status.CONVERGED
+    assert volume_iou(fit.superquadric, truth) > 0.97
+
+
+def test_a_right_mask_keeps_its_pixels_whatever_the_plane(rng: np.random.Generator) -> None:
+    depth, mask = image(BOX, rng)
+    crop = Crop.around(depth, mask, CAMERA, None)
+    assert crop is not None
+    known, unknown = crop.observed(0.0025, None, TABLE), crop.observed(0.0025, None)
+    np.testing.assert_array_equal(known.pixels, unknown.pixels)
+
+
+def test_a_thing_of_which_most_is_as_low_as_its_support_keeps_its_pixels(rng: np.random.Generator) -> None:
+    depth, mask = image(BOX, rng)
+    crop = Crop.around(depth, mask, CAMERA, None)
+    assert crop is not None
+    above = TABLE - [0.0, 0.0, 0.0, 2 * HALF]  # a plane through its top
+    assert len(crop.observed(0.0025, None, above).pixels) == len(crop.observed(0.0025, None).pixels)
