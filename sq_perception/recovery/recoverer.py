@@ -313,7 +313,7 @@ def _plausible(depth: np.ndarray, camera: Camera) -> np.ndarray:
     """The image without readings that are none; what is no depth image at all is for the segmentation to refuse."""
     if depth.dtype.kind != "f":
         return depth
-    wild = np.abs(depth) > _FARTHEST
+    wild = np.abs(depth) > min(_FARTHEST, float(np.finfo(depth.dtype).max))  # which half precision does not reach
     if camera.is_pinhole:
         wild |= (depth > 0) & (depth < _NEAREST)
     return np.where(wild, depth.dtype.type(np.nan), depth) if wild.any() else depth

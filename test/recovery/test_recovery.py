@@ -170,6 +170,14 @@ def test_images_without_objects_say_why(method, image, why):
     assert found.labels.shape == (48, 64)
 
 
+def test_half_precision_is_read_as_single_precision(symmetry):
+    """Not even with a warning: the farthest reading is no number of half precision."""
+    depth, labels = seen(random_bodies(1, 3), CAMERA, background=1.4)
+    depth = depth.astype(np.float16)
+    half, single = (symmetry.recover(image, CAMERA, labels) for image in (depth, depth.astype(np.float32)))
+    np.testing.assert_array_equal(half.bodies[0].superquadric.to_flat(), single.bodies[0].superquadric.to_flat())
+
+
 @pytest.mark.parametrize("method", ["symmetry", "classic", "auto", "network"])
 @pytest.mark.parametrize("projection", ["pinhole", "orthographic"])
 def test_no_depth_value_raises(method, projection, weights):
