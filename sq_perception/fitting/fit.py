@@ -41,9 +41,10 @@ class Fit:
     status, message
         How far the body can be trusted, and why.
     noise
-        Standard deviation of the depth noise, estimated or given, metres.
+        Standard deviation of the depth noise, estimated or given, joined in squares by how far a thing may stray from a
+        superquadric, metres.
     inlier_share
-        Share of the object's pixels within three noise levels of the surface, 0 to 1.
+        Share of the object's pixels within three such deviations of the surface, 0 to 1.
     seen
         (3,) share of each full size that the measured points span along its axis, 0 to 1: the rest is inferred, from
         free space, the support plane, symmetry and what bodies mostly are.
