@@ -129,14 +129,14 @@ def support(
 ) -> np.ndarray | None:
     """What the object stands on: the frame's plane, or another one that its surroundings show right below it.
 
-    An object behind the frame's plane does not stand on it, and one high above it neither: held before a wall,
-    say.  One less high above it, without any such surroundings, stands on other objects.
+    An object behind the frame's plane does not stand on it, one that goes on below it hardly, and one high above it
+    neither: held before a wall, say.  One less high above it, without any such surroundings, stands on other objects.
     """
     if found.plane is None:
         return None
     low, median = obj.levels(found.plane)
     behind = median <= 0
-    if not behind and low < _HOVERING:
+    if not behind and abs(low) < _HOVERING:
         return found.plane
     other = segments.support_under(found, obj.label, depth, camera, options)
     if other is not None:

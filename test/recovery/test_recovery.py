@@ -94,6 +94,26 @@ def test_the_flat_front_of_an_occluder_is_no_support(symmetry, seed):
     assert iou(found.bodies[0].superquadric, truth) > 0.85
 
 
+def test_a_thing_on_the_lower_of_two_levels_reaches_below_the_higher_one(symmetry):
+    """Most of what is seen of it is its top, which lies above the higher level, the support of the frame."""
+    pitch, drop, half = np.deg2rad(60), 0.1, 0.055
+    normal = -np.array([0.0, np.cos(pitch), np.sin(pitch)])
+    away = np.array([0.0, -np.sin(pitch), np.cos(pitch)])
+    turn = rotation.from_matrix(np.stack([[1.0, 0.0, 0.0], away, normal], axis=1))
+    other = Superquadric([0.05, 0.04, half], [0.2, 0.2], np.array([-0.12, 0.0, 0.8]) + half * normal, turn)
+    truth = Superquadric([0.05, 0.03, half], [0.2, 0.9], np.array([0.12, 0.0, 0.8]) + (half - drop) * normal, turn)
+    depth, labels = seen([other, truth], CAMERA, background=np.inf)
+    _, rays = CAMERA.rays(*np.meshgrid(np.arange(CAMERA.width), np.arange(CAMERA.height)))
+    higher = -0.8 * np.sin(pitch) / (rays @ normal)
+    levels = np.where(higher * rays[..., 0] < 0.0, higher, -(0.8 * np.sin(pitch) + drop) / (rays @ normal))
+    labels[levels < depth] = 0
+    found = symmetry.recover(np.minimum(depth, levels).astype(np.float32), CAMERA, labels)
+    assert abs(found.plane[3] - 0.8 * np.sin(pitch)) < 0.01
+    by_label = {body.label: body.superquadric for body in found.bodies}
+    assert iou(by_label[1], other) > 0.9
+    assert iou(by_label[2], truth) > 0.9
+
+
 def test_a_frame_with_masks_keeps_their_values_and_order(symmetry):
     left, right = random_bodies(2, 7, scale=0.07)
     left = Superquadric(left.size, left.shape, [-0.15, 0, 0.8], left.rotation)
