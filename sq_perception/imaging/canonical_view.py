@@ -11,10 +11,11 @@ It follows from the optical frame by
 
     p_canonical = R (p_optical - anchor) / extent + (1/2, 1/2, z0)
 
-with R = diag(1, -1, -1) R_look, where R_look turns the ray to the object's middle into the z axis (identity for an
-orthographic camera), the anchor at the silhouette's middle and the depth of the nearest point, z0 = (1 + 1/margin)/2,
-and the extent such that silhouette and visible depth fill 1/margin of the cube.  Both directions are exact; a
-superquadric stays one, since the map is a similarity.
+with R = diag(1, -1, -1) R_up R_look, where R_look turns the ray to the object's middle into the z axis (identity for an
+orthographic camera), R_up undoes the roll of the camera, about the same axis, where the support tells it: a camera on a
+wrist has any roll, and things stand as they do.  The anchor is at the silhouette's middle and the depth of the nearest
+point, z0 = (1 + 1/margin)/2, and the extent such that silhouette and visible depth fill 1/margin of the cube.  Both
+directions are exact; a superquadric stays one, since the map is a similarity.
 
 What the network must learn shrinks: position, size and (for a pinhole camera) perspective are divided out.
 """
@@ -45,6 +46,9 @@ _SURROUNDINGS = 1.2
 """More than MARGIN: under perspective the view's edges are not where those of the silhouette's box are."""
 _NEARER = 0.04
 """What stands nearer than the object by this share of the view's side hides what is behind it."""
+_FROM_ABOVE, _LEVEL = 0.2, float(np.cos(np.deg2rad(15.0)))
+"""A support whose normal has less across the optical axis, 12 degrees, does not tell the roll; and the cosine of a roll
+that is none: networks have seen as much."""
 _ROUNDS = 3
 """Readings of z that settle where a pixel of the view looks."""
 _FLIP = np.diag([1.0, -1.0, -1.0])
@@ -123,7 +127,8 @@ def from_mask(
     find_hidden : bool
         Whether to look at the object's surroundings for what may hide a part of it.
     plane : (4,), optional
-        What the object stands on, n.p + d = 0: seen in front of the object it hides nothing.
+        What the object stands on, n.p + d = 0, n up: it tells the camera's roll, and seen in front of the object it
+        hides nothing.
     missing_is_hidden : bool
         Whether the object may go on at every pixel without a reading, on it and beside it, and beyond the image; asks
         for ``find_hidden`` too.  By default a pixel that measured nothing hides something within the object's convex
@@ -141,13 +146,15 @@ def from_mask(
         raise ValueError("a canonical view needs at least one pixel with a depth under the mask")
     find_hidden |= missing_is_hidden
     whole = camera
-    look = np.eye(3)
+    look, wider = np.eye(3), 1.0
     if camera.is_pinhole:
         middle_u, middle_v = left + 0.5 * (width - 1), top + 0.5 * (height - 1)
         toward = camera.unproject(np.array(middle_u), np.array(middle_v), np.array(1.0))
         look = _rotation_to_z(toward / np.linalg.norm(toward))
+        up = upright(plane[:3]) if plane is not None else np.eye(3)
+        look, wider = up @ look, float(np.abs(up[0]).sum() ** 2)
     if find_hidden:
-        left, top, width, height = _with_surroundings(left, top, width, height, camera)
+        left, top, width, height = _with_surroundings(left, top, width, height, camera, wider)
     camera = camera.cropped(left, top, width, height)
     window = np.s_[top : top + height, left : left + width]
     depth, mask = np.ascontiguousarray(depth[window], dtype=np.float32), np.ascontiguousarray(mask[window])
@@ -202,9 +209,21 @@ def full_frame(depth: np.ndarray, mask: np.ndarray, camera: Camera, pixels: int)
     return CanonicalView(image, np.zeros(image.shape, bool), quaternions.from_matrix(_FLIP), anchor, 1.0)
 
 
-def _with_surroundings(left: int, top: int, width: int, height: int, camera: Camera) -> tuple[int, int, int, int]:
-    """The part of the image that a square view of a box of pixels shows."""
-    side = _SURROUNDINGS * max(width, height)
+def upright(normal: np.ndarray) -> np.ndarray:
+    """The rotation (3, 3) about the optical axis that undoes a camera's roll, by the support's normal (3,), upwards."""
+    x, y, _ = normal
+    across = float(np.hypot(x, y))
+    if across < _FROM_ABOVE or -y > _LEVEL * across:
+        return np.eye(3)
+    c, s = -y / across, x / across
+    return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _with_surroundings(
+    left: int, top: int, width: int, height: int, camera: Camera, wider: float
+) -> tuple[int, int, int, int]:
+    """The part of the image that a square view of a box of pixels shows, so many times wider as it is turned."""
+    side = _SURROUNDINGS * wider * max(width, height)
     right, bottom = left + width, top + height
     beside, above = int(np.ceil(0.5 * (side - width))) + 1, int(np.ceil(0.5 * (side - height))) + 1
     left, top = max(0, left - beside), max(0, top - above)

@@ -28,7 +28,7 @@ from typing import Protocol, TypeVar
 import numpy as np
 
 from sq_perception.fitting.options import MIN_PIXELS
-from sq_perception.imaging import regions, segment_view
+from sq_perception.imaging import canonical_view, regions, segment_view
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.segment_view import SegmentView
 from sq_perception.learning.forward import CompactMasks
@@ -171,7 +171,7 @@ class SegmentNetwork:
         The least sure piece is asked about first, then what no object claims.
         """
         first = [doubt.view.of_part(doubt.pieces == doubt.sure.argmin()) for doubt in doubts]
-        answers = self.of_pieces.logits(np.stack(first))
+        answers = self._logits(self.of_pieces, first)
         return [self._objects_of(doubt, answer) for doubt, answer in zip(doubts, answers, strict=True)]
 
     def _objects_of(self, doubt: _Doubt, logits: np.ndarray) -> list[np.ndarray]:
@@ -188,7 +188,7 @@ class SegmentNetwork:
             if claimed.min() >= _APART:
                 return list(objects.values())
             piece = int(np.lexsort((doubt.sure, claimed))[0])
-            logits = self.of_pieces.logits(doubt.view.of_part(doubt.pieces == piece)[None])[0]
+            logits = self._logits(self.of_pieces, [doubt.view.of_part(doubt.pieces == piece)])[0]
 
     def _seen(self, labels: np.ndarray, chosen: Sequence[int]) -> dict[int, _Seen]:
         extents, windows = regions.extents(labels), {}
@@ -201,10 +201,20 @@ class SegmentNetwork:
                 segment_view.from_segment(self.depth, labels, label, windows[label], self.camera, self.plane)
                 for label in some
             ]
-            logits = self.network.logits(np.stack([view.image for view in views]))
+            logits = self._logits(self.network, [view.image for view in views])
             return [_Seen(windows[label], view, each) for label, view, each in zip(some, views, logits, strict=True)]
 
         return dict(zip(chosen, self.mapped(of_some, chosen), strict=True))
+
+    def _logits(self, network: CompactMasks, images: Sequence[np.ndarray]) -> np.ndarray:
+        """A network's logits (n, p, p) for images (p, p, CHANNELS), shown to it as an upright camera sees them.
+
+        Turned by whole quarters, as a view of a segment follows the image's rows and columns.
+        """
+        up = np.eye(3) if self.plane is None else canonical_view.upright(self.plane[:3])
+        quarters = round(2 / np.pi * np.arctan2(up[0, 1], up[0, 0]))
+        answers = network.logits(np.ascontiguousarray(np.rot90(np.stack(images), quarters, axes=(1, 2))))
+        return np.ascontiguousarray(np.rot90(answers, -quarters, axes=(1, 2)))
 
 
 def _probability(logits: np.ndarray) -> np.ndarray:

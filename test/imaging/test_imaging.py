@@ -214,6 +214,37 @@ class TestCanonicalView:
         assert np.mean(off_near) < 0.015
         assert np.mean(np.array(off_near) < np.array(off_far)) >= 0.8
 
+    @pytest.mark.parametrize("degrees", [90, 180, -90, 70, -155])
+    def test_a_rolled_camera_has_the_same_view(self, degrees: float) -> None:
+        """The support tells what is up, whatever is up in the image."""
+        camera = Camera(480, 480, 520.0, 520.0, 239.5, 239.5)
+        body = Superquadric([0.05, 0.08, 0.12], [0.3, 0.7], [0.02, -0.03, 0.9], [0.5, 0.2, -0.1, 0.8])
+        plane = np.array([0.0, -0.61, -0.79, 0.9])
+        roll = np.array([0.0, 0.0, np.sin(np.deg2rad(degrees) / 2), np.cos(np.deg2rad(degrees) / 2)])
+
+        def seen(body: Superquadric, plane: np.ndarray) -> canonical_view.CanonicalView:
+            depth, index = raycast.render(body, camera)
+            depth = np.where(index >= 0, depth, np.nan)
+            return canonical_view.from_mask(depth, index >= 0, camera, plane=plane, missing_is_hidden=True)
+
+        rolled = body.transformed(roll, np.zeros(3)), np.append(rotation.to_matrix(roll) @ plane[:3], plane[3])
+        view, same = seen(body, plane), seen(*rolled)
+        np.testing.assert_allclose(same.plane_to_canonical(rolled[1]), view.plane_to_canonical(plane), atol=0.02)
+        np.testing.assert_allclose(
+            same.to_canonical(rolled[0]).to_flat()[:8], view.to_canonical(body).to_flat()[:8], atol=0.02
+        )
+        assert (view.hidden != same.hidden).mean() < 0.04
+        both = (view.image > 0) & (same.image > 0)
+        assert np.abs(view.image - same.image)[both].mean() < 0.01
+
+    @pytest.mark.parametrize("normal", [(0.06, 0.04, -0.997), (0.1, -0.7, -0.707)], ids=["from above", "hardly rolled"])
+    def test_where_there_is_no_roll_to_undo_the_view_is_that_of_the_camera(self, normal: tuple[float, ...]) -> None:
+        body = Superquadric([0.05, 0.08, 0.12], [0.3, 0.7], [0.0, 0.0, 0.9], [0.5, 0.2, -0.1, 0.8])
+        depth, index = raycast.render(body, VGA)
+        view = canonical_view.from_mask(depth, index >= 0, VGA, plane=np.array([*normal, 1.2]))
+        plain = canonical_view.from_mask(depth, index >= 0, VGA)
+        np.testing.assert_array_equal(view.image, plain.image)
+
     def test_empty_mask_is_misuse(self) -> None:
         with pytest.raises(ValueError, match="at least one pixel"):
             canonical_view.from_mask(np.full((48, 64), np.nan), np.ones((48, 64), bool), Camera(64, 48, 50, 50, 32, 24))

@@ -57,10 +57,10 @@ class GivenLogits:
         return np.asarray(self._function(views), np.float32)
 
 
-def of(networks: Any, depth: np.ndarray) -> SegmentNetwork:
+def of(networks: Any, depth: np.ndarray, camera: Camera = CAMERA, plane: np.ndarray = PLANE) -> SegmentNetwork:
     """Before an image: of a network for segments and for pieces, or of one of each."""
     of_segments, of_pieces = networks if isinstance(networks, tuple) else (networks, networks)
-    return SegmentNetwork(of_segments, of_pieces, depth, CAMERA, PLANE, lambda function, labels: function(labels))
+    return SegmentNetwork(of_segments, of_pieces, depth, camera, plane, lambda function, labels: function(labels))
 
 
 @pytest.fixture(scope="module")
@@ -237,3 +237,25 @@ def test_frames_keep_the_strays_in_their_labels_and_count_them() -> None:
     np.testing.assert_array_equal(with_masks.labels, without.labels)
     assert [body.pixels for body in with_masks.bodies] == [body.pixels for body in without.bodies]
     assert min(body.pixels for body in with_masks.bodies) > MIN_PIXELS
+
+
+@pytest.mark.parametrize("quarters", [1, 2, 3])
+def test_networks_are_shown_what_a_rolled_camera_sees_as_if_it_were_upright(quarters: int) -> None:
+    """Their answers are turned back: the upper half of the can is the object, whatever is up in the image."""
+
+    def upper(views: np.ndarray) -> np.ndarray:
+        there = views[..., segment_view.SEGMENT] > 0
+        rows = np.arange(views.shape[1])[:, None]
+        return np.where(there & (rows < views.shape[1] / 2), 5.0, -5.0)
+
+    square = Camera(240, 240, 300.0, 300.0, 119.5, 119.5)
+    depth, truth = (image[:, 40:280] for image in seen([standing(0, 0, *CAN)]))
+    turned = [np.ascontiguousarray(np.rot90(image, quarters)) for image in (depth, truth)]
+    matrix = np.linalg.matrix_power(np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), quarters)
+    upright = of(GivenLogits(upper), np.ascontiguousarray(depth), square).improved(segmentation(truth))
+    plane = np.append(matrix @ PLANE[:3], PLANE[3])
+    rolled = of(GivenLogits(upper), turned[0], square, plane).improved(segmentation(turned[1]))
+    assert upright.strays is not None
+    assert rolled.strays is not None
+    assert 0.05 < upright.strays.sum() / (truth > 0).sum() < 0.5
+    assert (np.rot90(rolled.strays, -quarters) != upright.strays).mean() < 0.005
