@@ -13,13 +13,13 @@ a2^2 v^e2) s^e1 and z^2 = a3^2 t^e1, with u + v = 1 and s + t = 1, none below 0.
     sphere     has as radius the largest |p|,
 
 and both radii have closed forms: the maximum of c u^e + d v^e is (c^k + d^k)^(1/k), k = 1/(1 - e), for e < 1 (Hölder's
-inequality), and max(c, d) otherwise.  For e > 1 the same formula is the minimum, which is min(c, d) otherwise.
+inequality), and max(c, d) otherwise.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import exp, expm1, gamma, hypot, log, pi, sqrt
+from math import exp, log, pi, sqrt
 
 import numpy as np
 from geometry_msgs.msg import Point
@@ -43,28 +43,16 @@ class Primitive:
         BOX, CYLINDER (axis along the body's z) or SPHERE.
     dimensions
         As SolidPrimitive has them: box: full edges x y z; cylinder: height, radius; sphere: radius; metres.
-    overhang
-        No point of the solid is farther from the body than this, metres; 0 only where it is the body itself.
-    volume_ratio
-        Volume of the solid over that of the body, at least 1.
     """
 
     kind: str
     dimensions: tuple[float, ...]
-    overhang: float
-    volume_ratio: float
 
     @property
     def message(self) -> SolidPrimitive:
         """The solid as a message, centred at the origin of the body's pose."""
         kinds = {BOX: SolidPrimitive.BOX, CYLINDER: SolidPrimitive.CYLINDER, SPHERE: SolidPrimitive.SPHERE}
         return SolidPrimitive(type=kinds[self.kind], dimensions=list(self.dimensions))
-
-    def __str__(self) -> str:
-        return (
-            f"a {self.kind} that encloses the body, stands off it by up to {1e3 * self.overhang:.1f} mm and has "
-            f"{self.volume_ratio:.2f} times its volume"
-        )
 
 
 def primitive(size: np.ndarray, shape: np.ndarray) -> Primitive:
@@ -86,20 +74,15 @@ def primitive(size: np.ndarray, shape: np.ndarray) -> Primitive:
         If a half size is not positive or an exponent not in (0, 2].
     """
     (a1, a2, a3), (e1, e2) = _checked(size, shape)
-    across = _extremes(a1**2, a2**2, e2)
-    nearest, radius = sqrt(across[0]), sqrt(across[1])
-    inner, outer = sqrt(_extremes(across[0], a3**2, e1)[0]), sqrt(_extremes(across[1], a3**2, e1)[1])
-    body = 2 * a1 * a2 * a3 * e1 * e2 * _beta(e1 / 2 + 1, e1) * _beta(e2 / 2, e2 / 2)
-    # The gauge is largest, and so the way back to the body longest, at a corner or on a rim.
-    corner = sqrt(a1**2 + a2**2 + a3**2) * _way_back(log(2) * e2 / e1, e1)
-    rim = hypot(radius, a3) * _way_back(2 / e1 * log(radius / nearest), e1)
+    radius = sqrt(_largest(a1**2, a2**2, e2))
+    outer = sqrt(_largest(radius**2, a3**2, e1))
     candidates = (
-        (8 * a1 * a2 * a3, BOX, (2 * a1, 2 * a2, 2 * a3), corner),
-        (2 * pi * radius**2 * a3, CYLINDER, (2 * a3, radius), rim),
-        (4 / 3 * pi * outer**3, SPHERE, (outer,), max(outer - inner, 0.0)),
+        (8 * a1 * a2 * a3, BOX, (2 * a1, 2 * a2, 2 * a3)),
+        (2 * pi * radius**2 * a3, CYLINDER, (2 * a3, radius)),
+        (4 / 3 * pi * outer**3, SPHERE, (outer,)),
     )
-    volume, kind, dimensions, overhang = min(candidates)
-    return Primitive(kind, dimensions, overhang, max(volume / body, 1.0))
+    _, kind, dimensions = min(candidates)
+    return Primitive(kind, dimensions)
 
 
 def primitives(superquadrics: SuperquadricArray) -> list[Primitive]:
@@ -158,18 +141,12 @@ def enclosing_factor(vertices: np.ndarray, faces: np.ndarray, size: np.ndarray, 
     return max(float((support / distance).max()), 1.0)
 
 
-def _extremes(c: float, d: float, e: float) -> tuple[float, float]:
-    """Least and largest of c u^e + d v^e for u, v >= 0 with u + v = 1."""
-    if e == 1:
-        return min(c, d), max(c, d)
+def _largest(c: float, d: float, e: float) -> float:
+    """Of c u^e + d v^e for u, v >= 0 with u + v = 1."""
+    if e >= 1:
+        return max(c, d)
     k = 1 / (1 - e)
-    inside = exp(float(np.logaddexp(k * log(c), k * log(d))) / k)
-    return (min(c, d), inside) if e < 1 else (inside, max(c, d))
-
-
-def _way_back(log_ratio: float, e1: float) -> float:
-    """1 - 1/g of a point with z = a3, whose share of F in xy is exp(``log_ratio``)."""
-    return -expm1(-e1 / 2 * float(np.logaddexp(log_ratio, 0.0)))
+    return exp(float(np.logaddexp(k * log(c), k * log(d))) / k)
 
 
 def _dual(u: np.ndarray, v: np.ndarray, e: float) -> np.ndarray:
@@ -179,10 +156,6 @@ def _dual(u: np.ndarray, v: np.ndarray, e: float) -> np.ndarray:
     if e == 2:
         return larger
     return larger * (1 + ratio ** (2 / (2 - e))) ** ((2 - e) / 2)
-
-
-def _beta(p: float, q: float) -> float:
-    return gamma(p) * gamma(q) / gamma(p + q)
 
 
 def _checked(size: np.ndarray, shape: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
