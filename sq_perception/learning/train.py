@@ -38,7 +38,7 @@ from sq_perception.learning.inference import checked_device
 from sq_perception.learning.objective import Objective
 from sq_perception.learning.regressor import Regressor, RegressorConfig
 from sq_perception.learning.training_config import TrainingConfig
-from sq_perception.learning.training_state import TrainingState, mixed_precision, read_tensors, recalibrate
+from sq_perception.learning.training_state import SETTINGS, TrainingState, mixed_precision, read_tensors, recalibrate
 
 _OF_A_RUN = ("loss", "backbone", "framing", "pixels", "canonical_labels", "optimizer")
 """Settings whose change makes another run; others may change when it goes on."""
@@ -88,16 +88,26 @@ def train(config: TrainingConfig, output: Path, network: RegressorConfig | None 
 
 def _check_same_run(config: TrainingConfig, output: Path) -> None:
     """Raise CheckpointError where a folder holds the state of a run of another kind, naming what differs."""
-    newest = output / "last.safetensors"
-    if not ((output / "state.safetensors").exists() and newest.exists()):
+    state = output / "state.safetensors"
+    if not state.exists():
         return
-    before = json.loads(checkpoint.read_header(newest).get("training", "{}"))
+    # States of 0.2.0 name no settings; the newest network of their run does, from its first validation on.
+    named = [path for path in (state, output / "last.safetensors") if SETTINGS in _header(path)]
+    before = json.loads(_header(named[0])[SETTINGS]) if named else {}
     other = [name for name in _OF_A_RUN if before.get(name, getattr(config, name)) != getattr(config, name)]
     if other:
         differences = ", ".join(f"{name} {before[name]!r}, not {getattr(config, name)!r}" for name in other)
         raise checkpoint.CheckpointError(
             f"{output}: holds a run with {differences}: expected another --output, or the same settings"
         )
+
+
+def _header(path: Path) -> dict[str, str]:
+    """The header of a file of weights; empty if there is none, or no such file."""
+    try:
+        return checkpoint.read_header(path)
+    except checkpoint.CheckpointError:  # a damaged state is refused where it is read
+        return {}
 
 
 def _train(
@@ -114,7 +124,8 @@ def _train(
     model = _new_network(config, network).to(device)
     layout = torch.channels_last if model.config.widths[0] >= _FEWEST_CHANNELS_LAST else torch.contiguous_format
     model.to(memory_format=layout)  # type: ignore[call-overload]
-    state = TrainingState(output / "state.safetensors", model, _optimizer(config, model))
+    settings = json.dumps(asdict(config))
+    state = TrainingState(output / "state.safetensors", model, _optimizer(config, model), settings)
     seed = np.random.SeedSequence([config.seed, state.step])
     generator = torch.Generator(device=device).manual_seed(int(seed.generate_state(1)[0]))
     batches = _batches(config, model.config, np.random.default_rng(seed))

@@ -27,6 +27,8 @@ from sq_perception.learning.checkpoint import CheckpointError
 from sq_perception.learning.training_config import Plateau
 
 Network = TypeVar("Network", bound=nn.Module)
+SETTINGS = "training"
+"""Name, in the header of the file, of what a run is made of."""
 _CLIP = 1.0
 """Largest norm of the gradient."""
 
@@ -54,6 +56,8 @@ class TrainingState(Generic[Network]):
     path: Path
     model: Network
     optimizer: torch.optim.Optimizer
+    settings: str = ""
+    """What the run is made of, JSON; empty where that is not to be compared when it goes on."""
     average: Network = field(init=False)
     plateau: Plateau = field(default_factory=Plateau)
     step: int = 0
@@ -83,7 +87,8 @@ class TrainingState(Generic[Network]):
             tensors.update({f"{prefix}.{k}": v.contiguous() for k, v in network.state_dict().items()})
         for index, slots in self.optimizer.state_dict()["state"].items():
             tensors.update({f"optimizer.{index}.{k}": torch.as_tensor(v).contiguous() for k, v in slots.items()})
-        output_file.write(self.path, bytes_of(tensors))
+        header = {SETTINGS: self.settings} if self.settings else None
+        output_file.write(self.path, bytes_of(tensors, header))
 
     def _restore(self) -> None:
         try:

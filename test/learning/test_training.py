@@ -199,6 +199,16 @@ class TestInterruptions:
             train.train(replace(RUN, steps=4, loss="render"), tmp_path, SMALL)
         assert (tmp_path / "state.safetensors").read_bytes() == before
 
+    def test_it_is_refused_also_before_the_first_validation(self, tmp_path: Path) -> None:
+        train.train(replace(RUN, steps=2), tmp_path, SMALL)
+        # What a run that is stopped before its first validation leaves.
+        (tmp_path / "last.safetensors").unlink()
+        (tmp_path / "model.safetensors").unlink()
+        before = (tmp_path / "state.safetensors").read_bytes()
+        with pytest.raises(checkpoint.CheckpointError, match=f"loss '{RUN.loss}', not 'render'"):
+            train.train(replace(RUN, steps=4, loss="render"), tmp_path, SMALL)
+        assert (tmp_path / "state.safetensors").read_bytes() == before
+
     @pytest.mark.parametrize("content", [b"not a state", None])
     def test_foreign_state_is_refused(self, content: bytes | None, tmp_path: Path) -> None:
         path = tmp_path / "state.safetensors"
