@@ -1,7 +1,7 @@
 """How the network of masks (:mod:`sq_perception.learning.mask_network`) is trained on segments.
 
-A view is mirrored or turned by a quarter at random, and shown now and then as if there were no support plane, or no
-other segments.
+Batches are mirrored or turned by a quarter at random, and a view is shown now and then as if there were no support
+plane, or no other segments.
 
     loss = sum_cells w cross entropy(l, truth) / sum_cells w,    w = 1 within the segment, AROUND beside it,
                                                                  0 where nothing was measured
