@@ -12,8 +12,7 @@ from contextlib import suppress
 from time import monotonic
 from typing import Any
 
-from lifecycle_msgs.msg import Transition
-from lifecycle_msgs.srv import ChangeState, GetState
+from lifecycle_msgs.srv import GetState
 from rcl_interfaces.msg import ParameterEvent
 from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
@@ -25,8 +24,6 @@ from sq_perception.viewing.page import Page
 
 _PATIENCE = 3.0
 """Seconds until a call is given up."""
-_TRANSITION_PATIENCE = 60.0
-"""Configuring loads a network and compiles."""
 _LOOK_PERIOD = 0.5
 """Seconds between two looks at whether the node is there, and at its lifecycle state."""
 _SETTLED = 0.4
@@ -43,7 +40,6 @@ class RemoteNode:
         self._node = node
         self._parameters = AsyncParameterClient(node, name)
         self._state = node.create_client(GetState, f"{name}/get_state")
-        self._transit = node.create_client(ChangeState, f"{name}/change_state")
         self._deadlines: dict[Future, float] = {}
         self._known: set[str] = set()
         self._look_due = 0.0
@@ -92,19 +88,6 @@ class RemoteNode:
             for value in response.values:  # none where there is no such parameter
                 self._note_values({name: parameter_value_to_python(value)})
 
-    async def transit(self, label: str) -> None:
-        """Ask for a lifecycle transition."""
-        if not self._transit.service_is_ready():
-            return
-        request = ChangeState.Request(transition=Transition(id=getattr(Transition, f"TRANSITION_{label.upper()}")))
-        try:
-            response = await self._answer(self._transit.call_async(request), _TRANSITION_PATIENCE)
-        except TimeoutError:
-            self._note(f"{label}: no answer", False)
-            return
-        self._note(f"{label}: {'done' if response.success else 'the node could not'}", response.success)
-        self._look_due = 0.0
-
     def _look(self) -> None:
         was_there, self.is_there = self.is_there, self._parameters.services_are_ready()
         if self.is_there and not was_there:
@@ -136,9 +119,9 @@ class RemoteNode:
         controls = [control(*both) for both in zip(described.descriptors, read, strict=True)]
         self._news.append(lambda page: page.show_controls(self.name, controls))
 
-    async def _answer(self, call: Future, patience: float = _PATIENCE) -> Any:
+    async def _answer(self, call: Future) -> Any:
         """The answer of a service.  Raises TimeoutError if there is none."""
-        self._deadlines[call] = monotonic() + patience
+        self._deadlines[call] = monotonic() + _PATIENCE
         try:
             answer = await call
         finally:

@@ -36,7 +36,7 @@ from sq_perception.nodes.tracking import CameraPoses, PoseError
 from sq_perception.recordings.publication import drawn, superquadrics
 from sq_perception.viewing import tables
 from sq_perception.viewing.drawings import Bodies
-from sq_perception.viewing.page import Change, Page
+from sq_perception.viewing.page import Page
 from sq_perception.viewing.tables import NodeState
 
 _IMAGES = 8
@@ -127,12 +127,8 @@ class ViewNode(Node):
             self._inputs = []
         executor = self.executor
         assert executor is not None, "it calls this"
-        for request in self._page.requests():
-            remote = self._remote[request.node]
-            if isinstance(request, Change):
-                executor.create_task(remote.change, request.name, request.value)
-            else:
-                executor.create_task(remote.transit, request.label)
+        for change in self._page.changes():
+            executor.create_task(self._remote[change.node].change, change.name, change.value)
         for remote in self._remote.values():
             remote.tick()
 

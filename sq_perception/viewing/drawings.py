@@ -182,18 +182,6 @@ def shell(body: Superquadric, sigma_size: np.ndarray) -> Superquadric | None:
     return Superquadric(size, body.shape, body.translation, body.rotation)
 
 
-def error_bars(body: Superquadric, sigma_size: np.ndarray) -> np.ndarray:
-    """Line segments (j, 2, 3) in the body's own frame, centred: along each axis from a - 2 sigma to a + 2 sigma.
-
-    Axes whose deviation is unknown have none; bars end where the shell does, and begin at the centre at the latest.
-    """
-    size, sigma = np.asarray(body.size, dtype=float), np.asarray(sigma_size, dtype=float)
-    inner = np.maximum(size - SHELL_SIGMAS * sigma, 0.0)
-    outer = np.minimum(size + SHELL_SIGMAS * sigma, LARGEST_SHELL * size)
-    bars = (np.stack([inner, outer], axis=1)[:, :, None] * np.eye(3)[:, None])[sigma > 0]
-    return np.stack([-bars, bars], axis=1).reshape(-1, 2, 3).astype(np.float32)
-
-
 def label_position(body: Superquadric) -> np.ndarray:
     """Where the label of a body stands, (3,): a little above its highest point (y down)."""
     up = np.array([0.0, -1.0, 0.0])

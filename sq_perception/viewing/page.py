@@ -1,13 +1,12 @@
 """The page: a scene in three dimensions (:mod:`~sq_perception.viewing.scene`), numbers, and controls for parameters.
 
-One thread, the drawing thread, calls the methods; only :attr:`Page.watched` and :meth:`Page.requests` may be called
-from others.  What a user does on the page waits in a queue until :meth:`Page.requests` takes it.
+One thread, the drawing thread, calls the methods; only :attr:`Page.watched` and :meth:`Page.changes` may be called from
+others.  What a user does on the page waits until :meth:`Page.changes` takes it.
 """
 
 from __future__ import annotations
 
 import contextlib
-import queue
 import socket
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -32,7 +31,6 @@ _SHOWN = {
     "Bodies": None,
     "Ids": None,
     "Shells": f"The body with half sizes {drawings.SHELL_SIGMAS:g} standard deviations larger",
-    "Error bars": f"± {drawings.SHELL_SIGMAS:g} standard deviations of each half size",
     "Camera": "What the camera sees, and its optical frame",
     "Depth image": None,
 }
@@ -46,17 +44,6 @@ class Change:
     node: str
     name: str
     value: Any
-
-
-@dataclass(frozen=True)
-class Transition:
-    """A user wants a node to go through a lifecycle transition, such as activate."""
-
-    node: str
-    label: str
-
-
-Request = Change | Transition
 
 
 class Page:
@@ -83,7 +70,6 @@ class Page:
         self, bound: socket.socket, nodes: Sequence[str], most_points: int = 40000, *, parameters: bool = True
     ) -> None:
         self._most_points = most_points
-        self._requests: queue.SimpleQueue[Request] = queue.SimpleQueue()
         self._span: tuple[float, float] | None = None
         self._aimed_at_bodies = False
         self.server = server.serve(bound)
@@ -101,10 +87,10 @@ class Page:
         """Stop serving; browsers show that the connection is lost."""
         self.server.stop()
 
-    def requests(self) -> list[Request]:
-        """What users have asked for since the last call, in order; of several values of a parameter the last."""
+    def changes(self) -> list[Change]:
+        """What users have asked for since the last call; of several values of a parameter the last."""
         now = monotonic()
-        changes = [self._requests.get_nowait() for _ in range(self._requests.qsize())]
+        wanted = []
         for part in self._nodes.values():
             for name, pending in list(part.pending.items()):
                 value, due = pending
@@ -112,8 +98,8 @@ class Page:
                     # A newer value that comes this instant has replaced the entry and stays.
                     if part.pending.get(name) is pending:
                         del part.pending[name]
-                    changes.append(Change(part.name, name, value))
-        return changes
+                    wanted.append(Change(part.name, name, value))
+        return wanted
 
     # The scene
 
@@ -154,12 +140,8 @@ class Page:
         part.table.content = tables.bodies_table(node, bodies, stamp, state, is_cube=is_cube)
 
     def show_state(self, state: NodeState) -> None:
-        """Write how a node is doing; its lifecycle buttons appear with its state."""
-        part = self._nodes[state.name]
-        part.status.content = tables.node_status(state)
-        possible = _TRANSITIONS.get(state.lifecycle, ())
-        for label, button in part.buttons.items():
-            button.visible = label in possible
+        """Write how a node is doing."""
+        self._nodes[state.name].status.content = tables.node_status(state)
 
     def show_source(self, text: str) -> None:
         """Write where the depth comes from, as HTML of :mod:`sq_perception.viewing.tables`."""
@@ -231,8 +213,6 @@ class Page:
             part.tab = tabs.add_tab(titles[1])
             with part.tab:
                 part.answer = gui.add_html("")
-                for label in ("configure", "activate", "deactivate", "cleanup"):
-                    part.buttons[label] = self._add_button(part, label)
         with tabs.add_tab("View"):
             self._add_view_controls()
         with gui.add_folder("Depth image"):
@@ -259,15 +239,6 @@ class Page:
 
     def _is_wanted(self, what: str) -> bool:
         return bool(self._wanted[what].value)
-
-    def _add_button(self, part: _NodePart, label: str) -> Any:
-        button = self.server.gui.add_button(label.capitalize(), visible=False)
-
-        @button.on_click
-        def _(_: viser.GuiEvent) -> None:
-            self._requests.put(Transition(part.name, label))
-
-        return button
 
     def _add_control(self, part: _NodePart, about: Control) -> Any:
         gui, value = self.server.gui, about.value
@@ -304,17 +275,9 @@ class _NodePart:
     tab: Any = None
     answer: Any = None
     wanted: Any = None
-    buttons: dict[str, Any] = field(default_factory=dict)
     folders: list[Any] = field(default_factory=list)
     controls: dict[str, Control] = field(default_factory=dict)
     handles: dict[str, Any] = field(default_factory=dict)
     known: dict[str, Any] = field(default_factory=dict)
     pending: dict[str, tuple[Any, float]] = field(default_factory=dict)
     """Values that wait for the user to stop typing, and when they are sent."""
-
-
-_TRANSITIONS: dict[str, tuple[str, ...]] = {
-    "unconfigured": ("configure",),
-    "inactive": ("activate", "cleanup"),
-    "active": ("deactivate",),
-}

@@ -20,7 +20,7 @@ _UP = (0.0, -1.0, 0.0)
 _VIEW_ANGLE = np.deg2rad(42.0)
 _BACKGROUND = np.full((2, 2, 3), (22, 24, 28), np.uint8)
 _BODY_ALPHA, _FADED_ALPHA, _SHELL_ALPHA = 0.85, 0.2, 0.2
-_FRUSTUM, _BARS = (150, 160, 175), (245, 245, 245)
+_FRUSTUM = (150, 160, 175)
 START, CAMERA = "behind", "camera"
 PLACES = {
     START: (1.0, np.array([0.28, -0.38, -1.25])),
@@ -100,14 +100,11 @@ class Scene:
         state: dict[str, Any] = {"visible": is_wanted}
         if (camera, length) != (self.camera, self._length):
             self.camera, self._length, state["points"] = camera, length, drawings.view_volume(camera, length)
-        self._put("", "/camera", partial(self._add_lines, _FRUSTUM, 1.5), **state)
-
-    def _add_lines(self, colour: tuple[int, int, int], width: float, path: str, **state: Any) -> Any:
-        look: dict[str, Any] = {"colors": colour, "thickness": width, "thickness_units": "screen"}
-        return self._server.scene.add_line_segments(path, **look, **state)
+        look: dict[str, Any] = {"colors": _FRUSTUM, "thickness": 1.5, "thickness_units": "screen"}
+        self._put("", "/camera", partial(self._server.scene.add_line_segments, **look), **state)
 
     def draw_body(self, node: str, bodies: Bodies, k: int, is_silent: bool, wanted: Callable[[str], bool]) -> set[str]:
-        """Surface, label, shell and error bars of a body, as far as they are wanted and known; their paths."""
+        """Surface, label and shell of a body, as far as they are wanted and known; their paths."""
         body, sigma, number = bodies.superquadrics[k], bodies.sigma_size[k], int(bodies.ids[k])
         colour: Any = tuple(round(255 * float(channel)) for channel in bodies.colours[k])
         x, y, z, w = body.rotation
@@ -123,12 +120,10 @@ class Scene:
             self._put(node, f"{path}/surface", surface, vertices=drawings.mesh_vertices(body), **look, **pose),
             self._put(node, f"{path}/id", label, **where),
         }
-        around, bars = drawings.shell(body, sigma), drawings.error_bars(body, sigma)
+        around = drawings.shell(body, sigma)
         if around is not None and wanted("Shells"):
             add = partial(surface, opacity=_SHELL_ALPHA, side="front")
             paths.add(self._put(node, f"{path}/shell", add, vertices=drawings.mesh_vertices(around), **pose))
-        if len(bars) and wanted("Error bars"):
-            paths.add(self._put(node, f"{path}/bars", partial(self._add_lines, _BARS, 2.5), points=bars, **pose))
         return paths
 
     def aim(self, target: np.ndarray) -> None:

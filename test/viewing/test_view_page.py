@@ -224,7 +224,7 @@ def test_bodies_are_drawn_where_and_as_they_are(bench: Bench) -> None:
     """Through the camera: its pixel of every body's centre has the hue of that body's id."""
     browser = bench.browser
     browser.click("View")
-    for label in ("Points", "Ids", "Shells", "Error bars"):
+    for label in ("Points", "Ids", "Shells"):
         browser.click(label)
     browser.click("camera")
     expected = hues(255 * PALETTE[np.array(IDS) % len(PALETTE)])

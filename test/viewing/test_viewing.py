@@ -101,13 +101,6 @@ def test_a_shell_is_two_deviations_larger_but_never_huge() -> None:
     assert drawings.shell(one, np.zeros(3)) is None
 
 
-def test_error_bars_straddle_the_surface() -> None:
-    bars = drawings.error_bars(body(), np.array([0.01, np.nan, 5.0]))
-    assert bars.shape == (4, 2, 3)
-    np.testing.assert_allclose(bars[1], [[0.08, 0, 0], [0.12, 0, 0]], atol=1e-7)
-    np.testing.assert_allclose(bars[2], [[0, 0, 0], [0, 0, -0.15]], atol=1e-7)
-
-
 def test_a_label_stands_above_its_body() -> None:
     one = body()
     place = drawings.label_position(one)
@@ -343,10 +336,10 @@ def test_the_page_draws_what_is_there_and_takes_away_what_is_not() -> None:
                 assert volume[..., 2].max() == pytest.approx(far)
             page.show_bodies("/a/b", bodies(), 0.0, NodeState("/a/b", age=99.0))
             for found, parts in (
-                (bodies(), {"surface", "id", "shell", "bars"}),
+                (bodies(), {"surface", "id", "shell"}),
                 (bodies(np.nan), {"surface", "id"}),
                 (None, set()),
-                (bodies(), {"surface", "id", "shell", "bars"}),
+                (bodies(), {"surface", "id", "shell"}),
             ):
                 page.show_bodies("/a", found, 0.0, NodeState("/a", age=0.0))
                 assert {path for node, path in page._scene._handles if node == "/a"} == {
