@@ -50,8 +50,15 @@ _DECISIVE = (
 
 
 def replaced_input(options: argparse.Namespace, inputs: Sequence[Path]) -> str:
-    """Which output would take the place of an input; empty if none."""
+    """Which output would take the place of an input, or of another output; empty if none."""
     files = {name: getattr(options, name) for name in _FILES}
+    taken: dict[Path, str] = {}
+    for name, file in files.items():
+        if file is None or str(file) == console.STANDARD_OUTPUT or output_file.is_stream(Path(file)):
+            continue  # a device takes all of them
+        other = taken.setdefault(Path(file).resolve(), name)
+        if other != name:
+            return f"--{other}, --{name}: {file}: expected a file for each of them"
     folders = {"pictures": (options.pictures, ".png"), "meshes": (options.meshes, f".{options.mesh_format}")}
     return console.replaced_input(inputs, files, folders)
 

@@ -391,6 +391,14 @@ def test_inputs_are_not_replaced(tmp_path, capsys):
     assert {path: path.read_bytes() for path in before} == before
 
 
+def test_no_output_takes_the_place_of_another(tmp_path, capsys):
+    frame, out = save_npz(tmp_path / "a.npz"), tmp_path / "out.json"
+    assert main.main(["recover", str(frame), "--json", str(out), "--jsonl", f"{tmp_path}/./out.json"]) == 2
+    assert "--json, --jsonl: " in capsys.readouterr().err
+    assert not out.exists()
+    assert main.main(["recover", str(frame), "--json", "/dev/null", "--csv", "/dev/null"]) == 0
+
+
 def test_a_folder_is_resumed_where_it_ended(tmp_path, monkeypatch):
     """Interrupted after two of five frames, then again to the end: every frame once, in order, computed once."""
     from sq_perception.recovery.recoverer import Recoverer
