@@ -206,7 +206,10 @@ class Recoverer:
             fresh = [obj for obj in objects if obj.label not in same]
             config = None if network is None else network.config
             fresh = fresh if strays is None else [obj.without(strays) for obj in fresh]
-            fresh = self._mapped(lambda obj: seen_object.viewed(obj, depth, camera, found, options, config), fresh)
+            is_given = labels is not None
+            fresh = self._mapped(
+                lambda obj: seen_object.viewed(obj, depth, camera, found, options, config, is_given), fresh
+            )
             if network is not None:
                 fresh = self._predicted(fresh, network, options)
 

@@ -8,11 +8,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
 from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.quantiles import quantile
-from sq_perception.imaging import canonical_view, regions
+from sq_perception.imaging import canonical_view, depth_steps, regions
 from sq_perception.imaging.camera import Camera, Lens
 from sq_perception.imaging.canonical_view import CanonicalView
 from sq_perception.imaging.coherence import coherent
@@ -33,6 +34,12 @@ _HIGHEST_STACK = 0.5
 _ON_TABLE = 0.003
 _JUMP_PIXELS, _JUMP = 10.0, 0.002
 """What a network is shown, and a score is measured on: metres above the table; steps in pixel widths, and metres."""
+_SURROUNDED, _RIM_HEIGHT = 0.6, 0.01
+"""Share of the pixels next to a given mask that go on with it, this many metres above its support, if it is too small.
+Of the second row of pixels around 200 things of benchmarks/household_things 4 % do typically, 50 % of one in twenty;
+70 % where masks are two pixels too small."""
+_LEAST_ROWS, _MOST_ROWS = 2, 4
+"""By how many pixels a given mask is too small, if it is: a sensor widens an edge by one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,6 +127,38 @@ def objects(
     return seen
 
 
+def completed(obj: SeenObject, depth: np.ndarray, camera: Camera, labels: np.ndarray) -> SeenObject:
+    """The object with what goes on from its mask nearly all around, without a step: of a mask too small by some pixels.
+
+    Else they would be free space beside the object, and its outline to a network.  Beside a right mask there is the
+    support, what is far behind, or another object.  ``labels`` (height, width) are those of all objects.
+    """
+    if obj.plane is None or not camera.is_pinhole:
+        return obj
+    down, across = obj.window
+    top, left = max(down.start - _MOST_ROWS, 0), max(across.start - _MOST_ROWS, 0)
+    around = slice(top, down.stop + _MOST_ROWS), slice(left, across.stop + _MOST_ROWS)
+    near, names = np.ascontiguousarray(depth[around]), labels[around]
+    view = camera.cropped(left, top, near.shape[1], near.shape[0])
+    unnamed = np.isfinite(near) & (names == 0)
+    free = unnamed & (_heights(near, unnamed, view.lens, obj.plane) > _RIM_HEIGHT)
+    mask, rows = names == obj.label, 0
+    while rows < _MOST_ROWS:
+        rim = (cv2.dilate(mask.view(np.uint8), depth_steps.CROSS) > 0) & ~mask
+        grown = depth_steps.grown(mask.astype(np.int32), free & rim, near, 1, depth_steps.STEP) > 0
+        if np.count_nonzero(grown & rim) <= _SURROUNDED * np.count_nonzero(rim):
+            break
+        mask, rows = grown, rows + 1
+    if rows < _LEAST_ROWS:
+        return obj
+    whole = np.zeros_like(obj.mask)
+    whole[around] = mask & np.isfinite(near)
+    x, y, width, height = regions.box(whole)
+    window = slice(y, y + height), slice(x, x + width)
+    crop = camera.cropped(x, y, width, height)
+    return replace(obj, mask=whole, depth_crop=depth[window], mask_crop=whole[window], camera_crop=crop, window=window)
+
+
 def support(
     obj: SeenObject,
     depth: np.ndarray,
@@ -153,9 +192,12 @@ def viewed(
     found: segments.Segmentation,
     options: RecoveryOptions,
     config: RegressorConfig | ThingConfig | None,
+    is_given: bool,
 ) -> SeenObject:
     """The object with what it stands on, what a network of this configuration is shown, and what its score takes."""
     obj = replace(obj, plane=support(obj, depth, camera, found, options.segmentation_options()))
+    if is_given:
+        obj = completed(obj, depth, camera, found.labels)
     inner = core(obj, depth, camera)
     shown = None if config is None else config.view_of(depth, inner, camera, obj.plane)
     if shown is not None and not (isinstance(config, RegressorConfig) and config.framing == "full"):

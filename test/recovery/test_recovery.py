@@ -5,7 +5,9 @@ from __future__ import annotations
 import subprocess
 import sys
 import threading
+from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -18,7 +20,9 @@ from sq_perception.imaging import canonical_view, raycast, unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.learning import checkpoint
 from sq_perception.learning.regressor import Regressor, RegressorConfig
+from sq_perception.recovery import seen_object
 from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, RecoveryOptions, render_recovery
+from sq_perception.segmentation.segments import Segmentation
 from sq_perception.simulation.scenes import table_scene
 
 CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)
@@ -225,6 +229,23 @@ def test_what_is_out_of_range_of_an_object_is_not_measured(symmetry):
     cropped = symmetry.recover(depth, CAMERA, labels, RecoveryOptions(method="symmetry", depth_range=(cut, 9.0)))
     without = symmetry.recover(lost, CAMERA, labels, RecoveryOptions(method="symmetry", depth_range=(cut, 9.0)))
     np.testing.assert_array_equal(cropped.bodies[0].superquadric.to_flat(), without.bodies[0].superquadric.to_flat())
+
+
+@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("pixels", [0, 2, 3])
+def test_what_goes_on_all_around_a_mask_that_is_too_small_is_the_object(symmetry, pixels, seed):
+    """It is no free space beside it; of a right mask nothing is added."""
+    scene = table_scene(np.random.default_rng(seed), 1, CAMERA)
+    depth, labels = scene.render()
+    small = cv2.erode((labels > 0).astype(np.uint8), np.ones((2 * pixels + 1,) * 2, np.uint8)).astype(np.int32)
+    assert small.sum() > 200
+    found = symmetry.recover(depth.astype(np.float32), CAMERA, small)
+    assert iou(found.bodies[0].superquadric, scene.bodies[0]) > 0.95
+    given = Segmentation(small, scene.plane, (1,))
+    (obj,) = seen_object.objects(depth, given, CAMERA, (0.0, np.inf))
+    whole = seen_object.completed(replace(obj, plane=scene.plane), depth, CAMERA, small)
+    assert not (whole.mask & (labels == 0)).any()
+    assert (whole.mask & ~obj.mask).any() == (pixels > 0)
 
 
 def test_methods_do_what_they_say(weights):
