@@ -13,6 +13,7 @@ import logging
 import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
+from typing import TypeAlias
 
 from sq_perception.recordings import bag_file, camera_file, frame_file
 from sq_perception.recordings.bag_file import InputOptions, RecordedBag
@@ -28,6 +29,8 @@ CAMERA_FILES = (
 )
 SUFFIXES = frame_file.SUFFIXES + bag_file.SUFFIXES
 
+_Source: TypeAlias = tuple[Path, str | Path | None] | tuple[Path, FrameError]
+"""A file with its camera, or what cannot be read, and why."""
 _log = logging.getLogger(__name__)
 _ANY_SIZE = (640, 480)
 """Pixels, of images that nothing is known of yet."""
@@ -64,7 +67,7 @@ class RecordedInput:
             # Auto depends on what the images are called.
             treatment = "ignore" if self._options.distortion == "auto" else self._options.distortion
             camera_file.read_calibration(self._options.camera_info, treatment, size=_ANY_SIZE)
-        self._sources: list[tuple[Path, str | Path | None] | tuple[Path, FrameError]] = []
+        self._sources: list[_Source] = []
         for name in names:
             self._add(Path(name))
         self.total = len(self._sources)
@@ -95,21 +98,20 @@ class RecordedInput:
         if not path.is_dir() or bag_file.is_bag(path):
             self._sources.append((path, self._options.camera_info or _camera_file(path.parent)))
             return
-        try:
-            found = self._in_folders(path, None)
-        except OSError as error:
-            self._sources.append((path, FrameError(f"{path}: {error}")))
-            return
+        found = self._in_folders(path, None)
         self._sources += found or [(path, FrameError(f"{path}: no frames in it ({', '.join(SUFFIXES)})"))]
 
-    def _in_folders(self, folder: Path, above: str | Path | None) -> list[tuple[Path, str | Path | None]]:
+    def _in_folders(self, folder: Path, above: str | Path | None) -> list[_Source]:
         """The frames of a folder, or of those in it, with their camera, which may be that of the folder ``above``."""
-        camera_info = self._options.camera_info or _camera_file(folder) or above
-        if found := in_folder(folder):
-            _log.info("%s: %d frames, camera %s", folder, len(found), camera_info or "of the files")
-            return [(path, camera_info) for path in found[:: self._options.every][: self._options.limit]]
-        folders = [inner for inner in folder.iterdir() if inner.is_dir() and not inner.is_symlink()]
-        return [pair for inner in sorted(folders, key=_natural) for pair in self._in_folders(inner, camera_info)]
+        try:
+            camera_info = self._options.camera_info or _camera_file(folder) or above
+            if found := in_folder(folder):
+                _log.info("%s: %d frames, camera %s", folder, len(found), camera_info or "of the files")
+                return [(path, camera_info) for path in found[:: self._options.every][: self._options.limit]]
+            folders = [inner for inner in folder.iterdir() if inner.is_dir() and not inner.is_symlink()]
+        except OSError as error:
+            return [(folder, FrameError(f"{folder}: {error}"))]
+        return [one for inner in sorted(folders, key=_natural) for one in self._in_folders(inner, camera_info)]
 
     def _file(self, path: Path, camera_info: str | Path | None) -> RecordedFrame | FrameError:
         try:

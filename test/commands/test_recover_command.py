@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -84,6 +85,23 @@ def test_a_folder_gives_its_frames_in_natural_order_with_its_camera(tmp_path):
     assert [frame.camera.fx for _, frame in RecordedInput([str(tmp_path)], some)] == [200, 400]
     given = camera_yaml(tmp_path / "mine.yaml", 500.0)
     assert [frame.camera.fx for _, frame in RecordedInput([str(tmp_path)], InputOptions(given))] == [200] + 4 * [500]
+
+
+def test_a_folder_that_cannot_be_read_hides_none_beside_it(tmp_path, monkeypatch):
+    for name in ("a", "b", "c"):
+        (tmp_path / name).mkdir()
+        save_npz(tmp_path / name / "f.npz")
+    listed = Path.iterdir
+
+    def iterdir(path):
+        if path.name == "b":
+            raise PermissionError(13, "Permission denied")
+        return listed(path)
+
+    monkeypatch.setattr(Path, "iterdir", iterdir)
+    found = list(RecordedInput([str(tmp_path)]))
+    assert [Path(source).relative_to(tmp_path).parts[0] for source, _ in found] == ["a", "b", "c"]
+    assert [isinstance(frame, FrameError) for _, frame in found] == [False, True, False]
 
 
 def test_bad_inputs_come_as_errors_in_their_place(tmp_path):
