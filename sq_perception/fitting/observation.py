@@ -29,9 +29,9 @@ from sq_perception.fitting.depth_noise import DepthNoise
 from sq_perception.fitting.rays import drawn, through
 from sq_perception.geometry.kernels import kernel
 from sq_perception.imaging import depth_steps, regions
-from sq_perception.imaging.camera import Camera, Lens
+from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.coherence import coherent
-from sq_perception.imaging.lens import point_at
+from sq_perception.imaging.lens import heights
 
 _STEEPEST = 6.0
 """Slopes above this, 80 degrees, count as this: there a pixel determines little of the depth."""
@@ -44,7 +44,7 @@ _HOLE = 5
 """Holes and notches of the mask up to this width, pixels, are closed: the outline of a convex body has none."""
 _JUMP_PIXELS, _JUMP_NOISE = 10.0, 6.0
 """A depth step between neighbours above so many pixel widths, plus so many noise levels, ends a surface."""
-_ON_PLANE, _FOOT_PIXELS = 0.003, 3
+ON_SUPPORT, _FOOT_PIXELS = 0.003, 3
 """Metres above its support, up to which a pixel of a mask may show that, and pixels up to which the foot of an object
 is so low."""
 _BEHIND_SHARE = 0.05
@@ -148,7 +148,9 @@ class Crop:
         on from the foot without a step: then what is above the support counts alone.
         """
         inside = coherent(self.depth, self.mask, jump)
-        low = np.zeros_like(self.mask) if plane is None else _low(self.depth, self.mask, self.camera.lens, plane)
+        if plane is None:
+            return inside
+        low = heights(self.depth, self.mask, self.camera.lens, plane) <= ON_SUPPORT
         # Of a thin thing on its support all is as low.
         if not low.any() or 2 * np.count_nonzero(low) > np.count_nonzero(self.mask):
             return inside
@@ -259,18 +261,6 @@ def _convex_hull(mask: np.ndarray) -> np.ndarray:
     hull = np.zeros_like(mask)
     cv2.fillConvexPoly(hull, cv2.convexHull(np.concatenate(outlines)), 1)
     return hull
-
-
-@kernel
-def _low(depth: np.ndarray, mask: np.ndarray, lens: Lens, plane: np.ndarray) -> np.ndarray:
-    """The pixels (h, w) of a mask that measured something no higher above the plane than what may be the plane."""
-    low = np.zeros(mask.shape, np.bool_)
-    for v in range(depth.shape[0]):
-        for u in range(depth.shape[1]):
-            if mask[v, u]:
-                x, y, z = point_at(u, v, np.float64(depth[v, u]), lens)
-                low[v, u] = plane[0] * x + plane[1] * y + plane[2] * z + plane[3] <= _ON_PLANE
-    return low
 
 
 @kernel

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
-from numba.core import event
+from numba.core.event import Event, Listener, register
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 _log = logging.getLogger(__name__)
@@ -42,22 +42,23 @@ def compiled(function: _F, options: dict[str, Any]) -> _F:
         settings.CACHE_DIR = before
 
 
-class _Announcement(event.Listener):
-    """Says once that kernels of this package are being compiled, and not found."""
+class _Compiling(Listener):
+    """Hears of kernels that are compiled, as they are not on disk."""
 
-    def on_start(self, event: event.Event) -> None:
+    def on_start(self, event: Event) -> None:
         if event.data["dispatcher"].py_func.__module__.startswith(__package__.partition(".")[0]):
-            self._announce()
+            _announce()
 
-    def on_end(self, event: event.Event) -> None:
+    def on_end(self, event: Event) -> None:
         pass
 
-    @cache  # noqa: B019 - there is one of them
-    def _announce(self) -> None:
-        _log.info("compiling, once for this installation: all kernels take about two minutes")
+
+@cache
+def _announce() -> None:
+    _log.info("compiling, once for this installation: all kernels take about two minutes")
 
 
-event.register("numba:compile", _Announcement())
+register("numba:compile", _Compiling())
 
 
 @cache

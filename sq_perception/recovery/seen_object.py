@@ -11,13 +11,12 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
-from sq_perception.geometry.kernels import kernel
+from sq_perception.fitting.observation import ON_SUPPORT
 from sq_perception.geometry.quantiles import quantile
-from sq_perception.imaging import canonical_view, depth_steps, regions
-from sq_perception.imaging.camera import Camera, Lens
+from sq_perception.imaging import canonical_view, depth_steps, lens, regions
+from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.canonical_view import CanonicalView
 from sq_perception.imaging.coherence import coherent
-from sq_perception.imaging.lens import point_at
 from sq_perception.learning.network_config import RegressorConfig, ThingConfig
 from sq_perception.recovery.options import RecoveryOptions
 from sq_perception.recovery.prediction import Prediction
@@ -31,9 +30,8 @@ _LOWEST, _HOVERING = 0.02, 0.02
 """An object this many metres above its plane, by its lowest points, may stand on another one."""
 _HIGHEST_STACK = 0.5
 """Higher above its plane, metres, an object does not even stand on others that stand on it."""
-_ON_TABLE = 0.003
 _JUMP_PIXELS, _JUMP = 10.0, 0.002
-"""What a network is shown, and a score is measured on: metres above the table; steps in pixel widths, and metres."""
+"""Steps in pixel widths, and metres, that end what a network is shown and a score is measured on."""
 _SURROUNDED, _RIM_HEIGHT = 0.6, 0.01
 """Share of the pixels next to a given mask that go on with it, this many metres above its support, if it is too small.
 Of the second row of pixels around 200 things of benchmarks/household_things 4 % do typically, 50 % of one in twenty;
@@ -51,9 +49,10 @@ class SeenObject:
     label
         Its value in the label image.
     pixels, masked
-        Number of its measured pixels, and of the pixels of its label around them.
+        Number of the measured pixels of its label, and of all of its label around them.
     mask : bool (height, width)
-        These pixels; ``mask_crop``, ``depth_crop`` and ``camera_crop`` are their ``window`` of mask, depth and camera.
+        What measured it: those pixels without strays, or with what goes on from them (:func:`completed`);
+        ``mask_crop``, ``depth_crop`` and ``camera_crop`` are its ``window`` of mask, depth and camera.
     plane : (4,) or None
         What it stands on.
     shown
@@ -88,7 +87,7 @@ class SeenObject:
     def heights(self, plane: np.ndarray) -> np.ndarray:
         """Metres above a plane (4,): of the pixels of ``mask_crop``, NaN elsewhere."""
         depth, mask = np.ascontiguousarray(self.depth_crop), np.ascontiguousarray(self.mask_crop)
-        return _heights(depth, mask, self.camera_crop.lens, plane)
+        return lens.heights(depth, mask, self.camera_crop.lens, plane)
 
     def levels(self, plane: np.ndarray) -> tuple[float, float]:
         """The height of its lowest pixels above a plane, and the median of all, metres; of some thousand pixels."""
@@ -141,7 +140,7 @@ def completed(obj: SeenObject, depth: np.ndarray, camera: Camera, labels: np.nda
     near, names = np.ascontiguousarray(depth[around]), labels[around]
     view = camera.cropped(left, top, near.shape[1], near.shape[0])
     unnamed = np.isfinite(near) & (names == 0)
-    free = unnamed & (_heights(near, unnamed, view.lens, obj.plane) > _RIM_HEIGHT)
+    free = unnamed & (lens.heights(near, unnamed, view.lens, obj.plane) > _RIM_HEIGHT)
     mask, rows = names == obj.label, 0
     while rows < _MOST_ROWS:
         rim = (cv2.dilate(mask.view(np.uint8), depth_steps.CROSS) > 0) & ~mask
@@ -215,7 +214,7 @@ def core(obj: SeenObject, depth: np.ndarray, camera: Camera) -> np.ndarray:
         return obj.mask
     inner = obj.mask_crop
     if obj.plane is not None:
-        above = obj.heights(obj.plane) > _ON_TABLE
+        above = obj.heights(obj.plane) > ON_SUPPORT
         inner = above if 2 * np.count_nonzero(above) > obj.pixels else inner
     footprint = quantile(obj.depth_crop[obj.mask_crop], 0.5) / np.sqrt(camera.fx * camera.fy)
     whole = np.zeros_like(obj.mask)
@@ -227,14 +226,3 @@ def core(obj: SeenObject, depth: np.ndarray, camera: Camera) -> np.ndarray:
         np.ascontiguousarray(depth[around]), np.ascontiguousarray(whole[around]), _JUMP_PIXELS * footprint + _JUMP
     )
     return whole
-
-
-@kernel
-def _heights(depth: np.ndarray, mask: np.ndarray, lens: Lens, plane: np.ndarray) -> np.ndarray:
-    heights = np.full(depth.shape, np.nan)
-    for v in range(depth.shape[0]):
-        for u in range(depth.shape[1]):
-            if mask[v, u]:
-                x, y, z = point_at(u, v, np.float64(depth[v, u]), lens)
-                heights[v, u] = plane[0] * x + plane[1] * y + plane[2] * z + plane[3]
-    return heights
