@@ -2,31 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-
 import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
-from frame_node_bench import CAMERA, Bench
+from frame_node_bench import CAMERA
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2, PointField
 from std_msgs.msg import Header
 
 from sq_perception.imaging import compressed_depth
-
-
-@pytest.fixture
-def make_bench() -> Iterator[Callable[..., Bench]]:
-    benches: list[Bench] = []
-
-    def make(*arguments: str) -> Bench:
-        benches.append(Bench(*arguments))
-        return benches[-1]
-
-    yield make
-    for bench in benches:
-        bench.close()
 
 
 def test_packed_images_are_read_and_hostile_ones_refused(make_bench):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
 from dataclasses import fields
 from types import SimpleNamespace
 from typing import Any
@@ -12,51 +11,26 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
-from frame_node_bench import CAMERA, FRAME_ID, Bench, ball
+from frame_node_bench import CAMERA, FRAME_ID
 from geometry_msgs.msg import PoseStamped
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from std_msgs.msg import Header
 from std_srvs.srv import SetBool, Trigger
-from visualization_msgs.msg import Marker, MarkerArray
 
 from sq_msgs_py.answers import from_response
 from sq_msgs_py.depth_image import (
-    depth_from_message,
     depth_to_message,
     grey_to_message,
     labels_to_message,
 )
 from sq_msgs_py.poses import plane_of
 from sq_msgs_py.superquadrics import MessageError
-from sq_perception.fitting.fit import Status
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.nodes import fast_dds, frame_node
 from sq_perception.nodes.frame import stamp_of
-
-
-@pytest.fixture
-def make_bench() -> Iterator[Callable[..., Bench]]:
-    benches: list[Bench] = []
-
-    def make(*arguments: str) -> Bench:
-        benches.append(Bench(*arguments))
-        return benches[-1]
-
-    yield make
-    for bench in benches:
-        bench.close()
-
-
-@pytest.fixture
-def bench(make_bench: Callable[..., Bench]) -> Bench:
-    one = make_bench()
-    one.send_info()
-    return one
 
 
 def test_stamp_frame_and_numbers_arrive(bench):
@@ -388,83 +362,6 @@ def test_masks_of_the_same_stamp_are_used(bench):
     masks.publish(labels_to_message(labels, image.header))
     bench.answer(image)
     assert bench.recoverer.asked[-1][2] is None
-
-
-def test_pictures_are_made_while_somebody_listens_and_stale_markers_go(bench):
-    assert bench.node.set_parameters([Parameter("tracking", value=False)])[0].successful
-    bench.recoverer.bodies = (ball(1), ball(5), ball(6, Status.FAILED))
-    assert len(bench.answer(bench.depth())[1]) == 3
-    shown: list[MarkerArray] = []
-    rendered: list[Image] = []
-    bench.peer.create_subscription(MarkerArray, "recover_node/markers", shown.append, 5)
-    bench.peer.create_subscription(Image, "recover_node/rendered_depth", rendered.append, 5)
-    bench.until(
-        lambda: (
-            bench.node._outputs.markers.get_subscription_count()
-            and bench.node._outputs.rendered_depth.get_subscription_count()
-        )
-    )
-    assert not shown
-    image = bench.depth()
-    bench.answer(image)
-    bench.until(lambda: shown and rendered)
-    assert sorted({marker.id for marker in shown[0].markers}) == [1, 5]
-    assert all(marker.header == image.header for marker in shown[0].markers)
-    depth = depth_from_message(rendered[0])
-    assert rendered[0].header == image.header
-    assert np.nanmin(depth) == pytest.approx(0.4, abs=2e-3)
-    assert np.isnan(depth).any()
-
-    bench.recoverer.bodies = (ball(5),)
-    bench.answer(bench.depth())
-    bench.until(lambda: len(shown) == 2)
-    actions = {(marker.id, marker.action) for marker in shown[1].markers}
-    assert actions == {(5, Marker.ADD), (1, Marker.DELETE)}
-
-
-def test_a_marker_goes_though_its_listener_was_too_busy_to_hear_of_it(bench):
-    """RViz has a queue of 5 messages: the one that deletes a marker falls out of it while RViz draws something else."""
-    assert bench.node.set_parameters([Parameter("tracking", value=False)])[0].successful
-    busy, shown = Node("busy", context=bench.context), set()
-
-    def draw(message: MarkerArray) -> None:
-        for marker in message.markers:
-            (shown.add if marker.action == Marker.ADD else shown.discard)(marker.id)
-
-    busy.create_subscription(MarkerArray, "recover_node/markers", draw, 5)
-    executor = SingleThreadedExecutor(context=bench.context)
-    executor.add_node(busy)
-    bench.until(lambda: bench.node._outputs.markers.get_subscription_count())
-    bench.recoverer.bodies = (ball(1), ball(5))
-    bench.answer(bench.depth())
-    bench.until(lambda: executor.spin_once(0.05) or shown == {1, 5})
-    bench.recoverer.bodies = (ball(5),)
-    for _ in range(8):
-        bench.answer(bench.depth())
-    bench.until(lambda: executor.spin_once(0.05) or shown == {5})
-    executor.remove_node(busy)
-    busy.destroy_node()
-
-
-@pytest.mark.parametrize("end", ["disabled", "deactivated", "ended"])
-def test_markers_go_with_the_one_who_would_move_them(bench, end):
-    shown: list[MarkerArray] = []
-    bench.peer.create_subscription(MarkerArray, "recover_node/markers", shown.append, 5)
-    bench.until(lambda: bench.node._outputs.markers.get_subscription_count())
-    bench.recoverer.bodies = (ball(1), ball(5))
-    bench.answer(bench.depth())
-    bench.until(lambda: len(shown) == 1)
-    if end == "disabled":
-        assert bench.call(SetBool, "/recover_node/enable", SetBool.Request(data=False)).success
-    elif end == "deactivated":
-        bench.node._tasks.put(lambda: bench.node._change("deactivate"))
-    else:
-        bench.until(bench.node.close)
-    bench.until(lambda: len(shown) == 2)
-    actions = {(marker.id, marker.ns, marker.action) for marker in shown[1].markers}
-    kinds = ("superquadrics/surface", "superquadrics/outline")
-    names = {marker.id: marker.id for marker in shown[0].markers}
-    assert actions == {(number, kind, Marker.DELETE) for number in names for kind in kinds}
 
 
 def test_orthographic_frames_need_no_camera_info_and_answer_in_the_cube_frame(make_bench):

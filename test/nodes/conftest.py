@@ -1,0 +1,35 @@
+"""Frame nodes under test, closed at the end of each."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING
+
+import pytest
+
+if TYPE_CHECKING:
+    from frame_node_bench import Bench
+
+
+@pytest.fixture
+def make_bench() -> Iterator[Callable[..., Bench]]:
+    """Makes benches around nodes with these arguments."""
+    from frame_node_bench import Bench  # needs rclpy; tests without it are skipped before they ask for this
+
+    benches: list[Bench] = []
+
+    def make(*arguments: str) -> Bench:
+        benches.append(Bench(*arguments))
+        return benches[-1]
+
+    yield make
+    for bench in benches:
+        bench.close()
+
+
+@pytest.fixture
+def bench(make_bench: Callable[..., Bench]) -> Bench:
+    """One with a camera_info."""
+    one = make_bench()
+    one.send_info()
+    return one
