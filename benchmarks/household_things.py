@@ -1,12 +1,11 @@
 """Household things as they are, through a depth sensor: how close the recovered bodies come to the true hulls.
 
     python benchmarks/household_things.py [--scenes 1000] [--first 0] [--jobs 1] [--sensor stereo]
-                                          [--roll 90] [--each FILE] [--name household_things]
+                                          [--each FILE] [--name household_things]
 
 Scenes are those of :mod:`sq_perception.simulation.things_on_table`: unions of superquadrics (cartons, cans, round and
 oval bottles, open vessels, fruit, tools, toys, bags) that stand, lie, lean on each other and are stacked; scene k from
-the seed (``SEED``, k) alone.  Sensors alternate (:data:`tabletop.SENSORS`).  With ``--roll`` the camera has a
-roll of so many degrees.  Methods and measures are those of
+the seed (``SEED``, k) alone.  Sensors alternate (:data:`tabletop.SENSORS`).  Methods and measures are those of
 :mod:`scene_verdict`, rows those of :mod:`real_scenes`.  Counted are things at least half visible, apart from the rows
 that say otherwise; things with under 200 pixels are left out and numbered.
 
@@ -19,7 +18,6 @@ from __future__ import annotations
 if __name__ == "__main__":
     import one_thread  # noqa: F401
 
-from dataclasses import replace
 from functools import partial
 
 import mesh_things
@@ -33,7 +31,6 @@ from scipy.spatial import ConvexHull
 
 from sq_perception.geometry import Superquadric
 from sq_perception.geometry import rotation as quaternions
-from sq_perception.imaging.camera import Camera
 from sq_perception.simulation import sensor_noise
 from sq_perception.simulation.household import KINDS
 from sq_perception.simulation.rendering import render_things
@@ -56,29 +53,6 @@ def scene(seed: int, sensor: str | None, count: int | None = None) -> tabletop.T
     placed = tuple(_known(each, truth) for each in truth.placed)
     return tabletop.Tabletop(
         seed, sensor, truth.camera, depth, truth.depth, truth.labels, truth.plane, truth.table, placed
-    )
-
-
-def rolled(scene: tabletop.Tabletop, quarters: int) -> tabletop.Tabletop:
-    """What a camera sees that is turned clockwise by so many quarters about its optical axis."""
-    camera, matrix = scene.camera, np.eye(3)
-    for _ in range(quarters % 4):
-        camera = Camera(camera.height, camera.width, camera.fy, camera.fx, camera.cy, camera.width - 1 - camera.cx)
-        matrix = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]) @ matrix
-    depth, true_depth, labels = (
-        np.ascontiguousarray(np.rot90(image, quarters)) for image in (scene.depth, scene.true_depth, scene.labels)
-    )
-    return replace(
-        scene,
-        camera=camera,
-        depth=depth,
-        true_depth=true_depth,
-        labels=labels,
-        plane=np.append(matrix @ scene.plane[:3], scene.plane[3]),
-        table=matrix @ scene.table,
-        placed=tuple(
-            replace(one, rotation=matrix @ one.rotation, translation=matrix @ one.translation) for one in scene.placed
-        ),
     )
 
 
@@ -105,9 +79,9 @@ def hull_points(parts: Superquadric) -> np.ndarray:
     return np.asarray(parts.parametric_points(grid[:, 0], grid[:, 1])).reshape(-1, 3)
 
 
-def verdict(seed: int, sensor: str | None, quarters: int = 0) -> SceneVerdict:
+def verdict(seed: int, sensor: str | None) -> SceneVerdict:
     """Make the scene of a seed and evaluate every method on it."""
-    return scene_verdict.evaluated(rolled(scene(seed, sensor), quarters))
+    return scene_verdict.evaluated(scene(seed, sensor))
 
 
 def groups(everything: list[ThingVerdict]) -> dict[str, list[ThingVerdict]]:
@@ -122,11 +96,8 @@ def groups(everything: list[ThingVerdict]) -> dict[str, list[ThingVerdict]]:
 
 
 def main() -> None:
-    parser = real_scenes.arguments(__doc__, "household_things")
-    parser.add_argument("--roll", type=int, choices=(0, 90, 180, 270), default=0, help="of the camera, degrees")
-    options = parser.parse_args()
-    evaluate = partial(verdict, sensor=options.sensor, quarters=options.roll // 90)
-    real_scenes.run(evaluate, options, groups, GOALS, seed=SEED)
+    options = real_scenes.arguments(__doc__, "household_things").parse_args()
+    real_scenes.run(partial(verdict, sensor=options.sensor), options, groups, GOALS, seed=SEED)
 
 
 if __name__ == "__main__":

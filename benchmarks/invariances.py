@@ -1,0 +1,135 @@
+"""What must not matter: the roll of the camera, and given masks that are some pixels too small or too large.
+
+    python benchmarks/invariances.py [--scenes 70] [--first 30000] [--name invariances]
+
+Scenes of :mod:`household_things`, as they are and with one thing changed:
+
+    roll    the camera is turned by 90, 180 and 270 degrees about its optical axis
+    masks   the given ones are 1 to 3 pixels smaller, or larger where there is no other thing
+
+Counted are things at least half visible, with 200 pixels and half of them measured.  IoU is with the convex hull, 0
+where there is no body or a failed one, and by its own segments where masks are ``own``, matched as in
+:mod:`scene_verdict`; ``difference`` is to the scenes as they are, thing by thing, with its standard error; ``2 sigma``
+the share of half sizes within two reported deviations.
+"""
+
+from __future__ import annotations
+
+if __name__ == "__main__":
+    import one_thread  # noqa: F401
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+
+import cv2
+import household_things
+import numpy as np
+import report
+import scene_verdict
+from tabletop import Tabletop
+
+from sq_perception.imaging.camera import Camera
+
+AS_IT_IS = "as it is"
+
+
+@dataclass(frozen=True)
+class Row:
+    """What is changed in a scene, and whose masks are taken."""
+
+    name: str
+    masks: str
+    change: Callable[[Tabletop], Tabletop]
+
+
+def rolled(scene: Tabletop, quarters: int) -> Tabletop:
+    """What a camera sees that is turned clockwise by so many quarters about its optical axis."""
+    camera, matrix = scene.camera, np.eye(3)
+    for _ in range(quarters):
+        camera = Camera(camera.height, camera.width, camera.fy, camera.fx, camera.cy, camera.width - 1 - camera.cx)
+        matrix = np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]) @ matrix
+    depth, true_depth, labels = (
+        np.ascontiguousarray(np.rot90(image, quarters)) for image in (scene.depth, scene.true_depth, scene.labels)
+    )
+    placed = [
+        replace(one, rotation=matrix @ one.rotation, translation=matrix @ one.translation) for one in scene.placed
+    ]
+    return replace(
+        scene,
+        camera=camera,
+        depth=depth,
+        true_depth=true_depth,
+        labels=labels,
+        plane=np.append(matrix @ scene.plane[:3], scene.plane[3]),
+        table=matrix @ scene.table,
+        placed=tuple(placed),
+    )
+
+
+def misfit(scene: Tabletop, pixels: int) -> Tabletop:
+    """With masks so many pixels larger, or smaller if negative."""
+    brush, labels = np.ones((2 * abs(pixels) + 1,) * 2, np.uint8), np.zeros_like(scene.labels)
+    for label in np.unique(scene.labels[scene.labels > 0]).tolist():
+        mask = (scene.labels == label).view(np.uint8)
+        other = cv2.dilate(mask, brush) if pixels > 0 else cv2.erode(mask, brush, borderValue=1)
+        labels[(other > 0) & np.isin(scene.labels, (0, label))] = label
+    return replace(scene, labels=labels)
+
+
+def rows() -> list[Row]:
+    found = [Row(AS_IT_IS, masks, lambda scene: scene) for masks in ("given", "own")]
+    for masks in ("given", "own"):
+        found += [Row(f"roll {90 * k}", masks, partial(rolled, quarters=k)) for k in (1, 2, 3)]
+    return found + [Row(f"masks {k:+d} pixels", "given", partial(misfit, pixels=k)) for k in (-3, -2, -1, 1, 2, 3)]
+
+
+def answers(scene: Tabletop, counted: list[int], row: Row) -> list[scene_verdict.Answer]:
+    """Of the counted things of a scene, changed as a row says."""
+    changed = row.change(scene)
+    given = changed.labels if row.masks == "given" else None
+    frame = scene_verdict.recoverer().recover(changed.depth, changed.camera, given)
+    known = {label: label for label in counted}
+    if given is None:
+        known = scene_verdict.matches(frame.labels, np.where(np.isfinite(changed.depth), changed.labels, 0))
+    things = {one.label: one for one in changed.placed}
+    return [scene_verdict.of_frame(frame, known.get(label, 0), things[label], changed) for label in counted]
+
+
+def main() -> None:
+    parser = report.parser(__doc__, "invariances")
+    parser.add_argument("--scenes", type=int, default=70, help="number of scenes")
+    parser.add_argument("--first", type=int, default=30000, help="seed of the first scene")
+    options = parser.parse_args()
+    every: dict[tuple[str, str], list[scene_verdict.Answer]] = {(row.name, row.masks): [] for row in rows()}
+    for seed in range(options.first, options.first + options.scenes):
+        scene = household_things.scene(seed, None)
+        counted = [
+            one.label
+            for one in scene.placed
+            if one.pixels >= scene_verdict.FEWEST_PIXELS
+            and one.visible_share >= household_things.real_scenes.HALF
+            and 2 * np.count_nonzero((scene.labels == one.label) & np.isfinite(scene.depth)) >= one.pixels
+        ]
+        for row in rows():
+            every[row.name, row.masks] += answers(scene, counted, row)
+        print(f"scene {seed}", flush=True)
+    result, lines = [], []
+    for (name, masks), found in every.items():
+        iou = np.array([answer.iou for answer in found])
+        difference = iou - [answer.iou for answer in every[AS_IT_IS, masks]]
+        covered = float(np.nanmean([answer.covered for answer in found]))
+        mean, doubt = difference.mean(), difference.std() / np.sqrt(len(iou))
+        result.append(
+            {"row": name, "masks": masks, "things": len(iou), "iou": iou.mean(), "difference": mean, "error": doubt}
+            | {"two_sigma": covered}
+        )
+        shown = f"{100 * mean:+.1f} +- {100 * doubt:.1f}"
+        lines.append([name, masks, str(len(iou)), f"{100 * iou.mean():.1f}", shown, f"{100 * covered:.0f}"])
+    header = ["scenes", "masks", "things", "IoU %", "difference", "2 sigma %"]
+    facts = {"scenes": options.scenes, "first": options.first}
+    report.write(options.name, {**facts, "rows": result}, report.table(header, lines))
+
+
+if __name__ == "__main__":
+    main()
