@@ -1,7 +1,8 @@
 """Lines of sight between samples of segments, walked in a depth image: which are crossed, and where pixels go.
 
 The equation is that of :mod:`sq_perception.segmentation.convex_parts`.  A line is crossed where what was seen lies
-behind it by ``noise`` times the square of the depth, and by ``least``, metres.  Depth is 0 where there is none.
+behind it by ``noise`` times the square of the depth, and by ``least``, metres, or a hundredth of the depth where that
+is less.  Depth is 0 where there is none.
 """
 
 from __future__ import annotations
@@ -15,6 +16,8 @@ from sq_perception.imaging.depth_steps import STEP
 
 _STEPS = 8
 """In which a line is walked."""
+_SHARE = 0.01
+"""Of the depth, that something lies behind a line at least."""
 _HOME = 0.1
 """A pixel leaves the part of its nearest sample only if another one's lines are so much freer."""
 
@@ -29,7 +32,7 @@ def _crossed(
         t = k / _STEPS
         seen = np.float64(depth[int((1 - t) * v0 + t * v1 + 0.5), int((1 - t) * u0 + t * u1 + 0.5)])
         line = 1.0 / ((1 - t) * w0 + t * w1)
-        if seen - line > max(noise * line * line, least):
+        if seen - line > max(noise * line * line, min(least, _SHARE * line)):
             return True
     return False
 

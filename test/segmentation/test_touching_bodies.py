@@ -91,6 +91,23 @@ def test_touching_bodies_are_parted(bodies, noise):
     assert min(ious(truth, found.labels)) > 0.75
 
 
+@pytest.mark.parametrize("distance", [0.3, 0.45])
+@pytest.mark.parametrize("noise", [0.0, 0.0015])
+def test_small_blocks_seen_near_are_parted(noise, distance):
+    """Cubes of 26 mm that touch, one of them on two others."""
+    table, cube = Table(distance=distance), (0.013, 0.013, 0.013)
+    blocks = [
+        table.body(-0.016, 0.0, cube),
+        table.body(0.016, 0.0, cube, turn=0.8),
+        table.body(0.0, 0.004, cube, turn=0.4, height=0.026),
+        table.body(0.05, 0.0, cube, turn=0.3),
+    ]
+    depth, truth = table.see(blocks, noise)
+    found = segment(depth, VGA)
+    assert len(found.ids) == len(blocks)
+    assert min(ious(truth, found.labels)) > 0.75
+
+
 WHOLE = {
     "corner of a box": TABLE.body(0, 0, (0.06, 0.06, 0.06), turn=np.pi / 4),
     "long box": TABLE.body(0, 0, (0.12, 0.03, 0.04), turn=0.5),
