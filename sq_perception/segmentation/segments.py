@@ -238,13 +238,14 @@ def support_under(
 
 
 def warm_up() -> None:
-    """Compile, or load from disk, every kernel by a ball on a table and by two that touch."""
+    """Compile, or load from disk, every kernel by a ball on a table, beside a hole, and by two that touch."""
     convex_parts.warm_up()
     pieces.warm_up()
     camera = Camera(96, 72, 180.0, 180.0, 47.5, 35.5)
     v, u = np.indices((camera.height, camera.width))
     radius = np.hypot(u - camera.cx, v - camera.cy) / 20
-    segment((0.7 - 0.08 * np.sqrt(np.maximum(1 - radius**2, 0))).astype(np.float32), camera)
+    depth = (0.7 - 0.08 * np.sqrt(np.maximum(1 - radius**2, 0))).astype(np.float32)
+    segment(np.where(np.abs(radius - 1.2) < 0.1, np.float32(np.nan), depth), camera)
 
 
 def _points(mask: np.ndarray, depth: np.ndarray, valid: np.ndarray, camera: Camera) -> np.ndarray:
