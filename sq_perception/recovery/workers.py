@@ -177,6 +177,7 @@ class Cluster:
     def __init__(self, setup: Setup, address: str) -> None:
         import distributed
 
+        distributed.comm.get_address_host_port(address)  # a client that cannot read its own hangs in the end
         self._setup, self.lost = setup, distributed.KilledWorker
         self._client = distributed.Client(address, set_as_default=False)
 

@@ -135,6 +135,15 @@ def test_a_worker_of_a_cluster_that_is_killed_costs_no_frame_and_answers_none_tw
         np.testing.assert_allclose(mine.to_flat(), theirs.to_flat(), rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.parametrize("address", ["localhost", "http://localhost:8787", "localhost:eight"])
+def test_what_is_no_address_of_a_cluster_leaves_nothing_behind_that_would_hang(address: str) -> None:
+    pytest.importorskip("distributed", reason="needs the extra 'cluster'")
+    before = threading.enumerate()
+    with pytest.raises(ValueError, match=r"port|scheme|invalid literal"):
+        workers.Cluster(_SETUP, address)
+    assert threading.enumerate() == before
+
+
 def _children() -> list[int]:
     """Processes of this one that compute; the first ones that spawn needs are no workers."""
     end = time.monotonic() + 60
