@@ -67,12 +67,14 @@ class Camera:
 
     @classmethod
     def from_matrix(cls, matrix: np.ndarray, width: int, height: int) -> Camera:
-        """A pinhole camera from a 3 x 3 matrix K; skew is refused, as no depth camera in use has any."""
+        """A pinhole camera from a 3 x 3 matrix K, refused with skew, as no depth camera has any, or transposed."""
         k = np.asarray(matrix, dtype=float)
         if k.shape != (3, 3):
             raise ValueError(f"camera matrix: expected 3 x 3, got {k.shape}")
         if abs(k[0, 1]) > 1e-6 * abs(k[0, 0]):
             raise ValueError(f"camera matrix: expected no skew, got {k[0, 1]:g}")
+        if k[2, :2].any() and not k[:2, 2].any():
+            raise ValueError("camera matrix: expected 0 0 1 in its last row; it seems to be transposed")
         return cls(width, height, float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2]))
 
     @property

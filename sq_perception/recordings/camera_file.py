@@ -112,7 +112,7 @@ def _camera_info(path: Path) -> CameraInfo:
     projection = _matrix(info, _PROJECTION, 12)
     if not info.keys() & {*_MATRIX, *_PROJECTION}:
         raise FrameError("expected a camera_matrix (or k) of 9 numbers, or a projection_matrix (or p) of 12")
-    if is_transposed(matrix):
+    if matrix[6:8].any() and not matrix[[2, 5]].any():
         raise FrameError("camera matrix: expected 0 0 1 in its last row; it seems to be transposed")
     if abs(matrix[1]) > _SKEW * abs(matrix[0]):
         raise FrameError(f"camera matrix: expected no skew, got {matrix[1]:g}")
@@ -130,11 +130,6 @@ def _camera_info(path: Path) -> CameraInfo:
         _count(info, "binning_y"),
         Region(*(_count(region, name) for name in ("x_offset", "y_offset", "width", "height"))),
     )
-
-
-def is_transposed(matrix: np.ndarray) -> bool:
-    """Whether the centre (cx, cy) stands in the last row of a flat camera matrix, not in its last column."""
-    return bool((matrix[6:8] != 0).any() and not (matrix[[2, 5]] != 0).any())
 
 
 def _four_numbers(text: str) -> list[float] | None:

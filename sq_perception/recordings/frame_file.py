@@ -38,7 +38,7 @@ from sq_perception.imaging import unit_cube
 from sq_perception.imaging.calibration import Treatment
 from sq_perception.imaging.camera import Camera, Projection
 from sq_perception.recordings import cloud_file
-from sq_perception.recordings.camera_file import FrameError, is_transposed, read_calibration
+from sq_perception.recordings.camera_file import FrameError, read_calibration
 
 SUFFIXES = (".npz", ".npy", ".png", ".bmp", ".tif", ".tiff", ".exr", *cloud_file.SUFFIXES)
 MILLIMETRES = 1000.0
@@ -341,8 +341,6 @@ def _read_npz(path: Path, projection: Projection, scale: float | None) -> Record
         return RecordedFrame(depth, unit_cube.camera(width, height), labels, path.name, warning=warning)
     if "K" not in fields:
         raise ValueError("expected a field 'K', the 3 x 3 camera matrix")
-    if fields["K"].shape == (3, 3) and is_transposed(fields["K"].ravel()):
-        raise ValueError("K: expected 0 0 1 in its last row; it seems to be transposed")
     try:
         camera = Camera.from_matrix(fields["K"], width, height)
     except (ValueError, TypeError) as error:

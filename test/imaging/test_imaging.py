@@ -67,6 +67,11 @@ class TestCamera:
         with pytest.raises(ValueError, match=message):
             Camera(**{**good, **change})
 
+    def test_a_matrix_is_read_by_rows_and_refused_where_it_is_transposed(self) -> None:
+        assert Camera.from_matrix(VGA.matrix, 640, 480) == VGA
+        with pytest.raises(ValueError, match="transposed"):
+            Camera.from_matrix(VGA.matrix.T, 640, 480)
+
     def test_points_behind_a_pinhole_have_no_pixel(self) -> None:
         assert np.isnan(VGA.project(np.array([0.1, 0.1, -1.0]))).all()
 
