@@ -43,7 +43,8 @@ class Camera:
     Raises
     ------
     ValueError
-        For a size below one pixel, a focal length that is not positive, or anything not finite.
+        For a size that is no whole number of pixels or below one, a focal length that is not positive, or anything not
+        finite.
     """
 
     width: int
@@ -57,8 +58,8 @@ class Camera:
     def __post_init__(self) -> None:
         if self.projection not in ("pinhole", "orthographic"):
             raise ValueError(f"projection: expected 'pinhole' or 'orthographic', got {self.projection!r}")
-        if self.width < 1 or self.height < 1:
-            raise ValueError(f"image size: expected at least 1 x 1, got {self.width} x {self.height}")
+        if not all(isinstance(side, int | np.integer) and side >= 1 for side in (self.width, self.height)):
+            raise ValueError(f"image size: expected whole numbers, at least 1 x 1, got {self.width} x {self.height}")
         numbers = [float(number) for number in (self.fx, self.fy, self.cx, self.cy)]
         if not all(map(math.isfinite, numbers)):
             raise ValueError(f"fx fy cx cy: expected finite numbers, got {numbers}")

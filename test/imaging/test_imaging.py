@@ -60,7 +60,10 @@ class TestCamera:
 
     @pytest.mark.parametrize(
         ("change", "message"),
-        [({"fx": 0.0}, "focal"), ({"fy": -3.0}, "focal"), ({"cx": np.nan}, "finite"), ({"width": 0}, "1 x 1")],
+        [
+            *(({"fx": 0.0}, "focal"), ({"fy": -3.0}, "focal"), ({"cx": np.nan}, "finite"), ({"width": 0}, "1 x 1")),
+            ({"width": 4.0}, "whole numbers"),
+        ],
     )
     def test_refuses_what_is_no_camera(self, change: dict[str, float], message: str) -> None:
         good = {"width": 4, "height": 4, "fx": 1.0, "fy": 1.0, "cx": 2.0, "cy": 2.0}
