@@ -47,17 +47,24 @@ def run(options: argparse.Namespace) -> int:
         recoverer = Recoverer()
         entries: list[dict[str, Any]] = []
         stems: set[str] = set()
-        code = console.SUCCESS
-        for file, frame in recorded:
-            if isinstance(frame, FrameError):
-                code = failed(str(frame))
-            elif frame.is_cube:
-                code = failed(f"{file}: a view of the unit cube has no metres to grasp in")
-            else:
-                if frame.warning:
-                    complain(f"warning: {frame.name}: {frame.warning}")
-                stem = output_file.free_name(frame.name if frame.topic else Path(frame.name).stem, stems)
-                entries.append({"file": file, "bodies": _bodies(stem, frame, recoverer, hand, friction, options)})
+        code, is_whole = console.SUCCESS, False
+        try:
+            for file, frame in recorded:
+                if isinstance(frame, FrameError):
+                    code = failed(str(frame))
+                elif frame.is_cube:
+                    code = failed(f"{file}: a view of the unit cube has no metres to grasp in")
+                else:
+                    if frame.warning:
+                        complain(f"warning: {frame.name}: {frame.warning}")
+                    stem = output_file.free_name(frame.name if frame.topic else Path(frame.name).stem, stems)
+                    entries.append({"file": file, "bodies": _bodies(stem, frame, recoverer, hand, friction, options)})
+            is_whole = True
+        except KeyboardInterrupt:
+            complain("interrupted; what is done so far is kept")
+            code = console.INTERRUPTED
+        except OSError as error:  # of a picture or mesh: the disk is full, and will be for the next frame
+            code = failed(str(error))
         chosen = {"gripper": hand.name, "friction": friction}
         document = {"format": FORMAT, "version": VERSION, "options": chosen, "frames": entries}
         text = json.dumps(document, indent=1, allow_nan=False)
@@ -65,7 +72,9 @@ def run(options: argparse.Namespace) -> int:
             sys.stdout.write(f"{text}\n")
             return code
         if options.json and entries:
-            output_file.write(options.json, f"{text}\n".encode())
+            written = output_file.write(options.json, f"{text}\n".encode(), is_whole)
+            if written != Path(options.json):
+                complain(f"--json: unfinished, so {options.json} stays as it is: see {written}")
         _print_table(entries)
         return code
     except (FrameError, CheckpointError, OSError) as error:

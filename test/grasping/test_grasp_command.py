@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from sq_perception.commands import main
+from sq_perception.commands import grasp_run, main
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
 from sq_perception.simulation.rendering import render_things
@@ -68,6 +68,27 @@ def test_no_input_is_replaced(frame, tmp_path, capsys):
 def test_a_full_disk_is_a_sentence(frame, capsys):
     assert main.main(["grasp", str(frame), "--json", "/dev/full"]) == 1
     assert "No space left" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("end", "code"), [(KeyboardInterrupt(), 130), (OSError("No space left"), 1)])
+def test_what_is_done_is_kept_when_a_run_ends_early(frame, tmp_path, capsys, monkeypatch, end, code):
+    """Beside a file of an earlier run, in place of none."""
+    out = tmp_path / "out.json"
+    for there, written in ((None, out), ("of a whole run", tmp_path / "out.partial.json")):
+        answers = iter([[], end])
+
+        def bodies(*_, answers=answers):
+            if isinstance(answer := next(answers), BaseException):
+                raise answer
+            return answer
+
+        monkeypatch.setattr(grasp_run, "_bodies", bodies)
+        if there:
+            out.write_text(there)
+        assert main.main(["grasp", str(frame), str(frame), "--json", str(out)]) == code
+        assert len(json.loads(written.read_text())["frames"]) == 1
+        assert {130: "is kept", 1: "No space left"}[code] in (err := capsys.readouterr().err)
+        assert (there is not None) == (f"see {written}" in err) == (out.read_text() == there)
 
 
 def test_frames_of_one_name_have_a_picture_each_and_their_warnings_are_told(frame, tmp_path, capsys):
