@@ -85,8 +85,8 @@ def _draw_numbers(ax: Axes, recovery: FrameRecovery, unit: str) -> None:
             ax.text(0.06, y, shorten(f"failed: {body.message}", _LONGEST), fontsize=9, color=plots.FAINT, va="center")
             continue
         e1, e2 = body.superquadric.shape
-        text = wording.edges(body.superquadric.size, body.sigma_size, unit != "m")
-        look = {"fontsize": 9, "color": plots.INK, "va": "center"}
+        text = wording.edges(body.superquadric.size, body.sigma_size, unit != "m").replace(" of the cube", "")
+        look = {"fontsize": 9 if unit == "m" else 8, "color": plots.INK, "va": "center"}
         ax.text(0.06, y + 0.018, text, look)
         ax.text(1, y + 0.018, f"e {e1:.2f} {e2:.2f}  {body.score:.2f}", look, ha="right")
         verdict = f"{body.status.name.lower()}: {body.message}" if body.status == Status.WEAK else body.message

@@ -95,6 +95,21 @@ def test_figures_of_full_and_empty_frames(tmp_path):
     assert full.std() > 20
 
 
+def test_numbers_of_a_body_in_the_cube_are_beside_each_other():
+    camera = unit_cube.camera(96)
+    depth, labels = shot(
+        unit_cube.optical_from_cube(Superquadric([0.3, 0.2, 0.1], BODY.shape, [0.5] * 3, BODY.rotation)), camera
+    )
+    found = Recoverer(method="symmetry").recover(depth, camera, labels)
+    figure = recovery_figure(depth, camera, found, unit="of the cube")
+    figure.canvas.draw()
+    edges, exponents = (
+        next(text for text in figure.axes[-1].texts if text.get_text().startswith(start)) for start in ("0.6", "e ")
+    )
+    assert edges.get_text().count("+-0.000") == 3
+    assert edges.get_window_extent().x1 < exponents.get_window_extent().x0
+
+
 def test_draw_on_a_plane_with_points_and_true_wires():
     figure = plots.new_figure(4, 4)
     ax = figure.add_axes((0, 0, 1, 1))
