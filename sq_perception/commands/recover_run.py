@@ -19,7 +19,7 @@ from sq_perception.recordings import result_json
 from sq_perception.recordings.bag_file import InputOptions
 from sq_perception.recordings.frame_file import FrameError, Reading, RecordedFrame
 from sq_perception.recordings.inputs import RecordedInput
-from sq_perception.recordings.tracks import RecordedTracks
+from sq_perception.recordings.tracks import RecordedTracks, sequence_of
 from sq_perception.recovery import workers
 from sq_perception.recovery.options import NEEDS_NETWORK
 from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, RecoveryOptions
@@ -153,6 +153,7 @@ class RecoverRun:
             yield from workers.recovered(works, executor)
             return
         previous: FrameRecovery | None = None
+        sequence = ("", "")
         for pair in pairs:
             answer: Any = None
             if isinstance(frame := pair[1], RecordedFrame):
@@ -160,6 +161,8 @@ class RecoverRun:
                     if frame.camera not in self._warm:
                         executor.warm_up(frame.camera)
                         self._warm.add(frame.camera)
+                    if sequence != (of_frame := sequence_of(pair[0], frame)):
+                        sequence, previous = of_frame, None
                     work = self._work(frame)
                     answer = executor.recover(work.depth, work.camera, work.labels, work.options, previous)
                     previous = answer if self._tracks else None

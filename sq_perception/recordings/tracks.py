@@ -17,6 +17,11 @@ INTERVAL = 0.1
 """Seconds."""
 
 
+def sequence_of(file: str, frame: RecordedFrame) -> tuple[str, str]:
+    """What the frames of a sequence have in common; ``file`` is the frame's source."""
+    return (file, frame.topic) if frame.topic else (str(Path(file).parent), "")
+
+
 class RecordedTracks:
     """Follows the bodies of one sequence after the other; ``warn`` is called once where stamps are missing."""
 
@@ -29,7 +34,7 @@ class RecordedTracks:
 
     def follow(self, file: str, frame: RecordedFrame, recovery: FrameRecovery) -> tuple[Followed, ...]:
         """What is known of the track of each body that did not fail, in their order; ``file`` is the frame's source."""
-        sequence = (file, frame.topic) if frame.topic else (str(Path(file).parent), "")
+        sequence = sequence_of(file, frame)
         if sequence != self._sequence:
             self._session.reset()
             self._sequence, self._number = sequence, 0

@@ -327,6 +327,20 @@ def test_track_is_asked_for_and_says_where_stamps_are_missing(tmp_path, capsys):
     assert capsys.readouterr().err.count("taken to be 0.1 s apart") == 1
 
 
+def test_a_still_scene_is_recovered_anew_in_each_folder(tmp_path):
+    rendered, _ = raycast.render(BODIES, CAMERA)
+    rng = np.random.default_rng(1)
+    for folder in ("a", "b"):
+        (tmp_path / folder).mkdir()
+        depth = np.where(np.isfinite(rendered), rendered + rng.normal(0, 1e-3, rendered.shape), np.nan)
+        save_npz(tmp_path / folder / "f.npz", depth.astype(np.float32))
+    first, second = recover(tmp_path, tmp_path / "a", tmp_path / "b", "--track")
+    (alone,) = recover(tmp_path, tmp_path / "b")
+    for other, is_same in ((first, False), (alone, True)):
+        sizes = ([one["size"] for one in frame["superquadrics"]] for frame in (second, other))
+        assert np.allclose(*sizes, rtol=1e-9) == is_same
+
+
 def test_a_budget_is_positive(tmp_path, capsys):
     assert main.main(["recover", str(tmp_path), "--time-budget", "0"]) == 2
     assert "--time-budget" in capsys.readouterr().err
