@@ -297,7 +297,9 @@ def stamp_of(path: Path) -> Stamp | None:
 
 def _read_cloud(path: Path, reading: Reading) -> RecordedFrame:
     depth, camera, is_image = cloud_file.as_image(cloud_file.read_points(path) / (reading.scale or 1.0))
-    labels = reading.labels(path.stem, depth) if is_image else None
+    if reading.masks is not None and not is_image:
+        raise ValueError("a cloud that is no image has no pixels that a mask could be of")
+    labels = reading.labels(path.stem, depth)
     warning = "" if is_image else cloud_file.UNORGANISED
     return RecordedFrame(depth, camera, labels, path.name, warning=warning, encoding="32FC1", has_free_space=is_image)
 

@@ -75,6 +75,8 @@ def test_a_cloud_in_any_order_is_seen_again(tmp_path):
     frame = read(tmp_path / "a.ply")
     assert frame.warning == UNORGANISED
     assert not frame.has_free_space
+    with pytest.raises(FrameError, match="no pixels that a mask could be of"):
+        read(tmp_path / "a.ply", reading=Reading(masks=tmp_path))
     rows, columns = np.nonzero(np.isfinite(frame.depth))
     assert np.isfinite(frame.depth).mean() > 0.8
     seen = frame.camera.unproject(columns, rows, frame.depth[rows, columns])
