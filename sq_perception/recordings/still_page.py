@@ -44,7 +44,11 @@ class StillPage:
         scene_to = scene_to_html(nothing)
         there = base64.b64encode(nothing.export(file_type="glb")).decode()
         beginning, self._end = _TEMPLATE.read_text(encoding="utf-8").split("<!-- frames -->\n")
-        self._file.write(beginning.replace("$VIEWER", _as_script(scene_to.replace(there, _SCENE))))
+        try:
+            self._file.write(beginning.replace("$VIEWER", _as_script(scene_to.replace(there, _SCENE))))
+        except OSError:
+            self._output.discard()
+            raise
 
     def add(self, frame: RecordedFrame, recovery: FrameRecovery) -> None:
         """Write a frame and what was recovered from it."""
@@ -58,12 +62,12 @@ class StillPage:
         """Finish the file; where it is, None without a frame.  See :meth:`OutputFile.commit`."""
         if self._file.closed:
             return None
-        with self._file:
-            self._file.write(self._end)
-        if not self._count:
+        try:
+            with self._file:
+                self._file.write(self._end)
+            return self._output.commit(whole) if self._count else None
+        finally:
             self._output.discard()
-            return None
-        return self._output.commit(whole)
 
 
 def _as_script(value: object) -> str:

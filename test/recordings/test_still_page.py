@@ -6,6 +6,7 @@ import base64
 import io
 import json
 import re
+import resource
 
 import numpy as np
 import pytest
@@ -83,6 +84,28 @@ def test_no_page_without_a_frame(tmp_path):
 
 
 @pytest.mark.skipif(executable() is None, reason="no Chromium or Chrome is installed")
+@pytest.mark.parametrize("room", [1000, 1_000_000])
+def test_a_full_disk_keeps_nothing_of_a_page(tmp_path, shot, room):
+    """Which is found when the page is begun, or by a frame."""
+
+    def write():
+        page = StillPage(tmp_path / "out.html")
+        try:
+            for _ in range(30):
+                page.add(RecordedFrame(shot[0], CAMERA, None, "one"), shot[1])
+        finally:
+            page.close(whole=False)
+
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (room, limits[1]))
+    try:
+        with pytest.raises(OSError, match="too large"):
+            write()
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_browser_draws_it(page):
     with Browser(640, 480) as browser:
         browser.open(page.as_uri())
