@@ -48,6 +48,7 @@ def validate(network: MaskNetwork, views: SegmentViews) -> dict[str, float]:
         strays += int((inside & ~own).sum())
         left += int((inside & ~own & kept).sum())
         lost += int((own & ~kept).sum())
+    objects = max(objects, 1)  # views of no object at all have strays alone
     return {"strays": strays / objects, "left": left / objects, "lost": lost / objects}
 
 

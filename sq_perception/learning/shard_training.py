@@ -77,7 +77,13 @@ def write_views(folder: Path, shards: Iterable[int], draw: Callable[[np.random.G
 
 
 def read_views(none: Views, paths: list[Path]) -> Views:
-    """All views of some shards, in the form of ``none``; raises ValueError if one is damaged, or of another form."""
+    """All views of some shards, in the form of ``none``.
+
+    Raises
+    ------
+    ValueError
+        If a shard is damaged, or of another form, or all of them are empty.
+    """
     kind, shards = type(none), []
     for path in paths:
         try:
@@ -89,6 +95,8 @@ def read_views(none: Views, paths: list[Path]) -> Views:
                     raise ValueError(f"{name}: expected {wanted.dtype} {shape}, got {array.dtype} {array.shape}")
         except (SafetensorError, KeyError, TypeError, ValueError) as error:
             raise ValueError(f"{path}: not a readable shard of {kind.__name__}: {error}") from error
+    if not any(len(shard[0]) for shard in shards):
+        raise ValueError(f"{paths[0].parent}: expected views in {', '.join(path.name for path in paths)}, found none")
     return kind(*(np.concatenate(parts) for parts in zip(*shards, strict=True)))
 
 

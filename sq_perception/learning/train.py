@@ -122,6 +122,11 @@ def _train(
     _check_same_run(config, output)
     torch.manual_seed(config.seed)
     model = _new_network(config, network).to(device)
+    if config.batch == 1 and model.config.pixels == model.config.stride:
+        raise ValueError(
+            f"batch: expected at least 2 with views of {model.config.pixels} pixels, of which one cell is left: "
+            "one number has no deviation to normalise by"
+        )
     layout = torch.channels_last if model.config.widths[0] >= _FEWEST_CHANNELS_LAST else torch.contiguous_format
     model.to(memory_format=layout)  # type: ignore[call-overload]
     settings = json.dumps(asdict(config))

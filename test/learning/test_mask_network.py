@@ -120,6 +120,24 @@ def test_a_shard_of_another_form_is_named(
         shard_training.read_views(mask_training.MASKS.none, sorted((tmp_path / "views").iterdir()))
 
 
+@pytest.mark.parametrize("filled", [False, True])
+def test_shards_without_a_view_are_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], rng: np.random.Generator, filled: bool
+) -> None:
+    """All of them, or those that are kept for validation."""
+    shards(tmp_path / "views", 3, rng)
+    for k in range(2 if filled else 3):
+        save_file(vars(mask_training.MASKS.none), str(tmp_path / "views" / f"{k:05d}.safetensors"))
+    assert main.main(["train-masks", str(tmp_path / "views"), "--output", str(tmp_path / "run")]) == 1
+    assert "expected views in 00000.safetensors, 00001.safetensors, found none" in capsys.readouterr().err
+
+
+def test_views_of_no_object_have_figures(rng: np.random.Generator) -> None:
+    images = rng.random((2, PIXELS, PIXELS, CHANNELS)).astype(np.float16)
+    found = mask_training.validate(MaskNetwork(SMALL), SegmentViews(images, np.full((2, PIXELS, PIXELS), NO, np.uint8)))
+    assert found["strays"] > 0 == found["lost"]
+
+
 def test_a_shard_that_comes_before_those_held_is_trained_on(tmp_path: Path, rng: np.random.Generator) -> None:
     """Between two parts of a run one of a lower number appears: what the first part learnt is not validated on."""
     shards(tmp_path / "views", 3, rng)

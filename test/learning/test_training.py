@@ -143,6 +143,13 @@ def test_a_thread_count_holds_for_network_and_rendering_and_ends_with_the_run(
     assert (torch.get_num_threads(), numba.get_num_threads()) == before
 
 
+def test_one_view_a_step_is_refused_where_nothing_is_left_to_normalise(tmp_path: Path) -> None:
+    form = replace(SMALL, pixels=8)
+    with pytest.raises(ValueError, match="batch: expected at least 2 with views of 8 pixels"):
+        train.train(replace(RUN, batch=1), tmp_path, form)
+    train.train(replace(RUN, batch=1, steps=1, average=0.0), tmp_path, replace(form, pixels=16))
+
+
 class TestInterruptions:
     def test_terminated_run_goes_on_where_it_stopped(self, tmp_path: Path) -> None:
         command = [sys.executable, "-m", "sq_perception", "train", "--output", str(tmp_path), "--pixels", "16"]
