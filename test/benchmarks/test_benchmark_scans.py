@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import importlib
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
-from types import ModuleType
-
+import household_things
+import hull_oracle
+import mesh_scene
 import numpy as np
 import pytest
 import trimesh
@@ -21,31 +18,11 @@ from sq_perception.simulation.things_on_table import TABLE_CAMERA, things_on_tab
 BODY = Superquadric([0.06, 0.04, 0.03], [0.3, 0.7], [0.05, -0.03, 0.7], [0.3, -0.2, 0.5, 0.8])
 
 
-@pytest.fixture(scope="module")
-def scene(repository: Path) -> Iterator[ModuleType]:
-    with benchmarks_on_path(repository):
-        yield importlib.import_module("mesh_scene")
-
-
-@pytest.fixture(scope="module")
-def hulls(repository: Path) -> Iterator[ModuleType]:
-    with benchmarks_on_path(repository):
-        yield importlib.import_module("hull_oracle")
-
-
-@contextmanager
-def benchmarks_on_path(repository: Path) -> Iterator[None]:
-    """The benchmarks are scripts beside each other, no package."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(repository / "benchmarks"))
-        yield
-
-
-def test_a_resting_mesh_stands_on_the_plane_it_is_seen_on(scene: ModuleType, rng: np.random.Generator) -> None:
+def test_a_resting_mesh_stands_on_the_plane_it_is_seen_on(rng: np.random.Generator) -> None:
     block = trimesh.creation.box((0.04, 0.07, 0.1))
-    poser = scene.resting(block)
+    poser = mesh_scene.resting(block)
     for _ in range(5):
-        view = scene.view(block, poser, rng)
+        view = mesh_scene.view(block, poser, rng)
         height = (block.vertices @ view.rotation.T + view.translation) @ view.plane[:3] + view.plane[3]
         assert height.min() == pytest.approx(0, abs=1e-9)
         assert np.sum(height < 1e-9) == 4
@@ -56,8 +33,8 @@ def test_a_resting_mesh_stands_on_the_plane_it_is_seen_on(scene: ModuleType, rng
         assert (points[view.mask] @ view.plane[:3] + view.plane[3] > -0.01).all()
 
 
-def test_iou_with_a_hull_is_the_iou_of_the_bodies(hulls: ModuleType, rng: np.random.Generator) -> None:
-    columns = hulls.Columns.of(mesh(BODY, 128).vertices)
+def test_iou_with_a_hull_is_the_iou_of_the_bodies(rng: np.random.Generator) -> None:
+    columns = hull_oracle.Columns.of(mesh(BODY, 128).vertices)
     assert columns.volume == pytest.approx(float(BODY.volume()), rel=2e-3)
     assert columns.iou(BODY) > 0.995
     for _ in range(5):
@@ -66,22 +43,19 @@ def test_iou_with_a_hull_is_the_iou_of_the_bodies(hulls: ModuleType, rng: np.ran
         assert columns.iou(moved) == pytest.approx(float(metrics.volume_iou(moved, BODY, 128)), abs=3e-3)
 
 
-def test_hull_points_span_the_hull(repository: Path) -> None:
-    with benchmarks_on_path(repository):
-        hull_points = importlib.import_module("household_things").hull_points
+def test_hull_points_span_the_hull() -> None:
     scene = things_on_table(np.random.default_rng(3), 4)
     assert scene.camera == TABLE_CAMERA
     for placed in scene.placed:
-        points = hull_points(placed.thing.parts)
+        points = household_things.hull_points(placed.thing.parts)
         reach = placed.thing.support(DIRECTIONS)
         spanned = (points[ConvexHull(points).vertices] @ DIRECTIONS.T).max(axis=0)
         assert (spanned <= reach + 1e-9).all()
         assert (reach - spanned).max() < 0.02 * np.linalg.norm(placed.thing.box[1] - placed.thing.box[0])
 
 
-def test_a_thing_shows_no_more_than_it_would_alone(repository: Path) -> None:
-    with benchmarks_on_path(repository):
-        scene = importlib.import_module("household_things").scene(0, None, 5)
+def test_a_thing_shows_no_more_than_it_would_alone() -> None:
+    scene = household_things.scene(0, None, 5)
     shares = [placed.visible_share for placed in scene.placed]
     assert len(shares) == 5
     assert 0 <= min(shares) < 1

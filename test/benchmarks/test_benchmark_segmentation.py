@@ -2,40 +2,27 @@
 
 from __future__ import annotations
 
-import importlib
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
-
-
-@pytest.fixture(scope="module")
-def score(repository: Path):
-    sys.path.insert(0, str(repository / "benchmarks"))
-    try:
-        yield importlib.import_module("segmentation").score
-    finally:
-        sys.path.remove(str(repository / "benchmarks"))
-
+from segmentation import score
 
 TRUTH = np.repeat([[0, 1, 1, 1, 1, 2, 2, 2, 2, 0]], 10, axis=0)
 
 
-def test_the_same_labels_in_another_order(score):
+def test_the_same_labels_in_another_order():
     found = np.choose(TRUTH, [0, 2, 1])
     result = score(TRUTH, found)
     assert result.ious == (1.0, 1.0)
     assert (result.objects, result.segments, result.hits, result.cut, result.joined) == (2, 2, 2, 0, 0)
 
 
-def test_joined(score):
+def test_joined():
     result = score(TRUTH, (TRUTH > 0).astype(int))
     assert sorted(result.ious) == [0.0, 0.5]
     assert (result.segments, result.hits, result.cut, result.joined) == (1, 1, 0, 1)
 
 
-def test_cut(score):
+def test_cut():
     found = TRUTH.copy()
     found[:4][TRUTH[:4] == 1] = 3
     result = score(TRUTH, found)
@@ -43,7 +30,7 @@ def test_cut(score):
     assert (result.segments, result.hits, result.cut, result.joined) == (3, 2, 1, 0)
 
 
-def test_nothing_found_and_nothing_there(score):
+def test_nothing_found_and_nothing_there():
     nothing = np.zeros_like(TRUTH)
     assert score(TRUTH, nothing).ious == (0.0, 0.0)
     assert score(TRUTH, nothing).hits == 0

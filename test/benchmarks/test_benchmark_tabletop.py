@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import importlib
-from collections.abc import Iterator
-from pathlib import Path
-from types import ModuleType
-from typing import Any
-
+import mesh_things
 import numpy as np
 import pytest
+import real_scenes
+import scene_verdict
+import tabletop
 import trimesh
 
 from sq_perception.geometry import Superquadric, rotation
@@ -18,30 +16,11 @@ SEEDS = range(6)
 
 
 @pytest.fixture(scope="module")
-def modules(repository: Path) -> Iterator[dict[str, ModuleType]]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(repository / "benchmarks"))
-        yield {
-            name: importlib.import_module(name) for name in ("mesh_things", "tabletop", "scene_verdict", "real_scenes")
-        }
-
-
-@pytest.fixture(scope="module")
-def tabletop(modules: dict[str, ModuleType]) -> ModuleType:
-    return modules["tabletop"]
-
-
-@pytest.fixture(scope="module")
-def mesh_things(modules: dict[str, ModuleType]) -> ModuleType:
-    return modules["mesh_things"]
-
-
-@pytest.fixture(scope="module")
-def scenes(tabletop: ModuleType) -> list[Any]:
+def scenes() -> list[tabletop.Tabletop]:
     return [tabletop.scene(seed) for seed in SEEDS]
 
 
-def test_things_stand_on_the_table_and_apart(scenes: list[Any], tabletop: ModuleType) -> None:
+def test_things_stand_on_the_table_and_apart(scenes: list[tabletop.Tabletop]) -> None:
     assert max(len(scene.placed) for scene in scenes) > 4
     for scene in scenes:
         normal = scene.plane[:3]
@@ -58,14 +37,14 @@ def test_things_stand_on_the_table_and_apart(scenes: list[Any], tabletop: Module
                 assert tabletop.gap(one, other) >= tabletop.GAP - 1e-9
 
 
-def test_the_gap_of_two_squares_is_their_distance(tabletop: ModuleType) -> None:
+def test_the_gap_of_two_squares_is_their_distance() -> None:
     square = np.array([[0.0, 0], [1, 0], [1, 1], [0, 1]])
     assert tabletop.gap(square, square + [1.5, 0.3]) == pytest.approx(0.5)
     assert tabletop.gap(square, square + [0.8, 0.9]) == pytest.approx(-0.1)
     assert tabletop.gap(square, 0.1 * square + 0.4) < 0
 
 
-def test_a_seed_is_a_scene(scenes: list[Any], tabletop: ModuleType) -> None:
+def test_a_seed_is_a_scene(scenes: list[tabletop.Tabletop]) -> None:
     again = tabletop.scene(3)
     np.testing.assert_array_equal(again.depth, scenes[3].depth)
     np.testing.assert_array_equal(again.labels, scenes[3].labels)
@@ -73,7 +52,7 @@ def test_a_seed_is_a_scene(scenes: list[Any], tabletop: ModuleType) -> None:
     assert scenes[2].sensor == scenes[4].sensor != scenes[3].sensor
 
 
-def test_what_stands_alone_is_wholly_visible(scenes: list[Any]) -> None:
+def test_what_stands_alone_is_wholly_visible(scenes: list[tabletop.Tabletop]) -> None:
     shares = []
     for scene in scenes:
         counts = np.bincount(scene.labels.ravel(), minlength=len(scene.placed) + 1)
@@ -85,7 +64,7 @@ def test_what_stands_alone_is_wholly_visible(scenes: list[Any]) -> None:
     assert max(shares) == 1
 
 
-def test_a_mask_shows_the_mesh_and_the_sensor_nearly_does(scenes: list[Any]) -> None:
+def test_a_mask_shows_the_mesh_and_the_sensor_nearly_does(scenes: list[tabletop.Tabletop]) -> None:
     for scene in scenes[:4]:
         points = scene.camera.points(np.where(np.isfinite(scene.true_depth), scene.true_depth, np.nan))
         for placed in scene.placed:
@@ -103,7 +82,7 @@ def test_a_mask_shows_the_mesh_and_the_sensor_nearly_does(scenes: list[Any]) -> 
 
 
 @pytest.mark.parametrize("kind", ["box", "can", "bottle"])
-def test_edges_are_those_of_the_hull(mesh_things: ModuleType, kind: str, rng: np.random.Generator) -> None:
+def test_edges_are_those_of_the_hull(kind: str, rng: np.random.Generator) -> None:
     for _ in range(5):
         thing = mesh_things.MAKERS[kind](rng)
         np.testing.assert_allclose(np.sort(np.ptp(thing.hull, axis=0)), thing.edges, rtol=2e-3)
@@ -114,42 +93,41 @@ def test_edges_are_those_of_the_hull(mesh_things: ModuleType, kind: str, rng: np
             assert np.linalg.det(rest.turn) == pytest.approx(1)
 
 
-def test_a_box_is_itself(modules: dict[str, ModuleType], scenes: list[Any]) -> None:
+def test_a_box_is_itself(scenes: list[tabletop.Tabletop]) -> None:
     edges = np.array([0.04, 0.09, 0.15])
-    thing = modules["mesh_things"].rounded_box(edges, 0.0005)
+    thing = mesh_things.rounded_box(edges, 0.0005)
     scene = scenes[1]
     turn, place = scene.table, scene.table @ np.array([0, 0, 0.075]) + scene.placed[0].translation
-    placed = modules["tabletop"].Placed(thing, "upright", turn, place, 1, 1000, 1000)
+    placed = tabletop.Placed(thing, "upright", turn, place, 1, 1000, 1000)
     body = Superquadric(edges[[2, 0, 1]] / 2, [0.02, 0.02], place, rotation.from_matrix(turn[:, [2, 0, 1]]))
-    answer = modules["scene_verdict"]._answer(body, placed, scene)
+    answer = scene_verdict._answer(body, placed, scene)
     assert answer.iou > 0.995
     np.testing.assert_allclose(answer.edge_errors, 0, atol=1e-9)
     np.testing.assert_allclose(answer.excess, 0, atol=2e-3)
     longer = Superquadric(body.size * [1.1, 1, 1], body.shape, body.translation, body.rotation)
-    answer = modules["scene_verdict"]._answer(longer, placed, scene)
+    answer = scene_verdict._answer(longer, placed, scene)
     assert answer.iou == pytest.approx(1 / 1.1, abs=0.005)
     np.testing.assert_allclose(answer.edge_errors, [0, 0, 0.015], atol=1e-9)
     assert answer.size_error == pytest.approx(0.005)
     assert answer.excess[2] == pytest.approx(0.015, abs=2e-3)
 
 
-def test_masks_match_by_their_common_share(modules: dict[str, ModuleType]) -> None:
+def test_masks_match_by_their_common_share() -> None:
     true, own = np.zeros((10, 30), int), np.zeros((10, 30), int)
     true[:, :10], true[:, 10:20], true[:, 20:] = 1, 2, 3
     own[:, :8], own[:4, 10:20], own[4:, 10:20], own[:, 24:] = 7, 8, 9, 5
-    assert modules["scene_verdict"].matches(own, true) == {1: 7, 2: 9, 3: 5}
+    assert scene_verdict.matches(own, true) == {1: 7, 2: 9, 3: 5}
     own[:, 24:26] = 0
-    assert modules["scene_verdict"].matches(own, true) == {1: 7, 2: 9}
+    assert scene_verdict.matches(own, true) == {1: 7, 2: 9}
 
 
-def test_a_missed_thing_has_no_iou_and_no_size(modules: dict[str, ModuleType]) -> None:
-    verdict, tables = modules["scene_verdict"], modules["real_scenes"]
-    found = verdict.Answer(0.9, np.array([0.001, -0.002, 0.006]), np.zeros(3), np.array([1.0, 1, 0]), "weak", "")
+def test_a_missed_thing_has_no_iou_and_no_size() -> None:
+    found = scene_verdict.Answer(0.9, np.array([0.001, -0.002, 0.006]), np.zeros(3), np.array([1.0, 1, 0]), "weak", "")
     things = [
-        verdict.ThingVerdict(0, "stereo", "box", "box", "flat", 1, 900, 900, 1.0, np.ones(3), {"own": answer})
-        for answer in (found, verdict.Answer())
+        scene_verdict.ThingVerdict(0, "stereo", "box", "box", "flat", 1, 900, 900, 1.0, np.ones(3), {"own": answer})
+        for answer in (found, scene_verdict.Answer())
     ]
-    figures = tables.summary(things, "own")
+    figures = real_scenes.summary(things, "own")
     assert figures["iou"]["mean"] == pytest.approx(45)
     assert figures["edge_error"]["mean"] == pytest.approx(3)
     assert figures["within_2_sigma"] == pytest.approx(200 / 3)

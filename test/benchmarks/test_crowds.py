@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
-from collections.abc import Iterator
-from types import ModuleType
-
+import crowds
 import numpy as np
 import pytest
 
@@ -14,15 +11,8 @@ from sq_perception.segmentation.segments import segment
 from sq_perception.simulation import sensor_noise
 
 
-@pytest.fixture(scope="module")
-def crowds(repository) -> Iterator[ModuleType]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(repository / "benchmarks"))
-        yield importlib.import_module("crowds")
-
-
 @pytest.mark.parametrize("seed", range(8))
-def test_a_crowd_rests_touches_and_does_not_overlap(seed, crowds):
+def test_a_crowd_rests_touches_and_does_not_overlap(seed):
     rng = np.random.default_rng(seed)
     scene = crowds.crowded_scene(rng, 5)
     normal, offset = scene.plane[:3], scene.plane[3]
@@ -38,7 +28,7 @@ def test_a_crowd_rests_touches_and_does_not_overlap(seed, crowds):
     assert min(gaps) < 1.05  # at least one pair touches
 
 
-def test_crowds_are_refused_where_there_is_no_room(crowds, monkeypatch):
+def test_crowds_are_refused_where_there_is_no_room(monkeypatch):
     with pytest.raises(ValueError, match="1 to 12"):
         crowds.crowded_scene(np.random.default_rng(0), 13)
     monkeypatch.setattr(crowds, "TABLE_CAMERA", Camera(64, 48, 2000.0, 2000.0, 31.5, 23.5))
@@ -47,7 +37,7 @@ def test_crowds_are_refused_where_there_is_no_room(crowds, monkeypatch):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_crowd_seen_by_a_stereo_camera_is_parted(seed, crowds):
+def test_a_crowd_seen_by_a_stereo_camera_is_parted(seed):
     """Noise that is alike over windows of pixels makes folds and hides them; lines of sight are longer than windows."""
     rng = np.random.default_rng(seed)
     scene = crowds.crowded_scene(rng, 6)

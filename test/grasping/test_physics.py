@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-
 import numpy as np
 import pytest
 
@@ -20,14 +18,11 @@ TABLE = Surroundings(plane=np.array([0.0, 0.0, 1.0, 0.0]))
 
 
 @pytest.fixture(scope="module")
-def picking(repository):
+def picking():
     """The world and the benchmark."""
-    sys.path.insert(0, str(repository / "benchmarks"))
-    try:
-        import picking
-        import picking_world
-    finally:
-        sys.path.pop(0)
+    import picking
+    import picking_world
+
     return picking_world, picking
 
 
