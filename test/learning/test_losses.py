@@ -43,6 +43,16 @@ class TestParameterLoss:
         assert losses.parameter_loss(guess, truth).item() == pytest.approx((0.1**2 + 0.2**2) / 8)
 
 
+class TestOccupancyLoss:
+    def test_hand_computed(self) -> None:
+        """One point: at the centre of the truth (G = sigma(s)) and on the prediction's surface (G = 1/2)."""
+        q = [0.0, 0, 0, 1]
+        truth = Superquadric.from_flat(torch.tensor([[0.2, 0.2, 0.2, 1, 1, 0, 0, 0, *q]]))
+        moved = Superquadric.from_flat(torch.tensor([[0.2, 0.2, 0.2, 1, 1, 0.2, 0, 0, *q]]))
+        loss = losses.occupancy_loss(moved, truth, torch.zeros(1, 1, 3), 3.0)
+        assert loss.item() == pytest.approx((1 / (1 + np.exp(-3)) - 0.5) ** 2, rel=1e-5)
+
+
 class TestDualLoss:
     POINTS = grid(24)
 

@@ -38,6 +38,23 @@ def log_of(folder: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in (folder / "log.jsonl").read_text().splitlines()]
 
 
+def endless(folder: Path, validation: int) -> list[str]:
+    """The command of a run that somebody has to stop."""
+    command = [
+        sys.executable,
+        "-m",
+        "sq_perception",
+        "train",
+        "--output",
+        str(folder),
+        "--pixels",
+        "16",
+        "--batch",
+        "4",
+    ]
+    return [*command, "--points", "16", "--validation", str(validation), "--threads", "1", "--steps", "100000"]
+
+
 class TestConfig:
     @pytest.mark.parametrize("name", training_config.shipped())
     def test_shipped_files_are_configurations(self, name: str) -> None:
@@ -152,8 +169,7 @@ def test_one_view_a_step_is_refused_where_nothing_is_left_to_normalise(tmp_path:
 
 class TestInterruptions:
     def test_terminated_run_goes_on_where_it_stopped(self, tmp_path: Path) -> None:
-        command = [sys.executable, "-m", "sq_perception", "train", "--output", str(tmp_path), "--pixels", "16"]
-        command += ["--batch", "4", "--points", "16", "--validation", "50", "--threads", "1", "--steps", "100000"]
+        command = endless(tmp_path, validation=50)
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         assert process.stdout is not None
         first = json.loads(process.stdout.readline())
@@ -169,9 +185,9 @@ class TestInterruptions:
         assert int(load_file(str(tmp_path / "state.safetensors"))["step"]) == done + 3
 
     def test_killed_run_leaves_whole_files(self, tmp_path: Path) -> None:
-        command = [sys.executable, "-m", "sq_perception", "train", "--output", str(tmp_path), "--pixels", "16"]
-        command += ["--batch", "4", "--points", "16", "--validation", "2", "--threads", "1", "--steps", "100000"]
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True)
+        process = subprocess.Popen(
+            endless(tmp_path, validation=2), stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
+        )
         assert process.stdout is not None
         for _ in range(2):  # what the first line tells of is on disk before the second is said
             process.stdout.readline()
@@ -199,18 +215,12 @@ class TestInterruptions:
         assert (tmp_path / "state.safetensors").read_bytes() == before
         checkpoint.load(tmp_path / "model.safetensors")
 
-    def test_a_folder_of_another_run_is_refused_with_what_differs(self, tmp_path: Path) -> None:
+    @pytest.mark.parametrize("validated", [True, False])
+    def test_a_folder_of_another_run_is_refused_with_what_differs(self, tmp_path: Path, validated: bool) -> None:
         train.train(replace(RUN, steps=2), tmp_path, SMALL)
-        before = (tmp_path / "state.safetensors").read_bytes()
-        with pytest.raises(checkpoint.CheckpointError, match=f"loss '{RUN.loss}', not 'render'"):
-            train.train(replace(RUN, steps=4, loss="render"), tmp_path, SMALL)
-        assert (tmp_path / "state.safetensors").read_bytes() == before
-
-    def test_it_is_refused_also_before_the_first_validation(self, tmp_path: Path) -> None:
-        train.train(replace(RUN, steps=2), tmp_path, SMALL)
-        # What a run that is stopped before its first validation leaves.
-        (tmp_path / "last.safetensors").unlink()
-        (tmp_path / "model.safetensors").unlink()
+        if not validated:  # what a run that is stopped before its first validation leaves
+            (tmp_path / "last.safetensors").unlink()
+            (tmp_path / "model.safetensors").unlink()
         before = (tmp_path / "state.safetensors").read_bytes()
         with pytest.raises(checkpoint.CheckpointError, match=f"loss '{RUN.loss}', not 'render'"):
             train.train(replace(RUN, steps=4, loss="render"), tmp_path, SMALL)
