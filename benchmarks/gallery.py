@@ -29,26 +29,12 @@ import mesh_things
 import numpy as np
 import report
 import tracking
-from gallery_figures import (
-    FAINT,
-    MatchedThing,
-    empty_figure,
-    matched,
-    panel_title,
-    scene_figure,
-    write_picture,
-)
+from gallery_figures import MatchedThing, empty_figure, matched, scene_figure, write_picture
 from gallery_scenes import Stood, bottle, can, carton, kitchen, viewed
 from matplotlib.axes import Axes
 from scene_verdict import recoverer
 
-from sq_perception.evaluation.plots import (
-    WIRE,
-    colour,
-    draw_depth,
-    draw_outlines,
-    new_figure,
-)
+from sq_perception.evaluation.plots import FAINT, WIRE, colour, draw_depth, draw_outlines, heading_of, new_figure
 from sq_perception.fitting.fit import Status
 from sq_perception.recovery.recoverer import FrameRecovery
 from sq_perception.simulation import sensor_noise
@@ -131,7 +117,7 @@ def empty(path: Path) -> Entry:
     """A table with nothing on it through every sensor."""
     views = [viewed((), name) for name in sensor_noise.PRESETS]
     frames = [recoverer().recover(view.depth, view.camera) for view in views]
-    write_picture(empty_figure(views), path)
+    write_picture(empty_figure(views, frames), path)
     number = sum(len(frame.bodies) for frame in frames)
     reasons = " / ".join(sorted({frame.message for frame in frames if frame.message}))
     return Entry(
@@ -171,12 +157,10 @@ def tracked(path: Path) -> Entry:
     axes = grid[0].subgridspec(1, len(kept), wspace=0.015).subplots()
     for ax, (k, (view, _, followed)) in zip(axes, kept.items(), strict=True):
         camera = view.scene.camera
-        draw_depth(ax, view.depth)
+        draw_depth(ax, view.depth, window=TRACKED_WINDOW)
         bodies = [one.superquadric for one in followed]
         draw_outlines(ax, bodies, camera, [colour(one.id - 1) for one in followed], width=1.5)
-        ax.set_xlim(TRACKED_WINDOW[0], TRACKED_WINDOW[1])
-        ax.set_ylim(TRACKED_WINDOW[3], TRACKED_WINDOW[2])
-        panel_title(ax, f"Frame {k}", f"camera at {tracking.ARC * (k - 1) / (TRACKED[-1] - 1):.0f}°")
+        heading_of(ax, f"Frame {k}", f"camera at {tracking.ARC * (k - 1) / (TRACKED[-1] - 1):.0f}°")
     course = figure.add_subplot(grid[1])
     _draw_course(course, error[:, chosen, axis], sigma[:, chosen, axis], single[:, chosen, axis])
     write_picture(figure, path)
@@ -200,9 +184,8 @@ def _draw_course(ax: Axes, error: np.ndarray, sigma: np.ndarray, single: np.ndar
     ax.set_xlim(1, len(error))
     ax.set_xticks(TRACKED)
     ax.tick_params(labelsize=8, colors=FAINT, length=2, pad=2)
-    for side in ("top", "right", "left", "bottom"):
-        ax.spines[side].set_color("#cfd7de")
-    panel_title(ax, "Error, mm", "± 1 and ± 2 deviations")
+    ax.spines[:].set_color("#cfd7de")
+    heading_of(ax, "Error, mm", "± 1 and ± 2 deviations")
 
 
 ENTRIES: dict[str, Callable[[Path], Entry]] = {

@@ -13,39 +13,31 @@ from pathlib import Path
 
 import numpy as np
 from hull_oracle import Columns
-from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from PIL import Image
-from scene_verdict import recoverer
 from scipy.optimize import linear_sum_assignment
 from tabletop import Placed, Tabletop
 
-from sq_perception.evaluation.body_pictures import draw_bodies_3d, picture_axes
+from sq_perception.evaluation.body_pictures import draw_bodies_3d
 from sq_perception.evaluation.plots import (
-    INK,
-    WIRE,
     colour,
     draw_depth,
     draw_masks,
     draw_outlines,
+    heading_of,
     new_figure,
     save,
+    window_of,
 )
-from sq_perception.geometry import Superquadric
-from sq_perception.geometry import rotation as quaternions
 from sq_perception.recovery.recoverer import FrameRecovery, Recovery
 
 SENSORS = {"realsense_d435": "stereo, RealSense D435", "kinect_v1": "structured light, Kinect v1"}
 DOTS = 100
 COLOURS = 224
-ASPECT = 1.28
-"""Width over height of a panel with an image."""
-FAINT = "#6b7885"
-_MARGIN = 30
 _ELEVATION = 24.0
 """Degrees, of the pictures of bodies."""
 _BEFORE, _BEHIND = 0.05, 0.08
+"""Metres that the scale of depths is longer than the things."""
 _SEGMENTS = 64
 
 
@@ -76,74 +68,38 @@ def matched(view: Tabletop, frame: FrameRecovery) -> list[MatchedThing]:
 
 def scene_figure(view: Tabletop, frame: FrameRecovery, azimuth: float) -> Figure:
     """The three panels of one scene."""
-    figure = new_figure(11.8, 3.55)
-    axes = figure.subplots(1, 3, gridspec_kw={"wspace": 0.028, "width_ratios": [ASPECT, ASPECT, 1.0]})
+    figure = new_figure(12.15, 3.55)
+    axes = figure.subplots(1, 3, gridspec_kw={"wspace": 0.028, "width_ratios": [4, 4, 3]})
     figure.subplots_adjust(left=0.004, right=0.996, top=0.925, bottom=0.012)
     bodies = [body.superquadric for body in frame.recovered]
     shades = [colour(k) for k in range(len(bodies))]
-    window = _window(view)
-    limits = _limits(view)
+    window = window_of([], view.camera, np.argwhere(view.labels)[:, ::-1].astype(float))
+    near, far = np.nanquantile(view.depth[view.labels > 0], (0.005, 0.995))
     for ax in axes[:2]:
-        draw_depth(ax, view.depth, limits)
+        draw_depth(ax, view.depth, (near - _BEFORE, far + _BEHIND), window)
     draw_masks(axes[1], frame.labels, [body.label for body in frame.recovered], 0.5)
     draw_outlines(axes[1], bodies, view.camera, shades, width=1.5)
-    for ax in axes[:2]:
-        ax.set_xlim(window[0], window[1])
-        ax.set_ylim(window[3], window[2])
-    panel_title(axes[0], "Depth", SENSORS[view.sensor])
-    panel_title(axes[1], "Own masks, recovered outlines", f"{len(bodies)} bodies" if len(bodies) != 1 else "1 body")
+    heading_of(axes[0], "Depth", SENSORS[view.sensor])
+    heading_of(axes[1], "Own masks, recovered outlines", f"{len(bodies)} bodies" if len(bodies) != 1 else "1 body")
     cages = [line for placed in view.placed for line in _cage(placed)]
-    around = [_box_around(placed) for placed in view.placed]
     draw_bodies_3d(
-        axes[2], bodies, plane=view.plane, colours=shades, elevation=_ELEVATION, azimuth=azimuth, enclosed=around
+        axes[2], bodies, plane=view.plane, colours=shades, elevation=_ELEVATION, azimuth=azimuth, wires=cages
     )
-    _draw_lines(axes[2], cages, picture_axes(_ELEVATION, azimuth, view.plane))
-    panel_title(axes[2], "From the right", "thin lines: the true things")
+    heading_of(axes[2], "From the right", "thin lines: the true things")
     return figure
 
 
-def empty_figure(views: Sequence[Tabletop]) -> Figure:
+def empty_figure(views: Sequence[Tabletop], frames: Sequence[FrameRecovery]) -> Figure:
     """What each sensor makes of a table with nothing on it."""
     figure = new_figure(11.62, 2.42)
     axes = figure.subplots(1, len(views), gridspec_kw={"wspace": 0.025})
     figure.subplots_adjust(left=0.004, right=0.996, top=0.9, bottom=0.012)
-    for ax, view in zip(axes, views, strict=True):
-        frame = recoverer().recover(view.depth, view.camera)
+    for ax, view, frame in zip(axes, views, frames, strict=True):
         draw_depth(ax, view.depth)
         draw_masks(ax, frame.labels, [body.label for body in frame.bodies])
         missing = 100 * (1 - np.isfinite(view.depth).mean())
-        panel_title(ax, f"{view.sensor}: {len(frame.bodies)} bodies", f"{missing:.0f} % missing")
+        heading_of(ax, f"{view.sensor}: {len(frame.bodies)} bodies", f"{missing:.0f} % missing")
     return figure
-
-
-def _window(view: Tabletop) -> tuple[float, float, float, float]:
-    """Left, right, top, bottom of the part of the image with the things, in the proportions of a panel."""
-    rows, columns = np.nonzero(view.labels)
-    low = np.array([columns.min(), rows.min()], dtype=float) - _MARGIN
-    high = np.array([columns.max(), rows.max()], dtype=float) + _MARGIN
-    half = max((high - low)[1] / 2, (high - low)[0] / 2 / ASPECT) * np.array([ASPECT, 1.0])
-    limit = np.array([view.camera.width, view.camera.height]) / 2
-    half = half * min(1.0, float((limit / half).min()))
-    middle = np.clip((low + high) / 2, half - 0.5, 2 * limit - 0.5 - half)
-    return middle[0] - half[0], middle[0] + half[0], middle[1] - half[1], middle[1] + half[1]
-
-
-def _limits(view: Tabletop) -> tuple[float, float]:
-    """Nearest and farthest depth of the scale: those of the things, and a little behind them."""
-    near, far = np.nanquantile(view.depth[view.labels > 0], (0.005, 0.995))
-    return float(near) - _BEFORE, float(far) + _BEHIND
-
-
-def panel_title(ax: Axes, text: str, detail: str) -> None:
-    ax.set_title(text, loc="left", fontsize=10.5, color=INK, pad=4)
-    ax.set_title(detail, loc="right", fontsize=8.5, color=FAINT, pad=4)
-
-
-def _box_around(placed: Placed) -> Superquadric:
-    """A thing's box in its own frame."""
-    low, high = placed.thing.hull.min(axis=0), placed.thing.hull.max(axis=0)
-    middle = placed.rotation @ ((low + high) / 2) + placed.translation
-    return Superquadric((high - low) / 2, np.full(2, 0.1), middle, quaternions.from_matrix(placed.rotation))
 
 
 def _cage(placed: Placed) -> list[np.ndarray]:
@@ -178,11 +134,6 @@ def _rims(profile: np.ndarray) -> list[tuple[float, float]]:
         rims += [(height[narrow & (height > height[wide].max())].min(), radius[-1])]
     rims.append((height.max(), radius[height > height.max() - 1e-3].max()))
     return [(float(z), float(r)) for z, r in rims]
-
-
-def _draw_lines(ax: Axes, lines: Sequence[np.ndarray], view: np.ndarray) -> None:
-    flat = [(line @ view.T)[:, :2] for line in lines]
-    ax.add_collection(LineCollection(flat, colors=[WIRE], linewidths=0.7, zorder=6), autolim=False)
 
 
 def write_picture(figure: Figure, path: Path) -> int:

@@ -17,11 +17,11 @@ from typing import Any
 import household_things
 import numpy as np
 import report
-from gallery_figures import WIRE, write_picture
+from gallery_figures import write_picture
 from matplotlib.axes import Axes
 from scipy.spatial import ConvexHull
 
-from sq_perception.evaluation.plots import colour, draw_depth, draw_outlines, heading_of, new_figure
+from sq_perception.evaluation.plots import WIRE, colour, draw_depth, draw_outlines, heading_of, new_figure
 from sq_perception.geometry import Superquadric
 from sq_perception.simulation.household import KINDS
 
@@ -46,7 +46,9 @@ def draw(ax: Axes, row: dict[str, Any]) -> None:
     outline = corners[ConvexHull(corners).vertices]
     low, high = outline.min(axis=0), outline.max(axis=0)
     middle, reach = (low + high) / 2, (0.5 + AROUND) * float((high - low).max())
-    draw_depth(ax, scene.depth)
+    left, top = middle - reach
+    right, bottom = middle + reach
+    draw_depth(ax, scene.depth, window=(left, right, top, bottom))
     closed = np.vstack([outline, outline[:1]])
     ax.plot(*closed.T, color=WIRE, linewidth=1.0)
     answer = row["answers"][METHOD]
@@ -56,10 +58,6 @@ def draw(ax: Axes, row: dict[str, Any]) -> None:
         body = Superquadric.from_flat(np.array(answer["body"]))
         draw_outlines(ax, [body], scene.camera, [colour(0)], width=1.6)
         text = " x ".join(f"{2e3 * size:.0f}" for size in sorted(body.size))
-    ax.set_xlim(middle[0] - reach, middle[0] + reach)
-    ax.set_ylim(middle[1] + reach, middle[1] - reach)
-    ax.set_xticks([])
-    ax.set_yticks([])
     heading_of(ax, row["name"], f"IoU {100 * answer['iou']:.0f} %, {answer['status'].lower()}")
     ax.set_xlabel(f"{text}, true {edges} mm", fontsize=8)
 

@@ -39,8 +39,7 @@ def draw_bodies_3d(
     azimuth: float = 30.0,
     unit: str = "m",
     pixels: int = 560,
-    wires: Sequence[Superquadric] = (),
-    enclosed: Sequence[Superquadric] = (),
+    wires: Sequence[np.ndarray] = (),
 ) -> None:
     """Shaded picture of bodies of the optical frame from another place, exact as the depth images are.
 
@@ -63,25 +62,21 @@ def draw_bodies_3d(
     pixels
         Width and height of the picture.
     wires
-        Other bodies, the true ones for instance, drawn as edges in front of everything.
-    enclosed
-        Bodies that the picture has room for without drawing them, so that the pictures of a film do not jump.
+        Lines (n, 3), of the true bodies for instance, drawn in front of everything.
     """
     ax.set_axis_off()
     if not bodies:
         return
     upright = _upright(plane)
-    view = picture_axes(elevation, azimuth, plane)
+    view = _picture_axes(elevation, azimuth) @ upright
     turn = quaternions.from_matrix(view)
-    turned, cages, unseen = (
-        [body.transformed(turn, np.zeros(3)) for body in group] for group in (bodies, wires, enclosed)
-    )
+    turned = [body.transformed(turn, np.zeros(3)) for body in bodies]
+    lines = [np.asarray(wire) @ view.T for wire in wires]
     shades = [np.asarray(colour(k) if colours is None else colours[k % len(colours)]) for k in range(len(bodies))]
     clouds = [np.asarray(cloud) @ view.T for cloud in points or []]
-    boxes = [body.bounding_box() for body in turned + cages + unseen]
-    low, high = (np.array(corner) for corner in zip(*boxes, strict=True))
-    middle = 0.5 * (low.min(axis=0) + high.max(axis=0))
-    half = 0.62 * float((high.max(axis=0) - low.min(axis=0))[:2].max())
+    shown = np.vstack([*(corner for body in turned for corner in body.bounding_box()), *lines])
+    middle = 0.5 * (shown.min(axis=0) + shown.max(axis=0))
+    half = 0.62 * float(np.ptp(shown, axis=0)[:2].max())
     side = 2 * pixels  # twice as fine as the picture
     scale = side / (2 * half)
     cx, cy = side / 2 - 0.5 - scale * middle[:2]
@@ -99,24 +94,23 @@ def draw_bodies_3d(
         segments = outline(body, 64)
         centres = segments.mean(axis=1)
         seen = (body.normals(centres) @ forward < 0) & ~_hidden(centres, depth, camera, 0.01 * half)
-        lines = LineCollection(segments[seen][..., :2], colors=[0.35 * shade], linewidths=0.9, zorder=3)
-        ax.add_collection(lines, autolim=False)
+        edges = LineCollection(segments[seen][..., :2], colors=[0.35 * shade], linewidths=0.9, zorder=3)
+        ax.add_collection(edges, autolim=False)
     for cloud, shade in zip(clouds, shades, strict=False):
         cloud = cloud[:: max(1, len(cloud) // _MOST_POINTS)]
         cloud = cloud[~_hidden(cloud, depth, camera, 0.02 * half)]
         ax.scatter(cloud[:, 0], cloud[:, 1], s=1.6, color=[0.25 * shade], alpha=0.55, linewidths=0, zorder=4)
-    for cage in cages:
-        edges = LineCollection(list(outline(cage, 64)[..., :2]), colors=[WIRE], linewidths=1.0, zorder=5)
-        ax.add_collection(edges, autolim=False)
+    cages = LineCollection([line[:, :2] for line in lines], colors=[WIRE], linewidths=1.0, zorder=5)
+    ax.add_collection(cages, autolim=False)
     _scale_bar(ax, extent, unit)
 
 
-def picture_axes(elevation: float, azimuth: float, plane: np.ndarray | None = None) -> np.ndarray:
-    """Rows: right, down, forward of a picture of :func:`draw_bodies_3d`, in the optical frame."""
+def _picture_axes(elevation: float, azimuth: float) -> np.ndarray:
+    """Rows: right, down, forward of a picture, in a frame of right, away and up."""
     tilt, turn = np.radians([elevation, azimuth])
     forward = np.array([-np.sin(turn) * np.cos(tilt), np.cos(turn) * np.cos(tilt), -np.sin(tilt)])
     right = np.array([np.cos(turn), np.sin(turn), 0.0])
-    return np.stack([right, np.cross(forward, right), forward]) @ _upright(plane)
+    return np.stack([right, np.cross(forward, right), forward])
 
 
 def _upright(plane: np.ndarray | None) -> np.ndarray:

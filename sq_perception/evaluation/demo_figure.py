@@ -14,6 +14,7 @@ from matplotlib.patches import Rectangle
 
 from sq_perception.evaluation import plots
 from sq_perception.evaluation.body_pictures import draw_bodies_3d
+from sq_perception.geometry.mesh import outline
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
 
@@ -43,6 +44,7 @@ def demo_figure(
         Support plane n.p + d = height.
     """
     figure = plots.new_figure(15.0, 8.5)
+    wires = [line for body in truth for line in outline(body, 64)]
     figure.text(0.02, 0.958, heading, fontsize=15, weight="bold", color=plots.INK)
     if truth:
         figure.text(0.98, 0.958, "wires: the true bodies", fontsize=11, color=plots.WIRE, ha="right")
@@ -64,8 +66,6 @@ def demo_figure(
     for k, (name, bodies, _) in enumerate(methods):
         for i, (elevation, azimuth, direction) in enumerate(_VIEWS):
             ax = figure.add_subplot(below[2 * k + i])
-            draw_bodies_3d(
-                ax, list(bodies), plane=plane, elevation=elevation, azimuth=azimuth, unit=unit, wires=list(truth)
-            )
+            draw_bodies_3d(ax, list(bodies), plane=plane, elevation=elevation, azimuth=azimuth, unit=unit, wires=wires)
             plots.heading_of(ax, name if i == 0 else "", direction)
     return figure

@@ -19,6 +19,7 @@ from sq_perception.evaluation.body_pictures import draw_bodies_3d
 from sq_perception.evaluation.contest import Outcome
 from sq_perception.evaluation.figures_of_merit import GOOD_IOU
 from sq_perception.evaluation.thesis_images import ThesisImages
+from sq_perception.geometry.mesh import outline
 from sq_perception.imaging import raycast, unit_cube
 
 _BAR = "#7f97aa"
@@ -106,8 +107,8 @@ def _draw_example(axes: Sequence[Axes], outcome: Outcome, images: ThesisImages, 
     axes[0].set_title(f"{100 * outcome.figures.iou[number]:.1f} %", loc="left", fontsize=10, color=plots.INK, pad=3)
     axes[0].set_title(f"body {number}", loc="right", fontsize=8.5, color=plots.FAINT, pad=3)
     if is_recovered:
-        true = unit_cube.optical_from_cube(outcome.labels[number])
-        draw_bodies_3d(axes[2], [predicted], wires=[true], elevation=22.0, azimuth=55.0, unit="", pixels=300)
+        true = outline(unit_cube.optical_from_cube(outcome.labels[number]), 64)
+        draw_bodies_3d(axes[2], [predicted], wires=list(true), elevation=22.0, azimuth=55.0, unit="", pixels=300)
     else:
         axes[2].set_axis_off()
         axes[2].text(0.5, 0.5, "no body", transform=axes[2].transAxes, ha="center", fontsize=9, color=plots.FAINT)

@@ -12,6 +12,7 @@ import pytest
 from sq_perception.evaluation import plots
 from sq_perception.evaluation.body_pictures import draw_bodies_3d
 from sq_perception.evaluation.recovery_figure import recovery_figure
+from sq_perception.geometry.mesh import outline
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast, unit_cube
 from sq_perception.imaging.camera import Camera
@@ -115,7 +116,7 @@ def test_draw_on_a_plane_with_points_and_true_wires():
     ax = figure.add_axes((0, 0, 1, 1))
     depth, labels = shot()
     v, u = np.nonzero(labels)
-    draw_bodies_3d(ax, [BODY], [CAMERA.unproject(u, v, depth[v, u])], PLANE, wires=[BODY])
+    draw_bodies_3d(ax, [BODY], [CAMERA.unproject(u, v, depth[v, u])], PLANE, wires=list(outline(BODY)))
     assert drawn(figure).std() > 20
     empty = plots.new_figure(2, 2)
     draw_bodies_3d(empty.add_axes((0, 0, 1, 1)), [])
