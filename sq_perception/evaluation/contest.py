@@ -201,23 +201,21 @@ def compare(
     for contestant, count in contestants:
         if not 1 <= count <= images.count:
             raise ValueError(f"{contestant.name}: expected 1 to {images.count} bodies, got {count}")
-    parts: list[list[tuple[FiguresOfMerit, np.ndarray, np.ndarray]]] = [[] for _ in contestants]
+    answers: list[list[Answers]] = [[] for _ in contestants]
     for piece in images.chunks():
-        for (contestant, count), part in zip(contestants, parts, strict=True):
-            mine = piece.head(count - piece.first)
-            if len(mine) == 0:
-                continue
-            answers, labels = contestant.recover(mine), contestant.labels(mine.truth)
-            bodies = contestant.with_given(answers.bodies, labels)
-            figures = FiguresOfMerit.of(bodies, labels, answers.recovered, answers.milliseconds)
-            part.append((figures, bodies.to_flat(), labels.to_flat()))
-            if advance:
-                advance(contestant.name, mine.first + len(mine))
+        for (contestant, count), mine in zip(contestants, answers, strict=True):
+            shown = piece.head(count - piece.first)
+            if len(shown):
+                mine.append(contestant.recover(shown))
+                if advance:
+                    advance(contestant.name, shown.first + len(shown))
     outcomes = []
-    for (contestant, _), part in zip(contestants, parts, strict=True):
-        figures, flats, labels_flat = zip(*part, strict=True)
-        bodies, labels = (Superquadric.from_flat(np.concatenate(flat)) for flat in (flats, labels_flat))
-        outcomes.append(Outcome(contestant, FiguresOfMerit.concatenated(figures), bodies, labels))
+    for (contestant, count), mine in zip(contestants, answers, strict=True):
+        recovered, milliseconds = np.concatenate([[each.recovered, each.milliseconds] for each in mine], axis=1)
+        labels = contestant.labels(images.truth[:count])
+        bodies = Superquadric.from_flat(np.concatenate([each.bodies.to_flat() for each in mine]))
+        bodies = contestant.with_given(bodies, labels)
+        outcomes.append(Outcome(contestant, FiguresOfMerit.of(bodies, labels, recovered, milliseconds), bodies, labels))
     return outcomes
 
 

@@ -28,8 +28,8 @@ A body that was not recovered has IoU 0, and NaN in everything that compares par
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -114,11 +114,6 @@ class FiguresOfMerit:
             known(angles.min(axis=(0, 1))),
             np.full(count, np.nan) if milliseconds is None else np.asarray(milliseconds, dtype=float),
         )
-
-    @classmethod
-    def concatenated(cls, parts: Sequence[FiguresOfMerit]) -> FiguresOfMerit:
-        """The figures of several batches, one after the other."""
-        return cls(*(np.concatenate([getattr(part, field.name) for part in parts]) for field in fields(cls)))
 
     def summary(self) -> dict[str, Any]:
         """Means over a test set, as in the thesis' tables: JSON values by name.
