@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 
-from sq_perception.commands.console import INTERRUPTED, SUCCESS, failed, parser
+from sq_perception.commands.console import INTERRUPTED, SUCCESS, failed, parser, progress
 from sq_perception.learning import training_config
 from sq_perception.learning.training_config import CHOICES, TrainingConfig
 
@@ -50,7 +50,13 @@ def main(arguments: Sequence[str]) -> int:
     from sq_perception.learning.train import Stopped, train
 
     try:
-        train(config, output)
+        with progress() as bar:
+            task = bar.add_task("training", total=config.steps)
+            train(
+                config,
+                output,
+                advance=lambda step, loss: bar.update(task, completed=step, description=f"loss {loss:.4f}"),
+            )
     except Stopped as stopped:
         print(stopped, file=sys.stderr)
         return INTERRUPTED

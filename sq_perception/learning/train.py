@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import json
 import signal
-import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -23,8 +22,6 @@ from typing import Any
 import numba
 import numpy as np
 import torch
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from sq_perception.files import provenance
 from sq_perception.geometry.metrics import volume_iou
@@ -58,7 +55,12 @@ class Stopped(Exception):  # noqa: N818 - nothing is wrong
     """A run that was asked to stop; its state is saved."""
 
 
-def train(config: TrainingConfig, output: Path, network: RegressorConfig | None = None) -> Regressor:
+def train(
+    config: TrainingConfig,
+    output: Path,
+    network: RegressorConfig | None = None,
+    advance: Callable[[int, float], None] = lambda step, loss: None,
+) -> Regressor:
     """Run, or continue, a training; returns the averaged network, also saved in ``output``.
 
     Parameters
@@ -69,6 +71,8 @@ def train(config: TrainingConfig, output: Path, network: RegressorConfig | None 
         Its folder.
     network
         A form other than that of ``config``.
+    advance
+        Called with the steps done and the loss of the last one.
 
     Raises
     ------
@@ -83,7 +87,66 @@ def train(config: TrainingConfig, output: Path, network: RegressorConfig | None 
     """
     device = torch.device(checked_device(config.device))
     with _threads(config.threads), _stop_requests() as stop_requested:
-        return _train(config, output, network, device, stop_requested)
+        objective = Objective(config.loss, config.points, config.sharpness_start, config.sharpness_end)
+        output.mkdir(parents=True, exist_ok=True)
+        _check_same_run(config, output)
+        torch.manual_seed(config.seed)
+        model = _new_network(config, network).to(device)
+        if config.batch == 1 and model.config.pixels == model.config.stride:
+            raise ValueError(
+                f"batch: expected at least 2 with views of {model.config.pixels} pixels, of which one cell is left: "
+                "one number has no deviation to normalise by"
+            )
+        layout = torch.channels_last if model.config.widths[0] >= _FEWEST_CHANNELS_LAST else torch.contiguous_format
+        model.to(memory_format=layout)  # type: ignore[call-overload]
+        settings = json.dumps(asdict(config))
+        state = TrainingState(output / "state.safetensors", model, _optimizer(config, model), settings)
+        seed = np.random.SeedSequence([config.seed, state.step])
+        generator = torch.Generator(device=device).manual_seed(int(seed.generate_state(1)[0]))
+        batches = _batches(config, model.config, np.random.default_rng(seed))
+        validation = _validation_sets(config, model.config)
+        notes = {"training": asdict(config), "made": provenance.facts("sq-perception train")}
+        if device.type == "cuda":
+            notes["made"]["device"] = torch.cuda.get_device_name(device)
+        started, saved, losses = time.monotonic() - state.seconds, time.monotonic(), []
+        while state.step < config.steps and not (config.schedule == "plateau" and state.plateau.exhausted):
+            progress, rate = state.step / config.steps, config.rate(state.step, state.plateau)
+            images, bodies = batches.batch(config.batch)
+            views = torch.from_numpy(images)[:, None].to(device, memory_format=layout)
+            truth = None
+            if objective.needs_labels:
+                labels = bodies.canonical_form() if config.canonical_labels else bodies
+                truth = Superquadric.from_flat(torch.from_numpy(labels.to_flat()).float().to(device))
+            model.train()
+            with mixed_precision(device.type, config.bfloat16):
+                prediction = model(views)
+            loss = objective.loss(prediction, views, truth, progress, generator).mean()
+            state.descend(loss, rate, config.average)
+            losses.append(loss.item())
+            advance(state.step, losses[-1])
+
+            finished = state.step == config.steps
+            stopping = stop_requested()
+            if state.step % config.validation == 0 or finished:
+                state.seconds = time.monotonic() - started
+                if config.average > 0:
+                    calibration = batches.batch(max(CALIBRATION_VIEWS, config.batch))[0]
+                    recalibrate(state.average, torch.from_numpy(calibration)[:, None], config.batch)
+                record = {"step": state.step, "loss": float(np.mean(losses)), "rate": rate}
+                record |= {"sharpness": objective.sharpness(progress), "seconds": state.seconds}
+                record |= _validated(state.average, validation, objective)
+                print(json.dumps(record), flush=True)
+                state.log(record)
+                _keep(output, state, record, notes)
+                state.plateau.validated(1 - record["iou"])
+                losses.clear()
+            due = time.monotonic() - saved > _SAVE_SECONDS
+            if state.step % config.validation == 0 or finished or stopping or due:
+                state.seconds, saved = time.monotonic() - started, time.monotonic()
+                state.save()
+            if stopping and not finished:
+                raise Stopped(f"stopped after step {state.step}; the same command goes on from {state.path}")
+        return state.average.eval()
 
 
 def _check_same_run(config: TrainingConfig, output: Path) -> None:
@@ -108,76 +171,6 @@ def _header(path: Path) -> dict[str, str]:
         return checkpoint.read_header(path)
     except checkpoint.CheckpointError:  # a damaged state is refused where it is read
         return {}
-
-
-def _train(
-    config: TrainingConfig,
-    output: Path,
-    network: RegressorConfig | None,
-    device: torch.device,
-    stop_requested: Callable[[], bool],
-) -> Regressor:
-    objective = Objective(config.loss, config.points, config.sharpness_start, config.sharpness_end)
-    output.mkdir(parents=True, exist_ok=True)
-    _check_same_run(config, output)
-    torch.manual_seed(config.seed)
-    model = _new_network(config, network).to(device)
-    if config.batch == 1 and model.config.pixels == model.config.stride:
-        raise ValueError(
-            f"batch: expected at least 2 with views of {model.config.pixels} pixels, of which one cell is left: "
-            "one number has no deviation to normalise by"
-        )
-    layout = torch.channels_last if model.config.widths[0] >= _FEWEST_CHANNELS_LAST else torch.contiguous_format
-    model.to(memory_format=layout)  # type: ignore[call-overload]
-    settings = json.dumps(asdict(config))
-    state = TrainingState(output / "state.safetensors", model, _optimizer(config, model), settings)
-    seed = np.random.SeedSequence([config.seed, state.step])
-    generator = torch.Generator(device=device).manual_seed(int(seed.generate_state(1)[0]))
-    batches = _batches(config, model.config, np.random.default_rng(seed))
-    validation = _validation_sets(config, model.config)
-    notes = {"training": asdict(config), "made": provenance.facts("sq-perception train")}
-    if device.type == "cuda":
-        notes["made"]["device"] = torch.cuda.get_device_name(device)
-    started, saved, losses = time.monotonic() - state.seconds, time.monotonic(), []
-    with _bar(config.steps, state.step) as show:
-        while state.step < config.steps and not (config.schedule == "plateau" and state.plateau.exhausted):
-            progress, rate = state.step / config.steps, config.rate(state.step, state.plateau)
-            images, bodies = batches.batch(config.batch)
-            views = torch.from_numpy(images)[:, None].to(device, memory_format=layout)
-            truth = None
-            if objective.needs_labels:
-                labels = bodies.canonical_form() if config.canonical_labels else bodies
-                truth = Superquadric.from_flat(torch.from_numpy(labels.to_flat()).float().to(device))
-            model.train()
-            with mixed_precision(device.type, config.bfloat16):
-                prediction = model(views)
-            loss = objective.loss(prediction, views, truth, progress, generator).mean()
-            state.descend(loss, rate, config.average)
-            losses.append(loss.item())
-            show(state.step, losses[-1])
-
-            finished = state.step == config.steps
-            stopping = stop_requested()
-            if state.step % config.validation == 0 or finished:
-                state.seconds = time.monotonic() - started
-                if config.average > 0:
-                    calibration = batches.batch(max(CALIBRATION_VIEWS, config.batch))[0]
-                    recalibrate(state.average, torch.from_numpy(calibration)[:, None], config.batch)
-                record = {"step": state.step, "loss": float(np.mean(losses)), "rate": rate}
-                record |= {"sharpness": objective.sharpness(progress), "seconds": state.seconds}
-                record |= _validated(state.average, validation, objective)
-                print(json.dumps(record), flush=True)
-                state.log(record)
-                _keep(output, state, record, notes)
-                state.plateau.validated(1 - record["iou"])
-                losses.clear()
-            due = time.monotonic() - saved > _SAVE_SECONDS
-            if state.step % config.validation == 0 or finished or stopping or due:
-                state.seconds, saved = time.monotonic() - started, time.monotonic()
-                state.save()
-            if stopping and not finished:
-                raise Stopped(f"stopped after step {state.step}; the same command goes on from {state.path}")
-    return state.average.eval()
 
 
 def validate(
@@ -267,16 +260,6 @@ def _keep(output: Path, state: TrainingState, record: dict[str, Any], notes: dic
         names.append("model.safetensors")
     for name in names:
         checkpoint.save(output / name, state.average, {**notes, "metrics": record})
-
-
-@contextmanager
-def _bar(steps: int, first: int) -> Iterator[Callable[[int, float], None]]:
-    """A bar on a terminal, for a run of ``steps`` of which ``first`` are done; called with steps done and a loss."""
-    columns = (TextColumn("step"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[note]}"))
-    quiet = not sys.stderr.isatty()
-    with Progress(*columns, TimeRemainingColumn(), console=Console(stderr=True), disable=quiet) as progress:
-        task = progress.add_task("training", total=steps, completed=first, note="")
-        yield lambda done, loss: progress.update(task, completed=done, note=f"loss {loss:.4f}")
 
 
 @contextmanager
