@@ -85,8 +85,7 @@ def draw_bodies_3d(
     extent = (middle[0] - half, middle[0] + half, middle[1] + half, middle[1] - half)
     picture = _shaded(depth, index, turned, shades, camera)
     ax.imshow(cv2.resize(picture, (pixels, pixels), interpolation=cv2.INTER_AREA), extent=extent, zorder=2)
-    ax.set_xlim(extent[0], extent[1])
-    ax.set_ylim(extent[2], extent[3])
+    ax.set(xlim=extent[:2], ylim=extent[2:])
     if plane is not None:
         _draw_ground(ax, bodies, np.asarray(plane, dtype=float), view, upright, half)
     forward = np.array([0.0, 0.0, 1.0])

@@ -62,12 +62,8 @@ def draw_depth(
     span = max(limits[1] - limits[0], 1e-6)
     ax.imshow(finite, cmap=shades, vmin=limits[0], vmax=limits[0] + span, interpolation="nearest")
     left, right, top, bottom = window or (-0.5, depth.shape[1] - 0.5, -0.5, depth.shape[0] - 0.5)
-    ax.set_xlim(left, right)
-    ax.set_ylim(bottom, top)
-    ax.set_xticks([])
-    ax.set_yticks([])
-    for side in ax.spines.values():
-        side.set_visible(False)
+    ax.set(xlim=(left, right), ylim=(bottom, top), xticks=[], yticks=[])
+    ax.spines[:].set_visible(False)
 
 
 def draw_masks(ax: Axes, labels: np.ndarray, ids: Sequence[int], opacity: float = 0.55) -> None:

@@ -70,8 +70,7 @@ def recovery_figure(
 def _draw_numbers(ax: Axes, recovery: FrameRecovery, unit: str) -> None:
     """The bodies' full edges with their deviations, exponents, score and verdict as text."""
     ax.set_axis_off()
-    ax.set_xlim(0, 1)
-    ax.set_ylim(0, 1)
+    ax.set(xlim=(0, 1), ylim=(0, 1))
     total = recovery.milliseconds.get("total", float("nan"))
     ax.text(0, 0.95, "Full edges, exponents, score", fontsize=10.5, color=plots.INK)
     ax.text(1, 0.95, f"{total:.0f} ms", fontsize=9.5, color=plots.FAINT, ha="right")

@@ -18,7 +18,7 @@ import math
 from contextlib import suppress
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, get_args
 
 from sq_perception.files import plain_yaml
 from sq_perception.learning.choices import LOSSES, UNSUPERVISED, Backbone, Framing
@@ -26,15 +26,13 @@ from sq_perception.learning.choices import LOSSES, UNSUPERVISED, Backbone, Frami
 if TYPE_CHECKING:
     from sq_perception.learning.network_config import RegressorConfig
 
-Optimizer = Literal["adamw", "adam"]
 _SHIPPED = Path(__file__).with_name("configurations")
-ScheduleName = Literal["cosine", "plateau"]
 CHOICES: dict[str, tuple[str, ...]] = {
     "loss": LOSSES,
     "backbone": get_args(Backbone),
     "framing": get_args(Framing),
-    "optimizer": get_args(Optimizer),
-    "schedule": get_args(ScheduleName),
+    "optimizer": ("adamw", "adam"),
+    "schedule": ("cosine", "plateau"),
 }
 """Fields that name something, and the names there are."""
 _PATIENCE = 10
