@@ -146,9 +146,9 @@ class TrainingConfig:
         for name in ("steps", "batch", "points", "validation", "reuse"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name}: expected at least 1, got {getattr(self, name)}")
-        for name in ("seed", "threads"):
-            if getattr(self, name) < 0:
-                raise ValueError(f"{name}: expected at least 0, got {getattr(self, name)}")
+        for name in ("seed", "threads", "sharpness_start", "sharpness_end"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise ValueError(f"{name}: expected a finite number of at least 0, got {getattr(self, name)}")
         for name in ("pinhole_share", "wide_share", "occluded_share", "noisy_share"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name}: expected a share from 0 to 1, got {getattr(self, name)}")
@@ -160,6 +160,8 @@ class TrainingConfig:
             raise ValueError(f"{self.loss} takes each view as it is; occluders and noise need a loss with labels")
         if self.framing == "full" and (self.pinhole_share or self.occluded_share or self.noisy_share):
             raise ValueError("full frames are the thesis' images: orthographic, whole and clean")
+        if self.data and (self.pinhole_share or self.wide_share or self.marks_hidden):
+            raise ValueError("data: the views of a fixed set are drawn already: expected shares of 0")
         if self.imagenet and self.backbone != "resnet18":
             raise ValueError("imagenet: only resnet18 has the form of those weights")
 

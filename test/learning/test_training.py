@@ -86,6 +86,8 @@ class TestConfig:
             ("a: [", "not a YAML file"),
             ("loss: render\noccluded_share: 0.5", "need a loss with labels"),
             ("framing: full\npinhole_share: 0.5", "orthographic"),
+            ("data: set\nnoisy_share: 0.5", "expected shares of 0"),
+            ("sharpness_start: -5", "sharpness_start: expected a finite number"),
             ("!!python/object/apply:os.system ['true']", "not a YAML file"),
         ],
     )
