@@ -25,10 +25,9 @@ from scipy.optimize import minimize_scalar
 from sq_perception.geometry.support_directions import mirrored
 from sq_perception.learning import checkpoint, thing_network
 from sq_perception.learning.checkpoint import CheckpointError
-from sq_perception.learning.network_config import mirrored_planes
+from sq_perception.learning.network_config import RegressorConfig, ThingConfig, mirrored_planes
 from sq_perception.learning.shard_training import Subject
 from sq_perception.learning.thing_network import HullPrediction, ThingNetwork
-from sq_perception.learning.training_state import read_tensors
 from sq_perception.simulation.household import KINDS
 from sq_perception.simulation.thing_views import ThingViews, draw_thing_views
 
@@ -107,10 +106,11 @@ def begin_with(network: ThingNetwork, path: Path) -> None:
     Raises
     ------
     CheckpointError
-        If the file cannot be read, or nothing in it fits.
+        If the file cannot be read, is of another kind of network, or nothing in it fits.
     """
-    given = {name: tensor.float() for name, tensor in read_tensors(path).items()}
-    if "mixer.0.weight" not in given:  # a Regressor flattens there, and has one channel in and no plane
+    kind: type[Any] = ThingConfig if checkpoint.predicts_hulls(path) else RegressorConfig
+    given = {name: torch.from_numpy(array) for name, array in checkpoint.read(kind, path)[1].items()}
+    if kind is RegressorConfig:  # it flattens there, and has one channel in and no plane
         given = {n.replace("mixer.1.", "mixer.0.").replace("mixer.3.", "mixer.2."): given[n] for n in given}
     taken = 0
     with torch.no_grad():

@@ -11,6 +11,7 @@ from __future__ import annotations
 import copy
 import json
 import math
+import textwrap
 from dataclasses import astuple, dataclass, field
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -31,6 +32,8 @@ SETTINGS = "training"
 """Name, in the header of the file, of what a run is made of."""
 _CLIP = 1.0
 """Largest norm of the gradient."""
+_LONGEST = 240
+"""Characters of a reason."""
 
 
 def mixed_precision(device: str, wanted: bool) -> torch.autocast:
@@ -109,7 +112,8 @@ class TrainingState(Generic[Network]):
             if "held" in tensors:  # not in the states of 0.2.0
                 self.held = bytes(tensors["held"].tolist()).decode().splitlines()
         except (SafetensorError, OSError, KeyError, IndexError, RuntimeError, ValueError) as error:
-            raise CheckpointError(f"{self.path}: not the state of such a run: {error}") from error
+            reason = textwrap.shorten(str(error), _LONGEST)  # of another network's weights every one is named
+            raise CheckpointError(f"{self.path}: not the state of such a run: {reason}") from error
 
     def log(self, record: dict[str, Any]) -> None:
         """Add the numbers of a validation, by name, to the ``log.jsonl`` beside the file."""

@@ -18,9 +18,11 @@ from sq_perception.geometry.support_directions import DIRECTIONS, mirrored
 from sq_perception.imaging.canonical_view import NEAREST
 from sq_perception.learning import checkpoint, shard_training, thing_network, thing_training
 from sq_perception.learning.inference import ThingPredictor
+from sq_perception.learning.mask_network import MaskNetwork
 from sq_perception.learning.network_config import mirrored_planes
 from sq_perception.learning.thing_network import HullPrediction, ThingConfig, ThingNetwork
 from sq_perception.learning.training_config import THING_RUN
+from sq_perception.learning.training_state import TrainingState
 from sq_perception.simulation.thing_views import ThingViews, draw_thing_views
 
 SMALL = ThingConfig(widths=(8, 16, 16, 16), blocks=1, hidden=16, factors=2)
@@ -131,6 +133,20 @@ def test_it_begins_with_all_weights_of_another_of_its_kind(tmp_path: Path) -> No
     for name, weights in given.state_dict().items():
         # Files keep 11 bits.
         assert torch.allclose(weights.float(), network.state_dict()[name].float(), rtol=1e-3, atol=1e-4), name
+
+
+def test_it_begins_with_no_network_of_masks_and_no_other_goes_on_with_its_state(
+    tmp_path: Path, rng: np.random.Generator, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shards(tmp_path / "views", 3, rng)
+    run = ["train-things", str(tmp_path / "views"), "--output", str(tmp_path / "run"), "--batch", "2"]
+    assert main.main([*run, "--start", "masks"]) == main.FAILURE
+    assert "expected a header 'format: sq_perception.regressor', got 'sq_perception.masks'" in capsys.readouterr().err
+    TrainingState(tmp_path / "run" / "state.safetensors", MaskNetwork(), torch.optim.AdamW([torch.zeros(1)])).save()
+    assert main.main(run) == main.FAILURE
+    said = capsys.readouterr().err
+    assert "not the state of such a run" in said
+    assert len(said) < 500
 
 
 def test_weights_of_another_kind_are_refused(tmp_path: Path) -> None:
