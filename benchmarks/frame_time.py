@@ -35,7 +35,7 @@ import numba
 import numpy as np
 import report
 import torch
-from synthetic_tabletop import STAGES, SensedScene, scored, visible_shares
+from synthetic_tabletop import STAGES, SensedScene, scored, sensed
 
 from sq_perception.geometry import Superquadric
 from sq_perception.geometry import rotation as quaternions
@@ -44,7 +44,6 @@ from sq_perception.grasping.planner import grasps
 from sq_perception.grasping.surroundings import Surroundings
 from sq_perception.imaging.camera import Camera
 from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, RecoveryOptions
-from sq_perception.simulation import sensor_noise
 from sq_perception.simulation.scenes import Scene, inside_image
 
 SEED = 8100
@@ -141,11 +140,7 @@ def bodies_on_a_table(count: int, number: int) -> tuple[Superquadric, np.ndarray
 def frame(count: int, number: int, seen_by: Camera, sensor: str) -> SensedScene:
     """Scene ``number`` of ``count`` bodies through a sensor."""
     bodies, plane = bodies_on_a_table(count, number)
-    scene = Scene(bodies, seen_by, plane)
-    depth, labels = scene.render()
-    visible = visible_shares(scene, labels)
-    depth = sensor_noise.preset(sensor).measured(depth, seen_by, np.random.default_rng([SEED, count, number, 1]))
-    return SensedScene(scene, depth, np.where(np.isfinite(depth), labels, 0), visible)
+    return sensed(Scene(bodies, seen_by, plane), sensor, np.random.default_rng([SEED, count, number, 1]))
 
 
 def measured(recoverer: Recoverer, frames: list[SensedScene], setting: str, repeats: int) -> dict[str, Any]:

@@ -84,7 +84,11 @@ class FrameScore:
 def frame(number: int, sensor: str) -> SensedScene:
     """Scene ``number`` through a sensor."""
     rng = np.random.default_rng([SEED, number])
-    scene = crowded_scene(rng, int(rng.integers(BODIES[0], BODIES[1] + 1)))
+    return sensed(crowded_scene(rng, int(rng.integers(BODIES[0], BODIES[1] + 1))), sensor, rng)
+
+
+def sensed(scene: Scene, sensor: str, rng: np.random.Generator) -> SensedScene:
+    """A scene through a sensor."""
     depth, labels = scene.render()
     visible = visible_shares(scene, labels)
     if sensor == PLAIN:
