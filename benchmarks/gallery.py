@@ -38,7 +38,7 @@ from sq_perception.evaluation.plots import FAINT, WIRE, colour, draw_depth, draw
 from sq_perception.fitting.fit import Status
 from sq_perception.recovery.recoverer import FrameRecovery
 from sq_perception.simulation import sensor_noise
-from sq_perception.tracking.session import Followed, TrackingSession
+from sq_perception.tracking.session import Followed
 
 TRACKED = (1, 10, 30)
 TRACKED_SCENE = 2
@@ -130,23 +130,13 @@ def tracked(path: Path) -> Entry:
     """Sizes of tracked bodies and their deviations over 30 frames of a camera that goes about a table."""
     *_, shown = tracking.scenes(TRACKED_SCENE + 1, 1)
     row = tracking.Row(sensor_noise.preset("realsense_d435"), tracking.ARC)
-    session = TrackingSession()
-    kept: dict[int, tuple[tracking.View, FrameRecovery, tuple[Followed, ...]]] = {}
-    count = len(shown.bodies.size)
-    error, sigma, single = np.full((3, TRACKED[-1], count, 3), np.nan)
+    record = tracking.Record(TRACKED[-1])
+    kept: dict[int, tuple[tracking.View, tuple[Followed, ...]]] = {}
     for k, view in enumerate(tracking.views(shown, row, TRACKED[-1], np.random.default_rng(5))):
-        camera = view.scene.camera
-        frame = recoverer().recover(view.depth, camera)
-        followed = session.follow(frame.recovered, k / tracking.RATE, view.pose, camera=camera, depth=view.depth)
-        owner, _ = tracking.owners(view.labels, frame)
-        for j, index in owner.items():
-            truth = view.scene.bodies[j]
-            relative, order = tracking.size_errors(followed[index].superquadric, truth)
-            error[k, j] = 2e3 * relative * truth.size
-            sigma[k, j] = 2e3 * followed[index].sigma_size[order]
-            single[k, j] = 2e3 * tracking.size_errors(frame.recovered[index].superquadric, truth)[0] * truth.size
+        followed = record.follow(k, view, recoverer().recover(view.depth, view.scene.camera))
         if k + 1 in TRACKED:
-            kept[k + 1] = view, frame, followed
+            kept[k + 1] = view, followed
+    error, sigma, single = (2e3 * each * shown.bodies.size for each in (record.fused, record.sigma, record.single))
     # The body whose first view determines least.
     chosen = int(np.nanargmax(np.where(np.isfinite(sigma[0]).all(axis=-1), sigma[0].max(axis=-1), np.nan)))
     axis = int(sigma[0, chosen].argmax())
@@ -155,21 +145,20 @@ def tracked(path: Path) -> Entry:
         1, 2, width_ratios=[3, 1.02], wspace=0.075, left=0.004, right=0.99, top=0.905, bottom=0.085
     )
     axes = grid[0].subgridspec(1, len(kept), wspace=0.015).subplots()
-    for ax, (k, (view, _, followed)) in zip(axes, kept.items(), strict=True):
-        camera = view.scene.camera
+    for ax, (k, (view, followed)) in zip(axes, kept.items(), strict=True):
         draw_depth(ax, view.depth, window=TRACKED_WINDOW)
         bodies = [one.superquadric for one in followed]
-        draw_outlines(ax, bodies, camera, [colour(one.id - 1) for one in followed], width=1.5)
+        draw_outlines(ax, bodies, view.scene.camera, [colour(one.id - 1) for one in followed], width=1.5)
         heading_of(ax, f"Frame {k}", f"camera at {tracking.ARC * (k - 1) / (TRACKED[-1] - 1):.0f}°")
     course = figure.add_subplot(grid[1])
     _draw_course(course, error[:, chosen, axis], sigma[:, chosen, axis], single[:, chosen, axis])
     write_picture(figure, path)
-    births = session.tally.births
     steps = ", ".join(f"{error[k - 1, chosen, axis]:+.1f} ± {sigma[k - 1, chosen, axis]:.1f}" for k in TRACKED)
     return Entry(
         "Thirty frames of a moving camera",
-        f"{count} bodies, a stereo camera that goes {tracking.ARC:.0f} degrees about the table, its pose known; ids "
-        f"given: {births}. Right, the edge of which the first frame knows least: its error is {steps} mm after frames "
+        f"{tracking.BODIES} bodies, a stereo camera that goes {tracking.ARC:.0f} degrees about the table, its pose "
+        f"known; ids given: {record.session.tally.births}. Right, the edge of which the first frame knows least: its "
+        f"error is {steps} mm after frames "
         f"{', '.join(map(str, TRACKED))} (line: fused; dots: each frame by itself).",
     )
 

@@ -34,7 +34,7 @@ if __name__ == "__main__":
 
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import cv2
@@ -49,7 +49,7 @@ from sq_perception.simulation.scenes import Scene, table_scene
 from sq_perception.simulation.sensor_model import Ideal
 from sq_perception.simulation.sensor_noise import SensorNoise, preset
 from sq_perception.tracking.forms import TURNS
-from sq_perception.tracking.session import TrackingSession
+from sq_perception.tracking.session import Followed, TrackingSession
 
 BODIES = 5
 RANGE = (0.6, 1.0)
@@ -78,27 +78,6 @@ ROWS = {
 MASKS = ("given", "own")
 
 
-@dataclass
-class Record:
-    """What is kept of one scene: (frames, bodies, 3) with NaN where a body has no segment."""
-
-    fused: np.ndarray
-    sigma: np.ndarray
-    single: np.ndarray
-    switches: int = 0
-    split: int = 0
-    lost: int = 0
-    births: int = 0
-    milliseconds: list[float] = field(default_factory=list)
-
-    @classmethod
-    def empty(cls, frames: int) -> Record:
-        def nothing() -> np.ndarray:
-            return np.full((frames, BODIES, 3), np.nan)
-
-        return cls(nothing(), nothing(), nothing())
-
-
 @dataclass(frozen=True, eq=False)
 class View:
     """One frame: the scene in its optical frame, what it shows, and the camera's pose in the first frame's."""
@@ -108,6 +87,43 @@ class View:
     labels: np.ndarray
     visible: np.ndarray
     pose: tuple[np.ndarray, np.ndarray]
+
+
+class Record:
+    """What is kept of one scene: arrays (frames, bodies, 3) with NaN where a body has no segment, and counts."""
+
+    def __init__(self, frames: int) -> None:
+        self.fused, self.sigma, self.single = np.full((3, frames, BODIES, 3), np.nan)
+        self.switches = self.split = self.lost = 0
+        self.milliseconds: list[float] = []
+        self.session = TrackingSession()
+        self._ids: dict[int, int] = {}
+        self._cut: set[int] = set()
+
+    @property
+    def births(self) -> int:
+        return self.session.tally.births - BODIES
+
+    def follow(self, k: int, view: View, found: FrameRecovery) -> tuple[Followed, ...]:
+        """Track one frame, and keep its figures."""
+        started = time.process_time()
+        followed = self.session.follow(found.recovered, k / RATE, view.pose, camera=view.scene.camera, depth=view.depth)
+        self.milliseconds.append(1e3 * (time.process_time() - started))
+        owner, cut = owners(view.labels, found)
+        for j in range(BODIES):
+            if j not in owner:
+                self.lost += bool(view.visible[j] > VISIBLE)
+                continue
+            one, raw, truth = followed[owner[j]], found.recovered[owner[j]], view.scene.bodies[j]
+            self.fused[k, j], order = size_errors(one.superquadric, truth)
+            self.sigma[k, j] = one.sigma_size[order] / truth.size
+            self.single[k, j], _ = size_errors(raw.superquadric, truth)
+            if view.visible[j] > VISIBLE and self._ids.get(j, one.id) != one.id:
+                self.switches += 1
+                self.split += j in self._cut | cut
+            self._ids[j] = one.id
+        self._cut = cut
+        return followed
 
 
 def scenes(count: int, seed: int) -> Iterator[Scene]:
@@ -140,30 +156,6 @@ def views(shown: Scene, row: Row, frames: int, rng: np.random.Generator) -> Iter
         here, pose = moved(shown, row.arc * k / max(frames - 1, 1))
         depth, labels = here.render()
         yield View(here, row.sensor.measured(depth, here.camera, rng), labels, visible_shares(here, labels), pose)
-
-
-def follow(session: TrackingSession, record: Record, k: int, view: View, found: FrameRecovery, ids: dict[int, int],
-           cut: set[int]) -> None:  # fmt: skip
-    """Track one frame and keep its figures; ``ids`` and ``cut`` are of the frame before and are brought up to date."""
-    started = time.process_time()
-    followed = session.follow(found.recovered, k / RATE, view.pose, camera=view.scene.camera, depth=view.depth)
-    record.milliseconds.append(1e3 * (time.process_time() - started))
-    record.births = session.tally.births - BODIES
-    owner, now_cut = owners(view.labels, found)
-    for j in range(BODIES):
-        if j not in owner:
-            record.lost += bool(view.visible[j] > VISIBLE)
-            continue
-        one, raw, truth = followed[owner[j]], found.recovered[owner[j]], view.scene.bodies[j]
-        record.fused[k, j], order = size_errors(one.superquadric, truth)
-        record.sigma[k, j] = one.sigma_size[order] / truth.size
-        record.single[k, j], _ = size_errors(raw.superquadric, truth)
-        if view.visible[j] > VISIBLE and ids.get(j, one.id) != one.id:
-            record.switches += 1
-            record.split += j in cut | now_cut
-        ids[j] = one.id
-    cut.clear()
-    cut.update(now_cut)
 
 
 def size_errors(body: Superquadric, truth: Superquadric) -> tuple[np.ndarray, np.ndarray]:
@@ -218,14 +210,13 @@ def run(row: Row, count: int, frames: int, seed: int) -> dict[str, list[Record]]
     kept: dict[str, list[Record]] = {masks: [] for masks in MASKS}
     for number, shown in enumerate(scenes(count, seed)):
         recoverer.warm_up(shown.camera)
-        state = {masks: (TrackingSession(), Record.empty(frames), {}, set()) for masks in MASKS}
+        records = {masks: Record(frames) for masks in MASKS}
         for k, view in enumerate(views(shown, row, frames, np.random.default_rng([seed, number, 1]))):
-            for masks, (session, record, ids, cut) in state.items():
+            for masks, record in records.items():
                 labels = view.labels if masks == "given" else None
-                found = recoverer.recover(view.depth, shown.camera, labels)
-                follow(session, record, k, view, found, ids, cut)
+                record.follow(k, view, recoverer.recover(view.depth, shown.camera, labels))
         for masks in MASKS:
-            kept[masks].append(state[masks][1])
+            kept[masks].append(records[masks])
     return kept
 
 
