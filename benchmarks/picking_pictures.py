@@ -29,8 +29,6 @@ from sq_perception.evaluation import plots
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.grasping.plan import GraspPlan
-from sq_perception.grasping.planner import grasps
-from sq_perception.grasping.surroundings import Surroundings
 from sq_perception.imaging.camera import Camera
 from sq_perception.recovery.recoverer import Recoverer
 from sq_perception.simulation.rendering import render_things
@@ -56,14 +54,12 @@ def scenes(path: Path, seed: int, recoverer: Recoverer) -> None:
     figure = plots.new_figure(13.0, 5.1)
     for column, kind in enumerate(KINDS):
         scene = picking_scenes.scene(kind, seed)
-        depth = picking_scenes.observed(scene.world(), scene.sensor, np.random.default_rng([seed, 1]))
-        found = recoverer.recover(depth, TABLE_CAMERA)
-        bodies = [one.superquadric for one in found.recovered]
-        covariance = np.array([one.covariance for one in found.recovered])
-        around = Surroundings.of_image(depth, TABLE_CAMERA, found.plane)
-        plan = grasps(Superquadric.stack(bodies), GRIPPER, covariance, around)
+        world = scene.world()
+        depth = picking_scenes.observed(world, scene.sensor, np.random.default_rng([seed, 1]))
+        seen = picking_contestants.Seen(depth, recoverer.recover(depth, TABLE_CAMERA), world)
+        bodies = [one.superquadric for one in seen.recovery.recovered]
         ax = figure.add_axes((0.5 * column + 0.003, 0.0, 0.494, 1.0))
-        _draw(ax, depth, bodies, plan, f"{kind}, {scene.sensor}")
+        _draw(ax, depth, bodies, GraspPlan(picking_contestants.ours(seen)), f"{kind}, {scene.sensor}")
     plots.save(figure, path, dots_per_inch=90)
 
 
