@@ -29,7 +29,8 @@ if __name__ == "__main__":
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 from unittest.mock import patch
@@ -68,16 +69,6 @@ class Seen:
     hull: np.ndarray
 
 
-@dataclass(frozen=True)
-class Row:
-    """One way to fit: what is changed in the options, in the predicted hull, and in the program."""
-
-    name: str
-    options: dict[str, Any]
-    hull: Callable[[HullPrior, Seen], HullPrior | None]
-    program: Callable[[], AbstractContextManager[Any]]
-
-
 def _same(hull: HullPrior, _: Seen) -> HullPrior:
     return hull
 
@@ -87,33 +78,36 @@ def _true(hull: HullPrior, seen: Seen) -> HullPrior:
     return replace(hull, support=(seen.hull @ hull.directions.T).max(axis=0), covariance=exact)
 
 
-def rows() -> tuple[Row, ...]:
-    def row(
-        name: str,
-        hull: Callable[[HullPrior, Seen], HullPrior | None] = _same,
-        program: Callable[[], AbstractContextManager[Any]] = nullcontext,
-        **options: Any,
-    ) -> Row:
-        return Row(name, options, hull, program)
+def _rays(count: float) -> AbstractContextManager[Any]:
+    return patch.object(tolerant, "INDEPENDENT_OF_PREDICTED", count)
 
-    def rays(count: float) -> Callable[[], AbstractContextManager[Any]]:
-        return lambda: patch.object(tolerant, "INDEPENDENT_OF_PREDICTED", count)
 
-    return (
-        row("whole"),
-        row("no predicted hull", hull=lambda *_: None),
-        row("no covariance", hull=lambda h, _: replace(h, covariance=np.diag(np.diag(h.covariance)))),
-        row("twice as vague", hull=lambda h, _: replace(h, covariance=4 * h.covariance)),
-        row("twice as sure", hull=lambda h, _: replace(h, covariance=h.covariance / 4)),
-        row("every ray counts", program=rays(1000.0)),
-        row("as a body", program=lambda: patch.multiple(Observation, of_hull=lambda self: self)),
-        row("no plane", plane=None),
-        row("no plane, exactly", program=lambda: patch.object(surface_fit, "_fills", lambda _: True), plane=None),
-        row("no free space", nan_is_empty=False),
-        row("missing is empty", nan_is_empty=True),
-        row("hull alone", program=rays(3.0)),
-        row("true hull", hull=_true),
-    )
+@dataclass(frozen=True)
+class Row:
+    """One way to fit: what is changed in the predicted hull, in the program, and in the options."""
+
+    name: str
+    hull: Callable[[HullPrior, Seen], HullPrior | None] = _same
+    program: Callable[[], AbstractContextManager[Any]] = nullcontext
+    options: dict[str, Any] = field(default_factory=dict)
+
+
+ROWS = (
+    Row("whole"),
+    Row("no predicted hull", hull=lambda *_: None),
+    Row("no covariance", hull=lambda h, _: replace(h, covariance=np.diag(np.diag(h.covariance)))),
+    Row("twice as vague", hull=lambda h, _: replace(h, covariance=4 * h.covariance)),
+    Row("twice as sure", hull=lambda h, _: replace(h, covariance=h.covariance / 4)),
+    Row("every ray counts", program=partial(_rays, 1000.0)),
+    Row("as a body", program=lambda: patch.multiple(Observation, of_hull=lambda self: self)),
+    Row("no plane", options={"plane": None}),
+    Row("no plane, exactly", program=lambda: patch.object(surface_fit, "_fills", lambda _: True),
+        options={"plane": None}),
+    Row("no free space", options={"nan_is_empty": False}),
+    Row("missing is empty", options={"nan_is_empty": True}),
+    Row("hull alone", program=partial(_rays, 3.0)),
+    Row("true hull", hull=_true),
+)  # fmt: skip
 
 
 def iou(seen: Seen, columns: Columns, row: Row) -> float:
@@ -184,7 +178,7 @@ def compared(things: list[Seen]) -> dict[str, Any]:
     kinds = np.array([seen.kind for seen in things])
     result: dict[str, Any] = {}
     first = None
-    for row in rows():
+    for row in ROWS:
         ious = 100 * np.array([iou(seen, each, row) for seen, each in zip(things, columns, strict=True)])
         first = ious if first is None else first
         difference = ious - first
