@@ -68,7 +68,7 @@ setup(
     name=NAME,
     version="0.2.0",
     description="Superquadrics from depth images: a network, exact fits and ROS 2 nodes",
-    long_description=Path(__file__).with_name("README.md").read_text(encoding="utf-8"),
+    long_description=Path(__file__).resolve().with_name("README.md").read_text(encoding="utf-8"),
     long_description_content_type="text/markdown",
     author="sq_perception maintainers",
     author_email="sq-perception@example.org",

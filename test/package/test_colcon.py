@@ -17,15 +17,13 @@ PACKAGE = "sq_perception"
 EXECUTABLES = ("recover_node", "recover_cameras", "fitter_node", "grasp_node", "synthetic_depth_node", "sq-perception")
 
 
-@pytest.fixture(scope="module")
-def install(source_copy: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def built(source: Path, workspace: Path, *options: str) -> Path:
     """The install folder of a workspace with this package in src/."""
-    workspace = tmp_path_factory.mktemp("workspace")
-    shutil.copytree(source_copy, workspace / "src" / PACKAGE)
+    shutil.copytree(source, workspace / "src" / PACKAGE)
     environment = {**os.environ, "COLCON_HOME": str(workspace / "home"), "COLCON_LOG_LEVEL": "30"}
     environment["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ["PATH"]])
     result = subprocess.run(
-        [sys.executable, "-m", "colcon", "build", "--base-paths", "src", "--executor", "sequential"],
+        [sys.executable, "-m", "colcon", "build", "--base-paths", "src", "--executor", "sequential", *options],
         cwd=workspace,
         env=environment,
         capture_output=True,
@@ -35,6 +33,11 @@ def install(source_copy: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
     assert result.returncode == 0, result.stdout + result.stderr
     assert f"Finished <<< {PACKAGE}" in result.stdout
     return workspace / "install"
+
+
+@pytest.fixture(scope="module")
+def install(source_copy: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return built(source_copy, tmp_path_factory.mktemp("workspace"))
 
 
 def sourced(install: Path, command: list[str], cwd: Path) -> subprocess.CompletedProcess[str]:
@@ -87,6 +90,15 @@ def test_share_is_complete(install: Path) -> None:
     ):
         assert (share / PACKAGE / name).is_file(), name
     assert list((share / PACKAGE / "config").glob("*.yaml"))
+
+
+def test_a_workspace_of_links_is_whole(source_copy: Path, tmp_path: Path) -> None:
+    """There setup.py is a link in another folder, with the packages and data files beside it and nothing else."""
+    prefix = built(source_copy, tmp_path, "--symlink-install") / PACKAGE
+    assert (prefix / "share" / PACKAGE / "launch/recover.launch.py").samefile(
+        tmp_path / "src" / PACKAGE / "launch_scripts/recover.launch.py"
+    )
+    assert all(os.access(prefix / "lib" / PACKAGE / name, os.X_OK) for name in EXECUTABLES)
 
 
 def test_the_sourced_workspace_is_on_the_ament_path(install: Path, tmp_path: Path) -> None:
