@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import ctypes
 import gc
+import importlib.util
 import os
 import signal
 import sys
@@ -63,6 +64,10 @@ def run(name: str, create: Callable[[], Iterable[Stoppable]], arguments: Sequenc
     ``create`` imports what the nodes need, so that a signal during seconds of imports finds this function in charge.
     Nodes that it has yielded are closed also where a later one cannot be made.
     """
+    if importlib.util.find_spec("rclpy") is None:
+        remedy = "pip install 'sq_perception[ros]', or source a ROS 2 Jazzy installation"
+        print(f"{name} needs ROS 2 in Python: {remedy}", file=sys.stderr)
+        return 1
     stop = _Stop()
     for number in _SIGNALS:
         signal.signal(number, stop)

@@ -69,6 +69,15 @@ def test_what_is_kept_is_not_looked_at_until_it_is_released():
     assert ghost() is None
 
 
+def test_without_rclpy_a_node_says_what_is_missing():
+    code = "import sys; sys.modules['rclpy'] = None; from sq_perception.nodes import executables; "
+    for node in ("recover_node()", "grasp_node()", "recover_cameras(['front'])"):
+        command = [sys.executable, "-c", f"{code} sys.exit(executables.{node})"]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=600, check=False)
+        assert (done.returncode, done.stderr.count("\n")) == (1, 1), done.stderr
+        assert "needs ROS 2 in Python: pip install 'sq_perception[ros]'" in done.stderr
+
+
 HEAPS = """
 import ctypes, threading
 from sq_perception.nodes import process
