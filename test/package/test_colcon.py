@@ -32,6 +32,7 @@ def built(source: Path, workspace: Path, *options: str) -> Path:
     )
     assert result.returncode == 0, result.stdout + result.stderr
     assert f"Finished <<< {PACKAGE}" in result.stdout
+    assert "Deprecat" not in result.stderr
     return workspace / "install"
 
 
