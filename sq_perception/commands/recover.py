@@ -34,7 +34,7 @@ EPILOG = """\
 methods:
   auto       the network and central symmetry start an exact surface fit (best)
   symmetry   the same fit, without the network
-  network    the network alone, unrefined (fastest)
+  network    the network alone
   classic    Solina and Bajcsy's fit to the points
 
 examples:
