@@ -117,6 +117,7 @@ setup(
         "picking": picking,
         "docs": docs,
         "test": [
+            "torch==2.13.0",  # one release for all tests; after `train` pip would fetch the newest one first
             *bags,
             *cluster,
             *exr,
@@ -124,7 +125,6 @@ setup(
             *view,
             *picking,
             *docs,
-            "torch==2.13.0",  # one release for all tests; the newest one may fetch several GB
             "pytest>=7,<8.4",  # later ones break the launch_testing plugins of a ROS installation
             "hypothesis>=6",
             "jsonschema>=4.18",  # what recover writes against its schema
