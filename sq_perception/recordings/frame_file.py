@@ -268,7 +268,7 @@ def _read(
             "for grey images of the thesis' kind choose the orthographic projection"
         )
     if camera_info is None:
-        raise ValueError("a depth image needs a camera_info file with the camera's intrinsics")
+        raise ValueError("a depth image needs a camera_info with the camera's intrinsics, a file or fx,fy,cx,cy")
     size = image.shape[1], image.shape[0]
     calibration = read_calibration(camera_info, distortion, path.with_suffix("").as_posix(), size)
     scale, warnings = 1.0 if is_metric else MILLIMETRES, [f"{camera_info}: {calibration.note}"] * bool(calibration.note)
