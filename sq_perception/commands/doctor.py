@@ -25,6 +25,7 @@ _EXTRAS = {
     "ros": ("rclpy", "sensor_msgs", "visualization_msgs"),
 }
 """The modules of each extra."""
+_CANNOT = "cannot be loaded"
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -61,7 +62,8 @@ def findings() -> Iterator[tuple[str, str, bool]]:
     if distro := os.environ.get("ROS_DISTRO"):
         yield "ROS", f"{distro}, sourced", False
     yield "weights", *_weights()
-    yield "kernels", _kernels(), False
+    kernels = _kernels()
+    yield "kernels", kernels, kernels.startswith(_CANNOT)
 
 
 def _requirements() -> list[str]:
@@ -81,7 +83,7 @@ def _kernels() -> str:
     try:
         from sq_perception.geometry import kernels
     except ImportError as error:
-        return f"cannot be loaded: {error}"
+        return f"{_CANNOT}: {error}"
     gauge: Any = kernels.gauge
     folder, changed = Path(gauge.stats.cache_path), Path(kernels.__file__).stat().st_mtime
     kept = list(folder.glob("kernels.gauge_????????????-*.nbi"))

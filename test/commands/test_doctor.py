@@ -28,6 +28,14 @@ def test_what_is_missing_comes_with_its_remedy(monkeypatch, capsys):
     assert "missing: pip install 'no-such-package>=3'" in said
 
 
+def test_sources_without_their_requirements_are_a_fault():
+    """Run from a checkout nothing says what is required, but the kernels cannot be loaded."""
+    code = "import sys; sys.modules['numba'] = None; from sq_perception.commands.doctor import main; sys.exit(main([]))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=600, check=False)
+    assert done.returncode == 1
+    assert "cannot be loaded: " in done.stdout
+
+
 def test_kernels_of_other_sources_are_told_from_none(tmp_path):
     """As after an update, whose digest is another one, and after an edit, which is younger than the code."""
     code = """
