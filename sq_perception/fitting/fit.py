@@ -22,6 +22,7 @@ class Status(IntEnum):
     """How far a recovery can be trusted; the numbers travel in messages and never change."""
 
     CONVERGED = 0
+    """Each half size is known to 15 % or better, as far as the fit determines it."""
     WEAK = 1
     """Converged, but the view does not determine every quantity, or part of a thing sticks out: see the message."""
     FAILED = 2
