@@ -98,7 +98,8 @@ def file_size_limit() -> Callable[[int], AbstractContextManager[None]]:
 def source_copy(repository: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A copy of the source tree, so that builds leave nothing in the tree itself."""
     target = tmp_path_factory.mktemp("source") / "sq_perception"
-    generated = ("build", "install", "log", "dist", "site", "runs", "*.egg-info", "__pycache__", ".*")
+    hidden = (".git", ".venv*", ".*cache", ".hypothesis")
+    generated = ("build", "install", "log", "dist", "site", "runs", "*.egg-info", "__pycache__", *hidden)
     shutil.copytree(repository, target, ignore=shutil.ignore_patterns(*generated))
     for made in ("demo.png", "demo.glb", "demo.json"):  # by `make demo`; the documents have pictures of that name
         (target / made).unlink(missing_ok=True)
