@@ -9,7 +9,7 @@ A square window of the image about the segment, larger than its longer side L by
     segment     1 within it
     others      1 within other segments
     image       1 where the image is
-    scale       log(s / 0.2 m)
+    scale       log(s / 0.2 m), of the largest s that things have in training for what is larger
     grain       log of the pixels to a cell's side
     plane       1 if there is a support plane
 
@@ -33,6 +33,10 @@ MEASURED, HEIGHT, SEGMENT, OTHERS, IMAGE, SCALE, PLANE = 0, 2, 3, 4, 5, 6, 8
 """Channels that others than the network look at."""
 USUAL_SIDE = 0.2
 """Metres; that the channel of the scale is 0 for it."""
+_LARGEST = 0.3
+"""The same: larger in training were walls and furniture, for which the network takes all that is.  Of 226 household
+things of three times their size before a simulated D435 it misses 31 %, not 45 %, of 1010 of their own size 8 % either
+way."""
 _WIDER, _MORE = 1.5, 8
 """The window's side in that of the segment, and pixels beyond."""
 _HEIGHTS = (-0.3, 1.5)
@@ -125,5 +129,5 @@ def from_segment(
     image[..., SEGMENT] = shown == label
     image[..., OTHERS] = (shown > 0) & (shown != label)
     image[..., IMAGE] = within
-    image[..., 6:] = np.log(scale / USUAL_SIDE), np.log(side / PIXELS), plane is not None
+    image[..., 6:] = np.log(min(scale, _LARGEST) / USUAL_SIDE), np.log(side / PIXELS), plane is not None
     return SegmentView(image, rows, columns, left, top, side)

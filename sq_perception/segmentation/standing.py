@@ -47,6 +47,9 @@ _BUMP, _ON_WALL = 6.0, 3.5
 """A thing rises so many deviations of the support's own points above it, as they are beside the thing, and is that far
 off any other plane; pixels within so many of another plane are a part of that.  Of normal noise 0.05 % lies beyond 3.5;
 a bump of correlated noise seldom reaches 6, and of 374 simulated things that were found one does not."""
+_TALL = 20.0
+"""Deviations of the support's points, and no more than ``HIGHEST`` tolerances: a segment that is higher on average is no
+noise beside another one, even where little noise or a long way makes things low against the tolerance."""
 _SMEARED, _BESIDE = 2, 12
 """Pixels about a segment that a sensor smears, and up to which the support is beside it; 5 to 20 do as well."""
 _FACE_SHARE = 0.5
@@ -193,7 +196,7 @@ def standing(
     """
     last_row, last_column = camera.height - 1, camera.width - 1
     measured = np.count_nonzero(depth)
-    around = (depth > 0) & ~_tall(labels, relative)
+    around = (depth > 0) & ~_tall(labels, relative, support.sigma)
     coarse = depth[::_SPARSE, ::_SPARSE]
     nearest = quantile(coarse[coarse > 0], _STRAY) * (1 + depth_steps.STEP) if coarse.any() else 0.0
     plane = support.plane
@@ -227,20 +230,21 @@ def standing(
     return is_thing
 
 
-def _tall(labels: np.ndarray, relative: np.ndarray) -> np.ndarray:
+def _tall(labels: np.ndarray, relative: np.ndarray, sigma: float) -> np.ndarray:
     """Pixels, bool (height, width), of segments that are higher than any noise, on average: things or the room."""
-    return np.asarray(_higher(labels, relative, int(labels.max(initial=0)) + 1))
+    limit = float(min(HIGHEST * TOLERANCE, _TALL * sigma))
+    return np.asarray(_higher(labels, relative, int(labels.max(initial=0)) + 1, limit))
 
 
 @kernel
-def _higher(labels: np.ndarray, relative: np.ndarray, count: int) -> np.ndarray:
+def _higher(labels: np.ndarray, relative: np.ndarray, count: int, limit: float) -> np.ndarray:
     sums, pixels = np.zeros(count), np.zeros(count)
     for v in range(labels.shape[0]):
         for u in range(labels.shape[1]):
             if labels[v, u] > 0:
                 sums[labels[v, u]] += relative[v, u]
                 pixels[labels[v, u]] += 1
-    is_high = sums > HIGHEST * TOLERANCE * pixels
+    is_high = sums > limit * pixels
     found = np.empty(labels.shape, np.bool_)
     for v in range(labels.shape[0]):
         for u in range(labels.shape[1]):

@@ -221,6 +221,15 @@ def test_the_floor_behind_a_table_is_no_object(shipped: Any) -> None:
     np.testing.assert_array_equal(found.labels, truth)
 
 
+@pytest.mark.parametrize("times", [1, 4])
+def test_what_is_larger_than_all_of_a_household_is_an_object(shipped: Any, times: float) -> None:
+    """All lengths are multiplied: a crate at the height of a palletizer's camera instead of a can."""
+    depth, truth = seen([standing(0, 0, *CAN)])
+    plane = PLANE * np.array([1.0, 1.0, 1.0, times])
+    far = (times * depth).astype(np.float32)
+    assert of(shipped, far, plane=plane).improved(segmentation(truth)).found.ids == (1,)
+
+
 def test_no_segments_ask_nothing() -> None:
     depth, truth = seen([standing(0, 0, *CAN)])
     network = GivenLogits(lambda views: views)

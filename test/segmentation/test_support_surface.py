@@ -293,15 +293,17 @@ def test_the_largest_edge_is_that_of_the_box_and_not_its_diagonal(turn):
     assert standing.largest_edge(wild, up) == pytest.approx(0.4, rel=0.08)
 
 
-def test_tall_neighbours_are_not_taken_for_each_other_s_noise():
+@pytest.mark.parametrize(("away", "sigma"), [(1.0, 1e-3), (3.0, 2e-4)])
+def test_tall_neighbours_are_not_taken_for_each_other_s_noise(away, sigma):
     """Slanted blocks of 12 cm side by side from border to border of an image: around each there are only others."""
     camera = Camera(160, 60, 270.0, 270.0, 79.5, 29.5)
-    depth = np.tile(1 - np.linspace(0, 0.12, 40), (60, 4)).astype(np.float32)
+    depth = np.tile(away - np.linspace(0, 0.12, 40), (60, 4)).astype(np.float32)
     labels = np.tile(np.repeat(np.arange(1, 5, dtype=np.int32), 40), (60, 1))
-    table = support_plane.Plane(np.array([0.0, 0.0, -1.0, 1.0]), 1.0, 1e-3)
-    support = support_surface.SupportSurface(table, np.zeros(6), 0.0, 1e-3)
+    table = support_plane.Plane(np.array([0.0, 0.0, -1.0, away]), 1.0, sigma)
+    support = support_surface.SupportSurface(table, np.zeros(6), 0.0, sigma)
     relative = support.image_relative(depth, camera)
-    is_thing = standing.standing(depth, relative, labels, camera, support, [], standing.Limits(0.6, None, None))
+    limits = standing.Limits(0.9 * away, None, None)
+    is_thing = standing.standing(depth, relative, labels, camera, support, [], limits)
     assert all(is_thing(*np.nonzero(labels == k)) for k in range(1, 5))
 
 
