@@ -48,8 +48,8 @@ _BUMP, _ON_WALL = 6.0, 3.5
 off any other plane; pixels within so many of another plane are a part of that.  Of normal noise 0.05 % lies beyond 3.5;
 a bump of correlated noise seldom reaches 6, and of 374 simulated things that were found one does not."""
 _TALL = 20.0
-"""Deviations of the support's points, and no more than ``HIGHEST`` tolerances: a segment that is higher on average is no
-noise beside another one, even where little noise or a long way makes things low against the tolerance."""
+"""Deviations of the support's points, and no more than ``HIGHEST`` tolerances: a segment that is higher on average is
+no noise beside another one, even where little noise or a long way makes things low against the tolerance."""
 _SMEARED, _BESIDE = 2, 12
 """Pixels about a segment that a sensor smears, and up to which the support is beside it; 5 to 20 do as well."""
 _FACE_SHARE = 0.5

@@ -43,7 +43,10 @@ def test_cells_show_the_pixels_under_their_middles() -> None:
     np.testing.assert_allclose(shown.image[known][:, HEIGHT], (1.0 - depth[grid][known]) / scale, atol=1e-6)
     assert (shown.image[~known][:, [NEARNESS, HEIGHT]] == 0).all()
     assert (shown.image[..., [IMAGE, PLANE]] == 1).all()
-    np.testing.assert_allclose(shown.image[..., SCALE], np.log(scale / 0.2), rtol=1e-6)
+    assert scale > 0.3
+    np.testing.assert_allclose(shown.image[..., SCALE], np.log(0.3 / 0.2), rtol=1e-6)
+    near = segment_view.from_segment(depth / 2, labels, 1, WINDOW, CAMERA, None)
+    np.testing.assert_allclose(near.image[..., SCALE], np.log(scale / 2 / 0.2), rtol=1e-6)
     np.testing.assert_allclose(shown.image[..., GRAIN], np.log(shown.side / PIXELS), rtol=1e-6)
 
 
