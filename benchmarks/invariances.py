@@ -1,4 +1,4 @@
-"""What must not matter: the roll of the camera, and given masks that are some pixels too small or too large.
+"""What must not matter: the camera's roll, masks that are some pixels too small or too large, the size of the world.
 
     python benchmarks/invariances.py [--scenes 70] [--first 30000] [--name invariances]
 
@@ -6,6 +6,8 @@ Scenes of :mod:`household_things`, as they are and with one thing changed:
 
     roll    the camera is turned by 90, 180 and 270 degrees about its optical axis
     masks   the given ones are 1 to 3 pixels smaller, or larger where there is no other thing
+    size    all lengths are multiplied, before another sensor, whose noise is that of the distance: blocks of some
+            centimetres at 0.3 m, crates at 3 m; ``max_size`` grows with them
 
 Counted are things at least half visible, with 200 pixels and half of them measured.  IoU is with the convex hull, 0
 where there is no body or a failed one, and by its own segments where masks are ``own``, matched as in
@@ -27,11 +29,16 @@ import household_things
 import numpy as np
 import report
 import scene_verdict
+from mesh_things import MeshThing
 from tabletop import Tabletop
 
+import sq_perception as sq
 from sq_perception.imaging.camera import Camera
+from sq_perception.simulation import sensor_noise
 
 AS_IT_IS = "as it is"
+SIZES = {"realsense_d435": (0.4, 0.7, 1.0, 2.0, 3.0), "azure_kinect": (1.0, 2.0, 3.0)}
+_MAX_SIZE = sq.RecoveryOptions().max_size
 
 
 @dataclass(frozen=True)
@@ -41,6 +48,7 @@ class Row:
     name: str
     masks: str
     change: Callable[[Tabletop], Tabletop]
+    times: float = 1.0
 
 
 def rolled(scene: Tabletop, quarters: int) -> Tabletop:
@@ -77,18 +85,40 @@ def misfit(scene: Tabletop, pixels: int) -> Tabletop:
     return replace(scene, labels=labels)
 
 
+def resized(scene: Tabletop, times: float, sensor: str) -> Tabletop:
+    """With all lengths multiplied, as a sensor sees it."""
+    rng, true_depth = np.random.default_rng([scene.seed]), times * scene.true_depth
+    depth = sensor_noise.preset(sensor).measured(true_depth, scene.camera, rng)
+    plane = scene.plane * np.array([1.0, 1.0, 1.0, times])
+    placed = tuple(
+        replace(one, thing=resized_thing(one.thing, times), translation=times * one.translation) for one in scene.placed
+    )
+    return replace(scene, sensor=sensor, depth=depth, true_depth=true_depth, plane=plane, placed=placed)
+
+
+def resized_thing(thing: MeshThing, times: float) -> MeshThing:
+    mesh = thing.mesh.copy().apply_scale(times)
+    return MeshThing(thing.kind, thing.name, mesh, times * thing.hull, times * thing.edges, ())
+
+
 def rows() -> list[Row]:
     found = [Row(AS_IT_IS, masks, lambda scene: scene) for masks in ("given", "own")]
     for masks in ("given", "own"):
         found += [Row(f"roll {90 * k}", masks, partial(rolled, quarters=k)) for k in (1, 2, 3)]
-    return found + [Row(f"masks {k:+d} pixels", "given", partial(misfit, pixels=k)) for k in (-3, -2, -1, 1, 2, 3)]
+    found += [Row(f"masks {k:+d} pixels", "given", partial(misfit, pixels=k)) for k in (-3, -2, -1, 1, 2, 3)]
+    for masks in ("given", "own"):
+        for sensor, sizes in SIZES.items():
+            changes = {k: partial(resized, times=k, sensor=sensor) for k in sizes}
+            found += [Row(f"size x {k:g}, {sensor}", masks, change, k) for k, change in changes.items()]
+    return found
 
 
 def answers(scene: Tabletop, counted: list[int], row: Row) -> list[scene_verdict.Answer]:
     """Of the counted things of a scene, changed as a row says."""
     changed = row.change(scene)
     given = changed.labels if row.masks == "given" else None
-    frame = scene_verdict.recoverer().recover(changed.depth, changed.camera, given)
+    limits = sq.RecoveryOptions(max_size=_MAX_SIZE * max(1.0, row.times))
+    frame = scene_verdict.recoverer().recover(changed.depth, changed.camera, given, limits)
     known = {label: label for label in counted}
     if given is None:
         known = scene_verdict.matches(frame.labels, np.where(np.isfinite(changed.depth), changed.labels, 0))

@@ -149,7 +149,7 @@ class Recoverer:
         Parameters
         ----------
         depth : float (height, width)
-            Metres in the optical frame; NaN, inf, less than 0, of a pinhole camera 0 too: nothing measured.
+            Metres in the optical frame; NaN, inf, masked, less than 0, of a pinhole camera 0 too: nothing measured.
         camera : Camera
         labels : integer (height, width), optional
             Instance masks, 0 for background; without them the image is segmented.
@@ -184,7 +184,7 @@ class Recoverer:
             network = self._load_network(camera.is_pinhole and options.method == "auto")
 
         with timed(milliseconds, "segmentation"):
-            depth = _plausible(np.asarray(depth), camera)
+            depth = _plausible(np.ma.filled(depth, np.nan), camera)
             camera.check_image(depth)
             cleaned, kept = _cleaned(depth, camera), continuity.NOTHING
             if previous is not None:

@@ -202,6 +202,16 @@ def test_half_precision_is_read_as_single_precision(symmetry):
     np.testing.assert_array_equal(half.bodies[0].superquadric.to_flat(), single.bodies[0].superquadric.to_flat())
 
 
+def test_masked_readings_are_none(symmetry):
+    depth, labels = seen(random_bodies(1, 3), CAMERA, background=1.4)
+    wrong = np.zeros(depth.shape, bool)
+    wrong[::3] = True
+    spoilt = np.where(wrong, 0.5 * depth, depth)
+    masked, missing = np.ma.masked_array(spoilt, wrong), np.where(wrong, np.nan, depth)
+    found, known = (symmetry.recover(image, CAMERA, labels).bodies[0].superquadric for image in (masked, missing))
+    np.testing.assert_array_equal(found.to_flat(), known.to_flat())
+
+
 @pytest.mark.parametrize("method", ["symmetry", "classic", "auto", "network"])
 @pytest.mark.parametrize("projection", ["pinhole", "orthographic"])
 def test_no_depth_value_raises(method, projection, weights):
