@@ -25,7 +25,6 @@ _EXTRAS = {
     "ros": ("rclpy", "sensor_msgs", "visualization_msgs"),
 }
 """The modules of each extra."""
-_CANNOT = "cannot be loaded"
 
 
 def main(arguments: Sequence[str]) -> int:
@@ -62,8 +61,7 @@ def findings() -> Iterator[tuple[str, str, bool]]:
     if distro := os.environ.get("ROS_DISTRO"):
         yield "ROS", f"{distro}, sourced", False
     yield "weights", *_weights()
-    kernels = _kernels()
-    yield "kernels", kernels, kernels.startswith(_CANNOT)
+    yield "kernels", *_kernels()
 
 
 def _requirements() -> list[str]:
@@ -78,16 +76,16 @@ def _weights() -> tuple[str, bool]:
     return (", ".join(path.stem for path in found) or "missing: install the package again", not found)
 
 
-def _kernels() -> str:
+def _kernels() -> tuple[str, bool]:
     """Whether code of these sources is kept: names of files end in a digest of them, and older files are not used."""
     try:
         from sq_perception.geometry import kernels
     except ImportError as error:
-        return f"{_CANNOT}: {error}"
+        return f"cannot be loaded: {error}", True
     gauge: Any = kernels.gauge
     folder, changed = Path(gauge.stats.cache_path), Path(kernels.__file__).stat().st_mtime
     kept = list(folder.glob("kernels.gauge_????????????-*.nbi"))
     if any(gauge.py_func.__qualname__ in file.name and file.stat().st_mtime > changed for file in kept):
-        return f"compiled, in {folder}"
+        return f"compiled, in {folder}", False
     why = "compiled for other sources" if kept else "not compiled yet"
-    return f"{why}: sq-perception warm-up; they go to {folder}"
+    return f"{why}: sq-perception warm-up; they go to {folder}", False
