@@ -35,8 +35,8 @@ USUAL_SIDE = 0.2
 """Metres; that the channel of the scale is 0 for it."""
 _LARGEST = 0.3
 """Metres of s that the network is told at most: larger in training were walls and furniture, for which it takes all
-that is.  Of 226 household things of three times their size before a simulated D435 31 % are missed, not 45 %, of 1010 of
-their own size 8 % either way."""
+that is.  Of 226 household things of three times their size before a simulated D435 31 % are missed, not 45 %, of 1010
+of their own size 8 % either way."""
 _WIDER, _MORE = 1.5, 8
 """The window's side in that of the segment, and pixels beyond."""
 _HEIGHTS = (-0.3, 1.5)

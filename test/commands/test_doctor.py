@@ -50,7 +50,7 @@ said += [doctor._kernels()[0]]
 os.utime(file, (0, 0))
 said += [doctor._kernels()[0]]
 file.rename(file.with_name("kernels.gauge_0123456789ab-1.nbi"))
-print(*said, doctor._kernels(), sep="\\n")
+print(*said, doctor._kernels()[0], sep="\\n")
 """
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path)}
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
