@@ -72,7 +72,7 @@ benchmarks/household_things, and neither did the deeper boxes."""
 _INNER_CAUCHY = 1.0
 """Noise levels behind the surface of a hull, beyond which a point hardly counts."""
 _AS_HULL = ("like the convex hull of the object",)
-_SPREAD = 2.5**2
+SPREAD = 2.5**2
 """Factor of the covariance for things that are no superquadrics, whose errors are alike."""
 _HUBER, _HUBER_OF_PREDICTED = 2.0, 1.0
 """Noise levels; what strays farther from a superquadric is another part of the thing: a neck, a handle.  Where the
@@ -115,7 +115,7 @@ def _best(problem: Problem, starts: Sequence[State]) -> Solution:
 
 def _refined(problem: Problem, settled: Sequence[State]) -> Solution:
     rays = draw(problem, problem.options.pixels or SAMPLE, 0.3)
-    return Solution(problem, refined_best(problem, settled, rays, 2 * REFINE_STEPS), rays, spread_factor=_SPREAD)
+    return Solution(problem, refined_best(problem, settled, rays, 2 * REFINE_STEPS), rays, spread_factor=SPREAD)
 
 
 def _mean_loss(problem: Problem, body: State) -> float:

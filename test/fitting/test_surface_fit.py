@@ -19,6 +19,7 @@ from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast, unit_cube
 from sq_perception.imaging.camera import Camera
+from sq_perception.simulation import scenes, sensor_noise
 
 GREY = 1 / 255
 
@@ -516,3 +517,21 @@ def test_a_longer_body_is_not_taken_for_a_smaller_mask() -> None:
     depth, mask = pinhole_image(truth)
     start = Superquadric(truth.size * np.array([1.0, 1.0, 1.3]), truth.shape, truth.translation, truth.rotation)
     assert iou(surface_fit.fit(depth, mask, CAMERA, start=start), truth) > 0.97
+
+
+def lone_body_on_a_table(seed: int, sensor: str) -> tuple[scenes.Scene, np.ndarray, np.ndarray]:
+    """A scene, what a sensor measures of it, and the body's mask."""
+    rng = np.random.default_rng(seed)
+    scene = scenes.table_scene(rng, 1)
+    depth, labels = scene.render()
+    return scene, sensor_noise.preset(sensor).measured(depth, scene.camera, rng), labels == 1
+
+
+def test_edges_that_a_time_of_flight_camera_mixes_do_not_make_a_body_sure_of_a_wrong_size() -> None:
+    off = []
+    for seed in range(8):
+        scene, depth, mask = lone_body_on_a_table(seed, "azure_kinect")
+        fit = surface_fit.fit(depth, mask, scene.camera, options=FitOptions(plane=scene.plane))
+        extent = scene.bodies[0].support(fit.superquadric.rotation_matrix.T)
+        off.append(np.abs(fit.superquadric.size - extent) / fit.sigma_size)
+    assert np.mean(np.array(off) < 2) > 0.75
