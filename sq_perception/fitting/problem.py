@@ -24,7 +24,7 @@ from sq_perception.fitting.covariance import Alternative, covariance_at
 from sq_perception.fitting.hull_prior import HullPrior
 from sq_perception.fitting.levenberg_marquardt import State, minimize
 from sq_perception.fitting.observation import Observation
-from sq_perception.fitting.options import FitOptions
+from sq_perception.fitting.options import MODEL_ERROR, FitOptions
 from sq_perception.fitting.rays import SAMPLE, WEIGHT, Rays
 from sq_perception.fitting.residuals import RENDERED, SAMPSON, surface_distance
 from sq_perception.geometry.superquadric import Superquadric
@@ -61,7 +61,8 @@ HIT_TOLERANCE = 3e-3
 """Of g where a ray meets the body.  Rays remember where that was: this error vanishes as the search converges."""
 PLANE_SIGMA, GAP_SIGMA, REST_SIGMA = 0.001, 0.005, 0.05
 """Metres below the plane and above it, and sine of the angle between the normal and an axis of the body: how well a
-plane fitted to a depth image is known, and a wide prior with long tails (:mod:`sq_perception.fitting.priors`)."""
+plane fitted to a depth image is known, and a wide prior with long tails (:mod:`sq_perception.fitting.priors`).  Both
+lengths shrink with the model error of small things."""
 PROPORTION_SIGMA = 1.0
 """Of a log size against the mean of the three: a factor e, a wide prior."""
 VOLUME_PRICE = 0.5
@@ -187,10 +188,11 @@ def terms_of(observation: Observation, options: FitOptions) -> Terms:
     )
     if options.plane is None:
         return terms
+    scale = min((options.model_error or MODEL_ERROR) / MODEL_ERROR, 1.0)
     return terms._replace(
         plane=options.plane,
-        plane_stiffness=1 / PLANE_SIGMA,
-        gap_stiffness=1 / GAP_SIGMA,
+        plane_stiffness=1 / (PLANE_SIGMA * scale),
+        gap_stiffness=1 / (GAP_SIGMA * scale),
         rest_stiffness=1 / REST_SIGMA,
         volume_price=VOLUME_PRICE,
     )

@@ -11,6 +11,7 @@ Frames and units: optical frame, metres, radians.
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -40,6 +41,9 @@ _FINE_NOISE = 0.1
 """Of what things stray from superquadrics: under less noise the exact course goes first, as what the tolerant one
 leaves of a true superquadric may then be more than the noise.  Under more, true superquadrics were left 0.5 to 0.8 of
 it, and things of benchmarks/household_things 1.2 and more."""
+_MODEL_SHARE = 0.04
+"""How far a small thing may stray, as a share of the side of a square as large as what is seen of it: of 6 cm and more
+things of a household stray by :data:`~sq_perception.fitting.options.MODEL_ERROR`, and no more."""
 _NOISE_ALONE = 1.06
 """Mean squared residual up to which a thing is taken for a superquadric.  19 in 20 superquadrics under independent
 noise left less.  Things that left more were worse by the exact course; of a time-of-flight camera, whose edges mix,
@@ -89,7 +93,8 @@ def fit(
     if crop is None:
         raise ValueError("the mask holds no pixel with a depth: there is nothing to fit")
     undecided = options.model_error is None
-    fine = crop.noise.at(crop.distance) < _FINE_NOISE * MODEL_ERROR
+    model_error = min(MODEL_ERROR, _MODEL_SHARE * crop.footprint * math.sqrt(np.count_nonzero(crop.mask)))
+    fine = crop.noise.at(crop.distance) < _FINE_NOISE * model_error
     if undecided and (later is not None if options.plane is None else fine):
         exactly = _exactly(crop, options, given, later, began)
         if exactly is not None and not (camera.is_pinhole and _is_thing(mask, options)):
@@ -100,7 +105,7 @@ def fit(
     if is_thing:
         # Also without a plane: to look for a superquadric from everywhere first takes six times as long, and gains none
         # (benchmarks/ablation, "no plane, exactly") but 0.3 % of IoU where things are noisy superquadrics.
-        options = replace(options, model_error=MODEL_ERROR)
+        options = replace(options, model_error=model_error)
     observation = crop.observed(options.model_error or 0.0, options.nan_is_empty, options.plane)
     reason = _hopeless(observation)
     if reason:

@@ -535,3 +535,15 @@ def test_edges_that_a_time_of_flight_camera_mixes_do_not_make_a_body_sure_of_a_w
         extent = scene.bodies[0].support(fit.superquadric.rotation_matrix.T)
         off.append(np.abs(fit.superquadric.size - extent) / fit.sigma_size)
     assert np.mean(np.array(off) < 2) > 0.75
+
+
+def test_what_is_seen_of_a_small_near_body_is_what_is_seen_of_a_large_far_one() -> None:
+    small = 0.2
+    unlike = []
+    for seed in range(7):
+        scene, depth, mask = lone_body_on_a_table(seed, "realsense_d435")
+        nearer = scene.plane * [1, 1, 1, small]
+        large = surface_fit.fit(depth, mask, scene.camera, options=FitOptions(plane=scene.plane))
+        tiny = surface_fit.fit(depth * np.float32(small), mask, scene.camera, options=FitOptions(plane=nearer))
+        unlike.append(np.sort(tiny.superquadric.size) / np.sort(large.superquadric.size) / small - 1)
+    assert np.abs(unlike).max() < 0.1
