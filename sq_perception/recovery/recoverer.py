@@ -36,7 +36,7 @@ from sq_perception.fitting import surface_fit
 from sq_perception.fitting.fit import Status
 from sq_perception.geometry.one_thread import one_blas_thread
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.imaging import raycast
+from sq_perception.imaging import perforation, raycast
 from sq_perception.imaging.camera import Camera
 from sq_perception.learning import checkpoint, inference
 from sq_perception.learning.forward import CompactMasks
@@ -184,11 +184,15 @@ class Recoverer:
             network = self._load_network(camera.is_pinhole and options.method == "auto")
 
         with timed(milliseconds, "segmentation"):
-            depth = _plausible(np.ma.filled(depth, np.nan), camera)
-            camera.check_image(depth)
-            cleaned, kept = _cleaned(depth, camera), continuity.NOTHING
+            measured = _measured(np.ma.filled(depth, np.nan), camera)
+            camera.check_image(measured)
+            if labels is not None:
+                labels = np.asarray(labels)
+                camera.check_image(labels)
+            measured, labels = perforation.filled(measured, labels)
+            kept = continuity.NOTHING
             if previous is not None:
-                kept = continuity.repeated(previous, cleaned, camera, options, labels)
+                kept = continuity.repeated(previous, measured, camera, options, labels)
             if previous is not None and kept.reference and len(kept.bodies) == len(previous.bodies):
                 milliseconds["segmentation"] = milliseconds["total"] = 1e3 * (time.perf_counter() - started)
                 bodies = tuple(replace(body, repeats=body.repeats + 1) for body in previous.bodies)
@@ -196,9 +200,9 @@ class Recoverer:
             if kept.reference:
                 segmented, age = kept.reference.segments, kept.reference.age
             else:
-                segmented, age = self._segmented(depth, cleaned, camera, labels, options, network), 0
+                segmented, age = self._segmented(measured, camera, labels, options, network), 0
             found, strays = segmented.found, segmented.strays
-            depth = _in_range(cleaned, found.labels, options.depth_range)
+            depth = _in_range(measured, found.labels, options.depth_range)
             objects = seen_object.objects(depth, found, camera, options.depth_range)
             same = {} if previous is None else continuity.matched(kept, previous.labels, objects)
 
@@ -222,7 +226,7 @@ class Recoverer:
             for obj, fit, score in zip(fresh, fits, scores, strict=True):
                 of_label[obj.label] = Recovery(fit, score, obj.label, obj.pixels)
             bodies = tuple(of_label[obj.label] for obj in objects)
-        reference = Reference.of(cleaned, camera, options, segmented, age=age, given=labels is not None)
+        reference = Reference.of(measured, camera, options, segmented, age=age, given=labels is not None)
         if previous is not None and previous.reference is not None and same:
             reference = reference.keeping(
                 previous.reference, found.labels, [body.label for body in bodies if body.repeats]
@@ -234,7 +238,6 @@ class Recoverer:
     def _segmented(
         self,
         depth: np.ndarray,
-        cleaned: np.ndarray,
         camera: Camera,
         labels: np.ndarray | None,
         options: RecoveryOptions,
@@ -246,7 +249,7 @@ class Recoverer:
         found = segments.segment(depth, camera, options.segmentation_options())
         if not (options.repair and isinstance(network, inference.ThingPredictor)):
             return OwnSegments(found)
-        return SegmentNetwork(*self._load_masks(), cleaned, camera, found.plane, self._shared).improved(found)
+        return SegmentNetwork(*self._load_masks(), depth, camera, found.plane, self._shared).improved(found)
 
     def _predicted(self, objects: Sequence[SeenObject], network: Network, options: RecoveryOptions) -> list[SeenObject]:
         """The objects with their predictions; those of bodies may still be computed, beside fits that begin without."""
@@ -312,23 +315,13 @@ def render_recovery(frame: FrameRecovery, camera: Camera) -> tuple[np.ndarray, n
     return depth, np.append(np.array(shown, dtype=np.int32), np.int32(-1))[index]
 
 
-def _plausible(depth: np.ndarray, camera: Camera) -> np.ndarray:
-    """The image without readings that are none; what is no depth image at all is for the segmentation to refuse."""
+def _measured(depth: np.ndarray, camera: Camera) -> np.ndarray:
+    """float32, NaN for all that is no measurement; what is no depth image at all is for the segmentation to refuse."""
     if depth.dtype.kind != "f":
         return depth
-    wild = np.abs(depth) > min(_FARTHEST, float(np.finfo(depth.dtype).max))  # which half precision does not reach
-    if camera.is_pinhole:
-        wild |= (depth > 0) & (depth < _NEAREST)
-    return np.where(wild, depth.dtype.type(np.nan), depth) if wild.any() else depth
-
-
-def _cleaned(depth: np.ndarray, camera: Camera) -> np.ndarray:
-    """float32 with NaN for everything that is no measurement."""
-    depth = depth.astype(np.float32, copy=False)
-    bad = ~np.isfinite(depth)
-    if camera.is_pinhole:
-        bad |= depth <= 0
-    return np.where(bad, np.float32(np.nan), depth)
+    farthest = min(_FARTHEST, float(np.finfo(depth.dtype).max))  # which half precision does not reach
+    within = (depth >= (_NEAREST if camera.is_pinhole else 0)) & (depth <= farthest)
+    return np.where(within, depth, np.nan).astype(np.float32)
 
 
 def _in_range(depth: np.ndarray, labels: np.ndarray, depth_range: tuple[float, float]) -> np.ndarray:
