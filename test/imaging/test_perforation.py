@@ -1,0 +1,64 @@
+"""Gaps between readings take the nearest reading; holes, and images without gaps, stay as they are."""
+
+import numpy as np
+import pytest
+
+from sq_perception.imaging import perforation
+from sq_perception.recovery.recoverer import Recoverer
+from sq_perception.simulation import scenes
+
+ROWS, COLUMNS = np.indices((24, 32))
+SLOPE = (1 + 0.01 * ROWS + 0.002 * COLUMNS).astype(np.float32)
+PATTERNS = {
+    "single readings": (ROWS % 4 == 3) & (COLUMNS % 4 == 2),
+    "every second line": ROWS % 2 == 1,
+    "a chess board": (ROWS + COLUMNS) % 2 == 1,
+    "registered to three times as many pixels a side": (ROWS % 3 != 0) | (COLUMNS % 3 != 0),
+    "registered to five times as many pixels a side": (ROWS % 5 != 0) | (COLUMNS % 5 != 0),
+}
+
+
+@pytest.mark.parametrize("pattern", PATTERNS.values(), ids=PATTERNS)
+def test_gaps_take_the_nearest_reading_and_its_label(pattern: np.ndarray) -> None:
+    labels = np.where(pattern, 9, ROWS // 4 + 1)
+    filled, named = perforation.filled(np.where(pattern, np.float32(np.nan), SLOPE), labels)
+    inside = np.s_[2:-4, 2:-4]
+    rows, columns = np.nonzero(~pattern)
+    away = np.hypot(ROWS[inside][..., None] - rows, COLUMNS[inside][..., None] - columns)
+    nearest = away <= away.min(axis=-1, keepdims=True)
+    assert (nearest & (filled[inside][..., None] == SLOPE[rows, columns])).any(axis=-1).all()
+    assert (nearest & (named[inside][..., None] == labels[rows, columns])).any(axis=-1).all()
+    assert np.array_equal(filled[~pattern], SLOPE[~pattern])
+
+
+def test_large_holes_stay_and_nothing_that_was_given_is_written_to() -> None:
+    image = np.where(PATTERNS["every second line"], np.float32(np.nan), SLOPE)
+    image[8:15, 8:15] = np.nan
+    given, labels = image.copy(), ROWS // 4
+    filled, named = perforation.filled(image, labels)
+    assert np.isnan(filled[9:14, 9:14]).all()
+    assert np.isfinite(filled[:, :8]).all()
+    assert named is not labels
+    assert np.array_equal(image, given, equal_nan=True)
+    assert np.array_equal(labels, ROWS // 4)
+
+
+def test_single_gaps_as_of_recorded_frames_stay() -> None:
+    image = np.where((ROWS % 8 == 3) & (COLUMNS % 8 == 2), np.float32(np.nan), SLOPE)
+    assert perforation.filled(image)[0] is image
+
+
+def test_an_image_without_gaps_is_given_back() -> None:
+    assert perforation.filled(SLOPE)[0] is SLOPE
+
+
+@pytest.mark.parametrize("masks", ["given", "own"])
+def test_things_are_found_and_fitted_in_depth_registered_to_more_pixels(masks: str) -> None:
+    scene = scenes.table_scene(np.random.default_rng(3), 2)
+    depth, labels = scene.render()
+    rows, columns = np.indices(depth.shape)
+    sparse = np.where((rows % 3 == 0) & (columns % 3 == 0), depth, np.nan).astype(np.float32)
+    frame = Recoverer().recover(sparse, scene.camera, labels if masks == "given" else None)
+    assert len(frame.bodies) == 2
+    away = [min(np.linalg.norm(b.superquadric.translation - t.translation) for b in frame.bodies) for t in scene.bodies]
+    assert max(away) < 0.01
