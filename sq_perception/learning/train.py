@@ -39,7 +39,8 @@ from sq_perception.learning.training_state import SETTINGS, TrainingState, mixed
 
 _OF_A_RUN = ("loss", "backbone", "framing", "pixels", "canonical_labels", "optimizer")
 """Settings whose change makes another run; others may change when it goes on."""
-CALIBRATION_VIEWS = 2048
+CALIBRATION_VIEWS, _CALIBRATION_BATCH = 2048, 32
+"""Views from which normalisations are measured anew, and at least so many at once: fewer take long and say less."""
 _SAVE_SECONDS = 300.0
 """Longest time between two saved states."""
 _BATCH = 250
@@ -130,8 +131,9 @@ def train(
             if state.step % config.validation == 0 or finished:
                 state.seconds = time.monotonic() - started
                 if config.average > 0:
+                    at_once = max(config.batch, _CALIBRATION_BATCH)
                     calibration = batches.batch(max(CALIBRATION_VIEWS, config.batch))[0]
-                    recalibrate(state.average, torch.from_numpy(calibration)[:, None], config.batch)
+                    recalibrate(state.average, torch.from_numpy(calibration)[:, None], at_once)
                 record = {"step": state.step, "loss": float(np.mean(losses)), "rate": rate}
                 record |= {"sharpness": objective.sharpness(progress), "seconds": state.seconds}
                 record |= _validated(state.average, validation, objective)
