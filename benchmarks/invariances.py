@@ -1,4 +1,4 @@
-"""What must not matter: the camera's roll, masks that are some pixels too small or too large, the size of the world.
+"""What must not matter: the camera's roll, masks of some pixels more or less, gaps in the image, the size of the world.
 
     python benchmarks/invariances.py [--scenes 70] [--first 30000] [--name invariances]
 
@@ -6,6 +6,8 @@ Scenes of :mod:`household_things`, as they are and with one thing changed:
 
     roll    the camera is turned by 90, 180 and 270 degrees about its optical axis
     masks   the given ones are 1 to 3 pixels smaller, or larger where there is no other thing
+    gaps    every second line is missing, every second pixel of each line in turn, or all but every third pixel of every
+            third line, as in depth that was registered to more pixels
     size    all lengths are multiplied, before another sensor, whose noise is that of the distance: blocks of some
             centimetres at 0.3 m, crates at 3 m; ``max_size`` grows with them
 
@@ -38,6 +40,11 @@ from sq_perception.simulation import sensor_noise
 
 AS_IT_IS = "as it is"
 SIZES = {"realsense_d435": (0.4, 0.7, 1.0, 2.0, 3.0), "azure_kinect": (1.0, 2.0, 3.0)}
+GAPS: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {
+    "every second line": lambda row, column: row % 2 == 1,
+    "a chess board": lambda row, column: (row + column) % 2 == 1,
+    "all but 1 in 9": lambda row, column: (row % 3 > 0) | (column % 3 > 0),
+}
 _MAX_SIZE = sq.RecoveryOptions().max_size
 
 
@@ -85,6 +92,11 @@ def misfit(scene: Tabletop, pixels: int) -> Tabletop:
     return replace(scene, labels=labels)
 
 
+def sparse(scene: Tabletop, missing: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Tabletop:
+    """Without the readings of the rows and columns for which this holds."""
+    return replace(scene, depth=np.where(missing(*np.indices(scene.depth.shape)), np.float32(np.nan), scene.depth))
+
+
 def resized(scene: Tabletop, times: float, sensor: str) -> Tabletop:
     """With all lengths multiplied, as a sensor sees it."""
     rng, true_depth = np.random.default_rng([scene.seed]), times * scene.true_depth
@@ -107,6 +119,8 @@ def rows() -> list[Row]:
         found += [Row(f"roll {90 * k}", masks, partial(rolled, quarters=k)) for k in (1, 2, 3)]
     found += [Row(f"masks {k:+d} pixels", "given", partial(misfit, pixels=k)) for k in (-3, -2, -1, 1, 2, 3)]
     for masks in ("given", "own"):
+        found += [Row(f"missing {name}", masks, partial(sparse, missing=gaps)) for name, gaps in GAPS.items()]
+    for masks in ("given", "own"):
         for sensor, sizes in SIZES.items():
             changes = {k: partial(resized, times=k, sensor=sensor) for k in sizes}
             found += [Row(f"size x {k:g}, {sensor}", masks, change, k) for k, change in changes.items()]
@@ -121,7 +135,8 @@ def answers(scene: Tabletop, counted: list[int], row: Row) -> list[scene_verdict
     frame = scene_verdict.recoverer().recover(changed.depth, changed.camera, given, limits)
     known = {label: label for label in counted}
     if given is None:
-        known = scene_verdict.matches(frame.labels, np.where(np.isfinite(changed.depth), changed.labels, 0))
+        measured = np.isfinite(changed.depth)
+        known = scene_verdict.matches(np.where(measured, frame.labels, 0), np.where(measured, changed.labels, 0))
     things = {one.label: one for one in changed.placed}
     return [scene_verdict.of_frame(frame, known.get(label, 0), things[label], changed) for label in counted]
 
