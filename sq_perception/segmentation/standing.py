@@ -207,7 +207,8 @@ def standing(
         points = camera.unproject(c, r, depth[r, c])
         growth = noise_growth(points[:, 2])
         height = relative[r, c]
-        noise = max(support.sigma, _spread(relative, around, rows, columns))
+        behind = float(points[:, 2].max()) + limits.max_size
+        noise = max(support.sigma, _spread(relative, around & (depth < behind), rows, columns))
         least = max(_LEAST_HEIGHT, MIN_HEIGHT * min(1.0, float(quantile(growth, 0.5))))
         if _top(height * growth) < least or _top(height) < _BUMP * noise:
             return False

@@ -55,6 +55,10 @@ _LEVEL, _STOREY, _TABLE_SHARE = 0.99, 0.3, 0.4
 """Cosine between the normals of level planes, metres from a floor to the table above it, and the share that it shows of
 what the floor does.  Of lower steps the larger level is the support, and things are found on both."""
 
+_CLOSE, _HELD_SHARE = 0.6, 0.1
+"""Metres above a support in which what stands on it is, and the least share of that, of what another plane has there:
+the wall behind a table has a tenth and less of it, and may be eight times as large in the image."""
+
 LEAST_GROWTH = 0.1
 """Of the noise: nearer than 0.3 m it falls no further, as a sensor's own quantisation and calibration remain."""
 
@@ -115,9 +119,16 @@ def support(candidates: list[Plane], depth: np.ndarray, valid: np.ndarray, camer
     floor below it things stand on the table, though the picture may show more of the floor.
     """
     surfaces = _on_one_surface(depth, valid, camera)
-    chosen = [plane for plane in candidates if not _is_face(plane, surfaces)]
-    if not chosen:
+    is_face = [_is_face(plane, surfaces) for plane in candidates]
+    if all(is_face):
         return None
+    held = _held(candidates, _some_points(depth, valid, camera, _PLANE_POINTS))
+    least = _HELD_SHARE * max(held)
+    chosen = [
+        plane
+        for plane, share, face in zip(candidates, held, is_face, strict=True)
+        if share >= least and (share > 0.5 or not face)
+    ]
     best = max(chosen, key=_vote)
     tables = [
         plane
@@ -285,6 +296,14 @@ def _on_one_surface(depth: np.ndarray, valid: np.ndarray, camera: Camera) -> lis
         points = camera.unproject(k * columns, k * rows, coarse[rows, columns])
         surfaces.append((points, inside and size < _ISLAND_SHARE * labels.size))
     return surfaces
+
+
+def _held(candidates: list[Plane], points: np.ndarray) -> list[float]:
+    """Of each plane, the share of the points on none of them that are as close above it as what stands on it."""
+    heights = np.stack([plane.height(points) for plane in candidates])
+    rest = heights[:, (np.abs(heights) > TOLERANCE * noise_growth(points[:, 2])).all(axis=0)]
+    close = np.count_nonzero((rest > 0) & (rest < _CLOSE), axis=1)
+    return (close / max(rest.shape[1], 1)).tolist()
 
 
 def _vote(plane: Plane) -> float:

@@ -11,6 +11,7 @@ from sq_perception.imaging import raycast, unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.recordings.frame_file import read
 from sq_perception.segmentation.segments import Segmentation, SegmentationOptions, from_labels, segment, support_under
+from sq_perception.simulation import sensor_noise
 
 CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)
 TILT = 0.7
@@ -206,6 +207,32 @@ def test_the_plane_below_the_bodies_and_not_the_wall_behind_them():
     depth = np.where(truth > 0, scene(THREE[:1])[0], depth)
     found = from_labels(truth, depth, CAMERA)
     assert np.degrees(np.arccos(np.clip(found.plane[:3] @ NORMAL, -1, 1))) < 1.0
+
+
+@pytest.mark.parametrize("wall", [1.5, 3.0])
+@pytest.mark.parametrize("edge", [1.0, 1.2])
+def test_a_low_camera_finds_what_stands_before_a_wall_that_fills_most_of_the_image(wall, edge):
+    camera = Camera(640, 480, 554.3, 554.3, 319.5, 239.5)
+    down = np.deg2rad(9.0)
+    up = np.array([0.0, -np.cos(down), -np.sin(down)])
+    away = np.array([0.0, -np.sin(down), np.cos(down)])
+    bodies = [
+        Superquadric(
+            np.array(size),
+            np.array([0.2, 0.8]),
+            x * np.array([1.0, 0.0, 0.0]) + far * away + (size[2] - 0.13) * up,
+            rotation.from_matrix(np.stack([[1.0, 0.0, 0.0], away, up], axis=1)),
+        )
+        for x, far, size in ((-0.1, 0.6, (0.03, 0.03, 0.05)), (0.06, 0.7, (0.04, 0.03, 0.08)))
+    ]
+    table = table_depth(camera, np.append(up, 0.13))
+    rendered, index = raycast.render(Superquadric.stack(bodies), camera)
+    room = np.minimum(np.where(table < edge, table, wall), rendered).astype(np.float32)
+    depth = sensor_noise.preset("kinect_v1").measured(room, camera, np.random.default_rng(0))
+    found = segment(depth, camera)
+    assert found.plane is not None
+    assert found.plane[:3] @ up > 0.99
+    assert min(best_iou(index == k, found.labels) for k in range(2)) > 0.85
 
 
 def test_misuse_is_refused():
