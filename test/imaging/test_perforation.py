@@ -14,7 +14,6 @@ PATTERNS = {
     "every second line": ROWS % 2 == 1,
     "a chess board": (ROWS + COLUMNS) % 2 == 1,
     "registered to three times as many pixels a side": (ROWS % 3 != 0) | (COLUMNS % 3 != 0),
-    "registered to five times as many pixels a side": (ROWS % 5 != 0) | (COLUMNS % 5 != 0),
 }
 
 
