@@ -24,7 +24,7 @@ def filled(depth: np.ndarray, labels: np.ndarray | None = None) -> tuple[np.ndar
     if measured.all():
         return depth, labels
     narrow = _gaps(measured, 1)
-    share = np.count_nonzero(narrow) / max(np.count_nonzero(narrow | measured), 1)
+    share = np.mean(narrow[narrow | measured]) if measured.any() else 0.0
     if share < _PERFORATED:
         return depth, labels
     reach, gaps = (1, narrow) if share < _SPARSE else (2, _gaps(measured, 2))
