@@ -20,7 +20,7 @@ A FRAME is
   .npz           depth (float, metres, NaN = no reading) and K (3 x 3); optional labels = instance masks, which are
                  then used instead of an own segmentation
   an image       PNG or TIFF of 16 bit (millimetres), TIFF, NPY or EXR (extra 'exr') of floats (metres), or see
-                 --depth-scale; 0 = no reading; with --camera-info or a camera file beside it
+                 --depth-scale; 0 = no reading; with --camera-info, a camera file beside it, or a YAML of its name
   .pcd, .ply     a point cloud in the optical frame; a PCD that is an image of a pinhole camera is taken as one
   .png, .bmp     with --projection orthographic: grey images of the unit cube, larger is nearer, 0 = background
   a folder       all frames in it, in natural order, or those of its subfolders where it has none; camera_info.yaml,

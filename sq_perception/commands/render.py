@@ -35,7 +35,7 @@ examples:
 
 files:
   orthographic  .png (8 bit, or 16 with --bits 16), .bmp (8 bit), .npz
-  pinhole       .png (16 bit, millimetres; its camera goes into a .yaml of the same name, for --camera-info), .npz
+  pinhole       .png (16 bit, millimetres; its camera goes into a .yaml of the same name, where recover finds it), .npz
   An NPZ also holds labels and the parameters (superquadrics, 1 x 12).
 """
 

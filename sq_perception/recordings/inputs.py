@@ -3,8 +3,8 @@
 A folder gives its frames and bags in natural order (frame_2 before frame_10), NPYs only where it has nothing else, as
 matrices of calibrations are such files too; one without any gives those of its subfolders.  The camera of its images,
 and of an image that is named by itself, is ``camera_info.yaml``, ``camera.yaml``, ``intrinsics.json`` or
-``camera_intrinsic.json`` beside it, or in the folder that was named.  What cannot be read comes as an error with the
-reason, in its place, and the rest follows.
+``camera_intrinsic.json`` beside it, or in the folder that was named, else the YAML of its own name.  What cannot be
+read comes as an error with the reason, in its place, and the rest follows.
 """
 
 from __future__ import annotations
@@ -96,7 +96,7 @@ class RecordedInput:
 
     def _add(self, path: Path) -> None:
         if not path.is_dir() or bag_file.is_bag(path):
-            self._sources.append((path, self._options.camera_info or _camera_file(path.parent)))
+            self._sources.append((path, self._options.camera_info or _camera_file(path.parent) or _of_its_name(path)))
             return
         found = self._in_folders(path, None)
         self._sources += found or [(path, FrameError(f"{path}: no frames in it ({', '.join(SUFFIXES)})"))]
@@ -107,7 +107,8 @@ class RecordedInput:
             camera_info = self._options.camera_info or _camera_file(folder) or above
             if found := in_folder(folder):
                 _log.info("%s: %d frames, camera %s", folder, len(found), camera_info or "of the files")
-                return [(path, camera_info) for path in found[:: self._options.every][: self._options.limit]]
+                chosen = found[:: self._options.every][: self._options.limit]
+                return [(path, camera_info or _of_its_name(path)) for path in chosen]
             folders = [inner for inner in folder.iterdir() if inner.is_dir() and not inner.is_symlink()]
         except OSError as error:
             return [(folder, FrameError(f"{folder}: {error}"))]
@@ -152,3 +153,9 @@ def _natural(path: Path) -> tuple[list[str | int], str]:
 
 def _camera_file(folder: Path) -> Path | None:
     return next((folder / name for name in CAMERA_FILES if (folder / name).is_file()), None)
+
+
+def _of_its_name(path: Path) -> Path | None:
+    """The camera that ``sq-perception render`` writes beside an image."""
+    beside = path.with_suffix(".yaml")
+    return beside if beside.is_file() else None

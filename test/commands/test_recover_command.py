@@ -87,6 +87,18 @@ def test_a_folder_gives_its_frames_in_natural_order_with_its_camera(tmp_path):
     assert [frame.camera.fx for _, frame in RecordedInput([str(tmp_path)], InputOptions(given))] == [200] + 4 * [500]
 
 
+def test_a_rendered_image_is_recovered_with_the_camera_beside_it_unless_the_folder_has_one(tmp_path):
+    body = ["0.04", "0.03", "0.06", "0.3", "0.8", "0", "0", "0.6", "0", "0", "0", "1"]
+    assert main.main(["render", *body, "--projection", "pinhole", "--output", str(tmp_path / "can.png")]) == 0
+    written = yaml.safe_load((tmp_path / "can.yaml").read_text())["camera_matrix"]["data"]
+    for named in (tmp_path / "can.png", tmp_path):
+        (_, frame), *none = RecordedInput([str(named)])
+        assert not none
+        assert frame.camera.matrix.ravel().tolist() == written
+    (tmp_path / "camera.yaml").write_text((tmp_path / "can.yaml").read_text().replace("525.0", "300.0"))
+    assert [frame.camera.fx for _, frame in RecordedInput([str(tmp_path)])] == [300]
+
+
 def test_a_folder_that_cannot_be_read_hides_none_beside_it(tmp_path, monkeypatch):
     for name in ("a", "b", "c"):
         (tmp_path / name).mkdir()
