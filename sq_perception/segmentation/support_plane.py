@@ -32,6 +32,9 @@ TOLERANCE = 0.008
 """Half thickness of a plane while it is searched, metres at a depth of one metre."""
 _LEAST_SHARE = 0.1
 """Of the valid pixels that a plane has."""
+_LEAST_BEFORE_WALL, _FRONTAL = 0.03, 0.3
+"""The same where only planes were found that face the camera, to whose normals the image's vertical has at most that
+cosine: before a wall a low camera sees little of a table.  What faces the camera too is the front of a thing."""
 _SEED = 0
 """Of the random sample; the same image gives the same planes."""
 _PLANE_POINTS = 1500
@@ -97,12 +100,15 @@ def planes(depth: np.ndarray, valid: np.ndarray, camera: Camera) -> list[Plane]:
     """Up to three planes, the one with most points first; each is taken away before the next is searched."""
     points = _some_points(depth, valid, camera, _REFINE_POINTS)
     rng = np.random.default_rng(_SEED)
-    total, found = len(points), []
+    total = len(points)
+    found: list[Plane] = []
     for _ in range(_PLANES):
-        if len(points) < max(12, _LEAST_SHARE * total):
+        walls_alone = bool(found) and all(abs(plane.equation[1]) < _FRONTAL for plane in found)
+        least = (_LEAST_BEFORE_WALL if walls_alone else _LEAST_SHARE) * total
+        if len(points) < max(12, least):
             break
-        plane, inside = _dominant_plane(points, _LEAST_SHARE * total / len(points), rng)
-        if plane is None or inside.sum() < _LEAST_SHARE * total:
+        plane, inside = _dominant_plane(points, least / len(points), rng)
+        if plane is None or inside.sum() < (_LEAST_SHARE * total if abs(plane[1]) < _FRONTAL else least):
             break
         near = points[inside]
         spread = np.abs(near @ plane[:3] + plane[3]) / noise_growth(near[:, 2])

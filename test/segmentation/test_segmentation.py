@@ -210,10 +210,10 @@ def test_the_plane_below_the_bodies_and_not_the_wall_behind_them():
 
 
 @pytest.mark.parametrize("wall", [1.5, 3.0])
-@pytest.mark.parametrize("edge", [1.0, 1.2])
-def test_a_low_camera_finds_what_stands_before_a_wall_that_fills_most_of_the_image(wall, edge):
+@pytest.mark.parametrize(("degrees", "edge"), [(7.0, 0.85), (9.0, 1.0), (9.0, 1.2)])
+def test_a_low_camera_finds_what_stands_before_a_wall_that_fills_most_of_the_image(wall, degrees, edge):
     camera = Camera(640, 480, 554.3, 554.3, 319.5, 239.5)
-    down = np.deg2rad(9.0)
+    down = np.deg2rad(degrees)
     up = np.array([0.0, -np.cos(down), -np.sin(down)])
     away = np.array([0.0, -np.sin(down), np.cos(down)])
     bodies = [
