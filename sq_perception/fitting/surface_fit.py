@@ -99,8 +99,8 @@ def fit(
         exactly = _exactly(crop, options, given, later, began)
         if exactly is not None and not (camera.is_pinhole and _is_thing(mask, options)):
             return assessed(exactly, began)
-        if exactly is not None and _leaves_noise(exactly):
-            return assessed(replace(exactly, spread_factor=tolerant.SPREAD), began)
+        if (thing := _as_thing(exactly)) is not None:
+            return assessed(thing, began)
     is_thing = undecided and _is_thing(mask, options)
     if is_thing:
         # Also without a plane: to look for a superquadric from everywhere first takes six times as long, and gains none
@@ -116,9 +116,7 @@ def fit(
     solution = course.solve(Problem.of(observation, options, began), given)
     untried = options.plane is None or not fine
     if is_thing and untried and _is_explained(solution, crop.noise.at(crop.distance)):
-        exactly = _exactly(crop, options, [solution.state, *given], None, began)
-        if exactly is not None and _leaves_noise(exactly):
-            solution = replace(exactly, spread_factor=tolerant.SPREAD)
+        solution = _as_thing(_exactly(crop, options, [solution.state, *given], None, began)) or solution
     return assessed(solution, began)
 
 
@@ -127,9 +125,11 @@ def _is_thing(mask: np.ndarray, options: FitOptions) -> bool:
     return options.plane is not None or (not _fills(mask) and options.predicted_hull() is not None)
 
 
-def _leaves_noise(solution: Solution) -> bool:
-    """Whether a body of the exact course leaves no more than the noise, on all its rays."""
-    return solution.state.cost < _NOISE_ALONE * solution.rays.weight
+def _as_thing(exactly: Solution | None) -> Solution | None:
+    """What the exact course found of a thing, with the deviations of things; None if it leaves more than the noise."""
+    if exactly is None or exactly.state.cost >= _NOISE_ALONE * exactly.rays.weight:
+        return None
+    return replace(exactly, spread_factor=tolerant.SPREAD)
 
 
 def _fills(mask: np.ndarray) -> bool:

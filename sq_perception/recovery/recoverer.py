@@ -321,7 +321,7 @@ def _measured(depth: np.ndarray, camera: Camera) -> np.ndarray:
         return depth
     farthest = min(_FARTHEST, float(np.finfo(depth.dtype).max))  # which half precision does not reach
     within = (depth >= (_NEAREST if camera.is_pinhole else 0)) & (depth <= farthest)
-    return np.where(within, depth, np.nan).astype(np.float32)
+    return np.where(within, depth, np.nan).astype(np.float32, copy=False)
 
 
 def _in_range(depth: np.ndarray, labels: np.ndarray, depth_range: tuple[float, float]) -> np.ndarray:

@@ -210,7 +210,7 @@ def standing(
         growth = noise_growth(points[:, 2])
         height = relative[r, c]
         behind = float(points[:, 2].max()) + limits.max_size
-        noise = max(support.sigma, _spread(relative, around & (depth < behind), rows, columns))
+        noise = max(support.sigma, _spread(relative, depth, around, behind, rows, columns))
         least = max(_LEAST_HEIGHT, MIN_HEIGHT * min(1.0, float(quantile(growth, 0.5))))
         if _top(height * growth) < least or _top(height) < _BUMP * noise:
             return False
@@ -255,27 +255,32 @@ def _higher(labels: np.ndarray, relative: np.ndarray, count: int, limit: float) 
     return found
 
 
-def _spread(relative: np.ndarray, around: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> float:
+def _spread(
+    relative: np.ndarray, depth: np.ndarray, around: np.ndarray, behind: float, rows: np.ndarray, columns: np.ndarray
+) -> float:
     """Deviation of the support's heights beside a segment from 0, 0 where too little of it is seen.
 
     Noise grows at the rims of an image and where light is reflected to and fro; ``around`` is false on other things.
+    What is farther than ``behind``, metres, is not beside the segment: a far wall may be as high as the support.
     """
     top, left = max(int(rows.min()) - _BESIDE, 0), max(int(columns.min()) - _BESIDE, 0)
     window = slice(top, int(rows.max()) + _BESIDE + 1), slice(left, int(columns.max()) + _BESIDE + 1)
     mask = np.zeros(relative[window].shape, np.uint8)
     mask[rows - top, columns - left] = 1
     near, ring = (cv2.dilate(mask, np.ones((2 * k + 1, 2 * k + 1), np.uint8)) for k in (_SMEARED, _BESIDE))
-    heights = _heights_where(relative, around, ring - near, top, left)
+    heights = _heights_where(relative, depth, around, behind, ring - near, top, left)
     return 1.4826 * quantile(heights, 0.5) if heights.size >= _FEWEST else 0.0
 
 
 @kernel
-def _heights_where(relative: np.ndarray, around: np.ndarray, mask: np.ndarray, top: int, left: int) -> np.ndarray:
-    """|heights| (n,) of the pixels around a thing in a mask, whose corner lies there, but for what is too high."""
+def _heights_where(
+    relative: np.ndarray, depth: np.ndarray, around: np.ndarray, behind: float, mask: np.ndarray, top: int, left: int
+) -> np.ndarray:
+    """|heights| (n,) of pixels around a thing in a mask, whose corner lies there, but for what is too high or far."""
     found, n = np.empty(mask.size, np.float32), 0
     for v in range(mask.shape[0]):
         for u in range(mask.shape[1]):
-            if mask[v, u] > 0 and around[top + v, left + u]:
+            if mask[v, u] > 0 and around[top + v, left + u] and depth[top + v, left + u] < behind:
                 height = abs(relative[top + v, left + u])
                 if height < HIGHEST * TOLERANCE:
                     found[n] = height

@@ -122,19 +122,18 @@ def support(candidates: list[Plane], depth: np.ndarray, valid: np.ndarray, camer
 
     A camera is mounted upright or looks straight down.  The table seen from straight above and a wall look alike; a
     wall counts less, as a floor or a table in the same picture then has a normal that points up.  Of a table and the
-    floor below it things stand on the table, though the picture may show more of the floor.
+    floor below it things stand on the table, though the picture may show more of the floor.  What hardly anything is
+    close above is no support, such as the wall metres behind a low camera's table; nor is the face of a body, unless
+    most of what is on no plane is close above it.
     """
     surfaces = _on_one_surface(depth, valid, camera)
     is_face = [_is_face(plane, surfaces) for plane in candidates]
     if all(is_face):
         return None
     held = _held(candidates, _some_points(depth, valid, camera, _PLANE_POINTS))
-    least = _HELD_SHARE * max(held)
-    chosen = [
-        plane
-        for plane, share, face in zip(candidates, held, is_face, strict=True)
-        if share >= least and (share > 0.5 or not face)
-    ]
+    bearing = [k for k, face in enumerate(is_face) if held[k] > 0.5 or not face]
+    least = _HELD_SHARE * max(held[k] for k in bearing)
+    chosen = [candidates[k] for k in bearing if held[k] >= least]
     best = max(chosen, key=_vote)
     tables = [
         plane

@@ -10,6 +10,7 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast, unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.recordings.frame_file import read
+from sq_perception.segmentation import support_plane
 from sq_perception.segmentation.segments import Segmentation, SegmentationOptions, from_labels, segment, support_under
 from sq_perception.simulation import sensor_noise
 
@@ -233,6 +234,16 @@ def test_a_low_camera_finds_what_stands_before_a_wall_that_fills_most_of_the_ima
     assert found.plane is not None
     assert found.plane[:3] @ up > 0.99
     assert min(best_iou(index == k, found.labels) for k in range(2)) > 0.85
+
+
+def test_a_face_that_holds_more_than_a_wall_but_not_most_leaves_the_wall(monkeypatch):
+    wall, face = (
+        support_plane.Plane(np.array([0.0, 0.0, -1.0, d]), share, 1e-3) for d, share in ((2.0, 0.6), (1.0, 0.2))
+    )
+    monkeypatch.setattr(support_plane, "_is_face", lambda plane, _: plane is face)
+    monkeypatch.setattr(support_plane, "_held", lambda *_: [0.0, 0.4])
+    depth = np.full((CAMERA.height, CAMERA.width), 2.0, np.float32)
+    assert support_plane.support([wall, face], depth, depth > 0, CAMERA) is wall
 
 
 def test_misuse_is_refused():
