@@ -31,11 +31,18 @@ from scipy.spatial import ConvexHull
 
 from sq_perception.geometry import Superquadric
 from sq_perception.geometry import rotation as quaternions
+from sq_perception.imaging.camera import Camera
 from sq_perception.simulation import sensor_noise
 from sq_perception.simulation.household import KINDS
 from sq_perception.simulation.rendering import render_things
 from sq_perception.simulation.thing import NO_CAVITY
-from sq_perception.simulation.things_on_table import PlacedThing, ThingsOnTable, things_on_table
+from sq_perception.simulation.things_on_table import (
+    ELEVATION,
+    TABLE_CAMERA,
+    PlacedThing,
+    ThingsOnTable,
+    things_on_table,
+)
 
 SEED = 7801
 GOALS = {"given": "88", "own": "85"}
@@ -44,11 +51,17 @@ WAYS = ("standing", "lying", "leaning", "stacked")
 _GRID = (33, 64)
 
 
-def scene(seed: int, sensor: str | None, count: int | None = None) -> tabletop.Tabletop:
+def scene(
+    seed: int,
+    sensor: str | None,
+    count: int | None = None,
+    camera: Camera = TABLE_CAMERA,
+    elevation: tuple[float, float] = ELEVATION,
+) -> tabletop.Tabletop:
     """The scene of a seed, of ``count`` things or 1 to 8, through a sensor, as scene_verdict takes it."""
     sensor = sensor or list(tabletop.SENSORS)[seed % len(tabletop.SENSORS)]
     rng = np.random.default_rng([SEED, seed])
-    truth = things_on_table(rng, count)
+    truth = things_on_table(rng, count, camera, elevation)
     depth = sensor_noise.preset(tabletop.SENSORS[sensor]).measured(truth.depth, truth.camera, rng)
     placed = tuple(_known(each, truth) for each in truth.placed)
     return tabletop.Tabletop(

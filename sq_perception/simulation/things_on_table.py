@@ -1,7 +1,7 @@
 """Scenes of household things on a table: standing, lying, leaning on each other, stacked, close together.
 
 The table's frame has x to the right, y away from the camera, z up; its origin is the point that the camera looks at,
-from 0.5 to 1.2 m and 20 to 70 degrees above the table.  Things rest in it:
+from 0.5 to 1.2 m and, unless told otherwise, 20 to 70 degrees above the table.  Things rest in it:
 
     apart       somewhere on the table, at least 3 mm from all others
     beside      pushed along the table against another one until they touch
@@ -35,7 +35,8 @@ TABLE_CAMERA = Camera(640, 480, 554.3, 554.3, 319.5, 239.5)
 """VGA, 60 degrees wide."""
 
 _DISTANCE = (0.5, 1.2)
-_ELEVATION = tuple(np.deg2rad([20.0, 70.0]))
+ELEVATION = (20.0, 70.0)
+"""Degrees."""
 _ROLL = float(np.deg2rad(5.0))
 _WALL = (1.8, 3.5)
 _HOW = ("apart", "beside", "leaning", "leaning", "stacked", "stacked")
@@ -129,8 +130,15 @@ class _Resting:
         return bool((free[:_UP] >= gap).any() or (free[_UP:] >= -1e-9).any())
 
 
-def things_on_table(rng: np.random.Generator, count: int | None = None, camera: Camera = TABLE_CAMERA) -> ThingsOnTable:
+def things_on_table(
+    rng: np.random.Generator,
+    count: int | None = None,
+    camera: Camera = TABLE_CAMERA,
+    elevation: tuple[float, float] = ELEVATION,
+) -> ThingsOnTable:
     """``count`` things, or 1 to 8, on a table, all of them wholly inside the image.
+
+    The camera is ``elevation`` (least, greatest) degrees above the table.
 
     Raises
     ------
@@ -143,7 +151,7 @@ def things_on_table(rng: np.random.Generator, count: int | None = None, camera: 
         raise ValueError("camera: expected a pinhole camera, got an orthographic one")
     wanted = int(rng.integers(1, MOST_THINGS + 1)) if count is None else count
     for _ in range(_SCENES):
-        look = looking_down(rng.uniform(*_ELEVATION), rng.uniform(-_ROLL, _ROLL))
+        look = looking_down(rng.uniform(*np.deg2rad(elevation)), rng.uniform(-_ROLL, _ROLL))
         eye = np.array([0.0, 0.0, rng.uniform(*_DISTANCE)])
         resting = _arranged(wanted, look, eye, camera, rng)
         if resting is not None:

@@ -1,0 +1,121 @@
+"""Other cameras than the one that everything was made with: fields of view, numbers of pixels, heights above the table.
+
+    python benchmarks/cameras.py [--scenes 30] [--first 30400] [--name cameras]
+
+Scenes of :mod:`household_things`, before each camera others, as things have to lie inside its image; scene k from the
+seed (``household_things.SEED``, k) alone.  Counted are things at least half visible, with 200 pixels of an image of
+640 x 480 and half of them measured.  IoU is with the convex hull, 0 where there is no body or a failed one, with its
+standard error; ``missed`` the share of these things that no own segment agrees with, as in :mod:`scene_verdict`;
+``false`` the own bodies a scene that are of no thing.
+"""
+
+from __future__ import annotations
+
+if __name__ == "__main__":
+    import one_thread  # noqa: F401
+
+from dataclasses import dataclass
+
+import household_things
+import numpy as np
+import report
+import scene_verdict
+from tabletop import Placed, Tabletop
+
+from sq_perception.imaging.camera import Camera
+from sq_perception.simulation.things_on_table import ELEVATION, TABLE_CAMERA
+
+
+@dataclass(frozen=True)
+class View:
+    """A camera and the degrees above the table from which it looks."""
+
+    camera: Camera
+    elevation: tuple[float, float] = ELEVATION
+
+
+@dataclass(frozen=True)
+class Found:
+    """What became of one thing: IoU with its mask given and without, and whether an own segment agrees with it."""
+
+    given: float
+    own: float
+    is_found: bool
+
+
+def of_width(width: int, height: int, degrees: float, aside: float = 0.0) -> Camera:
+    """A camera so many degrees wide, its principal point ``aside`` pixels off the middle both ways."""
+    focal = width / (2 * np.tan(np.deg2rad(degrees) / 2))
+    return Camera(width, height, focal, focal, (width - 1) / 2 + aside, (height - 1) / 2 + aside)
+
+
+VIEWS = {
+    "640 x 480, 60 degrees": View(TABLE_CAMERA),
+    "1280 x 720, 90": View(of_width(1280, 720, 90.0)),
+    "1920 x 1080, 70": View(of_width(1920, 1080, 70.0)),
+    "848 x 480, 87": View(of_width(848, 480, 87.0)),
+    "640 x 480, 30": View(of_width(640, 480, 30.0)),
+    "640 x 480, 120": View(of_width(640, 480, 120.0)),
+    "320 x 240, 60": View(of_width(320, 240, 60.0)),
+    "160 x 120, 60": View(of_width(160, 120, 60.0)),
+    "60, principal point 100 pixels off": View(of_width(640, 480, 60.0, 100.0)),
+    "60, 80 to 90 degrees above": View(TABLE_CAMERA, (80.0, 90.0)),
+    "60, 6 to 16 degrees above": View(TABLE_CAMERA, (6.0, 16.0)),
+}
+
+
+def is_counted(one: Placed, scene: Tabletop) -> bool:
+    fewest = scene_verdict.FEWEST_PIXELS * scene.depth.size / (TABLE_CAMERA.width * TABLE_CAMERA.height)
+    measured = np.count_nonzero((scene.labels == one.label) & np.isfinite(scene.depth))
+    return (
+        one.pixels >= fewest and one.visible_share >= household_things.real_scenes.HALF and 2 * measured >= one.pixels
+    )
+
+
+def looked_at(scene: Tabletop) -> tuple[list[Found], int]:
+    """What became of the things of a scene, and how many own bodies are of none."""
+    given = scene_verdict.recoverer().recover(scene.depth, scene.camera, scene.labels)
+    own = scene_verdict.recoverer().recover(scene.depth, scene.camera)
+    measured = np.isfinite(scene.depth)
+    of_thing = scene_verdict.matches(np.where(measured, own.labels, 0), np.where(measured, scene.labels, 0))
+    found = [
+        Found(
+            scene_verdict.of_frame(given, one.label, one, scene).iou,
+            scene_verdict.of_frame(own, of_thing.get(one.label, 0), one, scene).iou,
+            one.label in of_thing,
+        )
+        for one in scene.placed
+        if is_counted(one, scene)
+    ]
+    taken = set(of_thing.values())
+    return found, sum(body.label not in taken for body in own.recovered)
+
+
+def main() -> None:
+    parser = report.parser(__doc__, "cameras")
+    parser.add_argument("--scenes", type=int, default=30, help="number of scenes before each camera")
+    parser.add_argument("--first", type=int, default=30400, help="seed of the first scene")
+    options = parser.parse_args()
+    result, lines = [], []
+    for name, view in VIEWS.items():
+        found: list[Found] = []
+        others = 0
+        for seed in range(options.first, options.first + options.scenes):
+            some, false = looked_at(household_things.scene(seed, None, camera=view.camera, elevation=view.elevation))
+            found, others = found + some, others + false
+        given, own = (np.array([getattr(one, masks) for one in found]) for masks in ("given", "own"))
+        missed = float(np.mean([not one.is_found for one in found]))
+        row = {"camera": name, "things": len(found), "missed": missed, "false": others / options.scenes}
+        for masks, iou in (("given", given), ("own", own)):
+            row |= {masks: iou.mean(), f"{masks} error": iou.std() / np.sqrt(len(iou))}
+        result.append(row)
+        shown = [f"{100 * row[masks]:.1f} +- {100 * row[f'{masks} error']:.1f}" for masks in ("given", "own")]
+        lines.append([name, str(len(found)), *shown, f"{100 * missed:.0f}", f"{row['false']:.2f}"])
+        print(*lines[-1], flush=True)
+    header = ["camera", "things", "IoU %, masks given", "own masks", "missed %", "false"]
+    facts = {"scenes": options.scenes, "first": options.first}
+    report.write(options.name, {**facts, "rows": result}, report.table(header, lines))
+
+
+if __name__ == "__main__":
+    main()
