@@ -116,15 +116,15 @@ class Outputs:
             self.markers.publish(markers([], [], header, previous_ids=self._marker_ids.replaced(())))
 
     def answer(self, found: Identified, frame: Frame, parameters: RecoverParameters) -> Findings:
-        """Publish the point cloud, in ``target_frame`` if there is one; what was found as every output shows it.
+        """Publish plane and point cloud, in ``target_frame`` if there is one; what was found as every output shows it.
 
         Raises ValueError if the transform to that frame is not known: nothing may be published in a wrong frame.
         """
         here = findings(found, frame.header, frame.is_cube)
         there = in_frame(here, self._poses, parameters.target_frame, parameters.tf_tolerance)
-        self.superquadrics.publish(to_message(there.array, there.header))
-        if there.plane is not None:
+        if there.plane is not None:  # first: who plans on the bodies, as grasp_node does, has what they stand on
             self.support_plane.publish(plane_message(there.plane, there.header))
+        self.superquadrics.publish(to_message(there.array, there.header))
         return there
 
     def accompany(

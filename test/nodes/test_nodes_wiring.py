@@ -30,7 +30,7 @@ from sq_msgs_py.superquadrics import MessageError
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.nodes import fast_dds, frame_node
-from sq_perception.nodes.frame import stamp_of
+from sq_perception.nodes.frame import latched, stamp_of
 
 
 def test_stamp_frame_and_numbers_arrive(bench):
@@ -488,6 +488,26 @@ def test_the_support_plane_reaches_those_who_come_late(bench):
     bench.until(lambda: heard)
     assert heard[0].header == header
     np.testing.assert_allclose(plane_of(heard[0]), [0.0, -0.8, -0.6, 0.5], atol=1e-12)
+
+
+def test_the_support_plane_of_a_frame_is_there_before_its_bodies(bench):
+    """Who plans on the bodies of a camera that has moved must not do so on the plane of the frame before."""
+    planes: list[Any] = []
+    pairs: list[tuple[Any, Any]] = []
+    bench.recoverer.plane = np.array([0.0, -0.8, -0.6, 0.5])
+    bench.peer.create_subscription(PoseStamped, "recover_node/support_plane", planes.append, latched())
+
+    def plan(message: PointCloud2) -> None:
+        pairs.append((message.header, planes[-1].header if planes else None))
+
+    bench.peer.create_subscription(PointCloud2, "recover_node/superquadrics", plan, 10)
+    outputs = bench.node._outputs
+    bench.until(lambda: outputs.support_plane.get_subscription_count() == 1)
+    bench.until(lambda: outputs.superquadrics.get_subscription_count() == 2)
+    for count in range(1, 9):
+        bench.answer(bench.depth())
+        bench.until(lambda count=count: len(pairs) == count)
+    assert all(of_cloud == of_plane for of_cloud, of_plane in pairs), pairs
 
 
 @pytest.mark.parametrize(("target", "pose"), [("", None), (FRAME_ID, ((0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.0)))])
