@@ -35,7 +35,8 @@ from sq_perception.recordings.cloud_file import UNORGANISED
 _INFOS = 16
 _MASKS = 8
 _WAITING = 64
-"""Images that wait for their companions at the same time; older ones are dropped."""
+"""Images that wait for their companions at the same time; beyond them the oldest one's patience is at an end.  Dropped
+instead it would be again and again, and a camera that sends so many within ``patience`` be answered never."""
 
 
 @dataclass(frozen=True)
@@ -251,12 +252,14 @@ class Input:
     def _promote(self, now: float) -> None:
         """Make the newest image ready that is complete or has waited long enough; it takes the place of older ones."""
         ready = [k for k, arrival in enumerate(self._waiting) if arrival.deadline <= now or self._is_complete(arrival)]
-        gone = [self._waiting.popleft() for _ in range(ready[-1] + 1 if ready else len(self._waiting) - _WAITING)]
+        if not ready and len(self._waiting) > _WAITING:
+            ready = [0]
         if ready:
+            gone = [self._waiting.popleft() for _ in range(ready[-1] + 1)]
             arrival = gone.pop()
             gone += [self._ready] if self._ready is not None else []
             self._ready = replace(arrival, mask=self._masks.pop(stamp_of(arrival.message), None))
-        self._statistics.count("dropped", len(gone))
+            self._statistics.count("dropped", len(gone))
         self._changed.notify_all()
 
     def _is_complete(self, arrival: Arrival) -> bool:

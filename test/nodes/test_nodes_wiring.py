@@ -30,6 +30,7 @@ from sq_msgs_py.superquadrics import MessageError
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.nodes import fast_dds, frame_node
+from sq_perception.nodes import input as input_module
 from sq_perception.nodes.frame import latched, stamp_of
 
 
@@ -362,6 +363,24 @@ def test_masks_of_the_same_stamp_are_used(bench):
     masks.publish(labels_to_message(labels, image.header))
     bench.answer(image)
     assert bench.recoverer.asked[-1][2] is None
+
+
+def test_images_whose_masks_never_come_are_answered_before_too_many_wait(make_bench):
+    """A mask network that hangs, and more images within the patience than are kept: the oldest go on without masks."""
+    bench = make_bench("-p", "patience:=10.0")
+    bench.send_info()
+    bench.peer.create_publisher(Image, "mask/image", 5)
+    bench.until(lambda: bench.node.count_publishers("/mask/image"))
+    images = [bench.depth() for _ in range(input_module._WAITING + 3)]
+    for image in images[:-3]:
+        bench.node._input._on_image(image)
+    assert not bench.recoverer.asked
+    for count, image in enumerate(images[-3:], start=1):
+        bench.node._input._on_image(image)
+        bench.until(lambda count=count: len(bench.answers) == count)
+    assert [answer.header for answer in bench.answers] == [image.header for image in images[:3]]
+    assert all(asked[2] is None for asked in bench.recoverer.asked)
+    assert bench.counts.dropped == 0
 
 
 def test_orthographic_frames_need_no_camera_info_and_answer_in_the_cube_frame(make_bench):
