@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from itertools import compress
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from geometry_msgs.msg import Pose, Quaternion
@@ -39,17 +39,25 @@ _AGAIN, _MOST_GONE = 2, 100
 """Repetitions that remove a body that is gone, as a planner may be busy when the first one comes, and of how many."""
 
 
+class _Known(NamedTuple):
+    """An object as it was sent, and its body; None for one that has to be sent again when it is shown."""
+
+    message: CollisionObject
+    body: SuperquadricArray | None
+
+
 class Scene:
     """The bodies of one source as planners know them: what each frame changes.
 
     An object is sent again when it has changed, as a planner copies its world for each message, and all of them in
     another frame or as other shapes.  One is removed when its id is gone, that is neither shown nor hidden: what a
-    robot's arm hides is still there.
+    robot's arm hides is still there, and another planner is told of it as well.
     """
 
     def __init__(self) -> None:
-        self._known: dict[str, SuperquadricArray | None] = {}
-        """By name; None for those that have to be sent again."""
+        self._known: dict[str, _Known] = {}
+        """By name."""
+        self._is_all_due = False
         self._gone: dict[str, int] = {}
         """How many repetitions remove a name once more, in the order in which they went."""
         self._gone_again: frozenset[str] = frozenset()
@@ -59,7 +67,8 @@ class Scene:
 
     def forget(self) -> None:
         """Let the next frame send every object again: another planner listens."""
-        self._known = dict.fromkeys(self._known)
+        self._known = {key: known._replace(body=None) for key, known in self._known.items()}
+        self._is_all_due = True
 
     def repeat(self) -> None:
         """Let the next frame send every object and every late removal again: a planner may have lost messages."""
@@ -73,6 +82,7 @@ class Scene:
         header: Any,
         hidden: Iterable[int] = (),
         *,
+        rests: bool = True,
         meshes: Callable[[], Sequence[Mesh]] | None = None,
         prefix: str = PREFIX,
     ) -> list[CollisionObject]:
@@ -82,6 +92,8 @@ class Scene:
         ----------
         hidden
             Ids of bodies that the frame does not show and that are not given up.
+        rests
+            Whether the header's frame does: where it moves, what is hidden is no longer where it was sent to.
         meshes
             Makes those of the bodies that did not fail, where they are needed.
         """
@@ -91,18 +103,25 @@ class Scene:
         self._known_as, self._header = known_as, header
         shown = superquadrics.recovered
         names = [name(number, prefix) for number in shown.id]
-        new = np.array([_has_changed(self._known.get(key), shown, k) for k, key in enumerate(names)], dtype=bool)
+        bodies = [self._known[key].body if key in self._known else None for key in names]
+        new = np.array([_has_changed(body, shown, k) for k, body in enumerate(bodies)], dtype=bool)
         surfaces = None
         if meshes is not None:
             surfaces = list(compress(meshes(), new)) if new.any() else []
         objects = collision_objects(shown.where(new), header, meshes=surfaces, prefix=prefix)
-        kept = {*names, *(name(number, prefix) for number in hidden)}
+        sent = dict(zip(np.flatnonzero(new), objects, strict=True))
+        unseen = {name(number, prefix) for number in hidden}
+        if self._is_all_due and rests:
+            told = (self._known[key].message for key in sorted(unseen & self._known.keys()))
+            objects += (message for message in told if message.header.frame_id == header.frame_id)
+        self._is_all_due = False
+        kept = {*names, *unseen}
         gone = self._known.keys() - kept
         objects += removals((gone | self._gone_again) - kept, header)
         late = [*((key, left) for key, left in self._gone.items() if key not in gone), *((key, _AGAIN) for key in gone)]
         self._gone, self._gone_again = dict(late[-_MOST_GONE:]), frozenset()
-        self._known = {key: state for key, state in self._known.items() if key in kept}
-        self._known.update({names[k]: shown.where(np.arange(len(shown)) == k) for k in np.flatnonzero(new)})
+        self._known = {key: known for key, known in self._known.items() if key in kept}
+        self._known.update({names[k]: _Known(one, shown.where(np.arange(len(shown)) == k)) for k, one in sent.items()})
         return objects
 
     def clear(self) -> list[CollisionObject]:

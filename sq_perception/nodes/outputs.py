@@ -226,7 +226,14 @@ class OptionalOutputs:
             self._all_due = monotonic() + _ALL_AGAIN
         if heard is not None and parameters.publish_collision_objects and has_frame:
             meshes = (lambda: found.meshes) if parameters.collision_shapes == "mesh" else None
-            objects = self._scene.changes(found.array, found.header, hidden, meshes=meshes, prefix=parameters.tf_prefix)
+            objects = self._scene.changes(
+                found.array,
+                found.header,
+                hidden,
+                rests=bool(parameters.target_frame) or not parameters.fixed_frame,
+                meshes=meshes,
+                prefix=parameters.tf_prefix,
+            )
             if objects:
                 heard.publish(collision_objects.planning_scene(objects))
 

@@ -248,6 +248,35 @@ def test_planners_are_told_of_changes_alone_and_a_new_planner_of_everything(node
     assert show(BOX, CAN, collision_shapes="mesh") == 0
 
 
+def test_a_new_planner_is_told_of_what_an_arm_hides(node):
+    """MoveIt is started again while the arm is before body 2; with a camera that moves nobody knows where that is."""
+    outputs = OptionalOutputs(node)
+    outputs.follow(ALL)
+    scene = node.publishers[SCENE]
+    outputs.publish(found(1, 2), ALL)
+    (_, before) = scene.sent[-1].world.collision_objects
+    for repeats in (lambda: setattr(scene, "restarts", 1), lambda: setattr(node, "time", node.time + 6)):
+        repeats()
+        outputs.publish(found(1), ALL, hidden=(2, 7))
+        (_, again) = scene.sent[-1].world.collision_objects
+        assert again == before, "as it was last seen"
+        count = len(scene.sent)
+        outputs.publish(found(1), ALL, hidden=(2, 7))
+        assert len(scene.sent) == count
+    outputs.publish(found(1, 2), ALL)
+    assert list(objects(scene)) == ["superquadric_2"], "shown again"
+
+    scene.restarts = 2
+    outputs.publish(found(1), replace(ALL, fixed_frame="map"), hidden=(2,))
+    assert list(objects(scene)) == ["superquadric_1"]
+    scene.restarts = 3
+    outputs.publish(found(1), replace(ALL, fixed_frame="map", target_frame="base_link"), hidden=(2,))
+    assert list(objects(scene)) == ["superquadric_1", "superquadric_2"]
+    scene.restarts = 4
+    outputs.publish(found(1, header=Header(frame_id="other")), ALL, hidden=(2,))
+    assert list(objects(scene)) == ["superquadric_1"], "planners that know it know it in its own frame"
+
+
 def test_a_planner_that_was_busy_knows_in_the_end_what_is_there(node):
     """It plans while one body goes and another one moves, and gets the last ten messages of that time."""
     outputs = OptionalOutputs(node)
