@@ -191,7 +191,7 @@ class FrameNode(ManagedNode):
                     arrival = source.take()
                     found = self._recovered(source, arrival) if arrival is not None and self._is_wanted() else None
                 with self._publishing:
-                    # Deactivated or disabled meanwhile: nothing is published, least of all a grasped body.
+                    # Deactivated or disabled meanwhile: nothing is published.
                     if arrival and found and self._input is source and self._is_wanted():
                         outcome = self._published(arrival, *found)
                         self._defects = 0
@@ -205,14 +205,14 @@ class FrameNode(ManagedNode):
                 self._note_defect(outcome.text)
             if arrival is None:
                 continue
+            was_wanted = self._is_wanted()
             if outcome is None:
                 self._statistics.count("dropped")
-                continue
-            if not outcome.is_answered:
-                self._statistics.refuse(outcome.text)
-                self.get_logger().warning(f"refused a frame: {outcome.text}", throttle_duration_sec=THROTTLE)
-            was_wanted = self._is_wanted()
-            self._resolve(outcome, arrival.time)
+            else:
+                if not outcome.is_answered:
+                    self._statistics.refuse(outcome.text)
+                    self.get_logger().warning(f"refused a frame: {outcome.text}", throttle_duration_sec=THROTTLE)
+                self._resolve(outcome, arrival.time)
             if not was_wanted:
                 with self._publishing:
                     self._outputs.hide()
@@ -247,19 +247,23 @@ class FrameNode(ManagedNode):
                 turn, shift = pose_in(*asked, parameters.tf_tolerance)
         return tuple(turn.tolist()), tuple(shift.tolist())
 
-    def _published(self, arrival: Arrival, frame: Frame, answer: Answer, stages: dict[str, float]) -> Outcome:
-        """Name the bodies and publish them."""
+    def _published(self, arrival: Arrival, frame: Frame, answer: Answer, stages: dict[str, float]) -> Outcome | None:
+        """Name the bodies and publish them; None where that is not wanted any more."""
         parameters = self._settings.current
         with timed(stages, "tracking"):
             found = self._tracking.identify(*answer, frame, arrival.time, parameters)
         with timed(stages, "publish"):
-            findings = self._outputs.answer(found, frame, parameters)
+            shown = self._outputs.shown(found, frame, parameters)
+            # Both may have waited for transforms.  Disabled meanwhile: least of all a grasped body is published.
+            if not self._is_wanted():
+                return None
+            self._outputs.answer(shown)
         age = 1e-9 * (self.get_clock().now().nanoseconds - stamp_of(frame))
         if abs(age) < _OLDEST:
             stages["stamp to result"] = 1e3 * age
-        self._outputs.accompany(found, findings, frame, parameters, stages)
+        self._outputs.accompany(found, shown, frame, parameters, stages)
         self._statistics.answer(stages, found.summary)
-        return Outcome(True, found.summary, findings)
+        return Outcome(True, found.summary, shown)
 
     def _resolve(self, outcome: Outcome, arrived: float = math.inf) -> None:
         """Answer who was waiting when the frame arrived, at ``arrived`` of the monotonic clock."""

@@ -115,17 +115,19 @@ class Outputs:
             header, self._header = self._header, None
             self.markers.publish(markers([], [], header, previous_ids=self._marker_ids.replaced(())))
 
-    def answer(self, found: Identified, frame: Frame, parameters: RecoverParameters) -> Findings:
-        """Publish plane and point cloud, in ``target_frame`` if there is one; what was found as every output shows it.
+    def shown(self, found: Identified, frame: Frame, parameters: RecoverParameters) -> Findings:
+        """What was found as every output shows it: in ``target_frame`` if there is one.
 
         Raises ValueError if the transform to that frame is not known: nothing may be published in a wrong frame.
         """
         here = findings(found, frame.header, frame.is_cube)
-        there = in_frame(here, self._poses, parameters.target_frame, parameters.tf_tolerance)
-        if there.plane is not None:  # first: who plans on the bodies, as grasp_node does, has what they stand on
-            self.support_plane.publish(plane_message(there.plane, there.header))
-        self.superquadrics.publish(to_message(there.array, there.header))
-        return there
+        return in_frame(here, self._poses, parameters.target_frame, parameters.tf_tolerance)
+
+    def answer(self, shown: Findings) -> None:
+        """Publish plane and point cloud."""
+        if shown.plane is not None:  # first: who plans on the bodies, as grasp_node does, has what they stand on
+            self.support_plane.publish(plane_message(shown.plane, shown.header))
+        self.superquadrics.publish(to_message(shown.array, shown.header))
 
     def accompany(
         self, found: Identified, shown: Findings, frame: Frame, parameters: RecoverParameters, stages: dict[str, float]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+import threading
 import types
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -17,7 +18,9 @@ from diagnostic_msgs.msg import DiagnosticArray
 from frame_node_bench import CAMERA, FRAME_ID, Bench
 from geometry_msgs.msg import TransformStamped
 from rclpy.parameter import Parameter
+from spun_nodes import PATIENCE
 from std_msgs.msg import Header
+from std_srvs.srv import SetBool
 from visualization_msgs.msg import Marker, MarkerArray
 
 from sq_msgs_py.depth_image import depth_to_message
@@ -236,6 +239,38 @@ def test_a_bag_that_begins_again_is_seen_in_the_target_frame_again(make_bench, m
     bench = make_bench("-p", "target_frame:=base", "-p", "tf_tolerance:=0.0", "-p", f"tracking:={tracking}", *box)
     counts = [bench.send(image(sec)) for sec in (60.0, 3.0, 3.1)]
     assert [(one.answered, one.refused) for one in counts] == [(1, 0), (1, 1), (2, 1)], counts[-1].last_error
+
+
+@pytest.mark.parametrize("name", ["fixed_frame", "target_frame"])
+def test_what_is_disabled_while_a_transform_is_waited_for_publishes_nothing(make_bench, monkeypatch, name):
+    """Else a body that the gripper holds by now would come into the planning scene again."""
+    tf2, waits, comes = Tf2(), threading.Event(), threading.Event()
+    stands = np.array([0.0, 0.0, 0.0, 1.0]), np.zeros(3)
+    tf2.poses = {10.0: stands, 11.0: stands}
+    look_up = tf2.lookup_transform
+
+    def lookup_transform(*asked: Any) -> TransformStamped:
+        waits.set()
+        assert comes.wait(PATIENCE)
+        return look_up(*asked)
+
+    monkeypatch.setitem(sys.modules, "tf2_ros", tf2.module)
+    bench = make_bench("-p", f"{name}:=base")
+    actions: list[int] = []
+    bench.peer.create_subscription(
+        MarkerArray, "recover_node/markers", lambda array: actions.extend(one.action for one in array.markers), 10
+    )
+    bench.until(lambda: bench.node._outputs.markers.get_subscription_count() == 1)
+    bench.answer(image(10.0))
+    bench.until(lambda: actions == [Marker.ADD] * 2)
+    tf2.lookup_transform = lookup_transform
+    bench.images.publish(image(11.0))
+    bench.until(waits.is_set)
+    assert bench.call(SetBool, "/recover_node/enable", SetBool.Request(data=False)).success
+    comes.set()
+    bench.until(lambda: bench.counts.in_work == 0)
+    assert (bench.counts.answered, bench.counts.dropped, len(bench.answers)) == (1, 1, 1)
+    bench.until(lambda: actions == [Marker.ADD] * 2 + [Marker.DELETE] * 2)
 
 
 def test_without_tf2_ids_remain(make_bench, monkeypatch, capfd):
