@@ -12,8 +12,10 @@ from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
 
 import numpy as np
+from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
+from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 
 from sq_msgs_py.depth_image import DEPTH_ENCODINGS, GREY_ENCODINGS, labels_from_message, size_mismatch
@@ -140,6 +142,19 @@ def image_topic(node: Node, name: str, transport: str) -> str:
     if transport == RAW or resolved.endswith(f"/{transport}"):
         return resolved
     return f"{resolved}/{transport}"
+
+
+def listen_to_latched_info(node: Node, topic: str, callback: Callable[[CameraInfo], None]) -> Subscription | None:
+    """Subscribe to a camera_info that was published once and is kept for late comers, if somebody offers one now.
+
+    Not without looking: a driver that keeps nothing would log an incompatible subscription.
+    """
+    offered = node.get_publishers_info_by_topic(topic)
+    if all(publisher.qos_profile.durability != QoSDurabilityPolicy.TRANSIENT_LOCAL for publisher in offered):
+        return None
+    # Others on the topic may keep nothing; a plain subscription hears them.
+    quietly = SubscriptionEventCallbacks(incompatible_qos=lambda _: None)
+    return node.create_subscription(CameraInfo, topic, callback, latched(), event_callbacks=quietly)
 
 
 def stamp_of(message: Any) -> int:

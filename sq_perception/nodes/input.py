@@ -18,7 +18,7 @@ from typing import Any
 
 from rclpy.event_handler import SubscriptionEventCallbacks
 from rclpy.node import Node
-from rclpy.qos import QoSCompatibility, QoSDurabilityPolicy, QoSReliabilityPolicy, qos_check_compatible
+from rclpy.qos import QoSCompatibility, QoSReliabilityPolicy, qos_check_compatible
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from rclpy.subscription import Subscription
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
@@ -26,7 +26,16 @@ from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 from sq_msgs_py.depth_image import size_mismatch
 from sq_perception.imaging.calibration import Calibration
 from sq_perception.nodes import fast_dds
-from sq_perception.nodes.frame import DepthMessage, Frame, decode, image_topic, latched, newest, size_of, stamp_of
+from sq_perception.nodes.frame import (
+    DepthMessage,
+    Frame,
+    decode,
+    image_topic,
+    listen_to_latched_info,
+    newest,
+    size_of,
+    stamp_of,
+)
 from sq_perception.nodes.live_parameters import LiveParameters
 from sq_perception.nodes.parameters import POINTS, RAW, RecoverParameters
 from sq_perception.nodes.statistics import THROTTLE, Statistics
@@ -104,22 +113,9 @@ class Input:
         self._image = self._listen(kind, self.topic, self._on_image)
 
     def look_for_latched(self) -> None:
-        """Subscribe to a camera_info that was published once and is kept for late comers, if there is one; each second.
-
-        Not from the start: a driver that keeps nothing would log an incompatible subscription.
-        """
-        if self._info is None or self._latched is not None or self._is_closed:
-            return
-        offered = self._node.get_publishers_info_by_topic(self._info_topic)
-        if any(publisher.qos_profile.durability == QoSDurabilityPolicy.TRANSIENT_LOCAL for publisher in offered):
-            self._latched = self._node.create_subscription(
-                CameraInfo,
-                self._info_topic,
-                self._on_info,
-                latched(),
-                # Others on the topic may keep nothing; the plain subscription hears them.
-                event_callbacks=SubscriptionEventCallbacks(incompatible_qos=lambda _: None),
-            )
+        """Hear a camera_info that was published once before, if there is one; called each second."""
+        if self._info is not None and self._latched is None and not self._is_closed:
+            self._latched = listen_to_latched_info(self._node, self._info_topic, self._on_info)
 
     @property
     def silence(self) -> float:

@@ -29,7 +29,7 @@ from sq_msgs_py.depth_image import GREY_ENCODINGS
 from sq_msgs_py.superquadrics import from_message
 from sq_perception.geometry import rotation
 from sq_perception.imaging import unit_cube
-from sq_perception.nodes.frame import decode_by, newest, size_of, stamp_of
+from sq_perception.nodes.frame import decode_by, listen_to_latched_info, newest, size_of, stamp_of
 from sq_perception.nodes.remote_node import RemoteNode
 from sq_perception.nodes.statistics import THROTTLE
 from sq_perception.nodes.tracking import CameraPoses, PoseError
@@ -92,6 +92,7 @@ class ViewNode(Node):
         self._diagnosed: dict[str, dict[str, str]] = {}
         self._poses = CameraPoses(self)
         self._inputs: list[Subscription] = []
+        self._latched: Subscription | None = None
         self._drawn: Image | None = None
         self._shown: dict[str, _Result | None] = {}
         """The result of each node that was drawn last."""
@@ -122,9 +123,12 @@ class ViewNode(Node):
         if watched and not self._inputs:
             self._listen()
         elif not watched and self._inputs:
-            for subscription in self._inputs:
-                self.destroy_subscription(subscription)
-            self._inputs = []
+            for subscription in (*self._inputs, self._latched):
+                if subscription is not None:
+                    self.destroy_subscription(subscription)
+            self._inputs, self._latched = [], None
+        if self._inputs and self._latched is None:
+            self._latched = listen_to_latched_info(self, self._topics[1], self._on_info)
         executor = self.executor
         assert executor is not None, "it calls this"
         for change in self._page.changes():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
+from time import monotonic
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,10 +17,15 @@ pytest.importorskip("viser", reason="needs the extra 'view'")
 from builtin_interfaces.msg import Time
 from geometry_msgs.msg import TransformStamped
 from rclpy.context import Context
+from rclpy.executors import SingleThreadedExecutor
+from rclpy.node import Node
+from sensor_msgs.msg import CameraInfo
+from spun_nodes import PATIENCE
 from std_msgs.msg import Header
 
 from sq_msgs_py.depth_image import depth_to_message
 from sq_msgs_py.superquadrics import SuperquadricArray, to_message
+from sq_perception.nodes.frame import latched
 from sq_perception.nodes.view_node import ViewNode
 
 
@@ -57,6 +63,26 @@ def test_bodies_in_another_frame_are_drawn_though_a_bag_begins_again(view, monke
         cloud = to_message(SuperquadricArray.empty(), Header(stamp=stamp, frame_id="base"))
         drawn.append(view._converted(cloud, image.header)[1] == "")
     assert drawn == [True, False, True]
+
+
+def test_a_camera_info_that_was_published_once_before_is_received(view):
+    """By a driver that keeps it for late comers; nobody hears it who does not ask for that."""
+    executor, peer = SingleThreadedExecutor(context=view.context), Node("peer", context=view.context)
+    infos = peer.create_publisher(CameraInfo, "depth/camera_info", latched())
+    infos.publish(CameraInfo(width=2, height=2))
+    view._page.watched, view._page.changes = True, tuple
+    executor.add_node(view)
+    deadline = monotonic() + PATIENCE
+    while view._info is None:
+        assert monotonic() < deadline, "waited in vain"
+        executor.spin_once(timeout_sec=0.2)
+    assert view._info.width == 2
+    view._page.watched = False
+    view._on_tick()
+    assert (view._inputs, view._latched) == ([], None)
+    executor.remove_node(view)
+    executor.shutdown()
+    peer.destroy_node()
 
 
 def test_the_newest_image_is_the_last_one_where_a_short_bag_is_in_a_loop(view):
