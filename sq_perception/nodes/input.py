@@ -159,6 +159,8 @@ class Input:
         with self._changed:
             self._promote(monotonic())
             arrival, self._ready = self._ready, None
+            if arrival is not None and arrival.mask is None:  # it may have come since, beyond the patience
+                arrival = replace(arrival, mask=self._masks.pop(stamp_of(arrival.message), None))
             return arrival
 
     def frame(self, arrival: Arrival, parameters: RecoverParameters) -> Frame:

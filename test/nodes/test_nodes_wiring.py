@@ -365,6 +365,29 @@ def test_masks_of_the_same_stamp_are_used(bench):
     assert bench.recoverer.asked[-1][2] is None
 
 
+def test_a_mask_that_comes_while_the_node_is_busy_is_used(make_bench):
+    """The image's patience is at an end, and its turn has not come."""
+    bench = make_bench("-p", "patience:=0.0")
+    bench.send_info()
+    masks = bench.peer.create_publisher(Image, "mask/image", 5)
+    bench.until(lambda: masks.get_subscription_count() == 1 and bench.node.count_publishers("/mask/image"))
+    assert bench.node.set_parameters([Parameter("use_masks", value="never")])[0].successful
+    bench.recoverer.gate.clear()
+    bench.images.publish(bench.depth())
+    bench.until(lambda: len(bench.recoverer.asked) == 1)
+    assert bench.node.set_parameters([Parameter("use_masks", value="always")])[0].successful
+    image = bench.depth()
+    bench.images.publish(image)
+    bench.until(lambda: bench.node._input._ready is not None)
+    masks.publish(labels_to_message(np.full((48, 64), 3, np.int32), image.header))
+    bench.until(lambda: bench.node._input._masks)
+    bench.recoverer.gate.set()
+    bench.until(lambda: bench.counts.in_work == 0)
+    assert (bench.counts.answered, bench.counts.refused) == (2, 0), bench.counts.last_error
+    assert (bench.recoverer.asked[-1][2] == 3).all()
+    assert not bench.node._input._masks
+
+
 def test_images_whose_masks_never_come_are_answered_before_too_many_wait(make_bench):
     """A mask network that hangs, and more images within the patience than are kept: the oldest go on without masks."""
     bench = make_bench("-p", "patience:=10.0")
