@@ -40,6 +40,8 @@ class Statistics:
         self._lost: Counter[str] = Counter()
         self._reported: tuple[int, Counter[str]] = 0, Counter()
         """Refused and lost when the last status was made."""
+        self._stood = self._started
+        """When something else than frames was last reported, such as that nobody wants them."""
         self._last_error = self._last_answer = ""
 
     def count(self, what: str, number: int = 1) -> None:
@@ -79,15 +81,17 @@ class Statistics:
             last_error, last_answer = self._last_error, self._last_answer
         number = Counter(what for _, what in recent)
         rate = number["answered"] / min(SECONDS, max(now - self._started, 1.0))
-        since = now - next((time for time, what in recent if what == "received"), now)
+        came = [time for time, what in recent if what == "received" and time > self._stood]
+        since = now - min(came, default=now)
         (refused, known), self._reported = self._reported, (counts["refused"], lost)
         level, message = DiagnosticStatus.WARN, ""
         if standing is not None:
             level, message = standing
+            self._stood = now
         elif counts["refused"] > refused:
             message = f"refused a frame: {last_error.partition(' ')[2]}"
         elif since > _SLOW and not number["answered"]:
-            message = f"{number['received']} frames came within {since:.0f} s, none was answered"
+            message = f"{len(came)} frames came within {since:.0f} s, none was answered"
         elif new := lost - known:
             parts = ", ".join(f"{number} of {topic}" for topic, number in new.items())
             message = f"messages lost before they arrived: {parts}"

@@ -74,6 +74,23 @@ def test_frames_that_come_and_are_not_answered_are_a_warning(statistics, clock):
     assert said(statistics)[0].level == DiagnosticStatus.OK
 
 
+def test_frames_that_nobody_wanted_are_no_warning_once_they_are_wanted(statistics, clock):
+    """Disabled for a while, then enabled; the first frame is still at work when the next status is due."""
+    for _ in range(8):
+        clock.now += 1.0
+        statistics.count("received")
+        statistics.count("dropped")
+        statistics.status("/recover_node", (DiagnosticStatus.OK, "disabled"), {})
+    clock.now += 0.5
+    statistics.count("received")
+    clock.now += 0.5
+    assert said(statistics)[0].level == DiagnosticStatus.OK
+    for _ in range(4):
+        clock.now += 1.0
+        statistics.count("received")
+    assert said(statistics)[0].message == "5 frames came within 4 s, none was answered"
+
+
 def test_the_first_frame_of_a_start_is_no_warning(statistics, clock):
     statistics.count("received")
     clock.now += 1.0
