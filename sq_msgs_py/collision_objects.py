@@ -57,7 +57,8 @@ class Scene:
     def __init__(self) -> None:
         self._known: dict[str, _Known] = {}
         """By name."""
-        self._is_all_due = False
+        self._is_new = False
+        """Whether a planner listens that knows nothing."""
         self._gone: dict[str, int] = {}
         """How many repetitions remove a name once more, in the order in which they went."""
         self._gone_again: frozenset[str] = frozenset()
@@ -66,13 +67,16 @@ class Scene:
         self._header: Any = None
 
     def forget(self) -> None:
-        """Let the next frame send every object again: another planner listens."""
-        self._known = {key: known._replace(body=None) for key, known in self._known.items()}
-        self._is_all_due = True
+        """Let the next frame send every object again, hidden ones as they were: another planner listens."""
+        self._send_again()
+        self._is_new = True
 
     def repeat(self) -> None:
-        """Let the next frame send every object and every late removal again: a planner may have lost messages."""
-        self.forget()
+        """Let the next frame send every object and every late removal again: a planner may have lost messages.
+
+        None that is hidden: one that a gripper has taken, and that is attached to it by now, would come back.
+        """
+        self._send_again()
         self._gone_again = frozenset(self._gone)
         self._gone = {key: left - 1 for key, left in self._gone.items() if left > 1}
 
@@ -99,7 +103,7 @@ class Scene:
         """
         known_as = header.frame_id, meshes is not None
         if known_as != self._known_as:
-            self.forget()
+            self._send_again()
         self._known_as, self._header = known_as, header
         shown = superquadrics.recovered
         names = [name(number, prefix) for number in shown.id]
@@ -111,10 +115,10 @@ class Scene:
         objects = collision_objects(shown.where(new), header, meshes=surfaces, prefix=prefix)
         sent = dict(zip(np.flatnonzero(new), objects, strict=True))
         unseen = {name(number, prefix) for number in hidden}
-        if self._is_all_due and rests:
+        if self._is_new and rests:
             told = (self._known[key].message for key in sorted(unseen & self._known.keys()))
             objects += (message for message in told if message.header.frame_id == header.frame_id)
-        self._is_all_due = False
+        self._is_new = False
         kept = {*names, *unseen}
         gone = self._known.keys() - kept
         objects += removals((gone | self._gone_again) - kept, header)
@@ -123,6 +127,9 @@ class Scene:
         self._known = {key: known for key, known in self._known.items() if key in kept}
         self._known.update({names[k]: _Known(one, shown.where(np.arange(len(shown)) == k)) for k, one in sent.items()})
         return objects
+
+    def _send_again(self) -> None:
+        self._known = {key: known._replace(body=None) for key, known in self._known.items()}
 
     def clear(self) -> list[CollisionObject]:
         """Objects that REMOVE all that planners know of."""
