@@ -49,10 +49,11 @@ class GraspNode(ManagedNode):
         self._last: PointCloud2 | None = None
         self._plane: PoseStamped | None = None
         self._marker_ids = MarkerIds()
-        self._publishers: list[Publisher] = []
+        # By names that rclpy's Node has not: it keeps lists of its own, and destroying takes out of these.
+        self._outputs: list[Publisher] = []
         self._publishing = threading.Lock()
         """Held while something is published, or nothing is any more."""
-        self._subscriptions: list[Any] = []
+        self._inputs: list[Any] = []
         self.create_service(Trigger, "~/plan", self._on_plan)
         with suppress(ImportError):
             self.create_service(installed("moveit_msgs/srv/GraspPlanning"), "~/plan_grasps", self._on_plan_grasps)
@@ -70,24 +71,24 @@ class GraspNode(ManagedNode):
             (PointCloud2, "~/grasp_details"),
             (MarkerArray, "~/markers"),
         )
-        self._publishers = [self.create_publisher(kind, topic, 10) for kind, topic in kinds]
-        self._subscriptions = [
+        self._outputs = [self.create_publisher(kind, topic, 10) for kind, topic in kinds]
+        self._inputs = [
             self.create_subscription(PoseStamped, "support_plane", self._on_plane, latched()),
             self.create_subscription(PointCloud2, "superquadrics", self._on_cloud, 1),
         ]
 
     def _deactivate(self) -> None:
-        for subscription in self._subscriptions:
+        for subscription in self._inputs:
             self.destroy_subscription(subscription)
-        self._subscriptions = []
+        self._inputs = []
         with self._publishing:
-            if self._publishers and self._last is not None and self.context.ok():
-                shown = self._publishers[-1]
+            if self._outputs and self._last is not None and self.context.ok():
+                shown = self._outputs[-1]
                 shown.publish(self._markers([], [], self._last.header))
                 shown.wait_for_all_acked(ARRIVAL)
-            for publisher in self._publishers:
+            for publisher in self._outputs:
                 self.destroy_publisher(publisher)
-            self._publishers = []
+            self._outputs = []
 
     def _cleanup(self) -> None:
         self._deactivate()
@@ -144,7 +145,7 @@ class GraspNode(ManagedNode):
             bodies = from_message(message).recovered
             plan = planned(bodies, self._settings.current, self._plane_in(message.header))
             with self._publishing:
-                if not self._publishers:  # deactivated while it was planned
+                if not self._outputs:  # deactivated while it was planned
                     return None, f"the node is {self.state}"
                 found = self._published(message.header, bodies, plan, gripper(self._settings.current.gripper))
         except Exception as error:
@@ -165,7 +166,7 @@ class GraspNode(ManagedNode):
             np.array([grasp.score for grasp in plan.grasps]),
             np.array([bodies.id[grasp.body] for grasp in plan.grasps], dtype=np.uint32),
         )
-        poses, details, shown = self._publishers
+        poses, details, shown = self._outputs
         poses.publish(messages.poses(found, header))
         details.publish(messages.to_message(found, header))
         best = {int(bodies.id[grasp.body]): grasp for grasp in reversed(plan.grasps)}

@@ -65,7 +65,7 @@ class Bench(SpunNodes):
         self.spin([self.node])
         self.until(lambda: self.node.is_active and self.cloud.get_subscription_count())
         self.until(lambda: self.node._plane is not None)
-        self.until(lambda: all(one.get_subscription_count() for one in self.node._publishers))
+        self.until(lambda: all(one.get_subscription_count() for one in self.node._outputs))
 
     def answer(self, message):
         self.heard.clear()
@@ -164,9 +164,22 @@ def test_a_cloud_that_is_planned_while_the_node_is_deactivated_is_dropped(bench,
         assert bench.node._answered(to_message(bodies(), HEADER)) == (None, "the node is inactive")
     assert not said
     assert bench.node._change("activate")
-    bench.until(lambda: all(one.get_subscription_count() for one in bench.node._publishers))
+    bench.until(lambda: all(one.get_subscription_count() for one in bench.node._outputs))
     bench.until(bench.cloud.get_subscription_count)
     assert len(bench.answer(to_message(bodies(), HEADER))["grasps"].poses) > 0
+
+
+def test_a_pause_leaves_no_subscription_and_no_publisher_behind(bench):
+    def there():
+        names = [f"/grasp_node/{name}" for name in ("grasps", "grasp_details", "markers")]
+        counts = [len(bench.peer.get_publishers_info_by_topic(name)) for name in names]
+        return [*counts, bench.plane.get_subscription_count(), bench.cloud.get_subscription_count()]
+
+    for _ in range(3):
+        bench.until(lambda: there() == [1] * 5)
+        assert bench.node._change("deactivate")
+        bench.until(lambda: there() == [0] * 5)
+        assert bench.node._change("activate")
 
 
 def test_what_was_there_before_a_pause_is_not_planned_for_after_it(bench):
