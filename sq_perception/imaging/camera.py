@@ -132,6 +132,8 @@ class Camera:
 
     def check_image(self, image: np.ndarray) -> None:
         """Raise ValueError unless the image has this camera's size."""
+        if image.ndim != 2:
+            raise ValueError(f"expected an image (height, width), got an array of shape {image.shape}")
         if image.shape[:2] != (self.height, self.width):
             raise ValueError(
                 f"image of {image.shape[1]} x {image.shape[0]} pixels does not fit a camera of "

@@ -89,6 +89,8 @@ class Recoverer:
         If the method needs the network and the file is missing or wrong.
     ValueError
         For an unknown method, a device that this machine does not have, or less than one thread.
+    TypeError
+        For a model that is neither a path nor a name, such as options, which :meth:`recover` takes.
     """
 
     def __init__(
@@ -100,6 +102,9 @@ class Recoverer:
         *,
         weights_of: Recoverer | None = None,
     ) -> None:
+        if not isinstance(model, str | Path | None):
+            given = type(model).__name__
+            raise TypeError(f"model: expected a file of weights or its name, got {given}; recover takes options")
         if threads is not None and threads < 1:
             raise ValueError(f"threads: expected at least 1, got {threads}")
         self._threads = threads or len(os.sched_getaffinity(0))
