@@ -146,8 +146,9 @@ def writing(path: str | Path) -> Iterator[Path]:
     """Where to write a file that shall appear whole or not at all; raises OSError as :class:`OutputFile` does."""
     output = OutputFile(path)
     try:
-        yield output.partial
-        output.commit()
+        with named(path):
+            yield output.partial
+            output.commit()
     finally:
         output.discard()
 
@@ -156,10 +157,22 @@ def write(path: str | Path, data: bytes, whole: bool = True) -> Path:
     """Write a result at once; returns where it is, see :meth:`OutputFile.commit`."""
     output = OutputFile(path)
     try:
-        output.partial.write_bytes(data)
-        return output.commit(whole)
+        with named(path):
+            output.partial.write_bytes(data)
+            return output.commit(whole)
     finally:
         output.discard()
+
+
+@contextmanager
+def named(path: str | Path) -> Iterator[None]:
+    """Within it an OSError that names no file, such as that of a full disk, names this one."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None:
+            error.filename = str(path)
+        raise
 
 
 def check(path: str | Path) -> None:

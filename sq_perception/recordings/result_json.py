@@ -206,8 +206,9 @@ class ResultLines:
     def _put(self, data: bytes) -> None:
         rest = memoryview(data)
         try:
-            while rest:
-                rest = rest[os.write(self._descriptor, rest) :]
+            with output_file.named(self._path):
+                while rest:
+                    rest = rest[os.write(self._descriptor, rest) :]
         except BaseException:
             if self._can_go_back:
                 with suppress(OSError):

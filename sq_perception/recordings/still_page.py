@@ -18,7 +18,7 @@ from trimesh.viewer.notebook import scene_to_html
 from trimesh.visual import TextureVisuals
 from trimesh.visual.material import PBRMaterial
 
-from sq_perception.files.output_file import OutputFile
+from sq_perception.files.output_file import OutputFile, named
 from sq_perception.fitting.fit import Status
 from sq_perception.geometry.mesh import COLOURS, triangles
 from sq_perception.recordings.frame_file import RecordedFrame
@@ -45,7 +45,8 @@ class StillPage:
         there = base64.b64encode(nothing.export(file_type="glb")).decode()
         beginning, self._end = _TEMPLATE.read_text(encoding="utf-8").split("<!-- frames -->\n")
         try:
-            self._file.write(beginning.replace("$VIEWER", _as_script(scene_to.replace(there, _SCENE))))
+            with named(path):
+                self._file.write(beginning.replace("$VIEWER", _as_script(scene_to.replace(there, _SCENE))))
         except OSError:
             self._output.discard()
             raise
@@ -55,7 +56,8 @@ class StillPage:
         glb = base64.b64encode(_scene(frame, recovery).export(file_type="glb")).decode()
         name = f"{self._count}: {frame.name}"
         content = _as_script({"name": name, "glb": glb, "numbers": _numbers(frame, recovery)})
-        self._file.write(f"<script>frames.push({content});</script>\n")
+        with named(self._output.path):
+            self._file.write(f"<script>frames.push({content});</script>\n")
         self._count += 1
 
     def close(self, whole: bool = True) -> Path | None:
@@ -63,9 +65,10 @@ class StillPage:
         if self._file.closed:
             return None
         try:
-            with self._file:
-                self._file.write(self._end)
-            return self._output.commit(whole) if self._count else None
+            with named(self._output.path):
+                with self._file:
+                    self._file.write(self._end)
+                return self._output.commit(whole) if self._count else None
         finally:
             self._output.discard()
 

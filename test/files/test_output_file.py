@@ -105,8 +105,19 @@ def test_an_open_descriptor_keeps_what_was_written_to_it(tmp_path):
 
 
 def test_a_full_device_is_an_error(tmp_path):
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(OSError, match="No space left on device: '/dev/full'"):
         output_file.write("/dev/full", NEW)
+
+
+def test_the_error_of_a_full_disk_names_the_file(old, file_size_limit):
+    def grow():
+        with output_file.writing(old) as partial:
+            partial.write_bytes(NEW)
+
+    for way in (grow, lambda: output_file.write(old, NEW)):
+        with file_size_limit(1), pytest.raises(OSError, match=r"too large: '.*/out\.json'"):
+            way()
+        assert old.read_bytes() == OLD
 
 
 @pytest.mark.parametrize("name", ["missing/out.json", ".", "/proc/out.json", "x" * 256])

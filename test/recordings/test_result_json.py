@@ -96,7 +96,7 @@ def test_two_programs_do_not_share_a_file(path):
 
 def test_a_full_disk_leaves_whole_lines(path, file_size_limit):
     lines, before = ResultLines(path, OPTIONS), path.read_bytes()
-    with file_size_limit(len(before) + 20), pytest.raises(OSError, match="large"):
+    with file_size_limit(len(before) + 20), pytest.raises(OSError, match=f"too large: '{path}'"):
         lines.add(entry(2))
     assert path.read_bytes() == before
     lines.add(entry(2))
