@@ -39,6 +39,8 @@ from sq_perception.learning.training_state import SETTINGS, TrainingState, mixed
 
 _OF_A_RUN = ("loss", "backbone", "framing", "pixels", "canonical_labels", "optimizer")
 """Settings whose change makes another run; others may change when it goes on."""
+_FORM = ("backbone", "framing", "pixels")
+"""Settings that a network to begin with brings along."""
 CALIBRATION_VIEWS, _CALIBRATION_BATCH = 2048, 32
 """Views from which normalisations are measured anew, and at least so many at once: fewer take long and say less."""
 _SAVE_SECONDS = 300.0
@@ -84,7 +86,7 @@ def train(
     CheckpointError
         If a file to begin or to go on with does not fit.
     ValueError
-        For a device that this machine does not have, or data of another form.
+        For a device that this machine does not have, or data or a network to begin with of another form.
     """
     device = torch.device(checked_device(config.device))
     with _threads(config.threads), _stop_requests() as stop_requested:
@@ -195,6 +197,10 @@ def _new_network(config: TrainingConfig, form: RegressorConfig | None) -> Regres
             model.features.load_imagenet(read_tensors(Path(config.imagenet)))
         return model
     model = checkpoint.load(config.start)
+    for name in _FORM:
+        wanted, brought = getattr(config, name), getattr(model.config, name)
+        if wanted not in (getattr(TrainingConfig, name), brought):  # defaults say nothing: a start keeps its form
+            raise ValueError(f"{name}: expected {brought!r}, as the network of start has it, got {wanted!r}")
     model.config = replace(model.config, marks_hidden=model.config.marks_hidden or config.marks_hidden)
     return model
 

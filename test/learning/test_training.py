@@ -265,6 +265,14 @@ class TestContinuation:
         record = log_of(tmp_path / "run")[-1]
         assert {"iou", "iou_hidden", "iou_worn"} <= set(record)
 
+    @pytest.mark.parametrize("other", [{"pixels": 48}, {"backbone": "resnet18"}, {"framing": "full"}])
+    def test_a_start_of_another_form_than_is_asked_for_is_refused(self, other: dict[str, Any], tmp_path: Path) -> None:
+        checkpoint.save(tmp_path / "start.safetensors", Regressor(SMALL))
+        ((name, value),) = other.items()
+        config = replace(RUN, steps=1, start=str(tmp_path / "start.safetensors"), **other)
+        with pytest.raises(ValueError, match=f"{name}: expected {getattr(SMALL, name)!r}, .* got {value!r}"):
+            train.train(config, tmp_path / "run")
+
 
 class TestThesisSetting:
     """ResNet-18 on full frames, here of 64 pixels; drawn on the fly, and from a fixed set."""
