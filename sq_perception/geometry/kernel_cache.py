@@ -27,19 +27,24 @@ _log = logging.getLogger(__name__)
 
 def compiled(function: _F, options: dict[str, Any]) -> _F:
     """numba's ``njit`` with these options, its machine code kept wherever there is a place."""
+    settings: Any = numba.config
+    named = settings.CACHE_DIR
     try:
-        return cast(_F, numba.njit(cache=True, **options)(function))
+        kept: Any = numba.njit(cache=True, **options)(function)
     except RuntimeError:  # numba knows no place
-        folder = temporary_folder()
+        kept = None
+    if named and (kept is None or not Path(kept.stats.cache_path).is_relative_to(named)):
+        _passed_over(named)
+    if kept is not None:
+        return cast(_F, kept)
+    folder = temporary_folder()
     if folder is None:
         return cast(_F, numba.njit(**options)(function))
-    settings: Any = numba.config
-    before = settings.CACHE_DIR
     settings.CACHE_DIR = str(folder)  # read when a function is decorated; other packages keep theirs where they did
     try:
         return cast(_F, numba.njit(cache=True, **options)(function))
     finally:
-        settings.CACHE_DIR = before
+        settings.CACHE_DIR = named
 
 
 class _Compiling(Listener):
@@ -56,6 +61,15 @@ class _Compiling(Listener):
 @cache
 def _announce() -> None:
     _log.info("compiling, once for this installation: all kernels take about two minutes")
+
+
+@cache
+def _passed_over(named: str) -> None:
+    """Say once what numba does not."""
+    _log.warning(
+        "NUMBA_CACHE_DIR: %s cannot be written: compiled kernels are kept elsewhere, `sq-perception doctor` says where",
+        named,
+    )
 
 
 register("numba:compile", _Compiling())

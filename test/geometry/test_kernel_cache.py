@@ -104,6 +104,20 @@ def test_a_named_place_goes_first(installation: Path, tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["named"]
 
 
+def test_a_named_place_that_cannot_be_written_is_not_passed_over_in_silence(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    done = subprocess.run(
+        [sys.executable, "-m", "sq_perception", "doctor"],
+        env={**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "file")},
+        capture_output=True,
+        text=True,
+        timeout=PATIENCE,
+        check=True,
+    )
+    assert done.stderr.count("\n") == 1
+    assert f"NUMBA_CACHE_DIR: {tmp_path / 'file'} cannot be written" in done.stderr
+
+
 def test_the_name_of_a_kernel_follows_what_its_module_imports(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Machine code is compiled again after a change of what was compiled into it, and after no other."""
     package = tmp_path / "sq_perception"
