@@ -113,13 +113,18 @@ class Recoverer:
         self._device = inference.checked_device(device)
         self._loaded: dict[bool, Network] = {} if weights_of is None else weights_of._loaded
         self._masks: tuple[CompactMasks, CompactMasks] | None = None if weights_of is None else weights_of._masks
-        self._lock = threading.Lock()
-        self._beside = ThreadPoolExecutor(1, thread_name_prefix="network")
-        self._pool = ThreadPoolExecutor(self._threads, thread_name_prefix="fit")
+        self._begin()
         if method in NEEDS_NETWORK:
             self._load_network(method == "auto")
         if method == "auto":
             self._load_masks()
+
+    def _begin(self) -> None:
+        """Threads, and what they wait for, of this process."""
+        self._process = os.getpid()
+        self._lock = threading.Lock()
+        self._beside = ThreadPoolExecutor(1, thread_name_prefix="network")
+        self._pool = ThreadPoolExecutor(self._threads, thread_name_prefix="fit")
 
     @property
     def has_weights(self) -> bool:
@@ -171,6 +176,8 @@ class Recoverer:
         CheckpointError
             If the method needs the network and it cannot be loaded.
         """
+        if self._process != os.getpid():  # forked: threads stay behind, and who waits for them waits for ever
+            self._begin()
         with one_blas_thread():
             return self._recover(depth, camera, labels, options or self._options, previous)
 

@@ -370,3 +370,22 @@ def test_frames_are_fitted_by_threads_that_stay():
         assert len(recoverer.recover(depth, scene.camera, labels).bodies) == 3
         own |= alive() - others
     assert 1 <= len(own) <= 3, "two that fit, and one for the network"
+
+
+def test_a_forked_process_has_threads_of_its_own():
+    """Those of its parent stay there, and who waits for one of them waits for ever."""
+    code = (
+        "import os, signal, numpy as np\n"
+        "from sq_perception.imaging.camera import Camera\n"
+        "from sq_perception.recovery.recoverer import Recoverer\n"
+        "recoverer, camera = Recoverer(method='symmetry', threads=2), Camera(64, 48, 60.0, 60.0, 31.5, 23.5)\n"
+        "labels = np.zeros((48, 64), int)\n"
+        "labels[10:20, 10:20], labels[10:20, 30:40] = 1, 2\n"
+        "found = lambda: len(recoverer.recover(np.ones((48, 64), np.float32), camera, labels).bodies)\n"
+        "assert found() == 2\n"
+        "if child := os.fork():\n"
+        "    raise SystemExit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))\n"
+        "signal.alarm(20)\n"
+        "os._exit(found() != 2)\n"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, timeout=120)
