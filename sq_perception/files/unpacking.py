@@ -3,7 +3,7 @@
 A file of a megabyte can claim, or unpack to, any number of gigabytes.  So the size that it claims is read first, must
 be bounded, and for arrays must be what the file really holds; only then is memory taken.
 
-Pillow reads the size in an image's header without unpacking it.
+Pillow reads the size and the kind in an image's header without unpacking it.
 
 Reference: https://numpy.org/doc/stable/reference/generated/numpy.lib.format.html (an NPZ is a ZIP of such arrays).
 """
@@ -75,7 +75,7 @@ def grey_image(path: Path) -> np.ndarray:
     if path.stat().st_size > MOST_BYTES:
         raise UnpackingError(f"expected at most {MOST_BYTES} bytes, got {path.stat().st_size}")
     encoded = np.fromfile(path, dtype=np.uint8)
-    width, height = _image_size(encoded)
+    width, height, has_palette = _image_header(encoded)
     if not (width >= 1 and height >= 1 and width * height <= MOST_PIXELS):
         raise UnpackingError(f"not a readable image: expected 1 to {MOST_PIXELS} pixels, got {width} x {height}")
     try:
@@ -88,7 +88,9 @@ def grey_image(path: Path) -> np.ndarray:
         first, *others = np.moveaxis(image[..., :3], -1, 0)
         if not all(np.array_equal(first, other, equal_nan=True) for other in others):
             raise UnpackingError(
-                "expected a grey image, got a colour image: is it the camera's picture, or depth drawn in colours?"
+                "expected a grey image, got a palette of colours: save its indices as grey values"
+                if has_palette
+                else "expected a grey image, got a colour image: is it the camera's picture, or depth drawn in colours?"
             )
         image = np.ascontiguousarray(first)
     if image.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
@@ -151,14 +153,15 @@ def _numbers(file: IO[bytes], file_size: int, where: str = "") -> np.ndarray:
     return np.frombuffer(data, dtype).reshape(shape, order="F" if is_fortran else "C").copy()
 
 
-def _image_size(encoded: np.ndarray) -> tuple[int, int]:
+def _image_header(encoded: np.ndarray) -> tuple[int, int, bool]:
+    """Width, height, and whether the pixels are indices of colours."""
     from PIL import Image
 
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of large and damaged ones: they are handled here
             with Image.open(io.BytesIO(encoded.tobytes()), formats=("PNG", "BMP", "TIFF")) as image:
-                return image.size
+                return *image.size, image.mode in ("P", "PA")
     except Exception as error:  # whatever damaged headers lead to
         kinds = "PNG, BMP or TIFF"
         raise UnpackingError(f"not a readable image: expected {kinds} of at most {MOST_PIXELS} pixels") from error

@@ -11,6 +11,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from sq_perception.files import unpacking
 from sq_perception.files.unpacking import UnpackingError, grey_image, npz_arrays
@@ -124,6 +125,19 @@ def test_grey_images_are_read(tmp_path):
     np.testing.assert_array_equal(grey_image(tmp_path / "e.tiff"), far)
     (tmp_path / "d.png").write_bytes(png(3, 2, b"\x00\x01\x02\x03\x00\x04\x05\x06"))
     np.testing.assert_array_equal(grey_image(tmp_path / "d.png"), [[1, 2, 3], [4, 5, 6]])
+
+
+def test_a_palette_is_named_as_what_is_in_the_way(tmp_path):
+    """As of masks that are drawn in colours: their labels are the indices."""
+    image = Image.fromarray(np.array([[0, 1], [2, 0]], np.uint8), "P")
+    for colours, words in (([0, 0, 0, 128, 0, 0, 0, 128, 0], "got a palette of colours: save its indices"), (None, "")):
+        image.putpalette(colours or [0, 0, 0, 1, 1, 1, 2, 2, 2])
+        image.save(tmp_path / "mask.png")
+        if words:
+            with pytest.raises(UnpackingError, match=words):
+                grey_image(tmp_path / "mask.png")
+        else:
+            assert grey_image(tmp_path / "mask.png").tolist() == [[0, 1], [2, 0]]
 
 
 @pytest.mark.parametrize(
