@@ -145,7 +145,7 @@ def export(
     Raises
     ------
     ValueError
-        For another suffix, where there is no body to write, or not one name a body.
+        For another suffix, where there is no body to write, not one name a body, or colours of another form.
     """
     import trimesh
 
@@ -160,6 +160,8 @@ def export(
     if len(set(names)) != len(singles):
         raise ValueError(f"names: expected {len(singles)} different ones, got {names}")
     palette = COLOURS if colours is None else np.asarray(colours, dtype=float)
+    if palette.ndim != 2 or palette.shape[1] != 3 or not len(palette) or not ((palette >= 0) & (palette <= 1)).all():
+        raise ValueError(f"colours: expected red, green, blue (n, 3) in [0, 1], got {colours}")
     meshes = []
     for k, body in enumerate(singles):
         part = mesh(body, resolution)

@@ -29,7 +29,14 @@ def render(bodies: Superquadric, camera: Camera) -> tuple[np.ndarray, np.ndarray
         of it; a camera inside a body does not see that body.
     index : int32 (height, width)
         Number of the visible body within the batch, -1 where there is none.
+
+    Raises
+    ------
+    ValueError
+        For a batch of more dimensions.
     """
+    if len(bodies.batch_shape) > 1:
+        raise ValueError(f"bodies: expected one or a batch (n,), got a batch of shape {bodies.batch_shape}")
     if not bodies.batch_shape:
         bodies = Superquadric.from_flat(bodies.to_flat()[None])
     depth = np.full((camera.height, camera.width), np.inf)

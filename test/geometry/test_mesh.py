@@ -84,6 +84,13 @@ def test_misuse_is_refused(tmp_path):
         export([body(), body()], tmp_path / "two.glb", names=["a", "a"])
 
 
+@pytest.mark.parametrize("colours", [[], [1.0, 0.0, 0.0], [[255, 0, 0]], [[1.0, 0.0, 0.0, 0.5]], [[np.nan, 0, 0]]])
+def test_colours_that_are_none_are_refused(tmp_path, colours):
+    """Bytes would wrap: 255 times 255 is 1."""
+    with pytest.raises(ValueError, match=r"colours: expected red, green, blue \(n, 3\) in \[0, 1\], got"):
+        export(body(), tmp_path / "one.glb", colours=colours)
+
+
 def test_any_two_colours_differ_to_every_eye():
     """CIE 1976 differences as normal, deuteranopic and protanopic eyes see them (Machado et al. 2009, severity 1)."""
     eyes = {

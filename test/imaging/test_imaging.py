@@ -91,6 +91,11 @@ class TestRaycast:
             facing = (body.normals(points) * points).sum(axis=-1)
             assert (facing < 1e-6 * np.linalg.norm(points, axis=-1)).all(), "a visible point faces the camera"
 
+    def test_a_batch_of_batches_is_refused(self) -> None:
+        bodies = tabletop_bodies(2, 0)
+        with pytest.raises(ValueError, match=r"batch \(n,\), got a batch of shape \(2, 2\)"):
+            raycast.render(Superquadric.stack([bodies, bodies]), VGA)
+
     def test_nearest_body_wins(self) -> None:
         bodies = tabletop_bodies(12, 2)
         depth, _ = raycast.render(bodies, VGA)
