@@ -358,6 +358,23 @@ def test_a_budget_is_positive(tmp_path, capsys):
     assert "--time-budget" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("score", ["nan", "-inf", "90", "all"])
+def test_a_score_is_from_0_to_1(tmp_path, score, capsys):
+    """Of a frame that was recovered with another one, nothing was left, and no JSON could be written."""
+    assert run(save_npz(tmp_path / "a.npz"), f"--min-score={score}", "--json", tmp_path / "out.json") == 2
+    assert "--min-score: expected a score from 0 to 1" in capsys.readouterr().err
+
+
+def test_a_workspace_may_have_no_end(tmp_path):
+    """JSON knows no infinity; the same command goes on with its lines."""
+    save_npz(tmp_path / "a.npz")
+    box = ["--workspace", "-1", "-1", "0", "1", "1", "inf", "--jsonl", tmp_path / "out.jsonl"]
+    for _ in range(2):
+        assert len(recover(tmp_path, tmp_path / "a.npz", *box)[0]["superquadrics"]) == 2
+    options = json.loads((tmp_path / "out.jsonl").read_text().splitlines()[0])["options"]
+    assert options["workspace"] == [-1, -1, 0, 1, 1, None]
+
+
 def test_a_message_is_one_printable_line(capsys):
     complain("a\x1b[2J\nb")
     assert capsys.readouterr().err == "sq-perception: a?[2J b\n"
