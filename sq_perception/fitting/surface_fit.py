@@ -170,12 +170,9 @@ def warm_up() -> None:
 
 
 def _checked_images(depth: np.ndarray, mask: np.ndarray, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    depth, mask = np.asarray(depth), np.asarray(mask)
-    if depth.ndim != 2 or not np.issubdtype(depth.dtype, np.floating):
-        raise ValueError(f"depth: expected a float image (height, width) in metres, got {depth.dtype} {depth.shape}")
+    depth, mask = camera.readings(depth), np.asarray(mask)
     if mask.shape != depth.shape or mask.dtype != bool:
         raise ValueError(f"mask: expected a bool image of shape {depth.shape}, got {mask.dtype} {mask.shape}")
-    camera.check_image(depth)
     return depth, mask
 
 

@@ -62,7 +62,7 @@ class Surroundings:
         if (self.depth is None) != (self.camera is None):
             raise ValueError("depth, camera: expected both or neither")
         if self.camera is not None and self.depth is not None:
-            self.camera.check_image(self.depth)
+            object.__setattr__(self, "depth", self.camera.readings(self.depth))
 
     @classmethod
     def of_image(cls, depth: np.ndarray, camera: Camera, plane: np.ndarray | None) -> Surroundings:
@@ -76,7 +76,7 @@ class Surroundings:
             A pinhole camera.
         plane : (4,), optional
         """
-        camera.check_image(depth)
+        depth = camera.readings(depth)
         z = np.where(np.isfinite(depth) & (depth > 0), depth, np.nan)
         if plane is None:
             rows, columns = np.nonzero(np.isfinite(z))

@@ -113,9 +113,8 @@ class Camera:
 
     def points(self, depth: np.ndarray) -> np.ndarray:
         """The organised cloud (height, width, 3) of a depth image; NaN where the depth is."""
-        self.check_image(depth)
         u, v = np.meshgrid(np.arange(self.width), np.arange(self.height))
-        return self.unproject(u, v, depth)
+        return self.unproject(u, v, self.readings(depth))
 
     def project(self, points: np.ndarray) -> np.ndarray:
         """Pixel coordinates (..., 2) = (u, v) of points (..., 3); NaN for points not in front of a pinhole camera."""
@@ -129,6 +128,21 @@ class Camera:
     def cropped(self, left: int, top: int, width: int, height: int) -> Camera:
         """The camera of an image cut out at column ``left`` and row ``top``."""
         return Camera(width, height, self.fx, self.fy, self.cx - left, self.cy - top, self.projection)
+
+    def readings(self, depth: np.ndarray) -> np.ndarray:
+        """A depth image as a plain array, NaN where it is masked.
+
+        Raises
+        ------
+        ValueError
+            If it is no float image (height, width), such as one in millimetres, or has not this camera's size.
+        """
+        image = np.asanyarray(depth)
+        if image.ndim != 2 or image.dtype.kind != "f":
+            given = f"{image.dtype} {image.shape}"
+            raise ValueError(f"depth: expected a float image (height, width) in metres, got {given}")
+        self.check_image(image)
+        return np.asarray(np.ma.filled(image, np.nan))
 
     def check_image(self, image: np.ndarray) -> None:
         """Raise ValueError unless the image has this camera's size."""

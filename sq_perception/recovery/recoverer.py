@@ -196,8 +196,7 @@ class Recoverer:
             network = self._load_network(camera.is_pinhole and options.method == "auto")
 
         with timed(milliseconds, "segmentation"):
-            measured = _measured(np.ma.filled(depth, np.nan), camera)
-            camera.check_image(measured)
+            measured = _measured(camera.readings(depth), camera)
             if labels is not None:
                 labels = np.asarray(labels)
                 camera.check_image(labels)
@@ -328,9 +327,7 @@ def render_recovery(frame: FrameRecovery, camera: Camera) -> tuple[np.ndarray, n
 
 
 def _measured(depth: np.ndarray, camera: Camera) -> np.ndarray:
-    """float32, NaN for all that is no measurement; what is no depth image at all is for the segmentation to refuse."""
-    if depth.dtype.kind != "f":
-        return depth
+    """float32, NaN for all that is no measurement."""
     farthest = min(_FARTHEST, float(np.finfo(depth.dtype).max))  # which half precision does not reach
     within = (depth >= (_NEAREST if camera.is_pinhole else 0)) & (depth <= farthest)
     return np.where(within, depth, np.nan).astype(np.float32, copy=False)

@@ -254,11 +254,7 @@ def _points(mask: np.ndarray, depth: np.ndarray, valid: np.ndarray, camera: Came
 
 
 def _checked(depth: np.ndarray, camera: Camera, limits: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:
-    depth = np.asarray(depth)
-    if depth.ndim != 2 or depth.dtype.kind != "f":
-        raise ValueError(f"depth: expected a float image (height, width), got {depth.dtype} {depth.shape}")
-    camera.check_image(depth)
-    depth = depth.astype(np.float32, copy=False)
+    depth = camera.readings(depth).astype(np.float32, copy=False)
     near, far = limits
     valid = np.isfinite(depth) if np.isinf(far) else depth <= far
     if camera.is_pinhole:

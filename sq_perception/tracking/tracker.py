@@ -114,14 +114,14 @@ class Tracker:
         ------
         ValueError
             For a stamp that is not finite, a pose that is no rigid motion, a covariance of another shape than (11, 11),
-            a depth image without camera or of another size.
+            a depth image without camera, of another size or not of floats.
         """
         if not np.isfinite(stamp):
             raise ValueError(f"stamp: expected a finite number of seconds, got {stamp}")
         if depth is not None:
             if camera is None:
                 raise ValueError("depth: expected its camera along with it")
-            camera.check_image(depth)
+            depth = camera.readings(depth)
         rotation, position = state.as_pose(camera_pose)
         orthographic = camera is not None and not camera.is_pinhole
         observed, covariance = _in_world(recoveries, rotation, position)

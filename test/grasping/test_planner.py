@@ -141,6 +141,20 @@ def test_what_no_pad_meets_squarely_has_friction_for_a_reason():
     assert plan(pebble, friction=0.4).reasons == ("nothing holds: friction",)
 
 
+def test_masked_readings_hide_nothing_and_millimetres_are_refused():
+    camera = Camera(100, 100, 100.0, 100.0, 49.5, 49.5)
+    is_near = np.zeros((100, 100), bool)
+    is_near[40:60, 40:60] = True
+    depth = np.ma.masked_array(np.where(is_near, 1.0, 2.0), is_near)
+    assert Surroundings.of_image(depth, camera, None).points[:, 2].min() == 2.0
+    assert np.isnan(Surroundings(depth=depth, camera=camera).beyond(np.array([0.0, 0.0, 1.5])))
+    millimetres = np.full((100, 100), 2000, np.uint16)
+    with pytest.raises(ValueError, match="depth: expected a float image"):
+        Surroundings.of_image(millimetres, camera, None)
+    with pytest.raises(ValueError, match="depth: expected a float image"):
+        Surroundings(depth=millimetres, camera=camera)
+
+
 def test_no_more_points_are_kept_than_are_promised_and_from_everywhere():
     camera = Camera(100, 100, 100.0, 100.0, 49.5, 49.5)
     points = Surroundings.of_image(np.full((100, 100), 2.0), camera, None).points

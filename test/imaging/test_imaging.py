@@ -75,6 +75,15 @@ class TestCamera:
         with pytest.raises(ValueError, match="transposed"):
             Camera.from_matrix(VGA.matrix.T, 640, 480)
 
+    def test_masked_readings_are_none_and_whole_numbers_no_metres(self) -> None:
+        hidden = np.arange(VGA.width * VGA.height).reshape(VGA.height, VGA.width) % 3 == 0
+        depth = np.ma.masked_array(np.full(hidden.shape, 0.5), hidden)
+        np.testing.assert_array_equal(VGA.readings(depth), np.where(hidden, np.nan, 0.5))
+        np.testing.assert_array_equal(np.isnan(VGA.points(depth)[..., 2]), hidden)
+        for image in (np.full(hidden.shape, 500, np.uint16), depth[..., None], depth[0]):
+            with pytest.raises(ValueError, match=r"depth: expected a float image \(height, width\) in metres, got"):
+                VGA.readings(image)
+
     def test_points_behind_a_pinhole_have_no_pixel(self) -> None:
         assert np.isnan(VGA.project(np.array([0.1, 0.1, -1.0]))).all()
 

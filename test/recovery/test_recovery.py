@@ -315,7 +315,7 @@ def test_misuse_is_refused(symmetry):
     with pytest.raises(TypeError, match="model: expected a file of weights or its name, got RecoveryOptions"):
         Recoverer(RecoveryOptions())
     for depth in (np.ones((240, 320, 1)), np.ones(320), np.array(1.0)):
-        with pytest.raises(ValueError, match=r"expected an image \(height, width\), got an array of shape"):
+        with pytest.raises(ValueError, match=r"depth: expected a float image \(height, width\) in metres, got"):
             symmetry.recover(depth, CAMERA)
     for name, value in (
         ("sharpness", 0.0),

@@ -284,6 +284,14 @@ def test_open_share_knows_the_image_and_what_stands_in_front():
         np.testing.assert_array_equal(sight.open_share(bodies, CAMERA, depth), [share, 0, 0])
 
 
+def test_masked_readings_are_no_empty_space(rng):
+    tracker, masked = Tracker(), np.ma.masked_array(np.full((CAMERA.height, CAMERA.width), 9.0), True)
+    tracker.update([draw(body(), noise(), rng)], 0.0)
+    for k in range(1, 60):
+        tracks = tracker.update([], FORGET_AFTER * k / 100, camera=CAMERA, depth=masked)
+    assert len(tracks) == 1
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -294,6 +302,7 @@ def test_open_share_knows_the_image_and_what_stands_in_front():
         ({"camera_pose": (np.ones(3), np.zeros(3))}, "shapes"),
         ({"depth": np.zeros((120, 160))}, "camera"),
         ({"depth": np.zeros((10, 10)), "camera": CAMERA}, "fit"),
+        ({"depth": np.full((CAMERA.height, CAMERA.width), 500, np.uint16), "camera": CAMERA}, "float image"),
         ({"recoveries": [Seen(body(), np.eye(3))]}, r"\(11, 11\)"),
         ({"recoveries": [Seen(Superquadric.stack([body()]), np.eye(11))]}, "single"),
     ],
