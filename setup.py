@@ -97,7 +97,7 @@ setup(
         "scipy>=1.11",  # special functions, hulls, small linear algebra
         "numba>=0.60",  # ray casting and residuals, compiled
         "opencv-python-headless>=4.8",  # images and contours
-        "trimesh>=4",  # meshes and GLB
+        "trimesh>=4.6",  # meshes and GLB
         "safetensors>=0.4",  # weights that cannot carry code
         "array-api-compat>=1.9",  # one geometry for NumPy and torch
         "threadpoolctl>=3",  # keeps BLAS from threading products of 2000 x 3, which took the second core from the fits

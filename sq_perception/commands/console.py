@@ -186,4 +186,6 @@ def progress() -> Progress:
     from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    return Progress(*columns, console=Console(stderr=True), transient=True, disable=not sys.stderr.isatty())
+    is_hidden = not sys.stderr.isatty()
+    # Quiet as well: rich before 14.3 ends a bar that is disabled with an empty line.
+    return Progress(*columns, console=Console(stderr=True, quiet=is_hidden), transient=True, disable=is_hidden)

@@ -14,6 +14,7 @@ import pytest
 import yaml
 
 from sq_perception.commands import main
+from sq_perception.commands.console import progress
 
 CAMERA = {"image_width": 40, "image_height": 30, "camera_matrix": {"data": [50, 0, 19.5, 0, 50, 14.5, 0, 0, 1]}}
 
@@ -91,3 +92,11 @@ def test_a_training_that_is_interrupted_says_so_by_its_code(tmp_path, command, m
     monkeypatch.setattr(shard_training, "train", interrupted)
     assert main.main([command, str(tmp_path), "--output", str(tmp_path)]) == 130
     assert "the same command goes on" in capsys.readouterr().err
+
+
+def test_a_bar_that_no_terminal_shows_writes_nothing(capsys):
+    """Not even an empty line, as rich before 14.3 ends it with."""
+    with progress() as bar:
+        bar.add_task("recovering", total=1)
+        bar.console.line()
+    assert capsys.readouterr().err == ""
