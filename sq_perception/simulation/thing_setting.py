@@ -1,8 +1,9 @@
 """A thing before a camera, in a random pose with what is around it; metres, optical frame unless noted.
 
 pose        standing, lying, leaning (:meth:`Thing.pose`), on the table, on top of something, or free in any pose
-camera      5 to 85 degrees above the table, most 20 to 70; a roll of some degrees; off the image's middle by up to
-            27 degrees; 0.35 to 2 m away; the thing is 30 to 80 pixels wide
+camera      sees the thing from 20 to 70 degrees above the table, in a quarter from 65 to 90 (many robots' cameras look
+            straight down), in a fifth from 3 to 25; a roll of some degrees; off the image's middle by up to 27 degrees;
+            0.35 to 2 m away; the thing is 30 to 80 pixels wide
 around it   up to three neighbours on the table, the table's end, a wall or nothing behind it
 """
 
@@ -21,6 +22,9 @@ from sq_perception.simulation.thing import NO_CAVITY, SIX_WAYS, Thing
 
 ON_TOP, FREE = 0.10, 0.05
 """Shares of the views in which the thing stands on something on the table, and in which there is no table."""
+_ELEVATIONS = ((20.0, 70.0), (65.0, 90.0), (3.0, 25.0))
+"""Degrees."""
+_OFTEN = (0.55, 0.25, 0.2)
 _DISTANCE = (0.35, 1.3, 2.0)
 _FARTHEST = 12.0
 """Diagonals of its box, more than which no thing is away."""
@@ -86,15 +90,15 @@ def draw_setting(thing: Thing, rng: np.random.Generator) -> Setting:
             others.append(_stand(reach, floor, rng))
         others += _neighbours(parts, floor, rng)
 
-    elevation = np.deg2rad(rng.uniform(20, 70) if rng.random() < 0.75 else rng.uniform(5, 85))
+    elevation = np.deg2rad(rng.uniform(*rng.choice(_ELEVATIONS, p=_OFTEN)))
     roll = rng.normal(0, np.deg2rad(4.0)) if rng.random() < 0.93 else rng.uniform(-np.pi, np.pi)
     aside, below = rng.uniform(-1, 1, 2) * _OFF_AXIS
-    look = looking_down(elevation - np.arctan(below), roll)
+    ray = np.array([aside, below, 1.0])
+    look = looking_down(_pitch(ray, elevation, roll), roll)
     matrix = quaternions.to_matrix(look)
     near, usual, far = _DISTANCE
     distance = np.exp(rng.uniform(np.log(near), np.log(usual if rng.random() < 0.85 else far)))
     distance = min(distance, _FARTHEST * float(np.linalg.norm(reach[:3] + reach[3:])))
-    ray = np.array([aside, below, 1.0])
     # The table's frame has its origin below the thing, at the height of its lowest point.
     lift = np.array([0.0, 0.0, reach[5]])
     shift = distance * ray / np.linalg.norm(ray) - matrix @ (lift + 0.5 * (reach[:3] - reach[3:]))
@@ -121,6 +125,16 @@ def looking_down(pitch: float, roll: float) -> np.ndarray:
     half, other = 0.5 * (np.pi / 2 + pitch), 0.5 * roll
     c, s = np.cos(half), np.sin(half)
     return np.array([s * np.cos(other), s * np.sin(other), c * np.sin(other), c * np.cos(other)])
+
+
+def _pitch(ray: np.ndarray, elevation: float, roll: float) -> float:
+    """That of a camera whose ray comes down on the table at ``elevation``, or as steeply as it can; radians.
+
+    With r the ray, its length one, turned back by the roll, r_y cos p + r_z sin p = sin(elevation).
+    """
+    x, y, z = ray / np.linalg.norm(ray)
+    y = np.cos(roll) * y - np.sin(roll) * x
+    return float(np.arcsin(min(np.sin(elevation) / np.hypot(y, z), 1.0)) - np.arctan2(y, z))
 
 
 def _camera(parts: np.ndarray, rng: np.random.Generator) -> Camera:

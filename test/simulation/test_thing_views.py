@@ -90,6 +90,21 @@ def test_the_plane_touches_what_stands_on_it() -> None:
     assert touching > 40
 
 
+def test_things_are_seen_from_the_elevations_that_are_drawn() -> None:
+    """Whatever the camera's roll, and however far off its axis: from above the table, often from straight above it."""
+    rng = np.random.default_rng(4)
+    settings = [draw_setting(draw_thing(rng, ["box"]), rng) for _ in range(400)]
+    sines = []
+    for setting in settings:
+        if setting.table is not None:
+            middle = setting.parts.translation.mean(axis=0)
+            sines.append(-setting.table[:3] @ middle / np.linalg.norm(middle))
+    degrees = np.rad2deg(np.arcsin(sines))
+    assert degrees.min() > 2
+    assert 0.15 < np.mean(degrees > 65) < 0.35
+    assert 0.1 < np.mean(degrees < 20) < 0.25
+
+
 def test_a_view_is_that_of_a_large_image() -> None:
     """Three times the pixels show the same thing, framed alike; the renderer agrees with the plain ray caster."""
     rng = np.random.default_rng(2)
