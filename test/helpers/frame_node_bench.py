@@ -91,7 +91,7 @@ class Bench(SpunNodes):
     def close(self) -> None:
         self.recoverer.gate.set()
         self.until(self.node.close)  # a starved machine collects garbage for longer than a node waits for it
-        self.finish()
+        super().close()
         self.stand_ins.stop()
 
     @property

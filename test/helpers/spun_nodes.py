@@ -18,7 +18,7 @@ PATIENCE = 30.0
 
 
 class SpunNodes:
-    """Make the nodes in ``context``, then :meth:`spin` them; :meth:`finish` destroys them and the peer."""
+    """Make the nodes in ``context``, then :meth:`spin` them; :meth:`close` destroys them and the peer."""
 
     def __init__(self, *arguments: str) -> None:
         self.context = Context()
@@ -27,12 +27,22 @@ class SpunNodes:
 
     def spin(self, nodes: Sequence[Node], executor: Any = None) -> None:
         """Spin the nodes and the peer by an executor of that class."""
-        self._all = (*nodes, self.peer)
+        self._all: list[Node] = []
         self.executor = (executor or SingleThreadedExecutor)(context=self.context)
-        for node in self._all:
-            self.executor.add_node(node)
+        for node in (*nodes, self.peer):
+            self.add(node)
         self.thread = threading.Thread(target=self._spin, daemon=True)
         self.thread.start()
+
+    def add(self, node: Node) -> None:
+        """Spin one more."""
+        self._all.append(node)
+        self.executor.add_node(node)
+
+    def remove(self, node: Node) -> None:
+        """Spin that one no longer; it remains to be destroyed."""
+        self._all.remove(node)
+        self.executor.remove_node(node)
 
     def _spin(self) -> None:
         try:
@@ -43,7 +53,13 @@ class SpunNodes:
             if self.context.ok():
                 raise
 
-    def finish(self) -> None:
+    def __enter__(self) -> Any:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
         self.context.try_shutdown()
         self.thread.join(PATIENCE)
         for node in self._all:

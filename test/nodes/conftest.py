@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from typing import TYPE_CHECKING
 
 import pytest
@@ -16,15 +17,8 @@ def make_bench() -> Iterator[Callable[..., Bench]]:
     """Makes benches around nodes with these arguments."""
     from frame_node_bench import Bench  # needs rclpy; tests without it are skipped before they ask for this
 
-    benches: list[Bench] = []
-
-    def make(*arguments: str) -> Bench:
-        benches.append(Bench(*arguments))
-        return benches[-1]
-
-    yield make
-    for bench in benches:
-        bench.close()
+    with ExitStack() as benches:
+        yield lambda *arguments: benches.enter_context(Bench(*arguments))
 
 
 @pytest.fixture

@@ -73,9 +73,9 @@ class Bench(SpunNodes):
         self.until(lambda: len(self.heard) == 3)
         return self.heard
 
-    def finish(self):
+    def close(self):
         self.node.close()
-        super().finish()
+        super().close()
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -86,9 +86,8 @@ def compiled():
 
 @pytest.fixture
 def bench():
-    one = Bench()
-    yield one
-    one.finish()
+    with Bench() as one:
+        yield one
 
 
 def test_grasps_come_best_first_with_the_header_of_the_bodies(bench):

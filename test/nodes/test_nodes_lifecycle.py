@@ -8,6 +8,7 @@ import threading
 import time
 import weakref
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -122,7 +123,7 @@ class Bench(SpunNodes):
         self.gate.set()
         for node in self.nodes:
             self.until(lambda node=node: node.close() or not node.is_configured)
-        self.finish()
+        super().close()
         self.stand_ins.stop()
 
     def change(self, transition: int, label: str = "") -> bool:
@@ -171,21 +172,18 @@ class Bench(SpunNodes):
     def report(self, condition: Callable[[DiagnosticStatus], bool]) -> None:
         self.until(lambda: any(condition(one) for one in self.reports[-3:]))
 
-    def refused(self) -> int:
-        return int(counts_of(self.node).refused)
+    def publish_refused(self, frames: int) -> None:
+        """Publish so many that are refused, one after the other."""
+        for _ in range(frames):
+            before = counts_of(self.node).refused
+            self.publish()
+            self.until(lambda before=before: counts_of(self.node).refused > before)
 
 
 @pytest.fixture
 def make_bench() -> Iterator[Callable[..., Bench]]:
-    benches: list[Bench] = []
-
-    def make(*arguments: str, **options: Any) -> Bench:
-        benches.append(Bench(*arguments, **options))
-        return benches[-1]
-
-    yield make
-    for bench in benches:
-        bench.close()
+    with ExitStack() as benches:
+        yield lambda *arguments, **options: benches.enter_context(Bench(*arguments, **options))
 
 
 class TestLifecycle:
@@ -292,10 +290,7 @@ class TestLifecycle:
         bench = make_bench().active()
         assert bench.answer() == 1.0
         bench.made[0].error = ZeroDivisionError("device lost")
-        for _ in range(10):
-            before = bench.refused()
-            bench.publish()
-            bench.until(lambda before=before: bench.refused() > before)
+        bench.publish_refused(10)
         bench.until(lambda: len(bench.made) == 2)  # another one, though the first is still there to be shared
         assert bench.active().answer() == 1.0
         assert bench.node.fault == ""
@@ -306,10 +301,7 @@ class TestLifecycle:
         bench.answer()
         bench.made[0].error = ZeroDivisionError("device lost")
         bench.fault = RuntimeError("no device")
-        for _ in range(10):
-            before = bench.refused()
-            bench.publish()
-            bench.until(lambda before=before: bench.refused() > before)
+        bench.publish_refused(10)
         bench.until(lambda: bench.node.start_failure)
         assert bench.node.start_failure == "cannot configure: no device"
 
@@ -336,10 +328,7 @@ class TestLifecycle:
         bench = make_bench().active()
         bench.answer()
         bench.made[-1].error = ValueError("a hard frame")
-        for _ in range(12):
-            before = bench.refused()
-            bench.publish()
-            bench.until(lambda before=before: bench.refused() > before)
+        bench.publish_refused(12)
         bench.made[-1].error = None
         assert bench.answer() == 1.0
         assert len(bench.made) == 1

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import threading
 import types
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -45,17 +45,13 @@ def grown(body: Superquadric, share: float) -> Superquadric:
 
 
 @pytest.fixture
-def make_bench() -> Iterator[Callable[..., Bench]]:
-    benches: list[Bench] = []
-
+def make_bench(make_bench: Callable[..., Bench]) -> Callable[..., Bench]:
     def make(*arguments: str) -> Bench:
-        benches.append(Bench(*arguments))
-        benches[-1].send_info()
-        return benches[-1]
+        bench = make_bench(*arguments)
+        bench.send_info()
+        return bench
 
-    yield make
-    for bench in benches:
-        bench.close()
+    return make
 
 
 def image(sec: float, frame_id: str = FRAME_ID) -> Any:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
+from contextlib import ExitStack
 
 import numpy as np
 import pytest
@@ -11,10 +11,8 @@ import yaml
 
 pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
-from rclpy.context import Context
-from rclpy.executors import SingleThreadedExecutor
-from rclpy.node import Node
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+from spun_nodes import SpunNodes
 from std_msgs.msg import Header
 
 from sq_msgs_py.depth_image import depth_from_message, depth_to_message, labels_from_message
@@ -28,7 +26,6 @@ from sq_perception.nodes.live_parameters import ParameterError
 from sq_perception.nodes.parameters import SyntheticParameters
 from sq_perception.nodes.synthetic_depth_node import SyntheticDepthNode, frame_source
 
-PATIENCE = 20.0
 LENS = Distortion("plumb_bob", (-0.2, 0.05, 0.001, -0.001, 0.0))
 
 
@@ -50,15 +47,10 @@ def distorted_camera(tmp_path):
     ],
 )
 def test_topics_follow_the_image_s(rules, expected):
-    context = Context()
-    context.init(args=["--ros-args", *rules])
-    node = Node("listener", context=context)
-    try:
-        assert image_topic(node, "depth/image", "compressedDepth") == expected
-        assert image_topic(node, "depth/image", "raw") == node.resolve_topic_name("depth/image")
-    finally:
-        node.destroy_node()
-        context.try_shutdown()
+    with SpunNodes(*rules) as nodes:
+        nodes.spin([])
+        assert image_topic(nodes.peer, "depth/image", "compressedDepth") == expected
+        assert image_topic(nodes.peer, "depth/image", "raw") == nodes.peer.resolve_topic_name("depth/image")
 
 
 def test_packed_and_plain_are_read_alike(rng):
@@ -82,14 +74,11 @@ def test_packed_and_plain_are_read_alike(rng):
             read(hostile)
 
 
-class Heard:
+class Heard(SpunNodes):
     """Everything that a synthetic camera with these parameters sends, by stamp."""
 
     def __init__(self, **parameters) -> None:
-        self.context = Context()
-        rules = [argument for name, value in parameters.items() for argument in ("-p", f"{name}:={value}")]
-        self.context.init(args=["--ros-args", *rules])
-        self.peer = Node("peer", context=self.context)
+        super().__init__(*(word for name, value in parameters.items() for word in ("-p", f"{name}:={value}")))
         self.messages: dict[str, dict] = {}
         topics = {
             "depth/image": Image,
@@ -101,41 +90,26 @@ class Heard:
             self.messages[topic] = {}
             self.peer.create_subscription(kind, topic, lambda message, topic=topic: self.keep(topic, message), 20)
         self.node = SyntheticDepthNode("synthetic", context=self.context)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.node)
-        self.executor.add_node(self.peer)
+        self.spin([self.node])
 
     def keep(self, topic, message) -> None:
         self.messages[topic][message.header.stamp.sec, message.header.stamp.nanosec] = message
 
     def together(self, *topics):
         """The first messages of the topics with a common stamp."""
-        deadline = time.monotonic() + PATIENCE
-        while time.monotonic() < deadline:
-            self.executor.spin_once(timeout_sec=0.2)
-            common = set.intersection(*(set(self.messages[topic]) for topic in topics))
-            if common:
-                return [self.messages[topic][min(common)] for topic in topics]
-        raise AssertionError("waited in vain")
 
-    def close(self) -> None:
-        self.executor.shutdown()
-        self.node.destroy_node()
-        self.peer.destroy_node()
-        self.context.try_shutdown()
+        def common() -> set:
+            return set.intersection(*(set(self.messages[topic]) for topic in topics))
+
+        self.until(common)
+        stamp = min(common())
+        return [self.messages[topic][stamp] for topic in topics]
 
 
 @pytest.fixture
 def hear() -> Iterator:
-    opened = []
-
-    def make(**parameters) -> Heard:
-        opened.append(Heard(**parameters))
-        return opened[-1]
-
-    yield make
-    for one in opened:
-        one.close()
+    with ExitStack() as opened:
+        yield lambda **parameters: opened.enter_context(Heard(**parameters))
 
 
 def test_a_distorting_synthetic_camera_sends_raw_images_packed_and_plain(hear, distorted_camera):

@@ -6,7 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -20,9 +19,8 @@ pytest.importorskip("viser", reason="needs the extra 'view'")
 
 from rcl_interfaces.msg import ParameterEvent
 from rclpy.context import Context
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.lifecycle import LifecycleNode, TransitionCallbackReturn
-from rclpy.node import Node
+from spun_nodes import PATIENCE, SpunNodes
 
 from sq_perception.nodes.live_parameters import LiveParameters
 from sq_perception.nodes.parameters import FitterParameters
@@ -30,7 +28,6 @@ from sq_perception.nodes.remote_node import RemoteNode
 from sq_perception.viewing.controls import Control
 
 NAME = "/somewhere/fitter_node"
-PATIENCE = 20.0
 
 
 class Managed(LifecycleNode):
@@ -64,19 +61,16 @@ class Page:
         self.answers.append((text, good))
 
 
-class Bench:
+class Bench(SpunNodes):
+    """The peer asks, as the viewer does."""
+
     def __init__(self) -> None:
-        self.context = Context()
-        self.context.init(args=["--ros-args"])
-        self.asker = Node("asker", context=self.context)
-        self.remote = RemoteNode(self.asker, NAME)
+        super().__init__()
+        self.remote = RemoteNode(self.peer, NAME)
         self.page: Any = Page()
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.asker)
-        self.asker.create_subscription(ParameterEvent, "/parameter_events", self._on_event, 100)
-        self.asker.create_timer(0.02, self.remote.tick)
-        self.thread = threading.Thread(target=self._spin, daemon=True)
-        self.thread.start()
+        self.peer.create_subscription(ParameterEvent, "/parameter_events", self._on_event, 100)
+        self.peer.create_timer(0.02, self.remote.tick)
+        self.spin([])
 
     def _on_event(self, event: ParameterEvent) -> None:
         if event.node == NAME:
@@ -84,66 +78,54 @@ class Bench:
 
     def start(self) -> Managed:
         node = Managed(self.context)
-        self.executor.add_node(node)
+        self.add(node)
         return node
 
-    def until(self, condition: Callable[[], Any]) -> None:
-        deadline = time.monotonic() + PATIENCE
-        while not condition():
-            assert time.monotonic() < deadline, (self.remote.lifecycle, self.page.values, self.page.answers)
+    def shows(self, condition: Callable[[], Any]) -> None:
+        """Wait until the page that is shown fulfils that."""
+
+        def shown() -> Any:
             self.remote.show(self.page)
-            time.sleep(0.01)
+            return condition()
+
+        self.until(shown)
 
     def asked(self, action: Callable[..., Any], *arguments: Any) -> None:
         """Calls of services belong into the executor's thread."""
         self.executor.create_task(action, *arguments)
 
-    def close(self) -> None:
-        self.context.try_shutdown()
-        self.thread.join(PATIENCE)
-
-    def _spin(self) -> None:
-        try:
-            while self.context.ok():
-                self.executor.spin_once(timeout_sec=0.1)
-        except ExternalShutdownException:
-            return
-
 
 @pytest.fixture
 def bench() -> Iterator[Bench]:
-    made = Bench()
-    try:
+    with Bench() as made:
         yield made
-    finally:
-        made.close()
 
 
 def test_a_node_that_is_not_there_says_so(bench: Bench) -> None:
     bench.asked(bench.remote.change, "s", 1.0)
-    bench.until(lambda: bench.page.answers == [(f"s: {NAME} is not there", False)])
+    bench.shows(lambda: bench.page.answers == [(f"s: {NAME} is not there", False)])
     assert not bench.remote.is_there
     assert bench.remote.lifecycle == ""
 
 
 def test_lifecycle_and_parameters_are_followed(bench: Bench) -> None:
     node = bench.start()
-    bench.until(lambda: bench.remote.lifecycle == "unconfigured" and bench.page.values.get("s") == 117.3)
+    bench.shows(lambda: bench.remote.lifecycle == "unconfigured" and bench.page.values.get("s") == 117.3)
     bench.asked(node.trigger_configure)
-    bench.until(lambda: bench.remote.lifecycle == "inactive")
+    bench.shows(lambda: bench.remote.lifecycle == "inactive")
     # Declared by the transition: an event says so, and all controls are read anew.
-    bench.until(lambda: "late" in bench.page.values)
+    bench.shows(lambda: "late" in bench.page.values)
 
     bench.asked(bench.remote.change, "s", 3.5)
-    bench.until(lambda: ("s is now 3.5", True) in bench.page.answers)
+    bench.shows(lambda: ("s is now 3.5", True) in bench.page.answers)
     assert node.settings.current.s == 3.5
     bench.asked(bench.remote.change, "tau", 1e6)
-    bench.until(lambda: not bench.page.answers[-1][1] and "tau out of range" in bench.page.answers[-1][0])
-    bench.until(lambda: bench.page.values["tau"] == 4.82)
+    bench.shows(lambda: not bench.page.answers[-1][1] and "tau out of range" in bench.page.answers[-1][0])
+    bench.shows(lambda: bench.page.values["tau"] == 4.82)
     bench.asked(bench.remote.change, "projection", "orthographic")
-    bench.until(lambda: not bench.page.answers[-1][1] and "read-only" in bench.page.answers[-1][0])
+    bench.shows(lambda: not bench.page.answers[-1][1] and "read-only" in bench.page.answers[-1][0])
     bench.asked(bench.remote.change, "no_such_parameter", 1)
-    bench.until(lambda: not bench.page.answers[-1][1] and "no_such_parameter" in bench.page.answers[-1][0])
+    bench.shows(lambda: not bench.page.answers[-1][1] and "no_such_parameter" in bench.page.answers[-1][0])
     assert node.get_parameter("projection").value == "pinhole"
 
 

@@ -152,11 +152,9 @@ def test_a_node_replays_what_a_folder_holds(tmp_path):
         bench.peer.create_subscription(kind, f"/{topic}", heard[topic].append, 10)
     node = SyntheticDepthNode("synthetic_depth_node", context=bench.context)
     bench.spin([node])
-    try:
+    with bench:
         bench.until(lambda: all(len(messages) > 2 for messages in heard.values()))
         assert {message.encoding for message in heard["mask/image"]} == {"32SC1"}
-    finally:
-        bench.finish()
 
 
 def test_a_sensor_that_cannot_measure_the_scene_is_refused_while_the_node_runs(tmp_path):
@@ -164,9 +162,7 @@ def test_a_sensor_that_cannot_measure_the_scene_is_refused_while_the_node_runs(t
     bench = SpunNodes("-p", "scene:=replay", "-p", f"path:={tmp_path}")
     node = SyntheticDepthNode("synthetic_depth_node", context=bench.context)
     bench.spin([node])
-    try:
+    with bench:
         (refused,) = node.set_parameters([Parameter("sensor", value="zed")])
         assert not refused.successful
         assert "sensor" in refused.reason
-    finally:
-        bench.finish()

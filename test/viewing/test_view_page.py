@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -17,10 +16,10 @@ pytest.importorskip("viser", reason="needs the extra 'view'")
 from browser import Browser, executable
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from rclpy.context import Context
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from spun_nodes import SpunNodes
 from std_msgs.msg import Header
 
 from sq_msgs_py.depth_image import Intrinsics, depth_to_message, intrinsics_to_message
@@ -65,46 +64,40 @@ class FrameNode(Node):
         self.diagnostics.publish(DiagnosticArray(status=[status]))
 
 
-class Bench:
-    """A camera, a frame node and the viewer in one process, a browser beside it."""
+class Bench(SpunNodes):
+    """A camera (the peer), a frame node and the viewer in one process, a browser beside it."""
 
     def __init__(self, browser: Browser) -> None:
+        super().__init__()
         self.browser = browser
-        self.context = Context()
-        self.context.init(args=["--ros-args"])
-        self.camera = Node("camera", context=self.context)
-        self.images = self.camera.create_publisher(Image, "depth/image", 1)
-        self.infos = self.camera.create_publisher(CameraInfo, "depth/camera_info", 1)
-        self.executor = SingleThreadedExecutor(context=self.context)
-        self.executor.add_node(self.camera)
+        self.images = self.peer.create_publisher(Image, "depth/image", 1)
+        self.infos = self.peer.create_publisher(CameraInfo, "depth/camera_info", 1)
         self.frames: FrameNode | None = None
-        self.start_frames()
         bound = server.listening_socket("127.0.0.1", 0)
         self.address = f"http://127.0.0.1:{bound.getsockname()[1]}"
         self.page = Page(bound, [NODE], 5000)
         self.view = ViewNode("sq_view", self.page, "depth/image", "depth/camera_info", [NODE], 10.0, self.context)
-        self.executor.add_node(self.view)
         self.kept = list(range(len(IDS)))
         self.speaks = True
         depth, _ = raycast.render(BODIES, CAMERA)
         self.depth = np.where(np.isfinite(depth), depth, np.nan).astype(np.float32)
-        self.camera.create_timer(0.1, self.publish)
-        self.thread = threading.Thread(target=self._spin, daemon=True)
-        self.thread.start()
+        self.peer.create_timer(0.1, self.publish)
+        self.spin([self.view])
+        self.start_frames()
 
     def start_frames(self) -> None:
         self.frames = FrameNode(self.context)
-        self.executor.add_node(self.frames)
+        self.add(self.frames)
 
     def stop_frames(self) -> None:
         frames, self.frames = self.frames, None
         assert frames is not None
-        self.executor.remove_node(frames)
+        self.remove(frames)
         time.sleep(0.3)
         frames.destroy_node()
 
     def publish(self) -> None:
-        header = Header(stamp=self.camera.get_clock().now().to_msg(), frame_id="camera_depth_optical_frame")
+        header = Header(stamp=self.peer.get_clock().now().to_msg(), frame_id="camera_depth_optical_frame")
         known = Intrinsics(CAMERA.width, CAMERA.height, CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy)
         self.infos.publish(intrinsics_to_message(known, header))
         self.images.publish(depth_to_message(self.depth, header))
@@ -134,25 +127,13 @@ class Bench:
 
     def close(self) -> None:
         self.view.close()
-        self.context.try_shutdown()
-        self.thread.join(10)
-
-    def _spin(self) -> None:
-        try:
-            while self.context.ok():
-                self.executor.spin_once(timeout_sec=0.2)
-        except ExternalShutdownException:
-            return
+        super().close()
 
 
 @pytest.fixture(scope="module")
 def bench() -> Iterator[Bench]:
-    with Browser(960, 640) as browser:
-        made = Bench(browser)
-        try:
-            yield made
-        finally:
-            made.close()
+    with Browser(960, 640) as browser, Bench(browser) as made:
+        yield made
 
 
 def input_of(browser: Browser, name: str) -> str:
