@@ -6,7 +6,6 @@ import base64
 import io
 import json
 import re
-import resource
 
 import numpy as np
 import pytest
@@ -83,9 +82,8 @@ def test_no_page_without_a_frame(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.skipif(executable() is None, reason="no Chromium or Chrome is installed")
 @pytest.mark.parametrize("room", [1000, 1_000_000])
-def test_a_full_disk_keeps_nothing_of_a_page(tmp_path, shot, room):
+def test_a_full_disk_keeps_nothing_of_a_page(tmp_path, shot, file_size_limit, room):
     """Which is found when the page is begun, or by a frame."""
 
     def write():
@@ -96,16 +94,12 @@ def test_a_full_disk_keeps_nothing_of_a_page(tmp_path, shot, room):
         finally:
             page.close(whole=False)
 
-    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
-    resource.setrlimit(resource.RLIMIT_FSIZE, (room, limits[1]))
-    try:
-        with pytest.raises(OSError, match=r"too large: '.*/out\.html'"):
-            write()
-    finally:
-        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    with file_size_limit(room), pytest.raises(OSError, match=r"too large: '.*/out\.html'"):
+        write()
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.skipif(executable() is None, reason="no Chromium or Chrome is installed")
 def test_a_browser_draws_it(page):
     with Browser(640, 480) as browser:
         browser.open(page.as_uri())
