@@ -148,8 +148,8 @@ def test_what_becomes_of_distortion_is_said_once_unless_it_was_asked_for(tmp_pat
     assert errors.count("\n") == (2 if words else 1)
 
 
-@pytest.mark.parametrize("option", ["--every", "--limit"])
-def test_counts_are_at_least_one(tmp_path, option, capsys):
+@pytest.mark.parametrize("option", ["--every", "--limit", "--time-budget"])
+def test_counts_and_budgets_are_positive(tmp_path, option, capsys):
     assert main.main(["recover", str(tmp_path), option, "0"]) == 2
     assert option in capsys.readouterr().err
 
@@ -351,11 +351,6 @@ def test_a_still_scene_is_recovered_anew_in_each_folder(tmp_path):
     for other, is_same in ((first, False), (alone, True)):
         sizes = ([one["size"] for one in frame["superquadrics"]] for frame in (second, other))
         assert np.allclose(*sizes, rtol=1e-9) == is_same
-
-
-def test_a_budget_is_positive(tmp_path, capsys):
-    assert main.main(["recover", str(tmp_path), "--time-budget", "0"]) == 2
-    assert "--time-budget" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("score", ["nan", "-inf", "90", "all"])
