@@ -13,6 +13,7 @@ from rclpy.context import Context
 from rclpy.exceptions import InvalidHandle
 from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
 from rclpy.node import Node
+from rclpy.task import Future
 
 PATIENCE = 30.0
 
@@ -77,9 +78,13 @@ class SpunNodes:
             assert time.monotonic() < deadline, "waited in vain"
             time.sleep(0.005)
 
-    def call(self, kind: Any, name: str, request: Any) -> Any:
+    def ask(self, kind: Any, name: str, request: Any = None) -> Future:
+        """Call a service; the answer is still to come."""
         client = self.peer.create_client(kind, name)
         self.until(client.service_is_ready)
-        future = client.call_async(request)
+        return client.call_async(request or kind.Request())
+
+    def call(self, kind: Any, name: str, request: Any = None) -> Any:
+        future = self.ask(kind, name, request)
         self.until(future.done)
         return future.result()

@@ -108,7 +108,7 @@ def test_grasps_come_best_first_with_the_header_of_the_bodies(bench):
 def test_one_body_may_be_asked_for_and_the_reason_of_none_is_told(bench):
     bench.answer(to_message(bodies(), HEADER))
     bench.node.set_parameters([Parameter("only_id", value=WALL)])
-    answer = bench.call(Trigger, "/grasp_node/plan", Trigger.Request())
+    answer = bench.call(Trigger, "/grasp_node/plan")
     assert not answer.success
     assert f"{WALL}: wider than the opening" in answer.message
     bench.until(lambda: not bench.heard["grasps"].poses)
@@ -121,14 +121,14 @@ def test_a_region_may_be_asked_for_and_the_answer_has_its_grasps(bench):
     (refused,) = bench.node.set_parameters([Parameter("region", value=[0.5, -0.1, 0.0, 0.4, 0.1, 0.2])])
     assert "region: expected least x, y, z and greater" in refused.reason
     bench.node.set_parameters([Parameter("region", value=[0.5, -0.1, 0.0, 0.7, 0.1, 0.2])])
-    answer = answers.grasps_from_response(bench.call(Trigger, "/grasp_node/plan", Trigger.Request()))
+    answer = answers.grasps_from_response(bench.call(Trigger, "/grasp_node/plan"))
     assert answer.frame_id == "base_link"
     assert set(answer.grasps.id) == {CAN}
     bench.until(lambda: "grasp_details" in bench.heard)
     told = messages.from_message(bench.heard["grasp_details"])
     np.testing.assert_array_equal(answer.grasps.position, told.position)
     bench.node.set_parameters([Parameter("only_id", value=BOX)])
-    answer = bench.call(Trigger, "/grasp_node/plan", Trigger.Request())
+    answer = bench.call(Trigger, "/grasp_node/plan")
     assert not answer.success
     assert answer.message == "0 grasps of 3 bodies; only_id and region leave none"
 
@@ -183,10 +183,10 @@ def test_a_pause_leaves_no_subscription_and_no_publisher_behind(bench):
 
 def test_what_was_there_before_a_pause_is_not_planned_for_after_it(bench):
     bench.answer(to_message(bodies(), HEADER))
-    assert bench.call(Trigger, "/grasp_node/plan", Trigger.Request()).success
+    assert bench.call(Trigger, "/grasp_node/plan").success
     assert bench.node._change("deactivate")
     assert bench.node._change("activate")
-    answer = bench.call(Trigger, "/grasp_node/plan", Trigger.Request())
+    answer = bench.call(Trigger, "/grasp_node/plan")
     assert (answer.success, answer.message) == (False, "no superquadrics have come yet")
 
 

@@ -131,7 +131,7 @@ class Bench(SpunNodes):
         return bool(self.call(ChangeState, "/recover_node/change_state", request).success)
 
     def state(self) -> str:
-        return str(self.call(GetState, "/recover_node/get_state", GetState.Request()).current_state.label)
+        return str(self.call(GetState, "/recover_node/get_state").current_state.label)
 
     def active(self) -> Bench:
         for space, node in zip(self.answers, self.nodes, strict=True):
@@ -195,7 +195,7 @@ class TestLifecycle:
         assert bench.state() == "inactive"
         bench.until(lambda: bench.events[-2:] == ["deactivating", "inactive"])
         bench.until(lambda: bench.images[""].get_subscription_count() == 0)
-        refused = bench.call(Trigger, "/recover_node/trigger", Trigger.Request())
+        refused = bench.call(Trigger, "/recover_node/trigger")
         assert (refused.success, refused.message) == (False, "the node is inactive, not active")
         assert bench.change(Transition.TRANSITION_ACTIVATE)
         assert bench.active().answer() == 1.0
@@ -250,10 +250,8 @@ class TestLifecycle:
     def test_services_answer_while_the_model_loads(self, make_bench):
         bench = make_bench("-p", "autostart:=false")
         bench.gate.clear()
-        client = bench.peer.create_client(ChangeState, "/recover_node/change_state")
-        bench.until(client.service_is_ready)
         request = ChangeState.Request(transition=Transition(id=Transition.TRANSITION_CONFIGURE))
-        future = client.call_async(request)
+        future = bench.ask(ChangeState, "/recover_node/change_state", request)
         bench.until(lambda: bench.node.state == "configuring")
         assert bench.state() == "configuring"
         assert not future.done()
