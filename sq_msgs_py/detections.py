@@ -27,7 +27,7 @@ from sq_msgs_py.transforms import PREFIX, name
 if TYPE_CHECKING:
     from vision_msgs.msg import Detection3DArray
 
-CLASS_ID = "superquadric"
+_CLASS_ID = "superquadric"
 
 
 def detections(
@@ -35,7 +35,6 @@ def detections(
     header: Any,
     *,
     covariances: np.ndarray | None = None,
-    class_id: str = CLASS_ID,
     prefix: str = PREFIX,
 ) -> Detection3DArray:
     """One detection for each body that did not fail.
@@ -46,8 +45,8 @@ def detections(
         std_msgs/Header of the bodies.
     covariances : (n, 6, 6), optional
         Of the poses of all n bodies, failed ones included, as in :mod:`sq_msgs_py.poses`.
-    class_id, prefix
-        Of every detection.
+    prefix
+        Of the names of the bodies.
 
     Raises
     ------
@@ -67,7 +66,7 @@ def detections(
     message = Detection3DArray(header=header)
     for k, pose in enumerate(pose_messages(bodies)):
         result = ObjectHypothesisWithPose()
-        result.hypothesis.class_id = class_id
+        result.hypothesis.class_id = _CLASS_ID
         result.hypothesis.score = float(np.nan_to_num(bodies.score[k], nan=0.0, posinf=0.0, neginf=0.0))
         result.pose.pose = pose
         if np.isfinite(known[k]).all():

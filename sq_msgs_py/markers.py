@@ -41,6 +41,8 @@ PALETTE = np.array(
 ALPHA = 0.7
 """Opacity of surfaces unless given."""
 _OUTLINE_COLOUR = np.array([0.05, 0.05, 0.05, 1.0])
+_LINE_WIDTH = 0.002
+"""Of outlines, metres."""
 
 
 def markers(
@@ -50,7 +52,6 @@ def markers(
     *,
     colours: np.ndarray | None = None,
     alpha: float = ALPHA,
-    line_width: float = 0.002,
     namespace: str = "superquadrics",
     previous_ids: Iterable[int] = (),
     types: MessageTypes = installed,
@@ -64,11 +65,9 @@ def markers(
     header
         std_msgs/Header of the image that the bodies were recovered from.
     colours
-        (n, 3) RGB or (n, 4) RGBA, 0 to 1; by default the palette's colour of each id.
+        (n, 3) RGB, 0 to 1; by default the palette's colour of each id.
     alpha
-        Opacity of surfaces whose colour has none.
-    line_width
-        Width of the outline, metres.
+        Opacity of surfaces.
     types
         Where the classes of messages come from.
 
@@ -83,10 +82,9 @@ def markers(
     if len(set(ids)) != len(ids) or any(not 0 <= number < 2**31 for number in ids):
         raise ValueError(f"ids: expected different numbers from 0 to 2^31 - 1, got {ids}")
     paint = PALETTE[np.array(ids, dtype=int) % len(PALETTE)] if colours is None else np.asarray(colours, dtype=float)
-    if paint.shape not in ((len(ids), 3), (len(ids), 4)):
-        raise ValueError(f"colours: expected ({len(ids)}, 3) or ({len(ids)}, 4), got {paint.shape}")
-    if paint.shape[1] == 3:
-        paint = np.column_stack([paint, np.full(len(ids), alpha)])
+    if paint.shape != (len(ids), 3):
+        raise ValueError(f"colours: expected ({len(ids)}, 3), got {paint.shape}")
+    paint = np.column_stack([paint, np.full(len(ids), alpha)])
 
     make_marker, make_scale = types("visualization_msgs/msg/Marker"), types("geometry_msgs/msg/Vector3")
     point = types("geometry_msgs/msg/Point")
@@ -107,7 +105,7 @@ def markers(
             points=points,
         )
 
-    as_it_is, as_wide = make_scale(x=1.0, y=1.0, z=1.0), make_scale(x=float(line_width))
+    as_it_is, as_wide = make_scale(x=1.0, y=1.0, z=1.0), make_scale(x=_LINE_WIDTH)
     found = []
     for number, (surface_vertices, surface_faces, outline), colour in zip(ids, meshes, paint, strict=True):
         vertices, faces = checked_mesh(surface_vertices, surface_faces)

@@ -52,11 +52,11 @@ class Child(subprocess.Popen[bytes]):
         """None while it runs."""
         return self.poll()
 
-    def last_lines(self, count: int = 15) -> list[str]:
+    def last_lines(self) -> list[str]:
         """Its last output, standard output and error together."""
         number = self._output.fileno()
         tail = os.pread(number, _TAIL, max(0, os.fstat(number).st_size - _TAIL))
-        return tail.decode(errors="replace").splitlines()[-count:]
+        return tail.decode(errors="replace").splitlines()[-15:]
 
     def interrupt(self) -> None:
         """Interrupt it and all that it started, as Ctrl-C does."""

@@ -46,7 +46,7 @@ def _body(obj: SeenObject, depth: np.ndarray, camera: Camera, options: RecoveryO
     if options.method == "classic":
         return solina_bajcsy.fit(obj.points)
     if options.method == "network":
-        return _unfitted(_predicted(obj), obj, "prediction of the network, not refined")
+        return _predicted(obj)
     known = FitOptions(plane=obj.plane, time_budget=max(deadline - time.perf_counter(), _LEAST_BUDGET))
     if not options.free_space:
         depth = np.where(obj.mask, depth, np.float32(np.nan))
@@ -66,17 +66,14 @@ def _surface_fit(obj: SeenObject, depth: np.ndarray, camera: Camera, known: FitO
     return surface_fit.fit(depth, obj.mask, camera, start=predicted, options=options)
 
 
-def _predicted(obj: SeenObject) -> Superquadric:
+def _predicted(obj: SeenObject) -> Fit:
+    """The prediction itself, with its distance from the points; nothing is known about its uncertainty."""
     if obj.prediction is None:
         raise ValueError("no prediction")
-    return obj.prediction.body()
-
-
-def _unfitted(body: Superquadric, obj: SeenObject, message: str) -> Fit:
-    """The answer of a method that is no least squares fit: distances measured, nothing known about uncertainty."""
+    body = obj.prediction.body()
     distance = body.sampson_distance(obj.points)
     residual = float(np.sqrt(np.mean(distance**2)))
-    return Fit(body, residual, Status.CONVERGED, message)
+    return Fit(body, residual, Status.CONVERGED, "prediction of the network, not refined")
 
 
 def _failed(obj: SeenObject, reason: str) -> Fit:

@@ -140,7 +140,7 @@ def test_frames_of_bodies_that_did_not_fail():
 
 
 def test_detections_say_full_sizes_scores_and_names():
-    message = detections(three(), HEADER, class_id="mug", prefix="body")
+    message = detections(three(), HEADER, prefix="body")
     assert message.header == HEADER
     box, can = message.detections
     assert (box.id, can.id) == ("body4", "body6")
@@ -149,7 +149,7 @@ def test_detections_say_full_sizes_scores_and_names():
     assert numbers(box.bbox.center) == numbers(box.results[0].pose.pose)
     assert numbers(box.bbox.center)[0] == [1.0, 2.0, 3.0]
     (result,) = box.results
-    assert (result.hypothesis.class_id, result.hypothesis.score) == ("mug", 0.75)
+    assert (result.hypothesis.class_id, result.hypothesis.score) == ("superquadric", 0.75)
     assert can.results[0].hypothesis.score == 0.0, "unknown"
     assert not np.any(result.pose.covariance)
     assert detections(SuperquadricArray.empty(), HEADER).detections == []

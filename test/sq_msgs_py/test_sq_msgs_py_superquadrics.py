@@ -232,7 +232,7 @@ def actions(array_message: MarkerArray) -> dict[tuple[str, int], int]:
 
 
 def test_a_mesh_becomes_its_triangles_and_its_outline() -> None:
-    message = markers([TETRAHEDRON], [5], HEADER, namespace="body", line_width=0.004, alpha=0.5)
+    message = markers([TETRAHEDRON], [5], HEADER, namespace="body", alpha=0.5)
     surface, outline = message.markers
     assert (surface.ns, surface.id, surface.type, surface.action) == (
         "body/surface",
@@ -245,7 +245,7 @@ def test_a_mesh_becomes_its_triangles_and_its_outline() -> None:
     assert (outline.ns, outline.id, outline.type) == ("body/outline", 5, Marker.LINE_LIST)
     ends = np.array([[point.x, point.y, point.z] for point in outline.points])
     np.testing.assert_array_equal(ends, TETRAHEDRON[2].reshape(-1, 3))
-    assert outline.scale.x == 0.004
+    assert outline.scale.x == 0.002
     assert surface.color.a == 0.5
     assert np.float32([surface.color.r, surface.color.g, surface.color.b]) == pytest.approx(np.float32(PALETTE[5]))
     for marker in message.markers:
