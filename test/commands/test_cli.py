@@ -239,18 +239,14 @@ def test_demo_without_ros_says_what_is_missing():
     assert done.returncode in (1, 2)
 
 
-def test_train_has_its_own_help(capsys):
-    assert main.main(["train", "--help"]) == main.SUCCESS
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [("train", ("--steps", "least_squares_free")), ("evaluate", ("--fit-bodies", "report.md"))],
+)
+def test_commands_have_a_help_of_their_own(command, words, capsys):
+    assert main.main([command, "--help"]) == main.SUCCESS
     help_text = capsys.readouterr().out
-    assert "--steps" in help_text
-    assert "least_squares_free" in help_text
-
-
-def test_evaluate_has_its_own_help(capsys):
-    assert main.main(["evaluate", "--help"]) == main.SUCCESS
-    help_text = capsys.readouterr().out
-    assert "--fit-bodies" in help_text
-    assert "report.md" in help_text
+    assert all(word in help_text for word in words)
 
 
 def test_author_renders(shared_data, tmp_path):

@@ -175,11 +175,9 @@ def test_a_quarter_turn_of_the_image_turns_the_body() -> None:
 
 def table_scene(truth: Superquadric, plane: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     body, _ = raycast.render(truth, CAMERA)
-    v, u = np.indices(body.shape)
-    _, direction = CAMERA.rays(u, v)
-    table = -plane[3] / (direction @ plane[:3])
-    mask = np.isfinite(body) & (body < np.where(table > 0, table, np.inf))
-    depth = np.where(mask, body, np.where(table > 0, table, np.nan))
+    table = scenes.plane_depth(plane, CAMERA)
+    mask = body < table
+    depth = np.where(mask, body, np.where(np.isfinite(table), table, np.nan))
     return np.round(depth * 1000).astype(np.float32) / np.float32(1000), mask
 
 

@@ -194,16 +194,18 @@ class TestPrecision:
 
 
 class TestCheckpoint:
-    def test_the_thesis_network_round_trips(self, tmp_path: Path) -> None:
+    @pytest.mark.parametrize("config", [COMPACT, THESIS], ids=["compact", "resnet18"])
+    def test_networks_and_notes_round_trip(self, config: RegressorConfig, tmp_path: Path) -> None:
         torch.manual_seed(1)
-        model = Regressor(THESIS)
-        checkpoint.save(tmp_path / "m.safetensors", model, dtype=np.float32)
+        model = Regressor(config)
+        checkpoint.save(tmp_path / "m.safetensors", model, {"metrics": {"iou": 0.5}}, np.float32)
         again = checkpoint.load(tmp_path / "m.safetensors")
-        assert again.config == THESIS
-        assert isinstance(again.features, ResNet18)
+        assert again.config == config
+        assert isinstance(again.features, ResNet18) == (config is THESIS)
         assert all(parameter.requires_grad for parameter in again.parameters())
-        views = np.random.default_rng(8).random((2, 64, 64))
+        views = np.random.default_rng(8).random((3, config.pixels, config.pixels))
         np.testing.assert_array_equal(again.predict(views).to_flat(), model.predict(views).to_flat())
+        assert json.loads(checkpoint.read_header(tmp_path / "m.safetensors")["metrics"]) == {"iou": 0.5}
 
     def test_files_from_before_there_were_backbones(self, tmp_path: Path) -> None:
         path = tmp_path / "m.safetensors"

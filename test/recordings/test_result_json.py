@@ -37,24 +37,16 @@ def test_a_head_and_a_line_a_frame(path):
     assert frames == [entry(0), entry(1)]
 
 
-@pytest.mark.parametrize("cut", [1, 5, 30])
-def test_a_line_that_was_cut_short_is_written_again(path, cut):
+@pytest.mark.parametrize(("end", "done"), [(-1, 1), (-5, 1), (-30, 1), (10, 0)])
+def test_a_line_or_head_that_was_cut_short_is_written_again(path, end, done):
     whole = path.read_bytes()
-    path.write_bytes(whole[:-cut])
+    path.write_bytes(whole[:end])
     lines = ResultLines(path, OPTIONS)
-    assert lines.done == [entry(0)]
-    lines.add(entry(1))
+    assert lines.done == [entry(0)][:done]
+    for k in range(done, 2):
+        lines.add(entry(k))
     lines.close()
     assert path.read_bytes() == whole
-
-
-def test_a_head_that_was_cut_short_is_written_again(path):
-    whole = path.read_bytes()
-    path.write_bytes(whole[:10])
-    lines = ResultLines(path, OPTIONS)
-    assert lines.done == []
-    lines.close()
-    assert path.read_bytes() == whole.splitlines(keepends=True)[0]
 
 
 @pytest.mark.parametrize(

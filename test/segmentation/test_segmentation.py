@@ -13,6 +13,7 @@ from sq_perception.recordings.frame_file import read
 from sq_perception.segmentation import support_plane
 from sq_perception.segmentation.segments import Segmentation, SegmentationOptions, from_labels, segment, support_under
 from sq_perception.simulation import sensor_noise
+from sq_perception.simulation.scenes import plane_depth
 
 CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)
 TILT = 0.7
@@ -23,11 +24,8 @@ UP = np.stack([[1, 0, 0], np.cross(NORMAL, [1, 0, 0]), NORMAL], axis=1)
 
 
 def table_depth(camera=CAMERA, plane=PLANE):
-    v, u = np.indices((camera.height, camera.width))
-    _, direction = camera.rays(u, v)
-    with np.errstate(divide="ignore"):
-        depth = -plane[3] / (direction @ plane[:3])
-    return np.where((depth > 0) & (depth < 2.0), depth, np.nan)
+    depth = plane_depth(plane, camera)
+    return np.where(depth < 2.0, depth, np.nan)
 
 
 def standing(x, y, size, shape=(0.2, 0.2), turn=0.0):

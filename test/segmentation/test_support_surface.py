@@ -12,6 +12,7 @@ from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation import standing, support_plane, support_surface
 from sq_perception.segmentation.segments import SegmentationOptions, from_labels, segment
+from sq_perception.simulation.scenes import plane_depth
 
 CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)
 STRAIGHT = np.array([0.0, 0.0, 0.0, 1.0])
@@ -19,12 +20,8 @@ TOLERANCE = support_plane.TOLERANCE
 
 
 def plane_image(normal, distance, camera=CAMERA):
-    """Depth of the plane n.p + distance = 0, infinite where no line of sight meets it."""
-    v, u = np.indices((camera.height, camera.width))
-    _, direction = camera.rays(u, v)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        depth = -distance / (direction @ np.asarray(normal, float))
-    return np.where(depth > 0, depth, np.inf)
+    """Depth of the plane n.p + distance = 0, infinite where it is not seen."""
+    return plane_depth(np.append(normal, distance), camera)
 
 
 def slanted(degrees):
