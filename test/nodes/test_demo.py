@@ -145,16 +145,28 @@ def marked(mark: str) -> dict[int, str]:
     return living
 
 
-def demo(*arguments: str, env: dict[str, str], cwd: Path) -> subprocess.Popen[str]:
-    code = f"import sys; sys.path[:1] = [{ROOT!r}]; from sq_perception.commands.main import main; sys.exit(main())"
-    return subprocess.Popen(
-        [sys.executable, "-c", code, "demo", *arguments],
-        cwd=cwd,
-        env=env,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-    )
+class Demo(subprocess.Popen[str]):
+    """The command in a folder; all that it starts inherits its mark."""
+
+    def __init__(self, folder: Path, *arguments: str) -> None:
+        env, self.mark = environment()
+        code = f"import sys; sys.path[:1] = [{ROOT!r}]; from sq_perception.commands.main import main; sys.exit(main())"
+        super().__init__(
+            [sys.executable, "-c", code, "demo", *arguments],
+            cwd=folder,
+            env=env,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+        )
+
+    def ended(self, code: int = 0, within: float = 180.0) -> str:
+        """What it said, when it has ended with this code, and without a trace."""
+        said, _ = self.communicate(timeout=within)
+        assert self.returncode == code, said
+        assert "Traceback" not in said
+        assert marked(self.mark) == {}
+        return said
 
 
 def wait_for(condition: object, seconds: float = 90.0) -> None:
@@ -166,11 +178,7 @@ def wait_for(condition: object, seconds: float = 90.0) -> None:
 
 
 def test_the_demonstration_shows_draws_and_leaves_nothing_running(tmp_path: Path) -> None:
-    env, mark = environment()
-    process = demo("--seconds", "4", "--output-dir", "out", env=env, cwd=tmp_path)
-    said, _ = process.communicate(timeout=180)
-    assert process.returncode == 0, said
-    assert "Traceback" not in said
+    said = Demo(tmp_path, "--seconds", "4", "--output-dir", "out").ended()
     number, row = r"[\d ]+ mm +│ [\d. ]+ ", r"│ +\d │ +"
     rows = re.findall(row + number + "│ +(?:" + number + r"│ +([\d.]+) %|not found)", said)
     assert rows, said
@@ -179,7 +187,6 @@ def test_the_demonstration_shows_draws_and_leaves_nothing_running(tmp_path: Path
     picture = cv2.imread(str(tmp_path / "out" / "demo.png"))
     assert picture.shape[1] > 1000
     assert (tmp_path / "out" / "demo.glb").read_bytes()[:4] == b"glTF"
-    assert marked(mark) == {}
 
 
 def test_a_recorded_grey_image_is_recognised_and_recovered(tmp_path: Path) -> None:
@@ -187,26 +194,18 @@ def test_a_recorded_grey_image_is_recognised_and_recovered(tmp_path: Path) -> No
                         np.array([0.3, 0.2, 0.1, 0.9]))  # fmt: skip
     depth, _ = raycast.render(unit_cube.optical_from_cube(body), unit_cube.camera())
     cv2.imwrite(str(tmp_path / "body.bmp"), unit_cube.grey_from_depth(depth))
-    env, mark = environment()
-    process = demo("--frame", "body.bmp", "--seconds", "1", env=env, cwd=tmp_path)
-    said, _ = process.communicate(timeout=180)
-    assert process.returncode == 0, said
+    said = Demo(tmp_path, "--frame", "body.bmp", "--seconds", "1").ended()
     sizes = re.search(r"│ +1 │ +([\d.]+) ([\d.]+) ([\d.]+) ", said)
     assert sizes is not None, said
     assert sorted(map(float, sizes.groups())) == pytest.approx([0.15, 0.2, 0.25], abs=0.01)
     assert (tmp_path / "demo.png").is_file()
-    assert marked(mark) == {}
 
 
 def test_ctrl_c_ends_it_at_any_time_without_a_trace(tmp_path: Path) -> None:
-    env, mark = environment()
-    process = demo("--seconds", "60", env=env, cwd=tmp_path)
-    wait_for(lambda: len(marked(mark)) >= 4)
+    process = Demo(tmp_path, "--seconds", "60")
+    wait_for(lambda: len(marked(process.mark)) >= 4)
     process.send_signal(signal.SIGINT)
-    said, _ = process.communicate(timeout=60)
-    assert process.returncode == 0, said
-    assert "Traceback" not in said
-    assert marked(mark) == {}
+    process.ended(within=60.0)
 
 
 def test_a_ctrl_c_that_got_lost_is_noticed() -> None:
@@ -238,19 +237,14 @@ def test_a_signal_while_a_node_is_started_leaves_none_behind(monkeypatch: pytest
 
 
 def test_a_node_that_dies_is_named_and_ends_the_demonstration(tmp_path: Path) -> None:
-    env, mark = environment()
-    process = demo("--seconds", "60", env=env, cwd=tmp_path)
+    process = Demo(tmp_path, "--seconds", "60")
 
     def victims() -> list[int]:
-        return [pid for pid, command in marked(mark).items() if "e.fitter_node(" in command]
+        return [pid for pid, command in marked(process.mark).items() if "e.fitter_node(" in command]
 
     wait_for(victims)
     os.kill(victims()[0], signal.SIGKILL)
-    said, _ = process.communicate(timeout=90)
-    assert process.returncode == 1, said
-    assert "fitter_node has ended with exit code -9" in said
-    assert "Traceback" not in said
-    assert marked(mark) == {}
+    assert "fitter_node has ended with exit code -9" in process.ended(1)
 
 
 @pytest.mark.parametrize(
@@ -265,12 +259,7 @@ def test_a_frame_that_cannot_be_read_is_refused_before_anything_starts(
     arguments: list[str], words: str, tmp_path: Path
 ) -> None:
     (tmp_path / "text.npz").write_text("not a frame")
-    env, _ = environment()
-    process = demo(*arguments, env=env, cwd=tmp_path)
-    said, _ = process.communicate(timeout=60)
-    assert process.returncode == 2, said
-    assert words in said
-    assert "Traceback" not in said
+    assert words in Demo(tmp_path, *arguments).ended(2)
 
 
 def test_a_child_that_cannot_start_says_why() -> None:
