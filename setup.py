@@ -147,11 +147,7 @@ setup(
     entry_points={
         "console_scripts": [
             "sq-perception = sq_perception.commands.main:main",
-            "recover_node = sq_perception.nodes.executables:recover_node",
-            "recover_cameras = sq_perception.nodes.executables:recover_cameras",
-            "fitter_node = sq_perception.nodes.executables:fitter_node",
-            "grasp_node = sq_perception.nodes.executables:grasp_node",
-            "synthetic_depth_node = sq_perception.nodes.executables:synthetic_depth_node",
+            *(f"{node} = sq_perception.nodes.executables:{node}" for node in NODES),
         ],
     },
     classifiers=[
