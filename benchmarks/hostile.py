@@ -121,7 +121,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--node", choices=("recover_node", "fitter_node"), default="recover_node")
     options = parser.parse_args()
-    with Peer("hostile") as peer, Children(environment()) as children:
+    with Peer() as peer, Children(environment()) as children:
         benchmark = Benchmark(options.node, peer, children)
         began = time.monotonic()
         for masked in (False, True):

@@ -49,7 +49,7 @@ def main() -> None:
     before = set(orphans())
     kills: list[Kill] = []
     with (
-        Peer("kills") as peer,
+        Peer() as peer,
         Robot(
             peer,
             camera=(f"rate:={options.rate}", f"objects:={options.objects}", "hold:=15"),

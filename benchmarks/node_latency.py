@@ -68,7 +68,7 @@ def record(folder: Path) -> None:
 
 def measure(camera: list[str], recovery: list[str], rate: float, seconds: float) -> dict[str, Any]:
     """Latencies and the recovery node's own counters, over some seconds from the first results on."""
-    with Peer("latency") as peer, Children(environment()) as nodes, Children(environment(**ONE_THREAD)) as cameras:
+    with Peer() as peer, Children(environment()) as nodes, Children(environment(**ONE_THREAD)) as cameras:
         answers, diagnoses = peer.answers(NODE), peer.diagnoses(NODE)
         node = nodes.start("recover_node", [*arguments(*recovery), *QUIET])
         source = cameras.start("synthetic_depth_node", [*arguments(*camera, f"rate:={rate}"), *QUIET])

@@ -274,7 +274,7 @@ def main() -> None:
     parser.add_argument("--node", choices=("recover_node", "fitter_node"), default="recover_node")
     options = parser.parse_args()
     with (
-        Peer("soak") as peer,
+        Peer() as peer,
         Children(environment()) as nodes,
         Children(environment(NUMBA_NUM_THREADS="1")) as cameras,
     ):

@@ -7,7 +7,6 @@ seconds of the monotonic clock, ages milliseconds from the stamp of an image to 
 from __future__ import annotations
 
 import os
-import threading
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -17,12 +16,10 @@ from typing import Any
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from rcl_interfaces.srv import GetParameters, SetParameters
-from rclpy.context import Context
-from rclpy.executors import ExternalShutdownException, SingleThreadedExecutor
-from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.task import Future
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
+from spun_nodes import SpunNodes
 from std_msgs.msg import Header
 
 from sq_msgs_py.depth_image import Intrinsics, depth_to_message, intrinsics_to_message
@@ -118,46 +115,29 @@ class Call:
 class Peer:
     """A node in this process, spun in the background, that publishes, listens and calls."""
 
-    def __init__(self, name: str = "peer") -> None:
+    def __init__(self) -> None:
         os.environ.update(fast_dds.additions())
-        self.context = Context()
-        self.context.init(args=[])
-        self.node = Node(name, context=self.context)
+        self._spun = SpunNodes()
+        self.node = self._spun.peer
         self._publishers: dict[str, Any] = {}
         self._clients: dict[str, Any] = {}
         self._answers: dict[str, list[Answer]] = {}
         self._diagnoses: dict[str, list[Diagnosis]] = {}
-        self._executor = SingleThreadedExecutor(context=self.context)
-        self._executor.add_node(self.node)
+        self._spun.spin([])
         self.listen(DiagnosticArray, "/diagnostics", self._on_diagnostics)
-        self._thread = threading.Thread(target=self._spin, daemon=True)
-        self._thread.start()
 
     def __enter__(self) -> Peer:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.close()
-
-    def close(self) -> None:
-        """Leave ROS."""
-        self.context.try_shutdown()
-        self._thread.join(PATIENCE)
-        self.node.destroy_node()
-
-    def _spin(self) -> None:
-        try:
-            while self.context.ok():
-                self._executor.spin_once(timeout_sec=0.2)
-        except ExternalShutdownException:
-            return
+        self._spun.close()
 
     # Listening
 
     def listen(self, kind: type[Any], topic: str, callback: Callable[[Any], None], depth: int = 50) -> None:
         """Subscribe; the callback runs in the background thread."""
         self.node.create_subscription(kind, topic, callback, depth)
-        self._executor.wake()
+        self._spun.executor.wake()
 
     def answers(self, node: str) -> list[Answer]:
         """The results of a node ("/recover_node"), growing from the first call on."""
@@ -205,7 +185,7 @@ class Peer:
         """Call a service; the future holds the response."""
         if name not in self._clients:
             self._clients[name] = self.node.create_client(kind, name)
-            self._executor.wake()
+            self._spun.executor.wake()
         until(self._clients[name].service_is_ready, alive)
         return self._clients[name].call_async(request)
 
