@@ -79,8 +79,7 @@ class Bench(SpunNodes):
         self.node = FrameNode("recover_node", context=self.context)
         self.images = self.peer.create_publisher(Image, "depth/image", 5)
         self.infos = self.peer.create_publisher(CameraInfo, "depth/camera_info", 5)
-        self.answers: list[PointCloud2] = []
-        self.peer.create_subscription(PointCloud2, "recover_node/superquadrics", self.answers.append, 10)
+        self.answers = self.hear(PointCloud2, "recover_node/superquadrics", 10)
         self.spin([self.node])
         self.until(lambda: self.node.is_active)
         if self.node._settings.current.image_transport == "raw":

@@ -78,6 +78,12 @@ class SpunNodes:
             assert time.monotonic() < deadline, "waited in vain"
             time.sleep(0.005)
 
+    def hear(self, kind: Any, topic: str, quality: Any = 5) -> list[Any]:
+        """The messages of a topic, growing."""
+        messages: list[Any] = []
+        self.peer.create_subscription(kind, topic, messages.append, quality)
+        return messages
+
     def ask(self, kind: Any, name: str, request: Any = None) -> Future:
         """Call a service; the answer is still to come."""
         client = self.peer.create_client(kind, name)

@@ -45,8 +45,7 @@ def test_raw_images_of_a_lens_are_rectified_and_rendered_as_they_were_sent(make_
     info = CameraInfo(width=64, height=48, distortion_model="plumb_bob", d=[-0.2, 0.05, 0.001, -0.001, 0.0])
     info.k = [60.0, 0.0, 31.5, 0.0, 60.0, 23.5, 0.0, 0.0, 1.0]
     bench.put_info(info)
-    rendered: list[Image] = []
-    bench.peer.create_subscription(Image, "recover_node/rendered_depth", rendered.append, 5)
+    rendered = bench.hear(Image, "recover_node/rendered_depth")
     bench.until(lambda: bench.node._outputs.rendered_depth.get_subscription_count())
     bench.answer(bench.depth())
     depth, camera, _, _ = bench.recoverer.asked[-1]

@@ -23,10 +23,8 @@ def test_pictures_are_made_while_somebody_listens_and_stale_markers_go(bench):
     assert bench.node.set_parameters([Parameter("tracking", value=False)])[0].successful
     bench.recoverer.bodies = (ball(1), ball(5), ball(6, Status.FAILED))
     assert len(bench.answer(bench.depth())[1]) == 3
-    shown: list[MarkerArray] = []
-    rendered: list[Image] = []
-    bench.peer.create_subscription(MarkerArray, "recover_node/markers", shown.append, 5)
-    bench.peer.create_subscription(Image, "recover_node/rendered_depth", rendered.append, 5)
+    shown = bench.hear(MarkerArray, "recover_node/markers")
+    rendered = bench.hear(Image, "recover_node/rendered_depth")
     bench.until(
         lambda: (
             bench.node._outputs.markers.get_subscription_count()
@@ -77,8 +75,7 @@ def test_a_marker_goes_though_its_listener_was_too_busy_to_hear_of_it(bench):
 
 @pytest.mark.parametrize("end", ["disabled", "deactivated", "ended"])
 def test_markers_go_with_the_one_who_would_move_them(bench, end):
-    shown: list[MarkerArray] = []
-    bench.peer.create_subscription(MarkerArray, "recover_node/markers", shown.append, 5)
+    shown = bench.hear(MarkerArray, "recover_node/markers")
     bench.until(lambda: bench.node._outputs.markers.get_subscription_count())
     bench.recoverer.bodies = (ball(1), ball(5))
     bench.answer(bench.depth())

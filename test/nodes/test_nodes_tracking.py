@@ -60,8 +60,7 @@ def image(sec: float, frame_id: str = FRAME_ID) -> Any:
 
 
 def diagnostics(bench: Bench) -> Callable[[], dict[str, str]]:
-    reports: list[DiagnosticArray] = []
-    bench.peer.create_subscription(DiagnosticArray, "/diagnostics", reports.append, 5)
+    reports = bench.hear(DiagnosticArray, "/diagnostics")
 
     def newest() -> dict[str, str]:
         before = len(reports)
@@ -74,8 +73,7 @@ def diagnostics(bench: Bench) -> Callable[[], dict[str, str]]:
 def test_ids_and_forms_last_and_numbers_are_fused(make_bench):
     """Labels change places, the fit names the axes anew, a body fails: ids, axes and markers stay."""
     bench = make_bench()
-    shown: list[MarkerArray] = []
-    bench.peer.create_subscription(MarkerArray, "recover_node/markers", shown.append, 5)
+    shown = bench.hear(MarkerArray, "recover_node/markers")
     bench.until(lambda: bench.node._outputs.markers.get_subscription_count())
     report = diagnostics(bench)
 

@@ -11,6 +11,7 @@ import pytest
 
 pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
+from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from frame_node_bench import CAMERA, FRAME_ID
 from geometry_msgs.msg import PoseStamped
 from rclpy.parameter import Parameter
@@ -246,12 +247,9 @@ def test_after_disable_nothing_is_published_any_more(bench):
 
 
 def test_a_clock_that_stands_still_stops_neither_diagnostics_nor_triggers(make_bench, monkeypatch):
-    from diagnostic_msgs.msg import DiagnosticArray
-
     monkeypatch.setattr(frame_node, "TRIGGER_TIMEOUT", 0.5)
     bench = make_bench("-p", "use_sim_time:=true")
-    reports: list[DiagnosticArray] = []
-    bench.peer.create_subscription(DiagnosticArray, "/diagnostics", reports.append, 5)
+    reports = bench.hear(DiagnosticArray, "/diagnostics")
     answer = bench.call(Trigger, "/recover_node/trigger")
     assert (answer.success, answer.message.split(":")[0]) == (False, "no frame on /depth/image within 0.75 s")
     bench.until(lambda: reports)
@@ -357,8 +355,7 @@ def test_images_whose_masks_never_come_are_answered_before_too_many_wait(make_be
 def test_orthographic_frames_need_no_camera_info_and_answer_in_the_cube_frame(make_bench):
     bench = make_bench("-p", "projection:=orthographic")
     assert bench.recoverer.warm == unit_cube.camera()
-    rendered: list[Image] = []
-    bench.peer.create_subscription(Image, "recover_node/rendered_depth", rendered.append, 5)
+    rendered = bench.hear(Image, "recover_node/rendered_depth")
     bench.until(lambda: bench.node._outputs.rendered_depth.get_subscription_count())
     for dtype in (np.uint8, np.uint16):
         grey = np.zeros((32, 32), dtype)
@@ -394,22 +391,18 @@ def test_a_latched_cloud_reaches_those_who_come_later(make_bench):
     bench = make_bench("-p", "qos_overrides./recover_node/superquadrics.publisher.durability:=transient_local")
     bench.send_info()
     bench.answer(bench.depth())
-    late: list[PointCloud2] = []
     kept = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
-    bench.peer.create_subscription(PointCloud2, "recover_node/superquadrics", late.append, kept)
+    late = bench.hear(PointCloud2, "recover_node/superquadrics", kept)
     bench.until(lambda: late)
 
 
 def test_diagnostics_count_and_warn(bench):
-    from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
-
-    reports: list[DiagnosticArray] = []
+    reports = bench.hear(DiagnosticArray, "/diagnostics")
 
     def latest() -> tuple[DiagnosticStatus, dict[str, str]]:
         status = reports[-1].status[0]
         return status, {pair.key: pair.value for pair in status.values}
 
-    bench.peer.create_subscription(DiagnosticArray, "/diagnostics", reports.append, 5)
     bench.answer(bench.depth())
     bench.until(lambda: reports and latest()[1]["answered"] == "1")
     assert "stamp to result: median [ms]" not in latest()[1], "the stamp of an old recording says nothing about latency"
@@ -458,11 +451,8 @@ def test_a_camera_info_that_was_published_once_before_is_received(make_bench):
 
 
 def test_silence_is_reported(make_bench):
-    from diagnostic_msgs.msg import DiagnosticArray
-
     bench = make_bench("-p", "no_frame_warning:=0.5")
-    reports: list[DiagnosticArray] = []
-    bench.peer.create_subscription(DiagnosticArray, "/diagnostics", reports.append, 5)
+    reports = bench.hear(DiagnosticArray, "/diagnostics")
     bench.until(lambda: reports and reports[-1].status[0].message == "no depth images arrive")
 
 
@@ -472,9 +462,8 @@ def test_the_support_plane_reaches_those_who_come_late(bench):
     header = bench.answer(bench.depth())[0].header
     bench.recoverer.plane = None
     bench.answer(bench.depth())
-    heard: list[Any] = []
     latched = QoSProfile(depth=1, durability=QoSDurabilityPolicy.TRANSIENT_LOCAL)
-    bench.peer.create_subscription(PoseStamped, "recover_node/support_plane", heard.append, latched)
+    heard = bench.hear(PoseStamped, "recover_node/support_plane", latched)
     bench.until(lambda: heard)
     assert heard[0].header == header
     np.testing.assert_allclose(plane_of(heard[0]), [0.0, -0.8, -0.6, 0.5], atol=1e-12)
