@@ -185,10 +185,6 @@ def test_a_consumer_loads_neither_torch_nor_the_package() -> None:
     assert not modules & {"torch", "sq_perception", "scipy", "cv2", "numba", "rclpy"}
 
 
-def test_importing_the_package_loads_next_to_nothing() -> None:
-    assert not loaded_after("import sq_perception") & {"torch", "numba", "scipy", "cv2", "matplotlib", "rclpy"}
-
-
 def test_recovery_neither_trains_nor_draws_reads_no_weights_and_knows_no_ros() -> None:
     statement = (
         "opened = []; sys.addaudithook(lambda event, args: opened.append(str(args[0])) if event == 'open' else None); "
