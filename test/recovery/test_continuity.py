@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy.stats import chi2
+from table_scenes import Table
 
 from sq_perception.fitting.fit import Status
 from sq_perception.geometry import rotation as quaternions
@@ -19,18 +20,12 @@ from sq_perception.tracking import state
 from sq_perception.tracking.tracker import Tracker
 
 CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)
-PITCH, DISTANCE, SIGMA = np.deg2rad(50), 0.8, 0.001
-NORMAL = -np.array([0.0, np.cos(PITCH), np.sin(PITCH)])
-AWAY = np.array([0.0, -np.sin(PITCH), np.cos(PITCH)])
-TABLE = np.stack([[1.0, 0, 0], AWAY, NORMAL], axis=1)
-"""Optical from table frame."""
+TABLE = Table(np.deg2rad(50), distance=0.8)
 PLACES = ((-0.16, 0.0), (0.0, 0.0), (0.16, 0.02))
 
 
 def standing(x, y, size=(0.04, 0.035, 0.05), shape=(0.3, 0.4), yaw=0.5):
-    c, s = np.cos(yaw), np.sin(yaw)
-    turn = quaternions.from_matrix(TABLE @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]]))
-    return Superquadric(np.array(size), np.array(shape), TABLE @ [x, y, size[2]] + [0, 0, DISTANCE], turn)
+    return TABLE.body(x, y, size, shape, yaw)
 
 
 STILL = tuple(standing(*place) for place in PLACES)
@@ -38,14 +33,7 @@ STILL = tuple(standing(*place) for place in PLACES)
 
 def image(bodies, seed, camera=CAMERA):
     """Things on the table with the noise of a sensor."""
-    depth, _ = raycast.render(Superquadric.stack(list(bodies)), camera)
-    rows, columns = np.mgrid[: camera.height, : camera.width]
-    rays = np.stack([(columns - camera.cx) / camera.fx, (rows - camera.cy) / camera.fy, np.ones(rows.shape)], axis=-1)
-    with np.errstate(divide="ignore"):
-        table = -DISTANCE * np.sin(PITCH) / (rays @ NORMAL)
-    z = np.minimum(depth, np.where(table > 0, table, np.inf))
-    z = z + np.random.default_rng(seed).normal(0, SIGMA, z.shape) * np.where(np.isfinite(z), z, 0) ** 2
-    return np.where(z < 3, z, np.nan).astype(np.float32)
+    return TABLE.see(bodies, 0.001, seed, camera)[0]
 
 
 def changed(k, body):

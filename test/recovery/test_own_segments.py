@@ -7,11 +7,11 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from table_scenes import Table
 
 from sq_perception.fitting.options import MIN_PIXELS
-from sq_perception.geometry import rotation
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.imaging import raycast, segment_view
+from sq_perception.imaging import segment_view
 from sq_perception.imaging.camera import Camera
 from sq_perception.learning import checkpoint, inference
 from sq_perception.recovery.own_segments import SegmentNetwork
@@ -20,23 +20,13 @@ from sq_perception.segmentation.segments import Segmentation
 from sq_perception.simulation.scenes import plane_depth
 
 CAMERA = Camera(320, 240, 300.0, 300.0, 159.5, 119.5)
-PITCH, DISTANCE = 0.75, 0.7
-PLANE = np.append(-np.array([0.0, np.cos(PITCH), np.sin(PITCH)]), DISTANCE * np.sin(PITCH))
-ACROSS = np.array([-1.0, 0.0, 0.0])
-AXES = np.stack([ACROSS, np.cross(PLANE[:3], ACROSS), PLANE[:3]], axis=1)
+TABLE = Table(distance=0.7)
+PLANE = TABLE.plane
 CAN = (0.035, 0.035, 0.05), (0.1, 1.0)
 
 
-def standing(x: float, y: float, size: Any, shape: Any) -> Superquadric:
-    centre = np.array([0, 0, DISTANCE]) + AXES @ np.array([x, y, size[2]])
-    return Superquadric(np.array(size), np.array(shape), centre, rotation.from_matrix(AXES))
-
-
 def seen(bodies: list[Superquadric]) -> tuple[np.ndarray, np.ndarray]:
-    depth, index = raycast.render(Superquadric.stack(bodies), CAMERA)
-    depth = np.where(index >= 0, depth, plane_depth(PLANE, CAMERA))
-    noise = 0.001 * depth**2 * np.random.default_rng(0).standard_normal(depth.shape)
-    return (depth + noise).astype(np.float32), (index + 1).astype(np.int32)
+    return TABLE.see(bodies, 0.001, camera=CAMERA)
 
 
 def segmentation(labels: np.ndarray) -> Segmentation:
@@ -70,7 +60,7 @@ def shipped() -> Any:
 
 def test_the_rim_that_a_sensor_adds_is_stray(shipped: Any) -> None:
     """Every pixel within two of the can shows the can's depth, as stereo matching has it."""
-    depth, truth = seen([standing(0, 0, *CAN)])
+    depth, truth = seen([TABLE.body(0, 0, *CAN)])
     brush = np.ones((5, 5), np.uint8)
     wider = cv2.dilate((truth > 0).view(np.uint8), brush) > 0
     depth = np.where(wider & (truth == 0), cv2.erode(np.where(truth > 0, depth, np.inf), brush), depth)
@@ -84,7 +74,7 @@ def test_the_rim_that_a_sensor_adds_is_stray(shipped: Any) -> None:
 
 
 def test_two_halves_of_a_can_are_joined_and_two_cans_are_not(shipped: Any) -> None:
-    depth, truth = seen([standing(-0.06, 0, *CAN), standing(0.06, 0.02, *CAN)])
+    depth, truth = seen([TABLE.body(-0.06, 0, *CAN), TABLE.body(0.06, 0.02, *CAN)])
     middle = np.median(np.nonzero(truth == 1)[1])
     halves = np.where((truth == 1) & (np.arange(CAMERA.width) > middle), 3, truth).astype(np.int32)
     found = of(shipped, depth).improved(segmentation(halves)).found
@@ -94,8 +84,7 @@ def test_two_halves_of_a_can_are_joined_and_two_cans_are_not(shipped: Any) -> No
 
 
 def test_two_boxes_under_one_label_become_two(shipped: Any) -> None:
-    boxes = standing(-0.055, 0, (0.05, 0.04, 0.03), (0.1, 0.1)), standing(0.035, 0.01, (0.04, 0.03, 0.06), (0.1, 0.1))
-    depth, truth = seen(list(boxes))
+    depth, truth = seen([TABLE.body(-0.055, 0, (0.05, 0.04, 0.03)), TABLE.body(0.035, 0.01, (0.04, 0.03, 0.06))])
     found = of(shipped, depth).improved(segmentation((truth > 0).astype(np.int32))).found
     assert found.ids == (1, 2)
     for box in (1, 2):
@@ -118,7 +107,7 @@ def claims_of_halves(views: np.ndarray) -> np.ndarray:
 
 
 def test_a_doubtful_segment_is_parted_where_its_pieces_say() -> None:
-    depth, truth = seen([standing(0, 0, *CAN)])
+    depth, truth = seen([TABLE.body(0, 0, *CAN)])
     found = of(GivenLogits(claims_of_halves), depth).improved(segmentation(truth)).found
     assert found.ids == (1, 2)
     np.testing.assert_array_equal(found.labels > 0, truth > 0)
@@ -134,7 +123,7 @@ def test_pieces_that_are_of_nothing_are_no_objects() -> None:
     def right_alone(views: np.ndarray) -> np.ndarray:
         return np.where(halves_of(views), -3.0, 3.0) * np.ones(views.shape[:3])
 
-    depth, truth = seen([standing(0, 0, *CAN)])
+    depth, truth = seen([TABLE.body(0, 0, *CAN)])
     network = GivenLogits(right_alone)
     found = of(network, depth).improved(segmentation(truth))
     np.testing.assert_array_equal(found.found.labels, truth)
@@ -142,7 +131,7 @@ def test_pieces_that_are_of_nothing_are_no_objects() -> None:
 
 
 def test_a_segment_that_is_surely_one_is_asked_about_once() -> None:
-    depth, truth = seen([standing(0, 0, *CAN)])
+    depth, truth = seen([TABLE.body(0, 0, *CAN)])
     network = GivenLogits(lambda views: np.full(views.shape[:3], 3.0))
     np.testing.assert_array_equal(of(network, depth).improved(segmentation(truth)).found.labels, truth)
     assert network.asked == 1
@@ -150,7 +139,7 @@ def test_a_segment_that_is_surely_one_is_asked_about_once() -> None:
 
 def test_pieces_are_joined_until_none_belong_together() -> None:
     """Four quarters of which each is taken for the whole: pairs first, then the pairs; labels from 1, no strays."""
-    depth, truth = seen([standing(0, 0, *CAN)])
+    depth, truth = seen([TABLE.body(0, 0, *CAN)])
     rows, columns = np.indices(truth.shape)
     v, u = (np.median(each) for each in np.nonzero(truth))
     quarters = np.where(truth > 0, 1 + (rows > v) + 2 * (columns > u), 0).astype(np.int32)
@@ -164,7 +153,7 @@ def test_pieces_are_joined_until_none_belong_together() -> None:
 
 def test_one_sided_belonging_joins_nothing() -> None:
     """A carton claims the can on it; the can does not claim the carton."""
-    depth, truth = seen([standing(-0.06, 0, *CAN), standing(0.06, 0.02, *CAN)])
+    depth, truth = seen([TABLE.body(-0.06, 0, *CAN), TABLE.body(0.06, 0.02, *CAN)])
 
     def claims_of_the_first(views: np.ndarray) -> np.ndarray:
         inside = views[..., segment_view.SEGMENT] > 0
@@ -187,14 +176,14 @@ def stray_in_rows(share: float) -> Any:
 
 
 def test_a_segment_that_is_mostly_stray_keeps_its_pixels() -> None:
-    depth, truth = seen([standing(0, 0, *CAN)])
+    depth, truth = seen([TABLE.body(0, 0, *CAN)])
     found = of(stray_in_rows(0.55), depth).improved(segmentation(truth))
     np.testing.assert_array_equal(found.found.labels, truth)
     assert not found.strays.any()
 
 
 def test_a_segment_that_shows_no_object_is_dropped() -> None:
-    depth, truth = seen([standing(0, 0, *CAN)])
+    depth, truth = seen([TABLE.body(0, 0, *CAN)])
     found = of(stray_in_rows(0.8), depth).improved(segmentation(truth))
     assert found.found.ids == ()
     assert not found.found.labels.any()
@@ -202,7 +191,7 @@ def test_a_segment_that_shows_no_object_is_dropped() -> None:
 
 def test_without_a_support_nothing_is_dropped() -> None:
     """A body alone in an image, as a renderer makes it: all that is seen is the object."""
-    depth, truth = seen([standing(0, 0, *CAN)])
+    depth, truth = seen([TABLE.body(0, 0, *CAN)])
     alone = np.where(truth > 0, depth, np.nan).astype(np.float32)
     mostly = stray_in_rows(0.8)
     network = SegmentNetwork(mostly, mostly, alone, CAMERA, None, lambda function, labels: function(labels))
@@ -211,7 +200,7 @@ def test_without_a_support_nothing_is_dropped() -> None:
 
 def test_the_floor_behind_a_table_is_no_object(shipped: Any) -> None:
     """It is the larger of two segments; the can is the first one then."""
-    depth, truth = seen([standing(0, 0, *CAN)])
+    depth, truth = seen([TABLE.body(0, 0, *CAN)])
     floor = plane_depth(PLANE + np.array([0.0, 0.0, 0.0, 0.7]), CAMERA)
     behind = np.arange(CAMERA.height)[:, None] < np.nonzero(truth)[0].min() - 10
     labels = np.where(behind, 1, 2 * truth).astype(np.int32)
@@ -224,7 +213,7 @@ def test_the_floor_behind_a_table_is_no_object(shipped: Any) -> None:
 @pytest.mark.parametrize("times", [1, 4])
 def test_what_is_larger_than_all_of_a_household_is_an_object(shipped: Any, times: float) -> None:
     """All lengths are multiplied: a crate at the height of a palletizer's camera instead of a can."""
-    depth, truth = seen([standing(0, 0, *CAN)])
+    depth, truth = seen([TABLE.body(0, 0, *CAN)])
     plane = PLANE * np.array([1.0, 1.0, 1.0, times])
     far = (times * depth).astype(np.float32)
     assert of(shipped, far, plane=plane).improved(segmentation(truth)).found.ids == (1,)
@@ -244,14 +233,14 @@ def test_cans_in_an_image_of_few_pixels_are_objects(shipped: Any) -> None:
 
 
 def test_no_segments_ask_nothing() -> None:
-    depth, truth = seen([standing(0, 0, *CAN)])
+    depth, truth = seen([TABLE.body(0, 0, *CAN)])
     network = GivenLogits(lambda views: views)
     assert of(network, depth).improved(segmentation(np.zeros_like(truth))).found.ids == ()
     assert network.asked == 0
 
 
 def test_frames_keep_the_strays_in_their_labels_and_count_them() -> None:
-    depth, _ = seen([standing(-0.06, 0, *CAN), standing(0.06, 0.02, *CAN)])
+    depth, _ = seen([TABLE.body(-0.06, 0, *CAN), TABLE.body(0.06, 0.02, *CAN)])
     recoverer = Recoverer(threads=1)
     with_masks, without = (
         recoverer.recover(depth, CAMERA, options=RecoveryOptions(repair=repair)) for repair in (True, False)
@@ -271,7 +260,7 @@ def test_networks_are_shown_what_a_rolled_camera_sees_as_if_it_were_upright(quar
         return np.where(there & (rows < views.shape[1] / 2), 5.0, -5.0)
 
     square = Camera(240, 240, 300.0, 300.0, 119.5, 119.5)
-    depth, truth = (image[:, 40:280] for image in seen([standing(0, 0, *CAN)]))
+    depth, truth = (image[:, 40:280] for image in seen([TABLE.body(0, 0, *CAN)]))
     turned = [np.ascontiguousarray(np.rot90(image, quarters)) for image in (depth, truth)]
     matrix = np.linalg.matrix_power(np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), quarters)
     upright = of(GivenLogits(upper), np.ascontiguousarray(depth), square).improved(segmentation(truth))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from table_scenes import Table
 
 from sq_perception.geometry import rotation
 from sq_perception.geometry.superquadric import Superquadric
@@ -16,11 +17,8 @@ from sq_perception.simulation import sensor_noise
 from sq_perception.simulation.scenes import plane_depth
 
 CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)
-TILT = 0.7
-NORMAL = np.array([0.0, -np.cos(TILT), -np.sin(TILT)])
-PLANE = np.append(NORMAL, 0.7)
-UP = np.stack([[1, 0, 0], np.cross(NORMAL, [1, 0, 0]), NORMAL], axis=1)
-"""Columns: x and y of the table and its normal, in the optical frame."""
+TABLE = Table(0.7, distance=0.7 / np.sin(0.7))
+PLANE, NORMAL = TABLE.plane, TABLE.plane[:3]
 
 
 def table_depth(camera=CAMERA, plane=PLANE):
@@ -29,15 +27,7 @@ def table_depth(camera=CAMERA, plane=PLANE):
 
 
 def standing(x, y, size, shape=(0.2, 0.2), turn=0.0):
-    """A body that stands at (x, y) of the table; (0, 0) is below the middle of the image."""
-    origin = np.array([0, 0, -PLANE[3] / NORMAL[2]])
-    about_z = rotation.from_rotation_vector(np.array([0, 0, turn]))
-    return Superquadric(
-        np.array(size),
-        np.array(shape),
-        origin + UP @ np.array([x, y, size[2]]),
-        rotation.multiply(rotation.from_matrix(UP), about_z),
-    )
+    return TABLE.body(x, y, size, shape, turn)
 
 
 def scene(bodies, camera=CAMERA, noise=0.0, seed=0):

@@ -4,48 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from table_scenes import VGA, Table, noisy
 
-from sq_perception.geometry import rotation
-from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.imaging import raycast
-from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation.segments import segment
 from sq_perception.simulation.scenes import plane_depth
 
-VGA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
-BOX, CAN, BALL = (0.1, 0.1), (0.1, 1.0), (1.0, 1.0)
-
-
-class Table:
-    """A table 0.9 m before the camera, seen at a pitch below the horizon and a roll; bodies are placed on it."""
-
-    def __init__(self, pitch=0.75, roll=0.0, distance=0.9):
-        up = -np.array([np.cos(pitch) * np.sin(roll), np.cos(pitch) * np.cos(roll), np.sin(pitch)])
-        self.plane = np.append(up, distance * np.sin(pitch))
-        self.origin = np.array([0, 0, distance])
-        across = np.cross([0, 0, 1.0], up)
-        across /= np.linalg.norm(across)
-        self.axes = np.stack([across, np.cross(up, across), up], axis=1)
-
-    def body(self, x, y, size, shape=BOX, turn=0.0, height=0.0):
-        about = rotation.from_rotation_vector(np.array([0, 0, turn]))
-        centre = self.origin + self.axes @ np.array([x, y, height + size[2]])
-        turned = rotation.multiply(rotation.from_matrix(self.axes), about)
-        return Superquadric(np.array(size), np.array(shape), centre, turned)
-
-    def see(self, bodies, noise=0.0, seed=0, camera=VGA, table=True):
-        """Depth float32 with noise that grows as z^2, and labels."""
-        depth, index = raycast.render(Superquadric.stack(bodies), camera)
-        behind = plane_depth(self.plane, camera) if table else np.full(depth.shape, np.inf)
-        seen = (index >= 0) & ~(behind < depth)
-        depth = np.where(seen, depth, behind)
-        depth = np.where(np.isfinite(depth), depth, np.nan)
-        return noisy(depth, noise, seed), np.where(seen, index + 1, 0)
-
-
-def noisy(depth, noise, seed=0):
-    rng = np.random.default_rng(seed)
-    return (depth + noise * depth**2 * rng.standard_normal(depth.shape)).astype(np.float32)
+CAN, BALL = (0.1, 1.0), (1.0, 1.0)
 
 
 def ious(truth, labels):
