@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from table_scenes import Table
 
 from sq_perception.fitting import revolution, surface_fit
 from sq_perception.fitting.fit import Fit
@@ -20,18 +21,14 @@ from sq_perception.imaging.coherence import coherent
 from sq_perception.simulation.scenes import plane_depth
 
 CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)
-NORMAL = np.array([0.0, -math.sin(math.radians(40)), -math.cos(math.radians(40))])
-PLANE = np.append(NORMAL, 0.62)
-UPRIGHT = np.stack([[1.0, 0.0, 0.0], np.cross(NORMAL, [1.0, 0.0, 0.0]), NORMAL], axis=1)
+TABLE = Table(math.radians(50), distance=0.62 / math.sin(math.radians(50)))
+PLANE, NORMAL = TABLE.plane, TABLE.plane[:3]
 NOISE = 0.0015
 
 
 def standing(size: list[float], shape: list[float], turn: float = 0.0) -> Superquadric:
     """A body on the plane in the middle of the image, turned about the normal."""
-    foot = np.array([0.0, 0.0, -PLANE[3] / NORMAL[2]])
-    rotation = quaternions.from_matrix(UPRIGHT)
-    spin = quaternions.from_rotation_vector(np.array([0.0, 0.0, turn]))
-    return Superquadric(size, shape, foot + size[2] * NORMAL, quaternions.multiply(rotation, spin))
+    return TABLE.body(0, 0, size, shape, turn)
 
 
 def fitted(body: Superquadric, seed: int = 3, **options: object) -> Fit:

@@ -1,4 +1,4 @@
-"""Bodies on a table, seen by a camera with noise."""
+"""Bodies on a table, seen by a camera with noise, and how well segments cover them."""
 
 from __future__ import annotations
 
@@ -44,3 +44,14 @@ class Table:
 def noisy(depth, noise, seed=0):
     rng = np.random.default_rng(seed)
     return (depth + noise * depth**2 * rng.standard_normal(depth.shape)).astype(np.float32)
+
+
+def best_iou(mask, labels):
+    """Of a body with the segment that fits it best."""
+    found = [labels == k for k in range(1, labels.max() + 1)]
+    return max((np.sum(mask & one) / np.sum(mask | one) for one in found), default=0.0)
+
+
+def ious(truth, labels):
+    """Of each body, likewise."""
+    return [best_iou(truth == k, labels) for k in range(1, truth.max() + 1)]

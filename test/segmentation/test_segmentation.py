@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from table_scenes import Table
+from table_scenes import Table, best_iou
 
 from sq_perception.geometry import rotation
 from sq_perception.geometry.superquadric import Superquadric
@@ -46,11 +46,6 @@ THREE = [
     standing(0.02, 0.05, (0.05, 0.05, 0.07), (0.1, 1.0)),
     standing(0.25, -0.05, (0.05, 0.05, 0.05), (1.0, 1.0)),
 ]
-
-
-def best_iou(mask, labels):
-    found = [labels == k for k in range(1, labels.max() + 1)]
-    return max((np.sum(mask & one) / np.sum(mask | one) for one in found), default=0)
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.002])

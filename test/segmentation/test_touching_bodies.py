@@ -4,21 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from table_scenes import VGA, Table, noisy
+from table_scenes import VGA, Table, ious, noisy
 
 from sq_perception.segmentation.segments import segment
 from sq_perception.simulation.scenes import plane_depth
 
 CAN, BALL = (0.1, 1.0), (1.0, 1.0)
-
-
-def ious(truth, labels):
-    """Of each body with the segment that fits it best."""
-    found = [labels == k for k in range(1, labels.max() + 1)]
-    return [
-        max((np.sum(mask & one) / np.sum(mask | one) for one in found), default=0.0)
-        for mask in (truth == k for k in range(1, truth.max() + 1))
-    ]
 
 
 TABLE = Table()
