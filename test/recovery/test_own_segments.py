@@ -221,14 +221,10 @@ def test_what_is_larger_than_all_of_a_household_is_an_object(shipped: Any, times
 
 def test_cans_in_an_image_of_few_pixels_are_objects(shipped: Any) -> None:
     """At a metre in images of 160 x 120 pixels, of 160 each: told that grain, the network takes all for nothing."""
-    farther = np.array([0.0, 0.0, 0.3])
-    bodies = [standing(0.11 * k - 0.22, 0.05 * (k % 2), *CAN) for k in range(5)]
-    there = Superquadric.stack(bodies).transformed(np.array([0.0, 0.0, 0.0, 1.0]), farther)
-    camera, plane = Camera(160, 120, 138.6, 138.6, 79.5, 59.5), PLANE - np.append(np.zeros(3), PLANE[:3] @ farther)
-    depth, index = raycast.render(there, camera)
-    depth = np.where(index >= 0, depth, plane_depth(plane, camera))
-    depth = (depth + 0.002 * depth**2 * np.random.default_rng(0).standard_normal(depth.shape)).astype(np.float32)
-    found = of(shipped, depth, camera, plane).improved(segmentation((index + 1).astype(np.int32)))
+    table, camera = Table(distance=1.0), Camera(160, 120, 138.6, 138.6, 79.5, 59.5)
+    bodies = [table.body(0.11 * k - 0.22, 0.05 * (k % 2), *CAN) for k in range(5)]
+    depth, truth = table.see(bodies, 0.002, camera=camera)
+    found = of(shipped, depth, camera, table.plane).improved(segmentation(truth))
     assert len(found.found.ids) == 5
 
 
