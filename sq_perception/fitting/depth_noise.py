@@ -58,9 +58,8 @@ def estimate(depth: np.ndarray, inside: np.ndarray, least: float) -> DepthNoise:
     """The noise of the depth image within a mask (h, w); ``least`` metres if it is smaller or cannot be estimated."""
     typical, quantum = _typical(depth, inside)
     spread = typical * MEDIAN_TO_SIGMA / math.sqrt(20.0)
-    if spread < 0.5 * quantum:
-        return DepthNoise(max(quantum / math.sqrt(12.0), least), quantum=quantum)
-    return DepthNoise(max(spread, least))
+    is_rounded = spread < 0.5 * quantum
+    return DepthNoise(max(spread, quantum / math.sqrt(12.0), least), quantum=quantum if is_rounded else 0.0)
 
 
 @kernel

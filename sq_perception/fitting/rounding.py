@@ -27,8 +27,8 @@ from sq_perception.fitting.rivals import other_orders, resized
 
 _FACE_SHARE = 0.04
 """A depth that this share of all rays has in common is that of a face."""
-_DEAD_ZONE = math.sqrt(3.0) * 1.01
-"""Half a step in standard deviations q / sqrt(12) of its noise, and a little for single precision."""
+_DEAD_ZONE = 0.5 * 1.01
+"""Half a step, and a little for single precision."""
 _RAYS = 1000
 """Of the search for each of up to 21 bodies, which begins at a neighbour's."""
 _PACES = (1.05, 1.08, 1.12, 1.18, 1.25, 1.25, 1.25, 1.25, 1.25, 1.25)
@@ -71,7 +71,9 @@ def plausible(solution: Solution) -> tuple[State, list[Alternative]]:
     """
     best, rays = solution.state, solution.rays
     rays = rays.every(max(1, len(rays.hits) // _RAYS))
-    walk = _Walk(solution.problem.with_terms(dead_zone=_DEAD_ZONE), rays)
+    observation = solution.problem.observation
+    dead_zone = _DEAD_ZONE * observation.noise.quantum / observation.sigma
+    walk = _Walk(solution.problem.with_terms(dead_zone=dead_zone), rays)
     walk.along_view(best)
     if walk.least < _ALLOWED and walk.deviation() < _CERTAIN:
         return best, []

@@ -42,6 +42,31 @@ def test_rounding_alone(rng: np.random.Generator) -> None:
     assert found.quantum == pytest.approx(step)
 
 
+@pytest.mark.parametrize("levels", [0.3, 0.35, 0.4])
+def test_noise_of_less_than_half_a_step_joins_the_rounding(levels: float, rng: np.random.Generator) -> None:
+    """On a bowl, whose slopes of all sizes make the errors of rounding of neighbours independent."""
+    step, (v, u) = 1 / 256, np.indices(INSIDE.shape)
+    bowl = 200 + 0.02 * ((u - 80) ** 2 + (v - 60) ** 2)
+    depth = np.round(bowl + levels * rng.standard_normal(INSIDE.shape)) * step
+    found = depth_noise.estimate(depth.astype(np.float32), INSIDE, 1e-6)
+    assert found.constant == pytest.approx(np.hypot(levels, 1 / np.sqrt(12)) * step, rel=0.15)
+
+
+def test_a_fit_is_surer_with_less_noise_than_with_more_than_half_a_step() -> None:
+    """Noise below half a step was taken for none: what it left was no noise, and deviations grew ten times."""
+    camera = Camera(256, 256, 255.0, 255.0, 127.5, 127.5, "orthographic")
+    body = Superquadric([0.25, 0.2, 0.15], [0.3, 0.6], [0.02, 0.01, 0.5], [0.3, 0.5, 0.1, 0.8])
+    exact, index = raycast.render(body, camera)
+    step, deviations = 1 / 255, []
+    for levels in (0.3, 0.6):
+        noise = levels * step * np.random.default_rng(3).standard_normal(exact.shape)
+        depth = np.where(index >= 0, np.round((exact + noise) / step) * step, np.nan)
+        fit = surface_fit.fit(depth, index >= 0, camera)
+        assert fit.noise == pytest.approx(np.hypot(levels, 1 / np.sqrt(12)) * step, rel=0.1)
+        deviations.append(fit.sigma_size)
+    assert (deviations[0] < deviations[1]).all()
+
+
 @pytest.mark.parametrize("shape", [(48, 48), (5, 300), (299, 4), (121, 7), (3, 3)])
 def test_images_of_any_shape(shape: tuple[int, int], rng: np.random.Generator) -> None:
     depth = (1 + 0.01 * rng.standard_normal(shape)).astype(np.float32)
