@@ -254,7 +254,10 @@ def drawn(array: SuperquadricArray, bodies: Superquadric) -> Bodies:
 
 
 def covariances(array: SuperquadricArray) -> np.ndarray:
-    """(n, 11, 11) of the bodies of a message, from the deviations of sizes, centre and turn; NaN where unknown."""
+    """(n, 11, 11) of the bodies of a message, from the deviations of sizes, centre and turn; NaN where unknown.
+
+    A message has no correlations, which sizes and centre of a fit have: a seen side is surer, a hidden one less sure.
+    """
     found = np.zeros((len(array), 11, 11))
     deviations = [np.asarray(each, float) for each in (array.sigma_size, array.sigma_centre, array.sigma_turn)]
     size, centre, turn = (np.where(np.isfinite(each), each**2, np.nan) for each in deviations)
