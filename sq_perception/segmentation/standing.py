@@ -26,7 +26,7 @@ from sq_perception.imaging import depth_steps
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation import support_plane
 from sq_perception.segmentation.support_plane import COARSE_PIXELS, TOLERANCE, Plane, noise_growth
-from sq_perception.segmentation.support_surface import HIGHEST, SupportSurface
+from sq_perception.segmentation.support_surface import HIGHEST, LEVEL_SHARE, SupportSurface
 
 ObjectTest = Callable[[np.ndarray, np.ndarray], bool]
 """Of the rows and columns of a segment's pixels."""
@@ -210,9 +210,9 @@ def standing(
         growth = noise_growth(points[:, 2])
         height = relative[r, c]
         behind = float(points[:, 2].max()) + limits.max_size
-        noise = max(support.sigma, _spread(relative, depth, around, behind, rows, columns))
+        beside = _beside(relative, depth, around, behind, rows, columns)
         least = max(_LEAST_HEIGHT, MIN_HEIGHT * min(1.0, float(quantile(growth, 0.5))))
-        if _top(height * growth) < least or _top(height) < _BUMP * noise:
+        if _top(height * growth) < least or not _rises(_top(height), beside, support.sigma):
             return False
         at_border = rows.min() == 0 or columns.min() == 0 or rows.max() == last_row or columns.max() == last_column
         for wall in walls:
@@ -255,10 +255,27 @@ def _higher(labels: np.ndarray, relative: np.ndarray, count: int, limit: float) 
     return found
 
 
-def _spread(
+def _rises(top: float, beside: np.ndarray, sigma: float) -> bool:
+    """Whether the top of a segment is above the noise of the support, of deviation ``sigma`` and as the heights (n,)
+    beside the segment show it: about the support, or about what lies on it there if they are level, as the height of a
+    board or a mat is no noise."""
+    bases = [0.0]
+    if beside.size >= _FEWEST:
+        level = quantile(beside, 0.5)
+        if np.mean(np.abs(beside - level) < 0.5 * TOLERANCE) > LEVEL_SHARE:
+            bases.append(level)
+    return any(top - base >= _BUMP * max(sigma, _spread(beside, base)) for base in bases)
+
+
+def _spread(heights: np.ndarray, base: float) -> float:
+    """Deviation of heights (n,) from a base, 0 of too few."""
+    return 1.4826 * quantile(np.abs(heights - base), 0.5) if heights.size >= _FEWEST else 0.0
+
+
+def _beside(
     relative: np.ndarray, depth: np.ndarray, around: np.ndarray, behind: float, rows: np.ndarray, columns: np.ndarray
-) -> float:
-    """Deviation of the support's heights beside a segment from 0, 0 where too little of it is seen.
+) -> np.ndarray:
+    """Heights (n,) of the support beside a segment.
 
     Noise grows at the rims of an image and where light is reflected to and fro; ``around`` is false on other things.
     What is farther than ``behind``, metres, is not beside the segment: a far wall may be as high as the support.
@@ -268,21 +285,20 @@ def _spread(
     mask = np.zeros(relative[window].shape, np.uint8)
     mask[rows - top, columns - left] = 1
     near, ring = (cv2.dilate(mask, np.ones((2 * k + 1, 2 * k + 1), np.uint8)) for k in (_SMEARED, _BESIDE))
-    heights = _heights_where(relative, depth, around, behind, ring - near, top, left)
-    return 1.4826 * quantile(heights, 0.5) if heights.size >= _FEWEST else 0.0
+    return np.asarray(_heights_where(relative, depth, around, behind, ring - near, top, left))
 
 
 @kernel
 def _heights_where(
     relative: np.ndarray, depth: np.ndarray, around: np.ndarray, behind: float, mask: np.ndarray, top: int, left: int
 ) -> np.ndarray:
-    """|heights| (n,) of pixels around a thing in a mask, whose corner lies there, but for what is too high or far."""
+    """Heights (n,) of pixels around a thing in a mask, whose corner is there, but for what is too high, low or far."""
     found, n = np.empty(mask.size, np.float32), 0
     for v in range(mask.shape[0]):
         for u in range(mask.shape[1]):
             if mask[v, u] > 0 and around[top + v, left + u] and depth[top + v, left + u] < behind:
-                height = abs(relative[top + v, left + u])
-                if height < HIGHEST * TOLERANCE:
+                height = relative[top + v, left + u]
+                if abs(height) < HIGHEST * TOLERANCE:
                     found[n] = height
                     n += 1
     return found[:n]

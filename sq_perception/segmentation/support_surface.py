@@ -50,7 +50,7 @@ _RAMP_LENGTH = 0.08
 
 _LEVELS = (0.5, 1.0, 2.0, 3.0, 4.0)
 """Tolerances above the support at which is looked for low things: from what counts as above it to the highest ramp."""
-_LEVEL_SHARE, _LEVEL_SAMPLES = 0.5, 8
+LEVEL_SHARE, _LEVEL_SAMPLES = 0.5, 8
 """Share of a part's samples that lie within half a tolerance of one height if it is level, and least samples of it.  Of
 a ramp that is a tenth, or a third where it runs out."""
 
@@ -198,7 +198,7 @@ def _level(height: np.ndarray, reached: np.ndarray) -> np.ndarray:
         if part > 0:
             heights = np.sort(height[regions.pixels(parts, int(part), extents[part])])
             about = np.searchsorted(heights, heights + 0.5 * TOLERANCE, side="right") - np.arange(len(heights))
-            level[part] = about[heights > 0.75 * TOLERANCE].max(initial=0) > _LEVEL_SHARE * len(heights)
+            level[part] = about[heights > 0.75 * TOLERANCE].max(initial=0) > LEVEL_SHARE * len(heights)
     return level[parts]
 
 

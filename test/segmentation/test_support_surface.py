@@ -153,6 +153,18 @@ def test_bumps_where_the_noise_is_large_are_no_things(seed, monkeypatch):
     assert 3 * len(found.ids) < len(segment(depth.astype(np.float32), CAMERA).ids)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_the_height_of_a_board_is_no_noise_to_what_stands_on_it(seed):
+    """The board is 6 mm high, too low for a thing, and all around what stands on it."""
+    table = plane_image(slanted(90), 0.8)
+    v, u = np.indices(table.shape)
+    board = (np.abs(u - 160) < 80) & (np.abs(v - 120) < 60)
+    things = [np.hypot(u - x, v - 120) < 15 for x in (125, 195)]
+    depth = table - 0.006 * board - 0.03 * (things[0] | things[1])
+    found = segment(noisy(depth, 1e-3, seed), CAMERA)
+    assert min(overlap(thing, found.labels) for thing in things) > 0.8
+
+
 def test_walls_are_furniture_and_faces_of_things_are_not():
     """The same plane holds a wall and, apart from it, the front of a box as a thing may be."""
     wall = support_plane.Plane(np.array([0.0, 0.0, -1.0, 2.0]), 0.5, 1e-3)
