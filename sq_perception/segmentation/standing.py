@@ -214,13 +214,14 @@ def standing(
         least = max(_LEAST_HEIGHT, MIN_HEIGHT * min(1.0, float(quantile(growth, 0.5))))
         if _top(height * growth) < least or not _rises(_top(height), beside, support.sigma):
             return False
-        at_border = rows.min() == 0 or columns.min() == 0 or rows.max() == last_row or columns.max() == last_column
+        borders = sum((rows.min() == 0, columns.min() == 0, rows.max() == last_row, columns.max() == last_column))
         for wall in walls:
             off = np.abs(wall.height(points)) / growth
             on_it = rows.size < _FACE_SHARE * wall.share * measured
             if on_it and _top(off) < _BUMP * wall.sigma:
                 return False
-            if at_border and np.mean(off < 2 * TOLERANCE) > 0.5:
+            # A carton's face may be cut by one border; a wall of which little is seen leaves by two.
+            if borders > (0 if on_it else 1) and np.mean(off < 2 * TOLERANCE) > 0.5:
                 return False
         if not limits.hold(points, plane.equation[:3]):
             return False

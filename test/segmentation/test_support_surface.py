@@ -177,6 +177,19 @@ def test_walls_are_furniture_and_faces_of_things_are_not():
     assert not large[:, 160:].any()
 
 
+@pytest.mark.parametrize("away", [0.05, -0.02])
+def test_a_carton_that_the_border_cuts_is_no_furniture(away):
+    """Its front fills a quarter of the image, more than a plane needs, and is most of that plane."""
+    normal = slanted(45)
+    ahead = np.cross([1.0, 0.0, 0.0], normal)
+    foot = np.array([0.0, 0.0, 0.35 / np.sin(np.deg2rad(45))]) + away * ahead
+    carton = Superquadric(np.array([0.1, 0.04, 0.15]), np.full(2, 0.1), foot + 0.15 * normal, frame_of(normal))
+    depth, truth = with_bodies(plane_image(normal, 0.35), [carton])
+    assert truth[0].any()
+    assert (truth > 0).mean() > 0.2
+    assert overlap(truth == 1, segment(noisy(depth), CAMERA).labels) > 0.9
+
+
 def test_a_table_whose_border_is_round_carries_what_stands_on_it():
     """Its front edge bends down and runs on as an apron, a floor lies below: it is the support all the same."""
     normal = slanted(35)
