@@ -162,7 +162,7 @@ def test_the_height_of_a_board_is_no_noise_to_what_stands_on_it(seed):
     things = [np.hypot(u - x, v - 120) < 15 for x in (125, 195)]
     depth = table - 0.006 * board - 0.03 * (things[0] | things[1])
     found = segment(noisy(depth, 1e-3, seed), CAMERA)
-    assert min(overlap(thing, found.labels) for thing in things) > 0.8
+    assert min(best_iou(thing, found.labels) for thing in things) > 0.8
 
 
 def test_walls_are_furniture_and_faces_of_things_are_not():
@@ -187,7 +187,7 @@ def test_a_carton_that_the_border_cuts_is_no_furniture(away):
     depth, truth = with_bodies(plane_image(normal, 0.35), [carton])
     assert truth[0].any()
     assert (truth > 0).mean() > 0.2
-    assert overlap(truth == 1, segment(noisy(depth), CAMERA).labels) > 0.9
+    assert best_iou(truth == 1, segment(noisy(depth), CAMERA).labels) > 0.9
 
 
 def test_a_table_whose_border_is_round_carries_what_stands_on_it():
