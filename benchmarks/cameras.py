@@ -20,7 +20,7 @@ import household_things
 import numpy as np
 import report
 import scene_verdict
-from tabletop import Placed, Tabletop
+from tabletop import Tabletop
 
 from sq_perception.imaging.camera import Camera
 from sq_perception.simulation.things_on_table import ELEVATION, TABLE_CAMERA
@@ -64,14 +64,6 @@ VIEWS = {
 }
 
 
-def is_counted(one: Placed, scene: Tabletop) -> bool:
-    fewest = scene_verdict.FEWEST_PIXELS * scene.depth.size / (TABLE_CAMERA.width * TABLE_CAMERA.height)
-    measured = np.count_nonzero((scene.labels == one.label) & np.isfinite(scene.depth))
-    return (
-        one.pixels >= fewest and one.visible_share >= household_things.real_scenes.HALF and 2 * measured >= one.pixels
-    )
-
-
 def looked_at(scene: Tabletop) -> tuple[list[Found], int]:
     """What became of the things of a scene, and how many own bodies are of none."""
     given = scene_verdict.recoverer().recover(scene.depth, scene.camera, scene.labels)
@@ -85,7 +77,7 @@ def looked_at(scene: Tabletop) -> tuple[list[Found], int]:
             one.label in of_thing,
         )
         for one in scene.placed
-        if is_counted(one, scene)
+        if household_things.is_counted(one, scene)
     ]
     taken = set(of_thing.values())
     return found, sum(body.label not in taken for body in own.recovered)

@@ -82,6 +82,13 @@ def _known(placed: PlacedThing, truth: ThingsOnTable) -> tabletop.Placed:
     return tabletop.Placed(known, placed.rest, matrix, placed.translation, placed.label, placed.pixels, alone)
 
 
+def is_counted(one: tabletop.Placed, scene: tabletop.Tabletop) -> bool:
+    """Whether a thing is half visible, half of it measured, and no smaller than 200 pixels of a VGA image."""
+    fewest = scene_verdict.FEWEST_PIXELS * scene.depth.size / (TABLE_CAMERA.width * TABLE_CAMERA.height)
+    measured = np.count_nonzero((scene.labels == one.label) & np.isfinite(scene.depth))
+    return one.pixels >= fewest and one.visible_share >= real_scenes.HALF and 2 * measured >= one.pixels
+
+
 def hull_points(parts: Superquadric) -> np.ndarray:
     """Points (n, 3) whose convex hull is that of a union, to some thousandths of its size.
 

@@ -149,13 +149,7 @@ def main() -> None:
     every: dict[tuple[str, str], list[scene_verdict.Answer]] = {(row.name, row.masks): [] for row in rows()}
     for seed in range(options.first, options.first + options.scenes):
         scene = household_things.scene(seed, None)
-        counted = [
-            one.label
-            for one in scene.placed
-            if one.pixels >= scene_verdict.FEWEST_PIXELS
-            and one.visible_share >= household_things.real_scenes.HALF
-            and 2 * np.count_nonzero((scene.labels == one.label) & np.isfinite(scene.depth)) >= one.pixels
-        ]
+        counted = [one.label for one in scene.placed if household_things.is_counted(one, scene)]
         for row in rows():
             every[row.name, row.masks] += answers(scene, counted, row)
         print(f"scene {seed}", flush=True)

@@ -22,9 +22,9 @@ from sq_perception.simulation.thing import NO_CAVITY, SIX_WAYS, Thing
 
 ON_TOP, FREE = 0.10, 0.05
 """Shares of the views in which the thing stands on something on the table, and in which there is no table."""
-_ELEVATIONS = ((20.0, 70.0), (65.0, 90.0), (3.0, 25.0))
-"""Degrees."""
-_OFTEN = (0.55, 0.25, 0.2)
+_ELEVATIONS, _OFTEN = ((20.0, 70.0), (65.0, 90.0), (3.0, 25.0)), (0.55, 0.25, 0.2)
+"""Degrees, and shares of the views.  Chosen: of a network that saw 0.5 % from above 80 degrees the hulls there erred
+half as much again as those at 20 to 70."""
 _DISTANCE = (0.35, 1.3, 2.0)
 _FARTHEST = 12.0
 """Diagonals of its box, more than which no thing is away."""
