@@ -33,6 +33,7 @@ from sq_perception.imaging import depth_steps, regions
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation import (
     convex_parts,
+    level_faces,
     patch_grouping,
     pieces,
     standing,
@@ -170,6 +171,8 @@ def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | No
         everything = cv2.copyTo(everything, measured.view(np.uint8))
     relative = support.image_relative(everything, camera)
     labels = _above(known, relative * valid, valid, camera, support, walls, limits)
+    for face in level_faces.found(labels, known, camera, support, least):
+        labels = _unloaded(labels, face, known, everything, camera, walls, limits, least)
     test = standing.standing(everything, relative, labels, camera, support, walls, limits)
     labels, ids = _ordered(labels, least, options.max_objects, test)
     return Segmentation(labels, plane.equation, ids, max(support.sigma, _LEAST_SIGMA))
@@ -299,6 +302,25 @@ def _above(
     foot = above[window] & (inside == 0)
     labels[window] = depth_steps.grown(inside, foot, known, _FOOT_PIXELS, depth_steps.STEP)
     return labels
+
+
+def _unloaded(
+    labels: np.ndarray,
+    face: level_faces.LevelFace,
+    known: np.ndarray,
+    everything: np.ndarray,
+    camera: Camera,
+    walls: list[Plane],
+    limits: standing.Limits,
+    least: int,
+) -> np.ndarray:
+    """Labels in which what stands on a level face of a segment is taken apart once more, with the face as support."""
+    relative = face.surface.image_relative(everything, camera)
+    valid = face.under(labels, known, camera) & (relative > -support_plane.TOLERANCE)
+    above = _above(known, relative * valid, valid, camera, face.surface, walls, limits)
+    test = standing.standing(everything, relative, above, camera, face.surface, walls, limits)
+    above, _ = _ordered(above, least, above.max(initial=0), test)
+    return np.where(above > 0, above + labels.max(), labels)
 
 
 def _bodies(

@@ -42,7 +42,7 @@ _REFINE_POINTS = 8000
 _HYPOTHESES, _MOST_HYPOTHESES, _MISSED = 200, 2000, 0.01
 """Draws at first, and at most until a plane is missed with that probability.  200 alone missed a table of 10 to 15 % of
 the points seven times of 20."""
-_LAYER = 0.7
+LAYER = 0.7
 """Share of the points within two tolerances that lie within one: of a plane nearly all, of noise half."""
 _FEW_POINTS, _FINALISTS = 300, 100
 """On so many points more draws are counted, and the best of them on all."""
@@ -54,7 +54,7 @@ COARSE_PIXELS = 120
 _ISLAND_SHARE = 0.25
 """Of the image; an island that fills less is a body seen face-on, as a camera that looks at a table shows more of it.
 Chosen: lone bodies are found by it, and 81 recorded and simulated frames of tables are the same without it."""
-_LEVEL, _STOREY, _TABLE_SHARE = 0.99, 0.3, 0.4
+LEVEL, _STOREY, _TABLE_SHARE = 0.99, 0.3, 0.4
 """Cosine between the normals of level planes, metres from a floor to the table above it, and the share that it shows of
 what the floor does.  Of lower steps the larger level is the support, and things are found on both."""
 
@@ -138,7 +138,7 @@ def support(candidates: list[Plane], depth: np.ndarray, valid: np.ndarray, camer
     tables = [
         plane
         for plane in chosen
-        if plane.equation[:3] @ best.equation[:3] > _LEVEL
+        if plane.equation[:3] @ best.equation[:3] > LEVEL
         and best.equation[3] - plane.equation[3] > _STOREY
         and plane.share > _TABLE_SHARE * best.share
     ]
@@ -224,7 +224,7 @@ def _dominant_plane(points: np.ndarray, least: float, rng: np.random.Generator) 
         votes = _votes(more, weighted)
         top = more[votes.argmax()][None] if len(more) else more
         # Of points all over the room a tenth may lie in a layer as thick, but as many beside it.
-        if len(top) and votes.max() > max(most, _LAYER * _votes(top, weighted / 2)[0]):
+        if len(top) and votes.max() > max(most, LAYER * _votes(top, weighted / 2)[0]):
             best = top[0]
     plane = best.astype(float)
     growth = noise_growth(points[:, 2])
@@ -257,6 +257,11 @@ def _votes(planes: np.ndarray, points: np.ndarray) -> np.ndarray:
         for i in range(points.shape[1]):
             votes[k] += abs(a * points[0, i] + b * points[1, i] + c * points[2, i] + d * points[3, i]) < 1
     return votes
+
+
+def through(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """The plane (4,) nearest to weighted points (n, 3), normal towards the camera."""
+    return _least_squares_plane(np.ascontiguousarray(points.T), weights)
 
 
 def _least_squares_plane(points: np.ndarray, weights: np.ndarray) -> np.ndarray:

@@ -1,0 +1,119 @@
+"""Level faces of segments: the tops of cartons and stools, on which other things may stand.
+
+A thing that stands on a larger one is often low before the noise, or its surface goes on into that of the larger one:
+then both are one segment.  The larger one's top is a plane as level as the support, and above that plane the smaller
+one stands alone.  Of the heights of a segment above the support
+
+    a face is where most of them lie within a tolerance of one height,
+
+far above the lowest of them: the bottom of a vessel lies low in it, and what rises from that is the vessel's wall.
+
+Metres, optical frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from sq_perception.geometry.quantiles import quantile
+from sq_perception.imaging import regions
+from sq_perception.imaging.camera import Camera
+from sq_perception.segmentation import standing, support_plane
+from sq_perception.segmentation.support_plane import TOLERANCE, Plane, noise_growth
+from sq_perception.segmentation.support_surface import HIGHEST, SupportSurface
+
+_SAMPLES, _FEWEST = 800, 60
+"""Of a segment, evenly taken, and of a face of it."""
+
+
+@dataclass(frozen=True, eq=False)
+class LevelFace:
+    """A level face of a segment, as a support, and points (n, 3) of all of that segment."""
+
+    label: int
+    surface: SupportSurface
+    points: np.ndarray
+
+    def under(self, labels: np.ndarray, depth: np.ndarray, camera: Camera) -> np.ndarray:
+        """Pixels, bool (height, width), of the segment and of those whose middle is right above it."""
+        axes = standing.TURNS @ support_plane.across(self.surface.plane.equation[:3]).T
+        reach = axes @ self.points.T
+        low, high = reach.min(axis=1), reach.max(axis=1)
+        extents = regions.extents(labels)
+        is_over = np.zeros(len(extents), bool)
+        for label in np.flatnonzero(extents[1:, 0]) + 1:
+            points = _samples(labels, int(label), extents[label], depth, camera)
+            middle = np.median(axes @ points.T, axis=1)
+            is_over[label] = ((middle > low) & (middle < high)).all()
+        is_over[self.label] = True
+        return is_over[labels]
+
+
+def found(
+    labels: np.ndarray, depth: np.ndarray, camera: Camera, support: SupportSurface, least: int
+) -> list[LevelFace]:
+    """Segments with a level face above which some of them is, and that face; those of the largest segments first.
+
+    Parameters
+    ----------
+    labels : int32 (height, width)
+        Segments from 1.
+    depth : (height, width)
+        Metres; every segment has one.
+    camera
+        A pinhole camera.
+    support
+        What the segments stand on.
+    least
+        Pixels of a segment.
+    """
+    extents = regions.extents(labels)
+    order = [int(label) for label in np.argsort(-extents[:, 0], kind="stable") if label > 0]
+    faces = []
+    for label in order:
+        if extents[label, 0] < 2 * least:
+            break
+        points = _samples(labels, label, extents[label], depth, camera)
+        face, above = _face(points, support)
+        if face is not None and above * extents[label, 0] >= least * len(points):
+            faces.append(LevelFace(label, face, points))
+    return faces
+
+
+def _samples(labels: np.ndarray, label: int, extent: np.ndarray, depth: np.ndarray, camera: Camera) -> np.ndarray:
+    rows, columns = regions.pixels(labels, label, extent)
+    step = max(1, rows.size // _SAMPLES)
+    rows, columns = rows[::step], columns[::step]
+    return camera.unproject(columns, rows, depth[rows, columns])
+
+
+def _face(points: np.ndarray, support: SupportSurface) -> tuple[SupportSurface | None, int]:
+    """The level face that most points (n, 3) of a segment lie on, and how many are clearly above it."""
+    growth = noise_growth(points[:, 2])
+    height = support.plane.height(points)
+    reach = TOLERANCE * quantile(growth, 0.5)
+    ordered = np.sort(height)
+    ends = np.searchsorted(ordered, ordered + reach, side="right")
+    counts = ends - np.arange(len(ordered))
+    counts[ordered < HIGHEST * reach] = 0
+    first = int(counts.argmax())
+    if counts[first] < _FEWEST:
+        return None, 0
+    on = (height >= ordered[first]) & (height <= ordered[first] + reach)
+    for _ in range(2):
+        plane = support_plane.through(points[on], growth[on] ** -2.0)
+        off = (points @ plane[:3] + plane[3]) / growth
+        on = np.abs(off) < TOLERANCE
+        count = np.count_nonzero(on)
+        if count < max(_FEWEST, support_plane.LAYER * np.count_nonzero(np.abs(off) < 2 * TOLERANCE)):
+            return None, 0
+        if plane[:3] @ support.plane.equation[:3] < support_plane.LEVEL:
+            return None, 0
+    sigma = max(support.sigma, 1.4826 * quantile(np.abs(off[on]), 0.5))
+    face = Plane(plane, np.count_nonzero(on) / len(points), sigma)
+    if np.count_nonzero(off > TOLERANCE) > count:
+        return None, 0
+    above = int(np.count_nonzero(off > max(0.5 * TOLERANCE, 4 * sigma)))
+    return SupportSurface(face, np.zeros_like(support.bend), 0.0, sigma), above
