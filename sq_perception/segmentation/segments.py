@@ -11,6 +11,8 @@ Steps
    (:mod:`sq_perception.segmentation.convex_parts`): that holds where noise hides folds, or makes some.
 5. Each body back to full resolution, beside a step with the pixels whose depth is like its own, and down to the edge of
    the noise on the table.
+6. What stands on the level top of a large segment (:mod:`sq_perception.segmentation.level_faces`) once more, with that
+   top for its support: low before the noise, it was taken for a part of the segment.
 
 Bodies are taken to be convex, or vessels.  Two bodies whose faces lie flush cannot be told apart by their depth.
 Things on a higher table are found as well, those on a lower one are not.  An orthographic camera sees the thesis'
