@@ -24,7 +24,7 @@ from sq_perception.segmentation import standing, support_plane
 from sq_perception.segmentation.support_plane import TOLERANCE, Plane, noise_growth
 from sq_perception.segmentation.support_surface import HIGHEST, SupportSurface
 
-_SAMPLES, _FEWEST = 800, 60
+_SAMPLES, _FEWEST = 400, 30
 """Of a segment, evenly taken, and of a face of it."""
 
 
@@ -44,7 +44,7 @@ class LevelFace:
         extents = regions.extents(labels)
         is_over = np.zeros(len(extents), bool)
         for label in np.flatnonzero(extents[1:, 0]) + 1:
-            points = _samples(labels, int(label), extents[label], depth, camera)
+            points = _samples(labels, int(label), extents[label], depth, camera, _SAMPLES)
             middle = np.median(axes @ points.T, axis=1)
             is_over[label] = ((middle > low) & (middle < high)).all()
         is_over[self.label] = True
@@ -73,34 +73,43 @@ def found(
     order = [int(label) for label in np.argsort(-extents[:, 0], kind="stable") if label > 0]
     faces = []
     for label in order:
-        if extents[label, 0] < 2 * least:
+        if extents[label, 0] < max(2 * least, _FEWEST):
             break
-        points = _samples(labels, label, extents[label], depth, camera)
-        face, above = _face(points, support)
-        if face is not None and above * extents[label, 0] >= least * len(points):
+        points = _samples(labels, label, extents[label], depth, camera, _SAMPLES)
+        face = _face(points, support)
+        if face is None:
+            continue
+        everything = _samples(labels, label, extents[label], depth, camera, extents[label, 0])
+        off = face.plane.height(everything) / noise_growth(everything[:, 2])
+        if np.count_nonzero(off > max(0.5 * TOLERANCE, 4 * face.sigma)) >= least:
             faces.append(LevelFace(label, face, points))
     return faces
 
 
-def _samples(labels: np.ndarray, label: int, extent: np.ndarray, depth: np.ndarray, camera: Camera) -> np.ndarray:
+def _samples(
+    labels: np.ndarray, label: int, extent: np.ndarray, depth: np.ndarray, camera: Camera, count: int
+) -> np.ndarray:
+    """Points (n, 3) of a segment, evenly taken, at least ``count`` of them or all."""
     rows, columns = regions.pixels(labels, label, extent)
-    step = max(1, rows.size // _SAMPLES)
+    step = max(1, rows.size // count)
     rows, columns = rows[::step], columns[::step]
     return camera.unproject(columns, rows, depth[rows, columns])
 
 
-def _face(points: np.ndarray, support: SupportSurface) -> tuple[SupportSurface | None, int]:
-    """The level face that most points (n, 3) of a segment lie on, and how many are clearly above it."""
+def _face(points: np.ndarray, support: SupportSurface) -> SupportSurface | None:
+    """The level face that most points (n, 3) of a segment lie on; None where more of them are above it."""
     growth = noise_growth(points[:, 2])
     height = support.plane.height(points)
     reach = TOLERANCE * quantile(growth, 0.5)
     ordered = np.sort(height)
+    if ordered[-_FEWEST] < HIGHEST * reach:
+        return None
     ends = np.searchsorted(ordered, ordered + reach, side="right")
     counts = ends - np.arange(len(ordered))
     counts[ordered < HIGHEST * reach] = 0
     first = int(counts.argmax())
     if counts[first] < _FEWEST:
-        return None, 0
+        return None
     on = (height >= ordered[first]) & (height <= ordered[first] + reach)
     for _ in range(2):
         plane = support_plane.through(points[on], growth[on] ** -2.0)
@@ -108,12 +117,11 @@ def _face(points: np.ndarray, support: SupportSurface) -> tuple[SupportSurface |
         on = np.abs(off) < TOLERANCE
         count = np.count_nonzero(on)
         if count < max(_FEWEST, support_plane.LAYER * np.count_nonzero(np.abs(off) < 2 * TOLERANCE)):
-            return None, 0
+            return None
         if plane[:3] @ support.plane.equation[:3] < support_plane.LEVEL:
-            return None, 0
+            return None
     sigma = max(support.sigma, 1.4826 * quantile(np.abs(off[on]), 0.5))
     face = Plane(plane, np.count_nonzero(on) / len(points), sigma)
     if np.count_nonzero(off > TOLERANCE) > count:
-        return None, 0
-    above = int(np.count_nonzero(off > max(0.5 * TOLERANCE, 4 * sigma)))
-    return SupportSurface(face, np.zeros_like(support.bend), 0.0, sigma), above
+        return None
+    return SupportSurface(face, np.zeros_like(support.bend), 0.0, sigma)

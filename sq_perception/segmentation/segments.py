@@ -161,7 +161,8 @@ def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | No
     known = cv2.copyTo(depth, valid.view(np.uint8))  # and 0 elsewhere
     limits = standing.Limits(options.max_size, options.workspace, options.workspace_pose)
     if plane is None:
-        labels = _bodies(known, valid, camera, _UNKNOWN_SIGMA, limits.is_small)
+        free = valid & ~standing.furniture(known, valid, camera, planes, limits)
+        labels = _bodies(known, free, camera, _UNKNOWN_SIGMA, limits.is_small)
         labels, ids = _ordered(labels, least, options.max_objects, standing.alone(known, camera, limits))
         return Segmentation(labels, None, ids)
     support = support_surface.measured(plane, known, valid, camera)

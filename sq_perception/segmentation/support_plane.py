@@ -61,6 +61,9 @@ what the floor does.  Of lower steps the larger level is the support, and things
 _CLOSE, _HELD_SHARE = 0.6, 0.1
 """Metres above a support in which what stands on it is, and the least share of that, of what another plane has there:
 the wall behind a table has a tenth and less of it, and may be eight times as large in the image."""
+_STRAY = 0.003
+"""Share of the points that may be on no plane although nothing is there: of normal noise 0.3 % lies beyond three
+deviations, and tolerances are wider."""
 
 LEAST_GROWTH = 0.1
 """Of the noise: nearer than 0.3 m it falls no further, as a sensor's own quantisation and calibration remain."""
@@ -123,18 +126,20 @@ def support(candidates: list[Plane], depth: np.ndarray, valid: np.ndarray, camer
     A camera is mounted upright or looks straight down.  The table seen from straight above and a wall look alike; a
     wall counts less, as a floor or a table in the same picture then has a normal that points up.  Of a table and the
     floor below it things stand on the table, though the picture may show more of the floor.  What hardly anything is
-    close above is no support, such as the wall metres behind a low camera's table; nor is the face of a body, unless
+    close above is no support, such as the wall metres behind a low camera's table, be that in sight or not; nor is the face of a body, unless
     most of what is on no plane is close above it.
     """
     surfaces = _on_one_surface(depth, valid, camera)
     is_face = [_is_face(plane, surfaces) for plane in candidates]
     if all(is_face):
         return None
-    held = _held(candidates, _some_points(depth, valid, camera, _PLANE_POINTS))
+    held, rest = _held(candidates, _some_points(depth, valid, camera, _PLANE_POINTS))
     bearing = [k for k, face in enumerate(is_face) if held[k] > 0.5 or not face]
     least = _HELD_SHARE * max(held[k] for k in bearing)
     chosen = [candidates[k] for k in bearing if held[k] >= least]
     best = max(chosen, key=_vote)
+    if rest > _STRAY and abs(best.equation[1]) < _FRONTAL and max(held) < _HELD_SHARE:
+        return None
     tables = [
         plane
         for plane in chosen
@@ -308,12 +313,13 @@ def _on_one_surface(depth: np.ndarray, valid: np.ndarray, camera: Camera) -> lis
     return surfaces
 
 
-def _held(candidates: list[Plane], points: np.ndarray) -> list[float]:
-    """Of each plane, the share of the points on none of them that are as close above it as what stands on it."""
+def _held(candidates: list[Plane], points: np.ndarray) -> tuple[list[float], float]:
+    """Of each plane, the share of the points on none of them that are as close above it as what stands on it; and what
+    share of all points is on none."""
     heights = np.stack([plane.height(points) for plane in candidates])
     rest = heights[:, (np.abs(heights) > TOLERANCE * noise_growth(points[:, 2])).all(axis=0)]
     close = np.count_nonzero((rest > 0) & (rest < _CLOSE), axis=1)
-    return (close / max(rest.shape[1], 1)).tolist()
+    return (close / max(rest.shape[1], 1)).tolist(), rest.shape[1] / len(points)
 
 
 def _vote(plane: Plane) -> float:
