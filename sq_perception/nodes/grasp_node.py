@@ -39,12 +39,15 @@ from sq_perception.nodes.parameters import GraspParameters
 from sq_perception.nodes.statistics import THROTTLE
 from sq_perception.recordings.publication import covariances, superquadrics
 
+_OF_EACH_GRASP = ("position", "rotation", "opening", "width", "score")
+"""Columns of a message that are attributes of a grasp of the same name."""
+
 
 class GraspNode(ManagedNode):
     """See the module."""
 
-    def __init__(self, name: str, *, namespace: str | None = None, context: Any = None) -> None:
-        super().__init__(name, namespace=namespace, context=context)
+    def __init__(self, name: str, *, context: Any = None) -> None:
+        super().__init__(name, context=context)
         self._settings = LiveParameters(self, GraspParameters)
         self._last: PointCloud2 | None = None
         self._plane: PoseStamped | None = None
@@ -66,12 +69,11 @@ class GraspNode(ManagedNode):
 
     def _activate(self) -> None:
         self._last = self._plane = None  # of another time: what was there then may be gone
-        kinds: tuple[tuple[type[Any], str], ...] = (
-            (PoseArray, "~/grasps"),
-            (PointCloud2, "~/grasp_details"),
-            (MarkerArray, "~/markers"),
-        )
-        self._outputs = [self.create_publisher(kind, topic, 10) for kind, topic in kinds]
+        self._outputs = [
+            self.create_publisher(PoseArray, "~/grasps", 10),
+            self.create_publisher(PointCloud2, "~/grasp_details", 10),
+            self.create_publisher(MarkerArray, "~/markers", 10),
+        ]
         self._inputs = [
             self.create_subscription(PoseStamped, "support_plane", self._on_plane, latched()),
             self.create_subscription(PointCloud2, "superquadrics", self._on_cloud, 1),
@@ -159,12 +161,8 @@ class GraspNode(ManagedNode):
 
     def _published(self, header: Any, bodies: SuperquadricArray, plan: GraspPlan, hand: Gripper) -> messages.GraspArray:
         found = messages.GraspArray(
-            np.array([grasp.position for grasp in plan.grasps]).reshape(-1, 3),
-            np.array([grasp.rotation for grasp in plan.grasps]).reshape(-1, 4),
-            np.array([grasp.opening for grasp in plan.grasps]),
-            np.array([grasp.width for grasp in plan.grasps]),
-            np.array([grasp.score for grasp in plan.grasps]),
-            np.array([bodies.id[grasp.body] for grasp in plan.grasps], dtype=np.uint32),
+            **{name: np.array([getattr(grasp, name) for grasp in plan.grasps]) for name in _OF_EACH_GRASP},
+            id=np.array([bodies.id[grasp.body] for grasp in plan.grasps]),
         )
         poses, details, shown = self._outputs
         poses.publish(messages.poses(found, header))
