@@ -55,8 +55,7 @@ def main(given: Sequence[str]) -> int:
     if not 0 < options.rate <= 60:
         parser.error(f"--rate: expected a number above 0, at most 60, got {options.rate:g}")
     if importlib.util.find_spec("rclpy") is None:
-        remedy = "pip install 'sq_perception[ros]', or source a ROS 2 Jazzy installation"
-        return console.failed(f"view needs ROS 2 in Python: {remedy}")
+        return console.failed(f"view needs ROS 2 in Python: {process.REMEDY}")
     try:
         from sq_perception.viewing import server
     except ImportError as error:

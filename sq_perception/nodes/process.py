@@ -43,6 +43,10 @@ _LOOK = 0.1
 """Seconds between two looks at whether a signal has arrived."""
 
 
+REMEDY = "pip install 'sq_perception[ros]', or source a ROS 2 Jazzy installation"
+"""Where rclpy is not there."""
+
+
 class Stoppable(Protocol):
     """An rclpy node that may fail to start, and has something to stop before it is destroyed."""
 
@@ -65,8 +69,7 @@ def run(name: str, create: Callable[[], Iterable[Stoppable]], arguments: Sequenc
     Nodes that it has yielded are closed also where a later one cannot be made.
     """
     if importlib.util.find_spec("rclpy") is None:
-        remedy = "pip install 'sq_perception[ros]', or source a ROS 2 Jazzy installation"
-        print(f"{name} needs ROS 2 in Python: {remedy}", file=sys.stderr)
+        print(f"{name} needs ROS 2 in Python: {REMEDY}", file=sys.stderr)
         return 1
     stop = _Stop()
     for number in _SIGNALS:

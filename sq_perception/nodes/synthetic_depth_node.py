@@ -22,7 +22,6 @@ from typing import Any
 
 import numpy as np
 from rclpy.node import Node
-from rclpy.qos import QoSHistoryPolicy, QoSProfile, QoSReliabilityPolicy
 from rclpy.qos_overriding_options import QoSOverridingOptions
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
 from std_msgs.msg import Header
@@ -109,9 +108,8 @@ class SyntheticDepthNode(Node):
         parameters.check(self._source.clean.is_cube, self._source.clean.name)
 
     def _output(self, kind: type[Any], topic: str) -> Any:
-        profile = QoSProfile(depth=2, history=QoSHistoryPolicy.KEEP_LAST, reliability=QoSReliabilityPolicy.RELIABLE)
         options = QoSOverridingOptions.with_default_policies()
-        return self.create_publisher(kind, topic, profile, qos_overriding_options=options)
+        return self.create_publisher(kind, topic, 2, qos_overriding_options=options)
 
     def _tick(self) -> None:
         settings = self._settings.current
