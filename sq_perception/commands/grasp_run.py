@@ -58,7 +58,12 @@ def run(options: argparse.Namespace) -> int:
                     if frame.warning:
                         complain(f"warning: {frame.name}: {frame.warning}")
                     stem = output_file.free_name(frame.name if frame.topic else Path(frame.name).stem, stems)
-                    entries.append({"file": file, "bodies": _bodies(stem, frame, recoverer, hand, friction, options)})
+                    try:
+                        bodies = _bodies(stem, frame, recoverer, hand, friction, options)
+                    except (ValueError, ArithmeticError) as error:  # such as a camera of no image
+                        code = failed(f"{file}: {frame.name}: {error}")
+                    else:
+                        entries.append({"file": file, "bodies": bodies})
             is_whole = True
         except KeyboardInterrupt:
             complain("interrupted; what is done so far is kept")

@@ -78,7 +78,12 @@ def _recovered(options: argparse.Namespace) -> Iterator[tuple[RecordedFrame, Fra
         print(f"recovering {frame.name}", flush=True)
         labels = None if options.ignore_masks else frame.labels
         settings = RecoveryOptions(method=options.method, free_space=frame.has_free_space)
-        yield frame, recoverer.recover(frame.depth, frame.camera, labels, settings)
+        try:
+            recovery = recoverer.recover(frame.depth, frame.camera, labels, settings)
+        except (ValueError, ArithmeticError) as error:  # such as a camera of no image
+            complain(f"{frame.name}: {error}")
+            continue
+        yield frame, recovery
 
 
 def _browse(

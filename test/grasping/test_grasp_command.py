@@ -91,6 +91,21 @@ def test_what_is_done_is_kept_when_a_run_ends_early(frame, tmp_path, capsys, mon
         assert (there is not None) == (f"see {written}" in err) == (out.read_text() == there)
 
 
+def test_a_frame_that_cannot_be_recovered_costs_no_other_one(frame, tmp_path, capsys, monkeypatch):
+    """Such as one of a camera that takes no image, principal point 1e300: its points are no numbers."""
+    out, answers = tmp_path / "out.json", iter([[], ValueError("expected finite numbers"), []])
+
+    def bodies(*_):
+        if isinstance(answer := next(answers), Exception):
+            raise answer
+        return answer
+
+    monkeypatch.setattr(grasp_run, "_bodies", bodies)
+    assert main.main(["grasp", *[str(frame)] * 3, "--json", str(out)]) == 1
+    assert len(json.loads(out.read_text())["frames"]) == 2
+    assert f"{frame}: can.npz: expected finite numbers" in capsys.readouterr().err
+
+
 def test_frames_of_one_name_have_a_picture_each_and_their_warnings_are_told(frame, tmp_path, capsys):
     other = tmp_path / "far" / frame.name
     other.parent.mkdir()

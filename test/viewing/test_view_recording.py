@@ -88,6 +88,23 @@ def test_what_one_waits_for_is_said(tmp_path, shot, capsys):
     assert capsys.readouterr().out == "recovering a.npz\n"
 
 
+def test_a_frame_that_cannot_be_recovered_is_passed_over(tmp_path, shot, capsys, monkeypatch):
+    frame, recovery = shot
+    np.savez(tmp_path / "a.npz", depth=frame.depth, K=CAMERA.matrix)
+    answers = iter([ValueError("expected finite numbers"), recovery])
+
+    def recover(*_, **__):
+        if isinstance(answer := next(answers), Exception):
+            raise answer
+        return answer
+
+    monkeypatch.setattr(Recoverer, "recover", recover)
+    given = {"frames": [str(tmp_path / "a.npz")] * 2, "method": "symmetry", "projection": "pinhole", "every": 1}
+    options = SimpleNamespace(**given, camera_info=None, topic=None, ignore_masks=True)
+    assert [found for _, found in view_recording._recovered(options)] == [recovery]
+    assert "a.npz: expected finite numbers" in capsys.readouterr().err
+
+
 def test_nothing_to_show_ends_at_once(tmp_path, capsys):
     pytest.importorskip("viser", reason="needs the extra 'view'")
     assert main.main(["view", str(tmp_path / "none.npz"), "--method", "symmetry"]) == 1
