@@ -126,8 +126,8 @@ def support(candidates: list[Plane], depth: np.ndarray, valid: np.ndarray, camer
     A camera is mounted upright or looks straight down.  The table seen from straight above and a wall look alike; a
     wall counts less, as a floor or a table in the same picture then has a normal that points up.  Of a table and the
     floor below it things stand on the table, though the picture may show more of the floor.  What hardly anything is
-    close above is no support, such as the wall metres behind a low camera's table, be that in sight or not; nor is the face of a body, unless
-    most of what is on no plane is close above it.
+    close above is no support, such as the wall metres behind a low camera's table, be that in sight or not; nor is the
+    face of a body, unless most of what is on no plane is close above it.
     """
     surfaces = _on_one_surface(depth, valid, camera)
     is_face = [_is_face(plane, surfaces) for plane in candidates]
