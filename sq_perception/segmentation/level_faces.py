@@ -6,7 +6,8 @@ one stands alone.  Of the heights of a segment above the support
 
     a face is where most of them lie within a tolerance of one height,
 
-far above the lowest of them: the bottom of a vessel lies low in it, and what rises from that is the vessel's wall.
+higher than the support is ever seen risen, as a plane whose normal is the support's, and more than what is above it:
+the bottom of a vessel lies low, and its wall is most of what is seen of it.
 
 Metres, optical frame.
 """
@@ -25,7 +26,8 @@ from sq_perception.segmentation.support_plane import TOLERANCE, Plane, noise_gro
 from sq_perception.segmentation.support_surface import HIGHEST, SupportSurface
 
 _SAMPLES, _FEWEST = 400, 30
-"""Of a segment, evenly taken, and of a face of it."""
+"""Of a segment, evenly taken, and least of a face of it: of an upright side 11 cm high 29 lie within a tolerance of one
+height.  With twice as many of both, things on cartons are missed 2 +- 2 % less often, on stools 2 +- 2 % more often."""
 
 
 @dataclass(frozen=True, eq=False)

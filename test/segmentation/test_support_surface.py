@@ -220,6 +220,28 @@ def test_a_room_corner_holds_no_objects():
     assert segment(noisy(room_corner(), 2e-3), CAMERA).ids == ()
 
 
+def test_a_wall_far_behind_all_that_is_seen_is_no_support():
+    """A level camera sees a table's edge alone, two things on it, and a wall 2 m behind them."""
+    things = [
+        Superquadric(np.array([0.04, 0.06, 0.04]), np.full(2, 0.2), np.array([x, 0, 0.8]), STRAIGHT) for x in _ASIDE
+    ]
+    depth, truth = with_bodies(np.full((240, 320), 2.8), things)
+    found = segment(noisy(depth, 2e-3), CAMERA)
+    assert found.plane is None
+    assert len(found.ids) == 2
+    assert min(best_iou(truth == k, found.labels) for k in (1, 2)) > 0.9
+
+
+_ASIDE = (-0.15, 0.12)
+
+
+def test_an_empty_table_seen_from_straight_above_is_the_support():
+    """As a wall it faces the camera, and nothing is close above it; but nothing is anywhere else."""
+    found = segment(noisy(np.full((240, 320), 0.9), 2e-3), CAMERA)
+    assert found.plane == pytest.approx([0, 0, -1, 0.9], abs=3e-3)
+    assert found.ids == ()
+
+
 def test_what_stands_behind_the_table_is_not_on_it():
     """A board half a metre behind the table's far edge, seen above it and running on below its height."""
     normal = slanted(30)
