@@ -27,7 +27,8 @@ from sq_perception.segmentation.support_surface import HIGHEST, SupportSurface
 
 _SAMPLES, _FEWEST = 400, 30
 """Of a segment, evenly taken, and least of a face of it: of an upright side 11 cm high 29 lie within a tolerance of one
-height.  With twice as many of both, things on cartons are missed 2 +- 2 % less often, on stools 2 +- 2 % more often."""
+height.
+With twice as many of both, 30 instead of 32 of 289 simulated things on cartons and stools are missed."""
 
 
 @dataclass(frozen=True, eq=False)
