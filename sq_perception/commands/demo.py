@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from sq_perception.commands.console import failed, folder, parser
-from sq_perception.nodes import process
 
 _HELP = """\
 Watch superquadrics being recovered: a camera, recover_node (CNN + fit) and fitter_node (classic fit) run as real ROS 2
@@ -40,6 +39,7 @@ def main(arguments: Sequence[str]) -> int:
         from sq_perception.commands import demonstration
     except ModuleNotFoundError as error:
         return failed(
-            f"the demonstration needs ROS 2 in Python, and the module {error.name!r} is missing: {process.REMEDY}"
+            f"the demonstration needs ROS 2 in Python, and the module {error.name!r} is missing: "
+            "pip install 'sq_perception[ros]', or source a ROS 2 Jazzy installation"
         )
     return demonstration.show(options)
