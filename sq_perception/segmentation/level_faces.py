@@ -115,7 +115,7 @@ def _face(points: np.ndarray, support: SupportSurface) -> SupportSurface | None:
         return None
     on = (height >= ordered[first]) & (height <= ordered[first] + reach)
     for _ in range(2):
-        plane = support_plane.through(points[on], growth[on] ** -2.0)
+        plane = support_plane.least_squares_plane(np.ascontiguousarray(points[on].T), growth[on] ** -2.0)
         off = (points @ plane[:3] + plane[3]) / growth
         on = np.abs(off) < TOLERANCE
         count = np.count_nonzero(on)

@@ -238,7 +238,7 @@ def _dominant_plane(points: np.ndarray, least: float, rng: np.random.Generator) 
         inside = np.abs(plane[:3] @ rows + plane[3]) < share * reach
         if np.count_nonzero(inside) < 12:
             return None, inside
-        plane = _least_squares_plane(rows, weights * inside)
+        plane = least_squares_plane(rows, weights * inside)
     return plane, np.abs(plane[:3] @ rows + plane[3]) < reach
 
 
@@ -264,12 +264,7 @@ def _votes(planes: np.ndarray, points: np.ndarray) -> np.ndarray:
     return votes
 
 
-def through(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """The plane (4,) nearest to weighted points (n, 3), normal towards the camera."""
-    return _least_squares_plane(np.ascontiguousarray(points.T), weights)
-
-
-def _least_squares_plane(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
+def least_squares_plane(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """The plane (4,) through weighted points (3, n), normal towards the camera."""
     middle = points @ weights / weights.sum()
     centred = points - middle[:, None]
