@@ -14,6 +14,7 @@ from __future__ import annotations
 if __name__ == "__main__":
     import one_thread  # noqa: F401
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import household_things
@@ -83,30 +84,47 @@ def looked_at(scene: Tabletop) -> tuple[list[Found], int]:
     return found, sum(body.label not in taken for body in own.recovered)
 
 
+def row(looked: Sequence[tuple[list[Found], int]]) -> dict[str, float]:
+    """Figures of what :func:`looked_at` says of some scenes."""
+    found = [one for some, _ in looked for one in some]
+    figures: dict[str, float] = {
+        "things": len(found),
+        "missed": float(np.mean([not one.is_found for one in found])),
+        "false": sum(others for _, others in looked) / len(looked),
+    }
+    for masks in ("given", "own"):
+        iou = np.array([getattr(one, masks) for one in found])
+        figures |= {masks: float(iou.mean()), f"{masks} error": float(iou.std() / np.sqrt(len(iou)))}
+    return figures
+
+
+def table(what: str, rows: dict[str, dict[str, float]]) -> str:
+    """The rows of :func:`row`, by name."""
+    lines = []
+    for name, figures in rows.items():
+        shown = [f"{100 * figures[masks]:.1f} +- {100 * figures[f'{masks} error']:.1f}" for masks in ("given", "own")]
+        lines.append([name, f"{figures['things']:.0f}", *shown, f"{100 * figures['missed']:.0f}"])
+        lines[-1].append(f"{figures['false']:.2f}")
+    return report.table([what, "things", "IoU %, masks given", "own masks", "missed %", "false"], lines)
+
+
 def main() -> None:
     parser = report.parser(__doc__, "cameras")
     parser.add_argument("--scenes", type=int, default=30, help="number of scenes before each camera")
     parser.add_argument("--first", type=int, default=30400, help="seed of the first scene")
     options = parser.parse_args()
-    result, lines = [], []
+    seeds = range(options.first, options.first + options.scenes)
+    rows = {}
     for name, view in VIEWS.items():
-        found: list[Found] = []
-        others = 0
-        for seed in range(options.first, options.first + options.scenes):
-            some, false = looked_at(household_things.scene(seed, None, camera=view.camera, elevation=view.elevation))
-            found, others = found + some, others + false
-        given, own = (np.array([getattr(one, masks) for one in found]) for masks in ("given", "own"))
-        missed = float(np.mean([not one.is_found for one in found]))
-        row = {"camera": name, "things": len(found), "missed": missed, "false": others / options.scenes}
-        for masks, iou in (("given", given), ("own", own)):
-            row |= {masks: iou.mean(), f"{masks} error": iou.std() / np.sqrt(len(iou))}
-        result.append(row)
-        shown = [f"{100 * row[masks]:.1f} +- {100 * row[f'{masks} error']:.1f}" for masks in ("given", "own")]
-        lines.append([name, str(len(found)), *shown, f"{100 * missed:.0f}", f"{row['false']:.2f}"])
-        print(*lines[-1], flush=True)
-    header = ["camera", "things", "IoU %, masks given", "own masks", "missed %", "false"]
+        rows[name] = row(
+            [
+                looked_at(household_things.scene(seed, None, camera=view.camera, elevation=view.elevation))
+                for seed in seeds
+            ]
+        )
+        print(name, rows[name], flush=True)
     facts = {"scenes": options.scenes, "first": options.first}
-    report.write(options.name, {**facts, "rows": result}, report.table(header, lines))
+    report.write(options.name, {**facts, "rows": rows}, table("camera", rows))
 
 
 if __name__ == "__main__":

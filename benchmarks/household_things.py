@@ -61,7 +61,11 @@ def scene(
     """The scene of a seed, of ``count`` things or 1 to 8, through a sensor, as scene_verdict takes it."""
     sensor = sensor or list(tabletop.SENSORS)[seed % len(tabletop.SENSORS)]
     rng = np.random.default_rng([SEED, seed])
-    truth = things_on_table(rng, count, camera, elevation)
+    return sensed(things_on_table(rng, count, camera, elevation), seed, sensor, rng)
+
+
+def sensed(truth: ThingsOnTable, seed: int, sensor: str, rng: np.random.Generator) -> tabletop.Tabletop:
+    """A scene through a sensor of :data:`tabletop.SENSORS`."""
     depth = sensor_noise.preset(tabletop.SENSORS[sensor]).measured(truth.depth, truth.camera, rng)
     placed = tuple(_known(each, truth) for each in truth.placed)
     return tabletop.Tabletop(

@@ -13,7 +13,6 @@ from sq_perception.fitting.options import MIN_PIXELS, MODEL_ERROR, FitOptions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import soft_agreement
 from sq_perception.imaging.camera import Camera
-from sq_perception.imaging.canonical_view import CanonicalView
 from sq_perception.recovery.options import RecoveryOptions
 from sq_perception.recovery.seen_object import SeenObject
 
@@ -84,8 +83,10 @@ def _failed(obj: SeenObject, reason: str) -> Fit:
     return Fit(body, np.nan, Status.FAILED, reason, inlier_share=0.0)
 
 
-def score(view: CanonicalView | None, fit: Fit, options: RecoveryOptions) -> float:
-    """Agreement of the soft-rendered body with the view, 0 to 1; 0 for a failed one."""
+def score(obj: SeenObject, fit: Fit, options: RecoveryOptions) -> float:
+    """Agreement of the soft-rendered body with the object's view, 0 to 1; 0 for a failed one, and half of it for one
+    whose surface runs out of the image on opposite sides: neither end was there to agree with."""
+    view = obj.view
     assert view is not None
     if fit.status == Status.FAILED:
         return 0.0
@@ -94,4 +95,6 @@ def score(view: CanonicalView | None, fit: Fit, options: RecoveryOptions) -> flo
     agreement = soft_agreement.agreement(
         view.image, _SCORE_STRIDE, parameters, body.rotation_matrix, options.sharpness, options.tau
     )
-    return min(max(agreement, 0.0), 1.0) if np.isfinite(agreement) else 0.0
+    if not np.isfinite(agreement):
+        return 0.0
+    return min(max(agreement, 0.0), 1.0) * (0.5 if obj.runs_through else 1.0)

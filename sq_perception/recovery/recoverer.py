@@ -232,7 +232,7 @@ class Recoverer:
             deadline = started + options.time_budget
             fits = self._mapped(lambda obj: methods.fitted(obj, depth, camera, options, deadline), fresh)
         with timed(milliseconds, "score"):
-            scores = self._mapped(lambda k: methods.score(fresh[k].view, fits[k], options), range(len(fresh)))
+            scores = self._mapped(lambda k: methods.score(fresh[k], fits[k], options), range(len(fresh)))
             of_label = dict(same)
             for obj, fit, score in zip(fresh, fits, scores, strict=True):
                 of_label[obj.label] = Recovery(fit, score, obj.label, obj.pixels)

@@ -14,6 +14,7 @@ Metres, optical frame.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -44,23 +45,36 @@ class LevelFace:
         axes = standing.TURNS @ support_plane.across(self.surface.plane.equation[:3]).T
         reach = axes @ self.points.T
         low, high = reach.min(axis=1), reach.max(axis=1)
-        extents = regions.extents(labels)
-        is_over = np.zeros(len(extents), bool)
-        for label in np.flatnonzero(extents[1:, 0]) + 1:
-            points = _samples(labels, int(label), extents[label], depth, camera, _SAMPLES)
+        is_over = np.zeros(int(labels.max(initial=0)) + 1, bool)
+        for label, points in samples(labels, depth, camera, 1).items():
             middle = np.median(axes @ points.T, axis=1)
             is_over[label] = ((middle > low) & (middle < high)).all()
         is_over[self.label] = True
         return is_over[labels]
 
 
+def samples(labels: np.ndarray, depth: np.ndarray, camera: Camera, least: int) -> dict[int, np.ndarray]:
+    """Some hundred points (n, 3) of each segment of at least so many pixels, evenly taken; the largest one first."""
+    extents = regions.extents(labels)
+    order = np.argsort(-extents[:, 0], kind="stable")
+    order = order[(extents[order, 0] >= least) & (order > 0)]
+    return {int(label): _points(labels, int(label), extents[label], depth, camera, _SAMPLES) for label in order}
+
+
 def found(
-    labels: np.ndarray, depth: np.ndarray, camera: Camera, support: SupportSurface, least: int
+    segments: Mapping[int, np.ndarray],
+    labels: np.ndarray,
+    depth: np.ndarray,
+    camera: Camera,
+    support: SupportSurface,
+    least: int,
 ) -> list[LevelFace]:
-    """Segments with a level face above which some of them is, and that face; those of the largest segments first.
+    """Segments with a level face above which some of them is, and that face; in the order of ``segments``.
 
     Parameters
     ----------
+    segments
+        Of the image, as :func:`samples`.
     labels : int32 (height, width)
         Segments from 1.
     depth : (height, width)
@@ -72,24 +86,21 @@ def found(
     least
         Pixels of a segment.
     """
-    extents = regions.extents(labels)
-    order = [int(label) for label in np.argsort(-extents[:, 0], kind="stable") if label > 0]
     faces = []
-    for label in order:
-        if extents[label, 0] < max(2 * least, _FEWEST):
-            break
-        points = _samples(labels, label, extents[label], depth, camera, _SAMPLES)
+    for label, points in segments.items():
+        if len(points) < _FEWEST:
+            continue
         face = _face(points, support)
         if face is None:
             continue
-        everything = _samples(labels, label, extents[label], depth, camera, extents[label, 0])
+        everything = _points(labels, label, regions.extents(labels)[label], depth, camera, labels.size)
         off = face.plane.height(everything) / noise_growth(everything[:, 2])
         if np.count_nonzero(off > max(0.5 * TOLERANCE, 4 * face.sigma)) >= least:
             faces.append(LevelFace(label, face, points))
     return faces
 
 
-def _samples(
+def _points(
     labels: np.ndarray, label: int, extent: np.ndarray, depth: np.ndarray, camera: Camera, count: int
 ) -> np.ndarray:
     """Points (n, 3) of a segment, evenly taken, at least ``count`` of them or all."""

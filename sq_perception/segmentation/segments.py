@@ -13,6 +13,7 @@ Steps
    the noise on the table.
 6. What stands on the level top of a large segment (:mod:`sq_perception.segmentation.level_faces`) once more, with that
    top for its support: low before the noise, it was taken for a part of the segment.
+7. Walls of a bin around things go (:mod:`sq_perception.segmentation.enclosures`).
 
 Bodies are taken to be convex, or vessels.  Two bodies whose faces lie flush cannot be told apart by their depth.
 Things on a higher table are found as well, those on a lower one are not.  An orthographic camera sees the thesis'
@@ -35,6 +36,7 @@ from sq_perception.imaging import depth_steps, regions
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation import (
     convex_parts,
+    enclosures,
     level_faces,
     patch_grouping,
     pieces,
@@ -174,8 +176,12 @@ def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | No
         everything = cv2.copyTo(everything, measured.view(np.uint8))
     relative = support.image_relative(everything, camera)
     labels = _above(known, relative * valid, valid, camera, support, walls, limits)
-    for face in level_faces.found(labels, known, camera, support, least):
+    samples = level_faces.samples(labels, known, camera, least)
+    for face in level_faces.found(samples, labels, known, camera, support, least):
         labels = _unloaded(labels, face, known, everything, camera, walls, limits, least)
+    around = enclosures.walls(samples, plane.equation)
+    if around:
+        labels = np.where(np.isin(labels, list(around)), 0, labels)
     test = standing.standing(everything, relative, labels, camera, support, walls, limits)
     labels, ids = _ordered(labels, least, options.max_objects, test)
     return Segmentation(labels, plane.equation, ids, max(support.sigma, _LEAST_SIGMA))

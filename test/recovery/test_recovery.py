@@ -288,6 +288,17 @@ def test_s_and_tau_drive_the_score(symmetry):
     assert scores[0] > scores[2] + 0.05
 
 
+@pytest.mark.parametrize(("left", "right", "vouched"), [(0, 320, True), (60, 320, True), (60, 260, False)])
+def test_what_runs_out_of_the_image_on_opposite_sides_has_half_a_score(symmetry, left, right, vouched):
+    """A bar of which the image shows both ends, one or none."""
+    bar = Superquadric([0.35, 0.05, 0.05], [0.2, 0.2], [0, 0, 0.8], [0.3, 0, 0, 1])
+    depth, labels = seen([bar], CAMERA)
+    window, camera = (slice(None), slice(left, right)), CAMERA.cropped(left, 0, right - left, CAMERA.height)
+    (body,) = symmetry.recover(depth[window], camera, labels[window]).bodies
+    assert body.status != Status.FAILED
+    assert (body.score > 0.5) == vouched
+
+
 def test_missing_and_foreign_weights(tmp_path):
     with pytest.raises(checkpoint.CheckpointError, match="no such model file"):
         Recoverer(tmp_path / "missing.safetensors")
