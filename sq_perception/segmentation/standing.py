@@ -61,6 +61,9 @@ TURNS = np.stack([np.cos(np.deg2rad(np.arange(0, 180, 10))), np.sin(np.deg2rad(n
 """Directions (18, 2) in which edges are measured."""
 _UNDER, _BELOW = 3.0, 2.0
 """Tolerances below the support at which is looked for it, and from which on something seen lies below it."""
+_SPECKLE = 4
+"""Pixels beside a foot where nothing was measured, at which is looked for the support; 2 to 6 do as well.  Of 188
+things before a D435 and a Kinect v1 3 to 14 degrees above the table 22 are missed, not 48."""
 _SUPPORTED = 1 / 4
 """Share of the feet that must be seen to have the support, or something before it, under them.  Not of what reaches the
 nearest depth of the image: it goes on where the sensor measures nothing, and may itself hide its feet.  Of tables seen
@@ -308,8 +311,8 @@ def _heights_where(
 def _stands(
     points: np.ndarray, least: float, depth: np.ndarray, relative: np.ndarray, camera: Camera, plane: Plane
 ) -> bool:
-    """Whether the support is under points (n, 3), as far as it is seen, of a share of them at least; what the
-    image cuts off counts as supported."""
+    """Whether the support is under points (n, 3), as far as it is seen there or around, of a share of them at least;
+    what the image cuts off counts as supported."""
     normal = plane.equation[:3]
     under = plane.height(points) + _UNDER * TOLERANCE * noise_growth(points[:, 2])
     feet = points - under[:, None] * normal
@@ -320,4 +323,14 @@ def _stands(
     measured = depth[rows, columns] > 0
     past = np.count_nonzero(measured & (relative[rows, columns] < -_BELOW * TOLERANCE))
     held = np.count_nonzero(measured) - past
+    # Of a table seen at a grazing angle single pixels are measured: those around tell of one that is not.
+    around = np.array([-_SPECKLE, 0, _SPECKLE])
+    rows, columns = rows[~measured], columns[~measured]
+    rows = np.clip(rows[:, None, None] + around[:, None], 0, camera.height - 1)
+    columns = np.clip(columns[:, None, None] + around, 0, camera.width - 1)
+    level = np.where(depth[rows, columns] > 0, relative[rows, columns], np.inf)
+    lower = np.count_nonzero(level < -_BELOW * TOLERANCE, axis=(1, 2))
+    on = np.count_nonzero(np.abs(level) <= _BELOW * TOLERANCE, axis=(1, 2))
+    past += np.count_nonzero(lower > on)
+    held += np.count_nonzero((on >= lower) & (on > 0))
     return bool(past <= held and held + np.count_nonzero(~inside) >= least * len(feet))
