@@ -159,9 +159,9 @@ def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | No
     if np.count_nonzero(valid) < least:
         return Segmentation(np.zeros(depth.shape, np.int32), None, ())
     planes = support_plane.planes(depth, valid, camera)
-    plane = support_plane.support(planes, depth, valid, camera)
-    known = cv2.copyTo(depth, valid.view(np.uint8))  # and 0 elsewhere
     limits = standing.Limits(options.max_size, options.workspace, options.workspace_pose)
+    plane = support_plane.support(planes, depth, valid, camera, limits.is_small)
+    known = cv2.copyTo(depth, valid.view(np.uint8))  # and 0 elsewhere
     if plane is None:
         free = valid & ~standing.furniture(known, valid, camera, planes, limits)
         labels = _bodies(known, free, camera, _UNKNOWN_SIGMA, limits.is_small)

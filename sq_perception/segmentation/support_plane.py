@@ -19,6 +19,7 @@ Metres and pixels.  Reference: M. A. Fischler, R. C. Bolles, Random Sample Conse
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import cv2
@@ -55,8 +56,8 @@ _ISLAND_SHARE = 0.25
 """Of the image; an island that fills less is a body seen face-on, as a camera that looks at a table shows more of it.
 Chosen: lone bodies are found by it, and 81 recorded and simulated frames of tables are the same without it."""
 LEVEL, _STOREY, _TABLE_SHARE = 0.99, 0.3, 0.4
-"""Cosine between the normals of level planes, metres from a floor to the table above it, and the share that it shows of
-what the floor does.  Of lower steps the larger level is the support, and things are found on both."""
+"""Cosine between the normals of level planes, metres from a floor to the table above it, and the share that a small one
+shows of what the floor does.  Of lower steps the larger level is the support, and things are found on both."""
 
 _CLOSE, _HELD_SHARE = 0.6, 0.1
 """Metres above a support in which what stands on it is, and the least share of that, of what another plane has there:
@@ -120,20 +121,28 @@ def planes(depth: np.ndarray, valid: np.ndarray, camera: Camera) -> list[Plane]:
     return found
 
 
-def support(candidates: list[Plane], depth: np.ndarray, valid: np.ndarray, camera: Camera) -> Plane | None:
+def support(
+    candidates: list[Plane],
+    depth: np.ndarray,
+    valid: np.ndarray,
+    camera: Camera,
+    is_small: Callable[[np.ndarray, np.ndarray], bool],
+) -> Plane | None:
     """The plane that things stand on: many points, and rather below the camera than in front of it or above it.
 
     A camera is mounted upright or looks straight down.  The table seen from straight above and a wall look alike; a
     wall counts less, as a floor or a table in the same picture then has a normal that points up.  Of a table and the
-    floor below it things stand on the table, though the picture may show more of the floor.  What hardly anything is
-    close above is no support, such as the wall metres behind a low camera's table, be that in sight or not; nor is the
-    face of a body, unless most of what is on no plane is close above it.
+    floor below it things stand on the table, though the picture may show more of the floor; what is no larger than a
+    thing, as ``is_small`` tells of points (n, 3) and their plane's normal, must be a good part of it to be a table.
+    What hardly anything is close above is no support, such as the wall metres behind a low camera's table, be that in
+    sight or not; nor is the face of a body, unless most of what is on no plane is close above it.
     """
     surfaces = _on_one_surface(depth, valid, camera)
     is_face = [_is_face(plane, surfaces) for plane in candidates]
     if all(is_face):
         return None
-    held, rest = _held(candidates, _some_points(depth, valid, camera, _PLANE_POINTS))
+    points = _some_points(depth, valid, camera, _PLANE_POINTS)
+    held, rest = _held(candidates, points)
     bearing = [k for k, face in enumerate(is_face) if held[k] > 0.5 or not face]
     least = _HELD_SHARE * max(held[k] for k in bearing)
     chosen = [candidates[k] for k in bearing if held[k] >= least]
@@ -145,7 +154,7 @@ def support(candidates: list[Plane], depth: np.ndarray, valid: np.ndarray, camer
         for plane in chosen
         if plane.equation[:3] @ best.equation[:3] > LEVEL
         and best.equation[3] - plane.equation[3] > _STOREY
-        and plane.share > _TABLE_SHARE * best.share
+        and (plane.share > _TABLE_SHARE * best.share or not is_small(_on(plane, points), plane.equation[:3]))
     ]
     return max(tables, key=_vote) if tables else best
 
@@ -306,6 +315,11 @@ def _on_one_surface(depth: np.ndarray, valid: np.ndarray, camera: Camera) -> lis
         points = camera.unproject(k * columns, k * rows, coarse[rows, columns])
         surfaces.append((points, inside and size < _ISLAND_SHARE * labels.size))
     return surfaces
+
+
+def _on(plane: Plane, points: np.ndarray) -> np.ndarray:
+    """Those of some points (n, 3) that lie on a plane."""
+    return points[np.abs(plane.height(points)) < TOLERANCE * noise_growth(points[:, 2])]
 
 
 def _held(candidates: list[Plane], points: np.ndarray) -> tuple[list[float], float]:

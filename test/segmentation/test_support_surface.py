@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 import pytest
-from table_scenes import best_iou
+from table_scenes import VGA, Table, best_iou
 
 from sq_perception.geometry import rotation
 from sq_perception.geometry.superquadric import Superquadric
@@ -203,6 +203,20 @@ def test_a_table_whose_border_is_round_carries_what_stands_on_it():
     assert found.plane is not None
     assert np.degrees(np.arccos(np.clip(found.plane[:3] @ normal, -1, 1))) < 2
     assert best_iou(truth == 1, found.labels) > 0.85
+
+
+def test_a_table_larger_than_a_thing_is_the_support_however_much_floor_is_seen():
+    """A bench 90 cm long; a box as high that is as much of the image stands on the floor with what it carries."""
+    floor, high = Table(pitch=0.8, distance=1.6), 0.45
+    things = [floor.body(-0.1, -0.05, (0.04, 0.03, 0.05), height=high)]
+    things.append(floor.body(0.1, 0.06, (0.05, 0.04, 0.03), (0.1, 1.0), height=high))
+    for half, stands in (((0.45, 0.2, 0.015), high), ((0.28, 0.28, high / 2), 0.0)):
+        top = floor.body(0, 0, half, (0.05, 0.05), turn=0.4, height=high - 2 * half[2])
+        depth, truth = floor.see([top, *things], 1e-3)
+        assert 0.09 < np.mean(truth == 1) < 0.3
+        found = segment(depth, VGA)
+        assert min(best_iou(truth == k, found.labels) for k in (2, 3)) > 0.85
+        assert found.plane == pytest.approx(floor.plane - np.array([0, 0, 0, stands]), abs=0.01)
 
 
 def room_corner():
