@@ -236,7 +236,7 @@ def test_a_face_that_holds_more_than_a_wall_but_not_most_leaves_the_wall(monkeyp
         support_plane.Plane(np.array([0.0, 0.0, -1.0, d]), share, 1e-3) for d, share in ((2.0, 0.6), (1.0, 0.2))
     )
     monkeypatch.setattr(support_plane, "_is_face", lambda plane, _: plane is face)
-    monkeypatch.setattr(support_plane, "_held", lambda *_: ([0.0, 0.4], 0.5))
+    monkeypatch.setattr(support_plane, "_held", lambda *_: ([0.0, 0.4], [1.0, 1.0], 0.5))
     depth = np.full((CAMERA.height, CAMERA.width), 2.0, np.float32)
     assert support_plane.support([wall, face], depth, depth > 0, CAMERA, lambda *_: True) is wall
 
