@@ -59,32 +59,35 @@ def walls(points: Mapping[int, np.ndarray], plane: np.ndarray) -> set[int]:
 
 def _around(level: list[int], points: Mapping[int, np.ndarray], axes: np.ndarray) -> set[int]:
     """Those of some equally high segments that are walls along the rectangle around them, as the longest lies."""
-    flat = {label: some @ axes for label, some in points.items()}
+    flat = {label: points[label] @ axes for label in level}
     # Not the smallest rectangle: two walls at a right angle have another one just as small.
-    moments = [np.linalg.eigh(np.cov(flat[label].T)) for label in level]
+    moments = [np.linalg.eigh(np.cov(some.T)) for some in flat.values()]
     _, directions = max(moments, key=lambda each: each[0][1] - each[0][0])
     turned = {label: some @ directions for label, some in flat.items()}
-    everything = np.concatenate([turned[label] for label in level])
+    everything = np.concatenate(list(turned.values()))
     low, high = everything.min(axis=0), everything.max(axis=0)
-    half = (high - low) / 2
+    middle, half = (low + high) / 2, (high - low) / 2
     if 2 * half.min() < _SMALLEST:
         return set()
-    inner = {label: some - (low + high) / 2 for label, some in turned.items()}
     thick = min(_THICK, _NARROW * half.min())
-    depth = {label: (half - np.abs(some)).min(axis=1) for label, some in inner.items()}
-    along = [label for label in level if np.mean(depth[label] > thick) < _STRAY]
+    along = [label for label in level if np.mean(_inwards(turned[label] - middle, half) > thick) < _STRAY]
     if not along:
         return set()
     cells = np.zeros((4, _CELLS), bool)
     for label in along:
-        _cover(cells, inner[label], half, thick)
+        _cover(cells, turned[label] - middle, half, thick)
     covered = cells.mean(axis=1)
     is_corner = bool((np.minimum(covered, np.roll(covered, 1)) > _LONG).any())
     if not is_corner or cells.mean() < _COVERED:
         return set()
-    others = (np.median(some, axis=0) for label, some in inner.items() if label not in along)
-    holds = any((half - np.abs(at)).min() > thick for at in others)
+    others = [np.median(some @ axes @ directions, axis=0) for label, some in points.items() if label not in along]
+    holds = bool(others) and bool((_inwards(np.array(others) - middle, half) > thick).any())
     return set(along) if holds else set()
+
+
+def _inwards(points: np.ndarray, half: np.ndarray) -> np.ndarray:
+    """Distances (n,) of points (n, 2) from the nearest side of a rectangle, positive inside."""
+    return np.asarray((half - np.abs(points)).min(axis=1))
 
 
 def _cover(cells: np.ndarray, points: np.ndarray, half: np.ndarray, thick: float) -> None:

@@ -63,9 +63,9 @@ _CLOSE, _HELD_SHARE = 0.6, 0.1
 """Metres above a support in which what stands on it is, and the least share of that, of what another plane has there:
 the wall behind a table has a tenth and less of it, and may be eight times as large in the image."""
 _TYPICAL_HEIGHT = 0.1
-"""Metres above their support of what is on no plane: exp(-h / this) is near.  A bin's wall, seen from above, is below the
-middle of the image as a table is, but its things are anywhere before it, and not on it.  The square of the mean counts:
-it decides for the bottom in four recorded bins of four, in one without, and simulated stools, boards and cartons gain."""
+"""Metres above their support of what is on no plane: exp(-h / this) is near.  A bin's wall, seen from above, is below
+the middle of the image as a table is, but things are anywhere before it, not on it.  The square of the mean counts: of
+four recorded bins the bottom was chosen once without, always with it; simulated stools, boards and cartons gain."""
 _STRAY = 0.003
 """Share of the points that may be on no plane although nothing is there: of normal noise 0.3 % lies beyond three
 deviations, and tolerances are wider."""
@@ -134,12 +134,13 @@ def support(
 ) -> Plane | None:
     """The plane that things stand on: many points, and rather below the camera than in front of it or above it.
 
-    What stands on it begins right above it.  A camera is mounted upright or looks straight down.  The table seen from straight above and a wall look alike; a
-    wall counts less, as a floor or a table in the same picture then has a normal that points up.  Of a table and the
-    floor below it things stand on the table, though the picture may show more of the floor; what is no larger than a
-    thing, as ``is_small`` tells of points (n, 3) and their plane's normal, must be a good part of it to be a table.
-    What hardly anything is close above is no support, such as the wall metres behind a low camera's table, be that in
-    sight or not; nor is the face of a body, unless most of what is on no plane is close above it.
+    What stands on it begins right above it.  A camera is mounted upright or looks straight down.  The table seen from
+    straight above and a wall look alike; a wall counts less, as a floor or a table in the same picture then has a
+    normal that points up.  Of a table and the floor below it things stand on the table, though the picture may show
+    more of the floor; what is no larger than a thing, as ``is_small`` tells of points (n, 3) and their plane's normal,
+    must be a good part of it to be a table.  What hardly anything is close above is no support, such as the wall metres
+    behind a low camera's table, be that in sight or not; nor is the face of a body, unless most of what is on no plane
+    is close above it.
     """
     surfaces = _on_one_surface(depth, valid, camera)
     is_face = [_is_face(plane, surfaces) for plane in candidates]

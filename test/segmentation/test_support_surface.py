@@ -219,6 +219,18 @@ def test_a_table_larger_than_a_thing_is_the_support_however_much_floor_is_seen()
         assert found.plane == pytest.approx(floor.plane - np.array([0, 0, 0, stands]), abs=0.01)
 
 
+def test_the_bottom_of_a_bin_is_its_support_and_not_its_wall():
+    """From above the wall that is nearest to the user is below the middle of the image, as a table would be."""
+    bottom, wall = np.full((240, 320), 0.8), plane_image(np.array([0.0, -1.0, 0.0]), 0.2)
+    v, u = np.indices(bottom.shape)
+    depth = np.minimum(bottom, wall)
+    things = (u // 40 % 2 == 0) & (v // 40 % 2 == 0) & (depth > 0.79)
+    high = 0.03 + 0.02 * (u // 80 + v // 80)
+    found = segment(noisy(depth - high * things, 1e-3), CAMERA)
+    assert found.plane == pytest.approx([0, 0, -1, 0.8], abs=0.01)
+    assert best_iou(things & (u // 80 == 1) & (v // 80 == 1), found.labels) > 0.9
+
+
 def room_corner():
     """A floor and two walls at right angles, 1.5 m away, the camera 1 m above the floor and tilted down."""
     tilt = np.deg2rad(25)
