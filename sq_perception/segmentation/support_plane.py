@@ -62,10 +62,11 @@ shows of what the floor does.  Of lower steps the larger level is the support, a
 _CLOSE, _HELD_SHARE = 0.6, 0.1
 """Metres above a support in which what stands on it is, and the least share of that, of what another plane has there:
 the wall behind a table has a tenth and less of it, and may be eight times as large in the image."""
-_TYPICAL_HEIGHT = 0.1
+_TYPICAL_HEIGHT, _FAR = 0.1, 0.1
 """Metres above their support of what is on no plane: exp(-h / this) is near.  A bin's wall, seen from above, is below
 the middle of the image as a table is, but things are anywhere before it, not on it.  The square of the mean counts: of
-four recorded bins the bottom was chosen once without, always with it; simulated stools, boards and cartons gain."""
+four recorded bins the bottom was chosen once without, always with it; simulated stools, boards and cartons gain.
+And that mean at least: where all is far from all planes, it says nothing."""
 _STRAY = 0.003
 """Share of the points that may be on no plane although nothing is there: of normal noise 0.3 % lies beyond three
 deviations, and tolerances are wider."""
@@ -336,7 +337,7 @@ def _held(candidates: list[Plane], points: np.ndarray) -> tuple[list[float], lis
         return [0.0] * len(candidates), [1.0] * len(candidates), 0.0
     held = np.mean((rest > 0) & (rest < _CLOSE), axis=1)
     near = np.mean(np.where(rest > 0, np.exp(-np.abs(rest) / _TYPICAL_HEIGHT), 0.0), axis=1)
-    return held.tolist(), near.tolist(), rest.shape[1] / len(points)
+    return held.tolist(), np.maximum(near, _FAR).tolist(), rest.shape[1] / len(points)
 
 
 def _vote(plane: Plane) -> float:
