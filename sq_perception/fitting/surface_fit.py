@@ -122,7 +122,7 @@ def fit(
 
 def _is_thing(mask: np.ndarray, options: FitOptions) -> bool:
     """Whether more is known of the object than its pixels: it stands on something, or its hull is predicted."""
-    return options.plane is not None or (not _fills(mask) and options.predicted_hull() is not None)
+    return options.plane is not None or (not fills(mask) and options.predicted_hull() is not None)
 
 
 def _as_thing(exactly: Solution | None) -> Solution | None:
@@ -132,8 +132,8 @@ def _as_thing(exactly: Solution | None) -> Solution | None:
     return replace(exactly, spread_factor=tolerant.SPREAD)
 
 
-def _fills(mask: np.ndarray) -> bool:
-    """Whether a mask runs out of the image on opposite sides: a surface, and no thing."""
+def fills(mask: np.ndarray) -> bool:
+    """Whether a mask (height, width) runs out of the image on opposite sides: a surface, and no thing."""
     return bool((mask[0].any() and mask[-1].any()) or (mask[:, 0].any() and mask[:, -1].any()))
 
 

@@ -84,13 +84,6 @@ class SeenObject:
         rows, columns = rows[::step], columns[::step]
         return self.camera_crop.unproject(columns, rows, self.depth_crop[rows, columns])
 
-    @property
-    def runs_through(self) -> bool:
-        """Whether its surface leaves the image on opposite sides."""
-        return any(
-            part.start == 0 and part.stop == size for part, size in zip(self.window, self.mask.shape, strict=True)
-        )
-
     def heights(self, plane: np.ndarray) -> np.ndarray:
         """Metres above a plane (4,): of the pixels of ``mask_crop``, NaN elsewhere."""
         depth, mask = np.ascontiguousarray(self.depth_crop), np.ascontiguousarray(self.mask_crop)
