@@ -4,7 +4,8 @@ Steps
 -----
 1. The support plane (:mod:`sq_perception.segmentation.support_plane`) and what is clearly above it; walls and other
    planes larger than a thing go first.
-2. Smooth patches of surface, cut at depth steps and folds (:mod:`sq_perception.segmentation.surface_patches`).
+2. Smooth patches of surface, cut at depth steps and folds (:mod:`sq_perception.segmentation.surface_patches`); this
+   step to step 5 are gone through in :mod:`sq_perception.segmentation.bodies`.
 3. Patches that belong to one body: convex edges join, concave edges and steps part, with exceptions for vessels and
    for bodies that go on behind others (:mod:`sq_perception.segmentation.patch_grouping`).
 4. Where lines of sight within a body cross empty space it is several, and where none do so between two they are one
@@ -24,42 +25,32 @@ Metres and pixels.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 
 import cv2
 import numpy as np
 
-from sq_perception.geometry.kernels import kernel
 from sq_perception.imaging import depth_steps, regions
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation import (
+    bodies,
     convex_parts,
     enclosures,
     level_faces,
-    patch_grouping,
     pieces,
     standing,
     support_plane,
     support_surface,
-    surface_patches,
 )
 from sq_perception.segmentation.support_plane import Plane
-from sq_perception.segmentation.support_surface import SupportSurface
 
 EVERYTHING = (0.0, np.inf)
 """Range of all depths, metres."""
 _LEAST_PIXELS, _LEAST_SHARE = 30, 5e-4
 """Of an object: pixels, and share of the image; at VGA a square of 2 cm at 0.8 m.  Smaller ones are bits of noise."""
-_FOOT_PIXELS = 3
-"""Up to which the foot of a thing reaches below what is clearly above the support."""
-_AROUND = 40
-"""Pixels around all that is above the support in which its noise is measured; two of the longest chords at VGA."""
-_LEAST_SIGMA = 5e-4
-"""Noise of the depth at one metre that is assumed at least, metres: rendered images have none."""
 _UNKNOWN_SIGMA = 1.5e-3
-"""The same where no support shows it: that of structured light (Khoshelham and Oude Elberink, Sensors 2012)."""
+"""Noise of the depth at one metre where no support shows it, metres: that of structured light (Khoshelham and Oude
+Elberink, Sensors 2012)."""
 
 
 @dataclass(frozen=True)
@@ -164,7 +155,7 @@ def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | No
     known = cv2.copyTo(depth, valid.view(np.uint8))  # and 0 elsewhere
     if plane is None:
         free = valid & ~standing.furniture(known, valid, camera, planes, limits)
-        labels = _bodies(known, free, camera, _UNKNOWN_SIGMA, limits.is_small)
+        labels = bodies.taken_apart(known, free, camera, _UNKNOWN_SIGMA, limits.is_small)
         labels, ids = _ordered(labels, least, options.max_objects, standing.alone(known, camera, limits))
         return Segmentation(labels, None, ids)
     support = support_surface.measured(plane, known, valid, camera)
@@ -175,7 +166,7 @@ def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | No
         everything, measured = _checked(depth, camera, EVERYTHING)
         everything = cv2.copyTo(everything, measured.view(np.uint8))
     relative = support.image_relative(everything, camera)
-    labels = _above(known, relative * valid, valid, camera, support, walls, limits)
+    labels = bodies.above(known, relative * valid, valid, camera, support, walls, limits)
     samples = level_faces.samples(labels, known, camera, least)
     for face in level_faces.found(samples, labels, known, camera, support, least):
         labels = _unloaded(labels, face, known, everything, camera, walls, limits, least)
@@ -184,7 +175,7 @@ def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | No
         labels = np.where(np.isin(labels, list(around)), 0, labels)
     test = standing.standing(everything, relative, labels, camera, support, walls, limits)
     labels, ids = _ordered(labels, least, options.max_objects, test)
-    return Segmentation(labels, plane.equation, ids, max(support.sigma, _LEAST_SIGMA))
+    return Segmentation(labels, plane.equation, ids, max(support.sigma, bodies.LEAST_SIGMA))
 
 
 def from_labels(
@@ -276,43 +267,6 @@ def _checked(depth: np.ndarray, camera: Camera, limits: tuple[float, float]) -> 
     return depth, valid
 
 
-# The objects on it
-
-
-def _above(
-    known: np.ndarray,
-    relative: np.ndarray,
-    valid: np.ndarray,
-    camera: Camera,
-    support: SupportSurface,
-    walls: list[Plane],
-    limits: standing.Limits,
-) -> np.ndarray:
-    """Bodies (labels from 1, unordered) of what is above the support; heights are 0 where depths are."""
-    labels = np.zeros(known.shape, np.int32)
-    # Half of the tolerance band is a compromise: bent depth of real cameras stays below, thin objects stay above.
-    clear = cv2.blur(relative, (3, 3)) > max(0.5 * support_plane.TOLERANCE, 4 * support.sigma)
-    # The mean beside a tall body is that of its height: the pixel itself decides there.
-    above = relative > max(0.25 * support_plane.TOLERANCE, 2 * support.sigma)
-    above &= ~support_surface.risen(relative, known, valid, camera)
-    clear &= above
-    clear &= ~standing.furniture(known, clear, camera, walls, limits)
-    left, top, width, height = cv2.boundingRect(clear.view(np.uint8))
-    if width == 0:
-        return labels
-    top, left = max(top - _AROUND, 0), max(left - _AROUND, 0)
-    window = slice(top, top + height + 2 * _AROUND), slice(left, left + width + 2 * _AROUND)
-    # Contiguous, as kernels are compiled for arrays of a kind.
-    flat = valid[window] & (np.abs(relative[window]) < support_plane.TOLERANCE)
-    known, clear = np.ascontiguousarray(known[window]), np.ascontiguousarray(clear[window])
-    seen = camera.cropped(left, top, known.shape[1], known.shape[0])
-    holds = partial(limits.is_small, up=support.plane.equation[:3])
-    inside = _bodies(known, clear, seen, support.sigma, holds, flat)
-    foot = above[window] & (inside == 0)
-    labels[window] = depth_steps.grown(inside, foot, known, _FOOT_PIXELS, depth_steps.STEP)
-    return labels
-
-
 def _unloaded(
     labels: np.ndarray,
     face: level_faces.LevelFace,
@@ -326,73 +280,10 @@ def _unloaded(
     """Labels in which what stands on a level face of a segment is taken apart once more, with the face as support."""
     relative = face.surface.image_relative(everything, camera)
     valid = face.under(labels, known, camera) & (relative > -support_plane.TOLERANCE)
-    above = _above(known, relative * valid, valid, camera, face.surface, walls, limits)
-    test = standing.standing(everything, relative, above, camera, face.surface, walls, limits)
-    above, _ = _ordered(above, least, above.max(initial=0), test)
-    return np.where(above > 0, above + labels.max(), labels)
-
-
-def _bodies(
-    depth: np.ndarray,
-    wanted: np.ndarray,
-    camera: Camera,
-    sigma: float,
-    holds: Callable[[np.ndarray], bool],
-    flat: np.ndarray | None = None,
-) -> np.ndarray:
-    """Bodies (labels from 1, unordered) of the wanted pixels, taken apart at steps and concave edges."""
-    sigma = max(sigma, _LEAST_SIGMA)
-    patches = surface_patches.find(depth, wanted, camera, sigma, flat)
-    if patches is None:
-        return convex_parts.corrected(depth_steps.separated(depth, wanted), depth, camera, sigma, holds)
-    body = patch_grouping.bodies(patches, camera)
-    labels = _refined(body[patches.labels].astype(np.int32), patches, depth, wanted)
-    labels = convex_parts.corrected(labels, depth, camera, sigma, holds)
-    # What is too small for a patch stays what the steps made of it.
-    rest = cv2.morphologyEx((wanted & (labels == 0)).view(np.uint8), cv2.MORPH_OPEN, depth_steps.CROSS)
-    if not rest.any():
-        return labels
-    rest = depth_steps.components(rest)
-    rest[rest > 0] += labels.max()
-    return labels + rest
-
-
-def _refined(body: np.ndarray, patches: surface_patches.Patches, depth: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Labels (height, width) from those of the samples; beside a step, of the one whose depth is most alike."""
-    unsure = patches.stepped | (body == 0)
-    known = np.pad(np.where(body > 0, patches.depth, np.float32(np.inf)), 1, constant_values=np.inf)
-    return np.asarray(_fine(body, unsure, known, depth, wanted, patches.stride, np.float32(depth_steps.STEP)))
-
-
-@kernel
-def _fine(
-    body: np.ndarray,
-    unsure: np.ndarray,
-    known: np.ndarray,
-    depth: np.ndarray,
-    wanted: np.ndarray,
-    stride: int,
-    step: np.float32,
-) -> np.ndarray:
-    """The same; ``known`` are the depths of labelled samples in a frame of one sample, inf for others."""
-    labels = np.zeros(depth.shape, np.int32)
-    rows, columns = body.shape
-    for v in range(depth.shape[0]):
-        for u in range(depth.shape[1]):
-            if not wanted[v, u]:
-                continue
-            if not unsure[v // stride, u // stride]:
-                labels[v, u] = body[v // stride, u // stride]
-                continue
-            r, c = (v + stride // 2) // stride, (u + stride // 2) // stride
-            least = step * depth[v, u]
-            for i in range(max(r - 1, 0), min(r + 2, rows)):
-                for j in range(max(c - 1, 0), min(c + 2, columns)):
-                    off = abs(known[i + 1, j + 1] - depth[v, u])
-                    if off < least:
-                        least = off
-                        labels[v, u] = body[i, j]
-    return labels
+    parts = bodies.above(known, relative * valid, valid, camera, face.surface, walls, limits)
+    test = standing.standing(everything, relative, parts, camera, face.surface, walls, limits)
+    parts, _ = _ordered(parts, least, parts.max(initial=0), test)
+    return np.where(parts > 0, parts + labels.max(), labels)
 
 
 def _ordered(
