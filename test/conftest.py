@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+import sq_perception
+
 REPOSITORY = Path(__file__).resolve().parent.parent
 _STARTING = {"subprocess", "browser", "running_nodes", "respawned_nodes", "hostile_messages", "sealed_network"}
 """Modules by which tests start processes."""
@@ -55,6 +57,20 @@ def _names(code: CodeType) -> list[str]:
     """All names of a function that are not its own, with those of the functions in it."""
     inner = [name for each in code.co_consts if isinstance(each, CodeType) for name in _names(each)]
     return [*code.co_names, *inner]
+
+
+@pytest.fixture(scope="session", autouse=True)
+def _away_from_the_sources(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Processes that tests start import the package that the tests import.
+
+    Python looks into the working directory first: `make test` begins in the source tree, whose kernels nobody compiled.
+    """
+    before, given = Path.cwd(), os.environ.get("PYTHONPATH")
+    if Path(sq_perception.__file__).resolve().parents[1] == REPOSITORY:
+        os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(REPOSITORY), given]))
+    os.chdir(tmp_path_factory.mktemp("away"))
+    yield
+    os.chdir(before)
 
 
 @pytest.fixture(scope="session")
