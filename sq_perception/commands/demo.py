@@ -28,7 +28,7 @@ def main(arguments: Sequence[str]) -> int:
     add(
         "--projection",
         choices=("pinhole", "orthographic"),
-        help="of the frame; 8 bit images are orthographic, others pinhole",
+        help="of the frame; 8 bit images are orthographic, NPZs what they say, others pinhole",
     )
     add("--seconds", type=float, default=20.0, help="how long (default: %(default)g)")
     add("--output-dir", type=folder, default=".", metavar="DIR", help="for demo.png and demo.glb")

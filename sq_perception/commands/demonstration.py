@@ -109,11 +109,11 @@ def _camera(frame: Path | None, camera_info: Path | None, projection: Projection
         return {"rate": _RATE, **own}
     if projection is None:
         projection = "orthographic" if _is_grey(frame) else "pinhole"
-    read(frame, camera_info, projection)
+    is_cube = read(frame, camera_info, projection).is_cube  # an NPZ may say so, whatever was expected of it
     files = {"path": str(frame.resolve())}
     if camera_info is not None:
         files["camera_info_file"] = str(camera_info.resolve())
-    return {"rate": _RATE, "scene": "replay", "projection": projection, **files}
+    return {"rate": _RATE, "scene": "replay", "projection": "orthographic" if is_cube else "pinhole", **files}
 
 
 def _is_grey(frame: Path) -> bool:

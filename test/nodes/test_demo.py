@@ -22,6 +22,7 @@ pytest.importorskip("rclpy", reason="rclpy missing: install the extra 'ros' or s
 
 import sq_perception
 from sq_perception.commands import children as children_module
+from sq_perception.commands import demo, demonstration
 from sq_perception.commands.children import Child, Children, parameter_arguments
 from sq_perception.evaluation.demo_figure import demo_figure
 from sq_perception.evaluation.demo_table import alike, demo_table, pair
@@ -199,6 +200,19 @@ def test_a_recorded_grey_image_is_recognised_and_recovered(tmp_path: Path) -> No
     assert sizes is not None, said
     assert sorted(map(float, sizes.groups())) == pytest.approx([0.15, 0.2, 0.25], abs=0.01)
     assert (tmp_path / "demo.png").is_file()
+
+
+@pytest.mark.parametrize("projection", ["orthographic", "pinhole"])
+def test_the_nodes_expect_what_an_npz_holds(projection: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nodes that expect another projection refuse each of its images."""
+    asked: list[dict[str, object]] = []
+    monkeypatch.setattr(demonstration, "run", lambda camera, *_: asked.append(camera) or 0)
+    path = tmp_path / "body.npz"
+    np.savez(
+        path, depth=np.full((20, 20), 0.5), K=np.array([[20, 0, 9.5], [0, 20, 9.5], [0, 0, 1.0]]), projection=projection
+    )
+    assert demo.main(["--frame", str(path), "--output-dir", str(tmp_path)]) == 0
+    assert [camera["projection"] for camera in asked] == [projection]
 
 
 def test_ctrl_c_ends_it_at_any_time_without_a_trace(tmp_path: Path) -> None:
