@@ -132,7 +132,10 @@ def _write_depth(
             np.savez_compressed(file, **fields)
         return
     if camera.is_pinhole:
-        image = np.where(np.isfinite(depth), np.clip(np.round(1e3 * depth), 0, 65535), 0).astype(np.uint16)
+        millimetres, most = np.round(1e3 * depth), np.iinfo(np.uint16).max
+        image = np.where(millimetres <= most, millimetres, 0).astype(np.uint16)
+        if (millimetres[index >= 0] > most).any():
+            complain(f"what is beyond 65.535 m is left out: {output.name} holds no more, an .npz does")
         _write_camera_info(output.with_suffix(".yaml"), camera)
     else:
         image = unit_cube.grey_from_depth(depth, np.uint16 if bits == 16 else np.uint8)

@@ -97,6 +97,19 @@ def test_pinhole_round_trips(tmp_path):
         np.testing.assert_allclose(archive["superquadrics"][0], flat(CAN).to_flat())
 
 
+def test_what_sixteen_bits_of_millimetres_cannot_say_is_no_reading(tmp_path, capsys):
+    """A ball from 64 to 68 m in front, of which they can say the nearest part."""
+    ball = ["2", "2", "2", "1", "1", "0", "0", "66", "0", "0", "0", "1", "--projection", "pinhole", "--focal", "4000"]
+    for name in ("ball.png", "ball.npz"):
+        assert main.main(["render", *ball, "-o", str(tmp_path / name)]) == 0
+    assert capsys.readouterr().err.count("beyond 65.535 m") == 1
+    millimetres = cv2.imread(str(tmp_path / "ball.png"), cv2.IMREAD_UNCHANGED)
+    depth = np.load(tmp_path / "ball.npz")["depth"]
+    assert np.nanmax(depth) > 65.54
+    np.testing.assert_array_equal(millimetres > 0, depth < 65.5355)
+    assert abs(millimetres / 1e3 - depth)[millimetres > 0].max() < 0.001
+
+
 def test_sixteen_bits_and_sizes(tmp_path):
     path = tmp_path / "fine.png"
     assert main.main(["render", *CUBE_BODY, "-o", str(path), "--bits", "16", "--width", "100", "--height", "80"]) == 0
