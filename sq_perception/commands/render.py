@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sq_perception.commands.console import SUCCESS, complain, failed, misused, parser, replaced_input, target
+from sq_perception.commands.console import SUCCESS, at_least, complain, failed, misused, parser, replaced_input, target
 from sq_perception.files import output_file
 
 if TYPE_CHECKING:
@@ -48,8 +48,8 @@ def main(arguments: Sequence[str]) -> int:
         add(name, type=float)
     add("--output", "-o", type=target, required=True, metavar="FILE", help=".png, .bmp or .npz")
     add("--projection", choices=("orthographic", "pinhole"), default="orthographic")
-    add("--width", type=int, help="pixels (256 orthographic, 640 pinhole)")
-    add("--height", type=int, help="pixels (as the width orthographic, 480 pinhole)")
+    add("--width", type=at_least(1), help="pixels (256 orthographic, 640 pinhole)")
+    add("--height", type=at_least(1), help="pixels (as the width orthographic, 480 pinhole)")
     add("--focal", type=float, default=525.0, help="focal length of the pinhole camera, pixels (525)")
     add("--camera-info", metavar="FILE", help="a pinhole camera from YAML instead")
     add("--bits", type=int, choices=(8, 16), default=8, help="depth of an orthographic PNG")

@@ -200,6 +200,8 @@ def test_a_missing_model_is_one_clear_line(tmp_path, view, capsys):
         ["render", "-1", *CUBE_BODY[1:], "--output", "x.png"],
         ["render", *CUBE_BODY[:8], "0", "0", "0", "0", "--output", "x.png"],
         ["render", *CUBE_BODY, "--output", "x.png", "--width", "1"],
+        ["render", *CUBE_BODY, "--output", "x.png", "--width", "0"],
+        ["render", *CAN, "--projection", "pinhole", "--output", "x.png", "--height", "0"],
         ["render", *CUBE_BODY, "--output", "no/such/folder/x.png"],
         ["render", "nan", *CUBE_BODY[1:], "--output", "x.png"],
         ["render-search", "--picture", "x.txt"],
