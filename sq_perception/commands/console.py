@@ -134,8 +134,8 @@ def replaced_input(
         for.
     """
     for name, file in files.items():
-        path = Path(file or STANDARD_OUTPUT)
-        if path.exists() and any(given.exists() and path.samefile(given) for given in inputs):
+        path = None if file is None or str(file) == STANDARD_OUTPUT else Path(file)
+        if path and path.exists() and any(given.exists() and path.samefile(given) for given in inputs):
             return f"--{name}: {path}: this is an input"
     for name, (folder, suffix) in (folders or {}).items():
         if folder and any(given.suffix.lower() == suffix and given.parent.samefile(folder) for given in inputs):

@@ -45,6 +45,15 @@ def test_neither_masks_nor_cameras_nor_the_files_of_a_bag_are_replaced(tmp_path,
     assert [path.read_bytes() for path in kept] == before
 
 
+def test_a_file_that_is_called_like_the_standard_output_is_no_output(tmp_path, monkeypatch, capsys):
+    """It is read where masks or the files of a bag are."""
+    cv2.imwrite(str(tmp_path / "a.png"), np.zeros((30, 40), np.uint16))
+    (tmp_path / "-").write_text("what somebody has left")
+    monkeypatch.chdir(tmp_path)
+    assert recover("a.png", "--camera-info", "50,50,19.5,14.5", "--masks", ".", "--json", "-") == 0
+    assert "input" not in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("output", "words"),
     [("/dev/full", "sq-perception: the standard output: No space left on device\n"), ("a closed pipe", "")],
