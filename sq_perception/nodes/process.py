@@ -102,7 +102,7 @@ def run(name: str, create: Callable[[], Iterable[Stoppable]], arguments: Sequenc
             if stop.received:
                 # Whatever was going on has failed because of the signal.
                 code = 0
-            elif stop.starting and isinstance(error, _start_errors()):
+            elif stop.starting and not isinstance(error, ImportError) and isinstance(error, _start_errors()):
                 _explain(name, str(error))
             else:
                 # Here and not by the interpreter, which may not come to it: see _finish.
@@ -203,14 +203,13 @@ def _explain(name: str, reason: str) -> None:
 
 
 def _finish(nodes: Sequence[Stoppable], code: int) -> None:
-    import rclpy
-
     with ThreadPoolExecutor(max(len(nodes), 1)) as pool:  # each may wait for a transition
         closed = list(pool.map(lambda node: node.close(), nodes))
     if all(closed):
         for node in nodes:
             node.destroy_node()
-    rclpy.try_shutdown()
+    if rclpy := sys.modules.get("rclpy"):  # it may have been the one that could not be imported
+        rclpy.try_shutdown()
     if code or not all(closed):
         # A node that could not be made is half there, and the interpreter would destroy it after its context.  A
         # thread that still compiles or loads cannot be interrupted, and to unload libraries under it would crash.

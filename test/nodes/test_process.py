@@ -78,6 +78,17 @@ def test_without_rclpy_a_node_says_what_is_missing():
         assert "needs ROS 2 in Python: pip install 'sq_perception[ros]'" in done.stderr
 
 
+def test_an_rclpy_that_cannot_be_imported_leaves_one_traceback(tmp_path):
+    """As one of another Python, whose compiled part is not found."""
+    (tmp_path / "rclpy").mkdir()
+    (tmp_path / "rclpy" / "__init__.py").write_text("raise ImportError('no compiled part')")
+    code = f"import sys; sys.path[:0] = [{str(tmp_path)!r}]; from sq_perception.nodes import executables; "
+    command = [sys.executable, "-c", f"{code} sys.exit(executables.recover_node([]))"]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr.count("Traceback")) == (1, 1), done.stderr
+    assert done.stderr.endswith("ImportError: no compiled part\n")
+
+
 HEAPS = """
 import ctypes, threading
 from sq_perception.nodes import process
