@@ -175,6 +175,9 @@ class Input:
         frame = decode(message, None if source is None else lambda: self._calibration_of(message, source))
         if not frame.has_free_space:
             self._node.get_logger().warning(f"{self.topic}: {UNORGANISED}", throttle_duration_sec=THROTTLE)
+            if use == "always":
+                raise ValueError("mask: expected an image or an organised cloud (use_masks is always), got another one")
+            return frame  # whose pixels are those of no mask
         if use == "always" and arrival.mask is None:
             expected = "expected one with the stamp of the image (use_masks is always)"
             raise ValueError(f"mask: {expected}, none came on {self._mask_topic}")

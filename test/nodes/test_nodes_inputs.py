@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
 pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
 from frame_node_bench import CAMERA
+from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2, PointField
 from std_msgs.msg import Header
 
+from sq_msgs_py.depth_image import labels_to_message
 from sq_perception.imaging import compressed_depth
 
 
@@ -111,3 +115,27 @@ def test_an_organised_cloud_is_its_depth_image_and_any_other_one_tells_less(make
         clouds.publish(hostile)
         bench.until(lambda number=number: bench.counts.refused == number)
     answered(cloud(points, bench.header()))
+
+
+def test_a_cloud_that_is_no_image_has_pixels_of_no_mask(make_bench):
+    bench = make_bench("-p", "image_transport:=points", "-p", "patience:=10.0")
+    clouds = bench.peer.create_publisher(PointCloud2, "depth/points", 5)
+    masks = bench.peer.create_publisher(Image, "mask/image", 5)
+    bench.until(lambda: clouds.get_subscription_count() == 1 and masks.get_subscription_count() == 1)
+    bench.until(lambda: bench.node.count_publishers("/mask/image"))
+    points = np.random.default_rng(7).uniform([-0.2, -0.2, 0.5], [0.2, 0.2, 0.6], (3000, 3)).astype(np.float32)
+    row = cloud(points[None], bench.header())
+
+    def decided(use: str) -> SimpleNamespace:
+        assert bench.node.set_parameters([Parameter("use_masks", value=use)])[0].successful
+        row.header = bench.header()
+        masks.publish(labels_to_message(np.ones((48, 64), np.int32), row.header))
+        before = bench.counts
+        clouds.publish(row)
+        bench.until(lambda: bench.counts.received > before.received and bench.counts.in_work == 0)
+        return bench.counts
+
+    counts = decided("auto")
+    assert (counts.answered, counts.refused) == (1, 0), counts.last_error
+    assert bench.recoverer.asked[-1][2] is None
+    assert "mask: expected an image or an organised cloud" in decided("always").last_error
