@@ -22,7 +22,7 @@ from sq_perception.grasping.plan import GraspPlan
 from sq_perception.grasping.surroundings import Surroundings
 from sq_perception.learning.checkpoint import CheckpointError
 from sq_perception.recordings.bag_file import InputOptions
-from sq_perception.recordings.frame_file import FrameError, RecordedFrame
+from sq_perception.recordings.frame_file import FrameError, RecordedFrame, Stamp
 from sq_perception.recordings.inputs import RecordedInput
 from sq_perception.recovery.options import RecoveryOptions
 from sq_perception.recovery.recoverer import Recoverer, Recovery
@@ -63,7 +63,8 @@ def run(options: argparse.Namespace) -> int:
                     except (ValueError, ArithmeticError) as error:  # such as a camera of no image
                         code = failed(f"{file}: {frame.name}: {error}")
                     else:
-                        entries.append({"file": file, "bodies": bodies})
+                        stamp = None if frame.stamp is None else frame.stamp._asdict()
+                        entries.append({"file": file, "stamp": stamp, "bodies": bodies})
             is_whole = True
         except KeyboardInterrupt:
             complain("interrupted; what is done so far is kept")
@@ -149,7 +150,7 @@ def _write_mesh(path: Path, found: Sequence[Recovery], plan: GraspPlan, hand: Gr
 
 def _print_table(entries: Sequence[dict[str, Any]]) -> None:
     for entry in entries:
-        print(entry["file"])
+        print(f"{entry['file']}  {Stamp(**entry['stamp']) if entry['stamp'] else ''}".rstrip())
         for body in entry["bodies"]:
             text = body["reason"]
             if body["grasps"]:

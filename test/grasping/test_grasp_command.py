@@ -116,6 +116,19 @@ def test_frames_of_one_name_have_a_picture_each_and_their_warnings_are_told(fram
     assert "for millimetres the depth scale is 1000" in capsys.readouterr().err
 
 
+def test_the_frames_of_a_bag_are_told_apart_by_their_stamps(frame, tmp_path, capsys, monkeypatch):
+    pytest.importorskip("mcap", reason="needs the extra 'bags'")
+    bag, out = tmp_path / "bag.mcap", tmp_path / "out.json"
+    assert main.main(["recover", str(frame), str(frame), "--method", "classic", "--mcap", str(bag)]) == 0
+    monkeypatch.setattr(grasp_run, "_bodies", lambda *_: [])
+    capsys.readouterr()
+    assert main.main(["grasp", str(bag), str(frame), "--json", str(out)]) == 0
+    first, second, file = json.loads(out.read_text())["frames"]
+    assert second["stamp"]["nanosec"] - first["stamp"]["nanosec"] == 100_000_000
+    assert file["stamp"] is None
+    assert len(set(capsys.readouterr().out.splitlines())) == 3
+
+
 @pytest.mark.parametrize("wrong", [["--gripper", "claw"], ["--friction", "0"], ["--json", "nowhere/out.json"]])
 def test_wrong_usage_is_told(frame, wrong, capsys):
     assert main.main(["grasp", str(frame), *wrong]) == 2
