@@ -106,7 +106,6 @@ class RecoverRun:
             self._executor = Recoverer(options.model, method=options.method)
         self._tracks = RecordedTracks(lambda text: complain(f"warning: {text}")) if options.track else None
         self._unreadable = 0
-        self._warm: set[Any] = set()
         self._warnings: set[str] = set()
 
     def over_all_frames(self) -> int:
@@ -153,14 +152,14 @@ class RecoverRun:
             yield from workers.recovered(works, executor)
             return
         previous: FrameRecovery | None = None
-        sequence = ("", "")
+        sequence, is_warm = ("", ""), False
         for pair in pairs:
             answer: Any = None
             if isinstance(frame := pair[1], RecordedFrame):
                 try:
-                    if frame.camera not in self._warm:
+                    if not is_warm:  # once, and not for each camera: it costs three frames, and each cloud has its own
                         executor.warm_up(frame.camera)
-                        self._warm.add(frame.camera)
+                        is_warm = True
                     if sequence != (of_frame := sequence_of(pair[0], frame)):
                         sequence, previous = of_frame, None
                     work = self._work(frame)

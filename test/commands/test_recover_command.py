@@ -22,6 +22,7 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.recordings.bag_file import InputOptions
 from sq_perception.recordings.frame_file import FrameError
 from sq_perception.recordings.inputs import RecordedInput, in_folder
+from sq_perception.recovery.recoverer import Recoverer
 
 CAMERA = Camera(160, 120, 200.0, 200.0, 79.5, 59.5)
 BODIES = Superquadric(
@@ -351,6 +352,17 @@ def test_a_still_scene_is_recovered_anew_in_each_folder(tmp_path):
     for other, is_same in ((first, False), (alone, True)):
         sizes = ([one["size"] for one in frame["superquadrics"]] for frame in (second, other))
         assert np.allclose(*sizes, rtol=1e-9) == is_same
+
+
+def test_a_run_warms_up_once_however_many_cameras_it_has(tmp_path, monkeypatch):
+    """Each cloud has a camera of its own."""
+    warmed = []
+    monkeypatch.setattr(Recoverer, "warm_up", lambda _, camera: warmed.append(camera))
+    for k, focal in enumerate((200.0, 210.0, 220.0)):
+        save_png(tmp_path / f"{k}.png")
+        camera_yaml(tmp_path / f"{k}.yaml", focal)
+    recover(tmp_path, *(str(tmp_path / f"{k}.png") for k in range(3)))
+    assert len(warmed) == 1
 
 
 @pytest.mark.parametrize("score", ["nan", "-inf", "90", "all"])
