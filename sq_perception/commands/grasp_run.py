@@ -30,6 +30,8 @@ from sq_perception.recovery.recoverer import Recoverer, Recovery
 FORMAT, VERSION = "sq_perception.grasps", 1
 _SHARP = 0.02
 """Exponents of a gripper's boxes in a mesh."""
+_LONGEST = 10.0
+"""Most that a side of a picture is longer than the other."""
 
 
 def run(options: argparse.Namespace) -> int:
@@ -125,7 +127,9 @@ def _bodies(
 def _draw(path: Path, frame: RecordedFrame, found: Sequence[Recovery], plan: GraspPlan, hand: Gripper) -> None:
     from sq_perception.evaluation import plots
 
-    figure = plots.new_figure(9.6, 9.6 * frame.camera.height / frame.camera.width)
+    # Of an image of few columns the picture would have more pixels than fit into memory, of one of few rows none.
+    form = min(max(frame.camera.height / frame.camera.width, 1 / _LONGEST), _LONGEST)
+    figure = plots.new_figure(9.6, 9.6 * form)
     ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     plots.draw_grasps(ax, frame.depth, frame.camera, [recovered.superquadric for recovered in found], plan, hand)
     with output_file.writing(path) as partial:

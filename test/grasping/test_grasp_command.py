@@ -52,6 +52,16 @@ def test_a_can_is_grasped_across_and_everything_is_written(frame, tmp_path, caps
     assert "mm open" in capsys.readouterr().out
 
 
+@pytest.mark.parametrize(("height", "width"), [(2, 2000), (400, 2)])
+def test_pictures_of_strips_can_be_looked_at(height, width, tmp_path):
+    path, out = tmp_path / "strip.npz", tmp_path / "out.json"
+    np.savez(path, depth=np.full((height, width), 0.5, np.float32), K=np.array([[50, 0, 1], [0, 50, 1], [0, 0, 1.0]]))
+    assert main.main(["grasp", str(path), "--json", str(out), "--pictures", str(tmp_path)]) == 0
+    rows, columns, _ = cv2.imread(str(tmp_path / "strip.png")).shape
+    assert max(rows / columns, columns / rows) == pytest.approx(10, rel=0.01)
+    assert len(json.loads(out.read_text())["frames"]) == 1
+
+
 def test_no_input_is_replaced(frame, tmp_path, capsys):
     """A depth image in the folder of the pictures, or named for the JSON."""
     depth = np.load(frame)["depth"]
