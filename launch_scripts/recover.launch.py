@@ -73,7 +73,8 @@ def _nodes(context: LaunchContext) -> list[Node]:
             output="screen",
             respawn=given["respawn"].lower() in _YES,
             respawn_delay=_RESPAWN_DELAY,
-            parameters=parameters,
+            # A file for recover_node has a method for all nodes.
+            parameters=parameters + [{"method": "classic"}] * (executable == "fitter_node"),
             arguments=[
                 *(cameras * (executable == "recover_cameras")),
                 *(["--ros-args", "--log-level", given["log_level"]] if given["log_level"] else []),

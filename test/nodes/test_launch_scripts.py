@@ -84,6 +84,7 @@ def test_recover_is_wired_to_the_camera(repository: Path, launch: dict[str, type
     both = nodes_of(path, launch, fitter="true", params_file="mine.yaml")
     assert [node.named["executable"] for node in both] == ["recover_node", "fitter_node"]
     assert both[0].named["parameters"] == ["mine.yaml"], "an argument that is not given overrides nothing"
+    assert both[1].named["parameters"] == ["mine.yaml", {"method": "classic"}], "recover_node.yaml has another method"
     assert both[0].named["respawn"]
     (managed,) = nodes_of(path, launch, namespace="wrist", autostart="false", respawn="false")
     assert (managed.named["namespace"], managed.named["respawn"]) == ("wrist", False)
