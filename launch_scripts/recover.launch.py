@@ -98,6 +98,7 @@ def _rviz(given: dict[str, str], namespace: str) -> Node:
         package="rviz2",
         executable="rviz2",
         arguments=["-d", share, "-f", given["rviz_frame"]],
+        parameters=[{"use_sim_time": given["use_sim_time"].lower() in _YES}],
         remappings=[
             ("/depth/image", _within(namespace, given["depth"])),
             ("/depth/camera_info", _within(namespace, given["camera_info"])),

@@ -136,6 +136,15 @@ def test_rviz_looks_at_the_topics_of_the_camera(repository: Path, launch: dict[s
     assert [node.named["executable"] for node in nodes] == ["recover_node", "rviz2"]
     assert dict(rviz.named["remappings"]) == {"/depth/image": "/zed/depth", "/depth/camera_info": "/zed/info"}
     assert rviz.named["arguments"][-1] == "zed_optical"
+    assert rviz.named["parameters"] == [{"use_sim_time": False}]
+
+
+def test_rviz_has_the_time_of_the_nodes(repository: Path, launch: dict[str, type]) -> None:
+    """By another one it takes every tf2 frame for one that has not been sent for long."""
+    path = repository / "launch_scripts" / "recover.launch.py"
+    assert rviz_of(nodes_of(path, launch, rviz="true", use_sim_time="true")).named["parameters"] == [
+        {"use_sim_time": True}
+    ]
 
 
 def test_of_several_cameras_rviz_and_the_classic_method_see_the_first(
