@@ -57,7 +57,7 @@ def show(options: argparse.Namespace) -> int:
     """What ``sq-perception demo`` does with these options; the exit code."""
     try:
         camera = _camera(options.frame, options.camera_info, options.projection)
-    except (FrameError, OSError) as error:
+    except FrameError as error:
         print(error, file=sys.stderr)
         return 2
     try:

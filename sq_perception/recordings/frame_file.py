@@ -232,11 +232,11 @@ def read(
     reading = reading or Reading()
     try:
         frame = _read(path, camera_info, projection, distortion, reading)
+        return reading.of(replace(frame, stamp=stamp_of(path)))
     except FrameError:
         raise
-    except ValueError as error:
+    except (ValueError, OSError, MemoryError) as error:
         raise FrameError(f"{path}: {error}") from error
-    return reading.of(replace(frame, stamp=stamp_of(path)))
 
 
 def _read(

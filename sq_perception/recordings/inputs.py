@@ -120,8 +120,6 @@ class RecordedInput:
             return frame_file.read(path, camera_info, options.projection, options.distortion, options.reading)
         except FrameError as error:
             return error
-        except (OSError, MemoryError) as error:
-            return FrameError(f"{path}: {error}")
 
     def _bag(self, path: Path) -> Iterator[tuple[str, RecordedFrame | FrameError]]:
         try:

@@ -12,6 +12,7 @@ from sq_perception.imaging import raycast, unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.distortion import Distortion
 from sq_perception.imaging.rectification import Rectification
+from sq_perception.recordings import frame_file
 from sq_perception.recordings.camera_file import FrameError, Region, read_calibration, read_camera_info
 from sq_perception.recordings.frame_file import read
 
@@ -37,6 +38,18 @@ def camera_info(path, **changes):
 @pytest.fixture
 def info(tmp_path):
     return camera_info(tmp_path / "camera.yaml")
+
+
+def test_an_image_that_may_not_be_read_is_a_frame_error(tmp_path, info, monkeypatch):
+    """Which a replay leaves out, and goes on with the next one."""
+
+    def refused(path):
+        raise PermissionError(13, "Permission denied", str(path))
+
+    cv2.imwrite(str(tmp_path / "a.png"), np.ones((48, 64), np.uint16))
+    monkeypatch.setattr(frame_file, "grey_image", refused)
+    with pytest.raises(FrameError, match=r"a\.png: .*Permission denied"):
+        read(tmp_path / "a.png", info)
 
 
 def save_npz(path, **fields):
