@@ -171,7 +171,7 @@ def test_one_view_a_step_is_refused_where_nothing_is_left_to_normalise(tmp_path:
 
 class TestInterruptions:
     def test_terminated_run_goes_on_where_it_stopped(self, tmp_path: Path) -> None:
-        command = endless(tmp_path, validation=50)
+        command = endless(tmp_path, validation=15)
         process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
         assert process.stdout is not None
         first = json.loads(process.stdout.readline())
@@ -180,7 +180,7 @@ class TestInterruptions:
         assert process.returncode == 130
         assert "the same command goes on" in complaint
         state = load_file(str(tmp_path / "state.safetensors"))
-        assert int(state["step"]) >= first["step"] == 50
+        assert int(state["step"]) >= first["step"] == 15
         done = int(state["step"])
         finish = [*command[:-1], str(done + 3)]
         subprocess.run(finish, check=True, capture_output=True, timeout=600)
