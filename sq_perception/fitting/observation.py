@@ -102,8 +102,8 @@ class Crop:
         top, left = max(y - margin, 0), max(x - margin, 0)
         bottom, right = min(y + height + margin, camera.height), min(x + width + margin, camera.width)
         crop = np.ascontiguousarray(depth[top:bottom, left:right], dtype=np.float32)
-        if camera.is_pinhole:
-            crop = np.where(crop > 0, crop, np.float32(np.nan))
+        measured = np.isfinite(crop) & (crop > 0) if camera.is_pinhole else np.isfinite(crop)
+        crop = np.where(measured, crop, np.float32(np.nan))
         inside = np.ascontiguousarray(mask[top:bottom, left:right])
         distance = _mean_depth(crop, inside)
         if not math.isfinite(distance):

@@ -64,3 +64,17 @@ def test_a_thing_of_which_most_is_as_low_as_its_support_keeps_its_pixels(rng: np
     assert crop is not None
     above = TABLE - [0.0, 0.0, 0.0, 2 * HALF]  # a plane through its top
     assert len(crop.observed(0.0025, None, above).pixels) == len(crop.observed(0.0025, None).pixels)
+
+
+@pytest.mark.parametrize("nothing", [np.inf, -np.inf, 0.0, -1.0])
+def test_readings_that_are_none_say_the_same_whatever_their_number(nothing: float, rng: np.random.Generator) -> None:
+    depth, mask = np.full((40, 40), 0.8), np.zeros((40, 40), bool)
+    mask[10:30, 10:30] = True
+    depth[mask] = 0.6 + 0.001 * rng.standard_normal(np.count_nonzero(mask))
+    lost = rng.random(depth.shape) < 0.15
+    camera = CAMERA.cropped(300, 220, 40, 40)
+    usual, other = (Crop.around(np.where(lost, number, depth), mask, camera, None) for number in (np.nan, nothing))
+    assert usual is not None
+    assert other is not None
+    assert usual.noise == other.noise
+    np.testing.assert_array_equal(usual.depth, other.depth)
