@@ -127,7 +127,7 @@ class Crop:
             beside = cv2.subtract(near, claimed)
             measured = cv2.bitwise_and(beside, np.isfinite(self.depth).view(np.uint8))
             nan_is_empty = cv2.countNonZero(measured) / max(cv2.countNonZero(beside), 1) < _BACKGROUND_SHARE
-        lost = _convex_hull(claimed) if nan_is_empty else np.ones_like(claimed)
+        lost = regions.convex_hull(claimed) if nan_is_empty else np.ones_like(claimed)
         pixels, areas, free, free_pixels = _sort(self.depth, inside, claimed, near, lost, self.footprint)
         shown = drawn(pixels, areas, _POINTS, 0.5)
         v, u = np.divmod(shown, self.camera.width)
@@ -226,7 +226,7 @@ class Observation(Crop):
 
     def of_hull(self) -> Observation:
         """The same observation of the object's convex hull: free pixels within the hull of the mask are left out."""
-        hull = _convex_hull(np.ascontiguousarray(self.mask).view(np.uint8))
+        hull = regions.convex_hull(np.ascontiguousarray(self.mask).view(np.uint8))
         kept = self.free[hull.ravel()[self.free] == 0]
         count = round(self.free_pixels * len(kept) / max(len(self.free), 1))
         return replace(self, free=kept, free_pixels=count)
@@ -253,14 +253,6 @@ def span(points: np.ndarray, directions: np.ndarray) -> np.ndarray:
     along = np.partition(directions @ points.T, (*before, *after), axis=1)
     lower, upper = along[:, before], along[:, after]
     return np.asarray(lower + (upper - lower) * (place - before))
-
-
-def _convex_hull(mask: np.ndarray) -> np.ndarray:
-    """The convex hull of a mask (h, w) of 0 and more, as one of 0 and 1."""
-    outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    hull = np.zeros_like(mask)
-    cv2.fillConvexPoly(hull, cv2.convexHull(np.concatenate(outlines)), 1)
-    return hull
 
 
 @kernel

@@ -169,7 +169,8 @@ def from_mask(
     extent = MARGIN * max(*(high - low + pixel), nearest - farthest)
     anchor = np.array([*(0.5 * (low + high)), nearest])
 
-    filled = _filled(image) if camera.is_pinhole or find_hidden else image
+    # Each NaN replaced by the nearest number.
+    filled = image.ravel()[regions.nearest(~np.isnan(image))] if camera.is_pinhole or find_hidden else image
     covered = np.zeros(mask.shape, dtype=bool)
     if find_hidden:
         lost = np.ones_like(mask) if missing_is_hidden else _within_hull(mask & np.isfinite(depth))
@@ -240,11 +241,8 @@ def _box(depth: np.ndarray, mask: np.ndarray) -> tuple[int, int, int, int]:
 
 def _within_hull(mask: np.ndarray) -> np.ndarray:
     """The pixels (height, width) within the convex hull of a mask."""
-    hull = np.zeros(mask.shape, dtype=np.uint8)
-    outline, _ = cv2.findContours(mask.view(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-    cv2.fillConvexPoly(hull, cv2.convexHull(np.concatenate(outline)), 1)
     # The hull's own border passes outside of a convex set of pixels.
-    return cv2.erode(hull, np.ones((3, 3), np.uint8)).view(bool)
+    return cv2.erode(regions.convex_hull(mask.view(np.uint8)), np.ones((3, 3), np.uint8)).view(bool)
 
 
 @kernel
@@ -354,16 +352,6 @@ def _resampled(
             if right > left and not (left <= u < right and top <= v < bottom):
                 hidden[i, j] = True
     return value, hidden
-
-
-def _filled(image: np.ndarray) -> np.ndarray:
-    """The image with each NaN replaced by the nearest number."""
-    empty = np.isnan(image).astype(np.uint8)
-    _, nearest = cv2.distanceTransformWithLabels(empty, cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
-    known = image[empty == 0]
-    by_label = np.zeros(int(nearest.max()) + 1, dtype=np.float32)
-    by_label[nearest[empty == 0]] = known
-    return by_label[nearest]
 
 
 def _rotation_to_z(direction: np.ndarray) -> np.ndarray:

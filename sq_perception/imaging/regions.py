@@ -2,9 +2,27 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 
 from sq_perception.geometry.kernels import kernel
+
+
+def nearest(wanted: np.ndarray) -> np.ndarray:
+    """Of each pixel (height, width) the nearest one of some, bool, at least one: its index into the flat image."""
+    away = (~wanted).view(np.uint8)
+    _, number = cv2.distanceTransformWithLabels(away, cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
+    index = np.zeros(int(number.max()) + 1, np.int64)
+    index[number[wanted]] = np.flatnonzero(wanted)
+    return np.asarray(index[number])
+
+
+def convex_hull(mask: np.ndarray) -> np.ndarray:
+    """The convex hull of a mask (height, width) of 0 and more, uint8, as one of 0 and 1."""
+    outlines, _ = cv2.findContours(mask, cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    hull = np.zeros_like(mask)
+    cv2.fillConvexPoly(hull, cv2.convexHull(np.concatenate(outlines)), 1)
+    return hull
 
 
 def extents(labels: np.ndarray) -> np.ndarray:

@@ -27,6 +27,7 @@ import numpy as np
 
 from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.quantiles import quantile
+from sq_perception.imaging import regions
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation.surface_patches import Patches
 
@@ -81,7 +82,9 @@ def _borders(patches: Patches) -> tuple[np.ndarray, ...]:
     Samples without a depth count to the nearest one that has some, as a body throws a shadow beside itself in which a
     triangulating camera measures nothing.
     """
-    labels, depth, gap = _bridged(patches)
+    gap = patches.depth == 0
+    nearest = regions.nearest(~gap)
+    labels, depth = patches.labels.ravel()[nearest], patches.depth.ravel()[nearest]
     known = np.nan_to_num(patches.fold)
     square = np.ones((5, 5), np.uint8)
     concave, convex = cv2.dilate(known, square), -cv2.erode(known, square)
@@ -119,32 +122,6 @@ def _border_sums(
                 if apart < _ATTACHED:
                     joint[a, b] += 1
     return scores, dents, over, joint
-
-
-def _bridged(patches: Patches) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Labels and depth with holes filled by the nearest measured sample, and where the holes are."""
-    gap = patches.depth == 0
-    labels, depth = patches.labels.copy(), patches.depth.copy()
-    if gap.any() and not gap.all():
-        _, nearest = cv2.distanceTransformWithLabels(gap.view(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL)
-        _fill(labels, depth, gap, nearest)
-    return labels, depth, gap
-
-
-@kernel
-def _fill(labels: np.ndarray, depth: np.ndarray, gap: np.ndarray, nearest: np.ndarray) -> None:
-    """Give holes the label and the depth of the measured sample that has the same number as the nearest one."""
-    rows, columns = labels.shape
-    source = np.zeros((nearest.max() + 1, 2), np.int64)
-    for v in range(rows):
-        for u in range(columns):
-            if not gap[v, u]:
-                source[nearest[v, u]] = v, u
-    for v in range(rows):
-        for u in range(columns):
-            if gap[v, u]:
-                from_v, from_u = source[nearest[v, u]]
-                labels[v, u], depth[v, u] = labels[from_v, from_u], depth[from_v, from_u]
 
 
 def _continued(patches: Patches, body: np.ndarray, camera: Camera) -> np.ndarray:

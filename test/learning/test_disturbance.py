@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from sq_perception.geometry import Superquadric
-from sq_perception.imaging import canonical_view, raycast
+from sq_perception.imaging import canonical_view, raycast, regions
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.canonical_view import HIDDEN
 from sq_perception.learning.dataset import ViewSource, draw_views, wide_bodies
@@ -164,7 +164,7 @@ def test_wide_bodies_have_the_proportions_they_say() -> None:
 def view_points(view: canonical_view.CanonicalView) -> np.ndarray:
     """The points (n, n, 3) of the optical frame behind the view's pixels, at the height of its nearest known one."""
     n = view.image.shape[0]
-    filled = canonical_view._filled(np.where(view.image > 0, view.image, np.nan).astype(np.float32))
+    filled = view.image.ravel()[regions.nearest(view.image > 0)]
     x, y = np.meshgrid((np.arange(n) + 0.5) / n, 1 - (np.arange(n) + 0.5) / n)
     points = np.stack([x, y, filled], axis=-1)
     dots = Superquadric(
