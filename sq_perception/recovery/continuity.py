@@ -44,7 +44,7 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.regions import extents
 from sq_perception.recovery.options import RecoveryOptions
 from sq_perception.recovery.recovery import FrameRecovery, Recovery
-from sq_perception.recovery.reference import BAND, Reference, sampled
+from sq_perception.recovery.reference import BAND, Reference, around, sampled
 from sq_perception.recovery.seen_object import SeenObject
 
 _CLIP, _FAR = 3.0, 6.0
@@ -137,11 +137,13 @@ def repeated(
         if body.label >= len(windows):
             continue
         _, top, bottom, left, right = windows[body.label].tolist()
-        window = slice(top, bottom), slice(left, right)
-        had = (shown[window] == body.label) & (old[window] > 0)
+        window = slice(max(top - BAND, 0), bottom + BAND), slice(max(left - BAND, 0), right + BAND)
+        own = shown[window] == body.label
+        had = own & (old[window] > 0)
         if np.count_nonzero(had & (new[window] > 0)) <= _MOST * np.count_nonzero(had):
             continue
-        sums, square = _moments(change, old, new, smooth, shown, body.label, (top, bottom, left, right), level)
+        seen = (np.ascontiguousarray(image[window]) for image in (change, old, new, smooth))
+        sums, square = _moments(around(own), level, *seen)
         square = share * square + 1e-6 * share * np.trace(square) * np.eye(len(square))
         if square.any() and sums @ np.linalg.solve(square, sums) < _CHANGED:
             repeating += 1
@@ -232,29 +234,21 @@ def _goes_on(old: np.ndarray, reading: float, v: int, u: int, level: float) -> b
 
 @kernel
 def _moments(
-    change: np.ndarray,
-    old: np.ndarray,
-    new: np.ndarray,
-    smooth: np.ndarray,
-    labels: np.ndarray,
-    label: int,
-    extent: tuple[int, int, int, int],
-    level: float,
+    near: np.ndarray, level: float, change: np.ndarray, old: np.ndarray, new: np.ndarray, smooth: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """V q (8,) and V V^T (8, 8) of the pixels of one object and around it; zeros where none has both readings."""
-    top, bottom = max(extent[0] - BAND, 0), min(extent[1] + BAND, labels.shape[0])
-    left, right = max(extent[2] - BAND, 0), min(extent[3] + BAND, labels.shape[1])
+    """V q (8,) and V V^T (8, 8) of the pixels in or near one object; zeros where none has both readings."""
+    rows, columns = near.shape
     sums, square, w = np.zeros(8), np.zeros((8, 8)), np.ones(8)
-    for v in range(top, bottom):
-        for u in range(left, right):
-            if not (old[v, u] > 0 and new[v, u] > 0 and _is_around(labels, label, v, u)):
+    for v in range(rows):
+        for u in range(columns):
+            if not (old[v, u] > 0 and new[v, u] > 0 and near[v, u]):
                 continue
             z = np.float64(min(old[v, u], new[v, u]))
             scale = level * max(z, 1e-6) ** 2
-            x, y = 2.0 * (u - left) / max(right - left - 1, 1) - 1.0, 2.0 * (v - top) / max(bottom - top - 1, 1) - 1.0
-            before, after = max(u - 1, left), min(u + 1, right - 1)
+            x, y = 2.0 * u / max(columns - 1, 1) - 1.0, 2.0 * v / max(rows - 1, 1) - 1.0
+            before, after = max(u - 1, 0), min(u + 1, columns - 1)
             across = (np.float64(smooth[v, after]) - smooth[v, before]) / max(after - before, 1)
-            before, after = max(v - 1, top), min(v + 1, bottom - 1)
+            before, after = max(v - 1, 0), min(v + 1, rows - 1)
             down = (np.float64(smooth[after, u]) - smooth[before, u]) / max(after - before, 1)
             w[1], w[2], w[3], w[4], w[5] = x, y, x * x, x * y, y * y
             w[6], w[7] = min(max(across / scale, -1.0), 1.0), min(max(down / scale, -1.0), 1.0)
@@ -265,15 +259,3 @@ def _moments(
     for i in range(8):
         square[i, i:] = square[i:, i]
     return sums, square
-
-
-@inline_kernel
-def _is_around(labels: np.ndarray, label: int, v: int, u: int) -> bool:
-    """Whether a pixel belongs to an object, or one near by does."""
-    if labels[v, u] == label:
-        return True
-    for i in range(max(v - BAND, 0), min(v + BAND + 1, labels.shape[0])):
-        for j in range(max(u - BAND, 0), min(u + BAND + 1, labels.shape[1])):
-            if labels[i, j] == label:
-                return True
-    return False

@@ -214,7 +214,7 @@ class Recoverer:
                 segmented, age = self._segmented(measured, camera, labels, options, network), 0
             found, strays = segmented.found, segmented.strays
             depth = _in_range(measured, found.labels, options.depth_range)
-            objects = seen_object.objects(depth, found, camera, options.depth_range)
+            objects = seen_object.objects(depth, found, camera)
             same = {} if previous is None else continuity.matched(kept, previous.labels, objects)
 
         with timed(milliseconds, "network"):

@@ -102,16 +102,10 @@ class SeenObject:
         return replace(self, mask=mask, mask_crop=kept)
 
 
-def objects(
-    depth: np.ndarray, found: segments.Segmentation, camera: Camera, depth_range: tuple[float, float]
-) -> list[SeenObject]:
-    """The objects of a segmentation, in its order, as far as they were measured within the range of depth; those that
-    were not at all are left out."""
-    measured = np.isfinite(depth)
-    near, far = depth_range
-    if near > 0 or np.isfinite(far):
-        measured &= (depth >= near) & (depth <= far)
-    seen = []
+def objects(depth: np.ndarray, found: segments.Segmentation, camera: Camera) -> list[SeenObject]:
+    """The objects of a segmentation, in its order, as far as they were measured; those that were not at all are left
+    out."""
+    measured, seen = np.isfinite(depth), []
     for label in found.ids:
         mask = (found.labels == label) & measured
         left, top, width, height = regions.box(mask)

@@ -252,7 +252,7 @@ def test_what_goes_on_all_around_a_mask_that_is_too_small_is_the_object(symmetry
     found = symmetry.recover(depth.astype(np.float32), CAMERA, small)
     assert iou(found.bodies[0].superquadric, scene.bodies[0]) > 0.95
     given = Segmentation(small, scene.plane, (1,))
-    (obj,) = seen_object.objects(depth, given, CAMERA, (0.0, np.inf))
+    (obj,) = seen_object.objects(depth, given, CAMERA)
     whole = seen_object.completed(replace(obj, plane=scene.plane), depth, CAMERA, small)
     assert not (whole.mask & (labels == 0)).any()
     assert (whole.mask & ~obj.mask).any() == (pixels > 0)
