@@ -198,7 +198,7 @@ class Recoverer:
         with timed(milliseconds, "segmentation"):
             measured = _measured(camera.readings(depth), camera)
             if labels is not None:
-                labels = np.asarray(labels)
+                labels = np.asarray(labels, order="C")
                 camera.check_image(labels)
             measured, labels = perforation.filled(measured, labels)
             kept = continuity.NOTHING
@@ -327,10 +327,10 @@ def render_recovery(frame: FrameRecovery, camera: Camera) -> tuple[np.ndarray, n
 
 
 def _measured(depth: np.ndarray, camera: Camera) -> np.ndarray:
-    """float32, NaN for all that is no measurement."""
+    """float32, NaN for all that is no measurement; row by row, as kernels are compiled for arrays of a kind."""
     farthest = min(_FARTHEST, float(np.finfo(depth.dtype).max))  # which half precision does not reach
     within = (depth >= (_NEAREST if camera.is_pinhole else 0)) & (depth <= farthest)
-    return np.where(within, depth, np.nan).astype(np.float32, copy=False)
+    return np.ascontiguousarray(np.where(within, depth, np.nan), dtype=np.float32)
 
 
 def _in_range(depth: np.ndarray, labels: np.ndarray, depth_range: tuple[float, float]) -> np.ndarray:

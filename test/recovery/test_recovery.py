@@ -229,6 +229,17 @@ def test_no_depth_value_raises(method, projection, weights):
                     assert 0 <= body.score <= 1
 
 
+def test_images_whose_columns_lie_in_a_row_are_put_in_order_before_kernels_see_them(symmetry):
+    """Kernels are compiled for arrays of a kind; for another one the first frame would wait for a compiler."""
+    scene = table_scene(np.random.default_rng(3), 1, CAMERA)
+    depth, labels = scene.render()
+    usual, turned = symmetry.recover(depth, CAMERA), symmetry.recover(np.asfortranarray(depth), CAMERA)
+    assert turned.reference.depth.flags.c_contiguous
+    np.testing.assert_array_equal(usual.labels, turned.labels)
+    given = symmetry.recover(depth, CAMERA, np.asfortranarray(labels))
+    assert given.labels.flags.c_contiguous
+
+
 def test_what_is_out_of_range_of_an_object_is_not_measured(symmetry):
     """Its near edge is cut off by the range: as if the sensor had lost it, and no free space before the rest."""
     scene = table_scene(np.random.default_rng(3), 1, CAMERA)
