@@ -32,7 +32,7 @@ Equal views are averaged with equal weights and P falls to B, not to zero; views
 
 A view beyond the kept number takes the place of the one used longest ago: P keeps its error, only that a later look
 from there counts as new.  So does, in those numbers, a look that knows some of them far better than the view's common
-error: a hand was in front, say, and is no more.
+error: a hand was in front, say, and is no more.  The three of the centre count as one, as their axes are the world's.
 
 Reference: S. F. Schmidt, Application of State-Space Methods to Navigation Problems, Adv. in Control Systems 3, 1966.
 """
@@ -46,7 +46,7 @@ import numpy as np
 
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.tracking import state
-from sq_perception.tracking.state import LENGTH, TURN
+from sq_perception.tracking.state import CENTRE, LENGTH, TURN
 
 VIEW_ANGLE = 0.25
 """Radians: views closer than this share their systematic error.  Chosen: outlines change little within 14 degrees."""
@@ -141,7 +141,7 @@ def fused(
     used[row, place] = used.max(axis=1) + 1
 
     bias, correlation = biases[row, place], correlations[row, place]
-    better = fresh[:, None] | (np.einsum("nii->ni", bias) > _BETTER * np.einsum("nii->ni", common))
+    better = fresh[:, None] | (_variances(bias) > _BETTER * _variances(common))
     same = ~better[:, :, None] & ~better[:, None, :]
     bias = np.where(same, bias, np.where(better[:, :, None] & better[:, None, :], common, 0.0))
     correlation = np.where(better[:, None, :], 0.0, correlation)
@@ -164,6 +164,13 @@ def fused(
     after = 0.5 * (after + after.swapaxes(1, 2))
     seen = Views(directions @ back, biases, correlations, used)
     return state.moved(track, step), after, kept @ lasting + gain @ shared, seen
+
+
+def _variances(covariance: np.ndarray) -> np.ndarray:
+    """Of the numbers (n, 11) of covariances (n, 11, 11), the mean for those of the centre: the same in any world."""
+    variances = np.einsum("nii->ni", covariance).copy()
+    variances[:, CENTRE] = variances[:, CENTRE].mean(axis=1, keepdims=True)
+    return variances
 
 
 def root(covariance: np.ndarray) -> np.ndarray:

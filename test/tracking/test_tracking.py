@@ -277,6 +277,20 @@ def test_a_motion_of_the_world_changes_nothing(rng):
             np.testing.assert_allclose(b.covariance, expected, atol=1e-9)
 
 
+def test_a_turn_of_the_world_changes_no_second_look(rng):
+    """The first look leaves one direction of the centre open, the second one does not: whatever the world's axes."""
+    turn, here, there = quaternions.random(1, rng)[0], Tracker(), Tracker()
+    loose, sure = noise(), noise()
+    loose[7, 7] = 0.02**2
+    for k in range(6):
+        seen = [draw(body(), loose if k == 0 else sure, rng, form=0)]
+        (one,), (other,) = here.update(seen, 0.1 * k), there.update(seen, 0.1 * k, (turn, np.zeros(3)))
+        carried = one.superquadric.transformed(turn, np.zeros(3))
+        np.testing.assert_allclose(state.difference(carried.to_flat(), other.superquadric.to_flat()), 0, atol=1e-9)
+        expected = state.turned(one.covariance, quaternions.to_matrix(turn))
+        np.testing.assert_allclose(other.covariance, expected, atol=1e-12)
+
+
 def test_open_share_knows_the_image_and_what_stands_in_front():
     bodies = Superquadric.stack([body(), body(centre=(3, 0, 0.8)), body(centre=(0, 0, -0.8))])
     for measured, share in ((np.nan, 0), (0.5, 0), (2.0, 1)):
