@@ -12,11 +12,14 @@ from __future__ import annotations
 
 import hashlib
 import math
+import os
 import re
+import threading
 from collections.abc import Callable
-from functools import cache
+from functools import cache, wraps
 from pathlib import Path
-from typing import Any, TypeAlias, TypeVar
+from types import FunctionType
+from typing import Any, TypeAlias, TypeVar, cast
 
 import numpy as np
 
@@ -30,6 +33,8 @@ Triple: TypeAlias = tuple[float, float, float]
 Form: TypeAlias = tuple[float, float, float, float, float]
 """a1 a2 a3 e1 e2."""
 
+_PROCESS, _one_at_a_time = os.getpid(), threading.Lock()
+"""Of parallel kernels."""
 _ROOT = Path(__file__).resolve().parents[1]
 _IMPORT = re.compile(rf"^ *from ({_ROOT.name}[.\w]*) import (\([^)]*\)|[^\n]*)", re.MULTILINE)
 FAST = {"contract", "arcp", "reassoc", "nsz", "afn"}
@@ -42,8 +47,23 @@ def kernel(function: _F) -> _F:
 
 
 def parallel_kernel(function: _F) -> _F:
-    """The same, with ``numba.prange`` over all cores; not to be called from several threads at once."""
-    return _compiled(function, parallel=True)
+    """The same, with ``numba.prange`` over all cores; for callers in Python.
+
+    Threads of numba may serve one call at a time, and end the process that calls them after a fork: calls wait for each
+    other, and a forked process computes on one thread.
+    """
+    alone = FunctionType(function.__code__, function.__globals__)
+    alone.__qualname__ = f"{function.__qualname__}_alone"
+    single, shared = _compiled(alone), _compiled(function, parallel=True)
+
+    @wraps(function)
+    def called(*arguments: Any) -> Any:
+        if os.getpid() != _PROCESS:
+            return single(*arguments)
+        with _one_at_a_time:
+            return shared(*arguments)
+
+    return cast(_F, called)
 
 
 def inline_kernel(function: _F) -> _F:

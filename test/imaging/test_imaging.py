@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import cv2
@@ -40,6 +43,28 @@ def author_renders(shared_data: Path) -> list[tuple[np.ndarray, Superquadric]]:
         np.testing.assert_allclose(body.rotation_matrix, v[8:17].reshape(3, 3), atol=2e-5)
         renders.append((cv2.imread(str(folder / name), cv2.IMREAD_GRAYSCALE), body))
     return renders
+
+
+RENDERING = """
+import os, threading
+import numpy as np
+from sq_perception.geometry import Superquadric, metrics
+from sq_perception.imaging import raycast
+from sq_perception.imaging.camera import Camera
+body, camera = Superquadric([0.1] * 3, [0.5, 0.5], [0, 0, 0.6], [0, 0, 0, 1.0]), Camera(320, 240, 250, 250, 160, 120)
+seen = lambda: np.append(raycast.render(body, camera)[0].ravel(), metrics.volume_iou(body, body))
+first = seen()
+"""
+FORKED = """
+child = os.fork()
+if not child:
+    os._exit(not np.array_equal(seen(), first))
+raise SystemExit(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"""
+THREADED = """
+calls = [threading.Thread(target=lambda: [seen() for _ in range(20)]) for _ in range(2)]
+_ = [call.start() for call in calls], [call.join() for call in calls]
+"""
 
 
 class TestCamera:
@@ -89,6 +114,12 @@ class TestCamera:
 
 
 class TestRaycast:
+    @pytest.mark.parametrize(("code", "threads"), [(FORKED, "default"), (THREADED, "workqueue")])
+    def test_forked_processes_and_threads_render_alike(self, code: str, threads: str) -> None:
+        """GNU's OpenMP ends a forked process that calls it, numba's own threads one that calls them twice at a time."""
+        known = {**os.environ, "NUMBA_THREADING_LAYER": threads}
+        subprocess.run([sys.executable, "-c", RENDERING + code], env=known, check=True, timeout=300)
+
     def test_rendered_depth_lies_on_the_surface(self) -> None:
         bodies = tabletop_bodies(30, 1)
         depth, index = raycast.render(bodies, VGA)
