@@ -29,8 +29,8 @@ class RecoveryOptions:
     max_objects
         The largest ones are recovered.
     time_budget
-        Seconds per frame after which the surface fit tries no further start for any object, and no segment is split any
-        more.  The objects with most pixels, large or near, come first.
+        Seconds per frame after which the surface fit tries no further start for any object.  Those with most pixels,
+        large or near, come first.  Segments and predictions take the time that they take.
     max_size
         Largest full edge of an object, metres: walls, furniture and tables are larger.  Masks from outside may be, too.
     workspace
