@@ -280,9 +280,7 @@ def _read(
             f"{path.parent}: names as in the TUM RGB-D benchmark, so {TUM_SCALE:g} units are a metre; "
             f"depth scale = {MILLIMETRES:g} takes them for millimetres"
         )
-    with np.errstate(invalid="ignore", over="ignore"):
-        depth = np.where(np.isfinite(image) & (image > 0), image / np.float32(scale), np.nan).astype(np.float32)
-    depth, labels = calibration.rectified(depth), reading.labels(path.stem, image)
+    depth, labels = calibration.rectified(_metres(image, scale)), reading.labels(path.stem, image)
     labels = None if labels is None else calibration.rectified_labels(labels)
     encoding = "16UC1" if scale == MILLIMETRES and not is_metric else "32FC1"
     warning = "; ".join(warnings)
@@ -337,20 +335,31 @@ def _read_npz(path: Path, projection: Projection, scale: float | None) -> Record
     height, width = depth.shape
     is_cube = str(fields.get("projection", "")) == "orthographic"
     if projection == "orthographic" or is_cube:
-        depth = np.where(np.isfinite(depth), depth, np.nan).astype(np.float32)
         has_camera = "K" in fields and not is_cube
         warning = "orthographic was asked for, and a file has the matrix K of a pinhole camera" if has_camera else ""
-        return RecordedFrame(depth, unit_cube.camera(width, height), labels, path.name, warning=warning)
+        return RecordedFrame(_single(depth), unit_cube.camera(width, height), labels, path.name, warning=warning)
     if "K" not in fields:
         raise ValueError("expected a field 'K', the 3 x 3 camera matrix")
     try:
         camera = Camera.from_matrix(fields["K"], width, height)
     except (ValueError, TypeError) as error:
         raise ValueError(f"K: {error}") from error
-    with np.errstate(invalid="ignore"):
-        depth = np.where(np.isfinite(depth) & (depth > 0), depth / (scale or 1.0), np.nan).astype(np.float32)
     if plane is not None:
         if plane.shape != (4,) or plane.dtype.kind not in "fiu" or not np.isfinite(plane).all():
             raise ValueError(f"plane: expected four finite numbers, got {plane.dtype} {plane.shape}")
         plane = plane.astype(float)
-    return RecordedFrame(depth, camera, labels, path.name, plane=plane, encoding="32FC1")
+    return RecordedFrame(_metres(depth, scale or 1.0), camera, labels, path.name, plane=plane, encoding="32FC1")
+
+
+def _metres(values: np.ndarray, scale: float) -> np.ndarray:
+    """Depth of values in ``scale`` units a metre, as :func:`_single`; what is not before the camera is none either."""
+    with np.errstate(all="ignore"):  # of what is no number, or none that a float holds
+        depth = _single(np.divide(values, scale, dtype=float))
+    return np.where(depth > 0, depth, np.float32(np.nan))
+
+
+def _single(depth: np.ndarray) -> np.ndarray:
+    """In float32, NaN for what is no reading: some programs write the largest number that their type holds."""
+    with np.errstate(over="ignore"):
+        found = depth.astype(np.float32)
+    return np.where(np.isfinite(found), found, np.float32(np.nan))

@@ -269,6 +269,25 @@ def test_a_scale_holds_for_floats_too(tmp_path, name):
     assert not frame.warning
 
 
+@pytest.mark.parametrize("name", ["a.npy", "a.npz", "cube.npz"])
+@pytest.mark.filterwarnings("error")
+def test_a_number_that_float32_does_not_hold_is_no_reading(tmp_path, name):
+    depth = np.full((48, 64), 0.5)
+    depth[0, :3] = np.finfo(float).max, -np.finfo(float).max, np.inf
+    fields = {"K": CAMERA.matrix} if name == "a.npz" else {"projection": "orthographic"}
+    np.save(tmp_path / name, depth) if name == "a.npy" else np.savez(tmp_path / name, depth=depth, **fields)
+    found = read(tmp_path / name, NUMBERS).depth
+    assert np.isnan(found[0, :3]).all()
+    assert np.all(found[1:] == 0.5)
+
+
+def test_half_floats_are_divided_in_full_precision(tmp_path):
+    depth = np.full((48, 64), 1234.0, np.float16)
+    np.savez(tmp_path / "a.npz", depth=depth, K=CAMERA.matrix)
+    frame = read(tmp_path / "a.npz", reading=Reading(scale=1000.0))
+    assert np.all(frame.depth == np.float32(1.234))
+
+
 def test_a_colour_picture_is_named(tmp_path):
     image = np.zeros((48, 64, 3), np.uint16)
     image[..., 2] = 900
