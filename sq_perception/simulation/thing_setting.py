@@ -28,6 +28,8 @@ half as much again as those at 20 to 70."""
 _DISTANCE = (0.35, 1.3, 2.0)
 _FARTHEST = 12.0
 """Diagonals of its box, more than which no thing is away."""
+_NEAREST = 0.05
+"""Metres before the camera that no thing comes nearer than: long ones are farther away."""
 _FOCALS = (425.0, 525.0, 580.0, 615.0, 700.0, 920.0)
 """Pixels: depth cameras at VGA to HD."""
 _PIXELS_ACROSS = (30.0, 80.0)
@@ -99,9 +101,13 @@ def draw_setting(thing: Thing, rng: np.random.Generator) -> Setting:
     near, usual, far = _DISTANCE
     distance = np.exp(rng.uniform(np.log(near), np.log(usual if rng.random() < 0.85 else far)))
     distance = min(distance, _FARTHEST * float(np.linalg.norm(reach[:3] + reach[3:])))
+    middle = 0.5 * (reach[:3] - reach[3:])
+    towards = -matrix[2]
+    before = float(flat_support(parts, towards[None])[0] - towards @ middle)
+    distance = max(distance, (before + _NEAREST) * float(np.linalg.norm(ray)))
     # The table's frame has its origin below the thing, at the height of its lowest point.
     lift = np.array([0.0, 0.0, reach[5]])
-    shift = distance * ray / np.linalg.norm(ray) - matrix @ (lift + 0.5 * (reach[:3] - reach[3:]))
+    shift = distance * ray / np.linalg.norm(ray) - matrix @ (lift + middle)
     parts = moved(parts, look, shift + matrix @ lift)
     surface = None
     if thing.surface is not None:

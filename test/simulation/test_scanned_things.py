@@ -108,6 +108,15 @@ def test_half_of_the_views_show_ones_own_things(
     assert capsys.readouterr().out.count("views\n") == 1
 
 
+def test_a_long_thing_is_wholly_before_the_camera(tmp_path: Path) -> None:
+    trimesh.creation.box([0.95, 0.06, 0.05]).export(tmp_path / "bat.ply")
+    (thing,) = read_things(tmp_path)
+    for seed in range(200):
+        setting = draw_setting(thing, np.random.default_rng(seed))
+        assert setting.surface is not None
+        assert setting.surface.vertices[:, 2].min() > 0.04
+
+
 def test_support_in_a_view_is_that_of_the_corners(folder: Path) -> None:
     from sq_perception.imaging import canonical_view
 
