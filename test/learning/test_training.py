@@ -81,6 +81,7 @@ class TestConfig:
             ("steps: 2.5", "steps: expected int"),
             ("bfloat16: 1", "bfloat16: expected bool"),
             ("steps: 0", "at least 1"),
+            ("points: 1", "at least 2"),  # half of them near the body, half around it: the mean of none is no number
             ("loss: magic", "loss: expected one of"),
             ("[1, 2]", "name: value"),
             ("a: [", "not a YAML file"),
