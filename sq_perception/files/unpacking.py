@@ -72,9 +72,12 @@ def grey_image(path: Path) -> np.ndarray:
     UnpackingError
         If it cannot be read, is no grey image of 8 or 16 bit or floats, or has more than MOST_PIXELS pixels.
     """
-    if path.stat().st_size > MOST_BYTES:
-        raise UnpackingError(f"expected at most {MOST_BYTES} bytes, got {path.stat().st_size}")
-    encoded = np.fromfile(path, dtype=np.uint8)
+    try:
+        if path.stat().st_size > MOST_BYTES:
+            raise UnpackingError(f"expected at most {MOST_BYTES} bytes, got {path.stat().st_size}")
+        encoded = np.fromfile(path, dtype=np.uint8)
+    except OSError as error:
+        raise UnpackingError(f"not a readable image: {error}") from error
     width, height, has_palette = _image_header(encoded)
     if not (width >= 1 and height >= 1 and width * height <= MOST_PIXELS):
         raise UnpackingError(f"not a readable image: expected 1 to {MOST_PIXELS} pixels, got {width} x {height}")

@@ -13,6 +13,7 @@ A pixel's centre has integer coordinates, in all of them.
 from __future__ import annotations
 
 import json
+import os
 import reprlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -89,7 +90,7 @@ def read_camera_info(source: str | Path, size: tuple[int, int] | None = None) ->
     ------
     FrameError
     """
-    if size is not None and not Path(source).exists() and (numbers := _four_numbers(str(source))) is not None:
+    if size is not None and not os.path.exists(source) and (numbers := _four_numbers(str(source))) is not None:
         fx, fy, cx, cy = numbers
         matrix = (fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0)
         return CameraInfo(*size, "plumb_bob", (), matrix, (0.0,) * 12, 0, 0, Region())

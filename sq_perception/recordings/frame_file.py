@@ -226,11 +226,10 @@ def read(
         raise ValueError(f"projection: expected 'pinhole' or 'orthographic', got {projection!r}")
     if distortion not in get_args(Treatment):
         raise ValueError(f"distortion: expected {', '.join(get_args(Treatment))}, got {distortion!r}")
-    path = Path(path)
-    if not path.is_file():
-        raise FrameError(f"{path}: no such file")
-    reading = reading or Reading()
+    path, reading = Path(path), reading or Reading()
     try:
+        if not path.is_file():
+            raise FrameError(f"{path}: no such file")
         frame = _read(path, camera_info, projection, distortion, reading)
         return reading.of(replace(frame, stamp=stamp_of(path)))
     except FrameError:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import cv2
 import numpy as np
 import pytest
@@ -14,7 +16,7 @@ from sq_perception.imaging.distortion import Distortion
 from sq_perception.imaging.rectification import Rectification
 from sq_perception.recordings import frame_file
 from sq_perception.recordings.camera_file import FrameError, Region, read_calibration, read_camera_info
-from sq_perception.recordings.frame_file import read
+from sq_perception.recordings.frame_file import Reading, read
 
 K = np.array([[60.0, 0, 31.5], [0, 61.0, 23.5], [0, 0, 1]])
 
@@ -226,6 +228,41 @@ def test_bad_images_are_named(tmp_path, info):
         read(tmp_path / "missing.npz")
     with pytest.raises(FrameError, match="no such file"):
         read(tmp_path)
+
+
+@pytest.mark.parametrize("error", [PermissionError(13, "Permission denied"), MemoryError("Unable to allocate 1 TiB")])
+def test_what_the_system_refuses_is_named(tmp_path, info, monkeypatch, error):
+    cv2.imwrite(str(tmp_path / "depth.png"), np.ones((48, 64), np.uint16))
+
+    def refused(*_, **__):
+        raise error
+
+    monkeypatch.setattr(np, "fromfile", refused)
+    with pytest.raises(FrameError, match=re.escape(str(error))):
+        read(tmp_path / "depth.png", info)
+
+
+def test_a_mask_that_the_system_refuses_is_named(tmp_path, monkeypatch):
+    """Of a bag's frame too, which takes its masks so: one unreadable file must not end the whole run."""
+    cv2.imwrite(str(tmp_path / "a.png"), np.ones((48, 64), np.uint8))
+    assert Reading(masks=tmp_path).labels("a", np.ones((48, 64))).all()
+
+    def refused(*_, **__):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr(np, "fromfile", refused)
+    with pytest.raises(FrameError, match="Permission denied"):
+        Reading(masks=tmp_path).labels("a", np.ones((48, 64)))
+
+
+def test_names_that_no_file_can_have_are_named(tmp_path):
+    with pytest.raises(FrameError, match=r"aaa\.npz"):
+        read(tmp_path / f"{'a' * 300}.npz")
+    cv2.imwrite(str(tmp_path / "depth.png"), np.ones((48, 64), np.uint16))
+    with pytest.raises(FrameError, match="camera_info"):
+        read(tmp_path / "depth.png", "a" * 300)
+    numbers = ",".join(f"{number:.90f}" for number in (60.0, 61.0, 31.5, 23.5))
+    assert read(tmp_path / "depth.png", numbers).camera == Camera(64, 48, 60.0, 61.0, 31.5, 23.5)
     (tmp_path / "depth.txt").write_text("1 2 3")
     with pytest.raises(FrameError, match=r"\.npz, \.npy, \.png, \.bmp"):
         read(tmp_path / "depth.txt")
