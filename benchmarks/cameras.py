@@ -69,8 +69,7 @@ def looked_at(scene: Tabletop) -> tuple[list[Found], int]:
     """What became of the things of a scene, and how many own bodies are of none."""
     given = scene_verdict.recoverer().recover(scene.depth, scene.camera, scene.labels)
     own = scene_verdict.recoverer().recover(scene.depth, scene.camera)
-    measured = np.isfinite(scene.depth)
-    of_thing = scene_verdict.matches(np.where(measured, own.labels, 0), np.where(measured, scene.labels, 0))
+    of_thing = scene_verdict.matches(own.labels, scene.labels, scene.depth)
     found = [
         Found(
             scene_verdict.of_frame(given, one.label, one, scene).iou,

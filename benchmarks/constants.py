@@ -92,7 +92,7 @@ def of_tables(own: bool) -> Measured:
     results, ious = [], []
     for scene in tables():
         frame = scene_verdict.recoverer().recover(scene.depth, scene.camera, None if own else scene.labels)
-        matches = scene_verdict.matches(frame.labels, scene.labels) if own else {}
+        matches = scene_verdict.matches(frame.labels, scene.labels, scene.depth) if own else {}
         for placed in scene.placed:
             label = matches.get(placed.label, 0) if own else placed.label
             answer = scene_verdict.of_frame(frame, label, placed, scene)

@@ -135,8 +135,7 @@ def answers(scene: Tabletop, counted: list[int], row: Row) -> list[scene_verdict
     frame = scene_verdict.recoverer().recover(changed.depth, changed.camera, given, limits)
     known = {label: label for label in counted}
     if given is None:
-        measured = np.isfinite(changed.depth)
-        known = scene_verdict.matches(np.where(measured, frame.labels, 0), np.where(measured, changed.labels, 0))
+        known = scene_verdict.matches(frame.labels, changed.labels, changed.depth)
     things = {one.label: one for one in changed.placed}
     return [scene_verdict.of_frame(frame, known.get(label, 0), things[label], changed) for label in counted]
 

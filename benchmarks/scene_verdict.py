@@ -154,7 +154,7 @@ def evaluated(scene: Tabletop) -> SceneVerdict:
         "given": recoverer().recover(depth, camera, labels),
         "own": recoverer().recover(depth, camera),
     }
-    known = matches(frames["own"].labels, np.where(np.isfinite(depth), labels, 0))
+    known = matches(frames["own"].labels, labels, depth)
     things = []
     for placed in scene.placed:
         if placed.pixels < FEWEST_PIXELS:
@@ -231,8 +231,9 @@ def _answer(
     return Answer(iou, errors, excess, covered, status, message, np.array(body.to_flat(), dtype=float))
 
 
-def matches(own: np.ndarray, true: np.ndarray) -> dict[int, int]:
-    """The own label of each true one whose masks agree."""
+def matches(own: np.ndarray, true: np.ndarray, depth: np.ndarray) -> dict[int, int]:
+    """The own label of each true one whose masks agree where something was measured."""
+    own, true = own[np.isfinite(depth)], true[np.isfinite(depth)]
     found = {}
     for label in np.unique(true[true > 0]):
         inside = true == label

@@ -34,9 +34,9 @@ from sq_perception.simulation import sensor_noise
 COUNTS = (1, 5, 8)
 
 
-def ious(frame: FrameRecovery, scene: tabletop.Tabletop) -> list[float]:
-    """Of the things that are at least half visible."""
-    labels = scene_verdict.matches(frame.labels, scene.labels)
+def ious(frame: FrameRecovery, scene: tabletop.Tabletop, depth: np.ndarray) -> list[float]:
+    """Of the things that are at least half visible; ``depth`` is what the frame was recovered from."""
+    labels = scene_verdict.matches(frame.labels, scene.labels, depth)
     half = [each for each in scene.placed if each.visible_share >= real_scenes.HALF]
     return [scene_verdict.of_frame(frame, labels.get(each.label, 0), each, scene).iou for each in half]
 
@@ -60,8 +60,8 @@ def measured(recoverer: Recoverer, count: int, scenes: int, frames: int, sensor:
             if previous is not None:
                 spent = 1e3 * np.diff(moments)
                 times.append((float(spent[0]), float(spent[1])))
-                quality["alone"] += ious(alone, scene)
-                quality["following"] += ious(following, scene)
+                quality["alone"] += ious(alone, scene, depth)
+                quality["following"] += ious(following, scene, depth)
                 repeated += [body.repeats > 0 for body in following.bodies]
             previous = following
     alone_ms, following_ms = np.array(times).T

@@ -116,9 +116,12 @@ def test_masks_match_by_their_common_share() -> None:
     true, own = np.zeros((10, 30), int), np.zeros((10, 30), int)
     true[:, :10], true[:, 10:20], true[:, 20:] = 1, 2, 3
     own[:, :8], own[:4, 10:20], own[4:, 10:20], own[:, 24:] = 7, 8, 9, 5
-    assert scene_verdict.matches(own, true) == {1: 7, 2: 9, 3: 5}
+    depth = np.ones(true.shape)
+    assert scene_verdict.matches(own, true, depth) == {1: 7, 2: 9, 3: 5}
     own[:, 24:26] = 0
-    assert scene_verdict.matches(own, true) == {1: 7, 2: 9}
+    assert scene_verdict.matches(own, true, depth) == {1: 7, 2: 9}
+    depth[:, 20:22] = np.nan  # of the 8 columns that are left of it the mask has 4
+    assert scene_verdict.matches(own, true, depth) == {1: 7, 2: 9, 3: 5}
 
 
 def test_a_missed_thing_has_no_iou_and_no_size() -> None:
