@@ -26,7 +26,6 @@ import threading
 import weakref
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
-from urllib.parse import urlsplit
 
 import rich
 import viser
@@ -136,7 +135,7 @@ def refusal(headers: Mapping[str, str], own_names: frozenset[str]) -> str:
     if not (name == "localhost" or name in own_names or _address(name)):
         return f"Host {host!r} is no name of this machine"
     origin = headers.get("Origin")
-    if origin is not None and urlsplit(origin).netloc.lower() != host.lower():
+    if origin is not None and origin.partition("://")[2].lower() != host.lower():
         return f"a page of {origin!r} must not talk to this one"
     return ""
 

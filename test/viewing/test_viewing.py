@@ -282,7 +282,8 @@ def test_requests_of_strangers_are_refused() -> None:
         assert refusal({"Host": host}, names) == ""
         assert refusal({"Host": host, "Origin": f"http://{host}"}, names) == ""
         assert "must not talk" in refusal({"Host": host, "Origin": "https://evil.example"}, names)
-        assert "must not talk" in refusal({"Host": host, "Origin": "null"}, names)
+        for other in ("null", "http://[", f"http://{host}/", host, ""):
+            assert "must not talk" in refusal({"Host": host, "Origin": other}, names)
     for host in ("evil.example", "evil.example:8080", "", "localhost.evil.example", "localhost@evil.example", "a b"):
         assert "no name of this machine" in refusal({"Host": host, "Origin": f"http://{host}"}, names)
 
