@@ -108,6 +108,8 @@ def _number(about: Any, value: float, made: Control) -> Control:
         return made
     # What the node holds is shown, even where its descriptor rules it out.
     low, high = kind(min(ranges[0].from_value, value)), kind(max(ranges[0].to_value, value))
+    if math.isinf(high - low):  # open to a side, or as wide as the type
+        return replace(made, low=None if math.isinf(low) else low, high=None if math.isinf(high) else high)
     short = high - low <= (_SLIDER_SPAN if kind is float else _SLIDER_STEPS)
     step = float(ranges[0].step) or (10.0 ** (math.floor(math.log10(high - low)) - 2) if kind is float else 1)
     if short and step <= high - low:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import math
 import re
 import socket
 import subprocess
@@ -179,6 +180,19 @@ def test_what_the_node_holds_is_shown_even_outside_of_its_range() -> None:
     assert (made.low, made.high) == (0.0, 5.0)
     made = controls.control(describing("method", constraints="one of: a, b"), "new")
     assert made.choices == ("a", "b", "new")
+
+
+@pytest.mark.parametrize(
+    ("within", "ends"),
+    [
+        ((0.0, math.inf), (0.0, None)),
+        ((-math.inf, math.inf), (None, None)),
+        ((-sys.float_info.max, sys.float_info.max), (-sys.float_info.max, sys.float_info.max)),
+    ],
+)
+def test_a_range_may_be_open(within: tuple[float, float], ends: tuple[float | None, float | None]) -> None:
+    made = controls.control(describing("gain", within), 1.0)
+    assert (made.kind, made.value, (made.low, made.high)) == ("number", 1.0, ends)
 
 
 def test_half_a_number_is_no_wish() -> None:
