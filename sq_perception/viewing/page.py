@@ -25,6 +25,8 @@ from sq_perception.viewing.tables import NodeState
 
 TITLE = "sq_perception: superquadrics from depth"
 _PANEL_WIDTH = 420
+_DECIMALS = 7
+"""Of a number that is shown or typed; viser would cut off those that the value at the beginning has not."""
 _MUTED = "muted"
 _SHOWN = {
     "Points": "The measured depth",
@@ -252,6 +254,8 @@ class Page:
             handle = gui.add_slider(about.name, about.low, about.high, about.step, value, **common)
         elif about.kind == "number":
             handle = gui.add_number(about.name, value, min=about.low, max=about.high, **common)
+            if about.type is float:
+                handle.precision = _DECIMALS
         else:
             handle = gui.add_text(about.name, value, disabled=not about.can_change, **common)
         if about.can_change:

@@ -334,6 +334,22 @@ def test_a_port_that_is_taken_is_an_error_in_words(taken: int) -> None:
         assert free.getsockname()[1] > 0
 
 
+def test_decimals_may_be_typed_whatever_the_value_at_the_beginning() -> None:
+    pytest.importorskip("viser", reason="needs the extra 'view'")
+    from sq_perception.viewing.page import Page
+    from sq_perception.viewing.server import listening_socket
+
+    given = [controls.control(describing("depth_min", (0.0, 100.0)), 0.0), controls.control(describing("free"), 2.5)]
+    with listening_socket("127.0.0.1", 0) as bound:
+        page = Page(bound, ["/a"])
+        try:
+            page.show_controls("/a", given)
+            for handle in page._nodes["/a"].handles.values():
+                assert handle.precision >= 3  # what a browser keeps of 0.125
+        finally:
+            page.close()
+
+
 def test_the_page_draws_what_is_there_and_takes_away_what_is_not() -> None:
     """Without a browser: what viser is told to show of two nodes, frame by frame."""
     pytest.importorskip("viser", reason="needs the extra 'view'")
