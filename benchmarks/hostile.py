@@ -2,10 +2,10 @@
 
     python benchmarks/hostile.py [--messages 20000] [--seed 0] [--node recover_node]
 
-The frames are those of ``test/hostile_messages.py``: images, camera_infos and masks with wrong encodings, sizes, steps,
-lengths, byte orders, stamps, frames, pixels, matrices, distortions, regions.  Half of them come without masks, half
-with.  Each is sent over DDS to the node's own process and checked by it: ``~/trigger`` answers with what became of it.
-After every hundred a good frame follows, whose bodies are compared with those of the beginning.
+The frames are those of ``test/helpers/hostile_messages.py``: images, camera_infos and masks with wrong encodings,
+sizes, steps, lengths, byte orders, stamps, frames, pixels, matrices, distortions, regions.  Half of them come without
+masks, half with.  Each is sent over DDS to the node's own process and checked by it: ``~/trigger`` answers with what
+became of it.  After every hundred a good frame follows, whose bodies are compared with those of the beginning.
 """
 
 from __future__ import annotations
