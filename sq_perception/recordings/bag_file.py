@@ -280,7 +280,9 @@ class RecordedBag:
             camera = unit_cube.camera(depth.shape[1], depth.shape[0])
         else:
             if reading.scale is not None:
-                depth = depth * np.float32((MILLIMETRES if encoding.startswith("16UC1") else 1.0) / reading.scale)
+                usual = MILLIMETRES if encoding.startswith("16UC1") else 1.0
+                depth = depth * np.float32(usual / reading.scale)
+                encoding = encoding if reading.scale == usual else "32FC1"  # millimetres do not hold other units
             calibration = self._calibration(info, depth)
             labels = None if labels is None else calibration.rectified_labels(labels)
             depth, camera = calibration.rectified(depth), calibration.camera

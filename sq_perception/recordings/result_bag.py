@@ -9,6 +9,8 @@
 | `/recover_node/rendered_depth` | sensor_msgs/Image | on request: the recovered bodies |
 | `/mask/image` | sensor_msgs/Image | on request: the labels that bodies were recovered from |
 
+Depth that was read with another scale than its encoding's is written in 32FC1.
+
 Every message of a frame has its stamp and frame id.  Of a frame without a stamp it is INTERVAL after that of the frame
 before, the first one at INTERVAL, as time 0 means "unknown" in ROS: the same input gives the same times.  A frame that
 was no message has the frame id of the synthetic camera.  Messages are logged when the bag received the image; failing

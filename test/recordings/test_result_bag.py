@@ -31,8 +31,8 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast, unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.recordings import bag_messages, mcap_file
-from sq_perception.recordings.bag_file import RecordedBag
-from sq_perception.recordings.frame_file import FrameError, RecordedFrame, Stamp
+from sq_perception.recordings.bag_file import InputOptions, RecordedBag
+from sq_perception.recordings.frame_file import FrameError, Reading, RecordedFrame, Stamp
 from sq_perception.recordings.result_bag import MARKERS, RENDERED, SUPERQUADRICS, ResultBag
 from sq_perception.recovery.recoverer import Recoverer
 
@@ -187,6 +187,18 @@ def test_what_went_in_can_be_read_again(tmp_path, encoding):
         assert getattr(one, name) == getattr(two, name)
     (_, image), (_, original) = messages(first)[TOPIC][0], messages(next(bag.glob("*.mcap")))[TOPIC][0]
     np.testing.assert_array_equal(image.data, original.data)
+
+
+def test_depth_in_other_units_is_written_as_it_was_read(tmp_path, scene):
+    bag = record(tmp_path / "bag", [depth_of()])
+    with RecordedBag(bag, InputOptions(reading=Reading(scale=1e4))) as recorded:
+        (frame,) = recorded
+    with ResultBag(tmp_path / "results.mcap") as results:
+        results.add(frame, scene[1], None)
+    with RecordedBag(tmp_path / "results.mcap") as written:
+        (again,) = written
+    np.testing.assert_array_equal(again.depth, frame.depth)
+    assert frame.depth[60, 57] == pytest.approx(depth_of()[60, 57] / 10, abs=5.1e-5)
 
 
 def test_tracks_keep_their_ids_and_markers_that_are_gone_are_deleted(tmp_path):
