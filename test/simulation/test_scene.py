@@ -78,3 +78,7 @@ def test_misuse_is_named():
         table_scene(rng, 1, unit_cube.camera())
     with pytest.raises(ValueError, match="no room for 3 bodies"):
         table_scene(rng, 3, Camera(64, 48, 2000.0, 2000.0, 31.5, 23.5))
+
+
+def test_where_a_view_has_no_room_for_all_bodies_another_one_is_taken():
+    assert len(table_scene(np.random.default_rng([3, 1, 0]), 10).bodies) == 10
