@@ -95,6 +95,8 @@ def _bodies(
     """Draw the grasps of a frame where that is asked for; its ``bodies``."""
     settings = RecoveryOptions(free_space=frame.has_free_space)
     recovery = recoverer.recover(frame.depth, frame.camera, frame.labels, settings)
+    if recovery.message:
+        complain(f"{frame.name}: {recovery.message}")
     found = recovery.recovered
     bodies = Superquadric.stack([recovered.superquadric for recovered in found])
     covariance = np.array([recovered.covariance for recovered in found]).reshape(-1, 11, 11)

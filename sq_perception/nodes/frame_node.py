@@ -263,6 +263,8 @@ class FrameNode(ManagedNode):
             stages["stamp to result"] = 1e3 * age
         self._outputs.accompany(found, shown, frame, parameters, stages)
         self._statistics.answer(stages, found.summary)
+        if found.recovery.bodies and found.recovery.message:
+            self.get_logger().warning(found.recovery.message, throttle_duration_sec=THROTTLE)
         return Outcome(True, found.summary, shown)
 
     def _resolve(self, outcome: Outcome, arrived: float = math.inf) -> None:

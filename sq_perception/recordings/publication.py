@@ -70,9 +70,10 @@ class Identified:
     def summary(self) -> str:
         """One frame's results in a line."""
         recovery = self.recovery
-        took = f"in {recovery.milliseconds.get('total', 0.0):.0f} ms"
+        remark = f": {recovery.message}" if recovery.message else ""
+        took = f"in {recovery.milliseconds.get('total', 0.0):.0f} ms{remark}"
         if not recovery.bodies:
-            return f"no bodies {took}" + (f": {recovery.message}" if recovery.message else "")
+            return f"no bodies {took}"
         parts = []
         for body, number in zip(recovery.bodies, self.ids, strict=True):
             if body.status == Status.FAILED:

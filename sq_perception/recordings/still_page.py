@@ -117,8 +117,9 @@ def _looking(eye: np.ndarray, target: np.ndarray) -> np.ndarray:
 
 def _numbers(frame: RecordedFrame, recovery: FrameRecovery) -> str:
     """The bodies as an HTML table."""
+    remark = f"<p>{html.escape(recovery.message)}</p>" if recovery.message else ""
     if not recovery.bodies:
-        return f"<p>{html.escape(recovery.message)}</p>"
+        return remark
     titles = ("", "status", "full edges", "centre", "exponents", "score", "why")
     rows = ["".join(f"<th>{title}</th>" for title in titles)]
     for k, body in enumerate(recovery.bodies):
@@ -135,4 +136,4 @@ def _numbers(frame: RecordedFrame, recovery: FrameRecovery) -> str:
         ]
         chip = f'<td><span class="chip" style="background:rgb({red},{green},{blue})"></span>{k}</td>'
         rows.append(chip + "".join(f"<td>{html.escape(cell)}</td>" for cell in cells))
-    return "<table>" + "".join(f"<tr>{row}</tr>" for row in rows) + "</table>"
+    return remark + "<table>" + "".join(f"<tr>{row}</tr>" for row in rows) + "</table>"

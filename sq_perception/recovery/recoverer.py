@@ -243,7 +243,7 @@ class Recoverer:
                 previous.reference, found.labels, [body.label for body in bodies if body.repeats]
             )
         milliseconds["total"] = 1e3 * (time.perf_counter() - started)
-        message = "" if bodies else _why_empty(depth, found)
+        message = _left_out(found, options) if bodies else _why_empty(depth, found)
         return FrameRecovery(bodies, milliseconds, found.labels, found.plane, message, reference)
 
     def _segmented(
@@ -260,7 +260,13 @@ class Recoverer:
         found = segments.segment(depth, camera, options.segmentation_options())
         if not (options.repair and isinstance(network, inference.ThingPredictor)):
             return OwnSegments(found)
-        return SegmentNetwork(*self._load_masks(), depth, camera, found.plane, self._shared).improved(found)
+        improved = SegmentNetwork(*self._load_masks(), depth, camera, found.plane, self._shared).improved(found)
+        ids = improved.found.ids
+        if len(ids) <= options.max_objects:
+            return improved
+        most = ids[: options.max_objects]
+        labels = np.where(np.isin(improved.found.labels, most), improved.found.labels, 0)
+        return replace(improved, found=replace(improved.found, labels=labels, ids=most, is_cut=True))
 
     def _predicted(self, objects: Sequence[SeenObject], network: Network, options: RecoveryOptions) -> list[SeenObject]:
         """The objects with their predictions; those of bodies may still be computed, beside fits that begin without."""
@@ -340,6 +346,12 @@ def _in_range(depth: np.ndarray, labels: np.ndarray, depth_range: tuple[float, f
         return depth
     out = (labels > 0) & ((depth < near) | (depth > far))
     return np.where(out, np.float32(np.nan), depth)
+
+
+def _left_out(found: segments.Segmentation, options: RecoveryOptions) -> str:
+    if not found.is_cut:
+        return ""
+    return f"there are more objects than max_objects = {options.max_objects}: smaller ones are left out"
 
 
 def _why_empty(depth: np.ndarray, found: segments.Segmentation) -> str:

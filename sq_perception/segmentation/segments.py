@@ -112,6 +112,8 @@ class Segmentation:
         n and d of the support plane, height above it = n.p + d; None where there is none.
     ids : tuple of int
         Labels in the image, the one with most pixels first.
+    is_cut
+        Whether there were more objects than ``max_objects``.
     sigma
         Noise of the depth at one metre as measured on the plane, or a guess where there is none, metres.
     """
@@ -119,6 +121,7 @@ class Segmentation:
     labels: np.ndarray
     plane: np.ndarray | None
     ids: tuple[int, ...]
+    is_cut: bool = False
     sigma: float = _UNKNOWN_SIGMA
 
 
@@ -145,8 +148,8 @@ def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | No
     depth, valid = _checked(depth, camera, options.depth_range)
     least = max(_LEAST_PIXELS, round(_LEAST_SHARE * depth.size))
     if not camera.is_pinhole:
-        labels, ids = _ordered(depth_steps.components(valid), least, options.max_objects)
-        return Segmentation(labels, None, ids)
+        labels, ids, is_cut = _ordered(depth_steps.components(valid), least, options.max_objects)
+        return Segmentation(labels, None, ids, is_cut)
     if np.count_nonzero(valid) < least:
         return Segmentation(np.zeros(depth.shape, np.int32), None, ())
     planes = support_plane.planes(depth, valid, camera)
@@ -156,8 +159,9 @@ def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | No
     if plane is None:
         free = valid & ~standing.furniture(known, valid, camera, planes, limits)
         labels = bodies.taken_apart(known, free, camera, _UNKNOWN_SIGMA, limits.is_small)
-        labels, ids = _ordered(labels, least, options.max_objects, standing.alone(known, camera, limits))
-        return Segmentation(labels, None, ids)
+        test = standing.alone(known, camera, limits)
+        labels, ids, is_cut = _ordered(labels, least, options.max_objects, test)
+        return Segmentation(labels, None, ids, is_cut)
     support = support_surface.measured(plane, known, valid, camera)
     walls = [other for other in planes if other is not plane]
     everything = known
@@ -174,8 +178,8 @@ def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | No
     if around:
         labels = np.where(np.isin(labels, list(around)), 0, labels)
     test = standing.standing(everything, relative, labels, camera, support, walls, limits)
-    labels, ids = _ordered(labels, least, options.max_objects, test)
-    return Segmentation(labels, plane.equation, ids, max(support.sigma, bodies.LEAST_SIGMA))
+    labels, ids, is_cut = _ordered(labels, least, options.max_objects, test)
+    return Segmentation(labels, plane.equation, ids, is_cut, max(support.sigma, bodies.LEAST_SIGMA))
 
 
 def from_labels(
@@ -218,11 +222,12 @@ def from_labels(
     if options.workspace is not None:
         box, pose = options.workspace, options.workspace_pose
         ids = tuple(k for k in ids if standing.within(box, _points(labels == k, depth, valid, camera), pose))
+    is_cut = len(ids) > options.max_objects
     ids = ids[: options.max_objects]
     plane = None
     if ids and camera.is_pinhole:
         plane = support_plane.around(labels, ids, depth, valid, camera)
-    return Segmentation(labels, plane, ids)
+    return Segmentation(labels, plane, ids, is_cut)
 
 
 def support_under(
@@ -282,14 +287,15 @@ def _unloaded(
     valid = face.under(labels, known, camera) & (relative > -support_plane.TOLERANCE)
     parts = bodies.above(known, relative * valid, valid, camera, face.surface, walls, limits)
     test = standing.standing(everything, relative, parts, camera, face.surface, walls, limits)
-    parts, _ = _ordered(parts, least, parts.max(initial=0), test)
+    parts, _, _ = _ordered(parts, least, parts.max(initial=0), test)
     return np.where(parts > 0, parts + labels.max(), labels)
 
 
 def _ordered(
     labels: np.ndarray, least: int, most: int, accept: standing.ObjectTest | None = None
-) -> tuple[np.ndarray, tuple[int, ...]]:
-    """Components with at least ``least`` pixels, renumbered from 1 by falling size, at most ``most`` of them.
+) -> tuple[np.ndarray, tuple[int, ...], bool]:
+    """Components with at least ``least`` pixels, renumbered from 1 by falling size, at most ``most`` of them, and
+    whether there are more.
 
     Those that are not accepted are asked about once more: the test knows the things beside them then.
     """
@@ -297,11 +303,13 @@ def _ordered(
     order = np.argsort(-extents[:, 0], kind="stable")
     order = order[extents[order, 0] >= least]
     kept: set[int] = set()
+    is_cut = False
     for label in np.tile(order, 1 if accept is None else 2).tolist():
-        if len(kept) == most:
-            break
         if label not in kept and (accept is None or accept(*regions.pixels(labels, label, extents[label]))):
+            is_cut = len(kept) == most
+            if is_cut:
+                break
             kept.add(label)
     number = np.zeros(len(extents), np.int32)
     number[order[np.isin(order, list(kept))]] = np.arange(len(kept)) + 1
-    return regions.renumbered(labels, number), tuple(range(1, len(kept) + 1))
+    return regions.renumbered(labels, number), tuple(range(1, len(kept) + 1)), is_cut

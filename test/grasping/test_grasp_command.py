@@ -34,6 +34,12 @@ def frame(tmp_path):
     return path
 
 
+def test_why_a_frame_has_no_grasps_is_said(tmp_path, capsys):
+    np.savez(tmp_path / "dark.npz", depth=np.full((120, 160), np.nan, np.float32), K=CAMERA.matrix)
+    assert main.main(["grasp", str(tmp_path / "dark.npz")]) == 0
+    assert "dark.npz: the image holds no depth" in capsys.readouterr().err
+
+
 def test_a_can_is_grasped_across_and_everything_is_written(frame, tmp_path, capsys):
     out = tmp_path / "out.json"
     command = ["grasp", str(frame), "--json", str(out), "--pictures", str(tmp_path), "--meshes", str(tmp_path)]

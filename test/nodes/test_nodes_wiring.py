@@ -14,6 +14,7 @@ pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus
 from frame_node_bench import CAMERA, FRAME_ID
 from geometry_msgs.msg import PoseStamped
+from rcl_interfaces.msg import Log
 from rclpy.parameter import Parameter
 from rclpy.qos import QoSDurabilityPolicy, QoSProfile, QoSReliabilityPolicy
 from sensor_msgs.msg import CameraInfo, Image, PointCloud2
@@ -448,6 +449,13 @@ def test_a_camera_info_that_was_published_once_before_is_received(make_bench):
     latched.publish(bench.info())
     bench.until(lambda: len(bench.node._input._infos) == 1)
     assert len(bench.answer(bench.depth())[1]) == 1
+
+
+def test_what_is_left_out_of_a_frame_is_said(bench):
+    log = bench.hear(Log, "/rosout")
+    bench.recoverer.message = "there are more objects than max_objects = 1: smaller ones are left out"
+    assert len(bench.answer(bench.depth())[1]) == 1
+    bench.until(lambda: [entry for entry in log if "more objects than max_objects = 1" in entry.msg])
 
 
 def test_silence_is_reported(make_bench):

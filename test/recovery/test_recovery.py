@@ -20,7 +20,8 @@ from sq_perception.imaging import canonical_view, raycast, unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.learning import checkpoint
 from sq_perception.learning.regressor import Regressor, RegressorConfig
-from sq_perception.recovery import seen_object
+from sq_perception.recovery import own_segments, seen_object
+from sq_perception.recovery.own_segments import OwnSegments
 from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, RecoveryOptions, render_recovery
 from sq_perception.segmentation.segments import Segmentation
 from sq_perception.simulation.scenes import table_scene
@@ -192,6 +193,32 @@ def test_images_without_objects_say_why(method, image, why):
     assert found.bodies == ()
     assert why in found.message
     assert found.labels.shape == (48, 64)
+
+
+@pytest.mark.parametrize("most", [1, 2, 3])
+def test_a_frame_with_more_objects_says_so(symmetry, most):
+    labels = np.zeros((48, 64), int)
+    labels[10:30, 10:20] = 1
+    labels[10:20, 30:40] = 2
+    camera = Camera(64, 48, 60.0, 60.0, 32, 24)
+    options = RecoveryOptions(method="symmetry", max_objects=most)
+    found = symmetry.recover(np.ones((48, 64), np.float32), camera, labels, options)
+    assert [body.label for body in found.bodies] == [1, 2][:most]
+    assert ("max_objects = 1" in found.message) == (most == 1)
+    assert bool(found.message) == (most == 1)
+
+
+def test_parting_segments_makes_no_more_objects_than_are_wanted(monkeypatch):
+    labels = np.zeros((48, 64), np.int32)
+    for k in range(3):
+        labels[10:30, 10 + 15 * k : 20 + 15 * k] = k + 1
+    parted = OwnSegments(Segmentation(labels, None, (1, 2, 3)))
+    monkeypatch.setattr(own_segments.SegmentNetwork, "improved", lambda *_: parted)
+    camera = Camera(64, 48, 60.0, 60.0, 32, 24)
+    found = Recoverer().recover(np.ones((48, 64), np.float32), camera, options=RecoveryOptions(max_objects=2))
+    assert [body.label for body in found.bodies] == [1, 2]
+    assert set(np.unique(found.labels)) == {0, 1, 2}
+    assert "max_objects = 2" in found.message
 
 
 def test_half_precision_is_read_as_single_precision(symmetry):

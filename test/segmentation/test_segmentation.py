@@ -101,6 +101,15 @@ def test_options_choose():
     assert np.nanmax(depth[near.labels > 0]) <= 1.0
 
 
+@pytest.mark.parametrize("most", [1, 2, 3, 20])
+def test_that_there_are_more_objects_is_known(most):
+    depth, labels = scene(THREE)
+    own = segment(depth, CAMERA, SegmentationOptions(max_objects=most))
+    given = from_labels(labels, depth, CAMERA, SegmentationOptions(max_objects=most))
+    for found in own, given:
+        assert (len(found.ids), found.is_cut) == (min(most, 3), most < 3)
+
+
 @pytest.mark.parametrize(
     "depth",
     [
