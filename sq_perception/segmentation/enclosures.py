@@ -15,9 +15,11 @@ Metres, optical frame.
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
+from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.quantiles import quantile
 from sq_perception.segmentation import support_plane
 
@@ -46,53 +48,100 @@ def walls(points: Mapping[int, np.ndarray], plane: np.ndarray) -> set[int]:
     """
     if len(points) < 3:
         return set()
-    tops = {label: quantile(some @ plane[:3] + plane[3], _TOP) for label, some in points.items()}
-    tried = []
-    for top in tops.values():
-        level = [label for label in tops if abs(tops[label] - top) < _AS_HIGH]
-        if len(level) > 1 and level not in tried:
-            tried.append(level)
-            if found := _around(level, points, support_plane.across(plane[:3])):
-                return found
+    axes = support_plane.across(plane[:3])
+    tops = np.array([quantile(some @ plane[:3] + plane[3], _TOP) for some in points.values()])
+    flat = np.concatenate(list(points.values())) @ axes
+    owner = np.repeat(np.arange(len(points)), [len(some) for some in points.values()])
+    segments = _Segments(flat, owner, *_moments(flat, owner))
+    tried: list[bytes] = []
+    for top in tops:
+        level = np.abs(tops - top) < _AS_HIGH
+        if np.count_nonzero(level) > 1 and level.tobytes() not in tried:
+            tried.append(level.tobytes())
+            along = _around(level, segments)
+            if along.any():
+                return set(np.array(list(points))[along].tolist())
     return set()
 
 
-def _around(level: list[int], points: Mapping[int, np.ndarray], axes: np.ndarray) -> set[int]:
-    """Those of some equally high segments that are walls along the rectangle around them, as the longest lies."""
-    flat = {label: points[label] @ axes for label in level}
-    # Not the smallest rectangle: two walls at a right angle have another one just as small.
-    moments = [np.linalg.eigh(np.cov(some.T)) for some in flat.values()]
-    _, directions = max(moments, key=lambda each: each[0][1] - each[0][0])
-    turned = {label: some @ directions for label, some in flat.items()}
-    everything = np.concatenate(list(turned.values()))
-    low, high = everything.min(axis=0), everything.max(axis=0)
-    middle, half = (low + high) / 2, (high - low) / 2
-    if 2 * half.min() < _SMALLEST:
-        return set()
-    thick = min(_THICK, _NARROW * half.min())
-    along = [label for label in level if np.mean(_inwards(turned[label] - middle, half) > thick) < _STRAY]
-    if not along:
-        return set()
-    cells = np.zeros((4, _CELLS), bool)
-    for label in along:
-        _cover(cells, turned[label] - middle, half, thick)
-    covered = cells.mean(axis=1)
+def warm_up() -> None:
+    """Compile the kernel, or load it from disk, by three equally high squares."""
+    square = np.array([[0, 0, 0.1], [0.1, 0, 0.1], [0, 0.1, 0.1], [0.1, 0.1, 0.1]])
+    walls({k: square + [k, 0, 0] for k in range(3)}, np.array([0.0, 0.0, 1.0, 0.0]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Segments:
+    """Points (n, 2) of m segments along the support, and whose they are, from 0.
+
+    Of each segment, how much farther it reaches along its longer principal axis, as a variance (m,), and those axes
+    (m, 2, 2) in columns, the shorter one first.
+    """
+
+    points: np.ndarray
+    owner: np.ndarray
+    length: np.ndarray
+    directions: np.ndarray
+
+
+def _moments(points: np.ndarray, owner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """See _Segments."""
+    counts = np.bincount(owner)
+    centred = points - np.stack([np.bincount(owner, column) / counts for column in points.T], axis=1)[owner]
+    x, y = centred.T
+    xx, xy, yy = (np.bincount(owner, product) / np.maximum(counts - 1, 1) for product in (x * x, x * y, y * y))
+    variances, directions = np.linalg.eigh(np.stack([xx, xy, xy, yy], axis=1).reshape(-1, 2, 2))
+    return variances[:, 1] - variances[:, 0], directions
+
+
+def _around(level: np.ndarray, segments: _Segments) -> np.ndarray:
+    """Which of some equally high segments, bool (m,), are walls along the rectangle around them, as the longest lies.
+
+    Not the smallest rectangle: two walls at a right angle have another one just as small.
+    """
+    directions = segments.directions[np.where(level, segments.length, -np.inf).argmax()]
+    placed = np.empty_like(segments.points)
+    half, thick, along, covered = _laid(segments.points, segments.owner, level, directions, placed)
     is_corner = bool((np.minimum(covered, np.roll(covered, 1)) > _LONG).any())
-    if not is_corner or cells.mean() < _COVERED:
-        return set()
-    others = [np.median(some @ axes @ directions, axis=0) for label, some in points.items() if label not in along]
-    holds = bool(others) and bool((_inwards(np.array(others) - middle, half) > thick).any())
-    return set(along) if holds else set()
+    if 2 * half.min() < _SMALLEST or not is_corner or covered.mean() < _COVERED:
+        return np.zeros_like(along)
+    others = [np.median(placed[segments.owner == k], axis=0) for k in np.flatnonzero(~along)]
+    holds = any((half - np.abs(other)).min() > thick for other in others)
+    return along if holds else np.zeros_like(along)
 
 
-def _inwards(points: np.ndarray, half: np.ndarray) -> np.ndarray:
-    """Distances (n,) of points (n, 2) from the nearest side of a rectangle, positive inside."""
-    return np.asarray((half - np.abs(points)).min(axis=1))
-
-
-def _cover(cells: np.ndarray, points: np.ndarray, half: np.ndarray, thick: float) -> None:
-    """Mark the cells of the sides, in their order around the rectangle, that points (n, 2) lie along."""
-    at = np.clip((_CELLS * (points / (2 * half) + 0.5)).astype(int), 0, _CELLS - 1)
-    for side, (across, sign) in enumerate(((0, 1), (1, 1), (0, -1), (1, -1))):
-        near = half[across] - sign * points[:, across] < thick
-        cells[side, at[near, 1 - across]] = True
+@kernel
+def _laid(
+    points: np.ndarray, owner: np.ndarray, level: np.ndarray, directions: np.ndarray, placed: np.ndarray
+) -> tuple[np.ndarray, float, np.ndarray, np.ndarray]:
+    """The rectangle along ``directions`` (2, 2), in columns, around the points (n, 2) of the segments at a level: half
+    its sides, how thick a wall may be, which segments (m,) of the level lie along its sides, and the shares (4,) of the
+    sides, in their order around it, that these lie along.  ``placed`` takes all points as seen from its middle."""
+    low, high = np.full(2, np.inf), np.full(2, -np.inf)
+    for i in range(len(points)):
+        for k in range(2):
+            placed[i, k] = points[i, 0] * directions[0, k] + points[i, 1] * directions[1, k]
+            if level[owner[i]]:
+                low[k], high[k] = min(low[k], placed[i, k]), max(high[k], placed[i, k])
+    half = (high - low) / 2
+    thick = min(_THICK, _NARROW * min(half[0], half[1]))
+    count, inside = np.zeros(len(level)), np.zeros(len(level))
+    for i in range(len(points)):
+        for k in range(2):
+            placed[i, k] -= low[k] + half[k]
+        count[owner[i]] += 1
+        inside[owner[i]] += min(half[0] - abs(placed[i, 0]), half[1] - abs(placed[i, 1])) > thick
+    along = level & (inside < _STRAY * count)
+    cells = np.zeros((4, _CELLS), np.bool_)
+    for i in range(len(points)):
+        if along[owner[i]]:
+            for k in range(2):
+                other = 1 - k
+                at = int(_CELLS * (placed[i, other] / (2 * half[other]) + 0.5))
+                at = max(0, min(at, _CELLS - 1))
+                cells[k, at] |= half[k] - placed[i, k] < thick
+                cells[k + 2, at] |= half[k] + placed[i, k] < thick
+    covered = np.empty(4)
+    for side in range(4):
+        covered[side] = cells[side].sum() / _CELLS
+    return half, thick, along, covered

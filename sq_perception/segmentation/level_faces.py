@@ -86,17 +86,14 @@ def found(
     least
         Pixels of a segment.
     """
+    seen = {label: face for label, points in segments.items() if (face := _face(points, support)) is not None}
+    extents = regions.extents(labels) if seen else np.empty(0)
     faces = []
-    for label, points in segments.items():
-        if len(points) < _FEWEST:
-            continue
-        face = _face(points, support)
-        if face is None:
-            continue
-        everything = _points(labels, label, regions.extents(labels)[label], depth, camera, labels.size)
+    for label, face in seen.items():
+        everything = _points(labels, label, extents[label], depth, camera, labels.size)
         off = face.plane.height(everything) / noise_growth(everything[:, 2])
         if np.count_nonzero(off > max(0.5 * TOLERANCE, 4 * face.sigma)) >= least:
-            faces.append(LevelFace(label, face, points))
+            faces.append(LevelFace(label, face, segments[label]))
     return faces
 
 
@@ -112,6 +109,8 @@ def _points(
 
 def _face(points: np.ndarray, support: SupportSurface) -> SupportSurface | None:
     """The level face that most points (n, 3) of a segment lie on; None where more of them are above it."""
+    if len(points) < _FEWEST:
+        return None
     growth = noise_growth(points[:, 2])
     height = support.plane.height(points)
     reach = TOLERANCE * quantile(growth, 0.5)
