@@ -10,7 +10,7 @@ by type and encoding:
 | sensor_msgs/Image, orthographic | mono8, mono16 | grey values of the unit cube |
 
 Label images on the one topic that is called ``mask/image``, with or without a name before it, are the masks of the
-images with their stamps; they may have been recorded later.
+images with their stamps; they may have been recorded later, and in another order.
 
 The camera is that of the sibling topic ``camera_info``, as image_transport pairs them: the message with the image's
 stamp; failing that, the last one before the image; failing that, the bag's first, however late.  The name of their
@@ -141,7 +141,8 @@ class RecordedBag:
             self.topic = self._chosen(self._options.topic)
             self._info_topic = camera_info_topic(self.topic)
             self._masks = opened.enter_context(closing(self._recorded_masks()))
-            self._mask = next(self._masks, None)
+            self._passed: dict[Stamp, int] = {}
+            """When masks were recorded that have been read so far: not all of them fit into memory."""
             self._opened = opened.pop_all()
 
     def __enter__(self) -> RecordedBag:
@@ -237,28 +238,39 @@ class RecordedBag:
 
     # frames
 
-    def _recorded_masks(self) -> Generator[Message, None, None]:
+    def _mask_topics(self) -> set[str]:
+        images = self._reader.connections(IMAGE)
+        return {connection.topic for connection in images if connection.topic.endswith(_MASKS)} - {self.topic}
+
+    def _recorded_masks(self, received: int | None = None) -> Generator[Message, None, None]:
         """The messages of the mask topic, in a reading of their own, as they come at any distance from their images."""
-        topics = {
-            connection.topic for connection in self._reader.connections(IMAGE) if connection.topic.endswith(_MASKS)
-        } - {self.topic}
-        if len(topics) != 1:
+        if len(topics := self._mask_topics()) != 1:
             return
         with closing(BagReader(self._path)) as reader:
-            for message in reader.messages(reader.connections(IMAGE, topic=topics.pop())):
+            for message in reader.messages(reader.connections(IMAGE, topic=topics.pop()), received=received):
                 if not isinstance(message, FrameError):
                     yield message
+
+    def _mask(self, stamp: Stamp) -> Message | None:
+        """The first mask with this stamp, wherever it is: a segmentation may answer its images in another order."""
+        if stamp not in self._passed:
+            for message in self._masks:
+                self._passed.setdefault(message.stamp, message.received)
+                if message.stamp == stamp:
+                    return message
+            return None
+        with closing(self._recorded_masks(self._passed[stamp])) as again:
+            return next((message for message in again if message.stamp == stamp), None)
 
     def _labels(self, stamp: Stamp, name: str, image: np.ndarray) -> np.ndarray | None:
         """The masks of an image: from files if there is a folder of them, else from the bag."""
         labels = self._options.reading.labels(name, image)
         if labels is not None:
             return labels
-        while self._mask is not None and self._mask.stamp < stamp:
-            self._mask = next(self._masks, None)
-        if self._mask is None or self._mask.stamp != stamp:
+        mask = self._mask(stamp)
+        if mask is None:
             return None
-        labels = depth_image.labels_from_message(self._mask.content)
+        labels = depth_image.labels_from_message(mask.content)
         if labels.shape != image.shape:
             raise ValueError(f"mask: expected labels of the depth's shape {image.shape}, got {labels.shape}")
         return labels

@@ -50,12 +50,16 @@ class BagReader:
         return [each for each in self._reader.connections if each.msgtype in kinds and topic in (None, each.topic)]
 
     def messages(
-        self, connections: list[Any], every: int = 1, limit: int | None = None
+        self, connections: list[Any], every: int = 1, limit: int | None = None, received: int | None = None
     ) -> Iterator[Message | FrameError]:
-        """Messages in the order they were recorded; of images every n-th, at most ``limit``."""
+        """Messages in the order they were recorded; of images every n-th, at most ``limit``.
+
+        ``received``: only those of this time, nanoseconds.
+        """
         if not connections:  # which rosbags would take for all
             return
-        stored = self._reader.messages(connections)
+        span = () if received is None else (received, received + 1)
+        stored = self._reader.messages(connections, *span)
         seen = 0
         while True:
             try:

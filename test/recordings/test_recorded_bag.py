@@ -286,6 +286,20 @@ def test_orthographic_images(tmp_path):
     np.testing.assert_array_equal(frame.depth, unit_cube.depth_from_grey(grey))
 
 
+@pytest.mark.parametrize("storage", STORAGES, ids=lambda storage: storage.name)
+def test_masks_are_found_by_their_stamps_in_whatever_order_they_were_recorded(tmp_path, grey, storage):
+    """Before and after their images, not in their order; the third image has none, and the last comes twice."""
+    contents = [(INFO, 0, info(0))]
+    contents += [(TOPIC, 1 + k, image(grey, second, "16UC1")) for k, second in enumerate((1, 2, 3, 5, 4, 4))]
+    contents += [
+        ("/mask/image", second, image(np.full_like(grey, stamp), stamp, "8UC1"))
+        for second, stamp in ((1.5, 2), (1.6, 1), (2.5, 4), (2.6, 5))
+    ]
+    found = frames(write(tmp_path / "bag", sorted(contents, key=lambda one: one[1]), storage))
+    masks = [None if frame.labels is None else np.unique(frame.labels).tolist() for frame in found]
+    assert masks == [[1], [2], None, [5], [4], [4]]
+
+
 @pytest.mark.parametrize(("every", "limit", "wanted"), [(1, None, 7), (3, None, 3), (2, 2, 2), (1, 9, 7), (8, 1, 1)])
 def test_every_and_limit(tmp_path, grey, every, limit, wanted):
     contents = [(INFO, 0, info(0))] + [(TOPIC, second, image(grey, second, "16UC1")) for second in range(1, 8)]
