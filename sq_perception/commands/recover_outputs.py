@@ -24,6 +24,7 @@ from sq_perception.tracking.session import Followed
 
 if TYPE_CHECKING:
     from sq_perception.recordings.result_bag import ResultBag
+    from sq_perception.recordings.still_page import StillPage
 
 _FILES = ("json", "jsonl", "csv", "mcap", "html")
 _DECISIVE = (
@@ -94,14 +95,19 @@ class Outputs:
     def __init__(self, options: argparse.Namespace) -> None:
         self._options = options
         self.results: list[dict[str, Any]] = []
+        self._bag: ResultBag | None = None
+        self._page: StillPage | None = None
         self._lines = _lines(options)
         self.done = [] if self._lines is None else self._lines.done
-        self._bag = _bag(options)
-        self._page = None
-        if options.html:
-            from sq_perception.recordings.still_page import StillPage
+        try:
+            self._bag = _bag(options)
+            if options.html:
+                from sq_perception.recordings.still_page import StillPage
 
-            self._page = StillPage(options.html)
+                self._page = StillPage(options.html)
+        except BaseException:
+            self.discard()
+            raise
         self._stems: set[str] = set()
         given = [output_file.free_name(_stem(entry), self._stems) for entry in self.done]
         if options.pictures and (lost := sum(not (options.pictures / f"{stem}.png").is_file() for stem in given)):
@@ -131,6 +137,12 @@ class Outputs:
             self._page.add(frame, recovery)
         if self._lines is not None:  # last: what has a line has all its files
             self._lines.add(entry)
+
+    def discard(self) -> None:
+        """Close them before the first frame, with nothing left of those that were begun."""
+        for output in (self._lines, self._bag, self._page):
+            if output is not None:
+                output.close()
 
     def finish(self, whole: bool) -> Iterator[str]:
         """Close what grew and write the documents; what could not be done, or went elsewhere, one sentence each.

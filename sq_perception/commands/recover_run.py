@@ -96,17 +96,23 @@ class RecoverRun:
             checkpoint.check(options.model)
         self.outputs = Outputs(options)
         done.add(self.outputs.done)
-        setup = workers.Setup(options.model, self._settings)
-        self._executor: Recoverer | workers.Processes | workers.Cluster
-        if options.cluster:
-            self._executor = workers.Cluster(setup, options.cluster)
-        elif options.jobs > 1:
-            self._executor = workers.Processes(setup, options.jobs)
-        else:
-            self._executor = Recoverer(options.model, method=options.method)
+        try:
+            self._executor = self._chosen_executor()
+        except BaseException:  # damaged weights, no answer of a cluster, Ctrl-C while it waits for one
+            self.outputs.discard()
+            raise
         self._tracks = RecordedTracks(lambda text: complain(f"warning: {text}")) if options.track else None
         self._unreadable = 0
         self._warnings: set[str] = set()
+
+    def _chosen_executor(self) -> Recoverer | workers.Processes | workers.Cluster:
+        options = self._options
+        setup = workers.Setup(options.model, self._settings)
+        if options.cluster:
+            return workers.Cluster(setup, options.cluster)
+        if options.jobs > 1:
+            return workers.Processes(setup, options.jobs)
+        return Recoverer(options.model, method=options.method)
 
     def over_all_frames(self) -> int:
         """Recover them; the exit code."""

@@ -19,6 +19,8 @@ from sq_perception.geometry.mesh import COLOURS
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
+from sq_perception.learning import checkpoint
+from sq_perception.recordings import still_page
 from sq_perception.recordings.bag_file import InputOptions
 from sq_perception.recordings.frame_file import FrameError
 from sq_perception.recordings.inputs import RecordedInput, in_folder
@@ -442,6 +444,29 @@ def test_what_cannot_be_written_is_known_before_a_frame_is_computed(tmp_path, op
     frame = save_npz(tmp_path / "a.npz")
     assert run(frame, option, "/proc/sys/out.mcap") == 2
     assert option in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("option", ["--mcap", "--html"])
+def test_weights_damaged_beyond_their_header_leave_nothing_behind(tmp_path, option, capsys):
+    model, outputs = tmp_path / "damaged.safetensors", tmp_path / "outputs"
+    outputs.mkdir()
+    model.write_bytes(checkpoint.resolve(None).read_bytes()[:-1000] + 1000 * b"\xff")
+    frame, out = save_npz(tmp_path / "a.npz"), outputs / f"out.{option[2:]}"
+    assert main.main(["recover", str(frame), "--model", str(model), option, str(out)]) == 1
+    assert "not all finite" in capsys.readouterr().err
+    assert not list(outputs.iterdir())
+
+
+def test_a_bag_that_was_begun_is_forgotten_where_the_page_cannot_be(tmp_path, monkeypatch, capsys):
+    def full(path):
+        raise OSError(28, "No space left on device", str(path))
+
+    monkeypatch.setattr(still_page, "StillPage", full)
+    frame, outputs = save_npz(tmp_path / "a.npz"), tmp_path / "outputs"
+    outputs.mkdir()
+    assert run(frame, "--mcap", outputs / "out.mcap", "--html", outputs / "out.html") == 1
+    assert "No space left" in capsys.readouterr().err
+    assert not list(outputs.iterdir())
 
 
 def test_inputs_are_not_replaced(tmp_path, capsys):
