@@ -17,7 +17,7 @@ from sq_perception.files import output_file
 from sq_perception.fitting.fit import Status
 from sq_perception.geometry import mesh
 from sq_perception.recordings import bag_file, result_json
-from sq_perception.recordings.frame_file import RecordedFrame, Stamp
+from sq_perception.recordings.frame_file import FrameError, RecordedFrame, Stamp
 from sq_perception.recordings.result_json import in_result_frame
 from sq_perception.recovery.recovery import FrameRecovery
 from sq_perception.tracking.session import Followed
@@ -95,6 +95,8 @@ class Outputs:
     def __init__(self, options: argparse.Namespace) -> None:
         self._options = options
         self.results: list[dict[str, Any]] = []
+        self._not_in_bag: list[str] = []
+        """Why frames are not in the bag."""
         self._bag: ResultBag | None = None
         self._page: StillPage | None = None
         self._lines = _lines(options)
@@ -132,7 +134,10 @@ class Outputs:
         if options.meshes:
             _write_mesh(options.meshes / f"{stem}.{options.mesh_format}", frame, recovery)
         if self._bag is not None:
-            self._bag.add(frame, recovery, tracks)
+            try:
+                self._bag.add(frame, recovery, tracks)
+            except FrameError as error:  # of a name that no message takes; the other files have the frame
+                self._not_in_bag.append(str(error))
         if self._page is not None:
             self._page.add(frame, recovery)
         if self._lines is not None:  # last: what has a line has all its files
@@ -157,6 +162,8 @@ class Outputs:
                     yield from _elsewhere(name, Path(getattr(self._options, name)), found)
             except OSError as error:
                 yield f"--{name}: {error}"
+        if self._not_in_bag:
+            yield f"--mcap: {len(self._not_in_bag)} of the frames are not in it: {self._not_in_bag[0]}"
         entries = [*self.done, *self.results]
         for name, text in (
             ("json", lambda: result_json.document(_decisive(self._options), entries)),

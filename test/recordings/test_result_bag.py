@@ -59,7 +59,7 @@ def header(stamp, frame_id="depth_optical"):
     return bag_messages.types("std_msgs/msg/Header")(stamp=time, frame_id=frame_id)
 
 
-def record(path, depths, encoding="16UC1"):
+def record(path, depths, encoding="16UC1", frame_ids=()):
     """A bag of depth images, taken at 7.1, 7.2 ... and received at 100.003, 100.103 ..."""
     with Writer(path, version=9, storage_plugin=StoragePlugin.MCAP) as writer:
         topics = {
@@ -67,7 +67,7 @@ def record(path, depths, encoding="16UC1"):
             for topic, kind in ((TOPIC, "Image"), (INFO, "CameraInfo"))
         }
         for k, depth in enumerate(depths):
-            at = header(Stamp(7, (k + 1) * 10**8))
+            at = header(Stamp(7, (k + 1) * 10**8), *frame_ids[k : k + 1])
             known = Intrinsics(CAMERA.width, CAMERA.height, CAMERA.fx, CAMERA.fy, CAMERA.cx, CAMERA.cy)
             received = 100 * SECOND + 3_000_000 + k * 10**8
             info = intrinsics_to_message(known, at, bag_messages.types)
@@ -287,6 +287,20 @@ def test_names_of_recordings_are_not_trusted(tmp_path, scene):
         "/depth/image": len(topics) - 1,
         "/good/name": 1,
     }
+
+
+def test_a_frame_that_the_bag_refuses_is_in_all_other_files(tmp_path, capsys):
+    """It was read and recovered: no frame is unreadable."""
+    bag = record(tmp_path / "bag", 3 * [depth_of()], frame_ids=("optical", 256 * "x", "optical"))
+    out, document, page = (tmp_path / f"out.{suffix}" for suffix in ("mcap", "json", "html"))
+    recover(bag, "--mcap", out, "--json", document, "--jsonl", tmp_path / "out.jsonl", "--html", page, code=1)
+    errors = capsys.readouterr().err
+    assert "--mcap: 1 of the frames are not in it: bag_7.200000000: frame_id: expected at most 255" in errors
+    assert "3 frames, 6 objects (0 failed), median" in errors
+    assert len(json.loads(document.read_text())["frames"]) == 3
+    assert len((tmp_path / "out.jsonl").read_text().splitlines()) == 4
+    assert page.read_text().count("<script>frames.push") == 3
+    assert [time % SECOND for time, _ in messages(out)[SUPERQUADRICS]] == [3_000_000, 203_000_000]
 
 
 def test_times_of_recordings_are_not_trusted(tmp_path, scene):
