@@ -19,7 +19,8 @@ output:
    "weakest": ...}, ...]}, ...]}, ...]}
   Position and rotation are those of the gripper's tool centre point, metres in the optical frame: z the approach, y the
   way of the fingers.  "score" is the probability that the grasp holds, the best first; "weakest" what takes most from
-  it.  A body without a grasp has the reason.  The stamp is null where a frame has none.
+  it.  A body without a grasp has the reason; those that could not be recovered come last.  The stamp is null where a
+  frame has none.
 
 examples:
   sq-perception grasp table.npz --json grasps.json --pictures pictures/

@@ -14,6 +14,7 @@ import numpy as np
 from sq_perception.commands import console
 from sq_perception.commands.console import STANDARD_OUTPUT, complain, failed, misused
 from sq_perception.files import output_file
+from sq_perception.fitting.fit import Status
 from sq_perception.geometry import mesh
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.grasping import planner
@@ -92,7 +93,7 @@ def run(options: argparse.Namespace) -> int:
 def _bodies(
     stem: str, frame: RecordedFrame, recoverer: Recoverer, hand: Gripper, friction: float, options: argparse.Namespace
 ) -> list[dict[str, Any]]:
-    """Draw the grasps of a frame where that is asked for; its ``bodies``."""
+    """Draw the grasps of a frame where that is asked for; its ``bodies``, those that failed last."""
     settings = RecoveryOptions(free_space=frame.has_free_space)
     recovery = recoverer.recover(frame.depth, frame.camera, frame.labels, settings)
     if recovery.message:
@@ -106,7 +107,7 @@ def _bodies(
         _draw(options.pictures / f"{stem}.png", frame, found, plan, hand)
     if options.meshes and found:
         _write_mesh(options.meshes / f"{stem}.glb", found, plan, hand)
-    return [
+    planned = [
         {
             "label": int(recovered.label),
             "reason": plan.reasons[k],
@@ -123,6 +124,10 @@ def _bodies(
             ],
         }
         for k, recovered in enumerate(found)
+    ]
+    failures = [body for body in recovery.bodies if body.status == Status.FAILED]
+    return planned + [
+        {"label": int(body.label), "reason": f"failed: {body.message}", "grasps": []} for body in failures
     ]
 
 

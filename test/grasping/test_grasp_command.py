@@ -58,6 +58,21 @@ def test_a_can_is_grasped_across_and_everything_is_written(frame, tmp_path, caps
     assert "mm open" in capsys.readouterr().out
 
 
+def test_a_body_that_failed_is_listed_last_with_the_reason(frame, tmp_path, capsys):
+    recorded = dict(np.load(frame))
+    labels = np.where(recorded["labels"] == recorded["labels"][60, 80], 7, 0)
+    labels[0, :3] = 2
+    np.savez(frame, **{**recorded, "labels": labels})
+    out = tmp_path / "out.json"
+    assert main.main(["grasp", str(frame), "--json", str(out)]) == 0
+    can, failed = json.loads(out.read_text())["frames"][0]["bodies"]
+    assert (can["label"], can["reason"]) == (7, "")
+    assert can["grasps"]
+    assert (failed["label"], failed["grasps"]) == (2, [])
+    assert failed["reason"].startswith("failed: ")
+    assert f"     2  {failed['reason']}" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(("height", "width"), [(2, 2000), (400, 2)])
 def test_pictures_of_strips_can_be_looked_at(height, width, tmp_path):
     path, out = tmp_path / "strip.npz", tmp_path / "out.json"
