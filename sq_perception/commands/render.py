@@ -50,7 +50,7 @@ def main(arguments: Sequence[str]) -> int:
     add("--projection", choices=("orthographic", "pinhole"), default="orthographic")
     add("--width", type=at_least(1), help="pixels (256 orthographic, 640 pinhole)")
     add("--height", type=at_least(1), help="pixels (as the width orthographic, 480 pinhole)")
-    add("--focal", type=float, default=525.0, help="focal length of the pinhole camera, pixels (525)")
+    add("--focal", type=float, help="focal length of the pinhole camera, pixels (525)")
     add("--camera-info", metavar="FILE", help="a pinhole camera from YAML instead")
     add("--bits", type=int, choices=(8, 16), default=8, help="depth of an orthographic PNG")
     return _render(command.parse_args([_plain_number(argument) for argument in arguments]))
@@ -74,9 +74,14 @@ def _render(options: argparse.Namespace) -> int:
         return misused(problem)
     if options.bits == 16 and (pinhole or suffix != ".png"):
         return misused("--bits: only orthographic PNGs have a choice")
+    if not pinhole and (options.camera_info or options.focal is not None):
+        return misused("--camera-info, --focal: of a pinhole camera; see --projection")
+    if options.camera_info and (options.width, options.height, options.focal) != (None, None, None):
+        return misused("--width, --height, --focal: the camera of --camera-info has its own")
 
     import numpy as np
 
+    from sq_perception.files.unpacking import MOST_PIXELS
     from sq_perception.geometry.superquadric import Superquadric
     from sq_perception.imaging import raycast, unit_cube
     from sq_perception.imaging.camera import Camera
@@ -97,8 +102,10 @@ def _render(options: argparse.Namespace) -> int:
                 camera = read_calibration(options.camera_info, distortion="ignore").camera
             else:
                 width, height = options.width or 640, options.height or 480
-                focal = options.focal
+                focal = 525.0 if options.focal is None else options.focal
                 camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+        if camera.width * camera.height > MOST_PIXELS:  # nor would any command read it
+            return misused(f"expected an image of at most {MOST_PIXELS} pixels, got {camera.width} x {camera.height}")
     except ValueError as error:
         return misused(str(error))
     depth, index = raycast.render(seen, camera)
