@@ -2,7 +2,8 @@
 
 All outputs have the header of the cloud.  The last plane in its frame counts; without one, grippers come from the side
 of the frame's origin, that of the camera.  What no message holds, measured points and unseen space, is not looked at;
-the command ``sq-perception grasp`` does.  Correlations of a body's numbers are not in the cloud either.
+the command ``sq-perception grasp`` does.  Correlations of a body's numbers are not in the cloud either.  Nor is it told
+from the cloud whether it is in metres: one in the frame ``unit_cube`` is refused, no other one of orthographic images.
 
 Where moveit_msgs is installed, ``~/plan_grasps`` is its service GraspPlanning: moveit_msgs/Grasp of the body that the
 target's id names as a collision object, of all bodies without one.  Its other requests are not looked at.
@@ -37,7 +38,7 @@ from sq_perception.nodes.managed_node import ManagedNode
 from sq_perception.nodes.outputs import ARRIVAL, MarkerIds
 from sq_perception.nodes.parameters import GraspParameters
 from sq_perception.nodes.statistics import THROTTLE
-from sq_perception.recordings.publication import covariances, superquadrics
+from sq_perception.recordings.publication import CUBE_FRAME, covariances, superquadrics
 
 _OF_EACH_GRASP = ("position", "rotation", "opening", "width", "score")
 """Columns of a message that are attributes of a grasp of the same name."""
@@ -144,6 +145,8 @@ class GraspNode(ManagedNode):
     def _answered(self, message: PointCloud2) -> tuple[messages.GraspArray | None, str]:
         """Plan and publish; the grasps, and of how many bodies, and why others have none.  No message ends the node."""
         try:
+            if message.header.frame_id == CUBE_FRAME:
+                raise ValueError("views of the unit cube have no metres to grasp in")
             bodies = from_message(message).recovered
             plan = planned(bodies, self._settings.current, self._plane_in(message.header))
             with self._publishing:

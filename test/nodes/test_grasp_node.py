@@ -105,6 +105,16 @@ def test_grasps_come_best_first_with_the_header_of_the_bodies(bench):
     assert (tips > 0).all()
 
 
+def test_bodies_of_the_unit_cube_are_refused(bench):
+    """As by sq-perception grasp: they are no metres."""
+    bench.cloud.publish(to_message(bodies(), Header(frame_id="unit_cube")))
+    bench.until(lambda: bench.node._last is not None)
+    answer = bench.call(Trigger, "/grasp_node/plan")
+    assert not answer.success
+    assert "no metres to grasp in" in answer.message
+    assert not bench.heard
+
+
 def test_one_body_may_be_asked_for_and_the_reason_of_none_is_told(bench):
     bench.answer(to_message(bodies(), HEADER))
     bench.node.set_parameters([Parameter("only_id", value=WALL)])
