@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import logging
 import math
+import re
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 
 SUCCESS, FAILURE, USAGE, INTERRUPTED = 0, 1, 2, 130
 STANDARD_OUTPUT = "-"
+_NEGATIVE = re.compile(r"-(\d+\.?\d*|\.\d+)(e[-+]?\d+)?|-inf(inity)?", re.IGNORECASE)
 LAST_PORT = 65535
 
 
@@ -65,6 +67,14 @@ def parser(command: str, description: str, epilog: str | None = None) -> argpars
         epilog=epilog,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
+
+
+def with_negatives(arguments: Sequence[str]) -> list[str]:
+    """Arguments of a command that takes negative numbers: of -1e-3, -1. and -inf argparse makes options.
+
+    A blank before it makes a number no option, and is none of the number for ``float``.
+    """
+    return [f" {argument}" if _NEGATIVE.fullmatch(argument) else argument for argument in arguments]
 
 
 def at_least(least: int) -> Callable[[str], int]:

@@ -11,7 +11,16 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
-from sq_perception.commands.console import add_frames, at_least, folder, parser, positive, target, text_target
+from sq_perception.commands.console import (
+    add_frames,
+    at_least,
+    folder,
+    parser,
+    positive,
+    target,
+    text_target,
+    with_negatives,
+)
 
 HELP = """\
 Recover superquadrics from recorded depth images.
@@ -145,7 +154,7 @@ def main(arguments: Sequence[str]) -> int:
         metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
         help="box of the optical frame, metres, that the middle of an object lies in",
     )
-    options = command.parse_args(arguments)
+    options = command.parse_args(with_negatives(arguments))
 
     from sq_perception.commands import recover_run
 

@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 import argparse
-import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from sq_perception.commands.console import SUCCESS, at_least, complain, failed, misused, parser, replaced_input, target
+from sq_perception.commands.console import (
+    SUCCESS,
+    at_least,
+    complain,
+    failed,
+    misused,
+    parser,
+    replaced_input,
+    target,
+    with_negatives,
+)
 from sq_perception.files import output_file
 
 if TYPE_CHECKING:
@@ -18,7 +27,6 @@ if TYPE_CHECKING:
     from sq_perception.imaging.camera import Camera
 
 PARAMETERS = ("a1", "a2", "a3", "e1", "e2", "t1", "t2", "t3", "qx", "qy", "qz", "qw")
-_NEGATIVE_WITH_EXPONENT = re.compile(r"-(\d+\.?\d*|\.\d+)[eE][-+]?\d+")
 
 _HELP = """\
 Draw one superquadric as a depth image.
@@ -53,12 +61,7 @@ def main(arguments: Sequence[str]) -> int:
     add("--focal", type=float, help="focal length of the pinhole camera, pixels (525)")
     add("--camera-info", metavar="FILE", help="a pinhole camera from YAML instead")
     add("--bits", type=int, choices=(8, 16), default=8, help="depth of an orthographic PNG")
-    return _render(command.parse_args([_plain_number(argument) for argument in arguments]))
-
-
-def _plain_number(argument: str) -> str:
-    """argparse takes -1e-3 for an option; -0.001 it understands."""
-    return f"{float(argument):.20f}" if _NEGATIVE_WITH_EXPONENT.fullmatch(argument) else argument
+    return _render(command.parse_args(with_negatives(arguments)))
 
 
 def _render(options: argparse.Namespace) -> int:

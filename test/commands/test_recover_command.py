@@ -374,14 +374,16 @@ def test_a_score_is_from_0_to_1(tmp_path, score, capsys):
     assert "--min-score: expected a score from 0 to 1" in capsys.readouterr().err
 
 
-def test_a_workspace_may_have_no_end(tmp_path):
-    """JSON knows no infinity; the same command goes on with its lines."""
+@pytest.mark.parametrize("lowest", [("-1", "-1.", "0"), ("-1e0", "-inf", "-.1e-1")])
+def test_a_workspace_may_have_no_end(tmp_path, lowest):
+    """JSON knows no infinity; the same command goes on with its lines.  Negative numbers are no options."""
     save_npz(tmp_path / "a.npz")
-    box = ["--workspace", "-1", "-1", "0", "1", "1", "inf", "--jsonl", tmp_path / "out.jsonl"]
+    box = ["--workspace", *lowest, "1", "1", "inf", "--jsonl", tmp_path / "out.jsonl"]
     for _ in range(2):
         assert len(recover(tmp_path, tmp_path / "a.npz", *box)[0]["superquadrics"]) == 2
     options = json.loads((tmp_path / "out.jsonl").read_text().splitlines()[0])["options"]
-    assert options["workspace"] == [-1, -1, 0, 1, 1, None]
+    expected = [-1, None if "-inf" in lowest else -1, float(lowest[2]), 1, 1, None]
+    assert options["workspace"] == expected
 
 
 def test_a_message_is_one_printable_line(capsys):
