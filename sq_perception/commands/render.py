@@ -27,6 +27,8 @@ if TYPE_CHECKING:
     from sq_perception.imaging.camera import Camera
 
 PARAMETERS = ("a1", "a2", "a3", "e1", "e2", "t1", "t2", "t3", "qx", "qy", "qz", "qw")
+_LONGEST = 10**6
+"""Pixels of a side that OpenCV and libpng write and read."""
 
 _HELP = """\
 Draw one superquadric as a depth image.
@@ -107,8 +109,10 @@ def _render(options: argparse.Namespace) -> int:
                 width, height = options.width or 640, options.height or 480
                 focal = 525.0 if options.focal is None else options.focal
                 camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
-        if camera.width * camera.height > MOST_PIXELS:  # nor would any command read it
-            return misused(f"expected an image of at most {MOST_PIXELS} pixels, got {camera.width} x {camera.height}")
+        width, height = camera.width, camera.height
+        if width * height > MOST_PIXELS or max(width, height) > _LONGEST:  # nor would any command read it
+            expected = f"expected an image of at most {MOST_PIXELS} pixels, sides of at most {_LONGEST}"
+            return misused(f"{expected}, got {width} x {height}")
     except ValueError as error:
         return misused(str(error))
     depth, index = raycast.render(seen, camera)

@@ -202,6 +202,7 @@ def test_a_missing_model_is_one_clear_line(tmp_path, view, capsys):
         ["render", *CUBE_BODY, "--output", "x.png", "--width", "1"],
         ["render", *CUBE_BODY, "--output", "x.png", "--width", "0"],
         ["render", *CUBE_BODY, "--output", "x.png", "--width", "1000000"],
+        ["render", *CUBE_BODY, "--output", "x.png", "--width", "1000001", "--height", "2"],
         ["render", *CAN, "--projection", "pinhole", "--output", "x.npz", "--width", "100000", "--height", "100000"],
         ["render", *CUBE_BODY, "--output", "x.png", "--camera-info", "525,525,319.5,239.5"],
         ["render", *CUBE_BODY, "--output", "x.png", "--focal", "500"],
