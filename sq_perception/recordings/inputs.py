@@ -95,8 +95,13 @@ class RecordedInput:
                 yield str(path), self._file(path, rest)
 
     def _add(self, path: Path) -> None:
-        if not path.is_dir() or bag_file.is_bag(path):
-            self._sources.append((path, self._options.camera_info or _camera_file(path.parent) or _of_its_name(path)))
+        try:
+            if not path.is_dir() or bag_file.is_bag(path):
+                camera_info = self._options.camera_info or _camera_file(path.parent) or _of_its_name(path)
+                self._sources.append((path, camera_info))
+                return
+        except OSError as error:  # a folder that may not be looked into, a name that is too long
+            self._sources.append((path, FrameError(str(error))))
             return
         found = self._in_folders(path, None)
         self._sources += found or [(path, FrameError(f"{path}: no frames in it ({', '.join(SUFFIXES)})"))]

@@ -119,6 +119,15 @@ def test_a_folder_that_cannot_be_read_hides_none_beside_it(tmp_path, monkeypatch
     assert [isinstance(frame, FrameError) for _, frame in found] == [False, True, False]
 
 
+def test_a_name_that_cannot_even_be_looked_at_costs_no_other_frame(tmp_path, capsys):
+    """As one in a folder without permission; here one that is too long."""
+    (frame,) = recover(tmp_path, tmp_path / (300 * "a"), save_npz(tmp_path / "a.npz"), code=1)
+    assert frame["file"] == str(tmp_path / "a.npz")
+    errors = capsys.readouterr().err
+    assert "File name too long" in errors
+    assert "1 frame or source unreadable" in errors
+
+
 def test_bad_inputs_come_as_errors_in_their_place(tmp_path):
     empty = tmp_path / "empty"
     empty.mkdir()
