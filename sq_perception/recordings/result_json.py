@@ -225,7 +225,9 @@ class ResultLines:
             data = file.read()
         lines = data.split(b"\n")[:-1]
         entries = [self._entry(k + 1, line) for k, line in enumerate(lines)]
-        if entries:
+        if len(entries) == 1 and _is_head(entries[0], expected):
+            lines = []  # of a run that came to no frame: it is begun again, with any options
+        elif entries:
             self._compare(entries[0], expected)
         elif data.strip() and not _line(expected).startswith(data):
             raise ResumeError(f"{self._path}: expected a file of JSON lines that this command wrote")
@@ -280,6 +282,11 @@ class Recovered:
         if found:
             self._left[key] -= 1
         return found
+
+
+def _is_head(found: Mapping[str, Any], expected: Mapping[str, Any]) -> bool:
+    """Whether it is the first line of a file of lines, and no document, which has frames too."""
+    return found.keys() == expected.keys() and all(found[name] == expected[name] for name in ("format", "version"))
 
 
 def _refused(constant: str) -> None:

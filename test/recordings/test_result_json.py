@@ -69,6 +69,20 @@ def test_other_options_are_refused_by_name(path):
     assert path.read_bytes() == before
 
 
+def test_a_file_without_a_frame_takes_other_options(path):
+    """Of a run whose model turned out to be damaged, say; a document in one line is none."""
+    head = path.read_text().splitlines()[0]
+    other = {**OPTIONS, "method": "network"}
+    path.write_text(head + "\n")
+    ResultLines(path, other).close()
+    assert json.loads(path.read_text())["options"] == other
+    document = json.dumps({**json.loads(head), "frames": [entry(0)]}) + "\n"
+    path.write_text(document)
+    with pytest.raises(ResumeError):
+        ResultLines(path, other)
+    assert path.read_text() == document
+
+
 def test_a_damaged_line_is_named(path):
     lines = path.read_text().splitlines(keepends=True)
     path.write_text(lines[0] + "damaged\n" + lines[2])
