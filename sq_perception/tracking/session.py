@@ -176,9 +176,9 @@ class TrackingSession:
         return tuple(found)
 
     def _posed(self) -> Tracker:
-        """The tracker of frames with a pose, as it was before those without one; the ids that these gave are taken."""
+        """The tracker of frames with a pose, as it was before those without one, but for what these counted."""
         if self._without_pose is not None:
-            self._tracker.skip_ids(self._without_pose.births)
+            self._tracker.count_on(self._without_pose)
             self._without_pose = None
         return self._tracker
 

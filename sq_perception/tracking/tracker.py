@@ -81,9 +81,11 @@ class Tracker:
         """Forget every body; ids go on."""
         self._bodies, self._stamp = (), None
 
-    def skip_ids(self, births: int) -> None:
-        """Give none of so many first ids any more: another tracker, begun as a copy, has."""
-        self.births = max(self.births, births)
+    def count_on(self, other: Tracker) -> None:
+        """Take over what another tracker, begun as a copy, has counted: ids, and frames that showed a body."""
+        seen = {body.id: body.seen for body in other._bodies}
+        self._bodies = tuple(replace(body, seen=max(body.seen, seen.get(body.id, 0))) for body in self._bodies)
+        self.births = max(self.births, other.births)
 
     def update(
         self,

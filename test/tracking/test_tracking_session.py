@@ -104,6 +104,13 @@ def test_what_was_seen_before_the_first_pose_is_no_second_body(rng):
     assert one.hidden == ()
 
 
+def test_frames_without_a_pose_count_among_those_that_showed_a_body(rng):
+    one = TrackingSession()
+    for k in range(12):
+        (found,) = one.follow([draw(body(), noise(), rng)], 0.1 * k, is_pose_known=k % 4 == 0)
+        assert (found.id, found.seen) == (1, k + 1)
+
+
 def test_without_a_pose_there_are_ids_and_forms_but_no_fusion(rng):
     truth, one = body(), TrackingSession()
     last = None
