@@ -160,7 +160,10 @@ def _check_same_run(config: TrainingConfig, output: Path) -> None:
         return
     # States of 0.2.0 name no settings; the newest network of their run does, from its first validation on.
     named = [path for path in (state, output / "last.safetensors") if SETTINGS in _header(path)]
-    before = json.loads(_header(named[0])[SETTINGS]) if named else {}
+    try:
+        before = dict(json.loads(_header(named[0])[SETTINGS])) if named else {}
+    except (ValueError, TypeError) as error:
+        raise checkpoint.CheckpointError(f"{named[0]}: its header does not tell what run it is of: {error}") from error
     other = [name for name in _OF_A_RUN if before.get(name, getattr(config, name)) != getattr(config, name)]
     if other:
         differences = ", ".join(f"{name} {before[name]!r}, not {getattr(config, name)!r}" for name in other)

@@ -99,10 +99,14 @@ class TrainingState(Generic[Network]):
             for prefix, network in (("model.", self.model), ("average.", self.average)):
                 own = {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
                 network.load_state_dict(own)
-            state = self.optimizer.state_dict()
+            state, parameters = self.optimizer.state_dict(), list(self.model.parameters())
             for key, value in tensors.items():
                 if key.startswith("optimizer."):
                     _, index, slot = key.split(".")
+                    if value.ndim and value.shape != parameters[int(index)].shape:  # the optimizer would not say so
+                        raise ValueError(
+                            f"{key}: expected shape {[*parameters[int(index)].shape]}, got {[*value.shape]}"
+                        )
                     state["state"].setdefault(int(index), {})[slot] = value
             self.optimizer.load_state_dict(state)
             best, without_progress, reductions = tensors["schedule"].tolist() or astuple(Plateau())

@@ -239,6 +239,19 @@ class TestInterruptions:
         with pytest.raises(checkpoint.CheckpointError, match="not the state of such a run"):
             train.train(RUN, tmp_path, SMALL)
 
+    def test_moments_of_other_weights_are_refused(self, tmp_path: Path) -> None:
+        path = tmp_path / "state.safetensors"
+        train.train(replace(RUN, steps=1), tmp_path, SMALL)
+        save_file({**load_file(str(path)), "optimizer.0.exp_avg": torch.zeros(3)}, str(path))
+        with pytest.raises(checkpoint.CheckpointError, match=r"not the state of such a run: optimizer\.0\.exp_avg"):
+            train.train(replace(RUN, steps=2), tmp_path, SMALL)
+
+    @pytest.mark.parametrize("settings", ["{", "[1]", "null"])
+    def test_settings_that_are_none_are_refused(self, settings: str, tmp_path: Path) -> None:
+        save_file({"step": torch.tensor(1)}, str(tmp_path / "state.safetensors"), {"training": settings})
+        with pytest.raises(checkpoint.CheckpointError, match="does not tell what run it is of"):
+            train.train(RUN, tmp_path, SMALL)
+
 
 class TestContinuation:
     def test_average_follows_and_is_what_is_saved(self, tmp_path: Path) -> None:
