@@ -72,13 +72,17 @@ quick: $(VENV)/.package
 	$(VENV)/bin/pytest $(addprefix test/,$(CORE)) -m "not process"
 
 # Two at once: the lint while kernels are compiled, then tests that start processes, and mostly wait for them, beside
-# those that compute.
+# those that compute.  Those that train go with the first, so that both take equally long.
 test: $(VENV)/.dependencies
 	$(MAKE) --no-print-directory --jobs 2 --output-sync=target lint test-computing test-processes
 
 # The executable, not `python -m pytest`: that would put the source tree before the installed package.
-test-computing test-processes: $(VENV)/.package
-	$(VENV)/bin/pytest test -m "$(if $(filter %-processes,$@),,not )process"
+test-computing: $(VENV)/.package
+	$(VENV)/bin/pytest test -m "not process" --ignore=test/learning
+
+test-processes: $(VENV)/.package
+	$(VENV)/bin/pytest test -m process
+	$(VENV)/bin/pytest test/learning -m "not process"
 
 speed: $(VENV)/.package
 	$(VENV)/bin/python benchmarks/speed.py --repeats 3
