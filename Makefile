@@ -30,6 +30,7 @@ SOURCES := setup.py setup.cfg pyproject.toml package.xml resource/sq_perception 
 	$(wildcard config/*) $(wildcard launch_scripts/*.py) $(wildcard sq_msgs_py/*.py) \
 	$(wildcard sq_perception/*.py) $(wildcard sq_perception/*/*.py) $(wildcard sq_perception/*/*/*.yaml) $(wildcard sq_perception/weights/*)
 
+BESIDE := evaluation tracking
 CORE := geometry files imaging segmentation fitting tracking sq_msgs_py
 
 .PHONY: demo quick test test-computing test-processes lint speed bench docs install clean
@@ -72,17 +73,17 @@ quick: $(VENV)/.package
 	$(VENV)/bin/pytest $(addprefix test/,$(CORE)) -m "not process"
 
 # Two at once: the lint while kernels are compiled, then tests that start processes, and mostly wait for them, beside
-# those that compute.  Those that train go with the first, so that both take equally long.
+# those that compute.  Those of two rooms go with the first, so that both halves take equally long.
 test: $(VENV)/.dependencies
 	$(MAKE) --no-print-directory --jobs 2 --output-sync=target lint test-computing test-processes
 
 # The executable, not `python -m pytest`: that would put the source tree before the installed package.
 test-computing: $(VENV)/.package
-	$(VENV)/bin/pytest test -m "not process" --ignore=test/learning
+	$(VENV)/bin/pytest test -m "not process" $(addprefix --ignore=test/,$(BESIDE))
 
 test-processes: $(VENV)/.package
 	$(VENV)/bin/pytest test -m process
-	$(VENV)/bin/pytest test/learning -m "not process"
+	$(VENV)/bin/pytest $(addprefix test/,$(BESIDE)) -m "not process"
 
 speed: $(VENV)/.package
 	$(VENV)/bin/python benchmarks/speed.py --repeats 3
