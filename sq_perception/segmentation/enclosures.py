@@ -85,7 +85,7 @@ class _Segments:
 
 
 def _moments(points: np.ndarray, owner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """See _Segments."""
+    """How long the points (n, 2) of each segment are, and their principal axes, as :class:`_Segments` has them."""
     counts = np.bincount(owner)
     centred = points - np.stack([np.bincount(owner, column) / counts for column in points.T], axis=1)[owner]
     x, y = centred.T

@@ -112,17 +112,17 @@ class Segmentation:
         n and d of the support plane, height above it = n.p + d; None where there is none.
     ids : tuple of int
         Labels in the image, the one with most pixels first.
-    is_cut
-        Whether there were more objects than ``max_objects``.
     sigma
         Noise of the depth at one metre as measured on the plane, or a guess where there is none, metres.
+    is_cut
+        Whether there were more objects than ``max_objects``.
     """
 
     labels: np.ndarray
     plane: np.ndarray | None
     ids: tuple[int, ...]
-    is_cut: bool = False
     sigma: float = _UNKNOWN_SIGMA
+    is_cut: bool = False
 
 
 def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | None = None) -> Segmentation:
@@ -149,7 +149,7 @@ def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | No
     least = max(_LEAST_PIXELS, round(_LEAST_SHARE * depth.size))
     if not camera.is_pinhole:
         labels, ids, is_cut = _ordered(depth_steps.components(valid), least, options.max_objects)
-        return Segmentation(labels, None, ids, is_cut)
+        return Segmentation(labels, None, ids, is_cut=is_cut)
     if np.count_nonzero(valid) < least:
         return Segmentation(np.zeros(depth.shape, np.int32), None, ())
     planes = support_plane.planes(depth, valid, camera)
@@ -161,7 +161,7 @@ def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | No
         labels = bodies.taken_apart(known, free, camera, _UNKNOWN_SIGMA, limits.is_small)
         test = standing.alone(known, camera, limits)
         labels, ids, is_cut = _ordered(labels, least, options.max_objects, test)
-        return Segmentation(labels, None, ids, is_cut)
+        return Segmentation(labels, None, ids, is_cut=is_cut)
     support = support_surface.measured(plane, known, valid, camera)
     walls = [other for other in planes if other is not plane]
     everything = known
@@ -179,7 +179,7 @@ def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | No
         labels = np.where(np.isin(labels, list(around)), 0, labels)
     test = standing.standing(everything, relative, labels, camera, support, walls, limits)
     labels, ids, is_cut = _ordered(labels, least, options.max_objects, test)
-    return Segmentation(labels, plane.equation, ids, is_cut, max(support.sigma, bodies.LEAST_SIGMA))
+    return Segmentation(labels, plane.equation, ids, max(support.sigma, bodies.LEAST_SIGMA), is_cut)
 
 
 def from_labels(
@@ -227,7 +227,7 @@ def from_labels(
     plane = None
     if ids and camera.is_pinhole:
         plane = support_plane.around(labels, ids, depth, valid, camera)
-    return Segmentation(labels, plane, ids, is_cut)
+    return Segmentation(labels, plane, ids, is_cut=is_cut)
 
 
 def support_under(
