@@ -57,7 +57,8 @@ def checked_turn(parts: list[np.ndarray]) -> np.ndarray:
         raise ValueError(f"size: expected positive half sizes, got {size}")
     if ((shape <= 0) | (shape > 2)).any():
         raise ValueError(f"shape: expected exponents in (0, 2], got {shape}")
-    square = np.einsum("...i,...i->...", rotation, rotation)
-    if (square < _LEAST_SQUARE).any():
-        raise ValueError("rotation: expected a quaternion of non-zero length")
+    with np.errstate(over="ignore"):
+        square = np.einsum("...i,...i->...", rotation, rotation)
+    if not ((square >= _LEAST_SQUARE) & np.isfinite(square)).all():
+        raise ValueError(f"rotation: expected a quaternion of non-zero, finite length, got {rotation}")
     return rotation / np.sqrt(square)[..., None]

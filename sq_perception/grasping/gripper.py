@@ -25,6 +25,11 @@ _REACH = 0.1
 """The approach is straight for so many metres."""
 
 
+def _are_numbers(value: object, shape: tuple[int, ...]) -> bool:
+    numbers = np.asarray(value)
+    return numbers.dtype.kind in "iuf" and numbers.shape == shape and bool(np.isfinite(numbers).all())
+
+
 @dataclass(frozen=True)
 class Gripper:
     """One parallel gripper.
@@ -51,7 +56,8 @@ class Gripper:
     Raises
     ------
     ValueError
-        For a length or force that is not one positive and finite number, or a hand that is not three.
+        For a length or force that is not one positive and finite number, a hand that is not three, or a link_from_tcp
+        that is no pose.
     """
 
     name: str
@@ -70,10 +76,13 @@ class Gripper:
         for field in fields(self):
             value = getattr(self, field.name)
             if field.name not in ("name", "link", "link_from_tcp", "joints"):
-                numbers, count = np.asarray(value, dtype=float), (3,) if field.name == "hand" else ()
-                if numbers.shape != count or not (np.isfinite(numbers) & (numbers > 0)).all():
+                count = (3,) if field.name == "hand" else ()
+                if not (_are_numbers(value, count) and np.greater(value, 0).all()):
                     expected = "three positive numbers" if count else "a positive number"
-                    raise ValueError(f"{field.name}: expected {expected}, got {value}")
+                    raise ValueError(f"{field.name}: expected {expected}, got {value!r}")
+        place, turn = self.link_from_tcp if len(self.link_from_tcp) == 2 else ((), ())
+        if not (_are_numbers(place, (3,)) and _are_numbers(turn, (4,)) and np.any(turn)):
+            raise ValueError(f"link_from_tcp: expected a position and a quaternion, got {self.link_from_tcp}")
 
     def boxes(self, opening: float, reach: float = _REACH) -> np.ndarray:
         """Centre and half sizes (3, 6) of both fingers and the hand in the TCP's frame, at an opening.

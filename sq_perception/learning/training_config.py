@@ -35,6 +35,8 @@ CHOICES: dict[str, tuple[str, ...]] = {
     "schedule": ("cosine", "plateau"),
 }
 """Fields that name something, and the names there are."""
+_SEEDS = 2**63
+"""That torch takes."""
 _PATIENCE = 10
 _LONGEST = 20
 _FACTOR = 0.1
@@ -152,6 +154,8 @@ class TrainingConfig:
         for name in ("pinhole_share", "wide_share", "occluded_share", "noisy_share"):
             if not 0 <= getattr(self, name) <= 1:
                 raise ValueError(f"{name}: expected a share from 0 to 1, got {getattr(self, name)}")
+        if self.seed >= _SEEDS:
+            raise ValueError(f"seed: expected a number below 2^63, got {self.seed}")
         if not self.learning_rate > 0:
             raise ValueError(f"learning_rate: expected a positive number, got {self.learning_rate}")
         if not 0 <= self.average < 1:

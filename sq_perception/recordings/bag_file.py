@@ -10,7 +10,8 @@ by type and encoding:
 | sensor_msgs/Image, orthographic | mono8, mono16 | grey values of the unit cube |
 
 Label images on the one topic that is called ``mask/image``, with or without a name before it, are the masks of the
-images with their stamps; they may have been recorded later, and in another order.
+images with their stamps; they may have been recorded later, and in another order.  Of several such topics none is
+taken, and frames say so.
 
 The camera is that of the sibling topic ``camera_info``, as image_transport pairs them: the message with the image's
 stamp; failing that, the last one before the image; failing that, the bag's first, however late.  The name of their
@@ -140,6 +141,7 @@ class RecordedBag:
             self._reader = opened.enter_context(closing(BagReader(self._path)))
             self.topic = self._chosen(self._options.topic)
             self._info_topic = camera_info_topic(self.topic)
+            self._mask_topics = self._found_masks()
             self._masks = opened.enter_context(closing(self._recorded_masks()))
             self._passed: dict[Stamp, int] = {}
             """When masks were recorded that have been read so far: not all of them fit into memory."""
@@ -238,16 +240,16 @@ class RecordedBag:
 
     # frames
 
-    def _mask_topics(self) -> set[str]:
-        images = self._reader.connections(IMAGE)
-        return {connection.topic for connection in images if connection.topic.endswith(_MASKS)} - {self.topic}
+    def _found_masks(self) -> list[str]:
+        topics = {connection.topic for connection in self._reader.connections(IMAGE)} - {self.topic}
+        return sorted(topic for topic in topics if topic.endswith(_MASKS))
 
     def _recorded_masks(self, received: int | None = None) -> Generator[Message, None, None]:
         """The messages of the mask topic, in a reading of their own, as they come at any distance from their images."""
-        if len(topics := self._mask_topics()) != 1:
+        if len(self._mask_topics) != 1:
             return
         with closing(BagReader(self._path)) as reader:
-            for message in reader.messages(reader.connections(IMAGE, topic=topics.pop()), received=received):
+            for message in reader.messages(reader.connections(IMAGE, topic=self._mask_topics[0]), received=received):
                 if not isinstance(message, FrameError):
                     yield message
 
@@ -286,7 +288,7 @@ class RecordedBag:
 
     def _decoded(self, message: Message, info: Message | None) -> RecordedFrame:
         depth, encoding = publication.depth_of(message.content, self._orthographic)
-        name, warning, reading = frame_name(self._path, message.stamp), "", self._options.reading
+        name, notes, reading = frame_name(self._path, message.stamp), [], self._options.reading
         labels = self._labels(message.stamp, name, depth)
         if self._orthographic:
             camera = unit_cube.camera(depth.shape[1], depth.shape[0])
@@ -298,7 +300,9 @@ class RecordedBag:
             calibration = self._calibration(info, depth)
             labels = None if labels is None else calibration.rectified_labels(labels)
             depth, camera = calibration.rectified(depth), calibration.camera
-            warning = f"{self._path}: {self.topic}: {calibration.note}" if calibration.note else ""
+            notes += [f"{self.topic}: {calibration.note}"] if calibration.note else []
+        if len(self._mask_topics) > 1 and reading.masks is None:
+            notes.append(f"several topics with masks, none is taken: {', '.join(self._mask_topics)}")
         return reading.of(
             RecordedFrame(
                 depth,
@@ -308,7 +312,7 @@ class RecordedBag:
                 stamp=message.stamp,
                 topic=self.topic,
                 frame_id=message.content.header.frame_id,
-                warning=warning,
+                warning="; ".join(f"{self._path}: {note}" for note in notes),
                 encoding=encoding,
                 received=message.received,
             )

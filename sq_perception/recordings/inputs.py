@@ -69,7 +69,7 @@ class RecordedInput:
             camera_file.read_calibration(self._options.camera_info, treatment, size=_ANY_SIZE)
         self._sources: list[_Source] = []
         for name in names:
-            self._add(Path(name))
+            self._add(name)
         self.total = len(self._sources)
         """Frames to expect; a bag counts as one until it is opened."""
 
@@ -94,7 +94,11 @@ class RecordedInput:
             else:
                 yield str(path), self._file(path, rest)
 
-    def _add(self, path: Path) -> None:
+    def _add(self, name: str) -> None:
+        if not name:  # a variable of a shell that is not set: the current folder is called "."
+            self._sources.append((Path(), FrameError("expected the name of a file or folder, got an empty one")))
+            return
+        path = Path(name)
         try:
             if not path.is_dir() or bag_file.is_bag(path):
                 camera_info = self._options.camera_info or _camera_file(path.parent) or _of_its_name(path)

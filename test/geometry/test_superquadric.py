@@ -258,7 +258,8 @@ class TestMisuse:
             ("shape", [0.5, 2.5], "exponents"),
             ("shape", [0.0, 1.0], "exponents"),
             ("translation", [0, np.inf, 0], "finite"),
-            ("rotation", [0, 0, 0, 0], "non-zero length"),
+            ("rotation", [0, 0, 0, 0], "non-zero, finite length"),
+            ("rotation", [0, 0, 0, 1e300], "non-zero, finite length"),
         ],
     )
     @pytest.mark.parametrize("batch", [(), (2,)])

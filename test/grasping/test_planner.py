@@ -381,6 +381,9 @@ def test_misuse_is_told(wrong, what):
         ({"palm": (0.03, 0.03)}, "palm: expected a positive number"),
         ({"hand": (0.06, 0.2)}, "hand: expected three positive numbers"),
         ({"hand": (0.06, 0.2, -0.1)}, "hand"),
+        ({"opening": "0.08"}, "opening: expected a positive number, got '0.08'"),
+        ({"link_from_tcp": ((0, 0, 0.1), (0, 0, 0, 0))}, "link_from_tcp: expected a position and a quaternion"),
+        ({"link_from_tcp": (0, 0, 0.1)}, "link_from_tcp"),
     ],
 )
 def test_a_gripper_of_other_numbers_is_refused_before_it_plans(wrong, what):

@@ -89,6 +89,7 @@ class TestConfig:
             ("framing: full\npinhole_share: 0.5", "orthographic"),
             ("data: set\nnoisy_share: 0.5", "expected shares of 0"),
             ("sharpness_start: -5", "sharpness_start: expected a finite number"),
+            ("seed: 18446744073709551616", "seed: expected a number below 2\\^63"),
             ("!!python/object/apply:os.system ['true']", "not a YAML file"),
         ],
     )

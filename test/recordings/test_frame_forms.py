@@ -296,6 +296,13 @@ def test_a_colour_picture_is_named(tmp_path):
         read(tmp_path / "a.png", NUMBERS)
 
 
+def test_an_empty_name_is_no_folder(tmp_path, monkeypatch):
+    save(tmp_path / "a.png")
+    monkeypatch.chdir(tmp_path)
+    ((_, error),) = RecordedInput([""])
+    assert "got an empty one" in str(error)
+
+
 def test_a_folder_without_frames_gives_those_of_its_subfolders(tmp_path):
     """In natural order, with the camera beside them or above; a folder with frames keeps to them."""
     for name in ("take10/b.png", "take2/depth/a.png", "take2/depth/deeper/x.png"):

@@ -300,6 +300,14 @@ def test_masks_are_found_by_their_stamps_in_whatever_order_they_were_recorded(tm
     assert masks == [[1], [2], None, [5], [4], [4]]
 
 
+def test_of_several_topics_with_masks_none_is_taken_and_frames_say_so(tmp_path, grey):
+    contents = [(INFO, 0, info(0)), (TOPIC, 1, image(grey, 1, "16UC1"))]
+    contents += [(topic, 1, image(np.ones_like(grey), 1, "8UC1")) for topic in ("/b/mask/image", "/a/mask/image")]
+    (frame,) = frames(write(tmp_path / "bag", contents))
+    assert frame.labels is None
+    assert "several topics with masks, none is taken: /a/mask/image, /b/mask/image" in frame.warning
+
+
 @pytest.mark.parametrize(("every", "limit", "wanted"), [(1, None, 7), (3, None, 3), (2, 2, 2), (1, 9, 7), (8, 1, 1)])
 def test_every_and_limit(tmp_path, grey, every, limit, wanted):
     contents = [(INFO, 0, info(0))] + [(TOPIC, second, image(grey, second, "16UC1")) for second in range(1, 8)]
