@@ -1,11 +1,12 @@
 """Segments of simulated tables, with which of their readings are of their object: training data.
 
-A scene of :mod:`~sq_perception.simulation.things_on_table` before a random camera, of many the table ends in sight
-(:mod:`~sq_perception.simulation.room`), is measured by one of the sensors; of many a smaller image is taken, whose
-borders cut things.  It is segmented as any image is, and each segment seen as a
-:class:`~sq_perception.imaging.segment_view.SegmentView`.  Its object is the thing that most of its pixels show; what
-shows the table or the room at half of its pixels, and no thing at 30 % of them, has none.  A reading is one of the
-object if its pixel shows the object and it is no more than 10 mm + 1 % off: what a sensor smears over an edge is not.
+Things on a table (:mod:`~sq_perception.simulation.things_on_table`) that ends in sight in many scenes
+(:mod:`~sq_perception.simulation.room`), or in and on furniture (:mod:`~sq_perception.simulation.furniture`), before a
+random camera, are measured by one of the sensors; of many a smaller image is taken, whose borders cut things.  It is
+segmented as any image is, and each segment seen as a :class:`~sq_perception.imaging.segment_view.SegmentView`.  Its
+object is the thing that most of its pixels show; what shows the table, the furniture or the room at half of its pixels,
+and no thing at 30 % of them, has none.  A reading is one of the object if its pixel shows the object and it is no more
+than 10 mm + 1 % off: what a sensor smears over an edge is not.
 
 The network that tells whether a segment is one thing also sees compact pieces of segments
 (:mod:`~sq_perception.segmentation.pieces`), and of two neighbours as if they were one, each with the thing that it
@@ -24,17 +25,21 @@ from sq_perception.imaging import regions, segment_view
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.segment_view import SegmentView
 from sq_perception.segmentation import pieces, segments
-from sq_perception.simulation import room, sensor_noise
+from sq_perception.simulation import furniture, room, sensor_noise
 from sq_perception.simulation.things_on_table import TABLE_CAMERA, ThingsOnTable, things_on_table
 
 NO, YES, UNKNOWN = 0, 1, 2
 _SENSORS = ("realsense_d435", "kinect_v1", "realsense_d435", "kinect_v1", "azure_kinect", "zed")
-_FOCALS, _LARGE_FOCALS = (430.0, 700.0), (800.0, 1000.0)
-"""Pixels, at VGA and at 1280 x 720: depth cameras."""
-_LARGE = 0.15
-"""Share of the scenes at 1280 x 720."""
+_FOCALS = (430.0, 700.0)
+"""Pixels, at VGA: depth cameras, 49 to 73 degrees wide."""
+_WIDTHS, _OF_WIDTHS = (160, 320, 640, 1280), (0.1, 0.1, 0.65, 0.15)
+"""Pixels a row, and shares of the scenes that have so many."""
+_ELEVATIONS, _OF_ELEVATIONS = ((6.0, 20.0), (20.0, 70.0), (70.0, 90.0)), (0.2, 0.65, 0.15)
+"""Degrees that the camera is above the table, and shares of the scenes."""
+_IN_FURNITURE = 0.35
+"""Share of the scenes; their cameras are as high as the furniture asks."""
 _WITH_ROOM = 0.6
-"""Share of the scenes whose table ends in sight, before a room."""
+"""Share of the other scenes whose table ends in sight, before a room."""
 _LARGER, _TIMES = 0.35, (1.0, 2.5)
 """Share of the scenes that are as if all of it were so many times as large and as far: the largest thing that is
 recovered is 0.6 m long, and what is none is not told by its size."""
@@ -108,9 +113,13 @@ class _Measured:
 
 def _measured(rng: np.random.Generator) -> _Measured:
     """A random image."""
-    drawn = things_on_table(rng, camera=_camera(rng))
-    if rng.random() < _WITH_ROOM:
-        drawn = replace(drawn, depth=room.behind(drawn, rng))
+    if rng.random() < _IN_FURNITURE:
+        drawn = furniture.things_in_furniture(str(rng.choice(furniture.KINDS)), rng, _camera(rng))
+    else:
+        elevation = _ELEVATIONS[rng.choice(len(_ELEVATIONS), p=_OF_ELEVATIONS)]
+        drawn = things_on_table(rng, camera=_camera(rng), elevation=elevation)
+        if rng.random() < _WITH_ROOM:
+            drawn = replace(drawn, depth=room.behind(drawn, rng))
     if rng.random() < _LARGER:
         drawn = replace(drawn, depth=rng.uniform(*_TIMES) * drawn.depth)
     depth = sensor_noise.preset(str(rng.choice(_SENSORS))).measured(drawn.depth, drawn.camera, rng)
@@ -171,11 +180,10 @@ def _of_pieces(
 
 
 def _camera(rng: np.random.Generator) -> Camera:
-    if rng.random() < _LARGE:
-        focal = rng.uniform(*_LARGE_FOCALS)
-        return Camera(1280, 720, focal, focal, 639.5, 359.5)
-    focal = rng.uniform(*_FOCALS) if rng.random() < 0.5 else TABLE_CAMERA.fx
-    return Camera(640, 480, focal, focal, 319.5, 239.5)
+    width = int(rng.choice(_WIDTHS, p=_OF_WIDTHS))
+    height = width * (9 if width == _WIDTHS[-1] else 12) // 16
+    focal = (rng.uniform(*_FOCALS) if rng.random() < 0.5 else TABLE_CAMERA.fx) * width / TABLE_CAMERA.width
+    return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
 
 def _cut(scene: ThingsOnTable, rng: np.random.Generator) -> tuple[slice, slice]:

@@ -1,0 +1,175 @@
+"""Household things in and on furniture: what carries them is neither a table nor one of them.
+
+| | the plane that things stand on is | beside it |
+| --- | --- | --- |
+| carton | the top of a box 8 to 40 cm high | the floor |
+| stool | the top of a board on four legs, 25 to 60 cm high | the floor |
+| shelf board | the top of a board 2 cm thick | a wall right behind it, the floor 0.5 to 1.5 m below |
+| shelves | the same | a back, two sides, a board above and one below, the floor |
+| tray | the table | four walls 1.5 to 5 cm high around the things |
+| bin | the table | four walls 8 to 30 cm high |
+
+Metres, optical frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from sq_perception.geometry import rotation as quaternions
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging import raycast
+from sq_perception.imaging.camera import Camera
+from sq_perception.simulation.scenes import plane_depth
+from sq_perception.simulation.things_on_table import TABLE_CAMERA, ThingsOnTable, things_on_table
+
+_SHARP = 0.02
+_MARGIN = (0.02, 0.12)
+"""Metres of free board around all things."""
+_TRIES = 20
+
+
+@dataclass(frozen=True, eq=False)
+class _Place:
+    """The smallest rectangle around all things along some direction, and a margin.
+
+    Attributes
+    ----------
+    axes : (3, 3)
+        Columns: along its sides, and up.  The second one leads away from the camera.
+    middle : (3,)
+        On the plane that things stand on.
+    half : (2,)
+        Half its sides.
+    height
+        Of the highest thing.
+    """
+
+    axes: np.ndarray
+    middle: np.ndarray
+    half: np.ndarray
+    height: float
+
+    @classmethod
+    def around(cls, scene: ThingsOnTable, rng: np.random.Generator, turn: float) -> _Place:
+        yaw = rng.uniform(-turn, turn)
+        c, s = np.cos(yaw), np.sin(yaw)
+        axes = scene.table @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])
+        parts = [placed.parts for placed in scene.placed]
+        high = np.max([(each.translation @ axes + each.support(axes.T)).max(axis=0) for each in parts], axis=0)
+        low = np.min([(each.translation @ axes - each.support(-axes.T)).min(axis=0) for each in parts], axis=0)
+        low[:2] -= rng.uniform(*_MARGIN, 2)
+        high[:2] += rng.uniform(*_MARGIN, 2)
+        ground = -scene.plane[3]
+        middle = axes @ np.array([*(low + high)[:2] / 2, ground])
+        return cls(axes, middle, (high - low)[:2] / 2, float(high[2] - ground))
+
+    def box(self, low: tuple[float, float, float], high: tuple[float, float, float]) -> Superquadric:
+        """A box between two corners, which count from the middle."""
+        below, above = np.array(low), np.array(high)
+        centre = self.middle + self.axes @ (below + above) / 2
+        return Superquadric((above - below) / 2, np.full(2, _SHARP), centre, quaternions.from_matrix(self.axes))
+
+    def walls(self, height: float, thick: float) -> list[Superquadric]:
+        x, y = self.half
+        return [
+            self.box((-x - thick, -y - thick, 0), (-x, y + thick, height)),
+            self.box((x, -y - thick, 0), (x + thick, y + thick, height)),
+            self.box((-x, -y - thick, 0), (x, -y, height)),
+            self.box((-x, y, 0), (x, y + thick, height)),
+        ]
+
+
+_Parts = tuple[list[Superquadric], float]
+"""Of a piece of furniture, and how far below the things the floor is."""
+
+
+def _carton(place: _Place, rng: np.random.Generator) -> _Parts:
+    x, y, high = *place.half, rng.uniform(0.08, 0.4)
+    return [place.box((-x, -y, -high), (x, y, 0))], high
+
+
+def _stool(place: _Place, rng: np.random.Generator) -> _Parts:
+    x, y, high, thick = *place.half, rng.uniform(0.25, 0.6), rng.uniform(0.02, 0.04)
+    legs = [
+        place.box((min(a, 0.8 * a), min(b, 0.8 * b), -high), (max(a, 0.8 * a), max(b, 0.8 * b), -thick))
+        for a in (-x, x)
+        for b in (-y, y)
+    ]
+    return [place.box((-x, -y, -thick), (x, y, 0)), *legs], high
+
+
+def _shelf_board(place: _Place, rng: np.random.Generator) -> _Parts:
+    (x, y), down = place.half, rng.uniform(0.5, 1.5)
+    wall = place.box((-3.0, y, -down), (3.0, y + 0.05, 2.0))
+    return [place.box((-x, -y, -0.02), (x, y, 0)), wall], down
+
+
+def _shelves(place: _Place, rng: np.random.Generator) -> _Parts:
+    (x, y), thick, down = place.half, 0.02, rng.uniform(0.5, 1.5)
+    above, below = place.height + rng.uniform(0.05, 0.2), rng.uniform(0.25, 0.4)
+    boards = [place.box((-x, -y, z - thick), (x, y, z)) for z in (0.0, above + thick, -below)]
+    sides = [place.box((min(a, a + t), -y, -down), (max(a, a + t), y, 1.0)) for a, t in ((-x, -thick), (x, thick))]
+    return [*boards, *sides, place.box((-x, y, -down), (x, y + thick, 1.0))], down
+
+
+def _tray(place: _Place, rng: np.random.Generator) -> _Parts:
+    return place.walls(rng.uniform(0.015, 0.05), rng.uniform(0.004, 0.01)), 0.0
+
+
+def _bin(place: _Place, rng: np.random.Generator) -> _Parts:
+    return place.walls(rng.uniform(0.08, 0.3), rng.uniform(0.003, 0.02)), 0.0
+
+
+@dataclass(frozen=True)
+class _Kind:
+    """Of furniture: its parts, most things, degrees above it of the camera, radians by which it is turned at most."""
+
+    parts: Callable[[_Place, np.random.Generator], _Parts]
+    most: int
+    elevation: tuple[float, float]
+    turn: float
+
+
+_KINDS = {
+    "carton": _Kind(_carton, 3, (20.0, 70.0), np.pi),
+    "stool": _Kind(_stool, 3, (20.0, 70.0), np.pi),
+    "shelf board": _Kind(_shelf_board, 4, (10.0, 50.0), 0.6),
+    "shelves": _Kind(_shelves, 4, (3.0, 30.0), 0.6),
+    "tray": _Kind(_tray, 6, (25.0, 80.0), np.pi),
+    "bin": _Kind(_bin, 8, (45.0, 90.0), np.pi),
+}
+KINDS = tuple(_KINDS)
+
+
+def things_in_furniture(name: str, rng: np.random.Generator, camera: Camera = TABLE_CAMERA) -> ThingsOnTable:
+    """Things in or on a piece of furniture, one of ``KINDS``; those that it hides altogether are left out.
+
+    ``plane`` is the one that they stand on.
+
+    Raises
+    ------
+    ValueError
+        If the things find no room in the camera's image, or the furniture hides all of them again and again.
+    """
+    kind = _KINDS[name]
+    for _ in range(_TRIES):
+        scene = things_on_table(rng, int(rng.integers(1, kind.most + 1)), camera, kind.elevation)
+        seen = _furnished(scene, *kind.parts(_Place.around(scene, rng, kind.turn), rng))
+        if seen.placed:
+            return seen
+    raise ValueError(f"things in {name}: none is in sight")
+
+
+def _furnished(scene: ThingsOnTable, parts: list[Superquadric], down: float) -> ThingsOnTable:
+    behind, _ = raycast.render(Superquadric.stack(parts), scene.camera)
+    floor = plane_depth(scene.plane + np.array([0, 0, 0, down]), scene.camera)
+    behind = np.minimum(np.minimum(behind, floor), scene.wall)
+    labels = np.where(scene.depth < behind, scene.labels, 0)
+    depth = np.where(labels > 0, scene.depth, behind)
+    counts = np.bincount(labels.ravel(), minlength=1 + max(placed.label for placed in scene.placed))
+    placed = tuple(replace(one, pixels=int(counts[one.label])) for one in scene.placed if counts[one.label])
+    return replace(scene, depth=depth, labels=labels, placed=placed)
