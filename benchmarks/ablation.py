@@ -17,6 +17,8 @@ Things of household scenes (:mod:`household_things`), at least half visible, and
 | no plane, exactly | without one, and a superquadric that explains the image to its noise is sought first |
 | missing is empty | pixels without a reading belong to no part of the body |
 | hull alone | hardly any ray counts: what the network knows |
+| half the error | the mean of the predicted and the true support function, with half the deviations |
+| true behind | the true one in directions that point away from the camera, with a tenth of the deviations |
 | true hull | the true support function in place of the predicted one, 1 % of the view exact |
 
 IoU is with the true convex hull, 0 where no body was found.  The difference to the first row has its standard error.
@@ -55,6 +57,8 @@ from sq_perception.recovery.seen_object import SeenObject
 HALF, FEWEST_PIXELS = 0.5, 200
 EXACT = 0.01
 """Of a view's side: how well the true hull is taken to be known."""
+BEHIND = 0.1
+"""Least cosine between the line of sight and a direction that points away from the camera."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,7 +79,23 @@ def _same(hull: HullPrior, _: Seen) -> HullPrior:
 
 def _true(hull: HullPrior, seen: Seen) -> HullPrior:
     exact = (EXACT * hull.extent) ** 2 * np.eye(len(hull.support))
-    return replace(hull, support=(seen.hull @ hull.directions.T).max(axis=0), covariance=exact)
+    return replace(hull, support=_support(hull, seen), covariance=exact)
+
+
+def _half_true(hull: HullPrior, seen: Seen) -> HullPrior:
+    return replace(hull, support=0.5 * (hull.support + _support(hull, seen)), covariance=0.25 * hull.covariance)
+
+
+def _true_behind(hull: HullPrior, seen: Seen) -> HullPrior:
+    middle = seen.hull.mean(axis=0)
+    behind = hull.directions @ middle > BEHIND * np.linalg.norm(middle)
+    surer = np.where(behind, 0.1, 1.0)
+    support = np.where(behind, _support(hull, seen), hull.support)
+    return replace(hull, support=support, covariance=hull.covariance * np.outer(surer, surer))
+
+
+def _support(hull: HullPrior, seen: Seen) -> np.ndarray:
+    return np.asarray((seen.hull @ hull.directions.T).max(axis=0))
 
 
 def _rays(count: float) -> AbstractContextManager[Any]:
@@ -101,11 +121,13 @@ ROWS = (
     Row("every ray counts", program=partial(_rays, 1000.0)),
     Row("as a body", program=lambda: patch.multiple(Observation, of_hull=lambda self: self)),
     Row("no plane", options={"plane": None}),
-    Row("no plane, exactly", program=lambda: patch.object(surface_fit, "_fills", lambda _: True),
+    Row("no plane, exactly", program=lambda: patch.object(surface_fit, "fills", lambda _: True),
         options={"plane": None}),
     Row("no free space", options={"nan_is_empty": False}),
     Row("missing is empty", options={"nan_is_empty": True}),
     Row("hull alone", program=partial(_rays, 3.0)),
+    Row("half the error", hull=_half_true),
+    Row("true behind", hull=_true_behind),
     Row("true hull", hull=_true),
 )  # fmt: skip
 

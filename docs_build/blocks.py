@@ -242,6 +242,8 @@ ABLATIONS = {
     "no plane": "no support plane",
     "no free space": "no free space",
     "missing is empty": "missing readings are empty space",
+    "half the error": "a predicted hull that errs by half",
+    "true behind": "the true hull on the far side alone",
     "true hull": "the true hull in place of the predicted",
 }
 """Rows of the ablation that are shown."""
