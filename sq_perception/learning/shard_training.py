@@ -2,8 +2,9 @@
 
 Making a view takes as long as learning from it, and each is worth being seen several times; so views are written into
 a folder first, shard by shard, or meanwhile by another process, and a training reads what it finds there, again and
-again.  What is particular to a network is a :class:`Subject`:
-:data:`sq_perception.learning.thing_training.THINGS`, :data:`sq_perception.learning.mask_training.MASKS`.
+again.  Of more shards than the memory is to hold it reads some, others after each validation.  What is particular to a
+network is a :class:`Subject`: :data:`sq_perception.learning.thing_training.THINGS`,
+:data:`sq_perception.learning.mask_training.MASKS`.
 
 The learning rate falls as a cosine over the time that the run is given, as on a CPU the time is what is known
 beforehand.  An exponential average of the weights is what is validated and kept.  A run that was stopped goes on where
@@ -17,7 +18,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, Generic, TypeVar
@@ -39,6 +40,9 @@ _WARM_UP = 100
 """Steps over which the learning rate rises."""
 _AVERAGE = 0.998
 """The averaged weights remember some 500 steps."""
+_IN_MEMORY = 2**30
+"""Bytes of shards that are read at once, three times that while others are: as many views as a training of masks shows
+between two validations."""
 Network = TypeVar("Network", ThingNetwork, MaskNetwork)
 Views = TypeVar("Views")
 """A dataclass of arrays (n, ...), the views among them as ``images``."""
@@ -127,16 +131,14 @@ def train(subject: Subject[Network, Any], config: ShardTraining, views: Path, ou
     optimizer = torch.optim.AdamW(network.parameters(), lr=config.rate, weight_decay=config.weight_decay)
     state = TrainingState(output / "state.safetensors", network, optimizer)
     rng = np.random.default_rng([config.seed, state.step])
-    found = _shards(views, len(state.held) or config.held)
-    state.held = state.held or [shard.name for shard in found[: config.held]]
-    shards = [shard for shard in found if shard.name not in state.held]
-    held, pool = (read_views(subject.none, paths) for paths in ([views / name for name in state.held], shards))
+    state.held = state.held or [shard.name for shard in _shards(views, config.held)[: config.held]]
+    held = read_views(subject.none, [views / name for name in state.held])
+    shards = _some(views, state.held, rng)
+    pool = read_views(subject.none, shards)
     began, losses = time.monotonic() - state.seconds, []
     while (progress := (time.monotonic() - began) / (60 * config.minutes)) < 1:
-        if state.step % config.validation == 0:
-            found = [shard for shard in _shards(views, len(state.held)) if shard.name not in state.held]
-            if len(found) > len(shards):
-                shards, pool = found, read_views(subject.none, found)
+        if state.step % config.validation == 0 and (chosen := _some(views, state.held, rng)) != shards:
+            shards, pool = chosen, read_views(subject.none, chosen)
         rate = falling_rate(config.rate, state.step, progress)
         batch = subject.batch(pool, rng.integers(len(pool.images), size=config.batch), rng)
         with mixed_precision("cpu", config.bfloat16):
@@ -167,6 +169,18 @@ def _shards(folder: Path, held: int) -> list[Path]:
     if len(found) <= held:
         raise ValueError(f"{folder}: expected more than {held} shards of views, found {len(found)}")
     return found
+
+
+def _some(folder: Path, held: Sequence[str], rng: np.random.Generator) -> list[Path]:
+    """All shards to train on if the memory is to hold them, else some at random, in order."""
+    shards = [shard for shard in _shards(folder, len(held)) if shard.name not in held]
+    sizes = np.array([shard.stat().st_size for shard in shards])
+    if sizes.sum() <= _IN_MEMORY:
+        return shards
+    drawn = rng.permutation(len(shards))
+    fit = np.cumsum(sizes[drawn]) <= _IN_MEMORY
+    fit[0] = True
+    return [shards[k] for k in np.sort(drawn[fit])]
 
 
 def _keep(

@@ -74,6 +74,34 @@ def test_a_training_learns_goes_on_and_is_read_again(tmp_path: Path, rng: np.ran
     assert again.config == SMALL == first.config
 
 
+def test_of_a_set_larger_than_the_memory_some_shards_are_read_at_a_time(
+    tmp_path: Path, rng: np.random.Generator, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Two of five, or one that is larger than all that may be held; others after each validation."""
+    shards(tmp_path / "views", 6, rng)
+    size, read = (tmp_path / "views" / "00000.safetensors").stat().st_size, []
+    original = shard_training.read_views
+
+    def read_views(none: SegmentViews, paths: list[Path]) -> SegmentViews:
+        read.append([path.stem for path in paths])
+        if len(read) == 16:
+            raise ArithmeticError("enough")
+        return original(none, paths)
+
+    monkeypatch.setattr(shard_training, "read_views", read_views)
+    subject = replace(mask_training.MASKS, network=lambda _: MaskNetwork(SMALL))
+    config = replace(MASK_RUN, batch=2, threads=1, held=1, validation=1)
+    for name, memory, expected in (("two", 2.5 * size, 2), ("one", 0.5 * size, 1)):
+        read.clear()
+        monkeypatch.setattr(shard_training, "_IN_MEMORY", memory)
+        with pytest.raises(ArithmeticError, match="enough"):
+            shard_training.train(subject, config, tmp_path / "views", tmp_path / name)
+        held, *pools = read
+        assert held == ["00000"]
+        assert {len(pool) for pool in pools} == {expected}
+        assert {shard for pool in pools for shard in pool} == {f"{k:05d}" for k in range(1, 6)}
+
+
 def test_a_folder_without_views_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     tmp_path.joinpath("empty").mkdir()
     assert main.main(["train-masks", str(tmp_path / "empty"), "--output", str(tmp_path / "run")]) == 1
