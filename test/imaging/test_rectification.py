@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cv2
 import numpy as np
 import pytest
 from distorted_views import BARREL, FISHEYE, LENSES, RAW, WIDE, body_depth, plane_depth, rays, sphere_depth
@@ -15,6 +16,9 @@ from sq_perception.recovery.recoverer import Recoverer
 
 BODY = Superquadric([0.07, 0.05, 0.09], [0.3, 0.6], [0.16, 0.10, 0.75], [0.35, 0.25, 0.15, 0.85])
 
+COARSE = 1 if int(cv2.__version__.split(".")[0]) >= 5 else 5
+"""OpenCV before 5 looks up at 32nds of a pixel: what is between pixels is up to five times as far off."""
+
 
 def tilted(degrees, distance=1.0):
     """Normal and distance of a plane about the point (0, 0, distance)."""
@@ -25,7 +29,7 @@ def tilted(degrees, distance=1.0):
 @pytest.mark.parametrize("name", LENSES)
 @pytest.mark.parametrize("degrees", [0, 30, 60, 75])
 def test_planes_stay_planes(name, degrees):
-    """Between pixels by 1/z: a tenth of a millimetre where the nearest pixel is off by several."""
+    """Between pixels by 1/z: hundredths of a millimetre where the nearest pixel is off by several."""
     raw, lens = LENSES[name]
     undone = Rectification(raw, lens)
     seen = plane_depth(rays(raw, lens), *tilted(degrees))
@@ -35,15 +39,15 @@ def test_planes_stay_planes(name, degrees):
     near = np.isfinite(found) & (true < 3)
     error = np.abs(found - true)[near]
     assert near.mean() > 0.1
-    assert np.median(error) < 1e-5
-    assert np.quantile(error, 0.98) < 1e-4 + 1e-3 * (degrees == 75)
+    assert np.median(error) < 1e-5 * COARSE
+    assert np.quantile(error, 0.98) < 1e-4 * COARSE + 1e-3 * (degrees == 75)
     if degrees:
         by_pixel = np.abs(undone.there._nearest(seen.astype(np.float32), np.nan) - true)[near]
-        assert np.median(by_pixel) > 30 * np.median(error)
+        assert np.median(by_pixel) > 30 / COARSE * np.median(error)
     back = undone.back.depth(true)
     there = np.isfinite(back) & np.isfinite(seen) & (seen < 3)
     assert there.mean() > 0.1
-    assert np.median(np.abs(back - seen)[there]) < 1e-5
+    assert np.median(np.abs(back - seen)[there]) < 1e-5 * COARSE
 
 
 @pytest.mark.parametrize("name", LENSES)
@@ -141,7 +145,7 @@ def test_holes_keep_their_size(rng):
     true = plane_depth(rays(undone.camera), normal, distance)
     assert 0.09 < np.isnan(found[seen]).mean() < 0.15
     error = np.abs(found - true)[np.isfinite(found)]
-    assert np.median(error) < 1e-5
+    assert np.median(error) < 1e-5 * COARSE
     # A bridge has the depth of one of its neighbours.
     assert np.quantile(error, 0.95) < 2e-3
 
@@ -198,6 +202,6 @@ def test_a_body_is_recovered_through_a_lens(raw, lens):
     ignored, _ = recovered_sizes(seen, raw, mask)
     print(f"ideal {reference / true - 1}, rectified {sizes / true - 1}, ignored {ignored / true - 1}")
     np.testing.assert_allclose(reference, true, rtol=0.01)
-    np.testing.assert_allclose(sizes, true, rtol=0.002)
+    np.testing.assert_allclose(sizes, true, rtol=0.002 * COARSE)
     np.testing.assert_allclose(found.translation, BODY.translation, atol=2e-4)
     assert np.abs(ignored / true - 1).max() > 0.03
