@@ -111,12 +111,18 @@ class Outputs:
             self.discard()
             raise
         self._stems: set[str] = set()
-        given = [output_file.free_name(_stem(entry), self._stems) for entry in self.done]
-        if options.pictures and (lost := sum(not (options.pictures / f"{stem}.png").is_file() for stem in given)):
-            console.complain(
-                f"warning: --jsonl: {options.jsonl} has {len(given)} frames already, which are not drawn again: "
-                f"{lost} of them without a picture in {options.pictures}"
-            )
+        given = {output_file.free_name(_stem(entry), self._stems): entry for entry in self.done}
+        with_bodies = [stem for stem, entry in given.items() if _bodies(entry)]
+        for folder, suffix, stems, thing in (
+            (options.pictures, "png", list(given), "a picture"),
+            (options.meshes, options.mesh_format, with_bodies, "a mesh of their bodies"),
+        ):
+            lost = sum(not (folder / f"{stem}.{suffix}").is_file() for stem in stems) if folder else 0
+            if lost:
+                console.complain(
+                    f"warning: --jsonl: {options.jsonl} has {len(given)} frames already, which are not recovered "
+                    f"again: {lost} of them without {thing} in {folder}"
+                )
 
     def add(
         self,
@@ -187,6 +193,12 @@ def _stem(entry: Mapping[str, Any]) -> str:
     """What the picture and the meshes of a frame are called, unless another frame has that name, by its element."""
     path = Path(entry["file"])
     return bag_file.frame_name(path, Stamp(**entry["stamp"])) if entry.get("topic") else path.stem
+
+
+def _bodies(entry: Mapping[str, Any]) -> bool:
+    """Whether an element of ``frames`` has a body that did not fail, and so a mesh."""
+    statuses = [body.get("status") for body in entry["superquadrics"] if isinstance(body, Mapping)]
+    return any(status != Status.FAILED.name.lower() for status in statuses)
 
 
 def _lines(options: argparse.Namespace) -> result_json.ResultLines | None:
