@@ -4,7 +4,7 @@
 
 Scenes are those of :mod:`sq_perception.simulation.furniture`, as are those that the network of masks has learnt from;
 scene k of a kind follows from (``SEED``, kind, k) alone, and sensors alternate.  Figures are those of :mod:`cameras`.
-No furniture is a thing: a body of it is a false one.
+A body of furniture is a false one, but for a carton, which is a thing that is not asked for.
 """
 
 from __future__ import annotations

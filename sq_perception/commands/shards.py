@@ -49,15 +49,14 @@ def thing_views(arguments: Sequence[str]) -> int:
 def segment_views(arguments: Sequence[str]) -> int:
     """Entry of ``sq-perception segment-views``; the exit code."""
     example = "sq-perception segment-views sets/segments && sq-perception train-masks sets/segments"
-    what = "segments of simulated tables, and which of their readings are of their object,"
+    what = "segments of simulated scenes, and which of their readings are of their object,"
     command = _drawing("segment-views", what, example, shards=40)
-    command.add_argument("--scenes", type=at_least(1), default=200, help="a shard, of some four segments each (200)")
-    command.add_argument("--pieces", action="store_true", help="and compact pieces of segments")
+    command.add_argument("--scenes", type=at_least(1), default=200, help="a shard, of some eleven views each (200)")
     given = command.parse_args(arguments)
 
     from sq_perception.simulation.segment_views import draw_segment_views
 
-    return _draw("segment-views", given, lambda: partial(draw_segment_views, given.scenes, with_pieces=given.pieces))
+    return _draw("segment-views", given, lambda: partial(draw_segment_views, given.scenes))
 
 
 def train_things(arguments: Sequence[str]) -> int:

@@ -10,7 +10,7 @@ A square window of the image about the segment, larger than its longer side L by
     others      1 within other segments
     image       1 where the image is
     scale       log(s / 0.2 m), of the largest s that things have in training for what is larger
-    grain       log of the pixels to a cell's side, of a camera of 300 pixels focal length if this one has less
+    grain       log of the pixels to a cell's side
     plane       1 if there is a support plane
 
 where s, metres, is the side of the window at the depth m; what is not known is 0.  The last three are the same in all
@@ -29,19 +29,14 @@ from sq_perception.imaging.camera import Camera
 
 PIXELS = 64
 CHANNELS = 9
-MEASURED, HEIGHT, SEGMENT, OTHERS, IMAGE, SCALE, PLANE = 0, 2, 3, 4, 5, 6, 8
+MEASURED, HEIGHT, SEGMENT, OTHERS, IMAGE, PLANE = 0, 2, 3, 4, 5, 8
 """Channels that others than the network look at."""
-USUAL_SIDE = 0.2
+_USUAL_SIDE = 0.2
 """Metres; that the channel of the scale is 0 for it."""
 _LARGEST = 0.3
 """Metres of s that the network is told at most: larger in training were walls and furniture, for which it takes all
 that is.  Of 226 household things of three times their size before a simulated D435 31 % are missed, not 45 %, of 1010
 of their own size 8 % either way."""
-_LEAST_FOCAL = 300.0
-"""Pixels.  A segment of so few pixels as things have in coarser images was a shred in training, whose cameras have 430
-and more, and the network takes it for nothing: told its own grain, it leaves 35 of 126 household things in images of
-160 x 120 pixels, told that of this camera 91, and 115 of 127, not 111, at 320 x 240.  With 430 it leaves as many, and
-six shreds in three recorded frames of a camera of 365."""
 _WIDER, _MORE = 1.5, 8
 """The window's side in that of the segment, and pixels beyond."""
 _HEIGHTS = (-0.3, 1.5)
@@ -134,6 +129,5 @@ def from_segment(
     image[..., SEGMENT] = shown == label
     image[..., OTHERS] = (shown > 0) & (shown != label)
     image[..., IMAGE] = within
-    grain = np.log(side / PIXELS * max(_LEAST_FOCAL / camera.fx, 1.0))
-    image[..., 6:] = np.log(min(scale, _LARGEST) / USUAL_SIDE), grain, plane is not None
+    image[..., 6:] = np.log(min(scale, _LARGEST) / _USUAL_SIDE), np.log(side / PIXELS), plane is not None
     return SegmentView(image, rows, columns, left, top, side)

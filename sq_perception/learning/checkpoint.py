@@ -49,8 +49,6 @@ DEFAULT = "robust"
 """Name of the weights that predict a body where none are named."""
 _SHIPPED: dict[type[Any], str] = {RegressorConfig: DEFAULT, ThingConfig: "things", MaskConfig: "masks"}
 """Names of the weights that are used where none are named."""
-PIECES = "pieces"
-"""Name of the weights of the network of masks that is asked about pieces of segments."""
 _MAX_PARAMETERS = 200_000_000
 _MAX_BYTES = 4 * _MAX_PARAMETERS + 2**20
 _MAX_HEADER_BYTES = 2**20

@@ -144,7 +144,7 @@ def load_things(path: Path | str | None = None, device: str = "cpu") -> ThingPre
 
 
 def load_masks(path: Path | str | None = None) -> forward.CompactMasks:
-    """A network of masks, None for the one of segments that ships, computed without torch.
+    """A network of masks, None for the one that ships, computed without torch.
 
     Raises
     ------

@@ -112,7 +112,7 @@ class Recoverer:
         self._path = model
         self._device = inference.checked_device(device)
         self._loaded: dict[bool, Network] = {} if weights_of is None else weights_of._loaded
-        self._masks: tuple[CompactMasks, CompactMasks] | None = None if weights_of is None else weights_of._masks
+        self._masks: CompactMasks | None = None if weights_of is None else weights_of._masks
         self._begin()
         if method in NEEDS_NETWORK:
             self._load_network(method == "auto")
@@ -260,7 +260,7 @@ class Recoverer:
         found = segments.segment(depth, camera, options.segmentation_options())
         if not (options.repair and isinstance(network, inference.ThingPredictor)):
             return OwnSegments(found)
-        improved = SegmentNetwork(*self._load_masks(), depth, camera, found.plane, self._shared).improved(found)
+        improved = SegmentNetwork(self._load_masks(), depth, camera, found.plane, self._shared).improved(found)
         ids = improved.found.ids
         if len(ids) <= options.max_objects:
             return improved
@@ -304,11 +304,10 @@ class Recoverer:
                 self._loaded.update(dict.fromkeys(kinds, self._read_network(of_things)))
             return self._loaded[of_things]
 
-    def _load_masks(self) -> tuple[CompactMasks, CompactMasks]:
-        """Of segments, and of pieces of them."""
+    def _load_masks(self) -> CompactMasks:
         with self._lock:
             if self._masks is None:
-                self._masks = inference.load_masks(), inference.load_masks(checkpoint.PIECES)
+                self._masks = inference.load_masks()
             return self._masks
 
     def _read_network(self, of_things: bool) -> Network:

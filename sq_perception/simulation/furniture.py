@@ -1,4 +1,4 @@
-"""Household things in and on furniture: what carries them is neither a table nor one of them.
+"""Household things in and on furniture: what carries them is no table.
 
 | | the plane that things stand on is | beside it |
 | --- | --- | --- |
@@ -9,6 +9,7 @@
 | tray | the table | four walls 1.5 to 5 cm high around the things |
 | bin | the table | four walls 8 to 30 cm high |
 
+A carton is a thing as well, seen where its label is, though not one that was placed; all other furniture is none.
 Metres, optical frame.
 """
 
@@ -126,16 +127,18 @@ def _bin(place: _Place, rng: np.random.Generator) -> _Parts:
 
 @dataclass(frozen=True)
 class _Kind:
-    """Of furniture: its parts, most things, degrees above it of the camera, radians by which it is turned at most."""
+    """Of furniture: its parts, most things, degrees above it of the camera, radians by which it is turned at most, and
+    whether it is a thing."""
 
     parts: Callable[[_Place, np.random.Generator], _Parts]
     most: int
     elevation: tuple[float, float]
     turn: float
+    is_thing: bool = False
 
 
 _KINDS = {
-    "carton": _Kind(_carton, 3, (20.0, 70.0), np.pi),
+    "carton": _Kind(_carton, 3, (20.0, 70.0), np.pi, is_thing=True),
     "stool": _Kind(_stool, 3, (20.0, 70.0), np.pi),
     "shelf board": _Kind(_shelf_board, 4, (10.0, 50.0), 0.6),
     "shelves": _Kind(_shelves, 4, (3.0, 30.0), 0.6),
@@ -158,18 +161,20 @@ def things_in_furniture(name: str, rng: np.random.Generator, camera: Camera = TA
     kind = _KINDS[name]
     for _ in range(_TRIES):
         scene = things_on_table(rng, int(rng.integers(1, kind.most + 1)), camera, kind.elevation)
-        seen = _furnished(scene, *kind.parts(_Place.around(scene, rng, kind.turn), rng))
+        seen = _furnished(scene, *kind.parts(_Place.around(scene, rng, kind.turn), rng), kind.is_thing)
         if seen.placed:
             return seen
     raise ValueError(f"things in {name}: none is in sight")
 
 
-def _furnished(scene: ThingsOnTable, parts: list[Superquadric], down: float) -> ThingsOnTable:
-    behind, _ = raycast.render(Superquadric.stack(parts), scene.camera)
-    floor = plane_depth(scene.plane + np.array([0, 0, 0, down]), scene.camera)
-    behind = np.minimum(np.minimum(behind, floor), scene.wall)
-    labels = np.where(scene.depth < behind, scene.labels, 0)
-    depth = np.where(labels > 0, scene.depth, behind)
-    counts = np.bincount(labels.ravel(), minlength=1 + max(placed.label for placed in scene.placed))
+def _furnished(scene: ThingsOnTable, parts: list[Superquadric], down: float, is_thing: bool) -> ThingsOnTable:
+    furniture, _ = raycast.render(Superquadric.stack(parts), scene.camera)
+    beyond = np.minimum(plane_depth(scene.plane + np.array([0, 0, 0, down]), scene.camera), scene.wall)
+    behind = np.minimum(furniture, beyond)
+    most = max(placed.label for placed in scene.placed)
+    in_sight = (scene.labels > 0) & (scene.depth < behind)
+    around = np.where(is_thing & (furniture < beyond), np.int32(most + 1), np.int32(0))
+    labels, depth = np.where(in_sight, scene.labels, around), np.where(in_sight, scene.depth, behind)
+    counts = np.bincount(labels.ravel(), minlength=most + 1)
     placed = tuple(replace(one, pixels=int(counts[one.label])) for one in scene.placed if counts[one.label])
     return replace(scene, depth=depth, labels=labels, placed=placed)

@@ -8,9 +8,10 @@ object is the thing that most of its pixels show; what shows the table, the furn
 and no thing at 30 % of them, has none.  A reading is one of the object if its pixel shows the object and it is no more
 than 10 mm + 1 % off: what a sensor smears over an edge is not.
 
-The network that tells whether a segment is one thing also sees compact pieces of segments
-(:mod:`~sq_perception.segmentation.pieces`), and of two neighbours as if they were one, each with the thing that it
-shows; the rest of the segment is other segments.  Of a segment that shows several things it sees each one's part.
+The network that learns from them is also asked whether a segment is one thing, so compact pieces of segments
+(:mod:`~sq_perception.segmentation.pieces`) are among them, and of two neighbours as if they were one, each with the
+thing that it shows; the rest of the segment is other segments.  Of a segment that shows several things there is each
+one's part.
 """
 
 from __future__ import annotations
@@ -74,11 +75,11 @@ class SegmentViews:
     truth: np.ndarray
 
 
-def draw_segment_views(scenes: int, rng: np.random.Generator, with_pieces: bool = False) -> SegmentViews:
-    """Views of all segments of some random scenes, and perhaps of pieces of them."""
+def draw_segment_views(scenes: int, rng: np.random.Generator) -> SegmentViews:
+    """Views of all segments of some random scenes, and of pieces of them."""
     images, truth = [], []
     for _ in range(scenes):
-        for image, own in _views(_measured(rng), rng, with_pieces):
+        for image, own in _views(_measured(rng), rng):
             if np.count_nonzero(image[..., segment_view.MEASURED] * image[..., segment_view.SEGMENT]) >= _LEAST_CELLS:
                 images.append(image.astype(np.float16))
                 truth.append(own)
@@ -129,16 +130,15 @@ def _measured(rng: np.random.Generator) -> _Measured:
     return _Measured(depth, true_depth, shown, camera)
 
 
-def _views(measured: _Measured, rng: np.random.Generator, with_pieces: bool) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def _views(measured: _Measured, rng: np.random.Generator) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Images and truth of segments, and of pieces of them."""
     found = segments.segment(measured.depth, measured.camera)
     for label in found.ids:
         view = measured.view(found.labels, label, found.plane)
         shown = measured.shown[found.labels == label]
         yield view.image, _truth(*measured.in_cells(view), _object(shown))
-        if with_pieces:
-            yield from _of_pieces(view, measured, rng)
-            yield from _of_merged(label, found, measured, rng)
+        yield from _of_pieces(view, measured, rng)
+        yield from _of_merged(label, found, measured, rng)
 
 
 def _of_merged(

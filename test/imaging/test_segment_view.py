@@ -47,7 +47,7 @@ def test_cells_show_the_pixels_under_their_middles() -> None:
     np.testing.assert_allclose(shown.image[..., SCALE], np.log(0.3 / 0.2), rtol=1e-6)
     near = segment_view.from_segment(depth / 2, labels, 1, WINDOW, CAMERA, None)
     np.testing.assert_allclose(near.image[..., SCALE], np.log(scale / 2 / 0.2), rtol=1e-6)
-    np.testing.assert_allclose(shown.image[..., GRAIN], np.log(shown.side / PIXELS * 300 / CAMERA.fx), rtol=1e-6)
+    np.testing.assert_allclose(shown.image[..., GRAIN], np.log(shown.side / PIXELS), rtol=1e-6)
 
 
 def test_beyond_the_image_there_is_nothing() -> None:

@@ -90,7 +90,7 @@ class TestNetwork:
         assert (iou > 0.85).mean() > over_85
 
     def test_names_of_shipped_weights_stand_for_their_files(self, tmp_path: Path) -> None:
-        assert set(checkpoint.shipped()) == {"masks", "pieces", "robust", "supervised", "things"}
+        assert set(checkpoint.shipped()) == {"masks", "robust", "supervised", "things"}
         assert checkpoint.resolve() == checkpoint.shipped()[checkpoint.DEFAULT]
         assert checkpoint.resolve("supervised").is_file()
         assert checkpoint.resolve(tmp_path / "supervised.safetensors") == tmp_path / "supervised.safetensors"

@@ -13,7 +13,7 @@ from sq_perception.fitting.options import MIN_PIXELS
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import segment_view
 from sq_perception.imaging.camera import Camera
-from sq_perception.learning import checkpoint, inference
+from sq_perception.learning import inference
 from sq_perception.recovery.own_segments import SegmentNetwork
 from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
 from sq_perception.segmentation.segments import Segmentation
@@ -47,15 +47,14 @@ class GivenLogits:
         return np.asarray(self._function(views), np.float32)
 
 
-def of(networks: Any, depth: np.ndarray, camera: Camera = CAMERA, plane: np.ndarray = PLANE) -> SegmentNetwork:
-    """Before an image: of a network for segments and for pieces, or of one of each."""
-    of_segments, of_pieces = networks if isinstance(networks, tuple) else (networks, networks)
-    return SegmentNetwork(of_segments, of_pieces, depth, camera, plane, lambda function, labels: function(labels))
+def of(network: Any, depth: np.ndarray, camera: Camera = CAMERA, plane: np.ndarray = PLANE) -> SegmentNetwork:
+    """Before an image."""
+    return SegmentNetwork(network, depth, camera, plane, lambda function, labels: function(labels))
 
 
 @pytest.fixture(scope="module")
 def shipped() -> Any:
-    return inference.load_masks(), inference.load_masks(checkpoint.PIECES)
+    return inference.load_masks()
 
 
 def test_the_rim_that_a_sensor_adds_is_stray(shipped: Any) -> None:
@@ -193,8 +192,7 @@ def test_without_a_support_nothing_is_dropped() -> None:
     """A body alone in an image, as a renderer makes it: all that is seen is the object."""
     depth, truth = seen([TABLE.body(0, 0, *CAN)])
     alone = np.where(truth > 0, depth, np.nan).astype(np.float32)
-    mostly = stray_in_rows(0.8)
-    network = SegmentNetwork(mostly, mostly, alone, CAMERA, None, lambda function, labels: function(labels))
+    network = SegmentNetwork(stray_in_rows(0.8), alone, CAMERA, None, lambda function, labels: function(labels))
     assert network.improved(segmentation(truth)).found.ids == (1,)
 
 
@@ -220,7 +218,7 @@ def test_what_is_larger_than_all_of_a_household_is_an_object(shipped: Any, times
 
 
 def test_cans_in_an_image_of_few_pixels_are_objects(shipped: Any) -> None:
-    """At a metre in images of 160 x 120 pixels, of 160 each: told that grain, the network takes all for nothing."""
+    """At a metre in images of 160 x 120 pixels, of 160 each, as many as a shred has in an image of more pixels."""
     table, camera = Table(distance=1.0), Camera(160, 120, 138.6, 138.6, 79.5, 59.5)
     bodies = [table.body(0.11 * k - 0.22, 0.05 * (k % 2), *CAN) for k in range(5)]
     depth, truth = table.see(bodies, 0.002, camera=camera)

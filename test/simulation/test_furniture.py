@@ -1,4 +1,4 @@
-"""Things in and on furniture: what is seen of them stays, all else is none of them."""
+"""Things in and on furniture: what is seen of them stays, all else is none of them, but for a carton."""
 
 from __future__ import annotations
 
@@ -26,9 +26,14 @@ def heights(scene: ThingsOnTable, mask: np.ndarray) -> np.ndarray:
     return np.asarray(points @ scene.plane[:3] + scene.plane[3])
 
 
+def is_placed(scene: ThingsOnTable) -> np.ndarray:
+    """Where things are that were placed: all labels but a carton's."""
+    return np.isin(scene.labels, [placed.label for placed in scene.placed])
+
+
 def test_things_stand_on_the_plane(scene: tuple[str, ThingsOnTable]) -> None:
     _, seen = scene
-    assert heights(seen, seen.labels > 0).min() > -1e-6
+    assert heights(seen, is_placed(seen)).min() > -1e-6
     for placed in seen.placed:
         assert placed.pixels == np.count_nonzero(seen.labels == placed.label) > 0
         down = placed.parts.support(-seen.plane[None, :3])[:, 0]
@@ -38,7 +43,7 @@ def test_things_stand_on_the_plane(scene: tuple[str, ThingsOnTable]) -> None:
 
 def test_what_is_no_thing_is_furniture_floor_or_wall(scene: tuple[str, ThingsOnTable]) -> None:
     name, seen = scene
-    around = heights(seen, (seen.labels == 0) & (seen.depth < seen.wall - 1e-9))
+    around = heights(seen, ~is_placed(seen) & (seen.depth < seen.wall - 1e-9))
     assert np.mean(np.abs(around) < 1e-3) > 0.01  # the plane itself is in sight
     if name in LOWER:
         assert around.min() < -0.05
@@ -46,6 +51,18 @@ def test_what_is_no_thing_is_furniture_floor_or_wall(scene: tuple[str, ThingsOnT
         least, most = WALLED[name]
         assert around.min() > -1e-3
         assert least - 1e-6 < around.max() < most + 1e-6
+
+
+def test_a_carton_is_a_thing_and_other_furniture_is_none(scene: tuple[str, ThingsOnTable]) -> None:
+    name, seen = scene
+    other = (seen.labels > 0) & ~is_placed(seen)
+    assert other.any() == (name == "carton")
+    if name == "carton":
+        assert len(np.unique(seen.labels[other])) == 1
+        inside = heights(seen, other)
+        assert inside.max() < 1e-6  # up to the plane that things stand on, from the floor
+        floor = heights(seen, (seen.labels == 0) & (seen.depth < seen.wall - 1e-9))
+        assert inside.min() > floor.max() - 1e-6
 
 
 def test_a_seed_gives_one_scene_before_any_camera() -> None:

@@ -61,7 +61,7 @@ def test_pieces_of_merged_things_show_one_thing_each_or_none(monkeypatch: pytest
 
     monkeypatch.setattr(segment_views.segments, "segment", merged)
     scenes = 3
-    drawn = draw_segment_views(scenes, np.random.default_rng(2), with_pieces=True)
+    drawn = draw_segment_views(scenes, np.random.default_rng(2))
     inside = (drawn.images[..., SEGMENT] > 0) & (drawn.truth != UNKNOWN)
     pure = (inside & (drawn.truth == YES)).sum(axis=(1, 2)) / inside.sum(axis=(1, 2))
     assert np.count_nonzero((pure > 0) & (pure < 0.7)) <= scenes
