@@ -236,19 +236,13 @@ def support_under(
     """The plane (4,) that the surroundings of one object show below it; None where they show none but the known one.
 
     For objects that do not stand on the plane of the segmentation: a frame may show a table, a shelf and the floor.
-    Surroundings are what is no object, and where that shows none, the level tops of other objects.  ``depth`` and
-    ``camera`` are those of the segmentation.
+    ``depth`` and ``camera`` are those of the segmentation.
     """
     options = options or SegmentationOptions()
     depth, valid = _checked(depth, camera, options.depth_range)
-    alone = np.where(found.labels == label, found.labels, 0)
-    if not camera.is_pinhole or not valid[alone > 0].any():
+    if not camera.is_pinhole or not ((found.labels == label) & valid).any():
         return None
-    plane = support_plane.around(found.labels, (label,), depth, valid, camera, found.plane)
-    if plane is not None or found.plane is None:
-        return plane
-    top = support_plane.around(alone, (label,), depth, valid, camera, found.plane)
-    return top if top is not None and top[:3] @ found.plane[:3] > support_plane.LEVEL else None
+    return support_plane.around(found.labels, (label,), depth, valid, camera, found.plane)
 
 
 def warm_up() -> None:
