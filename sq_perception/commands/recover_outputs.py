@@ -112,7 +112,7 @@ class Outputs:
             raise
         self._stems: set[str] = set()
         given = {output_file.free_name(_stem(entry), self._stems): entry for entry in self.done}
-        with_bodies = [stem for stem, entry in given.items() if _bodies(entry)]
+        with_bodies = [stem for stem, entry in given.items() if _has_body(entry)]
         for folder, suffix, stems, thing in (
             (options.pictures, "png", list(given), "a picture"),
             (options.meshes, options.mesh_format, with_bodies, "a mesh of their bodies"),
@@ -195,7 +195,7 @@ def _stem(entry: Mapping[str, Any]) -> str:
     return bag_file.frame_name(path, Stamp(**entry["stamp"])) if entry.get("topic") else path.stem
 
 
-def _bodies(entry: Mapping[str, Any]) -> bool:
+def _has_body(entry: Mapping[str, Any]) -> bool:
     """Whether an element of ``frames`` has a body that did not fail, and so a mesh."""
     statuses = [body.get("status") for body in entry["superquadrics"] if isinstance(body, Mapping)]
     return any(status != Status.FAILED.name.lower() for status in statuses)

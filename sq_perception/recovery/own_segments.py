@@ -40,7 +40,7 @@ _ONE = 0.4
 _PIECES = 4
 """Of a segment.  Each should show one thing, and enough of it to tell things apart."""
 _SURE = 0.9
-"""Of the same things 0.85 and 0.93 find as many; with 0.85 one of 52 recorded ones stays in its neighbour."""
+"""Of the same things 0.85 finds as many; but of 52 recorded ones it leaves one more in its neighbour."""
 _APART = 0.3
 """Of the same things 0.2, 0.3 and 0.4 miss 6.2, 6.2 and 6.6 %, and leave 62, 66 and 74 bodies of none, or of parts."""
 _ITSELF = 0.5
