@@ -1,9 +1,10 @@
 """Segments of simulated tables, with which of their readings are of their object: training data.
 
 Things on a table (:mod:`~sq_perception.simulation.things_on_table`) that ends in sight in many scenes
-(:mod:`~sq_perception.simulation.room`), or in and on furniture (:mod:`~sq_perception.simulation.furniture`), before a
-random camera, are measured by one of the sensors; of many a smaller image is taken, whose borders cut things.  It is
-segmented as any image is, and each segment seen as a :class:`~sq_perception.imaging.segment_view.SegmentView`.  Its
+(:mod:`~sq_perception.simulation.room`), or in and on furniture (:mod:`~sq_perception.simulation.furniture`), or crowds
+of superquadrics (:mod:`~sq_perception.simulation.crowds`), before a random camera, are measured by one of the sensors;
+of many a smaller image is taken, whose borders cut things.  It is segmented as any image is, and each segment seen as a
+:class:`~sq_perception.imaging.segment_view.SegmentView`.  Its
 object is the thing that most of its pixels show; what shows the table, the furniture or the room at half of its pixels,
 and no thing at 30 % of them, has none.  A reading is one of the object if its pixel shows the object and it is no more
 than 10 mm + 1 % off: what a sensor smears over an edge is not.
@@ -17,7 +18,7 @@ one's part.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -26,19 +27,21 @@ from sq_perception.imaging import regions, segment_view
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.segment_view import SegmentView
 from sq_perception.segmentation import pieces, segments
-from sq_perception.simulation import furniture, room, sensor_noise
-from sq_perception.simulation.things_on_table import TABLE_CAMERA, ThingsOnTable, things_on_table
+from sq_perception.simulation import crowds, furniture, room, sensor_noise, thing_sensing
+from sq_perception.simulation.things_on_table import TABLE_CAMERA, things_on_table
 
 NO, YES, UNKNOWN = 0, 1, 2
 _SENSORS = ("realsense_d435", "kinect_v1", "realsense_d435", "kinect_v1", "azure_kinect", "zed")
+_ANY_SENSOR = 0.35
+"""Share of the scenes that a sensor of random parameters measures, in place of one of those."""
 _FOCALS = (430.0, 700.0)
 """Pixels, at VGA: depth cameras, 49 to 73 degrees wide."""
 _WIDTHS, _OF_WIDTHS = (160, 320, 640, 1280), (0.1, 0.1, 0.65, 0.15)
 """Pixels a row, and shares of the scenes that have so many."""
 _ELEVATIONS, _OF_ELEVATIONS = ((6.0, 20.0), (20.0, 70.0), (70.0, 90.0)), (0.2, 0.65, 0.15)
 """Degrees that the camera is above the table, and shares of the scenes."""
-_IN_FURNITURE = 0.35
-"""Share of the scenes; their cameras are as high as the furniture asks."""
+_CROWDS, _IN_FURNITURE = 0.2, 0.3
+"""Shares of the scenes; their cameras are as high as they ask."""
 _WITH_ROOM = 0.6
 """Share of the other scenes whose table ends in sight, before a room."""
 _LARGER, _TIMES = 0.35, (1.0, 2.5)
@@ -114,20 +117,31 @@ class _Measured:
 
 def _measured(rng: np.random.Generator) -> _Measured:
     """A random image."""
-    if rng.random() < _IN_FURNITURE:
-        drawn = furniture.things_in_furniture(str(rng.choice(furniture.KINDS)), rng, _camera(rng))
-    else:
-        elevation = _ELEVATIONS[rng.choice(len(_ELEVATIONS), p=_OF_ELEVATIONS)]
-        drawn = things_on_table(rng, camera=_camera(rng), elevation=elevation)
-        if rng.random() < _WITH_ROOM:
-            drawn = replace(drawn, depth=room.behind(drawn, rng))
+    true_depth, shown, camera = _scene(rng)
     if rng.random() < _LARGER:
-        drawn = replace(drawn, depth=rng.uniform(*_TIMES) * drawn.depth)
-    depth = sensor_noise.preset(str(rng.choice(_SENSORS))).measured(drawn.depth, drawn.camera, rng)
-    window = _cut(drawn, rng)
-    depth, true_depth, shown = (np.ascontiguousarray(each[window]) for each in (depth, drawn.depth, drawn.labels))
-    camera = drawn.camera.cropped(window[1].start, window[0].start, depth.shape[1], depth.shape[0])
+        true_depth = rng.uniform(*_TIMES) * true_depth
+    if rng.random() < _ANY_SENSOR:
+        depth = thing_sensing.measured_by_any(true_depth, shown > 0, camera, rng)
+    else:
+        depth = sensor_noise.preset(str(rng.choice(_SENSORS))).measured(true_depth, camera, rng)
+    window = _cut(shown, rng)
+    depth, true_depth, shown = (np.ascontiguousarray(each[window]) for each in (depth, true_depth, shown))
+    camera = camera.cropped(window[1].start, window[0].start, depth.shape[1], depth.shape[0])
     return _Measured(depth, true_depth, shown, camera)
+
+
+def _scene(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, Camera]:
+    """True depth (height, width), +inf where nothing is, and labels of a random scene."""
+    camera, kind = _camera(rng), rng.random()
+    if kind < _CROWDS:
+        depth, shown = crowds.crowded_scene(rng, int(rng.integers(1, crowds.MOST + 1)), camera).render()
+        return np.where(np.isnan(depth), np.inf, depth), shown, camera
+    if kind < _CROWDS + _IN_FURNITURE:
+        drawn = furniture.things_in_furniture(str(rng.choice(furniture.KINDS)), rng, camera)
+        return drawn.depth, drawn.labels, camera
+    elevation = _ELEVATIONS[rng.choice(len(_ELEVATIONS), p=_OF_ELEVATIONS)]
+    drawn = things_on_table(rng, camera=camera, elevation=elevation)
+    return room.behind(drawn, rng) if rng.random() < _WITH_ROOM else drawn.depth, drawn.labels, camera
 
 
 def _views(measured: _Measured, rng: np.random.Generator) -> Iterator[tuple[np.ndarray, np.ndarray]]:
@@ -186,14 +200,14 @@ def _camera(rng: np.random.Generator) -> Camera:
     return Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
 
 
-def _cut(scene: ThingsOnTable, rng: np.random.Generator) -> tuple[slice, slice]:
+def _cut(shown: np.ndarray, rng: np.random.Generator) -> tuple[slice, slice]:
     """A window of the image; some are small, about a thing or beside it, so that their borders cut things."""
-    height, width = scene.depth.shape
+    height, width = shown.shape
     if rng.random() >= _SMALLER:
         return slice(0, height), slice(0, width)
     size = np.rint(rng.uniform(*_SIDES) * np.array([height, width])).astype(int)
-    thing = scene.placed[int(rng.integers(len(scene.placed)))]
-    middle = np.mean(np.nonzero(scene.labels == thing.label), axis=1) if thing.pixels else 0.5 * size
+    rows, columns = np.nonzero(shown == rng.choice(np.unique(shown)[1:])) if shown.any() else ((), ())
+    middle = np.array([np.mean(rows), np.mean(columns)]) if len(rows) else 0.5 * size
     first = np.rint(middle + (rng.uniform(-0.5, 0.5, 2) - 0.5) * size).astype(int)
     top, left = np.clip(first, 0, np.array([height, width]) - size)
     return slice(int(top), int(top + size[0])), slice(int(left), int(left + size[1]))

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging.camera import Camera
 from sq_perception.simulation.scenes import TABLE_CAMERA, Scene, inside_image, resting_body, table_plane
 
 MOST = 12
@@ -27,7 +28,7 @@ _CONTACT = 2e-4
 _SURFACE_SAMPLES = 1500
 
 
-def crowded_scene(rng: np.random.Generator, count: int) -> Scene:
+def crowded_scene(rng: np.random.Generator, count: int, camera: Camera = TABLE_CAMERA) -> Scene:
     """``count`` random bodies on a table seen from 0.5 to 1.2 m, most touching another one, wholly inside the image.
 
     Raises
@@ -42,16 +43,16 @@ def crowded_scene(rng: np.random.Generator, count: int) -> Scene:
         bodies: list[_Placed] = []
         for _ in range(_ATTEMPTS):
             drawn = resting_body(rng, plane, RADIUS)[0]
-            if not inside_image(drawn, TABLE_CAMERA):
+            if not inside_image(drawn, camera):
                 continue
             body = _Placed.of(drawn, rng)
             if bodies and rng.random() < PUSHED:
                 body = _pushed(body, bodies[rng.integers(len(bodies))], plane[:3])
-            if not any(map(body.overlaps, bodies)) and inside_image(body.body, TABLE_CAMERA):
+            if not any(map(body.overlaps, bodies)) and inside_image(body.body, camera):
                 bodies.append(body)
             if len(bodies) == count:
-                return Scene(Superquadric.stack([placed.body for placed in bodies]), TABLE_CAMERA, plane)
-    raise ValueError(f"no room for {count} bodies in an image of {TABLE_CAMERA.width} x {TABLE_CAMERA.height} pixels")
+                return Scene(Superquadric.stack([placed.body for placed in bodies]), camera, plane)
+    raise ValueError(f"no room for {count} bodies in an image of {camera.width} x {camera.height} pixels")
 
 
 @dataclass(frozen=True)

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import crowds
 import numpy as np
 import pytest
 
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation.segments import segment
-from sq_perception.simulation import sensor_noise
+from sq_perception.simulation import crowds, sensor_noise
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -28,12 +27,11 @@ def test_a_crowd_rests_touches_and_does_not_overlap(seed):
     assert min(gaps) < 1.05  # at least one pair touches
 
 
-def test_crowds_are_refused_where_there_is_no_room(monkeypatch):
+def test_crowds_are_refused_where_there_is_no_room():
     with pytest.raises(ValueError, match="1 to 12"):
         crowds.crowded_scene(np.random.default_rng(0), 13)
-    monkeypatch.setattr(crowds, "TABLE_CAMERA", Camera(64, 48, 2000.0, 2000.0, 31.5, 23.5))
     with pytest.raises(ValueError, match="no room"):
-        crowds.crowded_scene(np.random.default_rng(0), 3)
+        crowds.crowded_scene(np.random.default_rng(0), 3, Camera(64, 48, 2000.0, 2000.0, 31.5, 23.5))
 
 
 @pytest.mark.parametrize("seed", range(4))
