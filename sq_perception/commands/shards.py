@@ -67,9 +67,7 @@ def train_things(arguments: Sequence[str]) -> int:
         weights="things.safetensors, which `recover --model` takes",
     )
     example = "sq-perception train-things sets/things --output runs/things --minutes 120 --start robust"
-    command = _training("things", text, example, THING_RUN)
-    command.add_argument("--bfloat16", action="store_true", help="half the bits, faster on processors that have them")
-    options = vars(command.parse_args(arguments))
+    options = vars(_training("things", text, example, THING_RUN).parse_args(arguments))
 
     from sq_perception.learning.thing_training import THINGS
 
@@ -127,6 +125,7 @@ def _training(subject: str, text: str, example: str, run: ShardTraining) -> argp
     add("--held", type=at_least(1), help="shards that are kept for validation (%(default)s)")
     add("--seed", type=at_least(0), help="default %(default)s")
     add("--start", metavar="MODEL", help="weights to begin with: a file, or shipped ones")
+    add("--bfloat16", action="store_true", help="half the bits, twice as fast on processors that have them")
     return command
 
 
