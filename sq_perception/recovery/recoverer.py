@@ -40,7 +40,7 @@ from sq_perception.imaging import perforation, raycast
 from sq_perception.imaging.camera import Camera
 from sq_perception.learning import checkpoint, inference
 from sq_perception.learning.forward import CompactMasks
-from sq_perception.recovery import continuity, methods, prediction, seen_object
+from sq_perception.recovery import continuity, methods, prediction, seen_object, supports
 from sq_perception.recovery.options import NEEDS_NETWORK, Method, RecoveryOptions
 from sq_perception.recovery.own_segments import OwnSegments, SegmentNetwork
 from sq_perception.recovery.prediction import Prediction
@@ -218,13 +218,17 @@ class Recoverer:
             same = {} if previous is None else continuity.matched(kept, previous.labels, objects)
 
         with timed(milliseconds, "network"):
-            fresh = [obj for obj in objects if obj.label not in same]
             config = None if network is None else network.config
-            fresh = fresh if strays is None else [obj.without(strays) for obj in fresh]
-            is_given = labels is not None
-            fresh = self._mapped(
-                lambda obj: seen_object.viewed(obj, depth, camera, found, options, config, is_given), fresh
-            )
+            cleaned = objects if strays is None else [obj.without(strays) for obj in objects]
+
+            def prepared(obj: SeenObject) -> SeenObject:
+                plane = supports.support(obj, cleaned, depth, camera, found, options.segmentation_options())
+                obj = replace(obj, plane=plane)
+                if labels is not None:
+                    obj = seen_object.completed(obj, depth, camera, found.labels)
+                return seen_object.viewed(obj, depth, camera, config)
+
+            fresh = self._mapped(prepared, [obj for obj in cleaned if obj.label not in same])
             if network is not None:
                 fresh = self._predicted(fresh, network, options)
 

@@ -18,7 +18,6 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.canonical_view import CanonicalView
 from sq_perception.imaging.coherence import coherent
 from sq_perception.learning.network_config import RegressorConfig, ThingConfig
-from sq_perception.recovery.options import RecoveryOptions
 from sq_perception.recovery.prediction import Prediction
 from sq_perception.segmentation import segments
 
@@ -26,10 +25,8 @@ _POINTS = 2000
 """Enough for quantiles of heights to settle."""
 _VIEW_PIXELS = 64
 """Of the view of a score; those of a network are its own."""
-_LOWEST, _HOVERING = 0.02, 0.02
-"""An object this many metres above its plane, by its lowest points, may stand on another one."""
-_HIGHEST_STACK = 0.5
-"""Higher above its plane, metres, an object does not even stand on others that stand on it."""
+_LOWEST = 0.02
+"""Share of its pixels that are an object's lowest."""
 _JUMP_PIXELS, _JUMP = 10.0, 0.002
 """Steps in pixel widths, and metres, that end what a network is shown and a score is measured on."""
 _SURROUNDED, _RIM_HEIGHT = 0.6, 0.01
@@ -152,45 +149,10 @@ def completed(obj: SeenObject, depth: np.ndarray, camera: Camera, labels: np.nda
     return replace(obj, mask=whole, depth_crop=depth[window], mask_crop=whole[window], camera_crop=crop, window=window)
 
 
-def support(
-    obj: SeenObject,
-    depth: np.ndarray,
-    camera: Camera,
-    found: segments.Segmentation,
-    options: segments.SegmentationOptions,
-) -> np.ndarray | None:
-    """What the object stands on: the frame's plane, or another one that its surroundings show right below it.
-
-    An object behind the frame's plane does not stand on it, one that goes on below it hardly, and one high above it
-    neither: held before a wall, say.  One less high above it, without any such surroundings, stands on other objects.
-    """
-    if found.plane is None:
-        return None
-    low, median = obj.levels(found.plane)
-    behind = median <= 0
-    if not behind and abs(low) < _HOVERING:
-        return found.plane
-    other = segments.support_under(found, obj.label, depth, camera, options)
-    if other is not None:
-        lowest, middle = obj.levels(other)
-        if abs(lowest) < _HOVERING < middle + _HOVERING:
-            return other
-    return None if behind or low > _HIGHEST_STACK else found.plane
-
-
 def viewed(
-    obj: SeenObject,
-    depth: np.ndarray,
-    camera: Camera,
-    found: segments.Segmentation,
-    options: RecoveryOptions,
-    config: RegressorConfig | ThingConfig | None,
-    is_given: bool,
+    obj: SeenObject, depth: np.ndarray, camera: Camera, config: RegressorConfig | ThingConfig | None
 ) -> SeenObject:
-    """The object with what it stands on, what a network of this configuration is shown, and what its score takes."""
-    obj = replace(obj, plane=support(obj, depth, camera, found, options.segmentation_options()))
-    if is_given:
-        obj = completed(obj, depth, camera, found.labels)
+    """The object with what a network of this configuration is shown, and what its score takes."""
     inner = core(obj, depth, camera)
     shown = None if config is None else config.view_of(depth, inner, camera, obj.plane)
     if shown is not None and not (isinstance(config, RegressorConfig) and config.framing == "full"):

@@ -1,0 +1,122 @@
+"""What an object stands on: the frame's plane, another one right below it, or the level top of another object.
+
+The lowest pixels that show an object are h above the frame's plane.  If h is more than the noise, it may stand on
+another object.  That one has a top at a height t if a good many of its points lie within the noise of t, no higher than
+h, nor much lower: of a lying bottle the lowest pixels seen are as high as its axis.  The object stands on the top if
+most of its feet, seen from above, lie within the convex hull of what is seen of the top.
+
+This tells what stands on an object from what stands behind it, of which the lowest pixels seen may be as high as its
+top.  Of 78 simulated things that stand on others and are in sight it finds 52, 51 of the heights right to 12 mm, and of
+798 things and superquadrics on the table, in crowds too, it takes none to be on another.
+
+Metres, optical frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import cv2
+import numpy as np
+
+from sq_perception.geometry.quantiles import quantile
+from sq_perception.imaging.camera import Camera
+from sq_perception.recovery.seen_object import SeenObject
+from sq_perception.segmentation import segments, support_plane
+from sq_perception.segmentation.support_plane import TOLERANCE
+
+_HOVERING = 0.02
+"""An object this many metres above its plane, by its lowest points, may stand on another surface."""
+_HIGHEST_STACK = 0.5
+"""Higher above its plane, metres, an object does not even stand on others that stand on it."""
+_UNSEEN = 0.05
+"""Metres of an object between what it stands on and its lowest pixels that are seen, at most; with 0.02, one of those
+things less is found, with 0.08 no more."""
+_FEET = 0.01
+"""Metres above the lowest pixels that are an object's feet."""
+_FEWEST = 15
+"""Points of a top, of some thousand of its object."""
+_NEIGHBOURS = 3
+"""Pixels between the windows of objects of which one stands on the other."""
+
+
+def support(
+    obj: SeenObject,
+    others: Iterable[SeenObject],
+    depth: np.ndarray,
+    camera: Camera,
+    found: segments.Segmentation,
+    options: segments.SegmentationOptions,
+) -> np.ndarray | None:
+    """The plane (4,) that the object stands on; None where it stands on nothing that is known.
+
+    An object behind the frame's plane does not stand on it, one that goes on below it hardly, and one high above it
+    neither: held before a wall, say.  One less high above it, without anything seen right below it, stands on others.
+
+    Parameters
+    ----------
+    others
+        All objects of the frame; ``obj`` may be among them.
+    depth : (height, width)
+        Metres.
+    """
+    if found.plane is None:
+        return None
+    low, median = obj.levels(found.plane)
+    behind = median <= 0
+    top = None if behind else _top_under(obj, low, others, found.plane)
+    if top is not None:
+        return top
+    if not behind and abs(low) < _HOVERING:
+        return found.plane
+    other = segments.support_under(found, obj.label, depth, camera, options)
+    if other is not None:
+        lowest, middle = obj.levels(other)
+        if abs(lowest) < _HOVERING < middle + _HOVERING:
+            return other
+    return None if behind or low > _HIGHEST_STACK else found.plane
+
+
+def _top_under(obj: SeenObject, low: float, others: Iterable[SeenObject], plane: np.ndarray) -> np.ndarray | None:
+    """The level top (4,) of another object under this one, whose lowest pixels are ``low`` above a plane (4,)."""
+    near = [other for other in others if other.label != obj.label and _meet(obj.window, other.window)]
+    reach = TOLERANCE * float(support_plane.noise_growth(np.array(quantile(obj.depth_crop[obj.mask_crop], 0.5))))
+    if not near or low < reach:
+        return None
+    axes, best, farthest = support_plane.across(plane[:3]), None, 0.0
+    points = obj.points
+    feet = _seen_from_above(points[points @ plane[:3] + plane[3] < low + _FEET], axes)
+    for other in near:
+        points = other.points
+        heights = points @ plane[:3] + plane[3]
+        height = _level(heights[(heights > low - _UNSEEN) & (heights < low + 2 * reach)], reach)
+        top = _seen_from_above(points[np.abs(heights - height) < reach], axes)
+        if len(top) < _FEWEST:
+            continue
+        hull = cv2.convexHull(top)
+        inside = np.median([cv2.pointPolygonTest(hull, foot, True) for foot in feet.tolist()])
+        if inside > farthest:
+            farthest, best = inside, height
+    return None if best is None else plane - np.array([0, 0, 0, best])
+
+
+def _level(heights: np.ndarray, reach: float) -> float:
+    """The middle of the range, of a width of ``reach``, that most of some heights (n,) lie in; NaN of none."""
+    if not len(heights):
+        return np.nan
+    ordered = np.sort(heights)
+    counts = np.searchsorted(ordered, ordered + reach, side="right") - np.arange(len(ordered))
+    first = int(counts.argmax())
+    return float(np.median(ordered[first : first + counts[first]]))
+
+
+def _seen_from_above(points: np.ndarray, axes: np.ndarray) -> np.ndarray:
+    """Points (n, 3) along two level axes (3, 2), float32 (n, 2)."""
+    return (points @ axes).astype(np.float32)
+
+
+def _meet(one: tuple[slice, slice], other: tuple[slice, slice]) -> bool:
+    """Whether two windows of an image overlap, or nearly."""
+    return all(
+        a.start < b.stop + _NEIGHBOURS and b.start < a.stop + _NEIGHBOURS for a, b in zip(one, other, strict=True)
+    )

@@ -1,0 +1,67 @@
+"""What objects stand on: the table, or the tops of others; what stands behind another one stands on the table."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from table_scenes import VGA, Table
+
+from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.recovery import seen_object, supports
+from sq_perception.segmentation.segments import SegmentationOptions, from_labels
+
+LOW_BOX = (0.12, 0.1, 0.04)
+
+
+def heights(table: Table, bodies: list[Superquadric], noise: float = 0.0) -> list[float]:
+    """Of what each body is said to stand on, above the table, metres."""
+    depth, labels = table.see(bodies, noise)
+    found = from_labels(labels, depth, VGA)
+    objects = {obj.label: obj for obj in seen_object.objects(depth, found, VGA)}
+    planes = [
+        supports.support(objects[k + 1], list(objects.values()), depth, VGA, found, SegmentationOptions())
+        for k in range(len(bodies))
+    ]
+    assert all(plane is not None and plane[:3] @ table.plane[:3] > 0.9999 for plane in planes)
+    return [float(table.plane[3] - plane[3]) for plane in planes if plane is not None]
+
+
+@pytest.mark.parametrize("noise", [0.0, 1.5e-3])
+@pytest.mark.parametrize(("x", "y"), [(0.0, 0.0), (-0.06, 0.04), (0.05, -0.05)])
+def test_a_box_on_a_box_stands_on_its_top(noise: float, x: float, y: float) -> None:
+    table = Table()
+    below, above = heights(table, [table.body(0, 0, LOW_BOX), table.body(x, y, (0.03,) * 3, height=0.08)], noise)
+    assert abs(below) < 2e-3
+    assert abs(above - 0.08) < 3e-3
+
+
+def test_of_three_storeys_each_stands_on_the_one_below() -> None:
+    table = Table()
+    bodies = [table.body(0, 0, LOW_BOX), table.body(0, 0, (0.07, 0.06, 0.03), height=0.08)]
+    bodies.append(table.body(0, 0, (0.03, 0.03, 0.03), height=0.14))
+    np.testing.assert_allclose(heights(table, bodies), [0, 0.08, 0.14], atol=3e-3)
+
+
+def test_an_egg_of_which_the_lower_half_is_unseen_stands_on_the_box() -> None:
+    table = Table(pitch=1.1)
+    egg = table.body(0, 0, (0.07, 0.035, 0.035), (1.0, 1.0), height=0.08)
+    assert abs(heights(table, [table.body(0, 0, LOW_BOX), egg])[1] - 0.08) < 3e-3
+
+
+@pytest.mark.parametrize("pitch", [0.5, 0.75, 1.0])
+@pytest.mark.parametrize("gap", [0.0, 0.01, 0.04])
+def test_what_stands_behind_another_stands_on_the_table(pitch: float, gap: float) -> None:
+    """The lowest that is seen of it is as high as the top before it, where both touch."""
+    table = Table(pitch)
+    before, behind = table.body(0, 0, LOW_BOX), table.body(0, 0.1 + gap + 0.04, (0.05, 0.04, 0.1))
+    assert behind.translation[2] > before.translation[2]
+    for at in heights(table, [before, behind]):
+        assert abs(at) < 2e-3
+
+
+def test_one_between_two_of_its_height_stands_on_the_table() -> None:
+    """Neither top reaches under it, though the hull of both does."""
+    table = Table()
+    bodies = [table.body(-0.1, 0, (0.04, 0.1, 0.04)), table.body(0.1, 0, (0.04, 0.1, 0.04))]
+    bodies.append(table.body(0, 0, (0.055, 0.05, 0.08)))
+    assert abs(heights(table, bodies)[2]) < 2e-3
