@@ -47,6 +47,8 @@ _BUMP, _ON_WALL = 6.0, 3.5
 """A thing rises so many deviations of the support's own points above it, as they are beside the thing, and is that far
 off any other plane; pixels within so many of another plane are a part of that.  Of normal noise 0.05 % lies beyond 3.5;
 a bump of correlated noise seldom reaches 6, and of 374 simulated things that were found one does not."""
+_LOWER_SIDE = 0.1
+"""Share of the heights beside a thing."""
 _TALL = 20.0
 """Deviations of the support's points, and no more than ``HIGHEST`` tolerances: a segment that is higher on average is
 no noise beside another one, even where little noise or a long way makes things low against the tolerance."""
@@ -268,7 +270,18 @@ def _rises(top: float, beside: np.ndarray, sigma: float) -> bool:
         level = quantile(beside, 0.5)
         if np.mean(np.abs(beside - level) < 0.5 * TOLERANCE) > LEVEL_SHARE:
             bases.append(level)
-    return any(top - base >= _BUMP * max(sigma, _spread(beside, base)) for base in bases)
+    return any(top - base >= _BUMP * max(sigma, _spread(_noise(beside, base, top), base)) for base in bases)
+
+
+def _noise(heights: np.ndarray, base: float, top: float) -> np.ndarray:
+    """Those of the heights (n,) beside a thing that tell of noise about a base.
+
+    Below the base there is nothing but noise; above it there may be low things, or a wall behind.  These count for what
+    is no higher than a support is ever seen raised.
+    """
+    below = heights[heights < base]
+    is_high = top - base > HIGHEST * TOLERANCE
+    return below if is_high and below.size >= max(_FEWEST, _LOWER_SIDE * heights.size) else heights
 
 
 def _spread(heights: np.ndarray, base: float) -> float:

@@ -385,3 +385,13 @@ def test_a_narrower_frame_shows_the_same_table(shared_data):
         plane = segment(window, camera.cropped(left, top, width - 2 * left, height - 2 * top)).plane
         assert plane is not None
         assert plane[:3] @ up > np.cos(np.deg2rad(3))
+
+
+def test_low_things_beside_a_tall_one_are_no_noise_of_the_support() -> None:
+    rng = np.random.default_rng(0)
+    support, low_things = rng.normal(0, 1e-3, 400), rng.uniform(0, 0.03, 600)
+    beside = np.concatenate([support, low_things]).astype(np.float32)
+    assert standing._rises(0.09, beside, 1e-3)
+    assert not standing._rises(0.03, beside, 1e-3)  # it may be more of the same
+    raised = np.abs(rng.normal(0, 0.02, 1000)).astype(np.float32)  # the support itself: nothing is below
+    assert not standing._rises(0.09, raised, 1e-3)
