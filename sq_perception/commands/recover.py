@@ -41,7 +41,7 @@ What cannot be read is reported and skipped; the exit code is then 1.
 """
 EPILOG = """\
 methods:
-  auto       the network and central symmetry start an exact surface fit (best)
+  auto       a surface fit with a network's help (best)
   symmetry   the same fit, without the network
   network    the network alone
   classic    Solina and Bajcsy's fit to the points

@@ -1,1 +1,1 @@
-"""The regressor that reads a superquadric off a canonical view: network, losses, data, training, checkpoints."""
+"""The networks that predict bodies, hulls and masks: losses, data, training, checkpoints."""

@@ -114,7 +114,7 @@ class TrainingConfig:
     steps: int = 20000
     """Steps of the run; with the plateau schedule, the most it may take."""
     batch: int = 128
-    """Views a step, in each process."""
+    """Views a step."""
     points: int = 256
     """Comparison points a body: half close around it, half in twice its box."""
     sharpness_start: float = 0.0
@@ -206,7 +206,7 @@ class ShardTraining:
     validation: int = 200
     """Steps between two validations."""
     bfloat16: bool = False
-    """Layers before the heads in half the bits, their weights in all: 1.7 times as fast where processors have it."""
+    """Layers before the heads in half the bits, their weights in all: twice as fast where processors have it."""
     start: str = ""
     """Weights to begin with: a file, or shipped ones."""
 

@@ -128,11 +128,11 @@ class RecoverParameters(Parameters):
     model: str = setting(
         "", "Weights: a .safetensors file or the name of shipped ones; empty: the default. Set again, it is read again."
     )
-    device: str = setting("cpu", "Where the network runs: cpu, cuda or cuda:N.")
+    device: str = setting("cpu", "Where the network of bodies or hulls runs: cpu, cuda or cuda:N.")
     threads: int = setting(0, "Objects worked on at the same time; 0: as many as there are cores.", within=(0, 256))
     method: Method = setting(
         "auto",
-        "Where the fit starts: network, symmetry, or auto (the best of them); classic is Solina and Bajcsy's method.",
+        "auto: a network and a fit; symmetry: a fit alone; network: no fit; classic: Solina and Bajcsy's fit.",
         choices=get_args(Method),
     )
     repair: bool = setting(True, "Part, join and drop own segments; leave readings of neighbours out of fits.")

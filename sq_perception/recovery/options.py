@@ -43,7 +43,7 @@ class RecoveryOptions:
         made of a cloud.  Without it things are fitted by the tolerant course.
     repair
         Part and join own segments, drop those of no object, and leave strays out of fits, by a network; with the method
-        ``auto`` alone.  Masks from outside stay as they are.
+        ``auto`` and a network that predicts hulls alone.  Masks from outside stay as they are.
 
     Raises
     ------

@@ -7,13 +7,13 @@ With ``auto``, own segments are parted, joined, dropped where they show no objec
 
 | method | body |
 | --- | --- |
-| auto | fit from the starts of central symmetry and, where needed, the network; open sizes predicted |
+| auto | fit with a network's help: of things to the predicted hull, else from the starts of central symmetry too |
 | symmetry | fit from the starts of central symmetry, no network |
 | network | the network alone |
 | classic | Solina and Bajcsy's fit to the points |
 
-With ``auto`` the network computes beside the fit's first, cheapest starts.  A body that these explain
-down to the noise needs no prediction and does not wait for it.
+Hulls are predicted before the fits; a network that predicts bodies computes beside the first, cheapest starts.  A body
+that these explain down to the noise needs no prediction and does not wait for it.
 
 Everything is metres in the optical frame.  A hard image is no error: an object without a body is listed with
 ``Status.FAILED``, score 0 and, in place of a body, an ellipsoid around its visible points.

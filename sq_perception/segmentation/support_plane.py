@@ -57,7 +57,7 @@ _ISLAND_SHARE = 0.25
 Chosen: lone bodies are found by it, and 81 recorded and simulated frames of tables are the same without it."""
 LEVEL, _STOREY, _TABLE_SHARE = 0.99, 0.3, 0.4
 """Cosine between the normals of level planes, metres from a floor to the table above it, and the share that a small one
-shows of what the floor does.  Of lower steps the larger level is the support, and things are found on both."""
+shows of what the floor does.  Of lower steps the larger level is the support; things on a lower one are not found."""
 
 _CLOSE, _HELD_SHARE = 0.6, 0.1
 """Metres above a support in which what stands on it is, and the least share of that, of what another plane has there:
