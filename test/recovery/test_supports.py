@@ -48,6 +48,13 @@ def test_an_egg_of_which_the_lower_half_is_unseen_stands_on_the_box() -> None:
     assert abs(heights(table, [table.body(0, 0, LOW_BOX), egg])[1] - 0.08) < 3e-3
 
 
+def test_a_tall_box_seen_from_straight_above_stands_on_the_top_around_it() -> None:
+    """The lowest that is seen of it is its own top."""
+    table = Table(pitch=np.pi / 2 - 1e-6)
+    boxes = [table.body(0, 0, LOW_BOX), table.body(0.02, 0, (0.06, 0.05, 0.08), height=0.08)]
+    assert abs(heights(table, boxes)[1] - 0.08) < 3e-3
+
+
 @pytest.mark.parametrize("pitch", [0.5, 0.75, 1.0])
 @pytest.mark.parametrize("gap", [0.0, 0.01, 0.04])
 def test_what_stands_behind_another_stands_on_the_table(pitch: float, gap: float) -> None:
