@@ -235,9 +235,8 @@ def _draw(path: Path, frame: RecordedFrame, recovery: FrameRecovery) -> None:
     from sq_perception.evaluation.plots import save
     from sq_perception.evaluation.recovery_figure import recovery_figure
 
-    unit = "of the cube" if frame.is_cube else "m"
     with output_file.writing(path) as partial:
-        save(recovery_figure(frame.depth, frame.camera, recovery, console.printable(frame.name), unit), partial)
+        save(recovery_figure(frame.depth, frame.camera, recovery, console.printable(frame.name)), partial)
 
 
 def _write_mesh(path: Path, frame: RecordedFrame, recovery: FrameRecovery) -> None:

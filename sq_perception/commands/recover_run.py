@@ -103,7 +103,7 @@ class RecoverRun:
             raise
         self._tracks = RecordedTracks(lambda text: complain(f"warning: {text}")) if options.track else None
         self._unreadable = 0
-        self._warnings: set[str] = set()
+        self._warnings: dict[str, set[str]] = {}
 
     def _chosen_executor(self) -> Recoverer | workers.Processes | workers.Cluster:
         options = self._options
@@ -131,6 +131,10 @@ class RecoverRun:
         except KeyboardInterrupt:
             complain("interrupted; what is done so far is kept")
             return console.INTERRUPTED
+        finally:
+            for warning, files in self._warnings.items():
+                if len(files) > 1:
+                    complain(f"warning: {_count(len(files) - 1, 'more file')}: {warning}")
         self.is_whole = True
         return FAILURE if self._unreadable else console.SUCCESS
 
@@ -176,16 +180,20 @@ class RecoverRun:
             yield pair, answer
 
     def _frame(self, file: str, frame: RecordedFrame, answer: FrameRecovery | Exception) -> None:
-        if frame.warning and frame.warning not in self._warnings:
-            complain(f"warning: {frame.warning}")
-            self._warnings.add(frame.warning)
+        if frame.warning:
+            if frame.warning not in self._warnings:
+                complain(f"warning: {file}: {frame.warning}")
+            self._warnings.setdefault(frame.warning, set()).add(file)
         if isinstance(answer, (ValueError, ArithmeticError, workers.WorkerLostError)):  # such as a camera of no image
             raise FrameError(f"{file}: {frame.name}: {answer}") from answer
         if isinstance(answer, Exception):
             raise answer
         least = self._options.min_score
         wanted = tuple(body for body in answer.bodies if body.status == Status.FAILED or body.score >= least)
-        recovery = replace(answer, bodies=wanted)
+        message = answer.message
+        if len(wanted) < len(answer.bodies) and not message:
+            message = f"{_count(len(answer.bodies) - len(wanted), 'body', 'bodies')} with a lower score left out"
+        recovery = replace(answer, bodies=wanted, message=message)
         tracks = self._tracks.follow(file, frame, recovery) if self._tracks else None
         has_masks = not self._options.ignore_masks and frame.labels is not None
         entry = result_json.frame_entry(file, frame, recovery, tracks, has_masks)

@@ -23,13 +23,13 @@ _LONGEST = 68
 _MOST_LISTED = 8
 
 
-def recovery_figure(
-    depth: np.ndarray, camera: Camera, recovery: FrameRecovery, title: str = "", unit: str = "m"
-) -> Figure:
+def recovery_figure(depth: np.ndarray, camera: Camera, recovery: FrameRecovery, title: str = "") -> Figure:
     """The whole story of one frame: input and masks, outlines on the depth picture, two 3D views, numbers.
 
-    A body has the same number, its place in ``recovery.bodies``, wherever it is drawn.
+    A body has the same number, its place in ``recovery.bodies``, wherever it is drawn.  Lengths are metres, or sides of
+    the unit cube, which an orthographic camera sees.
     """
+    unit = "m" if camera.is_pinhole else "of the cube"
     shown = [(k, body) for k, body in enumerate(recovery.bodies) if body.status != Status.FAILED]
     bodies = [body.superquadric for _, body in shown]
     shades = [plots.colour(k) for k, _ in shown]
@@ -55,7 +55,7 @@ def recovery_figure(
     for k, body in shown:
         _draw_open_axes(right, body, camera)
         _number(right, camera.project(body.superquadric.translation), k)
-    plots.heading_of(right, "Recovered outlines", "faint: hidden edges; axes: what the view leaves open")
+    plots.heading_of(right, "Recovered outlines", "faint: hidden edges; axes: left open")
 
     points = camera.points(depth)
     clouds = [points[(recovery.labels == body.label) & np.isfinite(depth)] for _, body in shown]

@@ -166,5 +166,5 @@ def _image_header(encoded: np.ndarray) -> tuple[int, int, bool]:
             with Image.open(io.BytesIO(encoded.tobytes()), formats=("PNG", "BMP", "TIFF")) as image:
                 return *image.size, image.mode in ("P", "PA")
     except Exception as error:  # whatever damaged headers lead to
-        kinds = "PNG, BMP or TIFF"
-        raise UnpackingError(f"not a readable image: expected {kinds} of at most {MOST_PIXELS} pixels") from error
+        kinds = "PNG, BMP or TIFF of 8 or 16 bit, or TIFF of 32 bit floats"
+        raise UnpackingError(f"not a readable image: expected {kinds}, at most {MOST_PIXELS} pixels") from error

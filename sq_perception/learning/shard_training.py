@@ -16,6 +16,7 @@ The state of the run names them: shards that come later change nothing in that.
 
 from __future__ import annotations
 
+import json
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -74,6 +75,7 @@ def write_views(folder: Path, shards: Iterable[int], draw: Callable[[np.random.G
     for k in shards:
         path = folder / f"{k:05d}.safetensors"
         if path.exists():
+            print(f"{path}: there already")
             continue
         drawn = draw(np.random.default_rng([seed, k]))
         output_file.write(path, bytes_of(_stored(drawn)))
@@ -192,6 +194,7 @@ def _keep(
 ) -> None:
     """Log, state and network of this moment."""
     record = {"step": state.step, "seconds": state.seconds, **record}
+    print(json.dumps(record), flush=True)
     state.log(record)
     state.save()
     training = {**asdict(config), "start": Path(config.start).name}

@@ -199,7 +199,8 @@ class Recoverer:
             measured = _measured(camera.readings(depth), camera)
             if labels is not None:
                 labels = np.asarray(labels, order="C")
-                camera.check_image(labels)
+                if labels.shape != measured.shape:
+                    raise ValueError(f"labels: expected the shape of the depth, {measured.shape}, got {labels.shape}")
             measured, labels = perforation.filled(measured, labels)
             kept = continuity.NOTHING
             if previous is not None:
@@ -247,7 +248,7 @@ class Recoverer:
                 previous.reference, found.labels, [body.label for body in bodies if body.repeats]
             )
         milliseconds["total"] = 1e3 * (time.perf_counter() - started)
-        message = _left_out(found, options) if bodies else _why_empty(depth, found)
+        message = _left_out(found, options) if bodies else _why_empty(depth, found, labels)
         return FrameRecovery(bodies, milliseconds, found.labels, found.plane, message, reference)
 
     def _segmented(
@@ -357,9 +358,11 @@ def _left_out(found: segments.Segmentation, options: RecoveryOptions) -> str:
     return f"there are more objects than max_objects = {options.max_objects}: smaller ones are left out"
 
 
-def _why_empty(depth: np.ndarray, found: segments.Segmentation) -> str:
+def _why_empty(depth: np.ndarray, found: segments.Segmentation, labels: np.ndarray | None) -> str:
     if not np.isfinite(depth).any():
         return "the image holds no depth"
+    if labels is not None and labels.max() <= 0:
+        return "the masks hold no object"
     if found.plane is not None:
         return "nothing stands on the plane"
     return "no object of the wanted size and distance"

@@ -149,7 +149,7 @@ def test_bad_inputs_come_as_errors_in_their_place(tmp_path):
         (("--distortion", "ignore"), ""),
     ],
 )
-def test_what_becomes_of_distortion_is_said_once_unless_it_was_asked_for(tmp_path, options, words, capsys):
+def test_what_becomes_of_distortion_is_said_of_the_first_file_unless_it_was_asked_for(tmp_path, options, words, capsys):
     camera_yaml(tmp_path / "camera.yaml", distortion=0.3)
     for k in range(3):
         save_png(tmp_path / f"{k}.png")
@@ -157,7 +157,8 @@ def test_what_becomes_of_distortion_is_said_once_unless_it_was_asked_for(tmp_pat
     errors = capsys.readouterr().err
     assert words in errors
     assert "3 frames, " in errors
-    assert errors.count("\n") == (2 if words else 1)
+    assert ("0.png: " in errors and "1.png: " not in errors and "2 more files: " in errors) == bool(words)
+    assert errors.count("\n") == (3 if words else 1)
 
 
 @pytest.mark.parametrize("option", ["--every", "--limit", "--time-budget"])
@@ -381,6 +382,13 @@ def test_a_score_is_from_0_to_1(tmp_path, score, capsys):
     """Of a frame that was recovered with another one, nothing was left, and no JSON could be written."""
     assert run(save_npz(tmp_path / "a.npz"), f"--min-score={score}", "--json", tmp_path / "out.json") == 2
     assert "--min-score: expected a score from 0 to 1" in capsys.readouterr().err
+
+
+def test_bodies_below_the_least_score_are_counted(tmp_path, capsys):
+    (all_of_them,) = recover(tmp_path, save_npz(tmp_path / "a.npz"))
+    (none,) = recover(tmp_path, tmp_path / "a.npz", "--min-score", "1")
+    assert not none["superquadrics"]
+    assert none["message"] == f"{len(all_of_them['superquadrics'])} bodies with a lower score left out"
 
 
 @pytest.mark.parametrize("lowest", [("-1", "-1.", "0"), ("-1e0", "-inf", "-.1e-1")])

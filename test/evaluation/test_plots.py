@@ -102,7 +102,7 @@ def test_numbers_of_a_body_in_the_cube_are_beside_each_other():
         unit_cube.optical_from_cube(Superquadric([0.3, 0.2, 0.1], BODY.shape, [0.5] * 3, BODY.rotation)), camera
     )
     found = Recoverer(method="symmetry").recover(depth, camera, labels)
-    figure = recovery_figure(depth, camera, found, unit="of the cube")
+    figure = recovery_figure(depth, camera, found)
     figure.canvas.draw()
     edges, exponents = (
         next(text for text in figure.axes[-1].texts if text.get_text().startswith(start)) for start in ("0.6", "e ")

@@ -195,6 +195,13 @@ def test_images_without_objects_say_why(method, image, why):
     assert found.labels.shape == (48, 64)
 
 
+def test_masks_without_an_object_say_so_and_ones_of_another_size_are_refused(symmetry):
+    camera, depth = Camera(64, 48, 60.0, 60.0, 32, 24), np.ones((48, 64), np.float32)
+    assert symmetry.recover(depth, camera, np.zeros((48, 64), int)).message == "the masks hold no object"
+    with pytest.raises(ValueError, match=r"labels: expected the shape of the depth, \(48, 64\), got \(24, 32\)"):
+        symmetry.recover(depth, camera, np.zeros((24, 32), int))
+
+
 @pytest.mark.parametrize("most", [1, 2, 3])
 def test_a_frame_with_more_objects_says_so(symmetry, most):
     labels = np.zeros((48, 64), int)
