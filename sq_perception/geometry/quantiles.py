@@ -1,4 +1,7 @@
-"""Quantiles without what ``np.quantile`` spends: for few numbers on axes and methods, for many on moving them."""
+"""Quantiles without what ``np.quantile`` spends, for few numbers on axes and methods, for many on moving them.
+
+And where numbers are densest.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +18,15 @@ def quantile(numbers: np.ndarray, share: float) -> float:
     ordered = np.partition(numbers, (before, after))
     lower, upper = float(ordered[before]), float(ordered[after])
     return lower + (upper - lower) * (place - before)
+
+
+def densest(ordered: np.ndarray, width: float) -> slice:
+    """Where most of some ordered numbers (n,) lie within a width of the first one there; the first of such places."""
+    if not len(ordered):
+        return slice(0)
+    counts = np.searchsorted(ordered, ordered + width, side="right") - np.arange(len(ordered))
+    first = int(counts.argmax())
+    return slice(first, first + int(counts[first]))
 
 
 @kernel

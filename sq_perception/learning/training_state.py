@@ -39,7 +39,7 @@ _LONGEST = 240
 def mixed_precision(device: str, wanted: bool) -> torch.autocast:
     """Within it a network computes in bfloat16, where that is wanted and the device has such products.
 
-    A processor without them takes 16 times as long for a step in bfloat16 as in float32; one with them is 1.7 times
+    A processor without them takes 16 times as long for a step in bfloat16 as in float32; one with them is twice
     as fast.
     """
     has_products = device != "cpu" or bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())

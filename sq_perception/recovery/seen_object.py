@@ -7,6 +7,7 @@ optical frame.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import cv2
 import numpy as np
@@ -73,7 +74,7 @@ class SeenObject:
     view: CanonicalView | None = None
     prediction: Prediction | None = None
 
-    @property
+    @cached_property
     def points(self) -> np.ndarray:
         """At most some thousand measured points (n, 3), evenly taken."""
         rows, columns = np.nonzero(self.mask_crop)

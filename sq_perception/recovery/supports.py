@@ -20,7 +20,7 @@ from collections.abc import Iterable
 import cv2
 import numpy as np
 
-from sq_perception.geometry.quantiles import quantile
+from sq_perception.geometry.quantiles import densest, quantile
 from sq_perception.imaging.camera import Camera
 from sq_perception.recovery.seen_object import SeenObject
 from sq_perception.segmentation import segments, support_plane
@@ -87,7 +87,10 @@ def _top_under(obj: SeenObject, low: float, others: Iterable[SeenObject], plane:
     for other in near:
         points = other.points
         heights = points @ plane[:3] + plane[3]
-        height = _level(heights[heights < low + 2 * reach], reach)
+        ordered = np.sort(heights[heights < low + 2 * reach])
+        if len(ordered) < _FEWEST:
+            continue
+        height = float(np.median(ordered[densest(ordered, reach)]))
         top = _seen_from_above(points[np.abs(heights - height) < reach], axes)
         if len(top) < _FEWEST:
             continue
@@ -96,16 +99,6 @@ def _top_under(obj: SeenObject, low: float, others: Iterable[SeenObject], plane:
         if inside > 0:
             best = max(best, height)
     return plane - np.array([0, 0, 0, best]) if best > 0 else None
-
-
-def _level(heights: np.ndarray, reach: float) -> float:
-    """The middle of the range, of a width of ``reach``, that most of some heights (n,) lie in; NaN of none."""
-    if not len(heights):
-        return np.nan
-    ordered = np.sort(heights)
-    counts = np.searchsorted(ordered, ordered + reach, side="right") - np.arange(len(ordered))
-    first = int(counts.argmax())
-    return float(np.median(ordered[first : first + counts[first]]))
 
 
 def _seen_from_above(points: np.ndarray, axes: np.ndarray) -> np.ndarray:

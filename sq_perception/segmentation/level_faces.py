@@ -19,7 +19,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from sq_perception.geometry.quantiles import quantile
+from sq_perception.geometry.quantiles import densest, quantile
 from sq_perception.imaging import regions
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation import standing, support_plane
@@ -117,13 +117,11 @@ def _face(points: np.ndarray, support: SupportSurface) -> SupportSurface | None:
     ordered = np.sort(height)
     if ordered[-_FEWEST] < HIGHEST * reach:
         return None
-    ends = np.searchsorted(ordered, ordered + reach, side="right")
-    counts = ends - np.arange(len(ordered))
-    counts[ordered < HIGHEST * reach] = 0
-    first = int(counts.argmax())
-    if counts[first] < _FEWEST:
+    ordered = ordered[ordered >= HIGHEST * reach]
+    level = ordered[densest(ordered, reach)]
+    if len(level) < _FEWEST:
         return None
-    on = (height >= ordered[first]) & (height <= ordered[first] + reach)
+    on = (height >= level[0]) & (height <= level[0] + reach)
     for _ in range(2):
         plane = support_plane.least_squares_plane(np.ascontiguousarray(points[on].T), growth[on] ** -2.0)
         off = (points @ plane[:3] + plane[3]) / growth

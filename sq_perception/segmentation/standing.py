@@ -48,7 +48,8 @@ _BUMP, _ON_WALL = 6.0, 3.5
 off any other plane; pixels within so many of another plane are a part of that.  Of normal noise 0.05 % lies beyond 3.5;
 a bump of correlated noise seldom reaches 6, and of 374 simulated things that were found one does not."""
 _LOWER_SIDE = 0.1
-"""Share of the heights beside a thing."""
+"""Share of the heights beside a thing, at least, that tell the noise from below.  Of 25 simulated things that were
+missed it finds two, 0.25 none."""
 _TALL = 20.0
 """Deviations of the support's points, and no more than ``HIGHEST`` tolerances: a segment that is higher on average is
 no noise beside another one, even where little noise or a long way makes things low against the tolerance."""

@@ -27,7 +27,7 @@ import cv2
 import numpy as np
 
 from sq_perception.geometry.kernels import kernel
-from sq_perception.geometry.quantiles import quantile
+from sq_perception.geometry.quantiles import densest, quantile
 from sq_perception.imaging import depth_steps, regions
 from sq_perception.imaging.camera import Camera, Lens
 from sq_perception.segmentation.support_plane import COARSE_PIXELS, LEAST_GROWTH, TOLERANCE, Plane, noise_growth
@@ -197,8 +197,8 @@ def _level(height: np.ndarray, reached: np.ndarray) -> np.ndarray:
     for part in np.flatnonzero(extents[:, 0] >= _LEVEL_SAMPLES):
         if part > 0:
             heights = np.sort(height[regions.pixels(parts, int(part), extents[part])])
-            about = np.searchsorted(heights, heights + 0.5 * TOLERANCE, side="right") - np.arange(len(heights))
-            level[part] = about[heights > 0.75 * TOLERANCE].max(initial=0) > LEVEL_SHARE * len(heights)
+            high = heights[heights > 0.75 * TOLERANCE]
+            level[part] = len(high[densest(high, 0.5 * TOLERANCE)]) > LEVEL_SHARE * len(heights)
     return level[parts]
 
 

@@ -1,13 +1,14 @@
-"""Segments of simulated tables, with which of their readings are of their object: training data.
+"""Segments of simulated scenes, with which of their readings are of their object: training data.
 
 Things on a table (:mod:`~sq_perception.simulation.things_on_table`) that ends in sight in many scenes
 (:mod:`~sq_perception.simulation.room`), or in and on furniture (:mod:`~sq_perception.simulation.furniture`), or crowds
-of superquadrics (:mod:`~sq_perception.simulation.crowds`), before a random camera, are measured by one of the sensors;
-of many a smaller image is taken, whose borders cut things.  It is segmented as any image is, and each segment seen as a
-:class:`~sq_perception.imaging.segment_view.SegmentView`.  Its
-object is the thing that most of its pixels show; what shows the table, the furniture or the room at half of its pixels,
-and no thing at 30 % of them, has none.  A reading is one of the object if its pixel shows the object and it is no more
-than 10 mm + 1 % off: what a sensor smears over an edge is not.
+of superquadrics (:mod:`~sq_perception.simulation.crowds`), before a random camera, are measured by a known sensor or by
+one of random parameters (:mod:`~sq_perception.simulation.thing_sensing`); of many a smaller image is taken, whose
+borders cut things.  It is segmented as any image is, and each segment seen as a
+:class:`~sq_perception.imaging.segment_view.SegmentView`.  Its object is the thing that most of its pixels show; what
+shows the table, the furniture or the room at half of its pixels, and no thing at 30 % of them, has none.  A reading is
+one of the object if its pixel shows the object and it is no more than 10 mm + 1 % off: what a sensor smears over an
+edge is not.
 
 The network that learns from them is also asked whether a segment is one thing, so compact pieces of segments
 (:mod:`~sq_perception.segmentation.pieces`) are among them, and of two neighbours as if they were one, each with the
@@ -41,7 +42,7 @@ _WIDTHS, _OF_WIDTHS = (160, 320, 640, 1280), (0.1, 0.1, 0.65, 0.15)
 _ELEVATIONS, _OF_ELEVATIONS = ((6.0, 20.0), (20.0, 70.0), (70.0, 90.0)), (0.2, 0.65, 0.15)
 """Degrees that the camera is above the table, and shares of the scenes."""
 _CROWDS, _IN_FURNITURE = 0.2, 0.3
-"""Shares of the scenes; their cameras are as high as they ask."""
+"""Shares of the scenes; they choose how high their cameras are."""
 _WITH_ROOM = 0.6
 """Share of the other scenes whose table ends in sight, before a room."""
 _LARGER, _TIMES = 0.35, (1.0, 2.5)
@@ -206,8 +207,8 @@ def _cut(shown: np.ndarray, rng: np.random.Generator) -> tuple[slice, slice]:
     if rng.random() >= _SMALLER:
         return slice(0, height), slice(0, width)
     size = np.rint(rng.uniform(*_SIDES) * np.array([height, width])).astype(int)
-    rows, columns = np.nonzero(shown == rng.choice(np.unique(shown)[1:])) if shown.any() else ((), ())
-    middle = np.array([np.mean(rows), np.mean(columns)]) if len(rows) else 0.5 * size
+    things = np.unique(shown[shown > 0])
+    middle = np.mean(np.nonzero(shown == rng.choice(things)), axis=1) if len(things) else 0.5 * size
     first = np.rint(middle + (rng.uniform(-0.5, 0.5, 2) - 0.5) * size).astype(int)
     top, left = np.clip(first, 0, np.array([height, width]) - size)
     return slice(int(top), int(top + size[0])), slice(int(left), int(left + size[1]))
