@@ -24,6 +24,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 
 Projection = Literal["pinhole", "orthographic"]
+LEAST_MEDIAN, GREATEST_MEDIAN = 0.01, 100.0
+"""Metres; no depth camera sees half of its image nearer or farther: other numbers have another unit."""
 
 
 class Lens(NamedTuple):

@@ -36,7 +36,7 @@ import numpy as np
 from sq_perception.files.unpacking import UnpackingError, exr_image, grey_image, npy_array, npz_arrays
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.calibration import Treatment
-from sq_perception.imaging.camera import Camera, Projection
+from sq_perception.imaging.camera import GREATEST_MEDIAN, LEAST_MEDIAN, Camera, Projection
 from sq_perception.recordings import cloud_file
 from sq_perception.recordings.camera_file import FrameError, read_calibration
 
@@ -46,8 +46,6 @@ MILLIMETRES = 1000.0
 TUM_SCALE = 5000.0
 """Of the TUM RGB-D benchmark, https://cvg.cit.tum.de/data/datasets/rgbd-dataset/file_formats"""
 _TUM_NAME = re.compile(r"\d{10}\.\d{6}")
-_NEAREST, _FARTHEST = 0.01, 100.0
-"""Metres; no depth camera sees half of its image nearer or farther."""
 _TIME = re.compile(r"(\d{1,18})\.(\d{1,9})")
 
 
@@ -310,10 +308,10 @@ def _likely_mistake(frame: RecordedFrame) -> str:
     if frame.is_cube:
         is_within = shown.min() > -1.0 and shown.max() < 2.0
         return "" if is_within else "depths far outside of the unit cube: a metric image is not orthographic"
-    if np.median(shown) > _FARTHEST:
-        return f"half of the image is farther than {_FARTHEST:g} m: for millimetres the depth scale is 1000"
-    if np.median(shown) < _NEAREST:
-        return f"half of the image is nearer than {_NEAREST:g} m: for metres the depth scale is 1"
+    if np.median(shown) > GREATEST_MEDIAN:
+        return f"half of the image is farther than {GREATEST_MEDIAN:g} m: for millimetres the depth scale is 1000"
+    if np.median(shown) < LEAST_MEDIAN:
+        return f"half of the image is nearer than {LEAST_MEDIAN:g} m: for metres the depth scale is 1"
     return ""
 
 

@@ -37,7 +37,7 @@ from sq_perception.fitting.fit import Status
 from sq_perception.geometry.one_thread import one_blas_thread
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import perforation, raycast
-from sq_perception.imaging.camera import Camera
+from sq_perception.imaging.camera import GREATEST_MEDIAN, Camera
 from sq_perception.learning import checkpoint, inference
 from sq_perception.learning.forward import CompactMasks
 from sq_perception.recovery import continuity, methods, prediction, seen_object, supports
@@ -61,6 +61,8 @@ __all__ = [
 _Item = TypeVar("_Item")
 _Answer = TypeVar("_Answer")
 Network: TypeAlias = inference.Predictor | inference.ThingPredictor
+_SPARSE = 8
+"""Every so many-th pixel tells what unit an image has."""
 _NEAREST, _FARTHEST = 1e-4, 1e5
 """Metres; no sensor measures beyond, and numbers beyond make squares and products that are none."""
 
@@ -173,9 +175,13 @@ class Recoverer:
         ------
         ValueError
             For images that do not fit the camera or have the wrong type.  No depth *value* raises.
+        TypeError
+            For a previous frame that is none.
         CheckpointError
             If the method needs the network and it cannot be loaded.
         """
+        if not isinstance(previous, FrameRecovery | None):
+            raise TypeError(f"previous: expected a FrameRecovery, got {type(previous).__name__}")
         if self._process != os.getpid():  # forked: threads stay behind, and who waits for them waits for ever
             self._begin()
         with one_blas_thread():
@@ -249,6 +255,7 @@ class Recoverer:
             )
         milliseconds["total"] = 1e3 * (time.perf_counter() - started)
         message = _left_out(found, options) if bodies else _why_empty(depth, found, labels)
+        message = "; ".join(filter(None, (message, _unlikely(measured, camera))))
         return FrameRecovery(bodies, milliseconds, found.labels, found.plane, message, reference)
 
     def _segmented(
@@ -356,6 +363,15 @@ def _left_out(found: segments.Segmentation, options: RecoveryOptions) -> str:
     if not found.is_cut:
         return ""
     return f"there are more objects than max_objects = {options.max_objects}: smaller ones are left out"
+
+
+def _unlikely(depth: np.ndarray, camera: Camera) -> str:
+    """What is wrong with an image that no depth camera takes; empty for others."""
+    some = depth[::_SPARSE, ::_SPARSE]
+    some = some[np.isfinite(some)]
+    if not camera.is_pinhole or not some.size or np.median(some) <= GREATEST_MEDIAN:
+        return ""
+    return f"half of the image is farther than {GREATEST_MEDIAN:g} m: depths are metres, not millimetres"
 
 
 def _why_empty(depth: np.ndarray, found: segments.Segmentation, labels: np.ndarray | None) -> str:

@@ -90,7 +90,7 @@ class FrameRecovery:
     plane : (4,) or None
         Support plane, height above it = n.p + d.
     message
-        Why there are no objects, or that some were left out; empty otherwise.
+        Why there are no objects, that some were left out, or that the depths are hardly metres; empty otherwise.
     reference
         What the next frame of the same camera is compared with.
     """

@@ -195,6 +195,19 @@ def test_images_without_objects_say_why(method, image, why):
     assert found.labels.shape == (48, 64)
 
 
+@pytest.mark.parametrize("masked", [False, True])
+def test_depths_in_millimetres_are_said(symmetry, masked):
+    depth, labels = seen([random_bodies(1, 3, scale=0.1)[0]], CAMERA)
+    for scale, is_said in ((1, False), (1000, True)):
+        found = symmetry.recover((scale * depth).astype(np.float32), CAMERA, labels if masked else None)
+        assert ("not millimetres" in found.message) == is_said
+
+
+def test_a_frame_before_that_is_none_is_refused(symmetry):
+    with pytest.raises(TypeError, match="previous: expected a FrameRecovery, got int"):
+        symmetry.recover(np.ones((CAMERA.height, CAMERA.width)), CAMERA, previous=1)
+
+
 def test_masks_without_an_object_say_so_and_ones_of_another_size_are_refused(symmetry):
     camera, depth = Camera(64, 48, 60.0, 60.0, 32, 24), np.ones((48, 64), np.float32)
     assert symmetry.recover(depth, camera, np.zeros((48, 64), int)).message == "the masks hold no object"
