@@ -162,7 +162,7 @@ def risen(relative: np.ndarray, depth: np.ndarray, valid: np.ndarray, camera: Ca
             reached[there] |= reached[here] & near & passable[there]
         if np.count_nonzero(reached) == before:
             break
-    reached &= ~_low_things(height, known, reached)
+    reached &= ~_low_things(height, noise_growth(z), known, reached)
     full = cv2.resize(reached.view(np.uint8), None, fx=k, fy=k, interpolation=cv2.INTER_NEAREST)
     return full[: depth.shape[0], : depth.shape[1]] > 0
 
@@ -174,7 +174,7 @@ def _cells(image: np.ndarray, k: int) -> np.ndarray:
     return cv2.resize(whole, None, fx=1 / k, fy=1 / k, interpolation=cv2.INTER_AREA)
 
 
-def _low_things(height: np.ndarray, known: np.ndarray, reached: np.ndarray) -> np.ndarray:
+def _low_things(height: np.ndarray, growth: np.ndarray, known: np.ndarray, reached: np.ndarray) -> np.ndarray:
     """Samples of what is no ramp although it was reached, as it does not lead up to anything.
 
     A ramp belongs to the tall thing beside which it rises.  Where the samples above some level hold together and what
@@ -182,21 +182,25 @@ def _low_things(height: np.ndarray, known: np.ndarray, reached: np.ndarray) -> n
     sensor smooth into ramps.  So are those that are level, a book under a box: a ramp has all heights up to what it
     leads to.
     """
-    own = _level(height, reached)
+    own = _level(height, growth, reached)
     for level in _LEVELS:
         parts = depth_steps.components(known & (height > level * TOLERANCE))
         _add_reached_tops(parts, reached, height, int(parts.max()), own)
     return own
 
 
-def _level(height: np.ndarray, reached: np.ndarray) -> np.ndarray:
-    """Parts of what was reached of which most samples lie at one height, a tolerance above the support or higher."""
+def _level(height: np.ndarray, growth: np.ndarray, reached: np.ndarray) -> np.ndarray:
+    """Parts of what was reached of which most samples lie at one height, a tolerance above the support or higher.
+
+    Both are lengths, and grow with the part's distance, not within it: a book that is near is level too.
+    """
     parts = depth_steps.components(reached & (height > 0.5 * TOLERANCE))
     extents = regions.extents(parts)
     level = np.zeros(len(extents), bool)
     for part in np.flatnonzero(extents[:, 0] >= _LEVEL_SAMPLES):
         if part > 0:
-            heights = np.sort(height[regions.pixels(parts, int(part), extents[part])])
+            pixels = regions.pixels(parts, int(part), extents[part])
+            heights = np.sort(height[pixels] * growth[pixels] / np.median(growth[pixels]))
             high = heights[heights > 0.75 * TOLERANCE]
             level[part] = len(high[densest(high, 0.5 * TOLERANCE)]) > LEVEL_SHARE * len(heights)
     return level[parts]
