@@ -17,7 +17,6 @@ from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
-from sq_perception.imaging.coherence import coherent
 from sq_perception.simulation.scenes import plane_depth
 
 CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)
@@ -175,28 +174,6 @@ def test_a_can_from_above_shows_all_of_its_width() -> None:
     assert (fit.seen > 0.85).all()
     assert (face_on().seen > 0.9).sum() == 2
     assert face_on().seen.min() < 0.2
-
-
-# What a mask holds beside the body
-
-
-def test_the_fringe_of_an_occluder_is_no_part_of_the_body() -> None:
-    depth = np.full((40, 60), 1.0)
-    depth[:, 40:] = 0.6
-    depth[:, 34:40] = np.nan
-    mask = np.zeros(depth.shape, dtype=bool)
-    mask[5:35, 10:43] = True
-    core = coherent(depth, mask, 0.02)
-    assert not core[:, 40:].any()
-    assert core[5:35, 10:40].all()
-
-
-def test_the_far_end_of_a_body_behind_a_bar_stays() -> None:
-    depth = np.full((40, 60), 1.5)
-    depth[5:35, 10:50] = 1.0
-    depth[:, 36:40] = 0.6
-    mask = depth == 1.0
-    np.testing.assert_array_equal(coherent(depth, mask, 0.02), mask)
 
 
 def test_a_hidden_foot_is_thought_to_reach_the_plane() -> None:

@@ -78,3 +78,18 @@ def test_readings_that_are_none_say_the_same_whatever_their_number(nothing: floa
     assert other is not None
     assert usual.noise == other.noise
     np.testing.assert_array_equal(usual.depth, other.depth)
+
+
+def test_a_thing_whose_head_hides_the_beginning_of_its_grip_is_fitted_whole() -> None:
+    """Of an image without noise a superquadric explains all pixels of the head, which are most; and a planner that
+    takes that for the thing runs into the grip."""
+    away = np.cross(NORMAL, RIGHT)
+    centre = np.array([0.0, 0.0, 0.8])
+    head = Superquadric([0.06, 0.03, 0.03], [0.3, 0.3], centre + 0.03 * NORMAL, UPRIGHT)
+    grip = Superquadric([0.02, 0.1, 0.01], [0.3, 0.3], centre + 0.01 * NORMAL + 0.12 * away, UPRIGHT)
+    parts = Superquadric.stack([head, grip])
+    depth, thing = render_things(parts, np.zeros(2), NO_CAVITY, np.zeros(0), CAMERA, TABLE, 1.5)
+    fit = surface_fit.fit(depth.astype(np.float32), thing == 0, CAMERA, options=FitOptions(plane=TABLE))
+    reach = (fit.superquadric.translation - centre) @ away + fit.superquadric.support(away[None])[0]
+    assert reach > 0.12
+    assert fit.status != Status.CONVERGED
