@@ -5,10 +5,10 @@
 Cases: thesis images (mono8, 256 x 256, orthographic) and table-tops with one and five objects (32FC1, 640 x 480,
 pinhole), the latter by a simulated D435, also at three times the rate, where frames are dropped.
 The stamp is the clock at the camera's publish call, so the latency holds no rendering, but both transports, the whole
-recovery and the way to a subscriber.  A new scene comes twice a second.  A real camera takes next to no processor time:
-this one runs at low priority on one thread, and what the D435 measures, 20 ms a frame, is simulated before the clock
-starts and replayed, ``SCENES`` scenes over and over.  The trend (latency of the last third minus that of the first)
-shows whether a queue grows; the counters of /diagnostics show whether every frame was answered or counted.
+recovery and the way to a subscriber. A new scene comes every ``HOLD`` frames. A real camera takes next to no processor
+time: this one runs at low priority on one thread, and what the D435 measures, 20 ms a frame, is simulated before the
+clock starts and replayed, ``SCENES`` scenes over and over. The trend (latency of the last third minus that of the
+first) shows whether a queue grows; the counters of /diagnostics show whether every frame was answered or counted.
 """
 
 from __future__ import annotations
