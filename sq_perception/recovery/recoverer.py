@@ -35,6 +35,7 @@ import numpy as np
 from sq_perception.fitting import surface_fit
 from sq_perception.fitting.fit import Status
 from sq_perception.geometry.one_thread import one_blas_thread
+from sq_perception.geometry.quantiles import quantile
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import perforation, raycast
 from sq_perception.imaging.camera import GREATEST_MEDIAN, Camera
@@ -255,7 +256,7 @@ class Recoverer:
             )
         milliseconds["total"] = 1e3 * (time.perf_counter() - started)
         message = _left_out(found, options) if bodies else _why_empty(depth, found, labels)
-        message = "; ".join(filter(None, (message, _unlikely(measured, camera))))
+        message = "; ".join(filter(None, (message, _wrong_unit(measured, camera))))
         return FrameRecovery(bodies, milliseconds, found.labels, found.plane, message, reference)
 
     def _segmented(
@@ -365,11 +366,11 @@ def _left_out(found: segments.Segmentation, options: RecoveryOptions) -> str:
     return f"there are more objects than max_objects = {options.max_objects}: smaller ones are left out"
 
 
-def _unlikely(depth: np.ndarray, camera: Camera) -> str:
-    """What is wrong with an image that no depth camera takes; empty for others."""
+def _wrong_unit(depth: np.ndarray, camera: Camera) -> str:
+    """That the depths (height, width) are hardly metres, NaN where nothing was measured; empty where they may be."""
     some = depth[::_SPARSE, ::_SPARSE]
     some = some[np.isfinite(some)]
-    if not camera.is_pinhole or not some.size or np.median(some) <= GREATEST_MEDIAN:
+    if not camera.is_pinhole or not some.size or quantile(some, 0.5) <= GREATEST_MEDIAN:
         return ""
     return f"half of the image is farther than {GREATEST_MEDIAN:g} m: depths are metres, not millimetres"
 

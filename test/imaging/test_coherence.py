@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from sq_perception.imaging.coherence import coherent
 
@@ -28,9 +29,10 @@ def test_the_far_end_of_a_body_behind_a_bar_stays() -> None:
     np.testing.assert_array_equal(coherent(depth, mask, JUMP), mask)
 
 
-def test_a_part_of_a_thing_that_another_one_hides_stays() -> None:
-    """A grip behind a head: its border is the border of what was measured as well."""
-    depth = np.full((40, 60), 1.5)
+@pytest.mark.parametrize("behind", [1.5, np.nan])
+def test_a_part_of_a_thing_that_another_one_hides_stays(behind: float) -> None:
+    """A grip behind a head: its border is a border in the depth as well, or of what was measured at all."""
+    depth = np.full((40, 60), behind)
     depth[5:25, 10:40] = 0.6
     depth[15:35, 40:55] = 0.7
     mask = depth < 1
