@@ -122,6 +122,8 @@ def _training(subject: str, text: str, example: str, run: ShardTraining) -> argp
     add("--batch", type=at_least(1), help="views a step (%(default)s)")
     add("--rate", type=positive, help="largest learning rate (%(default)s)")
     add("--threads", type=at_least(0), help="of torch; 0: its own choice")
+    add("--device", help="cpu or cuda (%(default)s)")
+    add("--validation", type=at_least(1), help="steps between two validations (%(default)s)")
     add("--held", type=at_least(1), help="shards that are kept for validation (%(default)s)")
     add("--seed", type=at_least(0), help="default %(default)s")
     add("--start", metavar="MODEL", help="weights to begin with: a file, or shipped ones")

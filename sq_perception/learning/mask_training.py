@@ -38,10 +38,11 @@ def mask_loss(logits: torch.Tensor, images: torch.Tensor, truth: torch.Tensor) -
 def validate(network: MaskNetwork, views: SegmentViews) -> dict[str, float]:
     """Shares in the objects' readings: strays in segments before and after, and readings that are lost."""
     network.eval()
+    device = next(network.parameters()).device
     strays = left = lost = objects = 0
     for i in range(0, len(views.images), _BATCH):
-        images = torch.from_numpy(views.images[i : i + _BATCH].astype(np.float32)).permute(0, 3, 1, 2)
-        truth = torch.from_numpy(views.truth[i : i + _BATCH])
+        images = torch.from_numpy(views.images[i : i + _BATCH].astype(np.float32)).to(device).permute(0, 3, 1, 2)
+        truth = torch.from_numpy(views.truth[i : i + _BATCH]).to(device)
         inside = (images[:, SEGMENT] > 0) & (truth != UNKNOWN)
         kept, own = network(images) >= 0, inside & (truth == YES)
         objects += int(own.sum())

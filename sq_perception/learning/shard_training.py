@@ -30,12 +30,13 @@ from safetensors import SafetensorError
 from safetensors.numpy import load_file as load_arrays
 from safetensors.numpy import save as bytes_of
 
-from sq_perception.files import output_file, provenance
+from sq_perception.files import output_file
 from sq_perception.learning import checkpoint
+from sq_perception.learning.inference import checked_device
 from sq_perception.learning.mask_network import MaskNetwork
 from sq_perception.learning.thing_network import ThingNetwork
 from sq_perception.learning.training_config import ShardTraining
-from sq_perception.learning.training_state import TrainingState, mixed_precision
+from sq_perception.learning.training_state import TrainingState, made_by, mixed_precision
 
 _WARM_UP = 100
 """Steps over which the learning rate rises."""
@@ -117,7 +118,8 @@ def train(subject: Subject[Network, Any], config: ShardTraining, views: Path, ou
     Raises
     ------
     ValueError
-        If the folder holds no more shards than are kept for validation, or one that cannot be read.
+        If the folder holds no more shards than are kept for validation, or one that cannot be read, or for a device
+        that this machine does not have.
     OSError
         If a shard that is kept for validation is gone.
     CheckpointError
@@ -125,11 +127,12 @@ def train(subject: Subject[Network, Any], config: ShardTraining, views: Path, ou
     ArithmeticError
         If the loss or a gradient is no longer finite; the last state that was saved stays.
     """
+    device = torch.device(checked_device(config.device))
     if config.threads:
         torch.set_num_threads(config.threads)
     torch.manual_seed(config.seed)
     output.mkdir(parents=True, exist_ok=True)
-    network = subject.network(config.start).train()
+    network = subject.network(config.start).to(device).train()
     optimizer = torch.optim.AdamW(network.parameters(), lr=config.rate, weight_decay=config.weight_decay)
     state = TrainingState(output / "state.safetensors", network, optimizer)
     rng = np.random.default_rng([config.seed, state.step])
@@ -142,8 +145,9 @@ def train(subject: Subject[Network, Any], config: ShardTraining, views: Path, ou
         if state.step % config.validation == 0 and (chosen := _some(views, state.held, rng)) != shards:
             shards, pool = chosen, read_views(subject.none, chosen)
         rate = falling_rate(config.rate, state.step, progress)
-        batch = subject.batch(pool, rng.integers(len(pool.images), size=config.batch), rng)
-        with mixed_precision("cpu", config.bfloat16):
+        drawn = subject.batch(pool, rng.integers(len(pool.images), size=config.batch), rng)
+        batch = [each.to(device) for each in drawn]
+        with mixed_precision(device.type, config.bfloat16):
             predicted = network(*batch[:-1])
         loss = subject.loss(predicted, *batch)
         state.descend(loss, rate, _AVERAGE)
@@ -198,6 +202,6 @@ def _keep(
     state.log(record)
     state.save()
     training = {**asdict(config), "start": Path(config.start).name}
-    made = provenance.facts(f"sq-perception train-{subject.name}")
+    made = made_by(f"train-{subject.name}", next(state.model.parameters()).device)
     facts = {"training": training, "made": made, "validation": record}
     checkpoint.save(output / f"{subject.name}.safetensors", state.average, facts)

@@ -60,7 +60,7 @@ def likeliest_spread(network: ThingNetwork, views: ThingViews) -> float:
     found = []
     for truth, predicted in _predictions(network, views):
         found.append(predicted.distance(truth)[0])
-    m, nu, count = torch.cat(found).numpy(), network.config.freedom, views.support.shape[1]
+    m, nu, count = torch.cat(found).cpu().numpy(), network.config.freedom, views.support.shape[1]
     best = minimize_scalar(
         lambda log: 0.5 * count * log + 0.5 * (nu + count) * float(np.log1p(m / (math.exp(log) * nu)).mean()),
         bounds=_LOG_SPREADS,
@@ -73,31 +73,33 @@ def validate(network: ThingNetwork, views: ThingViews) -> dict[str, Any]:
     """Mean errors of h and of the body's h in sides of the view, and the deviation of error / sigma, by kind."""
     errors, body_errors, ratios = [], [], []
     for truth, predicted in _predictions(network, views):
-        error = (predicted.support - truth).numpy()
-        body_errors.append(thing_network.body_loss(predicted.body, truth).numpy())
-        errors.append(np.abs(error).mean(axis=1))
-        ratios.append(error / predicted.deviation().numpy())
-    error, body_error, ratio = np.concatenate(errors), np.concatenate(body_errors), np.concatenate(ratios)
+        error = predicted.support - truth
+        body_errors.append(thing_network.body_loss(predicted.body, truth).cpu().numpy())
+        errors.append(error.abs().mean(dim=1).cpu().numpy())
+        ratios.append((error / predicted.deviation()).cpu().numpy())
+    mean_error, body_error, ratio = np.concatenate(errors), np.concatenate(body_errors), np.concatenate(ratios)
     found: dict[str, Any] = {
-        "error": float(error.mean()),
+        "error": float(mean_error.mean()),
         "body": float(body_error.mean()),
         "ratio": float(ratio.std()),
     }
     for k, kind in enumerate(KINDS):
         mine = views.kinds == k
         if mine.any():
-            found[kind] = [float(error[mine].mean()), float(np.sqrt(np.mean(ratio[mine] ** 2)))]
+            found[kind] = [float(mean_error[mine].mean()), float(np.sqrt(np.mean(ratio[mine] ** 2)))]
     return found
 
 
 @torch.inference_mode()
 def _predictions(network: ThingNetwork, views: ThingViews) -> Iterator[tuple[torch.Tensor, HullPrediction]]:
-    """True and predicted support functions, batch by batch."""
+    """True and predicted support functions, batch by batch, where the network is."""
     network.eval()
+    device = next(network.parameters()).device
     for i in range(0, len(views.images), _BATCH):
         part = slice(i, i + _BATCH)
-        shown = (views.images[part].astype(np.float32), views.planes[part], views.extents[part])
-        yield torch.from_numpy(views.support[part]), network(*map(torch.from_numpy, shown))
+        arrays = (views.images[part].astype(np.float32), views.planes[part], views.extents[part], views.support[part])
+        *shown, true = (torch.from_numpy(each).to(device) for each in arrays)
+        yield true, network(*shown)
 
 
 def begin_with(network: ThingNetwork, path: Path) -> None:

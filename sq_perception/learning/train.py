@@ -23,7 +23,6 @@ import numba
 import numpy as np
 import torch
 
-from sq_perception.files import provenance
 from sq_perception.geometry.metrics import volume_iou
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.learning import checkpoint
@@ -35,7 +34,14 @@ from sq_perception.learning.inference import checked_device
 from sq_perception.learning.objective import Objective
 from sq_perception.learning.regressor import Regressor, RegressorConfig
 from sq_perception.learning.training_config import TrainingConfig
-from sq_perception.learning.training_state import SETTINGS, TrainingState, mixed_precision, read_tensors, recalibrate
+from sq_perception.learning.training_state import (
+    SETTINGS,
+    TrainingState,
+    made_by,
+    mixed_precision,
+    read_tensors,
+    recalibrate,
+)
 
 _OF_A_RUN = ("loss", "backbone", "framing", "pixels", "canonical_labels", "optimizer")
 """Settings whose change makes another run; others may change when it goes on."""
@@ -108,9 +114,7 @@ def train(
         generator = torch.Generator(device=device).manual_seed(int(seed.generate_state(1)[0]))
         batches = _batches(config, model.config, np.random.default_rng(seed))
         validation = _validation_sets(config, model.config)
-        notes = {"training": asdict(config), "made": provenance.facts("sq-perception train")}
-        if device.type == "cuda":
-            notes["made"]["device"] = torch.cuda.get_device_name(device)
+        notes = {"training": asdict(config), "made": made_by("train", device)}
         started, saved, losses = time.monotonic() - state.seconds, time.monotonic(), []
         while state.step < config.steps and not (config.schedule == "plateau" and state.plateau.exhausted):
             progress, rate = state.step / config.steps, config.rate(state.step, state.plateau)

@@ -209,6 +209,8 @@ class ShardTraining:
     """Layers before the heads in half the bits, their weights in all: twice as fast where processors have it."""
     start: str = ""
     """Weights to begin with: a file, or shipped ones."""
+    device: str = "cpu"
+    """cpu or cuda."""
 
 
 THING_RUN = ShardTraining(minutes=120.0, rate=8e-4, weight_decay=1e-4)

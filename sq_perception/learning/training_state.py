@@ -23,7 +23,7 @@ from safetensors.torch import save as bytes_of
 from torch import nn
 from torch.optim.swa_utils import update_bn
 
-from sq_perception.files import output_file
+from sq_perception.files import output_file, provenance
 from sq_perception.learning.checkpoint import CheckpointError
 from sq_perception.learning.training_config import Plateau
 
@@ -44,6 +44,12 @@ def mixed_precision(device: str, wanted: bool) -> torch.autocast:
     """
     has_products = device != "cpu" or bool(torch.ops.mkldnn._is_mkldnn_bf16_supported())
     return torch.autocast(device, torch.bfloat16, enabled=wanted and has_products)
+
+
+def made_by(command: str, device: torch.device) -> dict[str, Any]:
+    """Where the weights of a run come from, the graphics card among it: :func:`provenance.facts`."""
+    facts = provenance.facts(f"sq-perception {command}")
+    return facts if device.type == "cpu" else {**facts, "device": torch.cuda.get_device_name(device)}
 
 
 @dataclass(eq=False)
