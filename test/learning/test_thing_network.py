@@ -177,9 +177,23 @@ def test_a_run_that_was_stopped_goes_on(tmp_path: Path, rng: np.random.Generator
     assert log[-1]["seconds"] > first[-1]["seconds"]
     kept = checkpoint.load_things(tmp_path / "run" / "things.safetensors").config
     assert replace(kept, spread=1.0) == SMALL
-    # A run that is over and asked for again does nothing, and is calibrated on what it was trained on.
+    # A run that is over and asked for again does nothing, and is calibrated on the same views.
     over = shard_training.train(subject, config, tmp_path / "views", tmp_path / "run")
     assert over.config == kept
+
+
+def test_the_spread_comes_from_views_that_were_not_trained_on(tmp_path: Path, rng: np.random.Generator) -> None:
+    shards(tmp_path / "views", 3, rng)
+    asked: list[ThingViews] = []
+    subject = replace(
+        thing_training.THINGS,
+        network=lambda _: ThingNetwork(SMALL),
+        finish=lambda _, views: asked.append(views),
+    )
+    config = replace(THING_RUN, minutes=0.005, batch=8, held=1, validation=1, threads=1)
+    shard_training.train(subject, config, tmp_path / "views", tmp_path / "run")
+    held = shard_training.read_views(thing_training.THINGS.none, [tmp_path / "views" / "00000.safetensors"])
+    assert [np.array_equal(views.support, held.support) for views in asked] == [True]
 
 
 def test_the_spread_is_that_of_the_errors(rng: np.random.Generator) -> None:
