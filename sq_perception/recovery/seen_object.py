@@ -87,9 +87,16 @@ class SeenObject:
         depth, mask = np.ascontiguousarray(self.depth_crop), np.ascontiguousarray(self.mask_crop)
         return lens.heights(depth, mask, self.camera_crop.lens, plane)
 
+    @cached_property
+    def connected(self) -> np.ndarray:
+        """``mask_crop`` without what a step in depth parts from most of it: the wall behind, in a mask too large."""
+        footprint = quantile(self.depth_crop[self.mask_crop], 0.5) / np.sqrt(self.camera_crop.fx * self.camera_crop.fy)
+        depth, mask = np.ascontiguousarray(self.depth_crop), np.ascontiguousarray(self.mask_crop)
+        return coherent(depth, mask, _JUMP_PIXELS * footprint + _JUMP)
+
     def levels(self, plane: np.ndarray) -> tuple[float, float]:
         """The height of its lowest pixels above a plane, and the median of all, metres; of some thousand pixels."""
-        heights = self.heights(plane)[self.mask_crop]
+        heights = self.heights(plane)[self.connected]
         heights = heights[:: max(1, heights.size // _POINTS)]
         return quantile(heights, _LOWEST), quantile(heights, 0.5)
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
+import cv2
 import numpy as np
 import pytest
 from table_scenes import VGA, Table
@@ -72,3 +75,17 @@ def test_one_between_two_of_its_height_stands_on_the_table() -> None:
     bodies = [table.body(-0.1, 0, (0.04, 0.1, 0.04)), table.body(0.1, 0, (0.04, 0.1, 0.04))]
     bodies.append(table.body(0, 0, (0.055, 0.05, 0.08)))
     assert abs(heights(table, bodies)[2]) < 2e-3
+
+
+@pytest.mark.parametrize("wall", [1.0, 1.2, 1.4])
+def test_the_wall_behind_in_a_mask_too_large_is_no_support(wall: float) -> None:
+    """A box that something unseen holds up, and a rim of pixels around it, a third of which show the wall behind."""
+    table = Table(pitch=0.35)
+    depth, labels = table.see([table.body(0, 0, (0.03, 0.02, 0.02), height=0.15)])
+    depth = np.fmin(depth, np.float32(wall))
+    labels = cv2.dilate(labels.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(np.int32)
+    assert np.mean(depth[labels > 0] > wall - 0.01) > 0.02
+    found = replace(from_labels(labels, depth, VGA), plane=table.plane)
+    (box,) = seen_object.objects(depth, found, VGA)
+    plane = supports.support(box, [box], depth, VGA, found, SegmentationOptions())
+    np.testing.assert_array_equal(plane, table.plane)
