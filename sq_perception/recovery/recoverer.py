@@ -67,6 +67,9 @@ _SPARSE = 8
 _NEAREST, _FARTHEST = 1e-4, 1e5
 """Metres; no sensor measures beyond, and numbers beyond make squares and products that are none."""
 
+_SEGMENTS = 2
+"""For each object that is asked for: a network joins some, and drops what shows none, which may be the largest."""
+
 
 class Recoverer:
     """Holds the network; one frame at a time.
@@ -270,9 +273,10 @@ class Recoverer:
         """The objects of an image: those given, or its own, which a network mends where one predicts hulls."""
         if labels is not None:
             return OwnSegments(segments.from_labels(labels, depth, camera, options.segmentation_options()))
-        found = segments.segment(depth, camera, options.segmentation_options())
+        wanted = options.segmentation_options()
         if not (options.repair and isinstance(network, inference.ThingPredictor)):
-            return OwnSegments(found)
+            return OwnSegments(segments.segment(depth, camera, wanted))
+        found = segments.segment(depth, camera, replace(wanted, max_objects=_SEGMENTS * wanted.max_objects))
         improved = SegmentNetwork(self._load_masks(), depth, camera, found.plane, self._shared).improved(found)
         ids = improved.found.ids
         if len(ids) <= options.max_objects:

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
+from table_scenes import VGA, Table
 
 from sq_perception.fitting.fit import Status
 from sq_perception.geometry import rotation
@@ -239,6 +240,20 @@ def test_parting_segments_makes_no_more_objects_than_are_wanted(monkeypatch):
     assert [body.label for body in found.bodies] == [1, 2]
     assert set(np.unique(found.labels)) == {0, 1, 2}
     assert "max_objects = 2" in found.message
+
+
+def test_segments_of_nothing_take_no_place_of_objects(monkeypatch):
+    """The network drops the larger of two boxes: the one object that is wanted is the other."""
+    table = Table()
+    depth, truth = table.see([table.body(-0.1, 0, (0.06, 0.06, 0.05)), table.body(0.12, 0, (0.03, 0.03, 0.03))])
+
+    def without_the_largest(_, found):
+        return OwnSegments(replace(found, labels=np.maximum(found.labels - 1, 0), ids=found.ids[:-1]))
+
+    monkeypatch.setattr(own_segments.SegmentNetwork, "improved", without_the_largest)
+    found = Recoverer().recover(depth, VGA, options=RecoveryOptions(max_objects=1))
+    assert [body.label for body in found.bodies] == [1]
+    assert np.mean(truth[found.labels == 1] == 2) > 0.95
 
 
 def test_half_precision_is_read_as_single_precision(symmetry):
