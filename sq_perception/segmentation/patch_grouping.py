@@ -44,6 +44,8 @@ _ATTACHED = 0.03
 """Surfaces no farther apart than this along the line of sight are attached, metres."""
 _HOLLOW_DEPTH = 0.3
 """A step down into a hollow is not deeper, metres; no vessel on a table is."""
+_HOLLOW_EXTENT = 0.35
+"""A hollow patch that is wider in the image, metres, is no vessel's inner wall, but that of a bin around other things."""
 _FLAT = 0.3
 """What a border scores at which the surface goes on: less than an edge, as noise makes flat borders of folds."""
 _UNKNOWN = 0.1
@@ -58,7 +60,7 @@ def bodies(patches: Patches, camera: Camera) -> np.ndarray:
     """Body (count + 1,) of each patch, from 1; 0 for 0."""
     n = patches.count + 1
     weights, dents, over, joint = _borders(patches)
-    hollow = patches.curvature > 1 / _HOLLOW_RADIUS
+    hollow = (patches.curvature > 1 / _HOLLOW_RADIUS) & (_extents(patches, camera) < _HOLLOW_EXTENT)
     gain = 2 * over * hollow[:, None]
     weights += gain + gain.T + 2 * dents * (hollow[:, None] & hollow[None, :])
     z = quantile(patches.depth[patches.labels > 0], 0.5)
@@ -68,6 +70,14 @@ def bodies(patches: Patches, camera: Camera) -> np.ndarray:
     weights += _continued(patches, body, camera)
     body = _contracted(member @ weights @ member.T)[body]
     return _without_fragments(body, areas, joint, least_area(z))
+
+
+def _extents(patches: Patches, camera: Camera) -> np.ndarray:
+    """Larger side (count + 1,) of the box around each patch in the image, at its mean depth, metres."""
+    boxes = regions.extents(patches.labels).astype(float)
+    depth = np.bincount(patches.labels.ravel(), patches.depth.ravel(), len(boxes)) / np.maximum(boxes[:, 0], 1)
+    rows, columns = boxes[:, 2] - boxes[:, 1], boxes[:, 4] - boxes[:, 3]
+    return np.asarray(patches.stride * depth * np.maximum(rows / camera.fy, columns / camera.fx))
 
 
 def least_area(z: float) -> float:

@@ -58,6 +58,8 @@ _TALL = 20.0
 no noise beside another one, even where little noise or a long way makes things low against the tolerance."""
 _SMEARED, _BESIDE = 2, 12
 """Pixels about a segment that a sensor smears, and up to which the support is beside it; 5 to 20 do as well."""
+_IN_SEGMENTS = 0.5
+"""Share of a plane's points in segments from which on it is the faces of things, and no wall."""
 _FACE_SHARE = 0.5
 """What makes up this share of a plane's points is no part of it: the plane is a face of the thing.  The larger part
 decides; without it 3 of 81 recorded and simulated frames lose a body."""
@@ -150,8 +152,7 @@ def furniture(depth: np.ndarray, valid: np.ndarray, camera: Camera, walls: list[
     points = camera.unproject(k * columns, k * rows, depth[::k, ::k][rows, columns])
     large = np.zeros(kept.shape, np.uint8)
     for wall in walls:
-        reach = max(0.5 * TOLERANCE, _ON_WALL * wall.sigma) * noise_growth(points[:, 2])
-        on = np.abs(wall.height(points)) < reach
+        on = _lie_on(wall, points)
         lies = np.zeros(kept.shape, bool)
         lies[rows[on], columns[on]] = True
         parts = depth_steps.components(lies)[rows, columns]
@@ -160,6 +161,24 @@ def furniture(depth: np.ndarray, valid: np.ndarray, camera: Camera, walls: list[
                 large[rows[parts == part], columns[parts == part]] = 1
     full = cv2.resize(large, (k * kept.shape[1], k * kept.shape[0]), interpolation=cv2.INTER_NEAREST)
     return full[: depth.shape[0], : depth.shape[1]] > 0
+
+
+def _lie_on(wall: Plane, points: np.ndarray) -> np.ndarray:
+    """Which points (n, 3) are of a plane."""
+    reach = max(0.5 * TOLERANCE, _ON_WALL * wall.sigma) * noise_growth(points[:, 2])
+    return np.asarray(np.abs(wall.height(points)) < reach)
+
+
+def _of_no_segments(depth: np.ndarray, labels: np.ndarray, camera: Camera, walls: list[Plane]) -> list[Plane]:
+    """Those of some planes whose points are mostly in no segment.
+
+    The tops or the fronts of equal things lie in a plane, too; larger surfaces are no segments (:func:`furniture`).
+    """
+    k = max(1, min(depth.shape) // COARSE_PIXELS)
+    rows, columns = np.nonzero(depth[::k, ::k])
+    points = camera.unproject(k * columns, k * rows, depth[::k, ::k][rows, columns])
+    in_segment = labels[::k, ::k][rows, columns] > 0
+    return [wall for wall in walls if np.mean(in_segment[_lie_on(wall, points)]) < _IN_SEGMENTS]
 
 
 def alone(depth: np.ndarray, camera: Camera, limits: Limits) -> ObjectTest:
@@ -211,6 +230,7 @@ def standing(
     coarse = depth[::_SPARSE, ::_SPARSE]
     nearest = quantile(coarse[coarse > 0], _STRAY) * (1 + depth_steps.STEP) if coarse.any() else 0.0
     plane = support.plane
+    walls = _of_no_segments(depth, labels, camera, walls)
 
     def is_thing(rows: np.ndarray, columns: np.ndarray) -> bool:
         step = max(1, rows.size // _SAMPLES)

@@ -11,6 +11,8 @@ from sq_perception.segmentation.surface_patches import Patches
 
 CAMERA = Camera(60, 40, 50.0, 50.0, 29.5, 19.5)
 """A sample is 2 cm wide at a depth of one metre: a body shows at least 4 samples."""
+NEAR_CAMERA = Camera(60, 40, 200.0, 200.0, 29.5, 19.5)
+"""One whose half of an image shows 20 cm."""
 LEFT, RIGHT = (slice(None), slice(0, 30)), (slice(None), slice(30, 60))
 
 
@@ -66,11 +68,12 @@ def test_of_two_edges_side_by_side_the_sharper_one_counts():
 def test_a_step_parts_but_not_a_hollow_from_its_rim():
     depth = np.ones((40, 60))
     depth[RIGHT] = 1.1
-    assert bodies(patches(halves(), depth), CAMERA).max() == 2
-    assert bodies(patches(halves(), depth, curvature=(0, 20)), CAMERA).max() == 1
-    assert bodies(patches(halves(), depth, curvature=(20, 0)), CAMERA).max() == 2, "the hollow lies behind its rim"
+    assert bodies(patches(halves(), depth), NEAR_CAMERA).max() == 2
+    assert bodies(patches(halves(), depth, curvature=(0, 20)), NEAR_CAMERA).max() == 1
+    assert bodies(patches(halves(), depth, curvature=(20, 0)), NEAR_CAMERA).max() == 2, "it lies behind its rim"
+    assert bodies(patches(halves(), depth, curvature=(0, 20)), CAMERA).max() == 2, "a bin's wall of 0.9 m"
     depth[RIGHT] = 1.5
-    assert bodies(patches(halves(), depth, curvature=(0, 20)), CAMERA).max() == 2, "no vessel is that deep"
+    assert bodies(patches(halves(), depth, curvature=(0, 20)), NEAR_CAMERA).max() == 2, "no vessel is that deep"
 
 
 def occluded(tilt=0.0, between=0.8):

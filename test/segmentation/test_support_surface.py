@@ -415,3 +415,37 @@ def test_a_support_that_dips_beside_a_thing_is_no_noise():
     assert standing._rises(0.095, beside, 1e-3)
     assert not standing._rises(0.045, beside, 1e-3)
     assert not standing._rises(0.095, beside - np.float32(0.02), 1e-3)
+
+
+@pytest.mark.parametrize("count", [2, 4])
+@pytest.mark.parametrize("height", [0.02, 0.04, 0.08])
+@pytest.mark.parametrize("noise", [0.0, 2e-3])
+def test_equal_boxes_from_above_are_found(count, height, noise):
+    """Their tops are one plane, of which each holds a part; but it is no wall."""
+    table = Table(pitch=1.5, distance=0.6)
+    grid = np.stack(np.meshgrid(*2 * [(np.arange(count) + 0.5) / count - 0.5]), axis=-1).reshape(-1, 2) * (0.48, 0.41)
+    size = (0.19 / count, 0.16 / count, height / 2)
+    depth, truth = table.see([table.body(x, y, size) for x, y in grid], noise=noise)
+    assert min(ious(truth, segment(depth, VGA).labels)) > 0.8
+
+
+@pytest.mark.parametrize("pitch", [0.15, 0.3])
+@pytest.mark.parametrize("count", [3, 6])
+@pytest.mark.parametrize("noise", [0.0, 2e-3])
+def test_a_row_of_equal_boxes_from_a_low_camera_is_found(pitch, count, noise):
+    """Their fronts are one plane."""
+    table = Table(pitch, distance=0.8)
+    places = 0.7 * ((np.arange(count) + 0.5) / count - 0.5)
+    depth, truth = table.see([table.body(x, 0, (0.28 / count, 0.03, 0.1)) for x in places], noise=noise)
+    assert min(ious(truth, segment(depth, VGA).labels)) > 0.8
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_things_among_others_of_their_height_are_found(seed):
+    """Sixteen boxes 3 to 5 cm high: of their tops, a quarter of the image, some lie in one plane by chance."""
+    rng = np.random.default_rng(seed)
+    table = Table(pitch=1.2, distance=0.6)
+    grid = np.stack(np.meshgrid(np.arange(4) - 1.5, np.arange(4) - 1.5), axis=-1).reshape(-1, 2) * (0.12, 0.102)
+    boxes = [table.body(x, y, (0.048, 0.041, rng.uniform(0.014, 0.026))) for x, y in grid]
+    depth, truth = table.see(boxes, noise=1e-3)
+    assert min(ious(truth, segment(depth, VGA).labels)) > 0.9
