@@ -45,7 +45,7 @@ _ATTACHED = 0.03
 _HOLLOW_DEPTH = 0.3
 """A step down into a hollow is not deeper, metres; no vessel on a table is."""
 _HOLLOW_EXTENT = 0.35
-"""A hollow patch that is wider in the image, metres, is no vessel's inner wall, but that of a bin around other things."""
+"""A hollow patch that is wider in the image, metres, is the wall of a bin around other things, not that of a vessel."""
 _FLAT = 0.3
 """What a border scores at which the surface goes on: less than an edge, as noise makes flat borders of folds."""
 _UNKNOWN = 0.1
