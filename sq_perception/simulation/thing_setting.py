@@ -55,6 +55,8 @@ class Setting:
     camera : Camera
     surface : Mesh, optional
         Of the thing, if it is seen as one.
+    height
+        Above the table, of what the thing stands on.
     """
 
     parts: Superquadric
@@ -64,6 +66,12 @@ class Setting:
     behind: float
     camera: Camera
     surface: Mesh | None = None
+    height: float = 0.0
+
+    @property
+    def under(self) -> np.ndarray | None:
+        """What the thing stands on, as ``table``: that, or along it the top of something."""
+        return None if self.table is None else self.table - np.array([0.0, 0.0, 0.0, self.height])
 
     def render(self) -> tuple[np.ndarray, np.ndarray]:
         """Depth (height, width), +inf where there is nothing, and where the thing is seen."""
@@ -123,7 +131,7 @@ def draw_setting(thing: Thing, rng: np.random.Generator) -> Setting:
     around = moved(np.array(others).reshape(-1, 12), look, shift)
     camera = _camera(parts, rng)
     thing_parts, others_around = Superquadric.from_flat(parts), Superquadric.from_flat(around)
-    return Setting(thing_parts, cavities, others_around, table, behind, camera, surface)
+    return Setting(thing_parts, cavities, others_around, table, behind, camera, surface, -floor)
 
 
 def looking_down(pitch: float, roll: float) -> np.ndarray:

@@ -36,7 +36,10 @@ from sq_perception.simulation.thing_setting import draw_setting
 
 OWN = 0.5
 """Share of the views that show one's own things, where there are such."""
-PLANE_GIVEN = 0.8
+PLANE_GIVEN, TOP_GIVEN = 0.8, 2 / 3
+"""Shares of the views with a plane, and of those of a thing on top of something in which it is that top, as often as
+:mod:`sq_perception.recovery.supports` finds it.  Else the thing hovers above its plane, and a network that often sees
+that expects it of things whose lower end is hidden."""
 PLANE_TILT, PLANE_SHIFT = float(np.deg2rad(0.7)), 0.002
 """Standard deviations of the given plane: of its tilt in both directions, and of its distance from the thing."""
 
@@ -104,8 +107,9 @@ def _draw_one(rng: np.random.Generator, own: Sequence[Thing]) -> tuple[Thing, Ca
             continue
         measured = measured_by_any(depth, seen, setting.camera, rng)
         plane = None
-        if setting.table is not None and rng.random() < PLANE_GIVEN:
-            plane = _imprecise(setting.table, setting.parts.translation.mean(axis=0), rng)
+        below = setting.under if rng.random() < TOP_GIVEN else setting.table
+        if below is not None and rng.random() < PLANE_GIVEN:
+            plane = _imprecise(below, setting.parts.translation.mean(axis=0), rng)
         if np.count_nonzero(seen & np.isfinite(measured)) < _LEAST_SEEN:
             continue
         mask = _masked(measured, seen, setting.camera, setting.table if plane is None else plane, rng)

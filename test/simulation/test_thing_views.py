@@ -261,3 +261,19 @@ def test_a_shadow_lies_on_one_side() -> None:
         found.append(int(sides[1] >= sides[0]))
     assert len(found) > 3
     assert np.mean(found) > 0.8
+
+
+def test_what_a_thing_stands_on_touches_it() -> None:
+    """The table, or the top of what is between: as high as its lowest point."""
+    heights = []
+    for seed in range(80):
+        rng = np.random.default_rng(seed)
+        setting = draw_setting(draw_thing(rng), rng)
+        if setting.table is None:
+            assert setting.under is None
+            continue
+        normal, offset = setting.under[:3], setting.under[3]
+        assert abs(offset - support_of_union(setting.parts, -normal[None])[0]) < 1e-6
+        heights.append(float(setting.table[3] - setting.under[3]))
+    assert 0.02 < np.mean(np.array(heights) > 0) < 0.25
+    assert max(heights) > 0.02
