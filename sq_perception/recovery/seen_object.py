@@ -88,11 +88,16 @@ class SeenObject:
         return lens.heights(depth, mask, self.camera_crop.lens, plane)
 
     @cached_property
+    def step(self) -> float:
+        """Metres between neighbours from which on one is not of the object."""
+        footprint = quantile(self.depth_crop[self.mask_crop], 0.5) / np.sqrt(self.camera_crop.fx * self.camera_crop.fy)
+        return float(_JUMP_PIXELS * footprint + _JUMP)
+
+    @cached_property
     def connected(self) -> np.ndarray:
         """``mask_crop`` without what a step in depth parts from most of it: the wall behind, in a mask too large."""
-        footprint = quantile(self.depth_crop[self.mask_crop], 0.5) / np.sqrt(self.camera_crop.fx * self.camera_crop.fy)
         depth, mask = np.ascontiguousarray(self.depth_crop), np.ascontiguousarray(self.mask_crop)
-        return coherent(depth, mask, _JUMP_PIXELS * footprint + _JUMP)
+        return coherent(depth, mask, self.step)
 
     def levels(self, plane: np.ndarray) -> tuple[float, float]:
         """The height of its lowest pixels above a plane, and the median of all, metres; of some thousand pixels."""
@@ -180,13 +185,10 @@ def core(obj: SeenObject, depth: np.ndarray, camera: Camera) -> np.ndarray:
     if obj.plane is not None:
         above = obj.heights(obj.plane) > ON_SUPPORT
         inner = above if 2 * np.count_nonzero(above) > obj.pixels else inner
-    footprint = quantile(obj.depth_crop[obj.mask_crop], 0.5) / np.sqrt(camera.fx * camera.fy)
     whole = np.zeros_like(obj.mask)
     whole[obj.window] = inner
     # With a margin, as a part that goes on beyond the mask is something else.
     down, across = obj.window
     around = slice(max(down.start - 1, 0), down.stop + 1), slice(max(across.start - 1, 0), across.stop + 1)
-    whole[around] &= coherent(
-        np.ascontiguousarray(depth[around]), np.ascontiguousarray(whole[around]), _JUMP_PIXELS * footprint + _JUMP
-    )
+    whole[around] &= coherent(np.ascontiguousarray(depth[around]), np.ascontiguousarray(whole[around]), obj.step)
     return whole

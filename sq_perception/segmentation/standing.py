@@ -146,21 +146,26 @@ def _top(values: np.ndarray) -> float:
 
 def furniture(depth: np.ndarray, valid: np.ndarray, camera: Camera, walls: list[Plane], limits: Limits) -> np.ndarray:
     """Pixels, bool (height, width), of surfaces in one of some planes that are larger than a thing."""
-    k = max(1, min(depth.shape) // COARSE_PIXELS)
-    kept = valid[::k, ::k]
-    rows, columns = np.nonzero(kept)
-    points = camera.unproject(k * columns, k * rows, depth[::k, ::k][rows, columns])
-    large = np.zeros(kept.shape, np.uint8)
+    k, rows, columns, points = _coarse(depth, valid, camera)
+    height, width = depth[::k, ::k].shape
+    large = np.zeros((height, width), np.uint8)
     for wall in walls:
         on = _lie_on(wall, points)
-        lies = np.zeros(kept.shape, bool)
+        lies = np.zeros(large.shape, bool)
         lies[rows[on], columns[on]] = True
         parts = depth_steps.components(lies)[rows, columns]
         for part in np.flatnonzero(np.bincount(parts) > _FEWEST):
             if part > 0 and largest_edge(points[parts == part]) > limits.max_size:
                 large[rows[parts == part], columns[parts == part]] = 1
-    full = cv2.resize(large, (k * kept.shape[1], k * kept.shape[0]), interpolation=cv2.INTER_NEAREST)
+    full = cv2.resize(large, (k * width, k * height), interpolation=cv2.INTER_NEAREST)
     return full[: depth.shape[0], : depth.shape[1]] > 0
+
+
+def _coarse(depth: np.ndarray, valid: np.ndarray, camera: Camera) -> tuple[int, np.ndarray, np.ndarray, np.ndarray]:
+    """Every k-th pixel of an image that is valid: k, rows and columns counted by it, and points (n, 3)."""
+    k = max(1, min(depth.shape) // COARSE_PIXELS)
+    rows, columns = np.nonzero(valid[::k, ::k])
+    return k, rows, columns, camera.unproject(k * columns, k * rows, depth[::k, ::k][rows, columns])
 
 
 def _lie_on(wall: Plane, points: np.ndarray) -> np.ndarray:
@@ -174,11 +179,14 @@ def _of_no_segments(depth: np.ndarray, labels: np.ndarray, camera: Camera, walls
 
     The tops or the fronts of equal things lie in a plane, too; larger surfaces are no segments (:func:`furniture`).
     """
-    k = max(1, min(depth.shape) // COARSE_PIXELS)
-    rows, columns = np.nonzero(depth[::k, ::k])
-    points = camera.unproject(k * columns, k * rows, depth[::k, ::k][rows, columns])
+    k, rows, columns, points = _coarse(depth, depth > 0, camera)
     in_segment = labels[::k, ::k][rows, columns] > 0
-    return [wall for wall in walls if np.mean(in_segment[_lie_on(wall, points)]) < _IN_SEGMENTS]
+    found = []
+    for wall in walls:
+        on = _lie_on(wall, points)
+        if np.count_nonzero(on & in_segment) < _IN_SEGMENTS * np.count_nonzero(on):
+            found.append(wall)
+    return found
 
 
 def alone(depth: np.ndarray, camera: Camera, limits: Limits) -> ObjectTest:
