@@ -12,7 +12,6 @@ honest network has at 1.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +19,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy.optimize import minimize_scalar
 
 from sq_perception.geometry.support_directions import mirrored
 from sq_perception.learning import checkpoint, thing_network
@@ -35,8 +33,6 @@ BODY, CENTRE = 2.0, 1.0
 """Weights of the losses beside the likelihood, which is of order 1 where they are of order 0.05."""
 _UNKNOWN_EXTENT = 0.1
 """Share of the views whose extent is hidden from the network."""
-_LOG_SPREADS = (-5.0, 3.0)
-"""Between what the spread of the errors is sought."""
 _BATCH = 256
 """Views of a validation that are computed at once."""
 
@@ -52,21 +48,13 @@ def hull_loss(
     )
 
 
-def likeliest_spread(network: ThingNetwork, views: ThingViews) -> float:
-    """The factor of S for which true hulls are likeliest, now that the network predicts and does not learn.
+def honest_spread(network: ThingNetwork, views: ThingViews) -> float:
+    """The factor of S with which error / sigma deviates by 1, now that the network predicts and does not learn.
 
-    As temperature scaling (C. Guo et al., "On calibration of modern neural networks", ICML 2017).
+    The likelihood would ask for less: where the tails of the errors are longer than those of the t distribution they
+    are taken for rare, and 1.3 is left.  But sigma is what a fit weighs by and a user is told.
     """
-    found = []
-    for truth, predicted in _predictions(network, views):
-        found.append(predicted.distance(truth)[0])
-    m, nu, count = torch.cat(found).cpu().numpy(), network.config.freedom, views.support.shape[1]
-    best = minimize_scalar(
-        lambda log: 0.5 * count * log + 0.5 * (nu + count) * float(np.log1p(m / (math.exp(log) * nu)).mean()),
-        bounds=_LOG_SPREADS,
-        method="bounded",
-    )
-    return network.config.spread * float(math.exp(best.x))
+    return float(network.config.spread * validate(network, views)["ratio"] ** 2)
 
 
 def validate(network: ThingNetwork, views: ThingViews) -> dict[str, Any]:
@@ -160,7 +148,7 @@ def _batch(views: ThingViews, chosen: np.ndarray, rng: np.random.Generator) -> t
 
 def _calibrate(network: ThingNetwork, views: ThingViews) -> None:
     """Give the network the spread that its errors on these views have; 4000 of them settle it to 2 %."""
-    network.config = replace(network.config, spread=likeliest_spread(network, views))
+    network.config = replace(network.config, spread=honest_spread(network, views))
 
 
 THINGS = Subject(
