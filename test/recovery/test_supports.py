@@ -79,7 +79,7 @@ def test_one_between_two_of_its_height_stands_on_the_table() -> None:
 
 @pytest.mark.parametrize("wall", [1.0, 1.2, 1.4])
 def test_the_wall_behind_in_a_mask_too_large_is_no_support(wall: float) -> None:
-    """A box that something unseen holds up, and a rim of pixels around it, a third of which show the wall behind."""
+    """A box that something unseen holds up, and a rim of pixels around it, some of which show the wall behind."""
     table = Table(pitch=0.35)
     depth, labels = table.see([table.body(0, 0, (0.03, 0.02, 0.02), height=0.15)])
     depth = np.fmin(depth, np.float32(wall))
