@@ -183,7 +183,7 @@ def _varied(solution: Solution) -> Solution:
     found: list[State] = []
     while True:
         best = solution.state
-        unexplained = best.cost > _SETTLED * solution.rays.weight
+        unexplained = best.cost > _SETTLED * solution.rays.weight or rounding.contradicts(solution)
         unsure = solution.unsure()
         if solution.problem.late or not (unexplained or unsure.max() > _UNSURE):
             break

@@ -20,7 +20,7 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.simulation.rendering import Mesh, render_mesh, render_things
 from sq_perception.simulation.thing import NO_CAVITY, SIX_WAYS, Thing
 
-ON_TOP, FREE = 0.10, 0.05
+ON_TOP, FREE = 0.15, 0.05
 """Shares of the views in which the thing stands on something on the table, and in which there is no table."""
 _ELEVATIONS, _OFTEN = ((20.0, 70.0), (65.0, 90.0), (3.0, 25.0)), (0.55, 0.25, 0.2)
 """Degrees, and shares of the views.  Chosen: of a network that saw 0.5 % from above 80 degrees the hulls there erred

@@ -8,6 +8,7 @@ import pytest
 from sq_perception.fitting import surface_fit
 from sq_perception.fitting.rays import DEPTH, RAY_COLUMNS
 from sq_perception.fitting.rounding import faces_camera
+from sq_perception.geometry.metrics import volume_iou
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast, unit_cube
 
@@ -43,3 +44,22 @@ def test_where_two_faces_are_seen_nothing_is_open() -> None:
     fit = surface_fit.fit(unit_cube.depth_from_grey(grey), grey > 0, unit_cube.camera())
     assert (fit.sigma_size < 0.01 * fit.superquadric.size).all()
     np.testing.assert_allclose(np.sort(fit.superquadric.size), [0.15, 0.2, 0.25], rtol=0.01)
+
+
+def test_a_body_that_passes_readings_at_more_than_half_a_step_is_not_the_last() -> None:
+    body = unit_cube.optical_from_cube(
+        Superquadric(
+            [0.160507, 0.150236, 0.170657],
+            [0.884777, 0.915079],
+            [0.379145, 0.402456, 0.529095],
+            [-0.671346, 0.200430, -0.628333, -0.338112],
+        )
+    )
+    depth, _ = raycast.render(body, unit_cube.camera())
+    grey = unit_cube.grey_from_depth(depth)
+    measured = unit_cube.depth_from_grey(grey)
+    fit = surface_fit.fit(measured, grey > 0, unit_cube.camera())
+    passed, _ = raycast.render(fit.superquadric, unit_cube.camera())
+    beyond = np.abs(passed - measured)[grey > 0] > 0.6 / 255
+    assert np.mean(beyond) < 0.01
+    assert volume_iou(fit.superquadric, body) > 0.98
