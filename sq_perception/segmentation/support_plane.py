@@ -71,6 +71,11 @@ _STRAY = 0.003
 """Share of the points that may be on no plane although nothing is there: of normal noise 0.3 % lies beyond three
 deviations, and tolerances are wider."""
 
+_LAYERS, _BESIDE = 3, 0.55
+"""Tolerances from a plane up to which points are counted on either side, and the most on both, over those on it.  Of
+160 recorded supports none has half as many on both sides, and noise as wide as the tolerance would leave a quarter; of
+planes through the heaps that fill two recorded bins both sides have six tenths and more."""
+
 LEAST_GROWTH = 0.1
 """Of the noise: nearer than 0.3 m it falls no further, as a sensor's own quantisation and calibration remain."""
 
@@ -141,7 +146,7 @@ def support(
     more of the floor; what is no larger than a thing, as ``is_small`` tells of points (n, 3) and their plane's normal,
     must be a good part of it to be a table.  What hardly anything is close above is no support, such as the wall metres
     behind a low camera's table, be that in sight or not; nor is the face of a body, unless most of what is on no plane
-    is close above it.
+    is close above it.  Nor is a plane amid a heap.
     """
     surfaces = _on_one_surface(depth, valid, camera)
     is_face = [_is_face(plane, surfaces) for plane in candidates]
@@ -154,6 +159,8 @@ def support(
     votes = {candidates[k]: _vote(candidates[k]) * near[k] ** 2 for k in bearing if held[k] >= least}
     best = max(votes, key=votes.__getitem__)
     if rest > _STRAY and abs(best.equation[1]) < _FRONTAL and max(held) < _HELD_SHARE:
+        return None
+    if _is_amid(best, points):
         return None
     tables = [
         plane
@@ -338,6 +345,15 @@ def _held(candidates: list[Plane], points: np.ndarray) -> tuple[list[float], lis
     held = np.mean((rest > 0) & (rest < _CLOSE), axis=1)
     near = np.mean(np.where(rest > 0, np.exp(-np.abs(rest) / _TYPICAL_HEIGHT), 0.0), axis=1)
     return held.tolist(), np.maximum(near, _FAR).tolist(), rest.shape[1] / len(points)
+
+
+def _is_amid(plane: Plane, points: np.ndarray) -> bool:
+    """Whether right above a plane and right below it there are hardly fewer points (n, 3) than on it."""
+    height = plane.height(points) / (TOLERANCE * noise_growth(points[:, 2]))
+    near = np.abs(height) < _LAYERS
+    off = near & (np.abs(height) >= 1)
+    fewest = min(np.count_nonzero(off & (height > 0)), np.count_nonzero(off & (height < 0)))
+    return bool(fewest > _BESIDE * np.count_nonzero(near & ~off))
 
 
 def _vote(plane: Plane) -> float:

@@ -250,6 +250,16 @@ def test_a_face_that_holds_more_than_a_wall_but_not_most_leaves_the_wall(monkeyp
     assert support_plane.support([wall, face], depth, depth > 0, CAMERA, lambda *_: True) is wall
 
 
+@pytest.mark.parametrize(("thickness", "is_support"), [(1.5, True), (4.0, False)])
+def test_a_plane_amid_a_heap_is_no_support(rng, thickness, is_support):
+    """Points anywhere within so many tolerances above and below a plane that is looked at from straight above."""
+    plane = support_plane.Plane(np.array([0.0, 0.0, -1.0, 0.7]), 0.3, 0.005)
+    within = support_plane.TOLERANCE * support_plane.noise_growth(np.array(0.7))
+    depth = 0.7 + thickness * within * rng.uniform(-1, 1, (CAMERA.height, CAMERA.width))
+    found = support_plane.support([plane], depth, depth > 0, CAMERA, lambda *_: False)
+    assert (found is plane) == is_support
+
+
 def test_misuse_is_refused():
     depth, truth = scene(THREE)
     with pytest.raises(ValueError, match="does not fit"):
