@@ -2,6 +2,7 @@
 
 Depth registered to a colour camera of more pixels, every other line of a fast mode and dropped readings look so.  Such
 a gap says nothing of the scene, but views and segments ask what is beside a pixel: it takes the reading nearest to it.
+A fit must not take that for a reading: of every other line the bodies would be a pixel off, many deviations.
 Gaps are what a morphological closing adds to the pixels with a reading; larger holes stay.  Images are float32
 (height, width), metres, NaN where nothing was measured; labels are integers of the same shape.
 """
@@ -18,15 +19,20 @@ _SPARSE = 0.2
 """Share from which on wider gaps are closed too: elsewhere they are more often holes, and fits lose 0.4 % IoU by it."""
 
 
-def filled(depth: np.ndarray, labels: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray | None]:
-    """A perforated image with its gaps closed, and labels that go with the readings; any other image as it is."""
+def filled(
+    depth: np.ndarray, labels: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray | None, np.ndarray | None]:
+    """A perforated image with its gaps closed, labels that go with the readings, and the gaps, bool (height, width).
+
+    Any other image as it is, without gaps: None.
+    """
     measured = np.isfinite(depth)
     if measured.all():
-        return depth, labels
+        return depth, labels, None
     narrow = _gaps(measured, 1)
     share = np.mean(narrow[narrow | measured]) if measured.any() else 0.0
     if share < _PERFORATED:
-        return depth, labels
+        return depth, labels, None
     reach, gaps = (1, narrow) if share < _SPARSE else (2, _gaps(measured, 2))
     source = _nearest(measured, gaps, reach)
     depth = depth.copy()
@@ -34,7 +40,7 @@ def filled(depth: np.ndarray, labels: np.ndarray | None = None) -> tuple[np.ndar
     if labels is not None:
         labels = labels.copy()
         labels[gaps] = labels[source]
-    return depth, labels
+    return depth, labels, gaps
 
 
 def _gaps(measured: np.ndarray, reach: int) -> np.ndarray:

@@ -208,10 +208,10 @@ class Recoverer:
         with timed(milliseconds, "segmentation"):
             measured = _measured(camera.readings(depth), camera)
             if labels is not None:
-                labels = np.asarray(labels, order="C")
+                labels = np.asarray(np.ma.filled(labels, 0), order="C")
                 if labels.shape != measured.shape:
                     raise ValueError(f"labels: expected the shape of the depth, {measured.shape}, got {labels.shape}")
-            measured, labels = perforation.filled(measured, labels)
+            measured, labels, closed = perforation.filled(measured, labels)
             kept = continuity.NOTHING
             if previous is not None:
                 kept = continuity.repeated(previous, measured, camera, options, labels)
@@ -245,6 +245,9 @@ class Recoverer:
 
         with timed(milliseconds, "fit"):
             deadline = started + options.time_budget
+            if closed is not None:  # what stands in for readings is none to a fit
+                depth = np.where(closed, np.float32(np.nan), depth)
+                fresh = [obj.of_readings(depth) for obj in fresh]
             fits = self._mapped(lambda obj: methods.fitted(obj, depth, camera, options, deadline), fresh)
         with timed(milliseconds, "score"):
             scores = self._mapped(lambda k: methods.score(fresh[k], fits[k], options), range(len(fresh)))

@@ -111,6 +111,12 @@ class SeenObject:
         mask[self.window] = kept = self.mask_crop & ~strays[self.window]
         return replace(self, mask=mask, mask_crop=kept)
 
+    def of_readings(self, depth: np.ndarray) -> SeenObject:
+        """The object in an image (height, width) of which some more is not measured."""
+        kept = self.without(np.isnan(depth))
+        lost = int(np.count_nonzero(self.mask_crop & ~kept.mask_crop))
+        return replace(kept, depth_crop=depth[self.window], pixels=self.pixels - lost)
+
 
 def objects(depth: np.ndarray, found: segments.Segmentation, camera: Camera) -> list[SeenObject]:
     """The objects of a segmentation, in its order, as far as they were measured; those that were not at all are left

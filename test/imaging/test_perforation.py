@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from table_scenes import VGA, Table
 
 from sq_perception.imaging import perforation
 from sq_perception.recovery.recoverer import Recoverer
@@ -20,7 +21,7 @@ PATTERNS = {
 @pytest.mark.parametrize("pattern", PATTERNS.values(), ids=PATTERNS)
 def test_gaps_take_the_nearest_reading_and_its_label(pattern: np.ndarray) -> None:
     labels = np.where(pattern, 9, ROWS // 4 + 1)
-    filled, named = perforation.filled(np.where(pattern, np.float32(np.nan), SLOPE), labels)
+    filled, named, gaps = perforation.filled(np.where(pattern, np.float32(np.nan), SLOPE), labels)
     inside = np.s_[2:-4, 2:-4]
     rows, columns = np.nonzero(~pattern)
     away = np.hypot(ROWS[inside][..., None] - rows, COLUMNS[inside][..., None] - columns)
@@ -28,13 +29,14 @@ def test_gaps_take_the_nearest_reading_and_its_label(pattern: np.ndarray) -> Non
     assert (nearest & (filled[inside][..., None] == SLOPE[rows, columns])).any(axis=-1).all()
     assert (nearest & (named[inside][..., None] == labels[rows, columns])).any(axis=-1).all()
     assert np.array_equal(filled[~pattern], SLOPE[~pattern])
+    assert np.array_equal(gaps, pattern & np.isfinite(filled))
 
 
 def test_large_holes_stay_and_nothing_that_was_given_is_written_to() -> None:
     image = np.where(PATTERNS["every second line"], np.float32(np.nan), SLOPE)
     image[8:15, 8:15] = np.nan
     given, labels = image.copy(), ROWS // 4
-    filled, named = perforation.filled(image, labels)
+    filled, named, _ = perforation.filled(image, labels)
     assert np.isnan(filled[9:14, 9:14]).all()
     assert np.isfinite(filled[:, :8]).all()
     assert named is not labels
@@ -44,11 +46,11 @@ def test_large_holes_stay_and_nothing_that_was_given_is_written_to() -> None:
 
 def test_single_gaps_as_of_recorded_frames_stay() -> None:
     image = np.where((ROWS % 8 == 3) & (COLUMNS % 8 == 2), np.float32(np.nan), SLOPE)
-    assert perforation.filled(image)[0] is image
+    assert perforation.filled(image) == (image, None, None)
 
 
 def test_an_image_without_gaps_is_given_back() -> None:
-    assert perforation.filled(SLOPE)[0] is SLOPE
+    assert perforation.filled(SLOPE) == (SLOPE, None, None)
 
 
 @pytest.mark.parametrize("masks", ["given", "own"])
@@ -61,3 +63,18 @@ def test_things_are_found_and_fitted_in_depth_registered_to_more_pixels(masks: s
     assert len(frame.bodies) == 2
     away = [min(np.linalg.norm(b.superquadric.translation - t.translation) for b in frame.bodies) for t in scene.bodies]
     assert max(away) < 0.01
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_what_stands_in_for_missing_lines_shifts_no_body(first: int) -> None:
+    table = Table(distance=0.9)
+    box, can = ((0.05, 0.03, 0.06), (0.1, 0.1)), ((0.035, 0.035, 0.06), (0.1, 1.0))
+    bodies = [table.body(-0.12, 0.0, *box, turn=0.7), table.body(0.1, 0.05, *can)]
+    depth, labels = table.see(bodies, noise=0.0005)
+    whole = Recoverer().recover(depth, VGA, labels)
+    depth[first::2] = np.nan
+    frame = Recoverer().recover(depth, VGA, labels)
+    for found, of_all in zip(frame.bodies, whole.bodies, strict=True):
+        true = bodies[found.label - 1]
+        np.testing.assert_allclose(found.superquadric.translation, true.translation, atol=4e-4)
+        assert abs(found.pixels / of_all.pixels - 0.5) < 0.05
