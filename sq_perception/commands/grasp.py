@@ -36,6 +36,7 @@ def main(arguments: Sequence[str]) -> int:
     add("--gripper", default="panda", help="panda, robotiq_2f_85 or robotiq_2f_140 (default panda)")
     add("--friction", type=positive, help="between pads and things at the least (default 0.5)")
     add("--camera-info", metavar="FILE", help="the intrinsics of images, as for recover")
+    add("--topic", metavar="TOPIC", help="the depth topic of a bag that has several")
     add("--json", type=text_target, metavar="OUT", help="write the grasps there; - is the standard output")
     add("--pictures", type=folder, metavar="DIR", help="draw a picture per frame into this folder")
     add("--meshes", type=folder, metavar="DIR", help="write bodies and best grasps of each frame as a GLB there")

@@ -43,7 +43,7 @@ def run(options: argparse.Namespace) -> int:
         return misused(str(error))
     friction = options.friction or planner.FRICTION
     try:
-        recorded = RecordedInput(options.frames, InputOptions(options.camera_info))
+        recorded = RecordedInput(options.frames, InputOptions(options.camera_info, topic=options.topic))
         pictures = {"pictures": (options.pictures, ".png")}
         if problem := console.replaced_input(recorded.files, {"json": options.json}, pictures):
             return misused(problem)

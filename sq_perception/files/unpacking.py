@@ -11,6 +11,7 @@ Reference: https://numpy.org/doc/stable/reference/generated/numpy.lib.format.htm
 from __future__ import annotations
 
 import io
+import lzma
 import math
 import tokenize
 import warnings
@@ -45,7 +46,7 @@ def npz_arrays(path: Path, names: Iterable[str]) -> dict[str, np.ndarray]:
         with zipfile.ZipFile(path) as archive:
             held = {info.filename: info for info in archive.infolist()}
             return {name: _array(archive, held[f"{name}.npy"]) for name in names if f"{name}.npy" in held}
-    except (OSError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error) as error:
+    except (OSError, ValueError, EOFError, RuntimeError, zipfile.BadZipFile, zlib.error, lzma.LZMAError) as error:
         raise UnpackingError(f"not a readable NPZ archive: {error}") from error
 
 

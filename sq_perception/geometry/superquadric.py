@@ -313,6 +313,8 @@ class Superquadric:
 
         NumPy bodies only.  A half turn about an axis moves that axis' component of the quaternion to qw, up to sign, so
         that the largest component names the half turn of the smallest angle; among equals qw, then x, y, z wins.
+        Where a1 = a2 no quarter turn is tried, and of two forms of equal angles either may come out: such bodies have
+        several representatives.
         """
         size, q = self.size, self.rotation
         if not self.batch_shape:  # numbers of a single body: a fourth of the time

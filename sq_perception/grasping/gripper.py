@@ -7,7 +7,8 @@ The frame of a grasp is that of the tool centre point, TCP, midway between the p
     x   along the width of a finger
 
 The fingers are boxes |x| <= finger_width / 2, opening / 2 <= |y| <= opening / 2 + finger_thickness, -palm <= z <= tip;
-the hand is a box behind them, z <= -palm, and so long that it holds the way of the approach as well.  Metres, newtons.
+the hand is a box behind them, z <= -palm, and so long and wide that it holds the way of the approach as well, its own
+and that of the fingers.  Metres, newtons.
 """
 
 from __future__ import annotations
@@ -87,11 +88,14 @@ class Gripper:
     def boxes(self, opening: float, reach: float = _REACH) -> np.ndarray:
         """Centre and half sizes (3, 6) of both fingers and the hand in the TCP's frame, at an opening.
 
-        The hand is longer by ``reach``, by which it sweeps the way that it comes.
+        The hand is longer by ``reach``, by which it sweeps the way that it comes, and as wide as the open fingers,
+        which come that way before it.
         """
         middle, long = 0.5 * (self.tip - self.palm), 0.5 * (self.tip + self.palm)
         aside = 0.5 * (opening + self.finger_thickness)
         x, y, z = self.hand
+        if reach > 0:
+            x, y = max(x, self.finger_width), max(y, self.opening + 2 * self.finger_thickness)
         z += reach
         finger = [0.5 * self.finger_width, 0.5 * self.finger_thickness, long]
         return np.array(

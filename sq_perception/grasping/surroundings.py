@@ -40,7 +40,7 @@ class Surroundings:
     Raises
     ------
     ValueError
-        For arrays of another form, a plane that is none, or an image without its camera.
+        For arrays of another form, a plane that is none, or an image without its camera, or of one that is no pinhole.
     """
 
     plane: np.ndarray | None = None
@@ -62,6 +62,8 @@ class Surroundings:
         if (self.depth is None) != (self.camera is None):
             raise ValueError("depth, camera: expected both or neither")
         if self.camera is not None and self.depth is not None:
+            if not self.camera.is_pinhole:
+                raise ValueError("camera: expected a pinhole camera, got an orthographic one")
             object.__setattr__(self, "depth", self.camera.readings(self.depth))
 
     @classmethod

@@ -76,9 +76,11 @@ class Camera:
             raise ValueError(f"camera matrix: expected 3 x 3, got {k.shape}")
         if abs(k[0, 1]) > 1e-6 * abs(k[0, 0]):
             raise ValueError(f"camera matrix: expected no skew, got {k[0, 1]:g}")
-        if k[2, :2].any() and not k[:2, 2].any():
-            raise ValueError("camera matrix: expected 0 0 1 in its last row; it seems to be transposed")
-        return cls(width, height, float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2]))
+        camera = cls(width, height, float(k[0, 0]), float(k[1, 1]), float(k[0, 2]), float(k[1, 2]))
+        if not np.allclose(k[2], [0, 0, 1]):
+            turned = "; it seems to be transposed" if k[2, :2].any() and not k[:2, 2].any() else ""
+            raise ValueError(f"camera matrix: expected 0 0 1 in its last row, got {k[2].tolist()}{turned}")
+        return camera
 
     @property
     def matrix(self) -> np.ndarray:

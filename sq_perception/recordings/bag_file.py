@@ -143,6 +143,7 @@ class RecordedBag:
             self._info_topic = camera_info_topic(self.topic)
             self._mask_topics = self._found_masks()
             self._masks = opened.enter_context(closing(self._recorded_masks()))
+            self._unread: FrameError | None = None
             self._passed: dict[Stamp, int] = {}
             """When masks were recorded that have been read so far: not all of them fit into memory."""
             self._opened = opened.pop_all()
@@ -244,25 +245,32 @@ class RecordedBag:
         topics = {connection.topic for connection in self._reader.connections(IMAGE)} - {self.topic}
         return sorted(topic for topic in topics if topic.endswith(_MASKS))
 
-    def _recorded_masks(self, received: int | None = None) -> Generator[Message, None, None]:
+    def _recorded_masks(self, received: int | None = None) -> Generator[Message | FrameError, None, None]:
         """The messages of the mask topic, in a reading of their own, as they come at any distance from their images."""
         if len(self._mask_topics) != 1:
             return
         with closing(BagReader(self._path)) as reader:
-            for message in reader.messages(reader.connections(IMAGE, topic=self._mask_topics[0]), received=received):
-                if not isinstance(message, FrameError):
-                    yield message
+            yield from reader.messages(reader.connections(IMAGE, topic=self._mask_topics[0]), received=received)
 
     def _mask(self, stamp: Stamp) -> Message | None:
-        """The first mask with this stamp, wherever it is: a segmentation may answer its images in another order."""
+        """The first mask with this stamp, wherever it is: a segmentation may answer its images in another order.
+
+        Raises ValueError where there is none, and one that cannot be read might be it.
+        """
         if stamp not in self._passed:
             for message in self._masks:
+                if isinstance(message, FrameError):
+                    self._unread = self._unread or message
+                    continue
                 self._passed.setdefault(message.stamp, message.received)
                 if message.stamp == stamp:
                     return message
+            if self._unread is not None:
+                raise ValueError(f"it has no mask, or one that cannot be read: {self._unread}")
             return None
         with closing(self._recorded_masks(self._passed[stamp])) as again:
-            return next((message for message in again if message.stamp == stamp), None)
+            found = (message for message in again if isinstance(message, Message) and message.stamp == stamp)
+            return next(found, None)
 
     def _labels(self, stamp: Stamp, name: str, image: np.ndarray) -> np.ndarray | None:
         """The masks of an image: from files if there is a folder of them, else from the bag."""

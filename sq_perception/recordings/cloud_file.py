@@ -126,7 +126,7 @@ def _pcd(data: bytes) -> np.ndarray:
     at = 0
     while "DATA" not in head:
         end = data.index(b"\n", at)
-        name, *values = data[at:end].decode("ascii").split() or [""]
+        name, *values = data[at:end].decode("ascii", errors="replace").split() or [""]
         head[name], at = values, end + 1
     width, height = int(head["WIDTH"][0]), int(head["HEIGHT"][0])
     count = width * height

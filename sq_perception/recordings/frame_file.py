@@ -250,6 +250,7 @@ def _read(
     if suffix not in SUFFIXES:
         raise ValueError(f"expected a name that ends in {', '.join(SUFFIXES)}")
     image = {".npy": npy_array, ".exr": exr_image}.get(suffix, grey_image)(path)
+    image = image.astype(image.dtype.newbyteorder("="), copy=False)
     if image.ndim != 2 or not image.size:
         raise ValueError(f"expected an image (height, width), got {image.shape}")
     if projection == "orthographic":

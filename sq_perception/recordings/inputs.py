@@ -146,7 +146,7 @@ def in_folder(folder: Path) -> list[Path]:
     """The frames and bags in a folder, in natural order."""
 
     def is_frame(path: Path) -> bool:
-        return path.suffix.lower() in frame_file.SUFFIXES and path.is_file()
+        return path.suffix.lower() in frame_file.SUFFIXES and not path.is_dir()  # a broken link is reported
 
     found = sorted((path for path in folder.iterdir() if is_frame(path) or bag_file.is_bag(path)), key=_natural)
     return [path for path in found if path.suffix.lower() != ".npy"] or found

@@ -1,11 +1,12 @@
 """Whether an observation agrees with its track, and in what it does not.
 
-With the error e = z - x^ and its covariance S an observation agrees if
+With the error e = z - x^ and S, the covariances of both added as if they erred apart, an observation agrees if
 
     e^T S^-1 e < chi2_11(0.999)
 
 and neither its centre nor its rotation alone is outside of chi2_3(0.999).  A centre or a rotation that is, by more than
-errors of no importance, has strayed.
+errors of no importance, has strayed.  What views err by in common is in both and cancels in e: of views from one side
+S is too large, and strays are noticed later than need be.
 """
 
 from __future__ import annotations

@@ -8,10 +8,10 @@ What a consumer gets of each body is in the optical frame of its frame and in th
 | known, or the camera stands still | has left its track, and the track has not followed | its own |
 | wanted and not known | any | its own; the pose of the frame before is taken to find the ids |
 
-So a body that is moved by a hand is never published where it was, and nothing is published that the frame does not
-show.  A single observation of other sizes in the same place is taken for an error and left out.  Observations keep
-their bodies, and have their axes named as the track's; where the fit has taken another axis as z, that changes the
-exponents (:func:`sq_perception.tracking.forms.named`).
+So a body that is moved by a hand is published no farther from where the frame shows it than four deviations of that
+one observation, and nothing is published that the frame does not show.  A single observation of other sizes in the same
+place is taken for an error and left out.  Observations keep their bodies, and have their axes named as the track's;
+where the fit has taken another axis as z, that changes the exponents (:func:`sq_perception.tracking.forms.named`).
 
 Ids count from 1 and are never used again, not after a reset either.  A body that failed has no track; its id is
 FIRST_FAILED_ID + its label, which no track reaches.

@@ -105,6 +105,18 @@ def test_a_damaged_header_is_refused_as_one(tmp_path, there, damaged):
         npz_arrays(archive(tmp_path, depth=data), ["depth"])
 
 
+def test_damage_in_any_packing_is_a_damaged_archive(tmp_path: Path) -> None:
+    for packing in (zipfile.ZIP_DEFLATED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA):
+        path = tmp_path / "frame.npz"
+        with zipfile.ZipFile(path, "w", packing) as file:
+            file.writestr("depth.npy", npy(np.random.default_rng(0).random(4000)))
+        data = bytearray(path.read_bytes())
+        data[2000:2040] = bytes(40)
+        path.write_bytes(data)
+        with pytest.raises(UnpackingError, match="not a readable NPZ archive"):
+            npz_arrays(path, ["depth"])
+
+
 def test_an_archive_that_unpacks_to_far_more_than_it_weighs_is_refused(tmp_path, monkeypatch):
     monkeypatch.setattr(unpacking, "MOST_PIXELS", 2**16)
     path = archive(tmp_path, depth=npy(np.zeros((2**9, 2**9))))

@@ -158,6 +158,8 @@ def test_the_frames_of_a_bag_are_told_apart_by_their_stamps(frame, tmp_path, cap
     assert second["stamp"]["nanosec"] - first["stamp"]["nanosec"] == 100_000_000
     assert file["stamp"] is None
     assert len(set(capsys.readouterr().out.splitlines())) == 3
+    assert main.main(["grasp", str(bag), "--topic", "/elsewhere"]) == 1
+    assert "no images on /elsewhere" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("wrong", [["--gripper", "claw"], ["--friction", "0"], ["--json", "nowhere/out.json"]])

@@ -369,6 +369,8 @@ def test_misuse_is_told(wrong, what):
         plan(standing(*CAN), **wrong)
     with pytest.raises(ValueError, match="plane"):
         Surroundings(plane=np.ones(4))
+    with pytest.raises(ValueError, match="camera: expected a pinhole camera"):
+        Surroundings.of_image(np.ones((4, 4)), Camera(4, 4, 4.0, 4.0, 2.0, 2.0, "orthographic"), None)
     with pytest.raises(ValueError, match="gripper"):
         gripper("claw")
 
@@ -389,6 +391,16 @@ def test_misuse_is_told(wrong, what):
 def test_a_gripper_of_other_numbers_is_refused_before_it_plans(wrong, what):
     with pytest.raises(ValueError, match=what):
         replace(PANDA, **wrong)
+
+
+def test_the_way_of_the_fingers_is_kept_clear_behind_a_narrow_hand():
+    narrow = replace(PANDA, hand=(0.01, 0.05, 0.066))
+    for hand in (narrow, PANDA):
+        *fingers, behind = hand.boxes(hand.opening)
+        for finger in fingers:
+            assert (np.abs(finger[:2]) + finger[3:5] <= behind[3:5] + 1e-12).all()
+    np.testing.assert_array_equal(narrow.boxes(0.0, reach=0.0)[2, 3:5], [0.005, 0.025])
+    np.testing.assert_array_equal(PANDA.boxes(0.0)[2, 3:5], 0.5 * np.array(PANDA.hand[:2]))
 
 
 @pytest.mark.parametrize("hand", GRIPPERS.values(), ids=lambda hand: hand.name)

@@ -99,6 +99,8 @@ class TestCamera:
         assert Camera.from_matrix(VGA.matrix, 640, 480) == VGA
         with pytest.raises(ValueError, match="transposed"):
             Camera.from_matrix(VGA.matrix.T, 640, 480)
+        with pytest.raises(ValueError, match="expected 0 0 1 in its last row"):
+            Camera.from_matrix(VGA.matrix * [[1], [1], [2]], 640, 480)
 
     def test_masked_readings_are_none_and_whole_numbers_no_metres(self) -> None:
         hidden = np.arange(VGA.width * VGA.height).reshape(VGA.height, VGA.width) % 3 == 0

@@ -66,6 +66,13 @@ def test_an_organised_cloud_is_its_depth_image(tmp_path, kind):
     )
 
 
+def test_a_comment_may_have_any_letters(tmp_path):
+    depth, cloud = points()
+    path = pcd(tmp_path / "a.pcd", cloud, "binary")
+    path.write_bytes("# .PCD v0.7 - mesuré\n".encode() + path.read_bytes())
+    np.testing.assert_allclose(read(path).depth, depth, rtol=1e-6)
+
+
 def test_a_cloud_in_any_order_is_seen_again(tmp_path):
     """A PLY of shuffled points: its pixels hold points of the cloud, most of them, and the body keeps its seen size."""
     _, cloud = points()

@@ -84,7 +84,7 @@ def test_deep_json_is_no_camera(tmp_path):
         read(save(tmp_path / "a.png"), path)
 
 
-@pytest.mark.parametrize(("value", "dtype"), [(0.8, np.float32), (0.8, np.float64), (800, np.uint16)])
+@pytest.mark.parametrize(("value", "dtype"), [(0.8, np.float32), (0.8, ">f8"), (800, np.uint16), (800, ">u2")])
 def test_npy_has_the_units_of_its_type(tmp_path, value, dtype):
     frame = read(save(tmp_path / "a.npy", value, dtype), NUMBERS)
     assert frame.depth.dtype == np.float32
@@ -301,6 +301,16 @@ def test_an_empty_name_is_no_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     ((_, error),) = RecordedInput([""])
     assert "got an empty one" in str(error)
+
+
+def test_a_broken_link_in_a_folder_is_reported(tmp_path):
+    """As of a data set of which not all was fetched."""
+    save(tmp_path / "a.png")
+    (tmp_path / "b.png").symlink_to(tmp_path / "elsewhere" / "b.png")
+    (_, frame), (file, error) = RecordedInput([str(tmp_path)], InputOptions(NUMBERS))
+    assert frame.camera == CAMERA
+    assert isinstance(error, FrameError)
+    assert file == str(tmp_path / "b.png")
 
 
 def test_a_folder_without_frames_gives_those_of_its_subfolders(tmp_path):

@@ -300,6 +300,16 @@ def test_masks_are_found_by_their_stamps_in_whatever_order_they_were_recorded(tm
     assert masks == [[1], [2], None, [5], [4], [4]]
 
 
+def test_where_a_mask_cannot_be_read_no_other_segments_are_taken_for_it(tmp_path, grey):
+    contents = [(INFO, 0, info(0))] + [(TOPIC, second, image(grey, second, "16UC1")) for second in (1, 2)]
+    contents += [("/mask/image", 1, image(np.ones_like(grey), 1, "8UC1"))]
+    cut = bytes(TYPES.serialize_cdr(image(np.ones_like(grey), 2, "8UC1"), "sensor_msgs/msg/Image"))[:-100]
+    first, second = frames(write(tmp_path / "bag", [*contents, ("/mask/image", 2, cut)]))
+    assert (first.labels == 1).all()
+    assert isinstance(second, FrameError)
+    assert "one that cannot be read" in str(second)
+
+
 def test_of_several_topics_with_masks_none_is_taken_and_frames_say_so(tmp_path, grey):
     contents = [(INFO, 0, info(0)), (TOPIC, 1, image(grey, 1, "16UC1"))]
     contents += [(topic, 1, image(np.ones_like(grey), 1, "8UC1")) for topic in ("/b/mask/image", "/a/mask/image")]

@@ -274,6 +274,12 @@ def test_masked_readings_are_none(symmetry):
     np.testing.assert_array_equal(found.to_flat(), known.to_flat())
 
 
+def test_masked_labels_are_none(symmetry):
+    depth, labels = seen(random_bodies(2, 3), CAMERA, background=1.4)
+    found = symmetry.recover(depth, CAMERA, np.ma.masked_array(labels, labels == 2))
+    assert [body.label for body in found.bodies] == [1]
+
+
 @pytest.mark.parametrize("method", ["symmetry", "classic", "auto", "network"])
 @pytest.mark.parametrize("projection", ["pinhole", "orthographic"])
 def test_no_depth_value_raises(method, projection, weights):
