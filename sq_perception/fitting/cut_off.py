@@ -1,0 +1,74 @@
+"""What the border of an image cuts off: half sizes of bodies that end beyond it.
+
+A prism, such as a can or a carton, looks the same however far it goes on beyond the border.  Its cost has a wall where
+it would be too short to reach the border, and is flat beyond: a search ends at the foot of the wall, whose curvature
+tells nothing of the flat.  So where the border cuts an object and an end of its body lies beyond, the body is also held
+with that end farther out and the other one in place, the rest fitted again.  What the image allows then adds to the
+covariance, with the weight of the body itself.
+
+This is about the exact course: the tolerant one has priors for what it does not see.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+from sq_perception.fitting.covariance import Alternative
+from sq_perception.fitting.levenberg_marquardt import State, minimize
+from sq_perception.fitting.observation import Observation
+from sq_perception.fitting.problem import BASIN_STEPS, DOUBT, TOLERANCE, Solution, settle
+from sq_perception.fitting.residuals import RENDERED
+
+_LONGER = (1.25, 1.6)
+"""Times the half size at hand."""
+_ALLOWED = DOUBT / 2
+"""A cost that is larger by this is so with a standard deviation of 7 through noise: no evidence against a length."""
+_RAYS = 1000
+"""Of the search for each longer body, which begins near its valley."""
+
+
+def with_open_ends(solution: Solution) -> Solution:
+    """The solution, with longer bodies beside it where the image's border hides how long it is."""
+    problem, state = solution.problem, solution.state
+    if problem.independent is not None:
+        return solution
+    ends = list(_hidden_ends(problem.observation, state))
+    if not ends:
+        return solution
+    rays = solution.rays.every(max(1, len(solution.rays.hits) // _RAYS))
+    most = settle(problem, state, rays, 0).cost + _ALLOWED
+    found = []
+    for axis, sign in ends:
+        for factor in _LONGER:
+            start = _longer(state, axis, sign, factor * state.parameters[axis])
+            lower, upper = (limit.copy() for limit in problem.limits)
+            lower[axis] = upper[axis] = start.parameters[axis]
+            held = minimize(RENDERED, *rays, problem.terms, start, (lower, upper), BASIN_STEPS, TOLERANCE)
+            if held.cost < most:
+                found.append(held)
+    others = tuple(Alternative(held, 1 / (1 + len(found))) for held in found)
+    return replace(solution, alternatives=(*solution.alternatives, *others))
+
+
+def _hidden_ends(observation: Observation, state: State) -> Iterator[tuple[int, float]]:
+    """Axis and sign of each end of a body that lies beyond a border of the image which cuts the object."""
+    mask, camera = observation.mask, observation.camera
+    for axis in range(3):
+        for sign in (1.0, -1.0):
+            u, v = camera.project(state.parameters[5:8] + sign * state.parameters[axis] * state.rotation[:, axis])
+            if (
+                (u < 0 and mask[:, 0].any())
+                or (v < 0 and mask[0].any())
+                or (u > camera.width - 1 and mask[:, -1].any())
+                or (v > camera.height - 1 and mask[-1].any())
+            ):
+                yield axis, sign
+
+
+def _longer(state: State, axis: int, sign: float, size: float) -> State:
+    """The body with one end farther out and the other one in place."""
+    parameters = state.parameters.copy()
+    parameters[5:8] += sign * (size - parameters[axis]) * state.rotation[:, axis]
+    parameters[axis] = size
+    return state._replace(parameters=parameters)
