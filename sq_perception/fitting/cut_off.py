@@ -15,10 +15,9 @@ from collections.abc import Iterator
 from dataclasses import replace
 
 from sq_perception.fitting.covariance import Alternative
-from sq_perception.fitting.levenberg_marquardt import State, minimize
+from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.observation import Observation
-from sq_perception.fitting.problem import BASIN_STEPS, DOUBT, TOLERANCE, Solution, settle
-from sq_perception.fitting.residuals import RENDERED
+from sq_perception.fitting.problem import DOUBT, Solution, held, settle
 
 _LONGER = (1.25, 1.6)
 """Times the half size at hand."""
@@ -41,13 +40,13 @@ def with_open_ends(solution: Solution) -> Solution:
     found = []
     for axis, sign in ends:
         for factor in _LONGER:
-            start = _longer(state, axis, sign, factor * state.parameters[axis])
-            lower, upper = (limit.copy() for limit in problem.limits)
-            lower[axis] = upper[axis] = start.parameters[axis]
-            held = minimize(RENDERED, *rays, problem.terms, start, (lower, upper), BASIN_STEPS, TOLERANCE)
-            if held.cost < most:
-                found.append(held)
-    others = tuple(Alternative(held, 1 / (1 + len(found))) for held in found)
+            longer = min(factor * state.parameters[axis], problem.limits[1][axis])
+            other = held(problem, _longer(state, axis, sign, longer), axis, rays)
+            if other.cost < most:
+                found.append(other)
+        if problem.late:
+            break
+    others = tuple(Alternative(other, 1 / (1 + len(found))) for other in found)
     return replace(solution, alternatives=(*solution.alternatives, *others))
 
 

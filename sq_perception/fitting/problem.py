@@ -248,6 +248,13 @@ def settle(problem: Problem, state: State, rays: Rays, steps: int = BASIN_STEPS)
     return _minimized(problem, RENDERED, state, rays, steps, TOLERANCE)
 
 
+def held(problem: Problem, state: State, axis: int, rays: Rays) -> State:
+    """The same with the half size along an axis kept as it is, within its limits."""
+    lower, upper = (limit.copy() for limit in problem.limits)
+    lower[axis] = upper[axis] = min(max(state.parameters[axis], lower[axis]), upper[axis])
+    return minimize(RENDERED, *rays, problem.terms, state, (lower, upper), BASIN_STEPS, TOLERANCE)
+
+
 def refine(problem: Problem, state: State, rays: Rays, steps: int = REFINE_STEPS) -> State:
     """A body at the end of its valley."""
     return _minimized(problem, RENDERED, state, rays, steps, FINAL_TOLERANCE)

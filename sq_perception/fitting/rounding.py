@@ -19,10 +19,9 @@ from dataclasses import replace
 import numpy as np
 
 from sq_perception.fitting.covariance import Alternative
-from sq_perception.fitting.levenberg_marquardt import State, minimize
-from sq_perception.fitting.problem import BASIN_STEPS, TOLERANCE, Problem, Solution, refine
+from sq_perception.fitting.levenberg_marquardt import State
+from sq_perception.fitting.problem import Problem, Solution, held, refine
 from sq_perception.fitting.rays import DEPTH, Rays
-from sq_perception.fitting.residuals import RENDERED
 from sq_perception.fitting.rivals import other_orders, resized
 
 _FACE_SHARE = 0.04
@@ -158,11 +157,9 @@ class _Walk:
 
     def _held(self, start: State, log_size: float) -> State:
         axis = _view_axis(start)
-        lower, upper = (limit.copy() for limit in self.problem.limits)
+        lower, upper = self.problem.limits
         size = min(max(math.exp(log_size), lower[axis]), upper[axis])
-        lower[axis] = upper[axis] = size
-        start = resized(start, axis, size)
-        return minimize(RENDERED, *self.rays, self.problem.terms, start, (lower, upper), BASIN_STEPS, TOLERANCE)
+        return held(self.problem, resized(start, axis, size), axis, self.rays)
 
 
 def _view_axis(state: State) -> int:

@@ -111,9 +111,9 @@ class SeenObject:
         mask[self.window] = kept = self.mask_crop & ~strays[self.window]
         return replace(self, mask=mask, mask_crop=kept)
 
-    def of_readings(self, depth: np.ndarray) -> SeenObject:
-        """The object in an image (height, width) of which some more is not measured."""
-        kept = self.without(np.isnan(depth))
+    def of_readings(self, depth: np.ndarray, gaps: np.ndarray) -> SeenObject:
+        """The object in an image (height, width) that has no readings in its ``gaps``, bool (height, width)."""
+        kept = self.without(gaps)
         lost = int(np.count_nonzero(self.mask_crop & ~kept.mask_crop))
         return replace(kept, depth_crop=depth[self.window], pixels=self.pixels - lost)
 
