@@ -14,8 +14,11 @@ import numpy as np
 from sq_perception.geometry.kernels import inline_kernel, kernel
 from sq_perception.imaging.depth_steps import STEP
 
-_STEPS = 8
-"""In which a line is walked."""
+_STEPS = 16
+"""In which a line is walked: gaps between round things that touch are narrow.  Of 884 simulated things own masks miss
+48; with 8 steps 57, with 24 49."""
+_LOOKS = 8
+"""At a line, for the mean gap behind it: it changes little where there are more."""
 _SHARE = 0.01
 """Of the depth, that something lies behind a line at least."""
 _HOME = 0.1
@@ -95,8 +98,8 @@ def gaps(pixels: np.ndarray, points: np.ndarray, depth: np.ndarray, labels: np.n
         own = labels[pixels[i, 0], pixels[i, 1]]
         for j in range(i):
             total, count = 0.0, 0
-            for k in range(1, _STEPS):
-                t = k / _STEPS
+            for k in range(1, _LOOKS):
+                t = k / _LOOKS
                 v = int((1 - t) * pixels[i, 0] + t * pixels[j, 0] + 0.5)
                 u = int((1 - t) * pixels[i, 1] + t * pixels[j, 1] + 0.5)
                 if labels[v, u] == own and depth[v, u] > 0.0:
