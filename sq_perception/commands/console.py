@@ -167,7 +167,12 @@ def add_frames(command: argparse.ArgumentParser) -> None:
     add("--every", type=at_least(1), default=1, metavar="N", help="only every Nth frame of a bag or folder")
     methods = ("auto", "network", "symmetry", "classic")
     add("--method", choices=methods, default="auto", help="how bodies are found; see recover --help")
-    add("--ignore-masks", action="store_true", help="segment, even where a frame brings labels")
+    add_ignore_masks(command)
+
+
+def add_ignore_masks(command: argparse.ArgumentParser) -> None:
+    """Whether labels of frames are looked at."""
+    command.add_argument("--ignore-masks", action="store_true", help="segment, even where a frame brings labels")
 
 
 def add_address(command: argparse.ArgumentParser) -> None:

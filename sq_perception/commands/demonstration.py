@@ -31,6 +31,7 @@ from sq_perception.imaging.camera import Projection
 from sq_perception.nodes import fast_dds
 from sq_perception.nodes.watch import CAMERA, Shot, Watch
 from sq_perception.recordings.frame_file import FrameError, read
+from sq_perception.recordings.inputs import camera_beside
 
 _RATE = 10.0
 _START_PATIENCE = 120.0
@@ -109,10 +110,11 @@ def _camera(frame: Path | None, camera_info: Path | None, projection: Projection
         return {"rate": _RATE, **own}
     if projection is None:
         projection = "orthographic" if _is_grey(frame) else "pinhole"
-    is_cube = read(frame, camera_info, projection).is_cube  # an NPZ may say so, whatever was expected of it
+    # An NPZ may be of the unit cube, whatever was expected of it.
+    is_cube = read(frame, camera_info or camera_beside(frame), projection).is_cube
     files = {"path": str(frame.resolve())}
     if camera_info is not None:
-        files["camera_info_file"] = str(camera_info.resolve())
+        files["camera_info_file"] = str(camera_info.resolve() if camera_info.exists() else camera_info)
     return {"rate": _RATE, "scene": "replay", "projection": "orthographic" if is_cube else "pinhole", **files}
 
 

@@ -23,7 +23,7 @@ from sq_perception.grasping.plan import GraspPlan
 from sq_perception.grasping.surroundings import Surroundings
 from sq_perception.learning.checkpoint import CheckpointError
 from sq_perception.recordings.bag_file import InputOptions
-from sq_perception.recordings.frame_file import FrameError, RecordedFrame, Stamp
+from sq_perception.recordings.frame_file import FrameError, Reading, RecordedFrame, Stamp
 from sq_perception.recordings.inputs import RecordedInput
 from sq_perception.recovery.options import RecoveryOptions
 from sq_perception.recovery.recoverer import Recoverer, Recovery
@@ -43,7 +43,10 @@ def run(options: argparse.Namespace) -> int:
         return misused(str(error))
     friction = options.friction or planner.FRICTION
     try:
-        recorded = RecordedInput(options.frames, InputOptions(options.camera_info, topic=options.topic))
+        reading = Reading(ignore_masks=options.ignore_masks)
+        recorded = RecordedInput(
+            options.frames, InputOptions(options.camera_info, topic=options.topic, reading=reading)
+        )
         pictures = {"pictures": (options.pictures, ".png")}
         if problem := console.replaced_input(recorded.files, {"json": options.json}, pictures):
             return misused(problem)

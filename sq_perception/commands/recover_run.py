@@ -87,7 +87,14 @@ class RecoverRun:
             options.every,
             options.limit,
             options.distortion,
-            Reading(options.depth_scale, options.depth_min, options.depth_max, options.roi, options.masks),
+            Reading(
+                options.depth_scale,
+                options.depth_min,
+                options.depth_max,
+                options.roi,
+                options.masks,
+                options.ignore_masks,
+            ),
         )
         self._recorded = RecordedInput(options.frames, wanted, done)
         if problem := replaced_input(options, self._recorded.files):
@@ -151,8 +158,8 @@ class RecoverRun:
         return ", ".join(parts)
 
     def _work(self, frame: RecordedFrame) -> workers.Work:
-        labels = None if self._options.ignore_masks else frame.labels
-        return workers.Work(frame.depth, frame.camera, labels, replace(self._settings, free_space=frame.has_free_space))
+        settings = replace(self._settings, free_space=frame.has_free_space)
+        return workers.Work(frame.depth, frame.camera, frame.labels, settings)
 
     def _answered(self, pairs: Iterable[tuple[str, Any]]) -> Iterator[tuple[tuple[str, Any], Any]]:
         """The frames with what was recovered of each, or the error that it raised; None for what is no frame."""
@@ -195,8 +202,7 @@ class RecoverRun:
             message = f"{_count(len(answer.bodies) - len(wanted), 'body', 'bodies')} with a lower score left out"
         recovery = replace(answer, bodies=wanted, message=message)
         tracks = self._tracks.follow(file, frame, recovery) if self._tracks else None
-        has_masks = not self._options.ignore_masks and frame.labels is not None
-        entry = result_json.frame_entry(file, frame, recovery, tracks, has_masks)
+        entry = result_json.frame_entry(file, frame, recovery, tracks, frame.labels is not None)
         self.outputs.add(frame, recovery, tracks, entry)
 
 

@@ -78,11 +78,6 @@ def _names_frames(parser: argparse.ArgumentParser, given: Sequence[str]) -> bool
     return any(not other.startswith("-") for other in others)
 
 
-def camera_info_beside(depth: str) -> str:
-    """The camera_info topic that goes with an image topic by the convention of ROS: the same name space."""
-    return f"{depth.rpartition('/')[0]}/camera_info" if "/" in depth else "camera_info"
-
-
 def _node(bound: socket.socket, nodes: Sequence[str], options: argparse.Namespace) -> ViewNode:
     from sq_perception.nodes.view_node import ViewNode
     from sq_perception.viewing.page import Page
@@ -90,9 +85,8 @@ def _node(bound: socket.socket, nodes: Sequence[str], options: argparse.Namespac
 
     host, port = bound.getsockname()[:2]
     page = Page(bound, nodes, options.max_points)
-    camera_info = options.camera_info or camera_info_beside(options.depth)
     try:
-        node = ViewNode(NAME, page, options.depth, camera_info, nodes, options.rate)
+        node = ViewNode(NAME, page, options.depth, options.camera_info, nodes, options.rate)
     except BaseException:
         page.close()
         raise

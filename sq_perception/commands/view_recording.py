@@ -62,11 +62,12 @@ def main(arguments: Sequence[str]) -> int:
 def _recovered(options: argparse.Namespace) -> Iterator[tuple[RecordedFrame, FrameRecovery]]:
     """The frames that can be read, one by one as they are asked for."""
     from sq_perception.recordings.bag_file import InputOptions
-    from sq_perception.recordings.frame_file import FrameError
+    from sq_perception.recordings.frame_file import FrameError, Reading
     from sq_perception.recordings.inputs import RecordedInput
     from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
 
-    wanted = InputOptions(options.camera_info, options.projection, options.topic, options.every)
+    reading = Reading(ignore_masks=options.ignore_masks)
+    wanted = InputOptions(options.camera_info, options.projection, options.topic, options.every, reading=reading)
     recorded = RecordedInput(options.frames, wanted)
     recoverer = Recoverer(method=options.method)
     for _, frame in recorded:
@@ -76,10 +77,9 @@ def _recovered(options: argparse.Namespace) -> Iterator[tuple[RecordedFrame, Fra
         if frame.warning:
             complain(f"warning: {frame.name}: {frame.warning}")
         print(f"recovering {frame.name}", flush=True)
-        labels = None if options.ignore_masks else frame.labels
         settings = RecoveryOptions(method=options.method, free_space=frame.has_free_space)
         try:
-            recovery = recoverer.recover(frame.depth, frame.camera, labels, settings)
+            recovery = recoverer.recover(frame.depth, frame.camera, frame.labels, settings)
         except (ValueError, ArithmeticError) as error:  # such as a camera of no image
             complain(f"{frame.name}: {error}")
             continue

@@ -69,15 +69,16 @@ def _node(name: str, namespace: str | None = None) -> process.Stoppable:
     if name == "grasp_node":
         from sq_perception.nodes.grasp_node import GraspNode
 
-        return GraspNode(name)
+        return process.made(GraspNode, name)
     if name == "synthetic_depth_node":
         from sq_perception.nodes.synthetic_depth_node import SyntheticDepthNode
 
-        return SyntheticDepthNode(name)
+        return process.made(SyntheticDepthNode, name)
     from sq_perception.nodes.frame_node import FrameNode
     from sq_perception.nodes.parameters import FitterParameters, RecoverParameters
 
-    return FrameNode(name, FitterParameters if name == "fitter_node" else RecoverParameters, namespace=namespace)
+    parameters = FitterParameters if name == "fitter_node" else RecoverParameters
+    return process.made(FrameNode, name, parameters, namespace=namespace)
 
 
 def _namespace(text: str) -> str:

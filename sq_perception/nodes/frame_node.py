@@ -175,8 +175,8 @@ class FrameNode(ManagedNode):
             return ""
         name = self.get_fully_qualified_name()
         return (
-            f"is read when the node is configured, and it is {self.state}: ros2 lifecycle set {name} deactivate, then "
-            "cleanup; set it; configure, activate"
+            f"is read when the node is configured (autostart: started), and it is {self.state}: ros2 lifecycle set "
+            f"{name} deactivate, then cleanup; set it; configure, activate"
         )
 
     # The worker

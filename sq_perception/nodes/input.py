@@ -38,7 +38,7 @@ from sq_perception.nodes.frame import (
 )
 from sq_perception.nodes.live_parameters import LiveParameters
 from sq_perception.nodes.parameters import POINTS, RAW, RecoverParameters
-from sq_perception.nodes.statistics import THROTTLE, Statistics
+from sq_perception.nodes.statistics import THROTTLE, WITHOUT_MASK, Statistics
 from sq_perception.recordings.cloud_file import UNORGANISED
 
 _INFOS = 16
@@ -181,6 +181,13 @@ class Input:
         if use == "always" and arrival.mask is None:
             expected = "expected one with the stamp of the image (use_masks is always)"
             raise ValueError(f"mask: {expected}, none came on {self._mask_topic}")
+        if use == "auto" and arrival.needs_mask and arrival.mask is None:
+            self._statistics.count(WITHOUT_MASK)
+            self._node.get_logger().warning(
+                f"{self._mask_topic}: no mask with the stamp of the image within {parameters.patience:g} s (patience): "
+                "segmented here",
+                throttle_duration_sec=THROTTLE,
+            )
         return frame if arrival.mask is None or use == "never" else frame.with_mask(arrival.mask)
 
     def _calibration_of(self, image: DepthMessage, source: Subscription) -> Calibration:

@@ -21,6 +21,8 @@ SECONDS = 10.0
 """What rates and latencies are taken over."""
 _MOST = 5000
 """Events that are kept: more than any camera causes in that time."""
+WITHOUT_MASK = "without mask"
+"""Frames that were segmented by the node, though somebody publishes masks."""
 _OUTCOMES = ("answered", "dropped", "refused")
 _SLOW = 3.0
 """Seconds after which a frame without an outcome is more than a start."""
@@ -38,14 +40,14 @@ class Statistics:
         self._recent: deque[tuple[float, str]] = deque(maxlen=_MOST)
         self._stages: deque[tuple[float, Mapping[str, float]]] = deque(maxlen=_MOST)
         self._lost: Counter[str] = Counter()
-        self._reported: tuple[int, Counter[str]] = 0, Counter()
-        """Refused and lost when the last status was made."""
+        self._reported: tuple[Counter[str], Counter[str]] = Counter(), Counter()
+        """Counts, and lost ones, when the last status was made."""
         self._stood = self._started
         """When something else than frames was last reported, such as that nobody wants them."""
         self._last_error = self._last_answer = ""
 
     def count(self, what: str, number: int = 1) -> None:
-        """Add to received or dropped."""
+        """Add to received or dropped, or to WITHOUT_MASK."""
         with self._lock:
             self._counts[what] += number
             self._recent.extend([(self._clock(), what)] * number)
@@ -70,8 +72,8 @@ class Statistics:
     def status(self, name: str, standing: Standing | None, more: Mapping[str, str]) -> DiagnosticStatus:
         """The diagnostics of a node, and ``more`` that there is to know beside the frames.
 
-        ``standing`` goes first; without it WARN where frames come and none is answered, or some were refused or lost
-        since the last status.
+        ``standing`` goes first; without it WARN where frames come and none is answered, or some were refused, lost or
+        left without a mask since the last status.
         """
         with self._lock:
             now = self._clock()
@@ -83,24 +85,27 @@ class Statistics:
         rate = number["answered"] / min(SECONDS, max(now - self._started, 1.0))
         came = [time for time, what in recent if what == "received" and time > self._stood]
         since = now - min(came, default=now)
-        (refused, known), self._reported = self._reported, (counts["refused"], lost)
+        (before, known), self._reported = self._reported, (counts, lost)
         level, message = DiagnosticStatus.WARN, ""
         if standing is not None:
             level, message = standing
             self._stood = now
-        elif counts["refused"] > refused:
+        elif counts["refused"] > before["refused"]:
             message = f"refused a frame: {last_error.partition(' ')[2]}"
         elif since > _SLOW and not number["answered"]:
             message = f"{len(came)} frames came within {since:.0f} s, none was answered"
         elif new := lost - known:
             parts = ", ".join(f"{number} of {topic}" for topic, number in new.items())
             message = f"messages lost before they arrived: {parts}"
+        elif unmasked := counts[WITHOUT_MASK] - before[WITHOUT_MASK]:
+            message = f"no mask came for {unmasked} frames: their objects are the node's own segments"
         else:
             level, message = DiagnosticStatus.OK, f"{rate:.1f} Hz"
         values = {
             "rate [Hz]": f"{rate:.2f}",
             **{what: str(counts[what]) for what in ("received", *_OUTCOMES)},
             "in work": str(counts["received"] - sum(counts[what] for what in _OUTCOMES)),
+            WITHOUT_MASK: str(counts[WITHOUT_MASK]),
             "lost": str(lost.total()),
             **{f"lost of {topic}": str(number) for topic, number in lost.items()},
             "last error": last_error,

@@ -39,7 +39,7 @@ from sq_perception.nodes.frame import image_topic, packed
 from sq_perception.nodes.live_parameters import LiveParameters
 from sq_perception.nodes.parameters import RAW, SyntheticParameters
 from sq_perception.nodes.statistics import THROTTLE
-from sq_perception.recordings import camera_file
+from sq_perception.recordings import camera_file, inputs
 from sq_perception.recordings.frame_source import FrameSource, SourceFrame, generated, recorded, recordings
 from sq_perception.recordings.publication import CAMERA_FRAME, CUBE_FRAME, depth_message, truth_array
 
@@ -52,14 +52,15 @@ def frame_source(parameters: SyntheticParameters) -> FrameSource:
     ValueError
         If there is nothing to replay, or the first image cannot be read, made, or published as they want it.
     """
-    calibration = None
-    if parameters.camera_info_file:
-        calibration = camera_file.read_calibration(parameters.camera_info_file)
+    info = parameters.camera_info_file
     if parameters.scene == "replay":
+        if info:
+            camera_file.read_calibration(info, "ignore", size=inputs.ANY_SIZE)  # what is wrong with it is said at once
         paths = recordings(Path(parameters.path))
-        camera_info, with_labels = parameters.camera_info_file or None, parameters.masks != "never"
-        count, make = len(paths), recorded(paths, camera_info, parameters.projection, with_labels=with_labels)
+        with_labels = parameters.masks != "never"
+        count, make = len(paths), recorded(paths, info or None, parameters.projection, with_labels=with_labels)
     else:
+        calibration = camera_file.read_calibration(info) if info else None
         count = parameters.scenes
         make = generated(
             parameters.scene,

@@ -33,6 +33,7 @@ from sq_perception.nodes.frame import decode_by, listen_to_latched_info, newest,
 from sq_perception.nodes.remote_node import RemoteNode
 from sq_perception.nodes.statistics import THROTTLE
 from sq_perception.nodes.tracking import CameraPoses, PoseError
+from sq_perception.recordings.bag_file import camera_info_topic
 from sq_perception.recordings.publication import drawn, superquadrics
 from sq_perception.viewing import tables
 from sq_perception.viewing.drawings import Bodies
@@ -65,7 +66,8 @@ class ViewNode(Node):
     page
         Shows the nodes named ``nodes``, fully qualified; closed with the node.
     depth, camera_info
-        Topics, resolved and remapped as those of a node are.
+        Topics, resolved and remapped as those of a node are.  Without a camera_info that is named or remapped, the one
+        in the name space of the images.
     rate
         Of drawing, Hz, at most.
     """
@@ -75,7 +77,7 @@ class ViewNode(Node):
         name: str,
         page: Page,
         depth: str,
-        camera_info: str,
+        camera_info: str | None,
         nodes: Sequence[str],
         rate: float = 10.0,
         context: Any = None,
@@ -83,7 +85,7 @@ class ViewNode(Node):
         super().__init__(name, context=context)
         self.start_failure = ""
         self._page, self._period = page, 1.0 / rate
-        self._topics = self.resolve_topic_name(depth), self.resolve_topic_name(camera_info)
+        self._topics = self._resolved(depth, camera_info)
         self._lock = threading.Lock()
         self._images: OrderedDict[int, Image] = OrderedDict()
         self._arrivals: deque[float] = deque(maxlen=1000)
@@ -106,6 +108,15 @@ class ViewNode(Node):
         self._news = threading.Event()
         self._drawer = threading.Thread(target=self._draw_on, name="drawer", daemon=True)
         self._drawer.start()
+
+    def _resolved(self, depth: str, camera_info: str | None) -> tuple[str, str]:
+        """The topics that are listened to."""
+        images = str(self.resolve_topic_name(depth))
+        name = camera_info or camera_info_topic(depth)
+        info = str(self.resolve_topic_name(name))
+        if camera_info is None and info == self.resolve_topic_name(name, only_expand=True):
+            info = camera_info_topic(images)
+        return images, info
 
     def close(self) -> bool:
         """Stop drawing and serving."""

@@ -44,6 +44,8 @@ from sq_perception.recordings.frame_file import MILLIMETRES, FrameError, Reading
 SUFFIXES = (".mcap", ".db3")
 _MASKS, _RENDERED = "/mask/image", "/rendered_depth"
 """Ends of the topics of labels, and of what was recovered: the latter is read where nothing else shows depth."""
+_BAG_KEY, _HEAD = b"rosbag2_bagfile_information", 4096
+"""Of a bag's metadata, and the bytes that it is looked for in."""
 _PEEKED = 10
 """Messages of a topic after which it shows no depth: the first ones may be damaged."""
 
@@ -51,7 +53,17 @@ _PEEKED = 10
 def is_bag(path: str | Path) -> bool:
     """Whether a path looks like a recording, from the outside."""
     path = Path(path)
-    return (path / "metadata.yaml").is_file() if path.is_dir() else path.suffix.lower() in SUFFIXES
+    if not path.is_dir():
+        return path.suffix.lower() in SUFFIXES
+    about = path / "metadata.yaml"
+    if not about.is_file():
+        return False
+    try:
+        with about.open("rb") as file:  # data sets have files of this name, too
+            head = file.read(_HEAD)
+    except OSError:
+        return True  # and the reader says what is wrong
+    return not head or _BAG_KEY in head
 
 
 def frame_name(path: Path, stamp: Stamp) -> str:
@@ -65,8 +77,9 @@ def raw_topic(topic: str) -> str:
 
 
 def camera_info_topic(topic: str) -> str:
-    """The camera_info topic of an image topic."""
-    return raw_topic(topic).rpartition("/")[0] + "/camera_info"
+    """The camera_info topic of an image topic: the one in its name space."""
+    space, slash, _ = raw_topic(topic).rpartition("/")
+    return f"{space}{slash}camera_info"
 
 
 @dataclass(frozen=True)
@@ -255,8 +268,11 @@ class RecordedBag:
     def _mask(self, stamp: Stamp) -> Message | None:
         """The first mask with this stamp, wherever it is: a segmentation may answer its images in another order.
 
-        Raises ValueError where there is none, and one that cannot be read might be it.
+        None for an image without a stamp, as a node has it.  Raises ValueError where there is none, and one that cannot
+        be read might be it.
         """
+        if stamp == Stamp(0, 0):
+            return None
         if stamp not in self._passed:
             for message in self._masks:
                 if isinstance(message, FrameError):
@@ -275,7 +291,7 @@ class RecordedBag:
     def _labels(self, stamp: Stamp, name: str, image: np.ndarray) -> np.ndarray | None:
         """The masks of an image: from files if there is a folder of them, else from the bag."""
         labels = self._options.reading.labels(name, image)
-        if labels is not None:
+        if labels is not None or self._options.reading.ignore_masks:
             return labels
         mask = self._mask(stamp)
         if mask is None:
@@ -309,7 +325,7 @@ class RecordedBag:
             labels = None if labels is None else calibration.rectified_labels(labels)
             depth, camera = calibration.rectified(depth), calibration.camera
             notes += [f"{self.topic}: {calibration.note}"] if calibration.note else []
-        if len(self._mask_topics) > 1 and reading.masks is None:
+        if len(self._mask_topics) > 1 and reading.masks is None and not reading.ignore_masks:
             notes.append(f"several topics with masks, none is taken: {', '.join(self._mask_topics)}")
         return reading.of(
             RecordedFrame(

@@ -20,6 +20,8 @@ LARGEST = 2**29
 """Bytes of one message, or of one unpacked chunk of messages."""
 IMAGE, COMPRESSED = "sensor_msgs/msg/Image", "sensor_msgs/msg/CompressedImage"
 CAMERA_INFO = "sensor_msgs/msg/CameraInfo"
+_CUT = "end magic"
+"""In what rosbags says of an MCAP without its end."""
 _ZSTD = b"\x28\xb5\x2f\xfd"
 """What packed messages begin with; a plain one begins with the byte 0."""
 
@@ -105,7 +107,8 @@ def _open(path: Path) -> tuple[Any, Any]:
         reader = rosbag2.Reader(path)
         reader.open()
     except Exception as error:  # whatever damaged files lead to
-        raise FrameError(f"{path}: not a readable bag: {described(error)}") from error
+        cut = " (of a recording that was cut short, mcap recover saves what is there)" * (_CUT in str(error).lower())
+        raise FrameError(f"{path}: not a readable bag: {described(error)}{cut}") from error
     storages: list[Any] = [reader.storage]
     if isinstance(reader.storage, rosbag2.reader.DirectoryReader):
         # Messages packed one by one would be unpacked without a bound; so they come as they are, for _plain.

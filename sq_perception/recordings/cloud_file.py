@@ -3,7 +3,7 @@
 An ORGANISED cloud (a PCD of several rows) of a pinhole camera IS a depth image: z, and the camera from the points
 themselves, as u = fx x / z + cx.  Any other cloud is looked at from the origin: each pixel takes its nearest point.
 Nothing is then known of the space beside an object (``RecordedFrame.has_free_space``), as points of several views, or
-thinned ones, leave gaps through which one sees what is behind.
+thinned ones, leave gaps through which one sees what is behind.  Points far off the axis are left out.
 
 References: PCD, https://pointclouds.org/documentation/tutorials/pcd_file_format.html; trimesh reads PLY.
 """
@@ -20,8 +20,9 @@ from sq_perception.imaging.camera import Camera
 
 SUFFIXES = (".pcd", ".ply")
 UNORGANISED = (
-    "a cloud that is no image, seen from its origin: nothing is known of the space beside an object, so that the side "
-    "that is not seen is less sure; a depth image or an organised cloud shows more"
+    "a cloud that is no image, seen from its origin, without points more than 60 degrees off its axis: nothing is "
+    "known of the space beside an object, so that the side that is not seen is less sure; a depth image or an "
+    "organised cloud shows more"
 )
 _NUMBERS = {"F": "f", "I": "i", "U": "u"}
 _NEAREST, _FARTHEST = 1e-4, 1e5
@@ -36,6 +37,9 @@ _LEAST_POINTS = 100
 _POINTS_A_PIXEL = 2.0
 """Of a cloud that is no image, so that few pixels of a surface stay empty."""
 _LARGEST_SIDE = 1024
+_WIDEST = 1.75
+"""|x / z| and |y / z| of points: 60 degrees off the axis, the edge of the widest images of depth cameras.  Clouds of
+several views have some below or beside the camera, and one of them is enough to leave no pixels for all others."""
 _NEIGHBOURS = 2000
 """Points whose nearest neighbour gives the density of the cloud."""
 
@@ -70,10 +74,9 @@ def as_image(points: np.ndarray) -> tuple[np.ndarray, Camera, bool]:
     with np.errstate(invalid="ignore"):
         there = np.isfinite(points).all(axis=2) & (points[..., 2] != 0)
         before = there & (points[..., 2] > _NEAREST) & (points[..., 2] < _FARTHEST)
+    expected = f"expected {_LEAST_POINTS} points or more, most of them before the camera: z forward, y down"
     if np.count_nonzero(before) < max(_LEAST_POINTS, 0.5 * np.count_nonzero(there)):
-        raise UnpackingError(
-            f"expected {_LEAST_POINTS} points or more, most of them before the camera: z forward, y down"
-        )
+        raise UnpackingError(expected)
     if points.shape[0] > 1:
         v, u = (index[:: 1 + np.count_nonzero(before) // _FITTED] for index in np.nonzero(before))
         x, y, z = points[v, u].astype(float).T
@@ -84,7 +87,11 @@ def as_image(points: np.ndarray) -> tuple[np.ndarray, Camera, bool]:
             depth = np.where(before, points[..., 2], np.nan).astype(np.float32)
             return depth, Camera(points.shape[1], points.shape[0], fx, fy, cx, cy), True
     x, y, z = points[before].astype(float).T
-    return (*_seen(np.stack([x / z, y / z], axis=1), z), False)
+    tangents = np.stack([x / z, y / z], axis=1)
+    near = np.abs(tangents).max(axis=1) < _WIDEST
+    if np.count_nonzero(near) < _LEAST_POINTS:
+        raise UnpackingError(expected)
+    return (*_seen(tangents[near], z[near]), False)
 
 
 def _line(tangents: np.ndarray, pixels: np.ndarray) -> tuple[float, float]:

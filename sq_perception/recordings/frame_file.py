@@ -121,6 +121,8 @@ class Reading:
         Left column, top row, width and height of the part to look at, pixels of the rectified image.
     masks : Path or None
         A folder with a label image for each frame, of its name and ``.png``: 0 is background.
+    ignore_masks : bool
+        Whether no labels are read, wherever they are.
 
     Raises
     ------
@@ -133,6 +135,7 @@ class Reading:
     farthest: float = math.inf
     region: tuple[int, int, int, int] | None = None
     masks: Path | None = None
+    ignore_masks: bool = False
 
     def __post_init__(self) -> None:
         if self.scale is not None and not 0 < self.scale < math.inf:
@@ -150,7 +153,7 @@ class Reading:
         FrameError
             If it is missing, unreadable, or not of the size of the image ``like``.
         """
-        if self.masks is None:
+        if self.masks is None or self.ignore_masks:
             return None
         path = self.masks / f"{name}.png"
         if not path.is_file():
@@ -242,7 +245,7 @@ def _read(
     """The frame; a ValueError that is no FrameError is about the file."""
     suffix = path.suffix.lower()
     if suffix == ".npz":
-        frame = _read_npz(path, projection, reading.scale)
+        frame = _read_npz(path, projection, reading)
         labels = reading.labels(path.stem, frame.depth)
         return frame if labels is None else replace(frame, labels=labels)
     if suffix in cloud_file.SUFFIXES:
@@ -268,7 +271,7 @@ def _read(
     if camera_info is None:
         raise ValueError("a depth image needs a camera_info with the camera's intrinsics, a file or fx,fy,cx,cy")
     size = image.shape[1], image.shape[0]
-    calibration = read_calibration(camera_info, distortion, path.with_suffix("").as_posix(), size)
+    calibration = read_calibration(camera_info, distortion, path.absolute().with_suffix("").as_posix(), size)
     scale, warnings = 1.0 if is_metric else MILLIMETRES, [f"{camera_info}: {calibration.note}"] * bool(calibration.note)
     if reading.scale is not None:
         scale = reading.scale
@@ -316,8 +319,9 @@ def _likely_mistake(frame: RecordedFrame) -> str:
     return ""
 
 
-def _read_npz(path: Path, projection: Projection, scale: float | None) -> RecordedFrame:
-    fields = npz_arrays(path, ("depth", "K", "labels", "plane", "projection"))
+def _read_npz(path: Path, projection: Projection, reading: Reading) -> RecordedFrame:
+    wanted = ("depth", "K", "plane", "projection") + ("labels",) * (not reading.ignore_masks)
+    fields = npz_arrays(path, wanted)
     if "depth" not in fields:
         raise ValueError("expected a field 'depth' in metres")
     depth, labels, plane = fields["depth"], fields.get("labels"), fields.get("plane")
@@ -346,7 +350,7 @@ def _read_npz(path: Path, projection: Projection, scale: float | None) -> Record
         if plane.shape != (4,) or plane.dtype.kind not in "fiu" or not np.isfinite(plane).all():
             raise ValueError(f"plane: expected four finite numbers, got {plane.dtype} {plane.shape}")
         plane = plane.astype(float)
-    return RecordedFrame(_metres(depth, scale or 1.0), camera, labels, path.name, plane=plane, encoding="32FC1")
+    return RecordedFrame(_metres(depth, reading.scale or 1.0), camera, labels, path.name, plane=plane, encoding="32FC1")
 
 
 def _metres(values: np.ndarray, scale: float) -> np.ndarray:

@@ -120,7 +120,8 @@ def recorded(
     """Recorded frames one after the other."""
 
     def make(position: int) -> SourceFrame:
-        frame = frame_file.read(paths[position], camera_info, projection)
+        path = paths[position]
+        frame = frame_file.read(path, camera_info or inputs.camera_beside(path), projection)
         labels = frame.labels if with_labels else None
         return SourceFrame(frame.depth, frame.camera, labels, frame.name)
 
@@ -128,7 +129,7 @@ def recorded(
 
 
 def recordings(path: Path) -> list[Path]:
-    """A recorded frame, or those of a folder in natural order.
+    """A recorded frame, or those of a folder in the order of :mod:`~sq_perception.recordings.inputs`.
 
     Raises
     ------

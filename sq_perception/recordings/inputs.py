@@ -1,10 +1,10 @@
 """All frames that a user names: files, folders of files, and bags, one frame after the other.
 
-A folder gives its frames and bags in natural order (frame_2 before frame_10), NPYs only where it has nothing else, as
-matrices of calibrations are such files too; one without any gives those of its subfolders.  The camera of its images,
-and of an image that is named by itself, is ``camera_info.yaml``, ``camera.yaml``, ``intrinsics.json`` or
-``camera_intrinsic.json`` beside it, or in the folder that was named, else the YAML of its own name.  What cannot be
-read comes as an error with the reason, in its place, and the rest follows.
+A folder gives its frames and bags in natural order (frame_2 before frame_10), by their times where all names are times,
+NPYs only where it has nothing else, as matrices of calibrations are such files too; one without any gives those of its
+subfolders.  The camera of its images, and of an image that is named by itself, is ``camera_info.yaml``,
+``camera.yaml``, ``intrinsics.json`` or ``camera_intrinsic.json`` beside it, or in the folder that was named, else the
+YAML of its own name.  What cannot be read comes as an error with the reason, in its place, and the rest follows.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ SUFFIXES = frame_file.SUFFIXES + bag_file.SUFFIXES
 _Source: TypeAlias = tuple[Path, str | Path | None] | tuple[Path, FrameError]
 """A file with its camera, or what cannot be read, and why."""
 _log = logging.getLogger(__name__)
-_ANY_SIZE = (640, 480)
+ANY_SIZE = (640, 480)
 """Pixels, of images that nothing is known of yet."""
 _DIGITS = re.compile(r"(\d+)")
 
@@ -66,7 +66,7 @@ class RecordedInput:
         if self._options.camera_info is not None:
             # Auto depends on what the images are called.
             treatment = "ignore" if self._options.distortion == "auto" else self._options.distortion
-            camera_file.read_calibration(self._options.camera_info, treatment, size=_ANY_SIZE)
+            camera_file.read_calibration(self._options.camera_info, treatment, size=ANY_SIZE)
         self._sources: list[_Source] = []
         for name in names:
             self._add(name)
@@ -101,8 +101,7 @@ class RecordedInput:
         path = Path(name)
         try:
             if not path.is_dir() or bag_file.is_bag(path):
-                camera_info = self._options.camera_info or _camera_file(path.parent) or _of_its_name(path)
-                self._sources.append((path, camera_info))
+                self._sources.append((path, self._options.camera_info or camera_beside(path)))
                 return
         except OSError as error:  # a folder that may not be looked into, a name that is too long
             self._sources.append((path, FrameError(str(error))))
@@ -143,19 +142,26 @@ class RecordedInput:
 
 
 def in_folder(folder: Path) -> list[Path]:
-    """The frames and bags in a folder, in natural order."""
+    """The frames and bags in a folder: by their times where all names are times, else in natural order."""
 
     def is_frame(path: Path) -> bool:
         return path.suffix.lower() in frame_file.SUFFIXES and not path.is_dir()  # a broken link is reported
 
     found = sorted((path for path in folder.iterdir() if is_frame(path) or bag_file.is_bag(path)), key=_natural)
-    return [path for path in found if path.suffix.lower() != ".npy"] or found
+    found = [path for path in found if path.suffix.lower() != ".npy"] or found
+    times = {path: stamp for path in found if (stamp := frame_file.stamp_of(path))}
+    return found if len(times) < len(found) else sorted(found, key=times.__getitem__)
 
 
 def _natural(path: Path) -> tuple[list[str | int], str]:
     """Numbers in a name count as numbers: every second part is one."""
     parts = _DIGITS.split(path.name.lower())
     return [int(part) if k % 2 else part for k, part in enumerate(parts)], path.name
+
+
+def camera_beside(path: Path) -> Path | None:
+    """The camera of an image: the file of its folder, or that of its name."""
+    return _camera_file(path.parent) or _of_its_name(path)
 
 
 def _camera_file(folder: Path) -> Path | None:

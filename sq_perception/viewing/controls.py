@@ -23,7 +23,7 @@ from typing import Any, Literal
 Kind = Literal["bool", "choice", "text", "slider", "number", "fixed"]
 Group = Literal["live", "start", "other"]
 GROUPS: dict[Group, str] = {
-    "live": "Changes at once",
+    "live": "Settings",
     "start": "Fixed at the start",
     "other": "Of ROS",
 }

@@ -182,6 +182,12 @@ def test_a_deaf_subscription_names_the_publisher(peer, start):
     stopped(process, number=signal.SIGTERM)
 
 
+def test_the_end_of_a_terminal_ends_a_node(start):
+    process = start("synthetic_depth_node", "rate:=5.0")
+    process.says("publishing table frames")
+    stopped(process, number=signal.SIGHUP)
+
+
 def test_thesis_frames_are_recovered_in_the_cube_frame(peer, start):
     source = start("synthetic_depth_node", "scene:=thesis", "rate:=5.0", "hold:=1000", "seed:=3")
     process = start("fitter_node", "projection:=orthographic", "s:=20")

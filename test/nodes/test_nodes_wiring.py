@@ -30,6 +30,7 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.nodes import fast_dds, frame_node
 from sq_perception.nodes import input as input_module
 from sq_perception.nodes.frame import latched, stamp_of
+from sq_perception.nodes.statistics import WITHOUT_MASK
 
 
 def test_stamp_frame_and_numbers_arrive(bench):
@@ -297,6 +298,7 @@ def test_masks_of_the_same_stamp_are_used(bench):
     masks.publish(labels_to_message(labels, bench.header()))
     bench.answer(bench.depth())
     assert bench.recoverer.asked[-1][2] is None
+    assert bench.node._statistics._counts[WITHOUT_MASK] == 1
 
     image = bench.depth()
     masks.publish(labels_to_message(labels[:10], image.header))

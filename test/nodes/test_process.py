@@ -8,6 +8,7 @@ import subprocess
 import sys
 import weakref
 from collections.abc import Iterator
+from typing import ClassVar
 
 import pytest
 
@@ -67,6 +68,22 @@ def test_what_is_kept_is_not_looked_at_until_it_is_released():
     assert ghost() is not None
     process.release_objects()
     assert ghost() is None
+
+
+def test_of_a_node_that_cannot_be_made_nothing_is_left():
+    class Half:
+        destroyed: ClassVar[list[str]] = []
+
+        def __init__(self, name: str) -> None:
+            self.name = name
+            raise ValueError("depth_min, depth_max: expected depth_min < depth_max")
+
+        def destroy_node(self) -> None:
+            self.destroyed.append(self.name)
+
+    with pytest.raises(ValueError, match="depth_min < depth_max"):
+        process.made(Half, "recover_node")
+    assert Half.destroyed == ["recover_node"]
 
 
 def test_without_rclpy_a_node_says_what_is_missing():

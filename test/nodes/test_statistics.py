@@ -10,7 +10,7 @@ pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
 from diagnostic_msgs.msg import DiagnosticStatus
 
-from sq_perception.nodes.statistics import SECONDS, Statistics
+from sq_perception.nodes.statistics import SECONDS, WITHOUT_MASK, Statistics
 
 
 class Clock:
@@ -113,3 +113,12 @@ def test_lost_messages_are_counted_by_topic(statistics):
     one, values = said(statistics)
     assert one.message == "messages lost before they arrived: 1 of /depth/image, 2 of /depth/camera_info"
     assert (values["lost"], values["lost of /depth/image"], values["lost of /depth/camera_info"]) == ("6", "4", "2")
+
+
+def test_frames_without_a_mask_where_masks_are_published_are_a_warning(statistics):
+    statistics.count(WITHOUT_MASK, 3)
+    one, values = said(statistics)
+    assert one.message == "no mask came for 3 frames: their objects are the node's own segments"
+    assert values["without mask"] == "3"
+    one, _ = said(statistics)
+    assert one.level == DiagnosticStatus.OK

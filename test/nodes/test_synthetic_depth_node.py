@@ -14,6 +14,7 @@ from sensor_msgs.msg import CameraInfo, Image
 from spun_nodes import SpunNodes
 
 from sq_perception.imaging import unit_cube
+from sq_perception.imaging.camera import Camera
 from sq_perception.nodes.live_parameters import ParameterError
 from sq_perception.nodes.parameters import SyntheticParameters
 from sq_perception.nodes.synthetic_depth_node import SyntheticDepthNode, frame_source
@@ -138,6 +139,17 @@ def test_misuse_is_named(recordings, tmp_path):
         replay(path=str(recordings))
     with pytest.raises(FrameError, match="camera_info"):
         replay(path=str(recordings / "1.npz"), camera_info_file=str(tmp_path / "no.yaml"))
+
+
+def test_a_camera_is_that_of_its_parameter_or_lies_beside_the_image(tmp_path):
+    cv2.imwrite(str(tmp_path / "1.png"), np.full((48, 64), 900, np.uint16))
+    numbers = SyntheticParameters(scene="replay", path=str(tmp_path), camera_info_file="60,60,31.5,23.5")
+    assert frame_source(numbers).clean.camera == Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+    (tmp_path / "intrinsics.json").write_text(
+        '{"width": 64, "height": 48, "intrinsic_matrix": [70, 0, 0, 0, 70, 0, 31.5, 23.5, 1]}'
+    )
+    beside = frame_source(SyntheticParameters(scene="replay", path=str(tmp_path)))
+    assert beside.clean.camera == Camera(64, 48, 70.0, 70.0, 31.5, 23.5)
 
 
 def test_a_node_replays_what_a_folder_holds(tmp_path):

@@ -91,3 +91,25 @@ def test_the_newest_image_is_the_last_one_where_a_short_bag_is_in_a_loop(view):
         view._on_image(depth_to_message(np.ones((2, 2)), Header(stamp=Time(sec=sec), frame_id="camera")))
         newest.append(next(reversed(view._images.values())).header.stamp.sec)
     assert newest == [1, 2, 3, 1, 2]
+
+
+@pytest.mark.parametrize(
+    ("remapped", "given", "expected"),
+    [
+        ((), None, "/depth/camera_info"),
+        (("depth/image:=/camera/depth/image_raw",), None, "/camera/depth/camera_info"),
+        (("depth/image:=/camera/depth/image_raw", "depth/camera_info:=/camera/info"), None, "/camera/info"),
+        (("depth/image:=/camera/depth/image_raw",), "/other/info", "/other/info"),
+    ],
+)
+def test_the_camera_info_is_beside_the_images_unless_it_is_named(remapped, given, expected):
+    page: Any = SimpleNamespace(watched=False, requests=list, close=lambda: None)
+    context = Context()
+    context.init(args=["--ros-args", *(part for rule in remapped for part in ("-r", rule))])
+    node = ViewNode("sq_view", page, "depth/image", given, ["/recover_node"], 10.0, context)
+    try:
+        assert node._topics[1] == expected
+    finally:
+        node.close()
+        node.destroy_node()
+        context.try_shutdown()

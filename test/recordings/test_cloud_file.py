@@ -97,6 +97,21 @@ def test_a_cloud_in_any_order_is_seen_again(tmp_path):
     assert (error < np.maximum(0.006, 3 * np.sort(found.sigma_size))).all()
 
 
+def test_points_far_off_the_axis_take_no_pixels_from_others(tmp_path):
+    """One near the plane of the origin, as clouds of several views have."""
+    _, cloud = points()
+    flat = cloud[np.isfinite(cloud).all(axis=2)]
+    trimesh.PointCloud(flat).export(tmp_path / "a.ply")
+    trimesh.PointCloud(np.concatenate([flat, [[0.3, 0.1, 0.0005], [1.0, 0.1, 0.02]]])).export(tmp_path / "b.ply")
+    clean, strayed = read(tmp_path / "a.ply"), read(tmp_path / "b.ply")
+    assert strayed.camera == clean.camera
+    np.testing.assert_array_equal(strayed.depth, clean.depth)
+    assert "60 degrees off its axis" in strayed.warning
+    trimesh.PointCloud(flat[:, [2, 1, 0]] * [1, 1, 0.01]).export(tmp_path / "c.ply")
+    with pytest.raises(FrameError, match="expected 100 points or more, most of them before the camera"):
+        read(tmp_path / "c.ply")
+
+
 def test_no_free_space_means_that_what_is_beside_says_nothing(monkeypatch):
     """The same body before a near wall and a far one: without free space both give the same fit."""
     depth, index = raycast.render(BODY, CAMERA)

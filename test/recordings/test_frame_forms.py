@@ -324,3 +324,14 @@ def test_a_folder_without_frames_gives_those_of_its_subfolders(tmp_path):
     found = list(RecordedInput([str(tmp_path)]))
     assert [file for file, _ in found] == [str(tmp_path / name) for name in ("take2/depth/a.png", "take10/b.png")]
     assert [frame.camera.fx for _, frame in found] == [60, 70]
+
+
+def test_a_folder_of_names_that_are_times_gives_them_by_time(tmp_path):
+    names = ("5.0", "5.05", "5.1", "5.15", "10.0")
+    for name in names:
+        save(tmp_path / f"{name}.png")
+    found = list(RecordedInput([str(tmp_path)], InputOptions(NUMBERS)))
+    assert [frame.name for _, frame in found] == [f"{name}.png" for name in names]
+    save(tmp_path / "5.1_b.png")
+    found = list(RecordedInput([str(tmp_path)], InputOptions(NUMBERS)))
+    assert [frame.name for _, frame in found][:4] == ["5.0.png", "5.1.png", "5.1_b.png", "5.05.png"]

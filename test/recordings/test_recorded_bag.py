@@ -29,7 +29,7 @@ from sq_perception.imaging.distortion import Distortion
 from sq_perception.imaging.rectification import Rectification
 from sq_perception.recordings import bag_file, bag_reader
 from sq_perception.recordings.bag_file import InputOptions, RecordedBag
-from sq_perception.recordings.frame_file import FrameError, RecordedFrame, Stamp
+from sq_perception.recordings.frame_file import FrameError, Reading, RecordedFrame, Stamp
 
 TYPES = get_typestore(Stores.ROS2_JAZZY)
 T = {name.rpartition("/")[2]: kind for name, kind in TYPES.types.items()}
@@ -300,6 +300,27 @@ def test_masks_are_found_by_their_stamps_in_whatever_order_they_were_recorded(tm
     assert masks == [[1], [2], None, [5], [4], [4]]
 
 
+def test_images_without_a_stamp_have_no_mask(tmp_path, grey):
+    contents = [(INFO, 0, info(0))]
+    for second in (1, 2):
+        mask = image(np.full_like(grey, second), 0, "8UC1")
+        contents += [(TOPIC, second, image(grey, 0, "16UC1")), ("/mask/image", second + 0.1, mask)]
+    assert [frame.labels for frame in frames(write(tmp_path / "bag", contents))] == [None, None]
+
+
+def test_masks_that_are_ignored_are_not_read(tmp_path, grey):
+    """As a coloured picture of segments on a topic of that name."""
+    colour = image(grey, 1, "16UC1")
+    colour.encoding = "rgb8"
+    path = write(
+        tmp_path / "bag", [(INFO, 0, info(0)), (TOPIC, 1, image(grey, 1, "16UC1")), ("/mask/image", 1, colour)]
+    )
+    (refused,) = frames(path)
+    assert "got 'rgb8'" in str(refused)
+    (frame,) = frames(path, reading=Reading(ignore_masks=True))
+    assert frame.labels is None
+
+
 def test_where_a_mask_cannot_be_read_no_other_segments_are_taken_for_it(tmp_path, grey):
     contents = [(INFO, 0, info(0))] + [(TOPIC, second, image(grey, second, "16UC1")) for second in (1, 2)]
     contents += [("/mask/image", 1, image(np.ones_like(grey), 1, "8UC1"))]
@@ -482,6 +503,10 @@ def test_what_is_a_bag(tmp_path):
     assert bag_file.is_bag("any.mcap")
     assert bag_file.is_bag("any.DB3")
     assert not bag_file.is_bag("any.npz")
+    (tmp_path / "metadata.yaml").write_text("name: a data set\n")
+    assert not bag_file.is_bag(tmp_path)
+    (tmp_path / "metadata.yaml").write_text("# of a bag\nrosbag2_bagfile_information:\n  version: 9\n")
+    assert bag_file.is_bag(tmp_path)
     with pytest.raises(FrameError, match=r"none\.mcap"):
         RecordedBag(tmp_path / "none.mcap")
 

@@ -103,7 +103,7 @@ def test_a_printed_message_is_a_camera_info_too(tmp_path):
     assert read_calibration(path).camera == Camera(20, 10, 30.0, 30.5, 10.75, 9.75)
 
 
-def test_a_distorted_image_is_rectified_unless_a_name_says_that_it_is(tmp_path, rng):
+def test_a_distorted_image_is_rectified_unless_a_name_says_that_it_is(tmp_path, rng, monkeypatch):
     rectified = np.array([[55.0, 0, 30.0, 0], [0, 55.0, 22.0, 0], [0, 0, 1, 0]])
     changes = {"distortion_coefficients": {"data": [0.1, 0, 0, 0, 0]}, "projection_matrix": rectified.ravel().tolist()}
     info = camera_info(tmp_path / "c.yaml", **changes)
@@ -118,6 +118,8 @@ def test_a_distorted_image_is_rectified_unless_a_name_says_that_it_is(tmp_path, 
     for frame in (read(tmp_path / "depth_rect" / "1.png", info), read(tmp_path / "1.png", info, distortion="ignore")):
         assert frame.camera == Camera(64, 48, 55.0, 55.0, 30.0, 22.0)
         np.testing.assert_array_equal(frame.depth, image / np.float32(1000))
+    monkeypatch.chdir(tmp_path / "depth_rect")
+    assert read("1.png", info).camera == Camera(64, 48, 55.0, 55.0, 30.0, 22.0)
     with pytest.raises(ValueError, match="distortion: expected auto, apply, ignore"):
         read(tmp_path / "1.png", info, distortion="perhaps")
     camera_info(info, **changes, distortion_model="unified")

@@ -19,6 +19,7 @@ from sq_perception.commands import view
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
 from sq_perception.imaging.camera import Camera
+from sq_perception.recordings.bag_file import camera_info_topic
 from sq_perception.viewing import controls, drawings, tables
 from sq_perception.viewing.controls import Control
 from sq_perception.viewing.drawings import Bodies
@@ -423,9 +424,9 @@ def test_without_the_viewer_s_library_the_command_says_how_to_get_it() -> None:
 
 
 def test_the_camera_info_is_beside_the_image() -> None:
-    assert view.camera_info_beside("depth/image") == "depth/camera_info"
-    assert view.camera_info_beside("/camera/depth/image_rect_raw") == "/camera/depth/camera_info"
-    assert view.camera_info_beside("image") == "camera_info"
+    assert camera_info_topic("depth/image") == "depth/camera_info"
+    assert camera_info_topic("/camera/depth/image_rect_raw") == "/camera/depth/camera_info"
+    assert camera_info_topic("image") == "camera_info"
 
 
 def test_the_help_names_every_option() -> None:
