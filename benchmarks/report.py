@@ -72,11 +72,23 @@ def write(name: str, result: dict[str, Any], table: str, shown: bool = True) -> 
     """Write ``results/name.json`` and ``results/name.md``, and print the table if it shall be shown."""
     RESULTS.mkdir(exist_ok=True)
     facts = environment()
-    (RESULTS / f"{name}.json").write_text(json.dumps({"environment": facts, **result}, indent=1) + "\n")
+    (RESULTS / f"{name}.json").write_text(by_rows({"environment": facts, **result}) + "\n")
     head = f"`{facts['command']}`, {facts['processor']}, {facts['date']}, commit {facts['commit']}"
     (RESULTS / f"{name}.md").write_text(f"{head}\n\n{table}\n")
     if shown:
         print(table)
+
+
+def by_rows(value: Any, indent: str = "") -> str:
+    """JSON in which what holds no list or mapping takes one line."""
+    parts = value.values() if isinstance(value, dict) else value if isinstance(value, list | tuple) else ()
+    if not any(isinstance(part, dict | list | tuple) for part in parts):
+        return json.dumps(value)
+    names = [f"{json.dumps(name)}: " for name in value] if isinstance(value, dict) else [""] * len(value)
+    inner = indent + " "
+    lines = [f"{inner}{name}{by_rows(part, inner)}" for name, part in zip(names, parts, strict=True)]
+    first, last = "{}" if isinstance(value, dict) else "[]"
+    return f"{first}\n" + ",\n".join(lines) + f"\n{indent}{last}"
 
 
 def table_of(rows: Sequence[Mapping[str, str]]) -> str:
