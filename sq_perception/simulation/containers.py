@@ -23,6 +23,14 @@ from sq_perception.simulation.thing import (
     part,
 )
 
+_OVERLAP, _EDGE = 0.56, 0.1
+"""Half height of the slabs that revolved things are stacked of, in their distance, and e1: where two meet, the surface
+is 0.6 % nearer to the axis."""
+_LEVELS = 100
+"""At which a cavity is looked at."""
+_NARROW = 0.3
+"""Share of the rim's radius: plates have none that is wider."""
+
 
 def bottle(rng: np.random.Generator) -> Thing:
     """Round and oval bottles: body, shoulders, neck; cap, nozzle, pump or trigger; sometimes a waist or a handle."""
@@ -141,28 +149,34 @@ def tube(rng: np.random.Generator) -> Thing:
     return assembled("bottle", "tube", rows, (("lying", ON_Y, 0.75), ("standing", UPRIGHT, 0.25)))
 
 
-def _revolved(radii: Numbers, height: float, e1: float, e2: float = 1.0, flat: float = 1.0) -> list[Row]:
+def _revolved(radii: Numbers, height: float, e2: float = 1.0, flat: float = 1.0) -> list[Row]:
     """A stack of slabs with these radii from the base to the top."""
     count = len(radii)
     return [
-        part((r, flat * r, 0.56 * height / count), (e1, e2), (0, 0, height * (k + 0.5) / count))
+        part((r, flat * r, _OVERLAP * height / count), (_EDGE, e2), (0, 0, height * (k + 0.5) / count))
         for k, r in enumerate(radii)
     ]
 
 
-def _cavity(radii: np.ndarray, height: float, wall: float, e2: float = 1.0, flat: float = 1.0) -> Row:
-    """The widest of some superquadrics about the middle of the rim that stays within a stack of slabs."""
+def _cavity(radii: np.ndarray, height: float, wall: float, e2: float = 1.0, flat: float = 1.0) -> list[Row]:
+    """The widest of some superquadrics about the middle of the rim that stays within a stack of slabs; none if narrow.
+
+    At the height z a superquadric of the half height h has the radius a (1 - |z / h|^(2 / e1))^(e1 / 2).
+    """
     count = len(radii)
-    # Depth below the rim of each slab's lower end, in depths of the cavity.
-    depth = np.minimum(height * (1 - np.arange(count) / count) / (height - wall), 0.97)
+    z = np.linspace(wall, height, _LEVELS, endpoint=False)
+    up = (z[:, None] - height * (np.arange(count) + 0.5) / count) / (_OVERLAP * height / count)
+    outer = (radii * np.maximum(1 - np.abs(up) ** (2 / _EDGE), 0.0) ** (_EDGE / 2)).max(axis=1)
+    down = (height - z) / (height - wall)
     widest, best = 0.0, 1.0
     for e1 in (0.15, 0.4, 0.7, 1.0):
-        radius = float(((radii - wall) / (1 - depth ** (2 / e1)) ** (e1 / 2)).min())
-        radius = min(radius, radii[-1] - wall)
+        profile = (1 - np.minimum(down, 1 - 1e-9) ** (2 / e1)) ** (e1 / 2)
+        radius = float(((outer - wall) / profile).min())
         if radius > widest + 1e-4:
             widest, best = radius, e1
-    widest = max(widest, 0.3 * float(radii[-1]))
-    return part((widest, flat * widest, height - wall), (best, e2), (0, 0, height))
+    if widest < _NARROW * radii[-1]:
+        return []
+    return [part((widest, flat * widest, height - wall), (best, e2), (0, 0, height))]
 
 
 def cup(rng: np.random.Generator) -> Thing:
@@ -172,8 +186,8 @@ def cup(rng: np.random.Generator) -> Thing:
     wall = rng.uniform(0.002, 0.006)
     count = 1 if bottom == top else 6
     radii = np.linspace(bottom, top, count + 2)[1:-1]
-    rows = _revolved(radii, height, 0.08 if count == 1 else 0.2)
-    cut = [_cavity(radii, height, wall)]
+    rows = _revolved(radii, height)
+    cut = _cavity(radii, height, wall)
     name = "cup"
     if rng.random() < 0.55:
         name, thick = "mug", rng.uniform(0.004, 0.009)
@@ -197,8 +211,8 @@ def bowl(rng: np.random.Generator) -> Thing:
     count = 4 if height < 0.03 else 8
     share = (np.arange(count) + 0.75) / count
     radii = foot + (top - foot) * share ** rng.uniform(0.4, 0.9)
-    rows = _revolved(radii, height, 0.35)
-    cut = [_cavity(radii, height, rng.uniform(0.003, 0.006))]
+    rows = _revolved(radii, height)
+    cut = _cavity(radii, height, rng.uniform(0.003, 0.006))
     return assembled("vessel", "bowl", rows, (("standing", UPRIGHT, 0.93), ("inverted", INVERTED, 0.07)), cut)
 
 
@@ -208,12 +222,12 @@ def tub(rng: np.random.Generator) -> Thing:
     bottom = top * rng.uniform(0.7, 1.0)
     e2, flat = (1.0, 1.0) if rng.random() < 0.6 else (rng.uniform(0.15, 0.6), rng.uniform(0.55, 1.0))
     radii = np.linspace(bottom, top, 6)[1:-1]
-    rows = _revolved(radii, height, 0.2, e2, flat)
+    rows = _revolved(radii, height, e2, flat)
     lid = rng.uniform(0.003, 0.01)
-    cut = []
+    cut: list[Row] = []
     if rng.random() < 0.7:
         rows.append(part((1.04 * top, 1.04 * flat * top, lid), (0.2, e2), (0, 0, height)))
     else:
-        cut = [_cavity(radii, height, 0.004, e2, flat)]
+        cut = _cavity(radii, height, 0.004, e2, flat)
     rests = (("standing", UPRIGHT, 0.85), ("inverted", INVERTED, 0.08), ("on its side", ON_Y, 0.07))
     return assembled("vessel", "tub", rows, rests, cut)

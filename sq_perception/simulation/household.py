@@ -95,14 +95,16 @@ def _tin(rng: np.random.Generator) -> Thing:
         radius = log_uniform(rng, 0.045, 0.13) / 2
     height = 2 * radius * log_uniform(rng, 0.35, 2.6)
     e1 = 0.03 + 0.2 * rng.random() ** 2
-    rows = [part((radius, radius, height / 2), (e1, 1.0))]
-    end, top = radius, height / 2
+    end, is_seamed = radius, rng.random() < 0.6
+    edge = 0.04 if is_seamed else 1.0  # seams are sharp
+    rows = [part((radius, radius, height / 2), (min(e1, edge), 1.0))]
+    top = height / 2
     if rng.random() < 0.35:  # the narrower end of a drink can, or a raised lid
         end, rim = rng.uniform(0.8, 0.98) * radius, rng.uniform(0.002, 0.01)
-        rows.append(part((end, end, rim), (0.15, 1.0), (0, 0, top)))
+        rows.append(part((end, end, rim), (min(0.15, edge), 1.0), (0, 0, top)))
         top += rim
     cut = []
-    if rng.random() < 0.6:  # seamed ends, which lie a countersink of 3 to 7 mm below their rims
+    if is_seamed:  # the ends lie a countersink of 3 to 7 mm below their rims
         for inner, z in ((end, top), (radius, -height / 2)):
             inner -= rng.uniform(0.0015, 0.0035)
             cut.append(part((inner, inner, rng.uniform(0.003, 0.007)), (0.1, 1.0), (0, 0, z)))

@@ -3,7 +3,7 @@
 pose        standing, lying, leaning (:meth:`Thing.pose`), on the table, on top of something, or free in any pose
 camera      sees the thing from 20 to 70 degrees above the table, in a quarter from 65 to 90 (many robots' cameras look
             straight down), in a fifth from 3 to 25; a roll of some degrees; off the image's middle by up to 27 degrees;
-            0.35 to 2 m away; the thing is 30 to 80 pixels wide
+            0.35 to 2 m away; the thing is 15 to 80 pixels wide
 around it   up to three neighbours on the table, the table's end, a wall or nothing behind it
 """
 
@@ -32,8 +32,10 @@ _NEAREST = 0.05
 """Metres before the camera that no thing comes nearer than: long ones are farther away."""
 _FOCALS = (425.0, 525.0, 580.0, 615.0, 700.0, 920.0)
 """Pixels: depth cameras at VGA to HD."""
-_PIXELS_ACROSS = (30.0, 80.0)
+_PIXELS_ACROSS = (15.0, 80.0)
 _OFF_AXIS = (0.5, 0.4)
+_BEARINGS = np.linspace(0, 2 * np.pi, 32, endpoint=False)
+_LEVEL = np.stack([np.cos(_BEARINGS), np.sin(_BEARINGS), 0 * _BEARINGS], axis=1)
 _AROUND = 0.7
 """Half of the image's side over the thing's width."""
 
@@ -98,7 +100,7 @@ def draw_setting(thing: Thing, rng: np.random.Generator) -> Setting:
         if rng.random() < ON_TOP:
             floor = -rng.uniform(0.02, 0.2)
             others.append(_stand(reach, floor, rng))
-        others += _neighbours(parts, floor, rng)
+        others = _with_neighbours(others, parts, floor, rng)
 
     elevation = np.deg2rad(rng.uniform(*rng.choice(_ELEVATIONS, p=_OFTEN)))
     roll = rng.normal(0, np.deg2rad(4.0)) if rng.random() < 0.93 else rng.uniform(-np.pi, np.pi)
@@ -172,9 +174,14 @@ def _stand(reach: np.ndarray, floor: float, rng: np.random.Generator) -> np.ndar
     return np.array([*half, -floor / 2, 0.05, e2, *middle, floor / 2, 0.0, 0.0, 0.0, 1.0])
 
 
-def _neighbours(parts: np.ndarray, floor: float, rng: np.random.Generator) -> list[np.ndarray]:
-    """Up to three parts (12,) beside the thing, as seen from above; many between it and the camera, many touch it."""
-    rows = []
+def _with_neighbours(
+    others: list[np.ndarray], parts: np.ndarray, floor: float, rng: np.random.Generator
+) -> list[np.ndarray]:
+    """Parts (12,), and up to three more beside the thing, as seen from above, of which none goes through another one.
+
+    Many are between it and the camera, many touch it.
+    """
+    rows = list(others)
     for _ in range(rng.choice((0, 0, 0, 0, 1, 1, 1, 2, 2, 3))):
         size = np.exp(rng.uniform(np.log(0.02), np.log(0.1), 3))
         shape = rng.uniform(0.1, 1.0, 2) ** [1.0, 0.7]
@@ -186,5 +193,11 @@ def _neighbours(parts: np.ndarray, floor: float, rng: np.random.Generator) -> li
         gap = 0.0 if rng.random() < 0.3 else rng.uniform(0, 0.08)
         far = flat_support(parts, way[None])[0] + flat_support(row[None], -way[None])[0] + gap
         row[5:7] = far * way[:2] + rng.normal(0, 0.02) * np.array([-way[1], way[0]])
-        rows.append(row)
+        if all(_apart(row[None], other[None]) for other in rows):
+            rows.append(row)
     return rows
+
+
+def _apart(row: np.ndarray, other: np.ndarray) -> bool:
+    """Whether one of some planes that stand on the table lies between both."""
+    return bool((flat_support(row, _LEVEL) + flat_support(other, -_LEVEL) <= 0).any())

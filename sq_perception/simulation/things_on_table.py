@@ -4,13 +4,14 @@ The table's frame has x to the right, y away from the camera, z up; its origin i
 from 0.5 to 1.2 m and, unless told otherwise, 20 to 70 degrees above the table.  Things rest in it:
 
     apart       somewhere on the table, at least 3 mm from all others
-    beside      pushed along the table against another one until they touch
+    beside      pushed along the table against another one until they touch, as seen from above
     leaning     tilted towards another one and pushed against it: its lowest edge is on the table, the other one, which
                 is high enough, holds its upper edge
     stacked     on a box or an upright can, its middle over the face that carries it
 
-Two convex bodies are apart if some plane lies between them; planes that stand on the table, in 32 directions, and the
-level ones between storeys are tried, so that nothing that is accepted penetrates.
+Two convex bodies are apart if some plane lies between them; planes that stand on the table, in 128 directions, and the
+level ones between storeys are tried, so that nothing that is accepted penetrates.  A push by t along w leaves the gap
+g_k + t n_k.w at the plane with the normal n_k; it ends where the widest one closes.
 
 Metres; depth is the z coordinate, +inf where nothing is.
 """
@@ -42,15 +43,19 @@ _WALL = (1.8, 3.5)
 _HOW = ("apart", "beside", "leaning", "leaning", "stacked", "stacked")
 """Tried; many a thing can neither lean nor be stacked where it is tried."""
 _GAP = 0.003
+_ALONG = 1e-6
+"""Of a unit vector: what comes no nearer than this to a plane moves along it."""
 _LEAN = tuple(np.deg2rad([8.0, 35.0]))
 _NEAREST = 0.35
 _TRIES = 60
 _SCENES = 15
 _MARGIN = 2.0
-_BEARINGS = np.linspace(0, 2 * np.pi, 32, endpoint=False)
+_UP, _DOWN = 128, 129
+"""The last of the directions that follow; of those before, opposite ones are half as far apart."""
+_BEARINGS = np.linspace(0, 2 * np.pi, _UP, endpoint=False)
+_QUARTER = _UP // 4
 _WAYS = np.concatenate([np.stack([np.cos(_BEARINGS), np.sin(_BEARINGS), 0 * _BEARINGS], axis=1), SIX_WAYS[[2, 5]]])
 _BACK = np.argmin(_WAYS @ _WAYS.T, axis=1)
-_UP, _DOWN = 32, 33
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,6 +134,16 @@ class _Resting:
         free = -(self.reach + other.reach[_BACK])
         return bool((free[:_UP] >= gap).any() or (free[_UP:] >= -1e-9).any())
 
+    def pushed(self, way: np.ndarray, other: _Resting) -> _Resting | None:
+        """Moved along the level ``way``, from before the other one, until it touches; None if it passes by."""
+        gap, closing = -(other.reach + self.reach[_BACK])[:_UP], -(_WAYS[:_UP] @ way)
+        comes = closing > _ALONG
+        ends = (gap[comes] / closing[comes]).max()
+        nearest = int(np.argmax(_WAYS[:_UP] @ way))
+        if (gap[~comes] >= 0).any() or ends > other.reach[nearest] + other.reach[_BACK[nearest]]:
+            return None
+        return self.at(self.shift + way * ends)
+
 
 def things_on_table(
     rng: np.random.Generator,
@@ -199,9 +214,9 @@ def _drawn(thing: Thing, how: str, others: list[_Resting], spread: float, rng: n
     if not able:
         return None
     other = able[rng.integers(len(able))]
-    middle = 0.5 * (other.reach - other.reach[_BACK]) @ _WAYS / 16
+    middle = 0.5 * (other.reach - other.reach[_BACK]) @ _WAYS / (_UP / 2)
     if how == "stacked":
-        face = 0.5 * np.array([other.reach[0] + other.reach[16], other.reach[8] + other.reach[24]])
+        face = 0.5 * (other.reach[: 2 * _QUARTER : _QUARTER] + other.reach[2 * _QUARTER : _UP : _QUARTER])
         at = middle[:2] + rng.uniform(-0.25, 0.25, 2) * face.min()
         return replace(body.at(np.array([*at, other.reach[_UP] + floor])), rest=f"stacked, {rest}")
     if other.reach[_DOWN] < -1e-3:  # itself not on the table
@@ -212,8 +227,8 @@ def _drawn(thing: Thing, how: str, others: list[_Resting], spread: float, rng: n
     aside = rng.normal(0, 0.01) if how == "leaning" else rng.normal(0, 0.03)
     # The plane across ``way`` that touches the other one, and this one from the other side.
     shift = way * (-where - reach) + along * (middle @ along + aside)
-    placed = body.at(np.array([*shift[:2], floor]))
-    if how == "leaning":
+    placed = body.at(np.array([*shift[:2], floor])).pushed(way, other)
+    if placed is not None and how == "leaning":
         if placed.reach[_UP] > other.reach[_UP] + 0.01 or thing.kind in ("round", "soft", "union"):
             return None
         return replace(placed, rest=f"leaning, {rest}")
