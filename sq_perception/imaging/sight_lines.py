@@ -36,10 +36,16 @@ _LAYER = 6.0
 """The layer ends where s (g^2 - 1) or the optical depth has this value: V, or what is still seen, is below 1/400."""
 
 
-def of_view(view: torch.Tensor, stride: int = 1, row: int = 0, column: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
-    """Lines (r, 2) of every ``stride``-th pixel of canonical views (n, p, p), and the views' values (n, r) there."""
+def of_view(
+    view: torch.Tensor, stride: int = 1, row: int = 0, column: int = 0, framing: str = "cropped"
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Lines (r, 2) of every ``stride``-th pixel of views (n, p, p), and the views' values (n, r) there.
+
+    Column k of a cropped canonical view is seen along x = (k + 1/2) / p; of a full frame, x = k / (p - 1).
+    """
     pixels = view.shape[-1]
-    centres = ((torch.arange(pixels, dtype=torch.float64, device=view.device) + 0.5) / pixels).to(view.dtype)
+    columns = torch.arange(pixels, dtype=torch.float64, device=view.device)
+    centres = (columns / (pixels - 1) if framing == "full" else (columns + 0.5) / pixels).to(view.dtype)
     y, x = torch.meshgrid(1 - centres[row::stride], centres[column::stride], indexing="ij")
     return torch.stack([x, y], dim=-1).reshape(-1, 2), view[..., row::stride, column::stride].flatten(-2)
 
@@ -67,7 +73,7 @@ def free_space_excess(bodies: Superquadric, lines: torch.Tensor, depth: torch.Te
 def soft_depth(
     bodies: Superquadric, lines: torch.Tensor, sharpness: float, density: float, cells: int = 12
 ) -> torch.Tensor:
-    """T (n, r) of each body alone, in [0, 1]; see the module.
+    """T (n, r) of each body alone, at least 0; see the module.
 
     Parameters
     ----------

@@ -56,6 +56,8 @@ class Objective:
     sharpness_start: float = 0.0
     sharpness_end: float = 0.0
     """s at the start and the end of the run; 0 takes the values of the table."""
+    framing: str = "cropped"
+    """Of the views."""
     stride: int = 2
     """Every ``stride``-th row and column of the view is a line of sight."""
 
@@ -93,7 +95,7 @@ class Objective:
             }[self.name]
             return compare(prediction, truth, torch.cat(around, dim=1), s)
         row, column = torch.randint(self.stride, (2,), generator=generator, device=views.device).tolist()
-        lines, depth = sight_lines.of_view(views[:, 0], self.stride, row, column)
+        lines, depth = sight_lines.of_view(views[:, 0], self.stride, row, column, self.framing)
         if self.name == "render":
             return losses.render_loss(prediction, lines, depth, s, _DENSITY * s)
         smallness = max(0.0, 1 - progress / _CURRICULUM)

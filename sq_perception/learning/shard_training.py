@@ -134,7 +134,8 @@ def train(subject: Subject[Network, Any], config: ShardTraining, views: Path, ou
         torch.set_num_threads(config.threads)
     torch.manual_seed(config.seed)
     output.mkdir(parents=True, exist_ok=True)
-    network = subject.network(config.start).to(device).train()
+    goes_on = (output / "state.safetensors").exists()  # and has all weights, though the start may be gone
+    network = subject.network("" if goes_on else config.start).to(device).train()
     optimizer = torch.optim.AdamW(network.parameters(), lr=config.rate, weight_decay=config.weight_decay)
     state = TrainingState(output / "state.safetensors", network, optimizer)
     rng = np.random.default_rng([config.seed, state.step])

@@ -23,7 +23,7 @@ import torch
 from sq_perception.geometry.support_directions import mirrored
 from sq_perception.learning import checkpoint, thing_network
 from sq_perception.learning.checkpoint import CheckpointError
-from sq_perception.learning.network_config import RegressorConfig, ThingConfig, mirrored_planes
+from sq_perception.learning.network_config import EXTENT, PLANE, RegressorConfig, ThingConfig, mirrored_planes
 from sq_perception.learning.shard_training import Subject
 from sq_perception.learning.thing_network import HullPrediction, ThingNetwork
 from sq_perception.simulation.household import KINDS
@@ -35,6 +35,8 @@ _UNKNOWN_EXTENT = 0.1
 """Share of the views whose extent is hidden from the network."""
 _BATCH = 256
 """Views of a validation that are computed at once."""
+_MORE = (1, PLANE + EXTENT)
+"""Inputs that layers of a Regressor do not have: the channel of heights; plane and extent."""
 
 
 def hull_loss(
@@ -110,7 +112,7 @@ def begin_with(network: ThingNetwork, path: Path) -> None:
                 continue
             if theirs.shape == mine.shape:
                 mine.copy_(theirs)
-            elif mine.ndim > 1 and theirs.shape[1] < mine.shape[1] and theirs.shape[0] == mine.shape[0]:
+            elif mine.ndim > 1 and mine.shape[1] - theirs.shape[1] in _MORE and theirs.shape[0] == mine.shape[0]:
                 mine.zero_()
                 mine[:, : theirs.shape[1]].copy_(theirs)
             else:

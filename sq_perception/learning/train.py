@@ -11,6 +11,7 @@ model.safetensors (the best one so far).
 from __future__ import annotations
 
 import json
+import math
 import signal
 import time
 from collections.abc import Callable, Iterator
@@ -33,7 +34,7 @@ from sq_perception.learning.fixed_set import FixedSet, ShuffledBatches
 from sq_perception.learning.inference import checked_device
 from sq_perception.learning.objective import Objective
 from sq_perception.learning.regressor import Regressor, RegressorConfig
-from sq_perception.learning.training_config import TrainingConfig
+from sq_perception.learning.training_config import Plateau, TrainingConfig
 from sq_perception.learning.training_state import (
     SETTINGS,
     TrainingState,
@@ -45,6 +46,8 @@ from sq_perception.learning.training_state import (
 
 _OF_A_RUN = ("loss", "backbone", "framing", "pixels", "canonical_labels", "optimizer")
 """Settings whose change makes another run; others may change when it goes on."""
+_VALIDATED = ("pinhole_share", "noisy_share", "occluded_share", "validation")
+"""Settings that decide what a network is validated on."""
 _FORM = ("backbone", "framing", "pixels")
 """Settings that a network to begin with brings along."""
 CALIBRATION_VIEWS, _CALIBRATION_BATCH = 2048, 32
@@ -96,11 +99,14 @@ def train(
     """
     device = torch.device(checked_device(config.device))
     with _threads(config.threads), _stop_requests() as stop_requested:
-        objective = Objective(config.loss, config.points, config.sharpness_start, config.sharpness_end)
         output.mkdir(parents=True, exist_ok=True)
-        _check_same_run(config, output)
         torch.manual_seed(config.seed)
         model = _new_network(config, network).to(device)
+        config = replace(config, **{name: getattr(model.config, name) for name in _FORM})
+        before = _check_same_run(config, output)
+        objective = Objective(
+            config.loss, config.points, config.sharpness_start, config.sharpness_end, framing=config.framing
+        )
         if config.batch == 1 and model.config.pixels == model.config.stride:
             raise ValueError(
                 f"batch: expected at least 2 with views of {model.config.pixels} pixels, of which one cell is left: "
@@ -110,6 +116,8 @@ def train(
         model.to(memory_format=layout)  # type: ignore[call-overload]
         settings = json.dumps(asdict(config))
         state = TrainingState(output / "state.safetensors", model, _optimizer(config, model), settings)
+        if any(before.get(name, getattr(config, name)) != getattr(config, name) for name in _VALIDATED):
+            state.best, state.plateau = -math.inf, Plateau()  # what was best was so of other views
         seed = np.random.SeedSequence([config.seed, state.step])
         generator = torch.Generator(device=device).manual_seed(int(seed.generate_state(1)[0]))
         batches = _batches(config, model.config, np.random.default_rng(seed))
@@ -157,11 +165,11 @@ def train(
         return state.average.eval()
 
 
-def _check_same_run(config: TrainingConfig, output: Path) -> None:
-    """Raise CheckpointError where a folder holds the state of a run of another kind, naming what differs."""
+def _check_same_run(config: TrainingConfig, output: Path) -> dict[str, Any]:
+    """The settings of the run so far; CheckpointError where it is of another kind, naming what differs."""
     state = output / "state.safetensors"
     if not state.exists():
-        return
+        return {}
     # States of 0.2.0 name no settings; the newest network of their run does, from its first validation on.
     named = [path for path in (state, output / "last.safetensors") if SETTINGS in _header(path)]
     try:
@@ -174,6 +182,7 @@ def _check_same_run(config: TrainingConfig, output: Path) -> None:
         raise checkpoint.CheckpointError(
             f"{output}: holds a run with {differences}: expected another --output, or the same settings"
         )
+    return before
 
 
 def _header(path: Path) -> dict[str, str]:
@@ -238,15 +247,17 @@ def _batches(config: TrainingConfig, network: RegressorConfig, rng: np.random.Ge
 def _validation_sets(config: TrainingConfig, network: RegressorConfig) -> dict[str, tuple[np.ndarray, Superquadric]]:
     """Views and bodies that no run trains on: the thesis' images, and what a real camera makes of them."""
     count, pixels = config.validation, network.pixels
-    sets = {"iou": draw_views(count, np.random.default_rng(0), ViewSource(pixels, framing=network.framing))}
+    # A seed of its own kind: [0], [0, 0] and [0, 0, 0], of a run and of a fixed set, are the same numbers.
+    seed = np.random.SeedSequence(0, spawn_key=(0,))
+    sets = {"iou": draw_views(count, np.random.default_rng(seed), ViewSource(pixels, framing=network.framing))}
     if config.pinhole_share > 0:
-        sets["iou_pinhole"] = draw_views(count, np.random.default_rng(0), ViewSource(pixels, 1.0))
+        sets["iou_pinhole"] = draw_views(count, np.random.default_rng(seed), ViewSource(pixels, 1.0))
     if config.noisy_share > 0:
-        rng = np.random.default_rng(0)
+        rng = np.random.default_rng(seed)
         near, bodies = draw_views(count, rng, ViewSource(pixels, config.pinhole_share))
         sets["iou_worn"] = Disturbance(noisy_share=1.0).applied(near, rng), bodies
     if config.occluded_share > 0:
-        rng = np.random.default_rng(0)
+        rng = np.random.default_rng(seed)
         occluder = any_occluder(np.full(count, VALIDATION_HIDDEN), rng)
         sets["iou_hidden"] = draw_views(count, rng, ViewSource(pixels, config.pinhole_share), occluder)
     if config.canonical_labels:  # what is given to the network counts as it was given in training

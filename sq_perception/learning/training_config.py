@@ -127,6 +127,7 @@ class TrainingConfig:
     """cosine: warm up, then fall to 0; plateau: divide by 10 after 10 validations without progress, stop after 20."""
     learning_rate: float = 1.5e-3
     weight_decay: float = 1e-2
+    """Of adamw; adam has none."""
     warm_up: int = 400
     """Steps over which the learning rate rises under the cosine schedule."""
     average: float = 0.999

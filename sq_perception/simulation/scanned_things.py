@@ -23,8 +23,8 @@ LARGEST, SMALLEST = 1.0, 0.005
 """Longest edge of the box around a thing, metres: others are taken for other units."""
 _POINT = 1e-5
 """Half size of a superquadric that stands for a point, metres."""
-_UNLIKELY = 0.01
-"""Share of the falls below which a pose is left out; not of a ball, which lies in so many that each is unlikely."""
+_USUAL = 0.99
+"""Share of the falls whose poses are kept, the likeliest first: each of a finely divided round side is unlikely."""
 
 
 def read_things(folder: Path) -> tuple[Thing, ...]:
@@ -35,7 +35,7 @@ def read_things(folder: Path) -> tuple[Thing, ...]:
     ValueError
         If there are none, one cannot be read or has no faces, or its size is none that one takes in a hand.
     """
-    paths = sorted(path for path in folder.glob("*") if path.suffix.lower() in SUFFIXES)
+    paths = sorted(path for path in folder.glob("[!.]*") if path.suffix.lower() in SUFFIXES)
     if not paths:
         raise ValueError(f"{folder}: expected meshes ({' '.join(SUFFIXES)}), found none")
     return tuple(_read(path) for path in paths)
@@ -46,7 +46,10 @@ def _read(path: Path) -> Thing:
 
     try:
         mesh = trimesh.load_mesh(path, process=False)
+        mesh.remove_unreferenced_vertices()  # nobody sees them
         hull = mesh.convex_hull
+        if not hull.volume > 0:
+            raise ValueError("it is flat")  # and trimesh would look for its poses for ever
         turns, likely = hull.compute_stable_poses()
     except Exception as error:  # whatever a reader of one of many formats raises
         raise ValueError(f"{path}: no mesh with a volume: {error}") from error
@@ -59,7 +62,8 @@ def _read(path: Path) -> Thing:
     corners = hull.vertices - middle
     points = np.zeros((len(corners), 12))
     points[:, :3], points[:, 3:5], points[:, 5:8], points[:, 11] = _POINT, 1.0, corners, 1.0
-    kept = likely > _UNLIKELY if likely.max() > _UNLIKELY else likely > 0
+    order = np.argsort(-likely, kind="stable")
+    kept = order[: np.searchsorted(np.cumsum(likely[order]), _USUAL * likely.sum()) + 1]
     turns, likely = turns[kept], likely[kept]
     rests = tuple(
         Rest(f"face {k}", quaternions.from_matrix(turn[:3, :3]), float(share))

@@ -8,7 +8,7 @@ import torch
 from unit_axis import cell_centres
 
 from sq_perception.geometry import Superquadric
-from sq_perception.imaging import sight_lines, soft_render
+from sq_perception.imaging import sight_lines, soft_render, unit_cube
 from sq_perception.simulation.scenes import thesis_bodies
 from sq_perception.simulation.view_rendering import render_views
 
@@ -33,6 +33,14 @@ class TestLines:
         lines, values = sight_lines.of_view(view, 2, row=1, column=0)
         assert values.tolist() == [[4, 6, 12, 14]]
         assert lines.tolist() == [[0.125, 0.625], [0.625, 0.625], [0.125, 0.125], [0.625, 0.125]]
+
+    def test_pixels_of_full_frames_lie_where_the_camera_of_the_cube_has_them(self) -> None:
+        camera = unit_cube.camera(5)
+        lines, _ = sight_lines.of_view(torch.zeros(1, 5, 5), framing="full")
+        v, u = np.indices((5, 5)).reshape(2, -1)
+        points = camera.unproject(u, v, np.full(25, 0.5))
+        expected = np.stack([points[:, 0], 1 - points[:, 1]], axis=1)
+        np.testing.assert_allclose(lines.numpy(), expected, atol=1e-7)
 
     def test_nearest_approach_of_ellipsoids_in_closed_form(self) -> None:
         """g^2 = p' M p with M = R diag(1/a^2) R' is least where its derivative along z, (M p)_z, is zero."""

@@ -104,6 +104,28 @@ class TestConfig:
         assert "no such configuration file" in capsys.readouterr().err
 
 
+class TestValidation:
+    def test_no_seed_trains_on_it(self, tmp_path: Path) -> None:
+        """NumPy takes [0] and [0, 0, 0], a run's and a set's numbers, for the same seed."""
+        kept = train._validation_sets(replace(RUN, validation=8), SMALL)["iou"][1].size
+        for seed in ([0], [0, 0], [0, 0, 0]):
+            assert not np.isin(kept, thesis_bodies(8, np.random.default_rng(seed)).size).any()
+
+    def test_a_run_that_goes_on_with_other_views_begins_to_compare_anew(self, tmp_path: Path) -> None:
+        form = replace(SMALL, marks_hidden=True)
+        train.train(RUN, tmp_path, form)
+        train.train(replace(RUN, steps=60, noisy_share=0.5, occluded_share=0.5), tmp_path, form)
+        metrics = json.loads(checkpoint.read_header(tmp_path / "model.safetensors")["metrics"])
+        assert {"iou_worn", "iou_hidden"} <= set(metrics)
+
+    def test_the_form_of_a_start_counts(self, tmp_path: Path) -> None:
+        """Full frames that its configuration does not name are no views to put noise on."""
+        train.train(replace(RUN, steps=2), tmp_path / "full", replace(SMALL, framing="full"))
+        start = str(tmp_path / "full" / "last.safetensors")
+        with pytest.raises(ValueError, match="full frames are the thesis' images"):
+            train.train(replace(RUN, start=start, noisy_share=0.5), tmp_path / "next")
+
+
 class TestSchedule:
     def test_cosine_rises_and_falls_to_zero(self) -> None:
         assert cosine(0, 10, 100) == pytest.approx(0.1)

@@ -111,6 +111,21 @@ def test_cavities_stay_within_the_outside_of_a_vessel() -> None:
         assert (support_of_union(thing.cavities, ways) < thing.support(ways)).all()
 
 
+@pytest.mark.parametrize("kind", ["vessel", "can"])
+def test_no_wall_has_a_slit(kind: str) -> None:
+    """What bounds a cavity below its rim lies inside the union."""
+    rng = np.random.default_rng(7)
+    checked = 0
+    for thing in (draw_thing(rng, [kind]) for _ in range(100)):
+        for cavity in thing.cavities:
+            surface = cavity.sample_surface(500, rng, oversampling=2)
+            inner = surface[np.abs(surface[:, 2]) < abs(cavity.translation[2]) - 0.001]
+            if len(inner):
+                assert thing.parts.gauge(inner).min(axis=0).max() < 1
+                checked += 1
+    assert checked > 30
+
+
 def test_the_same_seed_draws_the_same_things() -> None:
     first, second = ([draw_thing(np.random.default_rng(7)) for _ in range(3)] for _ in range(2))
     for one, other in zip(first, second, strict=True):

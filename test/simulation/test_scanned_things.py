@@ -140,3 +140,29 @@ def test_what_is_no_thing_is_refused(tmp_path: Path) -> None:
     (tmp_path / "broken.ply").write_bytes(b"ply\nnothing")
     with pytest.raises(ValueError, match="no mesh with a volume"):
         read_things(tmp_path)
+
+
+@pytest.mark.parametrize("sides", [32, 300])
+def test_a_round_thing_lies_as_often_however_finely_it_is_divided(tmp_path: Path, sides: int) -> None:
+    trimesh.creation.cylinder(0.03, 0.15, sections=sides).export(tmp_path / "can.ply")
+    (thing,) = read_things(tmp_path)
+    standing = sum(rest.likely for rest in thing.rests if abs(quaternions.to_matrix(rest.turn)[2, 2]) > 0.9)
+    assert standing == pytest.approx(0.071, abs=0.02)
+
+
+def test_points_of_no_face_are_no_part_of_a_thing(folder: Path) -> None:
+    box = trimesh.creation.box(EDGES)
+    stray = trimesh.Trimesh(np.concatenate([box.vertices, [[0.5, 0.5, 0.5]]]), box.faces, process=False)
+    stray.export(folder / "crate.ply")
+    (thing,) = read_things(folder)
+    low, high = thing.box
+    np.testing.assert_allclose(high - low, EDGES, atol=1e-4)
+
+
+def test_a_flat_sheet_is_refused_and_hidden_files_are_passed_over(tmp_path: Path, folder: Path) -> None:
+    (folder / "._crate.ply").write_bytes(b"of a file system")
+    assert len(read_things(folder)) == 1
+    vertices = np.array([[0, 0, 0], [0.1, 0, 0], [0.1, 0.1, 0], [0, 0.1, 0.0]])
+    trimesh.Trimesh(vertices, [[0, 1, 2], [0, 2, 3]], process=False).export(folder / "sheet.ply")
+    with pytest.raises(ValueError, match=r"sheet\.ply: no mesh with a volume"):
+        read_things(folder)

@@ -277,3 +277,18 @@ def test_what_a_thing_stands_on_touches_it() -> None:
         heights.append(float(setting.table[3] - setting.under[3]))
     assert 0.02 < np.mean(np.array(heights) > 0) < 0.25
     assert max(heights) > 0.02
+
+
+def test_what_is_around_a_thing_does_not_go_through_itself() -> None:
+    rng = np.random.default_rng(12)
+    pairs = 0
+    for _ in range(150):
+        setting = draw_setting(draw_thing(rng), rng)
+        others = setting.others
+        surfaces = [other.sample_surface(200, rng, oversampling=2) for other in others]
+        for i, other in enumerate(others):
+            for j, points in enumerate(surfaces):
+                if i != j:
+                    assert other.gauge(points).min() > 0.97
+                    pairs += 1
+    assert pairs > 20

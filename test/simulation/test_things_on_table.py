@@ -8,6 +8,7 @@ import pytest
 from sq_perception.geometry.support_directions import DIRECTIONS
 from sq_perception.geometry.union import support_of_union
 from sq_perception.imaging.camera import Camera
+from sq_perception.simulation import things_on_table as module
 from sq_perception.simulation.things_on_table import ThingsOnTable, things_on_table
 
 SMALL = Camera(160, 120, 138.6, 138.6, 79.5, 59.5)
@@ -41,6 +42,27 @@ def test_things_do_not_penetrate(scenes: list[ThingsOnTable]) -> None:
             for j, points in enumerate(surfaces):
                 if i != j:
                     assert placed.parts.gauge(points).min() > 1 - 1e-3
+
+
+@pytest.mark.parametrize("how", ["beside", "leaning"])
+def test_things_that_are_pushed_touch(monkeypatch: pytest.MonkeyPatch, how: str) -> None:
+    """Most hulls have another one within 3 mm; things of other heights touch only as seen from above."""
+    monkeypatch.setattr(module, "_HOW", (how,))
+    rng = np.random.default_rng(8)
+    ways = rng.normal(size=(4000, 3))
+    ways /= np.linalg.norm(ways, axis=1, keepdims=True)
+    near = count = 0
+    for seed in range(12):
+        first, *others = things_on_table(np.random.default_rng([6, seed]), 4, SMALL).placed
+        known = [first]
+        for placed in others:
+            gaps = [
+                -(support_of_union(placed.parts, ways) + support_of_union(other.parts, -ways)).min() for other in known
+            ]
+            known.append(placed)
+            near += min(gaps) < 0.003
+            count += 1
+    assert near > 0.5 * count
 
 
 def test_labels_are_those_of_things_in_the_image(scenes: list[ThingsOnTable]) -> None:
