@@ -6,6 +6,10 @@
 | ``525,525,319.5,239.5`` | papers and data sets: fx, fy, cx, cy in pixels, of an image without distortion |
 | JSON with ``ppx``, ``ppy`` | librealsense (``rs-enumerate-devices``, ``rs2_intrinsics``) |
 | JSON with ``intrinsic_matrix`` | Open3D: nine numbers, COLUMN by column |
+| JSON or YAML with ``fx``, ``fy``, ``cx``, ``cy``, or ``cam_K`` | BOP's camera.json, and many programs |
+| 3 x 3 numbers, row by row: text, NPY | ``cam_K.txt`` of FoundationPose, ``intrinsics.txt``, NumPy's savetxt |
+
+Forms without a size are of the images' size.
 
 A pixel's centre has integer coordinates, in all of them.
 """
@@ -14,6 +18,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import reprlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,13 +27,16 @@ from typing import Any
 import numpy as np
 
 from sq_perception.files import plain_yaml
+from sq_perception.files.unpacking import UnpackingError, npy_array
 from sq_perception.imaging.calibration import Calibration, Treatment
 
 LARGEST = 2**20
 """Bytes of a file."""
+_LONGEST = 2**12
+"""Bytes of a file that holds nothing but a matrix."""
 _SKEW = 1e-6
 """Of fx; no depth camera in use has any."""
-_MATRIX, _PROJECTION = ("camera_matrix", "k", "K"), ("projection_matrix", "p", "P")
+_MATRIX, _PROJECTION = ("camera_matrix", "k", "K", "cam_K"), ("projection_matrix", "p", "P")
 _NO_DISTORTION = ("none", "")
 _BROWN_CONRADY = ("brown conrady", "inverse brown conrady", "modified brown conrady")
 """Names of librealsense.  Of depth images the coefficients are zero; others are taken for plumb_bob's."""
@@ -95,18 +103,25 @@ def read_camera_info(source: str | Path, size: tuple[int, int] | None = None) ->
         matrix = (fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0)
         return CameraInfo(*size, "plumb_bob", (), matrix, (0.0,) * 12, 0, 0, Region())
     try:
-        return _camera_info(Path(source))
+        return _camera_info(Path(source), size)
     except (plain_yaml.YamlError, FrameError) as error:
         raise FrameError(f"{source}: cannot read the camera_info: {error}") from error
 
 
-def _camera_info(path: Path) -> CameraInfo:
-    if path.suffix.lower() == ".json":
-        info: Any = _read_json(path)
+def _camera_info(path: Path, size: tuple[int, int] | None) -> CameraInfo:
+    rows = _rows(path)
+    if rows is not None:
+        info: Any = {"k": rows}
+    elif path.suffix.lower() == ".json":
+        info = _read_json(path)
     else:
         info = next((entry for entry in plain_yaml.read_all(path) if entry is not None), None)
     if not isinstance(info, dict):
-        raise FrameError("expected a camera_info as a YAML mapping")
+        raise FrameError("expected a camera_info as a YAML mapping, or 3 x 3 numbers")
+    info = {**info, "k": _of_four(info)} if info.keys() >= {"fx", "fy", "cx", "cy"} else info
+    has_size = bool(info.keys() & {"image_width", "width", "image_height", "height"})
+    if size is not None and not has_size and info.keys() & {*_MATRIX, *_PROJECTION}:
+        info = {**info, "width": size[0], "height": size[1]}
     width, height = (_size(info, names) for names in (("image_width", "width"), ("image_height", "height")))
     matrix = _matrix(info, _MATRIX, 9)
     distortion = _matrix(info, ("distortion_coefficients", "d", "D"), None)
@@ -131,6 +146,34 @@ def _camera_info(path: Path) -> CameraInfo:
         _count(info, "binning_y"),
         Region(*(_count(region, name) for name in ("x_offset", "y_offset", "width", "height"))),
     )
+
+
+def _rows(path: Path) -> list[float] | None:
+    """The nine numbers of a file that holds nothing but a matrix, 3 x 3, or a larger one around it; else None."""
+    if path.suffix.lower() == ".npy":
+        try:
+            matrix = npy_array(path)
+        except UnpackingError as error:
+            raise FrameError(str(error)) from error
+    else:
+        try:
+            with path.open("rb") as file:
+                words = re.split(r"[\s,;\[\]]+", file.read(_LONGEST + 1).decode("ascii"))
+            matrix = np.array([float(word) for word in words if word])
+        except (OSError, ValueError):
+            return None
+        shape = {9: (3, 3), 12: (3, 4), 16: (4, 4)}.get(matrix.size)
+        if shape is None:
+            return None
+        matrix = matrix.reshape(shape)
+    if matrix.shape not in ((3, 3), (3, 4), (4, 4)) or matrix.dtype.kind not in "fiu":
+        raise FrameError(f"expected 3 x 3 numbers, got {matrix.dtype} {matrix.shape}")
+    return [float(number) for number in matrix[:3, :3].ravel()]
+
+
+def _of_four(info: dict[Any, Any]) -> list[Any]:
+    """The matrix, row by row, of the four numbers that a mapping names."""
+    return [info["fx"], 0, info["cx"], 0, info["fy"], info["cy"], 0, 0, 1]
 
 
 def _four_numbers(text: str) -> list[float] | None:

@@ -5,7 +5,8 @@ themselves, as u = fx x / z + cx.  Any other cloud is looked at from the origin:
 Nothing is then known of the space beside an object (``RecordedFrame.has_free_space``), as points of several views, or
 thinned ones, leave gaps through which one sees what is behind.  Points far off the axis are left out.
 
-References: PCD, https://pointclouds.org/documentation/tutorials/pcd_file_format.html; trimesh reads PLY.
+References: PCD, https://pointclouds.org/documentation/tutorials/pcd_file_format.html; LZF, which packs it, is
+http://oldhome.schmorp.de/marc/liblzf.html; trimesh reads PLY.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from sq_perception.files.unpacking import MOST_BYTES, MOST_PIXELS, UnpackingError
+from sq_perception.geometry.kernels import kernel
 from sq_perception.imaging.camera import Camera
 
 SUFFIXES = (".pcd", ".ply")
@@ -75,6 +77,8 @@ def as_image(points: np.ndarray) -> tuple[np.ndarray, Camera, bool]:
         there = np.isfinite(points).all(axis=2) & (points[..., 2] != 0)
         before = there & (points[..., 2] > _NEAREST) & (points[..., 2] < _FARTHEST)
     expected = f"expected {_LEAST_POINTS} points or more, most of them before the camera: z forward, y down"
+    if np.count_nonzero(there & (points[..., 2] < 0)) > 0.5 * np.count_nonzero(there):
+        expected += " (of clouds with z backward, as graphics has it, negate z, and y where it is up)"
     if np.count_nonzero(before) < max(_LEAST_POINTS, 0.5 * np.count_nonzero(there)):
         raise UnpackingError(expected)
     if points.shape[0] > 1:
@@ -147,7 +151,52 @@ def _pcd(data: bytes) -> np.ndarray:
         table = np.array(data[at:].split(), dtype=float).reshape(count, columns[-1])
         return table[:, [columns[k] for k in where]].reshape(height, width, 3)
     layout = np.dtype([(f"{k}", kind, (number,)) for k, (kind, number) in enumerate(zip(kinds, counts, strict=True))])
+    if head["DATA"] == ["binary_compressed"]:
+        # Packed column by column: all x, then all y.
+        packed, size = (int(number) for number in np.frombuffer(data, "<u4", 2, at))
+        if size != count * layout.itemsize or size > MOST_BYTES or packed > len(data) - at - 8:
+            raise UnpackingError(f"expected {count * layout.itemsize} bytes of points, got {size} in {packed}")
+        unpacked = np.zeros(size, np.uint8)
+        if not _unpack(np.frombuffer(data, np.uint8, packed, at + 8), unpacked):
+            raise UnpackingError("expected bytes that LZF packed")
+        ends = count * np.cumsum([0, *(layout[k].itemsize for k in range(len(kinds)))])
+        parts = [unpacked[ends[k] : ends[k + 1]].view(kinds[k]).reshape(count, counts[k])[:, 0] for k in where]
+        return np.stack(parts, axis=1).reshape(height, width, 3)
     if head["DATA"] != ["binary"]:
-        raise UnpackingError(f"DATA: expected ascii or binary, got {' '.join(head['DATA'])}")
+        raise UnpackingError(f"DATA: expected ascii, binary or binary_compressed, got {' '.join(head['DATA'])}")
     rows = np.frombuffer(data, layout, count, at)
     return np.stack([rows[f"{k}"][:, 0] for k in where], axis=1).reshape(height, width, 3)
+
+
+@kernel
+def _unpack(packed: np.ndarray, out: np.ndarray) -> bool:
+    """Whether LZF's bytes unpack to just as many as ``out`` holds: runs of literals, and copies of what came before."""
+    i, n, to = 0, len(packed), 0
+    while i < n:
+        control = int(packed[i])
+        i += 1
+        if control < 32:
+            length = control + 1
+            if i + length > n or to + length > len(out):
+                return False
+            for k in range(length):
+                out[to + k] = packed[i + k]
+            i += length
+        else:
+            length = control >> 5
+            if length == 7:
+                if i >= n:
+                    return False
+                length += int(packed[i])
+                i += 1
+            length += 2
+            if i >= n:
+                return False
+            start = to - ((control & 31) << 8) - int(packed[i]) - 1
+            i += 1
+            if start < 0 or to + length > len(out):
+                return False
+            for k in range(length):
+                out[to + k] = out[start + k]
+        to += length
+    return to == len(out)

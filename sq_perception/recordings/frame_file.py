@@ -254,6 +254,8 @@ def _read(
         raise ValueError(f"expected a name that ends in {', '.join(SUFFIXES)}")
     image = {".npy": npy_array, ".exr": exr_image}.get(suffix, grey_image)(path)
     image = image.astype(image.dtype.newbyteorder("="), copy=False)
+    if image.ndim == 3 and 1 in (image.shape[0], image.shape[2]):  # of one channel, as programs for networks have it
+        image = image.reshape(image.shape[1:] if image.shape[0] == 1 else image.shape[:2])
     if image.ndim != 2 or not image.size:
         raise ValueError(f"expected an image (height, width), got {image.shape}")
     if projection == "orthographic":
@@ -281,11 +283,15 @@ def _read(
             f"{path.parent}: names as in the TUM RGB-D benchmark, so {TUM_SCALE:g} units are a metre; "
             f"depth scale = {MILLIMETRES:g} takes them for millimetres"
         )
+    camera = calibration.camera
+    if not (-1 < camera.cx < camera.width and -1 < camera.cy < camera.height):
+        middle, shape = f"{camera.cx:g}, {camera.cy:g}", f"{camera.width} x {camera.height}"
+        warnings.append(f"{camera_info}: the middle {middle} is beside an image of {shape}: another resolution's?")
     depth, labels = calibration.rectified(_metres(image, scale)), reading.labels(path.stem, image)
     labels = None if labels is None else calibration.rectified_labels(labels)
     encoding = "16UC1" if scale == MILLIMETRES and not is_metric else "32FC1"
     warning = "; ".join(warnings)
-    return RecordedFrame(depth, calibration.camera, labels, path.name, warning=warning, encoding=encoding)
+    return RecordedFrame(depth, camera, labels, path.name, warning=warning, encoding=encoding)
 
 
 def stamp_of(path: Path) -> Stamp | None:

@@ -9,6 +9,7 @@ import trimesh
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
+from sq_perception.recordings import cloud_file
 from sq_perception.recordings.cloud_file import UNORGANISED
 from sq_perception.recordings.frame_file import FrameError, Reading, read
 from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
@@ -42,7 +43,13 @@ POINTS {width * height}
 DATA {kind}
 """
     flat = cloud.reshape(-1, 3).astype("<f4")
-    if kind == "ascii":
+    if kind == "binary_compressed":
+        count = len(flat)
+        columns = b"".join(column.tobytes() for column in flat.T) + bytes(4 * count) + bytes(4 * count)
+        literals = (columns[k : k + 32] for k in range(0, len(columns), 32))
+        packed = b"".join(bytes([len(part) - 1]) + part for part in literals)
+        body = np.array([len(packed), len(columns)], "<u4").tobytes() + packed
+    elif kind == "ascii":
         body = "\n".join(f"{x} {y} {z} 0 0 0 0 0.5" for x, y, z in flat).encode()
     else:
         rows = np.zeros(len(flat), np.dtype([("p", "<f4", 3), ("_", "u1", 4), ("rgb", "<f4")]))
@@ -52,7 +59,7 @@ DATA {kind}
     return path
 
 
-@pytest.mark.parametrize("kind", ["ascii", "binary"])
+@pytest.mark.parametrize("kind", ["ascii", "binary", "binary_compressed"])
 def test_an_organised_cloud_is_its_depth_image(tmp_path, kind):
     depth, cloud = points()
     frame = read(pcd(tmp_path / "a.pcd", cloud, kind))
@@ -64,6 +71,18 @@ def test_an_organised_cloud_is_its_depth_image(tmp_path, kind):
     assert (
         read(pcd(tmp_path / "a.pcd", 1e3 * cloud), reading=Reading(scale=1000.0)).depth[50, 50] == frame.depth[50, 50]
     )
+
+
+def test_lzf_copies_what_came_before_and_stays_within_its_buffers():
+    def unpacked(packed: bytes, size: int) -> bytes | None:
+        out = np.zeros(size, np.uint8)
+        return out.tobytes() if cloud_file._unpack(np.frombuffer(packed, np.uint8), out) else None
+
+    assert unpacked(b"\x02abc" + bytes([4 << 5, 2]), 9) == b"abcabcabc"
+    assert unpacked(b"\x00a" + bytes([7 << 5, 11, 0]), 21) == b"a" * 21
+    short, long, cut = (b"\x02abc", 4), (b"\x02abc", 2), (b"\x05abc", 6)
+    for packed, size in (short, long, cut, (b"\x00a\x80\x05", 7), (b"\x00a\xe0", 9)):
+        assert unpacked(packed, size) is None
 
 
 def test_a_comment_may_have_any_letters(tmp_path):
@@ -134,7 +153,10 @@ def test_no_free_space_means_that_what_is_beside_says_nothing(monkeypatch):
         (b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 100000\nHEIGHT 100000\nDATA binary\n", "points, got"),
         (b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 10\nHEIGHT 1\nDATA binary\n1234", "not a readable cloud"),
         (b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 10\nHEIGHT 1\nDATA zipped\n", "got zipped"),
-        (b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 10\nHEIGHT 1\nDATA binary_compressed\n1234", "ascii or binary"),
+        (
+            b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 10\nHEIGHT 1\nDATA binary_compressed\n1234",
+            "not a readable cloud",
+        ),
         (b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 1\nHEIGHT 1\nDATA ascii\n1 2 3\n", "or more"),
     ],
 )

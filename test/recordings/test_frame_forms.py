@@ -335,3 +335,32 @@ def test_a_folder_of_names_that_are_times_gives_them_by_time(tmp_path):
     save(tmp_path / "5.1_b.png")
     found = list(RecordedInput([str(tmp_path)], InputOptions(NUMBERS)))
     assert [frame.name for _, frame in found][:4] == ["5.0.png", "5.1.png", "5.1_b.png", "5.05.png"]
+
+
+@pytest.mark.parametrize(
+    ("name", "text"),
+    [
+        ("cam_K.txt", "60 0 31.5\n0 61 23.5\n0 0 1\n"),
+        ("intrinsics.csv", "60,0,31.5,0\n0,61,23.5,0\n0,0,1,0\n0,0,0,1\n"),
+        ("camera.json", '{"fx": 60, "fy": 61, "cx": 31.5, "cy": 23.5, "depth_scale": 1.0}'),
+        ("scene.json", '{"cam_K": [60, 0, 31.5, 0, 61, 23.5, 0, 0, 1]}'),
+        ("camera.yaml", "fx: 60\nfy: 61\ncx: 31.5\ncy: 23.5\n"),
+    ],
+)
+def test_intrinsics_without_a_size_are_of_the_images(tmp_path, name, text):
+    (tmp_path / name).write_text(text)
+    assert read(save(tmp_path / "a.png"), tmp_path / name).camera == CAMERA
+
+
+def test_intrinsics_of_another_resolution_are_noticed(tmp_path):
+    assert not read(save(tmp_path / "a.png"), NUMBERS).warning
+    assert "another resolution's?" in read(save(tmp_path / "a.png"), "600,610,315,235").warning
+
+
+def test_an_image_of_one_channel_is_one(tmp_path):
+    depth = np.full((48, 64), 0.8, np.float32)
+    for k, shape in enumerate(((48, 64, 1), (1, 48, 64))):
+        np.save(tmp_path / f"{k}.npy", depth.reshape(shape))
+        np.testing.assert_array_equal(read(tmp_path / f"{k}.npy", NUMBERS).depth, depth)
+    np.save(tmp_path / "K.npy", CAMERA.matrix)
+    assert read(tmp_path / "0.npy", tmp_path / "K.npy").camera == CAMERA
