@@ -7,6 +7,9 @@ import numpy as np
 
 from sq_perception.geometry.kernels import kernel
 
+_OPEN = 0.1
+"""Share of a region's border from which on it is not enclosed by others."""
+
 
 def nearest(wanted: np.ndarray) -> np.ndarray:
     """Of each pixel (height, width) the nearest one of some, bool, at least one: its index into the flat image."""
@@ -98,3 +101,34 @@ def _extents(labels: np.ndarray, count: int) -> np.ndarray:
                 extent[3] = min(extent[3], first)
                 extent[4] = max(extent[4], u)
     return found
+
+
+def contacts(labels: np.ndarray, known: np.ndarray, count: int) -> np.ndarray:
+    """How often each two of the labels 0 to ``count`` (count + 1, count + 1) are next to each other along the rows and
+    the columns of an image, across pixels that are not ``known``; the image's border is of label 0."""
+    labels = np.ascontiguousarray(labels, dtype=np.int32)
+    met = _contacts(labels, np.ascontiguousarray(known), count)
+    return np.asarray(met + met.T)
+
+
+def enclosed(met: np.ndarray) -> np.ndarray:
+    """Which labels (n,) are next to others nearly all around, hardly to 0, by their :func:`contacts`."""
+    return np.asarray(met[:, 0] < _OPEN * met.sum(axis=1))
+
+
+@kernel
+def _contacts(labels: np.ndarray, known: np.ndarray, count: int) -> np.ndarray:
+    met = np.zeros((count + 1, count + 1))
+    above = np.zeros(labels.shape[1], np.int32)
+    for v in range(labels.shape[0]):
+        left = 0
+        for u in range(labels.shape[1]):
+            if known[v, u]:
+                label = labels[v, u]
+                met[left, label] += left != label
+                met[above[u], label] += above[u] != label
+                left = above[u] = label
+        met[left, 0] += left != 0
+    for u in range(labels.shape[1]):
+        met[above[u], 0] += above[u] != 0
+    return met

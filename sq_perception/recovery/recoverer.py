@@ -379,7 +379,8 @@ def _wrong_unit(depth: np.ndarray, camera: Camera) -> str:
     some = some[np.isfinite(some)]
     if not camera.is_pinhole or not some.size or quantile(some, 0.5) <= GREATEST_MEDIAN:
         return ""
-    return f"half of the image is farther than {GREATEST_MEDIAN:g} m: depths are metres, not millimetres (recover has --depth-scale)"
+    unit = "depths are metres, not millimetres (recover has --depth-scale)"
+    return f"half of the image is farther than {GREATEST_MEDIAN:g} m: {unit}"
 
 
 def _why_empty(depth: np.ndarray, found: segments.Segmentation, labels: np.ndarray | None) -> str:

@@ -146,6 +146,10 @@ def _continued(patches: Patches, body: np.ndarray, camera: Camera) -> np.ndarray
         z = 1 / np.einsum("ij,ij->i", rays, patches.planes)
         distance = np.abs(1 - z[None, :] * (patches.planes @ rays.T)) / length[:, None]
         coplanar = (normals @ normals.T > np.cos(_PLANE_ANGLE)) & (np.maximum(distance, distance.T) < _PLANE_DISTANCE)
+    # The bottoms of vessels that stand side by side lie in one plane, too, but end at their walls.
+    met = regions.contacts(body[patches.labels], patches.depth > 0, int(body.max()))
+    ends = regions.enclosed(met)[body]
+    coplanar &= ~(ends[:, None] | ends[None, :])
     a, b = np.nonzero(np.triu(coplanar & (body[:, None] != body[None, :]), 1))
     weights = np.zeros((n, n))
     if a.size == 0:
@@ -157,8 +161,11 @@ def _continued(patches: Patches, body: np.ndarray, camera: Camera) -> np.ndarray
         "pki,pi->pk", _rays(way, patches.stride, camera), 0.5 * (patches.planes[a] + patches.planes[b])
     )
     measured = patches.depth[r, c] * expected
-    farther = np.mean(measured > 1 + patches.depth_step, axis=1)
-    other = body[patches.labels[r, c]]
+    # So is the support: it may be less than a step below the bottoms of two vessels.
+    seen = patches.labels[r, c]
+    bare = (seen == 0) & (patches.depth[r, c] > 0) & (measured > 1 - patches.depth_step)
+    farther = np.mean((measured > 1 + patches.depth_step) | bare, axis=1)
+    other = body[seen]
     other = (other > 0) & (other != body[a][:, None]) & (other != body[b][:, None])
     hidden = np.mean(other & (measured < 1 - patches.depth_step), axis=1)
     goes_on = (farther < _SEEN_THROUGH) & (hidden > _SEEN_THROUGH)

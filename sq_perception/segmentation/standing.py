@@ -56,10 +56,6 @@ high.  It changes nothing in 288 simulated scenes, and finds two things in 34 re
 _TALL = 20.0
 """Deviations of the support's points, and no more than ``HIGHEST`` tolerances: a segment that is higher on average is
 no noise beside another one, even where little noise or a long way makes things low against the tolerance."""
-_MUCH_HIGHER, _NO_NOISE = 2.0, 2.5
-"""Times as high as any support is seen raised: of such a top a few heights below the base tell the noise, and beyond
-the second it is none, whatever is beside it.  In a heap the heights there are those of other things.  Of 91
-recorded frames three find a thing more, two hold one together, and none loses one."""
 _SMEARED, _BESIDE = 2, 12
 """Pixels about a segment that a sensor smears, and up to which the support is beside it; 5 to 20 do as well."""
 _IN_SEGMENTS = 0.5
@@ -162,7 +158,7 @@ def furniture(depth: np.ndarray, valid: np.ndarray, camera: Camera, walls: list[
         lies[rows[on], columns[on]] = True
         parts = depth_steps.components(lies)[rows, columns]
         for part in np.flatnonzero(np.bincount(parts) > _FEWEST):
-            if part > 0 and largest_edge(points[parts == part]) > limits.max_size:
+            if part > 0 and largest_edge(points[parts == part], wall.equation[:3]) > limits.max_size:
                 large[rows[parts == part], columns[parts == part]] = 1
     full = cv2.resize(large, (k * width, k * height), interpolation=cv2.INTER_NEAREST)
     return full[: depth.shape[0], : depth.shape[1]] > 0
@@ -306,14 +302,15 @@ def _rises(top: float, beside: np.ndarray, sigma: float) -> bool:
     """Whether the top of a segment is above the noise of the support, of deviation ``sigma`` and as the heights (n,)
     beside the segment show it: about the support, or about what lies on it there if they are level, as the height of a
     board or a mat is no noise."""
-    if top > _NO_NOISE * HIGHEST * TOLERANCE:
-        return True
-    bases = [0.0]
+    noise = {0.0: _noise(beside, 0.0, top)}
     if beside.size >= _FEWEST:
         level = quantile(beside, 0.5)
         if np.mean(np.abs(beside - level) < 0.5 * TOLERANCE) > LEVEL_SHARE:
-            bases.append(level)
-    return any(top - base >= _BUMP * max(sigma, _spread(_noise(beside, base, top), base)) for base in bases)
+            noise[level] = _noise(beside, level, top)
+        elif top > HIGHEST * TOLERANCE and np.mean(beside < 0) < _LOWER_SIDE:
+            # Noise about the support would be below it, too: these are low things, the foot of a wall, a rim.
+            noise[level] = beside[beside > level]
+    return any(top - base >= _BUMP * max(sigma, _spread(heights, base)) for base, heights in noise.items())
 
 
 def _noise(heights: np.ndarray, base: float, top: float) -> np.ndarray:
@@ -323,9 +320,8 @@ def _noise(heights: np.ndarray, base: float, top: float) -> np.ndarray:
     is no higher than a support is ever seen raised.
     """
     below = heights[heights < base]
-    times = (top - base) / (HIGHEST * TOLERANCE)
-    share = 0.0 if times > _MUCH_HIGHER else _LOWER_SIDE
-    return below if times > 1 and below.size >= max(_FEWEST, share * heights.size) else heights
+    is_high = top - base > HIGHEST * TOLERANCE
+    return below if is_high and below.size >= max(_FEWEST, _LOWER_SIDE * heights.size) else heights
 
 
 def _spread(heights: np.ndarray, base: float) -> float:

@@ -58,6 +58,9 @@ Chosen: lone bodies are found by it, and 81 recorded and simulated frames of tab
 LEVEL, _STOREY, _TABLE_SHARE = 0.99, 0.3, 0.4
 """Cosine between the normals of level planes, metres from a floor to the table above it, and the share that a small one
 shows of what the floor does.  Of lower steps the larger level is the support; things on a lower one are not found."""
+_STEP_DOWN = 0.04
+"""Metres above a much larger level plane from which on one no larger than a thing is that thing's top: the bottom of a
+bin or a board on a table is lower."""
 
 _CLOSE, _HELD_SHARE = 0.6, 0.1
 """Metres above a support in which what stands on it is, and the least share of that, of what another plane has there:
@@ -163,12 +166,25 @@ def support(
         return None
     if _is_amid(best, points):
         return None
+
+    def is_thing(plane: Plane) -> bool:
+        return is_small(_largest_part(plane, depth, valid, camera), plane.equation[:3])
+
+    floors = [
+        plane
+        for plane in votes
+        if plane.equation[:3] @ best.equation[:3] > LEVEL
+        and plane.equation[3] - best.equation[3] > _STEP_DOWN
+        and best.share <= _TABLE_SHARE * plane.share
+    ]
+    if floors and is_thing(best):
+        best = max(floors, key=votes.__getitem__)
     tables = [
         plane
         for plane in votes
         if plane.equation[:3] @ best.equation[:3] > LEVEL
         and best.equation[3] - plane.equation[3] > _STOREY
-        and (plane.share > _TABLE_SHARE * best.share or not is_small(_on(plane, points), plane.equation[:3]))
+        and (plane.share > _TABLE_SHARE * best.share or not is_thing(plane))
     ]
     return max(tables, key=votes.__getitem__) if tables else best
 
@@ -331,9 +347,19 @@ def _on_one_surface(depth: np.ndarray, valid: np.ndarray, camera: Camera) -> lis
     return surfaces
 
 
-def _on(plane: Plane, points: np.ndarray) -> np.ndarray:
-    """Those of some points (n, 3) that lie on a plane."""
-    return points[np.abs(plane.height(points)) < TOLERANCE * noise_growth(points[:, 2])]
+def _largest_part(plane: Plane, depth: np.ndarray, valid: np.ndarray, camera: Camera) -> np.ndarray:
+    """Points (n, 3) of a coarse image that lie on a plane, of the largest connected part: the tops of two cartons may
+    lie in one plane."""
+    k = max(1, min(depth.shape) // COARSE_PIXELS)
+    rows, columns = np.nonzero(valid[::k, ::k])
+    points = camera.unproject(k * columns, k * rows, depth[::k, ::k][rows, columns])
+    on = np.abs(plane.height(points)) < TOLERANCE * noise_growth(points[:, 2])
+    lies = np.zeros(depth[::k, ::k].shape, bool)
+    lies[rows[on], columns[on]] = True
+    part = depth_steps.components(lies)[rows, columns]
+    counts = np.bincount(part)
+    counts[0] = 0
+    return np.asarray(points[part == counts.argmax()])
 
 
 def _held(candidates: list[Plane], points: np.ndarray) -> tuple[list[float], list[float], float]:

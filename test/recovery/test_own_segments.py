@@ -7,7 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
-from table_scenes import Table
+from table_scenes import VGA, Table, ious
 
 from sq_perception.fitting.options import MIN_PIXELS
 from sq_perception.geometry.superquadric import Superquadric
@@ -18,6 +18,7 @@ from sq_perception.recovery.own_segments import SegmentNetwork
 from sq_perception.recovery.recoverer import Recoverer, RecoveryOptions
 from sq_perception.segmentation.segments import Segmentation
 from sq_perception.simulation import sensor_noise
+from sq_perception.simulation.rendering import render_things
 from sq_perception.simulation.scenes import plane_depth
 
 CAMERA = Camera(320, 240, 300.0, 300.0, 159.5, 119.5)
@@ -287,3 +288,20 @@ def test_networks_are_shown_what_a_rolled_camera_sees_as_if_it_were_upright(quar
     assert rolled.strays is not None
     assert 0.05 < upright.strays.sum() / (truth > 0).sum() < 0.5
     assert (np.rot90(rolled.strays, -quarters) != upright.strays).mean() < 0.005
+
+
+@pytest.mark.parametrize(("pitch", "gap"), [(1.3, 0.02), (1.5, 0.01), (1.5, 0.05)])
+def test_mugs_side_by_side_seen_from_above_are_several(pitch, gap):
+    """Their bottoms lie in one plane, each behind walls, and hardly above the table between them."""
+    table, radius, half = Table(pitch=pitch, distance=0.7), 0.042, 0.05
+    outside, inside = [], []
+    for column in (-1, 0, 1):
+        for row in (-0.5, 0.5):
+            at = (2 * radius + gap) * column, (2 * radius + gap) * row
+            outside.append(table.body(*at, (radius, radius, half), (0.05, 1.0)))
+            inside.append(table.body(*at, (radius - 0.004, radius - 0.004, half), (0.05, 1.0), height=0.008))
+    of = np.arange(6)
+    parts, cavities = Superquadric.stack(outside), Superquadric.stack(inside)
+    depth, index = render_things(parts, of, cavities, of, VGA, table.plane)
+    found = Recoverer(threads=1).recover(depth.astype(np.float32), VGA).labels
+    assert min(ious(index + 1, found)) > 0.9

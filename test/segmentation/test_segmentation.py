@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from table_scenes import VGA, Table, best_iou
+from table_scenes import VGA, Table, best_iou, ious
 
 from sq_perception.geometry import rotation
 from sq_perception.geometry.superquadric import Superquadric
@@ -312,3 +312,28 @@ def test_another_support_is_sought_where_the_surroundings_show_one():
     found = Segmentation(labels, PLANE, (1, 3))
     np.testing.assert_allclose(support_under(found, 3, depth, CAMERA), shelf, atol=2e-3)
     assert support_under(found, 1, depth, CAMERA) is None
+
+
+@pytest.mark.parametrize("seed", [14, 24])
+def test_the_tops_of_two_cartons_are_no_support(seed: int) -> None:
+    """A plane through both, or the lower one's top, is nearer to their sides than the floor is."""
+    rng = np.random.default_rng(seed)
+    table = Table(pitch=rng.uniform(0.8, 1.4), distance=rng.uniform(1.2, 1.6))
+    cartons = []
+    for x in (-0.3, 0.3):
+        y, half = rng.uniform(-0.1, 0.1), (rng.uniform(0.12, 0.22), rng.uniform(0.12, 0.22), rng.uniform(0.08, 0.2))
+        cartons.append(table.body(x, y, half, (0.05, 0.05), rng.uniform(-0.4, 0.4)))
+    depth, truth = table.see(cartons, noise=1e-3, seed=seed)
+    assert min(ious(truth, segment(depth, VGA).labels)) > 0.8
+
+
+@pytest.mark.parametrize("seed", [7, 9, 14])
+def test_the_diagonal_of_a_square_carton_is_no_edge(seed: int) -> None:
+    """Half a metre wide, as much as an object may be; a square has no principal axes."""
+    rng = np.random.default_rng(seed)
+    table = Table(pitch=rng.uniform(0.6, 1.4), distance=rng.uniform(1.2, 1.6))
+    half = rng.uniform(0.225, 0.27)
+    size = (half, half, rng.uniform(0.1, 0.2))
+    carton = table.body(0, 0.05, size, (0.05, 0.05), np.pi / 4 + rng.uniform(-0.2, 0.2))
+    depth, truth = table.see([carton], noise=1e-3, seed=seed)
+    assert min(ious(truth, segment(depth, VGA).labels)) > 0.8

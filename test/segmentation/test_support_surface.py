@@ -408,6 +408,14 @@ def test_low_things_beside_a_tall_one_are_no_noise_of_the_support() -> None:
     assert not standing._rises(0.09, raised, 1e-3)
 
 
+def test_a_high_thing_beside_low_ones_alone_is_no_noise() -> None:
+    """As in the corner of a bin, where what lies beside it is the foot of its walls."""
+    rng = np.random.default_rng(0)
+    beside = rng.uniform(0.0, 0.04, 400).astype(np.float32)
+    assert standing._rises(0.15, beside, 1e-3)
+    assert not standing._rises(0.06, beside, 1e-3)
+
+
 def test_a_support_that_dips_beside_a_thing_is_no_noise():
     """By the 3 mm that it does around a banana half a metre away; what rises little more may be of the same wave."""
     rng = np.random.default_rng(5)
