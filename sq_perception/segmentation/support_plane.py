@@ -359,7 +359,7 @@ def _largest_part(plane: Plane, depth: np.ndarray, valid: np.ndarray, camera: Ca
     part = depth_steps.components(lies)[rows, columns]
     counts = np.bincount(part)
     counts[0] = 0
-    return np.asarray(points[part == counts.argmax()])
+    return np.asarray(points[on & (part == counts.argmax())])
 
 
 def _held(candidates: list[Plane], points: np.ndarray) -> tuple[list[float], list[float], float]:
