@@ -161,7 +161,7 @@ def add_frames(command: argparse.ArgumentParser) -> None:
     add(
         "--camera-info",
         metavar="FILE",
-        help="intrinsics of images and bags, before their own: YAML, JSON or fx,fy,cx,cy",
+        help="intrinsics of images and bags, before their own: YAML, JSON, 3 x 3 numbers or fx,fy,cx,cy",
     )
     add("--topic", metavar="NAME", help="depth images of a bag, where it has several such topics")
     add("--every", type=at_least(1), default=1, metavar="N", help="only every Nth frame of a bag or folder")

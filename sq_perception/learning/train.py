@@ -176,6 +176,8 @@ def _check_same_run(config: TrainingConfig, output: Path) -> dict[str, Any]:
         before = dict(json.loads(_header(named[0])[SETTINGS])) if named else {}
     except (ValueError, TypeError) as error:
         raise checkpoint.CheckpointError(f"{named[0]}: its header does not tell what run it is of: {error}") from error
+    if before.get("start"):  # whose form was not noted in former versions
+        before = {name: value for name, value in before.items() if name not in _FORM}
     other = [name for name in _OF_A_RUN if before.get(name, getattr(config, name)) != getattr(config, name)]
     if other:
         differences = ", ".join(f"{name} {before[name]!r}, not {getattr(config, name)!r}" for name in other)

@@ -130,11 +130,12 @@ def corrected(
         for a, b in np.argwhere(np.tril(crossed < _ONE_BODY)):
             if holds is not None and not holds(np.concatenate([image.points(parts[a]), image.points(parts[b])])):
                 crossed[a, b] = crossed[b, a] = np.inf
-        # The bottom of a vessel is seen over its wall alone: no line tells it from the bottom of the next one.
-        met = regions.contacts(result, image.depth > 0, count)
-        ends = regions.enclosed(met)[names]
-        apart = (ends[:, None] | ends[None, :]) & (met[np.ix_(names, names)] == 0)
-        crossed[apart] = np.inf
+        if (crossed < _ONE_BODY).any():
+            # The bottom of a vessel is seen over its wall alone: no line tells it from the bottom of the next one.
+            met = regions.contacts(result, image.depth > 0, count)
+            ends = regions.enclosed(met)[names]
+            apart = (ends[:, None] | ends[None, :]) & (met[np.ix_(names, names)] == 0)
+            crossed[apart] = np.inf
         group = _linked(crossed, np.array([len(part.z) for part in parts], float), _ONE_BODY)
         first = np.unique(group, return_index=True)[1]
         number_of[names] = names[first[group]]

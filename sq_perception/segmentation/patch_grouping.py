@@ -146,11 +146,12 @@ def _continued(patches: Patches, body: np.ndarray, camera: Camera) -> np.ndarray
         z = 1 / np.einsum("ij,ij->i", rays, patches.planes)
         distance = np.abs(1 - z[None, :] * (patches.planes @ rays.T)) / length[:, None]
         coplanar = (normals @ normals.T > np.cos(_PLANE_ANGLE)) & (np.maximum(distance, distance.T) < _PLANE_DISTANCE)
-    # The bottoms of vessels that stand side by side lie in one plane, too, but end at their walls.
-    met = regions.contacts(body[patches.labels], patches.depth > 0, int(body.max()))
-    ends = regions.enclosed(met)[body]
-    coplanar &= ~(ends[:, None] | ends[None, :])
     a, b = np.nonzero(np.triu(coplanar & (body[:, None] != body[None, :]), 1))
+    if a.size > 0:
+        # The bottoms of vessels that stand side by side lie in one plane, too, but end at their walls.
+        met = regions.contacts(body[patches.labels], patches.depth > 0, int(body.max()))
+        ends = regions.enclosed(met)[body]
+        a, b = a[~(ends[a] | ends[b])], b[~(ends[a] | ends[b])]
     weights = np.zeros((n, n))
     if a.size == 0:
         return weights
