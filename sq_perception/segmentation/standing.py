@@ -25,7 +25,7 @@ from sq_perception.geometry.quantiles import quantile
 from sq_perception.imaging import depth_steps
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation import support_plane
-from sq_perception.segmentation.support_plane import COARSE_PIXELS, TOLERANCE, Plane, noise_growth
+from sq_perception.segmentation.support_plane import TOLERANCE, Plane, coarse, noise_growth
 from sq_perception.segmentation.support_surface import HIGHEST, LEVEL_SHARE, SupportSurface
 
 ObjectTest = Callable[[np.ndarray, np.ndarray], bool]
@@ -149,7 +149,7 @@ def furniture(depth: np.ndarray, valid: np.ndarray, camera: Camera, walls: list[
     """Pixels, bool (height, width), of surfaces in one of some planes that are larger than a thing."""
     if not walls:
         return np.zeros(depth.shape, bool)
-    k, rows, columns, points = _coarse(depth, valid, camera)
+    k, rows, columns, points = coarse(depth, valid, camera)
     height, width = depth[::k, ::k].shape
     large = np.zeros((height, width), np.uint8)
     for wall in walls:
@@ -162,13 +162,6 @@ def furniture(depth: np.ndarray, valid: np.ndarray, camera: Camera, walls: list[
                 large[rows[parts == part], columns[parts == part]] = 1
     full = cv2.resize(large, (k * width, k * height), interpolation=cv2.INTER_NEAREST)
     return full[: depth.shape[0], : depth.shape[1]] > 0
-
-
-def _coarse(depth: np.ndarray, valid: np.ndarray, camera: Camera) -> tuple[int, np.ndarray, np.ndarray, np.ndarray]:
-    """Every k-th pixel of an image that is valid: k, rows and columns counted by it, and points (n, 3)."""
-    k = max(1, min(depth.shape) // COARSE_PIXELS)
-    rows, columns = np.nonzero(valid[::k, ::k])
-    return k, rows, columns, camera.unproject(k * columns, k * rows, depth[::k, ::k][rows, columns])
 
 
 def _lie_on(wall: Plane, points: np.ndarray) -> np.ndarray:
@@ -184,7 +177,7 @@ def _of_no_segments(depth: np.ndarray, labels: np.ndarray, camera: Camera, walls
     """
     if not walls:
         return []
-    k, rows, columns, points = _coarse(depth, depth > 0, camera)
+    k, rows, columns, points = coarse(depth, depth > 0, camera)
     in_segment = labels[::k, ::k][rows, columns] > 0
     found = []
     for wall in walls:

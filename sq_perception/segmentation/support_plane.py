@@ -347,12 +347,17 @@ def _on_one_surface(depth: np.ndarray, valid: np.ndarray, camera: Camera) -> lis
     return surfaces
 
 
+def coarse(depth: np.ndarray, valid: np.ndarray, camera: Camera) -> tuple[int, np.ndarray, np.ndarray, np.ndarray]:
+    """Every k-th pixel of an image that is valid: k, rows and columns counted by it, and points (n, 3)."""
+    k = max(1, min(depth.shape) // COARSE_PIXELS)
+    rows, columns = np.nonzero(valid[::k, ::k])
+    return k, rows, columns, camera.unproject(k * columns, k * rows, depth[::k, ::k][rows, columns])
+
+
 def _largest_part(plane: Plane, depth: np.ndarray, valid: np.ndarray, camera: Camera) -> np.ndarray:
     """Points (n, 3) of a coarse image that lie on a plane, of the largest connected part: the tops of two cartons may
     lie in one plane."""
-    k = max(1, min(depth.shape) // COARSE_PIXELS)
-    rows, columns = np.nonzero(valid[::k, ::k])
-    points = camera.unproject(k * columns, k * rows, depth[::k, ::k][rows, columns])
+    k, rows, columns, points = coarse(depth, valid, camera)
     on = np.abs(plane.height(points)) < TOLERANCE * noise_growth(points[:, 2])
     lies = np.zeros(depth[::k, ::k].shape, bool)
     lies[rows[on], columns[on]] = True
