@@ -41,7 +41,7 @@ import household_things
 import numpy as np
 import report
 import trimesh
-from hull_oracle import Columns
+from hull_columns import Columns
 from known_frames import camera_of
 
 from sq_perception.fitting import surface_fit, tolerant

@@ -24,10 +24,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import mesh_scene
 import mesh_things
 import numpy as np
 import report
+import tabletop
 import tracking
 from gallery_figures import MatchedThing, empty_figure, matched, scene_figure, write_picture
 from gallery_scenes import Stood, bottle, can, carton, kitchen, viewed
@@ -252,7 +252,7 @@ def main() -> None:
     options = parser.parse_args()
     pictures = options.docs / "gallery"
     pictures.mkdir(parents=True, exist_ok=True)
-    recoverer().warm_up(mesh_scene.CAMERA)
+    recoverer().warm_up(tabletop.CAMERA)
     facts = report.environment()
     introduction = INTRODUCTION.format(facts=f"{facts['date']}, commit {facts['commit']}")
     parts = ["# Gallery\n" + introduction]

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
-import mesh_scene
 import mesh_things
 import numpy as np
 import tabletop
@@ -42,13 +41,13 @@ def viewed(things: Sequence[Stood], sensor: str, down: float = 40.0, distance: f
     ValueError
         If two things are in one place, as seen from above.
     """
-    camera, table = mesh_scene.CAMERA, mesh_scene.looked_down_on(np.deg2rad(down))
+    camera, table = tabletop.CAMERA, tabletop.looked_down_on(np.deg2rad(down))
     origin = np.array([0.0, 0.0, distance])
     plane = np.append(table[:, 2], -table[:, 2] @ origin)
     placed: list[tuple[MeshThing, str, np.ndarray, np.ndarray]] = []
     outlines: list[np.ndarray] = []
     for each in things:
-        turn = mesh_scene.about_z(np.deg2rad(each.heading)) @ each.turn
+        turn = tabletop.about_z(np.deg2rad(each.heading)) @ each.turn
         corners = each.thing.hull @ turn.T
         low, high = corners.min(axis=0), corners.max(axis=0)
         place = np.append(each.place, 0.0) - np.append((low + high)[:2] / 2, low[2])

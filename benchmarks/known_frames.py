@@ -37,9 +37,8 @@ from typing import Any
 import numpy as np
 import report
 import trimesh
-from both_fits import measured_points
-from hull_oracle import Columns
-from scene_verdict import _oriented_box
+from hull_columns import Columns
+from scene_verdict import smallest_box
 
 from sq_perception.fitting.fit import Status
 from sq_perception.geometry.superquadric import Superquadric
@@ -113,8 +112,8 @@ def answers(name: str, frame: Any, hulls: Path, recoverer: Recoverer, others: Ot
             found.append(answer(frame, number, hulls, title, body, sigma, share))
     found += _own(frame, hulls, recoverer.recover(depth, camera))
     for number, label in enumerate(frame["ids"]):
-        points = measured_points(depth, (labels == label) & (depth > 0), camera)
-        found.append(answer(frame, number, hulls, METHODS[4], _oriented_box(points), np.full(3, np.nan), np.nan))
+        points = camera.points(depth)[(labels == label) & (depth > 0) & np.isfinite(depth)]
+        found.append(answer(frame, number, hulls, METHODS[4], smallest_box(points), np.full(3, np.nan), np.nan))
         for title, bodies in others.items():
             given = bodies.get((name, int(label)))
             body = None if given is None else _body(given)
