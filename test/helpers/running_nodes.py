@@ -320,11 +320,3 @@ def usage(pid: int) -> Usage:
         files=len(os.listdir(place / "fd")),
         segments=len(mapped),
     )
-
-
-def proportional(pid: int) -> tuple[float, float]:
-    """Proportional and unique set size, MB; costs the process a few milliseconds, so that it is asked for rarely."""
-    lines = (line.split() for line in (Path("/proc") / str(pid) / "smaps_rollup").read_text().splitlines()[1:])
-    kilobytes = {words[0]: int(words[1]) for words in lines}
-    unique = kilobytes["Private_Clean:"] + kilobytes["Private_Dirty:"]
-    return kilobytes["Pss:"] / 1024, unique / 1024
