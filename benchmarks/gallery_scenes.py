@@ -33,7 +33,7 @@ class Stood:
     turn: np.ndarray = field(default_factory=lambda: mesh_things.UPRIGHT)
 
 
-def viewed(things: Sequence[Stood], sensor: str, down: float = 40.0, distance: float = 0.75) -> Tabletop:
+def viewed(things: Sequence[Stood], sensor: str, down: float, distance: float) -> Tabletop:
     """Things on a table whose middle is ``distance`` metres away, looked down on by ``down`` degrees.
 
     Raises

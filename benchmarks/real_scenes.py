@@ -43,7 +43,6 @@ ALL = "**all, at least half visible**"
 MASKS = ("given", "own")
 HALF = 0.5
 POOR = 0.7
-WORST = 15
 GOALS = {"given": "85", "own": "80"}
 SHARES = {"all visible (90 % and more)": (0.9, np.inf), "50 to 90 %": (0.5, 0.9), "under 50 %": (0.0, 0.5)}
 
@@ -142,12 +141,7 @@ def tables(verdicts: list[SceneVerdict], groups: Groups, goals: dict[str, str]) 
                 result[f"{name.strip('*')}: {method}"] = figures = summary(chosen, method)
                 rows.append(line(name, method, figures, goals.get(method, "-") if name == ALL else ""))
     frame_figures, frame_text = frames(verdicts)
-    text = [report.table_of(rows), "Whole frames\n\n" + frame_text]
-    for method in MASKS:
-        order = sorted(found[ALL], key=lambda one: one.answers[method].iou)[:WORST]
-        result[f"worst: {method}"] = worst = [worst_line(one, method) for one in order]
-        text.append(f"The worst with masks {method}\n\n{report.table_of(worst)}")
-    return {**frame_figures, **result}, "\n\n".join(text)
+    return {**frame_figures, **result}, f"{report.table_of(rows)}\n\nWhole frames\n\n{frame_text}"
 
 
 def summary(chosen: list[ThingVerdict], method: str) -> dict[str, Any]:
@@ -218,26 +212,6 @@ def frames(verdicts: list[SceneVerdict]) -> tuple[dict[str, Any], str]:
             }
         )
     return result, report.table_of(rows)
-
-
-def worst_line(one: ThingVerdict, method: str) -> dict[str, str]:
-    answer = one.answers[method]
-    edges = 2e3 * np.sort(answer.body[:3])
-    return {
-        "seed, label": f"{one.seed}, {one.label}",
-        "thing": f"{one.name}, {one.rest}",
-        "sensor": one.sensor,
-        "visible %": f"{100 * one.visible_share:.0f}",
-        "IoU %": f"{100 * answer.iou:.0f}",
-        "edges / true ones mm": f"{_numbers(edges)} / {_numbers(1e3 * one.edges)}",
-        "excess right, away, up mm": _numbers(1e3 * answer.excess, "+.0f"),
-        "e1 e2": _numbers(answer.body[3:5], ".2f"),
-        "verdict": f"{answer.status}: {answer.message}" if answer.message else answer.status,
-    }
-
-
-def _numbers(values: np.ndarray, form: str = ".0f") -> str:
-    return " ".join(f"{x:{form}}" for x in values) if np.isfinite(values).all() else "-"
 
 
 if __name__ == "__main__":
