@@ -12,16 +12,15 @@ standard error; ``missed`` the share of these things that no own segment agrees 
 from __future__ import annotations
 
 if __name__ == "__main__":
-    import one_thread  # noqa: F401
+    from common import one_thread  # noqa: F401
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import household_things
 import numpy as np
-import report
-import scene_verdict
-from tabletop import Tabletop
+from common import report, scene_verdict
+from common.tabletop import Tabletop
 
 from sq_perception.imaging.camera import Camera
 from sq_perception.simulation.things_on_table import ELEVATION, TABLE_CAMERA

@@ -30,8 +30,8 @@ from typing import Any
 
 import numba
 import numpy as np
-import report
 import torch
+from common import report
 from synthetic_tabletop import STAGES, SensedScene, scored, sensed
 
 from sq_perception.geometry import Superquadric

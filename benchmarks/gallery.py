@@ -17,19 +17,17 @@ from __future__ import annotations
 import textwrap
 
 if __name__ == "__main__":
-    import one_thread  # noqa: F401
+    from common import one_thread  # noqa: F401
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import mesh_things
 import numpy as np
-import report
-import tabletop
-from gallery_figures import MatchedThing, matched, scene_figure, write_picture
-from gallery_scenes import Stood, bottle, can, carton, kitchen, viewed
-from scene_verdict import recoverer
+from common import mesh_things, report, tabletop
+from common.gallery_figures import MatchedThing, matched, scene_figure, write_picture
+from common.gallery_scenes import Stood, bottle, can, carton, kitchen, viewed
+from common.scene_verdict import recoverer
 
 from sq_perception.fitting.fit import Status
 from sq_perception.recovery.recoverer import FrameRecovery

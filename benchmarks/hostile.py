@@ -17,8 +17,10 @@ from collections import Counter
 from typing import Any
 
 import numpy as np
-import own_domain  # noqa: F401
-import report
+from common import (
+    own_domain,  # noqa: F401
+    report,
+)
 from hostile_messages import HostileFrame, Siege, Verdict, difference, frames
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from running_nodes import Peer, arguments, environment, until, usage

@@ -16,17 +16,15 @@ the half sizes of each kind within two reported deviations.
 from __future__ import annotations
 
 if __name__ == "__main__":
-    import one_thread  # noqa: F401
+    from common import one_thread  # noqa: F401
 
 from functools import partial
 
-import mesh_things
 import numpy as np
 import real_scenes
-import scene_verdict
-import tabletop
 import trimesh
-from scene_verdict import SceneVerdict, ThingVerdict
+from common import mesh_things, scene_verdict, tabletop
+from common.scene_verdict import SceneVerdict, ThingVerdict
 from scipy.spatial import ConvexHull
 
 from sq_perception.geometry import Superquadric

@@ -18,8 +18,10 @@ import time
 from dataclasses import asdict
 
 import numpy as np
-import own_domain  # noqa: F401
-import report
+from common import (
+    own_domain,  # noqa: F401
+    report,
+)
 from respawned_nodes import CAMERA, MEMBERS, NODE, VIEWER, Kill, Robot, orphans
 from running_nodes import Peer
 

@@ -26,7 +26,7 @@ The FILE of another METHOD is a JSON list of objects with ``frame`` (the NPZ's s
 from __future__ import annotations
 
 if __name__ == "__main__":
-    import one_thread  # noqa: F401
+    from common import one_thread  # noqa: F401
 
 import json
 from dataclasses import dataclass
@@ -35,10 +35,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import report
 import trimesh
-from hull_columns import Columns
-from scene_verdict import smallest_box
+from common import report
+from common.hull_columns import Columns
+from common.scene_verdict import smallest_box
 
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera

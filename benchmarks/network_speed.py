@@ -17,7 +17,7 @@ The thesis reports 2.88 +- 0.92 ms for its network on its graphics card (table 6
 from __future__ import annotations
 
 if __name__ == "__main__":
-    import one_thread  # noqa: F401
+    from common import one_thread  # noqa: F401
 
 import itertools
 import time
@@ -25,8 +25,8 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-import report
 import torch
+from common import report
 
 from sq_perception.imaging import raycast, unit_cube
 from sq_perception.learning import checkpoint

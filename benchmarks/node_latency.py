@@ -21,8 +21,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import own_domain  # noqa: F401
-import report
+from common import (
+    own_domain,  # noqa: F401
+    report,
+)
 from running_nodes import Peer, arguments, environment, until, usage
 
 from sq_perception.commands.children import Children

@@ -33,7 +33,7 @@ Published for orientation only, other things and another simulator: GIGA (HR) 87
 from __future__ import annotations
 
 if __name__ == "__main__":
-    import one_thread  # noqa: F401
+    from common import one_thread  # noqa: F401
 
 import json
 import time
@@ -44,11 +44,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import picking_scenes
-import report
-from picking_contestants import CONTESTANTS, PEERS, ContactGraspNet, Seen, recoverer_of
-from picking_scenes import KINDS, TABLE_CAMERA, THINGS, Scene
-from picking_world import Pick, World
+from common import picking_scenes, report
+from common.picking_contestants import CONTESTANTS, PEERS, ContactGraspNet, Seen, recoverer_of
+from common.picking_scenes import KINDS, TABLE_CAMERA, THINGS, Scene
+from common.picking_world import Pick, World
 from scipy.stats import binomtest
 
 from sq_perception.grasping.plan import Grasp

@@ -18,7 +18,7 @@ from __future__ import annotations
 import argparse
 
 if __name__ == "__main__":
-    import one_thread  # noqa: F401
+    from common import one_thread  # noqa: F401
 
 import json
 import multiprocessing
@@ -30,12 +30,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import mesh_things
 import numpy as np
-import report
-import scene_verdict
-import tabletop
-from scene_verdict import METHODS, SceneVerdict, ThingVerdict
+from common import mesh_things, report, scene_verdict, tabletop
+from common.scene_verdict import METHODS, SceneVerdict, ThingVerdict
 
 Groups = Callable[[list[ThingVerdict]], dict[str, list[ThingVerdict]]]
 """Makes the rows of a table of all things; the first one, ALL, is what goals are for."""

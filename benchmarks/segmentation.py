@@ -21,7 +21,7 @@ one pinned thread.
 from __future__ import annotations
 
 if __name__ == "__main__":
-    import one_thread  # noqa: F401
+    from common import one_thread  # noqa: F401
 
 import sys
 import time
@@ -31,7 +31,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-import report
+from common import report
 from scipy.optimize import linear_sum_assignment
 
 from sq_perception.recordings import frame_file

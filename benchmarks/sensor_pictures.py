@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import report
+from common import report
 from matplotlib import colormaps
 from PIL import Image
 

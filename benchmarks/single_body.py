@@ -15,7 +15,7 @@ true half sizes within two reported standard deviations, each estimated axis com
 from __future__ import annotations
 
 if __name__ == "__main__":
-    import one_thread  # noqa: F401
+    from common import one_thread  # noqa: F401
 
 import time
 from collections.abc import Callable
@@ -24,7 +24,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-import report
+from common import report
 from scipy.optimize import linear_sum_assignment
 
 from sq_perception.fitting import solina_bajcsy, surface_fit

@@ -20,8 +20,10 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
-import own_domain  # noqa: F401
-import report
+from common import (
+    own_domain,  # noqa: F401
+    report,
+)
 from rcl_interfaces.srv import GetParameters
 from running_nodes import (
     Answer,

@@ -16,7 +16,7 @@ what slows the machine slows both.
 from __future__ import annotations
 
 if __name__ == "__main__":
-    import one_thread  # noqa: F401
+    from common import one_thread  # noqa: F401
 
 import time
 from typing import Any
@@ -24,9 +24,7 @@ from typing import Any
 import household_things
 import numpy as np
 import real_scenes
-import report
-import scene_verdict
-import tabletop
+from common import report, scene_verdict, tabletop
 
 from sq_perception.recovery.recoverer import FrameRecovery, Recoverer
 from sq_perception.simulation import sensor_noise

@@ -30,7 +30,7 @@ Goals: no switch, and after 30 frames at most half of the error of the first fra
 from __future__ import annotations
 
 if __name__ == "__main__":
-    import one_thread  # noqa: F401
+    from common import one_thread  # noqa: F401
 
 import time
 from collections.abc import Iterator
@@ -39,7 +39,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-import report
+from common import report
 from synthetic_tabletop import visible_shares
 
 from sq_perception.geometry import Superquadric

@@ -16,8 +16,8 @@ from typing import Any
 
 import household_things
 import numpy as np
-import report
-from gallery_figures import write_picture
+from common import report
+from common.gallery_figures import write_picture
 from matplotlib.axes import Axes
 from scipy.spatial import ConvexHull
 

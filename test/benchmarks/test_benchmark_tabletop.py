@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import mesh_things
 import numpy as np
 import pytest
 import real_scenes
-import scene_verdict
-import tabletop
 import trimesh
+from common import mesh_things, scene_verdict, tabletop
 
 from sq_perception.geometry import Superquadric, rotation
 

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import household_things
-import hull_columns
 import numpy as np
 import pytest
+from common import hull_columns
 from scipy.spatial import ConvexHull
 
 from sq_perception.geometry import Superquadric, metrics, rotation

@@ -19,11 +19,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import mesh_things
 import numpy as np
-from mesh_things import MeshThing
 from scipy.spatial import ConvexHull
 
+from common import mesh_things
+from common.mesh_things import MeshThing
 from sq_perception.imaging.camera import Camera
 from sq_perception.simulation import sensor_noise
 from sq_perception.simulation.rendering import Mesh, render_mesh

@@ -26,10 +26,10 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import tabletop
 import trimesh
-from tabletop import Placed, Tabletop
 
+from common import tabletop
+from common.tabletop import Placed, Tabletop
 from sq_perception.fitting import solina_bajcsy
 from sq_perception.fitting.fit import Status
 from sq_perception.geometry import Superquadric

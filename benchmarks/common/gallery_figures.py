@@ -11,12 +11,12 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
-from hull_columns import Columns
 from matplotlib.figure import Figure
 from PIL import Image
 from scipy.optimize import linear_sum_assignment
-from tabletop import Placed, Tabletop
 
+from common.hull_columns import Columns
+from common.tabletop import Placed, Tabletop
 from sq_perception.evaluation.body_pictures import draw_bodies_3d
 from sq_perception.evaluation.plots import (
     colour,

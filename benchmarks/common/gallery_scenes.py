@@ -10,12 +10,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
-import mesh_things
 import numpy as np
-import tabletop
-from mesh_things import MeshThing
-from tabletop import Tabletop
 
+from common import mesh_things, tabletop
+from common.mesh_things import MeshThing
+from common.tabletop import Tabletop
 from sq_perception.simulation import sensor_noise
 from sq_perception.simulation.scenes import plane_depth
 

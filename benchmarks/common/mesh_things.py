@@ -23,8 +23,9 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from hull_columns import Columns
 from scipy.spatial import ConvexHull
+
+from common.hull_columns import Columns
 
 KINDS = {"box": 0.35, "can": 0.25, "bottle": 0.2, "scan": 0.2}
 """How often each comes."""

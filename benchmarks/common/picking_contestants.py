@@ -31,9 +31,9 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from picking_scenes import EYE, GRIPPER, LOOK, TABLE_CAMERA
-from picking_world import Thing, World
 
+from common.picking_scenes import EYE, GRIPPER, LOOK, TABLE_CAMERA
+from common.picking_world import Thing, World
 from sq_perception.fitting import solina_bajcsy
 from sq_perception.fitting.options import MODEL_ERROR
 from sq_perception.geometry import mesh
