@@ -42,6 +42,7 @@ import numpy as np
 import trimesh
 from common import report
 from common.hull_columns import Columns
+from common.scene_verdict import FEWEST_PIXELS, HALF
 from known_frames import camera_of
 
 from sq_perception.fitting import surface_fit, tolerant
@@ -54,7 +55,6 @@ from sq_perception.recovery import methods
 from sq_perception.recovery.recoverer import Recoverer
 from sq_perception.recovery.seen_object import SeenObject
 
-HALF, FEWEST_PIXELS = 0.5, 200
 EXACT = 0.01
 """Of a view's side: how well the true hull is taken to be known."""
 BEHIND = 0.1

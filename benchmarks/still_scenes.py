@@ -23,7 +23,6 @@ from typing import Any
 
 import household_things
 import numpy as np
-import real_scenes
 from common import report, scene_verdict, tabletop
 
 from sq_perception.recovery.recoverer import FrameRecovery, Recoverer
@@ -35,7 +34,7 @@ COUNTS = (1, 5, 8)
 def ious(frame: FrameRecovery, scene: tabletop.Tabletop, depth: np.ndarray) -> list[float]:
     """Of the things that are at least half visible; ``depth`` is what the frame was recovered from."""
     labels = scene_verdict.matches(frame.labels, scene.labels, depth)
-    half = [each for each in scene.placed if each.visible_share >= real_scenes.HALF]
+    half = [each for each in scene.placed if each.visible_share >= scene_verdict.HALF]
     return [scene_verdict.of_frame(frame, labels.get(each.label, 0), each, scene).iou for each in half]
 
 

@@ -22,13 +22,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cache
-from pathlib import Path
 
 import cv2
 import numpy as np
 import trimesh
 
-from common import tabletop
 from common.tabletop import Placed, Tabletop
 from sq_perception.fitting import solina_bajcsy
 from sq_perception.fitting.fit import Status
@@ -37,7 +35,8 @@ from sq_perception.geometry import rotation as quaternions
 from sq_perception.recovery.recoverer import FrameRecovery, Recoverer
 
 METHODS = ("given", "own", "classic", "oriented box")
-FEWEST_PIXELS = 200
+HALF, FEWEST_PIXELS = 0.5, 200
+"""Visible share and size of the things that are counted."""
 FEWEST_POINTS = 30
 EROSION = 3
 MATCH = 0.5
@@ -124,11 +123,6 @@ class SceneVerdict:
 @cache
 def recoverer() -> Recoverer:
     return Recoverer()
-
-
-def verdict(seed: int, scans: Path | None, sensor: str | None) -> SceneVerdict:
-    """Make the scene of a seed and evaluate every method on it."""
-    return evaluated(tabletop.scene(seed, scans, sensor))
 
 
 def evaluated(scene: Tabletop) -> SceneVerdict:
