@@ -109,7 +109,6 @@ class Benchmark:
             "largest_difference_mm": float(1e3 * distances.max()),
             "good_ms": {name: report.spread(np.array(found)[:, 1]) for name, found in self.good.items()},
             "undisturbed_ms": {name: report.spread(np.array(found)) for name, found in self.undisturbed.items()},
-            "verdict_ms": report.spread(np.array([one.milliseconds for one in self.verdicts])),
             "published_results": len(self.answers),
             "balanced": final.is_balanced and final.count("in work") == 0,
             "counters": {key: final.count(key) for key in ("received", "answered", "dropped", "refused", "lost")},

@@ -36,7 +36,6 @@ if __name__ == "__main__":
     from common import one_thread  # noqa: F401
 
 import json
-import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from itertools import pairwise, product
@@ -69,7 +68,6 @@ class Round:
     seen: Seen
     grasp: Grasp
     aim: int
-    milliseconds: float
     pick: Pick
 
 
@@ -84,14 +82,12 @@ def rounds(
             return
         depth = picking_scenes.observed(world, scene.sensor, rng)
         seen = Seen(depth, recoverer.recover(depth, TABLE_CAMERA), world, peer, chance.uniform())
-        started = time.process_time()
         found = CONTESTANTS[contestant](seen)
-        milliseconds = 1e3 * (time.process_time() - started)
         if not found:
             return
         position, rotation = scene.carried_out(found[0].position, found[0].rotation)
         aim = _aimed_at(world, position)
-        yield Round(seen, found[0], aim, milliseconds, world.pick(position, rotation, found[0].opening))
+        yield Round(seen, found[0], aim, world.pick(position, rotation, found[0].opening))
 
 
 def cleared(scene: Scene, contestant: str, recoverer: Recoverer, peer: ContactGraspNet | None) -> dict[str, Any]:
@@ -106,7 +102,6 @@ def cleared(scene: Scene, contestant: str, recoverer: Recoverer, peer: ContactGr
                 "score": one.grasp.score,
                 "weakest": one.grasp.weakest,
                 "aim": one.aim,
-                "ms": round(one.milliseconds, 1),
             }
         )
         failed = 0 if one.pick.held >= 0 else failed + 1
@@ -182,7 +177,6 @@ def summary(lines: list[dict[str, Any]]) -> dict[str, Any]:
                 "dr": wilson(sum(run["taken"] for run in runs), THINGS * len(runs)),
                 "causes": causes,
                 "bins": bins,
-                "planning_ms": float(np.median([pick["ms"] for pick in picks])) if picks else None,
             }
             commits = {run["commit"] for run in runs if run.get("commit")}
             if commits - {report.commit()}:
