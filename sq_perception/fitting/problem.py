@@ -56,7 +56,7 @@ RIVAL_SLACK = 4.0
 """Cost that few rays may hide: one such standard deviation."""
 INDEPENDENT_RAYS = 50.0
 """As how many independent rays an object counts whose model errs: errors of neighbouring pixels are alike.  Chosen on
-scanned YCB objects."""
+scanned objects."""
 HIT_TOLERANCE = 3e-3
 """Of g where a ray meets the body.  Rays remember where that was: this error vanishes as the search converges."""
 PLANE_SIGMA, GAP_SIGMA, REST_SIGMA = 0.001, 0.005, 0.05
@@ -66,7 +66,7 @@ lengths shrink with the model error of small things."""
 PROPORTION_SIGMA = 1.0
 """Of a log size against the mean of the three: a factor e, a wide prior."""
 VOLUME_PRICE = 0.5
-"""Of log(a1 a2 a3): what the image does not determine is not to grow.  Chosen on scanned YCB objects."""
+"""Of log(a1 a2 a3): what the image does not determine is not to grow.  Chosen on scanned objects."""
 
 
 @dataclass(frozen=True, eq=False)
