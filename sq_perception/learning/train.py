@@ -27,7 +27,6 @@ import torch
 from sq_perception.geometry.metrics import volume_iou
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.learning import checkpoint
-from sq_perception.learning.backbone import ResNet18
 from sq_perception.learning.dataset import POOL, ViewPool, ViewSource, draw_views
 from sq_perception.learning.disturbance import Disturbance, any_occluder
 from sq_perception.learning.fixed_set import FixedSet, ShuffledBatches
@@ -40,7 +39,6 @@ from sq_perception.learning.training_state import (
     TrainingState,
     made_by,
     mixed_precision,
-    read_tensors,
     recalibrate,
 )
 
@@ -209,11 +207,7 @@ def validate(
 
 def _new_network(config: TrainingConfig, form: RegressorConfig | None) -> Regressor:
     if not config.start:
-        model = Regressor(form or config.regressor())
-        if config.imagenet:
-            assert isinstance(model.features, ResNet18)
-            model.features.load_imagenet(read_tensors(Path(config.imagenet)))
-        return model
+        return Regressor(form or config.regressor())
     model = checkpoint.load(config.start)
     for name in _FORM:
         wanted, brought = getattr(config, name), getattr(model.config, name)
