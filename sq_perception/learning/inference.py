@@ -98,13 +98,9 @@ class ThingPredictor:
         Raises
         ------
         ValueError
-            For views, planes or extents of another form, or not finite.
+            For views of another form, or not finite.
         """
         views = checked_views(views, self.config.regressor())
-        if planes.shape != (len(views), 4) or not np.isfinite(planes).all():
-            raise ValueError(f"expected finite planes of shape ({len(views)}, 4), got {planes.shape}")
-        if extents.shape != (len(views),) or not np.isfinite(extents).all():
-            raise ValueError(f"expected finite extents of shape ({len(views)},), got {extents.shape}")
         both = np.concatenate([views, views[:, :, ::-1]])
         sides = np.concatenate([extents, extents]).astype(np.float32)
         supports = np.concatenate([planes, mirrored_planes(planes)]).astype(np.float32)
