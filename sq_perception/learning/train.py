@@ -1,4 +1,4 @@
-"""Train the regressor, with one of the losses of :mod:`sq_perception.learning.objective`.
+"""Train the regressor, with one of the losses of :mod:`sq_perception.learning.losses`.
 
 One linear script: take a batch, predict, compare, step.  Gradients are clipped; an exponential average of the weights
 is what is validated and saved.  Everything that changes lives in one state file, so that a run that was killed goes on
@@ -31,7 +31,7 @@ from sq_perception.learning.dataset import POOL, ViewPool, ViewSource, draw_view
 from sq_perception.learning.disturbance import Disturbance, any_occluder
 from sq_perception.learning.fixed_set import FixedSet, ShuffledBatches
 from sq_perception.learning.inference import checked_device
-from sq_perception.learning.objective import Objective
+from sq_perception.learning.losses import Objective
 from sq_perception.learning.regressor import Regressor, RegressorConfig
 from sq_perception.learning.training_config import Plateau, TrainingConfig
 from sq_perception.learning.training_state import (

@@ -86,7 +86,7 @@ class TrainingConfig:
     """
 
     loss: str = "occupancy"
-    """What is minimised, by its name in :mod:`sq_perception.learning.objective`."""
+    """What is minimised, by its name in :mod:`sq_perception.learning.losses`."""
     backbone: str = "compact"
     """compact, or resnet18 as in the thesis."""
     framing: str = "cropped"
