@@ -32,7 +32,7 @@ from sq_perception.imaging import unit_cube
 from sq_perception.learning import checkpoint, inference
 from sq_perception.learning.choices import LOSSES
 from sq_perception.learning.inference import Predictor
-from sq_perception.learning.objective import Objective
+from sq_perception.learning.losses import Objective
 from sq_perception.recovery.recoverer import Method, Recoverer, RecoveryOptions
 
 TIMED_IMAGES = 300
