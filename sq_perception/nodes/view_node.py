@@ -186,7 +186,7 @@ class ViewNode(Node):
 
     def _on_parameter_event(self, event: ParameterEvent) -> None:
         if event.node in self._remote:
-            self._remote[event.node].on_event(event)
+            self._remote[event.node].reload()
 
     # The drawing thread
 

@@ -63,10 +63,6 @@ class Control:
     def can_change(self) -> bool:
         return self.kind != "fixed"
 
-    def shown(self, value: Any) -> Any:
-        """A value of the node in the type of the control."""
-        return plain(value) if self.kind == "fixed" else self.type(value)
-
     def wanted(self, value: Any) -> Any:
         """A value of the page in the type of the parameter; None for what is no value, such as half a number."""
         if self.kind not in ("slider", "number"):

@@ -6,9 +6,8 @@ others.  What a user does on the page waits until :meth:`Page.changes` takes it.
 
 from __future__ import annotations
 
-import contextlib
 import socket
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from time import monotonic
 from typing import Any
@@ -157,7 +156,7 @@ class Page:
         if [replace(control, value=None) for control in controls] == [
             replace(control, value=None) for control in part.controls.values()
         ]:
-            self.show_values(node, {control.name: control.value for control in controls})
+            self._show_values(part, controls)
             return
         for folder in part.folders:
             folder.remove()
@@ -174,17 +173,13 @@ class Page:
                 for control in members:
                     part.handles[control.name] = self._add_control(part, control)
 
-    def show_values(self, node: str, values: Mapping[str, Any]) -> None:
-        """Put the node's values into its controls; unknown names are left aside."""
-        part = self._nodes[node]
-        for name, value in values.items():
-            about, handle = part.controls.get(name), part.handles.get(name)
-            if about is None or handle is None or name in part.pending:
-                continue
-            with contextlib.suppress(TypeError, ValueError):
+    def _show_values(self, part: _NodePart, controls: Sequence[Control]) -> None:
+        """Put the node's values into its controls, but for one that a user is changing."""
+        for control in controls:
+            if control.name not in part.pending:
                 # A setter runs the callbacks of the control; they are not to take this for a change by the user.
-                part.known[name] = about.shown(value)
-                handle.value = part.known[name]
+                part.known[control.name] = control.value
+                part.handles[control.name].value = control.value
 
     def show_answer(self, node: str, text: str, good: bool) -> None:
         """Show the answer of a node to a change."""

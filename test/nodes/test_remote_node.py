@@ -54,9 +54,6 @@ class Page:
         self.controls = controls
         self.values = {one.name: one.value for one in controls}
 
-    def show_values(self, node: str, values: dict[str, Any]) -> None:
-        self.values.update(values)
-
     def show_answer(self, node: str, text: str, good: bool) -> None:
         self.answers.append((text, good))
 
@@ -74,7 +71,7 @@ class Bench(SpunNodes):
 
     def _on_event(self, event: ParameterEvent) -> None:
         if event.node == NAME:
-            self.remote.on_event(event)
+            self.remote.reload()
 
     def start(self) -> Managed:
         node = Managed(self.context)
