@@ -6,8 +6,7 @@ it is not set; nothing is imported for that.  The rules:
     bool                                          a check box
     string with "one of: a, b" as constraint      a list to choose from
     other string                                  a line of text
-    number in a short range                       a slider
-    other number                                  a field for numbers
+    number                                        a field for numbers, within its range
     read-only, arrays, names with a dot           shown, not to be changed
 
 A number with a floating point range is a float even where its value has come as an integer, as `ros2 param set` sends
@@ -20,7 +19,7 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-Kind = Literal["bool", "choice", "text", "slider", "number", "fixed"]
+Kind = Literal["bool", "choice", "text", "number", "fixed"]
 Group = Literal["live", "start", "other"]
 GROUPS: dict[Group, str] = {
     "live": "Settings",
@@ -29,10 +28,6 @@ GROUPS: dict[Group, str] = {
 }
 _CHOICES = "one of:"
 _OF_EVERY_NODE = ("use_sim_time", "start_type_description_service")
-_SLIDER_STEPS = 100
-_SLIDER_SPAN = 1.0
-QUICK, TYPED = 0.0, 0.8
-"""Seconds without another change before a value is sent: at once, or when the typing has ended."""
 
 
 @dataclass(frozen=True)
@@ -43,8 +38,6 @@ class Control:
     ----------
     type : type
         Of the parameter's values, where they may be changed.
-    patience : float
-        Seconds to wait for further changes before the value is sent.
     """
 
     name: str
@@ -55,17 +48,19 @@ class Control:
     type: type[bool] | type[int] | type[float] | type[str] = str
     low: float | None = None
     high: float | None = None
-    step: float | None = None
     choices: tuple[str, ...] = ()
-    patience: float = QUICK
 
     @property
     def can_change(self) -> bool:
         return self.kind != "fixed"
 
+    @property
+    def is_typed(self) -> bool:
+        return self.kind in ("text", "number")
+
     def wanted(self, value: Any) -> Any:
         """A value of the page in the type of the parameter; None for what is no value, such as half a number."""
-        if self.kind not in ("slider", "number"):
+        if self.kind != "number":
             return self.type(value)
         number = float(value)
         if not math.isfinite(number):
@@ -90,7 +85,7 @@ def control(about: Any, value: Any) -> Control:
         if choices:
             choices = choices if value in choices else (*choices, value)
             return replace(made, kind="choice", value=value, choices=choices)
-        return replace(made, kind="text", value=value, patience=TYPED)
+        return replace(made, kind="text", value=value)
     if isinstance(value, (int, float)) and math.isfinite(value):
         return _number(about, value, made)
     return made
@@ -98,19 +93,12 @@ def control(about: Any, value: Any) -> Control:
 
 def _number(about: Any, value: float, made: Control) -> Control:
     kind = float if about.floating_point_range or isinstance(value, float) else int
-    made = replace(made, kind="number", type=kind, value=kind(value), patience=TYPED)
-    ranges = [*about.floating_point_range, *about.integer_range]
-    if not ranges or not ranges[0].from_value < ranges[0].to_value:
-        return made
-    # What the node holds is shown, even where its descriptor rules it out.
-    low, high = kind(min(ranges[0].from_value, value)), kind(max(ranges[0].to_value, value))
-    if math.isinf(high - low):  # open to a side, or as wide as the type
-        return replace(made, low=None if math.isinf(low) else low, high=None if math.isinf(high) else high)
-    short = high - low <= (_SLIDER_SPAN if kind is float else _SLIDER_STEPS)
-    step = float(ranges[0].step) or (10.0 ** (math.floor(math.log10(high - low)) - 2) if kind is float else 1)
-    if short and step <= high - low:
-        return replace(made, kind="slider", low=low, high=high, step=step, patience=0.15)
-    return replace(made, low=low, high=high)
+    made = replace(made, kind="number", type=kind, value=kind(value))
+    for ends in (*about.floating_point_range, *about.integer_range):  # one at most
+        # What the node holds is shown, even where its descriptor rules it out.
+        low, high = min(ends.from_value, value), max(ends.to_value, value)
+        made = replace(made, low=None if math.isinf(low) else kind(low), high=None if math.isinf(high) else kind(high))
+    return made
 
 
 def _choices(constraints: str) -> tuple[str, ...]:

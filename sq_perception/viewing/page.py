@@ -26,6 +26,8 @@ TITLE = "sq_perception: superquadrics from depth"
 _PANEL_WIDTH = 420
 _DECIMALS = 7
 """Of a number that is shown or typed; viser would cut off those that the value at the beginning has not."""
+_TYPING = 0.8
+"""Seconds without another change after which the typing of a value has ended."""
 _MUTED = "muted"
 _SHOWN = {
     "Points": "The measured depth",
@@ -245,8 +247,6 @@ class Page:
             handle: Any = gui.add_checkbox(about.name, value, **common)
         elif about.kind == "choice":
             handle = gui.add_dropdown(about.name, about.choices, initial_value=value, **common)
-        elif about.kind == "slider":
-            handle = gui.add_slider(about.name, about.low, about.high, about.step, value, **common)
         elif about.kind == "number":
             handle = gui.add_number(about.name, value, min=about.low, max=about.high, **common)
             if about.type is float:
@@ -259,7 +259,7 @@ class Page:
             def _(_: viser.GuiEvent) -> None:
                 wanted = about.wanted(handle.value)
                 if wanted is not None and wanted != part.known.get(about.name):
-                    part.pending[about.name] = wanted, monotonic() + about.patience
+                    part.pending[about.name] = wanted, monotonic() + (_TYPING if about.is_typed else 0.0)
 
         return handle
 
