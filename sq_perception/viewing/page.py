@@ -28,7 +28,6 @@ _DECIMALS = 7
 """Of a number that is shown or typed; viser would cut off those that the value at the beginning has not."""
 _TYPING = 0.8
 """Seconds without another change after which the typing of a value has ended."""
-_MUTED = "muted"
 _SHOWN = {
     "Points": "The measured depth",
     "Bodies": None,
@@ -112,7 +111,7 @@ class Page:
         if span is not None:
             self._span = drawings.steady_span(self._span, span)
         shown = self._span or (0.0, 1.0)
-        points = drawings.cloud(depth, camera, shown, self._most_points, is_muted=self._point_colours.value == _MUTED)
+        points = drawings.cloud(depth, camera, shown, self._most_points)
         with self.server.atomic():
             self._scene.draw_cloud(points, self._is_wanted("Points"))
             self._scene.draw_camera(camera, shown, self._is_wanted("Camera"))
@@ -221,7 +220,6 @@ class Page:
     def _add_view_controls(self) -> None:
         gui = self.server.gui
         places = gui.add_button_group("Look from", tuple(scene.PLACES), hint="Camera: as the depth camera sees it")
-        self._point_colours = gui.add_dropdown("Point colours", (_MUTED, "depth"), initial_value=_MUTED)
         self._wanted = {name: gui.add_checkbox(name, True, hint=hint) for name, hint in _SHOWN.items()}
         if len(self._nodes) > 1:
             for part in self._nodes.values():

@@ -61,8 +61,8 @@ def test_the_cloud_is_the_image_thinned(most: int, rng: np.random.Generator) -> 
 def test_an_image_without_a_reading_has_no_points() -> None:
     depth = np.full((48, 64), np.nan, np.float32)
     assert drawings.depth_span(depth) is None
-    assert drawings.cloud(depth, CAMERA, (0.0, 1.0), 100).points.shape == (0, 3)
-    assert drawings.cloud(depth, CAMERA, (0.0, 1.0), 100, is_muted=True).colours.shape == (0, 3)
+    points = drawings.cloud(depth, CAMERA, (0.0, 1.0), 100)
+    assert points.points.shape == points.colours.shape == (0, 3)
     assert drawings.picture(depth, (0.0, 1.0)).shape == (288, 384, 3)
 
 
