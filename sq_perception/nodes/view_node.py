@@ -51,11 +51,10 @@ _DRAWER_END = 5.0
 
 
 class _Result(NamedTuple):
-    """Superquadrics, when they came, in seconds of the monotonic clock, and after how many milliseconds."""
+    """Superquadrics, and when they came, in seconds of the monotonic clock."""
 
     message: PointCloud2
     time: float
-    latency: float | None
 
 
 class ViewNode(Node):
@@ -173,15 +172,13 @@ class ViewNode(Node):
             self._news.set()
 
     def _on_result(self, name: str, message: PointCloud2) -> None:
-        milliseconds = 1e-6 * (self.get_clock().now().nanoseconds - stamp_of(message))
-        latency = milliseconds if 0 <= milliseconds < 60e3 else None
-        self._results[name] = _Result(message, monotonic(), latency)
+        self._results[name] = _Result(message, monotonic())
         self._news.set()
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             for name in self._remote:
-                if status.hardware_id == name or status.name.split(":")[0].strip() == name.lstrip("/"):
+                if status.hardware_id == name:
                     self._diagnosed[name] = {pair.key: pair.value for pair in status.values}
 
     def _on_parameter_event(self, event: ParameterEvent) -> None:
@@ -257,7 +254,7 @@ class ViewNode(Node):
         if result is not None:
             bodies, remark = self._converted(result.message, header)
             stamp = 1e-9 * stamp_of(result.message)
-            state = replace(state, age=monotonic() - result.time, latency=result.latency, remark=remark)
+            state = replace(state, age=monotonic() - result.time, remark=remark)
         self._page.show_bodies(name, bodies, stamp, state)
         if status_due:
             self._page.show_state(state)

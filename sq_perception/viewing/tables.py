@@ -31,8 +31,6 @@ class NodeState:
     ----------
     age
         Seconds since its last result came; None if none ever did.
-    latency
-        Milliseconds from the image's stamp to the arrival of its last result here; None if unknown.
     lifecycle
         Its lifecycle state; empty for a node without one.
     diagnostics
@@ -45,7 +43,6 @@ class NodeState:
 
     name: str
     age: float | None = None
-    latency: float | None = None
     lifecycle: str = ""
     diagnostics: Mapping[str, str] = field(default_factory=dict)
     is_there: bool = False
@@ -100,14 +97,11 @@ def node_status(state: NodeState) -> str:
     colour, text = _verdict(state)
     values = state.diagnostics
     rate = values.get("rate [Hz]")
-    median, high = values.get("stamp to result: median [ms]"), values.get("stamp to result: p95 [ms]")
-    delay = "" if state.latency is None else f"{state.latency:.0f} ms"
-    if median:
-        delay = f"{_rounded(median)} ms, p95 {_rounded(high or '-')} ms"
+    median, high = values.get("stamp to result: median [ms]"), values.get("stamp to result: p95 [ms]", "-")
     counts = (key for key in ("received", "answered", "dropped", "refused", "lost") if key in values)
     facts = {
         "rate": f"{_rounded(rate, 1)} Hz" if rate else "",
-        "stamp to result": delay,
+        "stamp to result": f"{_rounded(median)} ms, p95 {_rounded(high)} ms" if median else "",
         "frames": ", ".join(f"{html.escape(values[key])} {key}" for key in counts),
         "tracks": html.escape(values.get("tracks", "")),
         "last error": _coloured(_OPEN, values.get("last error", "")),

@@ -264,7 +264,7 @@ def test_a_state_in_words(state: NodeState, words: str) -> None:
 def test_words_from_outside_are_escaped() -> None:
     evil = "<script>alert(1)</script>"
     values = dict.fromkeys(("rate [Hz]", "stamp to result: median [ms]", "dropped", "tracks", "last error"), evil)
-    state = NodeState(evil, 0.1, 1.0, evil, values, True, evil)
+    state = NodeState(evil, 0.1, evil, values, True, evil)
     texts = [
         tables.node_status(state),
         tables.bodies_table(evil, bodies(), 0.0, state),
