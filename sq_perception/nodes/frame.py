@@ -6,7 +6,6 @@ listened to is here too.
 
 from __future__ import annotations
 
-import array
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
@@ -167,9 +166,3 @@ def size_of(message: DepthMessage) -> tuple[int, int]:
     if isinstance(message, CompressedImage):
         return compressed_depth.size(message.format, message.data)
     return int(message.width), int(message.height)
-
-
-def packed(depth: np.ndarray, header: Any, encoding: str = "16UC1") -> CompressedImage:
-    """A packed message of depth (height, width) in metres, NaN or inf for nothing; 16UC1 or 32FC1."""
-    image_format, data = compressed_depth.encode(depth, encoding)
-    return CompressedImage(header=header, format=image_format, data=array.array("B", data))
