@@ -1,4 +1,4 @@
-"""Another node as the page sees it: its parameters, its lifecycle state, whether it is there.
+"""Another node as the page sees it: its parameters, and whether it is there.
 
 Services are called by tasks of the executor; a call without an answer is given up after a while, as the node may have
 died.  Parameters are always read as a whole: when the node appears, and again soon after something may have changed.
@@ -12,7 +12,6 @@ from collections.abc import Callable
 from time import monotonic
 from typing import Any
 
-from lifecycle_msgs.srv import GetState
 from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
@@ -23,8 +22,6 @@ from sq_perception.viewing.page import Page
 
 _PATIENCE = 3.0
 """Seconds until a call is given up."""
-_LOOK_PERIOD = 0.5
-"""Seconds between two looks at whether the node is there, and at its lifecycle state."""
 _SETTLED = 0.4
 """Seconds until parameters are read after a change: a node that starts sends an event for each."""
 
@@ -35,12 +32,9 @@ class RemoteNode:
     def __init__(self, node: Node, name: str) -> None:
         self.name = name
         self.is_there = False
-        self.lifecycle = ""
         self._node = node
         self._parameters = AsyncParameterClient(node, name)
-        self._state = node.create_client(GetState, f"{name}/get_state")
         self._deadlines: dict[Future, float] = {}
-        self._look_due = 0.0
         self._load_due: float | None = None
         self._news: deque[Callable[[Page], None]] = deque()
 
@@ -53,9 +47,9 @@ class RemoteNode:
         for call, deadline in tuple(self._deadlines.items()):
             if now > deadline:
                 call.cancel()  # nothing happens to one that is done
-        if now >= self._look_due:
-            self._look_due = now + _LOOK_PERIOD
-            self._look()
+        was_there, self.is_there = self.is_there, self._parameters.services_are_ready()
+        if self.is_there and not was_there:
+            self._load_due = now
         if self._load_due is not None and now >= self._load_due and self.is_there:
             self._load_due = None
             executor.create_task(self._load)
@@ -81,22 +75,6 @@ class RemoteNode:
         self._note(f"{name} is now {plain(value)}" if result.successful else reason, result.successful)
         self.reload()
 
-    def _look(self) -> None:
-        was_there, self.is_there = self.is_there, self._parameters.services_are_ready()
-        if self.is_there and not was_there:
-            self._load_due = monotonic()
-        if not self.is_there:
-            self.lifecycle = ""
-        elif self._state.service_is_ready():
-            call = self._state.call_async(GetState.Request())
-            self._deadlines[call] = monotonic() + _PATIENCE
-            call.add_done_callback(self._on_state)  # no task: one that is left at the end of the process complains
-
-    def _on_state(self, call: Future) -> None:
-        del self._deadlines[call]
-        if call.result() is not None:
-            self.lifecycle = str(call.result().current_state.label)
-
     async def _load(self) -> None:
         """Names, then descriptors, then values, then controls; all over again where an answer stays away."""
         try:
@@ -105,7 +83,7 @@ class RemoteNode:
             names = [descriptor.name for descriptor in described.descriptors]
             got = await self._answer(self._parameters.get_parameters(names))
         except TimeoutError:
-            self._load_due = monotonic() + _LOOK_PERIOD
+            self.reload()
             return
         read = [parameter_value_to_python(value) for value in got.values]
         controls = [control(*both) for both in zip(described.descriptors, read, strict=True)]

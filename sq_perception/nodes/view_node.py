@@ -1,7 +1,7 @@
 """The node behind ``sq-perception view``: listens to a camera and some frame nodes, and keeps what a page shows.
 
 Images, camera_info and superquadrics are subscribed to while a browser shows the page, /diagnostics and
-/parameter_events always; parameters and lifecycle go by services (:mod:`sq_perception.nodes.remote_node`).
+/parameter_events always; parameters go by services (:mod:`sq_perception.nodes.remote_node`).
 
 The executor's thread stores messages and talks to services; one drawing thread decodes the newest and draws them, at a
 limited rate and only while a browser shows the page.
@@ -247,9 +247,8 @@ class ViewNode(Node):
         if result is self._shown.get(name) and not status_due:
             return
         self._shown[name] = result
-        remote = self._remote[name]
-        diagnostics = self._diagnosed.get(name, {}) if remote.is_there else {}
-        state = NodeState(name, lifecycle=remote.lifecycle, diagnostics=diagnostics, is_there=remote.is_there)
+        is_there = self._remote[name].is_there
+        state = NodeState(name, diagnostics=self._diagnosed.get(name, {}) if is_there else {}, is_there=is_there)
         bodies, stamp = None, 0.0
         if result is not None:
             bodies, remark = self._converted(result.message, header)

@@ -31,8 +31,6 @@ class NodeState:
     ----------
     age
         Seconds since its last result came; None if none ever did.
-    lifecycle
-        Its lifecycle state; empty for a node without one.
     diagnostics
         Key and value of its last diagnostics.
     is_there
@@ -43,7 +41,6 @@ class NodeState:
 
     name: str
     age: float | None = None
-    lifecycle: str = ""
     diagnostics: Mapping[str, str] = field(default_factory=dict)
     is_there: bool = False
     remark: str = ""
@@ -171,7 +168,7 @@ def _rounded(text: str, digits: int = 0) -> str:
 
 
 def _verdict(state: NodeState) -> tuple[str, str]:
-    lifecycle = f"{state.lifecycle}, " if state.lifecycle else ""
+    lifecycle = f"{state.diagnostics['state']}, " if "state" in state.diagnostics else ""
     if state.age is None:
         text = "no result yet" if state.is_there else "not there"
         return (_OPEN if state.is_there else _BAD), lifecycle + text

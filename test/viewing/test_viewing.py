@@ -250,8 +250,8 @@ def test_a_table_has_a_row_for_every_body_and_says_what_failed() -> None:
     [
         (NodeState("/n"), "not there"),
         (NodeState("/n", is_there=True), "no result yet"),
-        (NodeState("/n", is_there=True, lifecycle="inactive"), "inactive, no result yet"),
-        (NodeState("/n", age=0.2, is_there=True, lifecycle="active"), "active, alive"),
+        (NodeState("/n", is_there=True, diagnostics={"state": "inactive"}), "inactive, no result yet"),
+        (NodeState("/n", age=0.2, is_there=True, diagnostics={"state": "active"}), "active, alive"),
         (NodeState("/n", age=65.0), "silent for 65 s"),
         (NodeState("/n", age=600.0), "silent for 10 min"),
         (NodeState("/n", age=9000.0), "silent for 2 h"),
@@ -263,8 +263,10 @@ def test_a_state_in_words(state: NodeState, words: str) -> None:
 
 def test_words_from_outside_are_escaped() -> None:
     evil = "<script>alert(1)</script>"
-    values = dict.fromkeys(("rate [Hz]", "stamp to result: median [ms]", "dropped", "tracks", "last error"), evil)
-    state = NodeState(evil, 0.1, evil, values, True, evil)
+    values = dict.fromkeys(
+        ("state", "rate [Hz]", "stamp to result: median [ms]", "dropped", "tracks", "last error"), evil
+    )
+    state = NodeState(evil, 0.1, values, True, evil)
     texts = [
         tables.node_status(state),
         tables.bodies_table(evil, bodies(), 0.0, state),
