@@ -96,7 +96,6 @@ class RecoverParameters(Parameters):
         "tf2 frame that the bodies rest in, for a camera that moves. Empty: the camera stands still. A change ends the "
         "tracks.",
     )
-    marker_colours: str = setting("id", "By id, or by score from red (0) to green (1).", choices=("id", "score"))
     marker_alpha: float = setting(ALPHA, "Opacity of the markers' surfaces.", within=(0.0, 1.0))
     no_frame_warning: float = setting(
         5.0, "Warn when no depth image came for so long; 0 never warns.", unit="s", within=(0.0, 3600.0)
