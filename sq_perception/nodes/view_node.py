@@ -95,7 +95,7 @@ class ViewNode(Node):
         self._inputs: list[Subscription] = []
         self._latched: Subscription | None = None
         self._drawn: Image | None = None
-        self._shown: dict[str, _Result | None] = {}
+        self._shown: dict[str, _Result] = {}
         """The result of each node that was drawn last."""
         self._status_due = 0.0
         self._remote = {name: RemoteNode(self, name) for name in nodes}
@@ -214,18 +214,19 @@ class ViewNode(Node):
         with self._lock:
             images = list(self._images.values())
             rate = sum(1 for time in self._arrivals if now - time <= _RATE_SECONDS) / _RATE_SECONDS
-        header = self._draw_depth(images, rate, results, status_due)
+        header = self._draw_depth(images, rate, results)
         for name in self._remote:
-            self._draw_node(name, results.get(name), header, status_due)
+            if status_due or results.get(name) is not self._shown.get(name):
+                self._draw_node(name, results.get(name), header)
+        self._shown = results
         if status_due:
             self._status_due = monotonic() + _STATUS_PERIOD
 
-    def _draw_depth(self, images: list[Image], rate: float, results: dict[str, _Result], status_due: bool) -> Any:
+    def _draw_depth(self, images: list[Image], rate: float, results: dict[str, _Result]) -> Any:
         """Draw the image that belongs to the newest results, else the newest; the header of what is drawn."""
         topic = self._topics[0]
         if not images:
-            if status_due:
-                self._page.show_source(tables.source_status(topic, None, 0.0, "", "no depth image has come yet"))
+            self._page.show_source(tables.source_status(topic, None, 0.0, "", "no depth image has come yet"))
             return None
         stamps = {
             stamp_of(result.message) for result in results.values() if monotonic() - result.time < tables.SILENT_SECONDS
@@ -239,24 +240,17 @@ class ViewNode(Node):
                 self._drawn = image
             except ValueError as error:
                 remark = str(error)
-        if status_due or remark:
-            self._page.show_source(tables.source_status(topic, size_of(image), rate, image.header.frame_id, remark))
+        self._page.show_source(tables.source_status(topic, size_of(image), rate, image.header.frame_id, remark))
         return image.header
 
-    def _draw_node(self, name: str, result: _Result | None, header: Any, status_due: bool) -> None:
-        if result is self._shown.get(name) and not status_due:
-            return
-        self._shown[name] = result
+    def _draw_node(self, name: str, result: _Result | None, header: Any) -> None:
         is_there = self._remote[name].is_there
         state = NodeState(name, diagnostics=self._diagnosed.get(name, {}) if is_there else {}, is_there=is_there)
-        bodies, stamp = None, 0.0
+        bodies = None
         if result is not None:
             bodies, remark = self._converted(result.message, header)
-            stamp = 1e-9 * stamp_of(result.message)
             state = replace(state, age=monotonic() - result.time, remark=remark)
-        self._page.show_bodies(name, bodies, stamp, state)
-        if status_due:
-            self._page.show_state(state)
+        self._page.show_bodies(bodies, state)
 
     def _converted(self, message: PointCloud2, header: Any) -> tuple[Bodies | None, str]:
         """The bodies in the frame of the depth image, and why they cannot be drawn."""

@@ -121,12 +121,12 @@ class Page:
         if span is not None and not self._scene.is_aimed:
             self._scene.aim(np.median(points.points, axis=0))
 
-    def show_bodies(self, node: str, bodies: Bodies | None, stamp: float, state: NodeState) -> None:
-        """Draw the bodies of a node, remove those that are gone, and fill its table.
+    def show_bodies(self, bodies: Bodies | None, state: NodeState) -> None:
+        """Draw the bodies of a node, remove those that are gone, fill its table, and write how it is doing.
 
         ``bodies`` is None while no result came.  They are not drawn if ``state.remark`` has a reason.
         """
-        part = self._nodes[node]
+        part = self._nodes[state.name]
         if bodies is not None and len(bodies) and not state.remark and not self._aimed_at_bodies:
             self._aimed_at_bodies = True
             self._scene.aim(bodies.superquadrics.translation.mean(axis=0))
@@ -136,14 +136,12 @@ class Page:
             kept: set[str] = set()
             if drawn is not None:
                 for k in range(len(drawn)):
-                    kept |= self._scene.draw_body(node, drawn, k, state.is_silent, self._is_wanted)
-            self._scene.keep(node, kept)
+                    kept |= self._scene.draw_body(state.name, drawn, k, state.is_silent, self._is_wanted)
+            self._scene.keep(state.name, kept)
         is_cube = self._scene.camera is not None and not self._scene.camera.is_pinhole
-        part.table.content = tables.bodies_table(node, bodies, stamp, state, is_cube=is_cube)
-
-    def show_state(self, state: NodeState) -> None:
-        """Write how a node is doing."""
-        self._nodes[state.name].status.content = tables.node_status(state)
+        part.table.content = tables.bodies_table(bodies, state, is_cube=is_cube)
+        if part.status is not None:
+            part.status.content = tables.node_status(state)
 
     def show_source(self, text: str) -> None:
         """Write where the depth comes from, as HTML of :mod:`sq_perception.viewing.tables`."""
@@ -196,8 +194,8 @@ class Page:
         gui.main_panel.set_width(_PANEL_WIDTH)
 
         self._source = gui.add_html("")
-        for part in self._nodes.values():
-            part.status = gui.add_html(tables.node_status(NodeState(part.name)) if parameters else "")
+        for part in self._nodes.values() if parameters else ():
+            part.status = gui.add_html(tables.node_status(NodeState(part.name)))
         tabs = gui.add_tab_group()
         for part in self._nodes.values():
             short = part.name.rsplit("/", 1)[-1]

@@ -50,8 +50,8 @@ class NodeState:
         return self.age is None or self.age > SILENT_SECONDS
 
 
-def bodies_table(name: str, bodies: Bodies | None, stamp: float, state: NodeState, *, is_cube: bool = False) -> str:
-    """The bodies of a node; ``stamp`` is that of their image, seconds; ``is_cube`` if it shows the unit cube."""
+def bodies_table(bodies: Bodies | None, state: NodeState, *, is_cube: bool = False) -> str:
+    """The bodies of a node; ``is_cube`` if their image shows the unit cube."""
     if bodies is None:
         return f'<div style="padding:4px 17px;font-size:12.5px;color:{_DIM}">No result has come yet.</div>'
     faded = ";opacity:0.45" if state.is_silent else ""
@@ -83,7 +83,7 @@ def bodies_table(name: str, bodies: Bodies | None, stamp: float, state: NodeStat
         failed = f'<div style="color:{_BAD};padding:3px 5px">no fit: {shown}{more}</div>'
     table = f'<table style="{_TABLE}"><thead><tr>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table>'
     return (
-        f'<div data-node="{html.escape(name)}" data-stamp="{stamp:.9f}" style="padding:2px 12px 6px 12px{faded}">'
+        f'<div data-node="{html.escape(state.name)}" style="padding:2px 12px 6px 12px{faded}">'
         f'<div style="{_SMALL};padding:2px 5px">{heading}; half sizes in {unit} ± standard deviation</div>'
         f'<div style="overflow-x:auto;overflow-y:auto;max-height:340px">{table if count else ""}</div>{failed}</div>'
     )

@@ -231,18 +231,17 @@ def test_every_parameter_of_the_nodes_has_a_control() -> None:
 
 def test_a_table_has_a_row_for_every_body_and_says_what_failed() -> None:
     state = NodeState("/recover_node", 0.1)
-    text = tables.bodies_table("/recover_node", bodies(np.nan, weak=True), 1.5, state)
+    text = tables.bodies_table(bodies(np.nan, weak=True), state)
     assert text.count("<tr") == 2
     assert "± ?" in text
     assert ">weak<" in text
-    assert 'data-stamp="1.500000000"' in text
     none = Bodies(
         Superquadric.stack([]), np.empty((0, 3)), np.empty(0), [], [], np.empty((0, 3)), failed=list(range(1, 9))
     )
-    text = tables.bodies_table("/recover_node", none, 0.0, state)
+    text = tables.bodies_table(none, state)
     assert "no bodies" in text
     assert "no fit: 1, 2, 3, 4, 5 and 3 more" in text
-    assert "No result" in tables.bodies_table("/recover_node", None, 0.0, state)
+    assert "No result" in tables.bodies_table(None, state)
 
 
 @pytest.mark.parametrize(
@@ -269,7 +268,7 @@ def test_words_from_outside_are_escaped() -> None:
     state = NodeState(evil, 0.1, values, True, evil)
     texts = [
         tables.node_status(state),
-        tables.bodies_table(evil, bodies(), 0.0, state),
+        tables.bodies_table(bodies(), state),
         tables.source_status(evil, (1, 1), 1.0, evil, ""),
         tables.source_status(evil, None, 1.0, evil, evil),
         tables.answer(evil, False),
@@ -368,14 +367,14 @@ def test_the_page_draws_what_is_there_and_takes_away_what_is_not() -> None:
                 volume = page._scene._handles["", "/camera"].points
                 assert volume.shape == (lines, 2, 3)
                 assert volume[..., 2].max() == pytest.approx(far)
-            page.show_bodies("/a/b", bodies(), 0.0, NodeState("/a/b", age=99.0))
+            page.show_bodies(bodies(), NodeState("/a/b", age=99.0))
             for found, parts in (
                 (bodies(), {"surface", "id", "shell"}),
                 (bodies(np.nan), {"surface", "id"}),
                 (None, set()),
                 (bodies(), {"surface", "id", "shell"}),
             ):
-                page.show_bodies("/a", found, 0.0, NodeState("/a", age=0.0))
+                page.show_bodies(found, NodeState("/a", age=0.0))
                 assert {path for node, path in page._scene._handles if node == "/a"} == {
                     f"/bodies/a/7/{x}" for x in parts
                 }
@@ -383,7 +382,7 @@ def test_the_page_draws_what_is_there_and_takes_away_what_is_not() -> None:
             assert silent < fresh
             assert page._scene._handles["/a/b", "/bodies/a/b/7/id"].text == "b 7"
             page._wanted["Shells"].value = False
-            page.show_bodies("/a", bodies(), 0.0, NodeState("/a", age=0.0))
+            page.show_bodies(bodies(), NodeState("/a", age=0.0))
             assert ("/a", "/bodies/a/7/shell") not in page._scene._handles
         finally:
             page.close()
