@@ -17,7 +17,7 @@ from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.task import Future
 
-from sq_perception.viewing.controls import control, plain
+from sq_perception.viewing.controls import control
 from sq_perception.viewing.page import Page
 
 _PATIENCE = 3.0
@@ -72,7 +72,7 @@ class RemoteNode:
         result = response.results[0]
         # Not every reason of rclpy's own names its parameter.
         reason = result.reason if name in result.reason else f"{name}: {result.reason or 'refused'}"
-        self._note(f"{name} is now {plain(value)}" if result.successful else reason, result.successful)
+        self._note(f"{name} is now {value}" if result.successful else reason, result.successful)
         self.reload()
 
     async def _load(self) -> None:
@@ -86,7 +86,8 @@ class RemoteNode:
             self.reload()
             return
         read = [parameter_value_to_python(value) for value in got.values]
-        controls = [control(*both) for both in zip(described.descriptors, read, strict=True)]
+        made = (control(*both) for both in zip(described.descriptors, read, strict=True))
+        controls = [each for each in made if each is not None]
         self._news.append(lambda page: page.show_controls(self.name, controls))
 
     async def _answer(self, call: Future) -> Any:

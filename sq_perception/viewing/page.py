@@ -17,7 +17,7 @@ import viser
 
 from sq_perception.imaging.camera import Camera
 from sq_perception.viewing import drawings, scene, server, tables
-from sq_perception.viewing.controls import GROUPS, Control
+from sq_perception.viewing.controls import Control
 from sq_perception.viewing.drawings import Bodies
 from sq_perception.viewing.scene import Scene
 from sq_perception.viewing.tables import NodeState
@@ -157,20 +157,12 @@ class Page:
         ]:
             self._show_values(part, controls)
             return
-        for folder in part.folders:
-            folder.remove()
-        part.folders, part.handles, part.controls = [], {}, {control.name: control for control in controls}
+        for handle in part.handles.values():
+            handle.remove()
+        part.controls = {control.name: control for control in controls}
         part.pending.clear()
-        for group, title in GROUPS.items():
-            members = [control for control in controls if control.group == group]
-            if not members:
-                continue
-            with part.tab:
-                folder = self.server.gui.add_folder(title, expand_by_default=group == "live")
-            part.folders.append(folder)
-            with folder:
-                for control in members:
-                    part.handles[control.name] = self._add_control(part, control)
+        with part.tab:
+            part.handles = {control.name: self._add_control(part, control) for control in controls}
 
     def _show_values(self, part: _NodePart, controls: Sequence[Control]) -> None:
         """Put the node's values into its controls, but for one that a user is changing."""
@@ -248,14 +240,13 @@ class Page:
             if about.type is float:
                 handle.precision = _DECIMALS
         else:
-            handle = gui.add_text(about.name, value, disabled=not about.can_change, **common)
-        if about.can_change:
+            handle = gui.add_text(about.name, value, **common)
 
-            @handle.on_update
-            def _(_: viser.GuiEvent) -> None:
-                wanted = about.wanted(handle.value)
-                if wanted is not None and wanted != part.known.get(about.name):
-                    part.pending[about.name] = wanted, monotonic() + (_TYPING if about.is_typed else 0.0)
+        @handle.on_update
+        def _(_: viser.GuiEvent) -> None:
+            wanted = about.wanted(handle.value)
+            if wanted is not None and wanted != part.known.get(about.name):
+                part.pending[about.name] = wanted, monotonic() + (_TYPING if about.is_typed else 0.0)
 
         return handle
 
@@ -270,7 +261,6 @@ class _NodePart:
     tab: Any = None
     answer: Any = None
     wanted: Any = None
-    folders: list[Any] = field(default_factory=list)
     controls: dict[str, Control] = field(default_factory=dict)
     handles: dict[str, Any] = field(default_factory=dict)
     known: dict[str, Any] = field(default_factory=dict)
