@@ -6,13 +6,16 @@ A supervisor starts the killed process again at once, as a launch file with ``re
 start to the first result that needs the process: of an image that was taken after it.  Meanwhile the others must not
 fall silent: results where the viewer was killed, camera_infos where the node was, diagnoses where the camera was.
 A process that does not come back within 30 s counts as never back (the reasons: test/helpers/respawned_nodes.py).
-Shared-memory segments are counted after each kill, those of dead owners separately.  They are freed by the next start
-of one of this package's nodes, not by the viewer's, and not before they are ten seconds old.
+Shared-memory segments are counted after each kill, those of dead owners separately; `fastdds shm clean` frees these
+before and after the run.
 """
 
 from __future__ import annotations
 
+import os
 import shlex
+import shutil
+import subprocess
 import sys
 import time
 from dataclasses import asdict
@@ -22,8 +25,6 @@ import own_domain  # noqa: F401
 import report
 from respawned_nodes import CAMERA, MEMBERS, NODE, VIEWER, Kill, Robot, orphans
 from running_nodes import Peer
-
-from sq_perception.nodes.fast_dds import remove_orphans
 
 ASKED = 5.0
 """Seconds to the first result after a restart."""
@@ -45,7 +46,7 @@ def main() -> None:
     rng = np.random.default_rng(options.seed)
     # An equal share of each, in a random order.
     order = rng.permutation(np.resize(MEMBERS, options.kills))
-    freed = remove_orphans()
+    free()
     before = set(orphans())
     kills: list[Kill] = []
     with (
@@ -54,7 +55,6 @@ def main() -> None:
             peer,
             camera=(f"rate:={options.rate}", f"objects:={options.objects}", "hold:=15"),
             node=options.node,
-            parameters=("free_shared_memory:=true",),
             viewer=shlex.split(options.viewer),
         ) as robot,
     ):
@@ -92,11 +92,17 @@ def main() -> None:
         "kills": [{**asdict(kill), "back": kill.back if np.isfinite(kill.back) else None} for kill in kills],
         "processes_left": left,
         "orphans": {"before": len(before), "at_most": most, "after": len(dead)},
-        "freed_before": len(freed),
     }
     report.write(options.name, result, f"{report.table_of(rows)}\n\n{summary}")
-    remove_orphans()
+    free()
     sys.exit(0 if not left and all(row["met"] == "yes" for row in rows) else 1)
+
+
+def free() -> None:
+    """Delete the segments of dead owners."""
+    places = os.pathsep.join((os.path.dirname(sys.executable), os.environ["PATH"]))
+    if tool := shutil.which("fastdds", path=places):
+        subprocess.run([tool, "shm", "clean"], check=True, stdout=subprocess.DEVNULL)
 
 
 if __name__ == "__main__":
