@@ -124,19 +124,17 @@ class Page:
     def show_bodies(self, bodies: Bodies | None, state: NodeState) -> None:
         """Draw the bodies of a node, remove those that are gone, fill its table, and write how it is doing.
 
-        ``bodies`` is None while no result came.  They are not drawn if ``state.remark`` has a reason.
+        ``bodies`` is None while no result came, and where it cannot be drawn, for the reason in ``state.remark``.
         """
         part = self._nodes[state.name]
-        if bodies is not None and len(bodies) and not state.remark and not self._aimed_at_bodies:
+        if bodies is not None and len(bodies) and not self._aimed_at_bodies:
             self._aimed_at_bodies = True
             self._scene.aim(bodies.superquadrics.translation.mean(axis=0))
-        is_wanted = part.wanted is None or part.wanted.value
-        drawn = bodies if bodies is not None and not state.remark and is_wanted else None
         with self.server.atomic():
             kept: set[str] = set()
-            if drawn is not None:
-                for k in range(len(drawn)):
-                    kept |= self._scene.draw_body(state.name, drawn, k, state.is_silent, self._is_wanted)
+            if bodies is not None and (part.wanted is None or part.wanted.value):
+                for k in range(len(bodies)):
+                    kept |= self._scene.draw_body(state.name, bodies, k, state.is_silent, self._is_wanted)
             self._scene.keep(state.name, kept)
         is_cube = self._scene.camera is not None and not self._scene.camera.is_pinhole
         part.table.content = tables.bodies_table(bodies, state, is_cube=is_cube)
