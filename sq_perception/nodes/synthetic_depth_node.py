@@ -75,15 +75,14 @@ class SyntheticDepthNode(Node):
     def __init__(self, name: str, context: Any = None) -> None:
         super().__init__(name, context=context)
         self.start_failure = ""
-        self._settings = LiveParameters(self, SyntheticParameters, check=self._check)
+        self._settings = LiveParameters(self, SyntheticParameters, check=self._check, changed=self._keep_time)
         self._source = frame_source(self._settings.current)
-        replay = self._settings.current.scene == "replay"
         self._image = self._output(Image, "depth/image")
-        self._info = None if self._source.clean.is_cube else self._output(CameraInfo, "depth/camera_info")
+        self._info = self._output(CameraInfo, "depth/camera_info")
+        self._truth = self._output(PointCloud2, "~/truth")
+        # Where somebody publishes masks, images wait for them.
         self._mask = self._output(Image, "mask/image") if self._source.clean.labels is not None else None
-        self._truth = None if replay else self._output(PointCloud2, "~/truth")
-        self._rate = self._settings.current.rate
-        self._ticks = self.create_timer(1 / self._rate, self._tick)
+        self._ticks = self.create_timer(1 / self._settings.current.rate, self._tick)
         self.get_logger().info(f"publishing {self._settings.current.scene} frames on {self._image.topic_name}")
 
     def close(self) -> bool:
@@ -93,15 +92,15 @@ class SyntheticDepthNode(Node):
     def _check(self, parameters: SyntheticParameters, _: frozenset[str]) -> None:
         parameters.check(self._source.clean.is_cube, self._source.clean.name)
 
+    def _keep_time(self, parameters: SyntheticParameters, _: frozenset[str]) -> None:
+        self._ticks.timer_period_ns = int(1e9 / parameters.rate)
+
     def _output(self, kind: type[Any], topic: str) -> Any:
         options = QoSOverridingOptions.with_default_policies()
         return self.create_publisher(kind, topic, 2, qos_overriding_options=options)
 
     def _tick(self) -> None:
         settings = self._settings.current
-        if settings.rate != self._rate:
-            self._rate = settings.rate
-            self._ticks.timer_period_ns = int(1e9 / self._rate)
         try:
             frame = self._source.next(settings.noise, settings.sensor)
             if frame is not None:
@@ -118,11 +117,9 @@ class SyntheticDepthNode(Node):
         header = Header(stamp=self.get_clock().now().to_msg(), frame_id=frame_id)
         fitting = GREY_ENCODINGS if frame.is_cube else ("32FC1", "16UC1")
         encoding = settings.encoding if settings.encoding in fitting else fitting[0]
-        if self._truth is not None and frame.truth is not None:
+        if frame.truth is not None:
             self._truth.publish(to_message(truth_array(frame.truth), header))
         if not frame.is_cube:
-            if self._info is None:
-                self._info = self._output(CameraInfo, "depth/camera_info")
             self._info.publish(intrinsics_to_message(intrinsics(frame.camera), header))
         if frame.labels is not None:
             if self._mask is None:
