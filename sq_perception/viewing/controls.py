@@ -38,10 +38,6 @@ class Control:
     high: float | None = None
     choices: tuple[str, ...] = ()
 
-    @property
-    def is_typed(self) -> bool:
-        return self.kind in ("text", "number")
-
     def wanted(self, value: Any) -> Any:
         """A value of the page in the type of the parameter; None for what is no value, such as half a number."""
         if self.kind != "number":
@@ -61,11 +57,11 @@ def control(about: Any, value: Any) -> Control | None:
     if isinstance(value, bool):
         return Control(about.name, "bool", value, hint, bool)
     if isinstance(value, str):
-        choices = _choices(constraints)
-        if choices:
-            choices = choices if value in choices else (*choices, value)
-            return Control(about.name, "choice", value, hint, str, choices=choices)
-        return Control(about.name, "text", value, hint, str)
+        if not constraints.startswith(_CHOICES):
+            return Control(about.name, "text", value, hint, str)
+        choices = tuple(name.strip() for name in constraints.removeprefix(_CHOICES).split(","))
+        choices = choices if value in choices else (*choices, value)
+        return Control(about.name, "choice", value, hint, str, choices=choices)
     if not (isinstance(value, (int, float)) and math.isfinite(value)):
         return None
     kind = float if about.floating_point_range or isinstance(value, float) else int
@@ -75,9 +71,3 @@ def control(about: Any, value: Any) -> Control | None:
         low, high = min(ends.from_value, value), max(ends.to_value, value)
         made = replace(made, low=None if math.isinf(low) else kind(low), high=None if math.isinf(high) else kind(high))
     return made
-
-
-def _choices(constraints: str) -> tuple[str, ...]:
-    if not constraints.startswith(_CHOICES):
-        return ()
-    return tuple(name.strip() for name in constraints[len(_CHOICES) :].split(",") if name.strip())

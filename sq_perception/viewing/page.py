@@ -244,7 +244,8 @@ class Page:
         def _(_: viser.GuiEvent) -> None:
             wanted = about.wanted(handle.value)
             if wanted is not None and wanted != part.known.get(about.name):
-                part.pending[about.name] = wanted, monotonic() + (_TYPING if about.is_typed else 0.0)
+                is_typed = about.kind in ("text", "number")
+                part.pending[about.name] = wanted, monotonic() + (_TYPING if is_typed else 0.0)
 
         return handle
 
