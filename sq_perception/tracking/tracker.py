@@ -233,7 +233,7 @@ def _still_there(
     Old answers are only where these do not say what was fused before, of a body that moves, or where the camera's pose
     was corrected or the first one was never seen.
     """
-    if not len(pairs.track):
+    if not len(pairs.track) or not any(repeats):
         return bodies, pairs
     after, new = list(bodies), np.ones(len(pairs.track), dtype=bool)
     agrees = _compared(bodies, pairs)[2].agrees
