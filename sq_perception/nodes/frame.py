@@ -129,15 +129,15 @@ def decode_by(info: CameraInfo | None, image: Image, topic: str) -> Frame:
     return decode(image, None if image.encoding in GREY_ENCODINGS else calibration)
 
 
-def image_topic(node: Node, name: str, transport: str) -> str:
-    """The topic to listen to for the images of ``name``, with the node's namespace and remappings.
+def image_topic(node: Node, transport: str) -> str:
+    """The topic to listen to for depth images, with the node's namespace and remappings.
 
-    The transport's part comes behind the remapped topic, unless that names it already.  Points have a topic beside it,
-    ``depth/points`` for ``depth/image``, which is remapped by itself.
+    The transport's part comes behind the remapped ``depth/image``, unless that names it already.  Points have a topic
+    of their own, ``depth/points``, which is remapped by itself.
     """
     if transport == POINTS:
-        return str(node.resolve_topic_name(f"{name.rpartition('/')[0]}/{POINTS}"))
-    resolved: str = node.resolve_topic_name(name)
+        return str(node.resolve_topic_name("depth/points"))
+    resolved: str = node.resolve_topic_name("depth/image")
     if transport == RAW or resolved.endswith(f"/{transport}"):
         return resolved
     return f"{resolved}/{transport}"

@@ -30,8 +30,8 @@ from sq_perception.nodes.frame import decode, image_topic, size_of
 def test_topics_follow_the_image_s(rules, expected):
     with SpunNodes(*rules) as nodes:
         nodes.spin([])
-        assert image_topic(nodes.peer, "depth/image", "compressedDepth") == expected
-        assert image_topic(nodes.peer, "depth/image", "raw") == nodes.peer.resolve_topic_name("depth/image")
+        assert image_topic(nodes.peer, "compressedDepth") == expected
+        assert image_topic(nodes.peer, "raw") == nodes.peer.resolve_topic_name("depth/image")
 
 
 def packed(depth, header):
