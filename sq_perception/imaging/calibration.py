@@ -140,11 +140,6 @@ class Calibration:
         self.camera.check_image(depth)
         return depth if self.rectification is None else self.rectification.back.depth(depth)
 
-    def labels_as_sent(self, labels: np.ndarray) -> np.ndarray:
-        """The same for a label image."""
-        self.camera.check_image(labels)
-        return labels if self.rectification is None else self.rectification.back.labels(labels)
-
     def check(self, image: np.ndarray) -> None:
         """Raise ValueError unless the image (height, width) has the size of those that are sent."""
         fault = size_mismatch((image.shape[1], image.shape[0]), self.size)

@@ -38,8 +38,6 @@ _SHAPE, _CENTRE, _TURN, _CENTRE_AND_TURN = slice(3, 5), slice(5, 8), slice(8, 11
 """Of a body's covariance: its exponents, its centre in the optical frame and its rotation vector in its own."""
 _OF_EACH_BODY = ("score", "residual", "sigma_size", "status", "label")
 """Columns of a message that are attributes of a recovery of the same name."""
-_WORST, _BEST = np.array([0.80, 0.20, 0.15]), np.array([0.20, 0.65, 0.30])
-
 
 Mesh = tuple[np.ndarray, np.ndarray]
 """Vertices (k, 3) and faces (m, 3) of vertex indices."""
@@ -173,13 +171,12 @@ class Findings:
     def markers(
         self,
         previous_ids: Iterable[int] = (),
-        by_score: bool = False,
         alpha: float = ALPHA,
         types: MessageTypes = installed,
     ) -> Any:
         """A MarkerArray of the bodies that did not fail; markers of ``previous_ids`` that are gone are deleted.
 
-        Colours are by id, or by score from red (0) to green (1); ``alpha`` is their opacity.
+        Colours are by id; ``alpha`` is their opacity.
         """
         shown = self.array.recovered
         turns = poses.matrices(poses.unit_quaternions(shown.rotation))
@@ -188,13 +185,7 @@ class Findings:
             turn, centre = turns[k].T, shown.translation[k].astype(float)
             lines = outline(Superquadric.at_origin(shown.size[k], shown.shape[k]))
             surfaces.append((vertices @ turn + centre, faces, lines @ turn + centre))
-        colours = None
-        if by_score:
-            share = np.clip(np.nan_to_num(shown.score), 0, 1)[:, None]
-            colours = (1 - share) * _WORST + share * _BEST
-        return markers(
-            surfaces, self.shown_ids, self.header, colours=colours, alpha=alpha, previous_ids=previous_ids, types=types
-        )
+        return markers(surfaces, self.shown_ids, self.header, alpha=alpha, previous_ids=previous_ids, types=types)
 
 
 def findings(found: Identified, header: Any, is_cube: bool) -> Findings:

@@ -81,7 +81,7 @@ def _as_script(value: object) -> str:
 def _scene(frame: RecordedFrame, recovery: FrameRecovery) -> trimesh.Scene:
     """Points and bodies, with a camera behind the one that took the image."""
     span = drawings.depth_span(frame.depth) or (0.0, 1.0)
-    cloud = drawings.cloud(frame.depth, frame.camera, span, _MOST_POINTS, is_muted=True)
+    cloud = drawings.cloud(frame.depth, frame.camera, span, _MOST_POINTS)
     whole = trimesh.Scene()
     points, colours = cloud.points, cloud.colours
     if not len(points):  # of a covered lens one black point, as no GLB is empty

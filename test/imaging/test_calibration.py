@@ -102,7 +102,6 @@ def test_which_image_it_is(changes, name, distortion, raw, camera, rng):
     np.testing.assert_array_equal(calibration.rectified_labels(labels), undone.there.labels(labels))
     seen = np.ones((undone.camera.height, undone.camera.width), np.float32)
     assert calibration.as_sent(seen).shape == depth.shape
-    assert calibration.labels_as_sent(seen.astype(np.int32)).shape == depth.shape
 
 
 def test_what_auto_has_decided_is_said():
