@@ -28,7 +28,7 @@ from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
 from sq_msgs_py import answers
-from sq_perception.nodes import process
+from sq_perception.nodes import fast_dds, process
 from sq_perception.nodes.engine import TURNS, Answer, Engine
 from sq_perception.nodes.frame import Frame, stamp_of
 from sq_perception.nodes.input import Arrival, Input
@@ -113,6 +113,9 @@ class FrameNode(ManagedNode):
 
     def _configure(self) -> None:
         parameters = self._settings.current
+        if parameters.free_shared_memory:
+            freed = fast_dds.remove_orphans()
+            self.get_logger().info(f"freed {len(freed)} shared-memory segments of processes that were killed")
         started = perf_counter()
         self.get_logger().info("warming up: loading compiled code, or compiling it on the first start")
         self._engine.build(parameters)

@@ -24,8 +24,8 @@ from running_nodes import Peer, arguments, environment, until
 from sensor_msgs.msg import CameraInfo
 
 from sq_perception.commands.children import Child
+from sq_perception.nodes.fast_dds import FOLDER
 
-FOLDER = Path("/dev/shm")  # noqa: S108 - where Fast DDS keeps its segments
 CAMERA, NODE, VIEWER = "camera", "node", "viewer"
 MEMBERS = (CAMERA, NODE, VIEWER)
 _VIEWER = """
