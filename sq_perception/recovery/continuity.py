@@ -116,7 +116,7 @@ def repeated(
         return NOTHING
     if previous.labels.max(initial=0) > previous.labels.size:  # given ones, and tables by label would be huge
         return NOTHING
-    old, new, sigma = before.depth, sampled(depth, before.stride), before.segments.found.sigma
+    old, new, sigma = before.depth, sampled(depth, before.stride), before.segments.sigma
     shown = np.ascontiguousarray(previous.labels[:: before.stride, :: before.stride], dtype=np.int32)
     reach = _REACH * float(old[shown > 0].max(initial=0))
     change, near = _changed(old, new, reach)

@@ -10,7 +10,7 @@ import numpy as np
 
 from sq_perception.imaging.camera import Camera
 from sq_perception.recovery.options import RecoveryOptions
-from sq_perception.recovery.own_segments import OwnSegments
+from sq_perception.segmentation.segments import Segmentation
 
 _WIDTH = 320
 """Columns that are compared: noise of neighbouring pixels is alike in all sensors of sensor_noise.preset."""
@@ -34,7 +34,7 @@ class Reference:
     stride: int
     camera: Camera
     options: RecoveryOptions
-    segments: OwnSegments
+    segments: Segmentation
     age: int
     given: bool
 
@@ -44,7 +44,7 @@ class Reference:
         depth: np.ndarray,
         camera: Camera,
         options: RecoveryOptions,
-        segments: OwnSegments,
+        segments: Segmentation,
         *,
         age: int,
         given: bool,

@@ -22,6 +22,7 @@ from sq_perception.segmentation import (
     support_surface,
     surface_patches,
 )
+from sq_perception.segmentation.options import SegmentationOptions
 from sq_perception.segmentation.support_plane import Plane
 from sq_perception.segmentation.support_surface import SupportSurface
 
@@ -40,7 +41,7 @@ def above(
     camera: Camera,
     support: SupportSurface,
     walls: list[Plane],
-    limits: standing.Limits,
+    options: SegmentationOptions,
 ) -> np.ndarray:
     """Bodies (labels from 1, unordered) of what is above the support; heights are 0 where depths are."""
     labels = np.zeros(known.shape, np.int32)
@@ -50,7 +51,7 @@ def above(
     above = relative > max(0.25 * support_plane.TOLERANCE, 2 * support.sigma)
     above &= ~support_surface.risen(relative, known, valid, camera)
     clear &= above
-    clear &= ~standing.furniture(known, clear, camera, walls, limits)
+    clear &= ~standing.furniture(known, clear, camera, walls, options)
     left, top, width, height = cv2.boundingRect(clear.view(np.uint8))
     if width == 0:
         return labels
@@ -60,7 +61,7 @@ def above(
     flat = valid[window] & (np.abs(relative[window]) < support_plane.TOLERANCE)
     known, clear = np.ascontiguousarray(known[window]), np.ascontiguousarray(clear[window])
     seen = camera.cropped(left, top, known.shape[1], known.shape[0])
-    holds = partial(limits.is_small, up=support.plane.equation[:3])
+    holds = partial(options.is_small, up=support.plane.equation[:3])
     inside = taken_apart(known, clear, seen, support.sigma, holds, flat)
     foot = above[window] & (inside == 0)
     labels[window] = depth_steps.grown(inside, foot, known, _FOOT_PIXELS, depth_steps.STEP)

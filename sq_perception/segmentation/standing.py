@@ -14,31 +14,26 @@ Metres, optical frame.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import cv2
 import numpy as np
 
-from sq_perception.geometry import rotation
 from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.quantiles import quantile
 from sq_perception.imaging import depth_steps
 from sq_perception.imaging.camera import Camera
-from sq_perception.segmentation import support_plane
+from sq_perception.segmentation.options import SegmentationOptions, largest_edge
 from sq_perception.segmentation.support_plane import TOLERANCE, Plane, coarse, noise_growth
 from sq_perception.segmentation.support_surface import HIGHEST, LEVEL_SHARE, SupportSurface
 
 ObjectTest = Callable[[np.ndarray, np.ndarray], bool]
 """Of the rows and columns of a segment's pixels."""
-Box = tuple[float, float, float, float, float, float]
-Pose = tuple[tuple[float, float, float, float], tuple[float, float, float]]
-"""Quaternion x y z w and translation."""
 
 MIN_HEIGHT, _LEAST_HEIGHT = 0.012, 0.008
 """Metres that a thing reaches above the support at least, a metre away and farther, and nearer as the noise falls: one
 and a half tolerances of a plane, and a book's thickness, as cloths have folds."""
 _SAMPLES = 400
-"""Of a segment, evenly taken: the 5 % above a height, or the 1 % that may stick out, are a few still."""
+"""Of a segment, evenly taken: the 5 % above a height are a few still."""
 _SPARSE, _STRAY = 8, 0.001
 """Every so many pixels tell the nearest depth of an image, but for that share of them, which may be stray readings."""
 _FEWEST = 30
@@ -64,10 +59,6 @@ Of 72 simulated scenes of furniture this leaves 10 more segments of it, of which
 _FACE_SHARE = 0.5
 """What makes up this share of a plane's points is no part of it: the plane is a face of the thing.  The larger part
 decides; without it 3 of 81 recorded and simulated frames lose a body."""
-_OUTLIERS = 0.01
-"""Share of the points at either end that do not count for the extent: sensors smear edges."""
-TURNS = np.stack([np.cos(np.deg2rad(np.arange(0, 180, 10))), np.sin(np.deg2rad(np.arange(0, 180, 10)))], axis=1)
-"""Directions (18, 2) in which edges are measured."""
 _UNDER, _BELOW = 3.0, 2.0
 """Tolerances below the support at which is looked for it, and from which on something seen lies below it."""
 _SPECKLE = 4
@@ -80,72 +71,15 @@ at a grazing angle half is not measured: with a third low cameras miss a few thi
 shows one more that is none."""
 
 
-@dataclass(frozen=True)
-class Limits:
-    """What a thing may be.
-
-    Attributes
-    ----------
-    max_size
-        Largest edge of a box around what is seen of it, metres.
-    workspace
-        The middle of what is seen of it lies in this box: least x, y, z and greatest x, y, z.
-    workspace_pose
-        Of the optical frame in the frame of the box; None: they are the same.
-    """
-
-    max_size: float
-    workspace: Box | None
-    workspace_pose: Pose | None
-
-    def hold(self, points: np.ndarray, up: np.ndarray | None = None) -> bool:
-        """Whether points (n, 3) are no larger than a thing and in the workspace; ``up`` is the support's normal."""
-        if self.workspace is not None and not within(self.workspace, points, self.workspace_pose):
-            return False
-        return self.is_small(points, up)
-
-    def is_small(self, points: np.ndarray, up: np.ndarray | None = None) -> bool:
-        """Whether points (n, 3) are no larger than a thing."""
-        return largest_edge(points, up) <= self.max_size
-
-
-def within(box: Box, points: np.ndarray, pose: Pose | None = None) -> bool:
-    """Whether the middle of points (n, 3) lies in a box; ``pose`` is that of their frame in the frame of the box."""
-    if pose is not None:
-        points = points @ rotation.to_matrix(np.array(pose[0])).T + np.array(pose[1])
-    middle = np.median(points, axis=0)
-    return bool((middle >= box[:3]).all() and (middle <= box[3:]).all())
-
-
-def largest_edge(points: np.ndarray, up: np.ndarray | None = None) -> float:
-    """Largest edge of the box around points (n, 3) whose largest edge is least, metres: upright, or of principal axes.
-
-    A hundredth of the points at either end may stick out.
-    """
-    points = points[:: 1 + len(points) // _SAMPLES]
-    if up is None:
-        axes = np.linalg.eigh(np.cov(points.T))[1] if len(points) > 3 else np.eye(3)
-        return float(_extents(axes.T @ points.T).max())
-    edges = _extents(np.concatenate([TURNS @ support_plane.across(up).T, up[None]]) @ points.T)
-    # A quarter turn apart, the two edges of one rectangle.
-    half = len(TURNS) // 2
-    return float(max(np.maximum(edges[:half], edges[half:-1]).min(), edges[-1]))
-
-
-def _extents(values: np.ndarray) -> np.ndarray:
-    """Of each row, without what sticks out."""
-    ordered = np.sort(values, axis=1)
-    out = int(_OUTLIERS * values.shape[1])
-    return np.asarray(ordered[:, -1 - out] - ordered[:, out])
-
-
 def _top(values: np.ndarray) -> float:
     """Their 95 % quantile; sensors smear edges."""
     k = int(0.95 * len(values))
     return float(np.partition(values, k)[k])
 
 
-def furniture(depth: np.ndarray, valid: np.ndarray, camera: Camera, walls: list[Plane], limits: Limits) -> np.ndarray:
+def furniture(
+    depth: np.ndarray, valid: np.ndarray, camera: Camera, walls: list[Plane], options: SegmentationOptions
+) -> np.ndarray:
     """Pixels, bool (height, width), of surfaces in one of some planes that are larger than a thing."""
     if not walls:
         return np.zeros(depth.shape, bool)
@@ -158,7 +92,7 @@ def furniture(depth: np.ndarray, valid: np.ndarray, camera: Camera, walls: list[
         lies[rows[on], columns[on]] = True
         parts = depth_steps.components(lies)[rows, columns]
         for part in np.flatnonzero(np.bincount(parts) > _FEWEST):
-            if part > 0 and largest_edge(points[parts == part], wall.equation[:3]) > limits.max_size:
+            if part > 0 and largest_edge(points[parts == part], wall.equation[:3]) > options.max_size:
                 large[rows[parts == part], columns[parts == part]] = 1
     full = cv2.resize(large, (k * width, k * height), interpolation=cv2.INTER_NEAREST)
     return full[: depth.shape[0], : depth.shape[1]] > 0
@@ -187,7 +121,7 @@ def _of_no_segments(depth: np.ndarray, labels: np.ndarray, camera: Camera, walls
     return found
 
 
-def alone(depth: np.ndarray, camera: Camera, limits: Limits) -> ObjectTest:
+def alone(depth: np.ndarray, camera: Camera, options: SegmentationOptions) -> ObjectTest:
     """The test of a segment in an image without a support: no larger than a thing, and not wherever the image ends.
 
     A surface that runs out of the image on opposite sides fills it.
@@ -199,7 +133,7 @@ def alone(depth: np.ndarray, camera: Camera, limits: Limits) -> ObjectTest:
             return False
         step = max(1, rows.size // _SAMPLES)
         r, c = rows[::step], columns[::step]
-        return limits.hold(camera.unproject(c, r, depth[r, c]))
+        return options.hold(camera.unproject(c, r, depth[r, c]))
 
     return is_thing
 
@@ -211,7 +145,7 @@ def standing(
     camera: Camera,
     support: SupportSurface,
     walls: list[Plane],
-    limits: Limits,
+    options: SegmentationOptions,
 ) -> ObjectTest:
     """The test of whether a segment is a thing that stands on the support, to be asked of the largest ones first.
 
@@ -244,7 +178,7 @@ def standing(
         points = camera.unproject(c, r, depth[r, c])
         growth = noise_growth(points[:, 2])
         height = relative[r, c]
-        behind = float(points[:, 2].max()) + limits.max_size
+        behind = float(points[:, 2].max()) + options.max_size
         beside = _beside(relative, depth, around, behind, rows, columns)
         least = max(_LEAST_HEIGHT, MIN_HEIGHT * min(1.0, float(quantile(growth, 0.5))))
         if _top(height * growth) < least or not _rises(_top(height), beside, support.sigma):
@@ -258,7 +192,7 @@ def standing(
             # A carton's face may be cut by one border; a wall of which little is seen leaves by two.
             if borders > (0 if on_it else 1) and np.mean(off < 2 * TOLERANCE) > 0.5:
                 return False
-        if not limits.hold(points, plane.equation[:3]):
+        if not options.hold(points, plane.equation[:3]):
             return False
         least_share = _SUPPORTED if points[:, 2].min() > nearest else 0.0
         if not _stands(points, least_share, depth, relative, camera, plane):
