@@ -10,8 +10,8 @@
 4. Where something is left unexplained, or a half size is not certain to 1 %, the rivals of the result are tried.  Those
    that explain the image almost as well stay as alternatives and add to the covariance.
 5. Half sizes along the view that the readings leave open are walked along (:mod:`sq_perception.fitting.rounding`).
-6. What the border of the image cuts off may be longer (:mod:`sq_perception.fitting.cut_off`).
-7. A half size that stays open is weighed against a prediction (:mod:`sq_perception.fitting.unseen`).
+6. What the border of the image cuts off may be longer (:mod:`sq_perception.fitting.unseen`).
+7. A half size that stays open is weighed against a prediction, likewise.
 
 The noise floor is a mean squared residual of 1, as residuals are in units of the noise.
 """
@@ -24,7 +24,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from sq_perception.fitting import cut_off, rounding, starts, tolerant, unseen
+from sq_perception.fitting import rounding, starts, tolerant, unseen
 from sq_perception.fitting.covariance import Alternative
 from sq_perception.fitting.depth_noise import MEDIAN_TO_SIGMA
 from sq_perception.fitting.levenberg_marquardt import State
@@ -145,7 +145,7 @@ def _decide(problem: Problem, finalists: list[State]) -> Solution:
     if not problem.late:
         solution = rounding.spread_along_view(solution)
     if not problem.late:
-        solution = cut_off.with_open_ends(solution)
+        solution = unseen.with_open_ends(solution)
     if not problem.late:
         solution = unseen.weighed(solution)
     return solution

@@ -46,7 +46,6 @@ from sq_perception.recovery.options import NEEDS_NETWORK, Method, RecoveryOption
 from sq_perception.recovery.own_segments import SegmentNetwork
 from sq_perception.recovery.prediction import Prediction
 from sq_perception.recovery.recovery import FrameRecovery, Recovery, timed
-from sq_perception.recovery.reference import Reference
 from sq_perception.recovery.seen_object import SeenObject
 from sq_perception.segmentation import segments
 
@@ -254,7 +253,7 @@ class Recoverer:
             for obj, fit, score in zip(fresh, fits, scores, strict=True):
                 of_label[obj.label] = Recovery(fit, score, obj.label, obj.pixels)
             bodies = tuple(of_label[obj.label] for obj in objects)
-        reference = Reference.of(measured, camera, options, found, age=age, given=labels is not None)
+        reference = continuity.Reference.of(measured, camera, options, found, age=age, given=labels is not None)
         if previous is not None and previous.reference is not None and same:
             reference = reference.keeping(
                 previous.reference, found.labels, [body.label for body in bodies if body.repeats]
