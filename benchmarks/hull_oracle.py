@@ -23,7 +23,7 @@ import trimesh
 from scipy.optimize import least_squares, minimize
 from scipy.spatial import ConvexHull
 
-from sq_perception.fitting.options import Bounds
+from sq_perception.fitting import options
 from sq_perception.geometry import Superquadric
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.kernels import in_object_frame, kernel, ray_interval
@@ -139,7 +139,7 @@ def _starts(hull: trimesh.Trimesh, points: np.ndarray) -> list[Superquadric]:
 def _moved(start: Superquadric, change: np.ndarray) -> Superquadric:
     """The body changed by log sizes (3), exponents (2), shares of its sizes (3) and a rotation vector (3)."""
     size = start.size * np.exp(np.clip(change[:3], -3, 3))
-    shape = np.clip(start.shape + change[3:5], *Bounds().shape)
+    shape = np.clip(start.shape + change[3:5], *options.EXPONENTS)
     translation = start.translation + start.rotation_matrix @ (change[5:8] * start.size)
     turn = quaternions.multiply(start.rotation, quaternions.from_rotation_vector(change[8:11]))
     return Superquadric(size, shape, translation, turn)
@@ -158,7 +158,7 @@ def _least_squares(start: Superquadric, points: np.ndarray) -> Superquadric:
 def _polished(start: Superquadric, columns: Columns) -> Superquadric:
     simplex = np.vstack([np.zeros(11), np.diag([0.05] * 3 + [0.1] * 2 + [0.03] * 3 + [0.05] * 3)])
     # An exponent at its upper limit must move inwards, or its corner of the simplex is the start itself.
-    simplex[[4, 5], [3, 4]] *= np.where(start.shape > np.mean(Bounds().shape), -1.0, 1.0)
+    simplex[[4, 5], [3, 4]] *= np.where(start.shape > np.mean(options.EXPONENTS), -1.0, 1.0)
     found = minimize(
         lambda change: -columns.iou(_moved(start, change)),
         np.zeros(11),

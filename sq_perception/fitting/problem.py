@@ -24,7 +24,7 @@ from sq_perception.fitting.covariance import Alternative, covariance_at
 from sq_perception.fitting.hull_prior import HullPrior
 from sq_perception.fitting.levenberg_marquardt import State, minimize
 from sq_perception.fitting.observation import Observation
-from sq_perception.fitting.options import MODEL_ERROR, FitOptions
+from sq_perception.fitting.options import MODEL_ERROR, FitOptions, limits
 from sq_perception.fitting.rays import SAMPLE, WEIGHT, Rays
 from sq_perception.fitting.residuals import RENDERED, SAMPSON, surface_distance
 from sq_perception.geometry.superquadric import Superquadric
@@ -106,8 +106,8 @@ class Problem:
     @classmethod
     def of(cls, observation: Observation, options: FitOptions, began: float) -> Problem:
         """The problem of a superquadric that leaves nothing but noise; ``began`` as by ``time.perf_counter``."""
-        limits = options.bounds.limits(observation.points)
-        return cls(observation, options, terms_of(observation, options), limits, began + options.time_budget)
+        terms, bounds = terms_of(observation, options), limits(observation.points)
+        return cls(observation, options, terms, bounds, began + options.time_budget)
 
     @property
     def late(self) -> bool:

@@ -94,7 +94,7 @@ def fit(
         raise ValueError("the mask holds no pixel with a depth: there is nothing to fit")
     undecided = options.model_error is None
     model_error = min(MODEL_ERROR, _MODEL_SHARE * crop.footprint * math.sqrt(np.count_nonzero(crop.mask)))
-    fine = crop.noise.at(crop.distance) < _FINE_NOISE * model_error
+    fine = crop.noise.sigma < _FINE_NOISE * model_error
     if undecided and (later is not None if options.plane is None else fine):
         exactly = _exactly(crop, options, given, later, began)
         if exactly is not None and not (camera.is_pinhole and _is_thing(mask, options)):
@@ -115,7 +115,7 @@ def fit(
     given = given if later is None else later()
     solution = course.solve(Problem.of(observation, options, began), given)
     untried = options.plane is None or not fine
-    if is_thing and untried and _is_explained(solution, crop.noise.at(crop.distance)):
+    if is_thing and untried and _is_explained(solution, crop.noise.sigma):
         solution = _as_thing(_exactly(crop, options, [solution.state, *given], None, began)) or solution
     return assessed(solution, began)
 
