@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import cache
 from typing import Literal
@@ -176,22 +176,14 @@ def _checked_images(depth: np.ndarray, mask: np.ndarray, camera: Camera) -> tupl
     return depth, mask
 
 
-def _checked_starts(start: object) -> list[State]:
-    if isinstance(start, str):
-        if start != "auto":
-            raise ValueError(f"start: expected 'auto' or superquadrics, got {start!r}")
+def _checked_starts(start: Superquadric | Literal["auto"] | Iterable[Superquadric]) -> list[State]:
+    if isinstance(start, str) and start == "auto":
         return []
-    bodies: list[object]
-    if isinstance(start, Superquadric):
-        bodies = list(start) if start.batch_shape else [start]
-    elif isinstance(start, Sequence):
-        bodies = list(start)
-    else:
-        raise ValueError(f"start: expected 'auto' or superquadrics, got {type(start).__name__}")
+    is_one = isinstance(start, Superquadric) and not start.batch_shape
     states = []
-    for body in bodies:
+    for body in [start] if is_one else start:
         if not isinstance(body, Superquadric) or body.batch_shape:
-            raise ValueError(f"start: expected single superquadrics, got {body!r}")
+            raise ValueError(f"start: expected 'auto' or single superquadrics, got {body!r}")
         states.append(State.of(Superquadric.from_flat(np.asarray(body.to_flat(), dtype=float))))
     return states
 
