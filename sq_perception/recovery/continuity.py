@@ -93,27 +93,16 @@ class Reference:
     """
 
     depth: np.ndarray
-    stride: int
     camera: Camera
     options: RecoveryOptions
     segments: Segmentation
     age: int
     given: bool
 
-    @classmethod
-    def of(
-        cls,
-        depth: np.ndarray,
-        camera: Camera,
-        options: RecoveryOptions,
-        segments: Segmentation,
-        *,
-        age: int,
-        given: bool,
-    ) -> Reference:
-        """Of an image (height, width) that is NaN where nothing was measured."""
-        stride = max(1, round(camera.width / _WIDTH))
-        return cls(_sampled(depth, stride), stride, camera, options, segments, age, given)
+    @property
+    def stride(self) -> int:
+        """Pixels from one that is compared to the next."""
+        return _stride(self.camera)
 
     def keeping(self, other: Reference, labels: np.ndarray, kept: Sequence[int]) -> Reference:
         """These readings, but those of another reference around the labels that were recovered from it."""
@@ -163,7 +152,7 @@ def repeated(
         return NOTHING
     if previous.labels.max(initial=0) > previous.labels.size:  # given ones, and tables by label would be huge
         return NOTHING
-    old, new, sigma = before.depth, _sampled(depth, before.stride), before.segments.sigma
+    old, new, sigma = before.depth, sampled(depth, camera), before.segments.sigma
     shown = np.ascontiguousarray(previous.labels[:: before.stride, :: before.stride], dtype=np.int32)
     reach = _REACH * float(old[shown > 0].max(initial=0))
     change, near = _changed(old, new, reach)
@@ -220,10 +209,15 @@ def matched(kept: Repeated, labels: np.ndarray, objects: Sequence[SeenObject]) -
     return same
 
 
-def _sampled(depth: np.ndarray, stride: int) -> np.ndarray:
-    """Every so many-th pixel, float32, of an image that is NaN where nothing was measured; 0 there."""
+def sampled(depth: np.ndarray, camera: Camera) -> np.ndarray:
+    """What is compared, float32, of an image (height, width) that is NaN where nothing was measured; 0 there."""
+    stride = _stride(camera)
     seen = np.asarray(depth[::stride, ::stride], dtype=np.float32)
     return np.where(np.isnan(seen), np.float32(0), seen)
+
+
+def _stride(camera: Camera) -> int:
+    return max(1, round(camera.width / _WIDTH))
 
 
 def _around(mask: np.ndarray) -> np.ndarray:

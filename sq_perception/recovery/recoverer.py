@@ -253,7 +253,9 @@ class Recoverer:
             for obj, fit, score in zip(fresh, fits, scores, strict=True):
                 of_label[obj.label] = Recovery(fit, score, obj.label, obj.pixels)
             bodies = tuple(of_label[obj.label] for obj in objects)
-        reference = continuity.Reference.of(measured, camera, options, found, age=age, given=labels is not None)
+        reference = continuity.Reference(
+            continuity.sampled(measured, camera), camera, options, found, age=age, given=labels is not None
+        )
         if previous is not None and previous.reference is not None and same:
             reference = reference.keeping(
                 previous.reference, found.labels, [body.label for body in bodies if body.repeats]
