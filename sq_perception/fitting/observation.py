@@ -227,10 +227,6 @@ class Observation(Crop):
         count = round(self.free_pixels * len(kept) / max(len(self.free), 1))
         return replace(self, free=kept, free_pixels=count)
 
-    def coarsened(self, model_error: float) -> Observation:
-        """The same observation trusted less."""
-        return replace(self, model_error=float(np.hypot(self.model_error, model_error)))
-
     @cached_property
     def _distance_to_mask(self) -> np.ndarray:
         distance = cv2.distanceTransform((~self.mask).view(np.uint8), cv2.DIST_L2, 3)

@@ -139,7 +139,8 @@ def take_over(problem: Problem, best: State, given: Sequence[State]) -> Solution
     hits = problem.observation.object_rays(FINAL_RAYS)
     distance = np.abs(surface_distance(hits, best.parameters, best.rotation))
     left_over = MEDIAN_TO_SIGMA * quantile(distance, 0.5)
-    observation = problem.observation.coarsened(left_over)
+    observation = problem.observation
+    observation = replace(observation, model_error=float(np.hypot(observation.model_error, left_over)))
     return solve(replace(problem, observation=observation, terms=terms_of(observation, problem.options)), given)
 
 

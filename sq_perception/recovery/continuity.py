@@ -132,13 +132,13 @@ NOTHING = Repeated({}, None)
 
 
 def repeated(
-    previous: FrameRecovery,
+    previous: FrameRecovery | None,
     depth: np.ndarray,
     camera: Camera,
     options: RecoveryOptions,
     labels: np.ndarray | None = None,
 ) -> Repeated:
-    """What an image repeats of the frame before it.
+    """What an image repeats of the frame before it, if there is one.
 
     Parameters
     ----------
@@ -147,8 +147,10 @@ def repeated(
     labels : integer (height, width), optional
         Masks that were given for the image: segments repeat only where these do, or where none were given to either.
     """
-    before = previous.reference
-    if before is None or before.camera != camera or before.options != options or not camera.is_pinhole:
+    before = None if previous is None else previous.reference
+    if previous is None or before is None:
+        return NOTHING
+    if before.camera != camera or before.options != options or not camera.is_pinhole:
         return NOTHING
     if previous.labels.max(initial=0) > previous.labels.size:  # given ones, and tables by label would be huge
         return NOTHING

@@ -211,9 +211,7 @@ class Recoverer:
                 if labels.shape != measured.shape:
                     raise ValueError(f"labels: expected the shape of the depth, {measured.shape}, got {labels.shape}")
             measured, labels, closed = perforation.filled(measured, labels)
-            kept = continuity.NOTHING
-            if previous is not None:
-                kept = continuity.repeated(previous, measured, camera, options, labels)
+            kept = continuity.repeated(previous, measured, camera, options, labels)
             if previous is not None and kept.reference and len(kept.bodies) == len(previous.bodies):
                 milliseconds["segmentation"] = milliseconds["total"] = 1e3 * (time.perf_counter() - started)
                 bodies = tuple(replace(body, repeats=body.repeats + 1) for body in previous.bodies)

@@ -177,7 +177,7 @@ def standing(seen: Seen, relative: np.ndarray, labels: np.ndarray, support: Supp
     depth, camera, options = seen.depth, seen.camera, seen.options
     last_row, last_column = camera.height - 1, camera.width - 1
     measured = np.count_nonzero(depth)
-    around = (depth > 0) & ~_tall(labels, relative, support.sigma)
+    around = (depth > 0) & ~_tall(labels, relative, int(labels.max(initial=0)) + 1, support.sigma)
     coarse = depth[::_SPARSE, ::_SPARSE]
     nearest = quantile(coarse[coarse > 0], _STRAY) * (1 + depth_steps.STEP) if coarse.any() else 0.0
     plane = support.plane
@@ -214,14 +214,10 @@ def standing(seen: Seen, relative: np.ndarray, labels: np.ndarray, support: Supp
     return is_thing
 
 
-def _tall(labels: np.ndarray, relative: np.ndarray, sigma: float) -> np.ndarray:
-    """Pixels, bool (height, width), of segments that are higher than any noise, on average: things or the room."""
-    limit = float(min(HIGHEST * TOLERANCE, _TALL * sigma))
-    return np.asarray(_higher(labels, relative, int(labels.max(initial=0)) + 1, limit))
-
-
 @kernel
-def _higher(labels: np.ndarray, relative: np.ndarray, count: int, limit: float) -> np.ndarray:
+def _tall(labels: np.ndarray, relative: np.ndarray, count: int, sigma: float) -> np.ndarray:
+    """Pixels, bool (height, width), of segments that are higher than any noise, on average: things or the room."""
+    limit = min(HIGHEST * TOLERANCE, _TALL * sigma)
     sums, pixels = np.zeros(count), np.zeros(count)
     for v in range(labels.shape[0]):
         for u in range(labels.shape[1]):
