@@ -295,8 +295,7 @@ class Recoverer:
 
             found = self._shared(of_some, range(len(views)))
         else:
-            submit = self._beside.submit if options.method == "auto" else prediction.at_once
-            found = prediction.of_bodies(views, network, submit)
+            found = prediction.of_bodies(views, network, self._beside if options.method == "auto" else None)
         return [replace(obj, prediction=predicted) for obj, predicted in zip(objects, found, strict=True)]
 
     def _mapped(self, function: Callable[[_Item], _Answer], items: Sequence[_Item]) -> list[_Answer]:
