@@ -15,7 +15,6 @@ Metres, optical frame.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
@@ -52,13 +51,14 @@ def walls(points: Mapping[int, np.ndarray], plane: np.ndarray) -> set[int]:
     tops = np.array([quantile(some @ plane[:3] + plane[3], _TOP) for some in points.values()])
     flat = np.concatenate(list(points.values())) @ axes
     owner = np.repeat(np.arange(len(points)), [len(some) for some in points.values()])
-    segments = _Segments(flat, owner, *_moments(flat, owner))
+    lengths, directions = _moments(flat, owner)
     tried: list[bytes] = []
     for top in tops:
         level = np.abs(tops - top) < _AS_HIGH
         if np.count_nonzero(level) > 1 and level.tobytes() not in tried:
             tried.append(level.tobytes())
-            along = _around(level, segments)
+            longest = np.where(level, lengths, -np.inf).argmax()
+            along = _around(level, flat, owner, directions[longest])
             if along.any():
                 return set(np.array(list(points))[along].tolist())
     return set()
@@ -70,22 +70,9 @@ def warm_up() -> None:
     walls({k: square + [k, 0, 0] for k in range(3)}, np.array([0.0, 0.0, 1.0, 0.0]))
 
 
-@dataclass(frozen=True, eq=False)
-class _Segments:
-    """Points (n, 2) of m segments along the support, and whose they are, from 0.
-
-    Of each segment, how much farther it reaches along its longer principal axis, as a variance (m,), and those axes
-    (m, 2, 2) in columns, the shorter one first.
-    """
-
-    points: np.ndarray
-    owner: np.ndarray
-    length: np.ndarray
-    directions: np.ndarray
-
-
 def _moments(points: np.ndarray, owner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How long the points (n, 2) of each segment are, and their principal axes, as :class:`_Segments` has them."""
+    """Of each of m segments, how much farther its points (n, 2) reach along their longer principal axis, as a variance
+    (m,), and those axes (m, 2, 2) in columns, the shorter one first."""
     counts = np.bincount(owner)
     centred = points - np.stack([np.bincount(owner, column) / counts for column in points.T], axis=1)[owner]
     x, y = centred.T
@@ -94,18 +81,18 @@ def _moments(points: np.ndarray, owner: np.ndarray) -> tuple[np.ndarray, np.ndar
     return variances[:, 1] - variances[:, 0], directions
 
 
-def _around(level: np.ndarray, segments: _Segments) -> np.ndarray:
+def _around(level: np.ndarray, points: np.ndarray, owner: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Which of some equally high segments, bool (m,), are walls along the rectangle around them, as the longest lies.
 
-    Not the smallest rectangle: two walls at a right angle have another one just as small.
+    Not the smallest rectangle: two walls at a right angle have another one just as small.  ``points`` (n, 2) are those
+    of all segments along the support, ``owner`` (n,) whose they are, from 0, ``directions`` (2, 2) the rectangle's.
     """
-    directions = segments.directions[np.where(level, segments.length, -np.inf).argmax()]
-    placed = np.empty_like(segments.points)
-    half, thick, along, covered = _laid(segments.points, segments.owner, level, directions, placed)
+    placed = np.empty_like(points)
+    half, thick, along, covered = _laid(points, owner, level, directions, placed)
     is_corner = bool((np.minimum(covered, np.roll(covered, 1)) > _LONG).any())
     if 2 * half.min() < _SMALLEST or not is_corner or covered.mean() < _COVERED:
         return np.zeros_like(along)
-    others = [np.median(placed[segments.owner == k], axis=0) for k in np.flatnonzero(~along)]
+    others = [np.median(placed[owner == k], axis=0) for k in np.flatnonzero(~along)]
     holds = any((half - np.abs(other)).min() > thick for other in others)
     return along if holds else np.zeros_like(along)
 

@@ -30,7 +30,7 @@ from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.quantiles import densest, quantile
 from sq_perception.imaging import depth_steps, regions
 from sq_perception.imaging.camera import Camera, Lens
-from sq_perception.segmentation.support_plane import COARSE_PIXELS, LEAST_GROWTH, TOLERANCE, Plane, noise_growth
+from sq_perception.segmentation.support_plane import LEAST_GROWTH, TOLERANCE, Plane, coarse_stride, noise_growth
 
 _ROUNDS = 6
 _TERMS = 6
@@ -96,7 +96,7 @@ def measured(plane: Plane, depth: np.ndarray, valid: np.ndarray, camera: Camera)
     camera
         A pinhole camera.
     """
-    k = _stride(depth.shape)
+    k = coarse_stride(depth.shape)
     x, y, z = _seen(depth, valid, k, camera.lens)
     growth = noise_growth(z)
     a, b, c, d = plane.equation
@@ -134,7 +134,7 @@ def risen(relative: np.ndarray, depth: np.ndarray, valid: np.ndarray, camera: Ca
     camera
         As in :func:`measured`.
     """
-    k = _stride(depth.shape)
+    k = coarse_stride(depth.shape)
     share = _cells(valid.astype(np.float32), k)
     known = share > 0.5
     weight = 1 / np.maximum(share, np.float32(0.5))
@@ -296,7 +296,3 @@ def _relative(
             relative = above / max(z * z, LEAST_GROWTH) - min(max(off, -limit), limit)
             height[v, u] = relative if z > 0 else 0.0
     return height
-
-
-def _stride(shape: tuple[int, ...]) -> int:
-    return max(1, min(shape[:2]) // COARSE_PIXELS)
