@@ -283,23 +283,10 @@ def _beside(
     mask = np.zeros(relative[window].shape, np.uint8)
     mask[rows - top, columns - left] = 1
     near, ring = (cv2.dilate(mask, np.ones((2 * k + 1, 2 * k + 1), np.uint8)) for k in (_SMEARED, _BESIDE))
-    return np.asarray(_heights_where(relative, depth, around, behind, ring - near, top, left))
-
-
-@kernel
-def _heights_where(
-    relative: np.ndarray, depth: np.ndarray, around: np.ndarray, behind: float, mask: np.ndarray, top: int, left: int
-) -> np.ndarray:
-    """Heights (n,) of pixels around a thing in a mask, whose corner is there, but for what is too high, low or far."""
-    found, n = np.empty(mask.size, np.float32), 0
-    for v in range(mask.shape[0]):
-        for u in range(mask.shape[1]):
-            if mask[v, u] > 0 and around[top + v, left + u] and depth[top + v, left + u] < behind:
-                height = relative[top + v, left + u]
-                if abs(height) < HIGHEST * TOLERANCE:
-                    found[n] = height
-                    n += 1
-    return found[:n]
+    height = relative[window]
+    is_far = depth[window] >= np.float64(behind)
+    is_support = np.abs(height) < np.float64(HIGHEST * TOLERANCE)
+    return np.asarray(height[(ring > near) & around[window] & is_support & ~is_far])
 
 
 def _stands(

@@ -29,7 +29,7 @@ import numpy as np
 from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.quantiles import densest, quantile
 from sq_perception.imaging import depth_steps, regions
-from sq_perception.imaging.camera import Camera, Lens
+from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation.support_plane import LEAST_GROWTH, TOLERANCE, Plane, coarse_stride, noise_growth
 
 _ROUNDS = 6
@@ -97,7 +97,9 @@ def measured(plane: Plane, depth: np.ndarray, valid: np.ndarray, camera: Camera)
         A pinhole camera.
     """
     k = coarse_stride(depth.shape)
-    x, y, z = _seen(depth, valid, k, camera.lens)
+    rows, columns = np.nonzero(valid[::k, ::k])
+    x, y = (k * columns - camera.cx) / camera.fx, (k * rows - camera.cy) / camera.fy
+    z = depth[::k, ::k][rows, columns].astype(float)
     growth = noise_growth(z)
     a, b, c, d = plane.equation
     height = (z * (a * x + b * y + c) + d) / growth
@@ -219,19 +221,6 @@ def _add_reached_tops(parts: np.ndarray, reached: np.ndarray, height: np.ndarray
         for u in range(parts.shape[1]):
             part = parts[v, u]
             own[v, u] |= part > 0 and tops[1, part] > tops[0, part] - 0.5 * TOLERANCE
-
-
-@kernel
-def _seen(depth: np.ndarray, valid: np.ndarray, k: int, lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """x, y and depth (n,) of every k-th valid pixel."""
-    x, y, z = np.empty((3, (depth.shape[0] // k + 1) * (depth.shape[1] // k + 1)))
-    n = 0
-    for v in range(0, depth.shape[0], k):
-        for u in range(0, depth.shape[1], k):
-            if valid[v, u]:
-                x[n], y[n], z[n] = (u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy, depth[v, u]
-                n += 1
-    return x[:n], y[:n], z[:n]
 
 
 @kernel
