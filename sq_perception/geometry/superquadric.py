@@ -292,13 +292,11 @@ class Superquadric:
         """
         xp = array_namespace(self.size)
         turns = np.concatenate([_HALF_TURNS, quaternions.multiply(_QUARTER_TURN, _HALF_TURNS)])
+        exchanged = xp.stack([self.size[..., k] for k in (1, 0, 2)], axis=-1)
         forms = []
-        for k, turn in enumerate(turns):
-            size = self.size
-            if k >= 4:
-                size = xp.stack([size[..., 1], size[..., 0], size[..., 2]], axis=-1)
-            step = xp.asarray(turn, dtype=self.rotation.dtype)
-            turned = quaternions.multiply(self.rotation, step + xp.zeros_like(self.rotation))
+        for turn, size in zip(turns, [self.size] * 4 + [exchanged] * 4, strict=True):
+            step = xp.asarray(turn, dtype=self.rotation.dtype) + xp.zeros_like(self.rotation)
+            turned = quaternions.multiply(self.rotation, step)
             forms.append(xp.concat([size, self.shape, self.translation, turned], axis=-1))
         return Superquadric.from_flat(xp.stack(forms))
 
