@@ -14,7 +14,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from sq_perception.fitting.fit import CUT_SHORT
-from sq_perception.recovery import wording
+from sq_perception.recovery.recovery import edges_as_text, place_as_text
 
 _AXES = re.compile(" along [xyz]( and [xyz])*")
 """Which ones they are, the deviations show."""
@@ -47,8 +47,8 @@ def _line(number: int, body: Mapping[str, Any], is_cube: bool) -> str:
         parts.append(f"({CUT_SHORT})")
     if body["status"] != "failed":
         sigma = [math.nan if value is None else value for value in body["sigma_size"]]
-        parts.append(wording.edges(body["size"], sigma, is_cube))
-    parts.append(f"at {wording.place(body['translation'], is_cube)}")
+        parts.append(edges_as_text(body["size"], sigma, is_cube))
+    parts.append(f"at {place_as_text(body['translation'], is_cube)}")
     if body["label"] is not None:
         parts.append(f" mask {body['label']}")
     if body["track"] is not None:

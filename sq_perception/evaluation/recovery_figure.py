@@ -15,8 +15,7 @@ from sq_perception.evaluation.body_pictures import draw_bodies_3d
 from sq_perception.fitting.covariance import undetermined
 from sq_perception.fitting.fit import Status
 from sq_perception.imaging.camera import Camera
-from sq_perception.recovery import wording
-from sq_perception.recovery.recovery import FrameRecovery, Recovery
+from sq_perception.recovery.recovery import FrameRecovery, Recovery, edges_as_text
 
 _LONGEST = 68
 """Characters of a verdict that fit in a line."""
@@ -84,7 +83,7 @@ def _draw_numbers(ax: Axes, recovery: FrameRecovery, unit: str) -> None:
             ax.text(0.06, y, shorten(f"failed: {body.message}", _LONGEST), fontsize=9, color=plots.FAINT, va="center")
             continue
         e1, e2 = body.superquadric.shape
-        text = wording.edges(body.superquadric.size, body.sigma_size, unit != "m").replace(" of the cube", "")
+        text = edges_as_text(body.superquadric.size, body.sigma_size, unit != "m").replace(" of the cube", "")
         look = {"fontsize": 9 if unit == "m" else 8, "color": plots.INK, "va": "center"}
         ax.text(0.06, y + 0.018, text, look)
         ax.text(1, y + 0.018, f"e {e1:.2f} {e2:.2f}  {body.score:.2f}", look, ha="right")

@@ -28,7 +28,7 @@ from sq_perception.nodes.frame import Frame
 from sq_perception.nodes.parameters import RecoverParameters
 from sq_perception.recovery.options import NEEDS_NETWORK
 from sq_perception.recovery.recoverer import FrameRecovery, Recoverer
-from sq_perception.segmentation.standing import Pose
+from sq_perception.segmentation.options import Pose
 
 WARM_UP_CAMERA = Camera(640, 480, 525.0, 525.0, 319.5, 239.5)
 _MADE_OF = ("device", "threads", "method", "model")

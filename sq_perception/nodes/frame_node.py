@@ -40,7 +40,7 @@ from sq_perception.nodes.statistics import THROTTLE, Standing, Statistics
 from sq_perception.nodes.tracking import CameraPoses, Tracking
 from sq_perception.recordings.publication import Findings
 from sq_perception.recovery.recovery import timed
-from sq_perception.segmentation.standing import Pose
+from sq_perception.segmentation.options import Pose
 from sq_perception.tracking import association
 
 _WORKER_END = 3.0

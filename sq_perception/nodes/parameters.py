@@ -15,7 +15,7 @@ from sq_perception.imaging.calibration import Treatment
 from sq_perception.imaging.camera import Projection
 from sq_perception.nodes.live_parameters import ParameterError, Parameters, setting
 from sq_perception.recovery.options import Method, RecoveryOptions
-from sq_perception.segmentation.standing import Box, Pose
+from sq_perception.segmentation.options import Box, Pose
 from sq_perception.simulation.sensor_noise import IDEAL, PRESETS
 
 RAW, POINTS = "raw", "points"

@@ -23,8 +23,7 @@ from sq_perception.fitting.fit import Status
 from sq_perception.geometry.mesh import COLOURS, triangles
 from sq_perception.recordings.frame_file import RecordedFrame
 from sq_perception.recordings.result_json import in_result_frame
-from sq_perception.recovery import wording
-from sq_perception.recovery.recovery import FrameRecovery
+from sq_perception.recovery.recovery import FrameRecovery, edges_as_text, place_as_text
 from sq_perception.viewing import drawings
 
 _MOST_POINTS = 30000
@@ -128,8 +127,8 @@ def _numbers(frame: RecordedFrame, recovery: FrameRecovery) -> str:
         is_failed = body.status == Status.FAILED
         cells = [
             body.status.name.lower(),
-            "" if is_failed else wording.edges(shown.size, body.sigma_size, frame.is_cube),
-            wording.place(shown.translation, frame.is_cube),
+            "" if is_failed else edges_as_text(shown.size, body.sigma_size, frame.is_cube),
+            place_as_text(shown.translation, frame.is_cube),
             "" if is_failed else " ".join(f"{value:.2f}" for value in shown.shape),
             f"{body.score:.2f}" if math.isfinite(body.score) else "",
             body.message,

@@ -44,9 +44,13 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.regions import extents
 from sq_perception.recovery.options import RecoveryOptions
 from sq_perception.recovery.recovery import FrameRecovery, Recovery
-from sq_perception.recovery.reference import BAND, Reference, around, sampled
 from sq_perception.recovery.seen_object import SeenObject
+from sq_perception.segmentation.segments import Segmentation
 
+_WIDTH = 320
+"""Columns that are compared: noise of neighbouring pixels is alike in all sensors of sensor_noise.preset."""
+_BAND = 2
+"""Compared pixels around an object that belong to it: free space and outline."""
 _CLIP, _FAR = 3.0, 6.0
 """Noise levels: more is an edge that wandered, in an object's sums and in a patch."""
 _CHANGED = 30.0
@@ -77,6 +81,38 @@ _ALIKE = 0.8
 
 
 @dataclass(frozen=True, eq=False)
+class Reference:
+    """What a frame's bodies were recovered from.
+
+    Attributes
+    ----------
+    depth : float32 (rows, columns)
+        Every ``stride``-th pixel of the image; 0 where nothing was measured.
+    segments
+        The objects, of all pixels, found ``age`` frames ago, or ``given``.
+    """
+
+    depth: np.ndarray
+    camera: Camera
+    options: RecoveryOptions
+    segments: Segmentation
+    age: int
+    given: bool
+
+    @property
+    def stride(self) -> int:
+        """Pixels from one that is compared to the next."""
+        return _stride(self.camera)
+
+    def keeping(self, other: Reference, labels: np.ndarray, kept: Sequence[int]) -> Reference:
+        """These readings, but those of another reference around the labels that were recovered from it."""
+        taken = np.zeros(self.depth.shape, bool)
+        for label in kept:
+            taken |= _around(labels[:: self.stride, :: self.stride] == label) > 0
+        return replace(self, depth=np.where(taken, other.depth, self.depth))
+
+
+@dataclass(frozen=True, eq=False)
 class Repeated:
     """What a frame repeats.
 
@@ -96,13 +132,13 @@ NOTHING = Repeated({}, None)
 
 
 def repeated(
-    previous: FrameRecovery,
+    previous: FrameRecovery | None,
     depth: np.ndarray,
     camera: Camera,
     options: RecoveryOptions,
     labels: np.ndarray | None = None,
 ) -> Repeated:
-    """What an image repeats of the frame before it.
+    """What an image repeats of the frame before it, if there is one.
 
     Parameters
     ----------
@@ -111,12 +147,14 @@ def repeated(
     labels : integer (height, width), optional
         Masks that were given for the image: segments repeat only where these do, or where none were given to either.
     """
-    before = previous.reference
-    if before is None or before.camera != camera or before.options != options or not camera.is_pinhole:
+    before = None if previous is None else previous.reference
+    if previous is None or before is None:
+        return NOTHING
+    if before.camera != camera or before.options != options or not camera.is_pinhole:
         return NOTHING
     if previous.labels.max(initial=0) > previous.labels.size:  # given ones, and tables by label would be huge
         return NOTHING
-    old, new, sigma = before.depth, sampled(depth, before.stride), before.segments.found.sigma
+    old, new, sigma = before.depth, sampled(depth, camera), before.segments.sigma
     shown = np.ascontiguousarray(previous.labels[:: before.stride, :: before.stride], dtype=np.int32)
     reach = _REACH * float(old[shown > 0].max(initial=0))
     change, near = _changed(old, new, reach)
@@ -137,13 +175,13 @@ def repeated(
         if body.label >= len(windows):
             continue
         _, top, bottom, left, right = windows[body.label].tolist()
-        window = slice(max(top - BAND, 0), bottom + BAND), slice(max(left - BAND, 0), right + BAND)
+        window = slice(max(top - _BAND, 0), bottom + _BAND), slice(max(left - _BAND, 0), right + _BAND)
         own = shown[window] == body.label
         had = own & (old[window] > 0)
         if np.count_nonzero(had & (new[window] > 0)) <= _MOST * np.count_nonzero(had):
             continue
         seen = (np.ascontiguousarray(image[window]) for image in (change, old, new, smooth))
-        sums, square = _moments(around(own), level, *seen)
+        sums, square = _moments(_around(own), level, *seen)
         square = share * square + 1e-6 * share * np.trace(square) * np.eye(len(square))
         if square.any() and sums @ np.linalg.solve(square, sums) < _CHANGED:
             repeating += 1
@@ -171,6 +209,22 @@ def matched(kept: Repeated, labels: np.ndarray, objects: Sequence[SeenObject]) -
         if body is not None and counts[label] > _ALIKE * (body.pixels + obj.pixels - counts[label]):
             same[obj.label] = replace(body, label=obj.label, pixels=obj.pixels, repeats=body.repeats + 1)
     return same
+
+
+def sampled(depth: np.ndarray, camera: Camera) -> np.ndarray:
+    """What is compared, float32, of an image (height, width) that is NaN where nothing was measured; 0 there."""
+    stride = _stride(camera)
+    seen = np.asarray(depth[::stride, ::stride], dtype=np.float32)
+    return np.where(np.isnan(seen), np.float32(0), seen)
+
+
+def _stride(camera: Camera) -> int:
+    return max(1, round(camera.width / _WIDTH))
+
+
+def _around(mask: np.ndarray) -> np.ndarray:
+    """An object with its surroundings, uint8."""
+    return cv2.dilate(mask.astype(np.uint8), np.ones((2 * _BAND + 1, 2 * _BAND + 1), np.uint8))
 
 
 def _due(bodies: Sequence[Recovery]) -> Recovery | None:

@@ -8,14 +8,14 @@ from typing import Literal, get_args
 import numpy as np
 
 from sq_perception.imaging import soft_agreement
-from sq_perception.segmentation import segments, standing
+from sq_perception.segmentation.options import SegmentationOptions
 
 Method = Literal["auto", "network", "symmetry", "classic"]
 NEEDS_NETWORK = ("auto", "network")
 
 
 @dataclass(frozen=True)
-class RecoveryOptions:
+class RecoveryOptions(SegmentationOptions):
     """What may change from one frame to the next.
 
     Attributes
@@ -54,16 +54,12 @@ class RecoveryOptions:
     method: Method = "auto"
     sharpness: float = soft_agreement.THESIS_SHARPNESS
     tau: float = soft_agreement.THESIS_TAU
-    depth_range: tuple[float, float] = (0.0, np.inf)
-    max_objects: int = 20
     time_budget: float = np.inf
-    max_size: float = 0.6
-    workspace: standing.Box | None = None
-    workspace_pose: standing.Pose | None = None
     free_space: bool = True
     repair: bool = True
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.method not in get_args(Method):
             raise ValueError(f"method: expected one of {', '.join(get_args(Method))}, got {self.method!r}")
         for name, number in (("sharpness", self.sharpness), ("tau", self.tau)):
@@ -71,7 +67,6 @@ class RecoveryOptions:
                 raise ValueError(f"{name}: expected a positive number, got {number}")
         if not self.time_budget > 0:
             raise ValueError(f"time_budget: expected a positive number of seconds, got {self.time_budget}")
-        self.segmentation_options()
         # Options are compared from frame to frame: of an array no one truth.
         object.__setattr__(self, "depth_range", tuple(float(end) for end in self.depth_range))
         if self.workspace is not None:
@@ -79,12 +74,3 @@ class RecoveryOptions:
         if self.workspace_pose is not None:
             pose = tuple(tuple(float(number) for number in part) for part in self.workspace_pose)
             object.__setattr__(self, "workspace_pose", pose)
-
-    def segmentation_options(self) -> segments.SegmentationOptions:
-        return segments.SegmentationOptions(
-            depth_range=self.depth_range,
-            max_objects=self.max_objects,
-            max_size=self.max_size,
-            workspace=self.workspace,
-            workspace_pose=self.workspace_pose,
-        )

@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol, TypeVar
+from typing import Any
 
 import numpy as np
 
@@ -60,21 +60,6 @@ _ROUNDS = 3
 
 
 @dataclass(frozen=True, eq=False)
-class OwnSegments:
-    """Segments, and which of their pixels measured their objects.
-
-    Attributes
-    ----------
-    found : Segmentation
-    strays : bool (height, width) or None
-        Pixels of segments that did not; None: not a single one.
-    """
-
-    found: Segmentation
-    strays: np.ndarray | None = None
-
-
-@dataclass(frozen=True, eq=False)
 class _Seen:
     """A segment as the network saw it, its window of the image, and the logits of p in the view's cells."""
 
@@ -92,13 +77,7 @@ class _Doubt:
     sure: np.ndarray
 
 
-_Answer = TypeVar("_Answer")
-
-
-class _Mapped(Protocol):
-    def __call__(
-        self, function: Callable[[Sequence[int]], list[_Answer]], labels: Sequence[int], /
-    ) -> list[_Answer]: ...
+_Mapped = Callable[[Callable[[Sequence[int]], list[Any]], Sequence[int]], list[Any]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,10 +102,10 @@ class SegmentNetwork:
     plane: np.ndarray | None
     mapped: _Mapped
 
-    def improved(self, found: Segmentation) -> OwnSegments:
-        """Segments parted, joined, rid of strays, without those of nothing; labels from 1, the largest first."""
+    def improved(self, found: Segmentation) -> Segmentation:
+        """Segments parted, joined, with their strays, without those of nothing; labels from 1, the largest first."""
         if not found.ids:
-            return OwnSegments(found)
+            return found
         labels = found.labels.copy()
         seen = self._seen(labels, found.ids)
         parts = self._parted(labels, seen)
@@ -144,13 +123,13 @@ class SegmentNetwork:
             window = seen[label].window
             strays[window] |= _strays(labels[window] == label, *shown[label])
         if not parts and len(kept) == len(found.ids):
-            return OwnSegments(found, strays)
+            return replace(found, strays=strays)
         counts = regions.extents(labels)[:, 0]
         order = sorted(kept, key=lambda label: (-counts[label], label))
         number = np.zeros(len(counts), np.int32)
         number[order] = np.arange(len(order)) + 1
-        renumbered = replace(found, labels=regions.renumbered(labels, number), ids=tuple(range(1, len(order) + 1)))
-        return OwnSegments(renumbered, strays)
+        labels = regions.renumbered(labels, number)
+        return replace(found, labels=labels, ids=tuple(range(1, len(order) + 1)), strays=strays)
 
     def _parted(self, labels: np.ndarray, seen: Mapping[int, _Seen]) -> list[int]:
         """Part segments that are several objects; the labels of all the parts."""
@@ -262,7 +241,7 @@ def _mutual(labels: np.ndarray, seen: Mapping[int, _Seen]) -> np.ndarray:
         grid = np.ix_(np.clip(answer.view.rows, 0, height - 1), np.clip(answer.view.columns, 0, width - 1))
         there = np.where(answer.view.image[..., segment_view.IMAGE] > 0, place[labels[grid]], 0).ravel()
         counts = np.bincount(there, minlength=len(seen) + 1)[1:]
-        sums = np.bincount(there, 1 / (1 + np.exp(-answer.logits.ravel())), len(seen) + 1)[1:]
+        sums = np.bincount(there, _probability(answer.logits).ravel(), len(seen) + 1)[1:]
         means[i] = np.where(counts >= _LEAST_CELLS, sums / np.maximum(counts, 1), 0)
     return np.triu(np.minimum(means, means.T), 1)
 

@@ -43,10 +43,9 @@ from sq_perception.learning import checkpoint, inference
 from sq_perception.learning.forward import CompactMasks
 from sq_perception.recovery import continuity, methods, prediction, seen_object, supports
 from sq_perception.recovery.options import NEEDS_NETWORK, Method, RecoveryOptions
-from sq_perception.recovery.own_segments import OwnSegments, SegmentNetwork
+from sq_perception.recovery.own_segments import SegmentNetwork
 from sq_perception.recovery.prediction import Prediction
 from sq_perception.recovery.recovery import FrameRecovery, Recovery, timed
-from sq_perception.recovery.reference import Reference
 from sq_perception.recovery.seen_object import SeenObject
 from sq_perception.segmentation import segments
 
@@ -212,28 +211,25 @@ class Recoverer:
                 if labels.shape != measured.shape:
                     raise ValueError(f"labels: expected the shape of the depth, {measured.shape}, got {labels.shape}")
             measured, labels, closed = perforation.filled(measured, labels)
-            kept = continuity.NOTHING
-            if previous is not None:
-                kept = continuity.repeated(previous, measured, camera, options, labels)
+            kept = continuity.repeated(previous, measured, camera, options, labels)
             if previous is not None and kept.reference and len(kept.bodies) == len(previous.bodies):
                 milliseconds["segmentation"] = milliseconds["total"] = 1e3 * (time.perf_counter() - started)
                 bodies = tuple(replace(body, repeats=body.repeats + 1) for body in previous.bodies)
                 return replace(previous, bodies=bodies, milliseconds=milliseconds, reference=kept.reference)
             if kept.reference:
-                segmented, age = kept.reference.segments, kept.reference.age
+                found, age = kept.reference.segments, kept.reference.age
             else:
-                segmented, age = self._segmented(measured, camera, labels, options, network), 0
-            found, strays = segmented.found, segmented.strays
+                found, age = self._segmented(measured, camera, labels, options, network), 0
             depth = _in_range(measured, found.labels, options.depth_range)
             objects = seen_object.objects(depth, found, camera)
             same = {} if previous is None else continuity.matched(kept, previous.labels, objects)
 
         with timed(milliseconds, "network"):
             config = None if network is None else network.config
-            cleaned = objects if strays is None else [obj.without(strays) for obj in objects]
+            cleaned = objects if found.strays is None else [obj.without(found.strays) for obj in objects]
 
             def prepared(obj: SeenObject) -> SeenObject:
-                plane = supports.support(obj, cleaned, depth, camera, found, options.segmentation_options())
+                plane = supports.support(obj, cleaned, depth, camera, found, options)
                 obj = replace(obj, plane=plane)
                 if labels is not None:
                     obj = seen_object.completed(obj, depth, camera, found.labels)
@@ -255,7 +251,9 @@ class Recoverer:
             for obj, fit, score in zip(fresh, fits, scores, strict=True):
                 of_label[obj.label] = Recovery(fit, score, obj.label, obj.pixels)
             bodies = tuple(of_label[obj.label] for obj in objects)
-        reference = Reference.of(measured, camera, options, segmented, age=age, given=labels is not None)
+        reference = continuity.Reference(
+            continuity.sampled(measured, camera), camera, options, found, age=age, given=labels is not None
+        )
         if previous is not None and previous.reference is not None and same:
             reference = reference.keeping(
                 previous.reference, found.labels, [body.label for body in bodies if body.repeats]
@@ -272,21 +270,18 @@ class Recoverer:
         labels: np.ndarray | None,
         options: RecoveryOptions,
         network: Network | None,
-    ) -> OwnSegments:
+    ) -> segments.Segmentation:
         """The objects of an image: those given, or its own, which a network mends where one predicts hulls."""
         if labels is not None:
-            return OwnSegments(segments.from_labels(labels, depth, camera, options.segmentation_options()))
-        wanted = options.segmentation_options()
+            return segments.from_labels(labels, depth, camera, options)
         if not (options.repair and isinstance(network, inference.ThingPredictor)):
-            return OwnSegments(segments.segment(depth, camera, wanted))
-        found = segments.segment(depth, camera, replace(wanted, max_objects=_SEGMENTS * wanted.max_objects))
-        improved = SegmentNetwork(self._load_masks(), depth, camera, found.plane, self._shared).improved(found)
-        ids = improved.found.ids
-        if len(ids) <= options.max_objects:
-            return improved
-        most = ids[: options.max_objects]
-        labels = np.where(np.isin(improved.found.labels, most), improved.found.labels, 0)
-        return replace(improved, found=replace(improved.found, labels=labels, ids=most, is_cut=True))
+            return segments.segment(depth, camera, options)
+        found = segments.segment(depth, camera, replace(options, max_objects=_SEGMENTS * options.max_objects))
+        found = SegmentNetwork(self._load_masks(), depth, camera, found.plane, self._shared).improved(found)
+        if len(found.ids) <= options.max_objects:
+            return found
+        most = found.ids[: options.max_objects]
+        return replace(found, labels=np.where(np.isin(found.labels, most), found.labels, 0), ids=most, is_cut=True)
 
     def _predicted(self, objects: Sequence[SeenObject], network: Network, options: RecoveryOptions) -> list[SeenObject]:
         """The objects with their predictions; those of bodies may still be computed, beside fits that begin without."""
@@ -300,8 +295,7 @@ class Recoverer:
 
             found = self._shared(of_some, range(len(views)))
         else:
-            submit = self._beside.submit if options.method == "auto" else prediction.at_once
-            found = prediction.of_bodies(views, network, submit)
+            found = prediction.of_bodies(views, network, self._beside if options.method == "auto" else None)
         return [replace(obj, prediction=predicted) for obj, predicted in zip(objects, found, strict=True)]
 
     def _mapped(self, function: Callable[[_Item], _Answer], items: Sequence[_Item]) -> list[_Answer]:

@@ -24,6 +24,7 @@ from sq_perception.geometry.quantiles import densest, quantile
 from sq_perception.imaging.camera import Camera
 from sq_perception.recovery.seen_object import SeenObject
 from sq_perception.segmentation import segments, support_plane
+from sq_perception.segmentation.options import SegmentationOptions
 from sq_perception.segmentation.support_plane import TOLERANCE
 
 _HOVERING = 0.02
@@ -44,7 +45,7 @@ def support(
     depth: np.ndarray,
     camera: Camera,
     found: segments.Segmentation,
-    options: segments.SegmentationOptions,
+    options: SegmentationOptions,
 ) -> np.ndarray | None:
     """The plane (4,) that the object stands on; None where it stands on nothing that is known.
 

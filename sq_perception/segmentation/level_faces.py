@@ -22,7 +22,8 @@ import numpy as np
 from sq_perception.geometry.quantiles import densest, quantile
 from sq_perception.imaging import regions
 from sq_perception.imaging.camera import Camera
-from sq_perception.segmentation import standing, support_plane
+from sq_perception.segmentation import support_plane
+from sq_perception.segmentation.options import TURNS
 from sq_perception.segmentation.support_plane import TOLERANCE, Plane, noise_growth
 from sq_perception.segmentation.support_surface import HIGHEST, SupportSurface
 
@@ -42,7 +43,7 @@ class LevelFace:
 
     def under(self, labels: np.ndarray, depth: np.ndarray, camera: Camera) -> np.ndarray:
         """Pixels, bool (height, width), of the segment and of those whose middle is right above it."""
-        axes = standing.TURNS @ support_plane.across(self.surface.plane.equation[:3]).T
+        axes = TURNS @ support_plane.across(self.surface.plane.equation[:3]).T
         reach = axes @ self.points.T
         low, high = reach.min(axis=1), reach.max(axis=1)
         is_over = np.zeros(int(labels.max(initial=0)) + 1, bool)

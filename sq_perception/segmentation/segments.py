@@ -42,62 +42,13 @@ from sq_perception.segmentation import (
     support_plane,
     support_surface,
 )
-from sq_perception.segmentation.support_plane import Plane
+from sq_perception.segmentation.options import EVERYTHING, SegmentationOptions
 
-EVERYTHING = (0.0, np.inf)
-"""Range of all depths, metres."""
 _LEAST_PIXELS, _LEAST_SHARE = 30, 5e-4
 """Of an object: pixels, and share of the image; at VGA a square of 2 cm at 0.8 m.  Smaller ones are bits of noise."""
 _UNKNOWN_SIGMA = 1.5e-3
 """Noise of the depth at one metre where no support shows it, metres: that of structured light (Khoshelham and Oude
 Elberink, Sensors 2012)."""
-
-
-@dataclass(frozen=True)
-class SegmentationOptions:
-    """What counts as an object.
-
-    Attributes
-    ----------
-    depth_range
-        Nearest and farthest depth that is looked at, metres.
-    max_objects
-        The largest ones are kept.
-    max_size
-        Largest edge of an object, metres; what is larger is furniture.  Not asked of labels from outside.
-    workspace
-        The middle of what is seen of an object lies in this box, metres: least x, y, z and greatest x, y, z.  None:
-        anywhere.
-    workspace_pose
-        Quaternion x y z w and translation of the optical frame in the frame of the box; None: they are the same.
-    """
-
-    depth_range: tuple[float, float] = EVERYTHING
-    max_objects: int = 20
-    max_size: float = 0.6
-    workspace: standing.Box | None = None
-    workspace_pose: standing.Pose | None = None
-
-    def __post_init__(self) -> None:
-        near, far = self.depth_range
-        if not (0 <= near < far):
-            raise ValueError(f"depth_range: expected 0 <= nearest < farthest, got {self.depth_range}")
-        if not (self.max_objects >= 1 and self.max_objects == int(self.max_objects)):
-            raise ValueError(f"max_objects: expected a whole number, at least 1, got {self.max_objects}")
-        if self.workspace is not None:
-            box = tuple(self.workspace)
-            if len(box) != 6 or not all(low < high for low, high in zip(box[:3], box[3:], strict=True)):
-                raise ValueError(
-                    f"workspace: expected least x, y, z and greater x, y, z in metres, got {self.workspace}"
-                )
-        if self.workspace_pose is not None:
-            turn, place = (np.asarray(part, dtype=float) for part in self.workspace_pose)
-            if turn.shape != (4,) or place.shape != (3,) or not np.isfinite([*turn, *place]).all() or not turn.any():
-                raise ValueError(
-                    f"workspace_pose: expected a quaternion and a translation in metres, got {self.workspace_pose}"
-                )
-        if not self.max_size > 0:
-            raise ValueError(f"max_size: expected a positive number, got {self.max_size}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,6 +67,8 @@ class Segmentation:
         Noise of the depth at one metre as measured on the plane, or a guess where there is none, metres.
     is_cut
         Whether there were more objects than ``max_objects``.
+    strays : bool (height, width) or None
+        Pixels of objects that did not measure them; None: not a single one that is known.
     """
 
     labels: np.ndarray
@@ -123,6 +76,7 @@ class Segmentation:
     ids: tuple[int, ...]
     sigma: float = _UNKNOWN_SIGMA
     is_cut: bool = False
+    strays: np.ndarray | None = None
 
 
 def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | None = None) -> Segmentation:
@@ -153,31 +107,29 @@ def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | No
     if np.count_nonzero(valid) < least:
         return Segmentation(np.zeros(depth.shape, np.int32), None, ())
     planes = support_plane.planes(depth, valid, camera)
-    limits = standing.Limits(options.max_size, options.workspace, options.workspace_pose)
-    plane = support_plane.support(planes, depth, valid, camera, limits.is_small)
+    plane = support_plane.support(planes, depth, valid, camera, options.is_small)
     known = cv2.copyTo(depth, valid.view(np.uint8))  # and 0 elsewhere
-    if plane is None:
-        free = valid & ~standing.furniture(known, valid, camera, planes, limits)
-        labels = bodies.taken_apart(known, free, camera, _UNKNOWN_SIGMA, limits.is_small)
-        test = standing.alone(known, camera, limits)
-        labels, ids, is_cut = _ordered(labels, least, options.max_objects, test)
-        return Segmentation(labels, None, ids, is_cut=is_cut)
-    support = support_surface.measured(plane, known, valid, camera)
-    walls = [other for other in planes if other is not plane]
     everything = known
     if options.depth_range != EVERYTHING:
         # What is out of range holds things up and hides them all the same.
         everything, measured = _checked(depth, camera, EVERYTHING)
         everything = cv2.copyTo(everything, measured.view(np.uint8))
+    seen = standing.Seen(everything, known, camera, [other for other in planes if other is not plane], options)
+    if plane is None:
+        free = valid & ~standing.furniture(seen, valid)
+        labels = bodies.taken_apart(known, free, camera, _UNKNOWN_SIGMA, options.is_small)
+        labels, ids, is_cut = _ordered(labels, least, options.max_objects, standing.alone(seen))
+        return Segmentation(labels, None, ids, is_cut=is_cut)
+    support = support_surface.measured(plane, known, valid, camera)
     relative = support.image_relative(everything, camera)
-    labels = bodies.above(known, relative * valid, valid, camera, support, walls, limits)
+    labels = bodies.above(seen, relative * valid, valid, support)
     samples = level_faces.samples(labels, known, camera, least)
     for face in level_faces.found(samples, labels, known, camera, support, least):
-        labels = _unloaded(labels, face, known, everything, camera, walls, limits, least)
+        labels = _unloaded(labels, face, seen, least)
     around = enclosures.walls(samples, plane.equation)
     if around:
         labels = np.where(np.isin(labels, list(around)), 0, labels)
-    test = standing.standing(everything, relative, labels, camera, support, walls, limits)
+    test = standing.standing(seen, relative, labels, support)
     labels, ids, is_cut = _ordered(labels, least, options.max_objects, test)
     return Segmentation(labels, plane.equation, ids, max(support.sigma, bodies.LEAST_SIGMA), is_cut)
 
@@ -220,8 +172,7 @@ def from_labels(
     order = np.argsort(-counts, kind="stable")
     ids = tuple(int(values[k]) for k in order)
     if options.workspace is not None:
-        box, pose = options.workspace, options.workspace_pose
-        ids = tuple(k for k in ids if standing.within(box, _points(labels == k, depth, valid, camera), pose))
+        ids = tuple(k for k in ids if options.is_within(_points(labels == k, depth, valid, camera)))
     is_cut = len(ids) > options.max_objects
     ids = ids[: options.max_objects]
     plane = None
@@ -248,7 +199,6 @@ def support_under(
 def warm_up() -> None:
     """Compile, or load from disk, every kernel by a ball on a table, beside a hole, and by two that touch."""
     convex_parts.warm_up()
-    enclosures.warm_up()
     pieces.warm_up()
     camera = Camera(96, 72, 180.0, 180.0, 47.5, 35.5)
     v, u = np.indices((camera.height, camera.width))
@@ -273,21 +223,12 @@ def _checked(depth: np.ndarray, camera: Camera, limits: tuple[float, float]) -> 
     return depth, valid
 
 
-def _unloaded(
-    labels: np.ndarray,
-    face: level_faces.LevelFace,
-    known: np.ndarray,
-    everything: np.ndarray,
-    camera: Camera,
-    walls: list[Plane],
-    limits: standing.Limits,
-    least: int,
-) -> np.ndarray:
+def _unloaded(labels: np.ndarray, face: level_faces.LevelFace, seen: standing.Seen, least: int) -> np.ndarray:
     """Labels in which what stands on a level face of a segment is taken apart once more, with the face as support."""
-    relative = face.surface.image_relative(everything, camera)
-    valid = face.under(labels, known, camera) & (relative > -support_plane.TOLERANCE)
-    parts = bodies.above(known, relative * valid, valid, camera, face.surface, walls, limits)
-    test = standing.standing(everything, relative, parts, camera, face.surface, walls, limits)
+    relative = face.surface.image_relative(seen.depth, seen.camera)
+    valid = face.under(labels, seen.known, seen.camera) & (relative > -support_plane.TOLERANCE)
+    parts = bodies.above(seen, relative * valid, valid, face.surface)
+    test = standing.standing(seen, relative, parts, face.surface)
     parts, _, _ = _ordered(parts, least, parts.max(initial=0), test)
     return np.where(parts > 0, parts + labels.max(), labels)
 

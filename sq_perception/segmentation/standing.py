@@ -19,26 +19,22 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from sq_perception.geometry import rotation
 from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.quantiles import quantile
 from sq_perception.imaging import depth_steps
 from sq_perception.imaging.camera import Camera
-from sq_perception.segmentation import support_plane
+from sq_perception.segmentation.options import SegmentationOptions, largest_edge
 from sq_perception.segmentation.support_plane import TOLERANCE, Plane, coarse, noise_growth
 from sq_perception.segmentation.support_surface import HIGHEST, LEVEL_SHARE, SupportSurface
 
 ObjectTest = Callable[[np.ndarray, np.ndarray], bool]
 """Of the rows and columns of a segment's pixels."""
-Box = tuple[float, float, float, float, float, float]
-Pose = tuple[tuple[float, float, float, float], tuple[float, float, float]]
-"""Quaternion x y z w and translation."""
 
 MIN_HEIGHT, _LEAST_HEIGHT = 0.012, 0.008
 """Metres that a thing reaches above the support at least, a metre away and farther, and nearer as the noise falls: one
 and a half tolerances of a plane, and a book's thickness, as cloths have folds."""
 _SAMPLES = 400
-"""Of a segment, evenly taken: the 5 % above a height, or the 1 % that may stick out, are a few still."""
+"""Of a segment, evenly taken: the 5 % above a height are a few still."""
 _SPARSE, _STRAY = 8, 0.001
 """Every so many pixels tell the nearest depth of an image, but for that share of them, which may be stray readings."""
 _FEWEST = 30
@@ -64,10 +60,6 @@ Of 72 simulated scenes of furniture this leaves 10 more segments of it, of which
 _FACE_SHARE = 0.5
 """What makes up this share of a plane's points is no part of it: the plane is a face of the thing.  The larger part
 decides; without it 3 of 81 recorded and simulated frames lose a body."""
-_OUTLIERS = 0.01
-"""Share of the points at either end that do not count for the extent: sensors smear edges."""
-TURNS = np.stack([np.cos(np.deg2rad(np.arange(0, 180, 10))), np.sin(np.deg2rad(np.arange(0, 180, 10)))], axis=1)
-"""Directions (18, 2) in which edges are measured."""
 _UNDER, _BELOW = 3.0, 2.0
 """Tolerances below the support at which is looked for it, and from which on something seen lies below it."""
 _SPECKLE = 4
@@ -80,63 +72,27 @@ at a grazing angle half is not measured: with a third low cameras miss a few thi
 shows one more that is none."""
 
 
-@dataclass(frozen=True)
-class Limits:
-    """What a thing may be.
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What an image of a pinhole camera shows.
 
     Attributes
     ----------
-    max_size
-        Largest edge of a box around what is seen of it, metres.
-    workspace
-        The middle of what is seen of it lies in this box: least x, y, z and greatest x, y, z.
-    workspace_pose
-        Of the optical frame in the frame of the box; None: they are the same.
+    depth : float32 (height, width)
+        Metres, 0 where nothing was measured.
+    known
+        The same, 0 also where objects are not looked for.
+    walls
+        Planes that are no support.
+    options
+        What objects may be.
     """
 
-    max_size: float
-    workspace: Box | None
-    workspace_pose: Pose | None
-
-    def hold(self, points: np.ndarray, up: np.ndarray | None = None) -> bool:
-        """Whether points (n, 3) are no larger than a thing and in the workspace; ``up`` is the support's normal."""
-        if self.workspace is not None and not within(self.workspace, points, self.workspace_pose):
-            return False
-        return self.is_small(points, up)
-
-    def is_small(self, points: np.ndarray, up: np.ndarray | None = None) -> bool:
-        """Whether points (n, 3) are no larger than a thing."""
-        return largest_edge(points, up) <= self.max_size
-
-
-def within(box: Box, points: np.ndarray, pose: Pose | None = None) -> bool:
-    """Whether the middle of points (n, 3) lies in a box; ``pose`` is that of their frame in the frame of the box."""
-    if pose is not None:
-        points = points @ rotation.to_matrix(np.array(pose[0])).T + np.array(pose[1])
-    middle = np.median(points, axis=0)
-    return bool((middle >= box[:3]).all() and (middle <= box[3:]).all())
-
-
-def largest_edge(points: np.ndarray, up: np.ndarray | None = None) -> float:
-    """Largest edge of the box around points (n, 3) whose largest edge is least, metres: upright, or of principal axes.
-
-    A hundredth of the points at either end may stick out.
-    """
-    points = points[:: 1 + len(points) // _SAMPLES]
-    if up is None:
-        axes = np.linalg.eigh(np.cov(points.T))[1] if len(points) > 3 else np.eye(3)
-        return float(_extents(axes.T @ points.T).max())
-    edges = _extents(np.concatenate([TURNS @ support_plane.across(up).T, up[None]]) @ points.T)
-    # A quarter turn apart, the two edges of one rectangle.
-    half = len(TURNS) // 2
-    return float(max(np.maximum(edges[:half], edges[half:-1]).min(), edges[-1]))
-
-
-def _extents(values: np.ndarray) -> np.ndarray:
-    """Of each row, without what sticks out."""
-    ordered = np.sort(values, axis=1)
-    out = int(_OUTLIERS * values.shape[1])
-    return np.asarray(ordered[:, -1 - out] - ordered[:, out])
+    depth: np.ndarray
+    known: np.ndarray
+    camera: Camera
+    walls: list[Plane]
+    options: SegmentationOptions
 
 
 def _top(values: np.ndarray) -> float:
@@ -145,23 +101,23 @@ def _top(values: np.ndarray) -> float:
     return float(np.partition(values, k)[k])
 
 
-def furniture(depth: np.ndarray, valid: np.ndarray, camera: Camera, walls: list[Plane], limits: Limits) -> np.ndarray:
-    """Pixels, bool (height, width), of surfaces in one of some planes that are larger than a thing."""
-    if not walls:
-        return np.zeros(depth.shape, bool)
-    k, rows, columns, points = coarse(depth, valid, camera)
-    height, width = depth[::k, ::k].shape
+def furniture(seen: Seen, valid: np.ndarray) -> np.ndarray:
+    """Valid pixels, bool (height, width), of surfaces in one of the walls that are larger than a thing."""
+    if not seen.walls:
+        return np.zeros(valid.shape, bool)
+    k, rows, columns, points = coarse(seen.known, valid, seen.camera)
+    height, width = valid[::k, ::k].shape
     large = np.zeros((height, width), np.uint8)
-    for wall in walls:
+    for wall in seen.walls:
         on = _lie_on(wall, points)
         lies = np.zeros(large.shape, bool)
         lies[rows[on], columns[on]] = True
         parts = depth_steps.components(lies)[rows, columns]
         for part in np.flatnonzero(np.bincount(parts) > _FEWEST):
-            if part > 0 and largest_edge(points[parts == part], wall.equation[:3]) > limits.max_size:
+            if part > 0 and largest_edge(points[parts == part], wall.equation[:3]) > seen.options.max_size:
                 large[rows[parts == part], columns[parts == part]] = 1
     full = cv2.resize(large, (k * width, k * height), interpolation=cv2.INTER_NEAREST)
-    return full[: depth.shape[0], : depth.shape[1]] > 0
+    return full[: valid.shape[0], : valid.shape[1]] > 0
 
 
 def _lie_on(wall: Plane, points: np.ndarray) -> np.ndarray:
@@ -170,73 +126,62 @@ def _lie_on(wall: Plane, points: np.ndarray) -> np.ndarray:
     return np.asarray(np.abs(wall.height(points)) < reach)
 
 
-def _of_no_segments(depth: np.ndarray, labels: np.ndarray, camera: Camera, walls: list[Plane]) -> list[Plane]:
-    """Those of some planes whose points are mostly in no segment.
+def _of_no_segments(seen: Seen, labels: np.ndarray) -> list[Plane]:
+    """Those of the walls whose points are mostly in no segment.
 
     The tops or the fronts of equal things lie in a plane, too; larger surfaces are no segments (:func:`furniture`).
     """
-    if not walls:
+    if not seen.walls:
         return []
-    k, rows, columns, points = coarse(depth, depth > 0, camera)
+    k, rows, columns, points = coarse(seen.depth, seen.depth > 0, seen.camera)
     in_segment = labels[::k, ::k][rows, columns] > 0
     found = []
-    for wall in walls:
+    for wall in seen.walls:
         on = _lie_on(wall, points)
         if np.count_nonzero(on & in_segment) < _IN_SEGMENTS * np.count_nonzero(on):
             found.append(wall)
     return found
 
 
-def alone(depth: np.ndarray, camera: Camera, limits: Limits) -> ObjectTest:
+def alone(seen: Seen) -> ObjectTest:
     """The test of a segment in an image without a support: no larger than a thing, and not wherever the image ends.
 
     A surface that runs out of the image on opposite sides fills it.
     """
-    last_row, last_column = camera.height - 1, camera.width - 1
+    last_row, last_column = seen.camera.height - 1, seen.camera.width - 1
 
     def is_thing(rows: np.ndarray, columns: np.ndarray) -> bool:
         if (rows.min() == 0 and rows.max() == last_row) or (columns.min() == 0 and columns.max() == last_column):
             return False
         step = max(1, rows.size // _SAMPLES)
         r, c = rows[::step], columns[::step]
-        return limits.hold(camera.unproject(c, r, depth[r, c]))
+        return seen.options.hold(seen.camera.unproject(c, r, seen.known[r, c]))
 
     return is_thing
 
 
-def standing(
-    depth: np.ndarray,
-    relative: np.ndarray,
-    labels: np.ndarray,
-    camera: Camera,
-    support: SupportSurface,
-    walls: list[Plane],
-    limits: Limits,
-) -> ObjectTest:
+def standing(seen: Seen, relative: np.ndarray, labels: np.ndarray, support: SupportSurface) -> ObjectTest:
     """The test of whether a segment is a thing that stands on the support, to be asked of the largest ones first.
 
     What beside a thing is taken for the noise of the support grows less with every other thing that was accepted.
 
     Parameters
     ----------
-    depth, relative : (height, width)
-        Metres, 0 where nothing was measured, and the heights above the support as at one metre of depth.
+    relative : (height, width)
+        Heights above the support as at one metre of depth, 0 where nothing was measured.
     labels : int32 (height, width)
         The segments.
-    camera
-        A pinhole camera.
     support
         What things stand on.
-    walls
-        Other planes of the image.
     """
+    depth, camera, options = seen.depth, seen.camera, seen.options
     last_row, last_column = camera.height - 1, camera.width - 1
     measured = np.count_nonzero(depth)
-    around = (depth > 0) & ~_tall(labels, relative, support.sigma)
+    around = (depth > 0) & ~_tall(labels, relative, int(labels.max(initial=0)) + 1, support.sigma)
     coarse = depth[::_SPARSE, ::_SPARSE]
     nearest = quantile(coarse[coarse > 0], _STRAY) * (1 + depth_steps.STEP) if coarse.any() else 0.0
     plane = support.plane
-    walls = _of_no_segments(depth, labels, camera, walls)
+    walls = _of_no_segments(seen, labels)
 
     def is_thing(rows: np.ndarray, columns: np.ndarray) -> bool:
         step = max(1, rows.size // _SAMPLES)
@@ -244,7 +189,7 @@ def standing(
         points = camera.unproject(c, r, depth[r, c])
         growth = noise_growth(points[:, 2])
         height = relative[r, c]
-        behind = float(points[:, 2].max()) + limits.max_size
+        behind = float(points[:, 2].max()) + options.max_size
         beside = _beside(relative, depth, around, behind, rows, columns)
         least = max(_LEAST_HEIGHT, MIN_HEIGHT * min(1.0, float(quantile(growth, 0.5))))
         if _top(height * growth) < least or not _rises(_top(height), beside, support.sigma):
@@ -258,7 +203,7 @@ def standing(
             # A carton's face may be cut by one border; a wall of which little is seen leaves by two.
             if borders > (0 if on_it else 1) and np.mean(off < 2 * TOLERANCE) > 0.5:
                 return False
-        if not limits.hold(points, plane.equation[:3]):
+        if not options.hold(points, plane.equation[:3]):
             return False
         least_share = _SUPPORTED if points[:, 2].min() > nearest else 0.0
         if not _stands(points, least_share, depth, relative, camera, plane):
@@ -269,14 +214,10 @@ def standing(
     return is_thing
 
 
-def _tall(labels: np.ndarray, relative: np.ndarray, sigma: float) -> np.ndarray:
-    """Pixels, bool (height, width), of segments that are higher than any noise, on average: things or the room."""
-    limit = float(min(HIGHEST * TOLERANCE, _TALL * sigma))
-    return np.asarray(_higher(labels, relative, int(labels.max(initial=0)) + 1, limit))
-
-
 @kernel
-def _higher(labels: np.ndarray, relative: np.ndarray, count: int, limit: float) -> np.ndarray:
+def _tall(labels: np.ndarray, relative: np.ndarray, count: int, sigma: float) -> np.ndarray:
+    """Pixels, bool (height, width), of segments that are higher than any noise, on average: things or the room."""
+    limit = min(HIGHEST * TOLERANCE, _TALL * sigma)
     sums, pixels = np.zeros(count), np.zeros(count)
     for v in range(labels.shape[0]):
         for u in range(labels.shape[1]):
@@ -342,23 +283,10 @@ def _beside(
     mask = np.zeros(relative[window].shape, np.uint8)
     mask[rows - top, columns - left] = 1
     near, ring = (cv2.dilate(mask, np.ones((2 * k + 1, 2 * k + 1), np.uint8)) for k in (_SMEARED, _BESIDE))
-    return np.asarray(_heights_where(relative, depth, around, behind, ring - near, top, left))
-
-
-@kernel
-def _heights_where(
-    relative: np.ndarray, depth: np.ndarray, around: np.ndarray, behind: float, mask: np.ndarray, top: int, left: int
-) -> np.ndarray:
-    """Heights (n,) of pixels around a thing in a mask, whose corner is there, but for what is too high, low or far."""
-    found, n = np.empty(mask.size, np.float32), 0
-    for v in range(mask.shape[0]):
-        for u in range(mask.shape[1]):
-            if mask[v, u] > 0 and around[top + v, left + u] and depth[top + v, left + u] < behind:
-                height = relative[top + v, left + u]
-                if abs(height) < HIGHEST * TOLERANCE:
-                    found[n] = height
-                    n += 1
-    return found[:n]
+    height = relative[window]
+    is_far = depth[window] >= np.float64(behind)
+    is_support = np.abs(height) < np.float64(HIGHEST * TOLERANCE)
+    return np.asarray(height[(ring > near) & around[window] & is_support & ~is_far])
 
 
 def _stands(

@@ -69,7 +69,7 @@ def test_the_rim_that_a_sensor_adds_is_stray(shipped: Any) -> None:
     wider = cv2.dilate((truth > 0).view(np.uint8), brush) > 0
     depth = np.where(wider & (truth == 0), cv2.erode(np.where(truth > 0, depth, np.inf), brush), depth)
     found = of(shipped, depth.astype(np.float32)).improved(segmentation(wider.astype(np.int32)))
-    np.testing.assert_array_equal(found.found.labels, wider)
+    np.testing.assert_array_equal(found.labels, wider)
     assert not (found.strays & ~wider).any()
     own = wider & ~found.strays
     rim = wider & (truth == 0)
@@ -87,7 +87,7 @@ def test_the_rim_that_a_stereo_camera_adds_is_stray(shipped: Any) -> None:
         measured = sensor_noise.preset("realsense_d435").measured(depth.astype(float), CAMERA, rng)
         can = wider & (np.abs(measured - np.median(depth[truth > 0])) < CAN[0][0])
         found = of(shipped, measured).improved(segmentation(can.astype(np.int32)))
-        np.testing.assert_array_equal(found.found.labels, can)
+        np.testing.assert_array_equal(found.labels, can)
         assert not (found.strays & ~can).any()
         counts += [[np.sum(each & (truth > 0)), np.sum(each & (truth == 0))] for each in (can, can & ~found.strays)]
     before, after = counts
@@ -100,7 +100,7 @@ def test_two_halves_of_a_can_are_joined_and_two_cans_are_not(shipped: Any) -> No
     depth, truth = seen([TABLE.body(-0.06, 0, *CAN), TABLE.body(0.06, 0.02, *CAN)])
     middle = np.median(np.nonzero(truth == 1)[1])
     halves = np.where((truth == 1) & (np.arange(CAMERA.width) > middle), 3, truth).astype(np.int32)
-    found = of(shipped, depth).improved(segmentation(halves)).found
+    found = of(shipped, depth).improved(segmentation(halves))
     assert len(found.ids) == 2
     for can in (1, 2):
         assert len(np.unique(found.labels[truth == can])) == 1
@@ -108,7 +108,7 @@ def test_two_halves_of_a_can_are_joined_and_two_cans_are_not(shipped: Any) -> No
 
 def test_two_boxes_under_one_label_become_two(shipped: Any) -> None:
     depth, truth = seen([TABLE.body(-0.055, 0, (0.05, 0.04, 0.03)), TABLE.body(0.035, 0.01, (0.04, 0.03, 0.06))])
-    found = of(shipped, depth).improved(segmentation((truth > 0).astype(np.int32))).found
+    found = of(shipped, depth).improved(segmentation((truth > 0).astype(np.int32)))
     assert found.ids == (1, 2)
     for box in (1, 2):
         mine = found.labels == np.bincount(found.labels[truth == box]).argmax()
@@ -131,7 +131,7 @@ def claims_of_halves(views: np.ndarray) -> np.ndarray:
 
 def test_a_doubtful_segment_is_parted_where_its_pieces_say() -> None:
     depth, truth = seen([TABLE.body(0, 0, *CAN)])
-    found = of(GivenLogits(claims_of_halves), depth).improved(segmentation(truth)).found
+    found = of(GivenLogits(claims_of_halves), depth).improved(segmentation(truth))
     assert found.ids == (1, 2)
     np.testing.assert_array_equal(found.labels > 0, truth > 0)
     columns = [np.nonzero(found.labels == label)[1] for label in found.ids]
@@ -149,14 +149,14 @@ def test_pieces_that_are_of_nothing_are_no_objects() -> None:
     depth, truth = seen([TABLE.body(0, 0, *CAN)])
     network = GivenLogits(right_alone)
     found = of(network, depth).improved(segmentation(truth))
-    np.testing.assert_array_equal(found.found.labels, truth)
+    np.testing.assert_array_equal(found.labels, truth)
     assert network.asked > 1
 
 
 def test_a_segment_that_is_surely_one_is_asked_about_once() -> None:
     depth, truth = seen([TABLE.body(0, 0, *CAN)])
     network = GivenLogits(lambda views: np.full(views.shape[:3], 3.0))
-    np.testing.assert_array_equal(of(network, depth).improved(segmentation(truth)).found.labels, truth)
+    np.testing.assert_array_equal(of(network, depth).improved(segmentation(truth)).labels, truth)
     assert network.asked == 1
 
 
@@ -168,8 +168,8 @@ def test_pieces_are_joined_until_none_belong_together() -> None:
     quarters = np.where(truth > 0, 1 + (rows > v) + 2 * (columns > u), 0).astype(np.int32)
     network = GivenLogits(lambda views: np.full(views.shape[:3], 3.0))
     found = of(network, depth).improved(segmentation(quarters))
-    np.testing.assert_array_equal(found.found.labels, truth)
-    assert found.found.ids == (1,)
+    np.testing.assert_array_equal(found.labels, truth)
+    assert found.ids == (1,)
     assert not found.strays.any()
     assert network.asked == 4 + 2 + 1
 
@@ -184,7 +184,7 @@ def test_one_sided_belonging_joins_nothing() -> None:
         return np.where(inside | claims, 3.0, -3.0)
 
     found = of(GivenLogits(claims_of_the_first), depth).improved(segmentation(truth))
-    assert sorted(found.found.ids) == [1, 2]
+    assert sorted(found.ids) == [1, 2]
 
 
 def stray_in_rows(share: float) -> Any:
@@ -201,15 +201,15 @@ def stray_in_rows(share: float) -> Any:
 def test_a_segment_that_is_mostly_stray_keeps_its_pixels() -> None:
     depth, truth = seen([TABLE.body(0, 0, *CAN)])
     found = of(stray_in_rows(0.55), depth).improved(segmentation(truth))
-    np.testing.assert_array_equal(found.found.labels, truth)
+    np.testing.assert_array_equal(found.labels, truth)
     assert not found.strays.any()
 
 
 def test_a_segment_that_shows_no_object_is_dropped() -> None:
     depth, truth = seen([TABLE.body(0, 0, *CAN)])
     found = of(stray_in_rows(0.8), depth).improved(segmentation(truth))
-    assert found.found.ids == ()
-    assert not found.found.labels.any()
+    assert found.ids == ()
+    assert not found.labels.any()
 
 
 def test_without_a_support_nothing_is_dropped() -> None:
@@ -217,7 +217,7 @@ def test_without_a_support_nothing_is_dropped() -> None:
     depth, truth = seen([TABLE.body(0, 0, *CAN)])
     alone = np.where(truth > 0, depth, np.nan).astype(np.float32)
     network = SegmentNetwork(stray_in_rows(0.8), alone, CAMERA, None, lambda function, labels: function(labels))
-    assert network.improved(segmentation(truth)).found.ids == (1,)
+    assert network.improved(segmentation(truth)).ids == (1,)
 
 
 def test_the_floor_behind_a_table_is_no_object(shipped: Any) -> None:
@@ -227,7 +227,7 @@ def test_the_floor_behind_a_table_is_no_object(shipped: Any) -> None:
     behind = np.arange(CAMERA.height)[:, None] < np.nonzero(truth)[0].min() - 10
     labels = np.where(behind, 1, 2 * truth).astype(np.int32)
     assert np.count_nonzero(labels == 1) > np.count_nonzero(labels == 2)
-    found = of(shipped, np.where(behind, floor, depth).astype(np.float32)).improved(segmentation(labels)).found
+    found = of(shipped, np.where(behind, floor, depth).astype(np.float32)).improved(segmentation(labels))
     assert found.ids == (1,)
     np.testing.assert_array_equal(found.labels, truth)
 
@@ -238,7 +238,7 @@ def test_what_is_larger_than_all_of_a_household_is_an_object(shipped: Any, times
     depth, truth = seen([TABLE.body(0, 0, *CAN)])
     plane = PLANE * np.array([1.0, 1.0, 1.0, times])
     far = (times * depth).astype(np.float32)
-    assert of(shipped, far, plane=plane).improved(segmentation(truth)).found.ids == (1,)
+    assert of(shipped, far, plane=plane).improved(segmentation(truth)).ids == (1,)
 
 
 def test_cans_in_an_image_of_few_pixels_are_objects(shipped: Any) -> None:
@@ -247,13 +247,13 @@ def test_cans_in_an_image_of_few_pixels_are_objects(shipped: Any) -> None:
     bodies = [table.body(0.11 * k - 0.22, 0.05 * (k % 2), *CAN) for k in range(5)]
     depth, truth = table.see(bodies, 0.002, camera=camera)
     found = of(shipped, depth, camera, table.plane).improved(segmentation(truth))
-    assert len(found.found.ids) == 5
+    assert len(found.ids) == 5
 
 
 def test_no_segments_ask_nothing() -> None:
     depth, truth = seen([TABLE.body(0, 0, *CAN)])
     network = GivenLogits(lambda views: views)
-    assert of(network, depth).improved(segmentation(np.zeros_like(truth))).found.ids == ()
+    assert of(network, depth).improved(segmentation(np.zeros_like(truth))).ids == ()
     assert network.asked == 0
 
 

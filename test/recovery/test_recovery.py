@@ -22,7 +22,6 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.learning import checkpoint
 from sq_perception.learning.regressor import Regressor, RegressorConfig
 from sq_perception.recovery import own_segments, seen_object
-from sq_perception.recovery.own_segments import OwnSegments
 from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, RecoveryOptions, render_recovery
 from sq_perception.segmentation.segments import Segmentation
 from sq_perception.simulation.scenes import table_scene
@@ -233,7 +232,7 @@ def test_parting_segments_makes_no_more_objects_than_are_wanted(monkeypatch):
     labels = np.zeros((48, 64), np.int32)
     for k in range(3):
         labels[10:30, 10 + 15 * k : 20 + 15 * k] = k + 1
-    parted = OwnSegments(Segmentation(labels, None, (1, 2, 3)))
+    parted = Segmentation(labels, None, (1, 2, 3))
     monkeypatch.setattr(own_segments.SegmentNetwork, "improved", lambda *_: parted)
     camera = Camera(64, 48, 60.0, 60.0, 32, 24)
     found = Recoverer().recover(np.ones((48, 64), np.float32), camera, options=RecoveryOptions(max_objects=2))
@@ -248,7 +247,7 @@ def test_segments_of_nothing_take_no_place_of_objects(monkeypatch):
     depth, truth = table.see([table.body(-0.1, 0, (0.06, 0.06, 0.05)), table.body(0.12, 0, (0.03, 0.03, 0.03))])
 
     def without_the_largest(_, found):
-        return OwnSegments(replace(found, labels=np.maximum(found.labels - 1, 0), ids=found.ids[:-1]))
+        return replace(found, labels=np.maximum(found.labels - 1, 0), ids=found.ids[:-1])
 
     monkeypatch.setattr(own_segments.SegmentNetwork, "improved", without_the_largest)
     found = Recoverer().recover(depth, VGA, options=RecoveryOptions(max_objects=1))

@@ -11,7 +11,8 @@ from table_scenes import VGA, Table
 
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.recovery import seen_object, supports
-from sq_perception.segmentation.segments import SegmentationOptions, from_labels
+from sq_perception.segmentation.options import SegmentationOptions
+from sq_perception.segmentation.segments import from_labels
 
 LOW_BOX = (0.12, 0.1, 0.04)
 

@@ -12,7 +12,8 @@ from sq_perception.imaging import raycast, unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.recordings.frame_file import read
 from sq_perception.segmentation import support_plane
-from sq_perception.segmentation.segments import Segmentation, SegmentationOptions, from_labels, segment, support_under
+from sq_perception.segmentation.options import SegmentationOptions
+from sq_perception.segmentation.segments import Segmentation, from_labels, segment, support_under
 from sq_perception.simulation import sensor_noise
 from sq_perception.simulation.scenes import plane_depth
 

@@ -12,7 +12,8 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation import standing, support_plane, support_surface
-from sq_perception.segmentation.segments import SegmentationOptions, from_labels, segment
+from sq_perception.segmentation.options import SegmentationOptions, largest_edge
+from sq_perception.segmentation.segments import from_labels, segment
 from sq_perception.simulation.scenes import plane_depth
 
 CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)
@@ -179,11 +180,12 @@ def test_the_height_of_a_board_is_no_noise_to_what_stands_on_it(seed):
 def test_walls_are_furniture_and_faces_of_things_are_not():
     """The same plane holds a wall and, apart from it, the front of a box as a thing may be."""
     wall = support_plane.Plane(np.array([0.0, 0.0, -1.0, 2.0]), 0.5, 1e-3)
-    limits = standing.Limits(0.6, None, None)
+    limits = SegmentationOptions(max_size=0.6)
     depth = np.zeros((240, 320), np.float32)
     depth[:, :150] = 2.0  # 1.1 m wide, 1.8 m high
     depth[100:160, 220:280] = 2.0  # 0.44 m
-    large = standing.furniture(noisy(depth), depth > 0, CAMERA, [wall], limits)
+    measured = noisy(depth)
+    large = standing.furniture(standing.Seen(measured, measured, CAMERA, [wall], limits), depth > 0)
     assert large[:, :140].mean() > 0.99
     assert not large[:, 160:].any()
 
@@ -365,9 +367,9 @@ def test_the_largest_edge_is_that_of_the_box_and_not_its_diagonal(turn):
     c, s = np.cos(turn), np.sin(turn)
     points = points @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
     up = np.array([0.0, 0.0, 1.0])
-    assert standing.largest_edge(points, up) == pytest.approx(0.4, rel=0.08)
+    assert largest_edge(points, up) == pytest.approx(0.4, rel=0.08)
     wild = np.concatenate([points, [[5.0, 5.0, 5.0]]])
-    assert standing.largest_edge(wild, up) == pytest.approx(0.4, rel=0.08)
+    assert largest_edge(wild, up) == pytest.approx(0.4, rel=0.08)
 
 
 @pytest.mark.parametrize(("away", "sigma"), [(1.0, 1e-3), (3.0, 2e-4)])
@@ -379,8 +381,8 @@ def test_tall_neighbours_are_not_taken_for_each_other_s_noise(away, sigma):
     table = support_plane.Plane(np.array([0.0, 0.0, -1.0, away]), 1.0, sigma)
     support = support_surface.SupportSurface(table, np.zeros(6), 0.0, sigma)
     relative = support.image_relative(depth, camera)
-    limits = standing.Limits(0.9 * away, None, None)
-    is_thing = standing.standing(depth, relative, labels, camera, support, [], limits)
+    limits = SegmentationOptions(max_size=0.9 * away)
+    is_thing = standing.standing(standing.Seen(depth, depth, camera, [], limits), relative, labels, support)
     assert all(is_thing(*np.nonzero(labels == k)) for k in range(1, 5))
 
 
