@@ -43,9 +43,8 @@ from sq_perception.geometry.quantiles import ranked
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.regions import extents
 from sq_perception.recovery.options import RecoveryOptions
-from sq_perception.recovery.recovery import FrameRecovery, Recovery
+from sq_perception.recovery.recovery import FrameRecovery, Recovery, Reference
 from sq_perception.recovery.seen_object import SeenObject
-from sq_perception.segmentation.segments import Segmentation
 
 _WIDTH = 320
 """Columns that are compared: noise of neighbouring pixels is alike in all sensors of sensor_noise.preset."""
@@ -78,38 +77,6 @@ _OLD = 30
 """Frames after which segments are found anew when a body's turn comes: a second at 30 Hz.  Chosen."""
 _ALIKE = 0.8
 """Intersection over union of two segments that are one: what noise leaves of a small object's edge."""
-
-
-@dataclass(frozen=True, eq=False)
-class Reference:
-    """What a frame's bodies were recovered from.
-
-    Attributes
-    ----------
-    depth : float32 (rows, columns)
-        Every ``stride``-th pixel of the image; 0 where nothing was measured.
-    segments
-        The objects, of all pixels, found ``age`` frames ago, or ``given``.
-    """
-
-    depth: np.ndarray
-    camera: Camera
-    options: RecoveryOptions
-    segments: Segmentation
-    age: int
-    given: bool
-
-    @property
-    def stride(self) -> int:
-        """Pixels from one that is compared to the next."""
-        return _stride(self.camera)
-
-    def keeping(self, other: Reference, labels: np.ndarray, kept: Sequence[int]) -> Reference:
-        """These readings, but those of another reference around the labels that were recovered from it."""
-        taken = np.zeros(self.depth.shape, bool)
-        for label in kept:
-            taken |= _around(labels[:: self.stride, :: self.stride] == label) > 0
-        return replace(self, depth=np.where(taken, other.depth, self.depth))
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +121,7 @@ def repeated(
         return NOTHING
     if previous.labels.max(initial=0) > previous.labels.size:  # given ones, and tables by label would be huge
         return NOTHING
-    old, new, sigma = before.depth, sampled(depth, camera), before.segments.sigma
+    old, new, sigma = before.depth, sampled(depth, camera)[0], before.segments.sigma
     shown = np.ascontiguousarray(previous.labels[:: before.stride, :: before.stride], dtype=np.int32)
     reach = _REACH * float(old[shown > 0].max(initial=0))
     change, near = _changed(old, new, reach)
@@ -211,15 +178,19 @@ def matched(kept: Repeated, labels: np.ndarray, objects: Sequence[SeenObject]) -
     return same
 
 
-def sampled(depth: np.ndarray, camera: Camera) -> np.ndarray:
-    """What is compared, float32, of an image (height, width) that is NaN where nothing was measured; 0 there."""
-    stride = _stride(camera)
+def sampled(depth: np.ndarray, camera: Camera) -> tuple[np.ndarray, int]:
+    """What is compared, float32, of an image (height, width) that is NaN where nothing was measured, and its stride."""
+    stride = max(1, round(camera.width / _WIDTH))
     seen = np.asarray(depth[::stride, ::stride], dtype=np.float32)
-    return np.where(np.isnan(seen), np.float32(0), seen)
+    return np.where(np.isnan(seen), np.float32(0), seen), stride
 
 
-def _stride(camera: Camera) -> int:
-    return max(1, round(camera.width / _WIDTH))
+def mixed(new: Reference, old: Reference, labels: np.ndarray, kept: Sequence[int]) -> Reference:
+    """The new readings, but the old ones around the labels that were recovered from these."""
+    taken = np.zeros(new.depth.shape, bool)
+    for label in kept:
+        taken |= _around(labels[:: new.stride, :: new.stride] == label) > 0
+    return replace(new, depth=np.where(taken, old.depth, new.depth))
 
 
 def _around(mask: np.ndarray) -> np.ndarray:

@@ -45,7 +45,7 @@ from sq_perception.recovery import continuity, methods, prediction, seen_object,
 from sq_perception.recovery.options import NEEDS_NETWORK, Method, RecoveryOptions
 from sq_perception.recovery.own_segments import SegmentNetwork
 from sq_perception.recovery.prediction import Prediction
-from sq_perception.recovery.recovery import FrameRecovery, Recovery, timed
+from sq_perception.recovery.recovery import FrameRecovery, Recovery, Reference, timed
 from sq_perception.recovery.seen_object import SeenObject
 from sq_perception.segmentation import segments
 
@@ -251,13 +251,12 @@ class Recoverer:
             for obj, fit, score in zip(fresh, fits, scores, strict=True):
                 of_label[obj.label] = Recovery(fit, score, obj.label, obj.pixels)
             bodies = tuple(of_label[obj.label] for obj in objects)
-        reference = continuity.Reference(
-            continuity.sampled(measured, camera), camera, options, found, age=age, given=labels is not None
+        reference = Reference(
+            *continuity.sampled(measured, camera), camera, options, found, age=age, given=labels is not None
         )
         if previous is not None and previous.reference is not None and same:
-            reference = reference.keeping(
-                previous.reference, found.labels, [body.label for body in bodies if body.repeats]
-            )
+            kept_labels = [body.label for body in bodies if body.repeats]
+            reference = continuity.mixed(reference, previous.reference, found.labels, kept_labels)
         milliseconds["total"] = 1e3 * (time.perf_counter() - started)
         message = _left_out(found, options) if bodies else _why_empty(depth, found, labels)
         message = "; ".join(filter(None, (message, _wrong_unit(measured, camera))))
