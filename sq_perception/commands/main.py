@@ -32,7 +32,6 @@ COMMANDS = {
     "train-masks": ("shards:train_masks", "train the network that finds strays in segments"),
     "dataset": ("dataset:main", "write a fixed set of training and test images"),
     "evaluate": ("evaluate:main", "the thesis' tables and plots, for networks and fits"),
-    "render-search": ("render_search:main", "find the best s and tau of the soft renderer"),
     "doctor": ("doctor:main", "versions, extras, kernels, cores, and what is missing"),
     "warm-up": ("warm_up:main", "compile everything once, so that no first image waits"),
 }

@@ -209,8 +209,6 @@ def test_a_missing_model_is_one_clear_line(tmp_path, view, capsys):
         ["render", *CAN, "--projection", "pinhole", "--output", "x.png", "--height", "0"],
         ["render", *CUBE_BODY, "--output", "no/such/folder/x.png"],
         ["render", "nan", *CUBE_BODY[1:], "--output", "x.png"],
-        ["render-search", "--picture", "x.txt"],
-        ["render-search", "--seed", "-1"],
         ["train", "--seed", "-1"],
         ["train", "--threads", "-1"],
     ],
