@@ -48,15 +48,21 @@ OCCLUDED = "occluded"
 WORST = 10
 
 
+def plane_of(path: Path) -> np.ndarray | None:
+    """The support plane (4,) of a recorded frame, height above it = n.p + d, where its file has one."""
+    with np.load(path, allow_pickle=False) as archive:
+        return archive["plane"].astype(float) if "plane" in archive else None
+
+
 def carton(folder: Path) -> tuple[dict[str, Any], str]:
     """Edge lengths of one carton from several sides."""
     views: dict[str, Any] = {}
     rows = []
     known_edges: list[list[float]] = [[], [], []]
     for path in sorted(folder.glob("felix_*.npz")):
-        frame = frame_file.read(path)
+        frame, plane = frame_file.read(path), plane_of(path)
         assert frame.labels is not None
-        found = both(frame.depth, frame.labels == 1, frame.camera, surface_fit.FitOptions(plane=frame.plane))
+        found = both(frame.depth, frame.labels == 1, frame.camera, surface_fit.FitOptions(plane=plane))
         size, sigma = found.fit.superquadric.size, found.fit.sigma_size
         order = np.argsort(size)
         edges, margins = 2e3 * size[order], 4e3 * sigma[order]
@@ -69,7 +75,7 @@ def carton(folder: Path) -> tuple[dict[str, Any], str]:
             "edges": edges.tolist(),
             "two_sigma": margins.tolist(),
             "determined": known.tolist(),
-            "plane": frame.plane is not None,
+            "plane": plane is not None,
             "status": found.fit.status.name.lower(),
             "message": found.fit.message,
             "milliseconds": found.milliseconds,
@@ -77,7 +83,7 @@ def carton(folder: Path) -> tuple[dict[str, Any], str]:
         }
         rows.append(
             [
-                path.stem + ("" if frame.plane is not None else " (no plane)"),
+                path.stem + ("" if plane is not None else " (no plane)"),
                 *(
                     f"{e:.1f} +- {m:.1f}" + ("" if sure else " (open)")
                     for e, m, sure in zip(edges, margins, known, strict=True)
@@ -146,10 +152,10 @@ def things(folder: Path, frames: int) -> list[MeasuredObject]:
         seen[category] = seen.get(category, 0) + 1
         if seen[category] > frames:
             continue
-        frame = frame_file.read(path)
+        frame, plane = frame_file.read(path), plane_of(path)
         assert frame.labels is not None
-        assert frame.plane is not None
-        plane = frame.plane / np.linalg.norm(frame.plane[:3])
+        assert plane is not None
+        plane = plane / np.linalg.norm(plane[:3])
         for label in ids:
             mask = frame.labels == label
             result = both(frame.depth, mask, frame.camera, surface_fit.FitOptions(plane=plane))
