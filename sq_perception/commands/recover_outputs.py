@@ -107,8 +107,10 @@ class Outputs:
                 from sq_perception.recordings.still_page import StillPage
 
                 self._page = StillPage(options.html)
-        except BaseException:
-            self.discard()
+        except BaseException:  # nothing is left of those that were begun
+            for output in (self._lines, self._bag, self._page):
+                if output is not None:
+                    output.close()
             raise
         self._stems: set[str] = set()
         given = {output_file.free_name(_stem(entry), self._stems): entry for entry in self.done}
@@ -148,12 +150,6 @@ class Outputs:
             self._page.add(frame, recovery)
         if self._lines is not None:  # last: what has a line has all its files
             self._lines.add(entry)
-
-    def discard(self) -> None:
-        """Close them before the first frame, with nothing left of those that were begun."""
-        for output in (self._lines, self._bag, self._page):
-            if output is not None:
-                output.close()
 
     def finish(self, whole: bool) -> Iterator[str]:
         """Close what grew and write the documents; what could not be done, or went elsewhere, one sentence each.
