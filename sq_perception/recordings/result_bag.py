@@ -95,11 +95,7 @@ class ResultBag:
         self._last = Stamp(0, 0)
         self._output = OutputFile(self._path, f"{self._path.name}.partial")
         self._raw = self._output.partial.open("wb")
-        try:
-            self._file = McapFile(self._raw, "sq_perception", bag_messages.definition)
-        except BaseException:
-            self._discard()
-            raise
+        self._file = McapFile(self._raw, "sq_perception", bag_messages.definition)
 
     def __enter__(self) -> ResultBag:
         return self
