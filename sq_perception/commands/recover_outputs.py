@@ -67,7 +67,6 @@ def replaced_input(options: argparse.Namespace, inputs: Sequence[Path]) -> str:
 def _decisive(options: argparse.Namespace) -> dict[str, Any]:
     """Options that decide what is found in a frame, as JSON values; what was not given or has no end is None."""
     values = {name: getattr(options, name) for name in _DECISIVE}
-    values["roi"] = values["roi"] and list(values["roi"])
     sides = values["workspace"]
     values["workspace"] = sides and [side if math.isfinite(side) else None for side in sides]
     values["masks"] = values["masks"] and str(values["masks"])
