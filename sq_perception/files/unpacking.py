@@ -66,12 +66,12 @@ def npy_array(path: Path) -> np.ndarray:
 
 
 def grey_image(path: Path) -> np.ndarray:
-    """A grey PNG, BMP or TIFF, uint8, uint16 or float32 (height, width); three equal channels are grey too.
+    """A grey PNG, BMP or TIFF (height, width), of any type of number; three equal channels are grey too.
 
     Raises
     ------
     UnpackingError
-        If it cannot be read, is no grey image of 8 or 16 bit or floats, or has more than MOST_PIXELS pixels.
+        If it cannot be read, is no grey image, or has more than MOST_PIXELS pixels.
     """
     try:
         if path.stat().st_size > MOST_BYTES:
@@ -97,8 +97,6 @@ def grey_image(path: Path) -> np.ndarray:
                 else "expected a grey image, got a colour image: is it the camera's picture, or depth drawn in colours?"
             )
         image = np.ascontiguousarray(first)
-    if image.dtype not in (np.uint8, np.uint16, np.float32, np.float64):
-        raise UnpackingError(f"expected 8 or 16 bit or floats, got {image.dtype}")
     return image
 
 
@@ -151,10 +149,7 @@ def _numbers(file: IO[bytes], file_size: int, where: str = "") -> np.ndarray:
     size = count * dtype.itemsize
     if file_size != file.tell() + size:
         raise UnpackingError(f"{where}expected {size} bytes of numbers, got {file_size - file.tell()}")
-    data = file.read(size)
-    if len(data) != size:
-        raise UnpackingError(f"{where}expected {size} bytes of numbers, got {len(data)}")
-    return np.frombuffer(data, dtype).reshape(shape, order="F" if is_fortran else "C").copy()
+    return np.frombuffer(file.read(size), dtype).reshape(shape, order="F" if is_fortran else "C").copy()
 
 
 def _image_header(encoded: np.ndarray) -> tuple[int, int, bool]:

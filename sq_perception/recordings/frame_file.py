@@ -256,8 +256,6 @@ def _read(
     if image.ndim != 2 or not image.size:
         raise ValueError(f"expected an image (height, width), got {image.shape}")
     if projection == "orthographic":
-        if image.dtype not in (np.uint8, np.uint16):
-            raise ValueError(f"expected 8 or 16 bit, got {image.dtype}")
         depth, camera = unit_cube.depth_from_grey(image), unit_cube.camera(image.shape[1], image.shape[0])
         encoding = "mono8" if image.dtype == np.uint8 else "mono16"
         return RecordedFrame(depth, camera, reading.labels(path.stem, image), path.name, encoding=encoding)
