@@ -102,7 +102,3 @@ def _parser() -> argparse.ArgumentParser:
     for name, (_, summary) in COMMANDS.items():
         commands.add_parser(name, help=summary, add_help=False)
     return parser
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())
