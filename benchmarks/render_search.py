@@ -18,8 +18,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import report
 import torch
+from common import report
 from matplotlib.figure import Figure
 
 from sq_perception.evaluation import plots
