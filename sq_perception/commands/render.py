@@ -70,6 +70,9 @@ def _render(options: argparse.Namespace) -> int:
     if suffix not in ((".png", ".npz") if pinhole else (".png", ".bmp", ".npz")):
         kinds = ".png or .npz" if pinhole else ".png, .bmp or .npz"
         return misused(f"--output: {output.name}: an image of this projection is a {kinds}")
+    beside = output.with_suffix(".yaml")
+    if pinhole and suffix == ".png" and beside.exists() and not output.exists():
+        return failed(f"{beside}: the camera of {output.name} goes there, but something else has that name")
     if not pinhole and options.focal is not None:
         return misused("--focal: of a pinhole camera; see --projection")
 

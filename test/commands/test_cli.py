@@ -86,6 +86,16 @@ def test_pinhole_round_trips(tmp_path):
         np.testing.assert_allclose(archive["superquadrics"][0], flat(CAN).to_flat())
 
 
+def test_what_has_the_name_of_the_camera_beside_an_image_is_kept(tmp_path, capsys):
+    (tmp_path / "can.yaml").write_text("mine")
+    render = ["render", *CAN, "--projection", "pinhole", "-o", str(tmp_path / "can.png")]
+    assert main.main(render) == 1
+    assert "can.yaml" in capsys.readouterr().err
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
+    (tmp_path / "can.yaml").unlink()
+    assert [main.main(render), main.main(render)] == [0, 0]  # a pair of one's own is made again
+
+
 def test_what_sixteen_bits_of_millimetres_cannot_say_is_no_reading(tmp_path, capsys):
     """A ball from 64 to 68 m in front, of which they can say the nearest part."""
     ball = ["2", "2", "2", "1", "1", "0", "0", "66", "0", "0", "0", "1", "--projection", "pinhole", "--focal", "4000"]
