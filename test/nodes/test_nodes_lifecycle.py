@@ -307,6 +307,7 @@ class TestLifecycle:
         self, make_bench, monkeypatch
     ):
         monkeypatch.setattr(managed_node, "_PAUSE", 0.1)
+        monkeypatch.setattr(managed_node, "_END", 60.0)  # on a busy machine
         bench = make_bench().active()
         withdrawn = []
         monkeypatch.setattr(bench.node._outputs.optional, "withdraw", lambda: withdrawn.append(bench.node.state))
