@@ -104,6 +104,8 @@ class Superquadric:
 
     def __getitem__(self, index: Any) -> Superquadric:
         """Index the leading dimensions."""
+        if not self.batch_shape:  # a slice would be of its numbers
+            raise TypeError("a single Superquadric cannot be indexed")
         return Superquadric(self.size[index], self.shape[index], self.translation[index], self.rotation[index])
 
     def __len__(self) -> int:

@@ -272,6 +272,12 @@ class TestMisuse:
         with pytest.raises(ValueError, match=r"\(\.\.\., 12\)"):
             Superquadric.from_flat(np.zeros(11))
 
+    @pytest.mark.parametrize("index", [0, slice(None, None, -1), None])
+    def test_a_single_body_has_no_parts(self, index: object) -> None:
+        body = Superquadric([1, 2, 3], [1, 1], [0, 0, 0], IDENTITY)
+        with pytest.raises(TypeError, match="a single Superquadric"):
+            body[index]
+
 
 def test_kept_machine_code_is_bound_to_all_kernel_sources(tmp_path: Path) -> None:
     """A kernel compiled into another module's function: after an edit of its file alone, the new code must run."""
