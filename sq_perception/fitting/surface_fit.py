@@ -180,8 +180,9 @@ def _checked_starts(start: Superquadric | Literal["auto"] | Iterable[Superquadri
     if isinstance(start, str) and start == "auto":
         return []
     is_one = isinstance(start, Superquadric) and not start.batch_shape
+    is_several = isinstance(start, Iterable) and not isinstance(start, str) and not is_one
     states = []
-    for body in [start] if is_one else start:
+    for body in start if is_several else [start]:
         if not isinstance(body, Superquadric) or body.batch_shape:
             raise ValueError(f"start: expected 'auto' or single superquadrics, got {body!r}")
         states.append(State.of(Superquadric.from_flat(np.asarray(body.to_flat(), dtype=float))))

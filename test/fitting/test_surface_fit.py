@@ -374,8 +374,9 @@ def test_misuse_raises() -> None:
         surface_fit.fit(FLAT[:100], mask[:100], CAMERA)
     with pytest.raises(ValueError, match="float"):
         surface_fit.fit(FLAT.astype(np.uint16), mask, CAMERA)
-    with pytest.raises(ValueError, match="start"):
-        surface_fit.fit(FLAT, mask, CAMERA, start="guess")  # type: ignore[arg-type]
+    for start in ("guess", "", None, 3):
+        with pytest.raises(ValueError, match=f"start: expected .* got {start!r}$"):
+            surface_fit.fit(FLAT, mask, CAMERA, start=start)  # type: ignore[arg-type]
     with pytest.raises(ValueError, match="start"):
         surface_fit.fit(FLAT, mask, CAMERA, start=[body, 3])  # type: ignore[list-item]
     with pytest.raises(ValueError, match="nothing to fit"):
