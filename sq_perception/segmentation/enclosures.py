@@ -80,22 +80,24 @@ def _around(level: np.ndarray, points: np.ndarray, owner: np.ndarray, directions
     Not the smallest rectangle: two walls at a right angle have another one just as small.  ``points`` (n, 2) are those
     of all segments along the support, ``owner`` (n,) whose they are, from 0, ``directions`` (2, 2) the rectangle's.
     """
-    placed = points[:, :1] * directions[0] + points[:, 1:] * directions[1]
-    low, high = placed[level[owner]].min(axis=0), placed[level[owner]].max(axis=0)
+    placed = directions[0, :, None] * points[:, 0] + directions[1, :, None] * points[:, 1]  # (2, n): long rows are fast
+    low, high = (end(placed[:, level[owner]], axis=1) for end in (np.min, np.max))
     half = np.maximum((high - low) / 2, 1e-9)  # of points on one line
     thick = min(_THICK, _NARROW * float(half.min()))
-    placed -= low + half
-    inside = (half - np.abs(placed)).min(axis=1) > thick
+    placed -= (low + half)[:, None]
+    inside = (half[:, None] - np.abs(placed)).min(axis=0) > thick
     along = level & (np.bincount(owner, inside) < _STRAY * np.bincount(owner))
-    # Of the four sides in their order around the rectangle, the share of their cells that hold points beside them.
-    of_walls = placed[along[owner]]
-    cell = np.clip((_CELLS * (of_walls / (2 * half) + 0.5)).astype(int), 0, _CELLS - 1)
-    sides = [(sign, k) for sign in (1, -1) for k in (0, 1)]
-    beside = [half[k] - sign * of_walls[:, k] < thick for sign, k in sides]
-    covered = np.array([np.unique(cell[at, 1 - k]).size for at, (_, k) in zip(beside, sides, strict=True)]) / _CELLS
-    is_corner = bool((np.minimum(covered, np.roll(covered, 1)) > _LONG).any())
-    if 2 * half.min() < _SMALLEST or not is_corner or covered.mean() < _COVERED:
+    if 2 * half.min() < _SMALLEST or not along.any():
         return np.zeros_like(along)
-    others = [np.median(placed[owner == k], axis=0) for k in np.flatnonzero(~along)]
+    # Of the four sides in their order around the rectangle, the share of their cells that hold points beside them.
+    of_walls = placed[:, along[owner]]
+    cell = np.clip((_CELLS * (of_walls / (2 * half[:, None]) + 0.5)).astype(int), 0, _CELLS - 1)
+    sides = [(sign, k) for sign in (1, -1) for k in (0, 1)]
+    beside = [half[k] - sign * of_walls[k] < thick for sign, k in sides]
+    covered = np.array([np.unique(cell[1 - k, at]).size for at, (_, k) in zip(beside, sides, strict=True)]) / _CELLS
+    is_corner = bool((np.minimum(covered, np.roll(covered, 1)) > _LONG).any())
+    if not is_corner or covered.mean() < _COVERED:
+        return np.zeros_like(along)
+    others = [np.median(placed[:, owner == k], axis=1) for k in np.flatnonzero(~along)]
     holds = any((half - np.abs(other)).min() > thick for other in others)
     return along if holds else np.zeros_like(along)
