@@ -3,9 +3,8 @@
     python benchmarks/real_scenes.py [--scenes 1000] [--first 0] [--jobs 1] [--sensor stereo]
                                      [--each FILE] [--name real_scenes]
 
-Scenes are those of :mod:`tabletop`, methods and measures those of :mod:`scene_verdict`, figures
-those of :mod:`scene_tables`.  Counted are things at least
-half visible; things with under 200 pixels are left out and numbered.
+Scenes are those of :mod:`tabletop`, methods and measures those of :mod:`scene_verdict`, figures those of
+:mod:`scene_tables`.  Counted are things at least half visible; things with under 200 pixels are left out and numbered.
 
 Goals, things at least half visible: IoU 85 % with masks given, 80 % with the program's own; error of full edges, mean
 of three: median 5 mm, mean 9 mm.

@@ -9,7 +9,7 @@ and its least value.  The thesis found 0.0056 at s = 117.3, tau = 4.82 on its ow
 the error falls with s as far as one looks, down to the half step of a voxel: only the gradient, which a sharp
 boundary has in a thin layer only, is a reason for a softer one.
 
-python benchmarks/render_search.py --picture docs/render_search.png
+    python benchmarks/render_search.py --picture docs/render_search.png
 """
 
 from __future__ import annotations
