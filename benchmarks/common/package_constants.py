@@ -69,10 +69,7 @@ class Constant:
         """For all that read it from now on."""
         if self.field:
             holder = getattr(self.home, self.name)
-            names = [each.name for each in dataclasses.fields(holder)]
-            defaults = list(holder.__init__.__defaults__)
-            defaults[names.index(self.field) - len(names)] = value
-            holder.__init__.__defaults__ = tuple(defaults)
+            holder.__init__.__kwdefaults__[self.field] = value
             setattr(holder, self.field, value)
             return
         before = self.value
