@@ -27,7 +27,7 @@ IoU is with the true convex hull, 0 where no body was found.  The difference to 
 from __future__ import annotations
 
 if __name__ == "__main__":
-    import one_thread  # noqa: F401
+    from common import one_thread  # noqa: F401
 
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, nullcontext
@@ -39,9 +39,10 @@ from unittest.mock import patch
 
 import household_things
 import numpy as np
-import report
 import trimesh
-from hull_oracle import Columns
+from common import report
+from common.hull_columns import Columns
+from common.scene_verdict import FEWEST_PIXELS, HALF
 from known_frames import camera_of
 
 from sq_perception.fitting import surface_fit, tolerant
@@ -54,7 +55,6 @@ from sq_perception.recovery import methods
 from sq_perception.recovery.recoverer import Recoverer
 from sq_perception.recovery.seen_object import SeenObject
 
-HALF, FEWEST_PIXELS = 0.5, 200
 EXACT = 0.01
 """Of a view's side: how well the true hull is taken to be known."""
 BEHIND = 0.1

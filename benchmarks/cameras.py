@@ -12,16 +12,15 @@ standard error; ``missed`` the share of these things that no own segment agrees 
 from __future__ import annotations
 
 if __name__ == "__main__":
-    import one_thread  # noqa: F401
+    from common import one_thread  # noqa: F401
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import household_things
 import numpy as np
-import report
-import scene_verdict
-from tabletop import Tabletop
+from common import report, scene_verdict
+from common.tabletop import Tabletop
 
 from sq_perception.imaging.camera import Camera
 from sq_perception.simulation.things_on_table import ELEVATION, TABLE_CAMERA
@@ -33,15 +32,6 @@ class View:
 
     camera: Camera
     elevation: tuple[float, float] = ELEVATION
-
-
-@dataclass(frozen=True)
-class Found:
-    """What became of one thing: IoU with its mask given and without, and whether an own segment agrees with it."""
-
-    given: float
-    own: float
-    is_found: bool
 
 
 def of_width(width: int, height: int, degrees: float, aside: float = 0.0) -> Camera:
@@ -65,13 +55,16 @@ VIEWS = {
 }
 
 
-def looked_at(scene: Tabletop) -> tuple[list[Found], int]:
-    """What became of the things of a scene, and how many own bodies are of none."""
+def looked_at(scene: Tabletop) -> tuple[np.ndarray, int]:
+    """What became of the things (n, 3) of a scene, and how many own bodies are of none.
+
+    Of a thing: IoU with its mask given, IoU without, and 1 where an own segment agrees with it.
+    """
     given = scene_verdict.recoverer().recover(scene.depth, scene.camera, scene.labels)
     own = scene_verdict.recoverer().recover(scene.depth, scene.camera)
     of_thing = scene_verdict.matches(own.labels, scene.labels, scene.depth)
     found = [
-        Found(
+        (
             scene_verdict.of_frame(given, one.label, one, scene).iou,
             scene_verdict.of_frame(own, of_thing.get(one.label, 0), one, scene).iou,
             one.label in of_thing,
@@ -80,19 +73,18 @@ def looked_at(scene: Tabletop) -> tuple[list[Found], int]:
         if household_things.is_counted(one, scene)
     ]
     taken = set(of_thing.values())
-    return found, sum(body.label not in taken for body in own.recovered)
+    return np.array(found, dtype=float).reshape(-1, 3), sum(body.label not in taken for body in own.recovered)
 
 
-def row(looked: Sequence[tuple[list[Found], int]]) -> dict[str, float]:
+def row(looked: Sequence[tuple[np.ndarray, int]]) -> dict[str, float]:
     """Figures of what :func:`looked_at` says of some scenes."""
-    found = [one for some, _ in looked for one in some]
+    given, own, is_found = np.concatenate([found for found, _ in looked]).T
     figures: dict[str, float] = {
-        "things": len(found),
-        "missed": float(np.mean([not one.is_found for one in found])),
+        "things": len(is_found),
+        "missed": float(np.mean(is_found == 0)),
         "false": sum(others for _, others in looked) / len(looked),
     }
-    for masks in ("given", "own"):
-        iou = np.array([getattr(one, masks) for one in found])
+    for masks, iou in (("given", given), ("own", own)):
         figures |= {masks: float(iou.mean()), f"{masks} error": float(iou.std() / np.sqrt(len(iou)))}
     return figures
 

@@ -24,7 +24,7 @@ numbers that are read when a module is loaded.  Results are written as they come
 from __future__ import annotations
 
 if __name__ == "__main__":
-    import one_thread  # noqa: F401
+    from common import one_thread  # noqa: F401
 
 import importlib
 import pkgutil
@@ -35,12 +35,11 @@ from typing import Any, NamedTuple
 
 import household_things
 import numpy as np
-import report
-import scene_verdict
 import single_body
 import tracking
-from package_constants import Constant, constants, forget, frozen_in, reason_to_pass, varied
-from tabletop import Tabletop
+from common import report, scene_verdict
+from common.package_constants import Constant, constants, forget, frozen_in, reason_to_pass, varied
+from common.tabletop import Tabletop
 
 import sq_perception
 from sq_perception.fitting import surface_fit

@@ -12,8 +12,7 @@ sq_perception.simulation.sensor_noise.
 
 Times are milliseconds of the clock on the wall, median and 95th percentile of all repetitions over all scenes, after a
 warm-up of each camera; those of stages are medians, so that they do not add up exactly.  The process has all cores and
-as many threads as the libraries take by themselves, as for a user.  ``busy`` is how many cores other processes took
-meanwhile, from /proc/stat.
+as many threads as the libraries take by themselves, as for a user.
 
 ``grasps`` is what follows for a gripper: what the image shows around the bodies, and the plan for all of them (Panda).
 
@@ -27,14 +26,12 @@ from __future__ import annotations
 
 import os
 import time
-from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numba
 import numpy as np
-import report
 import torch
+from common import report
 from synthetic_tabletop import STAGES, SensedScene, scored, sensed
 
 from sq_perception.geometry import Superquadric
@@ -69,31 +66,6 @@ TABLE = (0.34, 0.28)
 _SPREAD = 0.45
 _ATTEMPTS = 5000
 _BORDER = 4.0
-
-
-@dataclass
-class Busy:
-    """Processor time of the whole machine and of this process, seconds, at one moment; NaN where it is not known."""
-
-    machine: float
-    own: float
-    wall: float
-
-    @classmethod
-    def now(cls) -> Busy:
-        own = sum(os.times()[:2])
-        try:
-            ticks = [int(word) for word in Path("/proc/stat").read_text().split("\n", 1)[0].split()[1:]]
-            # user nice system idle iowait irq softirq steal; guests are in user already
-            machine = (sum(ticks[:8]) - ticks[3] - ticks[4]) / os.sysconf("SC_CLK_TCK")
-        except (OSError, IndexError, ValueError):
-            machine = float("nan")
-        return cls(machine, own, time.perf_counter())
-
-    def others_since(self, before: Busy) -> float:
-        """Cores that other processes took since then, on average."""
-        elapsed = max(self.wall - before.wall, 1e-3)
-        return ((self.machine - before.machine) - (self.own - before.own)) / elapsed
 
 
 def camera(width: int, height: int) -> Camera:
@@ -146,7 +118,6 @@ def frame(count: int, number: int, seen_by: Camera, sensor: str) -> SensedScene:
 def measured(recoverer: Recoverer, frames: list[SensedScene], setting: str, repeats: int) -> dict[str, Any]:
     """Times and accuracy of one row."""
     masks, options = SETTINGS[setting]
-    before = Busy.now()
     times: list[dict[str, float]] = []
     planning: list[tuple[float, float]] = []
     ious: list[float] = []
@@ -169,7 +140,6 @@ def measured(recoverer: Recoverer, frames: list[SensedScene], setting: str, repe
         "iou": report.spread(np.array(ious)),
         "recovered_per_frame": found / len(frames),
         "false_per_frame": false / len(frames),
-        "busy": Busy.now().others_since(before),
     }
 
 
@@ -202,7 +172,6 @@ def line(sensor: str, image: tuple[int, int], count: int, setting: str, row: dic
         "IoU %": f"{100 * row['iou']['mean']:.1f}",
         "found": f"{row['recovered_per_frame']:.1f}",
         "false": f"{row['false_per_frame']:.2f}",
-        "busy": f"{row['busy']:.2f}",
     }
 
 

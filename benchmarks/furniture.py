@@ -10,13 +10,12 @@ A body of furniture is a false one, but for a carton, which is a thing that is n
 from __future__ import annotations
 
 if __name__ == "__main__":
-    import one_thread  # noqa: F401
+    from common import one_thread  # noqa: F401
 
 import cameras
 import household_things
 import numpy as np
-import report
-import tabletop
+from common import report, tabletop
 
 from sq_perception.simulation.furniture import KINDS, things_in_furniture
 

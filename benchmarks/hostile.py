@@ -17,8 +17,10 @@ from collections import Counter
 from typing import Any
 
 import numpy as np
-import own_domain  # noqa: F401
-import report
+from common import (
+    own_domain,  # noqa: F401
+    report,
+)
 from hostile_messages import HostileFrame, Siege, Verdict, difference, frames
 from hypothesis import HealthCheck, Phase, given, seed, settings
 from running_nodes import Peer, arguments, environment, until, usage
@@ -107,7 +109,6 @@ class Benchmark:
             "largest_difference_mm": float(1e3 * distances.max()),
             "good_ms": {name: report.spread(np.array(found)[:, 1]) for name, found in self.good.items()},
             "undisturbed_ms": {name: report.spread(np.array(found)) for name, found in self.undisturbed.items()},
-            "verdict_ms": report.spread(np.array([one.milliseconds for one in self.verdicts])),
             "published_results": len(self.answers),
             "balanced": final.is_balanced and final.count("in work") == 0,
             "counters": {key: final.count(key) for key in ("received", "answered", "dropped", "refused", "lost")},

@@ -6,8 +6,8 @@
 Scenes are those of :mod:`sq_perception.simulation.things_on_table`: unions of superquadrics (cartons, cans, round and
 oval bottles, open vessels, fruit, tools, toys, bags) that stand, lie, lean on each other and are stacked; scene k from
 the seed (``SEED``, k) alone.  Sensors alternate (:data:`tabletop.SENSORS`).  Methods and measures are those of
-:mod:`scene_verdict`, rows those of :mod:`real_scenes`.  Counted are things at least half visible, apart from the rows
-that say otherwise; things with under 200 pixels are left out and numbered.
+:mod:`scene_verdict`, figures those of :mod:`scene_tables`.  Counted are things at least half visible, apart from the
+rows that say otherwise; things with under 200 pixels are left out and numbered.
 
 Goals: IoU 88 % with masks given, 85 % with the program's own; bottles 82 %; less than half visible 65 %; 90 to 98 % of
 the half sizes of each kind within two reported deviations.
@@ -16,17 +16,14 @@ the half sizes of each kind within two reported deviations.
 from __future__ import annotations
 
 if __name__ == "__main__":
-    import one_thread  # noqa: F401
+    from common import one_thread  # noqa: F401
 
 from functools import partial
 
-import mesh_things
 import numpy as np
-import real_scenes
-import scene_verdict
-import tabletop
 import trimesh
-from scene_verdict import SceneVerdict, ThingVerdict
+from common import mesh_things, scene_tables, scene_verdict, tabletop
+from common.scene_verdict import SceneVerdict, ThingVerdict
 from scipy.spatial import ConvexHull
 
 from sq_perception.geometry import Superquadric
@@ -90,7 +87,7 @@ def is_counted(one: tabletop.Placed, scene: tabletop.Tabletop) -> bool:
     """Whether a thing is half visible, half of it measured, and no smaller than 200 pixels of a VGA image."""
     fewest = scene_verdict.FEWEST_PIXELS * scene.depth.size / (TABLE_CAMERA.width * TABLE_CAMERA.height)
     measured = np.count_nonzero((scene.labels == one.label) & np.isfinite(scene.depth))
-    return one.pixels >= fewest and one.visible_share >= real_scenes.HALF and 2 * measured >= one.pixels
+    return one.pixels >= fewest and one.visible_share >= scene_verdict.HALF and 2 * measured >= one.pixels
 
 
 def hull_points(parts: Superquadric) -> np.ndarray:
@@ -110,18 +107,18 @@ def verdict(seed: int, sensor: str | None) -> SceneVerdict:
 
 def groups(everything: list[ThingVerdict]) -> dict[str, list[ThingVerdict]]:
     """The rows of the table: by kind, bottles apart, by the way a thing came to rest, by sensor, by visible share."""
-    half = [one for one in everything if one.visible_share >= real_scenes.HALF]
-    rows: dict[str, list[ThingVerdict]] = {real_scenes.ALL: half}
+    half = [one for one in everything if one.visible_share >= scene_verdict.HALF]
+    rows: dict[str, list[ThingVerdict]] = {scene_tables.ALL: half}
     rows |= {kind: [one for one in half if one.kind == kind] for kind in KINDS}
     rows |= {name: [one for one in half if one.name == name] for name in NAMES}
     rows |= {way: [one for one in half if one.rest.startswith(way)] for way in WAYS}
     rows["half of its pixels measured"] = [one for one in half if 2 * one.measured >= one.pixels]
-    return rows | real_scenes.by_sensor_and_share(half, everything)
+    return rows | scene_tables.by_sensor_and_share(everything)
 
 
 def main() -> None:
-    options = real_scenes.arguments(__doc__, "household_things").parse_args()
-    real_scenes.run(partial(verdict, sensor=options.sensor), options, groups, GOALS, seed=SEED)
+    options = scene_tables.arguments(__doc__, "household_things").parse_args()
+    scene_tables.run(partial(verdict, sensor=options.sensor), options, groups, GOALS, seed=SEED)
 
 
 if __name__ == "__main__":

@@ -20,7 +20,7 @@ the share of half sizes within two reported deviations.
 from __future__ import annotations
 
 if __name__ == "__main__":
-    import one_thread  # noqa: F401
+    from common import one_thread  # noqa: F401
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -29,10 +29,9 @@ from functools import partial
 import cv2
 import household_things
 import numpy as np
-import report
-import scene_verdict
-from mesh_things import MeshThing
-from tabletop import Tabletop
+from common import report, scene_verdict
+from common.mesh_things import MeshThing
+from common.tabletop import Tabletop
 
 import sq_perception as sq
 from sq_perception.imaging.camera import Camera

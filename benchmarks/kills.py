@@ -12,14 +12,15 @@ of one of this package's nodes, not by the viewer's, and not before they are ten
 
 from __future__ import annotations
 
-import shlex
 import sys
 import time
 from dataclasses import asdict
 
 import numpy as np
-import own_domain  # noqa: F401
-import report
+from common import (
+    own_domain,  # noqa: F401
+    report,
+)
 from respawned_nodes import CAMERA, MEMBERS, NODE, VIEWER, Kill, Robot, orphans
 from running_nodes import Peer
 
@@ -40,7 +41,6 @@ def main() -> None:
     parser.add_argument("--rate", type=float, default=30.0)
     parser.add_argument("--objects", type=int, default=1)
     parser.add_argument("--node", choices=("recover_node", "fitter_node"), default="recover_node")
-    parser.add_argument("--viewer", default="", help="command that prints a line for each result; a plain subscriber")
     options = parser.parse_args()
     rng = np.random.default_rng(options.seed)
     # An equal share of each, in a random order.
@@ -55,7 +55,6 @@ def main() -> None:
             camera=(f"rate:={options.rate}", f"objects:={options.objects}", "hold:=15"),
             node=options.node,
             parameters=("free_shared_memory:=true",),
-            viewer=shlex.split(options.viewer),
         ) as robot,
     ):
         for member in order:

@@ -26,7 +26,7 @@ The FILE of another METHOD is a JSON list of objects with ``frame`` (the NPZ's s
 from __future__ import annotations
 
 if __name__ == "__main__":
-    import one_thread  # noqa: F401
+    from common import one_thread  # noqa: F401
 
 import json
 from dataclasses import dataclass
@@ -35,16 +35,14 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import report
 import trimesh
-from both_fits import measured_points
-from hull_oracle import Columns
-from scene_verdict import _oriented_box
+from common import report
+from common.hull_columns import Columns
+from common.scene_verdict import smallest_box
 
-from sq_perception.fitting.fit import Status
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
-from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, RecoveryOptions
+from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, Recovery, RecoveryOptions
 
 FAIR = ("box", "rounded_box", "cylinder", "bottle")
 MATCH = 0.25
@@ -86,8 +84,8 @@ def answer(
     if mesh and np.isfinite(pose).all():
         iou = 0.0
         if body is not None:
-            turned = trimesh.transformations.quaternion_from_matrix(np.linalg.inv(pose))
             inverse = np.linalg.inv(pose)
+            turned = trimesh.transformations.quaternion_from_matrix(inverse)
             there = body.transformed(np.roll(turned, -1), inverse[:3, 3])
             iou = columns(hulls / f"{mesh}.hull.ply").iou(there)
     if body is not None and np.isfinite(dims).all():
@@ -102,25 +100,39 @@ def answers(name: str, frame: Any, hulls: Path, recoverer: Recoverer, others: Ot
     """Every method on every labelled thing of one frame."""
     depth, camera = frame["depth"], camera_of(frame)
     labels = frame["labels"].astype(np.int32)
+    unknown = np.full(3, np.nan)
     found: list[Answer] = []
-    for method, title in (("auto", METHODS[0]), ("network", METHODS[1]), ("classic", METHODS[3])):
-        result = recoverer.recover(depth, camera, labels, RecoveryOptions(method=method))  # type: ignore[arg-type]
+    for title in METHODS[:4]:
+        method, _, masks = title.partition(", ")
+        given = None if masks == "own" else labels
+        result = recoverer.recover(depth, camera, given, RecoveryOptions(method=method))  # type: ignore[arg-type]
         share = result.milliseconds["total"] / max(len(result.bodies), 1)
-        by_label = {one.label: one for one in result.bodies if one.status != Status.FAILED}
         for number, label in enumerate(frame["ids"]):
-            one = by_label.get(int(label))
-            body, sigma = (None, np.full(3, np.nan)) if one is None else (one.superquadric, one.sigma_size)
+            if given is None:
+                one = _agreeing(result, labels == label)
+            else:
+                one = next((each for each in result.recovered if each.label == label), None)
+            body, sigma = (None, unknown) if one is None else (one.superquadric, one.sigma_size)
             found.append(answer(frame, number, hulls, title, body, sigma, share))
-    found += _own(frame, hulls, recoverer.recover(depth, camera))
     for number, label in enumerate(frame["ids"]):
-        points = measured_points(depth, (labels == label) & (depth > 0), camera)
-        found.append(answer(frame, number, hulls, METHODS[4], _oriented_box(points), np.full(3, np.nan), np.nan))
+        points = camera.points(depth)[(labels == label) & (depth > 0) & np.isfinite(depth)]
+        found.append(answer(frame, number, hulls, METHODS[4], smallest_box(points), unknown, np.nan))
         for title, bodies in others.items():
-            given = bodies.get((name, int(label)))
-            body = None if given is None else _body(given)
-            milliseconds = np.nan if given is None else given["milliseconds"]
-            found.append(answer(frame, number, hulls, title, body, np.full(3, np.nan), milliseconds))
+            row = bodies.get((name, int(label)))
+            body, milliseconds = (None, np.nan) if row is None else (_body(row), row["milliseconds"])
+            found.append(answer(frame, number, hulls, title, body, unknown, milliseconds))
     return found
+
+
+def _agreeing(result: FrameRecovery, true: np.ndarray) -> Recovery | None:
+    """The body whose own mask has the largest IoU with a true one, if that is large enough."""
+    best, overlap = None, MATCH
+    for one in result.recovered:
+        mine = result.labels == one.label
+        iou = np.count_nonzero(mine & true) / max(np.count_nonzero(mine | true), 1)
+        if iou >= overlap:
+            best, overlap = one, iou
+    return best
 
 
 def _body(given: dict[str, Any]) -> Superquadric:
@@ -132,22 +144,6 @@ def _bodies_of(argument: str) -> tuple[str, dict[tuple[str, int], dict[str, Any]
     method, _, path = argument.partition("=")
     rows = json.loads(Path(path).read_text(encoding="utf-8"))
     return method, {(row["frame"], int(row["label"])): row for row in rows}
-
-
-def _own(frame: Any, hulls: Path, result: FrameRecovery) -> list[Answer]:
-    found = []
-    share = result.milliseconds["total"] / max(len(result.bodies), 1)
-    for number, label in enumerate(frame["ids"]):
-        true = frame["labels"] == label
-        best, overlap = None, MATCH
-        for one in result.recovered:
-            mine = result.labels == one.label
-            iou = np.count_nonzero(mine & true) / max(np.count_nonzero(mine | true), 1)
-            if iou >= overlap:
-                best, overlap = one, iou
-        body, sigma = (None, np.full(3, np.nan)) if best is None else (best.superquadric, best.sigma_size)
-        found.append(answer(frame, number, hulls, METHODS[2], body, sigma, share))
-    return found
 
 
 def summary(group: list[Answer]) -> dict[str, Any]:

@@ -14,15 +14,15 @@ from __future__ import annotations
 import os
 
 if __name__ == "__main__":
-    import one_thread  # noqa: F401
+    from common import one_thread  # noqa: F401
 
 import multiprocessing
 import time
 from typing import Any
 
 import frame_time
-import report
 import torch
+from common import report
 
 from sq_perception.recovery import workers
 from sq_perception.recovery.options import RecoveryOptions

@@ -14,13 +14,13 @@ from __future__ import annotations
 from pathlib import Path
 
 if __name__ == "__main__":
-    import one_thread  # noqa: F401
+    from common import one_thread  # noqa: F401
 
 from typing import Any
 
 import numpy as np
-import report
 import single_body
+from common import report
 
 from sq_perception.fitting.fit import Status
 from sq_perception.geometry import Superquadric, metrics

@@ -33,10 +33,9 @@ Published for orientation only, other things and another simulator: GIGA (HR) 87
 from __future__ import annotations
 
 if __name__ == "__main__":
-    import one_thread  # noqa: F401
+    from common import one_thread  # noqa: F401
 
 import json
-import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from itertools import pairwise, product
@@ -44,11 +43,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import picking_scenes
-import report
-from picking_contestants import CONTESTANTS, PEERS, ContactGraspNet, Seen, recoverer_of
-from picking_scenes import KINDS, TABLE_CAMERA, THINGS, Scene
-from picking_world import Pick, World
+from common import picking_scenes, report
+from common.picking_contestants import CONTESTANTS, PEERS, ContactGraspNet, Seen, recoverer_of
+from common.picking_scenes import KINDS, TABLE_CAMERA, THINGS, Scene
+from common.picking_world import Pick, World
 from scipy.stats import binomtest
 
 from sq_perception.grasping.plan import Grasp
@@ -70,7 +68,6 @@ class Round:
     seen: Seen
     grasp: Grasp
     aim: int
-    milliseconds: float
     pick: Pick
 
 
@@ -85,14 +82,12 @@ def rounds(
             return
         depth = picking_scenes.observed(world, scene.sensor, rng)
         seen = Seen(depth, recoverer.recover(depth, TABLE_CAMERA), world, peer, chance.uniform())
-        started = time.process_time()
         found = CONTESTANTS[contestant](seen)
-        milliseconds = 1e3 * (time.process_time() - started)
         if not found:
             return
         position, rotation = scene.carried_out(found[0].position, found[0].rotation)
         aim = _aimed_at(world, position)
-        yield Round(seen, found[0], aim, milliseconds, world.pick(position, rotation, found[0].opening))
+        yield Round(seen, found[0], aim, world.pick(position, rotation, found[0].opening))
 
 
 def cleared(scene: Scene, contestant: str, recoverer: Recoverer, peer: ContactGraspNet | None) -> dict[str, Any]:
@@ -107,7 +102,6 @@ def cleared(scene: Scene, contestant: str, recoverer: Recoverer, peer: ContactGr
                 "score": one.grasp.score,
                 "weakest": one.grasp.weakest,
                 "aim": one.aim,
-                "ms": round(one.milliseconds, 1),
             }
         )
         failed = 0 if one.pick.held >= 0 else failed + 1
@@ -183,7 +177,6 @@ def summary(lines: list[dict[str, Any]]) -> dict[str, Any]:
                 "dr": wilson(sum(run["taken"] for run in runs), THINGS * len(runs)),
                 "causes": causes,
                 "bins": bins,
-                "planning_ms": float(np.median([pick["ms"] for pick in picks])) if picks else None,
             }
             commits = {run["commit"] for run in runs if run.get("commit")}
             if commits - {report.commit()}:

@@ -18,11 +18,9 @@ from typing import Any
 
 import numpy as np
 import picking
-import picking_contestants
-import picking_scenes
-import report
-from picking_scenes import EYE, GRIPPER, KINDS, LOOK, TABLE_CAMERA
-from picking_world import STEP, World
+from common import picking_contestants, picking_scenes, report
+from common.picking_scenes import EYE, GRIPPER, KINDS, LOOK, TABLE_CAMERA
+from common.picking_world import STEP, World
 from PIL import Image
 
 from sq_perception.evaluation import plots

@@ -3,263 +3,47 @@
     python benchmarks/real_scenes.py [--scenes 1000] [--first 0] [--jobs 1] [--sensor stereo]
                                      [--each FILE] [--name real_scenes]
 
-Scenes are those of :mod:`tabletop`, methods and measures those of :mod:`scene_verdict`.  Counted are things at least
+Scenes are those of :mod:`tabletop`, methods and measures those of :mod:`scene_verdict`, figures
+those of :mod:`scene_tables`.  Counted are things at least
 half visible; things with under 200 pixels are left out and numbered.
 
 Goals, things at least half visible: IoU 85 % with masks given, 80 % with the program's own; error of full edges, mean
-of three: median 5 mm, mean 9 mm.  Whole chain, own masks: median distance from the things' measured pixels to the
-nearest body at most 3 mm, at least 95 % of them within 10 mm, no body below the table by more than 10 mm.
-
-``2 sigma`` is the share of half sizes within two reported deviations of half the hull's extent along the same axis.
-Millimetres; times are of one thread each, milliseconds.
+of three: median 5 mm, mean 9 mm.
 """
 
 from __future__ import annotations
 
-import argparse
-
 if __name__ == "__main__":
-    import one_thread  # noqa: F401
+    from common import one_thread  # noqa: F401
 
-import json
-import multiprocessing
-import time
-from collections.abc import Callable, Iterator
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import Any
 
-import mesh_scene
-import mesh_things
-import numpy as np
-import report
-import scene_verdict
-import tabletop
-from scene_verdict import EXPLAINED, METHODS, SceneVerdict, ThingVerdict
+from common import mesh_things, report, scene_tables, scene_verdict, tabletop
+from common.scene_verdict import HALF, SceneVerdict, ThingVerdict
 
-Groups = Callable[[list[ThingVerdict]], dict[str, list[ThingVerdict]]]
-"""Makes the rows of a table of all things; the first one, ALL, is what goals are for."""
-ALL = "**all, at least half visible**"
-HALF = 0.5
-POOR = 0.7
-TOO_FAR, TOO_LOW = 3.0, 10.0
-WORST = 15
 GOALS = {"given": "85", "own": "80"}
-SHARES = {"all visible (90 % and more)": (0.9, np.inf), "50 to 90 %": (0.5, 0.9), "under 50 %": (0.0, 0.5)}
 
 
-def main() -> None:
-    options = arguments(__doc__, "real_scenes").parse_args()
-    scans = report.shared_data("ycb_meshes")
-    run(partial(scene_verdict.verdict, scans=scans, sensor=options.sensor), options, groups, GOALS)
-
-
-def arguments(text: str | None, name: str) -> argparse.ArgumentParser:
-    """Options of a benchmark of scenes that describes itself so."""
-    parser = report.parser(text, name)
-    parser.add_argument("--scenes", type=int, default=1000, help="number of scenes")
-    parser.add_argument("--first", type=int, default=0, help="seed of the first scene")
-    parser.add_argument("--sensor", choices=list(tabletop.SENSORS), help="one for all scenes; they alternate otherwise")
-    parser.add_argument("--jobs", type=int, default=1, help="processes, each of one thread")
-    parser.add_argument("--each", type=Path, help="write every thing's figures and bodies to this file, JSON")
-    return parser
-
-
-def run(
-    evaluate: Callable[[int], SceneVerdict],
-    options: argparse.Namespace,
-    groups: Groups,
-    goals: dict[str, str],
-    **facts: Any,
-) -> None:
-    """Evaluate the scenes that were asked for, and write the results."""
-    verdicts = list(verdicts_of(evaluate, range(options.first, options.first + options.scenes), options.jobs))
-    if options.each is not None:
-        everything = [asdict(one) for each in verdicts for one in each.things]
-        options.each.write_text(json.dumps(everything, indent=1, default=_or_none) + "\n")
-    result, text = tables(verdicts, groups, goals)
-    given = {name: str(value) if isinstance(value, Path) else value for name, value in vars(options).items()}
-    report.write(options.name, {**facts, "options": given, **result}, text)
-
-
-def _or_none(values: np.ndarray) -> list[Any]:
-    """An array for JSON, None for what is not known."""
-    return list(np.where(np.isfinite(values), values, None))
-
-
-def verdicts_of(evaluate: Callable[[int], SceneVerdict], seeds: range, jobs: int) -> Iterator[SceneVerdict]:
-    """The verdicts of scenes in their order, with a line for each."""
-    began = time.perf_counter()
-    if jobs == 1:
-        report.pin()
-        warm_up()
-        yield from map(partial(_reported, began=began), map(evaluate, seeds))
-        return
-    # Spawned: a fork of a process whose threads run may wait for a lock forever.
-    with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), initializer=warm_up) as pool:
-        yield from map(partial(_reported, began=began), pool.map(evaluate, seeds))
-
-
-def warm_up() -> None:
-    """Nothing is compiled or loaded while the clock runs."""
-    scene_verdict.recoverer().warm_up(mesh_scene.CAMERA)
-
-
-def _reported(each: SceneVerdict, began: float) -> SceneVerdict:
-    given = " ".join(f"{one.name} {100 * one.answers['given'].iou:.0f}" for one in each.things)
-    own = " ".join(f"{100 * one.answers['own'].iou:.0f}" for one in each.things)
-    passed = time.perf_counter() - began
-    print(f"scene {each.seed} {each.sensor} | given: {given} | own: {own} | {passed:.0f} s", flush=True)
-    return each
+def verdict(seed: int, scans: Path | None, sensor: str | None) -> SceneVerdict:
+    """Make the scene of a seed and evaluate every method on it."""
+    return scene_verdict.evaluated(tabletop.scene(seed, scans, sensor))
 
 
 def groups(everything: list[ThingVerdict]) -> dict[str, list[ThingVerdict]]:
     """The rows of the table, all first."""
     half = [one for one in everything if one.visible_share >= HALF]
-    rows: dict[str, list[ThingVerdict]] = {ALL: half}
+    rows: dict[str, list[ThingVerdict]] = {scene_tables.ALL: half}
     for kind in mesh_things.KINDS:
         rows[kind] = chosen = [one for one in half if one.kind == kind]
         rows |= {f"{kind}, {rest}": [one for one in chosen if one.rest == rest] for rest in ("upright", "lying")}
-    return rows | by_sensor_and_share(half, everything)
+    return rows | scene_tables.by_sensor_and_share(everything)
 
 
-def by_sensor_and_share(half: list[ThingVerdict], counted: list[ThingVerdict]) -> dict[str, list[ThingVerdict]]:
-    """Rows of things at least half visible by sensor, and of all by their visible share."""
-    rows = {sensor: [one for one in half if one.sensor == sensor] for sensor in tabletop.SENSORS}
-    for name, (low, high) in SHARES.items():
-        rows[f"visible: {name}"] = [one for one in counted if low <= one.visible_share < high]
-    return rows
-
-
-def tables(verdicts: list[SceneVerdict], groups: Groups, goals: dict[str, str]) -> tuple[dict[str, Any], str]:
-    """All figures, as numbers and as Markdown."""
-    found = groups([one for each in verdicts for one in each.things])
-    result: dict[str, Any] = {}
-    rows = []
-    for name, chosen in found.items():
-        for method in METHODS if name == ALL else ("given", "own"):
-            if chosen:
-                result[f"{name.strip('*')}: {method}"] = figures = summary(chosen, method)
-                rows.append(line(name, method, figures, goals.get(method, "-") if name == ALL else ""))
-    chain_result, chain_text = chain(verdicts)
-    text = [report.table_of(rows), "Whole chain and times\n\n" + chain_text]
-    for method in ("given", "own"):
-        order = sorted(found[ALL], key=lambda one: one.answers[method].iou)[:WORST]
-        result[f"worst: {method}"] = worst = [worst_line(one, method) for one in order]
-        text.append(f"The worst with masks {method}\n\n{report.table_of(worst)}")
-    return {**chain_result, **result}, "\n\n".join(text)
-
-
-def summary(chosen: list[ThingVerdict], method: str) -> dict[str, Any]:
-    """The figures of some things with one method."""
-    answers = [one.answers[method] for one in chosen]
-    iou = 100 * np.array([answer.iou for answer in answers])
-    status = np.array([answer.status for answer in answers])
-    errors = 1e3 * np.array([answer.size_error for answer in answers])
-    excess = 1e3 * np.array([answer.excess for answer in answers])
-    covered = np.array([answer.covered for answer in answers]).ravel()
-    covered = covered[np.isfinite(covered)]
-    known = np.isfinite(errors)
-    return {
-        "iou": report.spread(iou),
-        "poor": float(100 * np.mean(iou < 100 * POOR)),
-        "edge_error": report.spread(errors[known]) if known.any() else None,
-        "excess": excess[known].mean(axis=0).tolist() if known.any() else None,
-        "status": {name: float(100 * np.mean(status == name)) for name in ("converged", "weak", "failed", "none")},
-        "within_2_sigma": float(100 * covered.mean()) if covered.size else None,
-    }
-
-
-def line(name: str, method: str, figures: dict[str, Any], goal: str) -> dict[str, str]:
-    """A row of the table."""
-    iou, errors, status, covered = (figures[key] for key in ("iou", "edge_error", "status", "within_2_sigma"))
-    return {
-        "things": name,
-        "method": method,
-        "count": f"{iou['count']:.0f}",
-        "IoU % mean +- std": f"{iou['mean']:.1f} +- {iou['std']:.1f}",
-        "median": f"{iou['median']:.1f}",
-        "goal": goal,
-        f"< {100 * POOR:.0f} % (%)": f"{figures['poor']:.0f}",
-        "edge error mm median": "" if errors is None else f"{errors['median']:.1f}",
-        "mean": "" if errors is None else f"{errors['mean']:.1f}",
-        "along: right, away, up: mean excess mm": " ".join(f"{x:+.1f}" for x in figures["excess"] or ()),
-        "weak / failed / missed %": " / ".join(f"{status[key]:.0f}" for key in ("weak", "failed", "none")),
-        "2 sigma %": "" if covered is None else f"{covered:.0f}",
-    }
-
-
-def chain(verdicts: list[SceneVerdict]) -> tuple[dict[str, Any], str]:
-    """The whole chain with its own masks, by sensor, and what it costs."""
-    result: dict[str, Any] = {}
-    rows = []
-    for sensor in (*tabletop.SENSORS, "all"):
-        chosen = [each for each in verdicts if sensor in (each.sensor, "all")]
-        if not chosen:
-            continue
-        distances = np.concatenate([each.distances for each in chosen])
-        below = np.concatenate([each.below for each in chosen])
-        medians = np.array([1e3 * np.median(each.distances) for each in chosen if each.distances.size])
-        bodies = sum(len(each.things) for each in chosen)
-        figures: dict[str, Any] = {
-            "scenes": len(chosen),
-            "things": bodies,
-            "under_200_pixels": sum(each.tiny for each in chosen),
-            "false_bodies": sum(each.false_bodies for each in chosen),
-            "median_distance": 1e3 * float(np.median(distances)),
-            "scenes_too_far": int((medians > TOO_FAR).sum()),
-            "explained": 100 * float(np.mean(distances <= EXPLAINED)),
-            "below_worst": float(below.max(initial=0.0)),
-            "too_low": int((below > TOO_LOW).sum()),
-            "no_plane": sum(bool(np.isnan(each.plane_error[0])) for each in chosen),
-            "plane_degrees_worst": float(np.nanmax([0.0, *(each.plane_error[0] for each in chosen)])),
-            "milliseconds": {
-                name: report.spread(np.array([each.milliseconds[name] for each in chosen])) for name in ("given", "own")
-            },
-            "milliseconds_per_thing": sum(each.milliseconds["given"] for each in chosen) / max(bodies, 1),
-        }
-        result[f"chain: {sensor}"] = figures
-        times = figures["milliseconds"]
-        rows.append(
-            {
-                "sensor": sensor,
-                "scenes": str(figures["scenes"]),
-                "things + under 200 pixels": f"{bodies} + {figures['under_200_pixels']}",
-                "false bodies": str(figures["false_bodies"]),
-                f"median distance mm (goal {TOO_FAR:.0f})": f"{figures['median_distance']:.2f}",
-                "scenes above": str(figures["scenes_too_far"]),
-                "within 10 mm % (goal 95)": f"{figures['explained']:.1f}",
-                f"below table mm (> {TOO_LOW:.0f}; goal 0)": f"{figures['below_worst']:.1f} ({figures['too_low']})",
-                "table off by degrees (not found)": f"{figures['plane_degrees_worst']:.1f} ({figures['no_plane']})",
-                "ms a frame, given: median / p95": f"{times['given']['median']:.0f} / {times['given']['p95']:.0f}",
-                "ms a frame, own": f"{times['own']['median']:.0f} / {times['own']['p95']:.0f}",
-                "ms a thing, given": f"{figures['milliseconds_per_thing']:.0f}",
-            }
-        )
-
-    return result, report.table_of(rows)
-
-
-def worst_line(one: ThingVerdict, method: str) -> dict[str, str]:
-    answer = one.answers[method]
-    edges = 2e3 * np.sort(answer.body[:3])
-    return {
-        "seed, label": f"{one.seed}, {one.label}",
-        "thing": f"{one.name}, {one.rest}",
-        "sensor": one.sensor,
-        "visible %": f"{100 * one.visible_share:.0f}",
-        "IoU %": f"{100 * answer.iou:.0f}",
-        "edges / true ones mm": f"{_numbers(edges)} / {_numbers(1e3 * one.edges)}",
-        "excess right, away, up mm": _numbers(1e3 * answer.excess, "+.0f"),
-        "e1 e2": _numbers(answer.body[3:5], ".2f"),
-        "verdict": f"{answer.status}: {answer.message}" if answer.message else answer.status,
-    }
-
-
-def _numbers(values: np.ndarray, form: str = ".0f") -> str:
-    return " ".join(f"{x:{form}}" for x in values) if np.isfinite(values).all() else "-"
+def main() -> None:
+    options = scene_tables.arguments(__doc__, "real_scenes").parse_args()
+    scans = report.shared_data("ycb_meshes")
+    scene_tables.run(partial(verdict, scans=scans, sensor=options.sensor), options, groups, GOALS)
 
 
 if __name__ == "__main__":

@@ -2,8 +2,8 @@
 
     python benchmarks/segmentation.py [--frames N] [--repeats 5] [--name segmentation]
 
-Data: ../shared/data/mosd_learn (Kinect v1, tables) and those of ../shared/data/frames that have masks (see its README);
-skipped where they are missing.  Only pixels with a depth count, as nothing else can be found in a depth image.
+Data: ../shared/data/mosd_learn (Kinect v1, tables; see its README); skipped where it is missing.  Only pixels with a
+depth count, as nothing else can be found in a depth image.
 
     matching  one to one, the sum of IoU is largest (Hungarian)
     IoU       mean over the matched pairs; "of all" counts a missed object as 0
@@ -11,8 +11,7 @@ skipped where they are missing.  Only pixels with a depth count, as nothing else
     cut       objects of which two segments or more each hold a tenth, and lie in it with more than half of themselves
     joined    segments that hold more than half of two objects or more
 
-The frames of ``frames`` have masks of chosen things only: a segment on what nobody labelled costs precision there, so
-that they stand apart and only their IoU means something.  Every third frame was held out while constants were chosen.
+Every third frame was held out while constants were chosen.
 
 Goals: IoU 0.85; F1 0.90 for boxes, stacks and round things, 0.80 for occluded; 15 ms of processor time,
 one pinned thread.
@@ -21,9 +20,8 @@ one pinned thread.
 from __future__ import annotations
 
 if __name__ == "__main__":
-    import one_thread  # noqa: F401
+    from common import one_thread  # noqa: F401
 
-import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,7 +29,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-import report
+from common import report
 from scipy.optimize import linear_sum_assignment
 
 from sq_perception.recordings import frame_file
@@ -40,7 +38,6 @@ from sq_perception.segmentation.segments import segment
 IOU_GOAL = 0.85
 F1_GOAL = {"boxes": 0.9, "stacked_boxes": 0.9, "cylindric": 0.9, "occluded": 0.8}
 NAMES = {"boxes": "boxes", "stacked_boxes": "stacked boxes", "cylindric": "round things", "occluded": "occluded"}
-OTHER = "other frames"
 HELD_OUT = 3
 """Every third frame, from the first, was not looked at while constants were chosen."""
 _MATCH = 0.5
@@ -97,20 +94,18 @@ def score(truth: np.ndarray, found: np.ndarray, milliseconds: float = 0.0) -> Sc
     )
 
 
-def frames(folders: list[Path], most: int) -> list[Instances]:
-    """Recorded frames that have masks."""
+def frames(folder: Path, most: int) -> list[Instances]:
+    """Recorded frames with masks."""
     found = []
-    for folder in folders:
-        for k, path in enumerate(sorted(folder.glob("*.npz"))[:most]):
-            frame = frame_file.read(path)
-            if frame.labels is None:
-                continue
-            with np.load(path, allow_pickle=False) as archive:
-                category = str(archive["category"]) if "category" in archive else OTHER
-            values = np.unique(frame.labels[frame.labels > 0])
-            truth = np.searchsorted(values, frame.labels) + 1
-            truth = np.where((frame.labels > 0) & np.isfinite(frame.depth), truth, 0)
-            found.append(Instances(path.stem, category, frame, truth, k % HELD_OUT == 0))
+    for k, path in enumerate(sorted(folder.glob("*.npz"))[:most]):
+        frame = frame_file.read(path)
+        assert frame.labels is not None
+        with np.load(path, allow_pickle=False) as archive:
+            category = str(archive["category"])
+        values = np.unique(frame.labels[frame.labels > 0])
+        truth = np.searchsorted(values, frame.labels) + 1
+        truth = np.where((frame.labels > 0) & np.isfinite(frame.depth), truth, 0)
+        found.append(Instances(path.stem, category, frame, truth, k % HELD_OUT == 0))
     return found
 
 
@@ -168,15 +163,13 @@ def summary(known: list[Instances], scores: list[Score]) -> tuple[dict[str, Any]
     result: dict[str, Any] = {}
     rows = []
     both = list(zip(known, scores, strict=True))
-    table = [(each, s) for each, s in both if each.category != OTHER]
     groups: list[tuple[str, list[Score], float | None]] = [
-        (name, [s for each, s in table if each.category == key], F1_GOAL[key]) for key, name in NAMES.items()
+        (name, [s for each, s in both if each.category == key], F1_GOAL[key]) for key, name in NAMES.items()
     ]
     groups += [
-        ("**all of these**", [s for _, s in table], None),
-        ("held out", [s for each, s in table if each.held_out], None),
-        ("looked at", [s for each, s in table if not each.held_out], None),
-        (OTHER, [s for each, s in both if each.category == OTHER], None),
+        ("**all of these**", scores, None),
+        ("held out", [s for each, s in both if each.held_out], None),
+        ("looked at", [s for each, s in both if not each.held_out], None),
     ]
     for name, chosen, goal in groups:
         if chosen:
@@ -186,7 +179,7 @@ def summary(known: list[Instances], scores: list[Score]) -> tuple[dict[str, Any]
     worst = [
         [each.name, each.category, " ".join(f"{x:.2f}" for x in s.ious), str(s.segments), str(s.cut), str(s.joined)]
         for each, s in both
-        if s.hits < s.objects or (s.hits < s.segments and each.category != OTHER)
+        if s.hits < max(s.objects, s.segments)
     ]
     text = report.table_of(rows)
     if worst:
@@ -197,15 +190,15 @@ def summary(known: list[Instances], scores: list[Score]) -> tuple[dict[str, Any]
 
 def main() -> None:
     parser = report.parser(__doc__, "segmentation")
-    parser.add_argument("--frames", type=int, default=1000, help="frames of each folder, at most")
+    parser.add_argument("--frames", type=int, default=1000, help="at most")
     parser.add_argument("--repeats", type=int, default=5, help="the time is the shortest of so many")
     options = parser.parse_args()
-    folders = [folder for folder in map(report.shared_data, ("mosd_learn", "frames")) if folder is not None]
-    if not folders:
-        sys.exit(0)
+    folder = report.shared_data("mosd_learn")
+    if folder is None:
+        return
     report.pin()
     cv2.setNumThreads(1)
-    known = frames(folders, options.frames)
+    known = frames(folder, options.frames)
     result, text = summary(known, [scored(each, options.repeats) for each in known])
     report.write(options.name, {"options": vars(options), **result}, text)
 

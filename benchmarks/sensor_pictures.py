@@ -8,11 +8,11 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import report
+from common import report
+from common.gallery_figures import write_picture
 from matplotlib import colormaps
-from PIL import Image
 
-from sq_perception.evaluation.plots import INK, NOTHING, draw_depth, new_figure, save
+from sq_perception.evaluation.plots import INK, NOTHING, draw_depth, new_figure
 from sq_perception.simulation import sensor_noise
 from sq_perception.simulation.scenes import table_scene
 
@@ -51,9 +51,7 @@ def main() -> None:
     bar = figure.colorbar(image, cax=grid[1, 0].inset_axes([0.2, 0.42, 0.75, 0.06]), orientation="horizontal")
     bar.set_label("mm", fontsize=9, color=INK)
     bar.ax.tick_params(labelsize=9)
-    save(figure, output, 100)
-    # Noise does not compress; fewer colours do.
-    Image.open(output).convert("RGB").quantize(160, kmeans=2).save(output, optimize=True)
+    write_picture(figure, output)
 
 
 if __name__ == "__main__":

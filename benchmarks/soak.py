@@ -7,10 +7,8 @@ it runs at ``rate`` for ``minutes``; memory, latency, services and diagnostics a
 than anybody could answer.  The camera shows the same scenes in all three, over and over; it runs at low priority on one
 thread, as a real camera takes next to no processor time.
 
-Latency goes from the stamp, the clock at the camera's publish call, to the arrival here.  A scene with an overlap takes
-longer than one without, so that a spread over scenes shows nothing of regularity: latencies are also divided by the
-median of their own scene.  Memory is resident memory; its growth is a straight line fitted to all seconds after the
-first minute.
+Latency goes from the stamp, the clock at the camera's publish call, to the arrival here.  Memory is resident memory;
+its growth is a straight line fitted to all seconds after the first minute.
 """
 
 from __future__ import annotations
@@ -18,14 +16,14 @@ from __future__ import annotations
 import os
 import sys
 import time
-import zlib
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
-import own_domain  # noqa: F401
-import report
+from common import (
+    own_domain,  # noqa: F401
+    report,
+)
 from rcl_interfaces.srv import GetParameters
 from running_nodes import (
     Answer,
@@ -34,15 +32,12 @@ from running_nodes import (
     Usage,
     arguments,
     environment,
-    nanoseconds,
-    proportional,
     until,
     usage,
 )
-from sensor_msgs.msg import PointCloud2
 from std_srvs.srv import SetBool
 
-from sq_perception.commands.children import Child, Children
+from sq_perception.commands.children import Children
 
 CAMERA_NODE = "synthetic_depth_node"
 SCENES = 8
@@ -52,7 +47,6 @@ _WARM = 60.0
 """Seconds after which memory is measured."""
 _SHORTEST_WARM = 0.25
 """Share of a run that is shorter than four minutes."""
-_MEMORY_EVERY = 30
 
 ASKED = {"growth": 3.0, "p99 to median": 2.0, "services": 50.0, "drift": 10.0, "best rate": 0.9}
 """Per cent, ratio, milliseconds, per cent, share."""
@@ -68,8 +62,6 @@ class Phase:
     answers: list[Answer] = field(default_factory=list)
     diagnoses: list[Diagnosis] = field(default_factory=list)
     usage: list[tuple[float, Usage]] = field(default_factory=list)
-    camera: list[tuple[float, Usage]] = field(default_factory=list)
-    memory: list[tuple[float, float, float]] = field(default_factory=list)
     calls: dict[str, list[float]] = field(default_factory=dict)
 
     @property
@@ -83,13 +75,8 @@ class Soak:
     def __init__(self, node: str, objects: int, peer: Peer, nodes: Children, cameras: Children) -> None:
         self.name, self.objects = f"/{node}", objects
         self.peer, self.cameras = peer, cameras
-        self.scenes: dict[int, int] = {}
-        peer.listen(PointCloud2, f"/{CAMERA_NODE}/truth", self._on_truth)
         self.answers, self.diagnoses = peer.answers(self.name), peer.diagnoses(self.name)
         self.node = nodes.start(node, ["--ros-args", "--log-level", "warn"])
-
-    def _on_truth(self, message: PointCloud2) -> None:
-        self.scenes[nanoseconds(message)] = zlib.crc32(bytes(message.data))
 
     def phase(self, rate: float, seconds: float, hold: int, *, services: bool = True) -> Phase:
         """Run the camera at a rate and watch."""
@@ -102,7 +89,7 @@ class Soak:
         phase = Phase(rate, time.monotonic())
         second = 0
         while time.monotonic() < phase.began + seconds:
-            self._look(phase, camera, second, services)
+            self._look(phase, services)
             second += 1
             time.sleep(max(0.0, phase.began + second - time.monotonic()))
         phase.ended = time.monotonic()
@@ -110,12 +97,8 @@ class Soak:
         self.cameras.stop()
         return phase
 
-    def _look(self, phase: Phase, camera: Child, second: int, services: bool) -> None:
-        now = time.monotonic() - phase.began
-        phase.usage.append((now, usage(self.node.pid)))
-        phase.camera.append((now, usage(camera.pid)))
-        if second % _MEMORY_EVERY == 0:
-            phase.memory.append((now, *proportional(self.node.pid)))
+    def _look(self, phase: Phase, services: bool) -> None:
+        phase.usage.append((time.monotonic() - phase.began, usage(self.node.pid)))
         if not services:
             return
         for name, kind, request in (
@@ -131,109 +114,74 @@ class Soak:
         until(lambda: self.diagnoses[-1].time > after + 2.0, (self.node,))
         return self.diagnoses[-1]
 
-    def by_scene(self, phase: Phase) -> dict[int, np.ndarray]:
-        """Ages in milliseconds by scene."""
-        found: dict[int, list[float]] = {}
-        for answer in phase.answers:
-            if answer.stamp in self.scenes:
-                found.setdefault(self.scenes[answer.stamp], []).append(answer.age)
-        return {scene: np.array(ages) for scene, ages in found.items()}
 
-
-def line(phase: Phase, what: str, begin: float) -> dict[str, float]:
-    """A straight line through a quantity of all seconds after ``begin``: MB, and per hour and per 1000 answers."""
-    points = np.array([(when, getattr(one, what)) for when, one in phase.usage if when >= begin])
-    if len(points) < 3:
-        return {
-            "mean": float(points[:, 1].mean()),
-            "slope_per_hour": 0.0,
-            "growth_percent": 0.0,
-            "per_1000_answers": 0.0,
-        }
-    (slope, offset), covariance = np.polyfit(points[:, 0], points[:, 1], 1, cov=True)
-    span = points[-1, 0] - points[0, 0]
-    frames = max(sum(answer.time - phase.began >= begin for answer in phase.answers), 1)
+def growth(phase: Phase, begin: float) -> dict[str, float]:
+    """A straight line through the resident memory of all seconds after ``begin``: MB, and per hour."""
+    when, memory = np.array([(when, one.rss) for when, one in phase.usage if when >= begin]).T
+    (slope, offset), covariance = np.polyfit(when, memory, 1, cov=True)
     return {
-        "mean": float(points[:, 1].mean()),
-        "min": float(points[:, 1].min()),
-        "max": float(points[:, 1].max()),
+        "mean": float(memory.mean()),
         "slope_per_hour": float(3600 * slope),
         "slope_error_per_hour": float(3600 * np.sqrt(covariance[0, 0])),
-        "growth_percent": float(100 * slope * span / (offset + slope * points[0, 0])),
-        "per_1000_answers": float(1000 * slope * span / frames),
+        "growth_percent": float(100 * slope * (when[-1] - when[0]) / (offset + slope * when[0])),
     }
 
 
-def latencies(soak: Soak, phase: Phase) -> dict[str, Any]:
-    """Ages as they are, and divided by the median of their scene."""
+def latencies(phase: Phase) -> dict[str, Any]:
+    """Ages of the results, milliseconds, and how many came."""
     ages = np.array([answer.age for answer in phase.answers])
-    scenes = soak.by_scene(phase)
-    relative = np.concatenate([found / np.median(found) for found in scenes.values()])
     third = max(len(ages) // 3, 1)
     first, last = np.median(ages[:third]), np.median(ages[-third:])
-    times = np.array([answer.time for answer in phase.answers])
     return {
         "milliseconds": {**report.spread(ages), "p99": float(np.percentile(ages, 99))},
-        "p99_to_median": float(np.percentile(ages, 99) / np.median(ages)),
-        "p99_to_median_of_scene": float(np.percentile(relative, 99)),
-        "largest_to_median_of_scene": float(relative.max()),
-        "scene_medians_ms": sorted(float(np.median(found)) for found in scenes.values()),
         "drift_percent": float(100 * (last - first) / first),
         "results_per_second": len(ages) / phase.seconds,
-        "longest_gap_ms": float(1e3 * np.diff(times).max()) if len(times) > 1 else None,
     }
 
 
-def account(soak: Soak, phase: Phase) -> dict[str, Any]:
+def account(phase: Phase) -> dict[str, Any]:
     """Everything that is known of a phase, as JSON."""
     begin = min(_WARM, _SHORTEST_WARM * phase.seconds)
     reports = np.array([phase.began, *(one.time for one in phase.diagnoses), phase.ended])
-    first, last = phase.usage[0], phase.usage[-1]
     settled = next(one for when, one in phase.usage if when >= begin)
-    calls = {
-        name: {**report.spread(np.array(took)), "p99": float(np.percentile(took, 99))}
-        for name, took in phase.calls.items()
-    }
     return {
         "rate": phase.rate,
         "seconds": phase.seconds,
-        "latency": latencies(soak, phase),
-        "memory": {what: line(phase, what, begin) for what in ("rss", "anonymous", "shared")},
-        "proportional_mb": [list(one) for one in phase.memory],
-        "cpu_share": (last[1].cpu - first[1].cpu) / max(last[0] - first[0], 1e-9),
-        "camera_cpu_share": (phase.camera[-1][1].cpu - phase.camera[0][1].cpu) / max(last[0] - first[0], 1e-9),
+        "latency": latencies(phase),
+        "memory": growth(phase, begin),
         "after_first_minute": asdict(settled),
-        "at_the_end": asdict(last[1]),
+        "at_the_end": asdict(phase.usage[-1][1]),
         "diagnoses": {"received": len(phase.diagnoses), "longest_gap_s": float(np.diff(reports).max())},
         "most_in_work": max((one.count("in work") for one in phase.diagnoses), default=0),
-        "services": calls,
-        "stages": {key: value for key, value in phase.diagnoses[-1].values.items() if "[ms]" in key},
+        "services": {
+            name: {**report.spread(np.array(took)), "p99": float(np.percentile(took, 99))}
+            for name, took in phase.calls.items()
+        },
     }
 
 
-def verdicts(alone: dict[str, Any], asked: dict[str, Any], offered: dict[str, Any] | None, final: Diagnosis,
-             ratios: Sequence[float]) -> list[list[str]]:  # fmt: skip
+def verdicts(
+    alone: dict[str, Any], asked: dict[str, Any], offered: dict[str, Any] | None, final: Diagnosis
+) -> list[list[str]]:
     """Rows: what, asked, reached, whether."""
 
     def row(what: str, wanted: str, reached: str, met: bool) -> list[str]:
         return [what, wanted, reached, "yes" if met else "NO"]
 
-    latency, memory = asked["latency"], asked["memory"]["rss"]
-    ms, growth = latency["milliseconds"], memory["growth_percent"]
+    latency, memory = asked["latency"], asked["memory"]
+    ms = latency["milliseconds"]
+    p99_to_median = ms["p99"] / ms["median"]
     before, after = asked["after_first_minute"], asked["at_the_end"]
     counts = {key: after[key] - before[key] for key in ("threads", "files", "segments")}
     diagnoses = asked["diagnoses"]
     rows = [
         row("resident memory after the first minute", f"+-{ASKED['growth']:g} %",
-            f"{growth:+.2f} % of {memory['mean']:.0f} MB ({memory['slope_per_hour']:+.1f} +- "
-            f"{memory.get('slope_error_per_hour', 0):.1f} MB/h)", abs(growth) <= ASKED["growth"]),
+            f"{memory['growth_percent']:+.2f} % of {memory['mean']:.0f} MB ({memory['slope_per_hour']:+.1f} +- "
+            f"{memory['slope_error_per_hour']:.1f} MB/h)", abs(memory["growth_percent"]) <= ASKED["growth"]),
         row("threads, open files, segments since then", "as many", ", ".join(f"{k} {v:+d}" for k, v in counts.items()),
             all(number <= 0 for number in counts.values())),
         row("latency p99 / median", f"<= {ASKED['p99 to median']:g}",
-            f"{latency['p99_to_median']:.2f} ({ms['p99']:.0f} / {ms['median']:.0f} ms)",
-            latency["p99_to_median"] <= ASKED["p99 to median"]),
-        row("the same within scenes", f"<= {ASKED['p99 to median']:g}", f"{latency['p99_to_median_of_scene']:.2f}",
-            latency["p99_to_median_of_scene"] <= ASKED["p99 to median"]),
+            f"{p99_to_median:.2f} ({ms['p99']:.0f} / {ms['median']:.0f} ms)", p99_to_median <= ASKED["p99 to median"]),
         row("latency, last third against first", f"< {ASKED['drift']:g} %", f"{latency['drift_percent']:+.1f} %",
             latency["drift_percent"] < ASKED["drift"]),
         row("frames in work", "<= 2", str(asked["most_in_work"]), asked["most_in_work"] <= 2),
@@ -255,12 +203,10 @@ def verdicts(alone: dict[str, Any], asked: dict[str, Any], offered: dict[str, An
         rows.append(
             row(f"results / s at {offered['rate']:g} Hz offered", f">= {least:.1f}", f"{rate:.1f}", rate >= least)
         )
-        ratio = float(np.median(ratios))
-        single = alone["latency"]["milliseconds"]["median"]
+        single, many = (phase["latency"]["milliseconds"]["median"] for phase in (alone, offered))
         rows.append(
             row(f"latency at {offered['rate']:g} Hz, of one frame", "that of a frame alone + its period, within 25 %",
-                f"{offered['latency']['milliseconds']['median']:.0f} ms, alone {single:.0f} ms, x {ratio:.2f} scene by "
-                "scene", ratio <= 1.25 + period / single)
+                f"{many:.0f} ms, alone {single:.0f} ms", many <= 1.25 * single + period)
         )  # fmt: skip
     return rows
 
@@ -288,22 +234,14 @@ def main() -> None:
             phases["offered"] = soak.phase(options.offered, seconds, round(options.offered * seconds / SCENES))
         final = soak.final()
         warnings = soak.node.last_lines()
-        accounts = {name: account(soak, phase) for name, phase in phases.items()}
-        single = soak.by_scene(alone)
-        most = soak.by_scene(phases.get("offered", asked))
-        ratios = [float(np.median(most[scene]) / np.median(single[scene])) for scene in most if scene in single]
-    rows = verdicts(accounts["alone"], accounts["asked"], accounts.get("offered"), final, ratios)
-    seconds = [
-        {"second": round(when, 2), **{key: round(value, 3) for key, value in asdict(one).items()}}
-        for when, one in asked.usage[:: max(1, len(asked.usage) // 200)]
-    ]
+        accounts = {name: account(phase) for name, phase in phases.items()}
+    rows = verdicts(accounts["alone"], accounts["asked"], accounts.get("offered"), final)
     result = {
         "options": vars(options),
         "phases": accounts,
         "verdicts": rows,
         "final": final.values,
         "log": warnings,
-        "course": seconds,
     }
     table = report.table(["what", "asked", "reached", "met"], rows)
     report.write(options.name, result, f"{options.node}, {options.objects} objects, {options.rate:g} Hz for "

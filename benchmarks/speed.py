@@ -22,7 +22,7 @@ faster; ``--record`` replaces them and keeps what they replace.  Under two minut
 from __future__ import annotations
 
 if __name__ == "__main__":
-    import one_thread  # noqa: F401
+    from common import one_thread  # noqa: F401
 
 import cProfile
 import pstats
@@ -36,8 +36,8 @@ from unittest import mock
 
 import frame_time
 import numpy as np
-import report
 import single_body
+from common import report
 from synthetic_tabletop import STAGES, scored
 
 from sq_perception.fitting import solina_bajcsy

@@ -16,17 +16,14 @@ what slows the machine slows both.
 from __future__ import annotations
 
 if __name__ == "__main__":
-    import one_thread  # noqa: F401
+    from common import one_thread  # noqa: F401
 
 import time
 from typing import Any
 
 import household_things
 import numpy as np
-import real_scenes
-import report
-import scene_verdict
-import tabletop
+from common import report, scene_verdict, tabletop
 
 from sq_perception.recovery.recoverer import FrameRecovery, Recoverer
 from sq_perception.simulation import sensor_noise
@@ -37,7 +34,7 @@ COUNTS = (1, 5, 8)
 def ious(frame: FrameRecovery, scene: tabletop.Tabletop, depth: np.ndarray) -> list[float]:
     """Of the things that are at least half visible; ``depth`` is what the frame was recovered from."""
     labels = scene_verdict.matches(frame.labels, scene.labels, depth)
-    half = [each for each in scene.placed if each.visible_share >= real_scenes.HALF]
+    half = [each for each in scene.placed if each.visible_share >= scene_verdict.HALF]
     return [scene_verdict.of_frame(frame, labels.get(each.label, 0), each, scene).iou for each in half]
 
 

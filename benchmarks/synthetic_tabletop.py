@@ -20,13 +20,13 @@ medians of one pinned thread.
 from __future__ import annotations
 
 if __name__ == "__main__":
-    import one_thread  # noqa: F401
+    from common import one_thread  # noqa: F401
 
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import report
+from common import report
 from scipy.optimize import linear_sum_assignment
 
 from sq_perception.geometry import Superquadric, metrics

@@ -30,7 +30,7 @@ Goals: no switch, and after 30 frames at most half of the error of the first fra
 from __future__ import annotations
 
 if __name__ == "__main__":
-    import one_thread  # noqa: F401
+    from common import one_thread  # noqa: F401
 
 import time
 from collections.abc import Iterator
@@ -39,7 +39,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-import report
+from common import report
 from synthetic_tabletop import visible_shares
 
 from sq_perception.geometry import Superquadric
@@ -175,10 +175,8 @@ def figures(records: list[Record]) -> dict[str, Any]:
     error = np.nanmean(np.abs(fused), axis=(1, 2))
     result: dict[str, Any] = {
         "error": {str(k): float(error[k - 1]) for k in SHOWN if k <= len(error)},
-        "first_single": float(np.nanmean(np.abs(single[0]))),
         "single": float(np.nanmean(np.abs(single))),
         "bias": float(np.abs(np.nanmean(single, axis=0)).mean()),
-        "median_first": float(np.nanmedian(np.abs(fused[0]))),
         "within_2_sigma": float(np.mean(np.abs(fused[known]) <= 2 * sigma[known])),
         "within_2_sigma_last": float(np.mean((np.abs(fused) <= 2 * sigma)[-1][known[-1]])),
         "milliseconds": report.spread(np.concatenate([one.milliseconds for one in records])),

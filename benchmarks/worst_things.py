@@ -16,8 +16,9 @@ from typing import Any
 
 import household_things
 import numpy as np
-import report
-from gallery_figures import write_picture
+from common import report
+from common.gallery_figures import write_picture
+from common.scene_verdict import HALF
 from matplotlib.axes import Axes
 from scipy.spatial import ConvexHull
 
@@ -25,7 +26,7 @@ from sq_perception.evaluation.plots import WIRE, colour, draw_depth, draw_outlin
 from sq_perception.geometry import Superquadric
 from sq_perception.simulation.household import KINDS
 
-METHOD, HALF = "given", 0.5
+METHOD = "given"
 AROUND = 0.6
 """Of a thing's larger side in the image: what is shown beside it."""
 COLUMNS, SIDE = 4, 2.9

@@ -310,19 +310,6 @@ def picking() -> str:
     return table(heads, rows)
 
 
-def picking_share() -> str:
-    """How much of what true bodies reach recovered ones reach."""
-    found = results("picking")["rows"]
-    rows = []
-    for kind in ("packed", "pile"):
-        ours, true = found[f"{kind}: ours"], found[f"{kind}: true bodies"]
-        if ours["scenes"] != true["scenes"]:
-            raise ValueError(f"{kind}: expected as many scenes of true bodies as of recovered ones")
-        gsr, dr = (100 * ours[rate][0] / true[rate][0] for rate in ("gsr", "dr"))
-        rows.append(f"{kind} | {ours['scenes']} | {gsr:.0f} | {dr:.0f}")
-    return table("of what true bodies reach | scenes | GSR % | DR %", rows)
-
-
 def picking_gains() -> str:
     """What parts of the recovery are worth to grasps, and by how much others are behind."""
     gains = results("picking")["gains"]
@@ -370,7 +357,6 @@ BLOCKS: dict[str, Callable[[], str]] = {
         latency,
         still,
         picking,
-        picking_share,
         picking_gains,
         picking_scores,
         tracks,

@@ -304,14 +304,6 @@ def intrinsics_to_message(intrinsics: Intrinsics, header: Any, types: MessageTyp
     )
 
 
-def raw_intrinsics_to_message(raw: RawIntrinsics, header: Any) -> CameraInfo:
-    """A camera_info of raw images: K, distortion, R = I, and P = K."""
-    message = intrinsics_to_message(raw.intrinsics, header)
-    message.distortion_model = raw.distortion_model
-    message.d = list(raw.distortion)
-    return message
-
-
 def byte_array(pixels: np.ndarray) -> array.array[int]:
     """The bytes of an array as array.array('B'), the one type that message setters take over without looking at it."""
     data = array.array("B")

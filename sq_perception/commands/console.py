@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 SUCCESS, FAILURE, USAGE, INTERRUPTED = 0, 1, 2, 130
 STANDARD_OUTPUT = "-"
 _NEGATIVE = re.compile(r"-(\d+\.?\d*|\.\d+)(e[-+]?\d+)?|-inf(inity)?", re.IGNORECASE)
-LAST_PORT = 65535
 
 
 def complain(message: str) -> None:
@@ -77,8 +76,8 @@ def with_negatives(arguments: Sequence[str]) -> list[str]:
     return [f" {argument}" if _NEGATIVE.fullmatch(argument) else argument for argument in arguments]
 
 
-def at_least(least: int) -> Callable[[str], int]:
-    """The type of an argument that is a whole number of at least so much."""
+def at_least(least: int, most: int | None = None) -> Callable[[str], int]:
+    """The type of an argument that is a whole number of at least, and perhaps at most, so much."""
 
     def checked(text: str) -> int:
         try:
@@ -87,20 +86,29 @@ def at_least(least: int) -> Callable[[str], int]:
             raise argparse.ArgumentTypeError(f"expected a whole number, got {text!r}") from None
         if value < least:
             raise argparse.ArgumentTypeError(f"expected at least {least}, got {value}")
+        if most is not None and value > most:
+            raise argparse.ArgumentTypeError(f"expected {least} to {most}, got {value}")
         return value
 
     return checked
 
 
-def positive(text: str) -> float:
-    """The type of an argument that is a finite number above 0."""
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0 < value < math.inf:
-        raise argparse.ArgumentTypeError(f"expected a positive number, got {text}")
-    return value
+def number(wanted: str, holds: Callable[[float], bool]) -> Callable[[str], float]:
+    """The type of an argument that is the wanted number, of which that holds; of one that is no number nothing does."""
+
+    def checked(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            value = math.nan
+        if not holds(value):
+            raise argparse.ArgumentTypeError(f"expected {wanted}, got {text}")
+        return value
+
+    return checked
+
+
+positive = number("a positive number", lambda value: 0 < value < math.inf)
 
 
 def target(text: str) -> Path:
@@ -184,15 +192,9 @@ def add_address(command: argparse.ArgumentParser) -> None:
         metavar="ADDRESS",
         help="%(default)s, this machine; 0.0.0.0 is open to the network, no password",
     )
-    add("--port", type=_port, help="port to serve on, 0 for any free one (8080, or the next free one)")
-
-
-def _port(text: str) -> int:
-    """Checked here, as the system counts larger numbers from 0 again."""
-    port = at_least(0)(text)
-    if port > LAST_PORT:
-        raise argparse.ArgumentTypeError(f"expected 0 to {LAST_PORT}, got {port}")
-    return port
+    # Checked here, as the system counts larger numbers from 0 again.
+    port = at_least(0, 65535)
+    add("--port", type=port, help="port to serve on, 0 for any free one (8080, or the next free one)")
 
 
 def progress() -> Progress:

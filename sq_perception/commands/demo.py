@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from sq_perception.commands.console import failed, folder, parser
+from sq_perception.commands.console import failed, folder, number, parser
 
 _HELP = """\
 Watch superquadrics being recovered: a camera, recover_node (CNN + fit) and fitter_node (classic fit) run as real ROS 2
@@ -30,11 +30,10 @@ def main(arguments: Sequence[str]) -> int:
         choices=("pinhole", "orthographic"),
         help="of the frame; 8 bit images are orthographic, NPZs what they say, others pinhole",
     )
-    add("--seconds", type=float, default=20.0, help="how long (default: %(default)g)")
+    above_0 = number("a number above 0", lambda value: value > 0)
+    add("--seconds", type=above_0, default=20.0, help="how long (default: %(default)g)")
     add("--output-dir", type=folder, default=".", metavar="DIR", help="for demo.png and demo.glb")
     options = command.parse_args(arguments)
-    if not options.seconds > 0:
-        command.error(f"--seconds: expected a number above 0, got {options.seconds:g}")
     try:
         from sq_perception.commands import demonstration
     except ModuleNotFoundError as error:

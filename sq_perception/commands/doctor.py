@@ -50,10 +50,8 @@ def findings() -> Iterator[tuple[str, str, bool]]:
     for requirement in _requirements():
         name = re.split(r"[^\w.-]", requirement, maxsplit=1)[0]
         if "extra ==" not in requirement:
-            try:
-                yield name, metadata.version(name), False
-            except metadata.PackageNotFoundError:
-                yield name, f"missing: pip install '{requirement}'", True
+            found = provenance.version(name)
+            yield name, found or f"missing: pip install '{requirement}'", found is None
     for extra, modules in _EXTRAS.items():
         missing = [name for name in modules if importlib.util.find_spec(name) is None]
         remedy = f"missing {', '.join(missing)}: pip install 'sq_perception[{extra}]'"

@@ -81,9 +81,8 @@ def _evaluate(options: argparse.Namespace, methods: list[Method], command: list[
         "seed": options.seed,
         "spawn_key": "(6, block), blocks of 500 bodies",
     }
-    found = thesis_report.document(outcomes, facts, failures)
-    written = thesis_report.write(options.output, found, outcomes, images)
-    print("\n\n".join(table.markdown() for table in thesis_tables.overview(found["contestants"])))
+    written, entries = thesis_report.write(options.output, outcomes, images, facts, failures)
+    print("\n\n".join(table.markdown() for table in thesis_tables.overview(entries)))
     print(f"written: {written}")
     return FAILURE if failures else SUCCESS
 

@@ -29,6 +29,7 @@ from sq_perception.recovery.options import RecoveryOptions
 from sq_perception.recovery.recoverer import Recoverer, Recovery
 
 FORMAT, VERSION = "sq_perception.grasps", 1
+_OF_EACH_GRASP = ("position", "rotation", "opening", "width", "score", "weakest")
 _SHARP = 0.02
 """Exponents of a gripper's boxes in a mesh."""
 _LONGEST = 10.0
@@ -79,7 +80,7 @@ def run(options: argparse.Namespace) -> int:
             code = failed(str(error))
         chosen = {"gripper": hand.name, "friction": friction}
         document = {"format": FORMAT, "version": VERSION, "options": chosen, "frames": entries}
-        text = json.dumps(document, indent=1, allow_nan=False)
+        text = json.dumps(document, indent=1, allow_nan=False, default=np.ndarray.tolist)
         if options.json == STANDARD_OUTPUT:
             sys.stdout.write(f"{text}\n")
             return code
@@ -114,17 +115,7 @@ def _bodies(
         {
             "label": int(recovered.label),
             "reason": plan.reasons[k],
-            "grasps": [
-                {
-                    "position": grasp.position.tolist(),
-                    "rotation": grasp.rotation.tolist(),
-                    "opening": grasp.opening,
-                    "width": grasp.width,
-                    "score": grasp.score,
-                    "weakest": grasp.weakest,
-                }
-                for grasp in plan.of(k)
-            ],
+            "grasps": [{name: getattr(grasp, name) for name in _OF_EACH_GRASP} for grasp in plan.of(k)],
         }
         for k, recovered in enumerate(found)
     ]
@@ -142,8 +133,7 @@ def _draw(path: Path, frame: RecordedFrame, found: Sequence[Recovery], plan: Gra
     figure = plots.new_figure(9.6, 9.6 * form)
     ax = figure.add_axes((0.0, 0.0, 1.0, 1.0))
     plots.draw_grasps(ax, frame.depth, frame.camera, [recovered.superquadric for recovered in found], plan, hand)
-    with output_file.writing(path) as partial:
-        plots.save(figure, partial)
+    plots.save(figure, path)
 
 
 def _write_mesh(path: Path, found: Sequence[Recovery], plan: GraspPlan, hand: Gripper) -> None:

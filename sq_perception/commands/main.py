@@ -32,7 +32,6 @@ COMMANDS = {
     "train-masks": ("shards:train_masks", "train the network that finds strays in segments"),
     "dataset": ("dataset:main", "write a fixed set of training and test images"),
     "evaluate": ("evaluate:main", "the thesis' tables and plots, for networks and fits"),
-    "render-search": ("render_search:main", "find the best s and tau of the soft renderer"),
     "doctor": ("doctor:main", "versions, extras, kernels, cores, and what is missing"),
     "warm-up": ("warm_up:main", "compile everything once, so that no first image waits"),
 }
@@ -103,7 +102,3 @@ def _parser() -> argparse.ArgumentParser:
     for name, (_, summary) in COMMANDS.items():
         commands.add_parser(name, help=summary, add_help=False)
     return parser
-
-
-if __name__ == "__main__":
-    raise SystemExit(main())

@@ -15,6 +15,7 @@ from sq_perception.commands.console import (
     add_frames,
     at_least,
     folder,
+    number,
     parser,
     positive,
     target,
@@ -142,7 +143,8 @@ def main(arguments: Sequence[str]) -> int:
         help="frames at a time, in processes of one thread (1: one, its objects in threads)",
     )
     add("--cluster", metavar="ADDRESS", help="a running Dask cluster whose workers have this package (extra 'cluster')")
-    add("--min-score", type=_score, default=0.0, metavar="S", help="leave out bodies with a lower score, 0 to 1")
+    score = number("a score from 0 to 1", lambda value: 0 <= value <= 1)
+    add("--min-score", type=score, default=0.0, metavar="S", help="leave out bodies with a lower score, 0 to 1")
     add("-q", "--quiet", action="store_true", help="no table and no summary; errors only")
     add("-v", "--verbose", action="store_true", help="also the time of each stage, and the log")
     add("--max-objects", type=at_least(1), default=20, metavar="N", help="largest ones first (default 20)")
@@ -167,16 +169,6 @@ def _region(text: str) -> tuple[int, int, int, int]:
     except ValueError:
         raise argparse.ArgumentTypeError(f"expected left,top,width,height in pixels, got {text!r}") from None
     return left, top, width, height
-
-
-def _score(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        value = math.nan
-    if not 0 <= value <= 1:
-        raise argparse.ArgumentTypeError(f"expected a score from 0 to 1, got {text}")
-    return value
 
 
 def _existing(text: str) -> Path:

@@ -67,7 +67,6 @@ def replaced_input(options: argparse.Namespace, inputs: Sequence[Path]) -> str:
 def _decisive(options: argparse.Namespace) -> dict[str, Any]:
     """Options that decide what is found in a frame, as JSON values; what was not given or has no end is None."""
     values = {name: getattr(options, name) for name in _DECISIVE}
-    values["roi"] = values["roi"] and list(values["roi"])
     sides = values["workspace"]
     values["workspace"] = sides and [side if math.isfinite(side) else None for side in sides]
     values["masks"] = values["masks"] and str(values["masks"])
@@ -107,8 +106,10 @@ class Outputs:
                 from sq_perception.recordings.still_page import StillPage
 
                 self._page = StillPage(options.html)
-        except BaseException:
-            self.discard()
+        except BaseException:  # nothing is left of those that were begun
+            for output in (self._lines, self._bag, self._page):
+                if output is not None:
+                    output.close()
             raise
         self._stems: set[str] = set()
         given = {output_file.free_name(_stem(entry), self._stems): entry for entry in self.done}
@@ -148,12 +149,6 @@ class Outputs:
             self._page.add(frame, recovery)
         if self._lines is not None:  # last: what has a line has all its files
             self._lines.add(entry)
-
-    def discard(self) -> None:
-        """Close them before the first frame, with nothing left of those that were begun."""
-        for output in (self._lines, self._bag, self._page):
-            if output is not None:
-                output.close()
 
     def finish(self, whole: bool) -> Iterator[str]:
         """Close what grew and write the documents; what could not be done, or went elsewhere, one sentence each.
@@ -235,8 +230,7 @@ def _draw(path: Path, frame: RecordedFrame, recovery: FrameRecovery) -> None:
     from sq_perception.evaluation.plots import save
     from sq_perception.evaluation.recovery_figure import recovery_figure
 
-    with output_file.writing(path) as partial:
-        save(recovery_figure(frame.depth, frame.camera, recovery, console.printable(frame.name)), partial)
+    save(recovery_figure(frame.depth, frame.camera, recovery, console.printable(frame.name)), path)
 
 
 def _write_mesh(path: Path, frame: RecordedFrame, recovery: FrameRecovery) -> None:

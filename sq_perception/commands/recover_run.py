@@ -101,13 +101,10 @@ class RecoverRun:
             raise ValueError(problem)
         if options.method in NEEDS_NETWORK:
             checkpoint.check(options.model)
+        # First: nothing is begun with damaged weights, without the answer of a cluster, or before a Ctrl-C meanwhile.
+        self._executor = self._chosen_executor()
         self.outputs = Outputs(options)
         done.add(self.outputs.done)
-        try:
-            self._executor = self._chosen_executor()
-        except BaseException:  # damaged weights, no answer of a cluster, Ctrl-C while it waits for one
-            self.outputs.discard()
-            raise
         self._tracks = RecordedTracks(lambda text: complain(f"warning: {text}")) if options.track else None
         self._unreadable = 0
         self._warnings: dict[str, set[str]] = {}

@@ -14,7 +14,6 @@ from sq_perception.commands.console import (
     failed,
     misused,
     parser,
-    replaced_input,
     target,
     with_negatives,
 )
@@ -44,7 +43,7 @@ examples:
   sq-perception recover view.png --projection orthographic --json -
 
 files:
-  orthographic  .png (8 bit, or 16 with --bits 16), .bmp (8 bit), .npz
+  orthographic  .png and .bmp (8 bit), .npz
   pinhole       .png (16 bit, millimetres; its camera goes into a .yaml of the same name, where recover finds it), .npz
   An NPZ also holds labels and the parameters (superquadrics, 1 x 12).
 """
@@ -61,8 +60,6 @@ def main(arguments: Sequence[str]) -> int:
     add("--width", type=at_least(1), help="pixels (256 orthographic, 640 pinhole)")
     add("--height", type=at_least(1), help="pixels (as the width orthographic, 480 pinhole)")
     add("--focal", type=float, help="focal length of the pinhole camera, pixels (525)")
-    add("--camera-info", metavar="FILE", help="a pinhole camera from YAML instead")
-    add("--bits", type=int, choices=(8, 16), default=8, help="depth of an orthographic PNG")
     return _render(command.parse_args(with_negatives(arguments)))
 
 
@@ -73,16 +70,8 @@ def _render(options: argparse.Namespace) -> int:
     if suffix not in ((".png", ".npz") if pinhole else (".png", ".bmp", ".npz")):
         kinds = ".png or .npz" if pinhole else ".png, .bmp or .npz"
         return misused(f"--output: {output.name}: an image of this projection is a {kinds}")
-    cameras = [Path(options.camera_info)] if options.camera_info else []
-    beside = output.with_suffix(".yaml") if pinhole and suffix == ".png" else None
-    if problem := replaced_input(cameras, {"output": beside}):
-        return misused(problem)
-    if options.bits == 16 and (pinhole or suffix != ".png"):
-        return misused("--bits: only orthographic PNGs have a choice")
-    if not pinhole and (options.camera_info or options.focal is not None):
-        return misused("--camera-info, --focal: of a pinhole camera; see --projection")
-    if options.camera_info and (options.width, options.height, options.focal) != (None, None, None):
-        return misused("--width, --height, --focal: the camera of --camera-info has its own")
+    if not pinhole and options.focal is not None:
+        return misused("--focal: of a pinhole camera; see --projection")
 
     import numpy as np
 
@@ -90,25 +79,20 @@ def _render(options: argparse.Namespace) -> int:
     from sq_perception.geometry.superquadric import Superquadric
     from sq_perception.imaging import raycast, unit_cube
     from sq_perception.imaging.camera import Camera
-    from sq_perception.recordings.camera_file import read_calibration
 
     try:
         given = np.array([getattr(options, name) for name in PARAMETERS])
         if not np.isfinite(given).all():
             return misused(f"expected finite parameters, got {' '.join(f'{value:g}' for value in given)}")
         body = Superquadric.from_flat(given)
-        if not pinhole:
-            width = options.width or unit_cube.THESIS_PIXELS
-            camera = unit_cube.camera(width, options.height)
-            seen = unit_cube.optical_from_cube(body)
-        else:
+        if pinhole:
             seen = body
-            if options.camera_info:
-                camera = read_calibration(options.camera_info, distortion="ignore").camera
-            else:
-                width, height = options.width or 640, options.height or 480
-                focal = 525.0 if options.focal is None else options.focal
-                camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+            width, height = options.width or 640, options.height or 480
+            focal = 525.0 if options.focal is None else options.focal
+            camera = Camera(width, height, focal, focal, (width - 1) / 2, (height - 1) / 2)
+        else:
+            seen = unit_cube.optical_from_cube(body)
+            camera = unit_cube.camera(options.width or unit_cube.THESIS_PIXELS, options.height)
         width, height = camera.width, camera.height
         if width * height > MOST_PIXELS or max(width, height) > _LONGEST:  # nor would any command read it
             expected = f"expected an image of at most {MOST_PIXELS} pixels, sides of at most {_LONGEST}"
@@ -119,15 +103,13 @@ def _render(options: argparse.Namespace) -> int:
     if not (index >= 0).any():
         complain("the camera does not see the body: the image is empty")
     try:
-        _write_depth(output, depth, index, camera, body, options.bits)
+        _write_depth(output, depth, index, camera, body)
     except OSError as error:
         return failed(str(error))
     return SUCCESS
 
 
-def _write_depth(
-    output: Path, depth: np.ndarray, index: np.ndarray, camera: Camera, body: Superquadric, bits: int
-) -> None:
+def _write_depth(output: Path, depth: np.ndarray, index: np.ndarray, camera: Camera, body: Superquadric) -> None:
     import cv2
     import numpy as np
 
@@ -152,7 +134,7 @@ def _write_depth(
             complain(f"what is beyond 65.535 m is left out: {output.name} holds no more, an .npz does")
         _write_camera_info(output.with_suffix(".yaml"), camera)
     else:
-        image = unit_cube.grey_from_depth(depth, np.uint16 if bits == 16 else np.uint8)
+        image = unit_cube.grey_from_depth(depth)
     _, encoded = cv2.imencode(output.suffix.lower(), image)
     output_file.write(output, encoded.tobytes())
 

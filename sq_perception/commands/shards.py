@@ -66,7 +66,7 @@ def train_things(arguments: Sequence[str]) -> int:
         views="views that `thing-views` wrote",
         weights="things.safetensors, which `recover --model` takes",
     )
-    example = "sq-perception train-things sets/things --output runs/things --minutes 120 --start robust"
+    example = "sq-perception train-things sets/things --output runs/things --minutes 120 --start things"
     options = vars(_training("things", text, example, THING_RUN).parse_args(arguments))
 
     from sq_perception.learning.thing_training import THINGS

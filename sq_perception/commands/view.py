@@ -52,8 +52,6 @@ def main(given: Sequence[str]) -> int:
     for name in nodes:
         if not _NODE_NAME.fullmatch(name):
             parser.error(f"--node: expected a name like {DEFAULT_NODE}, got {name!r}")
-    if not 0 < options.rate <= 60:
-        parser.error(f"--rate: expected a number above 0, at most 60, got {options.rate:g}")
     if importlib.util.find_spec("rclpy") is None:
         return console.failed(f"view needs ROS 2 in Python: {process.REMEDY}")
     try:
@@ -107,5 +105,6 @@ def _parser() -> argparse.ArgumentParser:
     add("--camera-info", metavar="TOPIC", help="its camera_info (the one in its name space)")
     console.add_address(parser)
     add("--max-points", type=console.at_least(1), default=40000, metavar="N", help="points of the cloud (%(default)s)")
-    add("--rate", type=float, default=10.0, metavar="HZ", help="pictures per second (%(default)g)")
+    rate = console.number("a number above 0, at most 60", lambda value: 0 < value <= 60)
+    add("--rate", type=rate, default=10.0, metavar="HZ", help="pictures per second (%(default)g)")
     return parser

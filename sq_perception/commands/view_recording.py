@@ -121,8 +121,7 @@ def _show(page: Page, frame: RecordedFrame, recovery: FrameRecovery) -> None:
     text = f"{frame.name}: {camera.width} x {camera.height}, {recovery.milliseconds['total']:.0f} ms"
     page.show_source(tables.answer(f"{text}; {recovery.message or frame.warning}".rstrip("; "), not frame.warning))
     page.show_depth(frame.depth, camera)
-    stamp = 0.0 if frame.stamp is None else frame.stamp.sec + 1e-9 * frame.stamp.nanosec
-    page.show_bodies(_SOURCE, bodies_of(recovery), stamp, NodeState(_SOURCE, age=0.0))
+    page.show_bodies(bodies_of(recovery), NodeState(_SOURCE, age=0.0))
 
 
 def bodies_of(recovery: FrameRecovery) -> Bodies:

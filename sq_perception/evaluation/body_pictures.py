@@ -131,8 +131,6 @@ def _shaded(
     picture[..., 3] = index >= 0
     for k, body in enumerate(bodies):
         rows, columns = np.nonzero(index == k)
-        if rows.size == 0:
-            continue
         normals = body.normals(camera.unproject(columns, rows, depth[rows, columns]))
         diffuse = np.clip(normals @ _LIGHT, 0, 1)
         facing = np.clip(-normals[:, 2], 0, 1)
@@ -144,8 +142,6 @@ def _shaded(
 
 def _hidden(points: np.ndarray, depth: np.ndarray, camera: Camera, tolerance: float) -> np.ndarray:
     """Which points (n, 3) lie behind the rendered surface."""
-    if len(points) == 0:
-        return np.zeros(0, bool)
     u, v = np.round(camera.project(points)).astype(int).T
     u, v = np.clip(u, 0, camera.width - 1), np.clip(v, 0, camera.height - 1)
     return points[:, 2] > depth[v, u] + tolerance

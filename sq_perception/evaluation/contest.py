@@ -32,7 +32,7 @@ from sq_perception.imaging import unit_cube
 from sq_perception.learning import checkpoint, inference
 from sq_perception.learning.choices import LOSSES
 from sq_perception.learning.inference import Predictor
-from sq_perception.learning.objective import Objective
+from sq_perception.learning.losses import Objective
 from sq_perception.recovery.recoverer import Method, Recoverer, RecoveryOptions
 
 TIMED_IMAGES = 300
@@ -112,7 +112,10 @@ def network(path: Path, name: str | None = None) -> Contestant:
     """
     model = inference.load(path)
     header = checkpoint.read_header(path)
-    training, metrics = (_note(header, key, path) for key in ("training", "metrics"))
+    try:
+        training, metrics = (dict(json.loads(header.get(key, "{}"))) for key in ("training", "metrics"))
+    except (ValueError, TypeError) as error:
+        raise checkpoint.CheckpointError(f"{path}: expected objects as the header's notes: {error}") from error
     if training.get("loss", LOSSES[0]) not in LOSSES:
         raise checkpoint.CheckpointError(f"{path}: the header names an unknown loss: {training['loss']!r}")
     # Headers without a loss are of the time when there was one only.
@@ -229,13 +232,3 @@ def unique_names(paths: Sequence[Path]) -> list[str]:
     """A name for each file, none of them twice and none of a fit."""
     taken = set[str](FITS)
     return [free_name(default_name(path), taken) for path in paths]
-
-
-def _note(header: dict[str, str], key: str, path: Path) -> dict[str, Any]:
-    try:
-        note = json.loads(header.get(key, "{}"))
-    except json.JSONDecodeError as error:
-        raise checkpoint.CheckpointError(f"{path}: the header's {key!r} is no JSON: {error}") from error
-    if not isinstance(note, dict):
-        raise checkpoint.CheckpointError(f"{path}: expected an object as the header's {key!r}, got {note!r}")
-    return note

@@ -26,8 +26,8 @@ _BAR = "#7f97aa"
 _GRID = "#dfe5ea"
 _EACH = 3
 _ARC_BINS = np.linspace(0, 360, 121)
-_ANGLE_BINS = np.linspace(0, 100, 101)
-_IOU_BINS = np.linspace(0, 100, 101)
+_BINS = np.linspace(0, 100, 101)
+"""Of IoU in per cent and of angles in degrees."""
 _CLOSE_IOU_BINS = np.linspace(95, 100, 101)
 """Where every body is this good."""
 
@@ -38,7 +38,7 @@ def distributions(outcome: Outcome) -> Figure:
     grid = figure.add_gridspec(1, 3, left=0.045, right=0.985, bottom=0.15, top=0.88, wspace=0.17)
     figures, summary = outcome.figures, outcome.figures.summary()
 
-    bins = _CLOSE_IOU_BINS if summary["iou_min"] > 0.01 * _CLOSE_IOU_BINS[0] else _IOU_BINS
+    bins = _CLOSE_IOU_BINS if summary["iou_min"] > 0.01 * _CLOSE_IOU_BINS[0] else _BINS
     ax = _histogram(figure.add_subplot(grid[0]), 100 * figures.iou, bins, "IoU, per cent")
     ax.axvline(100 * summary["iou_mean"], color=plots.WIRE, lw=1.2)
     low, high = (100 * (summary["iou_mean"] + side * summary["iou_std"]) for side in (-1, 1))
@@ -51,9 +51,9 @@ def distributions(outcome: Outcome) -> Figure:
     turned = f"{100 * summary['quarter_turns']:.0f} % quarter turns"
     plots.heading_of(ax, "Shortest arc to the label (figure 6.3)", turned)
 
-    ax = _histogram(figure.add_subplot(grid[2]), np.rad2deg(figures.symmetric_angle), _ANGLE_BINS, "degrees")
+    ax = _histogram(figure.add_subplot(grid[2]), np.rad2deg(figures.symmetric_angle), _BINS, "degrees")
     free = np.rad2deg(figures.any_order_angle)
-    ax.hist(free[np.isfinite(free)], bins=_ANGLE_BINS.tolist(), color=plots.WIRE, lw=1.1, histtype="step")
+    ax.hist(free[np.isfinite(free)], bins=_BINS.tolist(), color=plots.WIRE, lw=1.1, histtype="step")
     if summary["recovered"]:
         medians = np.rad2deg([summary["symmetric_angle_median"], summary["any_order_angle_median"]])
         names = (f"8 parameter vectors, median {medians[0]:.1f}", f"any order of axes, median {medians[1]:.1f}")

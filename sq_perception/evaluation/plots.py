@@ -22,6 +22,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
 
+from sq_perception.files import output_file
 from sq_perception.geometry.mesh import COLOURS, outline
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
@@ -134,10 +135,10 @@ def new_figure(width: float, height: float) -> Figure:
 
 
 def save(figure: Figure, path: str | Path, dots_per_inch: int = 110) -> Path:
-    """Write a figure as PNG."""
-    path = Path(path)
-    figure.savefig(path, dpi=dots_per_inch)
-    return path
+    """Write a figure as PNG, whole or not at all; raises OSError as :func:`output_file.writing` does."""
+    with output_file.writing(path) as partial:
+        figure.savefig(partial, dpi=dots_per_inch)
+    return Path(path)
 
 
 def heading_of(ax: Axes, text: str, detail: str) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -27,83 +26,68 @@ _CAPTIONS = {
 }
 
 
-def document(outcomes: Sequence[Outcome], facts: dict[str, Any], failures: Sequence[str] = ()) -> dict[str, Any]:
-    """Everything that was found, as results.json has it but for numbers that JSON does not know.
+def write(
+    folder: Path, outcomes: Sequence[Outcome], images: ThesisImages, facts: dict[str, Any], failures: Sequence[str] = ()
+) -> tuple[Path, list[Entry]]:
+    """Write report.md, results.json and the PNGs into an existing folder; returns report.md, and the contestants.
 
     Parameters
     ----------
     outcomes
         At least one.
     facts
-        JSON values about the run, as :func:`provenance.facts` gives them.
+        JSON values about the run: those of :func:`provenance.facts`, the threads and the seed.
     failures
         Why some contestants are missing; shown at the top.
     """
-    entries = [
-        {
-            "name": outcome.contestant.name,
-            "description": outcome.contestant.description,
-            "loss": outcome.contestant.loss or None,
-            "summary": outcome.figures.summary(),
-            "examples": pictures.ranked(outcome),
-            "pictures": [_file(outcome.contestant.name, kind) for kind in _CAPTIONS],
-            **outcome.contestant.notes,
-        }
-        for outcome in outcomes
-    ]
-    return {"format": FORMAT, "version": VERSION, "facts": facts, "failures": list(failures), "contestants": entries}
-
-
-def write(folder: Path, found: dict[str, Any], outcomes: Sequence[Outcome], images: ThesisImages) -> Path:
-    """Write report.md, results.json and the PNGs of a :func:`document` into an existing folder; returns report.md."""
+    entries: list[Entry] = []
     for outcome in outcomes:
-        plots.save(pictures.distributions(outcome), folder / _file(outcome.contestant.name, "distributions"))
-        plots.save(pictures.examples(outcome, images), folder / _file(outcome.contestant.name, "examples"))
-    text = json.dumps(_finite(found), indent=1, allow_nan=False, ensure_ascii=False)
+        contestant, name = outcome.contestant, outcome.contestant.name
+        plots.save(pictures.distributions(outcome), folder / _file(name, "distributions"))
+        plots.save(pictures.examples(outcome, images), folder / _file(name, "examples"))
+        entries.append(
+            {
+                "name": name,
+                "description": contestant.description,
+                "loss": contestant.loss or None,
+                "summary": outcome.figures.summary(),
+                "examples": pictures.ranked(outcome),
+                "pictures": [_file(name, kind) for kind in _CAPTIONS],
+                **contestant.notes,
+            }
+        )
+    found = {"format": FORMAT, "version": VERSION, "facts": facts, "failures": list(failures), "contestants": entries}
+    finite = json.loads(json.dumps(found), parse_constant=lambda _: None)  # JSON knows neither NaN nor infinity
+    text = json.dumps(finite, indent=1, allow_nan=False, ensure_ascii=False)
     (folder / "results.json").write_text(text + "\n", encoding="utf-8")
     path = folder / "report.md"
-    path.write_text(_markdown(found), encoding="utf-8")
-    return path
+    path.write_text(_markdown(entries, facts, failures), encoding="utf-8")
+    return path, entries
 
 
 def _file(name: str, kind: str) -> str:
     return f"{name}_{kind}.png"
 
 
-def _finite(value: Any) -> Any:
-    """The same values with None for what JSON does not know."""
-    if isinstance(value, dict):
-        return {str(key): _finite(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [_finite(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value
-
-
 def _facts_line(facts: dict[str, Any]) -> str:
-    commit = facts.get("commit") or "unknown"
-    changed = " with changes" if facts.get("modified") else ""
-    threads = ", ".join(f"{name} {count}" for name, count in facts.get("threads", {}).items()) or "unknown"
-    versions = ", ".join(f"{name} {version}" for name, version in facts.get("versions", {}).items() if version)
+    commit = facts["commit"] or "unknown"
+    changed = " with changes" if facts["modified"] else ""
+    threads = ", ".join(f"{name} {count}" for name, count in facts["threads"].items())
+    versions = ", ".join(f"{name} {version}" for name, version in facts["versions"].items() if version)
     return (
-        f"{facts.get('date')}, {facts.get('processor')}, threads {threads}, commit {commit}{changed}, "
-        f"seed {facts.get('seed')}, Python {facts.get('python')}, {versions}"
+        f"{facts['date']}, {facts['processor']}, threads {threads}, commit {commit}{changed}, "
+        f"seed {facts['seed']}, Python {facts['python']}, {versions}"
     )
 
 
-def _protocol(entries: Sequence[Entry]) -> str:
+def _markdown(entries: Sequence[Entry], facts: dict[str, Any], failures: Sequence[str]) -> str:
     bodies = " and ".join(str(count) for count in sorted({entry["summary"]["bodies"] for entry in entries}))
-    return (
+    protocol = (
         f"Bodies of the thesis' protocol that no training has seen, clean 8 bit images of 256 x 256 pixels, {bodies} "
         "of them (the table says who had how many, always the first ones). ΔT is in per cent of the cube's side."
     )
-
-
-def _markdown(found: dict[str, Any]) -> str:
-    entries, facts = found["contestants"], found["facts"]
-    lines = ["# Evaluation", "", f"`{facts.get('command')}`", "", _facts_line(facts), "", _protocol(entries), ""]
-    lines += [f"Left out: {failure}\n" for failure in found["failures"]]
+    lines = ["# Evaluation", "", f"`{facts['command']}`", "", _facts_line(facts), "", protocol, ""]
+    lines += [f"Left out: {failure}\n" for failure in failures]
     lines += [f"- {entry['name']}: {entry['description']}" for entry in entries]
     for table in (*thesis_tables.overview(entries), *thesis_tables.thesis_tables(entries)):
         lines += ["", f"## {table.title}", "", table.markdown()]

@@ -15,12 +15,6 @@ _PACKAGES = ("sq-perception", "numpy", "numba", "torch", "ros-jazzy-rclpy")
 
 def facts(command: str, file: str | Path = __file__) -> dict[str, Any]:
     """JSON values that belong beside every figure, for code in ``file``; what is not known is None."""
-    versions: dict[str, str | None] = {}
-    for package in _PACKAGES:
-        try:
-            versions[package] = metadata.version(package)
-        except metadata.PackageNotFoundError:
-            versions[package] = None
     known = commit(file)
     return {
         "command": command,
@@ -30,8 +24,16 @@ def facts(command: str, file: str | Path = __file__) -> dict[str, Any]:
         "processor": processor(),
         "cores": os.cpu_count(),
         "python": platform.python_version(),
-        "versions": versions,
+        "versions": {package: version(package) for package in _PACKAGES},
     }
+
+
+def version(package: str) -> str | None:
+    """Of an installed package; None where it is not installed."""
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
 
 
 def commit(file: str | Path = __file__) -> str | None:

@@ -1,11 +1,6 @@
-"""How far a depth image can be trusted: the standard deviation of its noise, given or estimated.
+"""How far a depth image can be trusted: the standard deviation of its noise, estimated.
 
-    sigma(z)^2 = constant^2 + (quadratic z^2)^2
-
-The quadratic part is that of triangulation (stereo, structured light), whose disparity errors grow so: an error of one
-disparity d is z^2 / (focal length x baseline) d.
-
-Estimate: third differences z0 - 3 z1 + 3 z2 - z3 of neighbouring pixels have variance 20 sigma^2 and cancel slope and
+Third differences z0 - 3 z1 + 3 z2 - z3 of neighbouring pixels have variance 20 sigma^2 and cancel slope and
 curvature; their median absolute value over the mask, times 1.4826 / sqrt(20), is sigma.  Quantisation with step q
 adds q^2 / 12 at least; q is the smallest depth difference that occurs.  It holds for the object as a whole.
 """
@@ -13,7 +8,7 @@ adds q^2 / 12 at least; q is the smallest depth difference that occurs.  It hold
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,31 +22,15 @@ _FEWEST = 8
 """Differences that it takes: with fewer, one edge within the mask is the median."""
 
 
-@dataclass(frozen=True)
-class DepthNoise:
-    """Standard deviation of the depth noise: ``constant`` metres, and ``quadratic`` metres at 1 m, growing with z^2.
+class DepthNoise(NamedTuple):
+    """Standard deviation ``sigma`` of the depth noise of an object, metres.
 
     ``quantum`` is the step of the readings, metres, where these have little other noise: then all readings of a face
     that looks at the camera err alike, as the same number was rounded.  0 where noise mixes the steps.
-
-    Raises
-    ------
-    ValueError
-        If a part is negative or not finite, or both are 0.
     """
 
-    constant: float
-    quadratic: float = 0.0
+    sigma: float
     quantum: float = 0.0
-
-    def __post_init__(self) -> None:
-        parts = (self.constant, self.quadratic, self.quantum)
-        if not (all(map(math.isfinite, parts)) and min(parts) >= 0 and max(parts[:2]) > 0):
-            raise ValueError(f"noise: expected positive metres, got {self.constant}, {self.quadratic}, {self.quantum}")
-
-    def at(self, z: float) -> float:
-        """Standard deviation at depth z, metres."""
-        return float(np.hypot(self.constant, self.quadratic * z * z))
 
 
 def estimate(depth: np.ndarray, inside: np.ndarray, least: float) -> DepthNoise:
@@ -59,7 +38,7 @@ def estimate(depth: np.ndarray, inside: np.ndarray, least: float) -> DepthNoise:
     typical, quantum = _typical(depth, inside)
     spread = typical * MEDIAN_TO_SIGMA / math.sqrt(20.0)
     is_rounded = spread < 0.5 * quantum
-    return DepthNoise(max(spread, quantum / math.sqrt(12.0), least), quantum=quantum if is_rounded else 0.0)
+    return DepthNoise(max(spread, quantum / math.sqrt(12.0), least), quantum if is_rounded else 0.0)
 
 
 @kernel

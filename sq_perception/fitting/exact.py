@@ -41,13 +41,7 @@ from sq_perception.fitting.problem import (
     Problem,
     Solution,
     by_cost,
-    coarse,
-    draw,
-    in_time,
     least,
-    refine,
-    select,
-    settle,
 )
 from sq_perception.fitting.residuals import surface_distance
 from sq_perception.fitting.rivals import SIGNIFICANT, alike, other_axes, other_depths
@@ -77,16 +71,16 @@ _HOPELESS = 2.0
 
 def solve(problem: Problem, given: Sequence[State]) -> Solution:
     """The best body from the given starts and, as far as needed, from automatic ones."""
-    tried = coarse(problem, given)
-    finalists = select(problem, tried) if given else []
+    tried = problem.coarse(given)
+    finalists = problem.select(tried) if given else []
     if not given or _goes_on(problem, finalists):
         found = _automatic(problem)
         tried += found
-        finalists = select(problem, found, finalists)
+        finalists = problem.select(found, finalists)
         if _goes_on(problem, finalists):
-            found = coarse(problem, starts.everything(problem.observation))
+            found = problem.coarse(starts.everything(problem.observation))
             tried += found
-            finalists = select(problem, found, finalists)
+            finalists = problem.select(found, finalists)
         if _goes_on(problem, finalists):
             return tolerant.take_over(problem, finalists[0], [*given, *by_cost(tried)[:_HANDED_OVER]])
     return _decide(problem, finalists)
@@ -102,9 +96,9 @@ def solve_cheaply(problem: Problem, given: Sequence[State], later: Callable[[], 
     groups: list[Callable[[], Sequence[State]]] = [lambda: given, lambda: next(symmetric)]
     for group in groups if later is None else [*groups, later]:
         candidates = group()
-        tried = coarse(problem, candidates) if candidates else []
+        tried = problem.coarse(candidates) if candidates else []
         if tried and least(tried).cost < _PROMISING * problem.floor(COARSE_RAYS):
-            finalists = select(problem, tried, finalists)
+            finalists = problem.select(tried, finalists)
         if problem.explained_by(finalists):
             return _decide(problem, finalists)
     return None
@@ -114,7 +108,7 @@ def _automatic(problem: Problem) -> list[State]:
     """Where the first groups of starts lead, as many as it takes to come near the noise."""
     found: list[State] = []
     for group in starts.groups(problem.observation):
-        found += coarse(problem, group)
+        found += problem.coarse(group)
         if least(found).cost < _GATE * problem.floor(COARSE_RAYS) or problem.late:
             break
     return found
@@ -131,15 +125,15 @@ def _decide(problem: Problem, finalists: list[State]) -> Solution:
     if not problem.late:
         problem, favourite = without_shrunk_edge(problem, favourite)
     enough = _enough_rays(problem.observation)
-    rays = draw(problem, problem.options.pixels or enough, 0.3)
+    rays = problem.draw(problem.options.pixels or enough, 0.3)
     rays = rays._replace(hits=_without_outliers(problem.observation, rays.hits, favourite))
-    problem, favourite = sharpened(problem, favourite, rays.free, draw(problem, enough // 4, 0.3))
+    problem, favourite = sharpened(problem, favourite, rays.free, problem.draw(enough // 4, 0.3))
 
     if others:
-        more = draw(problem, _MORE_RAYS, 0.3)
-        settled = by_cost(settle(problem, state, more) for state in [favourite, *others])
+        more = problem.draw(_MORE_RAYS, 0.3)
+        settled = by_cost(problem.settle(state, more) for state in [favourite, *others])
         favourite, *others = _distinct(settled, settled[0].cost + RIVAL_SLACK)
-    best = least(in_time(problem, [favourite, *others], lambda state: refine(problem, state, rays)))
+    best = least(problem.in_time([favourite, *others], lambda state: problem.refine(state, rays)))
 
     solution = _varied(Solution(problem, best, rays))
     if not problem.late:
@@ -205,20 +199,20 @@ def _varied(solution: Solution) -> Solution:
 def _better(solution: Solution, rivals: list[State]) -> tuple[State, list[State]]:
     """The best of a body and its rivals, and those that were refined; few rays first, all for what holds on them."""
     problem, best = solution.problem, solution.state
-    few = draw(problem, BASIN_RAYS, 0.2)
-    reference = settle(problem, best, few)
+    few = problem.draw(BASIN_RAYS, 0.2)
+    reference = problem.settle(best, few)
     hopeless = _HOPELESS * reference.cost
 
     def followed(rival: State) -> State:
-        state = settle(problem, rival, few, FIRST_STEPS)
-        return settle(problem, state, few, BASIN_STEPS - FIRST_STEPS) if state.cost < hopeless else state
+        state = problem.settle(rival, few, FIRST_STEPS)
+        return problem.settle(state, few, BASIN_STEPS - FIRST_STEPS) if state.cost < hopeless else state
 
     # On other rays the body may already find its way out of a shallow valley.
-    settled = [reference, *(state for state in in_time(problem, rivals, followed) if state.cost < hopeless)]
+    settled = [reference, *(state for state in problem.in_time(rivals, followed) if state.cost < hopeless)]
     chosen = _distinct(settled, reference.cost + RIVAL_SLACK, [best._replace(cost=reference.cost)])
     if not chosen:
         return best, []
-    found = in_time(problem, by_cost(chosen)[:FINALISTS], lambda rival: refine(problem, rival, solution.rays))
+    found = problem.in_time(by_cost(chosen)[:FINALISTS], lambda rival: problem.refine(rival, solution.rays))
     for state in found:
         if state.cost < best.cost - SIGNIFICANT:
             best = state

@@ -91,9 +91,7 @@ class Crop:
     footprint: float
 
     @classmethod
-    def around(
-        cls, depth: np.ndarray, mask: np.ndarray, camera: Camera, noise: float | DepthNoise | None
-    ) -> Crop | None:
+    def around(cls, depth: np.ndarray, mask: np.ndarray, camera: Camera, noise: float | None) -> Crop | None:
         """The crop around a mask of an image; None if it holds no depth at all.  ``noise`` None estimates it."""
         x, y, width, height = regions.box(np.ascontiguousarray(mask))
         extent = max(width, height)
@@ -108,17 +106,15 @@ class Crop:
         distance = _mean_depth(crop, inside)
         if not math.isfinite(distance):
             return None
-        if noise is None:
-            noise = depth_noise.estimate(crop, inside, _NO_NOISE * max(abs(distance), 1e-3))
-        elif not isinstance(noise, DepthNoise):
-            noise = DepthNoise(noise)
+        least = _NO_NOISE * max(abs(distance), 1e-3)
+        known = depth_noise.estimate(crop, inside, least) if noise is None else DepthNoise(noise)
         footprint = (distance if camera.is_pinhole else 1.0) / math.sqrt(camera.fx * camera.fy)
         view = camera.cropped(left, top, right - left, bottom - top)
-        return cls(crop, inside, view, band, noise, distance, footprint)
+        return cls(crop, inside, view, band, known, distance, footprint)
 
     def observed(self, model_error: float, nan_is_empty: bool | None, plane: np.ndarray | None = None) -> Observation:
         """Its pixels sorted; ``model_error`` in metres, ``nan_is_empty`` and ``plane`` as in the options."""
-        sigma = math.hypot(self.noise.at(self.distance), model_error)
+        sigma = math.hypot(self.noise.sigma, model_error)
         inside = self._coherent(_JUMP_PIXELS * self.footprint + _JUMP_NOISE * sigma, plane)
         filled = cv2.morphologyEx(inside.view(np.uint8), cv2.MORPH_CLOSE, np.ones((_HOLE, _HOLE), np.uint8))
         claimed = cv2.bitwise_or(filled, self.mask.view(np.uint8))
@@ -191,7 +187,7 @@ class Observation(Crop):
     @cached_property
     def sigma(self) -> float:
         """Noise and model error together at the object's distance, metres."""
-        return float(np.hypot(self.noise.at(self.distance), self.model_error))
+        return float(np.hypot(self.noise.sigma, self.model_error))
 
     @property
     def outline(self) -> float:
@@ -231,18 +227,13 @@ class Observation(Crop):
         count = round(self.free_pixels * len(kept) / max(len(self.free), 1))
         return replace(self, free=kept, free_pixels=count)
 
-    def coarsened(self, model_error: float) -> Observation:
-        """The same observation trusted less."""
-        return replace(self, model_error=float(np.hypot(self.model_error, model_error)))
-
     @cached_property
     def _distance_to_mask(self) -> np.ndarray:
         distance = cv2.distanceTransform((~self.mask).view(np.uint8), cv2.DIST_L2, 3)
         return distance.ravel()[self.free]
 
     def _through(self, pixels: np.ndarray, margin: float) -> np.ndarray:
-        noise = self.noise.constant, self.noise.quadratic, self.model_error
-        return through(pixels, self.depth, self.camera.lens, noise, margin)
+        return through(pixels, self.depth, self.camera.lens, self.noise.sigma, self.model_error, margin)
 
 
 def span(points: np.ndarray, directions: np.ndarray) -> np.ndarray:

@@ -4,66 +4,34 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
-from sq_perception.fitting.depth_noise import DepthNoise
 from sq_perception.fitting.hull_prior import HullPrior
 from sq_perception.geometry.superquadric import Superquadric
 
 SMALLEST_SIZE = 0.02
-"""Smallest size, as a share of the observed extent, when the data set the bounds: 6 mm of 30 cm."""
+"""Smallest size, as a share of the observed extent: 6 mm of 30 cm."""
 LARGEST_SIZE = 2.0
 """Largest size, likewise: a body may hide as much again as it shows."""
-WIDEST_EXPONENT = 2.0
-"""Beyond, a superquadric is not convex and its gauge no norm."""
+EXPONENTS = (0.1, 1.0)
+"""Of a fit: from boxes to ellipsoids, as in the thesis."""
 MIN_PIXELS = 12
 """A body has 11 parameters."""
 MODEL_ERROR = 0.0025
 """Real objects are no superquadrics; on tables of everyday things this is how far they stray, metres."""
 
 
-@dataclass(frozen=True)
-class Bounds:
-    """Limits of a fit.
-
-    Attributes
-    ----------
-    shape : (float, float)
-        Range of both exponents e1 and e2, within (0, 2].
-    size : (float, float) or None
-        Range of all three half sizes, metres.  None takes it from the extent of the observed points.
-
-    Raises
-    ------
-    ValueError
-        For a range that is empty, not finite or not positive, or exponents above 2.
-    """
-
-    shape: tuple[float, float] = (0.1, 1.0)
-    size: tuple[float, float] | None = None
-
-    def __post_init__(self) -> None:
-        for name, limits in (("shape", self.shape), ("size", self.size)):
-            if limits is None:
-                continue
-            low, high = limits
-            if not (np.isfinite([low, high]).all() and 0 < low <= high):
-                raise ValueError(f"bounds of {name}: expected 0 < low <= high, got {limits}")
-        if self.shape[1] > WIDEST_EXPONENT:
-            raise ValueError(f"bounds of shape: expected exponents up to {WIDEST_EXPONENT:g}, got {self.shape}")
-
-    def limits(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Lower and upper limit (8,) of a1 a2 a3 e1 e2 t1 t2 t3 for observed points (n, 3)."""
-        low, high = points.min(axis=0), points.max(axis=0)
-        extent = max(float(np.linalg.norm(high - low)), 1e-9)
-        size = self.size if self.size is not None else (SMALLEST_SIZE * extent / 2, LARGEST_SIZE * extent / 2)
-        reach = math.sqrt(3.0) * max(extent, size[1])  # no point of a body is farther from its centre
-        (smallest, largest), (sharpest, bluntest) = size, self.shape
-        lower = np.array([*[smallest] * 3, *[sharpest] * 2, *(low - reach)])
-        upper = np.array([*[largest] * 3, *[bluntest] * 2, *(high + reach)])
-        return lower, upper
+def limits(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper limit (8,) of a1 a2 a3 e1 e2 t1 t2 t3 for observed points (n, 3)."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    extent = max(float(np.linalg.norm(high - low)), 1e-9)
+    smallest, largest = SMALLEST_SIZE * extent / 2, LARGEST_SIZE * extent / 2
+    reach = math.sqrt(3.0) * max(extent, largest)  # no point of a body is farther from its centre
+    lower = np.array([*[smallest] * 3, *[EXPONENTS[0]] * 2, *(low - reach)])
+    upper = np.array([*[largest] * 3, *[EXPONENTS[1]] * 2, *(high + reach)])
+    return lower, upper
 
 
 @dataclass(frozen=True)
@@ -72,10 +40,8 @@ class FitOptions:
 
     Attributes
     ----------
-    bounds
-        Limits of sizes and exponents.
     noise
-        Standard deviation of the depth noise, metres, or how it grows with depth; None estimates it from the image.
+        Standard deviation of the depth noise, metres; None estimates it from the image.
     model_error
         How far the object may stray from a superquadric, metres.  None: 0 if a superquadric explains the image down
         to its noise, else 2.5 mm for objects on a plane or with a predicted hull, less for those of which less than
@@ -99,8 +65,7 @@ class FitOptions:
         Seconds after which no further start is tried; the best body so far is returned.
     """
 
-    bounds: Bounds = field(default_factory=Bounds)
-    noise: float | DepthNoise | None = None
+    noise: float | None = None
     model_error: float | None = None
     plane: np.ndarray | None = None
     expected: Superquadric | Callable[[], Superquadric] | None = None
@@ -110,8 +75,8 @@ class FitOptions:
     time_budget: float = math.inf
 
     def __post_init__(self) -> None:
-        if isinstance(self.noise, (int, float)):
-            object.__setattr__(self, "noise", DepthNoise(self.noise))
+        if self.noise is not None and not (np.isfinite(self.noise) and self.noise > 0):
+            raise ValueError(f"noise: expected positive metres, got {self.noise}")
         if self.model_error is not None and not (np.isfinite(self.model_error) and self.model_error >= 0):
             raise ValueError(f"model_error: expected metres, 0 or more, got {self.model_error}")
         if self.plane is not None:

@@ -14,7 +14,7 @@ import numpy as np
 
 from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.observation import BAND_PIXELS
-from sq_perception.fitting.problem import BASIN_STEPS, FINAL_RAYS, FIRST_STEPS, Problem, draw, refine, settle
+from sq_perception.fitting.problem import BASIN_STEPS, FINAL_RAYS, FIRST_STEPS, Problem
 from sq_perception.fitting.rays import Rays
 from sq_perception.fitting.residuals import penetration
 from sq_perception.geometry.quantiles import quantile
@@ -34,7 +34,7 @@ def without_shrunk_edge(problem: Problem, state: State) -> tuple[Problem, State]
     if _depth_inside(problem, state, full.ring(1)) < _SHRUNK:
         return problem, state
     problem = replace(problem, observation=full.beyond(BAND_PIXELS))
-    state = refine(problem, state, draw(problem, FINAL_RAYS, 0.6), BASIN_STEPS)
+    state = problem.refine(state, problem.draw(FINAL_RAYS, 0.6), BASIN_STEPS)
     rings = (k for k in range(1, BAND_PIXELS + 1) if _depth_inside(problem, state, full.ring(k)) < _SHRUNK)
     band = next(rings, BAND_PIXELS + 1) - 1
     return replace(problem, observation=full.beyond(band) if band > 0 else full), state
@@ -48,7 +48,7 @@ def sharpened(problem: Problem, state: State, free: np.ndarray, rays: Rays) -> t
         if not sigma < _SHARPER * before or problem.late:  # so that it ends for any sigma
             return problem, state
         problem = problem.with_terms(outline_stiffness=1 / sigma)
-        state = settle(problem, state, rays, FIRST_STEPS)
+        state = problem.settle(state, rays, FIRST_STEPS)
 
 
 def _depth_inside(problem: Problem, state: State, pixels: np.ndarray) -> float:

@@ -6,8 +6,8 @@
     settle    some more steps of one body with the rendered residual, on rays at hand
     refine    the same to convergence, on all rays
 
-All of them take a :class:`Problem` and return bodies (:class:`State`).  Costs are mean squared residuals in units of
-the noise times the rays' weight, so that a body that leaves nothing but noise costs about that weight.
+All of them are methods of a :class:`Problem` and return bodies (:class:`State`).  Costs are mean squared residuals in
+units of the noise times the rays' weight, so that a body that leaves nothing but noise costs about that weight.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from sq_perception.fitting.covariance import Alternative, covariance_at
 from sq_perception.fitting.hull_prior import HullPrior
 from sq_perception.fitting.levenberg_marquardt import State, minimize
 from sq_perception.fitting.observation import Observation
-from sq_perception.fitting.options import MODEL_ERROR, FitOptions
+from sq_perception.fitting.options import MODEL_ERROR, FitOptions, limits
 from sq_perception.fitting.rays import SAMPLE, WEIGHT, Rays
 from sq_perception.fitting.residuals import RENDERED, SAMPSON, surface_distance
 from sq_perception.geometry.superquadric import Superquadric
@@ -56,7 +56,7 @@ RIVAL_SLACK = 4.0
 """Cost that few rays may hide: one such standard deviation."""
 INDEPENDENT_RAYS = 50.0
 """As how many independent rays an object counts whose model errs: errors of neighbouring pixels are alike.  Chosen on
-benchmarks/scanned_objects."""
+scanned objects."""
 HIT_TOLERANCE = 3e-3
 """Of g where a ray meets the body.  Rays remember where that was: this error vanishes as the search converges."""
 PLANE_SIGMA, GAP_SIGMA, REST_SIGMA = 0.001, 0.005, 0.05
@@ -66,7 +66,7 @@ lengths shrink with the model error of small things."""
 PROPORTION_SIGMA = 1.0
 """Of a log size against the mean of the three: a factor e, a wide prior."""
 VOLUME_PRICE = 0.5
-"""Of log(a1 a2 a3): what the image does not determine is not to grow.  Chosen on benchmarks/scanned_objects."""
+"""Of log(a1 a2 a3): what the image does not determine is not to grow.  Chosen on scanned objects."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,8 +106,8 @@ class Problem:
     @classmethod
     def of(cls, observation: Observation, options: FitOptions, began: float) -> Problem:
         """The problem of a superquadric that leaves nothing but noise; ``began`` as by ``time.perf_counter``."""
-        limits = options.bounds.limits(observation.points)
-        return cls(observation, options, terms_of(observation, options), limits, began + options.time_budget)
+        terms, bounds = terms_of(observation, options), limits(observation.points)
+        return cls(observation, options, terms, bounds, began + options.time_budget)
 
     @property
     def late(self) -> bool:
@@ -131,6 +131,62 @@ class Problem:
     def explained_by(self, finalists: Sequence[State]) -> bool:
         """Whether the first of some selected bodies leaves nothing but noise."""
         return bool(finalists) and finalists[0].cost < FINAL_GATE * self.floor(BASIN_RAYS)
+
+    def draw(self, count: int, offset: float) -> Rays:
+        """About ``count`` object rays, and the free rays that come with them; other offsets take other pixels."""
+        seen = self.observation
+        hits, free = seen.object_rays(count, offset), seen.free_rays(int(FREE_SHARE * count), offset)
+        if self.independent is not None:
+            hits[:, WEIGHT] = self.independent / len(hits)
+            if len(free):
+                free[:, WEIGHT] = self.independent / len(seen.pixels) * seen.free_pixels / len(free)
+        return Rays(hits, free)
+
+    def coarse(self, starts: Iterable[State]) -> list[State]:
+        """Where a few steps lead from each start, in their order; from the first one at least."""
+        rays = self.draw(COARSE_RAYS, 0.5)
+        return self.in_time(starts, lambda start: self._minimized(SAMPSON, start, rays, COARSE_STEPS, TOLERANCE))
+
+    def in_time(self, states: Iterable[State], search: Callable[[State], State]) -> list[State]:
+        """Where a search leads from each state, in their order, while there is time; from the first one at least."""
+        found: list[State] = []
+        for state in states:
+            found.append(search(state))
+            if self.late:
+                break
+        return found
+
+    def select(self, candidates: Sequence[State], kept: Sequence[State] = ()) -> list[State]:
+        """The best of some candidates, refined, and of those kept before: at most FINALISTS, best first."""
+        rays = self.draw(BASIN_RAYS, 0.7)
+        for stage in (SAMPSON, RENDERED):
+            candidates = [
+                self._minimized(stage, candidate, rays, BASIN_STEPS, TOLERANCE)
+                for candidate in within_doubt(candidates)[:FINALISTS]
+            ]
+        return within_doubt([*kept, *candidates])[:FINALISTS]
+
+    def settle(self, state: State, rays: Rays, steps: int = BASIN_STEPS) -> State:
+        """A body after some steps with the rendered residual."""
+        return self._minimized(RENDERED, state, rays, steps, TOLERANCE)
+
+    def held(self, state: State, axis: int, rays: Rays) -> State:
+        """The same with the half size along an axis kept as it is, within its limits."""
+        lower, upper = (limit.copy() for limit in self.limits)
+        lower[axis] = upper[axis] = min(max(state.parameters[axis], lower[axis]), upper[axis])
+        return minimize(RENDERED, *rays, self.terms, state, (lower, upper), BASIN_STEPS, TOLERANCE)
+
+    def refine(self, state: State, rays: Rays, steps: int = REFINE_STEPS) -> State:
+        """A body at the end of its valley."""
+        return self._minimized(RENDERED, state, rays, steps, FINAL_TOLERANCE)
+
+    def refined_best(self, settled: Sequence[State], rays: Rays, steps: int = REFINE_STEPS) -> State:
+        """The best on these rays of bodies ranked on few; the second one only has a chance if the ranking is close."""
+        close = [state for state in settled[:2] if state.cost < settled[0].cost + RIVAL_SLACK]
+        return least([self.refine(state, rays, steps) for state in close])
+
+    def _minimized(self, stage: int, state: State, rays: Rays, steps: int, tolerance: float) -> State:
+        return minimize(stage, *rays, self.terms_at(state), state, self.limits, steps, tolerance)
 
 
 @dataclass(frozen=True, eq=False)
@@ -198,72 +254,11 @@ def terms_of(observation: Observation, options: FitOptions) -> Terms:
     )
 
 
-def draw(problem: Problem, count: int, offset: float) -> Rays:
-    """About ``count`` object rays, and the free rays that come with them; other offsets take other pixels."""
-    seen = problem.observation
-    hits, free = seen.object_rays(count, offset), seen.free_rays(int(FREE_SHARE * count), offset)
-    if problem.independent is not None:
-        hits[:, WEIGHT] = problem.independent / len(hits)
-        if len(free):
-            free[:, WEIGHT] = problem.independent / len(seen.pixels) * seen.free_pixels / len(free)
-    return Rays(hits, free)
-
-
-def coarse(problem: Problem, starts: Iterable[State]) -> list[State]:
-    """Where a few steps lead from each start, in their order; from the first one at least."""
-    rays = draw(problem, COARSE_RAYS, 0.5)
-    return in_time(problem, starts, lambda start: _minimized(problem, SAMPSON, start, rays, COARSE_STEPS, TOLERANCE))
-
-
-def in_time(problem: Problem, states: Iterable[State], search: Callable[[State], State]) -> list[State]:
-    """Where a search leads from each state, in their order, as long as there is time; from the first one at least."""
-    found: list[State] = []
-    for state in states:
-        found.append(search(state))
-        if problem.late:
-            break
-    return found
-
-
-def select(problem: Problem, candidates: Sequence[State], kept: Sequence[State] = ()) -> list[State]:
-    """The best of some candidates, refined, and of those kept before: at most FINALISTS, best first."""
-    rays = draw(problem, BASIN_RAYS, 0.7)
-    for stage in (SAMPSON, RENDERED):
-        candidates = [
-            _minimized(problem, stage, candidate, rays, BASIN_STEPS, TOLERANCE)
-            for candidate in within_doubt(candidates)[:FINALISTS]
-        ]
-    return within_doubt([*kept, *candidates])[:FINALISTS]
-
-
 def within_doubt(candidates: Iterable[State]) -> list[State]:
     """Candidates, best first, without those that the noise cannot have made worse than the best."""
     ranked = by_cost(candidates)
     least = ranked[0].cost
     return [state for state in ranked if state.cost <= least + max(DOUBT, (RIVAL - 1) * abs(least))]
-
-
-def settle(problem: Problem, state: State, rays: Rays, steps: int = BASIN_STEPS) -> State:
-    """A body after some steps with the rendered residual."""
-    return _minimized(problem, RENDERED, state, rays, steps, TOLERANCE)
-
-
-def held(problem: Problem, state: State, axis: int, rays: Rays) -> State:
-    """The same with the half size along an axis kept as it is, within its limits."""
-    lower, upper = (limit.copy() for limit in problem.limits)
-    lower[axis] = upper[axis] = min(max(state.parameters[axis], lower[axis]), upper[axis])
-    return minimize(RENDERED, *rays, problem.terms, state, (lower, upper), BASIN_STEPS, TOLERANCE)
-
-
-def refine(problem: Problem, state: State, rays: Rays, steps: int = REFINE_STEPS) -> State:
-    """A body at the end of its valley."""
-    return _minimized(problem, RENDERED, state, rays, steps, FINAL_TOLERANCE)
-
-
-def refined_best(problem: Problem, settled: Sequence[State], rays: Rays, steps: int = REFINE_STEPS) -> State:
-    """The best on these rays of bodies ranked on few; the second one only has a chance if the ranking is close."""
-    close = [state for state in settled[:2] if state.cost < settled[0].cost + RIVAL_SLACK]
-    return least([refine(problem, state, rays, steps) for state in close])
 
 
 def by_cost(states: Iterable[State]) -> list[State]:
@@ -274,7 +269,3 @@ def by_cost(states: Iterable[State]) -> list[State]:
 def least(states: Iterable[State]) -> State:
     """The cheapest."""
     return min(states, key=lambda state: state.cost)
-
-
-def _minimized(problem: Problem, stage: int, state: State, rays: Rays, steps: int, tolerance: float) -> State:
-    return minimize(stage, *rays, problem.terms_at(state), state, problem.limits, steps, tolerance)

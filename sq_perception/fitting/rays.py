@@ -78,20 +78,15 @@ def drawn(pixels: np.ndarray, areas: np.ndarray, count: int, offset: float) -> n
 
 @kernel
 def through(
-    pixels: np.ndarray,
-    depth: np.ndarray,
-    lens: Lens,
-    noise: tuple[float, float, float],
-    margin: float,
+    pixels: np.ndarray, depth: np.ndarray, lens: Lens, noise: float, model_error: float, margin: float
 ) -> np.ndarray:
     """Rays (n, 8) through pixels, indices into the depth image; object rays, or free ones that end a margin before.
 
-    ``noise``: its constant and quadratic part and the model error, which join in
-    squares; ``margin``: in such standard deviations, 0 for rays of the object.
+    Noise and model error join in squares; ``margin``: in such standard deviations, 0 for rays of the object.
     """
     fx, fy, cx, cy, pinhole = lens
-    constant, quadratic, model_error = noise
     width = depth.shape[1]
+    sigma = np.sqrt(noise * noise + model_error * model_error)
     rays = np.zeros((pixels.shape[0], RAY_COLUMNS))
     for i in range(pixels.shape[0]):
         v, u = pixels[i] // width, pixels[i] % width
@@ -105,8 +100,6 @@ def through(
         if not np.isfinite(z):
             rays[i, DEPTH] = 1e300
             continue
-        growing = quadratic * z * z
-        sigma = np.sqrt(constant * constant + growing * growing + model_error * model_error)
         rays[i, DEPTH] = rays[i, LAST] = z - margin * sigma
         if margin == 0.0:
             rays[i, STIFFNESS] = 1.0 / sigma

@@ -30,10 +30,6 @@ from sq_perception.fitting.problem import (
     BASIN_RAYS,
     Solution,
     by_cost,
-    coarse,
-    draw,
-    refined_best,
-    settle,
 )
 from sq_perception.fitting.rivals import resized
 from sq_perception.fitting.starts import ORDERS, standing_axes
@@ -58,10 +54,10 @@ def weighed(solution: Solution) -> Solution:
     starts = from_body(free)
     if problem.options.plane is not None:
         starts += on_plane(problem.observation.points, problem.options.plane)
-    promising = by_cost(coarse(round_, starts))[:_FINALISTS]
-    few = draw(problem, BASIN_RAYS, 0.7)
-    settled = by_cost(settle(round_, state, few) for state in promising)
-    best = refined_best(round_, settled, rays)
+    promising = by_cost(round_.coarse(starts))[:_FINALISTS]
+    few = problem.draw(BASIN_RAYS, 0.7)
+    settled = by_cost(round_.settle(state, few) for state in promising)
+    best = round_.refined_best(settled, rays)
     better = gain(free.cost, best.cost, rays.weight)
     weight = math.exp(-0.5 * abs(better))
     other = Alternative(free if better > 0 else best, weight / (1 + weight))

@@ -20,7 +20,7 @@ import numpy as np
 
 from sq_perception.fitting.covariance import Alternative
 from sq_perception.fitting.levenberg_marquardt import State
-from sq_perception.fitting.problem import Problem, Solution, held, refine
+from sq_perception.fitting.problem import Problem, Solution
 from sq_perception.fitting.rays import DEPTH, Rays
 from sq_perception.fitting.rivals import other_orders, resized
 
@@ -65,7 +65,7 @@ def contradicts(solution: Solution) -> bool:
     """
     if solution.problem.observation.noise.quantum == 0.0:
         return False
-    left = refine(_rounded(solution.problem), solution.state, solution.rays, steps=0)
+    left = _rounded(solution.problem).refine(solution.state, solution.rays, steps=0)
     return left.cost > _CONTRADICTED * solution.rays.weight
 
 
@@ -159,7 +159,7 @@ class _Walk:
         axis = _view_axis(start)
         lower, upper = self.problem.limits
         size = min(max(math.exp(log_size), lower[axis]), upper[axis])
-        return held(self.problem, resized(start, axis, size), axis, self.rays)
+        return self.problem.held(resized(start, axis, size), axis, self.rays)
 
 
 def _view_axis(state: State) -> int:

@@ -30,7 +30,7 @@ import numpy as np
 from sq_perception.fitting.cost import Terms
 from sq_perception.fitting.fit import FAILED_SHARE, INLIER, Fit, Status
 from sq_perception.fitting.levenberg_marquardt import State, minimize
-from sq_perception.fitting.options import MIN_PIXELS, Bounds
+from sq_perception.fitting.options import MIN_PIXELS, limits
 from sq_perception.fitting.rays import DEPTH, LAST, ORIGIN_X, ORIGIN_Y, RAY_COLUMNS, STIFFNESS, WEIGHT
 from sq_perception.fitting.residuals import CLASSIC
 from sq_perception.fitting.starts import on_one_line
@@ -91,12 +91,12 @@ def fit(points: np.ndarray, *, escapes: int = 0) -> Fit:
         rays = np.zeros((len(points), RAY_COLUMNS))
         rays[:, ORIGIN_X], rays[:, ORIGIN_Y], rays[:, DEPTH] = points.T
         rays[:, STIFFNESS], rays[:, WEIGHT], rays[:, LAST] = 1 / (_UNIT * extent**1.5), 1.0, points[:, 2]
-        limits, terms = Bounds().limits(points), Terms(huber=math.inf)
-        state = minimize(CLASSIC, rays, _NO_FREE_SPACE, terms, start, limits, _MOST_STEPS, _TOLERANCE)
+        bounds, terms = limits(points), Terms(huber=math.inf)
+        state = minimize(CLASSIC, rays, _NO_FREE_SPACE, terms, start, bounds, _MOST_STEPS, _TOLERANCE)
         rng = np.random.default_rng(0)
         for _ in range(escapes):
             other = _disturbed(state, rng)
-            other = minimize(CLASSIC, rays, _NO_FREE_SPACE, terms, other, limits, _MOST_STEPS, _TOLERANCE)
+            other = minimize(CLASSIC, rays, _NO_FREE_SPACE, terms, other, bounds, _MOST_STEPS, _TOLERANCE)
             state = min(state, other, key=lambda each: each.cost)
     body = state.body.canonical_form()
     distance = np.abs(body.sampson_distance(points))

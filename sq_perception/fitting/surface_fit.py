@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import cache
 from typing import Literal
@@ -94,7 +94,7 @@ def fit(
         raise ValueError("the mask holds no pixel with a depth: there is nothing to fit")
     undecided = options.model_error is None
     model_error = min(MODEL_ERROR, _MODEL_SHARE * crop.footprint * math.sqrt(np.count_nonzero(crop.mask)))
-    fine = crop.noise.at(crop.distance) < _FINE_NOISE * model_error
+    fine = crop.noise.sigma < _FINE_NOISE * model_error
     if undecided and (later is not None if options.plane is None else fine):
         exactly = _exactly(crop, options, given, later, began)
         if exactly is not None and not (camera.is_pinhole and _is_thing(mask, options)):
@@ -115,7 +115,7 @@ def fit(
     given = given if later is None else later()
     solution = course.solve(Problem.of(observation, options, began), given)
     untried = options.plane is None or not fine
-    if is_thing and untried and _is_explained(solution, crop.noise.at(crop.distance)):
+    if is_thing and untried and _is_explained(solution, crop.noise.sigma):
         solution = _as_thing(_exactly(crop, options, [solution.state, *given], None, began)) or solution
     return assessed(solution, began)
 
@@ -176,22 +176,14 @@ def _checked_images(depth: np.ndarray, mask: np.ndarray, camera: Camera) -> tupl
     return depth, mask
 
 
-def _checked_starts(start: object) -> list[State]:
-    if isinstance(start, str):
-        if start != "auto":
-            raise ValueError(f"start: expected 'auto' or superquadrics, got {start!r}")
+def _checked_starts(start: Superquadric | Literal["auto"] | Iterable[Superquadric]) -> list[State]:
+    if isinstance(start, str) and start == "auto":
         return []
-    bodies: list[object]
-    if isinstance(start, Superquadric):
-        bodies = list(start) if start.batch_shape else [start]
-    elif isinstance(start, Sequence):
-        bodies = list(start)
-    else:
-        raise ValueError(f"start: expected 'auto' or superquadrics, got {type(start).__name__}")
+    is_one = isinstance(start, Superquadric) and not start.batch_shape
     states = []
-    for body in bodies:
+    for body in [start] if is_one else start:
         if not isinstance(body, Superquadric) or body.batch_shape:
-            raise ValueError(f"start: expected single superquadrics, got {body!r}")
+            raise ValueError(f"start: expected 'auto' or single superquadrics, got {body!r}")
         states.append(State.of(Superquadric.from_flat(np.asarray(body.to_flat(), dtype=float))))
     return states
 

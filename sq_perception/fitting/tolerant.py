@@ -52,10 +52,6 @@ from sq_perception.fitting.problem import (
     Problem,
     Solution,
     by_cost,
-    draw,
-    in_time,
-    refined_best,
-    settle,
     terms_of,
 )
 from sq_perception.fitting.rays import SAMPLE
@@ -98,24 +94,24 @@ def solve(problem: Problem, given: Sequence[State]) -> Solution:
 
 
 def _best(problem: Problem, starts: Sequence[State]) -> Solution:
-    few = draw(problem, COARSE_RAYS, 0.7)
-    begun = by_cost(in_time(problem, starts, lambda start: settle(problem, start, few, FIRST_STEPS)))
+    few = problem.draw(COARSE_RAYS, 0.7)
+    begun = by_cost(problem.in_time(starts, lambda start: problem.settle(start, few, FIRST_STEPS)))
     kept = _KEPT if problem.hull is None else _KEPT_OF_PREDICTED
-    settled = by_cost(in_time(problem, begun[:kept], lambda state: settle(problem, state, few)))
+    settled = by_cost(problem.in_time(begun[:kept], lambda state: problem.settle(state, few)))
     if problem.hull is None or problem.late:
         return _refined(problem, settled)
     misfit = max(1.0, _mean_loss(problem, settled[0]) / EXPLAINED)
     terms = problem.terms if misfit == 1.0 else problem.terms._replace(hull_root=problem.hull.root(misfit))
     drawn = replace(problem, independent=INDEPENDENT_OF_PREDICTED / misfit, terms=terms)
-    few = draw(drawn, COARSE_RAYS, 0.7)
-    settled = by_cost(in_time(drawn, settled[:2], lambda state: settle(drawn, state, few)))
+    few = drawn.draw(COARSE_RAYS, 0.7)
+    settled = by_cost(drawn.in_time(settled[:2], lambda state: drawn.settle(state, few)))
     solution = _refined(drawn, settled)
     return replace(solution, problem=problem, rays=solution.rays.weighing(1 / misfit))
 
 
 def _refined(problem: Problem, settled: Sequence[State]) -> Solution:
-    rays = draw(problem, problem.options.pixels or SAMPLE, 0.3)
-    return Solution(problem, refined_best(problem, settled, rays, 2 * REFINE_STEPS), rays, spread_factor=SPREAD)
+    rays = problem.draw(problem.options.pixels or SAMPLE, 0.3)
+    return Solution(problem, problem.refined_best(settled, rays, 2 * REFINE_STEPS), rays, spread_factor=SPREAD)
 
 
 def _mean_loss(problem: Problem, body: State) -> float:
@@ -143,7 +139,8 @@ def take_over(problem: Problem, best: State, given: Sequence[State]) -> Solution
     hits = problem.observation.object_rays(FINAL_RAYS)
     distance = np.abs(surface_distance(hits, best.parameters, best.rotation))
     left_over = MEDIAN_TO_SIGMA * quantile(distance, 0.5)
-    observation = problem.observation.coarsened(left_over)
+    observation = problem.observation
+    observation = replace(observation, model_error=float(np.hypot(observation.model_error, left_over)))
     return solve(replace(problem, observation=observation, terms=terms_of(observation, problem.options)), given)
 
 

@@ -30,10 +30,6 @@ from sq_perception.fitting.problem import (
     VOLUME_PRICE,
     Solution,
     by_cost,
-    draw,
-    held,
-    refined_best,
-    settle,
 )
 from sq_perception.fitting.rivals import resized
 
@@ -69,10 +65,10 @@ def weighed(solution: Solution) -> Solution:
         notes = (*notes, "half sizes weighed against a prediction")
         extents = prior.support(state.rotation.T)
         rivals += [resized(state, int(k), float(extents[k])) for k in weak]
-    few = draw(problem, BASIN_RAYS, 0.2)
+    few = problem.draw(BASIN_RAYS, 0.2)
     few = few.weighing(rays.weight / few.weight)
-    settled = by_cost(settle(problem, rival, few) for rival in rivals)
-    best = refined_best(problem, settled, rays, 2 * REFINE_STEPS)
+    settled = by_cost(problem.settle(rival, few) for rival in rivals)
+    best = problem.refined_best(settled, rays, 2 * REFINE_STEPS)
     return replace(solution, problem=problem, state=best, rays=rays, notes=notes)
 
 
@@ -85,12 +81,12 @@ def with_open_ends(solution: Solution) -> Solution:
     if not ends:
         return solution
     rays = solution.rays.every(max(1, len(solution.rays.hits) // _RAYS))
-    most = settle(problem, state, rays, 0).cost + _ALLOWED
+    most = problem.settle(state, rays, 0).cost + _ALLOWED
     found = []
     for axis, sign in ends:
         for factor in _LONGER:
             longer = min(factor * state.parameters[axis], problem.limits[1][axis])
-            other = held(problem, _longer(state, axis, sign, longer), axis, rays)
+            other = problem.held(_longer(state, axis, sign, longer), axis, rays)
             if other.cost < most:
                 found.append(other)
         if problem.late:

@@ -104,8 +104,6 @@ class Superquadric:
 
     def __getitem__(self, index: Any) -> Superquadric:
         """Index the leading dimensions."""
-        if not self.batch_shape:
-            raise TypeError("a single Superquadric cannot be indexed")
         return Superquadric(self.size[index], self.shape[index], self.translation[index], self.rotation[index])
 
     def __len__(self) -> int:
@@ -240,8 +238,6 @@ class Superquadric:
         stands for the area a1 a2 a3 r^3 |grad g| (r = 1 / g(a v), from the volume of a thin cone), so that systematic
         resampling with this weight out of ``oversampling * count`` candidates is uniform in area.
         """
-        if is_torch_array(self.size):
-            raise TypeError("sample_surface draws with a NumPy generator: expected a NumPy Superquadric")
         shape = (*self.batch_shape, oversampling * count, 3)
         direction = rng.standard_normal(shape)
         direction /= np.linalg.norm(direction, axis=-1, keepdims=True)
@@ -262,12 +258,10 @@ class Superquadric:
     # Closed forms
 
     def volume(self) -> np.ndarray:
-        """Volume (...), cubic metres: 2 a1 a2 a3 e1 e2 B(e1/2 + 1, e1) B(e2/2, e2/2)."""
+        """Volume (...), cubic metres, of NumPy bodies: 2 a1 a2 a3 e1 e2 B(e1/2 + 1, e1) B(e2/2, e2/2)."""
         from scipy.special import beta  # here: a node that recovers does without
 
         size, shape = self.size, self.shape
-        if is_torch_array(size):
-            size, shape = size.detach().cpu().numpy(), shape.detach().cpu().numpy()
         e1, e2 = shape[..., 0], shape[..., 1]
         return 2 * np.prod(size, axis=-1) * e1 * e2 * beta(e1 / 2 + 1, e1) * beta(e2 / 2, e2 / 2)
 
@@ -298,13 +292,11 @@ class Superquadric:
         """
         xp = array_namespace(self.size)
         turns = np.concatenate([_HALF_TURNS, quaternions.multiply(_QUARTER_TURN, _HALF_TURNS)])
+        exchanged = xp.stack([self.size[..., k] for k in (1, 0, 2)], axis=-1)
         forms = []
-        for k, turn in enumerate(turns):
-            size = self.size
-            if k >= 4:
-                size = xp.stack([size[..., 1], size[..., 0], size[..., 2]], axis=-1)
-            step = xp.asarray(turn, dtype=self.rotation.dtype)
-            turned = quaternions.multiply(self.rotation, step + xp.zeros_like(self.rotation))
+        for turn, size in zip(turns, [self.size] * 4 + [exchanged] * 4, strict=True):
+            step = xp.asarray(turn, dtype=self.rotation.dtype) + xp.zeros_like(self.rotation)
+            turned = quaternions.multiply(self.rotation, step)
             forms.append(xp.concat([size, self.shape, self.translation, turned], axis=-1))
         return Superquadric.from_flat(xp.stack(forms))
 

@@ -40,11 +40,6 @@ class Grasp:
     score: float
     weakest: str
 
-    @property
-    def approach(self) -> np.ndarray:
-        """The unit vector (3,) along which the gripper comes."""
-        return np.asarray(quaternions.to_matrix(self.rotation))[:, 2]
-
     def placed(self, points: np.ndarray) -> np.ndarray:
         """Points (j, 3) of the TCP's frame in the frame of the bodies."""
         return points @ np.asarray(quaternions.to_matrix(self.rotation)).T + self.position

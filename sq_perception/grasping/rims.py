@@ -43,7 +43,7 @@ _HIGH, _THIN = 0.006, 0.012
 _FEWEST, _STRAY = 5, 3
 """Points of a bearing; of these the highest, up to flying pixels, is the top."""
 _UPRIGHT = 0.9
-"""Share of rims that held where all other margins were sure: 31 of 35 that scenes of benchmarks/picking_scenes.py from
+"""Share of rims that held where all other margins were sure: 31 of 35 that scenes of benchmarks/picking.py from
 seed 20000 on, none of which is reported, ended with.  In place of friction: how steep a wall is, is not looked at."""
 _STEEP = np.cos(np.deg2rad(35.0))
 """Of a body's axis to the vertical: vessels that lean farther have no rim that a hand comes to from above."""

@@ -18,13 +18,13 @@ LEAST_ENGAGED = 0.004
 TABLE_SIGMA, POINT_SIGMA = 0.002, 0.001
 SIDE_SIGMA = 0.0026
 """Metres to which thinned points tell where the side of a thing is that the image shows a finger to pass: of 247 such
-sides, 3.3 with the 2 mm of the hand (30 scenes of benchmarks/picking_scenes.py from seed 30010 on)."""
+sides, 3.3 with the 2 mm of the hand (30 scenes of benchmarks/picking.py from seed 30010 on)."""
 PASSES = 0.001
 """Metres by which a finger may come down on the edge of a thing: half of those that did passed it and pushed it aside
-(60 household things in known places in the physics of benchmarks/picking_world.py; a quarter at 2 mm, few at 3)."""
+(60 household things in known places in the physics of benchmarks/picking.py; a quarter at 2 mm, few at 3)."""
 NEARER = 0.4
 """Sigmas by which sides are nearer than fits say, of 797 tried ones that were known to more than 3.5 mm: medians of 0.3
-to 0.6 by how well (120 scenes of benchmarks/picking_scenes.py from seed 20000 on, none of which is reported); where
+to 0.6 by how well (120 scenes of benchmarks/picking.py from seed 20000 on, none of which is reported); where
 they are known better it is too little to matter."""
 MARGINS = ("opening", "engagement", "palm", "friction", "weight", "table", "other bodies", "measured points", "unseen")
 _GRAVITY, _LIFT = 9.81, 2.0

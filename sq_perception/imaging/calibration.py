@@ -37,7 +37,7 @@ import numpy as np
 from sq_msgs_py.depth_image import Intrinsics, intrinsics_from_message, raw_intrinsics_from_message, size_mismatch
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.compressed_depth import TRANSPORT
-from sq_perception.imaging.distortion import FISHEYE, MODELS, Distortion
+from sq_perception.imaging.distortion import FISHEYE, Distortion
 from sq_perception.imaging.rectification import Rectification, rectification
 
 Treatment = Literal["auto", "apply", "ignore"]
@@ -140,11 +140,6 @@ class Calibration:
         self.camera.check_image(depth)
         return depth if self.rectification is None else self.rectification.back.depth(depth)
 
-    def labels_as_sent(self, labels: np.ndarray) -> np.ndarray:
-        """The same for a label image."""
-        self.camera.check_image(labels)
-        return labels if self.rectification is None else self.rectification.back.labels(labels)
-
     def check(self, image: np.ndarray) -> None:
         """Raise ValueError unless the image (height, width) has the size of those that are sent."""
         fault = size_mismatch((image.shape[1], image.shape[0]), self.size)
@@ -172,8 +167,6 @@ def _lens(model: str, coefficients: tuple[float, ...]) -> Distortion | None:
     """None for one that moves nothing; a fisheye lens always moves."""
     if model != FISHEYE and not is_distorted(coefficients):
         return None
-    if model not in MODELS:
-        raise ValueError(f"camera_info: distortion_model: expected {', '.join(MODELS)}, got {model!r}")
     try:
         return Distortion(model, coefficients)
     except ValueError as error:

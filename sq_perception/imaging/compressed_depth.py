@@ -25,18 +25,12 @@ from sq_perception.files.unpacking import MOST_PIXELS
 from sq_perception.imaging import rvl
 
 TRANSPORT = "compressedDepth"
-FARTHEST = 10.0
-"""Metres up to which :func:`encode` quantises inverse depth; as in the reference."""
-
-_QUANTIZATION = 100.0
 _HEADER = struct.Struct("<iff")
 _PNG = b"\x89PNG\r\n\x1a\n"
 _IMAGE_HEADER = struct.Struct(">8xI4sIIBB")
 """Of a PNG: length and name of its first chunk, width, height, bits, colour type (0 is grey)."""
 _RVL_HEADER = struct.Struct("<II")
 _MILLIMETRES = np.float32(1000.0)
-_MOST_LEVELS = np.iinfo(np.uint16).max
-_FASTEST = (cv2.IMWRITE_PNG_COMPRESSION, 1)
 
 
 def encoding(image_format: str) -> str | None:
@@ -88,36 +82,6 @@ def decode(image_format: str, data: bytes | np.ndarray) -> np.ndarray:
             depth = np.float32(a) / (grey.astype(np.float32) - np.float32(b))
     depth[(grey == 0) | ~((depth > 0) & (depth < np.inf))] = np.nan
     return depth
-
-
-def encode(depth: np.ndarray, image_encoding: str = "16UC1") -> tuple[str, bytes]:
-    """``format`` and ``data`` of the message of a depth image (height, width) in metres, NaN or inf for nothing.
-
-    16UC1 keeps the nearest millimetre up to 65.535 m.  32FC1 keeps inverse depth of 0.16 to 10 m to the nearest of
-    10100 levels for each 1/m: 0.05 mm at 1 m and 5 mm at 10 m.  What is beyond becomes nothing.
-
-    Raises
-    ------
-    ValueError
-        For another encoding, or an array that is no image.
-    """
-    depth = np.asarray(depth, dtype=float)
-    if depth.ndim != 2 or depth.size == 0:
-        raise ValueError(f"depth: expected (height, width) with at least one pixel, got {depth.shape}")
-    a = b = 0.0
-    with np.errstate(divide="ignore", invalid="ignore"):
-        if image_encoding == "16UC1":
-            levels = 1e3 * depth
-        elif image_encoding == "32FC1":
-            a = _QUANTIZATION * (_QUANTIZATION + 1)
-            b = 1 - a / FARTHEST
-            levels = np.where(depth > 0, a / depth + b, 0)
-        else:
-            raise ValueError(f"encoding: expected 16UC1 or 32FC1, got {image_encoding!r}")
-        levels = np.rint(levels)
-        grey = np.where((levels >= 1) & (levels <= _MOST_LEVELS), levels, 0).astype(np.uint16)
-    _, png = cv2.imencode(".png", grey, _FASTEST)
-    return f"{image_encoding}; {TRANSPORT} png", _HEADER.pack(0, a, b) + png.tobytes()
 
 
 def _known(image_format: str) -> str:

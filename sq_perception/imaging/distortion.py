@@ -72,7 +72,7 @@ class Distortion:
 
     def __post_init__(self) -> None:
         if self.model not in MODELS:
-            raise ValueError(f"distortion model: expected {', '.join(MODELS)}, got {self.model!r}")
+            raise ValueError(f"distortion_model: expected {', '.join(MODELS)}, got {self.model!r}")
         given: Sequence[float] = self.coefficients
         coefficients = tuple(float(value) for value in given)
         lengths = _LENGTHS[self.model]

@@ -49,16 +49,15 @@ class InverseDepth:
 
     @classmethod
     def of(cls, depth: np.ndarray, camera: Camera) -> InverseDepth:
-        """Of a depth image (height, width) in metres, positive, +inf or NaN where nothing is seen.
+        """Of a depth image of the camera (height, width) in metres, positive, +inf or NaN where nothing is seen.
 
         Raises
         ------
         ValueError
-            If the camera is no pinhole, the image is not of its size, or a depth is not positive.
+            If the camera is no pinhole, or a depth is not positive.
         """
         if not camera.is_pinhole:
             raise ValueError(f"camera: expected a pinhole camera, got an {camera.projection} one")
-        camera.check_image(depth)
         with np.errstate(divide="ignore"):
             w = np.divide(1.0, depth, dtype=np.float32, casting="same_kind")
         w[np.isnan(w)] = 0.0

@@ -8,9 +8,14 @@ from __future__ import annotations
 import numba
 import numpy as np
 
-from sq_perception.geometry.kernels import box_interval, in_object_frame, kernel, parallel_kernel, ray_entry, support
+from sq_perception.geometry.kernels import box_interval, in_object_frame, parallel_kernel, ray_entry
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera, Lens
+
+_CORNERS = np.indices((2, 2, 2)).reshape(3, 8).T
+"""Of a box, which of its lower and upper x, y and z each is at."""
+_NEAR = 1e-6
+"""Metres before a pinhole camera, nearer than which a corner says nothing of where a thing is seen."""
 
 
 def render(bodies: Superquadric, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
@@ -43,41 +48,25 @@ def render(bodies: Superquadric, camera: Camera) -> tuple[np.ndarray, np.ndarray
     index = np.full((camera.height, camera.width), -1, dtype=np.int32)
     matrices = np.ascontiguousarray(bodies.rotation_matrix, dtype=float)
     flat = np.ascontiguousarray(bodies.to_flat(), dtype=float)
-    windows = _windows(flat, matrices, camera.lens, camera.width, camera.height)
-    _render_bodies(flat, matrices, windows, camera.lens, depth, index)
+    corners = np.stack(Superquadric.from_flat(flat).bounding_box(), axis=1)[:, _CORNERS, [0, 1, 2]]
+    _render_bodies(flat, matrices, windows(corners, camera), camera.lens, depth, index)
     return depth, index
 
 
-@kernel
-def _windows(flat: np.ndarray, matrices: np.ndarray, lens: Lens, width: int, height: int) -> np.ndarray:
-    """Pixels (n, 4): left, top, right, bottom, the last two exclusive, outside of which no part of a body is seen.
+def windows(corners: np.ndarray, camera: Camera) -> np.ndarray:
+    """Pixels int64 (n, 4): left, top, right, bottom, the last two exclusive, beside which nothing of things is seen.
 
-    Those of the corners of the box around each body.
+    Each is within the hull of its corners (n, k, 3); one that reaches behind a pinhole camera may be seen anywhere, one
+    that is behind it nowhere.
     """
-    fx, fy, cx, cy, pinhole = lens
-    windows = np.zeros((flat.shape[0], 4), np.int64)
-    reach = np.empty(3)
-    for k in range(flat.shape[0]):
-        a1, a2, a3, e1, e2, t1, t2, t3 = flat[k, :8]
-        for axis in range(3):
-            m = matrices[k, axis]
-            reach[axis] = support(m[0], m[1], m[2], a1, a2, a3, e1, e2)
-        if pinhole and t3 + reach[2] <= 0.0:
-            continue
-        left, top, right, bottom = 0.0, 0.0, float(width), float(height)
-        if not pinhole or t3 - reach[2] > 1e-6:
-            least_u, most_u, least_v, most_v = np.inf, -np.inf, np.inf, -np.inf
-            for corner in range(8):
-                x = t1 + (reach[0] if corner & 1 else -reach[0])
-                y = t2 + (reach[1] if corner & 2 else -reach[1])
-                scale = 1.0 / (t3 + (reach[2] if corner & 4 else -reach[2])) if pinhole else 1.0
-                u, v = fx * x * scale + cx, fy * y * scale + cy
-                least_u, most_u, least_v, most_v = min(least_u, u), max(most_u, u), min(least_v, v), max(most_v, v)
-            left, right = max(left, np.floor(least_u)), min(right, np.ceil(most_u) + 1.0)
-            top, bottom = max(top, np.floor(least_v)), min(bottom, np.ceil(most_v) + 1.0)
-        if left < right and top < bottom:
-            windows[k, 0], windows[k, 1], windows[k, 2], windows[k, 3] = int(left), int(top), int(right), int(bottom)
-    return windows
+    pixels, size = camera.project(corners), np.array([camera.width, camera.height])
+    first, last = np.ceil(pixels.min(axis=1) - 1e-6), np.floor(pixels.max(axis=1) + 1e-6) + 1
+    if camera.is_pinhole:
+        z = corners[..., 2]
+        reaches_behind = z.min(axis=1) <= _NEAR
+        first[reaches_behind], last[reaches_behind] = 0, size
+        last[z.max(axis=1) <= 0] = 0
+    return np.clip(np.concatenate([first, last], axis=1), 0, [*size, *size]).astype(np.int64)
 
 
 @parallel_kernel

@@ -93,12 +93,6 @@ class Rectification:
         return self.raw.cropped(left, top, right - left + 1, bottom - top + 1)
 
     @cached_property
-    def seen(self) -> float:
-        """Share of the raw pixels that the rectified image shows."""
-        u, v = self.back.u, self.back.v
-        return float(((u > -0.5) & (v > -0.5) & (u < self.camera.width - 0.5) & (v < self.camera.height - 0.5)).mean())
-
-    @cached_property
     def there(self) -> Lookup:
         """Images of :attr:`camera` from raw ones."""
         rays = _rays(self.camera, *_grid(self.camera))

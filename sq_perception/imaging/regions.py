@@ -41,22 +41,10 @@ def pixels(labels: np.ndarray, label: int, extent: np.ndarray) -> tuple[np.ndarr
     return rows, columns
 
 
-@kernel
 def box(mask: np.ndarray) -> tuple[int, int, int, int]:
     """Left, top, width and height of the set pixels of a mask, bool (height, width); all 0 where none is set."""
-    columns = np.zeros(mask.shape[1], np.bool_)
-    top, bottom = mask.shape[0], 0
-    for v in range(mask.shape[0]):
-        some = False
-        for u in range(mask.shape[1]):  # without an end before the last: vector code
-            some |= mask[v, u]
-        if some:
-            top, bottom = min(top, v), v + 1
-            columns |= mask[v]
-    found = np.flatnonzero(columns)
-    if found.size == 0:
-        return 0, 0, 0, 0
-    return found[0], top, found[-1] + 1 - found[0], bottom - top
+    left, top, width, height = cv2.boundingRect(mask.view(np.uint8))
+    return left, top, width, height
 
 
 @kernel

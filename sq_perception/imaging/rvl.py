@@ -24,16 +24,14 @@ _MOST_GROUPS = 9
 
 
 def decode(data: bytes, width: int, height: int) -> np.ndarray:
-    """The pixels, uint16 (height, width).
+    """The pixels, uint16 (height, width), 1 to ``MOST_PIXELS`` of them.
 
     Raises
     ------
     ValueError
-        If the size is below 1 x 1 or above ``MOST_PIXELS``, or the data does not hold that many pixels.
+        If the data does not hold that many pixels.
     """
     count = width * height
-    if not (width >= 1 and height >= 1 and count <= MOST_PIXELS):
-        raise ValueError(f"RVL: expected at most {MOST_PIXELS} pixels, got {width} x {height}")
     if len(data) > _MOST_BYTES * count + 64:
         raise ValueError(f"RVL: expected at most {_MOST_BYTES} bytes for each of {count} pixels, got {len(data)} bytes")
     numbers = _numbers(data)

@@ -8,20 +8,14 @@ Both are residual networks (He et al. 2016): every block adds the output of two 
 | ResNet18 | 256 x 256 | 7 x 7, stride 2; maximum of 3 x 3, stride 2 | 64, 128, 256, 512 channels | means (n, 512) |
 
 The thesis' network (chapter 5.2) is ResNet-18 with one input channel and without the classifier.  Its modules bear the
-names of torchvision's state dict, so that ImageNet weights find their places (:meth:`ResNet18.load_imagenet`).
+names of torchvision's state dict, so that ImageNet weights find their places (docs/training.md).
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import torch
 from torch import nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
-
-_CLASSIFIER = "fc."
-_COUNTER = "num_batches_tracked"
-"""Of normalisations; older weight files have none, and inference needs none."""
 
 
 class ResidualBlock(nn.Module):
@@ -90,31 +84,6 @@ class ResNet18(nn.Module):
         x = nn.functional.max_pool2d(x, 3, 2, 1)
         x = self.layer4(self.layer3(self.layer2(self.layer1(x))))
         return x.mean(dim=(2, 3))
-
-    def load_imagenet(self, state: Mapping[str, torch.Tensor]) -> None:
-        """Take over the weights of torchvision's ResNet-18, those of ``conv1`` summed over the three colours.
-
-        A grey view then gives the features that the colour network has of the view in each of its colours (thesis,
-        chapter 5.2).  The network knows nothing of the mean and spread by which colour images are normalised.
-
-        Parameters
-        ----------
-        state
-            A plain state dict, as ``safetensors.torch.load_file(path)`` reads it.  The classifier ``fc.*`` is not
-            taken; all else must fit by name and shape.
-
-        Raises
-        ------
-        ValueError
-            If a weight is missing, unknown or of another shape.
-        """
-        given = {name: tensor for name, tensor in state.items() if not name.startswith(_CLASSIFIER)}
-        counters = {name: tensor for name, tensor in self.state_dict().items() if name.endswith(_COUNTER)}
-        try:
-            given["conv1.weight"] = given["conv1.weight"].sum(dim=1, keepdim=True)
-            self.load_state_dict({**counters, **given})
-        except (KeyError, RuntimeError) as error:
-            raise ValueError(f"expected the weights of torchvision's ResNet-18: {error}") from error
 
 
 def fold(module: nn.Module) -> None:

@@ -9,7 +9,7 @@ Backbone = Literal["compact", "resnet18"]
 Framing = Literal["cropped", "full"]
 """What a view shows: one object that fills it, or the thesis' whole image."""
 Loss = Literal["occupancy", "occupancy_rotation", "dual", "least_squares", "least_squares_free", "render"]
-"""The losses of :mod:`sq_perception.learning.objective`."""
+"""The losses of :mod:`sq_perception.learning.losses`."""
 LOSSES: tuple[str, ...] = get_args(Loss)
 UNSUPERVISED = ("least_squares", "least_squares_free", "render")
 """Losses that see the view alone, no label."""

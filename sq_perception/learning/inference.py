@@ -11,7 +11,6 @@ torch is imported where it computes.
 
 from __future__ import annotations
 
-import importlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol
@@ -98,13 +97,9 @@ class ThingPredictor:
         Raises
         ------
         ValueError
-            For views, planes or extents of another form, or not finite.
+            For views of another form, or not finite.
         """
         views = checked_views(views, self.config.regressor())
-        if planes.shape != (len(views), 4) or not np.isfinite(planes).all():
-            raise ValueError(f"expected finite planes of shape ({len(views)}, 4), got {planes.shape}")
-        if extents.shape != (len(views),) or not np.isfinite(extents).all():
-            raise ValueError(f"expected finite extents of shape ({len(views)},), got {extents.shape}")
         both = np.concatenate([views, views[:, :, ::-1]])
         sides = np.concatenate([extents, extents]).astype(np.float32)
         supports = np.concatenate([planes, mirrored_planes(planes)]).astype(np.float32)
@@ -130,16 +125,24 @@ def load(path: Path | str | None = None, device: str = "cpu") -> Predictor:
     config, weights = checkpoint.read(RegressorConfig, path)
     if _is_cpu(device) and config.backbone == "compact":
         return forward.CompactRegressor(config, weights)
-    _need_torch(f"a network of the backbone {config.backbone} on {device}")
-    model = checkpoint.load(path, device).for_inference()
+    try:
+        model = checkpoint.load(path, device).for_inference()
+    except ModuleNotFoundError as error:
+        what = f"a network of the backbone {config.backbone} on {device}"
+        raise checkpoint.CheckpointError(f"{what} {NEEDS_TORCH}") from error
     return _OnOneThread(model) if _is_cpu(device) else model
 
 
 def load_things(path: Path | str | None = None, device: str = "cpu") -> ThingPredictor:
-    """A predictor of hulls, None for the network that ships; otherwise as :func:`load`."""
+    """A predictor of hulls, None for the network that ships; the device is one that :func:`checked_device` has seen.
+
+    Raises
+    ------
+    CheckpointError
+        As :func:`checkpoint.read`.
+    """
     if _is_cpu(device):
         return ThingPredictor(forward.CompactThings(*checkpoint.read(ThingConfig, path)))
-    _need_torch(f"a network of things on {device}")
     return ThingPredictor(checkpoint.load_things(path, device))
 
 
@@ -168,13 +171,6 @@ class _OnOneThread:
 
 def _is_cpu(device: str) -> bool:
     return device.partition(":")[0] == "cpu"
-
-
-def _need_torch(what: str) -> None:
-    try:
-        importlib.import_module("torch")
-    except ModuleNotFoundError as error:
-        raise checkpoint.CheckpointError(f"{what} {NEEDS_TORCH}") from error
 
 
 def checked_device(device: str) -> str:

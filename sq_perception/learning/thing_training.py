@@ -14,7 +14,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,8 +21,7 @@ import torch
 
 from sq_perception.geometry.support_directions import mirrored
 from sq_perception.learning import checkpoint, thing_network
-from sq_perception.learning.checkpoint import CheckpointError
-from sq_perception.learning.network_config import EXTENT, PLANE, RegressorConfig, ThingConfig, mirrored_planes
+from sq_perception.learning.network_config import mirrored_planes
 from sq_perception.learning.shard_training import Subject
 from sq_perception.learning.thing_network import HullPrediction, ThingNetwork
 from sq_perception.simulation.household import KINDS
@@ -35,8 +33,6 @@ _UNKNOWN_EXTENT = 0.1
 """Share of the views whose extent is hidden from the network."""
 _BATCH = 256
 """Views of a validation that are computed at once."""
-_MORE = (1, PLANE + EXTENT)
-"""Inputs that layers of a Regressor do not have: the channel of heights; plane and extent."""
 
 
 def hull_loss(
@@ -92,44 +88,9 @@ def _predictions(network: ThingNetwork, views: ThingViews) -> Iterator[tuple[tor
         yield true, network(*shown)
 
 
-def begin_with(network: ThingNetwork, path: Path) -> None:
-    """Take over the weights that fit by name and shape; those of a Regressor's first layers among them.
-
-    Raises
-    ------
-    CheckpointError
-        If the file cannot be read, is of another kind of network, or nothing in it fits.
-    """
-    kind: type[Any] = ThingConfig if checkpoint.predicts_hulls(path) else RegressorConfig
-    given = {name: torch.from_numpy(array) for name, array in checkpoint.read(kind, path)[1].items()}
-    if kind is RegressorConfig:  # it flattens there, and has one channel in and no plane
-        given = {n.replace("mixer.1.", "mixer.0.").replace("mixer.3.", "mixer.2."): given[n] for n in given}
-    taken = 0
-    with torch.no_grad():
-        for name, mine in network.state_dict().items():
-            theirs = given.get(name)
-            if theirs is None or theirs.ndim != mine.ndim:
-                continue
-            if theirs.shape == mine.shape:
-                mine.copy_(theirs)
-            elif mine.ndim > 1 and mine.shape[1] - theirs.shape[1] in _MORE and theirs.shape[0] == mine.shape[0]:
-                mine.zero_()
-                mine[:, : theirs.shape[1]].copy_(theirs)
-            else:
-                continue
-            taken += 1
-        for name, mine in network.body_head.named_parameters():  # a Regressor has one for each part of the body
-            heads = [f"{part}_head.{name}" for part in ("size", "shape", "translation", "rotation")]
-            if given.keys() >= set(heads):
-                mine.copy_(torch.cat([given[head] for head in heads]))
-    if taken == 0:
-        raise CheckpointError(f"{path}: none of its weights fits the network")
-
-
 def _new_network(start: str) -> ThingNetwork:
-    network = ThingNetwork()
-    if start:
-        begin_with(network, checkpoint.resolve(start))
+    network = checkpoint.load_things(start) if start else ThingNetwork()
+    network.config = replace(network.config, spread=1.0)  # that of the weights to come is set when the training ends
     return network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
 
 

@@ -1,4 +1,4 @@
-"""Train the regressor, with one of the losses of :mod:`sq_perception.learning.objective`.
+"""Train the regressor, with one of the losses of :mod:`sq_perception.learning.losses`.
 
 One linear script: take a batch, predict, compare, step.  Gradients are clipped; an exponential average of the weights
 is what is validated and saved.  Everything that changes lives in one state file, so that a run that was killed goes on
@@ -27,12 +27,11 @@ import torch
 from sq_perception.geometry.metrics import volume_iou
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.learning import checkpoint
-from sq_perception.learning.backbone import ResNet18
 from sq_perception.learning.dataset import POOL, ViewPool, ViewSource, draw_views
 from sq_perception.learning.disturbance import Disturbance, any_occluder
 from sq_perception.learning.fixed_set import FixedSet, ShuffledBatches
 from sq_perception.learning.inference import checked_device
-from sq_perception.learning.objective import Objective
+from sq_perception.learning.losses import Objective
 from sq_perception.learning.regressor import Regressor, RegressorConfig
 from sq_perception.learning.training_config import Plateau, TrainingConfig
 from sq_perception.learning.training_state import (
@@ -40,7 +39,6 @@ from sq_perception.learning.training_state import (
     TrainingState,
     made_by,
     mixed_precision,
-    read_tensors,
     recalibrate,
 )
 
@@ -209,11 +207,7 @@ def validate(
 
 def _new_network(config: TrainingConfig, form: RegressorConfig | None) -> Regressor:
     if not config.start:
-        model = Regressor(form or config.regressor())
-        if config.imagenet:
-            assert isinstance(model.features, ResNet18)
-            model.features.load_imagenet(read_tensors(Path(config.imagenet)))
-        return model
+        return Regressor(form or config.regressor())
     model = checkpoint.load(config.start)
     for name in _FORM:
         wanted, brought = getattr(config, name), getattr(model.config, name)

@@ -86,7 +86,7 @@ class TrainingConfig:
     """
 
     loss: str = "occupancy"
-    """What is minimised, by its name in :mod:`sq_perception.learning.objective`."""
+    """What is minimised, by its name in :mod:`sq_perception.learning.losses`."""
     backbone: str = "compact"
     """compact, or resnet18 as in the thesis."""
     framing: str = "cropped"
@@ -95,8 +95,6 @@ class TrainingConfig:
     """Side of the views: a multiple of 16 for compact, of 32 for resnet18; 256 in the thesis."""
     start: str = ""
     """A model file whose weights the network begins with; empty begins at random."""
-    imagenet: str = ""
-    """A ResNet-18 state dict trained on ImageNet (.safetensors) for resnet18 to begin with."""
     data: str = ""
     """Folder of a fixed set made by `sq-perception dataset`; empty draws and renders on the fly."""
     canonical_labels: bool = False
@@ -167,8 +165,6 @@ class TrainingConfig:
             raise ValueError("full frames are the thesis' images: orthographic, whole and clean")
         if self.data and (self.pinhole_share or self.wide_share or self.marks_hidden):
             raise ValueError("data: the views of a fixed set are drawn already: expected shares of 0")
-        if self.imagenet and self.backbone != "resnet18":
-            raise ValueError("imagenet: only resnet18 has the form of those weights")
 
     @property
     def marks_hidden(self) -> bool:

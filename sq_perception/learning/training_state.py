@@ -162,14 +162,6 @@ class TrainingState(Generic[Network]):
         self.step += 1
 
 
-def read_tensors(path: Path) -> dict[str, torch.Tensor]:
-    """Weights by their names; raises CheckpointError if the file cannot be read."""
-    try:
-        return load_file(str(path))
-    except (SafetensorError, OSError) as error:
-        raise CheckpointError(f"{path}: not a readable safetensors file: {error}") from error
-
-
 def recalibrate(model: nn.Module, views: torch.Tensor, batch: int) -> None:
     """Measure the means and variances of all normalisations anew, on ``views`` (n, 1, p, p).
 

@@ -6,7 +6,6 @@ listened to is here too.
 
 from __future__ import annotations
 
-import array
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, TypeAlias
@@ -130,15 +129,15 @@ def decode_by(info: CameraInfo | None, image: Image, topic: str) -> Frame:
     return decode(image, None if image.encoding in GREY_ENCODINGS else calibration)
 
 
-def image_topic(node: Node, name: str, transport: str) -> str:
-    """The topic to listen to for the images of ``name``, with the node's namespace and remappings.
+def image_topic(node: Node, transport: str) -> str:
+    """The topic to listen to for depth images, with the node's namespace and remappings.
 
-    The transport's part comes behind the remapped topic, unless that names it already.  Points have a topic beside it,
-    ``depth/points`` for ``depth/image``, which is remapped by itself.
+    The transport's part comes behind the remapped ``depth/image``, unless that names it already.  Points have a topic
+    of their own, ``depth/points``, which is remapped by itself.
     """
     if transport == POINTS:
-        return str(node.resolve_topic_name(f"{name.rpartition('/')[0]}/{POINTS}"))
-    resolved: str = node.resolve_topic_name(name)
+        return str(node.resolve_topic_name("depth/points"))
+    resolved: str = node.resolve_topic_name("depth/image")
     if transport == RAW or resolved.endswith(f"/{transport}"):
         return resolved
     return f"{resolved}/{transport}"
@@ -167,9 +166,3 @@ def size_of(message: DepthMessage) -> tuple[int, int]:
     if isinstance(message, CompressedImage):
         return compressed_depth.size(message.format, message.data)
     return int(message.width), int(message.height)
-
-
-def packed(depth: np.ndarray, header: Any, encoding: str = "16UC1") -> CompressedImage:
-    """A packed message of depth (height, width) in metres, NaN or inf for nothing; 16UC1 or 32FC1."""
-    image_format, data = compressed_depth.encode(depth, encoding)
-    return CompressedImage(header=header, format=image_format, data=array.array("B", data))

@@ -88,7 +88,7 @@ class Input:
     ) -> None:
         self._node, self._settings, self._is_wanted, self._statistics = node, settings, is_wanted, statistics
         transport = settings.current.image_transport
-        self.topic = image_topic(node, "depth/image", transport)
+        self.topic = image_topic(node, transport)
         """Of the depth images."""
         self._note = ""
         self._last_image = monotonic()

@@ -138,8 +138,8 @@ class Outputs:
                 self.optional.publish(shown, parameters, found.hidden)
             with timed(stages, "pictures"):
                 if self.markers.get_subscription_count():
-                    gone, by_score = self._marker_ids.replaced(shown.shown_ids), parameters.marker_colours == "score"
-                    self.markers.publish(shown.markers(gone, by_score, parameters.marker_alpha))
+                    gone = self._marker_ids.replaced(shown.shown_ids)
+                    self.markers.publish(shown.markers(gone, parameters.marker_alpha))
                     self._header = shown.header
                 if self.rendered_depth.get_subscription_count():
                     self.rendered_depth.publish(frame.encode(render_recovery(found.recovery, frame.camera)[0]))

@@ -18,11 +18,8 @@ from sq_perception.recovery.options import Method, RecoveryOptions
 from sq_perception.segmentation.options import Box, Pose
 from sq_perception.simulation.sensor_noise import IDEAL, PRESETS
 
-RAW = "raw"
-TRANSPORTS = (RAW, compressed_depth.TRANSPORT)
-"""As image_transport names them."""
-POINTS = "points"
-"""Depth images as clouds of points."""
+RAW, POINTS = "raw", "points"
+"""Plain images, and clouds of points, as image_transport names them."""
 EVERYWHERE = (-100.0, -100.0, -100.0, 100.0, 100.0, 100.0)
 
 
@@ -55,7 +52,7 @@ class RecoverParameters(Parameters):
         RAW,
         "How depth images come: raw on depth/image, compressedDepth (16 bit PNG or RVL) on "
         "depth/image/compressedDepth, points (sensor_msgs/PointCloud2, see docs/nodes.md) on depth/points.",
-        choices=(*TRANSPORTS, POINTS),
+        choices=(RAW, compressed_depth.TRANSPORT, POINTS),
         live=False,
     )
     distortion: Treatment = setting(
@@ -99,7 +96,6 @@ class RecoverParameters(Parameters):
         "tf2 frame that the bodies rest in, for a camera that moves. Empty: the camera stands still. A change ends the "
         "tracks.",
     )
-    marker_colours: str = setting("id", "By id, or by score from red (0) to green (1).", choices=("id", "score"))
     marker_alpha: float = setting(ALPHA, "Opacity of the markers' surfaces.", within=(0.0, 1.0))
     no_frame_warning: float = setting(
         5.0, "Warn when no depth image came for so long; 0 never warns.", unit="s", within=(0.0, 3600.0)
@@ -231,20 +227,13 @@ class SyntheticParameters(Parameters):
     path: str = setting("", "A recorded frame or a folder of them, for scene = replay.", live=False)
     camera_info_file: str = setting(
         "",
-        "camera_info YAML of recorded PNG depth images; also the camera of table scenes, which are published raw where "
-        "it distorts.",
+        "camera_info YAML of recorded PNG depth images; also the camera of table scenes, which show no distortion.",
         live=False,
     )
     projection: Projection = setting(
         "pinhole",
         "Camera model of recorded images: 8 bit orthographic images look like depth images.",
         choices=get_args(Projection),
-        live=False,
-    )
-    image_transport: str = setting(
-        RAW,
-        "compressedDepth: depth images are also published packed, on depth/image/compressedDepth.",
-        choices=TRANSPORTS,
         live=False,
     )
 
@@ -254,8 +243,6 @@ class SyntheticParameters(Parameters):
             self.check(self.scene == "thesis", f"scene = {self.scene}")
         elif not self.path:
             raise ParameterError("path: expected a recorded frame or a folder of them for scene = replay, got nothing")
-        if self.image_transport != RAW and (self.scene == "thesis" or self.encoding in GREY_ENCODINGS):
-            raise ParameterError(f"image_transport: expected {RAW} for grey images, got {self.image_transport}")
         if self.sensor != IDEAL and self.noise != 0:
             raise ParameterError(f"noise: expected 0 for sensor = {self.sensor}, which has its own, got {self.noise:g}")
 

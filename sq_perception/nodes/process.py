@@ -51,9 +51,8 @@ REMEDY = "pip install 'sq_perception[ros]', or source a ROS 2 Jazzy installation
 class Stoppable(Protocol):
     """An rclpy node that may fail to start, and has something to stop before it is destroyed."""
 
-    @property
-    def start_failure(self) -> str:
-        """Why the node cannot start, once it has found out; its process then ends."""
+    start_failure: str
+    """Why the node cannot start, once it has found out; its process then ends."""
 
     def close(self) -> bool:
         """Stop threads; called once, before destroy_node.  False if one of them could not be stopped."""

@@ -1,33 +1,29 @@
-"""Another node as the page sees it: its parameters, its lifecycle state, whether it is there.
+"""Another node as the page sees it: its parameters, and whether it is there.
 
 Services are called by tasks of the executor; a call without an answer is given up after a while, as the node may have
-died.  What is to be shown waits in its order, and the drawing thread takes it with :meth:`RemoteNode.show`.
+died.  Parameters are always read as a whole: when the node appears, and again soon after something may have changed.
+What is to be shown waits in its order, and the drawing thread takes it with :meth:`RemoteNode.show`.
 """
 
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable
 from time import monotonic
 from typing import Any
 
-from lifecycle_msgs.srv import GetState
-from rcl_interfaces.msg import ParameterEvent
 from rclpy.node import Node
 from rclpy.parameter import Parameter, parameter_value_to_python
 from rclpy.parameter_client import AsyncParameterClient
 from rclpy.task import Future
 
-from sq_perception.viewing.controls import control, plain
+from sq_perception.viewing.controls import control
 from sq_perception.viewing.page import Page
 
 _PATIENCE = 3.0
 """Seconds until a call is given up."""
-_LOOK_PERIOD = 0.5
-"""Seconds between two looks at whether the node is there, and at its lifecycle state."""
 _SETTLED = 0.4
-"""Seconds after the last of many parameter events until they are read: a node that starts sends one for each."""
+"""Seconds until parameters are read after a change: a node that starts sends an event for each."""
 
 
 class RemoteNode:
@@ -36,13 +32,9 @@ class RemoteNode:
     def __init__(self, node: Node, name: str) -> None:
         self.name = name
         self.is_there = False
-        self.lifecycle = ""
         self._node = node
         self._parameters = AsyncParameterClient(node, name)
-        self._state = node.create_client(GetState, f"{name}/get_state")
         self._deadlines: dict[Future, float] = {}
-        self._known: set[str] = set()
-        self._look_due = 0.0
         self._load_due: float | None = None
         self._news: deque[Callable[[Page], None]] = deque()
 
@@ -55,22 +47,20 @@ class RemoteNode:
         for call, deadline in tuple(self._deadlines.items()):
             if now > deadline:
                 call.cancel()  # nothing happens to one that is done
-        if now >= self._look_due:
-            self._look_due = now + _LOOK_PERIOD
-            self._look()
+        was_there, self.is_there = self.is_there, self._parameters.services_are_ready()
+        if self.is_there and not was_there:
+            self._load_due = now
         if self._load_due is not None and now >= self._load_due and self.is_there:
             self._load_due = None
             executor.create_task(self._load)
 
-    def on_event(self, event: ParameterEvent) -> None:
-        """Follow a message of /parameter_events of this node."""
-        if any(value.name not in self._known for value in event.new_parameters) or event.deleted_parameters:
+    def reload(self) -> None:
+        """Read the parameters again, soon: one may have changed, come or gone."""
+        if self._load_due is None:
             self._load_due = monotonic() + _SETTLED
-        values = [*event.new_parameters, *event.changed_parameters]
-        self._note_values({value.name: parameter_value_to_python(value.value) for value in values})
 
     async def change(self, name: str, value: Any) -> None:
-        """Ask for another value of a parameter; the node's answer is shown, and what it holds then."""
+        """Ask for another value of a parameter; the node's answer is shown, and then what it holds."""
         if not self.is_there:
             self._note(f"{name}: {self.name} is not there", False)
             return
@@ -82,27 +72,8 @@ class RemoteNode:
         result = response.results[0]
         # Not every reason of rclpy's own names its parameter.
         reason = result.reason if name in result.reason else f"{name}: {result.reason or 'refused'}"
-        self._note(f"{name} is now {plain(value)}" if result.successful else reason, result.successful)
-        with suppress(TimeoutError):
-            response = await self._answer(self._parameters.get_parameters([name]))
-            for value in response.values:  # none where there is no such parameter
-                self._note_values({name: parameter_value_to_python(value)})
-
-    def _look(self) -> None:
-        was_there, self.is_there = self.is_there, self._parameters.services_are_ready()
-        if self.is_there and not was_there:
-            self._load_due = monotonic()
-        if not self.is_there:
-            self.lifecycle = ""
-        elif self._state.service_is_ready():
-            call = self._state.call_async(GetState.Request())
-            self._deadlines[call] = monotonic() + _PATIENCE
-            call.add_done_callback(self._on_state)  # no task: one that is left at the end of the process complains
-
-    def _on_state(self, call: Future) -> None:
-        del self._deadlines[call]
-        if call.result() is not None:
-            self.lifecycle = str(call.result().current_state.label)
+        self._note(f"{name} is now {value}" if result.successful else reason, result.successful)
+        self.reload()
 
     async def _load(self) -> None:
         """Names, then descriptors, then values, then controls; all over again where an answer stays away."""
@@ -112,11 +83,11 @@ class RemoteNode:
             names = [descriptor.name for descriptor in described.descriptors]
             got = await self._answer(self._parameters.get_parameters(names))
         except TimeoutError:
-            self._load_due = monotonic() + _LOOK_PERIOD
+            self.reload()
             return
-        self._known = set(names)
         read = [parameter_value_to_python(value) for value in got.values]
-        controls = [control(*both) for both in zip(described.descriptors, read, strict=True)]
+        made = (control(*both) for both in zip(described.descriptors, read, strict=True))
+        controls = [each for each in made if each is not None]
         self._news.append(lambda page: page.show_controls(self.name, controls))
 
     async def _answer(self, call: Future) -> Any:
@@ -132,9 +103,6 @@ class RemoteNode:
 
     def _note(self, text: str, good: bool) -> None:
         self._news.append(lambda page: page.show_answer(self.name, text, good))
-
-    def _note_values(self, values: Mapping[str, Any]) -> None:
-        self._news.append(lambda page: page.show_values(self.name, values))
 
     # In the drawing thread
 

@@ -3,16 +3,12 @@
 | name | type | |
 | --- | --- | --- |
 | `depth/image` | sensor_msgs/Image | out: 32FC1 or 16UC1; mono8 or mono16 for orthographic frames |
-| `depth/image/compressedDepth` | sensor_msgs/CompressedImage | out, for `image_transport: compressedDepth`: packed |
 | `depth/camera_info` | sensor_msgs/CameraInfo | out: for pinhole frames |
 | `mask/image` | sensor_msgs/Image | out: label images (16UC1), where recordings have them or they are asked for |
 | `~/truth` | sensor_msgs/PointCloud2 | out: the bodies of generated scenes, in the message of the recovery |
 
 All carry the same stamp and frame.  Publishers are reliable, which best effort subscribers hear too.  The image goes
 last: whoever has it has the rest.
-
-A camera_info_file with distortion gives generated scenes a raw camera: the scene is rendered and measured as its
-rectified camera sees it, and distorted when it is published.
 """
 
 from __future__ import annotations
@@ -23,25 +19,19 @@ from typing import Any
 import numpy as np
 from rclpy.node import Node
 from rclpy.qos_overriding_options import QoSOverridingOptions
-from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2
+from sensor_msgs.msg import CameraInfo, Image, PointCloud2
 from std_msgs.msg import Header
 
-from sq_msgs_py.depth_image import (
-    GREY_ENCODINGS,
-    RawIntrinsics,
-    intrinsics_to_message,
-    labels_to_message,
-    raw_intrinsics_to_message,
-)
+from sq_msgs_py.depth_image import GREY_ENCODINGS, intrinsics_to_message, labels_to_message
 from sq_msgs_py.superquadrics import to_message
 from sq_perception.imaging.calibration import intrinsics
-from sq_perception.nodes.frame import image_topic, packed
 from sq_perception.nodes.live_parameters import LiveParameters
-from sq_perception.nodes.parameters import RAW, SyntheticParameters
+from sq_perception.nodes.parameters import SyntheticParameters
 from sq_perception.nodes.statistics import THROTTLE
 from sq_perception.recordings import camera_file, inputs
 from sq_perception.recordings.frame_source import FrameSource, SourceFrame, generated, recorded, recordings
 from sq_perception.recordings.publication import CAMERA_FRAME, CUBE_FRAME, depth_message, truth_array
+from sq_perception.simulation.scenes import TABLE_CAMERA
 
 
 def frame_source(parameters: SyntheticParameters) -> FrameSource:
@@ -60,13 +50,12 @@ def frame_source(parameters: SyntheticParameters) -> FrameSource:
         with_labels = parameters.masks != "never"
         count, make = len(paths), recorded(paths, info or None, parameters.projection, with_labels=with_labels)
     else:
-        calibration = camera_file.read_calibration(info) if info else None
         count = parameters.scenes
         make = generated(
             parameters.scene,
             parameters.seed,
             objects=parameters.objects,
-            calibration=calibration,
+            camera=camera_file.read_calibration(info, "ignore").camera if info else TABLE_CAMERA,
             with_labels=parameters.masks == "always",
         )
     source = FrameSource(make, count, seed=parameters.seed, hold=parameters.hold, loop=parameters.loop)
@@ -86,19 +75,14 @@ class SyntheticDepthNode(Node):
     def __init__(self, name: str, context: Any = None) -> None:
         super().__init__(name, context=context)
         self.start_failure = ""
-        self._settings = LiveParameters(self, SyntheticParameters, check=self._check)
+        self._settings = LiveParameters(self, SyntheticParameters, check=self._check, changed=self._keep_time)
         self._source = frame_source(self._settings.current)
-        replay = self._settings.current.scene == "replay"
         self._image = self._output(Image, "depth/image")
-        self._packed = None
-        if self._settings.current.image_transport != RAW:
-            topic = image_topic(self, "depth/image", self._settings.current.image_transport)
-            self._packed = self._output(CompressedImage, topic)
-        self._info = None if self._source.clean.is_cube else self._output(CameraInfo, "depth/camera_info")
+        self._info = self._output(CameraInfo, "depth/camera_info")
+        self._truth = self._output(PointCloud2, "~/truth")
+        # Where somebody publishes masks, images wait for them.
         self._mask = self._output(Image, "mask/image") if self._source.clean.labels is not None else None
-        self._truth = None if replay else self._output(PointCloud2, "~/truth")
-        self._rate = self._settings.current.rate
-        self._ticks = self.create_timer(1 / self._rate, self._tick)
+        self._ticks = self.create_timer(1 / self._settings.current.rate, self._tick)
         self.get_logger().info(f"publishing {self._settings.current.scene} frames on {self._image.topic_name}")
 
     def close(self) -> bool:
@@ -108,15 +92,15 @@ class SyntheticDepthNode(Node):
     def _check(self, parameters: SyntheticParameters, _: frozenset[str]) -> None:
         parameters.check(self._source.clean.is_cube, self._source.clean.name)
 
+    def _keep_time(self, parameters: SyntheticParameters, _: frozenset[str]) -> None:
+        self._ticks.timer_period_ns = int(1e9 / parameters.rate)
+
     def _output(self, kind: type[Any], topic: str) -> Any:
         options = QoSOverridingOptions.with_default_policies()
         return self.create_publisher(kind, topic, 2, qos_overriding_options=options)
 
     def _tick(self) -> None:
         settings = self._settings.current
-        if settings.rate != self._rate:
-            self._rate = settings.rate
-            self._ticks.timer_period_ns = int(1e9 / self._rate)
         try:
             frame = self._source.next(settings.noise, settings.sensor)
             if frame is not None:
@@ -133,28 +117,13 @@ class SyntheticDepthNode(Node):
         header = Header(stamp=self.get_clock().now().to_msg(), frame_id=frame_id)
         fitting = GREY_ENCODINGS if frame.is_cube else ("32FC1", "16UC1")
         encoding = settings.encoding if settings.encoding in fitting else fitting[0]
-        if self._truth is not None and frame.truth is not None:
+        if frame.truth is not None:
             self._truth.publish(to_message(truth_array(frame.truth), header))
         if not frame.is_cube:
-            if self._info is None:
-                self._info = self._output(CameraInfo, "depth/camera_info")
-            self._info.publish(_camera_info(frame, header))
-        depth, labels = frame.depth, frame.labels
-        if frame.calibration is not None:
-            depth = frame.calibration.as_sent(depth)
-            labels = None if labels is None else frame.calibration.labels_as_sent(labels)
-        if labels is not None:
+            self._info.publish(intrinsics_to_message(intrinsics(frame.camera), header))
+        if frame.labels is not None:
             if self._mask is None:
                 self._mask = self._output(Image, "mask/image")
-            wide = labels.max(initial=0) > np.iinfo(np.uint16).max
-            self._mask.publish(labels_to_message(labels, header, "32SC1" if wide else "16UC1"))
-        if self._packed is not None and not frame.is_cube and self._packed.get_subscription_count():
-            self._packed.publish(packed(depth, header, encoding))
-        self._image.publish(depth_message(depth, header, encoding))
-
-
-def _camera_info(frame: SourceFrame, header: Header) -> CameraInfo:
-    if frame.calibration is None or frame.calibration.rectification is None:
-        return intrinsics_to_message(intrinsics(frame.camera), header)
-    raw, lens = frame.calibration.rectification.raw, frame.calibration.rectification.distortion
-    return raw_intrinsics_to_message(RawIntrinsics(intrinsics(raw), lens.model, lens.coefficients), header)
+            wide = frame.labels.max(initial=0) > np.iinfo(np.uint16).max
+            self._mask.publish(labels_to_message(frame.labels, header, "32SC1" if wide else "16UC1"))
+        self._image.publish(depth_message(frame.depth, header, encoding))

@@ -1,7 +1,7 @@
 """The node behind ``sq-perception view``: listens to a camera and some frame nodes, and keeps what a page shows.
 
 Images, camera_info and superquadrics are subscribed to while a browser shows the page, /diagnostics and
-/parameter_events always; parameters and lifecycle go by services (:mod:`sq_perception.nodes.remote_node`).
+/parameter_events always; parameters go by services (:mod:`sq_perception.nodes.remote_node`).
 
 The executor's thread stores messages and talks to services; one drawing thread decodes the newest and draws them, at a
 limited rate and only while a browser shows the page.
@@ -51,11 +51,10 @@ _DRAWER_END = 5.0
 
 
 class _Result(NamedTuple):
-    """Superquadrics, when they came, in seconds of the monotonic clock, and after how many milliseconds."""
+    """Superquadrics, and when they came, in seconds of the monotonic clock."""
 
     message: PointCloud2
     time: float
-    latency: float | None
 
 
 class ViewNode(Node):
@@ -96,7 +95,7 @@ class ViewNode(Node):
         self._inputs: list[Subscription] = []
         self._latched: Subscription | None = None
         self._drawn: Image | None = None
-        self._shown: dict[str, _Result | None] = {}
+        self._shown: dict[str, _Result] = {}
         """The result of each node that was drawn last."""
         self._status_due = 0.0
         self._remote = {name: RemoteNode(self, name) for name in nodes}
@@ -173,20 +172,18 @@ class ViewNode(Node):
             self._news.set()
 
     def _on_result(self, name: str, message: PointCloud2) -> None:
-        milliseconds = 1e-6 * (self.get_clock().now().nanoseconds - stamp_of(message))
-        latency = milliseconds if 0 <= milliseconds < 60e3 else None
-        self._results[name] = _Result(message, monotonic(), latency)
+        self._results[name] = _Result(message, monotonic())
         self._news.set()
 
     def _on_diagnostics(self, message: DiagnosticArray) -> None:
         for status in message.status:
             for name in self._remote:
-                if status.hardware_id == name or status.name.split(":")[0].strip() == name.lstrip("/"):
+                if status.hardware_id == name:
                     self._diagnosed[name] = {pair.key: pair.value for pair in status.values}
 
     def _on_parameter_event(self, event: ParameterEvent) -> None:
         if event.node in self._remote:
-            self._remote[event.node].on_event(event)
+            self._remote[event.node].reload()
 
     # The drawing thread
 
@@ -217,18 +214,19 @@ class ViewNode(Node):
         with self._lock:
             images = list(self._images.values())
             rate = sum(1 for time in self._arrivals if now - time <= _RATE_SECONDS) / _RATE_SECONDS
-        header = self._draw_depth(images, rate, results, status_due)
+        header = self._draw_depth(images, rate, results)
         for name in self._remote:
-            self._draw_node(name, results.get(name), header, status_due)
+            if status_due or results.get(name) is not self._shown.get(name):
+                self._draw_node(name, results.get(name), header)
+        self._shown = results
         if status_due:
             self._status_due = monotonic() + _STATUS_PERIOD
 
-    def _draw_depth(self, images: list[Image], rate: float, results: dict[str, _Result], status_due: bool) -> Any:
+    def _draw_depth(self, images: list[Image], rate: float, results: dict[str, _Result]) -> Any:
         """Draw the image that belongs to the newest results, else the newest; the header of what is drawn."""
         topic = self._topics[0]
         if not images:
-            if status_due:
-                self._page.show_source(tables.source_status(topic, None, 0.0, "", "no depth image has come yet"))
+            self._page.show_source(tables.source_status(topic, None, 0.0, "", "no depth image has come yet"))
             return None
         stamps = {
             stamp_of(result.message) for result in results.values() if monotonic() - result.time < tables.SILENT_SECONDS
@@ -242,25 +240,17 @@ class ViewNode(Node):
                 self._drawn = image
             except ValueError as error:
                 remark = str(error)
-        if status_due or remark:
-            self._page.show_source(tables.source_status(topic, size_of(image), rate, image.header.frame_id, remark))
+        self._page.show_source(tables.source_status(topic, size_of(image), rate, image.header.frame_id, remark))
         return image.header
 
-    def _draw_node(self, name: str, result: _Result | None, header: Any, status_due: bool) -> None:
-        if result is self._shown.get(name) and not status_due:
-            return
-        self._shown[name] = result
-        remote = self._remote[name]
-        diagnostics = self._diagnosed.get(name, {}) if remote.is_there else {}
-        state = NodeState(name, lifecycle=remote.lifecycle, diagnostics=diagnostics, is_there=remote.is_there)
-        bodies, stamp = None, 0.0
+    def _draw_node(self, name: str, result: _Result | None, header: Any) -> None:
+        is_there = self._remote[name].is_there
+        state = NodeState(name, diagnostics=self._diagnosed.get(name, {}) if is_there else {}, is_there=is_there)
+        bodies = None
         if result is not None:
             bodies, remark = self._converted(result.message, header)
-            stamp = 1e-9 * stamp_of(result.message)
-            state = replace(state, age=monotonic() - result.time, latency=result.latency, remark=remark)
-        self._page.show_bodies(name, bodies, stamp, state)
-        if status_due:
-            self._page.show_state(state)
+            state = replace(state, age=monotonic() - result.time, remark=remark)
+        self._page.show_bodies(bodies, state)
 
     def _converted(self, message: PointCloud2, header: Any) -> tuple[Bodies | None, str]:
         """The bodies in the frame of the depth image, and why they cannot be drawn."""

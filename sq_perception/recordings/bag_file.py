@@ -154,7 +154,8 @@ class RecordedBag:
             self._reader = opened.enter_context(closing(BagReader(self._path)))
             self.topic = self._chosen(self._options.topic)
             self._info_topic = camera_info_topic(self.topic)
-            self._mask_topics = self._found_masks()
+            others = {connection.topic for connection in self._reader.connections(IMAGE)} - {self.topic}
+            self._mask_topics = sorted(topic for topic in others if topic.endswith(_MASKS))
             self._masks = opened.enter_context(closing(self._recorded_masks()))
             self._unread: FrameError | None = None
             self._passed: dict[Stamp, int] = {}
@@ -253,10 +254,6 @@ class RecordedBag:
         return None
 
     # frames
-
-    def _found_masks(self) -> list[str]:
-        topics = {connection.topic for connection in self._reader.connections(IMAGE)} - {self.topic}
-        return sorted(topic for topic in topics if topic.endswith(_MASKS))
 
     def _recorded_masks(self, received: int | None = None) -> Generator[Message | FrameError, None, None]:
         """The messages of the mask topic, in a reading of their own, as they come at any distance from their images."""

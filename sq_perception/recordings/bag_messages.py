@@ -23,6 +23,7 @@ _DECLARED = {"geometry_msgs/msg/Quaternion": {"w": 1.0}}
 
 @cache
 def _store() -> Any:
+    """One table of types, which keeps the code that it makes for each."""
     return get_typestore(Stores.ROS2_JAZZY)
 
 

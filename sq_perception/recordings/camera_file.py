@@ -36,6 +36,7 @@ _LONGEST = 2**12
 """Bytes of a file that holds nothing but a matrix."""
 _SKEW = 1e-6
 """Of fx; no depth camera in use has any."""
+_WIDTH, _HEIGHT = ("image_width", "width"), ("image_height", "height")
 _MATRIX, _PROJECTION = ("camera_matrix", "k", "K", "cam_K"), ("projection_matrix", "p", "P")
 _NO_DISTORTION = ("none", "")
 _BROWN_CONRADY = ("brown conrady", "inverse brown conrady", "modified brown conrady")
@@ -98,35 +99,26 @@ def read_camera_info(source: str | Path, size: tuple[int, int] | None = None) ->
     ------
     FrameError
     """
-    if size is not None and not os.path.exists(source) and (numbers := _four_numbers(str(source))) is not None:
-        fx, fy, cx, cy = numbers
-        matrix = (fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0)
-        return CameraInfo(*size, "plumb_bob", (), matrix, (0.0,) * 12, 0, 0, Region())
     try:
-        return _camera_info(Path(source), size)
+        four = None if size is None or os.path.exists(source) else _four_numbers(str(source))
+        return _camera_info(_mapping(Path(source)) if four is None else four, size)
     except (plain_yaml.YamlError, FrameError) as error:
         raise FrameError(f"{source}: cannot read the camera_info: {error}") from error
 
 
-def _camera_info(path: Path, size: tuple[int, int] | None) -> CameraInfo:
-    rows = _rows(path)
-    if rows is not None:
-        info: Any = {"k": rows}
-    elif path.suffix.lower() == ".json":
-        info = _read_json(path)
-    else:
-        info = next((entry for entry in plain_yaml.read_all(path) if entry is not None), None)
+def _camera_info(info: Any, size: tuple[int, int] | None) -> CameraInfo:
     if not isinstance(info, dict):
         raise FrameError("expected a camera_info as a YAML mapping, or 3 x 3 numbers")
-    info = {**info, "k": _of_four(info)} if info.keys() >= {"fx", "fy", "cx", "cy"} else info
-    has_size = bool(info.keys() & {"image_width", "width", "image_height", "height"})
-    if size is not None and not has_size and info.keys() & {*_MATRIX, *_PROJECTION}:
+    if info.keys() >= {"fx", "fy", "cx", "cy"}:
+        info = {**info, "k": [info["fx"], 0, info["cx"], 0, info["fy"], info["cy"], 0, 0, 1]}
+    has_matrix = bool(info.keys() & {*_MATRIX, *_PROJECTION})
+    if size is not None and has_matrix and not info.keys() & {*_WIDTH, *_HEIGHT}:
         info = {**info, "width": size[0], "height": size[1]}
-    width, height = (_size(info, names) for names in (("image_width", "width"), ("image_height", "height")))
+    width, height = _size(info, _WIDTH), _size(info, _HEIGHT)
     matrix = _matrix(info, _MATRIX, 9)
     distortion = _matrix(info, ("distortion_coefficients", "d", "D"), None)
     projection = _matrix(info, _PROJECTION, 12)
-    if not info.keys() & {*_MATRIX, *_PROJECTION}:
+    if not has_matrix:
         raise FrameError("expected a camera_matrix (or k) of 9 numbers, or a projection_matrix (or p) of 12")
     if matrix[6:8].any() and not matrix[[2, 5]].any():
         raise FrameError("camera matrix: expected 0 0 1 in its last row; it seems to be transposed")
@@ -146,6 +138,15 @@ def _camera_info(path: Path, size: tuple[int, int] | None) -> CameraInfo:
         _count(info, "binning_y"),
         Region(*(_count(region, name) for name in ("x_offset", "y_offset", "width", "height"))),
     )
+
+
+def _mapping(path: Path) -> Any:
+    """What a file holds, by the names of a camera_info; a mapping if it is one of the forms that are known."""
+    if (rows := _rows(path)) is not None:
+        return {"k": rows}
+    if path.suffix.lower() == ".json":
+        return _read_json(path)
+    return next((entry for entry in plain_yaml.read_all(path) if entry is not None), None)
 
 
 def _rows(path: Path) -> list[float] | None:
@@ -171,18 +172,12 @@ def _rows(path: Path) -> list[float] | None:
     return [float(number) for number in matrix[:3, :3].ravel()]
 
 
-def _of_four(info: dict[Any, Any]) -> list[Any]:
-    """The matrix, row by row, of the four numbers that a mapping names."""
-    return [info["fx"], 0, info["cx"], 0, info["fy"], info["cy"], 0, 0, 1]
-
-
-def _four_numbers(text: str) -> list[float] | None:
+def _four_numbers(text: str) -> dict[str, float] | None:
     """fx, fy, cx, cy of a text such as ``525,525,319.5,239.5``; None if it is another text, such as a path."""
     try:
-        numbers = [float(part) for part in text.split(",")]
+        return dict(zip(("fx", "fy", "cx", "cy"), map(float, text.split(",")), strict=True))
     except ValueError:
         return None
-    return numbers if len(numbers) == 4 else None
 
 
 def _read_json(path: Path) -> dict[str, Any]:

@@ -14,9 +14,9 @@ those of the TUM RGB-D benchmark, whose PNGs have 5000 units a metre: they are r
 is given.  ``Reading.scale`` goes before all of these units.  A camera_info is a YAML, or one of the forms of
 :mod:`sq_perception.recordings.camera_file`.
 
-The cube is the thesis' unit cube, :mod:`sq_perception.imaging.unit_cube`.  An NPZ may bring ``labels`` (h, w), a
-support ``plane`` (4,), and the text "orthographic" as ``projection``, which goes before the caller's.  Nothing
-in a file is executed: no pickle, plain YAML only; and nothing is unpacked that is larger than any camera's image.
+The cube is the thesis' unit cube, :mod:`sq_perception.imaging.unit_cube`.  An NPZ may bring ``labels`` (h, w)
+and the text "orthographic" as ``projection``, which goes before the caller's.  Nothing in a file is executed: no
+pickle, plain YAML only; and nothing is unpacked that is larger than any camera's image.
 
 Whether a PNG is raw and its distortion has to be undone is decided by :mod:`sq_perception.imaging.calibration`.
 
@@ -72,8 +72,6 @@ class RecordedFrame:
         Instance masks, 0 for background.
     name : str
         The file's name; of a frame in a bag, the bag's and the stamp.
-    plane : (4,) or None
-        Support plane of the recording, height above it = n.p + d.
     stamp : Stamp or None
         When it was taken, where the recording knows.
     topic, frame_id : str
@@ -92,7 +90,6 @@ class RecordedFrame:
     camera: Camera
     labels: np.ndarray | None
     name: str
-    plane: np.ndarray | None = None
     stamp: Stamp | None = None
     topic: str = ""
     frame_id: str = ""
@@ -259,8 +256,6 @@ def _read(
     if image.ndim != 2 or not image.size:
         raise ValueError(f"expected an image (height, width), got {image.shape}")
     if projection == "orthographic":
-        if image.dtype not in (np.uint8, np.uint16):
-            raise ValueError(f"expected 8 or 16 bit, got {image.dtype}")
         depth, camera = unit_cube.depth_from_grey(image), unit_cube.camera(image.shape[1], image.shape[0])
         encoding = "mono8" if image.dtype == np.uint8 else "mono16"
         return RecordedFrame(depth, camera, reading.labels(path.stem, image), path.name, encoding=encoding)
@@ -326,11 +321,11 @@ def _likely_mistake(frame: RecordedFrame) -> str:
 
 
 def _read_npz(path: Path, projection: Projection, reading: Reading) -> RecordedFrame:
-    wanted = ("depth", "K", "plane", "projection") + ("labels",) * (not reading.ignore_masks)
+    wanted = ("depth", "K", "projection") + ("labels",) * (not reading.ignore_masks)
     fields = npz_arrays(path, wanted)
     if "depth" not in fields:
         raise ValueError("expected a field 'depth' in metres")
-    depth, labels, plane = fields["depth"], fields.get("labels"), fields.get("plane")
+    depth, labels = fields["depth"], fields.get("labels")
     if depth.ndim != 2 or depth.dtype.kind != "f" or depth.size == 0:
         raise ValueError(f"depth: expected floats (height, width) in metres, got {depth.dtype} {depth.shape}")
     if labels is not None:
@@ -352,11 +347,7 @@ def _read_npz(path: Path, projection: Projection, reading: Reading) -> RecordedF
         camera = Camera.from_matrix(fields["K"], width, height)
     except (ValueError, TypeError) as error:
         raise ValueError(f"K: {error}") from error
-    if plane is not None:
-        if plane.shape != (4,) or plane.dtype.kind not in "fiu" or not np.isfinite(plane).all():
-            raise ValueError(f"plane: expected four finite numbers, got {plane.dtype} {plane.shape}")
-        plane = plane.astype(float)
-    return RecordedFrame(_metres(depth, reading.scale or 1.0), camera, labels, path.name, plane=plane, encoding="32FC1")
+    return RecordedFrame(_metres(depth, reading.scale or 1.0), camera, labels, path.name, encoding="32FC1")
 
 
 def _metres(values: np.ndarray, scale: float) -> np.ndarray:

@@ -15,11 +15,10 @@ import numpy as np
 
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
-from sq_perception.imaging.calibration import Calibration
-from sq_perception.imaging.camera import Projection
+from sq_perception.imaging.camera import Camera, Projection
 from sq_perception.recordings import bag_file, frame_file, inputs
 from sq_perception.recordings.frame_file import RecordedFrame
-from sq_perception.simulation.scenes import table_scene, thesis_scene
+from sq_perception.simulation.scenes import TABLE_CAMERA, table_scene, thesis_scene
 from sq_perception.simulation.sensor_noise import IDEAL, Ideal, preset
 
 _SCENES, _NOISE = 1, 2
@@ -34,12 +33,9 @@ class SourceFrame(RecordedFrame):
     ----------
     truth : Superquadric or None
         The bodies (n,) in the frame that results are published in: cube frame if ``is_cube``, else optical frame.
-    calibration : Calibration or None
-        Of the camera that publishes the image, where that distorts.
     """
 
     truth: Superquadric | None = None
-    calibration: Calibration | None = None
 
 
 Maker = Callable[[int], SourceFrame]
@@ -91,25 +87,23 @@ def generated(
     seed: int,
     *,
     objects: int,
-    calibration: Calibration | None,
-    with_labels: bool,
+    camera: Camera = TABLE_CAMERA,
+    with_labels: bool = False,
 ) -> Maker:
-    """Random scenes: a thesis' image, or ``objects`` on a table before the camera of ``calibration``."""
+    """Random scenes: a thesis' image, or ``objects`` on a table before a ``camera``."""
 
     def make(position: int) -> SourceFrame:
         rng = np.random.default_rng([seed, _SCENES, position])
         if scene == "thesis":
             made = thesis_scene(rng)
-            truth, distorting = unit_cube.cube_from_optical(made.bodies), None
+            truth = unit_cube.cube_from_optical(made.bodies)
         else:
-            options = {} if calibration is None else {"camera": calibration.camera}
-            made = table_scene(rng, objects, **options)
+            made = table_scene(rng, objects, camera)
             truth = made.bodies
-            distorting = None if calibration is None or calibration.rectification is None else calibration
         depth, labels = made.render()
         shown = labels if with_labels else None
         name = f"{scene} scene {position}"
-        return SourceFrame(depth, made.camera, shown, name, truth=truth, calibration=distorting)
+        return SourceFrame(depth, made.camera, shown, name, truth=truth)
 
     return make
 

@@ -67,9 +67,7 @@ class RecordedInput:
             # Auto depends on what the images are called.
             treatment = "ignore" if self._options.distortion == "auto" else self._options.distortion
             camera_file.read_calibration(self._options.camera_info, treatment, size=ANY_SIZE)
-        self._sources: list[_Source] = []
-        for name in names:
-            self._add(name)
+        self._sources = [source for name in names for source in self._named(name)]
         self.total = len(self._sources)
         """Frames to expect; a bag counts as one until it is opened."""
 
@@ -94,20 +92,17 @@ class RecordedInput:
             else:
                 yield str(path), self._file(path, rest)
 
-    def _add(self, name: str) -> None:
+    def _named(self, name: str) -> list[_Source]:
         if not name:  # a variable of a shell that is not set: the current folder is called "."
-            self._sources.append((Path(), FrameError("expected the name of a file or folder, got an empty one")))
-            return
+            return [(Path(), FrameError("expected the name of a file or folder, got an empty one"))]
         path = Path(name)
         try:
             if not path.is_dir() or bag_file.is_bag(path):
-                self._sources.append((path, self._options.camera_info or camera_beside(path)))
-                return
+                return [(path, self._options.camera_info or camera_beside(path))]
         except OSError as error:  # a folder that may not be looked into, a name that is too long
-            self._sources.append((path, FrameError(str(error))))
-            return
-        found = self._in_folders(path, None)
-        self._sources += found or [(path, FrameError(f"{path}: no frames in it ({', '.join(SUFFIXES)})"))]
+            return [(path, FrameError(str(error)))]
+        nothing = FrameError(f"{path}: no frames in it ({', '.join(SUFFIXES)})")
+        return self._in_folders(path, None) or [(path, nothing)]
 
     def _in_folders(self, folder: Path, above: str | Path | None) -> list[_Source]:
         """The frames of a folder, or of those in it, with their camera, which may be that of the folder ``above``."""

@@ -36,10 +36,10 @@ CAMERA_FRAME, CUBE_FRAME = "camera_depth_optical_frame", "unit_cube"
 _GREY_TYPES: dict[str, type[np.unsignedinteger]] = {"mono8": np.uint8, "mono16": np.uint16}
 _SHAPE, _CENTRE, _TURN, _CENTRE_AND_TURN = slice(3, 5), slice(5, 8), slice(8, 11), slice(5, 11)
 """Of a body's covariance: its exponents, its centre in the optical frame and its rotation vector in its own."""
+_OF_A_BODY = ("size", "shape", "translation", "rotation")
+"""Columns of a message that are attributes of superquadrics of the same name."""
 _OF_EACH_BODY = ("score", "residual", "sigma_size", "status", "label")
 """Columns of a message that are attributes of a recovery of the same name."""
-_WORST, _BEST = np.array([0.80, 0.20, 0.15]), np.array([0.20, 0.65, 0.30])
-
 
 Mesh = tuple[np.ndarray, np.ndarray]
 """Vertices (k, 3) and faces (m, 3) of vertex indices."""
@@ -173,13 +173,12 @@ class Findings:
     def markers(
         self,
         previous_ids: Iterable[int] = (),
-        by_score: bool = False,
         alpha: float = ALPHA,
         types: MessageTypes = installed,
     ) -> Any:
         """A MarkerArray of the bodies that did not fail; markers of ``previous_ids`` that are gone are deleted.
 
-        Colours are by id, or by score from red (0) to green (1); ``alpha`` is their opacity.
+        Colours are by id; ``alpha`` is their opacity.
         """
         shown = self.array.recovered
         turns = poses.matrices(poses.unit_quaternions(shown.rotation))
@@ -188,13 +187,7 @@ class Findings:
             turn, centre = turns[k].T, shown.translation[k].astype(float)
             lines = outline(Superquadric.at_origin(shown.size[k], shown.shape[k]))
             surfaces.append((vertices @ turn + centre, faces, lines @ turn + centre))
-        colours = None
-        if by_score:
-            share = np.clip(np.nan_to_num(shown.score), 0, 1)[:, None]
-            colours = (1 - share) * _WORST + share * _BEST
-        return markers(
-            surfaces, self.shown_ids, self.header, colours=colours, alpha=alpha, previous_ids=previous_ids, types=types
-        )
+        return markers(surfaces, self.shown_ids, self.header, alpha=alpha, previous_ids=previous_ids, types=types)
 
 
 def findings(found: Identified, header: Any, is_cube: bool) -> Findings:
@@ -221,10 +214,7 @@ def superquadric_array(found: Identified, is_cube: bool) -> SuperquadricArray:
     centres = np.swapaxes(turns, 1, 2) @ covariances[:, _CENTRE, _CENTRE] @ turns
     deviations = np.sqrt(np.einsum("nii->ni", covariances))
     return SuperquadricArray(
-        size=bodies.size,
-        shape=bodies.shape,
-        translation=bodies.translation,
-        rotation=bodies.rotation,
+        **{name: getattr(bodies, name) for name in _OF_A_BODY},
         id=np.array(found.ids),
         **{name: np.array([getattr(body, name) for body in recovery.bodies]) for name in _OF_EACH_BODY},
         **{name: np.array(values, np.uint32) for name, values in found.columns.items()},
@@ -236,8 +226,7 @@ def superquadric_array(found: Identified, is_cube: bool) -> SuperquadricArray:
 
 def superquadrics(array: SuperquadricArray) -> Superquadric:
     """The bodies (n,) of a message, in its frame."""
-    columns = (array.size, array.shape, array.translation, array.rotation)
-    return Superquadric(*(column.astype(float) for column in columns))
+    return Superquadric(**{name: getattr(array, name).astype(float) for name in _OF_A_BODY})
 
 
 def drawn(array: SuperquadricArray, bodies: Superquadric) -> Bodies:
@@ -273,10 +262,7 @@ def truth_array(bodies: Superquadric) -> SuperquadricArray:
     """A batch (n,) of known bodies: score 1, residual and deviations 0, ids 1 to n."""
     count = len(bodies)
     return SuperquadricArray(
-        size=bodies.size,
-        shape=bodies.shape,
-        translation=bodies.translation,
-        rotation=bodies.rotation,
+        **{name: getattr(bodies, name) for name in _OF_A_BODY},
         score=np.ones(count),
         residual=np.zeros(count),
         sigma_size=np.zeros((count, 3)),

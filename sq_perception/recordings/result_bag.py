@@ -95,11 +95,7 @@ class ResultBag:
         self._last = Stamp(0, 0)
         self._output = OutputFile(self._path, f"{self._path.name}.partial")
         self._raw = self._output.partial.open("wb")
-        try:
-            self._file = McapFile(self._raw, "sq_perception", bag_messages.definition)
-        except BaseException:
-            self._discard()
-            raise
+        self._file = McapFile(self._raw, "sq_perception", bag_messages.definition)
 
     def __enter__(self) -> ResultBag:
         return self
@@ -135,7 +131,7 @@ class ResultBag:
         try:
             self._file.add(group, min(max(received, 0), LATEST))
         except OSError as error:
-            place = self._end(whole=False)
+            place = self.close(whole=False)
             written = self._file.groups
             kept = f"the first {written} of {self._frames} frames are kept" if written else "nothing is kept"
             raise OSError(error.errno, f"{_reason(error)}; {kept}", str(place or self._path)) from error
@@ -154,7 +150,21 @@ class ResultBag:
         OSError
             As :meth:`add`.
         """
-        return None if self._raw.closed else self._end(whole)
+        if self._raw.closed:
+            return None
+        if not self._file.groups:
+            self._raw.close()
+            self._output.discard()
+            return None
+        try:
+            self._file.finish()
+            self._raw.close()
+        except OSError as error:
+            with suppress(OSError):  # what was left in its buffer has no more room
+                self._raw.close()
+            text = f"{_reason(error)}; kept without an index, from which 'mcap recover' makes a file"
+            raise OSError(error.errno, text, str(self._output.keep())) from error
+        return self._output.commit(whole)
 
     # frames
 
@@ -193,27 +203,6 @@ class ResultBag:
             return frame.stamp
         last = self._last.sec * _SECOND + self._last.nanosec
         return Stamp(*divmod(min(last + round(INTERVAL * _SECOND), _LAST_SECOND * _SECOND), _SECOND))
-
-    # the end
-
-    def _end(self, whole: bool) -> Path | None:
-        """Close the file and name it; no file where there is no frame."""
-        if not self._file.groups:
-            self._discard()
-            return None
-        try:
-            self._file.finish()
-            self._raw.close()
-        except OSError as error:
-            with suppress(OSError):  # what was left in its buffer has no more room
-                self._raw.close()
-            text = f"{_reason(error)}; kept without an index, from which 'mcap recover' makes a file"
-            raise OSError(error.errno, text, str(self._output.keep())) from error
-        return self._output.commit(whole)
-
-    def _discard(self) -> None:
-        self._raw.close()
-        self._output.discard()
 
 
 def _reason(error: OSError) -> str:

@@ -12,10 +12,9 @@ import csv
 import errno
 import io
 import json
-import math
 import os
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -64,35 +63,39 @@ def frame_entry(
         bodies.append(
             {
                 **_parameters(superquadric),
-                "score": _number(body.score),
-                "residual": _number(body.residual),
-                "sigma_size": _numbers(body.sigma_size),
-                "seen": _numbers(body.seen),
+                "score": body.score,
+                "residual": body.residual,
+                "sigma_size": body.sigma_size,
+                "seen": body.seen,
                 "status": body.status.name.lower(),
                 "message": body.message,
-                "label": int(body.label) if has_masks else None,
-                "pixels": int(body.pixels),
+                "label": body.label if has_masks else None,
+                "pixels": body.pixels,
                 "track": None if track is None else _track_entry(track, frame.is_cube),
             }
         )
-    return {
+    entry = {
         "file": file,
-        "ms": _number(recovery.milliseconds["total"]),
+        "ms": recovery.milliseconds["total"],
         "superquadrics": bodies,
         "coordinates": "cube" if frame.is_cube else "optical",
         "camera": {
             "projection": frame.camera.projection,
             "width": frame.camera.width,
             "height": frame.camera.height,
-            "K": _numbers(frame.camera.matrix.ravel()),
+            "K": frame.camera.matrix.ravel(),
         },
         "message": recovery.message,
-        "ms_by_stage": {stage: _number(value) for stage, value in recovery.milliseconds.items()},
-        "plane": None if recovery.plane is None else _numbers(recovery.plane),
+        "ms_by_stage": recovery.milliseconds,
+        "plane": recovery.plane,
         "stamp": None if frame.stamp is None else frame.stamp._asdict(),
         "topic": frame.topic or None,
         "frame_id": frame.frame_id or None,
     }
+    # Plain numbers and lists for those of NumPy, and null for NaN and infinity, which JSON does not know.
+    text = json.dumps(entry, default=lambda value: value.tolist())
+    plain: dict[str, Any] = json.loads(text, parse_constant=lambda _: None)
+    return plain
 
 
 def _track_entry(track: Followed, is_cube: bool) -> dict[str, Any]:
@@ -104,7 +107,7 @@ def _track_entry(track: Followed, is_cube: bool) -> dict[str, Any]:
         "seen": track.seen,
         "fused": track.is_fused,
         **_parameters(body),
-        "sigma_size": _numbers(track.sigma_size),
+        "sigma_size": track.sigma_size,
     }
 
 
@@ -113,17 +116,8 @@ def in_result_frame(body: Superquadric, is_cube: bool) -> Superquadric:
     return unit_cube.cube_from_optical(body).canonical_form() if is_cube else body
 
 
-def _parameters(body: Superquadric) -> dict[str, list[float | None]]:
-    return {name: _numbers(getattr(body, name)) for name in ("size", "shape", "translation", "rotation")}
-
-
-def _numbers(values: Iterable[float]) -> list[float | None]:
-    return [_number(value) for value in values]
-
-
-def _number(value: float) -> float | None:
-    """JSON knows neither NaN nor infinity."""
-    return float(value) if math.isfinite(value) else None
+def _parameters(body: Superquadric) -> dict[str, Any]:
+    return {name: getattr(body, name) for name in ("size", "shape", "translation", "rotation")}
 
 
 def document(options: Mapping[str, Any], frames: Sequence[Mapping[str, Any]]) -> str:

@@ -43,12 +43,8 @@ class StillPage:
         scene_to = scene_to_html(nothing)
         there = base64.b64encode(nothing.export(file_type="glb")).decode()
         beginning, self._end = _TEMPLATE.read_text(encoding="utf-8").split("<!-- frames -->\n")
-        try:
-            with named(path):
-                self._file.write(beginning.replace("$VIEWER", _as_script(scene_to.replace(there, _SCENE))))
-        except OSError:
-            self._output.discard()
-            raise
+        self._beginning = beginning.replace("$VIEWER", _as_script(scene_to.replace(there, _SCENE)))
+        """Until the first frame is written."""
 
     def add(self, frame: RecordedFrame, recovery: FrameRecovery) -> None:
         """Write a frame and what was recovered from it."""
@@ -56,8 +52,8 @@ class StillPage:
         name = f"{self._count}: {frame.name}"
         content = _as_script({"name": name, "glb": glb, "numbers": _numbers(frame, recovery)})
         with named(self._output.path):
-            self._file.write(f"<script>frames.push({content});</script>\n")
-        self._count += 1
+            self._file.write(f"{self._beginning}<script>frames.push({content});</script>\n")
+        self._count, self._beginning = self._count + 1, ""
 
     def close(self, whole: bool = True) -> Path | None:
         """Finish the file; where it is, None without a frame.  See :meth:`OutputFile.commit`."""
@@ -80,7 +76,7 @@ def _as_script(value: object) -> str:
 def _scene(frame: RecordedFrame, recovery: FrameRecovery) -> trimesh.Scene:
     """Points and bodies, with a camera behind the one that took the image."""
     span = drawings.depth_span(frame.depth) or (0.0, 1.0)
-    cloud = drawings.cloud(frame.depth, frame.camera, span, _MOST_POINTS, is_muted=True)
+    cloud = drawings.cloud(frame.depth, frame.camera, span, _MOST_POINTS)
     whole = trimesh.Scene()
     points, colours = cloud.points, cloud.colours
     if not len(points):  # of a covered lens one black point, as no GLB is empty

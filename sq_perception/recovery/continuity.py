@@ -43,9 +43,8 @@ from sq_perception.geometry.quantiles import ranked
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.regions import extents
 from sq_perception.recovery.options import RecoveryOptions
-from sq_perception.recovery.recovery import FrameRecovery, Recovery
+from sq_perception.recovery.recovery import FrameRecovery, Recovery, Reference
 from sq_perception.recovery.seen_object import SeenObject
-from sq_perception.segmentation.segments import Segmentation
 
 _WIDTH = 320
 """Columns that are compared: noise of neighbouring pixels is alike in all sensors of sensor_noise.preset."""
@@ -81,49 +80,6 @@ _ALIKE = 0.8
 
 
 @dataclass(frozen=True, eq=False)
-class Reference:
-    """What a frame's bodies were recovered from.
-
-    Attributes
-    ----------
-    depth : float32 (rows, columns)
-        Every ``stride``-th pixel of the image; 0 where nothing was measured.
-    segments
-        The objects, of all pixels, found ``age`` frames ago, or ``given``.
-    """
-
-    depth: np.ndarray
-    stride: int
-    camera: Camera
-    options: RecoveryOptions
-    segments: Segmentation
-    age: int
-    given: bool
-
-    @classmethod
-    def of(
-        cls,
-        depth: np.ndarray,
-        camera: Camera,
-        options: RecoveryOptions,
-        segments: Segmentation,
-        *,
-        age: int,
-        given: bool,
-    ) -> Reference:
-        """Of an image (height, width) that is NaN where nothing was measured."""
-        stride = max(1, round(camera.width / _WIDTH))
-        return cls(_sampled(depth, stride), stride, camera, options, segments, age, given)
-
-    def keeping(self, other: Reference, labels: np.ndarray, kept: Sequence[int]) -> Reference:
-        """These readings, but those of another reference around the labels that were recovered from it."""
-        taken = np.zeros(self.depth.shape, bool)
-        for label in kept:
-            taken |= _around(labels[:: self.stride, :: self.stride] == label) > 0
-        return replace(self, depth=np.where(taken, other.depth, self.depth))
-
-
-@dataclass(frozen=True, eq=False)
 class Repeated:
     """What a frame repeats.
 
@@ -143,13 +99,13 @@ NOTHING = Repeated({}, None)
 
 
 def repeated(
-    previous: FrameRecovery,
+    previous: FrameRecovery | None,
     depth: np.ndarray,
     camera: Camera,
     options: RecoveryOptions,
     labels: np.ndarray | None = None,
 ) -> Repeated:
-    """What an image repeats of the frame before it.
+    """What an image repeats of the frame before it, if there is one.
 
     Parameters
     ----------
@@ -158,12 +114,14 @@ def repeated(
     labels : integer (height, width), optional
         Masks that were given for the image: segments repeat only where these do, or where none were given to either.
     """
-    before = previous.reference
-    if before is None or before.camera != camera or before.options != options or not camera.is_pinhole:
+    before = None if previous is None else previous.reference
+    if previous is None or before is None:
+        return NOTHING
+    if before.camera != camera or before.options != options or not camera.is_pinhole:
         return NOTHING
     if previous.labels.max(initial=0) > previous.labels.size:  # given ones, and tables by label would be huge
         return NOTHING
-    old, new, sigma = before.depth, _sampled(depth, before.stride), before.segments.sigma
+    old, new, sigma = before.depth, sampled(depth, camera)[0], before.segments.sigma
     shown = np.ascontiguousarray(previous.labels[:: before.stride, :: before.stride], dtype=np.int32)
     reach = _REACH * float(old[shown > 0].max(initial=0))
     change, near = _changed(old, new, reach)
@@ -220,10 +178,19 @@ def matched(kept: Repeated, labels: np.ndarray, objects: Sequence[SeenObject]) -
     return same
 
 
-def _sampled(depth: np.ndarray, stride: int) -> np.ndarray:
-    """Every so many-th pixel, float32, of an image that is NaN where nothing was measured; 0 there."""
+def sampled(depth: np.ndarray, camera: Camera) -> tuple[np.ndarray, int]:
+    """What is compared, float32, of an image (height, width) that is NaN where nothing was measured, and its stride."""
+    stride = max(1, round(camera.width / _WIDTH))
     seen = np.asarray(depth[::stride, ::stride], dtype=np.float32)
-    return np.where(np.isnan(seen), np.float32(0), seen)
+    return np.where(np.isnan(seen), np.float32(0), seen), stride
+
+
+def mixed(new: Reference, old: Reference, labels: np.ndarray, kept: Sequence[int]) -> Reference:
+    """The new readings, but the old ones around the labels that were recovered from these."""
+    taken = np.zeros(new.depth.shape, bool)
+    for label in kept:
+        taken |= _around(labels[:: new.stride, :: new.stride] == label) > 0
+    return replace(new, depth=np.where(taken, old.depth, new.depth))
 
 
 def _around(mask: np.ndarray) -> np.ndarray:

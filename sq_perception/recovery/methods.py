@@ -33,12 +33,9 @@ def fitted(obj: SeenObject, depth: np.ndarray, camera: Camera, options: Recovery
         of_all = f" of {obj.masked}" if obj.pixels >= MIN_PIXELS else ""
         return _failed(obj, f"{obj.pixels}{of_all} pixels with a depth are too few for a body")
     try:
-        fit = _body(obj, depth, camera, options, deadline)
-    except _HARD_IMAGE as error:
+        return _body(obj, depth, camera, options, deadline)
+    except _HARD_IMAGE as error:  # a body that is not finite too
         return _failed(obj, f"{options.method}: {error}")
-    if not np.isfinite(fit.superquadric.to_flat()).all():
-        return _failed(obj, f"{options.method}: the result is not finite")
-    return fit
 
 
 def _body(obj: SeenObject, depth: np.ndarray, camera: Camera, options: RecoveryOptions, deadline: float) -> Fit:

@@ -14,7 +14,7 @@ Method = Literal["auto", "network", "symmetry", "classic"]
 NEEDS_NETWORK = ("auto", "network")
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RecoveryOptions(SegmentationOptions):
     """What may change from one frame to the next.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future
+from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -26,22 +26,22 @@ class Prediction:
     view
         What the network was shown.
     answers, number
-        Its answers for several objects, each in the frame of its view, and which of them is this one's.
+        What waits for its answers for several objects, each in the frame of its view, and which of them is this one's.
     """
 
     view: CanonicalView
-    answers: Future[Answers]
+    answers: Callable[[], Answers]
     number: int
 
     def body(self) -> Superquadric:
         """The predicted body in the optical frame; waits for it."""
-        answers = self.answers.result()
+        answers = self.answers()
         bodies = answers.bodies if isinstance(answers, HullPredictions) else answers
         return self.view.from_canonical(bodies[self.number]).canonical_form()
 
     def hull(self) -> HullPrior | None:
         """The predicted hull in the optical frame, if the network predicts hulls; waits for it."""
-        answers = self.answers.result()
+        answers = self.answers()
         return answers.hull(self.number, self.view) if isinstance(answers, HullPredictions) else None
 
 
@@ -53,25 +53,18 @@ def of_hulls(
     known = zip(views, planes, strict=True)
     below = np.stack([np.zeros(4) if plane is None else view.plane_to_canonical(plane) for view, plane in known])
     extents = np.array([view.extent for view in views])
-    return _answered(views, at_once(lambda: network.predict(shown, below, extents)))
+    found = network.predict(shown, below, extents)
+    return _answered(views, lambda: found)
 
 
-def of_bodies(
-    views: Sequence[CanonicalView],
-    network: Predictor,
-    submit: Callable[[Callable[[], Answers]], Future[Answers]],
-) -> list[Prediction]:
-    """Predictions of bodies from views, which what ``submit`` is given computes, now or beside fits."""
+def of_bodies(views: Sequence[CanonicalView], network: Predictor, beside: Executor | None) -> list[Prediction]:
+    """Predictions of bodies from views, computed by an executor beside fits, or now."""
     shown = np.stack([view.marked for view in views])
-    return _answered(views, submit(lambda: network.predict(shown)))
+    if beside is not None:
+        return _answered(views, beside.submit(network.predict, shown).result)
+    found = network.predict(shown)
+    return _answered(views, lambda: found)
 
 
-def at_once(computed: Callable[[], Answers]) -> Future[Answers]:
-    """What need not be waited for any more."""
-    found: Future[Answers] = Future()
-    found.set_result(computed())
-    return found
-
-
-def _answered(views: Sequence[CanonicalView], answers: Future[Answers]) -> list[Prediction]:
+def _answered(views: Sequence[CanonicalView], answers: Callable[[], Answers]) -> list[Prediction]:
     return [Prediction(view, answers, k) for k, view in enumerate(views)]

@@ -45,7 +45,7 @@ from sq_perception.recovery import continuity, methods, prediction, seen_object,
 from sq_perception.recovery.options import NEEDS_NETWORK, Method, RecoveryOptions
 from sq_perception.recovery.own_segments import SegmentNetwork
 from sq_perception.recovery.prediction import Prediction
-from sq_perception.recovery.recovery import FrameRecovery, Recovery, timed
+from sq_perception.recovery.recovery import FrameRecovery, Recovery, Reference, timed
 from sq_perception.recovery.seen_object import SeenObject
 from sq_perception.segmentation import segments
 
@@ -211,9 +211,7 @@ class Recoverer:
                 if labels.shape != measured.shape:
                     raise ValueError(f"labels: expected the shape of the depth, {measured.shape}, got {labels.shape}")
             measured, labels, closed = perforation.filled(measured, labels)
-            kept = continuity.NOTHING
-            if previous is not None:
-                kept = continuity.repeated(previous, measured, camera, options, labels)
+            kept = continuity.repeated(previous, measured, camera, options, labels)
             if previous is not None and kept.reference and len(kept.bodies) == len(previous.bodies):
                 milliseconds["segmentation"] = milliseconds["total"] = 1e3 * (time.perf_counter() - started)
                 bodies = tuple(replace(body, repeats=body.repeats + 1) for body in previous.bodies)
@@ -253,11 +251,12 @@ class Recoverer:
             for obj, fit, score in zip(fresh, fits, scores, strict=True):
                 of_label[obj.label] = Recovery(fit, score, obj.label, obj.pixels)
             bodies = tuple(of_label[obj.label] for obj in objects)
-        reference = continuity.Reference.of(measured, camera, options, found, age=age, given=labels is not None)
+        reference = Reference(
+            *continuity.sampled(measured, camera), camera, options, found, age=age, given=labels is not None
+        )
         if previous is not None and previous.reference is not None and same:
-            reference = reference.keeping(
-                previous.reference, found.labels, [body.label for body in bodies if body.repeats]
-            )
+            kept_labels = [body.label for body in bodies if body.repeats]
+            reference = continuity.mixed(reference, previous.reference, found.labels, kept_labels)
         milliseconds["total"] = 1e3 * (time.perf_counter() - started)
         message = _left_out(found, options) if bodies else _why_empty(depth, found, labels)
         message = "; ".join(filter(None, (message, _wrong_unit(measured, camera))))
@@ -295,8 +294,7 @@ class Recoverer:
 
             found = self._shared(of_some, range(len(views)))
         else:
-            submit = self._beside.submit if options.method == "auto" else prediction.at_once
-            found = prediction.of_bodies(views, network, submit)
+            found = prediction.of_bodies(views, network, self._beside if options.method == "auto" else None)
         return [replace(obj, prediction=predicted) for obj, predicted in zip(objects, found, strict=True)]
 
     def _mapped(self, function: Callable[[_Item], _Answer], items: Sequence[_Item]) -> list[_Answer]:

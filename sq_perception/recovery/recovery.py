@@ -11,15 +11,14 @@ import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from sq_perception.fitting.fit import Fit, Status
 from sq_perception.geometry.superquadric import Superquadric
-
-if TYPE_CHECKING:
-    from sq_perception.recovery.continuity import Reference
+from sq_perception.imaging.camera import Camera
+from sq_perception.recovery.options import RecoveryOptions
+from sq_perception.segmentation.segments import Segmentation
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,6 +80,27 @@ class Recovery:
     def seen(self) -> np.ndarray:
         """Share (3,) of each size that was seen, as in the fit; the rest is inferred."""
         return self.fit.seen
+
+
+@dataclass(frozen=True, eq=False)
+class Reference:
+    """What a frame's bodies were recovered from.
+
+    Attributes
+    ----------
+    depth : float32 (rows, columns)
+        Every ``stride``-th pixel of the image; 0 where nothing was measured.
+    segments
+        The objects, of all pixels, found ``age`` frames ago, or ``given``.
+    """
+
+    depth: np.ndarray
+    stride: int
+    camera: Camera
+    options: RecoveryOptions
+    segments: Segmentation
+    age: int
+    given: bool
 
 
 @dataclass(frozen=True, eq=False)

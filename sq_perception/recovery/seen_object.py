@@ -66,13 +66,16 @@ class SeenObject:
     masked: int
     mask: np.ndarray
     depth_crop: np.ndarray
-    mask_crop: np.ndarray
     camera_crop: Camera
     window: tuple[slice, slice]
     plane: np.ndarray | None = None
     shown: CanonicalView | None = None
     view: CanonicalView | None = None
     prediction: Prediction | None = None
+
+    @property
+    def mask_crop(self) -> np.ndarray:
+        return self.mask[self.window]
 
     @cached_property
     def points(self) -> np.ndarray:
@@ -107,9 +110,7 @@ class SeenObject:
 
     def without(self, strays: np.ndarray) -> SeenObject:
         """The object as its pixels show it but for those that are set in ``strays``, bool (height, width)."""
-        mask = np.zeros_like(self.mask)
-        mask[self.window] = kept = self.mask_crop & ~strays[self.window]
-        return replace(self, mask=mask, mask_crop=kept)
+        return replace(self, mask=self.mask & ~strays)
 
     def of_readings(self, depth: np.ndarray, gaps: np.ndarray) -> SeenObject:
         """The object in an image (height, width) that has no readings in its ``gaps``, bool (height, width)."""
@@ -128,11 +129,10 @@ def objects(depth: np.ndarray, found: segments.Segmentation, camera: Camera) -> 
         if width == 0:
             continue
         window = slice(top, top + height), slice(left, left + width)
-        crop = mask[window]
         camera_crop = camera.cropped(left, top, width, height)
-        pixels = int(np.count_nonzero(crop))
+        pixels = int(np.count_nonzero(mask[window]))
         masked = int(np.count_nonzero(found.labels[window] == label))
-        seen.append(SeenObject(label, pixels, masked, mask, depth[window], crop, camera_crop, window))
+        seen.append(SeenObject(label, pixels, masked, mask, depth[window], camera_crop, window))
     return seen
 
 
@@ -165,7 +165,7 @@ def completed(obj: SeenObject, depth: np.ndarray, camera: Camera, labels: np.nda
     x, y, width, height = regions.box(whole)
     window = slice(y, y + height), slice(x, x + width)
     crop = camera.cropped(x, y, width, height)
-    return replace(obj, mask=whole, depth_crop=depth[window], mask_crop=whole[window], camera_crop=crop, window=window)
+    return replace(obj, mask=whole, depth_crop=depth[window], camera_crop=crop, window=window)
 
 
 def viewed(

@@ -22,8 +22,6 @@ from sq_perception.segmentation import (
     support_surface,
     surface_patches,
 )
-from sq_perception.segmentation.options import SegmentationOptions
-from sq_perception.segmentation.support_plane import Plane
 from sq_perception.segmentation.support_surface import SupportSurface
 
 LEAST_SIGMA = 5e-4
@@ -34,16 +32,9 @@ _AROUND = 40
 """Pixels around all that is above the support in which its noise is measured; two of the longest chords at VGA."""
 
 
-def above(
-    known: np.ndarray,
-    relative: np.ndarray,
-    valid: np.ndarray,
-    camera: Camera,
-    support: SupportSurface,
-    walls: list[Plane],
-    options: SegmentationOptions,
-) -> np.ndarray:
+def above(seen: standing.Seen, relative: np.ndarray, valid: np.ndarray, support: SupportSurface) -> np.ndarray:
     """Bodies (labels from 1, unordered) of what is above the support; heights are 0 where depths are."""
+    known, camera = seen.known, seen.camera
     labels = np.zeros(known.shape, np.int32)
     # Half of the tolerance band is a compromise: bent depth of real cameras stays below, thin objects stay above.
     clear = cv2.blur(relative, (3, 3)) > max(0.5 * support_plane.TOLERANCE, 4 * support.sigma)
@@ -51,7 +42,7 @@ def above(
     above = relative > max(0.25 * support_plane.TOLERANCE, 2 * support.sigma)
     above &= ~support_surface.risen(relative, known, valid, camera)
     clear &= above
-    clear &= ~standing.furniture(known, clear, camera, walls, options)
+    clear &= ~standing.furniture(seen, clear)
     left, top, width, height = cv2.boundingRect(clear.view(np.uint8))
     if width == 0:
         return labels
@@ -60,9 +51,9 @@ def above(
     # Contiguous, as kernels are compiled for arrays of a kind.
     flat = valid[window] & (np.abs(relative[window]) < support_plane.TOLERANCE)
     known, clear = np.ascontiguousarray(known[window]), np.ascontiguousarray(clear[window])
-    seen = camera.cropped(left, top, known.shape[1], known.shape[0])
-    holds = partial(options.is_small, up=support.plane.equation[:3])
-    inside = taken_apart(known, clear, seen, support.sigma, holds, flat)
+    camera = camera.cropped(left, top, known.shape[1], known.shape[0])
+    holds = partial(seen.options.is_small, up=support.plane.equation[:3])
+    inside = taken_apart(known, clear, camera, support.sigma, holds, flat)
     foot = above[window] & (inside == 0)
     labels[window] = depth_steps.grown(inside, foot, known, _FOOT_PIXELS, depth_steps.STEP)
     return labels

@@ -262,7 +262,8 @@ class _Image:
 def _gathered(group: np.ndarray, crossed: np.ndarray, beside: np.ndarray) -> np.ndarray:
     """Groups (n,) of samples without strays: a clump of a group apart from its largest one goes to the group that it
     lies ``beside`` (n, n) and has the most free lines to, if these are as free as within a body."""
-    clump = _connected(beside & (group[:, None] == group))
+    joined = np.where(beside & (group[:, None] == group), 0.0, np.inf)
+    clump = _linked(joined, np.ones(len(group)), 1.0)
     count = int(clump.max()) + 1
     of_group = np.empty(count, int)
     of_group[clump] = group
@@ -277,25 +278,6 @@ def _gathered(group: np.ndarray, crossed: np.ndarray, beside: np.ndarray) -> np.
             share = [crossed[stray][:, group == other].mean() for other in near]
             if min(share) < _ONE_BODY:
                 found[stray] = near[int(np.argmin(share))]
-    return found
-
-
-@kernel
-def _connected(joined: np.ndarray) -> np.ndarray:
-    """Components (n,) from 0 of a graph (n, n) of bool."""
-    n = len(joined)
-    found, stack, count = np.full(n, -1), np.empty(n, np.int64), 0
-    for first in range(n):
-        if found[first] >= 0:
-            continue
-        found[first], stack[0], top = count, first, 1
-        while top > 0:
-            top -= 1
-            i = stack[top]
-            for j in range(n):
-                if joined[i, j] and found[j] < 0:
-                    found[j], stack[top], top = count, j, top + 1
-        count += 1
     return found
 
 

@@ -15,11 +15,9 @@ Metres, optical frame.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
-from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.quantiles import quantile
 from sq_perception.segmentation import support_plane
 
@@ -52,40 +50,22 @@ def walls(points: Mapping[int, np.ndarray], plane: np.ndarray) -> set[int]:
     tops = np.array([quantile(some @ plane[:3] + plane[3], _TOP) for some in points.values()])
     flat = np.concatenate(list(points.values())) @ axes
     owner = np.repeat(np.arange(len(points)), [len(some) for some in points.values()])
-    segments = _Segments(flat, owner, *_moments(flat, owner))
+    lengths, directions = _moments(flat, owner)
     tried: list[bytes] = []
     for top in tops:
         level = np.abs(tops - top) < _AS_HIGH
         if np.count_nonzero(level) > 1 and level.tobytes() not in tried:
             tried.append(level.tobytes())
-            along = _around(level, segments)
+            longest = np.where(level, lengths, -np.inf).argmax()
+            along = _around(level, flat, owner, directions[longest])
             if along.any():
                 return set(np.array(list(points))[along].tolist())
     return set()
 
 
-def warm_up() -> None:
-    """Compile the kernel, or load it from disk, by three equally high squares."""
-    square = np.array([[0, 0, 0.1], [0.1, 0, 0.1], [0, 0.1, 0.1], [0.1, 0.1, 0.1]])
-    walls({k: square + [k, 0, 0] for k in range(3)}, np.array([0.0, 0.0, 1.0, 0.0]))
-
-
-@dataclass(frozen=True, eq=False)
-class _Segments:
-    """Points (n, 2) of m segments along the support, and whose they are, from 0.
-
-    Of each segment, how much farther it reaches along its longer principal axis, as a variance (m,), and those axes
-    (m, 2, 2) in columns, the shorter one first.
-    """
-
-    points: np.ndarray
-    owner: np.ndarray
-    length: np.ndarray
-    directions: np.ndarray
-
-
 def _moments(points: np.ndarray, owner: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How long the points (n, 2) of each segment are, and their principal axes, as :class:`_Segments` has them."""
+    """Of each of m segments, how much farther its points (n, 2) reach along their longer principal axis, as a variance
+    (m,), and those axes (m, 2, 2) in columns, the shorter one first."""
     counts = np.bincount(owner)
     centred = points - np.stack([np.bincount(owner, column) / counts for column in points.T], axis=1)[owner]
     x, y = centred.T
@@ -94,54 +74,28 @@ def _moments(points: np.ndarray, owner: np.ndarray) -> tuple[np.ndarray, np.ndar
     return variances[:, 1] - variances[:, 0], directions
 
 
-def _around(level: np.ndarray, segments: _Segments) -> np.ndarray:
+def _around(level: np.ndarray, points: np.ndarray, owner: np.ndarray, directions: np.ndarray) -> np.ndarray:
     """Which of some equally high segments, bool (m,), are walls along the rectangle around them, as the longest lies.
 
-    Not the smallest rectangle: two walls at a right angle have another one just as small.
+    Not the smallest rectangle: two walls at a right angle have another one just as small.  ``points`` (n, 2) are those
+    of all segments along the support, ``owner`` (n,) whose they are, from 0, ``directions`` (2, 2) the rectangle's.
     """
-    directions = segments.directions[np.where(level, segments.length, -np.inf).argmax()]
-    placed = np.empty_like(segments.points)
-    half, thick, along, covered = _laid(segments.points, segments.owner, level, directions, placed)
+    placed = points[:, :1] * directions[0] + points[:, 1:] * directions[1]
+    low, high = placed[level[owner]].min(axis=0), placed[level[owner]].max(axis=0)
+    half = np.maximum((high - low) / 2, 1e-9)  # of points on one line
+    thick = min(_THICK, _NARROW * float(half.min()))
+    placed -= low + half
+    inside = (half - np.abs(placed)).min(axis=1) > thick
+    along = level & (np.bincount(owner, inside) < _STRAY * np.bincount(owner))
+    # Of the four sides in their order around the rectangle, the share of their cells that hold points beside them.
+    of_walls = placed[along[owner]]
+    cell = np.clip((_CELLS * (of_walls / (2 * half) + 0.5)).astype(int), 0, _CELLS - 1)
+    sides = [(sign, k) for sign in (1, -1) for k in (0, 1)]
+    beside = [half[k] - sign * of_walls[:, k] < thick for sign, k in sides]
+    covered = np.array([np.unique(cell[at, 1 - k]).size for at, (_, k) in zip(beside, sides, strict=True)]) / _CELLS
     is_corner = bool((np.minimum(covered, np.roll(covered, 1)) > _LONG).any())
     if 2 * half.min() < _SMALLEST or not is_corner or covered.mean() < _COVERED:
         return np.zeros_like(along)
-    others = [np.median(placed[segments.owner == k], axis=0) for k in np.flatnonzero(~along)]
+    others = [np.median(placed[owner == k], axis=0) for k in np.flatnonzero(~along)]
     holds = any((half - np.abs(other)).min() > thick for other in others)
     return along if holds else np.zeros_like(along)
-
-
-@kernel
-def _laid(
-    points: np.ndarray, owner: np.ndarray, level: np.ndarray, directions: np.ndarray, placed: np.ndarray
-) -> tuple[np.ndarray, float, np.ndarray, np.ndarray]:
-    """The rectangle along ``directions`` (2, 2), in columns, around the points (n, 2) of the segments at a level: half
-    its sides, how thick a wall may be, which segments (m,) of the level lie along its sides, and the shares (4,) of the
-    sides, in their order around it, that these lie along.  ``placed`` takes all points as seen from its middle."""
-    low, high = np.full(2, np.inf), np.full(2, -np.inf)
-    for i in range(len(points)):
-        for k in range(2):
-            placed[i, k] = points[i, 0] * directions[0, k] + points[i, 1] * directions[1, k]
-            if level[owner[i]]:
-                low[k], high[k] = min(low[k], placed[i, k]), max(high[k], placed[i, k])
-    half = (high - low) / 2
-    thick = min(_THICK, _NARROW * min(half[0], half[1]))
-    count, inside = np.zeros(len(level)), np.zeros(len(level))
-    for i in range(len(points)):
-        for k in range(2):
-            placed[i, k] -= low[k] + half[k]
-        count[owner[i]] += 1
-        inside[owner[i]] += min(half[0] - abs(placed[i, 0]), half[1] - abs(placed[i, 1])) > thick
-    along = level & (inside < _STRAY * count)
-    cells = np.zeros((4, _CELLS), np.bool_)
-    for i in range(len(points)):
-        if along[owner[i]]:
-            for k in range(2):
-                other = 1 - k
-                at = int(_CELLS * (placed[i, other] / (2 * half[other]) + 0.5))
-                at = max(0, min(at, _CELLS - 1))
-                cells[k, at] |= half[k] - placed[i, k] < thick
-                cells[k + 2, at] |= half[k] + placed[i, k] < thick
-    covered = np.empty(4)
-    for side in range(4):
-        covered[side] = cells[side].sum() / _CELLS
-    return half, thick, along, covered

@@ -26,7 +26,7 @@ TURNS = np.stack([np.cos(np.deg2rad(np.arange(0, 180, 10))), np.sin(np.deg2rad(n
 """Directions (18, 2) in which edges are measured."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SegmentationOptions:
     """What counts as an object.
 

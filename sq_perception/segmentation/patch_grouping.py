@@ -174,20 +174,13 @@ def _continued(patches: Patches, body: np.ndarray, camera: Camera) -> np.ndarray
     return weights + weights.T
 
 
-@kernel
 def _middles(labels: np.ndarray, n: int) -> tuple[np.ndarray, np.ndarray]:
     """Number of samples (n,) of each patch and their middle (n, 2), row and column; 0 for nothing."""
-    counts, middle = np.zeros(n), np.zeros((n, 2))
-    for v in range(labels.shape[0]):
-        for u in range(labels.shape[1]):
-            label = labels[v, u]
-            if label > 0:
-                counts[label] += 1
-                middle[label, 0] += v
-                middle[label, 1] += u
-    for label in range(n):
-        middle[label] /= max(counts[label], 1.0)
-    return counts, middle
+    rows, columns = np.nonzero(labels)
+    of = labels[rows, columns]
+    counts = np.bincount(of, minlength=n).astype(float)
+    sums = np.stack([np.bincount(of, rows, n), np.bincount(of, columns, n)], axis=1)
+    return counts, sums / np.maximum(counts, 1.0)[:, None]
 
 
 def _rays(grid: np.ndarray, stride: int, camera: Camera) -> np.ndarray:

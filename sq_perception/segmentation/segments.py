@@ -43,7 +43,6 @@ from sq_perception.segmentation import (
     support_surface,
 )
 from sq_perception.segmentation.options import EVERYTHING, SegmentationOptions
-from sq_perception.segmentation.support_plane import Plane
 
 _LEAST_PIXELS, _LEAST_SHARE = 30, 5e-4
 """Of an object: pixels, and share of the image; at VGA a square of 2 cm at 0.8 m.  Smaller ones are bits of noise."""
@@ -110,28 +109,27 @@ def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | No
     planes = support_plane.planes(depth, valid, camera)
     plane = support_plane.support(planes, depth, valid, camera, options.is_small)
     known = cv2.copyTo(depth, valid.view(np.uint8))  # and 0 elsewhere
-    if plane is None:
-        free = valid & ~standing.furniture(known, valid, camera, planes, options)
-        labels = bodies.taken_apart(known, free, camera, _UNKNOWN_SIGMA, options.is_small)
-        test = standing.alone(known, camera, options)
-        labels, ids, is_cut = _ordered(labels, least, options.max_objects, test)
-        return Segmentation(labels, None, ids, is_cut=is_cut)
-    support = support_surface.measured(plane, known, valid, camera)
-    walls = [other for other in planes if other is not plane]
     everything = known
     if options.depth_range != EVERYTHING:
         # What is out of range holds things up and hides them all the same.
         everything, measured = _checked(depth, camera, EVERYTHING)
         everything = cv2.copyTo(everything, measured.view(np.uint8))
+    seen = standing.Seen(everything, known, camera, [other for other in planes if other is not plane], options)
+    if plane is None:
+        free = valid & ~standing.furniture(seen, valid)
+        labels = bodies.taken_apart(known, free, camera, _UNKNOWN_SIGMA, options.is_small)
+        labels, ids, is_cut = _ordered(labels, least, options.max_objects, standing.alone(seen))
+        return Segmentation(labels, None, ids, is_cut=is_cut)
+    support = support_surface.measured(plane, known, valid, camera)
     relative = support.image_relative(everything, camera)
-    labels = bodies.above(known, relative * valid, valid, camera, support, walls, options)
+    labels = bodies.above(seen, relative * valid, valid, support)
     samples = level_faces.samples(labels, known, camera, least)
     for face in level_faces.found(samples, labels, known, camera, support, least):
-        labels = _unloaded(labels, face, known, everything, camera, walls, options, least)
+        labels = _unloaded(labels, face, seen, least)
     around = enclosures.walls(samples, plane.equation)
     if around:
         labels = np.where(np.isin(labels, list(around)), 0, labels)
-    test = standing.standing(everything, relative, labels, camera, support, walls, options)
+    test = standing.standing(seen, relative, labels, support)
     labels, ids, is_cut = _ordered(labels, least, options.max_objects, test)
     return Segmentation(labels, plane.equation, ids, max(support.sigma, bodies.LEAST_SIGMA), is_cut)
 
@@ -206,7 +204,6 @@ def support_under(
 def warm_up() -> None:
     """Compile, or load from disk, every kernel by a ball on a table, beside a hole, and by two that touch."""
     convex_parts.warm_up()
-    enclosures.warm_up()
     pieces.warm_up()
     camera = Camera(96, 72, 180.0, 180.0, 47.5, 35.5)
     v, u = np.indices((camera.height, camera.width))
@@ -231,21 +228,12 @@ def _checked(depth: np.ndarray, camera: Camera, limits: tuple[float, float]) -> 
     return depth, valid
 
 
-def _unloaded(
-    labels: np.ndarray,
-    face: level_faces.LevelFace,
-    known: np.ndarray,
-    everything: np.ndarray,
-    camera: Camera,
-    walls: list[Plane],
-    options: SegmentationOptions,
-    least: int,
-) -> np.ndarray:
+def _unloaded(labels: np.ndarray, face: level_faces.LevelFace, seen: standing.Seen, least: int) -> np.ndarray:
     """Labels in which what stands on a level face of a segment is taken apart once more, with the face as support."""
-    relative = face.surface.image_relative(everything, camera)
-    valid = face.under(labels, known, camera) & (relative > -support_plane.TOLERANCE)
-    parts = bodies.above(known, relative * valid, valid, camera, face.surface, walls, options)
-    test = standing.standing(everything, relative, parts, camera, face.surface, walls, options)
+    relative = face.surface.image_relative(seen.depth, seen.camera)
+    valid = face.under(labels, seen.known, seen.camera) & (relative > -support_plane.TOLERANCE)
+    parts = bodies.above(seen, relative * valid, valid, face.surface)
+    test = standing.standing(seen, relative, parts, face.surface)
     parts, _, _ = _ordered(parts, least, parts.max(initial=0), test)
     return np.where(parts > 0, parts + labels.max(), labels)
 

@@ -14,6 +14,7 @@ Metres, optical frame.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -71,31 +72,52 @@ at a grazing angle half is not measured: with a third low cameras miss a few thi
 shows one more that is none."""
 
 
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What an image of a pinhole camera shows.
+
+    Attributes
+    ----------
+    depth : float32 (height, width)
+        Metres, 0 where nothing was measured.
+    known
+        The same, 0 also where objects are not looked for.
+    walls
+        Planes that are no support.
+    options
+        What objects may be.
+    """
+
+    depth: np.ndarray
+    known: np.ndarray
+    camera: Camera
+    walls: list[Plane]
+    options: SegmentationOptions
+
+
 def _top(values: np.ndarray) -> float:
     """Their 95 % quantile; sensors smear edges."""
     k = int(0.95 * len(values))
     return float(np.partition(values, k)[k])
 
 
-def furniture(
-    depth: np.ndarray, valid: np.ndarray, camera: Camera, walls: list[Plane], options: SegmentationOptions
-) -> np.ndarray:
-    """Pixels, bool (height, width), of surfaces in one of some planes that are larger than a thing."""
-    if not walls:
-        return np.zeros(depth.shape, bool)
-    k, rows, columns, points = coarse(depth, valid, camera)
-    height, width = depth[::k, ::k].shape
+def furniture(seen: Seen, valid: np.ndarray) -> np.ndarray:
+    """Valid pixels, bool (height, width), of surfaces in one of the walls that are larger than a thing."""
+    if not seen.walls:
+        return np.zeros(valid.shape, bool)
+    k, rows, columns, points = coarse(seen.known, valid, seen.camera)
+    height, width = valid[::k, ::k].shape
     large = np.zeros((height, width), np.uint8)
-    for wall in walls:
+    for wall in seen.walls:
         on = _lie_on(wall, points)
         lies = np.zeros(large.shape, bool)
         lies[rows[on], columns[on]] = True
         parts = depth_steps.components(lies)[rows, columns]
         for part in np.flatnonzero(np.bincount(parts) > _FEWEST):
-            if part > 0 and largest_edge(points[parts == part], wall.equation[:3]) > options.max_size:
+            if part > 0 and largest_edge(points[parts == part], wall.equation[:3]) > seen.options.max_size:
                 large[rows[parts == part], columns[parts == part]] = 1
     full = cv2.resize(large, (k * width, k * height), interpolation=cv2.INTER_NEAREST)
-    return full[: depth.shape[0], : depth.shape[1]] > 0
+    return full[: valid.shape[0], : valid.shape[1]] > 0
 
 
 def _lie_on(wall: Plane, points: np.ndarray) -> np.ndarray:
@@ -104,73 +126,62 @@ def _lie_on(wall: Plane, points: np.ndarray) -> np.ndarray:
     return np.asarray(np.abs(wall.height(points)) < reach)
 
 
-def _of_no_segments(depth: np.ndarray, labels: np.ndarray, camera: Camera, walls: list[Plane]) -> list[Plane]:
-    """Those of some planes whose points are mostly in no segment.
+def _of_no_segments(seen: Seen, labels: np.ndarray) -> list[Plane]:
+    """Those of the walls whose points are mostly in no segment.
 
     The tops or the fronts of equal things lie in a plane, too; larger surfaces are no segments (:func:`furniture`).
     """
-    if not walls:
+    if not seen.walls:
         return []
-    k, rows, columns, points = coarse(depth, depth > 0, camera)
+    k, rows, columns, points = coarse(seen.depth, seen.depth > 0, seen.camera)
     in_segment = labels[::k, ::k][rows, columns] > 0
     found = []
-    for wall in walls:
+    for wall in seen.walls:
         on = _lie_on(wall, points)
         if np.count_nonzero(on & in_segment) < _IN_SEGMENTS * np.count_nonzero(on):
             found.append(wall)
     return found
 
 
-def alone(depth: np.ndarray, camera: Camera, options: SegmentationOptions) -> ObjectTest:
+def alone(seen: Seen) -> ObjectTest:
     """The test of a segment in an image without a support: no larger than a thing, and not wherever the image ends.
 
     A surface that runs out of the image on opposite sides fills it.
     """
-    last_row, last_column = camera.height - 1, camera.width - 1
+    last_row, last_column = seen.camera.height - 1, seen.camera.width - 1
 
     def is_thing(rows: np.ndarray, columns: np.ndarray) -> bool:
         if (rows.min() == 0 and rows.max() == last_row) or (columns.min() == 0 and columns.max() == last_column):
             return False
         step = max(1, rows.size // _SAMPLES)
         r, c = rows[::step], columns[::step]
-        return options.hold(camera.unproject(c, r, depth[r, c]))
+        return seen.options.hold(seen.camera.unproject(c, r, seen.known[r, c]))
 
     return is_thing
 
 
-def standing(
-    depth: np.ndarray,
-    relative: np.ndarray,
-    labels: np.ndarray,
-    camera: Camera,
-    support: SupportSurface,
-    walls: list[Plane],
-    options: SegmentationOptions,
-) -> ObjectTest:
+def standing(seen: Seen, relative: np.ndarray, labels: np.ndarray, support: SupportSurface) -> ObjectTest:
     """The test of whether a segment is a thing that stands on the support, to be asked of the largest ones first.
 
     What beside a thing is taken for the noise of the support grows less with every other thing that was accepted.
 
     Parameters
     ----------
-    depth, relative : (height, width)
-        Metres, 0 where nothing was measured, and the heights above the support as at one metre of depth.
+    relative : (height, width)
+        Heights above the support as at one metre of depth, 0 where nothing was measured.
     labels : int32 (height, width)
         The segments.
-    camera
-        A pinhole camera.
     support
         What things stand on.
-    walls
-        Other planes of the image.
     """
+    depth, camera, options = seen.depth, seen.camera, seen.options
     last_row, last_column = camera.height - 1, camera.width - 1
     measured = np.count_nonzero(depth)
-    around = (depth > 0) & ~_tall(labels, relative, support.sigma)
+    around = (depth > 0) & ~_tall(labels, relative, int(labels.max(initial=0)) + 1, support.sigma)
     coarse = depth[::_SPARSE, ::_SPARSE]
     nearest = quantile(coarse[coarse > 0], _STRAY) * (1 + depth_steps.STEP) if coarse.any() else 0.0
     plane = support.plane
-    walls = _of_no_segments(depth, labels, camera, walls)
+    walls = _of_no_segments(seen, labels)
 
     def is_thing(rows: np.ndarray, columns: np.ndarray) -> bool:
         step = max(1, rows.size // _SAMPLES)
@@ -203,14 +214,10 @@ def standing(
     return is_thing
 
 
-def _tall(labels: np.ndarray, relative: np.ndarray, sigma: float) -> np.ndarray:
-    """Pixels, bool (height, width), of segments that are higher than any noise, on average: things or the room."""
-    limit = float(min(HIGHEST * TOLERANCE, _TALL * sigma))
-    return np.asarray(_higher(labels, relative, int(labels.max(initial=0)) + 1, limit))
-
-
 @kernel
-def _higher(labels: np.ndarray, relative: np.ndarray, count: int, limit: float) -> np.ndarray:
+def _tall(labels: np.ndarray, relative: np.ndarray, count: int, sigma: float) -> np.ndarray:
+    """Pixels, bool (height, width), of segments that are higher than any noise, on average: things or the room."""
+    limit = min(HIGHEST * TOLERANCE, _TALL * sigma)
     sums, pixels = np.zeros(count), np.zeros(count)
     for v in range(labels.shape[0]):
         for u in range(labels.shape[1]):
@@ -276,23 +283,10 @@ def _beside(
     mask = np.zeros(relative[window].shape, np.uint8)
     mask[rows - top, columns - left] = 1
     near, ring = (cv2.dilate(mask, np.ones((2 * k + 1, 2 * k + 1), np.uint8)) for k in (_SMEARED, _BESIDE))
-    return np.asarray(_heights_where(relative, depth, around, behind, ring - near, top, left))
-
-
-@kernel
-def _heights_where(
-    relative: np.ndarray, depth: np.ndarray, around: np.ndarray, behind: float, mask: np.ndarray, top: int, left: int
-) -> np.ndarray:
-    """Heights (n,) of pixels around a thing in a mask, whose corner is there, but for what is too high, low or far."""
-    found, n = np.empty(mask.size, np.float32), 0
-    for v in range(mask.shape[0]):
-        for u in range(mask.shape[1]):
-            if mask[v, u] > 0 and around[top + v, left + u] and depth[top + v, left + u] < behind:
-                height = relative[top + v, left + u]
-                if abs(height) < HIGHEST * TOLERANCE:
-                    found[n] = height
-                    n += 1
-    return found[:n]
+    height = relative[window]
+    is_far = depth[window] >= np.float64(behind)
+    is_support = np.abs(height) < np.float64(HIGHEST * TOLERANCE)
+    return np.asarray(height[(ring > near) & around[window] & is_support & ~is_far])
 
 
 def _stands(

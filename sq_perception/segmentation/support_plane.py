@@ -50,7 +50,7 @@ _FEW_POINTS, _FINALISTS = 300, 100
 _PLANES = 3
 _APART = 2
 """Pixels next to a body that are none of its surroundings, as they may show either."""
-COARSE_PIXELS = 120
+_COARSE_PIXELS = 120
 """Samples along the shorter side of the image that surfaces are searched on."""
 _ISLAND_SHARE = 0.25
 """Of the image; an island that fills less is a body seen face-on, as a camera that looks at a table shows more of it.
@@ -333,7 +333,7 @@ def across(normal: np.ndarray) -> np.ndarray:
 
 def _on_one_surface(depth: np.ndarray, valid: np.ndarray, camera: Camera) -> list[_Surface]:
     """Each connected surface of a coarse image, as far as it is of any size, and whether it is a small island."""
-    k = max(1, min(depth.shape) // COARSE_PIXELS)
+    k = coarse_stride(depth.shape)
     coarse, kept = depth[::k, ::k], valid[::k, ::k]
     jumps = depth_steps.edges(np.where(kept, coarse, np.float32(0)), kept, k * depth_steps.STEP)
     labels = depth_steps.components(kept & ~jumps)
@@ -347,9 +347,14 @@ def _on_one_surface(depth: np.ndarray, valid: np.ndarray, camera: Camera) -> lis
     return surfaces
 
 
+def coarse_stride(shape: tuple[int, ...]) -> int:
+    """Pixels from a sample of a coarse image to the next."""
+    return max(1, min(shape) // _COARSE_PIXELS)
+
+
 def coarse(depth: np.ndarray, valid: np.ndarray, camera: Camera) -> tuple[int, np.ndarray, np.ndarray, np.ndarray]:
     """Every k-th pixel of an image that is valid: k, rows and columns counted by it, and points (n, 3)."""
-    k = max(1, min(depth.shape) // COARSE_PIXELS)
+    k = coarse_stride(depth.shape)
     rows, columns = np.nonzero(valid[::k, ::k])
     return k, rows, columns, camera.unproject(k * columns, k * rows, depth[::k, ::k][rows, columns])
 

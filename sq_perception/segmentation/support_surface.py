@@ -29,8 +29,8 @@ import numpy as np
 from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.quantiles import densest, quantile
 from sq_perception.imaging import depth_steps, regions
-from sq_perception.imaging.camera import Camera, Lens
-from sq_perception.segmentation.support_plane import COARSE_PIXELS, LEAST_GROWTH, TOLERANCE, Plane, noise_growth
+from sq_perception.imaging.camera import Camera
+from sq_perception.segmentation.support_plane import LEAST_GROWTH, TOLERANCE, Plane, coarse_stride, noise_growth
 
 _ROUNDS = 6
 _TERMS = 6
@@ -96,8 +96,10 @@ def measured(plane: Plane, depth: np.ndarray, valid: np.ndarray, camera: Camera)
     camera
         A pinhole camera.
     """
-    k = _stride(depth.shape)
-    x, y, z = _seen(depth, valid, k, camera.lens)
+    k = coarse_stride(depth.shape)
+    rows, columns = np.nonzero(valid[::k, ::k])
+    x, y = (k * columns - camera.cx) / camera.fx, (k * rows - camera.cy) / camera.fy
+    z = depth[::k, ::k][rows, columns].astype(float)
     growth = noise_growth(z)
     a, b, c, d = plane.equation
     height = (z * (a * x + b * y + c) + d) / growth
@@ -134,7 +136,7 @@ def risen(relative: np.ndarray, depth: np.ndarray, valid: np.ndarray, camera: Ca
     camera
         As in :func:`measured`.
     """
-    k = _stride(depth.shape)
+    k = coarse_stride(depth.shape)
     share = _cells(valid.astype(np.float32), k)
     known = share > 0.5
     weight = 1 / np.maximum(share, np.float32(0.5))
@@ -222,19 +224,6 @@ def _add_reached_tops(parts: np.ndarray, reached: np.ndarray, height: np.ndarray
 
 
 @kernel
-def _seen(depth: np.ndarray, valid: np.ndarray, k: int, lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """x, y and depth (n,) of every k-th valid pixel."""
-    x, y, z = np.empty((3, (depth.shape[0] // k + 1) * (depth.shape[1] // k + 1)))
-    n = 0
-    for v in range(0, depth.shape[0], k):
-        for u in range(0, depth.shape[1], k):
-            if valid[v, u]:
-                x[n], y[n], z[n] = (u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy, depth[v, u]
-                n += 1
-    return x[:n], y[:n], z[:n]
-
-
-@kernel
 def _normal_equations(
     x: np.ndarray, y: np.ndarray, height: np.ndarray, off: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -296,7 +285,3 @@ def _relative(
             relative = above / max(z * z, LEAST_GROWTH) - min(max(off, -limit), limit)
             height[v, u] = relative if z > 0 else 0.0
     return height
-
-
-def _stride(shape: tuple[int, ...]) -> int:
-    return max(1, min(shape[:2]) // COARSE_PIXELS)

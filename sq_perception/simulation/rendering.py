@@ -26,7 +26,7 @@ import numpy as np
 from sq_perception.geometry.kernels import gauge, in_object_frame, kernel, parallel_kernel, ray_interval
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera, Lens
-from sq_perception.imaging.raycast import render
+from sq_perception.imaging.raycast import render, windows
 
 
 def render_things(
@@ -135,11 +135,7 @@ def render_mesh(mesh: Mesh, camera: Camera) -> np.ndarray:
         raise ValueError("expected a pinhole camera and a mesh in front of it")
     depth = np.full((camera.height, camera.width), np.inf)
     corners = np.ascontiguousarray(mesh.vertices[mesh.faces], dtype=float)
-    pixels = camera.project(corners)
-    windows = np.concatenate([np.ceil(pixels.min(axis=1) - 1e-6), np.floor(pixels.max(axis=1) + 1e-6) + 1], axis=1)
-    limits = np.array([camera.width, camera.height, camera.width, camera.height])
-    windows = np.clip(windows, 0, limits).astype(np.int64)
-    _rasterise(corners, windows, camera.lens, depth)
+    _rasterise(corners, windows(corners, camera), camera.lens, depth)
     return depth
 
 

@@ -38,7 +38,7 @@ _DEEP = 0.5
 _FREEDOM = 5.0
 """nu of the Student density: long tails, as deviations are often too small.  Chosen."""
 _ALONE = 1e4
-"""d^2 of a pair that costs as much as what is left alone: beyond any error.  Chosen."""
+"""d^2 of a pair, of the median of covariances, that costs as much as what is left alone: beyond any error.  Chosen."""
 _TWIN = 30.0
 """What another pair than elder and first costs more: as much as d = 5.  Chosen."""
 
@@ -85,11 +85,9 @@ def in_place(
     pairs = Pairs(i, j, *forms.nearest(track[i], track_covariance[i], observed[j], covariance[j], forms.EXCHANGE))
     total = track_covariance[i] + pairs.covariance
     error = state.difference(track[i], pairs.state)
-    cost = _student(total, error)
     younger, later = np.any(twins(track), axis=1), np.greater(np.cumsum(deep, axis=1), deep)
     unlike = younger[i] != later[i, j]
-    cost = cost + _TWIN * unlike
-    return _assigned(pairs, cost, _alone(total, error), (len(track), len(observed)))
+    return _assigned(pairs, total, error, _TWIN * unlike, deep.shape)
 
 
 def twins(states: np.ndarray) -> np.ndarray:
@@ -114,11 +112,8 @@ def elsewhere(
     total = (track_covariance[i] + pairs.covariance)[:, SIZE_AND_SHAPE, SIZE_AND_SHAPE]
     error = state.difference(track[i], pairs.state)[:, SIZE_AND_SHAPE]
     alike = state.mahalanobis(total, error) < agreement.LIMITS[5]
-    if not alike.any():
-        return Pairs.none()
-    pairs, total, error = pairs.at(alike), total[alike], error[alike]
-    cost = _student(total, error) + (distance[i, j] / reach[i])[alike]
-    return _assigned(pairs, cost, _alone(total, error), (len(track), len(observed)))
+    way = distance[i, j] / reach[i]
+    return _assigned(pairs.at(alike), total[alike], error[alike], way[alike], distance.shape)
 
 
 def warm_up() -> None:
@@ -169,20 +164,16 @@ def _unplaced(covariance: np.ndarray, distance: np.ndarray) -> np.ndarray:
     return free
 
 
-def _student(covariance: np.ndarray, error: np.ndarray) -> np.ndarray:
-    square = state.mahalanobis(covariance, error)
-    return (error.shape[-1] + _FREEDOM) * np.log1p(square / _FREEDOM) + np.linalg.slogdet(covariance)[1]
-
-
-def _alone(covariance: np.ndarray, error: np.ndarray) -> float:
-    """Cost of a pair at d^2 = _ALONE with the median of covariances (k, n, n)."""
-    volume = float(np.median(np.linalg.slogdet(covariance)[1]))
-    return (error.shape[-1] + _FREEDOM) * float(np.log1p(_ALONE / _FREEDOM)) + volume
-
-
-def _assigned(pairs: Pairs, cost: np.ndarray, alone: float, shape: tuple[int, int]) -> Pairs:
-    table = np.full(shape, alone)
-    table[pairs.track, pairs.observed] = cost
+def _assigned(
+    pairs: Pairs, covariance: np.ndarray, error: np.ndarray, more: np.ndarray, shape: tuple[int, ...]
+) -> Pairs:
+    """The pairs (k,) of the assignment that costs least, with errors (k, n) and what each costs more."""
+    if not len(pairs.track):
+        return pairs
+    dimensions, volume = error.shape[-1] + _FREEDOM, np.linalg.slogdet(covariance)[1]
+    cost = dimensions * np.log1p(state.mahalanobis(covariance, error) / _FREEDOM) + volume
+    table = np.full(shape, dimensions * np.log1p(_ALONE / _FREEDOM) + np.median(volume))
+    table[pairs.track, pairs.observed] = cost + more
     kept = cheapest(table) if len(table) <= len(table.T) else cheapest(table.T.copy()).T
     return pairs.at(kept[pairs.track, pairs.observed])
 

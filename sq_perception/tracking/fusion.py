@@ -123,12 +123,10 @@ def fused(
         seen from stays where it is in the world; a turned body shows another side.
     """
     count = len(track)
-    seen_as = track[:, 8:12]
-    if turning.any():
-        turn = state.difference(track, observed)[:, TURN]
-        determined = np.einsum("nii->ni", white + common)[:, TURN] < state.DETERMINED**2
-        turn = np.where(determined & turning[:, None], turn, 0.0)
-        seen_as = quaternions.multiply(seen_as, quaternions.from_rotation_vector(turn))
+    error = state.difference(track, observed)
+    has_turned = turning[:, None] & (np.einsum("nii->ni", white + common)[:, TURN] < state.DETERMINED**2)
+    turn = quaternions.from_rotation_vector(np.where(has_turned, error[:, TURN], 0.0))
+    seen_as = quaternions.multiply(track[:, 8:12], turn)
     local = np.einsum("nji,nj->ni", quaternions.to_matrix(seen_as), direction)
 
     row = np.arange(count)
@@ -149,7 +147,7 @@ def fused(
     noise = bias + white
     total = covariance - correlation - correlation.swapaxes(1, 2) + noise
     gain = np.linalg.solve(total, (covariance - correlation).swapaxes(1, 2)).swapaxes(1, 2)
-    step = np.einsum("nij,nj->ni", gain, state.difference(track, observed))
+    step = np.einsum("nij,nj->ni", gain, error)
 
     kept = np.eye(LENGTH) - gain
     cross = kept @ correlation @ gain.swapaxes(1, 2)
@@ -157,10 +155,7 @@ def fused(
     correlations = kept[:, None] @ correlations
     correlations[row, place] += gain @ bias
 
-    correction = step[:, TURN]
-    if turning.any():
-        correction = np.where(determined & turning[:, None], 0.0, correction)
-    back = quaternions.to_matrix(quaternions.from_rotation_vector(correction))
+    back = quaternions.to_matrix(quaternions.from_rotation_vector(np.where(has_turned, 0.0, step[:, TURN])))
     after = 0.5 * (after + after.swapaxes(1, 2))
     seen = Views(directions @ back, biases, correlations, used)
     return state.moved(track, step), after, kept @ lasting + gain @ shared, seen

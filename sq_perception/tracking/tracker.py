@@ -135,11 +135,11 @@ class Tracker:
         elapsed = 0.0 if self._stamp is None else stamp - self._stamp
         bodies = tuple(body.predicted(elapsed, stamp) for body in self._bodies)
         repeats = [body.repeats > 0 for body in recoveries]
-        if all(repeats) and (tracks := _repeated(bodies, observed)) is not None:
-            bodies, missing = _unchanged(bodies, tracks, observed, stamp, expected)
-            new: list[int] = []
+        new: list[int] = []
+        if all(repeats) and (unchanged := _repeated(bodies, observed, stamp)) is not None:
+            bodies = unchanged
         else:
-            here, there, missing = _pairs(bodies, observed, covariance, stamp, expected)
+            here, there = _pairs(bodies, observed, covariance, stamp, expected)
             bodies, pairs = _placed(bodies, here, there), here + there
             bodies, fresh = _still_there(bodies, pairs, observed, repeats, stamp)
             bodies = _fused(bodies, fresh, to_camera[fresh.observed], stamp)
@@ -147,7 +147,7 @@ class Tracker:
         bodies += tuple(
             _born(self.births + n, k, observed[k], covariance[k], to_camera[k], stamp) for n, k in enumerate(new, 1)
         )
-        self._bodies, self._stamp, self.births = _survivors(bodies, missing, stamp), stamp, self.births + len(new)
+        self._bodies, self._stamp, self.births = _survivors(bodies, expected, stamp), stamp, self.births + len(new)
         return tuple(body.published() for body in self._bodies)
 
 
@@ -175,24 +175,19 @@ def _in_world(
     return flat, state.turned(covariance, matrix)
 
 
-def _repeated(bodies: _Bodies, observed: np.ndarray) -> list[int] | None:
-    """The track of each observation, where all of them are to the bit what showed bodies to be there the frame before.
+def _repeated(bodies: _Bodies, observed: np.ndarray, stamp: float) -> _Bodies | None:
+    """The bodies after observations that are all, to the bit, what showed them to be there the frame before.
 
-    Nothing has to be compared then: a table at which nothing happens costs next to nothing.
+    None if they are not.  Nothing has to be compared: a table at which nothing happens costs next to nothing.
     """
     by_answer = {body.answer.tobytes(): k for k, body in enumerate(bodies) if body.answer is not None}
     tracks = [by_answer.get(each.tobytes(), -1) for each in observed]
-    return tracks if tracks and min(tracks) >= 0 and len(set(tracks)) == len(tracks) else None
-
-
-def _unchanged(
-    bodies: _Bodies, tracks: Sequence[int], observed: np.ndarray, stamp: float, expected: _Expected
-) -> tuple[_Bodies, set[int]]:
-    """The bodies after such a frame, and the ids of those that should have been in it."""
-    after, left = list(bodies), [k for k in range(len(bodies)) if k not in tracks]
+    if not tracks or min(tracks) < 0 or len(set(tracks)) < len(tracks):
+        return None
+    after = list(bodies)
     for index, k in enumerate(tracks):
         after[k] = after[k].still_there(index, observed[index], stamp)
-    return tuple(after), {bodies[k].id for k in left if expected(bodies[k].state[None])[0]}
+    return tuple(after)
 
 
 def _pairs(
@@ -201,23 +196,21 @@ def _pairs(
     covariance: np.ndarray,
     stamp: float,
     expected: _Expected,
-) -> tuple[Pairs, Pairs, set[int]]:
-    """What was observed in place, and what was moved; and the ids of tracks that should have been in place."""
+) -> tuple[Pairs, Pairs]:
+    """What was observed in place, and what was moved."""
     if not bodies:
-        return Pairs.none(), Pairs.none(), set()
+        return Pairs.none(), Pairs.none()
     states, covariances = stacked(bodies)
     covariances = covariances + LEAST
     here = association.in_place(states, covariances, observed, covariance)
     left = np.setdiff1d(np.arange(len(states)), here.track)
     new = np.setdiff1d(np.arange(len(observed)), here.observed)
-    open_place = expected(states[left])
-    missing = {bodies[k].id for k, visible in zip(left, open_place, strict=True) if visible}
     # What is hidden has rather stayed where it was than become one more body of its kind far away.
-    free = np.array([visible or bodies[k].is_moving for k, visible in zip(left, open_place, strict=True)])
+    free = np.array([visible or bodies[k].is_moving for k, visible in zip(left, expected(states[left]), strict=True)])
     reach = FASTEST * np.array([stamp - bodies[k].last for k in left])
     reach = np.where(free, reach, np.minimum(reach, 2 * states[left, 0:3].max(axis=1)))
     there = association.elsewhere(states[left], covariances[left], reach, observed[new], covariance[new])
-    return here, there._replace(track=left[there.track], observed=new[there.observed]), missing
+    return here, there._replace(track=left[there.track], observed=new[there.observed])
 
 
 def _placed(bodies: _Bodies, here: Pairs, there: Pairs) -> _Bodies:
@@ -240,7 +233,7 @@ def _still_there(
     Old answers are only where these do not say what was fused before, of a body that moves, or where the camera's pose
     was corrected or the first one was never seen.
     """
-    if not len(pairs.track):
+    if not len(pairs.track) or not any(repeats):
         return bodies, pairs
     after, new = list(bodies), np.ones(len(pairs.track), dtype=bool)
     agrees = _compared(bodies, pairs)[2].agrees
@@ -363,13 +356,21 @@ def _born(
     )
 
 
-def _survivors(bodies: _Bodies, missing: set[int], stamp: float) -> _Bodies:
+def _survivors(bodies: _Bodies, expected: _Expected, stamp: float) -> _Bodies:
     """The bodies, with their misses counted, without the dead."""
-    ousted, left = _ousted(bodies), []
-    for body in bodies:
-        if body.observation is None:
-            missed = body.missed + 1 if body.id in missing | ousted else 0
-            patience = MISSES if body.seen >= CONFIRM_AFTER else 1 if body.id in ousted else 2
+    seen = np.array([body.observation is not None for body in bodies], dtype=bool)
+    if seen.all():
+        return bodies
+    states, _ = stacked(bodies)
+    overlap = association.twins(states)
+    ousted = ~seen & ((overlap | overlap.T) & seen).any(axis=1)  # in their place another body was seen
+    missing = ousted.copy()
+    missing[~seen] |= expected(states[~seen])
+    left = []
+    for k, body in enumerate(bodies):
+        if not seen[k]:
+            missed = body.missed + 1 if missing[k] else 0
+            patience = MISSES if body.seen >= CONFIRM_AFTER else 1 if ousted[k] else 2
             if missed >= patience or stamp - body.last > FORGET_AFTER:
                 continue
             body = replace(body, missed=missed)
@@ -377,13 +378,3 @@ def _survivors(bodies: _Bodies, missing: set[int], stamp: float) -> _Bodies:
     unseen = sorted((body for body in left if body.observation is None), key=lambda body: body.last)
     dead = {body.id for body in unseen[: max(0, len(left) - MOST)]}
     return tuple(body for body in left if body.id not in dead)
-
-
-def _ousted(bodies: _Bodies) -> set[int]:
-    """Ids of bodies that were not observed and whose place another one takes that was."""
-    seen = np.array([body.observation is not None for body in bodies])
-    if seen.all():
-        return set()
-    overlap = association.twins(stacked(bodies)[0])
-    ousted = ~seen & ((overlap | overlap.T) & seen).any(axis=1)
-    return {bodies[k].id for k in np.flatnonzero(ousted)}

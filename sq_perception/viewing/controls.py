@@ -1,14 +1,14 @@
-"""How a parameter is shown: the control that fits its descriptor, and the value as the node wants it.
+"""How a parameter is changed in the page: the control that fits its descriptor, and the value as the node wants it.
 
-A control is made from the fields of a rcl_interfaces/ParameterDescriptor and the value that the node holds, None where
-it is not set; nothing is imported for that.  The rules:
+A control is made from the fields of a rcl_interfaces/ParameterDescriptor and the value that the node holds; nothing is
+imported for that.  The rules:
 
     bool                                          a check box
     string with "one of: a, b" as constraint      a list to choose from
     other string                                  a line of text
-    number in a short range                       a slider
-    other number                                  a field for numbers
-    read-only, arrays, names with a dot           shown, not to be changed
+    number                                        a field for numbers, within its range
+
+Others have none: what is read-only, not set, an array or no number, and ROS' own (names with a dot among them).
 
 A number with a floating point range is a float even where its value has come as an integer, as `ros2 param set` sends
 it.
@@ -20,56 +20,27 @@ import math
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-Kind = Literal["bool", "choice", "text", "slider", "number", "fixed"]
-Group = Literal["live", "start", "other"]
-GROUPS: dict[Group, str] = {
-    "live": "Settings",
-    "start": "Fixed at the start",
-    "other": "Of ROS",
-}
+Kind = Literal["bool", "choice", "text", "number"]
 _CHOICES = "one of:"
 _OF_EVERY_NODE = ("use_sim_time", "start_type_description_service")
-_SLIDER_STEPS = 100
-_SLIDER_SPAN = 1.0
-QUICK, TYPED = 0.0, 0.8
-"""Seconds without another change before a value is sent: at once, or when the typing has ended."""
 
 
 @dataclass(frozen=True)
 class Control:
-    """What the page shows for a parameter.
-
-    Attributes
-    ----------
-    type : type
-        Of the parameter's values, where they may be changed.
-    patience : float
-        Seconds to wait for further changes before the value is sent.
-    """
+    """What the page shows for a parameter, whose values are of a ``type``."""
 
     name: str
     kind: Kind
     value: Any
     hint: str
-    group: Group
-    type: type[bool] | type[int] | type[float] | type[str] = str
+    type: type[bool] | type[int] | type[float] | type[str]
     low: float | None = None
     high: float | None = None
-    step: float | None = None
     choices: tuple[str, ...] = ()
-    patience: float = QUICK
-
-    @property
-    def can_change(self) -> bool:
-        return self.kind != "fixed"
-
-    def shown(self, value: Any) -> Any:
-        """A value of the node in the type of the control."""
-        return plain(value) if self.kind == "fixed" else self.type(value)
 
     def wanted(self, value: Any) -> Any:
         """A value of the page in the type of the parameter; None for what is no value, such as half a number."""
-        if self.kind not in ("slider", "number"):
+        if self.kind != "number":
             return self.type(value)
         number = float(value)
         if not math.isfinite(number):
@@ -77,63 +48,26 @@ class Control:
         return round(number) if self.type is int else number
 
 
-def control(about: Any, value: Any) -> Control:
-    """The control of a parameter, ``about`` its descriptor; see the module for the rules."""
+def control(about: Any, value: Any) -> Control | None:
+    """The control of a parameter, ``about`` its descriptor, or None; see the module for the rules."""
+    if about.read_only or "." in about.name or about.name in _OF_EVERY_NODE:
+        return None
     constraints: str = about.additional_constraints
     hint = " ".join(part for part in (about.description, f"({constraints})" if constraints else "") if part)
-    group: Group = "start" if about.read_only else "live"
-    if "." in about.name or about.name in _OF_EVERY_NODE:
-        group = "other"
-    made = Control(about.name, "fixed", plain(value), hint, group)
-    if about.read_only or group == "other":
-        return made
     if isinstance(value, bool):
-        return replace(made, kind="bool", type=bool, value=value)
+        return Control(about.name, "bool", value, hint, bool)
     if isinstance(value, str):
-        choices = _choices(constraints)
-        if choices:
-            choices = choices if value in choices else (*choices, value)
-            return replace(made, kind="choice", value=value, choices=choices)
-        return replace(made, kind="text", value=value, patience=TYPED)
-    if isinstance(value, (int, float)) and math.isfinite(value):
-        return _number(about, value, made)
-    return made
-
-
-def _number(about: Any, value: float, made: Control) -> Control:
+        if not constraints.startswith(_CHOICES):
+            return Control(about.name, "text", value, hint, str)
+        choices = tuple(name.strip() for name in constraints.removeprefix(_CHOICES).split(","))
+        choices = choices if value in choices else (*choices, value)
+        return Control(about.name, "choice", value, hint, str, choices=choices)
+    if not (isinstance(value, (int, float)) and math.isfinite(value)):
+        return None
     kind = float if about.floating_point_range or isinstance(value, float) else int
-    made = replace(made, kind="number", type=kind, value=kind(value), patience=TYPED)
-    ranges = [*about.floating_point_range, *about.integer_range]
-    if not ranges or not ranges[0].from_value < ranges[0].to_value:
-        return made
-    # What the node holds is shown, even where its descriptor rules it out.
-    low, high = kind(min(ranges[0].from_value, value)), kind(max(ranges[0].to_value, value))
-    if math.isinf(high - low):  # open to a side, or as wide as the type
-        return replace(made, low=None if math.isinf(low) else low, high=None if math.isinf(high) else high)
-    short = high - low <= (_SLIDER_SPAN if kind is float else _SLIDER_STEPS)
-    step = float(ranges[0].step) or (10.0 ** (math.floor(math.log10(high - low)) - 2) if kind is float else 1)
-    if short and step <= high - low:
-        return replace(made, kind="slider", low=low, high=high, step=step, patience=0.15)
-    return replace(made, low=low, high=high)
-
-
-def _choices(constraints: str) -> tuple[str, ...]:
-    if not constraints.startswith(_CHOICES):
-        return ()
-    return tuple(name.strip() for name in constraints[len(_CHOICES) :].split(",") if name.strip())
-
-
-def plain(value: Any) -> str:
-    """A value of a parameter as text."""
-    if value is None:
-        return "(not set)"
-    if isinstance(value, bool):
-        return str(value).lower()
-    if isinstance(value, float):
-        return f"{value:g}"
-    if isinstance(value, (str, int)):
-        return str(value)
-    try:
-        return ", ".join(plain(item) for item in value)
-    except TypeError:
-        return str(value)
+    made = Control(about.name, "number", kind(value), hint, kind)
+    for ends in (*about.floating_point_range, *about.integer_range):  # one at most
+        # What the node holds is shown, even where its descriptor rules it out.
+        low, high = min(ends.from_value, value), max(ends.to_value, value)
+        made = replace(made, low=None if math.isinf(low) else kind(low), high=None if math.isinf(high) else kind(high))
+    return made

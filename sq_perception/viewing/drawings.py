@@ -29,7 +29,7 @@ PICTURE_WIDTH = 384
 COLOUR_MAP = cv2.COLORMAP_TURBO
 _SPAN_PERCENTILES = (1.0, 99.0)
 _SPAN_POINTS = 20000
-_MUTED_NEAR, _MUTED_FAR = np.array([150.0, 162, 182]), np.array([52.0, 62, 84])
+_NEAR_GREY, _FAR_GREY = np.array([150.0, 162, 182]), np.array([52.0, 62, 84])
 _POINT_SHARE = 0.5
 """Of the pixels that a point stands for, so that what lies behind the points is to be seen between them."""
 _LEAST_SPAN = 0.05
@@ -99,10 +99,10 @@ def steady_span(before: tuple[float, float] | None, now: tuple[float, float]) ->
     return now if moved > 0.05 * length else before
 
 
-def cloud(depth: np.ndarray, camera: Camera, span: tuple[float, float], most: int, *, is_muted: bool = False) -> Cloud:
+def cloud(depth: np.ndarray, camera: Camera, span: tuple[float, float], most: int) -> Cloud:
     """The measured points of a depth image, every k-th row and column so that there are at most ``most``.
 
-    Their colours are those of :func:`coloured`, or, muted, greys that leave the colours to the bodies.
+    They are grey, darker with the depth: colours are left to the bodies.
 
     Raises
     ------
@@ -122,8 +122,9 @@ def cloud(depth: np.ndarray, camera: Camera, span: tuple[float, float], most: in
     points = camera.unproject(first + step * u, first + step * v, seen).astype(np.float32)
     typical = float(np.median(seen)) if seen.size else 1.0
     pixel = (typical if camera.is_pinhole else 1.0) / min(camera.fx, camera.fy)
-    colours = _muted(seen, span) if is_muted else coloured(seen[None], span)[0]
-    return Cloud(points, colours, _POINT_SHARE * step * pixel)
+    share = np.clip((seen - span[0]) / (span[1] - span[0]), 0.0, 1.0)[:, None]
+    greys = np.rint((1 - share) * _NEAR_GREY + share * _FAR_GREY).astype(np.uint8)
+    return Cloud(points, greys, _POINT_SHARE * step * pixel)
 
 
 def coloured(depth: np.ndarray, span: tuple[float, float]) -> np.ndarray:
@@ -133,8 +134,6 @@ def coloured(depth: np.ndarray, span: tuple[float, float]) -> np.ndarray:
         share = np.nan_to_num(np.clip((far - depth) / (far - near), 0.0, 1.0))
     # The ends of the map are nearly black.
     index = np.rint(20 + 220 * share).astype(np.uint8)
-    if not index.size:
-        return np.empty((*depth.shape, 3), np.uint8)
     colours = np.ascontiguousarray(cv2.applyColorMap(index, COLOUR_MAP)[..., ::-1])
     colours[~np.isfinite(depth)] = 38
     return colours
@@ -196,9 +195,3 @@ def view_volume(camera: Camera, length: float) -> np.ndarray:
     if not camera.is_pinhole:
         edges.append(np.stack([near, np.roll(near, -1, axis=0)], axis=1))
     return np.concatenate(edges).astype(np.float32)
-
-
-def _muted(depth: np.ndarray, span: tuple[float, float]) -> np.ndarray:
-    near, far = span
-    share = np.clip((depth - near) / (far - near), 0.0, 1.0)[:, None]
-    return np.rint((1 - share) * _MUTED_NEAR + share * _MUTED_FAR).astype(np.uint8)

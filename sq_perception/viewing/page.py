@@ -6,9 +6,8 @@ others.  What a user does on the page waits until :meth:`Page.changes` takes it.
 
 from __future__ import annotations
 
-import contextlib
 import socket
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from time import monotonic
 from typing import Any
@@ -18,7 +17,7 @@ import viser
 
 from sq_perception.imaging.camera import Camera
 from sq_perception.viewing import drawings, scene, server, tables
-from sq_perception.viewing.controls import GROUPS, Control
+from sq_perception.viewing.controls import Control
 from sq_perception.viewing.drawings import Bodies
 from sq_perception.viewing.scene import Scene
 from sq_perception.viewing.tables import NodeState
@@ -27,7 +26,8 @@ TITLE = "sq_perception: superquadrics from depth"
 _PANEL_WIDTH = 420
 _DECIMALS = 7
 """Of a number that is shown or typed; viser would cut off those that the value at the beginning has not."""
-_MUTED = "muted"
+_TYPING = 0.8
+"""Seconds without another change after which the typing of a value has ended."""
 _SHOWN = {
     "Points": "The measured depth",
     "Bodies": None,
@@ -111,7 +111,7 @@ class Page:
         if span is not None:
             self._span = drawings.steady_span(self._span, span)
         shown = self._span or (0.0, 1.0)
-        points = drawings.cloud(depth, camera, shown, self._most_points, is_muted=self._point_colours.value == _MUTED)
+        points = drawings.cloud(depth, camera, shown, self._most_points)
         with self.server.atomic():
             self._scene.draw_cloud(points, self._is_wanted("Points"))
             self._scene.draw_camera(camera, shown, self._is_wanted("Camera"))
@@ -121,29 +121,25 @@ class Page:
         if span is not None and not self._scene.is_aimed:
             self._scene.aim(np.median(points.points, axis=0))
 
-    def show_bodies(self, node: str, bodies: Bodies | None, stamp: float, state: NodeState) -> None:
-        """Draw the bodies of a node, remove those that are gone, and fill its table.
+    def show_bodies(self, bodies: Bodies | None, state: NodeState) -> None:
+        """Draw the bodies of a node, remove those that are gone, fill its table, and write how it is doing.
 
-        ``bodies`` is None while no result came.  They are not drawn if ``state.remark`` has a reason.
+        ``bodies`` is None while no result came, and where it cannot be drawn, for the reason in ``state.remark``.
         """
-        part = self._nodes[node]
-        if bodies is not None and len(bodies) and not state.remark and not self._aimed_at_bodies:
+        part = self._nodes[state.name]
+        if bodies is not None and len(bodies) and not self._aimed_at_bodies:
             self._aimed_at_bodies = True
             self._scene.aim(bodies.superquadrics.translation.mean(axis=0))
-        is_wanted = part.wanted is None or part.wanted.value
-        drawn = bodies if bodies is not None and not state.remark and is_wanted else None
         with self.server.atomic():
             kept: set[str] = set()
-            if drawn is not None:
-                for k in range(len(drawn)):
-                    kept |= self._scene.draw_body(node, drawn, k, state.is_silent, self._is_wanted)
-            self._scene.keep(node, kept)
+            if bodies is not None and (part.wanted is None or part.wanted.value):
+                for k in range(len(bodies)):
+                    kept |= self._scene.draw_body(state.name, bodies, k, state.is_silent, self._is_wanted)
+            self._scene.keep(state.name, kept)
         is_cube = self._scene.camera is not None and not self._scene.camera.is_pinhole
-        part.table.content = tables.bodies_table(node, bodies, stamp, state, is_cube=is_cube)
-
-    def show_state(self, state: NodeState) -> None:
-        """Write how a node is doing."""
-        self._nodes[state.name].status.content = tables.node_status(state)
+        part.table.content = tables.bodies_table(bodies, state, is_cube=is_cube)
+        if part.status is not None:
+            part.status.content = tables.node_status(state)
 
     def show_source(self, text: str) -> None:
         """Write where the depth comes from, as HTML of :mod:`sq_perception.viewing.tables`."""
@@ -157,34 +153,22 @@ class Page:
         if [replace(control, value=None) for control in controls] == [
             replace(control, value=None) for control in part.controls.values()
         ]:
-            self.show_values(node, {control.name: control.value for control in controls})
+            self._show_values(part, controls)
             return
-        for folder in part.folders:
-            folder.remove()
-        part.folders, part.handles, part.controls = [], {}, {control.name: control for control in controls}
+        for handle in part.handles.values():
+            handle.remove()
+        part.controls = {control.name: control for control in controls}
         part.pending.clear()
-        for group, title in GROUPS.items():
-            members = [control for control in controls if control.group == group]
-            if not members:
-                continue
-            with part.tab:
-                folder = self.server.gui.add_folder(title, expand_by_default=group == "live")
-            part.folders.append(folder)
-            with folder:
-                for control in members:
-                    part.handles[control.name] = self._add_control(part, control)
+        with part.tab:
+            part.handles = {control.name: self._add_control(part, control) for control in controls}
 
-    def show_values(self, node: str, values: Mapping[str, Any]) -> None:
-        """Put the node's values into its controls; unknown names are left aside."""
-        part = self._nodes[node]
-        for name, value in values.items():
-            about, handle = part.controls.get(name), part.handles.get(name)
-            if about is None or handle is None or name in part.pending:
-                continue
-            with contextlib.suppress(TypeError, ValueError):
+    def _show_values(self, part: _NodePart, controls: Sequence[Control]) -> None:
+        """Put the node's values into its controls, but for one that a user is changing."""
+        for control in controls:
+            if control.name not in part.pending:
                 # A setter runs the callbacks of the control; they are not to take this for a change by the user.
-                part.known[name] = about.shown(value)
-                handle.value = part.known[name]
+                part.known[control.name] = control.value
+                part.handles[control.name].value = control.value
 
     def show_answer(self, node: str, text: str, good: bool) -> None:
         """Show the answer of a node to a change."""
@@ -200,8 +184,8 @@ class Page:
         gui.main_panel.set_width(_PANEL_WIDTH)
 
         self._source = gui.add_html("")
-        for part in self._nodes.values():
-            part.status = gui.add_html(tables.node_status(NodeState(part.name)) if parameters else "")
+        for part in self._nodes.values() if parameters else ():
+            part.status = gui.add_html(tables.node_status(NodeState(part.name)))
         tabs = gui.add_tab_group()
         for part in self._nodes.values():
             short = part.name.rsplit("/", 1)[-1]
@@ -224,7 +208,6 @@ class Page:
     def _add_view_controls(self) -> None:
         gui = self.server.gui
         places = gui.add_button_group("Look from", tuple(scene.PLACES), hint="Camera: as the depth camera sees it")
-        self._point_colours = gui.add_dropdown("Point colours", (_MUTED, "depth"), initial_value=_MUTED)
         self._wanted = {name: gui.add_checkbox(name, True, hint=hint) for name, hint in _SHOWN.items()}
         if len(self._nodes) > 1:
             for part in self._nodes.values():
@@ -250,21 +233,19 @@ class Page:
             handle: Any = gui.add_checkbox(about.name, value, **common)
         elif about.kind == "choice":
             handle = gui.add_dropdown(about.name, about.choices, initial_value=value, **common)
-        elif about.kind == "slider":
-            handle = gui.add_slider(about.name, about.low, about.high, about.step, value, **common)
         elif about.kind == "number":
             handle = gui.add_number(about.name, value, min=about.low, max=about.high, **common)
             if about.type is float:
                 handle.precision = _DECIMALS
         else:
-            handle = gui.add_text(about.name, value, disabled=not about.can_change, **common)
-        if about.can_change:
+            handle = gui.add_text(about.name, value, **common)
 
-            @handle.on_update
-            def _(_: viser.GuiEvent) -> None:
-                wanted = about.wanted(handle.value)
-                if wanted is not None and wanted != part.known.get(about.name):
-                    part.pending[about.name] = wanted, monotonic() + about.patience
+        @handle.on_update
+        def _(_: viser.GuiEvent) -> None:
+            wanted = about.wanted(handle.value)
+            if wanted is not None and wanted != part.known.get(about.name):
+                is_typed = about.kind in ("text", "number")
+                part.pending[about.name] = wanted, monotonic() + (_TYPING if is_typed else 0.0)
 
         return handle
 
@@ -279,7 +260,6 @@ class _NodePart:
     tab: Any = None
     answer: Any = None
     wanted: Any = None
-    folders: list[Any] = field(default_factory=list)
     controls: dict[str, Control] = field(default_factory=dict)
     handles: dict[str, Any] = field(default_factory=dict)
     known: dict[str, Any] = field(default_factory=dict)

@@ -54,8 +54,6 @@ class Scene:
     def __init__(self, server: PageServer, has_one_node: bool) -> None:
         self._server, self._has_one_node = server, has_one_node
         self.camera: Camera | None = None
-        self._length = 0.0
-        """Of the view volume that is drawn."""
         self._target: np.ndarray | None = None
         self._faces = drawings.mesh_faces()
         self._handles: dict[tuple[str, str], Any] = {}
@@ -96,12 +94,10 @@ class Scene:
 
     def draw_camera(self, camera: Camera, span: tuple[float, float], is_wanted: bool) -> None:
         """Draw what a camera sees up to the nearest depths."""
-        length = max(_NEAR_SHARE * span[0] if camera.is_pinhole else 1.0, 1e-3)
-        state: dict[str, Any] = {"visible": is_wanted}
-        if (camera, length) != (self.camera, self._length):
-            self.camera, self._length, state["points"] = camera, length, drawings.view_volume(camera, length)
+        self.camera = camera
+        lines = drawings.view_volume(camera, max(_NEAR_SHARE * span[0] if camera.is_pinhole else 1.0, 1e-3))
         look: dict[str, Any] = {"colors": _FRUSTUM, "thickness": 1.5, "thickness_units": "screen"}
-        self._put("", "/camera", partial(self._server.scene.add_line_segments, **look), **state)
+        self._put("", "/camera", partial(self._server.scene.add_line_segments, **look), points=lines, visible=is_wanted)
 
     def draw_body(self, node: str, bodies: Bodies, k: int, is_silent: bool, wanted: Callable[[str], bool]) -> set[str]:
         """Surface, label and shell of a body, as far as they are wanted and known; their paths."""

@@ -20,6 +20,7 @@ import contextlib
 import errno
 import http
 import ipaddress
+import os
 import re
 import socket
 import threading
@@ -31,7 +32,6 @@ import rich
 import viser
 import websockets.asyncio.server
 from websockets.asyncio.server import ServerConnection
-from websockets.datastructures import Headers
 from websockets.http11 import Response
 
 PORT = 8080
@@ -79,29 +79,21 @@ def listening_socket(host: str, port: int | None) -> socket.socket:
         If the port is taken or must not be used, or the host is not an address of this machine.
     """
     tried = range(PORT, PORT + PORTS_TRIED) if port is None else (port,)
-    last: OSError | None = None
+    reason = ""
     for number in tried:
         try:
-            family, kind, protocol, _, address = socket.getaddrinfo(
-                host, number, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
-            )[0]
-        except (OSError, OverflowError, UnicodeError) as error:
+            family = socket.getaddrinfo(host, number, type=socket.SOCK_STREAM)[0][0]
+        except (OSError, UnicodeError) as error:
             raise ServerError(f"--host: expected an address of this machine, got {host!r} ({error})") from error
-        bound = socket.socket(family, kind, protocol)
         try:
-            bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-            bound.bind(address)
-            # A port in use by somebody who also reuses addresses is only noticed here.
-            bound.listen()
-            return bound
+            return socket.create_server((host, number), family=family, dualstack_ipv6=family == socket.AF_INET6)
         except OSError as error:
-            bound.close()
             if error.errno == errno.EADDRNOTAVAIL:
                 raise ServerError(f"--host: expected an address of this machine, got {host!r}") from error
-            last = error
+            reason = os.strerror(error.errno or 0)
     what = f"{PORT} to {PORT + PORTS_TRIED - 1}" if port is None else str(port)
     hint = "give another --port" if port is None else f"give another --port, or none to take the first free from {PORT}"
-    raise ServerError(f"--port: {what} of {host} cannot be used ({last.strerror if last else ''}); {hint}") from last
+    raise ServerError(f"--port: {what} of {host} cannot be used ({reason}); {hint}")
 
 
 def serve(bound: socket.socket) -> PageServer:
@@ -180,9 +172,7 @@ def _guarding(bound: socket.socket) -> Iterator[tuple[Callable[[], bool], weakre
         def process(connection: Any, request: Any) -> Any:
             why = refusal(request.headers, names)
             if why:
-                text = f"Refused: {why}.\n".encode()
-                fields = Headers({"Content-Type": "text/plain; charset=utf-8", "Content-Length": str(len(text))})
-                return Response(http.HTTPStatus.FORBIDDEN, "Forbidden", fields, text)
+                return connection.respond(http.HTTPStatus.FORBIDDEN, f"Refused: {why}.\n")
             response = process_request(connection, request)
             if isinstance(response, Response):
                 host = request.headers["Host"]

@@ -31,10 +31,6 @@ class NodeState:
     ----------
     age
         Seconds since its last result came; None if none ever did.
-    latency
-        Milliseconds from the image's stamp to the arrival of its last result here; None if unknown.
-    lifecycle
-        Its lifecycle state; empty for a node without one.
     diagnostics
         Key and value of its last diagnostics.
     is_there
@@ -45,8 +41,6 @@ class NodeState:
 
     name: str
     age: float | None = None
-    latency: float | None = None
-    lifecycle: str = ""
     diagnostics: Mapping[str, str] = field(default_factory=dict)
     is_there: bool = False
     remark: str = ""
@@ -56,8 +50,8 @@ class NodeState:
         return self.age is None or self.age > SILENT_SECONDS
 
 
-def bodies_table(name: str, bodies: Bodies | None, stamp: float, state: NodeState, *, is_cube: bool = False) -> str:
-    """The bodies of a node; ``stamp`` is that of their image, seconds; ``is_cube`` if it shows the unit cube."""
+def bodies_table(bodies: Bodies | None, state: NodeState, *, is_cube: bool = False) -> str:
+    """The bodies of a node; ``is_cube`` if their image shows the unit cube."""
     if bodies is None:
         return f'<div style="padding:4px 17px;font-size:12.5px;color:{_DIM}">No result has come yet.</div>'
     faded = ";opacity:0.45" if state.is_silent else ""
@@ -89,7 +83,7 @@ def bodies_table(name: str, bodies: Bodies | None, stamp: float, state: NodeStat
         failed = f'<div style="color:{_BAD};padding:3px 5px">no fit: {shown}{more}</div>'
     table = f'<table style="{_TABLE}"><thead><tr>{head}</tr></thead><tbody>{"".join(rows)}</tbody></table>'
     return (
-        f'<div data-node="{html.escape(name)}" data-stamp="{stamp:.9f}" style="padding:2px 12px 6px 12px{faded}">'
+        f'<div data-node="{html.escape(state.name)}" style="padding:2px 12px 6px 12px{faded}">'
         f'<div style="{_SMALL};padding:2px 5px">{heading}; half sizes in {unit} ± standard deviation</div>'
         f'<div style="overflow-x:auto;overflow-y:auto;max-height:340px">{table if count else ""}</div>{failed}</div>'
     )
@@ -100,14 +94,11 @@ def node_status(state: NodeState) -> str:
     colour, text = _verdict(state)
     values = state.diagnostics
     rate = values.get("rate [Hz]")
-    median, high = values.get("stamp to result: median [ms]"), values.get("stamp to result: p95 [ms]")
-    delay = "" if state.latency is None else f"{state.latency:.0f} ms"
-    if median:
-        delay = f"{_rounded(median)} ms, p95 {_rounded(high or '-')} ms"
+    median, high = values.get("stamp to result: median [ms]"), values.get("stamp to result: p95 [ms]", "-")
     counts = (key for key in ("received", "answered", "dropped", "refused", "lost") if key in values)
     facts = {
         "rate": f"{_rounded(rate, 1)} Hz" if rate else "",
-        "stamp to result": delay,
+        "stamp to result": f"{_rounded(median)} ms, p95 {_rounded(high)} ms" if median else "",
         "frames": ", ".join(f"{html.escape(values[key])} {key}" for key in counts),
         "tracks": html.escape(values.get("tracks", "")),
         "last error": _coloured(_OPEN, values.get("last error", "")),
@@ -177,7 +168,7 @@ def _rounded(text: str, digits: int = 0) -> str:
 
 
 def _verdict(state: NodeState) -> tuple[str, str]:
-    lifecycle = f"{state.lifecycle}, " if state.lifecycle else ""
+    lifecycle = f"{state.diagnostics['state']}, " if "state" in state.diagnostics else ""
     if state.age is None:
         text = "no result yet" if state.is_there else "not there"
         return (_OPEN if state.is_there else _BAD), lifecycle + text

@@ -18,7 +18,7 @@ for module in sys.argv[2:]:
     if changed:
         sys.exit(f"{changed} set by the import of {module}")
 """
-READ = "constants", "frame_time", "real_scenes", "scanned_objects", "segmentation", "single_body", "speed", "tracking"
+READ = "constants", "frame_time", "real_scenes", "segmentation", "single_body", "speed", "tracking"
 
 
 def test_an_import_leaves_the_number_of_threads_alone(repository: Path) -> None:

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import mesh_things
 import numpy as np
 import pytest
-import real_scenes
-import scene_verdict
-import tabletop
 import trimesh
+from common import mesh_things, scene_tables, scene_verdict, tabletop
 
 from sq_perception.geometry import Superquadric, rotation
 
@@ -130,7 +127,7 @@ def test_a_missed_thing_has_no_iou_and_no_size() -> None:
         scene_verdict.ThingVerdict(0, "stereo", "box", "box", "flat", 1, 900, 900, 1.0, np.ones(3), {"own": answer})
         for answer in (found, scene_verdict.Answer())
     ]
-    figures = real_scenes.summary(things, "own")
+    figures = scene_tables.summary(things, "own")
     assert figures["iou"]["mean"] == pytest.approx(45)
     assert figures["edge_error"]["mean"] == pytest.approx(3)
     assert figures["within_2_sigma"] == pytest.approx(200 / 3)

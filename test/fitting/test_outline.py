@@ -11,7 +11,7 @@ from sq_perception.fitting import outline
 from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.observation import Crop
 from sq_perception.fitting.options import FitOptions
-from sq_perception.fitting.problem import Problem, draw
+from sq_perception.fitting.problem import Problem
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
@@ -30,6 +30,6 @@ def test_a_reading_that_gets_no_smaller_is_the_last(monkeypatch: pytest.MonkeyPa
     problem = Problem.of(crop.observed(0.0, None), FitOptions(), 0.0)
     left = iter(readings)
     monkeypatch.setattr(outline, "_sigma", lambda *_: next(left))
-    rays = draw(problem, 100, 0.3)
+    rays = problem.draw(100, 0.3)
     _, state = outline.sharpened(problem, State.of(BODY), rays.free, rays)
     assert np.isfinite(state.parameters).all()

@@ -12,7 +12,6 @@ import pytest
 
 from sq_perception.fitting import covariance, quality, surface_fit
 from sq_perception.fitting.fit import CUT_SHORT, Fit, Status
-from sq_perception.fitting.options import Bounds
 from sq_perception.fitting.surface_fit import FitOptions
 from sq_perception.geometry import metrics
 from sq_perception.geometry import rotation as quaternions
@@ -260,16 +259,6 @@ def test_the_result_is_in_canonical_form() -> None:
     body = fit_grey(thesis_image(truth)).superquadric
     assert body.canonical_form().to_flat() == pytest.approx(body.to_flat())
     assert body.size[0] >= body.size[1]
-
-
-def test_bounds_are_kept() -> None:
-    truth = thesis_body(np.random.default_rng(6))
-    limits = Bounds(shape=(0.3, 0.5), size=(0.12, 0.2))
-    body = fit_grey(thesis_image(truth), bounds=limits).superquadric
-    assert body.shape.min() >= 0.3 - 1e-12
-    assert body.shape.max() <= 0.5 + 1e-12
-    assert body.size.min() >= 0.12 - 1e-12
-    assert body.size.max() <= 0.2 + 1e-12
 
 
 def test_a_time_budget_ends_the_search() -> None:

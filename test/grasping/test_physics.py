@@ -21,7 +21,7 @@ TABLE = Surroundings(plane=np.array([0.0, 0.0, 1.0, 0.0]))
 def picking():
     """The world and the benchmark."""
     import picking
-    import picking_world
+    from common import picking_world
 
     return picking_world, picking
 

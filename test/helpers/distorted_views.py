@@ -10,6 +10,7 @@ import numpy as np
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.distortion import Distortion
+from sq_perception.imaging.rectification import Rectification
 
 RAW = Camera(640, 480, 525.0, 520.0, 318.2, 241.7)
 WIDE = Camera(640, 480, 300.0, 301.0, 322.0, 236.5)
@@ -29,6 +30,12 @@ def rays(camera: Camera, lens: Distortion | None = None) -> np.ndarray:
     if lens is not None:
         points = lens.inverse(points)
     return np.concatenate([points, np.ones(u.shape + (1,))], axis=-1)
+
+
+def share_seen(undone: Rectification) -> float:
+    """Share of the raw pixels that the rectified image shows."""
+    u, v, camera = undone.back.u, undone.back.v, undone.camera
+    return float(((u > -0.5) & (v > -0.5) & (u < camera.width - 0.5) & (v < camera.height - 0.5)).mean())
 
 
 def plane_depth(directions: np.ndarray, normal: np.ndarray, distance: float) -> np.ndarray:

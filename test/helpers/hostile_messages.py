@@ -52,12 +52,10 @@ class HostileFrame:
 
 @dataclass(frozen=True)
 class Verdict:
-    """What a node answered to one frame, after so many milliseconds, to the ``sent``-th copy of it."""
+    """What a node answered to one frame."""
 
     answered: bool
     message: str
-    milliseconds: float
-    sent: int
 
     @property
     def kind(self) -> str:
@@ -292,18 +290,18 @@ class Siege:
         verdict = self._peer.start_call(Trigger, f"{self._node}/trigger", Trigger.Request(), self._alive)
         # The node must know of the question when the image arrives, or the next copy of it is answered.
         time.sleep(0.002)
-        began, copies, due = time.monotonic(), 0, 0.0
+        due = 0.0
 
         def answered() -> bool:
-            nonlocal copies, due
+            nonlocal due
             if not verdict.done() and time.monotonic() >= due:
-                copies, due = copies + 1, time.monotonic() + _AGAIN
+                due = time.monotonic() + _AGAIN
                 self._send(frame)
             return verdict.done()
 
         until(answered, self._alive)
         answer = verdict.result()
-        return Verdict(answer.success, answer.message, 1e3 * (time.monotonic() - began), copies)
+        return Verdict(answer.success, answer.message)
 
     def _send(self, frame: HostileFrame) -> None:
         if frame.info is not None:

@@ -1,8 +1,7 @@
 """A camera, a node and a viewer that are killed without warning and started again, as a robot's launch file does.
 
-The viewer is a plain subscriber in a process of its own, or any command that prints a line for each result.  What is
-measured of a kill: the time from the new start to the first result that needs the killed process, and the longest
-silence of those that live on.
+The viewer is a plain subscriber in a process of its own.  What is measured of a kill: the time from the new start to
+the first result that needs the killed process, and the longest silence of those that live on.
 """
 
 from __future__ import annotations
@@ -113,12 +112,10 @@ class Robot:
         camera: Sequence[str] = (),
         node: str = "recover_node",
         parameters: Sequence[str] = (),
-        viewer: Sequence[str] = (),
     ) -> None:
         self._peer, self._node = peer, node
         self._camera, self._parameters = tuple(camera), tuple(parameters)
-        topic = f"/{node}/superquadrics"
-        self._viewer = tuple(viewer) or (sys.executable, "-c", _VIEWER.format(topic=topic))
+        self._viewer = (sys.executable, "-c", _VIEWER.format(topic=f"/{node}/superquadrics"))
         self.running: dict[str, Any] = {}
         self.answers, self.diagnoses = peer.answers(f"/{node}"), peer.diagnoses(f"/{node}")
         self.infos: list[float] = []

@@ -278,18 +278,13 @@ class Usage:
 
     Attributes
     ----------
-    rss, anonymous, shared
-        Resident memory, its private part, and that in shared-memory segments; MB.
-    cpu
-        Seconds so far.
+    rss
+        Resident memory, MB.
     threads, files, segments
         Counts; segments are the files of Fast DDS that it maps.
     """
 
     rss: float
-    anonymous: float
-    shared: float
-    cpu: float
     threads: int
     files: int
     segments: int
@@ -306,25 +301,11 @@ def usage(pid: int) -> Usage:
     place = Path("/proc") / str(pid)
     lines = (line.split(":", 1) for line in (place / "status").read_text().splitlines())
     status = {key: value.split() for key, value in lines}
-    mega = {key: int(status[key][0]) / 1024 for key in ("VmRSS", "RssAnon", "RssShmem")}
-    words = (place / "stat").read_text().rsplit(")", 1)[1].split()
-    ticks = int(words[11]) + int(words[12])
     maps = (place / "maps").read_text().splitlines()
     mapped = {line.rsplit("/", 1)[1] for line in maps if "/fastrtps_" in line}
     return Usage(
-        rss=mega["VmRSS"],
-        anonymous=mega["RssAnon"],
-        shared=mega["RssShmem"],
-        cpu=ticks / os.sysconf("SC_CLK_TCK"),
+        rss=int(status["VmRSS"][0]) / 1024,
         threads=int(status["Threads"][0]),
         files=len(os.listdir(place / "fd")),
         segments=len(mapped),
     )
-
-
-def proportional(pid: int) -> tuple[float, float]:
-    """Proportional and unique set size, MB; costs the process a few milliseconds, so that it is asked for rarely."""
-    lines = (line.split() for line in (Path("/proc") / str(pid) / "smaps_rollup").read_text().splitlines()[1:])
-    kilobytes = {words[0]: int(words[1]) for words in lines}
-    unique = kilobytes["Private_Clean:"] + kilobytes["Private_Dirty:"]
-    return kilobytes["Pss:"] / 1024, unique / 1024

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.linalg  # noqa: F401  # its own BLAS, which is looked at below, is there from the start
 import torch
 from threadpoolctl import threadpool_info
 

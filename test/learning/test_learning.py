@@ -14,9 +14,10 @@ from safetensors.torch import load_file, save_file
 
 from sq_perception.geometry import Superquadric
 from sq_perception.learning import checkpoint
+from sq_perception.learning.choices import UNSUPERVISED
 from sq_perception.learning.dataset import ViewPool, ViewSource, draw_views, moved_bodies, moved_images
 from sq_perception.learning.disturbance import any_occluder
-from sq_perception.learning.objective import UNSUPERVISED, Objective
+from sq_perception.learning.losses import Objective
 from sq_perception.learning.regressor import Regressor, RegressorConfig
 from sq_perception.learning.train import train, validate
 from sq_perception.learning.training_config import TrainingConfig

@@ -14,7 +14,8 @@ from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.metrics import volume_iou
 from sq_perception.imaging import sight_lines
 from sq_perception.learning import losses
-from sq_perception.learning.objective import LOSSES, UNSUPERVISED, Objective
+from sq_perception.learning.choices import LOSSES, UNSUPERVISED
+from sq_perception.learning.losses import Objective
 from sq_perception.simulation.scenes import thesis_bodies
 from sq_perception.simulation.view_rendering import render_views
 

@@ -1,11 +1,14 @@
-"""The network: two backbones with one face, ImageNet weights that fit or are refused, precision, hostile headers."""
+"""The network: two backbones with one face, ImageNet weights to begin with, precision, hostile headers."""
 
 from __future__ import annotations
 
 import json
+import re
+import sys
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -16,7 +19,6 @@ from torch.nn import functional
 from sq_perception.learning import checkpoint
 from sq_perception.learning.backbone import ResNet18
 from sq_perception.learning.regressor import Regressor, RegressorConfig
-from sq_perception.learning.training_config import TrainingConfig
 
 COMPACT = RegressorConfig(pixels=32, widths=(4, 8, 8), blocks=1, hidden=32)
 THESIS = replace(RegressorConfig.thesis(), pixels=64)
@@ -78,11 +80,6 @@ def colour_features(state: dict[str, torch.Tensor], images: torch.Tensor) -> tor
     return functional.adaptive_avg_pool2d(x, 1).flatten(1)
 
 
-@pytest.fixture
-def state(rng: np.random.Generator) -> dict[str, torch.Tensor]:
-    return torchvision_state(rng)
-
-
 class TestConfig:
     def test_the_thesis_network(self) -> None:
         """Chapter 5.2: 11.2 million weights of ResNet-18 less two colours of the stem, then two layers of 256."""
@@ -125,57 +122,27 @@ class TestConfig:
         assert (bodies.size <= 0.401).all()
 
 
-class TestImagenet:
-    def test_a_grey_view_is_a_colour_image_of_three_equal_colours(
-        self, state: dict[str, torch.Tensor], rng: np.random.Generator
-    ) -> None:
-        model = Regressor(THESIS).eval()
-        model.features.load_imagenet(state)
-        views = torch.tensor(rng.random((3, 1, 64, 64))).float()
-        with torch.inference_mode():
-            features = model.features(views)
-            expected = colour_features(state, views.expand(-1, 3, -1, -1))
-            folded = model.for_inference().features(views)
-        assert expected.std() > 0.1
-        torch.testing.assert_close(features, expected, rtol=1e-4, atol=1e-4)
-        torch.testing.assert_close(folded, expected, rtol=1e-3, atol=1e-3)
-
-    def test_through_a_file_and_without_counters(self, state: dict[str, torch.Tensor], tmp_path: Path) -> None:
-        """Torchvision's own files are from before normalisations counted their batches."""
-        kept = {name: tensor for name, tensor in state.items() if "num_batches" not in name}
-        save_file(kept, str(tmp_path / "resnet18.safetensors"))
-        model = Regressor(THESIS)
-        model.features.load_imagenet(load_file(str(tmp_path / "resnet18.safetensors")))
-        torch.testing.assert_close(model.features.layer4[1].conv2.weight.data, state["layer4.1.conv2.weight"])
-
-    def test_heads_and_mixer_stay(self, state: dict[str, torch.Tensor]) -> None:
-        model = Regressor(THESIS)
-        before = {k: v.clone() for k, v in model.state_dict().items() if not k.startswith("features.")}
-        model.features.load_imagenet(state)
-        assert all(torch.equal(model.state_dict()[name], tensor) for name, tensor in before.items())
-
-    @pytest.mark.parametrize(
-        ("name", "tensor", "said"),
-        [
-            ("layer2.0.downsample.0.weight", None, r'Missing .* "layer2\.0\.downsample\.0\.weight"'),
-            ("layer1.2.conv1.weight", torch.zeros(64, 64, 3, 3), r'Unexpected .* "layer1\.2\.conv1\.weight"'),
-            ("conv1.weight", None, r"conv1\.weight"),
-            ("conv1.weight", torch.zeros(64, 3, 5, 5), r"mismatch for conv1\.weight"),
-            ("layer3.0.bn1.bias", torch.zeros(128), r"mismatch for layer3\.0\.bn1\.bias"),
-        ],
+def test_with_weights_of_imagenet_a_grey_view_is_a_colour_image_of_three_equal_colours(
+    repository: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, rng: np.random.Generator
+) -> None:
+    """Those that the page on training takes over; here random ones in torchvision's form."""
+    state, torchvision = torchvision_state(rng), MagicMock()
+    torchvision.models.resnet18.return_value.state_dict.return_value = dict(state)
+    monkeypatch.setitem(sys.modules, "torchvision", torchvision)
+    monkeypatch.chdir(tmp_path)
+    (snippet,) = re.findall(
+        r"^```python\n(.*?)^```$", (repository / "docs" / "training.md").read_text(encoding="utf-8"), re.M | re.S
     )
-    def test_all_must_fit(
-        self, name: str, tensor: torch.Tensor | None, said: str, state: dict[str, torch.Tensor]
-    ) -> None:
-        state.pop(name, None)
-        if tensor is not None:
-            state[name] = tensor
-        with pytest.raises(ValueError, match=said):
-            Regressor(THESIS).features.load_imagenet(state)
-
-    def test_only_for_resnet18(self) -> None:
-        with pytest.raises(ValueError, match="only resnet18"):
-            TrainingConfig(imagenet="resnet18.safetensors")
+    exec(compile(snippet, "training.md", "exec"), {})  # noqa: S102
+    model = checkpoint.load("resnet18.safetensors")
+    views = torch.tensor(rng.random((3, 1, 64, 64))).float()
+    with torch.inference_mode():
+        features = model.features(views)
+        expected = colour_features(state, views.expand(-1, 3, -1, -1))
+        folded = model.for_inference().features(views)
+    assert expected.std() > 0.1
+    torch.testing.assert_close(features, expected, rtol=1e-4, atol=1e-4)
+    torch.testing.assert_close(folded, expected, rtol=1e-3, atol=1e-3)
 
 
 class TestPrecision:

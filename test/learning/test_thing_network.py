@@ -114,34 +114,25 @@ def test_planes_mirror_with_their_points(rng: np.random.Generator) -> None:
     assert moved @ there[:3] + there[3] == pytest.approx(points @ plane[:3] + plane[3])
 
 
-def test_it_begins_with_the_weights_of_a_regressor() -> None:
-    """The second channel, plane and extent are not listened to at first: the features are those of the shipped one."""
-    network, given = ThingNetwork(), checkpoint.load("robust")
-    thing_training.begin_with(network, checkpoint.resolve("robust"))
-    network.eval()
-    views = torch.rand(2, 64, 64)
-    with torch.inference_mode():
-        body = network(views, torch.randn(2, 4), torch.rand(2)).body
-        expected = given(views[:, None])
-    assert torch.allclose(body.to_flat(), expected.to_flat(), atol=2e-2)
-
-
 def test_it_begins_with_all_weights_of_another_of_its_kind(tmp_path: Path) -> None:
-    path, given, network = tmp_path / "things.safetensors", ThingNetwork(SMALL), ThingNetwork(SMALL)
+    path, given = tmp_path / "things.safetensors", ThingNetwork(replace(SMALL, spread=0.4))
     checkpoint.save(path, given)
-    thing_training.begin_with(network, path)
+    network = thing_training.THINGS.network(str(path))
+    assert network.config == SMALL
     for name, weights in given.state_dict().items():
         # Files keep 11 bits.
         assert torch.allclose(weights.float(), network.state_dict()[name].float(), rtol=1e-3, atol=1e-4), name
 
 
-def test_it_begins_with_no_network_of_masks_and_no_other_goes_on_with_its_state(
+def test_it_begins_with_no_network_of_another_kind_and_no_other_goes_on_with_its_state(
     tmp_path: Path, rng: np.random.Generator, capsys: pytest.CaptureFixture[str]
 ) -> None:
     shards(tmp_path / "views", 3, rng)
     run = ["train-things", str(tmp_path / "views"), "--output", str(tmp_path / "run"), "--batch", "2"]
-    assert main.main([*run, "--start", "masks"]) == main.FAILURE
-    assert "expected a header 'format: sq_perception.regressor', got 'sq_perception.masks'" in capsys.readouterr().err
+    for start, kind in (("masks", "masks"), ("robust", "regressor")):
+        assert main.main([*run, "--start", start]) == main.FAILURE
+        said = f"expected a header 'format: sq_perception.things', got 'sq_perception.{kind}'"
+        assert said in capsys.readouterr().err
     TrainingState(tmp_path / "run" / "state.safetensors", MaskNetwork(), torch.optim.AdamW([torch.zeros(1)])).save()
     assert main.main(run) == main.FAILURE
     said = capsys.readouterr().err

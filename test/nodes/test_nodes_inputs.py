@@ -10,12 +10,12 @@ import pytest
 pytest.importorskip("rclpy", reason="needs the extra 'ros'")
 
 from frame_node_bench import CAMERA
+from packed_depth import pack
 from rclpy.parameter import Parameter
 from sensor_msgs.msg import CameraInfo, CompressedImage, Image, PointCloud2, PointField
 from std_msgs.msg import Header
 
 from sq_msgs_py.depth_image import labels_to_message
-from sq_perception.imaging import compressed_depth
 
 
 def test_packed_images_are_read_and_hostile_ones_refused(make_bench):
@@ -26,7 +26,7 @@ def test_packed_images_are_read_and_hostile_ones_refused(make_bench):
     depth = np.full((48, 64), 0.731, np.float32)
     depth[:5] = np.nan
     for encoding in ("16UC1", "32FC1"):
-        form, data = compressed_depth.encode(depth, encoding)
+        form, data = pack(depth, encoding)
         header = bench.header()
         packed.publish(CompressedImage(header=header, format=form, data=data))
         bench.until(lambda header=header: any(one.header == header for one in bench.answers))

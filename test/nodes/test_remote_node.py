@@ -1,4 +1,4 @@
-"""Another node through its services: lifecycle, parameters, answers; and the command as a process."""
+"""Another node through its services: parameters, answers; and the command as a process."""
 
 from __future__ import annotations
 
@@ -54,9 +54,6 @@ class Page:
         self.controls = controls
         self.values = {one.name: one.value for one in controls}
 
-    def show_values(self, node: str, values: dict[str, Any]) -> None:
-        self.values.update(values)
-
     def show_answer(self, node: str, text: str, good: bool) -> None:
         self.answers.append((text, good))
 
@@ -74,7 +71,7 @@ class Bench(SpunNodes):
 
     def _on_event(self, event: ParameterEvent) -> None:
         if event.node == NAME:
-            self.remote.on_event(event)
+            self.remote.reload()
 
     def start(self) -> Managed:
         node = Managed(self.context)
@@ -105,14 +102,12 @@ def test_a_node_that_is_not_there_says_so(bench: Bench) -> None:
     bench.asked(bench.remote.change, "s", 1.0)
     bench.shows(lambda: bench.page.answers == [(f"s: {NAME} is not there", False)])
     assert not bench.remote.is_there
-    assert bench.remote.lifecycle == ""
 
 
-def test_lifecycle_and_parameters_are_followed(bench: Bench) -> None:
+def test_parameters_are_followed(bench: Bench) -> None:
     node = bench.start()
-    bench.shows(lambda: bench.remote.lifecycle == "unconfigured" and bench.page.values.get("s") == 117.3)
+    bench.shows(lambda: bench.page.values.get("s") == 117.3)
     bench.asked(node.trigger_configure)
-    bench.shows(lambda: bench.remote.lifecycle == "inactive")
     # Declared by the transition: an event says so, and all controls are read anew.
     bench.shows(lambda: "late" in bench.page.values)
 

@@ -152,6 +152,14 @@ def test_a_camera_is_that_of_its_parameter_or_lies_beside_the_image(tmp_path):
     assert beside.clean.camera == Camera(64, 48, 70.0, 70.0, 31.5, 23.5)
 
 
+def test_a_table_is_seen_by_the_camera_of_a_file_without_its_distortion(tmp_path):
+    path = tmp_path / "lens.yaml"
+    path.write_text("{width: 320, height: 240, k: [262, 0, 159.5, 0, 260, 119.5, 0, 0, 1], d: [-0.2, 0.05, 0, 0, 0]}")
+    clean = frame_source(SyntheticParameters(camera_info_file=str(path))).clean
+    assert clean.camera == Camera(320, 240, 262.0, 260.0, 159.5, 119.5)
+    assert clean.depth.shape == (240, 320)
+
+
 def test_a_node_replays_what_a_folder_holds(tmp_path):
     """First an orthographic frame, then a pinhole one with large labels: camera_info and masks come with these."""
     depth = np.full((8, 8), 0.5, np.float32)

@@ -59,7 +59,7 @@ def test_recover(home: Path, tmp_path: Path) -> None:
     depth = np.full((60, 80), np.nan, np.float32)
     depth[20:40, 30:50] = 0.5
     np.savez(tmp_path / "a.npz", depth=depth, K=[[80, 0, 39.5], [0, 80, 29.5], [0, 0, 1]], labels=(depth > 0) * 1)
-    command = [sys.executable, "-m", "sq_perception.commands.main", "recover", "a.npz", "--json", "out.json"]
+    command = [sys.executable, "-m", "sq_perception", "recover", "a.npz", "--json", "out.json"]
     command += ["--jsonl", "out.jsonl", "--meshes", "meshes", "--mcap", "out.mcap"]
     found = sealed_network.run(command, environment(home), tmp_path, sealed_network.PATIENCE)
     assert found.code == 0, found.said

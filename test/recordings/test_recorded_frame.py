@@ -67,17 +67,16 @@ def test_npz_with_labels_that_would_become_others_is_refused(tmp_path):
         read(save_npz(tmp_path / "frame.npz", labels=labels))
 
 
-def test_npz_with_labels_and_plane(tmp_path):
+def test_npz_with_labels(tmp_path):
     labels = np.zeros((48, 64), np.int16)
     labels[10:20, 10:20] = 7
-    frame = read(save_npz(tmp_path / "frame.npz", labels=labels, plane=np.array([0, -1, 0, 0.5])))
+    frame = read(save_npz(tmp_path / "frame.npz", labels=labels))
     assert frame.camera == Camera(64, 48, 60.0, 61.0, 31.5, 23.5)
     assert frame.depth.dtype == np.float32
     assert frame.labels.dtype == np.int32
     assert np.isnan(frame.depth[0, :3]).all()
     assert np.isfinite(frame.depth).sum() == 48 * 64 - 3
     assert set(np.unique(frame.labels)) == {0, 7}
-    np.testing.assert_array_equal(frame.plane, [0, -1, 0, 0.5])
     assert frame.name == "frame.npz"
     assert not frame.is_cube
 
@@ -183,7 +182,6 @@ BAD_NPZ = {
     "skewed K": (lambda p: save_npz(p, K=K + np.eye(3, k=1)), "skew"),
     "other labels": (lambda p: save_npz(p, labels=np.zeros((3, 3), np.int32)), "labels"),
     "float labels": (lambda p: save_npz(p, labels=np.zeros((48, 64))), "labels"),
-    "bad plane": (lambda p: save_npz(p, plane=np.zeros(3)), "plane"),
     "objects": (lambda p: save_npz(p, depth=np.array([[{}]], dtype=object)), "readable NPZ"),
     "not a zip": (lambda p: p.write_bytes(b"not a zip") and p, "readable NPZ"),
     "empty": (lambda p: p.write_bytes(b"") or p, "readable NPZ"),

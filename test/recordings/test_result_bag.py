@@ -494,7 +494,7 @@ def test_the_file_holds_what_the_node_publishes(tmp_path, scene):
     shown = publication.findings(publication.Identified(recovery, ids), live.header, is_cube=False)
     expected = {
         SUPERQUADRICS: superquadrics.to_message(shown.array, live.header),
-        MARKERS: shown.markers((), defaults.marker_colours == "score", defaults.marker_alpha),
+        MARKERS: shown.markers((), defaults.marker_alpha),
         RENDERED: live.encode(render_recovery(recovery, frame.camera)[0]),
         "/a/image": live.encode(frame.depth),
     }

@@ -184,7 +184,8 @@ def test_walls_are_furniture_and_faces_of_things_are_not():
     depth = np.zeros((240, 320), np.float32)
     depth[:, :150] = 2.0  # 1.1 m wide, 1.8 m high
     depth[100:160, 220:280] = 2.0  # 0.44 m
-    large = standing.furniture(noisy(depth), depth > 0, CAMERA, [wall], limits)
+    measured = noisy(depth)
+    large = standing.furniture(standing.Seen(measured, measured, CAMERA, [wall], limits), depth > 0)
     assert large[:, :140].mean() > 0.99
     assert not large[:, 160:].any()
 
@@ -381,7 +382,7 @@ def test_tall_neighbours_are_not_taken_for_each_other_s_noise(away, sigma):
     support = support_surface.SupportSurface(table, np.zeros(6), 0.0, sigma)
     relative = support.image_relative(depth, camera)
     limits = SegmentationOptions(max_size=0.9 * away)
-    is_thing = standing.standing(depth, relative, labels, camera, support, [], limits)
+    is_thing = standing.standing(standing.Seen(depth, depth, camera, [], limits), relative, labels, support)
     assert all(is_thing(*np.nonzero(labels == k)) for k in range(1, 5))
 
 

@@ -58,7 +58,13 @@ class FrameNode(Node):
         self.create_timer(0.2, self._report)
 
     def _report(self) -> None:
-        values = {"rate [Hz]": "28.25", "dropped": "4", "lost": "0", "last error": "<b>no & camera</b>"}
+        values = {
+            "state": "active",
+            "rate [Hz]": "28.25",
+            "dropped": "4",
+            "lost": "0",
+            "last error": "<b>no & camera</b>",
+        }
         pairs = [KeyValue(key=key, value=value) for key, value in values.items()]
         status = DiagnosticStatus(name="bench/recover_node: frames", hardware_id=NODE, values=pairs)
         self.diagnostics.publish(DiagnosticArray(status=[status]))
@@ -198,6 +204,7 @@ def test_the_table_says_what_the_message_says(bench: Bench) -> None:
     # What others say is text, never a part of the page.
     assert "<b>no & camera</b>" in browser.text()
     assert "4 dropped" in browser.text()
+    assert "active, alive" in browser.text()
     browser.until(lambda: "160 × 120" in browser.text())  # the image comes on its own
 
 

@@ -64,7 +64,7 @@ def test_frames_are_turned_over_and_recovered_once(shot):
         server=SimpleNamespace(gui=SimpleNamespace(add_button_group=lambda *_: buttons)),
         show_source=show_source,
         show_depth=lambda depth, camera: None,
-        show_bodies=lambda node, bodies, stamp, state: None,
+        show_bodies=lambda bodies, state: None,
     )
 
     def rest():

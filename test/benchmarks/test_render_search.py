@@ -1,4 +1,4 @@
-"""The grid search of figure 7.6: what it computes, and that the command draws it."""
+"""The grid search of figure 7.6: what it computes, and that the script draws it."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import render_search
 import torch
+from render_search import search
 from unit_axis import soft_images
 
-from sq_perception.commands import main
-from sq_perception.evaluation.render_search import search
 from sq_perception.geometry import Superquadric
 from sq_perception.imaging import raycast, soft_render, unit_cube
 from sq_perception.simulation.scenes import thesis_bodies
@@ -35,15 +35,12 @@ def test_thesis_parameters_do_as_well_as_the_thesis_says() -> None:
     assert found.best[2] < 0.0056
 
 
-def test_command_prints_the_optimum_and_draws_the_map(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_the_script_prints_the_optimum_and_draws_the_map(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     picture = tmp_path / "map.png"
-    arguments = ["render-search", "--bodies", "2", "--resolution", "16", "--steps", "4", "--picture", str(picture)]
-    assert main.main(arguments) == main.SUCCESS
+    arguments = ["--bodies", "2", "--resolution", "16", "--steps", "4", "--picture", str(picture)]
+    monkeypatch.setattr("sys.argv", ["render_search.py", *arguments])
+    render_search.main()
     assert "least MAE" in capsys.readouterr().out
     assert cv2.imread(str(picture)) is not None
-
-
-def test_command_refuses_nonsense(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
-    for wrong in (["--bodies", "0"], ["--picture", str(tmp_path / "missing" / "map.png")]):
-        assert main.main(["render-search", *wrong]) == main.USAGE
-        assert wrong[0] in capsys.readouterr().err

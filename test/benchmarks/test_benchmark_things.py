@@ -1,13 +1,11 @@
-"""What benchmarks of scans and things build on: rasteriser, poses, IoU and hulls, against the package's own."""
+"""What benchmarks of things build on: IoU and hulls, against the package's own."""
 
 from __future__ import annotations
 
 import household_things
-import hull_oracle
-import mesh_scene
 import numpy as np
 import pytest
-import trimesh
+from common import hull_columns
 from scipy.spatial import ConvexHull
 
 from sq_perception.geometry import Superquadric, metrics, rotation
@@ -18,23 +16,8 @@ from sq_perception.simulation.things_on_table import TABLE_CAMERA, things_on_tab
 BODY = Superquadric([0.06, 0.04, 0.03], [0.3, 0.7], [0.05, -0.03, 0.7], [0.3, -0.2, 0.5, 0.8])
 
 
-def test_a_resting_mesh_stands_on_the_plane_it_is_seen_on(rng: np.random.Generator) -> None:
-    block = trimesh.creation.box((0.04, 0.07, 0.1))
-    poser = mesh_scene.resting(block)
-    for _ in range(5):
-        view = mesh_scene.view(block, poser, rng)
-        height = (block.vertices @ view.rotation.T + view.translation) @ view.plane[:3] + view.plane[3]
-        assert height.min() == pytest.approx(0, abs=1e-9)
-        assert np.sum(height < 1e-9) == 4
-        assert view.plane[3] > 0
-        points = view.camera.points(view.depth)
-        beside = points[~view.mask & np.isfinite(view.depth)] @ view.plane[:3] + view.plane[3]
-        assert abs(np.median(beside)) < 1e-3
-        assert (points[view.mask] @ view.plane[:3] + view.plane[3] > -0.01).all()
-
-
 def test_iou_with_a_hull_is_the_iou_of_the_bodies(rng: np.random.Generator) -> None:
-    columns = hull_oracle.Columns.of(mesh(BODY, 128).vertices)
+    columns = hull_columns.Columns.of(mesh(BODY, 128).vertices)
     assert columns.volume == pytest.approx(float(BODY.volume()), rel=2e-3)
     assert columns.iou(BODY) > 0.995
     for _ in range(5):

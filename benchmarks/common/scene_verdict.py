@@ -6,10 +6,9 @@
 | own | its own | `Recoverer().recover(depth, camera)`; the body of the mask that agrees, or none |
 | classic | true, eroded | Solina and Bajcsy's fit of the measured points |
 | oriented box | true, eroded | the smallest box around the measured points |
-| standing box | true, eroded | from the true table to the highest of them, over the smallest rectangle around all |
 
 Masks agree with an IoU of at least 0.5 among the pixels that have a reading.  Eroded by 3 pixels, since those of a
-sensor's edge lie on what is behind: none of these three would survive them.
+sensor's edge lie on what is behind: neither of these two would survive them.
 
 Volume IoU is with the convex hull of the thing, 0 where there is no body or a failed one.  Errors of size are those of
 full edges, both lists ascending (which is the order of axes with the least sum), and their mean over the three; a body
@@ -23,31 +22,24 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from functools import cache
-from pathlib import Path
 
 import cv2
 import numpy as np
-import tabletop
 import trimesh
-from both_fits import measured_points
-from mesh_scene import about_z
-from real_frames import below_table
-from tabletop import Placed, Tabletop
 
+from common.tabletop import Placed, Tabletop
 from sq_perception.fitting import solina_bajcsy
 from sq_perception.fitting.fit import Status
 from sq_perception.geometry import Superquadric
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.recovery.recoverer import FrameRecovery, Recoverer
 
-METHODS = ("given", "own", "classic", "oriented box", "standing box")
-FEWEST_PIXELS = 200
+METHODS = ("given", "own", "classic", "oriented box")
+HALF, FEWEST_PIXELS = 0.5, 200
+"""Visible share and size of the things that are counted."""
 FEWEST_POINTS = 30
 EROSION = 3
 MATCH = 0.5
-EXPLAINED = 0.010
-SAMPLED = 7
-"""Every so many-th pixel's distance to the surface is kept."""
 _SHARP = 0.02
 _THINNEST = 1e-3
 
@@ -118,12 +110,6 @@ class SceneVerdict:
         Of whole frames, by method.
     false_bodies
         Own bodies whose mask is none of a thing.
-    distances : (n,)
-        From some measured pixels of things to the nearest body of the own masks, metres; inf where there is none.
-    below : (m,)
-        How far each body of the own masks reaches below the true table, millimetres.
-    plane_error : (2,)
-        Of the table found: degrees, and metres at the point looked at; NaN without one.
     """
 
     seed: int
@@ -132,19 +118,11 @@ class SceneVerdict:
     tiny: int
     milliseconds: dict[str, float]
     false_bodies: int
-    distances: np.ndarray
-    below: np.ndarray
-    plane_error: np.ndarray
 
 
 @cache
 def recoverer() -> Recoverer:
     return Recoverer()
-
-
-def verdict(seed: int, scans: Path | None, sensor: str | None) -> SceneVerdict:
-    """Make the scene of a seed and evaluate every method on it."""
-    return evaluated(tabletop.scene(seed, scans, sensor))
 
 
 def evaluated(scene: Tabletop) -> SceneVerdict:
@@ -180,24 +158,14 @@ def evaluated(scene: Tabletop) -> SceneVerdict:
                 {name: answers[name] for name in METHODS},
             )
         )
-    own = frames["own"]
     taken = set(known.values())
-    plane_error = np.full(2, np.nan)
-    if own.plane is not None:
-        found = own.plane / np.linalg.norm(own.plane[:3])
-        middle = np.array([0, 0, -scene.plane[3] / scene.plane[2]])
-        plane_error[0] = np.degrees(np.arccos(np.clip(found[:3] @ scene.plane[:3], -1, 1)))
-        plane_error[1] = found[:3] @ middle + found[3]
     return SceneVerdict(
         scene.seed,
         scene.sensor,
         tuple(things),
         len(scene.placed) - len(things),
         {name: frame.milliseconds["total"] for name, frame in frames.items()},
-        sum(body.label not in taken for body in own.recovered),
-        _distances(own, scene),
-        np.array([below_table(body.superquadric, scene.plane) for body in own.recovered]),
-        plane_error,
+        sum(body.label not in taken for body in frames["own"].recovered),
     )
 
 
@@ -247,45 +215,25 @@ def matches(own: np.ndarray, true: np.ndarray, depth: np.ndarray) -> dict[int, i
 def _inner_points(label: int, scene: Tabletop) -> np.ndarray:
     """Measured points (n, 3) of a thing away from the edge of its mask."""
     mask = cv2.erode((scene.labels == label).astype(np.uint8), np.ones((2 * EROSION + 1,) * 2, np.uint8)) > 0
-    return measured_points(scene.depth, mask, scene.camera)
+    return scene.camera.points(scene.depth)[mask & np.isfinite(scene.depth)]
 
 
 def _simple(points: np.ndarray, placed: Placed, scene: Tabletop) -> dict[str, Answer]:
     """What the methods without masks' edges, free space and networks make of a thing's points."""
-    names = ("classic", "oriented box", "standing box")
     if len(points) < FEWEST_POINTS:
-        return {name: Answer(status="failed", message="too few points") for name in names}
+        return {name: Answer(status="failed", message="too few points") for name in ("classic", "oriented box")}
+    answers = {"oriented box": _answer(smallest_box(points), placed, scene)}
     classic = solina_bajcsy.fit(points)
-    bodies = classic.superquadric, _oriented_box(points), _standing_box(points, scene)
-    answers = {name: _answer(body, placed, scene) for name, body in zip(names, bodies, strict=True)}
     if classic.status == Status.FAILED:
         answers["classic"] = Answer(status="failed", message=classic.message)
+    else:
+        answers["classic"] = _answer(classic.superquadric, placed, scene)
     return answers
 
 
-def _oriented_box(points: np.ndarray) -> Superquadric:
+def smallest_box(points: np.ndarray) -> Superquadric:
+    """The smallest box around points (n, 3), as a sharp superquadric."""
     box_from_points, edges = trimesh.bounds.oriented_bounds(points)
     turn = box_from_points[:3, :3].T
-    return _box(edges, -turn @ box_from_points[:3, 3], turn)
-
-
-def _standing_box(points: np.ndarray, scene: Tabletop) -> Superquadric:
-    flat = points @ scene.table
-    height = points @ scene.plane[:3] + scene.plane[3]
-    middle, edges, degrees = cv2.minAreaRect(flat[:, :2].astype(np.float32))
-    top = max(float(height.max()), _THINNEST)
-    centre = scene.table @ np.array([*middle, top / 2 - scene.plane[3]])
-    return _box(np.array([*edges, top]), centre, scene.table @ about_z(np.deg2rad(degrees)))
-
-
-def _box(edges: np.ndarray, centre: np.ndarray, turn: np.ndarray) -> Superquadric:
-    half = np.maximum(np.asarray(edges), _THINNEST) / 2
-    return Superquadric(half, np.full(2, _SHARP), centre, quaternions.from_matrix(turn))
-
-
-def _distances(frame: FrameRecovery, scene: Tabletop) -> np.ndarray:
-    points = measured_points(scene.depth, scene.labels > 0, scene.camera)[::SAMPLED]
-    nearest = np.full(len(points), np.inf)
-    for body in frame.recovered:
-        nearest = np.minimum(nearest, np.abs(body.superquadric.sampson_distance(points)))
-    return nearest
+    half = np.maximum(edges, _THINNEST) / 2
+    return Superquadric(half, np.full(2, _SHARP), -turn @ box_from_points[:3, 3], quaternions.from_matrix(turn))

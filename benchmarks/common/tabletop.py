@@ -19,19 +19,19 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import mesh_scene
-import mesh_things
 import numpy as np
-from mesh_scene import about_z, looked_down_on
-from mesh_things import MeshThing
 from scipy.spatial import ConvexHull
 
+from common import mesh_things
+from common.mesh_things import MeshThing
 from sq_perception.imaging.camera import Camera
 from sq_perception.simulation import sensor_noise
+from sq_perception.simulation.rendering import Mesh, render_mesh
 from sq_perception.simulation.scenes import plane_depth
 
 SENSORS = {"stereo": "realsense_d435", "structured light": "kinect_v1"}
 """Scenes of even seeds are seen by the first, those of odd seeds by the second."""
+CAMERA = Camera(640, 480, 320 / np.tan(np.deg2rad(30)), 320 / np.tan(np.deg2rad(30)), 319.5, 239.5)
 MOST = 8
 DISTANCE = (0.5, 1.2)
 ELEVATION = (25.0, 65.0)
@@ -138,15 +138,8 @@ def scene(seed: int, scans: Path | None = None, sensor: str | None = None) -> Ta
         The folder of scanned objects; without it there are none of them.
     sensor
         One of ``SENSORS``; by default the seed decides.
-
-    Raises
-    ------
-    ValueError
-        For an unknown sensor.
     """
     sensor = sensor or list(SENSORS)[seed % len(SENSORS)]
-    if sensor not in SENSORS:
-        raise ValueError(f"sensor: expected one of {', '.join(SENSORS)}, got {sensor!r}")
     rng = np.random.default_rng([_STREAM, seed])
     model = sensor_noise.preset(SENSORS[sensor])
     nearest = max(NEAREST, getattr(model, "near", 0.0) + 0.01)
@@ -222,9 +215,8 @@ def _lying(thing: MeshThing, spread: float, rng: np.random.Generator) -> tuple[s
 def _in_view(corners: np.ndarray, nearest: float) -> bool:
     if corners[:, 2].min() < nearest:
         return False
-    camera = mesh_scene.CAMERA
-    pixels = camera.project(corners)
-    limit = np.array([camera.width, camera.height]) - 1 - _MARGIN
+    pixels = CAMERA.project(corners)
+    limit = np.array([CAMERA.width, CAMERA.height]) - 1 - _MARGIN
     return bool((pixels > _MARGIN).all() and (pixels < limit).all())
 
 
@@ -235,10 +227,14 @@ def rendered(
 
     Each comes with its rest, rotation (3, 3) and translation (3,), camera from thing.
     """
-    meshes, turns, places = ([each[k] for each in things] for k in (0, 2, 3))
-    depth, labels, alone = mesh_scene.render_meshes([thing.mesh for thing in meshes], turns, places, behind)
+    depth, labels, alone = behind, np.zeros(behind.shape, np.int32), []
+    for k, (thing, _, turn, place) in enumerate(things):
+        own = render_mesh(Mesh(thing.mesh.vertices @ turn.T + place, np.asarray(thing.mesh.faces)), CAMERA)
+        nearer = own < depth
+        depth, labels = np.where(nearer, own, depth), np.where(nearer, np.int32(k + 1), labels)
+        alone.append(int(np.count_nonzero(np.isfinite(own))))
     pixels = np.bincount(labels.ravel(), minlength=len(things) + 1)[1:]
-    placed = [Placed(*each, k + 1, int(pixels[k]), int(alone[k])) for k, each in enumerate(things)]
+    placed = [Placed(*each, k + 1, int(pixels[k]), alone[k]) for k, each in enumerate(things)]
     return depth, labels, tuple(placed)
 
 
@@ -251,21 +247,31 @@ def _seen(
     poses: list[tuple[str, np.ndarray]],
     rng: np.random.Generator,
 ) -> Tabletop:
-    camera = mesh_scene.CAMERA
     lying = [
         (thing, rest, stand.table @ pose[:3, :3], stand.table @ pose[:3, 3] + stand.origin)
         for thing, (rest, pose) in zip(things, poses, strict=True)
     ]
-    depth, labels, placed = rendered(lying, _background(stand, camera))
-    measured = model.measured(depth, camera, rng)
-    return Tabletop(seed, sensor, camera, measured, depth, labels, stand.plane, stand.table, placed)
+    depth, labels, placed = rendered(lying, _background(stand))
+    measured = model.measured(depth, CAMERA, rng)
+    return Tabletop(seed, sensor, CAMERA, measured, depth, labels, stand.plane, stand.table, placed)
 
 
-def _background(stand: _Stand, camera: Camera) -> np.ndarray:
+def _background(stand: _Stand) -> np.ndarray:
     """The table, and the floor beside it; +inf beyond."""
     plane = stand.plane
-    table = plane_depth(plane, camera)
-    points = camera.points(np.where(np.isfinite(table), table, 1e3)) - stand.origin
+    table = plane_depth(plane, CAMERA)
+    points = CAMERA.points(np.where(np.isfinite(table), table, 1e3)) - stand.origin
     along = (points @ stand.table[:, :2]) @ about_z(stand.yaw)[:2, :2]
     on_table = np.isfinite(table) & (np.abs(along) < stand.sides / 2).all(axis=-1)
-    return np.where(on_table, table, plane_depth(plane + [0, 0, 0, FLOOR], camera))
+    return np.where(on_table, table, plane_depth(plane + [0, 0, 0, FLOOR], CAMERA))
+
+
+def looked_down_on(down: float) -> np.ndarray:
+    """Columns: right, away and up on a table, in the optical frame of a camera that looks down by so many radians."""
+    return np.array([[1.0, 0, 0], [0, -np.sin(down), -np.cos(down)], [0, np.cos(down), -np.sin(down)]])
+
+
+def about_z(angle: float) -> np.ndarray:
+    """The rotation (3, 3) about z by so many radians."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1.0]])

@@ -6,18 +6,17 @@ shaded; pictures are written with few colours, as noise does not compress.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import product
 from pathlib import Path
 
 import numpy as np
-from hull_oracle import Columns
 from matplotlib.figure import Figure
 from PIL import Image
 from scipy.optimize import linear_sum_assignment
-from tabletop import Placed, Tabletop
 
+from common.hull_columns import Columns
+from common.tabletop import Placed, Tabletop
 from sq_perception.evaluation.body_pictures import draw_bodies_3d
 from sq_perception.evaluation.plots import (
     colour,
@@ -86,19 +85,6 @@ def scene_figure(view: Tabletop, frame: FrameRecovery, azimuth: float) -> Figure
         axes[2], bodies, plane=view.plane, colours=shades, elevation=_ELEVATION, azimuth=azimuth, wires=cages
     )
     heading_of(axes[2], "From the right", "thin lines: the true things")
-    return figure
-
-
-def empty_figure(views: Sequence[Tabletop], frames: Sequence[FrameRecovery]) -> Figure:
-    """What each sensor makes of a table with nothing on it."""
-    figure = new_figure(11.62, 2.42)
-    axes = figure.subplots(1, len(views), gridspec_kw={"wspace": 0.025})
-    figure.subplots_adjust(left=0.004, right=0.996, top=0.9, bottom=0.012)
-    for ax, view, frame in zip(axes, views, frames, strict=True):
-        draw_depth(ax, view.depth)
-        draw_masks(ax, frame.labels, [body.label for body in frame.bodies])
-        missing = 100 * (1 - np.isfinite(view.depth).mean())
-        heading_of(ax, f"{view.sensor}: {len(frame.bodies)} bodies", f"{missing:.0f} % missing")
     return figure
 
 

@@ -19,8 +19,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from picking_world import Thing, World
 
+from common.picking_world import Thing, World
 from sq_perception.geometry import mesh
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric

@@ -10,13 +10,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
-import mesh_scene
-import mesh_things
 import numpy as np
-import tabletop
-from mesh_things import MeshThing
-from tabletop import Tabletop
 
+from common import mesh_things, tabletop
+from common.mesh_things import MeshThing
+from common.tabletop import Tabletop
 from sq_perception.simulation import sensor_noise
 from sq_perception.simulation.scenes import plane_depth
 
@@ -34,7 +32,7 @@ class Stood:
     turn: np.ndarray = field(default_factory=lambda: mesh_things.UPRIGHT)
 
 
-def viewed(things: Sequence[Stood], sensor: str, down: float = 40.0, distance: float = 0.75) -> Tabletop:
+def viewed(things: Sequence[Stood], sensor: str, down: float, distance: float) -> Tabletop:
     """Things on a table whose middle is ``distance`` metres away, looked down on by ``down`` degrees.
 
     Raises
@@ -42,13 +40,13 @@ def viewed(things: Sequence[Stood], sensor: str, down: float = 40.0, distance: f
     ValueError
         If two things are in one place, as seen from above.
     """
-    camera, table = mesh_scene.CAMERA, mesh_scene.looked_down_on(np.deg2rad(down))
+    camera, table = tabletop.CAMERA, tabletop.looked_down_on(np.deg2rad(down))
     origin = np.array([0.0, 0.0, distance])
     plane = np.append(table[:, 2], -table[:, 2] @ origin)
     placed: list[tuple[MeshThing, str, np.ndarray, np.ndarray]] = []
     outlines: list[np.ndarray] = []
     for each in things:
-        turn = mesh_scene.about_z(np.deg2rad(each.heading)) @ each.turn
+        turn = tabletop.about_z(np.deg2rad(each.heading)) @ each.turn
         corners = each.thing.hull @ turn.T
         low, high = corners.min(axis=0), corners.max(axis=0)
         place = np.append(each.place, 0.0) - np.append((low + high)[:2] / 2, low[2])

@@ -8,4 +8,4 @@ from pathlib import Path
 
 os.environ.setdefault("ROS_DOMAIN_ID", str(1 + os.getpid() % 100))
 os.environ.setdefault("ROS_AUTOMATIC_DISCOVERY_RANGE", "LOCALHOST")
-sys.path.append(str(Path(__file__).resolve().parent.parent / "test" / "helpers"))
+sys.path.append(str(Path(__file__).resolve().parents[2] / "test" / "helpers"))

@@ -8,19 +8,25 @@ and by the soft renderer (equations 7.8 to 7.10) on a grid of r^3 voxels.  The s
 and its least value.  The thesis found 0.0056 at s = 117.3, tau = 4.82 on its own range.  With images as exact as these
 the error falls with s as far as one looks, down to the half step of a voxel: only the gradient, which a sharp
 boundary has in a thin layer only, is a reason for a softer one.
+
+python benchmarks/render_search.py --picture docs/render_search.png
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
+import report
 import torch
 from matplotlib.figure import Figure
 
 from sq_perception.evaluation import plots
 from sq_perception.geometry.superquadric import Superquadric
-from sq_perception.imaging import raycast, soft_agreement, soft_render, unit_cube
+from sq_perception.imaging import raycast, soft_render, unit_cube
+from sq_perception.imaging.soft_agreement import THESIS_SHARPNESS, THESIS_TAU
+from sq_perception.simulation.scenes import thesis_bodies
 
 SHARPNESS = (10.0, 1000.0)
 TAU = (0.25, 32.0)
@@ -79,7 +85,30 @@ def figure(found: RenderSearch) -> Figure:
     bar.set_label("MAE, sides of the cube")
     s, tau, error = found.best
     ax.plot(tau, s, "o", color="white", label=f"least {error:.4f}: s = {s:.1f}, tau = {tau:.2f}")
-    ax.plot(soft_agreement.THESIS_TAU, soft_agreement.THESIS_SHARPNESS, "x", color="white", label="thesis: 117.3, 4.82")
+    ax.plot(THESIS_TAU, THESIS_SHARPNESS, "x", color="white", label="thesis: 117.3, 4.82")
     ax.set(xscale="log", yscale="log", xlabel="tau", ylabel="s", title="Soft against exact images")
     ax.legend(loc="lower right", facecolor=plots.INK, labelcolor="white", fontsize=8)
     return sheet
+
+
+def main() -> None:
+    parser = report.parser(__doc__)
+    parser.add_argument("--bodies", type=int, default=20, help="random bodies (default %(default)s)")
+    parser.add_argument("--resolution", type=int, default=64, help="pixels and voxels a side (%(default)s)")
+    parser.add_argument("--steps", type=int, default=21, help="values of s and of tau (default %(default)s)")
+    parser.add_argument("--seed", type=int, default=2020, help="default %(default)s")
+    parser.add_argument("--picture", type=Path, help="PNG to draw the heat map to")
+    options = parser.parse_args()
+    bodies = thesis_bodies(options.bodies, np.random.default_rng(options.seed))
+    sharpness, taus = (np.geomspace(*limits, options.steps) for limits in (SHARPNESS, TAU))
+    found = search(bodies, sharpness, taus, options.resolution)
+    thesis = search(bodies, np.array([THESIS_SHARPNESS]), np.array([THESIS_TAU]), options.resolution)
+    s, tau, error = found.best
+    print(f"least MAE {error:.4f} at s = {s:.1f}, tau = {tau:.2f}")
+    print(f"at the thesis' s = 117.3, tau = 4.82: {thesis.best[2]:.4f} (the thesis reports 0.0056)")
+    if options.picture:
+        plots.save(figure(found), options.picture)
+
+
+if __name__ == "__main__":
+    main()

@@ -193,7 +193,6 @@ class World:
         """Take away the walls that things were dropped between."""
         for wall in self._walls:
             self.model.geom_contype[wall] = self.model.geom_conaffinity[wall] = 0
-            self.model.geom_rgba[wall, 3] = 0
 
     def gripper_pose(self) -> tuple[np.ndarray, np.ndarray, float]:
         """Position (3,) and rotation (4,) x y z w of the TCP, and the opening."""
@@ -360,7 +359,7 @@ def _xml(things: Sequence[Thing], gripper: Gripper, walls: float | None) -> str:
         for n, (ax, ay) in enumerate(((1, 0), (-1, 0), (0, 1), (0, -1))):
             size = (0.01, walls + 0.02, 0.5) if ax else (walls + 0.02, 0.01, 0.5)
             fence += (
-                f'<geom name="wall{n}" type="box" size="{_row(size)}" rgba="0 0 0 0.1" '
+                f'<geom name="wall{n}" type="box" size="{_row(size)}" '
                 f'pos="{ax * (walls + 0.01)} {ay * (walls + 0.01)} 0.5"/>'
             )
     return f"""

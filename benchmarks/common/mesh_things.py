@@ -15,7 +15,7 @@ Metres.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache, cached_property
 from itertools import product
@@ -23,8 +23,9 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from hull_oracle import Columns
 from scipy.spatial import ConvexHull
+
+from common.hull_columns import Columns
 
 KINDS = {"box": 0.35, "can": 0.25, "bottle": 0.2, "scan": 0.2}
 """How often each comes."""
@@ -121,24 +122,20 @@ def bottle(rng: np.random.Generator) -> MeshThing:
     return _revolved("bottle", "bottle", np.array(profile), lying=0.2)
 
 
-def scanned_meshes(folder: Path) -> Iterator[tuple[str, trimesh.Trimesh, trimesh.Trimesh]]:
-    """The name of every YCB object of a folder, its mesh and its convex hull, in the order of the files."""
-    for path in sorted(path for path in folder.glob("*.ply") if ".hull" not in path.name):
-        mesh = trimesh.load_mesh(path, process=False)
-        hull = trimesh.load_mesh(path.with_suffix(".hull.ply"), process=False)
-        yield path.stem.split("_", 1)[-1].replace("_", " "), mesh, hull
-
-
 @cache
 def scans(folder: Path | None) -> tuple[MeshThing, ...]:
-    """The YCB objects of a folder as things; none without one."""
+    """The YCB objects of a folder as things, in the order of the files; none without one."""
+    paths = [] if folder is None else sorted(path for path in folder.glob("*.ply") if ".hull" not in path.name)
     found = []
-    for name, mesh, hull in () if folder is None else scanned_meshes(folder):
+    for path in paths:
+        mesh = trimesh.load_mesh(path, process=False)
+        hull = trimesh.load_mesh(path.with_suffix(".hull.ply"), process=False)
         poses, likely = hull.compute_stable_poses()
         rests = tuple(
             MeshRest(f"rest {k}", pose[:3, :3], share)
             for k, (pose, share) in enumerate(zip(poses, likely / likely.sum(), strict=True))
         )
+        name = path.stem.split("_", 1)[-1].replace("_", " ")
         edges = np.sort(trimesh.bounds.oriented_bounds(hull)[1])
         found.append(MeshThing("scan", name, mesh, np.asarray(hull.vertices), edges, rests))
     return tuple(found)

@@ -14,7 +14,7 @@ import numpy as np
 
 from sq_perception.files import provenance
 
-RESULTS = Path(__file__).resolve().parent / "results"
+RESULTS = Path(__file__).resolve().parents[1] / "results"
 
 
 def parser(documentation: str | None, name: str = "") -> argparse.ArgumentParser:

@@ -31,10 +31,9 @@ from pathlib import Path
 
 import numpy as np
 import trimesh
-from both_fits import measured_points
-from picking_scenes import EYE, GRIPPER, LOOK, TABLE_CAMERA
-from picking_world import Thing, World
 
+from common.picking_scenes import EYE, GRIPPER, LOOK, TABLE_CAMERA
+from common.picking_world import Thing, World
 from sq_perception.fitting import solina_bajcsy
 from sq_perception.fitting.options import MODEL_ERROR
 from sq_perception.geometry import mesh
@@ -92,7 +91,7 @@ class Seen:
 
     def points(self, label: int) -> np.ndarray:
         """Measured points (n, 3) of one mask."""
-        return measured_points(self.depth.astype(float), self.recovery.labels == label, TABLE_CAMERA)
+        return TABLE_CAMERA.points(self.depth)[(self.recovery.labels == label) & np.isfinite(self.depth)]
 
     def planned(self, bodies: list[Superquadric], covariance: np.ndarray | None = None) -> tuple[Grasp, ...]:
         around = Surroundings.of_image(self.depth, TABLE_CAMERA, self.recovery.plane)
