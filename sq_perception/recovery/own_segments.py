@@ -145,29 +145,9 @@ class SegmentNetwork:
 
     def _left(self, labels: np.ndarray, kept: Sequence[int], strays: np.ndarray) -> list[int]:
         """Label the objects among what no object claims, in ``labels`` and ``strays``; these labels."""
-        nothing = np.ones(int(labels.max()) + 1, np.int32)
-        nothing[[0, *kept]] = 0
-        free = strays.view(np.uint8)
-        if nothing.any():
-            free = free | regions.renumbered(labels, nothing).astype(np.uint8)
-        pieces = depth_steps.components(cv2.morphologyEx(free, cv2.MORPH_OPEN, _BRUSH))
-        extents = regions.extents(pieces)
-        large = np.flatnonzero(extents[:, 0] >= segments.least_pixels(labels.size))
-        if not len(large):
-            return []
-        counts = regions.extents(labels)[:, 0]
-        asked, windows = labels.copy(), {}
-        for k in large:
-            size, top, bottom, left, right = extents[k].tolist()
-            window = slice(top, bottom), slice(left, right)
-            piece = pieces[window] == k
-            whose = int(np.bincount(labels[window][piece]).argmax())
-            if not (nothing[whose] and size > _ASKED * counts[whose]):
-                label = len(counts) + len(windows)
-                windows[label] = window
-                asked[window][piece] = label
+        asked, names = _unclaimed(labels, kept, strays)
         found = []
-        for label, answer in self._seen(asked, list(windows)).items() if windows else ():
+        for label, answer in self._seen(asked, names).items() if names else ():
             claims = _claims(asked, answer)
             if claims[label] >= _ITSELF_AFTER_ALL and np.delete(claims, label).max() < _APART:
                 found.append(label)
@@ -310,6 +290,33 @@ def _join(labels: np.ndarray, seen: dict[int, _Seen]) -> list[int]:
             del seen[order[j]]
             remain.append(order[i])
     return remain
+
+
+def _unclaimed(labels: np.ndarray, kept: Sequence[int], strays: np.ndarray) -> tuple[np.ndarray, list[int]]:
+    """Labels (height, width) in which large pieces of strays, and of segments that are not kept, have new ones; these.
+
+    A piece that is all of a segment has been asked about.
+    """
+    nothing = np.ones(int(labels.max()) + 1, np.int32)
+    nothing[[0, *kept]] = 0
+    free = regions.renumbered(labels, nothing).astype(np.uint8) | strays.view(np.uint8)
+    parts = depth_steps.components(cv2.morphologyEx(free, cv2.MORPH_OPEN, _BRUSH))
+    extents = regions.extents(parts)
+    large = np.flatnonzero(extents[:, 0] >= segments.least_pixels(labels.size))
+    if not len(large):
+        return labels, []
+    counts = regions.extents(labels)[:, 0]
+    asked = labels.copy()
+    names: list[int] = []
+    for k in large:
+        size, top, bottom, left, right = extents[k].tolist()
+        window = slice(top, bottom), slice(left, right)
+        part = parts[window] == k
+        whose = int(np.bincount(labels[window][part]).argmax())
+        if not (nothing[whose] and size > _ASKED * counts[whose]):
+            names.append(len(counts) + len(names))
+            asked[window][part] = names[-1]
+    return asked, names
 
 
 def _shown(labels: np.ndarray, label: int, answer: _Seen) -> tuple[np.ndarray, float]:
