@@ -100,7 +100,7 @@ def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | No
     """
     options = options or SegmentationOptions()
     depth, valid = _checked(depth, camera, options.depth_range)
-    least = max(_LEAST_PIXELS, round(_LEAST_SHARE * depth.size))
+    least = least_pixels(depth.size)
     if not camera.is_pinhole:
         labels, ids, is_cut = _ordered(depth_steps.components(valid), least, options.max_objects)
         return Segmentation(labels, None, ids, is_cut=is_cut)
@@ -179,6 +179,11 @@ def from_labels(
     if ids and camera.is_pinhole:
         plane = support_plane.around(labels, ids, depth, valid, camera)
     return Segmentation(labels, plane, ids, is_cut=is_cut)
+
+
+def least_pixels(size: int) -> int:
+    """Of an object in an image of so many pixels."""
+    return max(_LEAST_PIXELS, round(_LEAST_SHARE * size))
 
 
 def support_under(

@@ -24,6 +24,8 @@ from sq_perception.simulation.scenes import plane_depth
 CAMERA = Camera(320, 240, 300.0, 300.0, 159.5, 119.5)
 TABLE = Table(distance=0.7)
 PLANE = TABLE.plane
+GRAIN = 7
+"""The channel of the log of the pixels to a cell's side."""
 CAN = (0.035, 0.035, 0.05), (0.1, 1.0)
 
 
@@ -248,6 +250,52 @@ def test_cans_in_an_image_of_few_pixels_are_objects(shipped: Any) -> None:
     depth, truth = table.see(bodies, 0.002, camera=camera)
     found = of(shipped, depth, camera, table.plane).improved(segmentation(truth))
     assert len(found.ids) == 5
+
+
+def halves_alone(pixels: int, of_all: str, of_half: str = "itself") -> GivenLogits:
+    """A network that is shown a segment of so many pixels, halves and smaller pieces of it.
+
+    Of all it takes the left part, 60 %, for the object, or ``of_all`` is "nothing"; of the rest, or of a half, that
+    itself or "everything"; of a smaller piece nothing.
+    """
+
+    def logits(views: np.ndarray) -> np.ndarray:
+        answers = []
+        for mine, cell in zip(views[..., segment_view.SEGMENT] > 0, np.exp(views[:, 0, 0, GRAIN]), strict=True):
+            share = np.count_nonzero(mine) * cell**2 / pixels
+            left = np.arange(mine.shape[1]) < np.quantile(np.nonzero(mine)[1], 0.6)
+            if share > 0.75:
+                answers.append(mine & left & (of_all == "left"))
+            else:
+                answers.append((mine | (of_half == "everything")) & (share > 0.33))
+        return np.where(answers, 3.0, -3.0)
+
+    return GivenLogits(logits)
+
+
+def test_what_is_left_of_a_segment_may_be_an_object_of_its_own() -> None:
+    depth, truth = seen([TABLE.body(0, 0, *CAN)])
+    found = of(halves_alone((truth > 0).sum(), "left"), depth).improved(segmentation(truth))
+    assert found.ids == (1, 2)
+    np.testing.assert_array_equal(found.labels > 0, truth > 0)
+    columns = [np.nonzero((found.labels == label) & ~found.strays)[1] for label in found.ids]
+    first, second = sorted(columns, key=lambda each: float(each.mean()))
+    assert first.max() < second.min()
+    assert np.count_nonzero(found.strays) < 0.1 * np.count_nonzero(truth)
+
+
+def test_what_is_left_of_a_segment_and_claims_it_stays_stray() -> None:
+    depth, truth = seen([TABLE.body(0, 0, *CAN)])
+    found = of(halves_alone((truth > 0).sum(), "left", "everything"), depth).improved(segmentation(truth))
+    assert found.ids == (1,)
+    assert np.count_nonzero(found.strays) > 0.3 * np.count_nonzero(truth)
+
+
+def test_of_a_dropped_segment_that_is_not_connected_each_piece_is_asked_about() -> None:
+    depth, truth = seen([TABLE.body(-0.06, 0, *CAN), TABLE.body(0.06, 0.02, *CAN)])
+    found = of(halves_alone((truth > 0).sum(), "nothing"), depth).improved(segmentation((truth > 0).astype(np.int32)))
+    assert len(found.ids) == 2
+    assert min(ious(truth, found.labels)) > 0.95
 
 
 def test_no_segments_ask_nothing() -> None:
