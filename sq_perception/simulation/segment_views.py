@@ -18,9 +18,8 @@ one's part.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import partial
 
 import cv2
 import numpy as np
@@ -30,8 +29,6 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.segment_view import SegmentView
 from sq_perception.segmentation import pieces, segments
 from sq_perception.simulation import crowds, furniture, room, sensor_noise, thing_sensing
-from sq_perception.simulation.household import draw_thing
-from sq_perception.simulation.thing import ON_X, ON_Y, UPRIGHT, Thing, assembled, log_uniform, part
 from sq_perception.simulation.things_on_table import TABLE_CAMERA, things_on_table
 
 NO, YES, UNKNOWN = 0, 1, 2
@@ -46,11 +43,6 @@ _ELEVATIONS, _OF_ELEVATIONS = ((6.0, 20.0), (20.0, 70.0), (70.0, 90.0)), (0.2, 0
 """Degrees that the camera is above the table, and shares of the scenes."""
 _CROWDS, _IN_FURNITURE = 0.2, 0.3
 """Shares of the scenes; they choose how high their cameras are."""
-_BARS, _VESSELS = 0.15, 0.15
-"""Shares of the other scenes with bars among the things, and of nothing but vessels: of all things, own masks lose
-these most often."""
-_LONG, _THICK = (0.15, 0.5), (0.01, 0.05)
-"""Metres of a bar's longest edge, and of both its others; next to nothing of the household is as long and thin."""
 _WITH_ROOM = 0.6
 """Share of the other scenes whose table ends in sight, before a room."""
 _LARGER, _TIMES = 0.35, (1.0, 2.5)
@@ -149,23 +141,8 @@ def _scene(rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, Camera]:
         drawn = furniture.things_in_furniture(str(rng.choice(furniture.KINDS)), rng, camera)
         return drawn.depth, drawn.labels, camera
     elevation = _ELEVATIONS[rng.choice(len(_ELEVATIONS), p=_OF_ELEVATIONS)]
-    drawn = things_on_table(rng, camera=camera, elevation=elevation, draw=_drawing(rng.random()))
+    drawn = things_on_table(rng, camera=camera, elevation=elevation)
     return room.behind(drawn, rng) if rng.random() < _WITH_ROOM else drawn.depth, drawn.labels, camera
-
-
-def _drawing(chosen: float) -> Callable[[np.random.Generator], Thing]:
-    """How the things of a scene are drawn, by a number from 0 to 1."""
-    if chosen < _BARS:
-        return lambda rng: _bar(rng) if rng.random() < 0.5 else draw_thing(rng)
-    return partial(draw_thing, kinds=("vessel",)) if chosen < _BARS + _VESSELS else draw_thing
-
-
-def _bar(rng: np.random.Generator) -> Thing:
-    """Bars, boards, rulers, profiles, rods."""
-    edges = np.array([log_uniform(rng, *_THICK), log_uniform(rng, *_THICK), log_uniform(rng, *_LONG)])
-    e2 = 1.0 if rng.random() < 0.2 else rng.uniform(0.03, 0.3)
-    rests = (("lying", ON_X, 0.45), ("on its side", ON_Y, 0.45), ("standing", UPRIGHT, 0.1))
-    return assembled("box", "bar", [part(edges / 2, (rng.uniform(0.03, 0.3), e2))], rests)
 
 
 def _views(measured: _Measured, rng: np.random.Generator) -> Iterator[tuple[np.ndarray, np.ndarray]]:

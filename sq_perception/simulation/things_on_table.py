@@ -18,7 +18,6 @@ Metres; depth is the z coordinate, +inf where nothing is.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -151,9 +150,8 @@ def things_on_table(
     count: int | None = None,
     camera: Camera = TABLE_CAMERA,
     elevation: tuple[float, float] = ELEVATION,
-    draw: Callable[[np.random.Generator], Thing] = draw_thing,
 ) -> ThingsOnTable:
-    """``count`` things that ``draw`` draws, or 1 to 8, on a table, all of them wholly inside the image.
+    """``count`` things, or 1 to 8, on a table, all of them wholly inside the image.
 
     The camera is ``elevation`` (least, greatest) degrees above the table.
 
@@ -170,19 +168,14 @@ def things_on_table(
     for _ in range(_SCENES):
         look = looking_down(rng.uniform(*np.deg2rad(elevation)), rng.uniform(-_ROLL, _ROLL))
         eye = np.array([0.0, 0.0, rng.uniform(*_DISTANCE)])
-        resting = _arranged(wanted, draw, look, eye, camera, rng)
+        resting = _arranged(wanted, look, eye, camera, rng)
         if resting is not None:
             return _seen(resting, look, eye, camera, rng)
     raise ValueError(f"no room for {wanted} things in an image of {camera.width} x {camera.height} pixels")
 
 
 def _arranged(
-    count: int,
-    draw: Callable[[np.random.Generator], Thing],
-    look: np.ndarray,
-    eye: np.ndarray,
-    camera: Camera,
-    rng: np.random.Generator,
+    count: int, look: np.ndarray, eye: np.ndarray, camera: Camera, rng: np.random.Generator
 ) -> list[_Resting] | None:
     resting: list[_Resting] = []
     spread = rng.uniform(0.08, 0.3)
@@ -190,7 +183,7 @@ def _arranged(
     while failed < _TRIES:
         failed += 1
         how = str(rng.choice(_HOW)) if resting else "apart"
-        placed = _drawn(draw(rng), how, resting, spread, rng)
+        placed = _drawn(draw_thing(rng), how, resting, spread, rng)
         if placed is None or not _in_view(placed, look, eye, camera):
             continue
         if all(placed.apart(other, _GAP if how == "apart" else -1e-6) for other in resting):
