@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from dataclasses import replace
 from typing import Any
 
@@ -67,26 +66,3 @@ def test_pieces_of_merged_things_show_one_thing_each_or_none(monkeypatch: pytest
     pure = (inside & (drawn.truth == YES)).sum(axis=(1, 2)) / inside.sum(axis=(1, 2))
     assert np.count_nonzero((pure > 0) & (pure < 0.7)) <= scenes
     assert np.count_nonzero(pure >= 0.7) > 2 * scenes
-
-
-def test_scenes_show_bars_and_vessels_more_often_than_a_household(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of two hundred scenes of a table some show vessels alone, and some what is longer than all of a household."""
-    drawn = []
-
-    def without_an_image(rng: np.random.Generator, camera: Any, elevation: Any, draw: Any) -> Any:
-        drawn.append([draw(rng) for _ in range(5)])
-        raise _EnoughError
-
-    monkeypatch.setattr(segment_views, "things_on_table", without_an_image)
-    rng = np.random.default_rng(3)
-    while len(drawn) < 200:
-        with contextlib.suppress(_EnoughError):
-            segment_views.draw_segment_views(1, rng)
-    of_vessels = sum(all(thing.kind == "vessel" for thing in scene) for scene in drawn)
-    longest = [max(np.ptp(thing.box, axis=0).max() for thing in scene) for scene in drawn]
-    assert 15 < of_vessels < 45
-    assert 10 < np.count_nonzero(np.array(longest) > 0.36) < 40
-
-
-class _EnoughError(Exception):
-    """Nothing more is wanted of a scene."""
