@@ -7,6 +7,7 @@ a Ctrl-C meanwhile must end the process without a traceback.
 from __future__ import annotations
 
 import argparse
+import re
 import sys
 from collections.abc import Iterator, Sequence
 from functools import partial
@@ -23,6 +24,8 @@ Parameters are those of recover_node: in a file /**: is for all, /wrist/recover_
 
 Frames are computed one after the other, in the order in which they ask: a process per camera would hold the network
 once each and let them compete for the same cores."""
+_NAMESPACE = re.compile(r"/?[A-Za-z_][A-Za-z0-9_]*(/[A-Za-z_][A-Za-z0-9_]*)*")
+"""Checked here as well as by rclpy, which has begun to make a node by then and complains of its rest."""
 
 
 def _run(name: str, arguments: Sequence[str] | None = None) -> int:
@@ -42,8 +45,8 @@ def recover_cameras(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="recover_cameras", description=_CAMERAS, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("cameras", nargs="+", metavar="CAMERA", help="namespace of a camera")
-    cameras = [camera.strip("/") for camera in parser.parse_args(given[:cut]).cameras]
+    parser.add_argument("cameras", nargs="+", metavar="CAMERA", type=_namespace, help="namespace of a camera")
+    cameras = parser.parse_args(given[:cut]).cameras
     if len(set(cameras)) != len(cameras):
         parser.error(f"expected different cameras, got {' '.join(cameras)}")
 
@@ -76,3 +79,9 @@ def _node(name: str, namespace: str | None = None) -> process.Stoppable:
 
     parameters = FitterParameters if name == "fitter_node" else RecoverParameters
     return process.made(FrameNode, name, parameters, namespace=namespace)
+
+
+def _namespace(text: str) -> str:
+    if not _NAMESPACE.fullmatch(text):
+        raise argparse.ArgumentTypeError(f"expected a ROS name such as front or arm/wrist, got {text!r}")
+    return text.strip("/")
