@@ -41,31 +41,40 @@ Answer: TypeAlias = tuple[FrameRecovery, Hashable]
 
 
 class Turns:
-    """A lock that is given in the order in which it was asked for, so that no camera starves; held for a block."""
+    """A lock that is given in the order in which it was asked for, so that no camera starves."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
         self._waiting: deque[object] = deque()
 
-    def __enter__(self) -> None:
+    @contextmanager
+    def turn(self) -> Iterator[None]:
+        """Wait for one's turn, and keep it for the block."""
+        self._take()
+        try:
+            yield
+        finally:
+            self._give()
+
+    @contextmanager
+    def pause(self) -> Iterator[None]:
+        """Within one's turn: others have theirs during the block, and the next one is waited for at its end."""
+        self._give()
+        try:
+            yield
+        finally:
+            self._take()
+
+    def _take(self) -> None:
         ticket = object()
         with self._changed:
             self._waiting.append(ticket)
             self._changed.wait_for(lambda: self._waiting[0] is ticket)
 
-    def __exit__(self, *_: object) -> None:
+    def _give(self) -> None:
         with self._changed:
             self._waiting.popleft()
             self._changed.notify_all()
-
-    @contextmanager
-    def pause(self) -> Iterator[None]:
-        """Within one's turn: others have theirs during the block, and the next one is waited for at its end."""
-        self.__exit__()
-        try:
-            yield
-        finally:
-            self.__enter__()
 
 
 TURNS = Turns()
@@ -209,7 +218,7 @@ def _made(parameters: RecoverParameters, kept: _Built | None, is_wanted: Callabl
             parameters.threads or None,
             weights_of=None if kept is None else kept.recoverer,
         )
-    with TURNS:
+    with TURNS.turn():
         if not is_wanted():
             return None
         recoverer.warm_up(unit_cube.camera() if parameters.projection == "orthographic" else WARM_UP_CAMERA)

@@ -186,7 +186,7 @@ class FrameNode(ManagedNode):
             arrival: Arrival | None = None
             outcome: Outcome | None = None
             try:
-                with TURNS:
+                with TURNS.turn():
                     # Taken when the turn has come: while others were computing, a newer one may have arrived.
                     arrival = source.take()
                     found = self._recovered(source, arrival) if arrival is not None and self._is_wanted() else None
