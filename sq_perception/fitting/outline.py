@@ -41,14 +41,28 @@ def without_shrunk_edge(problem: Problem, state: State) -> tuple[Problem, State]
 
 
 def sharpened(problem: Problem, state: State, free: np.ndarray, rays: Rays) -> tuple[Problem, State]:
-    """Read the outline's precision from a body's misfit to free rays, and again from the better body it allows."""
+    """Read the outline's precision from a body's misfit to free rays, and again from the better body it allows.
+
+    It is no less than what was known before: pixels that miss a body would cost next to nothing, and it might leave.
+    """
+    state = _pulled_in(problem, state, free, rays)
     sigma = math.inf
     while True:
-        before, sigma = sigma, _sigma(problem, state, free)
+        before, sigma = sigma, min(_sigma(problem, state, free), problem.observation.outline)
         if not sigma < _SHARPER * before or problem.late:  # so that it ends for any sigma
             return problem, state
         problem = problem.with_terms(outline_stiffness=1 / sigma)
         state = problem.settle(state, rays, FIRST_STEPS)
+
+
+def _pulled_in(problem: Problem, state: State, free: np.ndarray, rays: Rays) -> State:
+    """A body that sticks out farther than was known before, in its outline to a pixel if it fits in there."""
+    sigma = _sigma(problem, state, free)
+    if not sigma > problem.observation.outline or problem.late:
+        return state
+    pixel = problem.with_terms(outline_stiffness=1 / problem.observation.footprint)
+    other = pixel.settle(state, rays)
+    return other if _sigma(problem, other, free) < _SHARPER * sigma else state
 
 
 def _depth_inside(problem: Problem, state: State, pixels: np.ndarray) -> float:

@@ -38,7 +38,7 @@ def grown(mask: np.ndarray, pixels: int) -> np.ndarray:
     return cv2.dilate(mask.astype(np.uint8), np.ones((2 * pixels + 1, 2 * pixels + 1), np.uint8)) > 0
 
 
-@pytest.mark.parametrize("pixels", [2, 3])
+@pytest.mark.parametrize("pixels", [1, 2, 3])
 @pytest.mark.parametrize("truth", [BOX, CAN], ids=["box", "can"])
 def test_a_mask_too_large_by_pixels_makes_neither_table_nor_wall_a_part(
     truth: Superquadric, pixels: int, rng: np.random.Generator
