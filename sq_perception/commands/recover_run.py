@@ -150,6 +150,8 @@ class RecoverRun:
         parts = [_count(len(entries), "frame"), f"{_count(len(bodies), 'object')} ({failed} failed)"]
         if self._unreadable:
             parts.append(f"{_count(self._unreadable, 'frame or source', 'frames or sources')} unreadable")
+        if self.outputs.done:
+            parts.append(f"{_count(len(self.outputs.done), 'frame')} in {self._options.jsonl} before")
         if entries:
             parts.append(f"median {statistics.median(entry['ms'] for entry in entries):.0f} ms")
         return ", ".join(parts)

@@ -49,7 +49,7 @@ def distributions(outcome: Outcome) -> Figure:
     ax = _histogram(figure.add_subplot(grid[1]), np.rad2deg(figures.shortest_arc), _ARC_BINS, "radians")
     ax.set_xticks(np.arange(0, 361, 90), ["0", "π/2", "π", "3π/2", "2π"])
     turned = f"{100 * summary['quarter_turns']:.0f} % quarter turns"
-    plots.heading_of(ax, "Shortest arc to the label (figure 6.3)", turned)
+    plots.heading_of(ax, "Arc to the label (figure 6.3)", turned)
 
     ax = _histogram(figure.add_subplot(grid[2]), np.rad2deg(figures.symmetric_angle), _BINS, "degrees")
     free = np.rad2deg(figures.any_order_angle)

@@ -21,6 +21,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 
 from sq_perception.files import output_file
 from sq_perception.geometry.mesh import COLOURS, outline
@@ -114,7 +115,8 @@ def draw_grasps(
                 ax.plot(*pixels.T, color="white", lw=5.0, solid_capstyle="round")
                 ax.plot(*pixels.T, color=colour(k), lw=2.6, solid_capstyle="round")
             where = float(pixels[-1, 0]), float(pixels[-1, 1])
-            ax.text(*where, f" {grasp.score:.2f}", color=INK, fontsize=11, weight="bold", clip_on=True)
+            text = ax.text(*where, f" {grasp.score:.2f}", color=INK, fontsize=11, weight="bold", clip_on=True)
+            text.set_path_effects([withStroke(linewidth=3.0, foreground="white")])  # the picture may be as dark as INK
 
 
 def silhouettes(body: Superquadric, camera: Camera) -> list[np.ndarray]:

@@ -29,6 +29,8 @@ from sq_perception.viewing import drawings
 _MOST_POINTS = 30000
 _HALF_TURN_ABOUT_X = np.diag([1.0, -1.0, -1.0, 1.0])
 _SCENE = "$SCENE"
+_LIT, _UNLIT = 0.32, 0.45
+"""Of a body's colour: the viewer has one lamp, of intensity 1.75, and no light where that does not shine."""
 _TEMPLATE = Path(__file__).with_name("still_page.html")
 
 
@@ -87,7 +89,9 @@ def _scene(frame: RecordedFrame, recovery: FrameRecovery) -> trimesh.Scene:
         if body.status == Status.FAILED:
             continue
         vertices, faces = triangles(body.superquadric)
-        matt = PBRMaterial(baseColorFactor=np.append(COLOURS[k % len(COLOURS)], 1.0), metallicFactor=0.0)
+        colour = COLOURS[k % len(COLOURS)]
+        lit, unlit = np.append(_LIT * colour, 1.0), _UNLIT * colour
+        matt = PBRMaterial(baseColorFactor=lit, emissiveFactor=unlit, metallicFactor=0.0)
         whole.add_geometry(
             trimesh.Trimesh(vertices, faces, visual=TextureVisuals(material=matt), process=False), node_name=f"body_{k}"
         )

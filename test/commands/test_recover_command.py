@@ -511,7 +511,7 @@ def test_no_output_takes_the_place_of_another(tmp_path, capsys):
     assert main.main(["recover", str(frame), "--json", "/dev/null", "--csv", "/dev/null"]) == 0
 
 
-def test_a_folder_is_resumed_where_it_ended(tmp_path, monkeypatch):
+def test_a_folder_is_resumed_where_it_ended(tmp_path, monkeypatch, capsys):
     """Interrupted after two of five frames, then again to the end: every frame once, in order, computed once."""
     from sq_perception.recovery.recoverer import Recoverer
 
@@ -533,6 +533,7 @@ def test_a_folder_is_resumed_where_it_ended(tmp_path, monkeypatch):
     assert sorted(path.name for path in meshes.iterdir()) == [f"f{k}.glb" for k in range(5)]
     monkeypatch.setattr(Recoverer, "recover", None)
     assert run(folder, "--jsonl", lines) == 0, "nothing is left to do"
+    assert f"0 frames, 0 objects (0 failed), 5 frames in {lines} before" in capsys.readouterr().err
     assert run(folder, "--jsonl", lines, "--max-objects", "3") == 2
     assert run(folder, "--jsonl", lines, "--workspace", *"001112") == 2
     assert run(folder, "--jsonl", lines, "--mcap", tmp_path / "out.mcap") == 2

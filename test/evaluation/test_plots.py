@@ -14,6 +14,8 @@ from sq_perception.evaluation.body_pictures import draw_bodies_3d
 from sq_perception.evaluation.recovery_figure import recovery_figure
 from sq_perception.geometry.mesh import outline
 from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.grasping.gripper import PANDA
+from sq_perception.grasping.plan import Grasp, GraspPlan
 from sq_perception.imaging import raycast, unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.recovery.recoverer import Recoverer
@@ -60,6 +62,20 @@ def test_outlines_lie_on_the_depth_picture():
     edge = cv2.morphologyEx((labels > 0).astype(np.uint8), cv2.MORPH_GRADIENT, np.ones((5, 5), np.uint8)) > 0
     assert changed.sum() > 100
     assert (edge[changed]).mean() > 0.95
+
+
+def test_scores_of_grasps_can_be_read_where_the_picture_is_dark():
+    """Where nothing is measured the picture is as dark as the letters."""
+    grasp = Grasp(0, BODY.translation, np.array([0, 0, 0, 1.0]), 0.08, 0.06, 0.875, "")
+    figure = plots.new_figure(6.4, 4.8)
+    ax = figure.add_axes((0, 0, 1, 1))
+    depth = np.full((CAMERA.height, CAMERA.width), np.nan)
+    plots.draw_grasps(ax, depth, CAMERA, [BODY], GraspPlan((grasp,), ("",)), PANDA)
+    drawn(figure)
+    (label,) = ax.texts
+    box = label.get_window_extent()
+    letters = drawn(figure)[int(480 - box.y1) : int(480 - box.y0), int(box.x0) + 12 : int(box.x1)]
+    assert np.ptp(letters.mean(axis=2)) > 150
 
 
 def test_a_view_from_the_camera_s_side_looks_like_the_image():

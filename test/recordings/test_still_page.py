@@ -106,4 +106,8 @@ def test_a_browser_draws_it(page):
         browser.until(lambda: "full edges" in browser.text())
         # The body in its blue, on white.
         browser.until(lambda: (browser.picture().astype(int)[..., 2] - browser.picture()[..., 0] > 60).sum() > 500)
+        picture = browser.picture().astype(int)
+        blue = picture[(picture[..., 2] - picture[..., 0] > 60) & (picture[..., 0] < 30)][:, 2]
+        assert np.percentile(blue, 5) > 90, "no side is black"
+        assert blue.max() < 255
         assert browser.requested() == [page.as_uri()]
