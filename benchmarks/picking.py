@@ -274,6 +274,8 @@ def main() -> None:
     parser.add_argument("--name", default="picking", help="of the results; empty: none are written")
     arguments = parser.parse_args()
     contestants = arguments.contestants.split(",")
+    if not set(contestants) <= {*CONTESTANTS, *PEERS}:
+        parser.error(f"--contestants: expected some of {', '.join((*CONTESTANTS, *PEERS))}")
     peer = None
     if arguments.contact_graspnet:
         peer = ContactGraspNet(arguments.contact_graspnet)

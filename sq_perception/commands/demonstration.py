@@ -46,8 +46,8 @@ What next
   {picture}    the last image: depth, recovered outlines, both methods in space
   {mesh}    the recovered bodies, for any glTF viewer
   sq-perception recover FRAME --json out.json    the same from files, without ROS
-  ros2 run sq_perception recover_node    on your camera; README.md has the topics and parameters
-  make demo FRAME=recording.npz    this with a frame of yours"""
+  ros2 run sq_perception recover_node    on your camera; README.md has the topics, docs/parameters.md the parameters
+  sq-perception demo --frame recording.npz    this with a frame of yours"""
 
 
 class DemoError(RuntimeError):
