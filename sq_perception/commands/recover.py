@@ -62,8 +62,8 @@ a line a body:
   What weak and failed mean, and what to do with them: docs/how_sure.md.
 
 files:
-  What is there stays until something better can take its place: a result that was interrupted, or of no frame at all,
-  does not replace a file but is put beside it as NAME.partial.SUFFIX.  Devices, FIFOs and links are written through.
+  What is there stays until something better can take its place: a result that was interrupted is put beside a file as
+  NAME.partial.SUFFIX, and one of no frame at all replaces none.  Devices, FIFOs and links are written through.
   --jsonl FILE grows by a line a frame; the same command with the same file skips the frames that are in it.
   JSON has HALF sizes in metres; sq_perception/recordings/result.schema.json describes every field of it.  CSV has a row
   a body, with the same numbers.  Positions are in the optical frame (x right, y down, z forward); those of orthographic
