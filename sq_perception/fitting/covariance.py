@@ -6,18 +6,26 @@ wide prior (a factor e in size, 0.5 in shape, one size in position, one radian i
 such as the turn of a round body about its axis, gets the width of the prior instead of infinity.  The outline counts
 with the noise or a whole pixel, whichever is more: its errors are no independent noise.
 
-That describes one valley of the cost.  Other bodies that the image allows add their second moments about the result.
+A predicted hull says itself how it errs, and its residuals r_h are apart from these: J_h^T J_h / (1 + |r_h|^2 / nu) is
+added to J^T J / s^2, as of a t distribution with nu degrees of freedom, whose scale is the less certain the farther off
+a body is.
+
+That describes one valley of the cost, as if the thing were a superquadric.  Other bodies that the image allows add
+their second moments about the result, and so does the hull that a body lies beside.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from typing import NamedTuple
 
 import numpy as np
 
 from sq_perception.fitting.cost import STEP_LENGTH, Terms
+from sq_perception.fitting.hull_prior import HullPrior
 from sq_perception.fitting.levenberg_marquardt import State
+from sq_perception.fitting.priors import hull_cost
 from sq_perception.fitting.rays import SAMPLE, WEIGHT, Rays
 from sq_perception.fitting.residuals import RENDERED, evaluate
 from sq_perception.geometry.kernels import kernel
@@ -25,14 +33,17 @@ from sq_perception.geometry.superquadric import Superquadric
 
 WEAK_SHARE = 0.15
 """A half size whose standard deviation exceeds this share of it is called undetermined."""
+_NEAR_AXIS = 16
+"""Power of the cosine to an axis by which directions count as near to it: half at 17 degrees, as neighbours are 32
+degrees apart."""
 _PRIOR_LOG_SIZE, _PRIOR_SHAPE, _PRIOR_ANGLE = 1.0, 0.5, 1.0
 """Standard deviations of the prior: a factor e, half of the range of an exponent, a radian."""
 
 
-def covariance_at(state: State, rays: Rays, terms: Terms, outline: float) -> np.ndarray:
+def covariance_at(state: State, rays: Rays, terms: Terms, outline: float, hull: HullPrior | None = None) -> np.ndarray:
     """(11, 11) of a1 a2 a3 e1 e2 t1 t2 t3 and the rotation vector in the object frame; metres and radians.
 
-    ``outline`` is the standard deviation of the outline, metres.
+    ``outline`` is the standard deviation of the outline, metres, ``hull`` the prediction of which the terms are.
     """
     stride = max(1, len(rays.hits) // SAMPLE)
     terms = terms._replace(outline_stiffness=1 / outline)
@@ -40,25 +51,38 @@ def covariance_at(state: State, rays: Rays, terms: Terms, outline: float) -> np.
     prior = (
         np.array([1 / _PRIOR_LOG_SIZE] * 3 + [1 / _PRIOR_SHAPE] * 2 + [1 / length] * 3 + [1 / _PRIOR_ANGLE] * 3) ** 2
     )
-    information = _information(*rays.every(stride).weighing(stride), terms, state.parameters, state.rotation, prior)
+    freedom = math.inf if hull is None else hull.freedom
+    hits, free = rays.every(stride).weighing(stride)
+    information = _information(hits, free, terms, state.parameters, state.rotation, prior, freedom)
     covariance = _inverse(information, float(prior.min()))
     units = np.concatenate([state.parameters[:3], np.ones(STEP_LENGTH - 3)])
     covariance = units[:, None] * covariance * units
-    return (covariance + covariance.T) / 2
+    covariance = (covariance + covariance.T) / 2
+    return covariance if hull is None else covariance + _beside(state, hull)
 
 
 @kernel
 def _information(
-    hits: np.ndarray, free: np.ndarray, terms: Terms, parameters: np.ndarray, rotation: np.ndarray, prior: np.ndarray
+    hits: np.ndarray,
+    free: np.ndarray,
+    terms: Terms,
+    parameters: np.ndarray,
+    rotation: np.ndarray,
+    prior: np.ndarray,
+    freedom: float,
 ) -> np.ndarray:
-    """J^T J / s^2 + P (11, 11), of which ``prior`` (11,) is the diagonal of P."""
+    """The inverse (11, 11) of the covariance, of which ``prior`` (11,) is the diagonal of P and ``freedom`` nu."""
     sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
-    cost = evaluate(RENDERED, hits, free, terms, parameters, rotation, sums)
-    variance = max(1.0, cost / hits[:, WEIGHT].sum())
+    of_hull = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
+    cost, square = evaluate(RENDERED, hits, free, terms, parameters, rotation, sums), 0.0
+    if terms.hull_directions.shape[0] > 0:
+        square = hull_cost(terms, parameters, rotation, of_hull)
+    variance = max(1.0, (cost - square) / hits[:, WEIGHT].sum())
+    vaguer = 1.0 + square / freedom
     information = np.diag(prior)
     for j in range(STEP_LENGTH):
         for k in range(j + 1):
-            information[j, k] += sums[j, k] / variance
+            information[j, k] += (sums[j, k] - of_hull[j, k]) / variance + of_hull[j, k] / vaguer
             information[k, j] = information[j, k]
     return information
 
@@ -75,6 +99,22 @@ def _inverse(information: np.ndarray, least: float) -> np.ndarray:
         return inverse
     values, axes = np.linalg.eigh(information)
     return np.asarray((axes / np.maximum(values, least)) @ axes.T)
+
+
+def _beside(state: State, hull: HullPrior) -> np.ndarray:
+    """(11, 11) what a body's distance to a predicted hull adds, of sizes and centre.
+
+    A thing that is no superquadric leaves the body beside its hull, and a wrong prediction does too.  Each end of an
+    axis errs as the directions near to it differ: whether both ends do so alike or apart, neither half their sum, the
+    size, nor half their difference, the centre, errs by more.
+    """
+    near = np.abs(hull.directions @ state.rotation) ** _NEAR_AXIS
+    off = hull.directions @ state.parameters[5:8] + state.body.support(hull.directions) - hull.support
+    square = off**2 @ near / near.sum(axis=0)
+    moments = np.zeros((STEP_LENGTH, STEP_LENGTH))
+    moments[0:3, 0:3] = np.diag(square)
+    moments[5:8, 5:8] = (state.rotation * square) @ state.rotation.T
+    return moments
 
 
 class Alternative(NamedTuple):

@@ -7,11 +7,13 @@ joins S as an error of each direction by itself, ``MODEL_SHARE`` of the thing's 
 
 The network predicts h ~ t_nu(b, S) with long tails (:mod:`sq_perception.learning.thing_network`); S alone, the scale of
 most errors, is what the fit takes.  With the tails the fit follows bodies that few directions agree with: that cost
-1.3 % of IoU on 229 things of benchmarks/household_things, seeds from 5000.
+1.3 % of IoU on 229 things of benchmarks/household_things, seeds from 5000.  How sure the fitted body is depends on
+them (:mod:`sq_perception.fitting.covariance`).
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -39,12 +41,15 @@ class HullPrior:
         S, square metres.
     extent : float
         The thing's size as far as it was seen, metres.
+    freedom : float
+        nu; infinite for errors of a normal distribution.
     """
 
     directions: np.ndarray
     support: np.ndarray
     covariance: np.ndarray
     extent: float
+    freedom: float = math.inf
 
     def root(self, misfit: float = 1.0) -> np.ndarray:
         """W (J, J) with W^T W = (S + model error)^-1 + (misfit - 1) / pull^2 (1 - mean over the directions).

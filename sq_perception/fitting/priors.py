@@ -41,7 +41,7 @@ def prior_cost(terms: Terms, parameters: np.ndarray, rotation: np.ndarray, sums:
     if terms.roundness_stiffness > 0.0:
         cost += _roundness_cost(terms, parameters, sums)
     if terms.hull_directions.shape[0] > 0:
-        cost += _hull_cost(terms, parameters, rotation, sums)
+        cost += hull_cost(terms, parameters, rotation, sums)
     if terms.volume_price > 0.0:
         for k in range(3):
             cost += terms.volume_price * math.log(parameters[k])
@@ -117,7 +117,8 @@ def _support_cost(terms: Terms, parameters: np.ndarray, rotation: np.ndarray, su
 
 
 @kernel
-def _hull_cost(terms: Terms, parameters: np.ndarray, rotation: np.ndarray, sums: np.ndarray) -> float:
+def hull_cost(terms: Terms, parameters: np.ndarray, rotation: np.ndarray, sums: np.ndarray) -> float:
+    """|W (h - b)|^2."""
     count = terms.hull_directions.shape[0]
     rows = np.empty((STEP_LENGTH + 1, count))
     for j in range(count):

@@ -226,7 +226,7 @@ class Solution:
     def covariance(self) -> np.ndarray:
         """(11, 11) of the valley of the cost that the body lies in."""
         terms, outline = self.problem.terms_at(self.state), self.problem.observation.outline
-        return covariance_at(self.state, self.rays, terms, outline) * self.spread_factor
+        return covariance_at(self.state, self.rays, terms, outline, self.problem.hull) * self.spread_factor
 
     def unsure(self) -> np.ndarray:
         """Standard deviations (3,) of the half sizes, as shares of them."""

@@ -63,18 +63,22 @@ class HullPredictions:
     support : (n, J)
         Support functions in sides of the view, from its middle (:data:`sq_perception.learning.thing_network.MIDDLE`).
     covariance : (n, J, J)
+        Scale of their errors.
+    freedom : float
+        nu.
     """
 
     bodies: Superquadric
     support: np.ndarray
     covariance: np.ndarray
+    freedom: float
 
     def hull(self, number: int, view: CanonicalView) -> HullPrior:
         """The prediction of one view in the optical frame."""
         directions = DIRECTIONS @ quaternions.to_matrix(view.rotation)
         support = directions @ view.anchor + view.extent * self.support[number]
         covariance = view.extent**2 * self.covariance[number]
-        return HullPrior(directions, support, covariance, view.extent)
+        return HullPrior(directions, support, covariance, view.extent, self.freedom)
 
 
 class ThingPredictor:
@@ -111,6 +115,7 @@ class ThingPredictor:
             bodies[: len(views)],
             (straight + turned[:, back]) / 2,
             (of_straight + of_turned[:, back][:, :, back]) / 2,
+            self.config.freedom,
         )
 
 

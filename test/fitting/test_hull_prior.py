@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from sq_perception.fitting import surface_fit
 from sq_perception.fitting.cost import STEP_LENGTH, Terms
+from sq_perception.fitting.covariance import covariance_at
 from sq_perception.fitting.hull_prior import MODEL_SHARE, PULL_SHARE, HullPrior
 from sq_perception.fitting.levenberg_marquardt import State, move
+from sq_perception.fitting.observation import Crop
 from sq_perception.fitting.priors import prior_cost
+from sq_perception.fitting.rays import Rays
 from sq_perception.fitting.surface_fit import FitOptions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.support_directions import DIRECTIONS
@@ -80,6 +84,35 @@ def test_the_gradient_is_that_of_the_cost() -> None:
             costs.append(prior_cost(terms, parameters, rotation, spare))
         slope = (costs[0] - costs[1]) / 2e-6
         assert 2 * sums[STEP_LENGTH, k] == pytest.approx(slope, rel=1e-4, abs=1e-4)
+
+
+@pytest.fixture(scope="module")
+def rays_of_body() -> Rays:
+    shown, _ = raycast.render(BODY, CAMERA)
+    crop = Crop.around(shown, np.isfinite(shown), CAMERA, 0.002)
+    assert crop is not None
+    return Rays(crop.observed(0.0, None).object_rays(200), np.empty((0, 8)))
+
+
+def test_a_body_beside_its_predicted_hull_is_as_much_less_sure(rays_of_body: Rays) -> None:
+    """Every end of it is 3 mm off; what the rays say of it stays as sure as it is."""
+    prior, state = told(BODY, 0.004), State.of(BODY)
+    beside = replace(prior, support=prior.support + 0.003)
+    on, off = (covariance_at(state, rays_of_body, terms_of(hull), 0.002, hull) for hull in (prior, beside))
+    more = np.zeros(STEP_LENGTH)
+    more[[0, 1, 2, 5, 6, 7]] = 0.003**2
+    assert off - on == pytest.approx(np.diag(more), abs=1e-12)
+
+
+def test_the_farther_off_the_vaguer_a_hull_of_long_tails(rays_of_body: Rays) -> None:
+    prior, state = told(BODY, 0.004), State.of(BODY)
+    beside = replace(prior, support=prior.support + 0.003, freedom=3.0)
+    square = float(np.square(prior.root() @ np.full(len(DIRECTIONS), 0.003)).sum())
+    vaguer = terms_of(beside)._replace(hull_root=beside.root() / math.sqrt(1 + square / 3.0))
+    found = covariance_at(state, rays_of_body, terms_of(beside), 0.002, beside)
+    assert found == pytest.approx(
+        covariance_at(state, rays_of_body, vaguer, 0.002, replace(beside, freedom=math.inf)), rel=1e-6, abs=1e-12
+    )
 
 
 @pytest.fixture(scope="module")
