@@ -25,7 +25,7 @@ import numpy as np
 from sq_perception.fitting.cost import STEP_LENGTH, Terms
 from sq_perception.fitting.hull_prior import HullPrior
 from sq_perception.fitting.levenberg_marquardt import State
-from sq_perception.fitting.priors import hull_cost
+from sq_perception.fitting.priors import hull_cost, hull_distances
 from sq_perception.fitting.rays import SAMPLE, WEIGHT, Rays
 from sq_perception.fitting.residuals import RENDERED, evaluate
 from sq_perception.geometry.kernels import kernel
@@ -58,7 +58,7 @@ def covariance_at(state: State, rays: Rays, terms: Terms, outline: float, hull: 
     units = np.concatenate([state.parameters[:3], np.ones(STEP_LENGTH - 3)])
     covariance = units[:, None] * covariance * units
     covariance = (covariance + covariance.T) / 2
-    return covariance if hull is None else covariance + _beside(state, hull)
+    return covariance if hull is None else covariance + _beside(state, terms)
 
 
 @kernel
@@ -101,15 +101,15 @@ def _inverse(information: np.ndarray, least: float) -> np.ndarray:
     return np.asarray((axes / np.maximum(values, least)) @ axes.T)
 
 
-def _beside(state: State, hull: HullPrior) -> np.ndarray:
+def _beside(state: State, terms: Terms) -> np.ndarray:
     """(11, 11) what a body's distance to a predicted hull adds, of sizes and centre.
 
     A thing that is no superquadric leaves the body beside its hull, and a wrong prediction does too.  Each end of an
     axis errs as the directions near to it differ: whether both ends do so alike or apart, neither half their sum, the
     size, nor half their difference, the centre, errs by more.
     """
-    near = np.abs(hull.directions @ state.rotation) ** _NEAR_AXIS
-    off = hull.directions @ state.parameters[5:8] + state.body.support(hull.directions) - hull.support
+    near = (terms.hull_directions @ state.rotation) ** _NEAR_AXIS
+    off = hull_distances(terms, state.parameters, state.rotation)
     square = off**2 @ near / near.sum(axis=0)
     moments = np.zeros((STEP_LENGTH, STEP_LENGTH))
     moments[0:3, 0:3] = np.diag(square)

@@ -120,11 +120,7 @@ def _support_cost(terms: Terms, parameters: np.ndarray, rotation: np.ndarray, su
 def hull_cost(terms: Terms, parameters: np.ndarray, rotation: np.ndarray, sums: np.ndarray) -> float:
     """|W (h - b)|^2."""
     count = terms.hull_directions.shape[0]
-    rows = np.empty((STEP_LENGTH + 1, count))
-    for j in range(count):
-        rows[5, j], rows[6, j], rows[7, j] = terms.hull_directions[j]
-        rows[STEP_LENGTH, j] = -terms.hull_support[j]
-    _hull_rows(count, parameters, rotation, rows)
+    rows = _hull_rows(terms, parameters, rotation)
     whitened = rows @ terms.hull_root.T
     square = 0.0
     for j in range(count):
@@ -134,8 +130,19 @@ def hull_cost(terms: Terms, parameters: np.ndarray, rotation: np.ndarray, sums: 
 
 
 @kernel
-def _hull_rows(count: int, parameters: np.ndarray, rotation: np.ndarray, rows: np.ndarray) -> None:
-    """Derivatives and residuals, of directions in rows 5 to 7 and minus their b in the last: one array, vector code."""
+def hull_distances(terms: Terms, parameters: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """h - b (J,), metres."""
+    return _hull_rows(terms, parameters, rotation)[STEP_LENGTH]
+
+
+@kernel
+def _hull_rows(terms: Terms, parameters: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """Derivatives of h, a column a direction, and h - b in the last row: one array, vector code."""
+    count = terms.hull_directions.shape[0]
+    rows = np.empty((STEP_LENGTH + 1, count))
+    for j in range(count):
+        rows[5, j], rows[6, j], rows[7, j] = terms.hull_directions[j]
+        rows[STEP_LENGTH, j] = -terms.hull_support[j]
     a1, a2, a3, e1, e2, t1, t2, t3 = parameters
     m11, m12, m13 = rotation[0]
     m21, m22, m23 = rotation[1]
@@ -150,6 +157,7 @@ def _hull_rows(count: int, parameters: np.ndarray, rotation: np.ndarray, rows: n
         rows[3, j], rows[4, j] = h1, h2
         rows[8, j], rows[9, j], rows[10, j] = hy * n2 - hz * n1, hz * n0 - hx * n2, hx * n1 - hy * n0
         rows[STEP_LENGTH, j] += d0 * t1 + d1 * t2 + d2 * t3 + h
+    return rows
 
 
 @kernel
