@@ -155,18 +155,16 @@ def groups(observation: Observation) -> Iterator[list[State]]:
 
 
 def everything(observation: Observation) -> list[State]:
-    """All starts at once, for images on which the first ones failed: boxes, and deeper and turned twice."""
+    """All starts at once, for images on which the first ones failed: boxes, and others than the first exponent."""
     found = principal(observation.points)
     completed = completed_moments(observation)
     if completed is None:
         return found
     centre, moments = completed
     axes = principal_axes(moments)
-    deeper = centre + np.array([0.0, 0.0, 0.5 * math.sqrt(float(np.trace(moments)) / 3)])
-    for middle in (centre, deeper):
-        for exponent in _EXPONENTS:
-            for turned in [axes, *eighth_turns(axes), *double_turns(axes)]:
-                found += states(middle, moments, turned, exponent)
+    for exponent in _EXPONENTS:
+        for turned in [axes, *eighth_turns(axes)]:
+            found += states(centre, moments, turned, exponent)
     return found
 
 
@@ -253,16 +251,6 @@ def eighth_turns(axes: np.ndarray) -> list[np.ndarray]:
         turn[i, i], turn[i, j], turn[j, i], turn[j, j] = c, -s, s, c
         turned.append(axes @ turn)
     return turned
-
-
-def double_turns(axes: np.ndarray) -> list[np.ndarray]:
-    """The axes turned by 45 degrees about two of themselves, one after the other: 6 orders."""
-    twice = []
-    for k, once in enumerate(eighth_turns(axes)):
-        for j, both in enumerate(eighth_turns(once)):
-            if j != k:
-                twice.append(both)
-    return twice
 
 
 def states(centre: np.ndarray, moments: np.ndarray, axes: np.ndarray, exponent: float = START_EXPONENT) -> list[State]:
