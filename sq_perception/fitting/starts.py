@@ -2,7 +2,7 @@
 
 Boxes lie along the points' principal axes, or stand on a support plane.  The oriented box of the visible points is a
 lower bound of the body in every direction; on a plane, its height is exact as far as the top is seen.  What the camera
-does not see lies behind: the narrow side is also tried deeper.
+does not see lies behind: without a plane, the narrow side is also tried deeper.
 
 Central symmetry: a superquadric is its own reflection through its centre C.
 
@@ -71,14 +71,29 @@ def on_one_line(points: np.ndarray) -> bool:
 
 
 def principal(points: np.ndarray, deeper: bool = True) -> list[State]:
-    """Boxes along the principal axes of the points, for each choice of z; deeper ones behind them if asked for."""
-    return _box_states(points, _axes_of(points), deeper)
+    """Boxes along the principal axes of the points, for each choice of z; deeper on the narrow side if asked for."""
+    axes = _axes_of(points)
+    low, high = span(points, axes.T).T
+    found = _ordered(low, high, axes)
+    if not deeper:
+        return found
+    extents = high - low
+    thin = int(np.argmin(extents))
+    seen_from_below = points.mean(axis=0) @ axes[:, thin] > 0
+    for share in (0.5, 1.0):
+        extra = share * float(extents.max()) - extents[thin]
+        if extra > 0:
+            more = np.where(np.arange(3) == thin, extra, 0.0)
+            found += _ordered(low, high + more, axes) if seen_from_below else _ordered(low - more, high, axes)
+    return found
 
 
-def on_plane(points: np.ndarray, plane: np.ndarray, deeper: bool = True) -> list[State]:
+def on_plane(points: np.ndarray, plane: np.ndarray) -> list[State]:
     """Boxes that stand on the plane: smallest rectangle around the footprint of the points, down to the plane."""
     axes = standing_axes(points, plane[:3])
-    return _box_states(points, axes, deeper, ground=float(-plane[3] * plane[:3] @ axes[:, 2]))
+    low, high = span(points, axes.T).T
+    low[2] = min(float(-plane[3] * plane[:3] @ axes[:, 2]), high[2] - 1e-4)
+    return _ordered(low, high, axes)
 
 
 def standing_axes(points: np.ndarray, normal: np.ndarray) -> np.ndarray:
@@ -110,25 +125,6 @@ def principal_axes(moments: np.ndarray) -> np.ndarray:
 def _axes_of(points: np.ndarray) -> np.ndarray:
     centred = points - points.mean(axis=0)
     return principal_axes(centred.T @ centred)
-
-
-def _box_states(points: np.ndarray, axes: np.ndarray, deeper: bool, ground: float | None = None) -> list[State]:
-    """Boxes along the axes, as measured, and deeper on the narrow side; down to the ground on the third axis."""
-    low, high = span(points, axes.T).T
-    if ground is not None:
-        low[2] = min(ground, high[2] - 1e-4)
-    found = _ordered(low, high, axes)
-    if not deeper:
-        return found
-    extents = high - low
-    thin = int(np.argmin(extents[:2] if ground is not None else extents))
-    seen_from_below = points.mean(axis=0) @ axes[:, thin] > 0
-    for share in (0.5, 1.0):
-        extra = share * float(extents.max()) - extents[thin]
-        if extra > 0:
-            more = np.where(np.arange(3) == thin, extra, 0.0)
-            found += _ordered(low, high + more, axes) if seen_from_below else _ordered(low - more, high, axes)
-    return found
 
 
 def _ordered(low: np.ndarray, high: np.ndarray, axes: np.ndarray) -> list[State]:

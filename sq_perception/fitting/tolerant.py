@@ -20,8 +20,7 @@ more it misfits, the more the body is drawn to the predicted hull
 (:meth:`~sq_perception.fitting.hull_prior.HullPrior.root`).  That pull makes the body no surer,
 and its rays count as fewer by m once more: what errs more does so over larger parts, a neck, a spout, a dent.
 
-1. Starts: the given bodies (the prediction), and boxes on the plane, or along the points' axes without one; where
-   nothing is predicted, deeper ones too.
+1. Starts: the given bodies (the prediction), and boxes on the plane, or along the points' axes without one.
 2. A few steps from each on few rays; more from the best, which determines c.
 3. To the end, on all rays, from the best one or two.
 4. Without a prediction: what is hollow or notched, once more as its convex hull; and all the same as a body of
@@ -64,7 +63,7 @@ INDEPENDENT_OF_PREDICTED, EXPLAINED = 100.0, 0.5
 cans leave.  Chosen on benchmarks/household_things: 200 rays gain on boxes what bottles lose, 50 the other way."""
 _KEPT, _KEPT_OF_PREDICTED = 4, 2
 """Starts that go on from the first few steps.  Beside a predicted hull, more changed nothing on
-benchmarks/household_things, and neither did the deeper boxes."""
+benchmarks/household_things.  Boxes that are deeper than what was seen never did."""
 _INNER_CAUCHY = 1.0
 """Noise levels behind the surface of a hull, beyond which a point hardly counts."""
 _AS_HULL = ("like the convex hull of the object",)
@@ -81,9 +80,7 @@ def solve(problem: Problem, given: Sequence[State]) -> Solution:
     """The most probable body, from the given starts and boxes."""
     problem = _with_priors(problem)
     points, plane = problem.observation.points, problem.options.plane
-    # How far a box goes on behind what was seen is predicted.
-    deeper = problem.hull is None
-    boxes = principal(points, deeper) if plane is None else on_plane(points, plane, deeper)
+    boxes = principal(points, deeper=False) if plane is None else on_plane(points, plane)
     starts = [*given, *boxes]
     solution = _best(problem, starts)
     if problem.hull is not None:
