@@ -61,9 +61,9 @@ from sq_perception.geometry.quantiles import quantile
 INDEPENDENT_OF_PREDICTED, EXPLAINED = 100.0, 0.5
 """Most rays that an object counts for beside a predicted hull, and the mean loss up to which it does: what cartons and
 cans leave.  Chosen on benchmarks/household_things: 200 rays gain on boxes what bottles lose, 50 the other way."""
-_KEPT, _KEPT_OF_PREDICTED = 4, 2
-"""Starts that go on from the first few steps.  Beside a predicted hull, more changed nothing on
-benchmarks/household_things.  Boxes that are deeper than what was seen never did."""
+_KEPT = 2
+"""Starts that go on from the first few steps.  More changed nothing on benchmarks/household_things, and neither did
+boxes that are deeper than what was seen."""
 _INNER_CAUCHY = 1.0
 """Noise levels behind the surface of a hull, beyond which a point hardly counts."""
 _AS_HULL = ("like the convex hull of the object",)
@@ -95,15 +95,14 @@ def solve(problem: Problem, given: Sequence[State]) -> Solution:
 def _best(problem: Problem, starts: Sequence[State]) -> Solution:
     few = problem.draw(COARSE_RAYS, 0.7)
     begun = by_cost(problem.in_time(starts, lambda start: problem.settle(start, few, FIRST_STEPS)))
-    kept = _KEPT if problem.hull is None else _KEPT_OF_PREDICTED
-    settled = by_cost(problem.in_time(begun[:kept], lambda state: problem.settle(state, few)))
+    settled = by_cost(problem.in_time(begun[:_KEPT], lambda state: problem.settle(state, few)))
     if problem.hull is None or problem.late:
         return _refined(problem, settled)
     misfit = max(1.0, _mean_loss(problem, settled[0]) / EXPLAINED)
     terms = problem.terms if misfit == 1.0 else problem.terms._replace(hull_root=problem.hull.root(misfit))
     drawn = replace(problem, independent=INDEPENDENT_OF_PREDICTED / misfit, terms=terms)
     few = drawn.draw(COARSE_RAYS, 0.7)
-    settled = by_cost(drawn.in_time(settled[:2], lambda state: drawn.settle(state, few)))
+    settled = by_cost(drawn.in_time(settled, lambda state: drawn.settle(state, few)))
     solution = _refined(drawn, settled)
     return replace(solution, problem=problem, rays=solution.rays.weighing(1 / misfit))
 
