@@ -71,9 +71,8 @@ SPREAD = 2.5**2
 """Factor of the covariance for things that are no superquadrics, whose errors are alike.  Beside a predicted hull the
 misfit and the distance to the hull say how much, each thing by itself: on 600 things of benchmarks/household_things,
 seeds from 3000, sigma and error then rank more alike (0.65, 0.57 with the factor), at two thirds of the sigma."""
-_HUBER, _HUBER_OF_PREDICTED = 2.0, 1.0
-"""Noise levels; what strays farther from a superquadric is another part of the thing: a neck, a handle.  Where the
-reach of the hull is predicted, such parts need not."""
+_HUBER = 1.0
+"""Noise levels; what strays farther from a superquadric is another part of the thing: a neck, a handle."""
 
 
 def solve(problem: Problem, given: Sequence[State]) -> Solution:
@@ -149,7 +148,7 @@ def _with_priors(problem: Problem) -> Problem:
         terms = problem.terms._replace(huber=_HUBER, inner_cauchy=_INNER_CAUCHY, volume_price=VOLUME_PRICE)
         return replace(problem, terms=terms, independent=INDEPENDENT_RAYS)
     terms = problem.terms._replace(
-        huber=_HUBER_OF_PREDICTED,
+        huber=_HUBER,
         inner_cauchy=_INNER_CAUCHY,
         proportion_stiffness=0.0,
         volume_price=0.0,
