@@ -115,6 +115,33 @@ def test_a_ramp_is_support_and_the_side_of_a_thing_is_not():
 
 
 @pytest.mark.parametrize("seed", range(3))
+def test_a_table_that_light_raises_all_around_a_box_is_support(seed):
+    """By 2 cm at the box, and less over the 7 cm beside it: as long as a board that leans, but all around."""
+    table = plane_image(slanted(90), 0.8)
+    v, u = np.indices(table.shape)
+    away = np.maximum(np.abs(v - 120), np.abs(u - 160)) / CAMERA.fx * 0.8 - 0.04
+    rise = np.clip(0.02 - np.tan(np.deg2rad(16)) * away, 0, 0.02)
+    depth, truth = with_bodies(table - rise, [cube_on(table, 160, 120, 0.04)])
+    found = segment(noisy(depth, 1e-3, seed), CAMERA)
+    assert len(found.ids) == 1
+    assert best_iou(truth == 1, found.labels) > 0.8
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_board_that_leans_on_a_box_is_no_ramp(seed):
+    """It rises by 15 degrees over 8 cm, on one side of the box alone."""
+    table = plane_image(slanted(90), 0.8)
+    v, u = np.indices(table.shape)
+    x = (u - CAMERA.cx) / CAMERA.fx * 0.8
+    board = (np.abs(v - 120) < 20) & (x > 0.02) & (x < 0.1)
+    rise = np.where(board, np.tan(np.deg2rad(15)) * (x - 0.02), 0)
+    depth, truth = with_bodies(table - rise, [cube_on(table, 207, 120, 0.04)])
+    found = segment(noisy(depth, 1e-3, seed), CAMERA)
+    assert len(found.ids) == 2
+    assert min(best_iou(mask, found.labels) for mask in (truth == 1, board & (truth == 0))) > 0.7
+
+
+@pytest.mark.parametrize("seed", range(3))
 def test_a_low_thing_whose_sides_the_sensor_smooths_is_no_ramp(seed):
     """A board 2 cm high, its sides smeared over 4 cm: slopes of about 27 degrees that lead up to nothing else."""
     table = plane_image(slanted(90), 0.8)
