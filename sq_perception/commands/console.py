@@ -174,7 +174,7 @@ def add_frames(command: argparse.ArgumentParser) -> None:
     add("--topic", metavar="NAME", help="depth images of a bag, where it has several such topics")
     add("--every", type=at_least(1), default=1, metavar="N", help="only every Nth frame of a bag or folder")
     methods = ("auto", "network", "symmetry", "classic")
-    add("--method", choices=methods, default="auto", help="how bodies are found; see recover --help")
+    add("--method", choices=methods, default="auto", help="how bodies are found: the methods of recover --help")
     add_ignore_masks(command)
 
 
