@@ -95,13 +95,14 @@ def _best(problem: Problem, starts: Sequence[State]) -> Solution:
     few = problem.draw(COARSE_RAYS, 0.7)
     begun = by_cost(problem.in_time(starts, lambda start: problem.settle(start, few, FIRST_STEPS)))
     settled = by_cost(problem.in_time(begun[:_KEPT], lambda state: problem.settle(state, few)))
-    if problem.hull is None or problem.late:
+    if problem.hull is None:
         return _refined(problem, settled)
     misfit = max(1.0, _mean_loss(problem, settled[0]) / EXPLAINED)
     terms = problem.terms if misfit == 1.0 else problem.terms._replace(hull_root=problem.hull.root(misfit))
     drawn = replace(problem, independent=INDEPENDENT_OF_PREDICTED / misfit, terms=terms)
-    few = drawn.draw(COARSE_RAYS, 0.7)
-    settled = by_cost(drawn.in_time(settled, lambda state: drawn.settle(state, few)))
+    if not problem.late:
+        few = drawn.draw(COARSE_RAYS, 0.7)
+        settled = by_cost(drawn.in_time(settled, lambda state: drawn.settle(state, few)))
     solution = _refined(drawn, settled)
     return replace(solution, problem=problem, rays=solution.rays.weighing(1 / misfit))
 

@@ -175,3 +175,18 @@ def test_a_thing_that_floats_is_fitted_as_one_on_a_plane_is(
     far = found.superquadric.translation[2] + found.superquadric.support(ahead)[0]
     assert far == pytest.approx(body.translation[2] + body.support(ahead)[0], abs=0.007)
     assert found.superquadric.size.max() == pytest.approx(0.06, abs=0.01)
+
+
+def test_a_thing_cut_short_is_no_surer_than_one_with_time(
+    box_from_the_front: tuple[np.ndarray, np.ndarray, Superquadric, np.ndarray],
+) -> None:
+    """What no superquadric fits counts as fewer rays, whether or not there is time to go on."""
+    depth, mask, body, plane = box_from_the_front
+    dents = 0.012 * np.sin(np.linspace(0, 40, depth.shape[1], dtype=np.float32))
+    options = FitOptions(plane=plane, model_error=0.0025, hull=told(body, 0.02))
+    patient, hasty = (
+        surface_fit.fit(depth + dents * mask, mask, CAMERA, options=replace(options, time_budget=budget))
+        for budget in (math.inf, 1e-9)
+    )
+    assert "time budget" in hasty.message
+    assert (hasty.sigma_size > 0.9 * patient.sigma_size).all()
