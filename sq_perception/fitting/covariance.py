@@ -51,7 +51,7 @@ def covariance_at(state: State, rays: Rays, terms: Terms, outline: float, hull: 
     prior = (
         np.array([1 / _PRIOR_LOG_SIZE] * 3 + [1 / _PRIOR_SHAPE] * 2 + [1 / length] * 3 + [1 / _PRIOR_ANGLE] * 3) ** 2
     )
-    freedom = math.inf if hull is None else hull.freedom
+    freedom = math.inf if hull is None else float(hull.freedom)  # of a whole number: another form to compile
     hits, free = rays.every(stride).weighing(stride)
     information = _information(hits, free, terms, state.parameters, state.rotation, prior, freedom)
     covariance = _inverse(information, float(prior.min()))

@@ -153,8 +153,9 @@ def _with_priors(problem: Problem) -> Problem:
         inner_cauchy=_INNER_CAUCHY,
         proportion_stiffness=0.0,
         volume_price=0.0,
-        hull_directions=np.array(hull.directions, order="C"),  # not read only: another form to compile
-        hull_support=np.ascontiguousarray(hull.support),
+        # Neither read only nor of single precision: another form to compile.
+        hull_directions=np.array(hull.directions, float, order="C"),
+        hull_support=np.array(hull.support, float, order="C"),
         hull_root=hull.root(),
     )
     observation = problem.observation.of_hull()

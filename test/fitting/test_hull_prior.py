@@ -8,11 +8,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from sq_perception.fitting import surface_fit
+from sq_perception.fitting import covariance, priors, surface_fit
 from sq_perception.fitting.cost import STEP_LENGTH, Terms
 from sq_perception.fitting.covariance import covariance_at
 from sq_perception.fitting.hull_prior import MODEL_SHARE, PULL_SHARE, HullPrior
-from sq_perception.fitting.levenberg_marquardt import State, move
+from sq_perception.fitting.levenberg_marquardt import State, minimize, move
 from sq_perception.fitting.observation import Crop
 from sq_perception.fitting.priors import prior_cost
 from sq_perception.fitting.rays import Rays
@@ -190,3 +190,19 @@ def test_a_thing_cut_short_is_no_surer_than_one_with_time(
     )
     assert "time budget" in hasty.message
     assert (hasty.sigma_size > 0.9 * patient.sigma_size).all()
+
+
+def test_no_form_of_a_hull_is_compiled_for(
+    box_from_the_front: tuple[np.ndarray, np.ndarray, Superquadric, np.ndarray],
+) -> None:
+    """A camera would wait for it: 12 s for single precision and read only arrays, 2 s for a whole number."""
+    depth, mask, body, plane = box_from_the_front
+    usual = told(body, 0.004)
+    single = replace(usual, directions=usual.directions.astype(np.float32), support=usual.support.astype(np.float32))
+    fixed = replace(usual, support=usual.support.copy(), freedom=3)
+    fixed.support.flags.writeable = False
+    forms = []
+    for hull in (usual, single, fixed):
+        surface_fit.fit(depth, mask, CAMERA, options=FitOptions(plane=plane, model_error=0.0025, hull=hull))
+        forms.append([len(form.signatures) for form in (minimize, covariance._information, priors.hull_distances)])
+    assert forms[0] == forms[1] == forms[2]
