@@ -7,8 +7,10 @@ such as the turn of a round body about its axis, gets the width of the prior ins
 with the noise or a whole pixel, whichever is more: its errors are no independent noise.
 
 A predicted hull says itself how it errs, and its residuals r_h are apart from these: J_h^T J_h / (1 + |r_h|^2 / nu) is
-added to J^T J / s^2, as of a t distribution with nu degrees of freedom, whose scale is the less certain the farther off
-a body is.
+added to J^T J / s^2.  The farther off a body is, the less it counts, as the weight (nu + J) / (nu + |r_h|^2) of a t
+distribution with nu degrees of freedom in J directions falls; but it begins at 1, not at 1 + J / nu, 15 here: with that
+91 instead of 97 % of the half sizes of 196 things of benchmarks/household_things, seeds from 7000, are within two
+deviations, and sigma and error rank less alike.
 
 That describes one valley of the cost, as if the thing were a superquadric.  Other bodies that the image allows add
 their second moments about the result, and so does the hull that a body lies beside.

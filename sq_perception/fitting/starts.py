@@ -2,7 +2,7 @@
 
 Boxes lie along the points' principal axes, or stand on a support plane.  The oriented box of the visible points is a
 lower bound of the body in every direction; on a plane, its height is exact as far as the top is seen.  What the camera
-does not see lies behind: without a plane, the narrow side is also tried deeper.
+does not see lies behind: where an exact body is sought, the narrow side is also tried deeper.
 
 Central symmetry: a superquadric is its own reflection through its centre C.
 
