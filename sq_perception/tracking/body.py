@@ -159,7 +159,7 @@ class Body:
 
     def published(self) -> Track:
         """What a consumer gets."""
-        covariance = states.from_log(self.covariance + self.lasting @ self.lasting.T, self.state[0:3])
+        covariance = self.covariance + self.lasting @ self.lasting.T
         known = TrackState.CONFIRMED if self.seen >= CONFIRM_AFTER else TrackState.TENTATIVE
         return Track(
             id=self.id,

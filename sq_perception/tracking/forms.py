@@ -12,7 +12,7 @@ wrong by (e1 - e2) / 2 in each of the two.  A box whose roundings differ by less
 now with this axis as z and now with that one.  Such an exchange is undone where |e1 - e2| is below a limit, with the
 variances
 
-    (e1 - e2)^2 on the exponents,    (0.1 (e1 - e2))^2 on the logarithms of the sizes
+    (e1 - e2)^2 on the exponents,    (0.1 (e1 - e2) a)^2 on the sizes a
 
 added to what was observed.  Candidates are compared by their likelihood, d^2 + log det S, so that an exchange has to
 earn its wider covariance.
@@ -33,7 +33,7 @@ with 0.4 to 2."""
 _SHORTLIST = 4
 """Forms compared with their whole covariances; the others are farther off already by their variances."""
 _SIZE_PER_SHAPE = 0.1
-"""Deviation of the log sizes after an exchange, for each |e1 - e2|; see the module.  Chosen."""
+"""Deviation of the sizes, as a share, after an exchange, for each |e1 - e2|; see the module.  Chosen."""
 _SAME_NAME = np.pi / 4
 """Radians: nearer to an axis than to any other one."""
 _SELDOM_TURNED = 2 * np.log(100)
@@ -82,12 +82,12 @@ def candidates(observed: np.ndarray) -> np.ndarray:
     )
 
 
-def _added(observed: np.ndarray) -> np.ndarray:
-    """Variances (..., 11) that an exchange of z adds to observations (..., 12)."""
-    unlike = np.abs(observed[..., 3] - observed[..., 4])
-    added = np.zeros((*unlike.shape, LENGTH))
-    added[..., SIZE] = (_SIZE_PER_SHAPE * unlike[..., None]) ** 2
-    added[..., SHAPE] = unlike[..., None] ** 2
+def _added(observed: np.ndarray, forms: np.ndarray) -> np.ndarray:
+    """Variances (..., k, 11) that an exchange of z adds to forms (..., k, 12) of observations (..., 12)."""
+    unlike = np.abs(observed[..., 3] - observed[..., 4])[..., None, None]
+    added = np.zeros((*forms.shape[:-1], LENGTH))
+    added[..., SIZE] = (_SIZE_PER_SHAPE * unlike * forms[..., SIZE]) ** 2
+    added[..., SHAPE] = unlike**2
     return added
 
 
@@ -100,18 +100,18 @@ def nearest(
     ----------
     track, observed : (n, 12)
     track_covariance, covariance : (n, 11, 11)
-        In logarithms of sizes, world frame.
+        World frame.
     exchange
         Largest |e1 - e2| for which z may change places with x or y.
     """
     count = len(track)
     forms = candidates(observed)
     errors = state.difference(track[:, None], forms)
-    added = _added(observed)
+    added = _added(observed, forms)
 
     own = np.einsum("nii->ni", covariance)
     variances = np.einsum("kij,nj->nki", _CHANGES**2, own) + np.einsum("nii->ni", track_covariance)[:, None]
-    variances[:, EXACT:] += added[:, None]
+    variances[:, EXACT:] += added[:, EXACT:]
     rough = (errors**2 / variances + np.log(variances)).sum(axis=-1)
     rough[:, EXACT:][np.abs(observed[:, 3] - observed[:, 4]) > exchange] = np.inf
 
@@ -119,7 +119,7 @@ def nearest(
     row = np.arange(count)[:, None]
     changes = _CHANGES[some]
     changed = changes @ covariance[:, None] @ changes.swapaxes(-1, -2)
-    changed[..., range(LENGTH), range(LENGTH)] += np.where(some[..., None] >= EXACT, added[:, None], 0)
+    changed[..., range(LENGTH), range(LENGTH)] += np.where(some[..., None] >= EXACT, added[row, some], 0)
     total = changed + track_covariance[:, None]
     cost = state.mahalanobis(total, errors[row, some]) + np.linalg.slogdet(total)[1]
     cost = np.where(np.isfinite(rough[row, some]), cost, np.inf)
@@ -154,7 +154,7 @@ def _form(
     forms = candidates(observed)
     errors = state.difference(track, forms)
     changed = _CHANGES @ covariance @ _CHANGES.swapaxes(-1, -2)
-    changed[EXACT:, range(LENGTH), range(LENGTH)] += _added(observed)
+    changed[EXACT:, range(LENGTH), range(LENGTH)] += _added(observed, forms)[EXACT:]
     total = (changed + track_covariance)[:, SIZE_AND_SHAPE, SIZE_AND_SHAPE]
     cost = state.mahalanobis(total, errors[:, SIZE_AND_SHAPE]) + np.linalg.slogdet(total)[1]
     keeps = np.linalg.norm(errors[:, TURN], axis=-1) <= _SAME_NAME

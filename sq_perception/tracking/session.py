@@ -187,12 +187,10 @@ def _in_form_of(body: Superquadric, covariance: np.ndarray, observation: Observe
     """What was observed with the axes named as those of a body with this covariance, and its own covariance."""
     own = np.asarray(observation.covariance, dtype=float)
     known = np.isfinite(own).all()
-    size = observation.superquadric.size
     found, changed = forms.named(
         body.to_flat(),
-        state.to_log(covariance, body.size),
+        covariance,
         observation.superquadric.to_flat(),
-        state.to_log(own if known else 0 * np.eye(LENGTH), size),
+        own if known else 0 * np.eye(LENGTH),
     )
-    named = Superquadric.from_flat(found)
-    return named, state.from_log(changed, named.size) if known else own
+    return Superquadric.from_flat(found), changed if known else own

@@ -4,13 +4,12 @@ State and error
 ---------------
 A state is the flat parameter vector (12,) of a superquadric in the world frame.  Its error lives in the 11 dimensions
 
-    log a1, log a2, log a3,  e1, e2,  t1, t2, t3 (world, metres),  w1, w2, w3 (rotation vector in the body's own frame)
+    a1, a2, a3,  e1, e2,  t1, t2, t3 (world),  w1, w2, w3 (rotation vector in the body's own frame)
 
-so that x + d has the sizes a exp(d_a), the exponents e + d_e, the centre t + d_t and the rotation R exp([d_w]).  In
-logarithms a size has no bound to respect; in the body's frame a turn of the world changes no number of the rotation.
-Every function takes leading batch dimensions.
-
-Fits speak of metres instead of logarithms: :func:`to_log` and :func:`from_log` go between, to first order.
+so that x + d has the sizes a + d_a, the exponents e + d_e, the centre t + d_t and the rotation R exp([d_w]).  Sizes are
+in metres as the fits' are, and not in logarithms: that something flat is twice as thick moves its centre by its
+thickness, and in logarithms that is another motion for each thickness that an observation takes it to have.  In the
+body's frame a turn of the world changes no number of the rotation.  Every function takes leading batch dimensions.
 """
 
 from __future__ import annotations
@@ -29,6 +28,8 @@ SIZE_AND_SHAPE, POSE = slice(0, 5), slice(5, 11)
 DETERMINED = 0.2
 """Radians: a turn about an axis whose standard deviation is larger is not determined by an observation.  Chosen:
 three of them reach the next axis of a cube, and fewer another side of the body."""
+_LEFT = 0.1
+"""Share of a size that a correction leaves at least.  Chosen."""
 _SHAPE_LIMITS = (0.01, 2.0)
 """Exponents: down to where the gauge was tried, up to where bodies are convex (:mod:`geometry.superquadric`)."""
 
@@ -56,8 +57,7 @@ def difference(state: np.ndarray, other: np.ndarray) -> np.ndarray:
     turn = quaternions.multiply(quaternions.conjugate(state[..., 8:12]), other[..., 8:12])
     return np.concatenate(
         [
-            np.log(other[..., 0:3] / state[..., 0:3]),
-            other[..., 3:8] - state[..., 3:8],
+            other[..., 0:8] - state[..., 0:8],
             quaternions.to_rotation_vector(turn),
         ],
         axis=-1,
@@ -65,11 +65,11 @@ def difference(state: np.ndarray, other: np.ndarray) -> np.ndarray:
 
 
 def moved(state: np.ndarray, error: np.ndarray) -> np.ndarray:
-    """The state (..., 12) at the end of an error (..., 11); exponents stay within (0, 2]."""
+    """The state (..., 12) at the end of an error (..., 11); sizes stay above 0, exponents within (0, 2]."""
     turn = quaternions.from_rotation_vector(error[..., TURN])
     return np.concatenate(
         [
-            state[..., 0:3] * np.exp(error[..., SIZE]),
+            np.maximum(state[..., 0:3] + error[..., SIZE], _LEFT * state[..., 0:3]),
             np.clip(state[..., 3:5] + error[..., SHAPE], *_SHAPE_LIMITS),
             state[..., 5:8] + error[..., CENTRE],
             quaternions.normalize(quaternions.multiply(state[..., 8:12], turn)),
@@ -78,15 +78,10 @@ def moved(state: np.ndarray, error: np.ndarray) -> np.ndarray:
     )
 
 
-def to_log(covariance: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """Covariances (..., 11, 11) with sizes in metres -> with logarithms of sizes (..., 3)."""
-    scale = np.concatenate([1 / size, np.ones((*size.shape[:-1], LENGTH - 3))], axis=-1)
-    return scale[..., :, None] * covariance * scale[..., None, :]
-
-
-def from_log(covariance: np.ndarray, size: np.ndarray) -> np.ndarray:
-    """The inverse of :func:`to_log`."""
-    return to_log(covariance, 1 / size)
+def in_metres(covariance: np.ndarray, size: np.ndarray) -> np.ndarray:
+    """Covariances (..., 11, 11) of errors in shares of the sizes (..., 3) -> of errors in metres."""
+    scale = np.concatenate([size, np.ones((*size.shape[:-1], LENGTH - 3))], axis=-1)
+    return np.asarray(scale[..., :, None] * covariance * scale[..., None, :])
 
 
 def turned(covariance: np.ndarray, matrix: np.ndarray) -> np.ndarray:
@@ -102,9 +97,9 @@ def mahalanobis(covariance: np.ndarray, error: np.ndarray) -> np.ndarray:
     return np.einsum("...i,...i->...", error, solved)
 
 
-def diagonal(log_size: float, shape: float, centre: float, turn: float) -> np.ndarray:
+def diagonal(size: float, shape: float, centre: float, turn: float) -> np.ndarray:
     """(11, 11) covariance of independent errors with these standard deviations."""
-    return np.diag(np.square([log_size] * 3 + [shape] * 2 + [centre] * 3 + [turn] * 3))
+    return np.diag(np.square([size] * 3 + [shape] * 2 + [centre] * 3 + [turn] * 3))
 
 
 def as_pose(pose: object) -> tuple[np.ndarray, np.ndarray]:

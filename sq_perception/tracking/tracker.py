@@ -41,12 +41,12 @@ COMMON_SHARE, LASTING_SHARE = 0.25, 0.25
 """rho and gamma, the shares of an observation's covariance that all views from one direction, and all views, have in
 common.  Chosen; benchmarks/tracking.py finds half of a view's error to be the same over all frames."""
 LEAST = state.diagonal(0.01, 0.02, 0.001, 0.01)
-"""F, the least common error of a view.  Chosen: 1 % in size, a millimetre, half a degree."""
+"""F, the least common error of a view, of sizes as a share.  Chosen: 1 % in size, a millimetre, half a degree."""
 _LEAST_WHITE = 1e-6
 """Share of F that is new in every observation at least: of exact ones, such as a simulator's, S has no inverse else."""
 UNKNOWN = 0.15, 0.2, 0.15, 0.2
-"""Deviations (log sizes, exponents, centre as a share of the mean half size, turn) of observations without covariance.
-Chosen: errors of the classic fit and of the network alone on household things are of this order."""
+"""Deviations (sizes as shares, exponents, centre as a share of the mean half size, turn) of observations without
+covariance.  Chosen: errors of the classic fit and of the network alone on household things are of this order."""
 PATIENCE = 2
 """After so many disagreeing observations in a row the track gives way: the second may not be chance any more."""
 FASTEST = 1.0
@@ -163,12 +163,13 @@ def _in_world(
         if np.shape(body.covariance) != (LENGTH, LENGTH):
             raise ValueError(f"covariance: expected shape (11, 11), got {np.shape(body.covariance)}")
     flat = np.array([body.superquadric.to_flat() for body in recoveries], dtype=float)
-    covariance = state.to_log(np.array([body.covariance for body in recoveries], dtype=float), flat[:, 0:3])
+    covariance = np.array([body.covariance for body in recoveries], dtype=float)
     unknown = ~np.isfinite(covariance).all(axis=(1, 2))
     if unknown.any():
-        log_size, shape, centre, turn = UNKNOWN
+        size, shape, centre, turn = UNKNOWN
         for k in np.flatnonzero(unknown):
-            covariance[k] = state.diagonal(log_size, shape, centre * float(flat[k, 0:3].mean()), turn)
+            shares = state.diagonal(size, shape, centre * float(flat[k, 0:3].mean()), turn)
+            covariance[k] = state.in_metres(shares, flat[k, 0:3])
     matrix = quaternions.to_matrix(rotation)
     flat[:, 5:8] = flat[:, 5:8] @ matrix.T + position
     flat[:, 8:12] = quaternions.multiply(rotation, flat[:, 8:12])
@@ -201,7 +202,7 @@ def _pairs(
     if not bodies:
         return Pairs.none(), Pairs.none()
     states, covariances = stacked(bodies)
-    covariances = covariances + LEAST
+    covariances = covariances + _least(states)
     here = association.in_place(states, covariances, observed, covariance)
     left = np.setdiff1d(np.arange(len(states)), here.track)
     new = np.setdiff1d(np.arange(len(observed)), here.observed)
@@ -249,7 +250,7 @@ def _still_there(
 def _compared(bodies: _Bodies, pairs: Pairs) -> tuple[np.ndarray, np.ndarray, agreement.Agreement]:
     """Covariances (n, 11, 11) and errors (n, 11) of what was observed beside the tracks, and whether they agree."""
     states, covariances = stacked([bodies[k] for k in pairs.track])
-    total, error = covariances + pairs.covariance + LEAST, state.difference(states, pairs.state)
+    total, error = covariances + pairs.covariance + _least(states), state.difference(states, pairs.state)
     return total, error, agreement.compared(states[:, 0:3], total, error)
 
 
@@ -259,9 +260,10 @@ def _fused(bodies: _Bodies, pairs: Pairs, to_camera: np.ndarray, stamp: float) -
         return bodies
     some = [bodies[k] for k in pairs.track]
     states, covariances = stacked(some)
-    common = COMMON_SHARE * pairs.covariance + LEAST
-    white = (1 - COMMON_SHARE - LASTING_SHARE) * pairs.covariance + _LEAST_WHITE * LEAST
-    whole = pairs.covariance + LEAST
+    least = _least(states)
+    common = COMMON_SHARE * pairs.covariance + least
+    white = (1 - COMMON_SHARE - LASTING_SHARE) * pairs.covariance + _LEAST_WHITE * least
+    whole = pairs.covariance + least
     total, error, verdict = _compared(bodies, pairs)
     turning = np.zeros(len(some), dtype=bool)
     for k, body in enumerate(some):
@@ -323,6 +325,11 @@ def _fused(bodies: _Bodies, pairs: Pairs, to_camera: np.ndarray, stamp: float) -
     return tuple(after)
 
 
+def _least(states: np.ndarray) -> np.ndarray:
+    """F (..., 11, 11) of states (..., 12)."""
+    return state.in_metres(LEAST, states[..., 0:3])
+
+
 def _velocity(body: Body, error: np.ndarray, slid: bool, stamp: float, covariance: np.ndarray) -> np.ndarray:
     """The velocity (3,) after an observation of the centre, ``error`` (3,) off its prediction."""
     elapsed = stamp - body.agreed
@@ -346,9 +353,9 @@ def _born(
     return Body(
         number,
         observed,
-        (1 - LASTING_SHARE) * covariance + LEAST,
+        (1 - LASTING_SHARE) * covariance + _least(observed),
         fusion.root(LASTING_SHARE * covariance),
-        Views.first(direction, COMMON_SHARE * covariance + LEAST),
+        Views.first(direction, COMMON_SHARE * covariance + _least(observed)),
         last=stamp,
         agreed=stamp,
         observation=index,

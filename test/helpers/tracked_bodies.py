@@ -57,22 +57,23 @@ def spread_bodies(count, rng, gap=0.3):
 
 
 def noise(size=0.03, shape=0.03, centre=0.001, turn=0.03):
+    """Sizes as shares of themselves, here and in what follows."""
     return state.diagonal(size, shape, centre, turn)
 
 
 def correlated(rng, scale=0.03):
-    """A random covariance in logarithms of sizes with correlations between everything."""
+    """A random covariance with correlations between everything."""
     deviation = np.sqrt(np.diag(noise(scale, scale, scale / 30, scale)))
     mix = rng.standard_normal((11, 22)) / np.sqrt(22)
     return deviation[:, None] * (mix @ mix.T) * deviation
 
 
 def draw(truth, covariance, rng, form=None, error=None):
-    """An observation of a body in a frame where its covariance (logarithms) holds; in a random form."""
+    """An observation of a body in a frame where its covariance holds; in a random form."""
     if error is None:
         error = rng.multivariate_normal(np.zeros(11), covariance)
-    seen = Superquadric.from_flat(state.moved(truth.to_flat(), error))
-    metres = state.from_log(covariance, seen.size)
+    seen = Superquadric.from_flat(state.moved(truth.to_flat(), np.r_[error[:3] * truth.size, error[3:]]))
+    metres = state.in_metres(covariance, truth.size)
     form = rng.integers(8) if form is None else form
     other = seen.equivalent_forms()[int(form)]
     return Seen(other, fit_covariance.carried_over(metres, seen, other))
@@ -104,12 +105,12 @@ def looking_at(target, direction, distance):
 
 
 def error_of(track, truth):
-    """Error of a track in the truth's nearest form, and its covariance, in logarithms."""
-    covariance = state.to_log(track.covariance, track.superquadric.size)
+    """Error of a track in the truth's nearest form, and its covariance, in shares of the true sizes."""
     (seen,), (known,) = forms.nearest(
-        truth.to_flat()[None], 1e-9 * np.eye(11)[None], track.superquadric.to_flat()[None], covariance[None], 0.0
+        truth.to_flat()[None], 1e-9 * np.eye(11)[None], track.superquadric.to_flat()[None], track.covariance[None], 0.0
     )
-    return state.difference(truth.to_flat(), seen), known
+    error = state.difference(truth.to_flat(), seen)
+    return np.r_[error[:3] / truth.size, error[3:]], state.in_metres(known, 1 / truth.size)
 
 
 def nees(track, truth):

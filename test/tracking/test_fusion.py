@@ -56,13 +56,13 @@ def test_the_nearest_form_undoes_any_exact_one_with_its_covariance(rng):
         seen = draw(truth, covariance, rng, form, np.zeros(11))
         states, covariances = forms.nearest(
             truth.to_flat()[None],
-            noise()[None],
+            state.in_metres(noise(), truth.size)[None],
             seen.superquadric.to_flat()[None],
-            state.to_log(seen.covariance, seen.superquadric.size)[None],
+            seen.covariance[None],
             0.3,
         )
         np.testing.assert_allclose(state.difference(truth.to_flat(), states[0]), 0, atol=1e-9)
-        np.testing.assert_allclose(covariances[0], covariance, atol=1e-12)
+        np.testing.assert_allclose(covariances[0], state.in_metres(covariance, truth.size), atol=1e-12)
 
 
 def test_z_changes_places_only_where_the_exponents_are_alike(rng):
@@ -74,9 +74,9 @@ def test_z_changes_places_only_where_the_exponents_are_alike(rng):
         count = len(flat)
         states, _ = forms.nearest(
             np.tile(truth.to_flat(), (count, 1)),
-            np.tile(noise(), (count, 1, 1)),
+            state.in_metres(noise(), np.tile(truth.size, (count, 1))),
             flat,
-            np.tile(noise(), (count, 1, 1)),
+            state.in_metres(noise(), flat[:, :3]),
             0.3,
         )
         turn = quaternions.geodesic_angle(states[:, 8:12], truth.rotation)
@@ -200,11 +200,29 @@ def test_what_is_half_seen_drags_nothing(rng):
     column[2], column[5:8] = 0.5, 0.5 * 0.03 * truth.rotation_matrix[:, 2]
     covariance = noise(0.02) + np.outer(column, column)
     for k in range(10, 40):
-        (track,) = tracker.update([draw(truth, covariance, rng, error=-1.0 * column)], 0.1 * k)
+        (track,) = tracker.update([draw(truth, covariance, rng, error=-0.8 * column)], 0.1 * k)
     error, _ = error_of(track, truth)
     assert track.id == 1
     assert np.abs(error[:3]).max() < 0.03
     assert np.linalg.norm(error[5:8]) < 0.002
+
+
+@pytest.mark.parametrize("thick", [(0.015, 0.003), (0.003, 0.015)])
+@pytest.mark.parametrize("shift", [1.0, 0.0, -1.0])
+def test_what_is_flat_and_unsure_becomes_no_thicker_than_it_was_seen(thick, shift):
+    """A plate taken for one of half the height 15 mm, then 3 mm, 13 mm unsure, along with its centre: from its bottom
+    up, with its centre kept, or from its top down."""
+    tracker = Tracker()
+    along = np.zeros(11)
+    along[[2, 7]] = 0.013
+    covariance = np.diag(np.square([0.013, 0.013, 0.002, 0.05, 0.05, *[0.002] * 3, 0.05, 0.05, 1.0]))
+    for k in range(30):
+        half = thick[k // 4 % 2]
+        plate = body((0.105, 0.105, half), (0.1, 1.0), centre=(0, 0, 0.7 + shift * half), turn=(0, 0, 0))
+        (track,) = tracker.update([Seen(plate, covariance + np.outer(along, along))], k / 30)
+        assert track.id == 1
+        assert 0.0029 < track.superquadric.size[2] < 0.0151
+        np.testing.assert_allclose(track.superquadric.size[:2], 0.105, atol=0.005)
 
 
 def test_one_wrong_valley_changes_little_and_is_forgotten(rng):
@@ -212,7 +230,7 @@ def test_one_wrong_valley_changes_little_and_is_forgotten(rng):
     for k in range(10):
         (before,) = tracker.update([draw(truth, noise(0.02), rng)], 0.1 * k)
     wrong = np.zeros(11)
-    wrong[2] = 0.8
+    wrong[2] = 1.2
     (after,) = tracker.update([draw(truth, noise(0.02), rng, error=wrong)], 1.0)
     assert after.id == before.id
     assert np.abs(np.log(after.superquadric.size / before.superquadric.size)).max() < 0.05
@@ -221,7 +239,7 @@ def test_one_wrong_valley_changes_little_and_is_forgotten(rng):
 def test_a_track_that_began_wrongly_gives_way(rng):
     truth, tracker = body(), Tracker()
     wrong = np.zeros(11)
-    wrong[2] = 0.8
+    wrong[2] = 1.2
     tracker.update([draw(truth, noise(0.02), rng, error=wrong)], 0.0)
     for k in range(1, 12):
         (track,) = tracker.update([draw(truth, noise(0.02), rng)], 0.1 * k)

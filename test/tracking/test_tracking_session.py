@@ -163,11 +163,11 @@ def test_a_turn_that_the_image_leaves_open_is_that_of_the_track(deviation, shown
     """0.7 radians about the axis of a can: chance where the fit says that it knows no better, and else a hand."""
     truth, one = body((0.04, 0.04, 0.03), (0.2, 0.95)), TrackingSession()
     covariance = noise(turn=0.01)
-    one.follow([Seen(truth, state.from_log(covariance, truth.size))], 0.0)
+    one.follow([Seen(truth, state.in_metres(covariance, truth.size))], 0.0)
     error = np.zeros(11)
     error[10], covariance[10, 10] = 0.7, deviation**2
     turned = Superquadric.from_flat(state.moved(truth.to_flat(), error))
-    (found,) = one.follow([Seen(turned, state.from_log(covariance, truth.size))], 0.1, is_pose_known=False)
+    (found,) = one.follow([Seen(turned, state.in_metres(covariance, truth.size))], 0.1, is_pose_known=False)
     assert angle_between(found.superquadric, truth) == pytest.approx(shown, abs=0.02)
     np.testing.assert_allclose(found.superquadric.size, truth.size)
 
