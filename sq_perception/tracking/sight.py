@@ -4,6 +4,9 @@
 side are left out.  A point is evidence of absence only where the image measured something farther: beyond the image,
 where nothing was measured, or where something lies in front or at the body's place, nothing shows that it has gone.
 
+Unless that is another body that was seen: two cannot be in one place, and a track whose surface lies mostly in or at
+others, such as that of a piece that a segmentation once cut off, has gone.
+
 Optical frame, metres.
 """
 
@@ -58,14 +61,31 @@ def open_share(bodies: Superquadric, camera: Camera, depth: np.ndarray) -> np.nd
     return clear.sum(axis=1) / np.maximum(near.sum(axis=1), 1)
 
 
+def taken_share(states: np.ndarray, others: np.ndarray) -> np.ndarray:
+    """Share (n,) of the surfaces of tracks (n, 12) that lies in others (m, 12), or at them."""
+    if not len(others):
+        return np.zeros(len(states))
+    bodies = Superquadric.from_flat(states)
+    points = _surface(bodies)
+    gauge = Superquadric.from_flat(others).gauge(points.reshape(1, -1, 3)).reshape(len(others), *points.shape[:2])
+    away = np.linalg.norm(points - others[:, None, None, 5:8], axis=-1)
+    tolerance = _TOLERANCE * bodies.size.min(axis=-1)[:, None]
+    return np.asarray((away * (1 - 1 / np.maximum(gauge, 1e-9)) < tolerance).any(axis=0).mean(axis=1))
+
+
 def _near_side(bodies: Superquadric, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
     """Surface points (n, 26, 3), and which of them (n, 26) face the camera."""
-    along = _DIRECTIONS * bodies.size[:, None]
-    local = Superquadric.at_origin(bodies.size, bodies.shape)
-    points = bodies.to_parent(along / local.gauge(along)[..., None])
+    points = _surface(bodies)
     normals = bodies.gauge_gradient(points)
     sight = points if camera.is_pinhole else np.array([0.0, 0.0, 1.0])
     return points, (normals * sight).sum(axis=-1) < 0
+
+
+def _surface(bodies: Superquadric) -> np.ndarray:
+    """Points (n, 26, 3) of the surfaces of bodies (n,)."""
+    along = _DIRECTIONS * bodies.size[:, None]
+    local = Superquadric.at_origin(bodies.size, bodies.shape)
+    return np.asarray(bodies.to_parent(along / local.gauge(along)[..., None]))
 
 
 def towards(centres: np.ndarray, rotation: np.ndarray, position: np.ndarray, orthographic: bool) -> np.ndarray:

@@ -371,6 +371,7 @@ def _survivors(bodies: _Bodies, expected: _Expected, stamp: float) -> _Bodies:
     states, _ = stacked(bodies)
     overlap = association.twins(states)
     ousted = ~seen & ((overlap | overlap.T) & seen).any(axis=1)  # in their place another body was seen
+    ousted[~seen] |= sight.taken_share(states[~seen], states[seen]) >= 0.5
     missing = ousted.copy()
     missing[~seen] |= expected(states[~seen])
     left = []

@@ -130,6 +130,20 @@ def test_what_is_there_but_was_not_recovered_does_not_die(rng):
     assert [t.state for t in tracks] == [TrackState.LOST]
 
 
+def test_a_piece_beside_the_middle_of_what_is_seen_whole_does_not_stay(rng):
+    """Its centre is no nearer to the whole one's than another thing's may be, but it lies in it."""
+    whole = body((0.06, 0.05, 0.05), turn=(0, 0, 0))
+    piece, beside = (body((0.02, 0.02, 0.02), centre=(x, 0, 0.8), turn=(0, 0, 0)) for x in (0.05, 0.085))
+    depth, _ = render(Superquadric.stack([whole, beside]), CAMERA)
+    depth = np.where(np.isfinite(depth), depth, 1.5)
+    for other, lives in ((piece, False), (beside, True)):
+        tracker = Tracker()
+        for k in range(20):
+            seen = [draw(each, noise(), rng) for each in ([whole, other] if k < 4 else [whole])]
+            tracks = tracker.update(seen, k / 30, camera=CAMERA, depth=depth)
+        assert [t.id for t in tracks] == ([1, 2] if lives else [1])
+
+
 def test_nothing_hidden_lives_for_ever(rng):
     tracker = Tracker()
     tracker.update([draw(body(), noise(), rng)], 0.0)
