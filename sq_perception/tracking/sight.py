@@ -22,6 +22,8 @@ _DIRECTIONS = np.array([d for d in np.ndindex(3, 3, 3) if d != (1, 1, 1)], dtype
 _TOLERANCE = 0.25
 """Of the smallest half size: a depth that differs by less is the body's own.  Chosen: above noise and misfit, below
 a thing that stands behind."""
+_TOLD = 0.25
+"""Share of the points of the near side that have to tell something, three of mostly twelve.  Chosen."""
 
 
 def expected(
@@ -29,8 +31,8 @@ def expected(
 ) -> np.ndarray:
     """Whether unseen tracks (n, 12) should have been seen, (n,), by a camera with this pose in the world.
 
-    Those whose near side it sees through for the greater part; all of them where the frame's camera or depth image is
-    not known.
+    Those that it sees through for the greater part of the near side that it could see; all of them where the frame's
+    camera or depth image is not known.
     """
     if camera is None or depth is None or not len(states):
         return np.ones(len(states), dtype=bool)
@@ -40,7 +42,7 @@ def expected(
 
 
 def open_share(bodies: Superquadric, camera: Camera, depth: np.ndarray) -> np.ndarray:
-    """Share (n,) of the near side that the camera sees through.
+    """Share (n,) of the near side that the camera sees through, of what it could see; 0 where that is too little.
 
     Parameters
     ----------
@@ -57,8 +59,9 @@ def open_share(bodies: Superquadric, camera: Camera, depth: np.ndarray) -> np.nd
     measured = np.asarray(depth)[row, column].astype(float)
     valid = np.isfinite(measured) & ((measured > 0) | (not camera.is_pinhole))
     tolerance = _TOLERANCE * bodies.size.min(axis=-1)[:, None]
-    clear = inside & valid & (np.where(valid, measured, 0) > points[..., 2] + tolerance)
-    return clear.sum(axis=1) / np.maximum(near.sum(axis=1), 1)
+    behind = np.where(inside & valid, measured, -np.inf) - points[..., 2]
+    clear, told = (behind > tolerance).sum(axis=1), (behind >= -tolerance).sum(axis=1)
+    return np.where(told >= _TOLD * near.sum(axis=1), clear / np.maximum(told, 1), 0.0)
 
 
 def taken_share(states: np.ndarray, others: np.ndarray) -> np.ndarray:

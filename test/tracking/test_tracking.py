@@ -144,6 +144,18 @@ def test_a_piece_beside_the_middle_of_what_is_seen_whole_does_not_stay(rng):
         assert [t.id for t in tracks] == ([1, 2] if lives else [1])
 
 
+def test_what_the_border_of_the_image_cuts_is_seen_to_have_gone(rng):
+    """A third of it would be within the image; the table is seen there, or it."""
+    cut, rest = body((0.05, 0.05, 0.05), centre=(0.475, 0, 0.8), turn=(0, 0, 0)), body()
+    for scene, lives in (([rest], False), ([rest, cut], True)):
+        depth, _ = render(Superquadric.stack(scene), CAMERA)
+        depth, tracker = np.where(np.isfinite(depth), depth, 1.5), Tracker()
+        for k in range(20):
+            seen = [draw(each, noise(), rng) for each in ([rest, cut] if k < 4 else [rest])]
+            tracks = tracker.update(seen, k / 30, camera=CAMERA, depth=depth)
+        assert [t.id for t in tracks] == ([1, 2] if lives else [1])
+
+
 def test_nothing_hidden_lives_for_ever(rng):
     tracker = Tracker()
     tracker.update([draw(body(), noise(), rng)], 0.0)
