@@ -74,14 +74,7 @@ def taken_apart(
         return convex_parts.corrected(depth_steps.separated(depth, wanted), depth, camera, sigma, holds)
     body = patch_grouping.bodies(patches, camera)
     labels = _refined(body[patches.labels].astype(np.int32), patches, depth, wanted)
-    labels = convex_parts.corrected(labels, depth, camera, sigma, holds)
-    # What is too small for a patch stays what the steps made of it.
-    rest = cv2.morphologyEx((wanted & (labels == 0)).view(np.uint8), cv2.MORPH_OPEN, depth_steps.CROSS)
-    if not rest.any():
-        return labels
-    rest = depth_steps.components(rest)
-    rest[rest > 0] += labels.max()
-    return labels + rest
+    return convex_parts.corrected(labels, depth, camera, sigma, holds)
 
 
 def _refined(body: np.ndarray, patches: surface_patches.Patches, depth: np.ndarray, wanted: np.ndarray) -> np.ndarray:
