@@ -189,8 +189,7 @@ def standing(seen: Seen, relative: np.ndarray, labels: np.ndarray, support: Supp
         points = camera.unproject(c, r, depth[r, c])
         growth = noise_growth(points[:, 2])
         height = relative[r, c]
-        behind = float(points[:, 2].max()) + options.max_size
-        beside = _beside(relative, depth, around, behind, rows, columns)
+        beside = _beside(relative, around, rows, columns)
         least = max(_LEAST_HEIGHT, MIN_HEIGHT * min(1.0, float(quantile(growth, 0.5))))
         if _top(height * growth) < least or not _rises(_top(height), beside, support.sigma):
             return False
@@ -270,13 +269,10 @@ def _spread(heights: np.ndarray, base: float) -> float:
     return max(_WAVE * -low, 1.4826 * quantile(np.abs(heights - base - low), 0.5))
 
 
-def _beside(
-    relative: np.ndarray, depth: np.ndarray, around: np.ndarray, behind: float, rows: np.ndarray, columns: np.ndarray
-) -> np.ndarray:
+def _beside(relative: np.ndarray, around: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """Heights (n,) of the support beside a segment.
 
     Noise grows at the rims of an image and where light is reflected to and fro; ``around`` is false on other things.
-    What is farther than ``behind``, metres, is not beside the segment: a far wall may be as high as the support.
     """
     top, left = max(int(rows.min()) - _BESIDE, 0), max(int(columns.min()) - _BESIDE, 0)
     window = slice(top, int(rows.max()) + _BESIDE + 1), slice(left, int(columns.max()) + _BESIDE + 1)
@@ -284,9 +280,8 @@ def _beside(
     mask[rows - top, columns - left] = 1
     near, ring = (cv2.dilate(mask, np.ones((2 * k + 1, 2 * k + 1), np.uint8)) for k in (_SMEARED, _BESIDE))
     height = relative[window]
-    is_far = depth[window] >= np.float64(behind)
     is_support = np.abs(height) < np.float64(HIGHEST * TOLERANCE)
-    return np.asarray(height[(ring > near) & around[window] & is_support & ~is_far])
+    return np.asarray(height[(ring > near) & around[window] & is_support])
 
 
 def _stands(
