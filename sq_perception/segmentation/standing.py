@@ -19,7 +19,6 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.quantiles import quantile
 from sq_perception.imaging import depth_steps
 from sq_perception.imaging.camera import Camera
@@ -49,9 +48,6 @@ missed it finds two, 0.25 none."""
 _WAVE = 0.5
 """Of what the support beside a thing lies lower than the base, that counts as a deviation: a thing is three times as
 high.  It changes nothing in 288 simulated scenes, and finds two things in 34 recorded frames."""
-_TALL = 20.0
-"""Deviations of the support's points, and no more than ``HIGHEST`` tolerances: a segment that is higher on average is
-no noise beside another one, even where little noise or a long way makes things low against the tolerance."""
 _SMEARED, _BESIDE = 2, 12
 """Pixels about a segment that a sensor smears, and up to which the support is beside it; 5 to 20 do as well."""
 _IN_SEGMENTS = 0.5
@@ -177,7 +173,7 @@ def standing(seen: Seen, relative: np.ndarray, labels: np.ndarray, support: Supp
     depth, camera, options = seen.depth, seen.camera, seen.options
     last_row, last_column = camera.height - 1, camera.width - 1
     measured = np.count_nonzero(depth)
-    around = (depth > 0) & ~_tall(labels, relative, int(labels.max(initial=0)) + 1, support.sigma)
+    around = depth > 0
     coarse = depth[::_SPARSE, ::_SPARSE]
     nearest = quantile(coarse[coarse > 0], _STRAY) * (1 + depth_steps.STEP) if coarse.any() else 0.0
     plane = support.plane
@@ -211,24 +207,6 @@ def standing(seen: Seen, relative: np.ndarray, labels: np.ndarray, support: Supp
         return True
 
     return is_thing
-
-
-@kernel
-def _tall(labels: np.ndarray, relative: np.ndarray, count: int, sigma: float) -> np.ndarray:
-    """Pixels, bool (height, width), of segments that are higher than any noise, on average: things or the room."""
-    limit = min(HIGHEST * TOLERANCE, _TALL * sigma)
-    sums, pixels = np.zeros(count), np.zeros(count)
-    for v in range(labels.shape[0]):
-        for u in range(labels.shape[1]):
-            if labels[v, u] > 0:
-                sums[labels[v, u]] += relative[v, u]
-                pixels[labels[v, u]] += 1
-    is_high = sums > limit * pixels
-    found = np.empty(labels.shape, np.bool_)
-    for v in range(labels.shape[0]):
-        for u in range(labels.shape[1]):
-            found[v, u] = is_high[labels[v, u]]
-    return found
 
 
 def _rises(top: float, beside: np.ndarray, sigma: float) -> bool:
