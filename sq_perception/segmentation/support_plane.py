@@ -58,9 +58,6 @@ Chosen: lone bodies are found by it, and 81 recorded and simulated frames of tab
 LEVEL, _STOREY, _TABLE_SHARE = 0.99, 0.3, 0.4
 """Cosine between the normals of level planes, metres from a floor to the table above it, and the share that a small one
 shows of what the floor does.  Of lower steps the larger level is the support; things on a lower one are not found."""
-_STEP_DOWN = 0.04
-"""Metres above a much larger level plane from which on one no larger than a thing is that thing's top: the bottom of a
-bin or a board on a table is lower."""
 
 _CLOSE, _HELD_SHARE = 0.6, 0.1
 """Metres above a support in which what stands on it is, and the least share of that, of what another plane has there:
@@ -170,15 +167,6 @@ def support(
     def is_thing(plane: Plane) -> bool:
         return is_small(_largest_part(plane, depth, valid, camera), plane.equation[:3])
 
-    floors = [
-        plane
-        for plane in votes
-        if plane.equation[:3] @ best.equation[:3] > LEVEL
-        and plane.equation[3] - best.equation[3] > _STEP_DOWN
-        and best.share <= _TABLE_SHARE * plane.share
-    ]
-    if floors and is_thing(best):
-        best = max(floors, key=votes.__getitem__)
     tables = [
         plane
         for plane in votes
