@@ -60,8 +60,8 @@ LEVEL, _STOREY, _TABLE_SHARE = 0.99, 0.3, 0.4
 shows of what the floor does.  Of lower steps the larger level is the support; things on a lower one are not found."""
 
 _CLOSE, _HELD_SHARE = 0.6, 0.1
-"""Metres above a support in which what stands on it is, and the least share of that, of what another plane has there:
-the wall behind a table has a tenth and less of it, and may be eight times as large in the image."""
+"""Metres above a support in which what stands on it is, and the least share of what is on no plane that is there: the
+wall behind a table has a tenth and less of it, and may be eight times as large in the image."""
 _TYPICAL_HEIGHT, _FAR = 0.1, 0.1
 """Metres above their support of what is on no plane: exp(-h / this) is near.  A bin's wall, seen from above, is below
 the middle of the image as a table is, but things are anywhere before it, not on it.  The square of the mean counts: of
@@ -156,8 +156,7 @@ def support(
     points = _some_points(depth, valid, camera, _PLANE_POINTS)
     held, near, rest = _held(candidates, points)
     bearing = [k for k, face in enumerate(is_face) if held[k] > 0.5 or not face]
-    least = _HELD_SHARE * max(held[k] for k in bearing)
-    votes = {candidates[k]: _vote(candidates[k]) * near[k] ** 2 for k in bearing if held[k] >= least}
+    votes = {candidates[k]: _vote(candidates[k]) * near[k] ** 2 for k in bearing}
     best = max(votes, key=votes.__getitem__)
     if rest > _STRAY and abs(best.equation[1]) < _FRONTAL and max(held) < _HELD_SHARE:
         return None
