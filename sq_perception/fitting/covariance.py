@@ -55,7 +55,8 @@ def covariance_at(state: State, rays: Rays, terms: Terms, outline: float, hull: 
     )
     freedom = math.inf if hull is None else float(hull.freedom)  # of a whole number: another form to compile
     hits, free = rays.every(stride).weighing(stride)
-    information = _information(hits, free, terms, state.parameters, state.rotation, prior, freedom)
+    others = terms._replace(hull_directions=terms.hull_directions[:0])
+    information = _information(hits, free, others, terms, state.parameters, state.rotation, prior, freedom)
     covariance = _inverse(information, float(prior.min()))
     units = np.concatenate([state.parameters[:3], np.ones(STEP_LENGTH - 3)])
     covariance = units[:, None] * covariance * units
@@ -67,24 +68,28 @@ def covariance_at(state: State, rays: Rays, terms: Terms, outline: float, hull: 
 def _information(
     hits: np.ndarray,
     free: np.ndarray,
+    others: Terms,
     terms: Terms,
     parameters: np.ndarray,
     rotation: np.ndarray,
     prior: np.ndarray,
     freedom: float,
 ) -> np.ndarray:
-    """The inverse (11, 11) of the covariance, of which ``prior`` (11,) is the diagonal of P and ``freedom`` nu."""
+    """The inverse (11, 11) of the covariance, of which ``prior`` (11,) is the diagonal of P and ``freedom`` nu.
+
+    ``others`` are the terms without the hull.
+    """
     sums = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
     of_hull = np.zeros((STEP_LENGTH + 1, STEP_LENGTH + 1))
-    cost, square = evaluate(RENDERED, hits, free, terms, parameters, rotation, sums), 0.0
+    cost = evaluate(RENDERED, hits, free, others, parameters, rotation, sums)
+    variance = max(1.0, cost / hits[:, WEIGHT].sum())
+    vaguer = 1.0
     if terms.hull_directions.shape[0] > 0:
-        square = hull_cost(terms, parameters, rotation, of_hull)
-    variance = max(1.0, (cost - square) / hits[:, WEIGHT].sum())
-    vaguer = 1.0 + square / freedom
+        vaguer += hull_cost(terms, parameters, rotation, of_hull) / freedom
     information = np.diag(prior)
     for j in range(STEP_LENGTH):
         for k in range(j + 1):
-            information[j, k] += (sums[j, k] - of_hull[j, k]) / variance + of_hull[j, k] / vaguer
+            information[j, k] += sums[j, k] / variance + of_hull[j, k] / vaguer
             information[k, j] = information[j, k]
     return information
 

@@ -224,7 +224,7 @@ class Solution:
         return surface_distance(rays, self.state.parameters, self.state.rotation)
 
     def covariance(self) -> np.ndarray:
-        """(11, 11) of the valley of the cost that the body lies in."""
+        """(11, 11) of the valley of the cost that the body lies in, and of its distance to a predicted hull."""
         terms, outline = self.problem.terms_at(self.state), self.problem.observation.outline
         return covariance_at(self.state, self.rays, terms, outline, self.problem.hull) * self.spread_factor
 

@@ -70,10 +70,9 @@ def taken_share(states: np.ndarray, others: np.ndarray) -> np.ndarray:
         return np.zeros(len(states))
     bodies = Superquadric.from_flat(states)
     points = _surface(bodies)
-    gauge = Superquadric.from_flat(others).gauge(points.reshape(1, -1, 3)).reshape(len(others), *points.shape[:2])
-    away = np.linalg.norm(points - others[:, None, None, 5:8], axis=-1)
+    away = Superquadric.from_flat(others).sampson_distance(points.reshape(1, -1, 3))
     tolerance = _TOLERANCE * bodies.size.min(axis=-1)[:, None]
-    return np.asarray((away * (1 - 1 / np.maximum(gauge, 1e-9)) < tolerance).any(axis=0).mean(axis=1))
+    return np.asarray((away.reshape(-1, *points.shape[:2]) < tolerance).any(axis=0).mean(axis=1))
 
 
 def _near_side(bodies: Superquadric, camera: Camera) -> tuple[np.ndarray, np.ndarray]:
