@@ -34,7 +34,7 @@ import numpy as np
 
 from sq_perception.fitting import surface_fit
 from sq_perception.fitting.fit import Status
-from sq_perception.geometry.one_thread import one_blas_thread
+from sq_perception.geometry.one_thread import one_blas_thread, short_turns
 from sq_perception.geometry.quantiles import quantile
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import perforation, raycast
@@ -301,7 +301,8 @@ class Recoverer:
         """The function of each item; several at a time in threads that stay, as new ones cost memory and time."""
         if len(items) < 2 or self._threads < 2:
             return [function(item) for item in items]
-        return list(self._pool.map(function, items))
+        with short_turns():
+            return list(self._pool.map(function, items))
 
     def _shared(self, function: Callable[[Sequence[int]], list[_Answer]], items: Sequence[int]) -> list[_Answer]:
         """The function's answers to items; each thread gets its share of them, as networks compute on one."""

@@ -11,9 +11,7 @@ import numpy as np
 import pytest
 import scipy.linalg  # noqa: F401  # its own BLAS, which is looked at below, is there from the start
 import torch
-from threadpoolctl import threadpool_info
 
-from sq_perception.geometry.one_thread import one_blas_thread
 from sq_perception.imaging.segment_view import CHANNELS
 from sq_perception.learning import checkpoint, inference, layout
 from sq_perception.learning.forward import CompactMasks, CompactRegressor, CompactThings
@@ -152,18 +150,3 @@ def test_torch_computes_what_is_no_compact_network(tmp_path: Path, rng: np.rando
     found = inference.load(tmp_path / "m.safetensors").predict(views)
     np.testing.assert_allclose(found.to_flat(), model.predict(views).to_flat(), atol=1e-4)
     assert torch.get_num_threads() == before
-
-
-def threads_of_blas() -> set[int]:
-    return {one["num_threads"] for one in threadpool_info() if one["user_api"] == "blas"}
-
-
-def test_the_last_block_gives_blas_its_threads_back() -> None:
-    before = threads_of_blas()
-    first, second = one_blas_thread(), one_blas_thread()
-    first.__enter__()
-    second.__enter__()
-    first.__exit__(None, None, None)
-    assert threads_of_blas() == {1}
-    second.__exit__(None, None, None)
-    assert threads_of_blas() == before
