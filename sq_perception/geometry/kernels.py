@@ -106,8 +106,8 @@ def _imported(file: Path) -> set[Path]:
     return {path for path in found if path.is_file()}
 
 
-RAY_TOLERANCE = 1e-9
-MAX_NEWTON_STEPS = 60
+RAY_TOLERANCE, MAX_NEWTON_STEPS = 1e-9, 60
+"""Where a ray meets a body, as a share of its way through the bounding box, and how near the gauge is to 1 there."""
 _NEGLIGIBLE_LOG2 = -115.0
 """A power below 2^this adds nothing to 1."""
 _TINIEST, _TINY = 1e-290, 1e-145

@@ -34,7 +34,9 @@ from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation.support_plane import LEAST_GROWTH, TOLERANCE, Plane, coarse_stride, noise_growth
 
 _ROUNDS = 6
+"""Of reweighting, at most: it ends when it is settled."""
 _TERMS = 6
+"""Of a quadratic surface."""
 _DISTORTION = 0.02
 """Makers of depth cameras promise an error of at most 2 % of the depth."""
 _GAIN = 1.05

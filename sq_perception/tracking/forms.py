@@ -53,6 +53,7 @@ def _turns() -> np.ndarray:
 
 TURNS = _turns()
 EXACT = 8
+"""Of the turns so many describe the same body; the others need its exponents exchanged."""
 _QUATERNIONS = quaternions.from_matrix(TURNS)
 
 
