@@ -166,16 +166,12 @@ def train(
 def _check_same_run(config: TrainingConfig, output: Path) -> dict[str, Any]:
     """The settings of the run so far; CheckpointError where it is of another kind, naming what differs."""
     state = output / "state.safetensors"
-    if not state.exists():
-        return {}
-    # States of 0.2.0 name no settings; the newest network of their run does, from its first validation on.
-    named = [path for path in (state, output / "last.safetensors") if SETTINGS in _header(path)]
     try:
-        before = dict(json.loads(_header(named[0])[SETTINGS])) if named else {}
+        before = dict(json.loads(checkpoint.read_header(state).get(SETTINGS, "{}")))
+    except checkpoint.CheckpointError:  # there is none yet, and a damaged one is refused where it is read
+        return {}
     except (ValueError, TypeError) as error:
-        raise checkpoint.CheckpointError(f"{named[0]}: its header does not tell what run it is of: {error}") from error
-    if before.get("start"):  # whose form was not noted in former versions
-        before = {name: value for name, value in before.items() if name not in _FORM}
+        raise checkpoint.CheckpointError(f"{state}: its header does not tell what run it is of: {error}") from error
     other = [name for name in _OF_A_RUN if before.get(name, getattr(config, name)) != getattr(config, name)]
     if other:
         differences = ", ".join(f"{name} {before[name]!r}, not {getattr(config, name)!r}" for name in other)
@@ -183,14 +179,6 @@ def _check_same_run(config: TrainingConfig, output: Path) -> dict[str, Any]:
             f"{output}: holds a run with {differences}: expected another --output, or the same settings"
         )
     return before
-
-
-def _header(path: Path) -> dict[str, str]:
-    """The header of a file of weights; empty if there is none, or no such file."""
-    try:
-        return checkpoint.read_header(path)
-    except checkpoint.CheckpointError:  # a damaged state is refused where it is read
-        return {}
 
 
 def validate(
