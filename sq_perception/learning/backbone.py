@@ -13,25 +13,37 @@ names of torchvision's state dict, so that ImageNet weights find their places (d
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import nn
 from torch.nn.utils.fusion import fuse_conv_bn_eval
 
+from sq_perception.learning.layout import BLOCK, TORCHVISION_BLOCK
+
 
 class ResidualBlock(nn.Module):
-    """Two 3 x 3 convolutions beside a shortcut; the first one may halve the resolution."""
+    """Two 3 x 3 convolutions beside a shortcut; the first one may halve the resolution.
 
-    def __init__(self, channels_in: int, channels_out: int, stride: int) -> None:
+    ``names`` are those of its five modules.
+    """
+
+    def __init__(self, channels_in: int, channels_out: int, stride: int, names: Sequence[str] = BLOCK) -> None:
         super().__init__()
-        self.first = nn.Conv2d(channels_in, channels_out, 3, stride, 1, bias=False)
-        self.first_norm = nn.BatchNorm2d(channels_out)
-        self.second = nn.Conv2d(channels_out, channels_out, 3, 1, 1, bias=False)
-        self.second_norm = nn.BatchNorm2d(channels_out)
-        self.shortcut = _shortcut(channels_in, channels_out, stride)
+        modules = (
+            nn.Conv2d(channels_in, channels_out, 3, stride, 1, bias=False),
+            nn.BatchNorm2d(channels_out),
+            nn.Conv2d(channels_out, channels_out, 3, 1, 1, bias=False),
+            nn.BatchNorm2d(channels_out),
+            _shortcut(channels_in, channels_out, stride),
+        )
+        for name, module in zip(names, modules, strict=True):
+            self.add_module(name, module)
 
     def forward(self, x: torch.Tensor) -> torch.Tensor:
-        y = torch.relu(self.first_norm(self.first(x)))
-        return torch.relu(self.second_norm(self.second(y)) + self.shortcut(x))
+        first, first_norm, second, second_norm, shortcut = self.children()
+        y = torch.relu(first_norm(first(x)))
+        return torch.relu(second_norm(second(y)) + shortcut(x))
 
 
 def compact_backbone(widths: tuple[int, ...], blocks: int, channels_in: int = 1) -> nn.Sequential:
@@ -40,26 +52,9 @@ def compact_backbone(widths: tuple[int, ...], blocks: int, channels_in: int = 1)
     layers: list[nn.Module] = [nn.Conv2d(channels_in, stem, 5, 2, 2, bias=False), nn.BatchNorm2d(stem), nn.ReLU()]
     channels = stem
     for width in stages:
-        layers.append(ResidualBlock(channels, width, 2))
-        layers.extend(ResidualBlock(width, width, 1) for _ in range(blocks - 1))
+        layers += _stage(channels, width, 2, blocks)
         channels = width
     return nn.Sequential(*layers)
-
-
-class BasicBlock(nn.Module):
-    """The residual block under torchvision's names."""
-
-    def __init__(self, channels_in: int, channels_out: int, stride: int) -> None:
-        super().__init__()
-        self.conv1 = nn.Conv2d(channels_in, channels_out, 3, stride, 1, bias=False)
-        self.bn1 = nn.BatchNorm2d(channels_out)
-        self.conv2 = nn.Conv2d(channels_out, channels_out, 3, 1, 1, bias=False)
-        self.bn2 = nn.BatchNorm2d(channels_out)
-        self.downsample = _shortcut(channels_in, channels_out, stride)
-
-    def forward(self, x: torch.Tensor) -> torch.Tensor:
-        y = torch.relu(self.bn1(self.conv1(x)))
-        return torch.relu(self.bn2(self.conv2(y)) + self.downsample(x))
 
 
 class ResNet18(nn.Module):
@@ -71,10 +66,10 @@ class ResNet18(nn.Module):
         super().__init__()
         self.conv1 = nn.Conv2d(1, 64, 7, 2, 3, bias=False)
         self.bn1 = nn.BatchNorm2d(64)
-        self.layer1 = nn.Sequential(BasicBlock(64, 64, 1), BasicBlock(64, 64, 1))
-        self.layer2 = nn.Sequential(BasicBlock(64, 128, 2), BasicBlock(128, 128, 1))
-        self.layer3 = nn.Sequential(BasicBlock(128, 256, 2), BasicBlock(256, 256, 1))
-        self.layer4 = nn.Sequential(BasicBlock(256, self.CHANNELS, 2), BasicBlock(self.CHANNELS, self.CHANNELS, 1))
+        self.layer1 = nn.Sequential(*_stage(64, 64, 1, 2, TORCHVISION_BLOCK))
+        self.layer2 = nn.Sequential(*_stage(64, 128, 2, 2, TORCHVISION_BLOCK))
+        self.layer3 = nn.Sequential(*_stage(128, 256, 2, 2, TORCHVISION_BLOCK))
+        self.layer4 = nn.Sequential(*_stage(256, self.CHANNELS, 2, 2, TORCHVISION_BLOCK))
         for module in self.modules():
             if isinstance(module, nn.Conv2d):  # keeps the size of gradients from layer to layer (He et al. 2015)
                 nn.init.kaiming_normal_(module.weight, mode="fan_out", nonlinearity="relu")
@@ -95,6 +90,14 @@ def fold(module: nn.Module) -> None:
             setattr(module, name, nn.Identity())
         fold(child)
         last = name, child
+
+
+def _stage(
+    channels_in: int, channels_out: int, stride: int, blocks: int, names: Sequence[str] = BLOCK
+) -> list[nn.Module]:
+    """Residual blocks one after the other, of which the first may halve the resolution."""
+    first: list[nn.Module] = [ResidualBlock(channels_in, channels_out, stride, names)]
+    return first + [ResidualBlock(channels_out, channels_out, 1, names) for _ in range(blocks - 1)]
 
 
 def _shortcut(channels_in: int, channels_out: int, stride: int) -> nn.Module:

@@ -6,6 +6,7 @@ files have none.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from itertools import pairwise
 
 from sq_perception.geometry.support_directions import DIRECTIONS
@@ -18,6 +19,10 @@ COUNTER = ".num_batches_tracked"
 """How the names of those counters end."""
 CELLS_AT_ONCE = 4
 """Outputs of the network of masks at a pixel of its stem's half resolution: 2 x 2 cells."""
+BLOCK = ("first", "first_norm", "second", "second_norm", "shortcut")
+"""The modules of a residual block: two convolutions, each with its normalisation, and the way beside them."""
+TORCHVISION_BLOCK = ("conv1", "bn1", "conv2", "bn2", "downsample")
+"""What torchvision calls them in ResNet-18."""
 _RESNET18_CHANNELS, _RESNET18_BLOCKS = (64, 128, 256, 512), 2
 _HEADS = {"size_head": 3, "shape_head": 2, "translation_head": 3, "rotation_head": 6}
 
@@ -59,8 +64,7 @@ def _masks(config: MaskConfig) -> Shapes:
     _compact(found, config.widths, config.blocks, CHANNELS)
     for k, (fine, coarse) in enumerate(pairwise(config.widths)):
         _biased(found, f"up.{k}", coarse, fine)
-        _convolution(found, f"joined.{k}.first", f"joined.{k}.first_norm", fine, fine, 3)
-        _convolution(found, f"joined.{k}.second", f"joined.{k}.second_norm", fine, fine, 3)
+        _block(found, f"joined.{k}", BLOCK, fine, fine, False)
     _biased(found, "head", config.widths[0], CELLS_AT_ONCE)
     return found
 
@@ -85,11 +89,7 @@ def _compact(found: Shapes, widths: tuple[int, ...], blocks: int, channels: int)
     channels, number = stem, 3
     for width in stages:
         for k in range(max(blocks, 1)):
-            name = f"features.{number}"
-            _convolution(found, f"{name}.first", f"{name}.first_norm", channels, width, 3)
-            _convolution(found, f"{name}.second", f"{name}.second_norm", width, width, 3)
-            if k == 0:
-                _convolution(found, f"{name}.shortcut.0", f"{name}.shortcut.1", channels, width, 1)
+            _block(found, f"features.{number}", BLOCK, channels, width, k == 0)
             channels, number = width, number + 1
     return channels
 
@@ -100,13 +100,20 @@ def _resnet18(found: Shapes) -> int:
     _convolution(found, "features.conv1", "features.bn1", 1, channels, 7)
     for stage, width in enumerate(_RESNET18_CHANNELS, 1):
         for k in range(_RESNET18_BLOCKS):
-            name = f"features.layer{stage}.{k}"
-            _convolution(found, f"{name}.conv1", f"{name}.bn1", channels, width, 3)
-            _convolution(found, f"{name}.conv2", f"{name}.bn2", width, width, 3)
-            if channels != width:
-                _convolution(found, f"{name}.downsample.0", f"{name}.downsample.1", channels, width, 1)
+            _block(found, f"features.layer{stage}.{k}", TORCHVISION_BLOCK, channels, width, channels != width)
             channels = width
     return channels
+
+
+def _block(
+    found: Shapes, name: str, modules: Sequence[str], channels_in: int, channels_out: int, changes: bool
+) -> None:
+    """A residual block; ``changes``: whether what goes beside it is another number of channels or pixels."""
+    first, first_norm, second, second_norm, shortcut = (f"{name}.{module}" for module in modules)
+    _convolution(found, first, first_norm, channels_in, channels_out, 3)
+    _convolution(found, second, second_norm, channels_out, channels_out, 3)
+    if changes:
+        _convolution(found, f"{shortcut}.0", f"{shortcut}.1", channels_in, channels_out, 1)
 
 
 def _convolution(found: Shapes, name: str, norm: str, channels_in: int, channels_out: int, size: int) -> None:
