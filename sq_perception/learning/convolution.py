@@ -16,10 +16,12 @@ with 36 products instead of 144 for each tile and pair of channels where s = 6, 
 from __future__ import annotations
 
 import math
+import threading
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 from sq_perception.geometry.kernels import inline_kernel, kernel
 
@@ -40,8 +42,8 @@ _CACHED, _FEWEST_ROWS = 130_000, 160
 its matrix: chosen on a cache of 1 MB a core."""
 
 
-class Memory:
-    """Arrays that are used again, by name; what was zero beside an image stays so."""
+class Memory(threading.local):
+    """Arrays that are used again, by name, each thread's own; what was zero beside an image stays so."""
 
     def __init__(self) -> None:
         self._arrays: dict[str, np.ndarray] = {}
@@ -89,15 +91,18 @@ class Direct:
         for part in _parts(len(x), pixels, len(self.matrix)):
             rows = out[part.start * pixels : part.stop * pixels]
             windows = memory.loose("windows", (len(rows), len(self.matrix)))
-            _write_windows(x[part], first, self.size, self.stride, side, windows)
+            seen = sliding_window_view(x[part, first:, first:], (self.size, self.size), axis=(1, 2))
+            seen = seen[:, : side * self.stride : self.stride, : side * self.stride : self.stride]
+            windows.reshape(*seen.shape[:3], self.size, self.size, -1)[...] = np.moveaxis(seen, 3, 5)
             np.matmul(windows, self.matrix, out=rows)
         return out
 
     def computed(self, x: np.ndarray, side: int, memory: Memory, name: str) -> np.ndarray:
         """Framed images of ``side`` pixels a side."""
         products = self.products(x, 0, side, memory, "products")
+        products += self.bias
         out = memory.framed(name, len(x), side, self.channels)
-        _write_sums(products, self.bias, side, out)
+        np.maximum(products.reshape(len(x), side, side, -1), _ZERO, out=out[:, 1 : side + 1, 1 : side + 1])
         return out
 
 
@@ -182,38 +187,6 @@ def _folded(weights: Weights, name: str, norm: str) -> tuple[np.ndarray, np.ndar
 
 def contiguous(values: np.ndarray) -> np.ndarray:
     return np.array(values, dtype=np.float32, order="C")
-
-
-@kernel
-def _write_windows(x: np.ndarray, first: int, size: int, stride: int, side: int, windows: np.ndarray) -> None:
-    """The windows of images (n, s, s, c) from a pixel on, side by side: (n side^2, size^2 c)."""
-    channels = x.shape[3]
-    length = size * channels
-    row = 0
-    for image in range(x.shape[0]):
-        lines = x[image].reshape(x.shape[1], x.shape[2] * channels)
-        for i in range(side):
-            for j in range(side):
-                begin = (first + stride * j) * channels
-                for d in range(size):
-                    there = windows[row, d * length : (d + 1) * length]
-                    line = lines[first + stride * i + d, begin : begin + length]
-                    for k in range(length):
-                        there[k] = line[k]
-                row += 1
-
-
-@kernel
-def _write_sums(products: np.ndarray, bias: np.ndarray, side: int, out: np.ndarray) -> None:
-    """max(0, product + bias) into framed images."""
-    row = 0
-    for image in range(out.shape[0]):
-        for i in range(side):
-            for j in range(side):
-                pixel, given = out[image, i + 1, j + 1], products[row]
-                for c in range(bias.shape[0]):
-                    pixel[c] = max(given[c] + bias[c], _ZERO)
-                row += 1
 
 
 @kernel

@@ -9,10 +9,6 @@ A test compares with the modules of torch (:mod:`sq_perception.learning.regresso
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Iterator
-from contextlib import contextmanager
-
 import numpy as np
 
 from sq_perception.geometry.one_thread import one_blas_thread
@@ -94,11 +90,12 @@ class CompactMasks:
         self._up = [_linear(weights, [f"up.{k}"]) for k in steps]
         self._joined = [Block.folded(weights, f"joined.{k}") for k in steps]
         self._head = _linear(weights, ["head"])
-        self._memories = _Memories()
+        self._memory = Memory()
 
     def logits(self, views: np.ndarray) -> np.ndarray:
         """Logits float32 (n, p, p) of views (n, p, p, CHANNELS)."""
-        with self._memories.one() as memory, one_blas_thread():
+        memory = self._memory
+        with one_blas_thread():
             images = self._backbone.computed(views, memory)
             stages = [images[0], *images[self.config.blocks :: self.config.blocks]]
             x, side = stages.pop()
@@ -124,19 +121,19 @@ class _Network:
         width, side = config.widths[-1], config.pixels // 2 ** len(config.widths)
         matrix, cells = self._mixer[0][0], width * side**2
         matrix[:cells] = matrix[:cells].reshape(width, side**2, -1).transpose(1, 0, 2).reshape(cells, -1)
-        self._memories = _Memories()
+        self._memory = Memory()
 
     def outputs(self, images: np.ndarray, more: np.ndarray) -> np.ndarray:
         """Outputs (n, k), float32."""
-        with self._memories.one() as memory, one_blas_thread():
+        with one_blas_thread():
             parts = [
-                self._outputs(images[first : first + _AT_ONCE], more[first : first + _AT_ONCE], memory)
+                self._outputs(images[first : first + _AT_ONCE], more[first : first + _AT_ONCE])
                 for first in range(0, len(images), _AT_ONCE)
             ]
         return np.concatenate(parts) if parts else np.empty((0, self._heads[0].shape[1]), np.float32)
 
-    def _outputs(self, images: np.ndarray, more: np.ndarray, memory: Memory) -> np.ndarray:
-        x, side = self._backbone.computed(images, memory)[-1]
+    def _outputs(self, images: np.ndarray, more: np.ndarray) -> np.ndarray:
+        x, side = self._backbone.computed(images, self._memory)[-1]
         h = np.concatenate([_inner(x, side).reshape(len(x), -1), more.astype(np.float32, copy=False)], axis=1)
         for matrix, bias in self._mixer:
             h = np.maximum(h @ matrix + bias, 0)
@@ -165,22 +162,6 @@ class _Backbone:
         for number, block in enumerate(self._blocks):
             found.append(block.computed(*found[-1], memory, str(number)))
         return found
-
-
-class _Memories:
-    """One memory for each thread that computes."""
-
-    def __init__(self) -> None:
-        self._free: deque[Memory] = deque()
-
-    @contextmanager
-    def one(self) -> Iterator[Memory]:
-        try:
-            memory = self._free.pop()
-        except IndexError:
-            memory = Memory()
-        yield memory
-        self._free.append(memory)
 
 
 def _inner(framed: np.ndarray, side: int) -> np.ndarray:
