@@ -19,14 +19,13 @@ from sq_perception.learning import layout
 from sq_perception.learning.convolution import Block, Direct, Memory, Weights, contiguous
 from sq_perception.learning.network_config import (
     BODY_OUTPUTS,
-    HALF_WAY,
     LEAST_LOG,
     MOST_LOG,
-    USUAL_EXTENT,
     MaskConfig,
     RegressorConfig,
     ThingConfig,
     checked_views,
+    shown_beside,
 )
 
 _AT_ONCE = 40
@@ -59,9 +58,8 @@ class CompactThings:
         self, views: np.ndarray, planes: np.ndarray, extents: np.ndarray
     ) -> tuple[Superquadric, np.ndarray, np.ndarray]:
         """As :meth:`sq_perception.learning.thing_network.ThingNetwork.predict`, without torch."""
-        known = extents > 0
-        scale = np.where(known, np.log(np.where(known, extents, 1.0) / USUAL_EXTENT), 0.0)
-        images = np.stack([views, _heights(views, planes)], axis=-1)
+        heights, scale = shown_beside(views, planes, extents)
+        images = np.stack([views, heights], axis=-1)
         raw = self._network.outputs(images, np.column_stack([planes, scale]))
         count = len(DIRECTIONS)
         body, support, sigma, factors = np.split(raw.astype(float), np.cumsum([BODY_OUTPUTS, count, count]), axis=1)
@@ -70,14 +68,6 @@ class CompactThings:
         covariance = factors @ factors.transpose(0, 2, 1)
         covariance[:, np.arange(count), np.arange(count)] += variance
         return self._encoding.decode(body), support, self.config.spread * covariance
-
-
-def _heights(views: np.ndarray, planes: np.ndarray) -> np.ndarray:
-    """Height above the plane of what each pixel shows, of a point half way down where it shows nothing."""
-    across = ((np.arange(views.shape[-1]) + 0.5) / views.shape[-1]).astype(np.float32)
-    n = planes[:, :, None, None]
-    flat = n[:, 0] * across[None, None, :] + n[:, 1] * (1 - across)[None, :, None] + n[:, 3]
-    return np.asarray(flat + n[:, 2] * np.where(views > 0, views, np.float32(HALF_WAY)))
 
 
 class CompactMasks:

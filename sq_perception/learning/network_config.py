@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Any, get_args
 
 import numpy as np
-from array_api_compat import array_namespace
+from array_api_compat import array_namespace, device
 
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
@@ -26,9 +26,9 @@ BODY_OUTPUTS = 14
 RESNET18_STRIDE = 32
 PLANE, EXTENT = 4, 1
 """Inputs of the network of things beside the view."""
-USUAL_EXTENT = 0.2
+_USUAL_EXTENT = 0.2
 """Metres; that the logarithm of a view's side is 0 for it."""
-HALF_WAY = 0.5
+_HALF_WAY = 0.5
 """Depth at which a pixel without a surface is given its height above the plane."""
 LEAST_LOG, MOST_LOG = -5.0, 0.5
 """Limits of log sigma: 0.7 % of the view's side, what a mask's pixel is, and more than the side."""
@@ -154,6 +154,20 @@ class MaskConfig:
     """Channels of the stem and of each stage; every stage halves the resolution."""
     blocks: int = 1
     """Residual blocks a stage on the way down."""
+
+
+def shown_beside(views: Array, planes: Array, extents: Array) -> tuple[Array, Array]:
+    """What the network of things is shown besides: heights (b, p, p) above the planes, and the logarithm of the sides.
+
+    A height is that of what a pixel shows, of a point half way down where it shows nothing.
+    """
+    xp, pixels = array_namespace(views), views.shape[-1]
+    across = (xp.arange(pixels, dtype=views.dtype, device=device(views)) + 0.5) / pixels
+    n = planes[:, :, None, None]
+    flat = n[:, 0] * across[None, None, :] + n[:, 1] * (1 - across)[None, :, None] + n[:, 3]
+    heights = flat + n[:, 2] * xp.where(views > 0, views, xp.full_like(views, _HALF_WAY))
+    usual = xp.full_like(extents, _USUAL_EXTENT)
+    return heights, xp.log(xp.where(extents > 0, extents, usual) / usual)
 
 
 def mirrored_planes(planes: np.ndarray) -> np.ndarray:

@@ -44,12 +44,11 @@ from sq_perception.learning.backbone import compact_backbone
 from sq_perception.learning.network_config import (
     BODY_OUTPUTS,
     EXTENT,
-    HALF_WAY,
     LEAST_LOG,
     MOST_LOG,
     PLANE,
-    USUAL_EXTENT,
     ThingConfig,
+    shown_beside,
 )
 
 MIDDLE = (0.5, 0.5, NEAREST)
@@ -136,9 +135,8 @@ class ThingNetwork(nn.Module):
             self.factor_head.weight.mul_(0.1)
 
     def forward(self, views: torch.Tensor, planes: torch.Tensor, extents: torch.Tensor) -> HullPrediction:
-        h = self.features(torch.stack([views, self._heights(views, planes)], dim=1)).flatten(1)
-        known = extents > 0
-        scale = torch.where(known, torch.log(torch.where(known, extents, 1.0) / USUAL_EXTENT), 0.0)
+        heights, scale = shown_beside(views, planes, extents)
+        h = self.features(torch.stack([views, heights], dim=1)).flatten(1)
         h = self.mixer(torch.cat([h, planes.to(h.dtype), scale[:, None].to(h.dtype)], dim=1)).float()
         with torch.autocast(views.device.type, enabled=False):  # eight bits of mantissa are too few for a size
             body = self._encoding.decode(self.body_head(h))
@@ -164,14 +162,6 @@ class ThingNetwork(nn.Module):
                 for each in (predicted.body.to_flat(), predicted.support, predicted.covariance())
             )
         return Superquadric.from_flat(flat), support, covariance
-
-    def _heights(self, views: torch.Tensor, planes: torch.Tensor) -> torch.Tensor:
-        """Height above the plane of what each pixel shows, of a point half way down where it shows nothing."""
-        pixels = views.shape[-1]
-        across = (torch.arange(pixels, device=views.device) + 0.5) / pixels
-        n = planes[:, :, None, None]
-        flat = n[:, 0] * across[None, None, :] + n[:, 1] * (1 - across)[None, :, None] + n[:, 3]
-        return flat + n[:, 2] * torch.where(views > 0, views, torch.full_like(views, HALF_WAY))
 
 
 def support_of(body: Superquadric) -> torch.Tensor:
