@@ -29,15 +29,18 @@ from sq_perception.files.output_file import free_name
 from sq_perception.fitting.fit import Status
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import unit_cube
+from sq_perception.imaging.camera import Camera
+from sq_perception.imaging.canonical_view import CanonicalView
 from sq_perception.learning import checkpoint, inference
 from sq_perception.learning.choices import LOSSES
 from sq_perception.learning.inference import Predictor
 from sq_perception.learning.losses import Objective
+from sq_perception.learning.network_config import RegressorConfig
 from sq_perception.recovery.recoverer import Method, Recoverer, RecoveryOptions
+from sq_perception.segmentation import segments
 
 TIMED_IMAGES = 300
-_IDENTITY = (0.0, 0.0, 0.0, 1.0)
-_NOBODY = np.array([1e-3, 1e-3, 1e-3, 1.0, 1.0, -1.0, -1.0, -1.0, *_IDENTITY])
+_NOBODY = np.array([1e-3, 1e-3, 1e-3, 1.0, 1.0, -1.0, -1.0, -1.0, 0.0, 0.0, 0.0, 1.0])
 """Stands where nothing was recovered: outside of the cube."""
 
 
@@ -145,7 +148,7 @@ def fit(method: Method) -> Contestant:
 
 def _predicted(model: Predictor, recoverer: Recoverer, images: ImageChunk) -> Answers:
     bodies: list[Superquadric | None] = [None] * len(images)
-    views = {k: view for k, view in enumerate(images.views(model.config)) if view is not None}
+    views = {k: view for k, depth in enumerate(images.depth) if (view := _largest(model.config, depth, images.camera))}
     if views:
         predicted = model.predict(np.stack([view.marked for view in views.values()]))
         for (k, view), body in zip(views.items(), predicted, strict=True):
@@ -156,6 +159,12 @@ def _predicted(model: Predictor, recoverer: Recoverer, images: ImageChunk) -> An
     for k in range(min(len(images), TIMED_IMAGES - images.first)):
         milliseconds[k] = recoverer.recover(images.depth[k], images.camera).milliseconds["total"]
     return Answers.of(bodies, milliseconds)
+
+
+def _largest(form: RegressorConfig, depth: np.ndarray, camera: Camera) -> CanonicalView | None:
+    """What a network is shown of an image's largest object, as in a recovery; None where nothing is found."""
+    found = segments.segment(depth, camera)
+    return form.view_of(depth, found.labels == found.ids[0], camera) if found.ids else None
 
 
 def _fitted(method: Method, recoverer: Recoverer, images: ImageChunk) -> Answers:

@@ -13,7 +13,7 @@ Images are rendered chunk by chunk and forgotten; a chunk of 200 takes 50 MB.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -22,9 +22,6 @@ from sq_perception.evaluation.protocol import DEFAULT_SEED
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import raycast, unit_cube
 from sq_perception.imaging.camera import Camera
-from sq_perception.imaging.canonical_view import CanonicalView
-from sq_perception.learning.network_config import RegressorConfig
-from sq_perception.segmentation import segments
 from sq_perception.simulation.scenes import thesis_bodies
 
 CHUNK = 200
@@ -52,32 +49,14 @@ class ImageChunk:
     truth: Superquadric
     depth: np.ndarray
     camera: Camera
-    _views: dict[tuple[object, ...], list[CanonicalView | None]] = field(default_factory=dict, repr=False)
 
     def __len__(self) -> int:
         return len(self.depth)
 
     def head(self, count: int) -> ImageChunk:
-        """The first ``count`` of these images; all of them, views included, where there are no more."""
-        if count >= len(self):
-            return self
+        """The first ``count`` of these images; all of them where there are no more."""
         count = max(count, 0)
         return ImageChunk(self.first, self.truth[:count], self.depth[:count], self.camera)
-
-    def views(self, form: RegressorConfig) -> list[CanonicalView | None]:
-        """What a network is shown of each image's largest object, as in a recovery; None where nothing is found."""
-        kind = (form.pixels, form.framing, form.marks_hidden)
-        if kind not in self._views:
-            self._views[kind] = [
-                None if mask is None else form.view_of(depth, mask, self.camera)
-                for depth, mask in zip(self.depth, self._masks, strict=True)
-            ]
-        return self._views[kind]
-
-    @cached_property
-    def _masks(self) -> list[np.ndarray | None]:
-        found = [segments.segment(depth, self.camera) for depth in self.depth]
-        return [segmented.labels == segmented.ids[0] if segmented.ids else None for segmented in found]
 
 
 @dataclass(frozen=True)
