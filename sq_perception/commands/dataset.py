@@ -47,8 +47,6 @@ def main(arguments: Sequence[str]) -> int:
             generate(folder, settings, partial(bar.advance, task))
     except FixedSetError as error:
         return failed(f"dataset: {error}")
-    except OSError as error:
-        return failed(f"dataset: {folder}: {error}")
     size = sum(path.stat().st_size for path in folder.glob("*.safetensors"))
     print(f"{folder}: {settings.train} + {settings.test} images, {size / 1e6:.1f} MB, all checksums right")
     return SUCCESS

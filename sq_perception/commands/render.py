@@ -105,10 +105,7 @@ def _render(options: argparse.Namespace) -> int:
     depth, index = raycast.render(seen, camera)
     if not (index >= 0).any():
         complain("the camera does not see the body: the image is empty")
-    try:
-        _write_depth(output, depth, index, camera, body)
-    except OSError as error:
-        return failed(str(error))
+    _write_depth(output, depth, index, camera, body)
     return SUCCESS
 
 

@@ -106,8 +106,6 @@ def _draw(name: str, given: argparse.Namespace, drawing: Callable[[], Callable[[
         write_views(given.folder, range(given.first, given.first + given.shards), drawing(), given.seed)
     except ValueError as error:
         return failed(f"{name}: {error}")
-    except OSError as error:
-        return failed(f"{name}: {given.folder}: {error}")
     return SUCCESS
 
 
