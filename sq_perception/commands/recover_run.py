@@ -201,7 +201,7 @@ class RecoverRun:
             message = f"{_count(len(answer.bodies) - len(wanted), 'body', 'bodies')} with a lower score left out"
         recovery = replace(answer, bodies=wanted, message=message)
         tracks = self._tracks.follow(file, frame, recovery) if self._tracks else None
-        entry = result_json.frame_entry(file, frame, recovery, tracks, frame.labels is not None)
+        entry = result_json.frame_entry(file, frame, recovery, tracks)
         self.outputs.add(frame, recovery, tracks, entry)
 
 

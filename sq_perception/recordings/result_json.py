@@ -46,16 +46,9 @@ def head(options: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def frame_entry(
-    file: str,
-    frame: RecordedFrame,
-    recovery: FrameRecovery,
-    tracks: Sequence[Followed] | None,
-    has_masks: bool,
+    file: str, frame: RecordedFrame, recovery: FrameRecovery, tracks: Sequence[Followed] | None
 ) -> dict[str, Any]:
-    """The element of ``frames``; ``tracks`` are those of the bodies that did not fail, None without tracking.
-
-    ``has_masks``: whether labels are those of masks that came with the frame.
-    """
+    """The element of ``frames``; ``tracks`` are those of the bodies that did not fail, None without tracking."""
     bodies, left = [], iter(tracks or ())
     for body in recovery.bodies:
         track = None if body.status == Status.FAILED else next(left, None)
@@ -69,7 +62,7 @@ def frame_entry(
                 "seen": body.seen,
                 "status": body.status.name.lower(),
                 "message": body.message,
-                "label": body.label if has_masks else None,
+                "label": body.label if frame.labels is not None else None,
                 "pixels": body.pixels,
                 "track": None if track is None else _track_entry(track, frame.is_cube),
             }
