@@ -32,7 +32,7 @@ _DESCRIPTORS = "/proc/"
 
 
 class OutputFile:
-    """One result to be: write it to ``partial``, then :meth:`commit` or :meth:`discard` it.
+    """One result to be: write it to ``partial``, then :meth:`commit` or :meth:`discard` it, as a ``with`` block does.
 
     Parameters
     ----------
@@ -74,6 +74,12 @@ class OutputFile:
         if self._through:
             self._descriptor, name = tempfile.mkstemp(self.path.suffix, "sq_perception-")
             self.partial = Path(name)
+
+    def __enter__(self) -> OutputFile:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.discard()
 
     def commit(self, whole: bool = True) -> Path:
         """Put the result where it belongs; returns where that is.
@@ -144,24 +150,16 @@ class OutputFile:
 @contextmanager
 def writing(path: str | Path) -> Iterator[Path]:
     """Where to write a file that shall appear whole or not at all; raises OSError as :class:`OutputFile` does."""
-    output = OutputFile(path)
-    try:
-        with named(path):
-            yield output.partial
-            output.commit()
-    finally:
-        output.discard()
+    with OutputFile(path) as output, named(path):
+        yield output.partial
+        output.commit()
 
 
 def write(path: str | Path, data: bytes, whole: bool = True) -> Path:
     """Write a result at once; returns where it is, see :meth:`OutputFile.commit`."""
-    output = OutputFile(path)
-    try:
-        with named(path):
-            output.partial.write_bytes(data)
-            return output.commit(whole)
-    finally:
-        output.discard()
+    with OutputFile(path) as output, named(path):
+        output.partial.write_bytes(data)
+        return output.commit(whole)
 
 
 @contextmanager
