@@ -212,12 +212,8 @@ def _of_librealsense(found: dict[str, Any]) -> dict[str, Any]:
     model = str(found.get("model", "")).lower().replace("_", " ").removeprefix("distortion.")
     if model not in _NO_DISTORTION + _BROWN_CONRADY:
         raise FrameError(f"model: expected Brown Conrady or none, got {found['model']!r}")
-    return {
-        "width": found["width"],
-        "height": found["height"],
-        "k": [found["fx"], 0, found["ppx"], 0, found["fy"], found["ppy"], 0, 0, 1],
-        "d": found.get("coeffs", []) if model in _BROWN_CONRADY else [],
-    }
+    distortion = found.get("coeffs", []) if model in _BROWN_CONRADY else []
+    return {**found, "cx": found["ppx"], "cy": found["ppy"], "d": distortion}
 
 
 def _of_open3d(found: dict[str, Any]) -> dict[str, Any]:
