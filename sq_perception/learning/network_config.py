@@ -67,11 +67,8 @@ class RegressorConfig:
                 raise ValueError(f"{name}: expected one of {', '.join(get_args(known))}, got {value!r}")
         if self.pixels < 1 or self.pixels % self.stride:
             raise ValueError(f"pixels: {self.backbone} expects a multiple of {self.stride}, got {self.pixels}")
-        for name, (low, high) in (
-            ("size_range", self.size_range),
-            ("shape_range", self.shape_range),
-            ("translation_range", self.translation_range),
-        ):
+        for name in ("size_range", "shape_range", "translation_range"):
+            low, high = getattr(self, name)
             if not (np.isfinite([low, high]).all() and low < high and (low > 0 or name == "translation_range")):
                 raise ValueError(f"{name}: expected a lower and a larger upper end, got {low} and {high}")
 
