@@ -42,7 +42,8 @@ Found by a random search for the greatest least difference (CIE 1976) of any two
 depth pictures, to normal, deuteranopic and protanopic eyes (Machado et al. 2009): 28.
 """
 
-_HALF_TURN_ABOUT_X = np.diag([1.0, -1.0, -1.0, 1.0])
+HALF_TURN_ABOUT_X = np.diag([1.0, -1.0, -1.0, 1.0])
+"""Between the optical frame, y down, and that of viewers of meshes, y up."""
 _SAME_POINT_DIGITS = 12
 
 
@@ -172,7 +173,7 @@ def export(
         trimesh.util.concatenate(meshes).export(path)
         return path
     scene = trimesh.Scene()
-    turn = _HALF_TURN_ABOUT_X if optical else np.eye(4)
+    turn = HALF_TURN_ABOUT_X if optical else np.eye(4)
     for name, part in zip(names, meshes, strict=True):
         scene.add_geometry(part, node_name=name, geom_name=name, transform=turn)
     scene.export(path)

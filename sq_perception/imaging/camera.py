@@ -28,6 +28,8 @@ from sq_msgs_py.depth_image import Intrinsics
 Projection = Literal["pinhole", "orthographic"]
 LEAST_MEDIAN, GREATEST_MEDIAN = 0.01, 100.0
 """Metres; no depth camera sees half of its image nearer or farther: other numbers have another unit."""
+LEAST_DEPTH, GREATEST_DEPTH = 1e-4, 1e5
+"""Metres; no sensor measures beyond, and numbers beyond make squares and products that are none."""
 
 
 class Lens(NamedTuple):

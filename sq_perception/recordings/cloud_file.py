@@ -18,7 +18,7 @@ import numpy as np
 
 from sq_perception.files.unpacking import MOST_BYTES, MOST_PIXELS, UnpackingError
 from sq_perception.geometry.kernels import kernel
-from sq_perception.imaging.camera import Camera
+from sq_perception.imaging.camera import GREATEST_DEPTH, LEAST_DEPTH, Camera
 
 SUFFIXES = (".pcd", ".ply")
 UNORGANISED = (
@@ -27,8 +27,6 @@ UNORGANISED = (
     "organised cloud shows more"
 )
 _NUMBERS = {"F": "f", "I": "i", "U": "u"}
-_NEAREST, _FARTHEST = 1e-4, 1e5
-"""Metres; no depth camera measures nearer or farther."""
 _PIXEL_ERROR = 0.1
 """Between the place of a point in an organised cloud and in the image of its camera."""
 _ON_PIXELS = 0.99
@@ -75,7 +73,7 @@ def as_image(points: np.ndarray) -> tuple[np.ndarray, Camera, bool]:
     """
     with np.errstate(invalid="ignore"):
         there = np.isfinite(points).all(axis=2) & (points[..., 2] != 0)
-        before = there & (points[..., 2] > _NEAREST) & (points[..., 2] < _FARTHEST)
+        before = there & (points[..., 2] > LEAST_DEPTH) & (points[..., 2] < GREATEST_DEPTH)
     expected = f"expected {_LEAST_POINTS} points or more, most of them before the camera: z forward, y down"
     if np.count_nonzero(there & (points[..., 2] < 0)) > 0.5 * np.count_nonzero(there):
         expected += " (of clouds with z backward, as graphics has it, negate z, and y where it is up)"

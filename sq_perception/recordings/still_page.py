@@ -20,14 +20,13 @@ from trimesh.visual.material import PBRMaterial
 
 from sq_perception.files.output_file import OutputFile, named
 from sq_perception.fitting.fit import Status
-from sq_perception.geometry.mesh import COLOURS, triangles
+from sq_perception.geometry.mesh import COLOURS, HALF_TURN_ABOUT_X, triangles
 from sq_perception.recordings.frame_file import RecordedFrame
 from sq_perception.recordings.result_json import in_result_frame
 from sq_perception.recovery.recovery import FrameRecovery, edges_as_text, place_as_text
 from sq_perception.viewing import drawings
 
 _MOST_POINTS = 30000
-_HALF_TURN_ABOUT_X = np.diag([1.0, -1.0, -1.0, 1.0])
 _SCENE = "$SCENE"
 _LIT, _UNLIT = 0.32, 0.45
 """Of a body's colour: the viewer has one lamp, of intensity 1.75, and no light where that does not shine."""
@@ -95,7 +94,7 @@ def _scene(frame: RecordedFrame, recovery: FrameRecovery) -> trimesh.Scene:
         whole.add_geometry(
             trimesh.Trimesh(vertices, faces, visual=TextureVisuals(material=matt), process=False), node_name=f"body_{k}"
         )
-    whole.apply_transform(_HALF_TURN_ABOUT_X)
+    whole.apply_transform(HALF_TURN_ABOUT_X)
     distance = 0.4 * float(np.linalg.norm(middle))
     target = middle * [1, -1, -1]
     eye = np.array([0.7 * distance, distance, distance]) * (1.0 if frame.camera.is_pinhole else 2.0)

@@ -38,7 +38,7 @@ from sq_perception.geometry.one_thread import one_blas_thread, short_turns
 from sq_perception.geometry.quantiles import quantile
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import perforation, raycast
-from sq_perception.imaging.camera import GREATEST_MEDIAN, Camera
+from sq_perception.imaging.camera import GREATEST_DEPTH, GREATEST_MEDIAN, LEAST_DEPTH, Camera
 from sq_perception.learning import checkpoint, inference
 from sq_perception.learning.forward import CompactMasks
 from sq_perception.recovery import continuity, methods, prediction, seen_object, supports
@@ -63,9 +63,6 @@ _Answer = TypeVar("_Answer")
 Network: TypeAlias = inference.Predictor | inference.ThingPredictor
 _SPARSE = 8
 """Every so many-th pixel tells what unit an image has."""
-_NEAREST, _FARTHEST = 1e-4, 1e5
-"""Metres; no sensor measures beyond, and numbers beyond make squares and products that are none."""
-
 _SEGMENTS = 2
 """For each object that is asked for: a network joins some, and drops what shows none, which may be the largest."""
 
@@ -347,8 +344,8 @@ def render_recovery(frame: FrameRecovery, camera: Camera) -> tuple[np.ndarray, n
 
 def _measured(depth: np.ndarray, camera: Camera) -> np.ndarray:
     """float32, NaN for all that is no measurement; row by row, as kernels are compiled for arrays of a kind."""
-    farthest = min(_FARTHEST, float(np.finfo(depth.dtype).max))  # which half precision does not reach
-    within = (depth >= (_NEAREST if camera.is_pinhole else 0)) & (depth <= farthest)
+    farthest = min(GREATEST_DEPTH, float(np.finfo(depth.dtype).max))  # which half precision does not reach
+    within = (depth >= (LEAST_DEPTH if camera.is_pinhole else 0)) & (depth <= farthest)
     return np.ascontiguousarray(np.where(within, depth, np.nan), dtype=np.float32)
 
 
