@@ -21,7 +21,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 
 from sq_perception.geometry.kernels import inline_kernel, kernel
 
@@ -91,18 +90,15 @@ class Direct:
         for part in _parts(len(x), pixels, len(self.matrix)):
             rows = out[part.start * pixels : part.stop * pixels]
             windows = memory.loose("windows", (len(rows), len(self.matrix)))
-            seen = sliding_window_view(x[part, first:, first:], (self.size, self.size), axis=(1, 2))
-            seen = seen[:, : side * self.stride : self.stride, : side * self.stride : self.stride]
-            windows.reshape(*seen.shape[:3], self.size, self.size, -1)[...] = np.moveaxis(seen, 3, 5)
+            _write_windows(x[part], first, self.size, self.stride, side, windows)
             np.matmul(windows, self.matrix, out=rows)
         return out
 
     def computed(self, x: np.ndarray, side: int, memory: Memory, name: str) -> np.ndarray:
         """Framed images of ``side`` pixels a side."""
         products = self.products(x, 0, side, memory, "products")
-        products += self.bias
         out = memory.framed(name, len(x), side, self.channels)
-        np.maximum(products.reshape(len(x), side, side, -1), _ZERO, out=out[:, 1 : side + 1, 1 : side + 1])
+        _write_sums(products, self.bias, side, out)
         return out
 
 
@@ -187,6 +183,38 @@ def _folded(weights: Weights, name: str, norm: str) -> tuple[np.ndarray, np.ndar
 
 def contiguous(values: np.ndarray) -> np.ndarray:
     return np.array(values, dtype=np.float32, order="C")
+
+
+@kernel
+def _write_windows(x: np.ndarray, first: int, size: int, stride: int, side: int, windows: np.ndarray) -> None:
+    """The windows of images (n, s, s, c) from a pixel on, side by side: (n side^2, size^2 c)."""
+    channels = x.shape[3]
+    length = size * channels
+    row = 0
+    for image in range(x.shape[0]):
+        lines = x[image].reshape(x.shape[1], x.shape[2] * channels)
+        for i in range(side):
+            for j in range(side):
+                begin = (first + stride * j) * channels
+                for d in range(size):
+                    there = windows[row, d * length : (d + 1) * length]
+                    line = lines[first + stride * i + d, begin : begin + length]
+                    for k in range(length):
+                        there[k] = line[k]
+                row += 1
+
+
+@kernel
+def _write_sums(products: np.ndarray, bias: np.ndarray, side: int, out: np.ndarray) -> None:
+    """max(0, product + bias) into framed images."""
+    row = 0
+    for image in range(out.shape[0]):
+        for i in range(side):
+            for j in range(side):
+                pixel, given = out[image, i + 1, j + 1], products[row]
+                for c in range(bias.shape[0]):
+                    pixel[c] = max(given[c] + bias[c], _ZERO)
+                row += 1
 
 
 @kernel
