@@ -23,6 +23,13 @@ depth outside the mask."""
 _PART = 0.1
 """Of the largest one's pixels, that a part across a step has at least.  With such parts 6 of 729 simulated things are
 fitted otherwise, on average 2 % of IoU better, and six recorded vessels gain 1.8 %."""
+_STEP_PIXELS, _STEP = 10.0, 0.002
+"""Pixel widths, and metres: together a step that ends what a network is shown and a score is measured on."""
+
+
+def shown_step(footprint: float) -> float:
+    """Metres between neighbours from which on one is not of the object, where a pixel is ``footprint`` metres wide."""
+    return _STEP_PIXELS * footprint + _STEP
 
 
 @kernel

@@ -17,7 +17,7 @@ from sq_perception.geometry.quantiles import quantile
 from sq_perception.imaging import canonical_view, depth_steps, lens, regions
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.canonical_view import CanonicalView
-from sq_perception.imaging.coherence import coherent
+from sq_perception.imaging.coherence import coherent, shown_step
 from sq_perception.learning.network_config import RegressorConfig, ThingConfig
 from sq_perception.recovery.prediction import Prediction
 from sq_perception.segmentation import segments
@@ -28,8 +28,6 @@ _VIEW_PIXELS = 64
 """Of the view of a score; those of a network are its own."""
 _LOWEST = 0.02
 """Share of its pixels that are an object's lowest."""
-_JUMP_PIXELS, _JUMP = 10.0, 0.002
-"""Steps in pixel widths, and metres, that end what a network is shown and a score is measured on."""
 _SURROUNDED, _RIM_HEIGHT = 0.6, 0.01
 """Share of the pixels next to a given mask that go on with it, this many metres above its support, if it is too small.
 Of the second row of pixels around 200 things of benchmarks/household_things 4 % do typically, 50 % of one in twenty;
@@ -94,7 +92,7 @@ class SeenObject:
     def step(self) -> float:
         """Metres between neighbours from which on one is not of the object."""
         footprint = quantile(self.depth_crop[self.mask_crop], 0.5) / np.sqrt(self.camera_crop.fx * self.camera_crop.fy)
-        return float(_JUMP_PIXELS * footprint + _JUMP)
+        return float(shown_step(footprint))
 
     @cached_property
     def connected(self) -> np.ndarray:

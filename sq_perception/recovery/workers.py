@@ -175,8 +175,12 @@ class Cluster:
     tries = 1  # for a scheduler that has tried ``distributed.scheduler.allowed-failures`` times
 
     def __init__(self, setup: Setup, address: str) -> None:
-        import distributed
-
+        try:
+            import distributed
+        except ModuleNotFoundError as error:
+            raise ImportError(
+                f"a cluster needs the module {error.name!r}: pip install 'sq_perception[cluster]'"
+            ) from error
         distributed.comm.get_address_host_port(address)  # a client that cannot read its own hangs in the end
         self._setup, self.lost = setup, distributed.KilledWorker
         self._client = distributed.Client(address, set_as_default=False)

@@ -28,7 +28,7 @@ from sq_perception.geometry.union import support_of_union
 from sq_perception.imaging import canonical_view
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.canonical_view import CanonicalView
-from sq_perception.imaging.coherence import coherent
+from sq_perception.imaging.coherence import coherent, shown_step
 from sq_perception.simulation.household import KINDS, draw_thing
 from sq_perception.simulation.thing import Thing
 from sq_perception.simulation.thing_sensing import measured_by_any
@@ -53,7 +53,6 @@ _LARGEST_SUPPORT, _LEAST_WIDTH = 3.0, 0.6
 _OPPOSITE = np.argmin(DIRECTIONS @ DIRECTIONS.T, axis=1)
 _ATTEMPTS = 50
 _ON_TABLE = 0.003
-_JUMP_PIXELS, _JUMP = 10.0, 0.002
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,7 +173,7 @@ def _masked(
         above[rows, columns] = ~(points @ table[:3] + table[3] <= _ON_TABLE)
         inner = above if 2 * np.count_nonzero(above) > rows.size else inner
     footprint = float(np.median(measured[seen][np.isfinite(measured[seen])], axis=0)) / camera.fx
-    return coherent(measured, inner, _JUMP_PIXELS * footprint + _JUMP)
+    return coherent(measured, inner, shown_step(footprint))
 
 
 def _cut(

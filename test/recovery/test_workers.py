@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import threading
 import time
 from multiprocessing.connection import Connection
@@ -142,6 +143,12 @@ def test_what_is_no_address_of_a_cluster_leaves_nothing_behind_that_would_hang(a
     with pytest.raises(ValueError, match=r"port|scheme|invalid literal"):
         workers.Cluster(_SETUP, address)
     assert threading.enumerate() == before
+
+
+def test_without_its_extra_a_cluster_names_the_cure(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(ImportError, match=r"'distributed': pip install 'sq_perception\[cluster\]'"):
+        workers.Cluster(_SETUP, "tcp://127.0.0.1:8786")
 
 
 def _children() -> list[int]:
