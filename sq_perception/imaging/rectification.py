@@ -21,8 +21,9 @@ length; now they are right to 0.6 %.  The price is a rim of half a pixel, and wh
 Neighbours show one surface if it would be seen at less than 84 degrees, a relative step of 10 / f, as in
 :mod:`sq_perception.imaging.inverse_depth`.  A smaller step may still be the edge of something flat; then a pixel is
 wrong by at most that step.  OpenCV before 5 looks up at 32nds of a pixel, and is off by up to five times as much
-between pixels, some hundredths of a millimetre.  Single pixels without depth inside a surface are no edge: they are
-bridged for their neighbours' sake, and stay empty.  Labels are those of the nearest pixel.
+between pixels, some hundredths of a millimetre.  Single pixels without depth inside a surface, and the gaps of a
+perforated image (:mod:`sq_perception.imaging.perforation`), are no edge: they are bridged for their neighbours' sake,
+and stay empty.  Labels are those of the nearest pixel.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ import cv2
 import numpy as np
 
 from sq_perception.files.unpacking import MOST_PIXELS
+from sq_perception.imaging import perforation
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.distortion import Distortion
 
@@ -163,7 +165,8 @@ class Lookup:
         nearest = self._nearest(image, np.nan)
         # Warnings for pixels without depth only.
         with np.errstate(divide="ignore", invalid="ignore"):
-            inverse = cv2.patchNaNs(1 / image, 0)
+            bridged, _, _ = perforation.filled(image)
+            inverse = cv2.patchNaNs(1 / bridged, 0)
             closed = cv2.morphologyEx(inverse, cv2.MORPH_CLOSE, _CROSS)
             inverse = cv2.copyTo(closed, (inverse == 0).view(np.uint8), inverse)
             # Of each pixel and its neighbours to the right, below, and across.

@@ -150,6 +150,24 @@ def test_holes_keep_their_size(rng):
     assert np.quantile(error, 0.95) < 2e-3
 
 
+@pytest.mark.parametrize("name", LENSES)
+@pytest.mark.parametrize("apart", [2, 3])
+def test_readings_apart_from_each_other_keep_their_number_and_lie_on_their_plane(name, apart):
+    """Depth registered to a distorted colour camera of two or three times as many pixels a side."""
+    raw, lens = LENSES[name]
+    undone = Rectification(raw, lens)
+    seen = plane_depth(rays(raw, lens), *tilted(30))
+    row, column = np.indices(seen.shape)
+    found = undone.there.depth(np.where((row % apart == 0) & (column % apart == 0), seen, np.nan))
+    whole, true = undone.there.depth(seen), plane_depth(rays(undone.camera), *tilted(30))
+    count = np.count_nonzero(np.isfinite(found)) * apart**2
+    assert 0.95 < count / np.count_nonzero(np.isfinite(whole)) < 1.05
+    near = np.isfinite(found) & (true < 3)
+    step = np.hypot(*np.gradient(true))[near]
+    stretched = 2.0 if name == "fisheye" else 1.0  # from a raw pixel to those of the pinhole image
+    assert np.quantile(np.abs(found - true)[near] / step, 0.95) < 0.71 * stretched, "half a pixel along and across"
+
+
 def test_equal_calibrations_share_their_tables():
     first = rectification(Camera(64, 48, 60.0, 60.0, 31.5, 23.5), Distortion("plumb_bob", (-0.1, 0, 0, 0)))
     again = rectification(Camera(64, 48, 60.0, 60.0, 31.5, 23.5), Distortion("plumb_bob", (-0.1, 0, 0, 0)))
