@@ -19,8 +19,9 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging.camera import Camera
 
 THESIS_PIXELS = 256
-_HALF_TURN_ABOUT_X = np.array([1.0, 0.0, 0.0, 0.0])
-_SHIFT = np.array([0.0, 1.0, 1.0])
+POSE = (1.0, 0.0, 0.0, 0.0), (0.0, 1.0, 1.0)
+"""Of the optical frame in the cube frame: a half turn about x, as a quaternion x y z w, and a translation."""
+_HALF_TURN_ABOUT_X, _SHIFT = (np.array(part) for part in POSE)
 
 
 def camera(width: int = THESIS_PIXELS, height: int | None = None) -> Camera:

@@ -28,6 +28,7 @@ from rclpy.task import Future
 from std_srvs.srv import SetBool, Trigger
 
 from sq_msgs_py import answers
+from sq_perception.imaging import unit_cube
 from sq_perception.nodes import fast_dds, process
 from sq_perception.nodes.engine import TURNS, Answer, Engine
 from sq_perception.nodes.frame import Frame, stamp_of
@@ -233,10 +234,12 @@ class FrameNode(ManagedNode):
         return frame, answer, stages
 
     def _pose_of(self, frame: Frame, parameters: RecoverParameters) -> Pose | None:
-        """Where the frame is in ``target_frame``, if its workspace is there; ValueError if that is not known.
+        """Where the optical frame is in that of the results, if that is another one and the workspace is there.
 
-        A transform that has not come yet is waited for while other cameras compute.
+        ValueError if it is not known.  A transform that has not come yet is waited for while other cameras compute.
         """
+        if frame.is_cube:
+            return unit_cube.POSE
         if not parameters.target_frame or parameters.box is None:
             return None
         asked = self._poses, frame.header, parameters.target_frame

@@ -18,7 +18,7 @@ Steps
 
 Bodies are taken to be convex, or vessels.  Two bodies whose faces lie flush cannot be told apart by their depth.
 Things on a higher table are found as well, those on a lower one are not.  An orthographic camera sees the thesis'
-world: there is no plane, and every connected set of pixels is an object.
+world: there is no plane, and every connected set of pixels in the workspace is an object, of any size.
 
 Metres and pixels.
 """
@@ -102,7 +102,12 @@ def segment(depth: np.ndarray, camera: Camera, options: SegmentationOptions | No
     depth, valid = _checked(depth, camera, options.depth_range)
     least = least_pixels(depth.size)
     if not camera.is_pinhole:
-        labels, ids, is_cut = _ordered(depth_steps.components(valid), least, options.max_objects)
+
+        def is_within(rows: np.ndarray, columns: np.ndarray) -> bool:
+            return options.is_within(camera.unproject(columns, rows, depth[rows, columns]))
+
+        accept = None if options.workspace is None else is_within
+        labels, ids, is_cut = _ordered(depth_steps.components(valid), least, options.max_objects, accept)
         return Segmentation(labels, None, ids, is_cut=is_cut)
     if np.count_nonzero(valid) < least:
         return Segmentation(np.zeros(depth.shape, np.int32), None, ())

@@ -509,6 +509,17 @@ def test_the_workspace_is_a_box_of_the_target_frame(make_bench, target, pose):
     assert (options.workspace, options.workspace_pose) == (tuple(box), pose)
 
 
+def test_the_workspace_of_orthographic_frames_is_a_box_of_the_cube_frame(make_bench):
+    """As the bodies are: what lies in the box above y = 0.5 is in the upper half of the image."""
+    box = [0.0, 0.5, 0.0, 1.0, 1.0, 1.0]
+    bench = make_bench("-p", "projection:=orthographic", "-p", f"workspace:={box}")
+    bench.answer(grey_to_message(np.full((32, 32), 99, np.uint8), bench.header()))
+    depth, camera, _, options = bench.recoverer.asked[-1]
+    points = camera.points(depth)
+    assert options.is_within(points[4:12].reshape(-1, 3))
+    assert not options.is_within(points[20:28].reshape(-1, 3))
+
+
 def test_without_its_transform_a_workspace_refuses_the_frame(make_bench):
     bench = make_bench("-p", "workspace:=[-1.0, -1.0, 0.0, 1.0, 1.0, 2.0]", "-p", "target_frame:=moon")
     bench.send_info()

@@ -385,6 +385,15 @@ def test_a_workspace_holds_the_middle_of_what_is_seen(box, pose):
     assert from_labels(truth.astype(np.int32), depth, CAMERA, right).ids == (2,)
 
 
+def test_a_workspace_is_one_to_orthographic_cameras_too():
+    camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5, "orthographic")
+    depth = np.full((48, 64), np.nan, np.float32)
+    depth[10:20, 5:25], depth[10:20, 40:60] = 0.5, 0.6
+    found = segment(depth, camera, SegmentationOptions(workspace=(0.0, -1.0, 0.0, 1.0, 1.0, 1.0)))
+    assert found.ids == (1,)
+    assert np.array_equal(found.labels > 0, depth == np.float32(0.6))
+
+
 @pytest.mark.parametrize("box", [(0, 0, 0, 1, 1), (0, 0, 0, 1, 0, 1), (0, 0, 0, 1, 1, np.nan)])
 def test_a_workspace_has_an_inside(box):
     with pytest.raises(ValueError, match="workspace: expected least x, y, z"):
