@@ -1,7 +1,8 @@
 """What shows which readings of a segment are of its object: the segment in its surroundings.
 
-A square window of the image about the segment, larger than its longer side L by L / 2 + 8 pixels, in ``PIXELS`` x
-``PIXELS`` cells.  A cell shows the pixel under its middle, by the channels
+A window of the image about the segment, square to the camera, larger than its longer side L by L / 2 + 8 pixels, in
+``PIXELS`` x ``PIXELS`` cells; of pixels that are not square, lengths count those of the same area that are.  A cell
+shows the pixel under its middle, by the channels
 
     measured    1 where there is a reading
     nearness    (m - z) / s, clipped to [-1, 1], of depths z; m is the segment's median depth
@@ -19,6 +20,7 @@ cells.  Pinhole cameras; metres, optical frame.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import cv2
@@ -51,8 +53,8 @@ class SegmentView:
         See the module.
     rows, columns : int (PIXELS,)
         Pixels of the image under the middles of the cells; some may be outside of it.
-    left, top, side
-        The window, in pixels: its corner, where the image's is (0, 0), and its length.
+    left, top, side, fall
+        The window, in pixels: its corner, where the image's is (0, 0), its width and its height.
     """
 
     image: np.ndarray
@@ -61,6 +63,7 @@ class SegmentView:
     left: float
     top: float
     side: float
+    fall: float
 
     def of_part(self, cells: np.ndarray) -> np.ndarray:
         """The image as it would be if the segment had these cells alone, bool (PIXELS, PIXELS), and the rest of them
@@ -73,9 +76,9 @@ class SegmentView:
     def at_pixels(self, values: np.ndarray, window: tuple[slice, slice]) -> np.ndarray:
         """Values (PIXELS, PIXELS) of the cells, between them interpolated, at the pixels of a window of the image."""
         down, across = window
-        cells = len(values) / self.side
+        cells = len(values) / np.array([self.side, self.fall])
         first = np.array([across.start + 0.5 - self.left, down.start + 0.5 - self.top]) * cells - 0.5
-        matrix = np.array([[cells, 0, first[0]], [0, cells, first[1]]])
+        matrix = np.column_stack([np.diag(cells), first])
         size = across.stop - across.start, down.stop - down.start
         flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
         return np.asarray(cv2.warpAffine(values, matrix, size, flags=flags, borderMode=cv2.BORDER_REPLICATE))
@@ -104,10 +107,12 @@ def from_segment(
     """
     down, across = window
     tall, wide = down.stop - down.start, across.stop - across.start
-    side = _WIDER * max(tall, wide) + _MORE
-    top, left = down.start + 0.5 * (tall - side), across.start + 0.5 * (wide - side)
-    middles = side * (np.arange(PIXELS) + 0.5) / PIXELS
-    rows, columns = np.floor(top + middles).astype(int), np.floor(left + middles).astype(int)
+    focal = math.sqrt(camera.fx * camera.fy)
+    length = _WIDER * max(tall * focal / camera.fy, wide * focal / camera.fx) + _MORE
+    side, fall = length * camera.fx / focal, length * camera.fy / focal
+    top, left = down.start + 0.5 * (tall - fall), across.start + 0.5 * (wide - side)
+    middles = (np.arange(PIXELS) + 0.5) / PIXELS
+    rows, columns = np.floor(top + fall * middles).astype(int), np.floor(left + side * middles).astype(int)
     height, width = depth.shape
     within = ((rows >= 0) & (rows < height))[:, None] & ((columns >= 0) & (columns < width))
     grid = np.ix_(np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1))
@@ -116,7 +121,7 @@ def from_segment(
     z = np.where(measured, z, 0.0)
     own = depth[window][labels[window] == label]
     middle = quantile(own[np.isfinite(own)], 0.5)
-    scale = side * middle / camera.fx
+    scale = length * middle / focal
 
     image = np.zeros((PIXELS, PIXELS, CHANNELS), np.float32)
     image[..., MEASURED] = measured
@@ -128,5 +133,5 @@ def from_segment(
     image[..., SEGMENT] = shown == label
     image[..., OTHERS] = (shown > 0) & (shown != label)
     image[..., IMAGE] = within
-    image[..., 6:] = np.log(min(scale, _LARGEST) / _USUAL_SIDE), np.log(side / PIXELS), plane is not None
-    return SegmentView(image, rows, columns, left, top, side)
+    image[..., 6:] = np.log(min(scale, _LARGEST) / _USUAL_SIDE), np.log(length / PIXELS), plane is not None
+    return SegmentView(image, rows, columns, left, top, side, fall)

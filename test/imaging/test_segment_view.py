@@ -75,6 +75,25 @@ def test_the_same_thing_at_another_grain_looks_alike(scale: float) -> None:
     np.testing.assert_allclose(shown.image[inside][:, HEIGHT].mean(), other.image[middle][:, HEIGHT].mean(), rtol=0.08)
 
 
+@pytest.mark.parametrize("axis", [0, 1])
+def test_pixels_that_are_not_square_show_the_same_shape(axis: int) -> None:
+    """Every pixel twice along an axis: cells show what they did, and their values come back to the right pixels."""
+    depth, labels, plane = table()
+    times = np.array([2, 1]) if axis == 0 else np.array([1, 2])
+    camera = Camera(200 * times[1], 150 * times[0], 180.0 * times[1], 180.0 * times[0], 0.0, 0.0)
+    window = tuple(slice(k * each.start, k * each.stop) for k, each in zip(times.tolist(), WINDOW, strict=True))
+    images = (np.repeat(image, 2, axis) for image in (depth, labels))
+    shown = segment_view.from_segment(*images, 1, (window[0], window[1]), camera, plane)
+    other = view()
+    for along in (0, 1):
+        extent, before = (each.image[..., SEGMENT].any(axis=along).sum() for each in (shown, other))
+        assert abs(extent - before) < 4, "the margin of eight pixels is another share of it"
+    inside = shown.image[..., SEGMENT].astype(np.float32)
+    back = shown.at_pixels(inside, (slice(0, camera.height), slice(0, camera.width))) > 0.5
+    true = np.repeat(labels, 2, axis) == 1
+    assert np.count_nonzero(back & true) > 0.93 * np.count_nonzero(back | true)
+
+
 def test_values_of_cells_come_back_to_their_pixels() -> None:
     """A linear ramp over the cells is a linear ramp over the pixels, at the places that the cells have."""
     shown = view()
