@@ -107,7 +107,12 @@ def main(arguments: Sequence[str]) -> int:
     )
     add("--depth-min", type=float, default=0.0, metavar="M", help="metres; nearer readings are none")
     add("--depth-max", type=float, default=math.inf, metavar="M", help="metres; farther ones likewise")
-    add("--roi", type=_region, metavar="X,Y,W,H", help="only this part of each image, in pixels")
+    add(
+        "--roi",
+        type=_region,
+        metavar="X,Y,W,H",
+        help="only this part of each image, in pixels, after distortion was undone",
+    )
     add("--masks", type=_existing, metavar="DIR", help="label images, one a frame: its name and .png, 0 is background")
     add(
         "--distortion",

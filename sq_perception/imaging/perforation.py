@@ -12,6 +12,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from sq_perception.geometry.kernels import kernel
+
 _PERFORATED = 0.03
 """Share of gaps of up to two pixels among readings and these gaps, from which on an image is perforated.  Recorded
 frames of four kinds of cameras have up to 0.016, where gaps follow the edges of things and are better left."""
@@ -52,12 +54,18 @@ def _gaps(measured: np.ndarray, reach: int) -> np.ndarray:
 def _nearest(measured: np.ndarray, gaps: np.ndarray, reach: int) -> tuple[np.ndarray, np.ndarray]:
     """Row and column of the reading nearest to each gap; a closing adds no pixel that has none within reach."""
     row, column = np.nonzero(gaps)
-    around = np.pad(measured, reach)
-    left = np.arange(len(row))
-    steps = range(-reach, reach + 1)
-    for dv, du in sorted(((dv, du) for dv in steps for du in steps), key=lambda step: step[0] ** 2 + step[1] ** 2):
-        v, u = row[left] + dv, column[left] + du
-        found = around[v + reach, u + reach]
-        row[left[found]], column[left[found]] = v[found], u[found]
-        left = left[~found]
+    span = range(-reach, reach + 1)
+    steps = sorted(((dv, du) for dv in span for du in span), key=lambda step: step[0] ** 2 + step[1] ** 2)
+    _move(row, column, measured, np.array(steps))
     return row, column
+
+
+@kernel
+def _move(row: np.ndarray, column: np.ndarray, measured: np.ndarray, steps: np.ndarray) -> None:
+    """Move pixels (n,) by the first of some steps (k, 2) that leads to a reading."""
+    for k in range(len(row)):
+        for i in range(len(steps)):
+            v, u = row[k] + steps[i, 0], column[k] + steps[i, 1]
+            if 0 <= v < measured.shape[0] and 0 <= u < measured.shape[1] and measured[v, u]:
+                row[k], column[k] = v, u
+                break

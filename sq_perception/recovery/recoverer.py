@@ -147,6 +147,8 @@ class Recoverer:
         image = np.where(np.isfinite(rendered), rendered, np.nan).astype(np.float32)
         self.recover(image, camera, (index >= 0).astype(np.int32))
         self.recover(image, camera, previous=self.recover(image, camera))
+        image[::2] = np.nan
+        perforation.filled(image)
 
     def recover(
         self,

@@ -16,6 +16,7 @@ import numpy as np
 
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging import perforation
 from sq_perception.imaging.camera import Camera
 
 _DIRECTIONS = np.array([d for d in np.ndindex(3, 3, 3) if d != (1, 1, 1)], dtype=float) - 1
@@ -56,8 +57,10 @@ def open_share(bodies: Superquadric, camera: Camera, depth: np.ndarray) -> np.nd
     pixels = camera.project(points)
     inside = near & (pixels >= 0).all(axis=-1) & (pixels <= [camera.width - 1, camera.height - 1]).all(axis=-1)
     column, row = np.where(inside[..., None], np.rint(np.nan_to_num(pixels)), 0).astype(int).transpose(2, 0, 1)
-    measured = np.asarray(depth)[row, column].astype(float)
-    valid = np.isfinite(measured) & ((measured > 0) | (not camera.is_pinhole))
+    is_reading = np.isfinite(depth) & ((depth > 0) | (not camera.is_pinhole))
+    # A point that falls into a gap between readings of the same surface is told by these.
+    measured = perforation.filled(np.where(is_reading, depth, np.nan))[0][row, column].astype(float)
+    valid = np.isfinite(measured)
     tolerance = _TOLERANCE * bodies.size.min(axis=-1)[:, None]
     behind = np.where(inside & valid, measured, -np.inf) - points[..., 2]
     clear, told = (behind > tolerance).sum(axis=1), (behind >= -tolerance).sum(axis=1)

@@ -313,6 +313,18 @@ def test_places_are_hidden_that_the_image_does_not_show_to_be_empty():
     assert Surroundings().hidden(np.array([before])) == 1
 
 
+def test_gaps_between_readings_hide_nothing_and_are_no_points():
+    """Depth registered to three times as many pixels a side."""
+    camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+    row, column = np.indices((48, 64))
+    depth = np.where((row % 3 == 0) & (column % 3 == 0), 1.0, np.nan)
+    around = Surroundings.of_image(depth, camera, None)
+    places = np.array([[x, y, z] for x in (-0.31, -0.1, 0.2) for y in (-0.2, 0.11) for z in (0.9, 1.1)])
+    np.testing.assert_allclose(around.hidden(places.reshape(2, -1, 3)), 0.5)
+    np.testing.assert_allclose(around.beyond(places), 1.0 - places[:, 2])
+    assert len(around.points) == np.count_nonzero(np.isfinite(depth))
+
+
 def test_a_doubtful_body_with_few_ways_is_planned_in_an_image_too():
     """All ways are looked at in the first round, so that none is left for the second."""
     camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)

@@ -324,6 +324,15 @@ def test_open_share_knows_the_image_and_what_stands_in_front():
         np.testing.assert_array_equal(sight.open_share(bodies, CAMERA, depth), [share, 0, 0])
 
 
+@pytest.mark.parametrize("nothing", [np.nan, 0.0])
+def test_what_is_gone_is_seen_to_have_gone_by_an_image_of_single_readings(nothing):
+    """Of depth registered to three times as many pixels a side hardly a point of a body has a reading of its own."""
+    row, column = np.indices((CAMERA.height, CAMERA.width))
+    depth = np.where((row % 3 == 1) & (column % 3 == 1), 2.0, nothing)
+    bodies = Superquadric.stack([body(), body(centre=(0.05, 0.03, 0.7)), body(centre=(0, 0, 3))])
+    np.testing.assert_array_equal(sight.open_share(bodies, CAMERA, depth), [1, 1, 0])
+
+
 def test_masked_readings_are_no_empty_space(rng):
     tracker, masked = Tracker(), np.ma.masked_array(np.full((CAMERA.height, CAMERA.width), 9.0), True)
     tracker.update([draw(body(), noise(), rng)], 0.0)
