@@ -50,7 +50,7 @@ covariance.  Chosen: errors of the classic fit and of the network alone on house
 PATIENCE = 2
 """After so many disagreeing observations in a row the track gives way: the second may not be chance any more."""
 FASTEST = 1.0
-"""Metres per second: how far a body may have been moved between two frames.  A hand that sets things down."""
+"""Metres per second: how far a body may have been moved since its track last followed it.  A hand sets things down."""
 MISSES = 5
 """A confirmed track dies in the so-manieth frame in a row that should have shown it; a tentative one in the second.
 Chosen: a sixth of a second of a camera at 30 Hz."""
@@ -208,7 +208,7 @@ def _pairs(
     new = np.setdiff1d(np.arange(len(observed)), here.observed)
     # What is hidden has rather stayed where it was than become one more body of its kind far away.
     free = np.array([visible or bodies[k].is_moving for k, visible in zip(left, expected(states[left]), strict=True)])
-    reach = FASTEST * np.array([stamp - bodies[k].last for k in left])
+    reach = FASTEST * np.array([stamp - bodies[k].agreed for k in left])
     reach = np.where(free, reach, np.minimum(reach, 2 * states[left, 0:3].max(axis=1)))
     there = association.elsewhere(states[left], covariances[left], reach, observed[new], covariance[new])
     return here, there._replace(track=left[there.track], observed=new[there.observed])

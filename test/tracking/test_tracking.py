@@ -317,6 +317,19 @@ def test_a_turn_of_the_world_changes_no_second_look(rng):
         np.testing.assert_allclose(other.covariance, expected, atol=1e-12)
 
 
+@pytest.mark.parametrize("speed", [0.4, 0.6, 0.7, 0.8, 0.95])
+def test_equal_things_on_a_belt_keep_their_ids(rng, speed):
+    """Up to the speed of a hand: what a track has not followed yet lies farther from it than one frame's way."""
+    tracker, ids = Tracker(), {k: set() for k in range(4)}
+    for k in range(30):
+        places = [-0.15 * n + speed * k / 30 for n in ids]
+        seen = [draw(body(centre=(x, 0, 0.8)), noise(0.01), rng) for x in places]
+        for track in tracker.update(seen, k / 30):
+            if track.observation is not None:
+                ids[track.observation].add(track.id)
+    assert ids == {n: {n + 1} for n in ids}
+
+
 def test_open_share_knows_the_image_and_what_stands_in_front():
     bodies = Superquadric.stack([body(), body(centre=(3, 0, 0.8)), body(centre=(0, 0, -0.8))])
     for measured, share in ((np.nan, 0), (0.5, 0), (2.0, 1)):
