@@ -1,9 +1,10 @@
 """grasp_node: superquadrics in, grasps of a parallel gripper out; its topics are in docs/grasping.md.
 
-All outputs have the header of the cloud.  The last plane in its frame counts; without one, grippers come from the side
-of the frame's origin, that of the camera.  What no message holds, measured points and unseen space, is not looked at;
-the command ``sq-perception grasp`` does.  Correlations of a body's numbers are not in the cloud either.  Nor is it told
-from the cloud whether it is in metres: one in the frame ``unit_cube`` is refused, no other one of orthographic images.
+All outputs have the header of the cloud.  The last plane in its frame counts, also where a camera has moved with that
+frame since; without one, grippers come from the side of the frame's origin: of the camera, or of ``target_frame``.
+What no message holds, measured points and unseen space, is not looked at; the command ``sq-perception grasp`` does.
+Correlations of a body's numbers are not in the cloud either.  Nor is it told from the cloud whether it is in metres:
+one in the frame ``unit_cube`` is refused, no other one of orthographic images.
 
 Where moveit_msgs is installed, ``~/plan_grasps`` is its service GraspPlanning: moveit_msgs/Grasp of the body that the
 target's id names as a collision object, of all bodies without one.  Its other requests are not looked at.

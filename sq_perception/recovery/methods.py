@@ -77,7 +77,7 @@ def _failed(obj: SeenObject, reason: str) -> Fit:
     low, high = points.min(axis=0), points.max(axis=0)
     size = np.maximum(0.5 * (high - low), 1e-3 * max(float((high - low).max()), 1e-3))
     body = Superquadric(size, np.ones(2), 0.5 * (low + high), np.array([0.0, 0.0, 0.0, 1.0]))
-    return Fit(body, np.nan, Status.FAILED, reason, inlier_share=0.0)
+    return Fit(body.canonical_form(), np.nan, Status.FAILED, reason, inlier_share=0.0)
 
 
 def score(obj: SeenObject, fit: Fit, options: RecoveryOptions) -> float:

@@ -242,7 +242,7 @@ class Recoverer:
             deadline = started + options.time_budget
             if closed is not None:  # what stands in for readings is none to a fit
                 depth = np.where(closed, np.float32(np.nan), depth)
-                fresh = [obj.of_readings(depth, closed) for obj in fresh]
+                fresh = [obj.of_readings(depth, closed, found.labels) for obj in fresh]
             fits = self._mapped(lambda obj: methods.fitted(obj, depth, camera, options, deadline), fresh)
         with timed(milliseconds, "score"):
             scores = self._mapped(lambda k: methods.score(fresh[k], fits[k], options), range(len(fresh)))

@@ -110,11 +110,10 @@ class SeenObject:
         """The object as its pixels show it but for those that are set in ``strays``, bool (height, width)."""
         return replace(self, mask=self.mask & ~strays)
 
-    def of_readings(self, depth: np.ndarray, gaps: np.ndarray) -> SeenObject:
+    def of_readings(self, depth: np.ndarray, gaps: np.ndarray, labels: np.ndarray) -> SeenObject:
         """The object in an image (height, width) that has no readings in its ``gaps``, bool (height, width)."""
-        kept = self.without(gaps)
-        lost = int(np.count_nonzero(self.mask_crop & ~kept.mask_crop))
-        return replace(kept, depth_crop=depth[self.window], pixels=self.pixels - lost)
+        left = np.isfinite(depth[self.window]) & (labels[self.window] == self.label)
+        return replace(self.without(gaps), depth_crop=depth[self.window], pixels=int(np.count_nonzero(left)))
 
 
 def objects(depth: np.ndarray, found: segments.Segmentation, camera: Camera) -> list[SeenObject]:

@@ -6,7 +6,7 @@ from table_scenes import VGA, Table
 
 from sq_perception.imaging import perforation
 from sq_perception.recovery.recoverer import Recoverer
-from sq_perception.simulation import scenes
+from sq_perception.simulation import scenes, sensor_noise
 
 ROWS, COLUMNS = np.indices((24, 32))
 SLOPE = (1 + 0.01 * ROWS + 0.002 * COLUMNS).astype(np.float32)
@@ -78,3 +78,14 @@ def test_what_stands_in_for_missing_lines_shifts_no_body(first: int) -> None:
         true = bodies[found.label - 1]
         np.testing.assert_allclose(found.superquadric.translation, true.translation, atol=4e-4)
         assert abs(found.pixels / of_all.pixels - 0.5) < 0.05
+
+
+def test_pixels_of_a_body_are_those_that_were_measured() -> None:
+    """Also where some of its segment are strays, as the rim is that a sensor adds."""
+    scene = scenes.table_scene(np.random.default_rng(3), 3)
+    depth = sensor_noise.preset("realsense_d435").measured(scene.render()[0], scene.camera, np.random.default_rng(4))
+    depth[1::2] = np.nan
+    frame = Recoverer().recover(depth, scene.camera)
+    assert len(frame.bodies) == 3
+    for body in frame.bodies:
+        assert body.pixels == np.count_nonzero(np.isfinite(depth) & (frame.labels == body.label))

@@ -163,6 +163,14 @@ def test_failed_bodies_are_listed_and_not_rendered(symmetry):
     assert (render_recovery(found, CAMERA)[1] == -1).all()
 
 
+def test_what_stands_for_a_failed_body_is_in_its_canonical_form_too(symmetry):
+    labels = np.zeros((240, 320), np.int32)
+    labels[50:55, 50:52] = 1
+    body = symmetry.recover(np.full((240, 320), 1.0, np.float32), CAMERA, labels).bodies[0]
+    assert body.status == Status.FAILED
+    np.testing.assert_array_equal(body.superquadric.to_flat(), body.superquadric.canonical_form().to_flat())
+
+
 @pytest.mark.parametrize("method", ["symmetry", "classic"])
 def test_a_mask_of_which_next_to_nothing_was_measured_shows_no_body(method):
     """A thing too near for the sensor, whose outline alone has readings, halfway to what is behind."""
