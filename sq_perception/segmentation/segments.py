@@ -26,6 +26,7 @@ Metres and pixels.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import islice
 
 import cv2
 import numpy as np
@@ -172,12 +173,15 @@ def from_labels(
     camera.check_image(labels)
     depth, valid = _checked(depth, camera, options.depth_range)
     labels = np.maximum(labels, 0).astype(np.int32)
-    given = labels[valid & (labels > 0)]  # of a table with few things, few pixels: these are sorted
-    values, counts = np.unique(given, return_counts=True)
-    order = np.argsort(-counts, kind="stable")
-    ids = tuple(int(values[k]) for k in order)
+    inside = np.flatnonzero(valid & (labels > 0))  # of a table with few things, few pixels: these are sorted
+    values, counts = np.unique(labels.flat[inside], return_counts=True)
+    order = np.argsort(-counts, kind="stable").tolist()
     if options.workspace is not None:
-        ids = tuple(k for k in ids if options.is_within(_points(labels == k, depth, valid, camera)))
+        rows, columns = np.unravel_index(inside[np.argsort(labels.flat[inside], kind="stable")], labels.shape)
+        points = np.split(camera.unproject(columns, rows, depth[rows, columns]), np.cumsum(counts)[:-1])
+        # No more are asked than are wanted: a depth image that was taken for masks has thousands.
+        order = list(islice((k for k in order if options.is_within(points[k])), options.max_objects + 1))
+    ids = tuple(int(values[k]) for k in order)
     is_cut = len(ids) > options.max_objects
     ids = ids[: options.max_objects]
     plane = None
@@ -215,11 +219,6 @@ def warm_up() -> None:
     radius = np.hypot(u - camera.cx, v - camera.cy) / 20
     depth = (0.7 - 0.08 * np.sqrt(np.maximum(1 - radius**2, 0))).astype(np.float32)
     segment(np.where(np.abs(radius - 1.2) < 0.1, np.float32(np.nan), depth), camera)
-
-
-def _points(mask: np.ndarray, depth: np.ndarray, valid: np.ndarray, camera: Camera) -> np.ndarray:
-    rows, columns = np.nonzero(mask & valid)
-    return camera.unproject(columns, rows, depth[rows, columns])
 
 
 def _checked(depth: np.ndarray, camera: Camera, limits: tuple[float, float]) -> tuple[np.ndarray, np.ndarray]:

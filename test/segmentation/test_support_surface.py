@@ -394,6 +394,16 @@ def test_a_workspace_is_one_to_orthographic_cameras_too():
     assert np.array_equal(found.labels > 0, depth == np.float32(0.6))
 
 
+def test_no_more_masks_are_asked_for_their_place_than_are_wanted(monkeypatch):
+    """A depth image that was taken for masks has thousands, whose frame took seconds; random numbers took minutes."""
+    asked = []
+    monkeypatch.setattr(SegmentationOptions, "is_within", lambda self, points: asked.append(len(points)) or True)
+    labels = 1 + np.arange(48 * 64).reshape(48, 64) // 3
+    options = SegmentationOptions(workspace=(-1.0, -1.0, 0.0, 1.0, 1.0, 2.0), max_objects=4)
+    found = from_labels(labels, np.ones((48, 64)), Camera(64, 48, 60.0, 60.0, 31.5, 23.5), options)
+    assert (found.ids, found.is_cut, asked) == ((1, 2, 3, 4), True, [3] * 5)
+
+
 @pytest.mark.parametrize("box", [(0, 0, 0, 1, 1), (0, 0, 0, 1, 0, 1), (0, 0, 0, 1, 1, np.nan)])
 def test_a_workspace_has_an_inside(box):
     with pytest.raises(ValueError, match="workspace: expected least x, y, z"):
