@@ -53,7 +53,7 @@ class SegmentView:
         See the module.
     rows, columns : int (PIXELS,)
         Pixels of the image under the middles of the cells; some may be outside of it.
-    left, top, side, fall
+    left, top, side, height
         The window, in pixels: its corner, where the image's is (0, 0), its width and its height.
     """
 
@@ -63,7 +63,7 @@ class SegmentView:
     left: float
     top: float
     side: float
-    fall: float
+    height: float
 
     def of_part(self, cells: np.ndarray) -> np.ndarray:
         """The image as it would be if the segment had these cells alone, bool (PIXELS, PIXELS), and the rest of them
@@ -76,7 +76,7 @@ class SegmentView:
     def at_pixels(self, values: np.ndarray, window: tuple[slice, slice]) -> np.ndarray:
         """Values (PIXELS, PIXELS) of the cells, between them interpolated, at the pixels of a window of the image."""
         down, across = window
-        cells = len(values) / np.array([self.side, self.fall])
+        cells = len(values) / np.array([self.side, self.height])
         first = np.array([across.start + 0.5 - self.left, down.start + 0.5 - self.top]) * cells - 0.5
         matrix = np.column_stack([np.diag(cells), first])
         size = across.stop - across.start, down.stop - down.start
@@ -109,10 +109,10 @@ def from_segment(
     tall, wide = down.stop - down.start, across.stop - across.start
     focal = math.sqrt(camera.fx * camera.fy)
     length = _WIDER * max(tall * focal / camera.fy, wide * focal / camera.fx) + _MORE
-    side, fall = length * camera.fx / focal, length * camera.fy / focal
-    top, left = down.start + 0.5 * (tall - fall), across.start + 0.5 * (wide - side)
+    side, high = length * camera.fx / focal, length * camera.fy / focal
+    top, left = down.start + 0.5 * (tall - high), across.start + 0.5 * (wide - side)
     middles = (np.arange(PIXELS) + 0.5) / PIXELS
-    rows, columns = np.floor(top + fall * middles).astype(int), np.floor(left + side * middles).astype(int)
+    rows, columns = np.floor(top + high * middles).astype(int), np.floor(left + side * middles).astype(int)
     height, width = depth.shape
     within = ((rows >= 0) & (rows < height))[:, None] & ((columns >= 0) & (columns < width))
     grid = np.ix_(np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1))
@@ -134,4 +134,4 @@ def from_segment(
     image[..., OTHERS] = (shown > 0) & (shown != label)
     image[..., IMAGE] = within
     image[..., 6:] = np.log(min(scale, _LARGEST) / _USUAL_SIDE), np.log(length / PIXELS), plane is not None
-    return SegmentView(image, rows, columns, left, top, side, fall)
+    return SegmentView(image, rows, columns, left, top, side, high)
