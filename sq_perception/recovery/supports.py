@@ -21,6 +21,7 @@ import cv2
 import numpy as np
 
 from sq_perception.geometry.quantiles import densest, quantile
+from sq_perception.imaging import lens
 from sq_perception.imaging.camera import Camera
 from sq_perception.recovery.seen_object import SeenObject
 from sq_perception.segmentation import segments, support_plane
@@ -37,6 +38,15 @@ _FEWEST = 15
 """Points of a top, of some thousand of its object."""
 _NEIGHBOURS = 3
 """Pixels between the windows of objects of which one stands on the other."""
+_NOT_ON_IT = 0.1
+"""Metres above its plane from which on what is beside an object may hold it: the support itself, which light that goes
+astray raises in corners, is up to half of that above."""
+_BESIDE = (3, 8)
+"""Pixels from an object at which something else is beside it: nearer, a sensor widens its edges."""
+_HELD = 0.15
+"""Share of what is beside an object from which on it is held by what is of no object, and not on the plane either.
+Beside nine in ten of 47 simulated things that hover above their table up to 0.02 is above it, beside two in three of 67
+in bins up to 0.1; beside 120 on a board whose front alone is seen, before a wall, 0.2 to 0.3."""
 
 
 def support(
@@ -50,7 +60,9 @@ def support(
     """The plane (4,) that the object stands on; None where it stands on nothing that is known.
 
     An object behind the frame's plane does not stand on it, one that goes on below it hardly, and one high above it
-    neither: held before a wall, say.  One less high above it, without anything seen right below it, stands on others.
+    neither: held before a wall, say.  One less high above it, without anything seen right below it, stands on others,
+    or reaches down to it unseen, as a box seen from above; but not where something of no object borders on it that is
+    no farther away: then it stands on a board of which only the front is seen, before a wall.
 
     Parameters
     ----------
@@ -73,7 +85,31 @@ def support(
         lowest, middle = obj.levels(other)
         if abs(lowest) < _HOVERING < middle + _HOVERING:
             return other
-    return None if behind or low > _HIGHEST_STACK else found.plane
+    if (
+        behind
+        or low > _HIGHEST_STACK
+        or (low > _NOT_ON_IT and _is_held(obj, low, depth, camera, found.labels, found.plane))
+    ):
+        return None
+    return found.plane
+
+
+def _is_held(
+    obj: SeenObject, low: float, depth: np.ndarray, camera: Camera, labels: np.ndarray, plane: np.ndarray
+) -> bool:
+    """Whether what is of no object, not behind this one, and no lower than its lowest pixels, ``low`` above a plane, is
+    beside a good part of it."""
+    (nearest, farthest), (down, across) = _BESIDE, obj.window
+    top, left = max(down.start - farthest, 0), max(across.start - farthest, 0)
+    around = slice(top, down.stop + farthest), slice(left, across.stop + farthest)
+    near, names = np.ascontiguousarray(depth[around]), labels[around]
+    own = (names == obj.label).view(np.uint8)
+    outer, inner = (cv2.dilate(own, np.ones((2 * k + 1, 2 * k + 1), np.uint8)) for k in (farthest, nearest))
+    beside = outer > inner
+    seen = beside & (names == 0) & (near < quantile(obj.depth_crop[obj.mask_crop], 0.5) + obj.step)
+    view = camera.cropped(left, top, near.shape[1], near.shape[0])
+    above = lens.heights(near, seen, view.lens, plane) > low
+    return bool(np.count_nonzero(above) > _HELD * np.count_nonzero(beside))
 
 
 def _top_under(obj: SeenObject, low: float, others: Iterable[SeenObject], plane: np.ndarray) -> np.ndarray | None:

@@ -10,6 +10,7 @@ import pytest
 from table_scenes import VGA, Table
 
 from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.imaging import raycast
 from sq_perception.recovery import seen_object, supports
 from sq_perception.segmentation.options import SegmentationOptions
 from sq_perception.segmentation.segments import from_labels
@@ -90,3 +91,24 @@ def test_the_wall_behind_in_a_mask_too_large_is_no_support(wall: float) -> None:
     (box,) = seen_object.objects(depth, found, VGA)
     plane = supports.support(box, [box], depth, VGA, found, SegmentationOptions())
     np.testing.assert_array_equal(plane, table.plane)
+
+
+@pytest.mark.parametrize("wall", [1.05, 1.2])
+def test_things_on_a_board_of_which_the_front_alone_is_seen_do_not_stand_on_the_wall(wall: float) -> None:
+    """A camera below the board, level: they would reach to the wall.  Without the board it is a table from above."""
+    camera, level = VGA, np.array([0.0, 0.0, 0.0, 1.0])
+    boxes = [
+        Superquadric([0.04, 0.08, 0.05], (0.1, 0.1), [-0.15, -0.12, 0.8], level),
+        Superquadric([0.03, 0.1, 0.03], (0.1, 0.1), [0.12, -0.14, 0.85], level),
+    ]
+    board = Superquadric([0.5, 0.01, 0.2], (0.1, 0.1), [0.0, -0.03, 0.85], level)
+    for shelf, stand in ((boxes, True), ([*boxes, board], False)):
+        depth, index = raycast.render(Superquadric.stack(shelf), camera)
+        labels = np.where((index >= 0) & (index < 2), index + 1, 0).astype(np.int32)
+        depth = np.where(np.isfinite(depth), depth, wall).astype(np.float32)
+        found = from_labels(labels, depth, camera)
+        assert found.plane is not None
+        assert abs(found.plane[3] - wall) < 0.01
+        objects = seen_object.objects(depth, found, camera)
+        planes = [supports.support(obj, objects, depth, camera, found, SegmentationOptions()) for obj in objects]
+        assert [plane is not None for plane in planes] == [stand, stand]
