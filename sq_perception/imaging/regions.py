@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from sq_perception.geometry.kernels import kernel
+from sq_perception.imaging import depth_steps
 
 _OPEN = 0.1
 """Share of a region's border from which on it is not enclosed by others."""
@@ -91,32 +92,57 @@ def _extents(labels: np.ndarray, count: int) -> np.ndarray:
     return found
 
 
-def contacts(labels: np.ndarray, known: np.ndarray, count: int) -> np.ndarray:
-    """How often each two of the labels 0 to ``count`` (count + 1, count + 1) are next to each other along the rows and
-    the columns of an image, across pixels that are not ``known``; the image's border is of label 0."""
+def borders(
+    labels: np.ndarray, depth: np.ndarray, count: int, near: float, far: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """How often each two of the labels 0 to ``count`` are next to each other along the rows and the columns of an
+    image, across pixels without a depth (0); the image's border is of label 0.
+
+    Returns
+    -------
+    met : (count + 1, count + 1)
+        All of these contacts.
+    beside
+        Those at which the two are less than ``near`` metres apart along the line of sight; none of label 0.
+    behind
+        Of a (row) and b (column), those at which a is farther than b by a depth step, and by less than ``far`` metres.
+    """
     labels = np.ascontiguousarray(labels, dtype=np.int32)
-    met = _contacts(labels, np.ascontiguousarray(known), count)
-    return np.asarray(met + met.T)
+    met, beside, behind = _borders(labels, np.ascontiguousarray(depth, dtype=np.float32), count, near, far)
+    return met + met.T, beside + beside.T, behind
 
 
 def enclosed(met: np.ndarray) -> np.ndarray:
-    """Which labels (n,) are next to others nearly all around, hardly to 0, by their :func:`contacts`."""
+    """Which labels (n,) are next to others nearly all around, hardly to 0, by their contacts."""
     return np.asarray(met[:, 0] < _OPEN * met.sum(axis=1))
 
 
 @kernel
-def _contacts(labels: np.ndarray, known: np.ndarray, count: int) -> np.ndarray:
-    met = np.zeros((count + 1, count + 1))
-    above = np.zeros(labels.shape[1], np.int32)
+def _borders(
+    labels: np.ndarray, depth: np.ndarray, count: int, near: float, far: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The same; of met and beside half of it each way."""
+    n = count + 1
+    met, beside, behind = np.zeros((n, n)), np.zeros((n, n)), np.zeros((n, n))
+    # The last pixel with a depth in each column, and in this row.
+    above, above_z = np.zeros(labels.shape[1], np.int32), np.zeros(labels.shape[1], np.float32)
     for v in range(labels.shape[0]):
-        left = 0
+        left, left_z = np.int32(0), np.float32(0)
         for u in range(labels.shape[1]):
-            if known[v, u]:
-                label = labels[v, u]
-                met[left, label] += left != label
-                met[above[u], label] += above[u] != label
-                left = above[u] = label
+            z = depth[v, u]
+            if z > 0:
+                here = labels[v, u]
+                for other, other_z in ((left, left_z), (above[u], above_z[u])):
+                    if other != here:
+                        met[other, here] += 1
+                        if other > 0 and here > 0:
+                            apart = abs(other_z - z)
+                            beside[other, here] += apart < near
+                            if depth_steps.STEP * min(other_z, z) < apart < far:
+                                behind[(other, here) if other_z > z else (here, other)] += 1
+                left = above[u] = here
+                left_z = above_z[u] = z
         met[left, 0] += left != 0
     for u in range(labels.shape[1]):
         met[above[u], 0] += above[u] != 0
-    return met
+    return met, beside, behind

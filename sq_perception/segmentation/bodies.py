@@ -1,6 +1,6 @@
-"""Bodies of the pixels that are above a support, or of all there are: patches, grouped, corrected, at full resolution.
+"""Bodies of the pixels that are above a support, or of all there are: components, parted and joined, and their feet.
 
-Steps 2 to 5 of :mod:`sq_perception.segmentation.segments`.  Metres and pixels.
+Steps 2 to 4 of :mod:`sq_perception.segmentation.segments`.  Metres and pixels.
 """
 
 from __future__ import annotations
@@ -11,25 +11,23 @@ from functools import partial
 import cv2
 import numpy as np
 
-from sq_perception.geometry.kernels import kernel
-from sq_perception.imaging import depth_steps
+from sq_perception.geometry.quantiles import quantile
+from sq_perception.imaging import depth_steps, regions
 from sq_perception.imaging.camera import Camera
-from sq_perception.segmentation import (
-    convex_parts,
-    patch_grouping,
-    standing,
-    support_plane,
-    support_surface,
-    surface_patches,
-)
+from sq_perception.segmentation import convex_parts, standing, support_plane, support_surface
 from sq_perception.segmentation.support_surface import SupportSurface
 
 LEAST_SIGMA = 5e-4
 """Noise of the depth at one metre that is assumed at least, metres: rendered images have none."""
 _FOOT_PIXELS = 3
 """Up to which the foot of a thing reaches below what is clearly above the support."""
-_AROUND = 40
-"""Pixels around all that is above the support in which its noise is measured; two of the longest chords at VGA."""
+_LEAST_AREA = 1e-4
+"""Of a component without a step in it, square metres across the line of sight."""
+_GROWN = 3
+"""Pixels that components grow by: those beside a step, and where they are narrow."""
+_GAP = 0.1
+"""Share of the depth by which pixels of a surface with steps in it differ at most: what lies behind a fringe is
+farther."""
 
 
 def above(seen: standing.Seen, relative: np.ndarray, valid: np.ndarray, support: SupportSurface) -> np.ndarray:
@@ -46,14 +44,14 @@ def above(seen: standing.Seen, relative: np.ndarray, valid: np.ndarray, support:
     left, top, width, height = cv2.boundingRect(clear.view(np.uint8))
     if width == 0:
         return labels
-    top, left = max(top - _AROUND, 0), max(left - _AROUND, 0)
-    window = slice(top, top + height + 2 * _AROUND), slice(left, left + width + 2 * _AROUND)
+    reach = _FOOT_PIXELS + 1
+    top, left = max(top - reach, 0), max(left - reach, 0)
+    window = slice(top, top + height + 2 * reach), slice(left, left + width + 2 * reach)
     # Contiguous, as kernels are compiled for arrays of a kind.
-    flat = valid[window] & (np.abs(relative[window]) < support_plane.TOLERANCE)
     known, clear = np.ascontiguousarray(known[window]), np.ascontiguousarray(clear[window])
     camera = camera.cropped(left, top, known.shape[1], known.shape[0])
     holds = partial(seen.options.is_small, up=support.plane.equation[:3])
-    inside = taken_apart(known, clear, camera, support.sigma, holds, flat)
+    inside = taken_apart(known, clear, camera, support.sigma, holds)
     foot = above[window] & (inside == 0)
     labels[window] = depth_steps.grown(inside, foot, known, _FOOT_PIXELS, depth_steps.STEP)
     return labels
@@ -65,51 +63,30 @@ def taken_apart(
     camera: Camera,
     sigma: float,
     holds: Callable[[np.ndarray], bool],
-    flat: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Bodies (labels from 1, unordered) of the wanted pixels, taken apart at steps and concave edges."""
-    sigma = max(sigma, LEAST_SIGMA)
-    patches = surface_patches.find(depth, wanted, camera, sigma, flat)
-    if patches is None:
-        return convex_parts.corrected(depth_steps.separated(depth, wanted), depth, camera, sigma, holds)
-    body = patch_grouping.bodies(patches, camera)
-    labels = _refined(body[patches.labels].astype(np.int32), patches, depth, wanted)
-    return convex_parts.corrected(labels, depth, camera, sigma, holds)
+    """Bodies (labels from 1, unordered) of the wanted pixels, taken apart at steps and by lines of sight."""
+    labels = _components(depth, wanted, camera)
+    return convex_parts.corrected(labels, depth, camera, max(sigma, LEAST_SIGMA), holds)
 
 
-def _refined(body: np.ndarray, patches: surface_patches.Patches, depth: np.ndarray, wanted: np.ndarray) -> np.ndarray:
-    """Labels (height, width) from those of the samples; beside a step, of the one whose depth is most alike."""
-    unsure = patches.stepped | (body == 0)
-    known = np.pad(np.where(body > 0, patches.depth, np.float32(np.inf)), 1, constant_values=np.inf)
-    return np.asarray(_fine(body, unsure, known, depth, wanted, patches.stride, np.float32(depth_steps.STEP)))
+def _components(depth: np.ndarray, wanted: np.ndarray, camera: Camera) -> np.ndarray:
+    """Labels (height, width) of the wanted pixels, cut at depth steps, without bits; what a sensor smeared over a step
+    is a bridge of few pixels, and does not connect."""
+    filled = cv2.copyTo(depth, wanted.view(np.uint8))  # and 0 elsewhere
+    some = filled[::4, ::4]
+    some = some[some > 0]
+    if some.size == 0:
+        return np.zeros(depth.shape, np.int32)
+    least = _LEAST_AREA * camera.fx * camera.fy / quantile(some, 0.5) ** 2
+    inner = (wanted & ~depth_steps.edges(filled, wanted, depth_steps.STEP)).view(np.uint8)
+    labels = _large(depth_steps.components(cv2.morphologyEx(inner, cv2.MORPH_OPEN, depth_steps.CROSS)), least)
+    labels = depth_steps.grown(labels, wanted & (labels == 0), depth, _GROWN, depth_steps.STEP)
+    # A side that is seen at a grazing angle has steps all over.
+    steep = _large(depth_steps.separated(depth, wanted & (labels == 0), _GAP), least)
+    return np.where(steep > 0, steep + labels.max(), labels)
 
 
-@kernel
-def _fine(
-    body: np.ndarray,
-    unsure: np.ndarray,
-    known: np.ndarray,
-    depth: np.ndarray,
-    wanted: np.ndarray,
-    stride: int,
-    step: np.float32,
-) -> np.ndarray:
-    """The same; ``known`` are the depths of labelled samples in a frame of one sample, inf for others."""
-    labels = np.zeros(depth.shape, np.int32)
-    rows, columns = body.shape
-    for v in range(depth.shape[0]):
-        for u in range(depth.shape[1]):
-            if not wanted[v, u]:
-                continue
-            if not unsure[v // stride, u // stride]:
-                labels[v, u] = body[v // stride, u // stride]
-                continue
-            r, c = (v + stride // 2) // stride, (u + stride // 2) // stride
-            least = step * depth[v, u]
-            for i in range(max(r - 1, 0), min(r + 2, rows)):
-                for j in range(max(c - 1, 0), min(c + 2, columns)):
-                    off = abs(known[i + 1, j + 1] - depth[v, u])
-                    if off < least:
-                        least = off
-                        labels[v, u] = body[i, j]
-    return labels
+def _large(labels: np.ndarray, least: float) -> np.ndarray:
+    """Those with at least so many pixels; labels from 1."""
+    kept = regions.extents(labels)[:, 0] >= least
+    return regions.renumbered(labels, (kept * np.cumsum(kept)).astype(np.int32))

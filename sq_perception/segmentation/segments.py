@@ -4,17 +4,14 @@ Steps
 -----
 1. The support plane (:mod:`sq_perception.segmentation.support_plane`) and what is clearly above it; walls and other
    planes larger than a thing go first.
-2. Smooth patches of surface, cut at depth steps and folds (:mod:`sq_perception.segmentation.surface_patches`); this
-   step to step 5 are gone through in :mod:`sq_perception.segmentation.bodies`.
-3. Patches that belong to one body: convex edges join, concave edges and steps part, with exceptions for vessels and
-   for bodies that go on behind others (:mod:`sq_perception.segmentation.patch_grouping`).
-4. Where lines of sight within a body cross empty space it is several, and where none do so between two they are one
-   (:mod:`sq_perception.segmentation.convex_parts`): that holds where noise hides folds, or makes some.
-5. Each body back to full resolution, beside a step with the pixels whose depth is like its own, and down to the edge of
-   the noise on the table.
-6. What stands on the level top of a large segment (:mod:`sq_perception.segmentation.level_faces`) once more, with that
+2. Components of it that no depth step cuts; this step to step 4 are gone through in
+   :mod:`sq_perception.segmentation.bodies`.
+3. Where lines of sight within a component cross empty space it is several bodies; where none do so between two, or two
+   go on behind something nearer, they are one (:mod:`sq_perception.segmentation.convex_parts`).
+4. Each body down to the edge of the noise on the table.
+5. What stands on the level top of a large segment (:mod:`sq_perception.segmentation.level_faces`) once more, with that
    top for its support: low before the noise, it was taken for a part of the segment.
-7. Walls of a bin around things go (:mod:`sq_perception.segmentation.enclosures`).
+6. Walls of a bin around things go (:mod:`sq_perception.segmentation.enclosures`).
 
 Bodies are taken to be convex, or vessels.  Two bodies whose faces lie flush cannot be told apart by their depth.
 Things on a higher table are found as well, those on a lower one are not.  An orthographic camera sees the thesis'

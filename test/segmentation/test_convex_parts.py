@@ -140,3 +140,50 @@ def test_bodies_apart_keep_their_segments():
     found = segment(depth, scene.camera)
     assert len(found.ids) == 4
     assert min(ious(truth, found.labels)) > 0.95
+
+
+def behind_a_post(tilt=0.0, between=0.5):
+    """Two parts of a board 0.7 m away, the right one turned by a tilt about its near edge, beside what is between."""
+    depth, labels = np.full((CAMERA.height, CAMERA.width), 1.5), np.zeros((CAMERA.height, CAMERA.width), np.int32)
+    v, u = np.indices(depth.shape)
+    x = (u - CAMERA.cx) / CAMERA.fx
+    parts = [(u > 90) & (u < 140), (u > 180) & (u < 230), (u >= 140) & (u <= 180)]
+    start = (180 - CAMERA.cx) / CAMERA.fx * 0.7
+    # A point (x z, y z, z) of the turned part: z - 0.7 = tan(tilt) (x z - start).
+    turned = (0.7 - np.tan(tilt) * start) / (1 - np.tan(tilt) * x)
+    for k, (where, z) in enumerate(zip(parts, (0.7, turned, between), strict=True)):
+        here = where & (v > 80) & (v < 160)
+        depth, labels = np.where(here, z, depth), np.where(here, k + 1, labels)
+    return depth.astype(np.float32), labels.astype(np.int32)
+
+
+def of_parts(depth, labels, **options):
+    found = convex_parts.corrected(labels, depth, CAMERA, NOISE, **options)
+    return [found[120, u] for u in (115, 205, 160)]
+
+
+def test_a_board_goes_on_behind_what_is_nearer():
+    left, right, post = of_parts(*behind_a_post())
+    assert left == right != post
+    assert len(set(of_parts(*behind_a_post(), holds=lambda points: np.ptp(points[:, 0]) < 0.2))) == 3
+    assert len(set(of_parts(*behind_a_post(tilt=0.5)))) == 3, "they are two faces"
+    assert len(set(of_parts(*behind_a_post(between=0.9)))) == 3, "the gap shows what lies behind"
+
+
+def pot(deep, scale=1.0):
+    """A front wall with an inside a step behind it, below whose bottom something else is seen."""
+    v, u = np.indices((CAMERA.height, CAMERA.width))
+    x, y = (u - CAMERA.cx) / CAMERA.fx * 0.7 / scale, (v - CAMERA.cy) / CAMERA.fy * 0.7 / scale
+    bulge = scale * np.sqrt(np.maximum(0.06**2 - x**2, 0))
+    across = np.abs(x) < 0.058
+    wall, inside = across & (y > 0) & (y < 0.06), across & (y > -0.04) & (y <= 0)
+    depth = np.where(wall, 0.7 - bulge, np.where(inside, 0.7 + deep + bulge, 1.5))
+    depth += NOISE * depth**2 * np.random.default_rng(0).standard_normal(depth.shape)
+    return depth.astype(np.float32), (wall + 2 * inside).astype(np.int32)
+
+
+@pytest.mark.parametrize(("deep", "scale", "is_one"), [(0.0, 1.0, True), (0.35, 1.0, False), (0.0, 3.5, False)])
+def test_an_inside_is_one_with_the_wall_before_it(deep, scale, is_one):
+    """No vessel is deeper than 0.3 m or wider than 0.35 m."""
+    depth, labels = pot(deep, scale)
+    assert (len(names(convex_parts.corrected(labels, depth, CAMERA, NOISE))) == 1) == is_one

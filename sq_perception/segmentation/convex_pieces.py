@@ -1,0 +1,180 @@
+"""Convex pieces of one segment, by the lines of sight within it.
+
+A segment of whose pairs of samples many are crossed is taken apart: its samples are clustered by average linkage, the
+distance being the share of crossed pairs (and a little of the metric one, which orders those that nothing parts).  The
+pieces need not be convex themselves: a third body among them, a handle and smeared edges cross their lines as well, and
+two things are two all the same.  Samples apart from the rest of their piece, amid another one that no line tells them
+from, are that one's: noise put them there.  A vessel, whose inner wall lies behind its own lines, stays whole.  Pixels
+go to the piece of the nearest sample; where near ones disagree, to the piece to which most lines are free.
+
+The equation is that of :mod:`sq_perception.segmentation.convex_parts`.  Metres and pixels.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from sq_perception.geometry.kernels import kernel
+from sq_perception.imaging import regions
+from sq_perception.segmentation import crossings
+from sq_perception.segmentation.sampled_image import MANY, SampledImage, Samples, least_area, stride
+
+HOLLOW = 0.5
+"""A piece whose surface lies behind its own lines, on average by that many standard deviations of the noise, is the
+inside of a vessel.  In 80 scenes of :mod:`~sq_perception.simulation.things_on_table` those of
+vessels lay 0.95 to 6 behind, those of all other pieces at most 0.4."""
+WIDEST_HOLLOW = 0.35
+"""A vessel is not wider in the image, metres, but the wall of a bin around other things is, and shelves.  0.25 to 0.45
+change nothing in 288 simulated scenes; in four of six recorded frames of a bin more things are found."""
+AS_ONE = 0.3
+"""What a smaller share of crossed lines parts is one body."""
+_SUSPICIOUS = 0.12
+"""Share of crossed pairs from which on a segment may be several bodies."""
+_APART = 0.55
+"""Share of crossed pairs, on average, between pieces of a segment: more than half, as between bodies that touch."""
+_LEAST_SAMPLES = 4
+"""Of a piece: six pairs."""
+_METRIC = 0.3
+"""What the metric distance adds to that between samples, at most: it orders those that nothing parts."""
+_INSIDE = 0.15
+"""Share of a segment's samples that are insides, beyond which the segment is one vessel: of recorded bowls and mugs
+seen from above they are a third and more, of one from the side among other things 0.07.  0.08 to 0.25 find the same
+things in 240 simulated scenes."""
+_BESIDE = 1.6
+"""Distances of samples on a grid up to which they are neighbours; those across are 1.41."""
+_BLOCKS = 4
+"""Blocks of pixels, which go to a piece together, from a sample to the next one.  To part a cluttered recorded frame
+takes 55 % less time; 920 things in 210 simulated and 45 recorded frames have the same IoU, 0.812, as pixel by pixel."""
+LEAST_SHARE = 0.5
+"""A piece shows that share of what a body that is attached to another shows at least.  Twice as much joins 8 more of
+335 household things."""
+
+
+def pieces(
+    image: SampledImage, part: Samples, extent: np.ndarray, least_share: float = LEAST_SHARE
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Rows and columns of each convex piece of a segment; nothing where it has no such pieces.
+
+    ``part`` are a few samples of it, ``extent`` is its row of :func:`~sq_perception.imaging.regions.extents`.
+    """
+    crossed, _ = crossings.within(part.pixels, part.points, image.depth, *image.limits)
+    if crossed.mean() < _SUSPICIOUS:
+        return []
+    whole = image.sampled(part.label, extent, MANY)
+    if whole is None:
+        return []
+    crossed, far = crossings.within(whole.pixels, whole.points, image.depth, *image.limits)
+    n = len(whole.z)
+    group = linked(crossed + _METRIC * far / max(far.max(), 1e-9), np.ones(n), _APART)
+    size = np.bincount(group)
+    large = size >= max(_LEAST_SAMPLES, least_share * least_area(whole.distance) / whole.spacing**2)
+    if np.count_nonzero(large) < 2:
+        return []
+    # What is too small for a piece joins the one that it is nearest to.
+    keep = np.flatnonzero(large[group])
+    group = np.unique(group[keep[np.argmin(far[:, keep], axis=1)]], return_inverse=True)[1]
+    group = _gathered(group, crossed, far < _BESIDE * whole.spacing)
+    if whole.width < WIDEST_HOLLOW:
+        gap = crossings.gaps(whole.pixels, whole.points, image.depth, image.labels)
+        group = _with_whole_vessels(group, gap, far, HOLLOW * image.sigma * whole.distance**2)
+    count = int(group.max()) + 1
+    if count < 2:
+        return []
+    rows, columns = regions.pixels(image.labels, part.label, extent)
+    seen = image.depth, image.focal, whole.spacing, max(1, stride(len(rows), MANY) // _BLOCKS), *image.limits
+    chosen = crossings.assigned(rows, columns, whole.pixels, whole.z, group, count, *seen)
+    return [(rows[chosen == k], columns[chosen == k]) for k in range(count) if (chosen == k).any()]
+
+
+def _gathered(group: np.ndarray, crossed: np.ndarray, beside: np.ndarray) -> np.ndarray:
+    """Groups (n,) of samples without strays: a clump of a group apart from its largest one goes to the group that it
+    lies ``beside`` (n, n) and has the most free lines to, if these are as free as within a body."""
+    joined = np.where(beside & (group[:, None] == group), 0.0, np.inf)
+    clump = linked(joined, np.ones(len(group)), 1.0)
+    count = int(clump.max()) + 1
+    of_group = np.empty(count, int)
+    of_group[clump] = group
+    size = np.bincount(clump)
+    largest = np.zeros(int(group.max()) + 1, int)
+    np.maximum.at(largest, of_group, size)
+    found = group.copy()
+    for k in np.flatnonzero(size < largest[of_group]):
+        stray = clump == k
+        near = np.setdiff1d(group[beside[stray].any(axis=0)], of_group[k])
+        if len(near):
+            share = [crossed[stray][:, group == other].mean() for other in near]
+            if min(share) < AS_ONE:
+                found[stray] = near[int(np.argmin(share))]
+    return found
+
+
+def _with_whole_vessels(group: np.ndarray, gap: np.ndarray, far: np.ndarray, hollow: float) -> np.ndarray:
+    """Groups (n,) of samples, from 0, with those of each vessel joined: one group where they are all of a vessel.
+
+    A group whose surface lies behind its own lines, by more than ``hollow`` of ``gap`` (n, n) on average, is an inside;
+    the nearest other one, by ``far`` (n, n), is its wall.
+    """
+    count = int(group.max()) + 1
+    member = (group == np.arange(count)[:, None]).astype(float)
+    size = member.sum(1)
+    inside = np.einsum("ki,ij,kj->k", member, gap, member, optimize=True) > hollow * size**2
+    if not inside.any():
+        return group
+    if size[inside].sum() > _INSIDE * len(group):
+        return np.zeros_like(group)
+    by_group = np.array([far[group == k].min(axis=0) for k in range(count)])
+    apart = np.array([by_group[:, group == k].min(axis=1) for k in range(count)])
+    np.fill_diagonal(apart, np.inf)
+    name = np.arange(count)
+    walls = np.where(inside[None, :], np.inf, apart).argmin(axis=1)
+    name[inside] = walls[inside]
+    return np.unique(name[group], return_inverse=True)[1]
+
+
+@kernel
+def linked(distance: np.ndarray, size: np.ndarray, limit: float) -> np.ndarray:
+    """Groups (n,) from 0 by average linkage: the two nearest of (n, n) are joined until none are nearer than a limit.
+
+    Distances to the joined group are averages by size; inf is no distance, and the other one's holds.
+    """
+    n = len(size)
+    far, weight = distance.copy(), size.copy()
+    parent = np.arange(n)
+    nearest, least = np.zeros(n, np.int64), np.full(n, np.inf)
+    for i in range(n):
+        far[i, i] = np.inf
+        nearest[i] = np.argmin(far[i])
+        least[i] = far[i, nearest[i]]
+    while True:
+        i = int(np.argmin(least))
+        j = int(nearest[i])
+        if not least[i] < limit:
+            break
+        for k in range(n):
+            if np.isinf(far[i, k]):
+                far[i, k] = far[k, i] = far[j, k]
+            elif not np.isinf(far[j, k]):
+                far[i, k] = far[k, i] = (weight[i] * far[i, k] + weight[j] * far[j, k]) / (weight[i] + weight[j])
+            far[j, k] = far[k, j] = np.inf
+        far[i, i] = np.inf
+        weight[i] += weight[j]
+        parent[j], least[j] = i, np.inf
+        for k in range(n):
+            if k == i or (parent[k] == k and (nearest[k] == i or nearest[k] == j)):
+                nearest[k] = np.argmin(far[k])
+                least[k] = far[k, nearest[k]]
+            elif far[i, k] < least[k]:
+                nearest[k], least[k] = i, far[i, k]
+    group, count = np.empty(n, np.int64), 0
+    for k in range(n):
+        root = k
+        while parent[root] != root:
+            root = parent[root]
+        parent[k] = root
+    number = np.full(n, -1)
+    for k in range(n):
+        if number[parent[k]] < 0:
+            number[parent[k]] = count
+            count += 1
+        group[k] = number[parent[k]]
+    return group
