@@ -14,11 +14,12 @@ That holds over the whole width of the bodies: noise that bends the surface wher
 
 Steps
 -----
-1. A segment is taken apart into the convex pieces that it has (:mod:`sq_perception.segmentation.convex_pieces`), these
-   again.  A vessel's inside is a step behind its rim: before that, an inside, a large share of whose border lies behind
-   a large share of another segment's border, is one with that, and stays whole.
+1. A segment is taken apart into the convex pieces that it has (:mod:`sq_perception.segmentation.convex_pieces`), and
+   large ones of these again.
 2. Neighbouring segments between which few pairs are crossed are one body.
-3. So are two segments that go on behind something nearer: lines leave the one along its surface, pass behind another
+3. So are the inside of a vessel and its wall, of which the inside is a step behind the near rim: a hollow segment and
+   one before it, if a large share of the border of both is such a step.
+4. So are two segments that go on behind something nearer: lines leave the one along its surface, pass behind another
    segment, and enter the other one along its surface.  A box behind a post is such; what is seen between two things
    that stand apart is farther than the line.
 
@@ -44,6 +45,9 @@ the distance of their samples."""
 _RIM = 0.12
 """Share of an inside's border that lies behind another segment, and of the border of that: of 12 recorded bowls, pots
 and mugs 0.13 and more of both, of 31 of 33 simulated insides beside a nearer thing that is not theirs less of one."""
+_OF_RIM = 0.1
+"""Share of that border at which a piece of the other segment is a part of the wall: noise may take a wall apart, and
+other things touch it."""
 _HOLLOW_DEPTH = 0.3
 """A step down into a hollow is not deeper, metres; no vessel on a table is."""
 _SHARE_AGAIN = 2.0
@@ -84,12 +88,12 @@ def corrected(
     """
     # The one layout that kernels are compiled for; labels are written to.
     image = SampledImage(np.ascontiguousarray(depth, dtype=np.float32), np.array(labels, order="C"), camera, sigma)
-    vessels = _with_insides(image)
-    parts, count = _parted(image, vessels)
-    number_of = np.arange(count + 1, dtype=np.int32)
+    insides = _insides(image)
+    parts, origin = _parted(image)
+    number_of = np.arange(len(origin), dtype=np.int32)
     if len(parts) > 1:
         names = np.array([part.label for part in parts])
-        crossed = _crossed_between(image, parts, count, holds)
+        crossed = _crossed_between(image, parts, np.array(origin), insides, holds)
         group = convex_pieces.linked(crossed, np.array([len(part.z) for part in parts], float), AS_ONE)
         first = np.unique(group, return_index=True)[1]
         number_of[names] = names[first[group]]
@@ -105,32 +109,29 @@ def warm_up() -> None:
     corrected((radius < 1).astype(np.int32), depth, camera, 1e-3)
 
 
-def _with_insides(image: SampledImage) -> set[int]:
-    """Join the insides of vessels to their walls, in the image's labels; the labels of these vessels."""
+def _insides(image: SampledImage) -> list[tuple[int, int]]:
+    """Labels of the insides of vessels that are a step behind their walls, and of the segments that these are of."""
     extents = regions.extents(image.labels)
     met, _, behind = regions.borders(image.labels, image.depth, len(extents) - 1, _NEAR, _HOLLOW_DEPTH)
     border = met.sum(axis=1)
-    number = np.arange(len(extents), dtype=np.int32)
-    vessels = set()
-    for inside, wall in np.argwhere(behind > _RIM * np.maximum(border[:, None], border[None, :])):
+    found = []
+    for inside, wall in np.argwhere(behind > _RIM * np.maximum(border[:, None], border[None, :])).tolist():
         part = image.sampled(inside, extents[inside], FEW)
         if part is None or part.width > convex_pieces.WIDEST_HOLLOW:
             continue
+        gap = crossings.gaps(part.pixels, part.points, image.depth, image.labels).mean()
         # Between two things side by side there is a hollow, too.
-        is_one = image.mean_gap(part) > convex_pieces.HOLLOW and not convex_pieces.pieces(image, part, extents[inside])
-        if is_one:
-            number[number == number[inside]] = number[wall]
-            vessels.add(inside)
-    if vessels:
-        image.labels[:] = regions.renumbered(image.labels, number)
-    return {int(number[inside]) for inside in vessels}
+        is_hollow = gap > convex_pieces.HOLLOW * image.sigma * part.distance**2
+        if is_hollow and not convex_pieces.pieces(image, part, extents[inside]):
+            found.append((inside, wall))
+    return found
 
 
-def _parted(image: SampledImage, vessels: set[int]) -> tuple[list[Samples], int]:
+def _parted(image: SampledImage) -> tuple[list[Samples], list[int]]:
     """Part segments that are several convex bodies, in the image's labels; samples of all segments that have enough,
-    and the largest label."""
+    and which segment each label is of."""
     extents = regions.extents(image.labels)
-    count = len(extents) - 1
+    origin = list(range(len(extents)))
     order = np.argsort(-extents[:, 0], kind="stable")
     waiting = [(int(label), extents[label], convex_pieces.LEAST_SHARE) for label in order if extents[label, 0] > 0]
     parts = []
@@ -139,34 +140,42 @@ def _parted(image: SampledImage, vessels: set[int]) -> tuple[list[Samples], int]
         part = image.sampled(label, extent, FEW)
         if part is None:
             continue
-        pieces = [] if label in vessels else convex_pieces.pieces(image, part, extent, least_share)
+        pieces = convex_pieces.pieces(image, part, extent, least_share)
         if not pieces:
             parts.append(part)
         for k, (rows, columns) in enumerate(pieces):
+            name = len(origin) if k > 0 else label
             if k > 0:
-                count += 1
-            name = count if k > 0 else label
+                origin.append(origin[label])
             image.labels[rows, columns] = name
             sides = rows.min(), rows.max() + 1, columns.min(), columns.max() + 1
             waiting.append((name, np.array([len(rows), *sides]), _SHARE_AGAIN))
-    return parts, count
+    return parts, origin
 
 
 def _crossed_between(
-    image: SampledImage, parts: list[Samples], count: int, holds: Callable[[np.ndarray], bool] | None
+    image: SampledImage,
+    parts: list[Samples],
+    origin: np.ndarray,
+    insides: list[tuple[int, int]],
+    holds: Callable[[np.ndarray], bool] | None,
 ) -> np.ndarray:
-    """Of each two segments the share (n, n) of crossed lines, 0 if they go on behind something nearer, inf if they are
-    neither near nor that, or no thing together."""
+    """Of each two segments the share (n, n) of crossed lines, 0 if they go on behind something nearer or are of one
+    vessel, inf if they are neither near nor that, or no thing together."""
     names = np.array([part.label for part in parts])
     pixels, points = (np.concatenate([getattr(part, name) for part in parts]) for name in ("pixels", "points"))
     ends = np.cumsum([0] + [len(part.z) for part in parts])
-    borders = regions.borders(image.labels, image.depth, count, _NEAR, _HOLLOW_DEPTH)
-    met, beside, _ = (each[np.ix_(names, names)] for each in borders)
+    borders = regions.borders(image.labels, image.depth, len(origin) - 1, _NEAR, _HOLLOW_DEPTH)
+    met, beside, behind = (each[np.ix_(names, names)] for each in borders)
     reach = _NEAR / 2 + 0.7 * np.array([part.spacing for part in parts])
     crossed = crossings.between(pixels, points, ends, reach, beside > 0, image.depth, *image.limits)
     far = np.isinf(crossed)
     along, over = crossings.hidden(pixels, points, ends, names, far, image.depth, image.labels, *image.limits)
     crossed[far & (along > _ALONG) & (over < AS_ONE)] = 0.0
+    for inside, wall in insides:
+        before = behind[names == inside].sum(axis=0) * (origin[names] == wall)
+        vessel = np.flatnonzero((before > _OF_RIM * before.sum()) | (names == inside))
+        crossed[np.ix_(vessel, vessel)] = 0.0
     for a, b in np.argwhere(np.tril(crossed < AS_ONE)):
         if holds is not None and not holds(np.concatenate([parts[a].points, parts[b].points])):
             crossed[a, b] = crossed[b, a] = np.inf

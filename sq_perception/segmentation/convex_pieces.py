@@ -17,7 +17,7 @@ import numpy as np
 from sq_perception.geometry.kernels import kernel
 from sq_perception.imaging import regions
 from sq_perception.segmentation import crossings
-from sq_perception.segmentation.sampled_image import MANY, SampledImage, Samples, least_area, stride
+from sq_perception.segmentation.sampled_image import LEAST_SAMPLES, MANY, SampledImage, Samples, least_area, stride
 
 HOLLOW = 0.5
 """A piece whose surface lies behind its own lines, on average by that many standard deviations of the noise, is the
@@ -32,8 +32,6 @@ _SUSPICIOUS = 0.12
 """Share of crossed pairs from which on a segment may be several bodies."""
 _APART = 0.55
 """Share of crossed pairs, on average, between pieces of a segment: more than half, as between bodies that touch."""
-_LEAST_SAMPLES = 4
-"""Of a piece: six pairs."""
 _METRIC = 0.3
 """What the metric distance adds to that between samples, at most: it orders those that nothing parts."""
 _INSIDE = 0.15
@@ -67,7 +65,7 @@ def pieces(
     n = len(whole.z)
     group = linked(crossed + _METRIC * far / max(far.max(), 1e-9), np.ones(n), _APART)
     size = np.bincount(group)
-    large = size >= max(_LEAST_SAMPLES, least_share * least_area(whole.distance) / whole.spacing**2)
+    large = size >= max(LEAST_SAMPLES, least_share * least_area(whole.distance) / whole.spacing**2)
     if np.count_nonzero(large) < 2:
         return []
     # What is too small for a piece joins the one that it is nearest to.

@@ -12,12 +12,11 @@ import numpy as np
 
 from sq_perception.geometry.quantiles import quantile
 from sq_perception.imaging.camera import Camera
-from sq_perception.segmentation import crossings
 
 FEW, MANY = 30, 160
 """Samples of a segment: to see whether its lines are crossed, 435 pairs, and to take it apart.  90 instead of 160 find
 0.4 % less of household things (80 scenes, IoU of all), 60 instead of 30 as much."""
-_LEAST_SAMPLES = 4
+LEAST_SAMPLES = 4
 """Of a segment: six pairs."""
 _NOISE_MARGIN, _LEAST_GAP = 4.0, 0.005
 """A line is crossed where what was seen lies behind it by so many standard deviations of the noise, and metres, or a
@@ -85,18 +84,13 @@ class SampledImage:
         top, left = (first + (step // 2 - first) % step for first in (top, left))
         window = slice(top, bottom, step), slice(left, right, step)
         rows, columns = np.nonzero((self.labels[window] == label) & (self.depth[window] > 0))
-        if len(rows) < _LEAST_SAMPLES:
+        if len(rows) < LEAST_SAMPLES:
             return None
         rows, columns = top + step * rows, left + step * columns
         points = self.camera.unproject(columns, rows, self.depth[rows, columns].astype(float))
         return Samples(
             label, np.stack([rows, columns], axis=-1), points, step * quantile(points[:, 2], 0.5) / self.focal
         )
-
-    def mean_gap(self, samples: Samples) -> float:
-        """How far a segment's surface lies behind its own lines on average, standard deviations of the noise."""
-        gap = crossings.gaps(samples.pixels, samples.points, self.depth, self.labels)
-        return float(gap.mean()) / (self.sigma * samples.distance**2)
 
 
 def least_area(z: float) -> float:
