@@ -81,8 +81,11 @@ def _components(depth: np.ndarray, wanted: np.ndarray, camera: Camera) -> np.nda
     inner = (wanted & ~depth_steps.edges(filled, wanted, depth_steps.STEP)).view(np.uint8)
     labels = _large(depth_steps.components(cv2.morphologyEx(inner, cv2.MORPH_OPEN, depth_steps.CROSS)), least)
     labels = depth_steps.grown(labels, wanted & (labels == 0), depth, _GROWN, depth_steps.STEP)
+    left = wanted & (labels == 0)
+    if np.count_nonzero(left) < least:
+        return labels
     # A side that is seen at a grazing angle has steps all over.
-    steep = _large(depth_steps.separated(depth, wanted & (labels == 0), _GAP), least)
+    steep = _large(depth_steps.separated(depth, left, _GAP), least)
     return np.where(steep > 0, steep + labels.max(), labels)
 
 

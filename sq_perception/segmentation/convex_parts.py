@@ -176,8 +176,8 @@ def _crossed_between(
     far = np.isinf(crossed)
     along, over = crossings.hidden(pixels, points, ends, names, far, image.depth, image.labels, *image.limits)
     crossed[far & (along > _ALONG) & (over < AS_ONE)] = 0.0
-    seen = regions.extents(image.labels)[names, 0] * np.array([part.distance for part in parts]) ** 2 / image.focal**2
-    is_bit = seen < np.array([least_area(part.distance) for part in parts])
+    extents = regions.extents(image.labels)
+    is_bit = np.array([image.area(part, extents[part.label]) < least_area(part.distance) for part in parts])
     crossed[(is_bit[:, None] != is_bit) & (beside > 0)] *= AS_ONE / _BIT_AS_ONE
     for inside, wall in insides:
         before = behind[names == inside].sum(axis=0) * (origin[names] == wall)

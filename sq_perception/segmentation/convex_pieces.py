@@ -55,6 +55,9 @@ def pieces(
 
     ``part`` are a few samples of it, ``extent`` is its row of :func:`~sq_perception.imaging.regions.extents`.
     """
+    least = least_share * least_area(part.distance)
+    if image.area(part, extent) < 2 * least:
+        return []
     crossed, _ = crossings.within(part.pixels, part.points, image.depth, *image.limits)
     if crossed.mean() < _SUSPICIOUS:
         return []
@@ -65,7 +68,7 @@ def pieces(
     n = len(whole.z)
     group = linked(crossed + _METRIC * far / max(far.max(), 1e-9), np.ones(n), _APART)
     size = np.bincount(group)
-    large = size >= max(LEAST_SAMPLES, least_share * least_area(whole.distance) / whole.spacing**2)
+    large = size >= max(LEAST_SAMPLES, least / whole.spacing**2)
     if np.count_nonzero(large) < 2:
         return []
     # What is too small for a piece joins the one that it is nearest to.

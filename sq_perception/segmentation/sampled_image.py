@@ -92,6 +92,10 @@ class SampledImage:
             label, np.stack([rows, columns], axis=-1), points, step * quantile(points[:, 2], 0.5) / self.focal
         )
 
+    def area(self, samples: Samples, extent: np.ndarray) -> float:
+        """Of all of a segment across the line of sight, square metres."""
+        return float(extent[0]) * (samples.distance / self.focal) ** 2
+
 
 def least_area(z: float) -> float:
     """Of a body that is attached to another, at a depth in metres: square metres across the line of sight."""
