@@ -23,6 +23,8 @@ _FOOT_PIXELS = 3
 """Up to which the foot of a thing reaches below what is clearly above the support."""
 _LEAST_AREA = 1e-4
 """Of a component without a step in it, square metres across the line of sight."""
+_MOST = 100
+"""Components; bounds the time of frames that are noise alone."""
 _GROWN = 3
 """Pixels that components grow by: those beside a step, and where they are narrow."""
 _GAP = 0.1
@@ -90,6 +92,7 @@ def _components(depth: np.ndarray, wanted: np.ndarray, camera: Camera) -> np.nda
 
 
 def _large(labels: np.ndarray, least: float) -> np.ndarray:
-    """Those with at least so many pixels; labels from 1."""
-    kept = regions.extents(labels)[:, 0] >= least
+    """Those with at least so many pixels, the largest ones if there are very many; labels from 1."""
+    counts = regions.extents(labels)[:, 0]
+    kept = counts >= max(least, np.sort(counts)[-_MOST:][0])
     return regions.renumbered(labels, (kept * np.cumsum(kept)).astype(np.int32))

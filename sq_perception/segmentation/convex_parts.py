@@ -173,12 +173,12 @@ def _crossed_between(
     met, beside, behind = (each[np.ix_(names, names)] for each in borders)
     reach = _NEAR / 2 + 0.7 * np.array([part.spacing for part in parts])
     crossed = crossings.between(pixels, points, ends, reach, beside > 0, image.depth, *image.limits)
-    far = np.isinf(crossed)
-    along, over = crossings.hidden(pixels, points, ends, names, far, image.depth, image.labels, *image.limits)
-    crossed[far & (along > _ALONG) & (over < AS_ONE)] = 0.0
     extents = regions.extents(image.labels)
     is_bit = np.array([image.area(part, extents[part.label]) < least_area(part.distance) for part in parts])
     crossed[(is_bit[:, None] != is_bit) & (beside > 0)] *= AS_ONE / _BIT_AS_ONE
+    far = np.isinf(crossed) & ~(is_bit[:, None] & is_bit)
+    along, over = crossings.hidden(pixels, points, ends, names, far, image.depth, image.labels, *image.limits)
+    crossed[far & (along > _ALONG) & (over < AS_ONE)] = 0.0
     for inside, wall in insides:
         before = behind[names == inside].sum(axis=0) * (origin[names] == wall)
         vessel = np.flatnonzero((before > _OF_RIM * before.sum()) | (names == inside))
@@ -187,6 +187,6 @@ def _crossed_between(
         if holds is not None and not holds(np.concatenate([parts[a].points, parts[b].points])):
             crossed[a, b] = crossed[b, a] = np.inf
     # The bottom of a vessel is seen over its wall alone: no line tells it from the bottom of the next one.
-    ends = regions.enclosed(borders[0])[names]
-    crossed[(ends[:, None] | ends[None, :]) & (met == 0)] = np.inf
+    is_enclosed = regions.enclosed(borders[0])[names]
+    crossed[(is_enclosed[:, None] | is_enclosed) & (met == 0)] = np.inf
     return crossed
