@@ -34,7 +34,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from sq_msgs_py.depth_image import intrinsics_from_message, raw_intrinsics_from_message, size_mismatch
+from sq_msgs_py.depth_image import Intrinsics, intrinsics_from_message, raw_intrinsics_from_message, size_mismatch
 from sq_perception.imaging.camera import Camera
 from sq_perception.imaging.compressed_depth import TRANSPORT
 from sq_perception.imaging.distortion import FISHEYE, Distortion
@@ -156,6 +156,11 @@ def is_rectified_name(name: str) -> bool:
 def is_distorted(coefficients: Sequence[float]) -> bool:
     """Whether distortion coefficients are not all zero; one that is no number counts."""
     return not all(abs(value) <= _NEGLIGIBLE for value in coefficients)
+
+
+def intrinsics(camera: Camera) -> Intrinsics:
+    """The intrinsics of a camera, as :class:`Calibration` compares them."""
+    return Intrinsics(camera.width, camera.height, camera.fx, camera.fy, camera.cx, camera.cy)
 
 
 def _lens(model: str, coefficients: tuple[float, ...]) -> Distortion | None:

@@ -23,8 +23,6 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from sq_msgs_py.depth_image import Intrinsics
-
 Projection = Literal["pinhole", "orthographic"]
 LEAST_MEDIAN, GREATEST_MEDIAN = 0.01, 100.0
 """Metres; no depth camera sees half of its image nearer or farther: other numbers have another unit."""
@@ -43,8 +41,8 @@ class Lens(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Camera(Intrinsics):
-    """Intrinsics of one image, width height fx fy cx cy, and its projection; see the module for the equations.
+class Camera:
+    """Intrinsics of one image; see the module for the equations.
 
     Raises
     ------
@@ -53,6 +51,12 @@ class Camera(Intrinsics):
         finite.
     """
 
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
     projection: Projection = "pinhole"
 
     def __post_init__(self) -> None:

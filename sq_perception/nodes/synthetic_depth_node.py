@@ -24,6 +24,7 @@ from std_msgs.msg import Header
 
 from sq_msgs_py.depth_image import GREY_ENCODINGS, intrinsics_to_message, labels_to_message
 from sq_msgs_py.superquadrics import to_message
+from sq_perception.imaging.calibration import intrinsics
 from sq_perception.nodes.live_parameters import LiveParameters
 from sq_perception.nodes.parameters import SyntheticParameters
 from sq_perception.nodes.statistics import THROTTLE
@@ -119,7 +120,7 @@ class SyntheticDepthNode(Node):
         if frame.truth is not None:
             self._truth.publish(to_message(truth_array(frame.truth), header))
         if not frame.is_cube:
-            self._info.publish(intrinsics_to_message(frame.camera, header))
+            self._info.publish(intrinsics_to_message(intrinsics(frame.camera), header))
         if frame.labels is not None:
             if self._mask is None:
                 self._mask = self._output(Image, "mask/image")

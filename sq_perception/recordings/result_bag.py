@@ -35,6 +35,7 @@ import numpy as np
 from sq_msgs_py import depth_image
 from sq_msgs_py.superquadrics import to_message
 from sq_perception.files.output_file import OutputFile
+from sq_perception.imaging.calibration import intrinsics
 from sq_perception.recordings import publication
 from sq_perception.recordings.bag_file import camera_info_topic, raw_topic
 from sq_perception.recordings.frame_file import FrameError, RecordedFrame, Stamp
@@ -174,7 +175,7 @@ class ResultBag:
         if "depth" in self._images:
             topic = _depth_topic(frame.topic)
             if not frame.is_cube:
-                info = depth_image.intrinsics_to_message(frame.camera, header, types)
+                info = depth_image.intrinsics_to_message(intrinsics(frame.camera), header, types)
                 messages.append((camera_info_topic(topic), info))
             messages.append((topic, publication.depth_message(frame.depth, header, encoding, types)))
         if "labels" in self._images:
