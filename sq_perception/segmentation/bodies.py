@@ -11,6 +11,7 @@ from functools import partial
 import cv2
 import numpy as np
 
+from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.quantiles import quantile
 from sq_perception.imaging import depth_steps, regions
 from sq_perception.imaging.camera import Camera
@@ -30,6 +31,9 @@ _GROWN = 3
 _GAP = 0.1
 """Share of the depth by which pixels of a surface with steps in it differ at most: what lies behind a fringe is
 farther."""
+_JAGGED = 0.3
+"""Share of the pixels of such a surface that stand out, by a step, from both their neighbours along a row or a column,
+beyond which it is noise: of independent noise most do, of a side seen at a grazing angle hardly any."""
 
 
 def above(seen: standing.Seen, relative: np.ndarray, valid: np.ndarray, support: SupportSurface) -> np.ndarray:
@@ -86,9 +90,37 @@ def _components(depth: np.ndarray, wanted: np.ndarray, camera: Camera) -> np.nda
     left = wanted & (labels == 0)
     if np.count_nonzero(left) < least:
         return labels
-    # A side that is seen at a grazing angle has steps all over.
+    # A side that is seen at a grazing angle has steps all over, but all one way.
     steep = _large(depth_steps.separated(depth, left, _GAP), least)
+    if steep.any():
+        counts, peaks = _counts_and_peaks(steep, depth, int(steep.max()), np.float32(depth_steps.STEP))
+        steep[(peaks > _JAGGED * counts)[steep]] = 0
     return np.where(steep > 0, steep + labels.max(), labels)
+
+
+@kernel
+def _counts_and_peaks(
+    labels: np.ndarray, depth: np.ndarray, count: int, step: np.float32
+) -> tuple[np.ndarray, np.ndarray]:
+    """Pixels (count + 1,) of each label, and how many of them are nearer, or farther, than both their neighbours along
+    a row or a column, by a share of the depth."""
+    pixels, peaks = np.zeros(count + 1), np.zeros(count + 1)
+    rows, columns = labels.shape
+    for v in range(rows):
+        for u in range(columns):
+            label = labels[v, u]
+            if label == 0:
+                continue
+            pixels[label] += 1
+            stands_out = False
+            for down, right in ((0, 1), (1, 0)):
+                if v >= down and u >= right and v + down < rows and u + right < columns:
+                    before, after = depth[v - down, u - right], depth[v + down, u + right]
+                    less, most = min(before, after), max(before, after)
+                    nearer = less - depth[v, u] > step * depth[v, u]
+                    stands_out |= less > 0 and (nearer or depth[v, u] - most > step * most)
+            peaks[label] += stands_out
+    return pixels, peaks
 
 
 def _large(labels: np.ndarray, least: float) -> np.ndarray:
