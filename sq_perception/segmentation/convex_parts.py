@@ -106,10 +106,10 @@ def corrected(
 
 def warm_up() -> None:
     """Compile, or load from disk, every kernel by parting and joining two balls."""
-    camera = Camera(64, 48, 60.0, 60.0, 31.5, 23.5)
+    camera = Camera(64, 48, 120.0, 120.0, 31.5, 23.5)
     v, u = np.indices((camera.height, camera.width))
     radius = np.hypot(np.abs(u - camera.cx) - 12, v - camera.cy) / 12
-    depth = np.where(radius < 1, 0.7 - 0.13 * np.sqrt(np.maximum(1 - radius**2, 0)), 1.0)
+    depth = np.where(radius < 1, 0.7 - 0.07 * np.sqrt(np.maximum(1 - radius**2, 0)), 1.0)
     corrected((radius < 1).astype(np.int32), depth, camera, 1e-3)
 
 
