@@ -37,6 +37,7 @@ from typing import Any, NamedTuple
 import furniture
 import household_things
 import numpy as np
+import segmentation
 import single_body
 import tracking
 from common import report, scene_verdict
@@ -115,15 +116,11 @@ def segmented_frames() -> list[Tabletop]:
 
 
 def of_segments() -> Measured:
-    """Every thing of some frames: the IoU of its readings with those of the best segment."""
+    """Every thing of some frames: the IoU of its readings with those of its segment."""
     results, ious = [], []
     for scene in segmented_frames():
         found = segments.segment(scene.depth, scene.camera).labels
-        known = np.isfinite(scene.depth)
-        joint = np.zeros((scene.labels.max() + 1, found.max() + 1))
-        np.add.at(joint, (scene.labels[known], found[known]), 1)
-        union = joint.sum(1, keepdims=True) + joint.sum(0) - joint
-        ious += (joint / np.maximum(union, 1))[1:, 1:].max(axis=1, initial=0).tolist()
+        ious += segmentation.score(np.where(np.isfinite(scene.depth), scene.labels, 0), found).ious
         results.append(found.tobytes())
     return Measured(results, 100 * float(np.mean(ious)))
 

@@ -1,7 +1,7 @@
 """The compact networks computed without torch: weights of a file in, outputs of the heads out.
 
 :mod:`sq_perception.learning.convolution` has the layers.  One thread computes: the layers are small, and one
-that fits bodies meanwhile wants the other cores (:mod:`sq_perception.geometry.one_thread`).
+that fits bodies meanwhile wants the other cores (:mod:`sq_perception.geometry.threads`).
 
 A test compares with the modules of torch (:mod:`sq_perception.learning.regressor`,
 :mod:`sq_perception.learning.thing_network`, :mod:`sq_perception.learning.mask_network`), which state the same networks.
@@ -11,9 +11,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from sq_perception.geometry.one_thread import one_blas_thread
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.support_directions import DIRECTIONS
+from sq_perception.geometry.threads import one_blas_thread
 from sq_perception.imaging.segment_view import CHANNELS
 from sq_perception.learning import layout
 from sq_perception.learning.convolution import Block, Direct, Memory, Weights, contiguous

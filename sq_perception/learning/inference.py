@@ -19,9 +19,9 @@ import numpy as np
 
 from sq_perception.fitting.hull_prior import HullPrior
 from sq_perception.geometry import rotation as quaternions
-from sq_perception.geometry.one_thread import one_torch_thread
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.support_directions import DIRECTIONS, mirrored
+from sq_perception.geometry.threads import one_torch_thread
 from sq_perception.imaging.canonical_view import CanonicalView
 from sq_perception.learning import checkpoint, forward
 from sq_perception.learning.choices import NEEDS_TORCH
@@ -131,13 +131,11 @@ def load(path: Path | str | None = None, device: str = "cpu") -> Predictor:
     if _is_cpu(device) and config.backbone == "compact":
         return forward.CompactRegressor(config, weights)
     try:
-        model: Predictor = checkpoint.load(path, device).for_inference()
+        model = checkpoint.load(path, device).for_inference()
     except ModuleNotFoundError as error:
         what = f"a network of the backbone {config.backbone} on {device}"
         raise checkpoint.CheckpointError(f"{what} {NEEDS_TORCH}") from error
-    if _is_cpu(device):
-        model.predict = one_torch_thread()(model.predict)  # type: ignore[method-assign]
-    return model
+    return _OnOneThread(model) if _is_cpu(device) else model
 
 
 def load_things(path: Path | str | None = None, device: str = "cpu") -> ThingPredictor:
@@ -162,6 +160,18 @@ def load_masks(path: Path | str | None = None) -> forward.CompactMasks:
         As :func:`checkpoint.read`.
     """
     return forward.CompactMasks(*checkpoint.read(MaskConfig, path))
+
+
+class _OnOneThread:
+    """A predictor of torch: on busy cores the slowest of several threads sets the time, and one image is small."""
+
+    def __init__(self, model: Predictor) -> None:
+        self.config = model.config
+        self._model = model
+
+    def predict(self, views: np.ndarray) -> Superquadric:
+        with one_torch_thread():
+            return self._model.predict(views)
 
 
 def _is_cpu(device: str) -> bool:

@@ -34,8 +34,6 @@ _THREADS = {"OMP_WAIT_POLICY": "PASSIVE", "OPENBLAS_NUM_THREADS": "1", "OPENCV_F
 """Threads that spin while they wait take the cores from the nodes beside them: on two busy cores a frame took 30 ms
 with these settings and 50 to 150 ms without.  Small solves and small images gain nothing from a second thread: OpenCV's
 took a tenth of the processor time of a VGA frame of one body, and made it 2 % faster on an idle core."""
-_SWITCH = 0.001
-"""Seconds after which Python lets another thread go on.  With its 5 ms, services waited behind the threads that fit."""
 _M_ARENA_MAX, _HEAPS = -8, 2
 """The option of glibc's malloc.h, and how many heaps a process gets: with one, threads waited for each other, and a
 frame took 10 % more processor time; with two, it took what it takes with one for each thread."""
@@ -82,12 +80,15 @@ def run(name: str, create: Callable[[], Iterable[Stoppable]], arguments: Sequenc
             # Libraries read these when they are loaded, rclpy already loads numpy.
             for variable, value in {**_THREADS, **fast_dds.additions()}.items():
                 os.environ.setdefault(variable, value)
-            sys.setswitchinterval(_SWITCH)
             share_heaps()
             with garbage_postponed():
                 import rclpy
                 from rclpy.executors import SingleThreadedExecutor
                 from rclpy.signals import SignalHandlerOptions
+
+                from sq_perception.geometry.threads import TURN
+
+                sys.setswitchinterval(TURN)  # services waited behind the threads that fit
 
                 # rclpy's own handlers end the context from another thread, and give way to the default action for an
                 # instant when they go: a second Ctrl-C then killed the process.

@@ -34,9 +34,9 @@ import numpy as np
 
 from sq_perception.fitting import surface_fit
 from sq_perception.fitting.fit import Status
-from sq_perception.geometry.one_thread import one_blas_thread, short_turns
 from sq_perception.geometry.quantiles import quantile
 from sq_perception.geometry.superquadric import Superquadric
+from sq_perception.geometry.threads import one_blas_thread, short_turns
 from sq_perception.imaging import perforation, raycast
 from sq_perception.imaging.camera import GREATEST_DEPTH, GREATEST_MEDIAN, LEAST_DEPTH, Camera
 from sq_perception.learning import checkpoint, inference

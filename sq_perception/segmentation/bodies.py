@@ -93,18 +93,16 @@ def _components(depth: np.ndarray, wanted: np.ndarray, camera: Camera) -> np.nda
     # A side that is seen at a grazing angle has steps all over, but all one way.
     steep = _large(depth_steps.separated(depth, left, _GAP), least)
     if steep.any():
-        counts, peaks = _counts_and_peaks(steep, depth, int(steep.max()), np.float32(depth_steps.STEP))
-        steep[(peaks > _JAGGED * counts)[steep]] = 0
+        jagged = _jagged_share(steep, depth, int(steep.max()), np.float32(depth_steps.STEP))
+        steep[(jagged > _JAGGED)[steep]] = 0
     return np.where(steep > 0, steep + labels.max(), labels)
 
 
 @kernel
-def _counts_and_peaks(
-    labels: np.ndarray, depth: np.ndarray, count: int, step: np.float32
-) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels (count + 1,) of each label, and how many of them are nearer, or farther, than both their neighbours along
-    a row or a column, by a share of the depth."""
-    pixels, peaks = np.zeros(count + 1), np.zeros(count + 1)
+def _jagged_share(labels: np.ndarray, depth: np.ndarray, count: int, step: np.float32) -> np.ndarray:
+    """Share (count + 1,) of the pixels of each label that are nearer, or farther, than both their neighbours along a
+    row or a column, by a share of the depth."""
+    pixels, jagged = np.zeros(count + 1), np.zeros(count + 1)
     rows, columns = labels.shape
     for v in range(rows):
         for u in range(columns):
@@ -119,8 +117,8 @@ def _counts_and_peaks(
                     less, most = min(before, after), max(before, after)
                     nearer = less - depth[v, u] > step * depth[v, u]
                     stands_out |= less > 0 and (nearer or depth[v, u] - most > step * most)
-            peaks[label] += stands_out
-    return pixels, peaks
+            jagged[label] += stands_out
+    return jagged / np.maximum(pixels, 1.0)
 
 
 def _large(labels: np.ndarray, least: float) -> np.ndarray:

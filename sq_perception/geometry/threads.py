@@ -19,7 +19,7 @@ from threadpoolctl import ThreadpoolController
 _lock = threading.Lock()
 _blocks: list[Any] = []
 """For each block that wants one thread what undoes the setting: the same for all."""
-_TURN = 0.001
+TURN = 0.001
 """Seconds after which a thread of Python lets another one go on.  One comes back from compiled code to wait for the
 interpreter: with Python's 5 ms, two threads recovered five bodies of a VGA frame in 53 ms, where one took 51; with 1 ms
 in 45, and with less as well."""
@@ -64,7 +64,7 @@ def short_turns() -> Iterator[None]:
     """Within the block, and as long as any other such block lasts, threads of Python take turns of a millisecond."""
     with _lock:
         _turns.append(_turns[0] if _turns else sys.getswitchinterval())
-        sys.setswitchinterval(min(_TURN, _turns[0]))
+        sys.setswitchinterval(min(TURN, _turns[0]))
     try:
         yield
     finally:

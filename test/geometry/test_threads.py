@@ -4,7 +4,7 @@ import sys
 
 from threadpoolctl import threadpool_info
 
-from sq_perception.geometry.one_thread import one_blas_thread, short_turns
+from sq_perception.geometry.threads import one_blas_thread, short_turns
 
 
 def threads_of_blas() -> set[int]:
