@@ -124,6 +124,10 @@ class Problem:
         """The problem with some terms changed."""
         return replace(self, terms=Terms(**{**self.terms._asdict(), **changed}))
 
+    def without_hull(self) -> Problem:
+        """The problem as if no hull had been predicted."""
+        return replace(self, terms=self.terms._replace(hull_directions=self.terms.hull_directions[:0]), hull=None)
+
     def floor(self, count: int) -> float:
         """Cost of a body that leaves nothing but noise on ``count`` drawn rays: their total weight."""
         return float(min(count, len(self.observation.pixels))) if self.independent is None else self.independent

@@ -82,13 +82,12 @@ def solve(problem: Problem, given: Sequence[State]) -> Solution:
     boxes = principal(points, deeper=False) if plane is None else on_plane(points, plane)
     starts = [*given, *boxes]
     solution = _best(problem, starts)
-    if problem.hull is not None:
-        if _mean_loss(problem, solution.state) > _typical_of_hollow(problem):
-            return replace(solution, notes=_AS_HULL, as_hull=True)
-        return solution
-    if problem.late:
-        return solution
-    return revolution.weighed(unseen.weighed(_hollow_as_hull(solution, starts)))
+    if problem.hull is None:
+        if not problem.late:
+            solution = revolution.weighed(unseen.weighed(_hollow_as_hull(solution, starts)))
+    elif _mean_loss(problem, solution.state) > _typical_of_hollow(problem):
+        solution = replace(solution, notes=_AS_HULL, as_hull=True)
+    return solution if problem.late else unseen.with_open_ends(solution)
 
 
 def _best(problem: Problem, starts: Sequence[State]) -> Solution:

@@ -8,8 +8,8 @@ What the border of an image cuts off is open as well.  A prism, such as a can or
 goes on beyond the border.  Its cost has a wall where it would be too short to reach the border, and is flat beyond: a
 search ends at the foot of the wall, whose curvature tells nothing of the flat.  So where the border cuts an object and
 an end of its body lies beyond, the body is also held with that end farther out and the other one in place, the rest
-fitted again.  What the image allows then adds to the covariance, with the weight of the body itself.  That is about the
-exact course: the tolerant one has priors for what it does not see.
+fitted again.  What the image allows then adds to the covariance, with the weight of the body itself.  A predicted hull
+has no say in that: it is about what the image shows, and mostly ends at the border, too.
 """
 
 from __future__ import annotations
@@ -75,11 +75,10 @@ def weighed(solution: Solution) -> Solution:
 def with_open_ends(solution: Solution) -> Solution:
     """The solution, with longer bodies beside it where the image's border hides how long it is."""
     problem, state = solution.problem, solution.state
-    if problem.independent is not None:
-        return solution
     ends = list(_hidden_ends(problem.observation, state))
     if not ends:
         return solution
+    problem = problem.without_hull()
     rays = solution.rays.every(max(1, len(solution.rays.hits) // _RAYS))
     most = problem.settle(state, rays, 0).cost + _ALLOWED
     found = []
