@@ -4,12 +4,12 @@ Where the image hardly determines a size, small errors of the model would decide
 a prediction where there is one.  The same body competes with that size like its others, thin, and as predicted, its
 seen face in place.
 
-What the border of an image cuts off is open as well.  A prism, such as a can or a carton, looks the same however far it
-goes on beyond the border.  Its cost has a wall where it would be too short to reach the border, and is flat beyond: a
-search ends at the foot of the wall, whose curvature tells nothing of the flat.  So where the border cuts an object and
-an end of its body lies beyond, the body is also held with that end farther out and the other one in place, the rest
-fitted again.  What the image allows then adds to the covariance, with the weight of the body itself.  A predicted hull
-has no say in that: it is about what the image shows, and mostly ends at the border, too.
+What the border of an image, or of its readings, cuts off is open as well.  A prism, such as a can or a carton, looks
+the same however far it goes on beyond the border.  Its cost has a wall where it would be too short to reach the border,
+and is flat beyond: a search ends at the foot of the wall, whose curvature tells nothing of the flat.  So where the
+border cuts an object and an end of its body lies beyond, the body is also held with that end farther out and the other
+one in place, the rest fitted again.  What the image allows then adds to the covariance, with the weight of the body
+itself.  A predicted hull has no say in that: it is about what the image shows, and mostly ends at the border, too.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ from sq_perception.fitting.problem import (
     by_cost,
 )
 from sq_perception.fitting.rivals import resized
+from sq_perception.geometry.kernels import kernel
 
 THIN = 0.3
 """A size that the image leaves open is also tried this thin, as a share of the other two."""
@@ -95,18 +96,52 @@ def with_open_ends(solution: Solution) -> Solution:
 
 
 def _hidden_ends(observation: Observation, state: State) -> Iterator[tuple[int, float]]:
-    """Axis and sign of each end of a body that lies beyond a border of the image which cuts the object."""
-    mask, camera = observation.mask, observation.camera
+    """Axis and sign of each end of a body that lies beyond all readings, on a side where these end within the object.
+
+    There is the border of the image, or a band without readings along it: of a rectified image, of a stereo camera.
+    """
+    left, top, right, bottom, cut = _borders(observation.depth, observation.mask, observation.free)
+    if not cut.any():
+        return
+    camera = observation.camera
     for axis in range(3):
         for sign in (1.0, -1.0):
             u, v = camera.project(state.parameters[5:8] + sign * state.parameters[axis] * state.rotation[:, axis])
-            if (
-                (u < 0 and mask[:, 0].any())
-                or (v < 0 and mask[0].any())
-                or (u > camera.width - 1 and mask[:, -1].any())
-                or (v > camera.height - 1 and mask[-1].any())
-            ):
+            if not np.isfinite([u, v]).all():
+                continue
+            row, column = (int(np.clip(np.rint(at), 0, n - 1)) for at, n in ((v, camera.height), (u, camera.width)))
+            if (cut & [u < left[row], v < top[column], u > right[row], v > bottom[column]]).any():
                 yield axis, sign
+
+
+@kernel
+def _borders(
+    depth: np.ndarray, mask: np.ndarray, free: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """First reading of each row (h,) and column (w,), the last ones, and on which of these sides (4,) the object has
+    any of them.  Free pixels, indices into the image (h, w), count as readings: some are known to be empty without.
+    """
+    height, width = depth.shape
+    known = np.isfinite(depth)
+    for pixel in free:
+        known[pixel // width, pixel % width] = True
+    left, right = np.full(height, width), np.full(height, -1)
+    top, bottom = np.full(width, height), np.full(width, -1)
+    for v in range(height):
+        for u in range(width):
+            if known[v, u]:
+                left[v], right[v] = min(left[v], u), u
+                top[u], bottom[u] = min(top[u], v), v
+    cut = np.zeros(4, np.bool_)
+    for v in range(height):
+        if right[v] >= 0:
+            cut[0] |= mask[v, left[v]]
+            cut[2] |= mask[v, right[v]]
+    for u in range(width):
+        if bottom[u] >= 0:
+            cut[1] |= mask[top[u], u]
+            cut[3] |= mask[bottom[u], u]
+    return left, top, right, bottom, cut
 
 
 def _longer(state: State, axis: int, sign: float, size: float) -> State:

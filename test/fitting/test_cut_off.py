@@ -18,14 +18,19 @@ BALL = (0.04, 0.04, 0.04), (1.0, 1.0)
 
 
 def lower_half(
-    size: tuple[float, ...], shape: tuple[float, ...], seed: int, as_thing: bool = False
+    size: tuple[float, ...], shape: tuple[float, ...], seed: int, as_thing: bool = False, dark: int = 0
 ) -> tuple[Superquadric, Fit]:
-    """A body of which the image shows the lower half, and its fit; of a thing, a hull is predicted that ends there."""
+    """A body of which the image shows the lower half, and its fit; of a thing, a hull is predicted that ends there.
+
+    Above the image are ``dark`` rows without readings, as rectified ones have them.
+    """
     table = Table(pitch=np.random.default_rng(seed).uniform(0.5, 1.1))
     body = table.body(0, 0, size, shape)
     depth, labels = table.see([body], noise=0.0007, seed=seed)
     rows = np.flatnonzero((labels == 1).any(axis=1))
     first = int(0.5 * (rows[0] + rows[-1]))
+    depth[first - dark : first], labels[first - dark : first] = np.nan, 0
+    first -= dark
     camera = VGA.cropped(0, first, VGA.width, VGA.height - first)
     options = FitOptions(plane=table.plane)
     if as_thing:
@@ -36,10 +41,11 @@ def lower_half(
     return body, surface_fit.fit(depth[first:], labels[first:] == 1, camera, options=options)
 
 
+@pytest.mark.parametrize("dark", [0, 20])
 @pytest.mark.parametrize("as_thing", [False, True])
 @pytest.mark.parametrize("seed", range(8))
-def test_a_can_may_be_longer_than_the_search_made_it(seed: int, as_thing: bool) -> None:
-    body, fit = lower_half(*CAN, seed, as_thing)
+def test_a_can_may_be_longer_than_the_search_made_it(seed: int, as_thing: bool, dark: int) -> None:
+    body, fit = lower_half(*CAN, seed, as_thing, dark)
     along = int(np.argmax(np.abs(fit.superquadric.rotation_matrix.T @ body.rotation_matrix[:, 2])))
     error = abs(fit.superquadric.size[along] - body.size[2])
     assert error < 3 * fit.sigma_size[along]
