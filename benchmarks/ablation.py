@@ -121,7 +121,7 @@ ROWS = (
     Row("every ray counts", program=partial(_rays, 1000.0)),
     Row("as a body", program=lambda: patch.multiple(Observation, of_hull=lambda self: self)),
     Row("no plane", options={"plane": None}),
-    Row("no plane, exactly", program=lambda: patch.object(surface_fit, "fills", lambda _: True),
+    Row("no plane, exactly", program=lambda: patch.object(surface_fit, "fills", lambda *_: True),
         options={"plane": None}),
     Row("no free space", options={"nan_is_empty": False}),
     Row("missing is empty", options={"nan_is_empty": True}),

@@ -34,6 +34,7 @@ from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.geometry.support_directions import DIRECTIONS
 from sq_perception.imaging import raycast
 from sq_perception.imaging.camera import Camera
+from sq_perception.imaging.regions import box, fills
 
 __all__ = ["FitOptions", "fit", "warm_up"]
 
@@ -97,11 +98,11 @@ def fit(
     fine = crop.noise.sigma < _FINE_NOISE * model_error
     if undecided and (later is not None if options.plane is None else fine):
         exactly = _exactly(crop, options, given, later, began)
-        if exactly is not None and not (camera.is_pinhole and _is_thing(mask, options)):
+        if exactly is not None and not (camera.is_pinhole and _is_thing(mask, depth, options)):
             return assessed(exactly, began)
         if (thing := _as_thing(exactly)) is not None:
             return assessed(thing, began)
-    is_thing = undecided and _is_thing(mask, options)
+    is_thing = undecided and _is_thing(mask, depth, options)
     if is_thing:
         # Also without a plane: to look for a superquadric from everywhere first takes six times as long, and gains none
         # (benchmarks/ablation, "no plane, exactly") but 0.3 % of IoU where things are noisy superquadrics.
@@ -120,9 +121,11 @@ def fit(
     return assessed(solution, began)
 
 
-def _is_thing(mask: np.ndarray, options: FitOptions) -> bool:
+def _is_thing(mask: np.ndarray, depth: np.ndarray, options: FitOptions) -> bool:
     """Whether more is known of the object than its pixels: it stands on something, or its hull is predicted."""
-    return options.plane is not None or (not fills(mask) and options.predicted_hull() is not None)
+    if options.plane is not None:
+        return True
+    return not fills(box(mask), np.isfinite(depth) & (depth > 0)) and options.predicted_hull() is not None
 
 
 def _as_thing(exactly: Solution | None) -> Solution | None:
@@ -130,11 +133,6 @@ def _as_thing(exactly: Solution | None) -> Solution | None:
     if exactly is None or exactly.state.cost >= _NOISE_ALONE * exactly.rays.weight:
         return None
     return replace(exactly, spread_factor=tolerant.SPREAD)
-
-
-def fills(mask: np.ndarray) -> bool:
-    """Whether a mask (height, width) runs out of the image on opposite sides: a surface, and no thing."""
-    return bool((mask[0].any() and mask[-1].any()) or (mask[:, 0].any() and mask[:, -1].any()))
 
 
 def _exactly(

@@ -94,4 +94,4 @@ def score(obj: SeenObject, fit: Fit, options: RecoveryOptions) -> float:
     )
     if not np.isfinite(agreement):
         return 0.0
-    return min(max(agreement, 0.0), 1.0) * (0.5 if surface_fit.fills(obj.mask) else 1.0)
+    return min(max(agreement, 0.0), 1.0) * (0.5 if obj.fills else 1.0)

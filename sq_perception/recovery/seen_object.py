@@ -57,6 +57,8 @@ class SeenObject:
         What its score is measured on.
     prediction
         What the network says, where there is one.
+    fills
+        Whether it runs out of the image on opposite sides: a surface, and no thing.
     """
 
     label: int
@@ -70,6 +72,7 @@ class SeenObject:
     shown: CanonicalView | None = None
     view: CanonicalView | None = None
     prediction: Prediction | None = None
+    fills: bool = False
 
     @property
     def mask_crop(self) -> np.ndarray:
@@ -129,7 +132,8 @@ def objects(depth: np.ndarray, found: segments.Segmentation, camera: Camera) -> 
         camera_crop = camera.cropped(left, top, width, height)
         pixels = int(np.count_nonzero(mask[window]))
         masked = int(np.count_nonzero(found.labels[window] == label))
-        seen.append(SeenObject(label, pixels, masked, mask, depth[window], camera_crop, window))
+        fills = regions.fills((left, top, width, height), measured)
+        seen.append(SeenObject(label, pixels, masked, mask, depth[window], camera_crop, window, fills=fills))
     return seen
 
 

@@ -20,7 +20,7 @@ import cv2
 import numpy as np
 
 from sq_perception.geometry.quantiles import quantile
-from sq_perception.imaging import depth_steps
+from sq_perception.imaging import depth_steps, regions
 from sq_perception.imaging.camera import Camera
 from sq_perception.segmentation.options import SegmentationOptions, largest_edge
 from sq_perception.segmentation.support_plane import TOLERANCE, Plane, coarse, noise_growth
@@ -144,10 +144,11 @@ def alone(seen: Seen) -> ObjectTest:
 
     A surface that runs out of the image on opposite sides fills it.
     """
-    last_row, last_column = seen.camera.height - 1, seen.camera.width - 1
+    measured = seen.depth > 0
 
     def is_thing(rows: np.ndarray, columns: np.ndarray) -> bool:
-        if (rows.min() == 0 and rows.max() == last_row) or (columns.min() == 0 and columns.max() == last_column):
+        left, top = int(columns.min()), int(rows.min())
+        if regions.fills((left, top, int(columns.max()) - left + 1, int(rows.max()) - top + 1), measured):
             return False
         step = max(1, rows.size // _SAMPLES)
         r, c = rows[::step], columns[::step]

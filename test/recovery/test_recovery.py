@@ -385,6 +385,21 @@ def test_what_runs_out_of_the_image_on_opposite_sides_has_half_a_score(symmetry,
     assert (body.score > 0.5) == vouched
 
 
+@pytest.mark.parametrize("dark", [0, 16])
+def test_what_fills_all_readings_is_a_surface_though_a_band_around_them_has_none(symmetry, dark):
+    """A barrel of 60 cm before the camera, as in a rectified image: its ends were not there to agree with."""
+    turn = rotation.from_rotation_vector(np.array([np.pi / 2, 0.0, 0.0]))
+    barrel = Superquadric(np.array([0.3, 0.3, 1.0]), np.array([0.1, 1.0]), np.array([0.0, 0.0, 0.85]), turn)
+    camera = Camera(320, 240, 350.0, 350.0, 159.5, 119.5)
+    depth, _ = seen([barrel], camera)
+    depth = depth + np.random.default_rng(1).normal(0, 0.001, depth.shape).astype(np.float32)
+    depth = np.pad(depth, dark, constant_values=np.nan)
+    camera = camera.cropped(-dark, -dark, *depth.shape[::-1])
+    assert symmetry.recover(depth, camera).bodies == ()
+    (body,) = symmetry.recover(depth, camera, np.isfinite(depth).astype(np.int32)).bodies
+    assert body.score < 0.5
+
+
 def test_missing_and_foreign_weights(tmp_path):
     with pytest.raises(checkpoint.CheckpointError, match="no such model file"):
         Recoverer(tmp_path / "missing.safetensors")
