@@ -92,8 +92,9 @@ def corrected(
     """
     # The one layout that kernels are compiled for; labels are written to.
     image = SampledImage(np.ascontiguousarray(depth, dtype=np.float32), np.array(labels, order="C"), camera, sigma)
-    insides = _insides(image)
+    rims = _rims(image)
     parts, origin = _parted(image)
+    insides = _insides(image, rims, parts, origin)
     number_of = np.arange(len(origin), dtype=np.int32)
     if len(parts) > 1:
         names = np.array([part.label for part in parts])
@@ -113,22 +114,26 @@ def warm_up() -> None:
     corrected((radius < 1).astype(np.int32), depth, camera, 1e-3)
 
 
-def _insides(image: SampledImage) -> list[tuple[int, int]]:
-    """Labels of the insides of vessels that are a step behind their walls, and of the segments that these are of."""
-    extents = regions.extents(image.labels)
-    met, _, behind = regions.borders(image.labels, image.depth, len(extents) - 1, _NEAR, _HOLLOW_DEPTH)
+def _rims(image: SampledImage) -> np.ndarray:
+    """Labels (n, 2) of two segments, the first a step behind the second along a large share of both borders."""
+    met, _, behind = regions.borders(image.labels, image.depth, int(image.labels.max()), _NEAR, _HOLLOW_DEPTH)
     border = met.sum(axis=1)
-    found = []
-    for inside, wall in np.argwhere(behind > _RIM * np.maximum(border[:, None], border[None, :])).tolist():
-        part = image.sampled(inside, extents[inside], FEW)
-        if part is None or part.width > convex_pieces.WIDEST_HOLLOW:
-            continue
-        gap = crossings.gaps(part.pixels, part.points, image.depth, image.labels).mean()
-        # Between two things side by side there is a hollow, too.
-        is_hollow = gap > convex_pieces.HOLLOW * image.sigma * part.distance**2
-        if is_hollow and not convex_pieces.pieces(image, part, extents[inside]):
-            found.append((inside, wall))
-    return found
+    return np.argwhere(behind > _RIM * np.maximum(border[:, None], border[None, :]))
+
+
+def _insides(image: SampledImage, rims: np.ndarray, parts: list[Samples], origin: list[int]) -> list[tuple[int, int]]:
+    """Those of such pairs that are the inside of a vessel, which has no convex pieces, and what its wall is of."""
+    whole = [part for part in parts if part.label in rims[:, 0] and origin.count(part.label) == 1]
+    hollow = [part.label for part in whole if _is_hollow(image, part)]
+    return [(inside, wall) for inside, wall in rims.tolist() if inside in hollow]
+
+
+def _is_hollow(image: SampledImage, part: Samples) -> bool:
+    """Whether the surface lies behind its own lines; between two things side by side it does, too."""
+    if part.width > convex_pieces.WIDEST_HOLLOW:
+        return False
+    gap = crossings.gaps(part.pixels, part.points, image.depth, image.labels).mean()
+    return bool(gap > convex_pieces.HOLLOW * image.sigma * part.distance**2)
 
 
 def _parted(image: SampledImage) -> tuple[list[Samples], list[int]]:
