@@ -92,9 +92,8 @@ def _components(depth: np.ndarray, wanted: np.ndarray, camera: Camera) -> np.nda
         return labels
     # A side that is seen at a grazing angle has steps all over, but all one way.
     steep = _large(depth_steps.separated(depth, left, _GAP), least)
-    if steep.any():
-        jagged = _jagged_share(steep, depth, int(steep.max()), np.float32(depth_steps.STEP))
-        steep[(jagged > _JAGGED)[steep]] = 0
+    jagged = _jagged_share(steep, depth, int(steep.max()), np.float32(depth_steps.STEP))
+    steep[(jagged > _JAGGED)[steep]] = 0
     return np.where(steep > 0, steep + labels.max(), labels)
 
 

@@ -92,9 +92,7 @@ def _gathered(group: np.ndarray, crossed: np.ndarray, beside: np.ndarray) -> np.
     lies ``beside`` (n, n) and has the most free lines to, if these are as free as within a body."""
     joined = np.where(beside & (group[:, None] == group), 0.0, np.inf)
     clump = linked(joined, np.ones(len(group)), 1.0)
-    count = int(clump.max()) + 1
-    of_group = np.empty(count, int)
-    of_group[clump] = group
+    of_group = group[np.unique(clump, return_index=True)[1]]
     size = np.bincount(clump)
     largest = np.zeros(int(group.max()) + 1, int)
     np.maximum.at(largest, of_group, size)
@@ -166,16 +164,13 @@ def linked(distance: np.ndarray, size: np.ndarray, limit: float) -> np.ndarray:
                 least[k] = far[k, nearest[k]]
             elif far[i, k] < least[k]:
                 nearest[k], least[k] = i, far[i, k]
-    group, count = np.empty(n, np.int64), 0
+    group, number, count = np.empty(n, np.int64), np.full(n, -1), 0
     for k in range(n):
         root = k
         while parent[root] != root:
             root = parent[root]
-        parent[k] = root
-    number = np.full(n, -1)
-    for k in range(n):
-        if number[parent[k]] < 0:
-            number[parent[k]] = count
+        if number[root] < 0:
+            number[root] = count
             count += 1
-        group[k] = number[parent[k]]
+        group[k] = number[root]
     return group

@@ -31,7 +31,7 @@ from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.quantiles import densest, quantile
 from sq_perception.imaging import depth_steps, regions
 from sq_perception.imaging.camera import Camera
-from sq_perception.segmentation.support_plane import LEAST_GROWTH, TOLERANCE, Plane, coarse_stride, noise_growth
+from sq_perception.segmentation.support_plane import LEAST_GROWTH, TOLERANCE, Plane, coarse, coarse_stride, noise_growth
 
 _ROUNDS = 6
 """Of reweighting, at most: it ends when it is settled."""
@@ -101,13 +101,10 @@ def measured(plane: Plane, depth: np.ndarray, valid: np.ndarray, camera: Camera)
     camera
         A pinhole camera.
     """
-    k = coarse_stride(depth.shape)
-    rows, columns = np.nonzero(valid[::k, ::k])
-    x, y = (k * columns - camera.cx) / camera.fx, (k * rows - camera.cy) / camera.fy
-    z = depth[::k, ::k][rows, columns].astype(float)
-    growth = noise_growth(z)
-    a, b, c, d = plane.equation
-    height = (z * (a * x + b * y + c) + d) / growth
+    points = coarse(depth, valid, camera)[3]
+    z = points[:, 2]
+    x, y, growth = points[:, 0] / z, points[:, 1] / z, noise_growth(z)
+    height = plane.height(points) / growth
     flat = SupportSurface(plane, np.zeros(_TERMS), 0.0, plane.sigma)
     on = np.abs(height) < TOLERANCE
     if not on.any():
