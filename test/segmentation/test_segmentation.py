@@ -328,6 +328,22 @@ def test_the_tops_of_two_cartons_are_no_support(seed: int) -> None:
     assert min(ious(truth, segment(depth, VGA).labels)) > 0.8
 
 
+@pytest.mark.parametrize("noise", [0.0, 0.0015])
+def test_a_flat_upright_face_at_a_grazing_angle_is_a_wall(noise):
+    """A sheet along the view, as the side of a bin, and the same turned to the camera; a box as thin shows an end."""
+    table = Table()
+    found = {}
+    for name, x, size, turn in (
+        ("wall", 0.1, (0.0015, 0.15, 0.05), 0.0),
+        ("sheet", 0.1, (0.0015, 0.15, 0.05), np.pi / 2),
+        ("box", 0.1, (0.02, 0.15, 0.05), 0.0),
+    ):
+        depth, truth = table.see([table.body(x, 0.0, size, turn=turn)], noise)
+        found[name] = best_iou(truth == 1, segment(depth, VGA).labels)
+    assert found["wall"] == 0.0
+    assert min(found["sheet"], found["box"]) > 0.75
+
+
 @pytest.mark.parametrize("seed", [7, 9, 14])
 def test_the_diagonal_of_a_square_carton_is_no_edge(seed: int) -> None:
     """Half a metre wide, as much as an object may be; a square has no principal axes."""
