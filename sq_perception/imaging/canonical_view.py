@@ -39,6 +39,10 @@ MARGIN = 1.06
 
 HIDDEN = -0.5
 """Value of a pixel at which the object may go on unseen, in views that distinguish this from background."""
+FLUSH = -0.25
+"""Value of a pixel beside the object that is as near as its edge, in views that show steps."""
+COVERED = -1.5
+"""Value of a pixel of the object's mask at which nothing was measured, in views that show steps."""
 
 NEAREST = 0.5 * (1 + 1 / MARGIN)
 OUTLIERS_PER_END = 1 / 500
@@ -62,10 +66,10 @@ class CanonicalView:
     ----------
     image : float32 (n, n)
         z of the visible surface, 0 for background.
-    hidden : bool (n, n)
-        Background pixels at which the object may go on unseen: something nearer stands there, or nothing was measured
-        within the object's convex hull, or nothing was measured at all; see :func:`from_mask`.  All False where it was
-        not asked for it.
+    beside : float32 (n, n)
+        How much nearer what was measured beside the object is than its nearest surface there, in sides of the view,
+        -1 to 1: positive before it, 0 flush with it, -1 far behind it, on the plane, or not asked for.  Where nothing
+        was measured +inf within the mask, and NaN where the object may go on beyond it.
     rotation : (4,)
         Quaternion, optical frame to canonical frame.
     anchor : (3,)
@@ -75,15 +79,42 @@ class CanonicalView:
     """
 
     image: np.ndarray
-    hidden: np.ndarray
+    beside: np.ndarray
     rotation: np.ndarray
     anchor: np.ndarray
     extent: float
 
     @property
+    def hidden(self) -> np.ndarray:
+        """Background pixels (n, n) at which the object may go on unseen.
+
+        Something nearer stands there, or nothing was measured within the object's convex hull, or nothing was measured
+        at all; see :func:`from_mask`.  All False where it was not asked for it.
+        """
+        return ~(self.beside <= _NEARER)
+
+    @property
     def marked(self) -> np.ndarray:
         """The image with :data:`HIDDEN` at the hidden pixels, for networks that distinguish them from background."""
         return np.where(self.hidden, np.float32(HIDDEN), self.image)
+
+    @property
+    def with_steps(self) -> np.ndarray:
+        """The image with the steps s = :attr:`beside` in depth around the object, for networks that are shown them.
+
+            COVERED                    nothing was measured, within the mask
+            HIDDEN                     nothing was measured, beyond it
+            HIDDEN (1 + root(s))       something nearer
+            FLUSH (1 - root(-s))       flush to far behind: 0
+
+        A thing that ends at what touches it mostly ends there, what stands far before it says nothing of where; flush
+        readings beside it are its own where a mask is too small.  Roots, as steps that matter are of hundredths.
+        """
+        ahead, behind = np.sqrt(np.clip(self.beside, 0, 1)), np.sqrt(np.clip(-self.beside, 0, 1))
+        step = np.where(self.hidden, HIDDEN * (1 + ahead), FLUSH * (1 - behind)).astype(np.float32)
+        step[np.isnan(self.beside)] = HIDDEN
+        step[self.beside == np.inf] = COVERED
+        return np.where(self.image > 0, self.image, step)
 
     def to_canonical(self, body: Superquadric) -> Superquadric:
         """A NumPy body of the optical frame in the canonical frame."""
@@ -144,7 +175,10 @@ def from_mask(
     left, top, width, height = _box(depth, mask)
     if width == 0:
         raise ValueError("a canonical view needs at least one pixel with a depth under the mask")
-    find_hidden |= missing_is_hidden
+    unread = np.nan
+    if missing_is_hidden:
+        find_hidden, unread = True, float(np.mean(depth, where=mask & np.isfinite(depth)))
+        left, top, width, height = regions.box(np.ascontiguousarray(mask))
     whole = camera
     look, wider = np.eye(3), 1.0
     if camera.is_pinhole:
@@ -160,7 +194,7 @@ def from_mask(
     depth, mask = np.ascontiguousarray(depth[window], dtype=np.float32), np.ascontiguousarray(mask[window])
 
     matrix = _FLIP @ look
-    image, low, high, closest = _turned(depth, mask, camera.lens, matrix)
+    image, low, high, closest = _turned(depth, mask, unread, camera.lens, matrix)
     z = image[np.isfinite(image)]
     outliers = int(z.size * OUTLIERS_PER_END)
     ordered = np.partition(z, [outliers, z.size // 2, z.size - 1 - outliers])
@@ -171,14 +205,14 @@ def from_mask(
 
     # Each NaN replaced by the nearest number.
     filled = image.ravel()[regions.nearest(~np.isnan(image))] if camera.is_pinhole or find_hidden else image
-    covered = np.zeros(mask.shape, dtype=bool)
+    nearer = np.full(mask.shape, np.float32(-np.inf))
     if find_hidden:
         lost = np.ones_like(mask) if missing_is_hidden else _within_hull(mask & np.isfinite(depth))
         ground = np.array([0.0, 0.0, 0.0, np.inf]) if plane is None else np.asarray(plane, dtype=float)
-        covered = _covered(depth, mask, filled, lost, camera.lens, matrix, ground, _NEARER * float(extent))
+        nearer = _nearer(depth, mask, filled, lost, camera.lens, matrix, ground, _NEARER * float(extent))
     beyond = (-left, -top, whole.width - left, whole.height - top) if missing_is_hidden else (0, 0, 0, 0)
-    value, hidden = _resampled(image, filled, covered, beyond, camera.lens, matrix, anchor, extent, middle, pixels)
-    return CanonicalView(value, hidden, quaternions.from_matrix(matrix), matrix.T @ anchor, float(extent))
+    value, beside = _resampled(image, filled, nearer, beyond, camera.lens, matrix, anchor, extent, middle, pixels)
+    return CanonicalView(value, beside, quaternions.from_matrix(matrix), matrix.T @ anchor, float(extent))
 
 
 def full_frame(depth: np.ndarray, mask: np.ndarray, camera: Camera, pixels: int) -> CanonicalView:
@@ -207,7 +241,8 @@ def full_frame(depth: np.ndarray, mask: np.ndarray, camera: Camera, pixels: int)
     image = np.where(np.isfinite(image), np.clip(image, 1 / 255, 1.0), 0.0).astype(np.float32)
     # The cube is the optical frame turned by _FLIP and shifted by (0, 1, 1).
     anchor = _FLIP @ (np.array([0.5, 0.5, NEAREST]) - np.array([0.0, 1.0, 1.0]))
-    return CanonicalView(image, np.zeros(image.shape, bool), quaternions.from_matrix(_FLIP), anchor, 1.0)
+    beside = np.full_like(image, -1.0)
+    return CanonicalView(image, beside, quaternions.from_matrix(_FLIP), anchor, 1.0)
 
 
 def upright(normal: np.ndarray) -> np.ndarray:
@@ -249,29 +284,33 @@ def _within_hull(mask: np.ndarray) -> np.ndarray:
 def _turned(
     depth: np.ndarray,
     mask: np.ndarray,
+    unread: float,
     lens: Lens,
     matrix: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
     """Turned z (height, width) of the measured pixels of a mask, NaN elsewhere.
 
-    And the least and the largest turned (x, y), and the least depth.
+    And the least and the largest turned (x, y), and the least depth.  Other pixels of the mask are as deep as
+    ``unread``, and if that is not NaN their (x, y) are among those.
     """
     image = np.full(depth.shape, np.float32(np.nan))
     low, high, closest = np.full(2, np.inf), np.full(2, -np.inf), np.inf
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):
-            if mask[v, u] and np.isfinite(depth[v, u]):
-                x, y, z = point_at(u, v, np.float64(depth[v, u]), lens)
-                image[v, u] = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z
+            is_read = np.isfinite(depth[v, u])
+            if mask[v, u] and (is_read or np.isfinite(unread)):
+                x, y, z = point_at(u, v, np.float64(depth[v, u]) if is_read else unread, lens)
                 for k in range(2):
                     along = matrix[k, 0] * x + matrix[k, 1] * y + matrix[k, 2] * z
                     low[k], high[k] = min(low[k], along), max(high[k], along)
-                closest = min(closest, z)
+                if is_read:
+                    image[v, u] = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z
+                    closest = min(closest, z)
     return image, low, high, closest
 
 
 @kernel
-def _covered(
+def _nearer(
     depth: np.ndarray,
     mask: np.ndarray,
     filled: np.ndarray,
@@ -281,28 +320,30 @@ def _covered(
     plane: np.ndarray,
     tolerance: float,
 ) -> np.ndarray:
-    """Pixels (height, width) where the object may go on unseen; ``lost``: at these if nothing was measured there.
+    """How much nearer (height, width) what was measured beside the object is than it, ``filled``; metres.
 
-    What stands nearer than the object, ``filled``, hides it, unless it is the plane.
+    At those of the pixels ``lost`` where nothing was measured +inf within the mask, else NaN; -inf at others without a
+    reading, and at those of the object and of the plane.
     """
-    covered = np.zeros(depth.shape, np.bool_)
+    nearer = np.full(depth.shape, np.float32(-np.inf))
     for v in range(depth.shape[0]):
         for u in range(depth.shape[1]):
             if not np.isfinite(depth[v, u]):
-                covered[v, u] = lost[v, u]
+                if lost[v, u]:
+                    nearer[v, u] = np.inf if mask[v, u] else np.nan
             elif not mask[v, u]:
                 x, y, z = point_at(u, v, np.float64(depth[v, u]), lens)
-                nearer = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z > filled[v, u] + tolerance
                 height = plane[0] * x + plane[1] * y + plane[2] * z + plane[3]
-                covered[v, u] = nearer and abs(height) > tolerance
-    return covered
+                if abs(height) > tolerance:
+                    nearer[v, u] = matrix[2, 0] * x + matrix[2, 1] * y + matrix[2, 2] * z - filled[v, u]
+    return nearer
 
 
 @kernel
 def _resampled(
     image: np.ndarray,
     filled: np.ndarray,
-    covered: np.ndarray,
+    nearer: np.ndarray,
     whole: tuple[int, int, int, int],
     lens: Lens,
     matrix: np.ndarray,
@@ -311,18 +352,19 @@ def _resampled(
     z_guess: float,
     pixels: int,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Values and hidden pixels (pixels, pixels) of a view, by the nearest pixel of a crop of the image (height, width).
+    """Values (pixels, pixels) of a view, and how much nearer what is beside is, in its sides.
+
+    By the nearest pixel of a crop of the image (height, width).
 
     A view pixel fixes turned x and y but not z, and a pinhole pixel depends on all three.  Reading z at the projection
     of the last guess is a contraction wherever the surface is not almost parallel to the ray; three rounds suffice.
     Guesses that fall beside the object go on with the z of its nearest pixel, which ``filled`` (turned z) holds.
-    The object may go on where ``covered`` is, and beyond ``whole``: left, top, right and bottom of the image, unless it
-    is empty.
+    The object may go on beyond ``whole``: left, top, right and bottom of the image, unless it is empty.
     """
     fx, fy, cx, cy, pinhole = lens
     height, width = image.shape
     left, top, right, bottom = whole
-    value, hidden = np.zeros((pixels, pixels), np.float32), np.zeros((pixels, pixels), np.bool_)
+    value, beside = np.zeros((pixels, pixels), np.float32), np.full((pixels, pixels), np.float32(-1))
     z, us, vs = np.empty(pixels), np.empty(pixels), np.empty(pixels)
     for i in range(pixels):
         y = anchor[1] - ((i + 0.5) / pixels - 0.5) * extent
@@ -348,10 +390,11 @@ def _resampled(
                 if np.isfinite(seen):
                     value[i, j] = min(max((seen - anchor[2]) / extent + NEAREST, 1 / 255), 1.0)
                 else:
-                    hidden[i, j] = covered[int(v), int(u)]
+                    step = nearer[int(v), int(u)] / extent
+                    beside[i, j] = min(max(step, -1.0), 1.0) if step < np.inf else step
             if right > left and not (left <= u < right and top <= v < bottom):
-                hidden[i, j] = True
-    return value, hidden
+                beside[i, j] = np.nan
+    return value, beside
 
 
 def _rotation_to_z(direction: np.ndarray) -> np.ndarray:

@@ -24,7 +24,7 @@ above the support; all zeros where none is known.
 
 The sides of the views in metres are an input too, as a logarithm: a thing of 0.2 m is seldom a jar.  0 is unknown.
 
-Input   views (b, p, p) with HIDDEN wherever nothing was measured, planes (b, 4), extents (b,)
+Input   views (b, p, p) as :attr:`CanonicalView.with_steps` has them, planes (b, 4), extents (b,)
 Output  :class:`HullPrediction`
 """
 

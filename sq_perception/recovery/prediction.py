@@ -49,7 +49,7 @@ def of_hulls(
     views: Sequence[CanonicalView], planes: Sequence[np.ndarray | None], network: ThingPredictor
 ) -> list[Prediction]:
     """Predictions of hulls from views and the support planes (4,) under them, optical frame."""
-    shown = np.stack([view.marked for view in views])
+    shown = np.stack([view.with_steps for view in views])
     known = zip(views, planes, strict=True)
     below = np.stack([np.zeros(4) if plane is None else view.plane_to_canonical(plane) for view, plane in known])
     extents = np.array([view.extent for view in views])

@@ -45,7 +45,7 @@ class SeenObject:
     label
         Its value in the label image.
     pixels, masked
-        Number of the measured pixels of its label, and of all of its label around them.
+        Number of the measured pixels of its label, and of all of its label.
     mask : bool (height, width)
         What measured it: those pixels without strays, or with what goes on from them (:func:`completed`);
         ``mask_crop``, ``depth_crop`` and ``camera_crop`` are its ``window`` of mask, depth and camera.
@@ -124,14 +124,15 @@ def objects(depth: np.ndarray, found: segments.Segmentation, camera: Camera) -> 
     out."""
     measured, seen = np.isfinite(depth), []
     for label in found.ids:
-        mask = (found.labels == label) & measured
+        named = found.labels == label
+        mask = named & measured
         left, top, width, height = regions.box(mask)
         if width == 0:
             continue
         window = slice(top, top + height), slice(left, left + width)
         camera_crop = camera.cropped(left, top, width, height)
         pixels = int(np.count_nonzero(mask[window]))
-        masked = int(np.count_nonzero(found.labels[window] == label))
+        masked = int(np.count_nonzero(named))
         fills = regions.fills((left, top, width, height), measured)
         seen.append(SeenObject(label, pixels, masked, mask, depth[window], camera_crop, window, fills=fills))
     return seen
@@ -170,11 +171,21 @@ def completed(obj: SeenObject, depth: np.ndarray, camera: Camera, labels: np.nda
 
 
 def viewed(
-    obj: SeenObject, depth: np.ndarray, camera: Camera, config: RegressorConfig | ThingConfig | None
+    obj: SeenObject,
+    depth: np.ndarray,
+    camera: Camera,
+    labels: np.ndarray,
+    config: RegressorConfig | ThingConfig | None,
 ) -> SeenObject:
-    """The object with what a network of this configuration is shown, and what its score takes."""
+    """The object with what a network of this configuration is shown, and what its score takes.
+
+    A mask of ``labels`` (height, width) that covers pixels without a reading tells that the object is there.
+    """
     inner = core(obj, depth, camera)
-    shown = None if config is None else config.view_of(depth, inner, camera, obj.plane)
+    shown = None
+    if config is not None:
+        whole = inner | ((labels == obj.label) & ~np.isfinite(depth)) if obj.masked > obj.pixels else inner
+        shown = config.view_of(depth, whole, camera, obj.plane)
     if shown is not None and not (isinstance(config, RegressorConfig) and config.framing == "full"):
         return replace(obj, shown=shown, view=shown)
     view = canonical_view.from_mask(obj.depth_crop, inner[obj.window], obj.camera_crop, _VIEW_PIXELS)

@@ -2,8 +2,8 @@
 
 One of :mod:`sensor_noise` with random parameters: noise of a window, steps, the shadow of the baseline on either side,
 fattened or mixed or wandering edges, lost grazing sides.  Besides, in some images: waves, a side that is lost as one
-eye hardly sees it, lost edges, contours, dark blobs and bands, smoothing.  In half of them what is missing beside the
-thing is filled with what is there.
+eye hardly sees it, lost edges, contours, dark blobs and bands, things that are lost but for patches, smoothing.  In
+half of them what is missing beside the thing is filled with what is there.
 
 Depth in metres.
 """
@@ -17,6 +17,10 @@ import numpy as np
 
 from sq_perception.imaging.camera import Camera
 from sq_perception.simulation.sensor_noise import Ideal, SensorNoise, Stereo, StructuredLight, TimeOfFlight
+
+_SHINING = 0.08
+"""Share of the images whose things are lost but for patches.  Of household things that are half visible, 4 % are
+measured at less than half of their pixels."""
 
 
 def draw_sensor(camera: Camera, rng: np.random.Generator) -> SensorNoise:
@@ -41,7 +45,7 @@ def draw_sensor(camera: Camera, rng: np.random.Generator) -> SensorNoise:
     }
     if choice < 0.65:
         return StructuredLight(**shared)
-    return Stereo(**shared, subpixel=rng.uniform(0.02, 0.15), fattening=int(rng.integers(0, 3)))
+    return Stereo(**shared, subpixel=rng.uniform(0.02, 0.15), fattening=int(rng.integers(0, 4)))
 
 
 def measured_by_any(depth: np.ndarray, seen: np.ndarray, camera: Camera, rng: np.random.Generator) -> np.ndarray:
@@ -58,6 +62,8 @@ def measured_by_any(depth: np.ndarray, seen: np.ndarray, camera: Camera, rng: np
         measured[seen & _contours(depth, seen, rng)] = np.nan
     if rng.random() < 0.15:
         measured[seen & _blob(seen, rng)] = np.nan
+    if rng.random() < _SHINING:
+        measured[seen & _between_patches(seen, rng)] = np.nan
     if rng.random() < 0.3:
         measured = _smoothed(measured, int(rng.choice((3, 5))), seen if rng.random() < 0.5 else None)
     if rng.random() < 0.5:
@@ -112,6 +118,13 @@ def _blob(seen: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     wide = side * rng.uniform(0.03, 0.2)
     long = np.inf if rng.random() < 0.3 else side * rng.uniform(0.05, 0.3)
     return np.square(x / long) + np.square(y / wide) < 1
+
+
+def _between_patches(seen: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Most of a thing that shines, is dark or lets light through."""
+    coarse = rng.standard_normal((int(rng.integers(3, 12)), int(rng.integers(3, 12))), dtype=np.float32)
+    field = cv2.resize(coarse, (seen.shape[1], seen.shape[0]), interpolation=cv2.INTER_CUBIC)
+    return field > np.quantile(field[seen], 1 - rng.uniform(0.3, 0.95))
 
 
 def _smoothed(measured: np.ndarray, width: int, within: np.ndarray | None) -> np.ndarray:

@@ -7,7 +7,8 @@ follows.
     setting     pose, camera and what is around the thing: :mod:`sq_perception.simulation.thing_setting`
     before it   in some images something nearer, which comes in from one side
     sensor      with what it loses: :mod:`sq_perception.simulation.thing_sensing`
-    mask        too small or too large by up to two pixels, with or without what measured the table
+    mask        too small or too large by up to two pixels, with or without what measured the table, and what nothing
+                measured; of some a part is lost
     image       a border that cuts the thing
 
 Metres; optical frame of the camera unless noted.
@@ -40,12 +41,21 @@ PLANE_GIVEN, TOP_GIVEN = 0.8, 2 / 3
 """Shares of the views with a plane, and of those of a thing on top of something in which it is that top, as often as
 :mod:`sq_perception.recovery.supports` finds it.  Else the thing hovers above its plane, and a network that often sees
 that expects it of things whose lower end is hidden."""
-BEFORE, MOST_BEFORE = 0.2, 0.6
+BEFORE, MOST_BEFORE = 0.25, 0.6
 """Share of the views with something nearer before the thing, and the most of the thing that it hides.  Chosen: of the
 things of household scenes a quarter are hidden by a tenth and more."""
+UNREAD = 0.5
+"""Share of the views whose mask covers pixels without a reading: masks from colour do, those from depth do not."""
+LOST, MOST_LOST = 0.08, 0.3
+"""Share of the views whose mask has lost what lies beyond a straight line, and the most of the thing that it loses.
+Of things of household scenes that are 50 to 90 % visible, one in five loses a tenth and more to a segmentation."""
 PLANE_TILT, PLANE_SHIFT = float(np.deg2rad(0.7)), 0.002
 """Standard deviations of the given plane: of its tilt in both directions, and of its distance from the thing."""
 
+_MASK_ERRORS = (-2, -1, 0, 0, 0, 0, 0, 1, 1, 2)
+"""Pixels by which masks are too large, each as often.  Few are too small, as those that are all around are completed
+before a view is made (:func:`sq_perception.recovery.seen_object.completed`), and what a stereo camera widens an edge by
+looks like them."""
 _PIXELS = 64
 """Side of the views: what the network of things takes."""
 _LEAST_SEEN = 40
@@ -62,7 +72,7 @@ class ThingViews:
     Attributes
     ----------
     images : float32 (n, p, p)
-        As :attr:`CanonicalView.marked`: z in (0, 1], 0 background, HIDDEN where the thing may go on unseen.
+        As :attr:`CanonicalView.with_steps`: z in (0, 1] on the thing.
     planes : float32 (n, 4)
         The plane n.p + d = 0 of the table in the view's frame and unit, n up; zeros where none is given.
     extents : float32 (n,)
@@ -87,7 +97,7 @@ def draw_thing_views(count: int, rng: np.random.Generator, own: Sequence[Thing] 
     support, numbers = np.empty((count, len(DIRECTIONS)), np.float32), np.empty(count, dtype=np.int64)
     for k in range(count):
         thing, view, plane, reach = _draw_one(rng, own)
-        images[k], planes[k], extents[k], support[k] = view.marked, plane, view.extent, reach
+        images[k], planes[k], extents[k], support[k] = view.with_steps, plane, view.extent, reach
         numbers[k] = KINDS.index(thing.kind)
     return ThingViews(images, planes, extents, support, numbers)
 
@@ -115,6 +125,10 @@ def _draw_one(rng: np.random.Generator, own: Sequence[Thing]) -> tuple[Thing, Ca
         if np.count_nonzero(seen & np.isfinite(measured)) < _LEAST_SEEN:
             continue
         mask = _masked(measured, seen, setting.camera, setting.table if plane is None else plane, rng)
+        if rng.random() < LOST:
+            mask = _partly(mask, rng)
+        if rng.random() >= UNREAD:
+            mask = mask & np.isfinite(measured)
         measured, mask, camera = _cut(measured, mask, setting.camera, rng)
         if np.count_nonzero(mask & np.isfinite(measured)) < _LEAST_SEEN:
             continue
@@ -157,7 +171,7 @@ def _masked(
     measured: np.ndarray, seen: np.ndarray, camera: Camera, table: np.ndarray | None, rng: np.random.Generator
 ) -> np.ndarray:
     """The mask that a segmentation or a person draws, less what measured the table, as the views of images have it."""
-    error = int(rng.choice((-2, -1, -1, -1, 0, 0, 0, 1, 1, 2)))
+    error = int(rng.choice(_MASK_ERRORS))
     mask: np.ndarray = seen.astype(np.uint8)
     if error:
         brush = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * abs(error) + 1, 2 * abs(error) + 1))
@@ -174,6 +188,18 @@ def _masked(
         inner = above if 2 * np.count_nonzero(above) > rows.size else inner
     footprint = float(np.median(measured[seen][np.isfinite(measured[seen])], axis=0)) / camera.fx
     return coherent(measured, inner, shown_step(footprint))
+
+
+def _partly(mask: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """The mask without what lies beyond a straight line."""
+    v, u = np.nonzero(mask)
+    if not v.size:
+        return mask
+    way, rest = rng.uniform(-np.pi, np.pi), mask.copy()
+    reach = np.cos(way) * u + np.sin(way) * v
+    lost = reach > np.quantile(reach, 1 - rng.uniform(0, MOST_LOST))
+    rest[v[lost], u[lost]] = False
+    return rest
 
 
 def _cut(

@@ -17,7 +17,7 @@ from sq_perception.geometry import Superquadric, rotation
 from sq_perception.imaging import canonical_view, raycast, soft_agreement, soft_render, unit_cube
 from sq_perception.imaging.camera import Camera
 from sq_perception.simulation import view_rendering
-from sq_perception.simulation.scenes import thesis_bodies
+from sq_perception.simulation.scenes import TABLE_CAMERA, plane_depth, table_scene, thesis_bodies
 
 VGA = Camera(640, 480, 520.0, 530.0, 322.5, 238.0)
 
@@ -299,6 +299,42 @@ class TestCanonicalView:
         view = canonical_view.from_mask(depth, index >= 0, VGA, plane=np.array([*normal, 1.2]))
         plain = canonical_view.from_mask(depth, index >= 0, VGA)
         np.testing.assert_array_equal(view.image, plain.image)
+
+    def test_what_is_beside_the_object_is_shown_by_how_much_nearer_it_is(self) -> None:
+        """A card of 40 pixels square, so that one is 1 / (40 MARGIN) of the view; what is beside it in six strips."""
+        camera = Camera(120, 120, 100.0, 100.0, 59.5, 59.5)
+        depth, mask = np.full((120, 120), 5.0), np.zeros((120, 120), bool)
+        mask[40:80, 40:80] = True
+        depth[mask] = 1.0
+        extent = canonical_view.from_mask(depth, mask, camera, missing_is_hidden=True).extent
+        depth[40:50, 80:], depth[50:60, 80:] = 1.0, 1 - 0.25 * extent
+        depth[60:70, 80:], depth[70:80, 80:] = 1 + 0.25 * extent, np.nan
+        depth[40:50, 40:50] = np.nan  # within the mask
+        view = canonical_view.from_mask(depth, mask, camera, missing_is_hidden=True)
+        rows, beyond = np.array([5, 15, 25, 35]), 40
+        i = np.rint((0.5 + (rows - 19.5) / (40 * canonical_view.MARGIN)) * 64 - 0.5).astype(int)
+        j = int((0.5 + (beyond - 19.5) / (40 * canonical_view.MARGIN)) * 64)
+        flush, hidden, covered = canonical_view.FLUSH, canonical_view.HIDDEN, canonical_view.COVERED
+        np.testing.assert_allclose(view.beside[i, j], [0, 0.25, -0.25, np.nan], atol=0.01)
+        np.testing.assert_allclose(view.with_steps[i, j], [flush, 1.5 * hidden, 0.5 * flush, hidden], atol=0.02)
+        np.testing.assert_array_equal(view.hidden[i, j], [False, True, False, True])
+        assert view.with_steps[i[0], i[0]] == covered
+        assert view.with_steps[i[2], 1] == 0  # far behind
+        np.testing.assert_array_equal(view.with_steps[view.image > 0], view.image[view.image > 0])
+        np.testing.assert_array_equal(view.with_steps < flush - 1e-3, view.hidden)
+
+    def test_the_table_is_no_step(self) -> None:
+        """It goes on beside all that stands on it, at any depth: its height is shown besides."""
+        scene = table_scene(np.random.default_rng(3), 1)
+        depth, index = raycast.render(scene.bodies, TABLE_CAMERA)
+        image = np.minimum(depth, plane_depth(scene.plane, TABLE_CAMERA))
+        image[~np.isfinite(image)] = np.nan
+        view = canonical_view.from_mask(image, index == 0, TABLE_CAMERA, plane=scene.plane, missing_is_hidden=True)
+        around = (view.image == 0) & ~view.hidden
+        assert around.mean() > 0.2
+        assert (view.with_steps[around] == 0).mean() > 0.98
+        unknown = canonical_view.from_mask(image, index == 0, TABLE_CAMERA, missing_is_hidden=True)
+        assert (unknown.with_steps[around] == 0).mean() < 0.9
 
     def test_empty_mask_is_misuse(self) -> None:
         with pytest.raises(ValueError, match="at least one pixel"):

@@ -24,7 +24,7 @@ from sq_perception.learning.regressor import Regressor, RegressorConfig
 from sq_perception.recovery import own_segments, seen_object
 from sq_perception.recovery.recoverer import FrameRecovery, Recoverer, RecoveryOptions, render_recovery
 from sq_perception.segmentation.segments import Segmentation
-from sq_perception.simulation.scenes import table_scene
+from sq_perception.simulation.scenes import TABLE_CAMERA, plane_depth, table_scene
 
 CAMERA = Camera(320, 240, 270.0, 270.0, 159.5, 119.5)
 STAGES = {"segmentation", "network", "fit", "score", "total"}
@@ -342,6 +342,28 @@ def test_what_goes_on_all_around_a_mask_that_is_too_small_is_the_object(symmetry
     whole = seen_object.completed(replace(obj, plane=scene.plane), depth, CAMERA, small)
     assert not (whole.mask & (labels == 0)).any()
     assert (whole.mask & ~obj.mask).any() == (pixels > 0)
+
+
+@pytest.mark.parametrize("share", [0.6, 0.75])
+def test_a_mask_tells_of_a_thing_where_nothing_was_measured(share):
+    """A can whose upper part shines: masks from colour show it, those from depth do not."""
+    down = np.deg2rad(35)
+    table = np.array([[1, 0, 0], [0, -np.sin(down), -np.cos(down)], [0, np.cos(down), -np.sin(down)]])
+    can = Superquadric([0.04, 0.04, 0.11], [0.1, 1.0], [0.0, 0.0, 0.8], rotation.from_matrix(table))
+    normal = table[:, 2]
+    plane = np.append(normal, -normal @ (can.translation - 0.11 * normal))
+    depth, index = raycast.render(can, TABLE_CAMERA)
+    depth = np.fmin(depth, plane_depth(plane, TABLE_CAMERA))
+    depth = np.where(np.isfinite(depth), depth, np.nan) + np.random.default_rng(0).normal(0, 0.001, depth.shape)
+    mask = index == 0
+    rows = np.flatnonzero(mask.any(axis=1))
+    depth[: rows[0] + int(share * len(rows))][mask[: rows[0] + int(share * len(rows))]] = np.nan
+    of_colour, of_depth = (
+        Recoverer(threads=1).recover(depth, TABLE_CAMERA, labels.astype(np.int32)).bodies[0].superquadric
+        for labels in (mask, mask & np.isfinite(depth))
+    )
+    assert of_colour.size.max() == pytest.approx(0.11, rel=0.15)
+    assert of_depth.size.max() < 0.08
 
 
 def test_methods_do_what_they_say(weights):

@@ -11,7 +11,7 @@ from sq_perception.geometry.support_directions import DIRECTIONS, mirrored
 from sq_perception.geometry.union import support_of_union
 from sq_perception.imaging import canonical_view
 from sq_perception.imaging.camera import Camera
-from sq_perception.imaging.canonical_view import HIDDEN, NEAREST
+from sq_perception.imaging.canonical_view import COVERED, FLUSH, HIDDEN, NEAREST
 from sq_perception.imaging.raycast import render
 from sq_perception.simulation.household import KINDS, draw_thing
 from sq_perception.simulation.rendering import render_things
@@ -52,8 +52,9 @@ def test_views_look_as_promised() -> None:
     assert views.planes.shape == (30, 4)
     assert views.support.shape == (30, len(DIRECTIONS))
     assert views.planes.dtype == views.support.dtype == np.float32
-    hidden = views.images == HIDDEN
-    assert ((views.images >= 0) | hidden).all()
+    hidden = (views.images <= HIDDEN) & (views.images > COVERED)
+    assert ((views.images >= FLUSH) | (hidden & (views.images >= 2 * HIDDEN)) | (views.images == COVERED)).all()
+    assert 0.3 < (views.images == COVERED).any(axis=(1, 2)).mean() < 0.7  # half of the masks cover what is not measured
     assert (views.images <= 1).all()
     assert (views.images > 0).any(axis=(1, 2)).all()
     assert hidden.any(axis=(1, 2)).mean() > 0.5
@@ -222,6 +223,7 @@ def test_pixels_without_a_reading_are_hidden_where_asked_for(columns: int) -> No
     mask = index >= 0
     left = int(np.nonzero(mask)[1].min())
     depth[:, : left + columns] = np.nan
+    mask &= np.isfinite(depth)
     plain = canonical_view.from_mask(depth, mask, camera, find_hidden=True)
     marked = canonical_view.from_mask(depth, mask, camera, missing_is_hidden=True)
     np.testing.assert_array_equal(plain.image, marked.image)
@@ -237,6 +239,26 @@ def test_pixels_without_a_reading_are_hidden_where_asked_for(columns: int) -> No
     assert not canonical_view.from_mask(
         depth[window], mask[window], camera.cropped(left + 3, 0, 57 - left, 60)
     ).hidden.any()
+
+
+@pytest.mark.parametrize("share", [0.3, 0.7])
+def test_a_view_frames_the_whole_mask_though_not_all_of_it_was_measured(share: float) -> None:
+    """A card, so that all of it is as deep as what was measured."""
+    camera = Camera(80, 80, 100.0, 100.0, 39.5, 39.5)
+    depth, mask = np.full((80, 80), 2.0), np.zeros((80, 80), bool)
+    mask[25:55, 20:60] = True
+    depth[mask] = 1.0
+    whole = canonical_view.from_mask(depth, mask, camera, missing_is_hidden=True)
+    depth[:, 20 : 20 + round(40 * share)] = np.nan
+    view = canonical_view.from_mask(depth, mask, camera, missing_is_hidden=True)
+    assert view.extent == pytest.approx(whole.extent, rel=1e-3)
+    np.testing.assert_allclose(view.anchor, whole.anchor, atol=1e-3)
+    covered = view.with_steps == COVERED
+    np.testing.assert_array_equal(covered | (view.image > 0), whole.image > 0)
+    assert np.count_nonzero(covered) / np.count_nonzero(whole.image) == pytest.approx(share, abs=0.03)
+    of_depth = canonical_view.from_mask(depth, mask & np.isfinite(depth), camera, missing_is_hidden=True)
+    assert of_depth.extent == pytest.approx(whole.extent * max(1 - share, 30 / 40), rel=0.02)
+    assert not (of_depth.with_steps == COVERED).any()
 
 
 def test_a_shadow_lies_on_one_side() -> None:
