@@ -100,14 +100,12 @@ def _drawing(name: str, what: str, example: str, shards: int) -> argparse.Argume
 
 def _draw(name: str, given: argparse.Namespace, drawing: Callable[[], Callable[[Any], Any]]) -> int:
     """Write the shards with what ``drawing`` gives, which may have to read something first."""
-    import numba
-
+    from sq_perception.geometry.threads import one_kernel_thread
     from sq_perception.learning.shard_training import write_views
 
-    # Images are small, and a process a core draws them: threads that wait for each other there take ten times as long.
-    numba.set_num_threads(1)
     try:
-        write_views(given.folder, range(given.first, given.first + given.shards), drawing(), given.seed)
+        with one_kernel_thread():  # a process a core draws
+            write_views(given.folder, range(given.first, given.first + given.shards), drawing(), given.seed)
     except ValueError as error:
         return failed(f"{name}: {error}")
     return SUCCESS

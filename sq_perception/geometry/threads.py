@@ -1,4 +1,4 @@
-"""What threads of this process may do: BLAS and torch on one thread, Python's own in short turns.
+"""What threads of this process may do: BLAS, torch and kernels on one thread, Python's own in short turns.
 
 The matrices here are small.  Threads of a BLAS spin after products as small as these, on the cores that fits of other
 objects, or other programs, want.  Settings are the process'; they are taken back when the last block that wants them
@@ -57,6 +57,22 @@ def one_torch_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
+
+
+@contextmanager
+def one_kernel_thread() -> Iterator[None]:
+    """Within the block kernels that are parallel compute on the thread that calls them.
+
+    For many small images beside other work: threads that wait for each other on busy cores take ten times as long.
+    """
+    import numba
+
+    before = numba.get_num_threads()
+    numba.set_num_threads(1)
+    try:
+        yield
+    finally:
+        numba.set_num_threads(before)
 
 
 @contextmanager

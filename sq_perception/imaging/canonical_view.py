@@ -172,13 +172,10 @@ def from_mask(
     """
     camera.check_image(depth)
     camera.check_image(mask)
-    left, top, width, height = _box(depth, mask)
+    left, top, width, height = _box(depth, mask, missing_is_hidden)
     if width == 0:
         raise ValueError("a canonical view needs at least one pixel with a depth under the mask")
-    unread = np.nan
-    if missing_is_hidden:
-        find_hidden, unread = True, float(np.mean(depth, where=mask & np.isfinite(depth)))
-        left, top, width, height = regions.box(np.ascontiguousarray(mask))
+    find_hidden |= missing_is_hidden
     whole = camera
     look, wider = np.eye(3), 1.0
     if camera.is_pinhole:
@@ -194,6 +191,7 @@ def from_mask(
     depth, mask = np.ascontiguousarray(depth[window], dtype=np.float32), np.ascontiguousarray(mask[window])
 
     matrix = _FLIP @ look
+    unread = float(np.mean(depth, where=mask & np.isfinite(depth))) if missing_is_hidden else np.nan
     image, low, high, closest = _turned(depth, mask, unread, camera.lens, matrix)
     z = image[np.isfinite(image)]
     outliers = int(z.size * OUTLIERS_PER_END)
@@ -266,12 +264,17 @@ def _with_surroundings(
     return left, top, min(camera.width, right + beside) - left, min(camera.height, bottom + above) - top
 
 
-def _box(depth: np.ndarray, mask: np.ndarray) -> tuple[int, int, int, int]:
-    """Left, top, width and height of the pixels of a mask that have a depth; widths of 0 where there are none."""
+def _box(depth: np.ndarray, mask: np.ndarray, whole: bool) -> tuple[int, int, int, int]:
+    """Left, top, width and height of the pixels of a mask that have a depth, or of the ``whole`` mask.
+
+    Widths of 0 where none has a depth.
+    """
     left, top, width, height = regions.box(np.ascontiguousarray(mask))
     window = np.s_[top : top + height, left : left + width]
-    inner_left, inner_top, width, height = regions.box(mask[window] & np.isfinite(depth[window]))
-    return left + inner_left, top + inner_top, width, height
+    inner_left, inner_top, inner_width, inner_height = regions.box(mask[window] & np.isfinite(depth[window]))
+    if whole and inner_width > 0:
+        return left, top, width, height
+    return left + inner_left, top + inner_top, inner_width, inner_height
 
 
 def _within_hull(mask: np.ndarray) -> np.ndarray:

@@ -232,7 +232,7 @@ class Recoverer:
                 obj = replace(obj, plane=plane)
                 if labels is not None:
                     obj = seen_object.completed(obj, depth, camera, found.labels)
-                return seen_object.viewed(obj, depth, camera, found.labels, config)
+                return seen_object.viewed(obj, depth, camera, config)
 
             fresh = self._mapped(prepared, [obj for obj in cleaned if obj.label not in same])
             if network is not None:

@@ -46,6 +46,8 @@ class SeenObject:
         Its value in the label image.
     pixels, masked
         Number of the measured pixels of its label, and of all of its label.
+    unread : (n,)
+        Those that were not measured, as indices into the image: a mask from colour tells that the object is there.
     mask : bool (height, width)
         What measured it: those pixels without strays, or with what goes on from them (:func:`completed`);
         ``mask_crop``, ``depth_crop`` and ``camera_crop`` are its ``window`` of mask, depth and camera.
@@ -64,6 +66,7 @@ class SeenObject:
     label: int
     pixels: int
     masked: int
+    unread: np.ndarray
     mask: np.ndarray
     depth_crop: np.ndarray
     camera_crop: Camera
@@ -132,9 +135,9 @@ def objects(depth: np.ndarray, found: segments.Segmentation, camera: Camera) -> 
         window = slice(top, top + height), slice(left, left + width)
         camera_crop = camera.cropped(left, top, width, height)
         pixels = int(np.count_nonzero(mask[window]))
-        masked = int(np.count_nonzero(named))
-        fills = regions.fills((left, top, width, height), measured)
-        seen.append(SeenObject(label, pixels, masked, mask, depth[window], camera_crop, window, fills=fills))
+        unread = np.flatnonzero(named ^ mask)
+        masked, fills = pixels + len(unread), regions.fills((left, top, width, height), measured)
+        seen.append(SeenObject(label, pixels, masked, unread, mask, depth[window], camera_crop, window, fills=fills))
     return seen
 
 
@@ -171,20 +174,14 @@ def completed(obj: SeenObject, depth: np.ndarray, camera: Camera, labels: np.nda
 
 
 def viewed(
-    obj: SeenObject,
-    depth: np.ndarray,
-    camera: Camera,
-    labels: np.ndarray,
-    config: RegressorConfig | ThingConfig | None,
+    obj: SeenObject, depth: np.ndarray, camera: Camera, config: RegressorConfig | ThingConfig | None
 ) -> SeenObject:
-    """The object with what a network of this configuration is shown, and what its score takes.
-
-    A mask of ``labels`` (height, width) that covers pixels without a reading tells that the object is there.
-    """
+    """The object with what a network of this configuration is shown, and what its score takes."""
     inner = core(obj, depth, camera)
     shown = None
     if config is not None:
-        whole = inner | ((labels == obj.label) & ~np.isfinite(depth)) if obj.masked > obj.pixels else inner
+        whole = inner.copy()
+        whole.flat[obj.unread] = True
         shown = config.view_of(depth, whole, camera, obj.plane)
     if shown is not None and not (isinstance(config, RegressorConfig) and config.framing == "full"):
         return replace(obj, shown=shown, view=shown)

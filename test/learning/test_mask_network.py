@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import numba
 import numpy as np
 import pytest
 import torch
@@ -194,6 +195,16 @@ def test_the_command_draws_what_the_training_reads(tmp_path: Path) -> None:
     again = draw_segment_views(2, np.random.default_rng([0, 0]))
     np.testing.assert_array_equal(drawn.images, again.images)
     np.testing.assert_array_equal(drawn.truth, again.truth)
+
+
+@pytest.mark.parametrize("command", ["segment-views", "thing-views"])
+def test_commands_draw_on_one_thread_as_a_process_a_core_may(command, monkeypatch, tmp_path) -> None:
+    found: list[int] = []
+    monkeypatch.setattr(shard_training, "write_views", lambda *_: found.append(numba.get_num_threads()))
+    before = numba.get_num_threads()
+    assert main.main([command, str(tmp_path)]) == 0
+    assert found == [1]
+    assert numba.get_num_threads() == before
 
 
 def test_weights_of_another_kind_are_refused() -> None:
