@@ -10,7 +10,7 @@ from __future__ import annotations
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from functools import cache
 from typing import Any
 
@@ -46,33 +46,31 @@ def one_blas_thread() -> Iterator[None]:
                 setting.restore_original_limits()
 
 
-@contextmanager
-def one_torch_thread() -> Iterator[None]:
+def one_torch_thread() -> AbstractContextManager[None]:
     """Within the block torch computes on the thread that calls it: on busy cores the slowest of many sets the time."""
     import torch
 
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    try:
-        yield
-    finally:
-        torch.set_num_threads(before)
+    return _one_thread(torch)
 
 
-@contextmanager
-def one_kernel_thread() -> Iterator[None]:
+def one_kernel_thread() -> AbstractContextManager[None]:
     """Within the block kernels that are parallel compute on the thread that calls them.
 
     For many small images beside other work: threads that wait for each other on busy cores take ten times as long.
     """
     import numba
 
-    before = numba.get_num_threads()
-    numba.set_num_threads(1)
+    return _one_thread(numba)
+
+
+@contextmanager
+def _one_thread(library: Any) -> Iterator[None]:
+    before = library.get_num_threads()
+    library.set_num_threads(1)
     try:
         yield
     finally:
-        numba.set_num_threads(before)
+        library.set_num_threads(before)
 
 
 @contextmanager

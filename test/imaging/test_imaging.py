@@ -301,7 +301,7 @@ class TestCanonicalView:
         np.testing.assert_array_equal(view.image, plain.image)
 
     def test_what_is_beside_the_object_is_shown_by_how_much_nearer_it_is(self) -> None:
-        """A card of 40 pixels square, so that one is 1 / (40 MARGIN) of the view; what is beside it in six strips."""
+        """A card of 40 pixels square, so that one is 1 / (40 MARGIN) of the view; what is beside it in four strips."""
         camera = Camera(120, 120, 100.0, 100.0, 59.5, 59.5)
         depth, mask = np.full((120, 120), 5.0), np.zeros((120, 120), bool)
         mask[40:80, 40:80] = True
