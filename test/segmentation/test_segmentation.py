@@ -261,6 +261,20 @@ def test_a_plane_amid_a_heap_is_no_support(rng, thickness, is_support):
     assert (found is plane) == is_support
 
 
+@pytest.mark.parametrize(("rows", "is_support"), [(slice(0, 240, 3), False), (slice(0, 240), True)])
+def test_a_plane_beside_the_camera_is_a_support_only_if_it_is_much_of_the_image(rng, rows, is_support):
+    """The side of a shelf before a level camera, or a table before one turned by a right angle; a heap beside it."""
+    heap = np.kron(rng.uniform(0.45, 0.7, (24, 32)), np.ones((10, 10)))
+    side = np.full((240, 320), np.inf)
+    side[rows, :155] = 0.15 * CAMERA.fx / (CAMERA.cx - np.arange(155))
+    depth = np.where(np.isinf(side) & (np.arange(320) < 100), np.nan, np.minimum(side, heap)).astype(np.float32)
+    valid = np.isfinite(depth)
+    planes = support_plane.planes(depth, valid, CAMERA)
+    assert planes[0].equation[0] > 0.99
+    found = support_plane.support(planes, depth, valid, CAMERA, lambda *_: True)
+    assert (found is planes[0]) if is_support else (found is None or found.equation[0] < 0.7)
+
+
 def test_misuse_is_refused():
     depth, truth = scene(THREE)
     with pytest.raises(ValueError, match="does not fit"):
