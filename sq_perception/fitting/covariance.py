@@ -25,7 +25,7 @@ from typing import NamedTuple
 import numpy as np
 
 from sq_perception.fitting.cost import STEP_LENGTH, Terms
-from sq_perception.fitting.hull_prior import HullPrior
+from sq_perception.fitting.hull_prior import HullPrior, near_axes
 from sq_perception.fitting.levenberg_marquardt import State
 from sq_perception.fitting.priors import hull_cost, hull_distances
 from sq_perception.fitting.rays import SAMPLE, WEIGHT, Rays
@@ -35,9 +35,6 @@ from sq_perception.geometry.superquadric import Superquadric
 
 WEAK_SHARE = 0.15
 """A half size whose standard deviation exceeds this share of it is called undetermined."""
-_NEAR_AXIS = 16
-"""Power of the cosine to an axis by which directions count as near to it: half at 17 degrees, as neighbours are 32
-degrees apart."""
 _PRIOR_LOG_SIZE, _PRIOR_SHAPE, _PRIOR_ANGLE = 1.0, 0.5, 1.0
 """Standard deviations of the prior: a factor e, half of the range of an exponent, a radian."""
 
@@ -115,7 +112,7 @@ def _beside(state: State, terms: Terms) -> np.ndarray:
     axis errs as the directions near to it differ: whether both ends do so alike or apart, neither half their sum, the
     size, nor half their difference, the centre, errs by more.
     """
-    near = (terms.hull_directions @ state.rotation) ** _NEAR_AXIS
+    near = near_axes(terms.hull_directions, state.rotation)
     off = hull_distances(terms, state.parameters, state.rotation)
     square = off**2 @ near / near.sum(axis=0)
     moments = np.zeros((STEP_LENGTH, STEP_LENGTH))

@@ -22,6 +22,13 @@ import numpy as np
 PULL_SHARE = 0.07
 """Standard deviation, as a share of the thing's extent, of what pulls a body that misfits by as much again as the best
 do.  On 408 things of benchmarks/household_things, seeds from 5000, 0.05 to 0.14 change IoU by less than 0.2 %."""
+EDGE_SHARE = 0.03
+"""The same of what pulls its edges: in directions near its own axes all of the difference counts, growth too.  On 1045
+of these things, seeds from 8700, edges err by 7 % less with it, those of bottles by 7, of tools by 16 and of vessels by
+20 %, at 0.1 +- 0.1 % of IoU.  On 870 more 0.02 gains another 1 % and costs as much."""
+_NEAR_AXIS = 16
+"""Power of the cosine to an axis by which directions count as near to it: half at 17 degrees, as neighbours are 32
+degrees apart."""
 MODEL_SHARE = 0.02
 """Difference between a thing's support function and that of the nearest superquadric, as a share of the thing's extent.
 Chosen on benchmarks/household_things, where 0.01 and 0.03 cost 0.2 % of IoU."""
@@ -51,18 +58,25 @@ class HullPrior:
     extent: float
     freedom: float = math.inf
 
-    def root(self, misfit: float = 1.0) -> np.ndarray:
-        """W (J, J) with W^T W = (S + model error)^-1 + (misfit - 1) / pull^2 (1 - mean over the directions).
+    def root(self, misfit: float = 1.0, rotation: np.ndarray | None = None) -> np.ndarray:
+        """W (J, J) with W^T W = (S + model error)^-1 + (misfit - 1) / pull^2 (1 - mean over the directions)
+        + (misfit - 1) / edge^2 near the axes.
 
-        ``misfit``, 1 or more: mean loss of the object's rays over that of what a superquadric fits.
+        ``misfit``, 1 or more: mean loss of the object's rays over that of what a superquadric fits; ``rotation`` (3, 3)
+        has the body's axes for columns.
         The body that is most probable is not the one that is nearest to what is expected.  A superquadric that fits
         has the thing's form, and S is how probable each of them is.  One that does not is a choice: b is the best
         that is known of the thing's form, and the body shall be near to it in each direction, however unsure.  Growth
-        in all directions is left to S: the outline determines a thing's size.
+        in all directions is left to S, as the outline determines a thing's size, but for the ends of the body's axes:
+        of whatever form, it is to be as long, wide and high as the thing.  A bottle, to which a superquadric cannot
+        taper, is too thin for its foot else.
         """
         count = len(self.support)
         pull = (misfit - 1.0) / (PULL_SHARE * self.extent) ** 2
         precision = self._precision + pull * (np.eye(count) - 1.0 / count)
+        if rotation is not None:
+            near = near_axes(self.directions, rotation).sum(axis=1)
+            precision += (misfit - 1.0) / (EDGE_SHARE * self.extent) ** 2 * np.diag(near)
         return np.ascontiguousarray(np.linalg.cholesky(precision).T)
 
     @cached_property
@@ -70,3 +84,8 @@ class HullPrior:
         """(S + model error)^-1."""
         model = MODEL_SHARE * self.extent
         return np.linalg.inv(self.covariance + model**2 * np.eye(len(self.support)))
+
+
+def near_axes(directions: np.ndarray, rotation: np.ndarray) -> np.ndarray:
+    """How much (J, 3), 0 to 1, directions (J, 3) are near to either end of the axes, columns of a matrix (3, 3)."""
+    return np.asarray((directions @ rotation) ** _NEAR_AXIS)

@@ -17,7 +17,7 @@ points behind its surface count by Cauchy's loss, and the space within the outli
 object then counts as INDEPENDENT_OF_PREDICTED / m rays, m = max(1, c / EXPLAINED), c their mean loss: the variance of
 the model's error is not known beforehand, and the likelihood that is largest over it divides by what is found.  And the
 more it misfits, the more the body is drawn to the predicted hull
-(:meth:`~sq_perception.fitting.hull_prior.HullPrior.root`).  That pull makes the body no surer,
+(:meth:`~sq_perception.fitting.hull_prior.HullPrior.root`), its edges most of all.  That pull makes the body no surer,
 and its rays count as fewer by m once more: what errs more does so over larger parts, a neck, a spout, a dent.
 
 1. Starts: the given bodies (the prediction), and boxes on the plane, or along the points' axes without one.
@@ -53,8 +53,8 @@ from sq_perception.fitting.problem import (
     by_cost,
     terms_of,
 )
-from sq_perception.fitting.rays import SAMPLE
-from sq_perception.fitting.residuals import mean_loss, surface_distance
+from sq_perception.fitting.rays import SAMPLE, STIFFNESS
+from sq_perception.fitting.residuals import surface_distance
 from sq_perception.fitting.starts import on_plane, principal
 from sq_perception.geometry.quantiles import quantile
 
@@ -97,7 +97,9 @@ def _best(problem: Problem, starts: Sequence[State]) -> Solution:
     if problem.hull is None:
         return _refined(problem, settled)
     misfit = max(1.0, _mean_loss(problem, settled[0]) / EXPLAINED)
-    terms = problem.terms if misfit == 1.0 else problem.terms._replace(hull_root=problem.hull.root(misfit))
+    terms = problem.terms
+    if misfit > 1.0:
+        terms = terms._replace(hull_root=problem.hull.root(misfit, settled[0].rotation))
     drawn = replace(problem, independent=INDEPENDENT_OF_PREDICTED / misfit, terms=terms)
     if not problem.late:
         few = drawn.draw(COARSE_RAYS, 0.7)
@@ -113,9 +115,11 @@ def _refined(problem: Problem, settled: Sequence[State]) -> Solution:
 
 
 def _mean_loss(problem: Problem, body: State) -> float:
-    """Of the object's rays: c of the module."""
+    """Of the object's rays: c of the module, Huber's losses in front of the surface and behind it alike."""
     rays = problem.observation.object_rays(SAMPLE, 0.1)
-    return mean_loss(rays, problem.terms.huber, body.parameters, body.rotation)
+    off = np.abs(surface_distance(rays, body.parameters, body.rotation) * rays[:, STIFFNESS])
+    inner = np.minimum(off, problem.terms.huber)
+    return float(np.mean(inner * (2 * off - inner)))
 
 
 def _typical_of_hollow(problem: Problem) -> float:
