@@ -53,6 +53,8 @@ class Fit:
         (11, 11) of a1 a2 a3 e1 e2 t1 t2 t3 and the rotation vector in the object frame; metres and radians.
     iterations, milliseconds
         What it cost.
+    is_predicted
+        Whether a predicted hull weighs in: it errs alike in all views of the thing.
     as_hull
         Whether no superquadric came near, so that the body was fitted as to the convex hull of the object: what the
         camera saw to be empty within the hull of the outline was let go.
@@ -68,6 +70,7 @@ class Fit:
     covariance: np.ndarray = field(default_factory=lambda: np.full((11, 11), np.nan))
     iterations: int = 0
     milliseconds: float = 0.0
+    is_predicted: bool = False
     as_hull: bool = False
 
     @property

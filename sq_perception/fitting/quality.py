@@ -49,6 +49,7 @@ def assessed(solution: Solution, began: float) -> Fit:
         covariance=covariance,
         iterations=state.iterations,
         milliseconds=(time.perf_counter() - began) * 1e3,
+        is_predicted=solution.problem.hull is not None,
         as_hull=solution.as_hull,
     )
 

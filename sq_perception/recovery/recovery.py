@@ -77,6 +77,11 @@ class Recovery:
         return self.fit.sigma_size
 
     @property
+    def is_predicted(self) -> bool:
+        """Whether a predicted hull weighs in, as in the fit."""
+        return self.fit.is_predicted
+
+    @property
     def seen(self) -> np.ndarray:
         """Share (3,) of each size that was seen, as in the fit; the rest is inferred."""
         return self.fit.seen

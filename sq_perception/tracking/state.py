@@ -38,8 +38,9 @@ class Observed(Protocol):
     """What the tracker reads of a body of one frame, as :class:`~sq_perception.recovery.recoverer.Recovery` is.
 
     ``superquadric`` is a single body in the optical frame.  ``covariance`` is (11, 11), of a1 a2 a3 e1 e2 t1 t2 t3 and
-    the rotation vector in the object frame, metres and radians; NaN where unknown.  ``repeats`` is above 0 for an
-    answer that was given before, of readings that are the same but for noise: its error is the same, too.
+    the rotation vector in the object frame, metres and radians; NaN where unknown.  ``is_predicted`` tells that much of
+    it is a prediction's, which errs alike from everywhere.  ``repeats`` is above 0 for an answer that was given before,
+    of readings that are the same but for noise: its error is the same, too.
     """
 
     @property
@@ -47,6 +48,9 @@ class Observed(Protocol):
 
     @property
     def covariance(self) -> np.ndarray: ...
+
+    @property
+    def is_predicted(self) -> bool: ...
 
     @property
     def repeats(self) -> int: ...

@@ -40,6 +40,9 @@ __all__ = ["Track", "TrackState", "Tracker"]
 COMMON_SHARE, LASTING_SHARE = 0.25, 0.25
 """rho and gamma, the shares of an observation's covariance that all views from one direction, and all views, have in
 common.  Chosen; benchmarks/tracking.py finds half of a view's error to be the same over all frames."""
+PREDICTED_SHARE = 0.6
+"""gamma of bodies beside a predicted hull.  Of 263 household things, own masks, 20 frames of a camera that goes 60
+degrees about them, 90 instead of 84 % of the half sizes are within two deviations, of single frames 93 %."""
 LEAST = state.diagonal(0.01, 0.02, 0.001, 0.01)
 """F, the least common error of a view, of sizes as a share.  Chosen: 1 % in size, a millimetre, half a degree."""
 _LEAST_WHITE = 1e-6
@@ -127,6 +130,7 @@ class Tracker:
         rotation, position = state.as_pose(camera_pose)
         orthographic = camera is not None and not camera.is_pinhole
         observed, covariance = _in_world(recoveries, rotation, position)
+        gamma = np.array([PREDICTED_SHARE if body.is_predicted else LASTING_SHARE for body in recoveries])
         to_camera = sight.towards(observed[:, 5:8], rotation, position, orthographic)
         expected = partial(sight.expected, camera=camera, depth=depth, rotation=rotation, position=position)
 
@@ -142,10 +146,11 @@ class Tracker:
             here, there = _pairs(bodies, observed, covariance, stamp, expected)
             bodies, pairs = _placed(bodies, here, there), here + there
             bodies, fresh = _still_there(bodies, pairs, observed, repeats, stamp)
-            bodies = _fused(bodies, fresh, to_camera[fresh.observed], stamp)
+            bodies = _fused(bodies, fresh, gamma[fresh.observed], to_camera[fresh.observed], stamp)
             new = np.setdiff1d(np.arange(len(observed)), pairs.observed).tolist()
         bodies += tuple(
-            _born(self.births + n, k, observed[k], covariance[k], to_camera[k], stamp) for n, k in enumerate(new, 1)
+            _born(self.births + n, k, observed[k], covariance[k], float(gamma[k]), to_camera[k], stamp)
+            for n, k in enumerate(new, 1)
         )
         self._bodies, self._stamp, self.births = _survivors(bodies, expected, stamp), stamp, self.births + len(new)
         return tuple(body.published() for body in self._bodies)
@@ -254,15 +259,16 @@ def _compared(bodies: _Bodies, pairs: Pairs) -> tuple[np.ndarray, np.ndarray, ag
     return total, error, agreement.compared(states[:, 0:3], total, error)
 
 
-def _fused(bodies: _Bodies, pairs: Pairs, to_camera: np.ndarray, stamp: float) -> _Bodies:
-    """The bodies after the observations of pairs, from directions ``to_camera`` (n, 3)."""
+def _fused(bodies: _Bodies, pairs: Pairs, gamma: np.ndarray, to_camera: np.ndarray, stamp: float) -> _Bodies:
+    """The bodies after the observations of pairs, gamma (n,) of each, from directions ``to_camera`` (n, 3)."""
     if not len(pairs.track):
         return bodies
     some = [bodies[k] for k in pairs.track]
     states, covariances = stacked(some)
     least = _least(states)
     common = COMMON_SHARE * pairs.covariance + least
-    white = (1 - COMMON_SHARE - LASTING_SHARE) * pairs.covariance + _LEAST_WHITE * least
+    shared = gamma[:, None, None] * pairs.covariance
+    white = (1 - COMMON_SHARE) * pairs.covariance - shared + _LEAST_WHITE * least
     whole = pairs.covariance + least
     total, error, verdict = _compared(bodies, pairs)
     turning = np.zeros(len(some), dtype=bool)
@@ -301,7 +307,7 @@ def _fused(bodies: _Bodies, pairs: Pairs, to_camera: np.ndarray, stamp: float) -
         pairs.state,
         white,
         common,
-        fusion.root(LASTING_SHARE * pairs.covariance),
+        fusion.root(shared),
         to_camera,
         turning,
     )
@@ -347,14 +353,20 @@ def _velocity(body: Body, error: np.ndarray, slid: bool, stamp: float, covarianc
 
 
 def _born(
-    number: int, index: int, observed: np.ndarray, covariance: np.ndarray, view: np.ndarray, stamp: float
+    number: int,
+    index: int,
+    observed: np.ndarray,
+    covariance: np.ndarray,
+    gamma: float,
+    view: np.ndarray,
+    stamp: float,
 ) -> Body:
     direction = quaternions.to_matrix(observed[8:12]).T @ view
     return Body(
         number,
         observed,
-        (1 - LASTING_SHARE) * covariance + _least(observed),
-        fusion.root(LASTING_SHARE * covariance),
+        (1 - gamma) * covariance + _least(observed),
+        fusion.root(gamma * covariance),
         Views.first(direction, COMMON_SHARE * covariance + _least(observed)),
         last=stamp,
         agreed=stamp,

@@ -23,6 +23,7 @@ class Seen(NamedTuple):
     superquadric: Superquadric
     covariance: np.ndarray
     repeats: int = 0
+    is_predicted: bool = False
 
 
 def nothing_but_the_covariances(patch, common, lasting):

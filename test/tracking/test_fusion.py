@@ -27,7 +27,7 @@ from tracked_bodies import (
 from sq_perception.geometry import rotation as quaternions
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.tracking import forms, state
-from sq_perception.tracking.tracker import Tracker
+from sq_perception.tracking.tracker import PREDICTED_SHARE, Tracker
 
 # Forms
 
@@ -155,6 +155,26 @@ def test_no_number_of_views_lessens_what_all_have_in_common(rng, monkeypatch):
     sizes = [np.abs(error_of(t, truth)[0][:3]) for t, truth in zip(tracks, truths, strict=True)]
     within = np.mean(np.array(sizes) < 2 * last)
     assert within > 0.9
+
+
+def test_most_of_what_a_prediction_errs_by_is_the_same_from_everywhere(rng):
+    """Of 20 bodies whose sizes err alike on all of 30 sides, by the share that predictions have in common."""
+    truths = spread_bodies(20, rng)
+    covariance, trackers = noise(), (Tracker(), Tracker())
+    middle, share = truths.translation.mean(axis=0), np.sqrt(PREDICTED_SHARE)
+    lasting = share * rng.multivariate_normal(np.zeros(11), covariance, 20)
+    for k in range(30):
+        pose = looking_at(middle, rng.standard_normal(3), 20.0)
+        errors = lasting + np.sqrt(1 - share**2) * rng.multivariate_normal(np.zeros(11), covariance, 20)
+        seen = [from_camera(draw(t, covariance, rng, error=e), *pose) for t, e in zip(truths, errors, strict=True)]
+        measured, predicted = (
+            each.update([one._replace(is_predicted=flag) for one in seen], 0.1 * k, pose)
+            for each, flag in zip(trackers, (False, True), strict=True)
+        )
+    for tracks, least, most in ((measured, 0.0, 0.9), (predicted, 0.9, 1.0)):
+        deviation = np.array([t.sigma_size / t.superquadric.size for t in tracks])
+        errors = [np.abs(error_of(t, truth)[0][:3]) for t, truth in zip(tracks, truths, strict=True)]
+        assert least < np.mean(np.array(errors) < 2 * deviation) <= most
 
 
 def test_a_turning_body_is_as_good_as_a_moving_camera(rng):
