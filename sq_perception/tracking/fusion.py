@@ -16,9 +16,8 @@ the error x^ - x of the estimate its correlation C_c = cov(x^ - x, b_c) with eac
     C_j <- (I-K) C_j + K B [j = c].
 
 g is common to all views from anywhere, such as edges that a sensor widens or what a network takes the unseen side for,
-and no number of views lessens it.  It is
-g = L q with L L^T = gamma R and one unknown q of unit covariance for the life of the track.  Its effect on x^
-is carried along,
+and no number of views lessens it.  It is g = L q with L L^T = gamma R and one unknown q of unit covariance for the life
+of the track.  Its effect on x^ is carried along,
 
     M <- (I-K) M + K L,    cov(x^ - x) = P + M M^T,
 
