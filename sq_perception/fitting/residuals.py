@@ -64,7 +64,7 @@ from sq_perception.fitting.intersection import (
     place,
 )
 from sq_perception.fitting.priors import prior_cost
-from sq_perception.fitting.rays import LAST
+from sq_perception.fitting.rays import LAST, STIFFNESS
 from sq_perception.geometry.kernels import inline_kernel, kernel
 
 CLASSIC, SAMPSON, RENDERED = 0, 1, 2
@@ -244,6 +244,17 @@ def surface_distance(rays: np.ndarray, parameters: np.ndarray, rotation: np.ndar
             gx, gy, gz = lanes[GX, i], lanes[GY, i], lanes[GZ, i]
             distance[begin + i] = (lanes[G, i] - 1.0) / math.sqrt(gx * gx + gy * gy + gz * gz + _TINY)
     return distance
+
+
+@kernel
+def mean_loss(rays: np.ndarray, huber: float, parameters: np.ndarray, rotation: np.ndarray) -> float:
+    """Mean of Huber's losses of the same in units of the noise, in front of the surface and behind it alike."""
+    distance = surface_distance(rays, parameters, rotation)
+    total = 0.0
+    for i in range(rays.shape[0]):
+        loss, _ = huber_loss(distance[i] * rays[i, STIFFNESS], huber, 1.0)
+        total += loss
+    return total / rays.shape[0]
 
 
 @kernel

@@ -53,8 +53,8 @@ from sq_perception.fitting.problem import (
     by_cost,
     terms_of,
 )
-from sq_perception.fitting.rays import SAMPLE, STIFFNESS
-from sq_perception.fitting.residuals import surface_distance
+from sq_perception.fitting.rays import SAMPLE
+from sq_perception.fitting.residuals import mean_loss, surface_distance
 from sq_perception.fitting.starts import on_plane, principal
 from sq_perception.geometry.quantiles import quantile
 
@@ -115,11 +115,9 @@ def _refined(problem: Problem, settled: Sequence[State]) -> Solution:
 
 
 def _mean_loss(problem: Problem, body: State) -> float:
-    """Of the object's rays: c of the module, Huber's losses in front of the surface and behind it alike."""
+    """Of the object's rays: c of the module."""
     rays = problem.observation.object_rays(SAMPLE, 0.1)
-    off = np.abs(surface_distance(rays, body.parameters, body.rotation) * rays[:, STIFFNESS])
-    inner = np.minimum(off, problem.terms.huber)
-    return float(np.mean(inner * (2 * off - inner)))
+    return mean_loss(rays, problem.terms.huber, body.parameters, body.rotation)
 
 
 def _typical_of_hollow(problem: Problem) -> float:
