@@ -302,20 +302,21 @@ def _unclaimed(labels: np.ndarray, kept: Sequence[int], strays: np.ndarray) -> t
     nothing = np.ones(int(labels.max()) + 1, np.int32)
     nothing[[0, *kept]] = 0
     free = regions.renumbered(labels, nothing).astype(np.uint8) | strays.view(np.uint8)
-    parts = depth_steps.components(cv2.morphologyEx(free, cv2.MORPH_OPEN, _BRUSH))
-    extents = regions.extents(parts)
-    large = np.flatnonzero(extents[:, 0] >= segments.least_pixels(labels.size))
+    left, top, width, height = cv2.boundingRect(free)
+    reach = len(_BRUSH)
+    window = slice(max(top - reach, 0), top + height + reach), slice(max(left - reach, 0), left + width + reach)
+    parts = depth_steps.components(cv2.morphologyEx(free[window], cv2.MORPH_OPEN, _BRUSH))
+    sizes = regions.extents(parts)[:, 0]
+    large = np.flatnonzero(sizes >= segments.least_pixels(labels.size))
     if not len(large):
         return labels, []
     counts = regions.extents(labels)[:, 0]
     asked = labels.copy()
     names: list[int] = []
     for k in large:
-        size, top, bottom, left, right = extents[k].tolist()
-        window = slice(top, bottom), slice(left, right)
-        part = parts[window] == k
+        part = parts == k
         whose = int(np.bincount(labels[window][part]).argmax())
-        if not (nothing[whose] and size > _ASKED * counts[whose]):
+        if not (nothing[whose] and sizes[k] > _ASKED * counts[whose]):
             names.append(len(counts) + len(names))
             asked[window][part] = names[-1]
     return asked, names

@@ -177,8 +177,8 @@ def standing(seen: Seen, relative: np.ndarray, labels: np.ndarray, support: Supp
     """
     depth, camera, options = seen.depth, seen.camera, seen.options
     last_row, last_column = camera.height - 1, camera.width - 1
-    measured = np.count_nonzero(depth)
     around = depth > 0
+    measured = np.count_nonzero(around)
     coarse = depth[::_SPARSE, ::_SPARSE]
     nearest = quantile(coarse[coarse > 0], _STRAY) * (1 + depth_steps.STEP) if coarse.any() else 0.0
     plane = support.plane

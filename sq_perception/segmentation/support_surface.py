@@ -159,7 +159,8 @@ def risen(relative: np.ndarray, depth: np.ndarray, valid: np.ndarray, camera: Ca
             ((slice(None), slice(1, None)), (slice(None), slice(None, -1))),
         )
     ]
-    foot, longest = (math.ceil(length / max(quantile(width[reached], 0.5), 1e-4)) for length in (_FOOT, _RAMP_LENGTH))
+    usual = max(quantile(width[reached], 0.5), 1e-4)
+    foot, longest = math.ceil(_FOOT / usual), math.ceil(_RAMP_LENGTH / usual)
     short = reached
     for step in range(longest):
         before = np.count_nonzero(reached)
@@ -222,9 +223,9 @@ def _level(height: np.ndarray, growth: np.ndarray, reached: np.ndarray) -> np.nd
     for part in np.flatnonzero(extents[:, 0] >= _LEVEL_SAMPLES):
         if part > 0:
             pixels = regions.pixels(parts, int(part), extents[part])
-            heights = np.sort(height[pixels] * growth[pixels] / np.median(growth[pixels]))
-            high = heights[heights > 0.75 * TOLERANCE]
-            level[part] = len(high[densest(high, 0.5 * TOLERANCE)]) > LEVEL_SHARE * len(heights)
+            heights = height[pixels] * growth[pixels] / quantile(growth[pixels], 0.5)
+            high, fewest = heights[heights > 0.75 * TOLERANCE], LEVEL_SHARE * len(heights)
+            level[part] = len(high) > fewest and len(high[densest(np.sort(high), 0.5 * TOLERANCE)]) > fewest
     return level[parts]
 
 
