@@ -14,8 +14,9 @@ shows the pixel under its middle, by the channels
     grain       log of the pixels to a cell's side
     plane       1 if there is a support plane
 
-where s, metres, is the side of the window at the depth m; what is not known is 0.  The last three are the same in all
-cells.  Pinhole cameras; metres, optical frame.
+z and h are means over 3 x 3 points of the cell, without those that a step in depth parts from its middle: less of the
+sensor's noise, and no edge is smoothed.  s, metres, is the side of the window at the depth m; what is not known is 0.
+The last three channels are the same in all cells.  Pinhole cameras; metres, optical frame.
 """
 
 from __future__ import annotations
@@ -26,13 +27,16 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.quantiles import quantile
 from sq_perception.imaging.camera import Camera
+from sq_perception.imaging.depth_steps import STEP
 
 PIXELS = 64
 CHANNELS = 9
-MEASURED, HEIGHT, SEGMENT, OTHERS, IMAGE, PLANE = 0, 2, 3, 4, 5, 8
-"""Channels that others than the network look at."""
+MEASURED, NEARNESS, HEIGHT, SEGMENT, OTHERS, IMAGE, SCALE, GRAIN, PLANE = range(CHANNELS)
+_POINTS = 3
+"""Of a cell, along each axis."""
 _USUAL_SIDE = 0.2
 """Metres; that the channel of the scale is 0 for it."""
 _LARGEST = 0.3
@@ -111,27 +115,63 @@ def from_segment(
     length = _WIDER * max(tall * focal / camera.fy, wide * focal / camera.fx) + _MORE
     side, high = length * camera.fx / focal, length * camera.fy / focal
     top, left = down.start + 0.5 * (tall - high), across.start + 0.5 * (wide - side)
-    middles = (np.arange(PIXELS) + 0.5) / PIXELS
-    rows, columns = np.floor(top + high * middles).astype(int), np.floor(left + side * middles).astype(int)
-    height, width = depth.shape
-    within = ((rows >= 0) & (rows < height))[:, None] & ((columns >= 0) & (columns < width))
-    grid = np.ix_(np.clip(rows, 0, height - 1), np.clip(columns, 0, width - 1))
-    z, shown = depth[grid].astype(np.float64), np.where(within, labels[grid], 0)
-    measured = within & np.isfinite(z) & (z > 0)
-    z = np.where(measured, z, 0.0)
+    points = (np.arange(_POINTS * PIXELS) + 0.5) / (_POINTS * PIXELS)
+    rows, columns = np.floor(top + high * points).astype(int), np.floor(left + side * points).astype(int)
     own = depth[window][labels[window] == label]
     middle = quantile(own[np.isfinite(own)], 0.5)
     scale = length * middle / focal
 
     image = np.zeros((PIXELS, PIXELS, CHANNELS), np.float32)
-    image[..., MEASURED] = measured
-    image[..., 1] = np.where(measured, np.clip((middle - z) / scale, -1, 1), 0)
-    if plane is not None:
-        x, y = (columns - camera.cx) / camera.fx * z, ((rows - camera.cy) / camera.fy)[:, None] * z
-        heights = plane[0] * x + plane[1] * y + plane[2] * z + plane[3]
-        image[..., HEIGHT] = np.where(measured, np.clip(heights / scale, *_HEIGHTS), 0)
-    image[..., SEGMENT] = shown == label
-    image[..., OTHERS] = (shown > 0) & (shown != label)
-    image[..., IMAGE] = within
-    image[..., 6:] = np.log(min(scale, _LARGEST) / _USUAL_SIDE), np.log(length / PIXELS), plane is not None
-    return SegmentView(image, rows, columns, left, top, side, high)
+    pinhole = camera.fx, camera.fy, camera.cx, camera.cy
+    known = np.zeros(4) if plane is None else np.asarray(plane, dtype=float)
+    _show(image, depth, labels, label, rows, columns, pinhole, known, middle, scale)
+    image[..., SCALE] = np.log(min(scale, _LARGEST) / _USUAL_SIDE)
+    image[..., GRAIN] = np.log(length / PIXELS)
+    image[..., PLANE] = plane is not None
+    centre = slice(_POINTS // 2, None, _POINTS)
+    return SegmentView(image, rows[centre], columns[centre], left, top, side, high)
+
+
+@kernel
+def _show(
+    image: np.ndarray,
+    depth: np.ndarray,
+    labels: np.ndarray,
+    label: int,
+    rows: np.ndarray,
+    columns: np.ndarray,
+    pinhole: tuple[float, float, float, float],
+    plane: np.ndarray,
+    middle: float,
+    scale: float,
+) -> None:
+    """Write what the cells of an empty view show.
+
+    ``rows`` and ``columns`` (POINTS PIXELS,) are the pixels under the points of the cells, ``middle`` and ``scale`` the
+    module's m and s; a ``plane`` that is not known is 0.
+    """
+    fx, fy, cx, cy = pinhole
+    height, width = depth.shape
+    least, most = _HEIGHTS
+    for i in range(PIXELS):
+        for j in range(PIXELS):
+            v, u = rows[_POINTS * i + _POINTS // 2], columns[_POINTS * j + _POINTS // 2]
+            if v < 0 or v >= height or u < 0 or u >= width:
+                continue
+            image[i, j, IMAGE] = 1
+            image[i, j, SEGMENT] = labels[v, u] == label
+            image[i, j, OTHERS] = labels[v, u] > 0 and labels[v, u] != label
+            z = depth[v, u]
+            if not (np.isfinite(z) and z > 0):
+                continue
+            depths, heights, count = 0.0, 0.0, 0
+            for k in range(_POINTS * i, _POINTS * (i + 1)):
+                for m in range(_POINTS * j, _POINTS * (j + 1)):
+                    v, u = rows[k], columns[m]
+                    if 0 <= v < height and 0 <= u < width and abs(depth[v, u] - z) < STEP * z:
+                        depths += depth[v, u]
+                        heights += depth[v, u] * (plane[0] * (u - cx) / fx + plane[1] * (v - cy) / fy + plane[2])
+                        count += 1
+            image[i, j, MEASURED] = 1
+            image[i, j, NEARNESS] = min(max((middle - depths / count) / scale, -1.0), 1.0)
+            image[i, j, HEIGHT] = min(max((heights / count + plane[3]) / scale, least), most)

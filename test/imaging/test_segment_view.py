@@ -7,11 +7,22 @@ import pytest
 
 from sq_perception.imaging import segment_view
 from sq_perception.imaging.camera import Camera
-from sq_perception.imaging.segment_view import CHANNELS, HEIGHT, IMAGE, MEASURED, OTHERS, PIXELS, PLANE, SEGMENT
+from sq_perception.imaging.segment_view import (
+    CHANNELS,
+    GRAIN,
+    HEIGHT,
+    IMAGE,
+    MEASURED,
+    NEARNESS,
+    OTHERS,
+    PIXELS,
+    PLANE,
+    SCALE,
+    SEGMENT,
+)
 
 CAMERA = Camera(200, 150, 180.0, 180.0, 99.5, 74.5)
 WINDOW = slice(50, 90), slice(60, 120)
-NEARNESS, SCALE, GRAIN = 1, 6, 7
 
 
 def table() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -48,6 +59,25 @@ def test_cells_show_the_pixels_under_their_middles() -> None:
     near = segment_view.from_segment(depth / 2, labels, 1, WINDOW, CAMERA, None)
     np.testing.assert_allclose(near.image[..., SCALE], np.log(scale / 2 / 0.2), rtol=1e-6)
     np.testing.assert_allclose(shown.image[..., GRAIN], np.log(shown.side / PIXELS), rtol=1e-6)
+
+
+def test_a_sensor_s_noise_is_averaged_within_cells_and_not_across_steps() -> None:
+    """Noise of nine independent readings is a third; a cell beside an edge shows one side of it."""
+    times = 4
+    rng = np.random.default_rng(3)
+    depth, labels = (np.kron(each, np.ones((times, times), each.dtype)) for each in table()[:2])
+    noise = (0.001 * rng.standard_normal(depth.shape)).astype(np.float32)
+    camera = Camera(200 * times, 150 * times, 180.0 * times, 180.0 * times, 99.5 * times, 74.5 * times)
+    window = slice(times * WINDOW[0].start, times * WINDOW[0].stop), slice(times * 60, times * 120)
+    plane = table()[2]
+    true, noisy = (segment_view.from_segment(each, labels, 1, window, camera, plane) for each in (depth, depth + noise))
+    inside = true.image[..., MEASURED] > 0
+    scale = true.side * 0.8 / camera.fx
+    for channel in (NEARNESS, HEIGHT):
+        errors = scale * (noisy.image - true.image)[inside][:, channel]
+        assert abs(errors.std() / (0.001 / 3) - 1) < 0.15
+    grid = np.ix_(true.rows, true.columns)
+    np.testing.assert_allclose(true.image[inside][:, HEIGHT], (1.0 - depth[grid][inside]) / scale, atol=1e-6)
 
 
 def test_beyond_the_image_there_is_nothing() -> None:
