@@ -122,7 +122,7 @@ def from_segment(
     scale = length * middle / focal
 
     image = np.zeros((PIXELS, PIXELS, CHANNELS), np.float32)
-    pinhole = camera.fx, camera.fy, camera.cx, camera.cy
+    pinhole = float(camera.fx), float(camera.fy), float(camera.cx), float(camera.cy)  # of one kind for the kernel
     known = np.zeros(4) if plane is None else np.asarray(plane, dtype=float)
     _show(image, depth, labels, label, rows, columns, pinhole, known, middle, scale)
     image[..., SCALE] = np.log(min(scale, _LARGEST) / _USUAL_SIDE)
