@@ -10,7 +10,7 @@ that their work empties the caches.
 
     loops     processor time of the frame / that of ``arithmetic``
     classic   the same / that of the classic fits of its objects
-    stages    shares of the frame, the network's under ``fit`` where it computes beside the fit
+    stages    shares of the frame, the network's under ``fit`` where the fit asks for it
     compiled  share in kernels, in libraries (NumPy, OpenCV, torch), in the interpreter, as the profiler sees it: it
               slows the interpreter alone, and counts operators on arrays as its work
     IoU       of volumes, mean over the true bodies at least half visible

@@ -193,7 +193,7 @@ def _varied(solution: Solution) -> Solution:
             break
         found.append(best)
         solution = replace(solution, state=better)
-    return replace(solution, alternatives=_alternatives(solution.state, found))
+    return replace(solution, alternatives=_alternatives(solution.state, found)) if found else solution
 
 
 def _better(solution: Solution, rivals: list[State]) -> tuple[State, list[State]]:

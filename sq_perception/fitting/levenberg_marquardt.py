@@ -18,7 +18,7 @@ import numpy as np
 from sq_perception.fitting.cost import STEP_LENGTH, Terms
 from sq_perception.fitting.residuals import evaluate
 from sq_perception.geometry import rotation as quaternions
-from sq_perception.geometry.kernels import kernel
+from sq_perception.geometry.kernels import inline_kernel, kernel
 from sq_perception.geometry.superquadric import Superquadric
 
 _LONGEST_LOG_SIZE, _LONGEST_SHAPE, _LONGEST_TURN = 0.5, 0.3, 0.5
@@ -29,6 +29,8 @@ _WORSE, _BETTER = 7.0, 0.12
 """Factors of the damping after a step that was refused and one that was taken."""
 _ATTEMPTS = 6
 """Steps refused in a row, damping growing 10^5 fold, before the search ends."""
+_LEAST_COST = 1e-12
+"""Of which a gain is a share: a body that leaves nothing at all has none to go on for."""
 
 
 class State(NamedTuple):
@@ -69,7 +71,7 @@ def minimize(
 ) -> State:
     """The best body found from ``start`` in at most ``max_iterations`` steps.
 
-    Stops when a step lowers the cost by less than ``tolerance`` of it, or when no step lowers it.
+    Stops when a step lowers the cost, or promises to, by less than ``tolerance`` of it, or when none lowers it.
     """
     lower, upper = limits
     parameters = np.minimum(np.maximum(start.parameters, lower), upper)
@@ -90,6 +92,8 @@ def minimize(
         accepted = False
         for _ in range(_ATTEMPTS):
             if solve_damped(sums, damping, held, factor, step):
+                if _promised(sums, step) <= tolerance * max(abs(cost), _LEAST_COST):
+                    break
                 move(parameters, rotation, step, lower, upper, next_parameters, next_rotation)
                 next_cost = evaluate(stage, rays, free, terms, next_parameters, next_rotation, next_sums)
                 if next_cost < cost:
@@ -104,9 +108,18 @@ def minimize(
         rotation, next_rotation = next_rotation, rotation
         sums, next_sums = next_sums, sums
         damping = max(damping * _BETTER, 1e-9)
-        if gain <= tolerance * max(abs(cost), 1e-12):
+        if gain <= tolerance * max(abs(cost), _LEAST_COST):
             break
     return State(parameters, rotation, cost, start.iterations + iterations)
+
+
+@inline_kernel
+def _promised(sums: np.ndarray, step: np.ndarray) -> float:
+    """-g^T s, half of the slope: a step of little damping lowers the linear model's cost by this, others by more."""
+    total = 0.0
+    for k in range(STEP_LENGTH):
+        total -= sums[STEP_LENGTH, k] * step[k]
+    return total
 
 
 @kernel

@@ -45,24 +45,27 @@ def sharpened(problem: Problem, state: State, free: np.ndarray, rays: Rays) -> t
 
     It is no less than what was known before: pixels that miss a body would cost next to nothing, and it might leave.
     """
-    state = _pulled_in(problem, state, free, rays)
-    sigma = math.inf
+    state, sigma = _pulled_in(problem, state, free, rays)
+    before = math.inf
     while True:
-        before, sigma = sigma, min(_sigma(problem, state, free), problem.observation.outline)
+        sigma = min(sigma, problem.observation.outline)
         if not sigma < _SHARPER * before or problem.late:  # so that it ends for any sigma
             return problem, state
         problem = problem.with_terms(outline_stiffness=1 / sigma)
         state = problem.settle(state, rays, FIRST_STEPS)
+        before, sigma = sigma, _sigma(problem, state, free)
 
 
-def _pulled_in(problem: Problem, state: State, free: np.ndarray, rays: Rays) -> State:
-    """A body that sticks out farther than was known before, in its outline to a pixel if it fits in there."""
+def _pulled_in(problem: Problem, state: State, free: np.ndarray, rays: Rays) -> tuple[State, float]:
+    """A body that sticks out farther than was known before, in its outline to a pixel if it fits in there; and how far
+    the one returned sticks out."""
     sigma = _sigma(problem, state, free)
     if not sigma > problem.observation.outline or problem.late:
-        return state
+        return state, sigma
     pixel = problem.with_terms(outline_stiffness=1 / problem.observation.footprint)
     other = pixel.settle(state, rays)
-    return other if _sigma(problem, other, free) < _SHARPER * sigma else state
+    nearer = _sigma(problem, other, free)
+    return (other, nearer) if nearer < _SHARPER * sigma else (state, sigma)
 
 
 def _depth_inside(problem: Problem, state: State, pixels: np.ndarray) -> float:

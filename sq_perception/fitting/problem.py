@@ -40,8 +40,8 @@ FINAL_RAYS = 3000
 benchmarks/single_body, like those above."""
 FREE_SHARE = 0.25
 """Free rays per object ray: an outline has fewer pixels than an area."""
-TOLERANCE, FINAL_TOLERANCE = 1e-3, 1e-4
-"""Share of the cost; a stage ends with a step that gains less."""
+TOLERANCE, FINAL_TOLERANCE = 1e-3, 3e-5
+"""Share of the cost; a stage ends before a step that promises less."""
 FINAL_GATE = 1.4
 """Mean squared residual up to which a body explains an image: 1, but for a sample of few rays and a search that is
 not finished.  Chosen on benchmarks/single_body."""
@@ -227,6 +227,7 @@ class Solution:
         rays = self.problem.observation.object_rays(SAMPLE)
         return surface_distance(rays, self.state.parameters, self.state.rotation)
 
+    @cached_property
     def covariance(self) -> np.ndarray:
         """(11, 11) of the valley of the cost that the body lies in, and of its distance to a predicted hull."""
         terms, outline = self.problem.terms_at(self.state), self.problem.observation.outline
@@ -234,7 +235,7 @@ class Solution:
 
     def unsure(self) -> np.ndarray:
         """Standard deviations (3,) of the half sizes, as shares of them."""
-        deviations = np.sqrt(np.diag(self.covariance())[:3])
+        deviations = np.sqrt(np.diag(self.covariance)[:3])
         return np.asarray(deviations / self.state.parameters[:3])
 
 

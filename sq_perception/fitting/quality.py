@@ -28,7 +28,7 @@ def assessed(solution: Solution, began: float) -> Fit:
     """The result of a fit, with its residual, inliers, covariance and status."""
     observation, state = solution.problem.observation, solution.state
     body = state.body
-    covariance = solution.covariance() + spread(state, solution.alternatives)
+    covariance = solution.covariance + spread(state, solution.alternatives)
     canonical = body.canonical_form()
     covariance = carried_over(covariance, body, canonical)
     typical = quantile(np.abs(solution.distances), 0.5)

@@ -146,7 +146,8 @@ def groups(observation: Observation) -> Iterator[list[State]]:
         return
     centre, moments = completed
     axes = principal_axes(moments)
-    for turned in [axes, *eighth_turns(axes)]:
+    yield states(centre, moments, axes)
+    for turned in eighth_turns(axes):
         yield states(centre, moments, turned)
 
 

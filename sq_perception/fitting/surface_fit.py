@@ -70,7 +70,7 @@ def fit(
     camera : Camera
     start : "auto", one body, a batch of bodies or a sequence of bodies, in the optical frame
         Where to begin.  A function that returns them is not called where the cheapest automatic starts explain the
-        image down to a fine noise: for starts that cost time, or are still being computed.
+        image down to a fine noise: for starts that cost time.
     options : FitOptions
 
     Returns

@@ -50,7 +50,7 @@ def weighed(solution: Solution) -> Solution:
     """The solution, or a better one once open half sizes are left to the priors and the prediction."""
     problem, state, rays = solution.problem, solution.state, solution.rays
     options, pinhole = problem.options, problem.observation.camera.is_pinhole
-    weak = np.flatnonzero(undetermined(solution.covariance(), state.parameters[:3]))
+    weak = np.flatnonzero(undetermined(solution.covariance, state.parameters[:3]))
     if len(weak) == 0 or not (pinhole or options.expected is not None):
         return solution
     if problem.independent is None and pinhole:

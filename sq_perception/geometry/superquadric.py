@@ -194,13 +194,7 @@ class Superquadric:
 
     def gauge_gradient(self, points: Array) -> Array:
         """Gradient of g at points (..., N, 3) in the parent frame, shape (..., N, 3); zero at the centre."""
-        p = self.to_object(points)
-        xp = array_namespace(p)
-        q = xp.abs(p) / self.size[..., None, :]
-        e1, e2 = self.shape[..., None, 0], self.shape[..., None, 1]
-        _, slopes = nested_norm_and_slopes(q[..., 0], q[..., 1], q[..., 2], e1, e2)
-        gradient = xp.stack(slopes, axis=-1) * xp.sign(p) / self.size[..., None, :]
-        return gradient @ xp.linalg.matrix_transpose(self.rotation_matrix)
+        return self._gauge_and_gradient(points)[1]
 
     def normals(self, points: Array) -> Array:
         """Outward unit normals at surface points (..., N, 3) in the parent frame, shape (..., N, 3)."""
@@ -210,10 +204,19 @@ class Superquadric:
 
     def sampson_distance(self, points: Array) -> Array:
         """First order distance (g - 1) / |grad g| of points (..., N, 3) to the surface, metres, positive outside."""
-        gradient = self.gauge_gradient(points)
+        gauge, gradient = self._gauge_and_gradient(points)
         xp = array_namespace(gradient)
         length = xp.sqrt(xp.sum(gradient * gradient, axis=-1))
-        return (self.gauge(points) - 1) / xp.where(length > 0, length, xp.ones_like(length))
+        return (gauge - 1) / xp.where(length > 0, length, xp.ones_like(length))
+
+    def _gauge_and_gradient(self, points: Array) -> tuple[Array, Array]:
+        p = self.to_object(points)
+        xp = array_namespace(p)
+        q = xp.abs(p) / self.size[..., None, :]
+        e1, e2 = self.shape[..., None, 0], self.shape[..., None, 1]
+        gauge, slopes = nested_norm_and_slopes(q[..., 0], q[..., 1], q[..., 2], e1, e2)
+        gradient = xp.stack(slopes, axis=-1) * xp.sign(p) / self.size[..., None, :]
+        return gauge, gradient @ xp.linalg.matrix_transpose(self.rotation_matrix)
 
     def parametric_points(self, eta: Array, omega: Array) -> Array:
         """Surface points (..., N, 3) in the parent frame at angles (N,) (thesis, equation 3.5).

@@ -109,10 +109,8 @@ class Camera:
     def unproject(self, u: np.ndarray, v: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """Points (..., 3) in the optical frame of pixels (...) at the given depths (...)."""
         z = np.asarray(depth, dtype=float)
-        if not self.is_pinhole:
-            origin, direction = self.rays(u, v)
-            return origin + z[..., None] * direction
-        x, y = z * ((np.asarray(u) - self.cx) / self.fx), z * ((np.asarray(v) - self.cy) / self.fy)
+        scale = z if self.is_pinhole else np.ones_like(z)
+        x, y = scale * ((np.asarray(u) - self.cx) / self.fx), scale * ((np.asarray(v) - self.cy) / self.fy)
         points = np.empty((*np.broadcast_shapes(x.shape, y.shape), 3))
         points[..., 0], points[..., 1], points[..., 2] = x, y, z
         return points

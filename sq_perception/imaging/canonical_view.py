@@ -191,7 +191,7 @@ def from_mask(
     depth, mask = np.ascontiguousarray(depth[window], dtype=np.float32), np.ascontiguousarray(mask[window])
 
     matrix = _FLIP @ look
-    unread = float(np.mean(depth, where=mask & np.isfinite(depth))) if missing_is_hidden else np.nan
+    unread = float(depth[mask & np.isfinite(depth)].mean()) if missing_is_hidden else np.nan
     image, low, high, closest = _turned(depth, mask, unread, camera.lens, matrix)
     z = image[np.isfinite(image)]
     outliers = int(z.size * OUTLIERS_PER_END)
@@ -201,8 +201,9 @@ def from_mask(
     extent = MARGIN * max(*(high - low + pixel), nearest - farthest)
     anchor = np.array([*(0.5 * (low + high)), nearest])
 
-    # Each NaN replaced by the nearest number.
-    filled = image.ravel()[regions.nearest(~np.isnan(image))] if camera.is_pinhole or find_hidden else image
+    # Each NaN replaced by the nearest number, where one is asked for.
+    is_asked = camera.is_pinhole or (find_hidden and bool((np.isfinite(depth) & ~mask).any()))
+    filled = image.ravel()[regions.nearest(~np.isnan(image))] if is_asked else image
     nearer = np.full(mask.shape, np.float32(-np.inf))
     if find_hidden:
         lost = np.ones_like(mask) if missing_is_hidden else _within_hull(mask & np.isfinite(depth))

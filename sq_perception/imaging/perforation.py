@@ -32,7 +32,8 @@ def filled(
     if measured.all():
         return depth, labels, None
     narrow = _gaps(measured, 1)
-    share = np.mean(narrow[narrow | measured]) if measured.any() else 0.0
+    closed = int(np.count_nonzero(narrow))
+    share = closed / max(closed + int(np.count_nonzero(measured)), 1)
     if share < _PERFORATED:
         return depth, labels, None
     reach, gaps = (1, narrow) if share < _SPARSE else (2, _gaps(measured, 2))

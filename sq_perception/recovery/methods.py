@@ -10,6 +10,7 @@ import numpy as np
 from sq_perception.fitting import solina_bajcsy, surface_fit
 from sq_perception.fitting.fit import Fit, Status
 from sq_perception.fitting.options import MIN_PIXELS, MODEL_ERROR, FitOptions
+from sq_perception.fitting.rays import SAMPLE
 from sq_perception.geometry.superquadric import Superquadric
 from sq_perception.imaging import soft_agreement
 from sq_perception.imaging.camera import Camera
@@ -51,7 +52,7 @@ def _body(obj: SeenObject, depth: np.ndarray, camera: Camera, options: RecoveryO
 
 
 def _surface_fit(obj: SeenObject, depth: np.ndarray, camera: Camera, known: FitOptions) -> Fit:
-    """From the network's prediction, which may still be computed; images without noise may not need it.
+    """From the network's prediction; images without noise may not need it, and it is not computed then.
 
     What the image leaves open after all, such as the depth of a box seen face-on, the prediction settles.
     """
@@ -67,7 +68,7 @@ def _predicted(obj: SeenObject) -> Fit:
     if obj.prediction is None:
         raise ValueError("no prediction")
     body = obj.prediction.body()
-    distance = body.sampson_distance(obj.points)
+    distance = body.sampson_distance(obj.points[:: max(1, len(obj.points) // SAMPLE)])
     residual = float(np.sqrt(np.mean(distance**2)))
     return Fit(body, residual, Status.CONVERGED, "prediction of the network, not refined")
 

@@ -1,9 +1,9 @@
-"""What networks predict of objects: for many views at once, beside other work or before it goes on."""
+"""What networks predict of objects: for many views at once, before other work goes on or only if that asks for it."""
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import Executor
 from dataclasses import dataclass
 from typing import TypeAlias
 
@@ -19,14 +19,14 @@ Answers: TypeAlias = Superquadric | HullPredictions
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """What a network predicts of one object; perhaps it is still being computed.
+    """What a network predicts of one object; perhaps it is computed when it is asked for.
 
     Attributes
     ----------
     view
         What the network was shown.
     answers, number
-        What waits for its answers for several objects, each in the frame of its view, and which of them is this one's.
+        What gives its answers for several objects, each in the frame of its view, and which of them is this one's.
     """
 
     view: CanonicalView
@@ -34,13 +34,13 @@ class Prediction:
     number: int
 
     def body(self) -> Superquadric:
-        """The predicted body in the optical frame; waits for it."""
+        """The predicted body in the optical frame."""
         answers = self.answers()
         bodies = answers.bodies if isinstance(answers, HullPredictions) else answers
         return self.view.from_canonical(bodies[self.number]).canonical_form()
 
     def hull(self) -> HullPrior | None:
-        """The predicted hull in the optical frame, if the network predicts hulls; waits for it."""
+        """The predicted hull in the optical frame, if the network predicts hulls."""
         answers = self.answers()
         return answers.hull(self.number, self.view) if isinstance(answers, HullPredictions) else None
 
@@ -57,13 +57,26 @@ def of_hulls(
     return _answered(views, lambda: found)
 
 
-def of_bodies(views: Sequence[CanonicalView], network: Predictor, beside: Executor | None) -> list[Prediction]:
-    """Predictions of bodies from views, computed by an executor beside fits, or now."""
+def of_bodies(views: Sequence[CanonicalView], network: Predictor, when_asked: bool) -> list[Prediction]:
+    """Predictions of bodies from views: computed now, or all of them when the first one is asked for."""
     shown = np.stack([view.marked for view in views])
-    if beside is not None:
-        return _answered(views, beside.submit(network.predict, shown).result)
+    if when_asked:
+        return _answered(views, _once(lambda: network.predict(shown)))
     found = network.predict(shown)
     return _answered(views, lambda: found)
+
+
+def _once(compute: Callable[[], Answers]) -> Callable[[], Answers]:
+    """A function that computes its answer in the first thread that asks; others wait for it."""
+    lock, found = threading.Lock(), list[Answers]()
+
+    def answers() -> Answers:
+        with lock:
+            if not found:
+                found.append(compute())
+            return found[0]
+
+    return answers
 
 
 def _answered(views: Sequence[CanonicalView], answers: Callable[[], Answers]) -> list[Prediction]:

@@ -12,8 +12,7 @@ With ``auto``, own segments are parted, joined, dropped where they show no objec
 | network | the network alone |
 | classic | Solina and Bajcsy's fit to the points |
 
-Hulls are predicted before the fits; a network that predicts bodies computes beside the first, cheapest starts.  A body
-that these explain down to the noise needs no prediction and does not wait for it.
+Hulls are predicted before the fits; bodies are predicted only where the first, cheapest starts leave more than noise.
 
 Everything is metres in the optical frame.  A hard image is no error: an object without a body is listed with
 ``Status.FAILED``, score 0 and, in place of a body, an ellipsoid around its visible points.
@@ -125,7 +124,6 @@ class Recoverer:
         """Threads, and what they wait for, of this process."""
         self._process = os.getpid()
         self._lock = threading.Lock()
-        self._beside = ThreadPoolExecutor(1, thread_name_prefix="network")
         self._pool = ThreadPoolExecutor(self._threads, thread_name_prefix="fit")
 
     @property
@@ -282,7 +280,7 @@ class Recoverer:
         return replace(found, labels=np.where(np.isin(found.labels, most), found.labels, 0), ids=most, is_cut=True)
 
     def _predicted(self, objects: Sequence[SeenObject], network: Network, options: RecoveryOptions) -> list[SeenObject]:
-        """The objects with their predictions; those of bodies may still be computed, beside fits that begin without."""
+        """The objects with their predictions; of bodies with ``auto``, those that a fit asks for are computed then."""
         views = [obj.shown for obj in objects if obj.shown is not None]
         if not views:
             return list(objects)
@@ -293,7 +291,7 @@ class Recoverer:
 
             found = self._shared(of_some, range(len(views)))
         else:
-            found = prediction.of_bodies(views, network, self._beside if options.method == "auto" else None)
+            found = prediction.of_bodies(views, network, when_asked=options.method == "auto")
         return [replace(obj, prediction=predicted) for obj, predicted in zip(objects, found, strict=True)]
 
     def _mapped(self, function: Callable[[_Item], _Answer], items: Sequence[_Item]) -> list[_Answer]:

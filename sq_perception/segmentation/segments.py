@@ -259,5 +259,5 @@ def _ordered(
                 break
             kept.add(label)
     number = np.zeros(len(extents), np.int32)
-    number[order[np.isin(order, list(kept))]] = np.arange(len(kept)) + 1
+    number[[label for label in order.tolist() if label in kept]] = np.arange(len(kept)) + 1
     return regions.renumbered(labels, number), tuple(range(1, len(kept) + 1)), is_cut
