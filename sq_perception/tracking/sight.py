@@ -57,14 +57,21 @@ def open_share(bodies: Superquadric, camera: Camera, depth: np.ndarray) -> np.nd
     pixels = camera.project(points)
     inside = near & (pixels >= 0).all(axis=-1) & (pixels <= [camera.width - 1, camera.height - 1]).all(axis=-1)
     column, row = np.where(inside[..., None], np.rint(np.nan_to_num(pixels)), 0).astype(int).transpose(2, 0, 1)
-    is_reading = np.isfinite(depth) & ((depth > 0) | (not camera.is_pinhole))
-    # A point that falls into a gap between readings of the same surface is told by these.
-    measured = perforation.filled(np.where(is_reading, depth, np.nan))[0][row, column].astype(float)
+    measured = _readings(depth[row, column].astype(float), camera)
     valid = np.isfinite(measured)
+    if (inside & ~valid).any():
+        # A point that falls into a gap between readings of the same surface is told by these.
+        measured = perforation.filled(_readings(depth, camera))[0][row, column].astype(float)
+        valid = np.isfinite(measured)
     tolerance = _TOLERANCE * bodies.size.min(axis=-1)[:, None]
     behind = np.where(inside & valid, measured, -np.inf) - points[..., 2]
     clear, told = (behind > tolerance).sum(axis=1), (behind >= -tolerance).sum(axis=1)
     return np.where(told >= _TOLD * near.sum(axis=1), clear / np.maximum(told, 1), 0.0)
+
+
+def _readings(depth: np.ndarray, camera: Camera) -> np.ndarray:
+    """The depths, NaN where nothing was measured."""
+    return np.where(np.isfinite(depth) & ((depth > 0) | (not camera.is_pinhole)), depth, np.nan)
 
 
 def taken_share(states: np.ndarray, others: np.ndarray) -> np.ndarray:

@@ -64,8 +64,8 @@ MOST = 100
 _RESTART = 3.0
 """A restarted pose is unsure by this many times the displacement.  Chosen."""
 _Bodies = tuple[Body, ...]
-_Expected = Callable[[np.ndarray], np.ndarray]
-"""Of states (n, 12), whether they should be seen (n,)."""
+_Expected = Callable[[Sequence[Body]], np.ndarray]
+"""Of bodies that were not seen (n,), whether they should have been, bool (n,)."""
 
 
 class Tracker:
@@ -132,7 +132,9 @@ class Tracker:
         observed, covariance = _in_world(recoveries, rotation, position)
         gamma = np.array([PREDICTED_SHARE if body.is_predicted else LASTING_SHARE for body in recoveries])
         to_camera = sight.towards(observed[:, 5:8], rotation, position, orthographic)
-        expected = partial(sight.expected, camera=camera, depth=depth, rotation=rotation, position=position)
+        expected = _asked_once(
+            partial(sight.expected, camera=camera, depth=depth, rotation=rotation, position=position)
+        )
 
         if self._stamp is not None and stamp < self._stamp:
             self.reset()
@@ -154,6 +156,19 @@ class Tracker:
         )
         self._bodies, self._stamp, self.births = _survivors(bodies, expected, stamp), stamp, self.births + len(new)
         return tuple(body.published() for body in self._bodies)
+
+
+def _asked_once(look: Callable[[np.ndarray], np.ndarray]) -> _Expected:
+    """Of each body it is looked once in a frame: one that was not seen is where it was predicted to be."""
+    known: dict[int, bool] = {}
+
+    def expected(bodies: Sequence[Body]) -> np.ndarray:
+        new = [body for body in bodies if body.id not in known]
+        if new:
+            known.update(zip((body.id for body in new), look(stacked(new)[0]).tolist(), strict=True))
+        return np.array([known[body.id] for body in bodies], dtype=bool)
+
+    return expected
 
 
 def _in_world(
@@ -212,7 +227,8 @@ def _pairs(
     left = np.setdiff1d(np.arange(len(states)), here.track)
     new = np.setdiff1d(np.arange(len(observed)), here.observed)
     # What is hidden has rather stayed where it was than become one more body of its kind far away.
-    free = np.array([visible or bodies[k].is_moving for k, visible in zip(left, expected(states[left]), strict=True)])
+    absent = [bodies[k] for k in left]
+    free = expected(absent) | np.array([body.is_moving for body in absent], dtype=bool)
     reach = FASTEST * np.array([stamp - bodies[k].agreed for k in left])
     reach = np.where(free, reach, np.minimum(reach, 2 * states[left, 0:3].max(axis=1)))
     there = association.elsewhere(states[left], covariances[left], reach, observed[new], covariance[new])
@@ -381,11 +397,12 @@ def _survivors(bodies: _Bodies, expected: _Expected, stamp: float) -> _Bodies:
     if seen.all():
         return bodies
     states, _ = stacked(bodies)
+    unseen = [body for body in bodies if body.observation is None]
     overlap = association.twins(states)
     ousted = ~seen & ((overlap | overlap.T) & seen).any(axis=1)  # in their place another body was seen
     ousted[~seen] |= sight.taken_share(states[~seen], states[seen]) >= 0.5
     missing = ousted.copy()
-    missing[~seen] |= expected(states[~seen])
+    missing[~seen] |= expected(unseen)
     left = []
     for k, body in enumerate(bodies):
         if not seen[k]:
@@ -395,6 +412,6 @@ def _survivors(bodies: _Bodies, expected: _Expected, stamp: float) -> _Bodies:
                 continue
             body = replace(body, missed=missed)
         left.append(body)
-    unseen = sorted((body for body in left if body.observation is None), key=lambda body: body.last)
-    dead = {body.id for body in unseen[: max(0, len(left) - MOST)]}
+    hidden = sorted((body for body in left if body.observation is None), key=lambda body: body.last)
+    dead = {body.id for body in hidden[: max(0, len(left) - MOST)]}
     return tuple(body for body in left if body.id not in dead)
