@@ -353,8 +353,8 @@ def _read_npz(path: Path, projection: Projection, reading: Reading) -> RecordedF
 def _metres(values: np.ndarray, scale: float) -> np.ndarray:
     """Depth of values in ``scale`` units a metre, as :func:`_single`; what is not before the camera is none either."""
     with np.errstate(all="ignore"):  # of what is no number, or none that a float holds
-        depth = _single(np.divide(values, scale, dtype=float))
-    return np.where(depth > 0, depth, np.float32(np.nan))
+        depth = (values if scale == 1 else np.divide(values, scale, dtype=float)).astype(np.float32)
+    return np.where((depth > 0) & (depth < np.inf), depth, np.float32(np.nan))
 
 
 def _single(depth: np.ndarray) -> np.ndarray:
