@@ -19,11 +19,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from sq_perception.geometry.kernels import kernel
 from sq_perception.geometry.quantiles import quantile
 from sq_perception.imaging import depth_steps, regions
-from sq_perception.imaging.camera import Camera
+from sq_perception.imaging.camera import Camera, Lens
 from sq_perception.segmentation.options import SegmentationOptions, largest_edge
-from sq_perception.segmentation.support_plane import TOLERANCE, Plane, coarse, noise_growth
+from sq_perception.segmentation.support_plane import LEAST_GROWTH, TOLERANCE, Plane, coarse, noise_growth
 from sq_perception.segmentation.support_surface import HIGHEST, LEVEL_SHARE, SupportSurface
 
 ObjectTest = Callable[[np.ndarray, np.ndarray], bool]
@@ -280,24 +281,45 @@ def _stands(
 ) -> bool:
     """Whether the support is under points (n, 3), as far as it is seen there or around, of a share of them at least;
     what the image cuts off counts as supported."""
-    normal = plane.equation[:3]
-    under = plane.height(points) + _UNDER * TOLERANCE * noise_growth(points[:, 2])
-    feet = points - under[:, None] * normal
-    feet = feet[feet[:, 2] > 0]
-    at = np.rint(camera.project(feet))
-    inside = (at >= 0).all(axis=1) & (at[:, 0] < camera.width) & (at[:, 1] < camera.height)
-    columns, rows = at[inside].astype(int).T
-    measured = depth[rows, columns] > 0
-    past = np.count_nonzero(measured & (relative[rows, columns] < -_BELOW * TOLERANCE))
-    held = np.count_nonzero(measured) - past
-    # Of a table seen at a grazing angle single pixels are measured: those around tell of one that is not.
-    around = np.array([-_SPECKLE, 0, _SPECKLE])
-    rows, columns = rows[~measured], columns[~measured]
-    rows = np.clip(rows[:, None, None] + around[:, None], 0, camera.height - 1)
-    columns = np.clip(columns[:, None, None] + around, 0, camera.width - 1)
-    level = np.where(depth[rows, columns] > 0, relative[rows, columns], np.inf)
-    lower = np.count_nonzero(level < -_BELOW * TOLERANCE, axis=(1, 2))
-    on = np.count_nonzero(np.abs(level) <= _BELOW * TOLERANCE, axis=(1, 2))
-    past += np.count_nonzero(lower > on)
-    held += np.count_nonzero((on >= lower) & (on > 0))
-    return bool(past <= held and held + np.count_nonzero(~inside) >= least * len(feet))
+    feet, past, held, cut_off = _feet(points, plane.equation, depth, relative, camera.lens)
+    return past <= held and held + cut_off >= least * feet
+
+
+@kernel
+def _feet(
+    points: np.ndarray, plane: np.ndarray, depth: np.ndarray, relative: np.ndarray, lens: Lens
+) -> tuple[int, int, int, int]:
+    """How many feet of points (n, 3) are before the camera, and of these, where something below the support is seen,
+    where the support is, or what stands on it, and how many are beyond the image."""
+    rows, columns = depth.shape
+    count, past, held, cut_off = 0, 0, 0, 0
+    for i in range(len(points)):
+        x, y, z = points[i]
+        height = plane[0] * x + plane[1] * y + plane[2] * z + plane[3]
+        under = height + _UNDER * TOLERANCE * max(z * z, LEAST_GROWTH)
+        z -= under * plane[2]
+        if not z > 0:
+            continue
+        count += 1
+        u = np.rint(lens.fx * (x - under * plane[0]) / z + lens.cx)
+        v = np.rint(lens.fy * (y - under * plane[1]) / z + lens.cy)
+        if not (0 <= u < columns and 0 <= v < rows):
+            cut_off += 1
+            continue
+        row, column = int(v), int(u)
+        if depth[row, column] > 0:
+            is_past = relative[row, column] < -_BELOW * TOLERANCE
+            past += is_past
+            held += not is_past
+            continue
+        # Of a table seen at a grazing angle single pixels are measured: those around tell of one that is not.
+        lower, on = 0, 0
+        for down in range(-_SPECKLE, _SPECKLE + 1, _SPECKLE):
+            for right in range(-_SPECKLE, _SPECKLE + 1, _SPECKLE):
+                r, c = min(max(row + down, 0), rows - 1), min(max(column + right, 0), columns - 1)
+                if depth[r, c] > 0:
+                    lower += relative[r, c] < -_BELOW * TOLERANCE
+                    on += abs(relative[r, c]) <= _BELOW * TOLERANCE
+        past += lower > on
+        held += on >= lower and on > 0
+    return count, past, held, cut_off
