@@ -10,6 +10,8 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
+from threadpoolctl import threadpool_info
+
 _PACKAGES = ("sq-perception", "numpy", "numba", "torch", "ros-jazzy-rclpy")
 
 
@@ -22,6 +24,7 @@ def facts(command: str, file: str | Path = __file__) -> dict[str, Any]:
         "commit": known,
         "modified": bool(_git(file, "status", "--porcelain", "--untracked-files=no")) if known else None,
         "processor": processor(),
+        "blas": blas(),
         "cores": os.cpu_count(),
         "python": platform.python_version(),
         "versions": {package: version(package) for package in _PACKAGES},
@@ -53,6 +56,12 @@ def processor() -> str:
     except OSError:
         pass
     return platform.processor()
+
+
+def blas() -> list[str]:
+    """Versions and kernels of NumPy's BLAS and of others that are loaded: OPENBLAS_CORETYPE may forbid the best."""
+    found = [library for library in threadpool_info() if library["user_api"] == "blas"]
+    return sorted(" ".join(str(each.get(k)) for k in ("internal_api", "version", "architecture")) for each in found)
 
 
 def _git(file: str | Path, *arguments: str) -> str | None:

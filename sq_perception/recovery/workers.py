@@ -91,7 +91,7 @@ def recovered(
         deaths = 0
         while True:
             try:
-                return key, answer.result()
+                return key, _unpacked(answer.result())
             except executor.lost:
                 deaths += 1
                 if deaths == executor.tries:
@@ -242,4 +242,14 @@ def _recoverer(setup: Setup) -> Recoverer:
 def _recover(setup: Setup, work: Work) -> FrameRecovery:
     with _one_at_a_time:  # workers of a cluster may have several threads
         found = _recoverer(setup).recover(work.depth, work.camera, work.labels, work.options)
-    return replace(found, reference=None)  # no frame follows it, and it is as large as the image
+    return _packed(found)
+
+
+def _packed(found: FrameRecovery) -> FrameRecovery:
+    """As it is sent: labels of few bytes, and no reference, as no frame follows it; both are as large as the image."""
+    labels = found.labels.astype(np.min_scalar_type(found.labels.max(initial=0)))
+    return replace(found, labels=labels, reference=None)
+
+
+def _unpacked(found: FrameRecovery | None) -> FrameRecovery | None:
+    return None if found is None else replace(found, labels=found.labels.astype(np.int32))

@@ -34,7 +34,8 @@ def _frames(count: int) -> list[tuple[int, Work]]:
         body = Superquadric(size, np.array([0.4, 0.8]), np.array([0.01 * k, 0.0, 0.5]), np.array([0.3, 0.2, 0.1, 1.0]))
         depth, index = raycast.render(body, _CAMERA)
         image = np.where(np.isfinite(depth), depth, np.nan).astype(np.float32)
-        frames.append((k, Work(image, _CAMERA, (index >= 0).astype(np.int32), _OPTIONS)))
+        labels = (1 + 30_000 * k) * (index >= 0).astype(np.int32)  # of one byte to four
+        frames.append((k, Work(image, _CAMERA, labels, _OPTIONS)))
     return frames
 
 
@@ -47,6 +48,8 @@ def test_two_processes_answer_as_one_and_in_order() -> None:
     for (_, work), (_, answer) in zip(frames, [one for one in answers if one[1] is not None], strict=True):
         expected = alone.recover(work.depth, work.camera, work.labels, work.options)
         mine, theirs = answer.bodies[0].superquadric, expected.bodies[0].superquadric
+        assert answer.labels.dtype == expected.labels.dtype
+        np.testing.assert_array_equal(answer.labels, expected.labels)
         # Kernels just compiled and those read from the cache may differ in the last bit.
         np.testing.assert_allclose(mine.to_flat(), theirs.to_flat(), rtol=1e-6, atol=1e-9)
 
